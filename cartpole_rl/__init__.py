@@ -1,0 +1,6 @@
+"""Train a cart-pole agent in simulation, drive a serial cart with it, and fine-tune it there.
+
+The floors of the house, and what may import what, are drawn in ``docs/house.md``.
+"""
+
+__version__ = "0.1.0"

@@ -1,0 +1,41 @@
+"""The error tree. Every error that a user can cause says in one line what is wrong and what would be right."""
+
+
+class CartPoleError(Exception):
+    """Anything this package raises on purpose. Commands print it as one line and exit with `exit_code`."""
+
+    exit_code = 1
+
+
+class ConfigError(CartPoleError):
+    """A setting is unknown, has the wrong type, is out of range, or contradicts another."""
+
+    exit_code = 2
+
+
+class CheckpointError(CartPoleError):
+    """A checkpoint is missing, damaged, or not one of ours."""
+
+
+class PlantError(CartPoleError):
+    """A cart cannot be driven."""
+
+
+class PortError(PlantError):
+    """A serial port does not exist, is busy, or may not be opened."""
+
+
+class LinkError(PlantError):
+    """The cart stopped answering, or was unplugged."""
+
+
+class FaultError(PlantError):
+    """The cart latched a fault; it does not move until CLEAR_FAULT."""
+
+
+class EmulatorError(PlantError):
+    """The emulated cart did not start, or ended too early."""
+
+
+class FrameError(CartPoleError):
+    """Bytes on the wire that are not a valid frame: bad stuffing, checksum, version, type or length."""

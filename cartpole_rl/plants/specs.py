@@ -1,0 +1,69 @@
+"""The contract that every plant keeps: what goes in, what comes out, in which shape and type."""
+
+import torch
+from tensordict import TensorDict
+from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+MOTOR_LIMIT = 255
+
+
+class Plant(EnvBase):
+    """A batch of N carts that speak encoder counts and motor values; simulated, or one cart on a wire.
+
+    In, each period: `motor` [N, 1] int64, -255 to 255, positive to the right.
+    Out: `counts` [N, 2] int64 (cart from the middle of the track, pole from upright, both positive to the
+    right, the pole not wrapped), `dt` [N, 1] float32 seconds since the previous frame by the plant's clock,
+    `motor_applied` [N, 1] int64, `terminated` [N, 1] bool (left the track, or a device fault),
+    `truncated` [N, 1] bool (link lost; time limits belong to the task).
+    A plant has no reward of its own and gives zeros.
+    """
+
+    def __init__(self, carts: int, device: torch.device | str = "cpu") -> None:
+        super().__init__(device=torch.device(device), batch_size=torch.Size([carts]))
+        self.action_spec = Composite(
+            motor=Bounded(-MOTOR_LIMIT, MOTOR_LIMIT, shape=(carts, 1), dtype=torch.int64, device=device),
+            shape=(carts,),
+        )
+        self.observation_spec = Composite(
+            counts=Unbounded(shape=(carts, 2), dtype=torch.int64, device=device),
+            dt=Unbounded(shape=(carts, 1), dtype=torch.float32, device=device),
+            motor_applied=Bounded(-MOTOR_LIMIT, MOTOR_LIMIT, shape=(carts, 1), dtype=torch.int64, device=device),
+            shape=(carts,),
+        )
+        self.reward_spec = Unbounded(shape=(carts, 1), device=device)
+        self.done_spec = Composite(
+            {key: Binary(shape=(carts, 1), dtype=torch.bool, device=device) for key in DONE_KEYS},
+            shape=(carts,),
+        )
+
+    @property
+    def carts(self) -> int:
+        """N, the number of carts in the batch."""
+        return self.batch_size[0]
+
+    def frame(
+        self,
+        counts: torch.Tensor,
+        dt: torch.Tensor,
+        motor_applied: torch.Tensor,
+        terminated: torch.Tensor,
+        truncated: torch.Tensor,
+    ) -> TensorDict:
+        """What `_reset` and `_step` return; `done` is `terminated | truncated`, the reward 0."""
+        return TensorDict(
+            {
+                "counts": counts,
+                "dt": dt,
+                "motor_applied": motor_applied,
+                "reward": torch.zeros_like(dt),
+                "terminated": terminated,
+                "truncated": truncated,
+                "done": terminated | truncated,
+            },
+            batch_size=self.batch_size,
+            device=self.device,
+        )
+
+
+DONE_KEYS = ("done", "terminated", "truncated")

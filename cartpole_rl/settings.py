@@ -1,0 +1,21 @@
+"""The base of every settings class: frozen, strict about unknown keys, checked when it is made.
+
+A settings class lives beside the thing it sets; only `cartpole_rl.commands` fills one from Hydra.
+Bounds are written on the field (``Annotated[float, Field(gt=0)]``), units in its comment.
+"""
+
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Fraction = Annotated[float, Field(ge=0, le=1)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Count = Annotated[int, Field(ge=1)]
+
+
+class Settings(BaseModel):
+    """A frozen pydantic model that refuses unknown keys and does not turn strings into numbers."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=False, validate_default=True)

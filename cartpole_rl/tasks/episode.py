@@ -1,0 +1,32 @@
+"""One finished episode as arrays: what evaluation scores, figures draw and recordings store."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One episode of T control periods, as the cart measured it.
+
+    Row t of the state is measured before `motor[t]` is chosen; the last row is where the episode ended.
+    """
+
+    time: Array  # [T+1] s, from 0, by the cart's clock
+    x: Array  # [T+1] m, positive to the right
+    x_dot: Array  # [T+1] m/s
+    theta: Array  # [T+1] rad, 0 upright, positive to the right, not wrapped
+    theta_dot: Array  # [T+1] rad/s
+    motor: NDArray[np.int64]  # [T] motor value that the agent asked for, -255 to 255
+    score: Array  # [T] equation (6.2) of each step, at state t+1
+    score_upright: Array  # [T] equation (6.1) of each step, at state t+1
+    reward: Array  # [T]
+    ended_by: str  # "time", "track", "angle", "fault", "link"
+
+    @property
+    def steps(self) -> int:
+        """Control periods in the episode."""
+        return len(self.motor)

@@ -1,0 +1,46 @@
+"""Wire protocol, version 1: bytes <-> dataclasses, without I/O. Written out in ``docs/protocol.md``."""
+
+from cartpole_rl.wire.frames import Frame, FrameSplitter, decode_frame, encode_frame
+from cartpole_rl.wire.messages import (
+    Ack,
+    ClearFault,
+    Fault,
+    FaultReport,
+    Flags,
+    Hello,
+    Home,
+    Info,
+    Message,
+    MessageType,
+    Nack,
+    Reason,
+    SetMotor,
+    SetPeriod,
+    Start,
+    State,
+    Stop,
+)
+
+__all__ = [
+    "Ack",
+    "ClearFault",
+    "Fault",
+    "FaultReport",
+    "Flags",
+    "Frame",
+    "FrameSplitter",
+    "Hello",
+    "Home",
+    "Info",
+    "Message",
+    "MessageType",
+    "Nack",
+    "Reason",
+    "SetMotor",
+    "SetPeriod",
+    "Start",
+    "State",
+    "Stop",
+    "decode_frame",
+    "encode_frame",
+]

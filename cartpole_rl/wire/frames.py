@@ -1,0 +1,74 @@
+"""Frames: COBS of (version u8, type u8, sequence u8, flags u8, payload, CRC-16 little-endian), ended by 0x00."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from cartpole_rl.errors import FrameError
+from cartpole_rl.wire import cobs
+from cartpole_rl.wire.checksum import crc16
+from cartpole_rl.wire.messages import MESSAGES, Message
+
+VERSION = 1
+END = b"\x00"
+HEADER_BYTES = 4
+CRC_BYTES = 2
+LONGEST_FRAME = 64  # stuffed bytes without the end; the longest message, INFO, takes 36
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One message with the header it travelled in."""
+
+    message: Message
+    sequence: int
+    flags: int = 0
+
+
+def encode_frame(message: Message, sequence: int, flags: int = 0) -> bytes:
+    """Bytes for the wire, the ending 0x00 included. `sequence` is taken modulo 256."""
+    body = bytes((VERSION, message.TYPE, sequence & 0xFF, flags)) + message.pack()
+    return cobs.encode(body + crc16(body).to_bytes(CRC_BYTES, "little")) + END
+
+
+def decode_frame(stuffed: bytes) -> Frame:
+    """The frame in `stuffed`, which comes without its ending 0x00.
+
+    Raises FrameError for bad stuffing, a frame cut short, a bad checksum, a foreign version,
+    an unknown type or a wrong payload length.
+    """
+    data = cobs.decode(stuffed)
+    if len(data) < HEADER_BYTES + CRC_BYTES:
+        raise FrameError(f"a frame of {len(data)} bytes is cut short")
+    body, checksum = data[:-CRC_BYTES], int.from_bytes(data[-CRC_BYTES:], "little")
+    if crc16(body) != checksum:
+        raise FrameError(f"checksum {checksum:#06x} is not {crc16(body):#06x}")
+    version, kind, sequence, flags = body[:HEADER_BYTES]
+    if version != VERSION:
+        raise FrameError(f"protocol version {version}; this side speaks {VERSION}")
+    if kind not in MESSAGES:
+        raise FrameError(f"unknown message type {kind:#04x}")
+    return Frame(MESSAGES[kind].unpack(body[HEADER_BYTES:]), sequence, flags)
+
+
+class FrameSplitter:
+    """Cuts a byte stream at each 0x00. Memory stays bounded: an overlong run is dropped up to the next 0x00."""
+
+    def __init__(self) -> None:
+        self._pending = bytearray()
+        self._dropping = False
+        self.overlong = 0
+
+    def feed(self, data: bytes) -> Iterator[bytes]:
+        """Yield each whole stuffed frame, without its 0x00; empty ones are skipped."""
+        for byte in data:
+            if byte == 0:
+                if self._pending and not self._dropping:
+                    yield bytes(self._pending)
+                self._pending.clear()
+                self._dropping = False
+            elif not self._dropping:
+                self._pending.append(byte)
+                if len(self._pending) > LONGEST_FRAME:
+                    self._pending.clear()
+                    self._dropping = True
+                    self.overlong += 1

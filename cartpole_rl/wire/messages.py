@@ -1,0 +1,226 @@
+"""The messages of protocol version 1. Every number is little-endian; `LAYOUT` is the payload in `struct`'s letters.
+
+Host to cart: HELLO, START, STOP, SET_MOTOR, HOME, CLEAR_FAULT, SET_PERIOD.
+Cart to host: INFO, STATE (each period), ACK, NACK, FAULT.
+"""
+
+import struct
+from dataclasses import astuple, dataclass
+from enum import IntEnum, IntFlag
+from typing import ClassVar, Self
+
+from cartpole_rl.errors import FrameError
+
+
+class MessageType(IntEnum):
+    """The frame's type byte. The top bit tells the direction: 0 host to cart, 1 cart to host."""
+
+    HELLO = 0x01
+    START = 0x02
+    STOP = 0x03
+    SET_MOTOR = 0x04
+    HOME = 0x05
+    CLEAR_FAULT = 0x06
+    SET_PERIOD = 0x07
+    INFO = 0x81
+    STATE = 0x82
+    ACK = 0x83
+    NACK = 0x84
+    FAULT = 0x85
+
+
+class Flags(IntFlag):
+    """The frame's flags byte in frames of the cart; the host sends 0."""
+
+    ARMED = 0x01
+    HOMED = 0x02
+    HOMING = 0x04
+    FAULTED = 0x08
+    SOFT_LIMIT = 0x10  # this period's command was outward beyond the soft limit and was held at 0
+    WATCHDOG = 0x20  # no valid command for three periods: motor 0
+
+
+class Fault(IntFlag):
+    """Latched faults: motor 0 until CLEAR_FAULT."""
+
+    NONE = 0
+    HARD_LIMIT = 0x0001
+    STALL = 0x0002
+    CART_ENCODER = 0x0004
+    POLE_ENCODER = 0x0008
+    HOMING = 0x0010  # a stop was not found, the span was off by over 3 %, or the pole did not come to rest
+
+
+class Reason(IntEnum):
+    """Why the cart refuses a message."""
+
+    UNKNOWN_TYPE = 1
+    BAD_LENGTH = 2
+    OUT_OF_RANGE = 3
+    NOT_HOMED = 4
+    NOT_ARMED = 5
+    FAULT_LATCHED = 6
+    BUSY = 7
+    BAD_VERSION = 8
+
+
+class Message:
+    """Base of the messages: packs and unpacks its fields in the order in which they stand."""
+
+    TYPE: ClassVar[MessageType]
+    LAYOUT: ClassVar[str] = ""
+
+    def pack(self) -> bytes:
+        """Payload bytes. Raises FrameError where a field does not fit its width."""
+        try:
+            return struct.pack("<" + self.LAYOUT, *astuple(self))  # type: ignore[call-overload]
+        except struct.error as error:
+            raise FrameError(f"{self.TYPE.name} does not fit its layout {self.LAYOUT!r}: {error}") from None
+
+    @classmethod
+    def unpack(cls, payload: bytes) -> Self:
+        """The message in `payload`. Raises FrameError for a wrong length or a value that has no meaning."""
+        if len(payload) != struct.calcsize("<" + cls.LAYOUT):
+            raise FrameError(
+                f"{cls.TYPE.name} has {len(payload)} payload bytes, not {struct.calcsize('<' + cls.LAYOUT)}"
+            )
+        try:
+            return cls(*struct.unpack("<" + cls.LAYOUT, payload))
+        except ValueError as error:
+            raise FrameError(f"{cls.TYPE.name}: {error}") from None
+
+
+@dataclass(frozen=True)
+class Hello(Message):
+    """Asks for INFO."""
+
+    TYPE = MessageType.HELLO
+
+
+@dataclass(frozen=True)
+class Start(Message):
+    """Arms the motor. Refused unless homed and free of faults."""
+
+    TYPE = MessageType.START
+
+
+@dataclass(frozen=True)
+class Stop(Message):
+    """Disarms: motor 0. Never refused; ends a homing."""
+
+    TYPE = MessageType.STOP
+
+
+@dataclass(frozen=True)
+class SetMotor(Message):
+    """Motor value, -255 to 255, positive to the right."""
+
+    TYPE = MessageType.SET_MOTOR
+    LAYOUT = "h"
+    motor: int
+
+
+@dataclass(frozen=True)
+class Home(Message):
+    """Touches both stops, checks the span, centres, waits for the pole to hang still, sets both zeros."""
+
+    TYPE = MessageType.HOME
+
+
+@dataclass(frozen=True)
+class ClearFault(Message):
+    """Clears the latched faults whose cause is gone."""
+
+    TYPE = MessageType.CLEAR_FAULT
+
+
+@dataclass(frozen=True)
+class SetPeriod(Message):
+    """Control period in microseconds; the cart accepts 5000 to 100000, only while disarmed."""
+
+    TYPE = MessageType.SET_PERIOD
+    LAYOUT = "I"
+    period_us: int
+
+
+@dataclass(frozen=True)
+class Info(Message):
+    """What the cart is. Answers HELLO and SET_PERIOD."""
+
+    TYPE = MessageType.INFO
+    LAYOUT = "BBBHIhiiI"
+    firmware_major: int
+    firmware_minor: int
+    firmware_patch: int
+    pole_counts_per_turn: int
+    cart_nanometres_per_count: int
+    motor_limit: int
+    soft_limit_counts: int  # from the middle: outward motion ends here
+    hard_limit_counts: int  # from the middle: HARD_LIMIT is latched here
+    period_us: int
+
+
+@dataclass(frozen=True)
+class State(Message):
+    """What the cart measures, once a period. Counts are 0 in the middle of the track and at the upright pole."""
+
+    TYPE = MessageType.STATE
+    LAYOUT = "IIiihBHH"
+    tick: int
+    time_us: int  # the cart's clock, wraps at 2**32
+    cart_counts: int  # positive to the right
+    pole_counts: int  # positive to the right, not wrapped at a turn
+    motor_applied: int
+    last_sequence: int  # of the newest host frame that was accepted
+    fault: int
+    command_age_ms: int  # since the newest valid SET_MOTOR, 65535 for none or longer
+
+
+@dataclass(frozen=True)
+class Ack(Message):
+    """The host frame of this sequence and type was carried out."""
+
+    TYPE = MessageType.ACK
+    LAYOUT = "BB"
+    sequence: int
+    type: int
+
+
+@dataclass(frozen=True)
+class Nack(Message):
+    """The host frame of this sequence and type was refused."""
+
+    TYPE = MessageType.NACK
+    LAYOUT = "BBB"
+    sequence: int
+    type: int
+    reason: int
+
+
+@dataclass(frozen=True)
+class FaultReport(Message):
+    """Sent once when a fault is latched; STATE repeats the bits each period."""
+
+    TYPE = MessageType.FAULT
+    LAYOUT = "HI"
+    fault: int
+    tick: int
+
+
+MESSAGES: dict[int, type[Message]] = {
+    message.TYPE: message
+    for message in (
+        Hello,
+        Start,
+        Stop,
+        SetMotor,
+        Home,
+        ClearFault,
+        SetPeriod,
+        Info,
+        State,
+        Ack,
+        Nack,
+        FaultReport,
+    )
+}
