@@ -1,0 +1,5 @@
+"""Agents: Q-networks, exploration, and the policy that leaves training."""
+
+from cartpole_rl.agents.dqn import AgentSettings, QAgent
+
+__all__ = ["AgentSettings", "QAgent"]

@@ -1,0 +1,1 @@
+"""Learning: replay, collection, updates, the training loop, and checkpoints."""

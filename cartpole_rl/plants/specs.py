@@ -38,6 +38,11 @@ class Plant(EnvBase):
         )
 
     @property
+    def pole_length(self) -> torch.Tensor:
+        """m, [N]: twice the distance from pivot to centre of mass; what a length-aware agent observes."""
+        raise NotImplementedError
+
+    @property
     def carts(self) -> int:
         """N, the number of carts in the batch."""
         return self.batch_size[0]
@@ -50,13 +55,12 @@ class Plant(EnvBase):
         terminated: torch.Tensor,
         truncated: torch.Tensor,
     ) -> TensorDict:
-        """What `_reset` and `_step` return; `done` is `terminated | truncated`, the reward 0."""
+        """What `_reset` returns; `done` is `terminated | truncated`."""
         return TensorDict(
             {
                 "counts": counts,
                 "dt": dt,
                 "motor_applied": motor_applied,
-                "reward": torch.zeros_like(dt),
                 "terminated": terminated,
                 "truncated": truncated,
                 "done": terminated | truncated,
@@ -64,6 +68,11 @@ class Plant(EnvBase):
             batch_size=self.batch_size,
             device=self.device,
         )
+
+    def step_frame(self, *frame: torch.Tensor) -> TensorDict:
+        """What `_step` returns: `frame` of the same arguments, and the reward 0, which TorchRL asks for."""
+        result = self.frame(*frame)
+        return result.set("reward", torch.zeros_like(result.get("dt")))
 
 
 DONE_KEYS = ("done", "terminated", "truncated")

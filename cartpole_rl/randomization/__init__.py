@@ -1,0 +1,7 @@
+"""Nominal parameters and a generator in, a batch of drawn parameters out."""
+
+from cartpole_rl.randomization.poles import Pole, PoleSettings
+from cartpole_rl.randomization.randomizer import Randomizer
+from cartpole_rl.randomization.ranges import Range
+
+__all__ = ["Pole", "PoleSettings", "Randomizer", "Range"]

@@ -1,0 +1,1 @@
+"""What is asked of a cart: features, rewards, scores, starts and endings, as pure tensor functions."""

@@ -1,0 +1,79 @@
+"""A DQN agent: the Q-network as a TorchRL actor, its loss with a target network, and its greedy policy."""
+
+import copy
+from typing import Annotated
+
+import torch
+from pydantic import Field
+from tensordict.nn import TensorDictModule
+from torch import nn
+from torchrl.data import Categorical
+from torchrl.modules import QValueActor
+from torchrl.objectives import DQNLoss, HardUpdate, SoftUpdate
+from torchrl.objectives.utils import TargetNetUpdater
+
+from cartpole_rl.agents.network import QNetwork
+from cartpole_rl.settings import Count, Fraction, Settings
+
+
+class AgentSettings(Settings):
+    """The agent and its loss."""
+
+    hidden: tuple[Count, ...]
+    layer_norm: bool
+    gamma: Annotated[float, Field(ge=0, lt=1)]
+    double: bool  # van Hasselt et al., 2016
+    loss: Annotated[str, Field(pattern="^(l2|smooth_l1)$")]
+    target_tau: Fraction | None  # Polyak averaging each update
+    target_period: Count | None  # or a copy every so many updates
+
+    def model_post_init(self, _: object) -> None:
+        """One way to move the target network, not two."""
+        if (self.target_tau is None) == (self.target_period is None):
+            raise ValueError("give either target_tau or target_period")
+
+
+class QAgent(nn.Module):
+    """Online and target Q-network of `observation_size` inputs and `actions` outputs."""
+
+    def __init__(self, settings: AgentSettings, observation_size: int, actions: int) -> None:
+        super().__init__()
+        self.settings = settings
+        network = QNetwork(observation_size, actions, settings.hidden, settings.layer_norm)
+        self.actor = QValueActor(network, in_keys=["observation"], spec=Categorical(actions))
+        self.loss = DQNLoss(
+            self.actor,
+            loss_function=settings.loss,
+            delay_value=True,
+            double_dqn=settings.double,
+            action_space="categorical",
+        )
+        self.loss.make_value_estimator(gamma=settings.gamma)
+
+    def target_updater(self) -> TargetNetUpdater:
+        """Call its `step` once after each gradient step."""
+        if self.settings.target_tau is not None:
+            return SoftUpdate(self.loss, tau=self.settings.target_tau)
+        assert self.settings.target_period is not None
+        # HardUpdate fires on every (interval + 1)th step
+        return HardUpdate(self.loss, value_network_update_interval=self.settings.target_period - 1)
+
+    def greedy_policy(self) -> TensorDictModule:
+        """The policy that is evaluated and exported; it follows the weights as they learn.
+
+        With Polyak averaging this is the averaged (target) network, which forgets less from one update to the
+        next; with periodic copies the online one, since the copy is stale.
+        """
+        if self.settings.target_tau is None:
+            return self.actor
+        averaged = copy.deepcopy(self.actor)
+        self.loss.target_value_network_params.to_module(averaged)
+        return averaged
+
+
+def seed_everything(seed: int) -> None:
+    """Seed what draws without a generator of its own: weights, exploration (torch), prioritized replay (NumPy)."""
+    import numpy as np
+
+    torch.manual_seed(seed)
+    np.random.seed(seed % 2**32)  # noqa: NPY002 - TorchRL's sampler draws from NumPy's global generator

@@ -1,0 +1,60 @@
+"""Collects experience: epsilon-greedy on all carts at once."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import EnvBase
+
+COLLECTED = (
+    "observation",
+    "action",
+    ("next", "observation"),
+    ("next", "reward"),
+    ("next", "terminated"),
+    ("next", "done"),
+    ("next", "score"),
+    ("next", "step_count"),
+)
+
+
+class Collector:
+    """Steps `env` with `policy`, resetting the carts whose episode ended; remembers where it stands."""
+
+    def __init__(self, env: EnvBase, policy: TensorDictModuleBase, actions: int, seed: int) -> None:
+        self.env, self.policy, self.actions = env, policy, actions
+        self.epsilon = 1.0
+        self._generator = torch.Generator(device=env.device)
+        self._generator.manual_seed(seed)
+        self._present = env.reset()
+
+    @torch.no_grad()
+    def collect(self, periods: int) -> TensorDictBase:
+        """Transitions [N, periods] with the keys COLLECTED."""
+        taken = []
+        for _ in range(periods):
+            self._act(self._present)
+            transition, self._present = self.env.step_and_maybe_reset(self._present)
+            taken.append(transition.select(*COLLECTED))
+        return torch.stack(taken, 1)
+
+    def _act(self, present: TensorDictBase) -> None:
+        carts = self.env.batch_size
+        draws = {"generator": self._generator, "device": self.env.device}
+        action = torch.randint(self.actions, carts, **draws)
+        if self.epsilon < 1:
+            explore = torch.rand(carts, **draws) < self.epsilon
+            greedy = self.policy(present.select("observation")).get("action")
+            action = torch.where(explore, action, greedy)
+        present.set("action", action)
+
+    def snapshot(self) -> dict[str, Any]:
+        """All that the next chunk depends on, beside the environment's own snapshot."""
+        return {"present": self._present.to_dict(), "generator": self._generator.get_state()}
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        """Go on from `snapshot`."""
+        self._present = TensorDict(snapshot["present"], batch_size=self.env.batch_size)
+        self._generator.set_state(snapshot["generator"])

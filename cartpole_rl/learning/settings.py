@@ -1,0 +1,60 @@
+"""What can be set about learning."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from cartpole_rl.settings import Count, Fraction, NonNegative, Positive, Settings
+
+
+class ReplaySettings(Settings):
+    """Replay buffer; `alpha` and `beta` are those of Schaul et al., "Prioritized experience replay", 2016."""
+
+    kind: Literal["prioritized", "uniform"]
+    size: Count  # transitions
+    alpha: NonNegative  # TorchRL's priority is the squared error, so this acts doubled
+    beta: tuple[Fraction, Fraction]  # from the first to the last update, linearly
+    priority_eps: Positive
+
+
+class OptimizerSettings(Settings):
+    """Adam or AdamW."""
+
+    kind: Literal["adam", "adamw"]
+    learning_rate: Positive
+    learning_rate_end: Fraction  # share of `learning_rate` at the end, reached along half a cosine
+    weight_decay: NonNegative
+    max_grad_norm: Positive
+
+
+class LearningSettings(Settings):
+    """The training loop. One iteration collects `chunk` periods on every cart, then makes `updates` updates."""
+
+    frames: Count  # transitions in all
+    carts: Count  # simulated in parallel
+    chunk: Count  # periods
+    updates: Count  # gradient steps an iteration
+    batch_size: Count
+    n_step: Annotated[int, Field(ge=1, le=20)]
+    warmup_frames: Annotated[int, Field(ge=0)]  # random actions before the first update
+    epsilon: tuple[Fraction, Fraction]  # exploration, from first to last
+    epsilon_frames: Count  # over which epsilon falls, linearly
+    evaluations: Count  # during training, evenly spaced, the last at the end
+    evaluation_episodes: Count
+    checkpoint_interval: Count  # evaluations between two checkpoints that training can resume from
+
+    @model_validator(mode="after")
+    def _long_enough(self) -> "LearningSettings":
+        if self.frames < self.carts * self.chunk * self.evaluations:
+            raise ValueError(
+                f"frames {self.frames} is less than one iteration an evaluation; it must be at least "
+                f"carts * chunk * evaluations = {self.carts * self.chunk * self.evaluations}"
+            )
+        if self.chunk < self.n_step:
+            raise ValueError(f"chunk {self.chunk} must be at least n_step {self.n_step}")
+        return self
+
+    @property
+    def iterations(self) -> int:
+        """Rounds of collecting and learning."""
+        return self.frames // (self.carts * self.chunk)

@@ -1,0 +1,71 @@
+"""Friction of the cart on its track and of the pole in its bearing: pure functions of the velocity.
+
+Each returns the friction's coefficient or torque so that the power it takes out, force times velocity, is never
+negative. Dry friction is given per newton of normal force, because the pole may press on the cart.
+"""
+
+from enum import StrEnum
+
+import torch
+from torch import Tensor
+
+from cartpole_rl.physics.parameters import CartParameters
+
+
+class CartFriction(StrEnum):
+    """Model of the cart's friction. All but NONE add the viscous term."""
+
+    NONE = "none"
+    LINEAR = "linear"  # (5.7): viscous alone
+    STEP = "step"  # (5.6)
+    SIGMOID = "sigmoid"  # (5.8)
+    STRIBECK = "stribeck"  # static friction above Coulomb, falling with speed
+
+
+class PoleFriction(StrEnum):
+    """Model of the pole's friction."""
+
+    NONE = "none"
+    EXPONENTIAL = "exponential"  # viscous: a small swing decays exponentially
+    EXPONENTIAL_DRAG = "exponential_drag"  # viscous and quadratic air drag
+
+
+STICKING = (CartFriction.STEP, CartFriction.STRIBECK)  # models with a force at rest
+
+
+def coulomb_force(x_dot: Tensor, cart: CartParameters) -> Tensor:
+    """Coulomb friction of the direction of motion, N >= 0, [N]."""
+    return cart.cart_coulomb * (1 + cart.cart_coulomb_asymmetry * torch.sign(x_dot))
+
+
+def dry_friction(x_dot: Tensor, cart: CartParameters, model: CartFriction) -> Tensor:
+    """Dry friction at the resting pole's normal force, N, [N], with the sign of the velocity.
+
+    Equations (5.6) and (5.8); Stribeck: Armstrong-Helouvry et al., Automatica 30(7), 1994,
+    F_c + (F_s - F_c) exp(-(v / v_s)^2).
+    """
+    if model in (CartFriction.NONE, CartFriction.LINEAR):
+        return torch.zeros_like(x_dot)
+    coulomb = coulomb_force(x_dot, cart)
+    if model is CartFriction.SIGMOID:
+        # 2 / (1 + exp(-rho v)) - 1 is tanh(rho v / 2)
+        return coulomb * torch.tanh(0.5 * cart.sigmoid_slope * x_dot)
+    if model is CartFriction.STRIBECK:
+        excess = (cart.cart_stiction_ratio - 1) * torch.exp(-((x_dot / cart.stribeck_velocity) ** 2))
+        coulomb = coulomb * (1 + excess)
+    return coulomb * torch.sign(x_dot)
+
+
+def viscous_coefficient(cart: CartParameters, model: CartFriction) -> Tensor:
+    """N s/m, [N]: equation (5.7), 0 for NONE."""
+    return torch.zeros_like(cart.cart_viscous) if model is CartFriction.NONE else cart.cart_viscous
+
+
+def pole_torque(theta_dot: Tensor, cart: CartParameters, model: PoleFriction) -> Tensor:
+    """Friction torque on the pole, N m, [N], against the angular velocity."""
+    if model is PoleFriction.NONE:
+        return torch.zeros_like(theta_dot)
+    torque = -cart.pole_viscous * theta_dot
+    if model is PoleFriction.EXPONENTIAL_DRAG:
+        torque = torque - cart.pole_drag * theta_dot * theta_dot.abs()
+    return torque

@@ -1,0 +1,52 @@
+"""Which pole a cart carries: one, one of several, or a rod of random length. A pole is chosen whole."""
+
+from pydantic import model_validator
+
+from cartpole_rl.physics.parameters import uniform_rod
+from cartpole_rl.settings import NonNegative, Positive, Settings
+
+
+class Pole(Settings):
+    """A rigid pole."""
+
+    pole_mass: Positive  # kg
+    pole_com: Positive  # m, pivot to centre of mass
+    pole_inertia: NonNegative  # kg m^2, about the centre of mass
+
+    @classmethod
+    def rod(cls, length: float) -> "Pole":
+        """A uniform rod of `length` m and the thesis's 0.7 kg/m."""
+        return cls(**uniform_rod(length))  # type: ignore[arg-type]
+
+
+class PoleSettings(Settings):
+    """`choices` by name, one drawn an episode, or `lengths` [low, high) in m of a uniform rod."""
+
+    choices: dict[str, Pole] | None = None
+    lengths: tuple[Positive, Positive] | None = None
+
+    @model_validator(mode="after")
+    def _one_way(self) -> "PoleSettings":
+        if (self.choices is None) == (self.lengths is None):
+            raise ValueError("give either choices or lengths")
+        if self.choices is not None and not self.choices:
+            raise ValueError("choices names no pole")
+        if self.lengths is not None and not self.lengths[0] < self.lengths[1]:
+            raise ValueError(f"lengths {list(self.lengths)} must rise")
+        return self
+
+    @property
+    def nominal(self) -> Pole:
+        """The pole that stands for the whole choice: the first one, or the rod of middle length."""
+        if self.choices is not None:
+            return next(iter(self.choices.values()))
+        assert self.lengths is not None
+        return Pole.rod(sum(self.lengths) / 2)
+
+    @property
+    def name(self) -> str:
+        """For tables and file names: "medium", "medium or large", "0.2 to 1.0 m"."""
+        if self.choices is not None:
+            return " or ".join(self.choices)
+        assert self.lengths is not None
+        return f"{self.lengths[0]:g} to {self.lengths[1]:g} m"

@@ -1,0 +1,79 @@
+"""One episode as an animated GIF in real time, small enough for a page, a pull request or TensorBoard.
+
+All frames share one fixed palette of 32 colours, so that a frame holds only what changed.
+"""
+
+import io
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageDraw
+
+from cartpole_rl.reporting.drawing import FINER, CartDrawing, palette
+from cartpole_rl.tasks.episode import Episode
+
+EVERY = 2  # control periods between frames: 25 frames a second at 50 Hz
+LAST_FRAME = 1000  # ms that the end stays before the animation begins again
+SHORTEST = 20  # ms; browsers slow down a frame that claims less
+
+
+def write_gif(
+    episode: Episode,
+    path: Path | str,
+    pole_length: float,
+    track_half_length: float,
+    title: str = "",
+    every: int = EVERY,
+) -> Path:
+    """Write the animation of `gif` to `path`; folders are made."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(gif(episode, pole_length, track_half_length, title, every))
+    return path
+
+
+def gif(
+    episode: Episode, pole_length: float, track_half_length: float, title: str = "", every: int = EVERY
+) -> bytes:
+    """The episode as the bytes of an endless GIF that runs in real time and rests on its last frame.
+
+    `pole_length` from pivot to tip and `track_half_length`, both in m; a frame every `every` control periods.
+    """
+    first, *others = frames(episode, pole_length, track_half_length, title, every)
+    buffer = io.BytesIO()
+    first.save(
+        buffer,
+        "GIF",
+        save_all=True,
+        append_images=others,
+        duration=durations(episode, every),
+        loop=0,
+        optimize=False,
+        disposal=1,
+    )
+    return buffer.getvalue()
+
+
+def frames(
+    episode: Episode, pole_length: float, track_half_length: float, title: str = "", every: int = EVERY
+) -> Iterator[Image.Image]:
+    """Pictures of 480 by 320 pixels in the fixed palette; arguments as for `gif`."""
+    drawing = CartDrawing.of(episode, pole_length, track_half_length)
+    still = drawing.still(title)
+    for row in rows(episode, every):
+        canvas = still.copy()
+        drawing.draw(ImageDraw.Draw(canvas), row)
+        yield canvas.reduce(FINER).quantize(palette=palette(), dither=Image.Dither.NONE)
+
+
+def rows(episode: Episode, every: int = EVERY) -> list[int]:
+    """Rows of the state that become frames: each `every`-th, and the last."""
+    chosen = list(range(0, episode.steps + 1, every))
+    return chosen if chosen[-1] == episode.steps else [*chosen, episode.steps]
+
+
+def durations(episode: Episode, every: int = EVERY) -> list[int]:
+    """How long each frame is shown, in ms: real time in the GIF's unit of 10 ms, rounded without drift."""
+    hundredths = np.rint(100 * episode.time[rows(episode, every)]).astype(int)
+    return [max(10 * int(wait), SHORTEST) for wait in np.diff(hundredths)] + [LAST_FRAME]

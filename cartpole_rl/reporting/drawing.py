@@ -1,0 +1,235 @@
+"""A cart, its pole and its track as a Pillow picture, to scale.
+
+Positions are those that the cart measured, x and theta positive to the right. Everything is drawn FINER times
+larger and scaled down, which smooths the edges; coordinates in this file are those fine pixels, sizes that a
+reader sees are given in pixels and multiplied. Colours mean what they mean in the figures.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageColor, ImageDraw, ImageFont
+
+from cartpole_rl.reporting import style
+from cartpole_rl.reporting.upright import is_upright
+from cartpole_rl.reporting.words import ending_text
+from cartpole_rl.tasks.endings import Ending
+from cartpole_rl.tasks.episode import Episode
+
+SIZE = (480, 320)  # pixels
+FINER = 2
+
+MARGIN = 20  # pixels, left and right
+PIVOT_HEIGHT = 172  # pixels from the top
+REACH = 118  # pixels that the pole may take above and below the pivot
+CART_WIDTH, CART_HEIGHT, WHEEL = 40, 20, 5  # pixels; a sign for the cart, the only thing not to scale
+FULL_MOTOR, LONGEST_ARROW = 255, 70  # motor value, and the pixels that it is drawn with
+BAR = (294, 301)  # pixels from the top: the bar that fills as time goes by
+LEGEND = 311  # pixels from the top
+TITLE_WIDTH = 270  # pixels; what is longer is cut
+TRAIL = 0.4  # s that the way of the pole's tip stays visible
+FAINTEST = 0.15  # part of its colour at the far end
+
+TINTS = {  # parts of each colour over white that smooth edges need; with white at most 32 colours
+    style.INK: (1.0, 0.8, 0.6, 0.42, 0.27, 0.13),
+    style.POLE: (1.0, 0.75, 0.5, 0.3, 0.15),
+    style.UPRIGHT: (1.0, 0.75, 0.5, 0.3, 0.15),
+    style.CART: (1.0, 0.8, 0.6, 0.4, 0.2),
+    style.MOTOR: (1.0, 0.75, 0.5, 0.25),
+    style.LIMIT: (1.0, 0.75, 0.5, 0.25),
+}
+
+Colour = tuple[int, int, int]
+Draw = ImageDraw.ImageDraw
+
+
+@dataclass(frozen=True)
+class CartDrawing:
+    """One episode, ready to be drawn row by row."""
+
+    episode: Episode
+    pole: float  # fine pixels
+    track: float  # fine pixels, half length
+    scale: float  # fine pixels a metre
+    upright: NDArray[np.bool_]  # [T+1]
+    score: NDArray[np.float64]  # [T+1] sum of equation (6.2) so far
+
+    @classmethod
+    def of(cls, episode: Episode, pole_length: float, track_half_length: float) -> "CartDrawing":
+        """At the largest scale at which the track fits sideways, and the pole up and down; lengths in m."""
+        width = SIZE[0] - 2 * MARGIN
+        scale = FINER * min(REACH / pole_length, (width - 1.3 * CART_WIDTH) / (2 * track_half_length))
+        return cls(
+            episode,
+            pole=pole_length * scale,
+            track=track_half_length * scale,
+            scale=scale,
+            upright=is_upright(episode.theta),
+            score=np.concatenate(([0.0], np.cumsum(episode.score))),
+        )
+
+    def still(self, title: str) -> Image.Image:
+        """What never changes: the title, the track with its stops and its middle, the empty time bar."""
+        canvas = Image.new("RGB", (FINER * SIZE[0], FINER * SIZE[1]), style.PAPER)
+        draw = ImageDraw.Draw(canvas)
+        self._draw_title(draw, title)
+        self._draw_track(draw)
+        draw.rectangle(_bar(0.0, 1.0), fill=tint(style.INK, 0.13))
+        _draw_legend(draw)
+        return canvas
+
+    def draw(self, draw: Draw, row: int) -> None:
+        """What moves, as it was at `row` of the state."""
+        self._draw_trail(draw, row)
+        self._draw_arrow(draw, row)
+        self._draw_cart(draw, row)
+        self._draw_progress(draw, row)
+        self._draw_numbers(draw, row)
+
+    def _cart(self, row: int) -> tuple[float, float]:
+        """Where the pivot is."""
+        return FINER * SIZE[0] / 2 + self.episode.x[row] * self.scale, FINER * float(PIVOT_HEIGHT)
+
+    def _tip(self, row: int) -> tuple[float, float]:
+        """Where the pole's tip is."""
+        x, y = self._cart(row)
+        theta = self.episode.theta[row]
+        return x + self.pole * math.sin(theta), y - self.pole * math.cos(theta)
+
+    def _colour(self, row: int) -> str:
+        """Green while the pole is upright."""
+        return style.UPRIGHT if self.upright[row] else style.POLE
+
+    def _draw_title(self, draw: Draw, title: str) -> None:
+        """The title, cut where the numbers begin."""
+        font, whole = _font(15, bold=True), title
+        while font.getlength(title) > FINER * TITLE_WIDTH:
+            whole = whole[:-1].rstrip()
+            title = whole + "…"
+        draw.text((FINER * MARGIN, FINER * 24), title, fill=style.INK, font=font, anchor="lm")
+
+    def _draw_track(self, draw: Draw) -> None:
+        """The rail, its stops, which a cart in the last position touches, and its middle."""
+        middle, height, grey = FINER * SIZE[0] / 2, FINER * PIVOT_HEIGHT, tint(style.INK, 0.42)
+        end = self.track + FINER * CART_WIDTH / 2
+        rail = height + FINER * (CART_HEIGHT / 2 + WHEEL)
+        draw.rectangle((middle - end, rail, middle + end, rail + FINER * 3), fill=grey)
+        for side in (-1, 1):
+            inner, outer = middle + side * end, middle + side * (end + FINER * 5)
+            box = (min(inner, outer), height - FINER * 12, max(inner, outer), rail + FINER * 3)
+            draw.rectangle(box, fill=style.LIMIT)
+        draw.line((middle, rail + FINER * 5, middle, rail + FINER * 11), fill=grey, width=FINER * 2)
+
+    def _draw_trail(self, draw: Draw, row: int) -> None:
+        """Where the tip was a moment ago, fading."""
+        since = self.episode.time[row] - self.episode.time[: row + 1]
+        for earlier in np.flatnonzero(since < TRAIL)[:-1]:
+            part = FAINTEST + (0.5 - FAINTEST) * (1 - since[earlier] / TRAIL)
+            points = (*self._tip(earlier), *self._tip(earlier + 1))
+            draw.line(points, fill=tint(self._colour(earlier), part), width=FINER * 3)
+
+    def _draw_arrow(self, draw: Draw, row: int) -> None:
+        """The motor value, from the side of the cart that it pushes towards."""
+        motor = int(self.episode.motor[row]) if row < self.episode.steps else 0
+        if motor == 0:
+            return
+        x, y = self._cart(row)
+        side = math.copysign(1, motor)
+        head = FINER * 9.0
+        start = x + side * FINER * (CART_WIDTH / 2 + 4)
+        end = start + side * (FINER * LONGEST_ARROW * abs(motor) / FULL_MOTOR + head)
+        draw.line((start, y, end - side * head, y), fill=style.MOTOR, width=FINER * 6)
+        draw.polygon(
+            [(end, y), (end - side * head, y - head), (end - side * head, y + head)], fill=style.MOTOR
+        )
+
+    def _draw_cart(self, draw: Draw, row: int) -> None:
+        """Wheels, cart and pole."""
+        x, y = self._cart(row)
+        half_width, half_height = FINER * CART_WIDTH / 2, FINER * CART_HEIGHT / 2
+        for side in (-0.55, 0.55):
+            _disc(draw, x + side * half_width, y + half_height, FINER * WHEEL, style.INK)
+        box = (x - half_width, y - half_height, x + half_width, y + half_height)
+        draw.rounded_rectangle(box, FINER * 4, fill=style.CART)
+        draw.line((x, y, *self._tip(row)), fill=self._colour(row), width=FINER * 7)
+        _disc(draw, *self._tip(row), FINER * 3.4, self._colour(row))
+        _disc(draw, x, y, FINER * 6.0, style.INK)
+        _disc(draw, x, y, FINER * 2.5, style.PAPER)
+
+    def _draw_progress(self, draw: Draw, row: int) -> None:
+        """Fill the bar up to now: green where the pole was upright."""
+        time = self.episode.time
+        span = time[-1] - time[0] or 1.0
+        edges = [0, *(np.flatnonzero(np.diff(self.upright[: row + 1])) + 1), row]
+        for start, stop in pairwise(edges):
+            colour = style.UPRIGHT if self.upright[start] else tint(style.POLE, 0.5)
+            draw.rectangle(_bar((time[start] - time[0]) / span, (time[stop] - time[0]) / span), fill=colour)
+
+    def _draw_numbers(self, draw: Draw, row: int) -> None:
+        """Clock and score so far, and whether the pole is up."""
+        right, font = FINER * (SIZE[0] - MARGIN), _font(15)
+        clock = f"{self.episode.time[row] - self.episode.time[0]:.2f} s"
+        draw.text((right, FINER * 24), clock, fill=style.INK, font=font, anchor="rm")
+        score = f"score {self.score[row]:.0f}"
+        draw.text((right - FINER * 75, FINER * 24), score, fill=style.INK, font=font, anchor="rm")
+        if row == self.episode.steps and self.episode.ended_by != Ending.TIME:
+            draw.text(
+                (FINER * MARGIN, FINER * 46),
+                ending_text(self.episode),
+                fill=style.LIMIT,
+                font=font,
+                anchor="lm",
+            )
+
+
+def tint(colour: str, part: float) -> Colour:
+    """`part` of a colour over white; 0 is white."""
+    red, green, blue = (round(255 + part * (level - 255)) for level in ImageColor.getrgb(colour)[:3])
+    return red, green, blue
+
+
+@cache
+def palette() -> Image.Image:
+    """The fixed colours, as Pillow wants them: a picture whose palette is read."""
+    colours = [tint(style.INK, 0.0)] + [
+        tint(colour, part) for colour, parts in TINTS.items() for part in parts
+    ]
+    holder = Image.new("P", (1, 1))
+    holder.putpalette([level for colour in colours for level in colour])
+    return holder
+
+
+@cache
+def _font(size: int, bold: bool = False) -> ImageFont.FreeTypeFont:
+    """The figures' own typeface, which matplotlib brings along, at `size` pixels."""
+    name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
+    return ImageFont.truetype(str(Path(matplotlib.get_data_path(), "fonts", "ttf", name)), FINER * size)
+
+
+def _bar(start: float, stop: float) -> tuple[float, float, float, float]:
+    """The time bar between two parts of the episode, 0 to 1, as a box."""
+    left, width = FINER * MARGIN, FINER * (SIZE[0] - 2 * MARGIN)
+    return left + start * width, FINER * BAR[0], left + stop * width, FINER * BAR[1]
+
+
+def _draw_legend(draw: Draw) -> None:
+    """Under the bar, what its green means, and what the arrow is."""
+    font, height, grey = _font(10), FINER * LEGEND, tint(style.INK, 0.6)
+    left, right = FINER * MARGIN, FINER * (SIZE[0] - MARGIN)
+    draw.text((left, height), "time, green while the pole is upright", fill=grey, font=font, anchor="lm")
+    words = "motor"
+    draw.text((right, height), words, fill=grey, font=font, anchor="rm")
+    tip, head = right - font.getlength(words) - FINER * 5, FINER * 4
+    draw.line((tip - FINER * 16, height, tip - head, height), fill=style.MOTOR, width=FINER * 3)
+    draw.polygon([(tip, height), (tip - head, height - head), (tip - head, height + head)], fill=style.MOTOR)
+
+
+def _disc(draw: Draw, x: float, y: float, radius: float, colour: str) -> None:
+    """A filled circle."""
+    draw.ellipse((x - radius, y - radius, x + radius, y + radius), fill=colour)

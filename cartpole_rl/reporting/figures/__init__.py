@@ -1,0 +1,21 @@
+"""Figures of a run: each function takes arrays and gives a matplotlib Figure; `save` writes one.
+
+No function touches pyplot or a global setting, so they may be called from any thread and beside anything else
+that draws.
+"""
+
+from cartpole_rl.reporting.figures.behaviours import behaviour
+from cartpole_rl.reporting.figures.comparisons import comparison
+from cartpole_rl.reporting.figures.files import png, save
+from cartpole_rl.reporting.figures.histograms import randomization_histograms
+from cartpole_rl.reporting.figures.learning_curves import THESIS_GUIDES, learning_curve
+
+__all__ = [
+    "THESIS_GUIDES",
+    "behaviour",
+    "comparison",
+    "learning_curve",
+    "png",
+    "randomization_histograms",
+    "save",
+]

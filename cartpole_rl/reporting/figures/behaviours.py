@@ -1,0 +1,121 @@
+"""What the cart did in one episode: angle, position and action over time (thesis, figures 6.2 and 6.10).
+
+The thesis scales the three to one axis; here each has its own panel and unit, on one time axis.
+"""
+
+import math
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from cartpole_rl.reporting import style
+from cartpole_rl.reporting.figures.notes import at_moment, beside
+from cartpole_rl.reporting.upright import is_upright, upright_since
+from cartpole_rl.reporting.words import ending_text
+from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.tasks.rewards import UPRIGHT_ANGLE
+
+SMALL_SWING = 40.0  # deg; a pole that never leaned further is shown enlarged
+MOTOR_LIMIT = 255
+MOTOR_TICKS = (-250, -125, 0, 125, 250)
+
+Array = NDArray[np.float64]
+
+
+def behaviour(episode: Episode, title: str = "One episode", track_half_length: float | None = None) -> Figure:
+    """Angle (deg, wrapped), position (cm) and motor value of one episode over time (s).
+
+    `track_half_length` in m draws the ends of the track. Under the title stand the score, equation (6.2),
+    how much of the time the pole was upright, and how the episode ended.
+    """
+    figure = style.new_figure(height=6.2)
+    angle, position, motor = figure.subplots(3, 1, sharex=True, height_ratios=(2.2, 1.3, 1.0))
+    _draw_angle(angle, episode)
+    _draw_position(position, episode, track_half_length)
+    _draw_motor(motor, episode)
+    style.title(angle, title, _summary(episode))
+    style.label(motor, x="time (s)")
+    figure.align_ylabels()
+    return figure
+
+
+def wrapped_line(time: Array, theta: Array) -> tuple[Array, Array]:
+    """The angle as a line that can be drawn: times (s) and degrees in [-180, 180], broken where it wraps.
+
+    `time` [T] in s and `theta` [T] in rad, wrapped or not, become arrays of at least T points. Where the pole
+    passes the bottom the line runs to the edge, breaks (a NaN) and comes in from the other edge, instead of
+    crossing the whole panel.
+    """
+    degrees = np.degrees(np.unwrap(theta))
+    turns = np.ceil((degrees - 180.0) / 360.0)  # 0 within (-180, 180]
+    wrapped = degrees - 360.0 * turns
+    times, angles = list(time[:1]), list(wrapped[:1])
+    for i in range(1, len(time)):
+        if turns[i] != turns[i - 1]:
+            side = np.sign(turns[i] - turns[i - 1])  # 1: leaves at 180, enters at -180
+            way = side * 180.0 - wrapped[i - 1]
+            moment = time[i - 1] + (time[i] - time[i - 1]) * way / (degrees[i] - degrees[i - 1])
+            times += [moment, moment, moment]
+            angles += [side * 180.0, math.nan, -side * 180.0]
+        times.append(time[i])
+        angles.append(wrapped[i])
+    return np.array(times), np.array(angles)
+
+
+def _draw_angle(axes: Axes, episode: Episode) -> None:
+    """The top panel: the wrapped angle, the upright band, and when the pole was up for the first time."""
+    style.dress(axes)
+    style.label(axes, y="pole angle (deg)")
+    band = math.degrees(UPRIGHT_ANGLE)
+    axes.axhspan(-band, band, color=style.UPRIGHT, alpha=0.2, linewidth=0)
+    axes.plot(*wrapped_line(episode.time, episode.theta), color=style.POLE, linewidth=1.6)
+    beside(axes, 0, "upright", style.UPRIGHT)
+    largest = float(np.degrees(np.abs(episode.theta)).max())
+    if largest < SMALL_SWING:
+        reach = 1.15 * max(largest, 1.3 * band)
+        axes.set_ylim(-reach, reach)
+    else:
+        axes.set_ylim(-190, 190)
+        axes.set_yticks((-180, -90, 0, 90, 180))
+        beside(axes, 180, "hanging", style.MUTED)
+        beside(axes, -180, "hanging", style.MUTED)
+    axes.set_xlim(episode.time[0], episode.time[-1])
+    moment = upright_since(episode.time, episode.theta)
+    if moment is not None and moment > episode.time[0]:
+        at_moment(axes, moment, f"up from {moment:.1f} s", style.UPRIGHT)
+
+
+def _draw_position(axes: Axes, episode: Episode, track_half_length: float | None) -> None:
+    """The middle panel: where the cart is, between the ends of its track."""
+    style.dress(axes)
+    style.label(axes, y="cart (cm)")
+    position = 100 * episode.x
+    axes.plot(episode.time, position, color=style.CART, linewidth=1.6)
+    reach = max(1.15 * float(np.abs(position).max()), 2.0)
+    if track_half_length is not None:
+        end = 100 * track_half_length
+        reach = max(reach, 1.15 * end)
+        for side in (-end, end):
+            axes.axhline(side, color=style.LIMIT, linewidth=1.4)
+            beside(axes, side, "end of track", style.LIMIT)
+    axes.set_ylim(-reach, reach)
+
+
+def _draw_motor(axes: Axes, episode: Episode) -> None:
+    """The bottom panel: the motor value asked for in each period."""
+    style.dress(axes)
+    style.label(axes, y="motor value")
+    axes.stairs(episode.motor, episode.time, fill=True, color=style.MOTOR, alpha=0.35)
+    axes.stairs(episode.motor, episode.time, baseline=None, color=style.MOTOR, linewidth=1.0)
+    axes.set_ylim(-1.15 * MOTOR_LIMIT, 1.15 * MOTOR_LIMIT)
+    axes.set_yticks(MOTOR_TICKS)
+    beside(axes, MOTOR_TICKS[-1], "pushes right", style.MUTED)
+    beside(axes, MOTOR_TICKS[0], "pushes left", style.MUTED)
+
+
+def _summary(episode: Episode) -> str:
+    """The episode in one line."""
+    share = 100 * is_upright(episode.theta[1:]).mean()
+    return f"score {episode.score.sum():.0f},  upright {share:.0f} % of the time,  {ending_text(episode)}"

@@ -1,0 +1,23 @@
+"""A figure as a file or as the bytes of one."""
+
+import io
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from cartpole_rl.reporting import style
+
+
+def save(figure: Figure, path: Path | str) -> Path:
+    """Write `figure` to `path`, whose ending chooses the format (.png, .pdf, .svg); folders are made."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=style.DPI)
+    return path
+
+
+def png(figure: Figure, dpi: float = style.DPI) -> bytes:
+    """`figure` as the bytes of a PNG file."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=dpi)
+    return buffer.getvalue()

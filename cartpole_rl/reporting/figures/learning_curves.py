@@ -1,0 +1,138 @@
+"""Learning curves: the score of the evaluation episodes over the frames seen (as figure 6.9 of the thesis).
+
+The thesis draws one agent; here every seed is drawn, so that luck shows.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
+
+from cartpole_rl.errors import ConfigError
+from cartpole_rl.reporting import style
+from cartpole_rl.reporting.figures.notes import guide
+
+THESIS_GUIDES = {"good": 2000.0, "very good": 2500.0}
+"""How the thesis judges a swing-up by score (6.2)."""
+
+MILLION = 1e6
+
+Record = Mapping[str, Any]
+Run = Sequence[Record]
+Array = NDArray[np.float64]
+
+
+def learning_curve(
+    histories: Sequence[tuple[str, Run]],
+    threshold: float | None = None,
+    guides: Mapping[str, float] | None = None,
+    title: str = "Learning curve",
+) -> Figure:
+    """Score per evaluation over millions of frames, one colour for each label.
+
+    A history is a label and its records, one an evaluation, in the order of learning: `frames`, `seconds` of
+    training, and over the episodes of that evaluation `score` (mean), `score_min`, `score_max`.
+    **Runs that share a label are seeds of one set-up**: each is a thin line, their median a thick one. A run
+    alone is a thick line. The band spans the worst to the best episode of all runs of that label.
+    `threshold` is a score to reach, `guides` names other scores, as THESIS_GUIDES does.
+    Raises ConfigError for no history and for one without a record.
+    """
+    if not histories or not all(records for _, records in histories):
+        raise ConfigError("a learning curve needs at least one run, and at least one evaluation in each")
+    figure = style.new_figure(height=4.4)
+    axes = figure.subplots()
+    style.dress(axes)
+    groups = _groups(histories)
+    for index, (name, runs) in enumerate(groups.items()):
+        _draw_group(axes, name, runs, style.series_colour(index))
+    _draw_guides(axes, guides or {}, threshold, [run for _, run in histories])
+    axes.xaxis.set_major_locator(MaxNLocator(nbins=8, steps=(1, 2, 5, 10)))
+    axes.set_xlim(left=0)
+    axes.set_ylim(bottom=min(0.0, axes.dataLim.y0))
+    axes.legend(loc="lower right", fontsize=style.NOTE_SIZE, frameon=True, framealpha=0.9, edgecolor="none")
+    style.label(axes, x="frames (millions)", y="score of an episode")
+    lines = "thin lines: runs,  thick line: their median" if len(histories) > len(groups) else "line: mean"
+    style.title(axes, title, f"{lines},  band: worst to best episode")
+    return figure
+
+
+def _groups(histories: Sequence[tuple[str, Run]]) -> dict[str, list[Run]]:
+    """The runs of each label, labels in the order in which they first come."""
+    groups: dict[str, list[Run]] = {}
+    for label, records in histories:
+        groups.setdefault(label, []).append(records)
+    return groups
+
+
+def _column(run: Run, key: str) -> Array:
+    """One key of a run's records as an array [evaluations]."""
+    return np.array([record[key] for record in run], dtype=np.float64)
+
+
+def _on_common_frames(runs: Sequence[Run], key: str) -> tuple[Array, Array]:
+    """Frames [F] that all runs have passed, and `key` of each run there [runs, F], interpolated."""
+    frames = [_column(run, "frames") for run in runs]
+    first, last = max(each[0] for each in frames), min(each[-1] for each in frames)
+    shared = np.unique(np.concatenate(frames))
+    shared = shared[(first <= shared) & (shared <= last)]
+    if not shared.size:  # runs that have no frame in common
+        shared = np.unique(np.concatenate(frames))
+    values = [np.interp(shared, own, _column(run, key)) for own, run in zip(frames, runs, strict=True)]
+    return shared, np.stack(values)
+
+
+def _draw_group(axes: Axes, name: str, runs: Sequence[Run], colour: str) -> None:
+    """The band, the thin line of each seed and the thick line of a label."""
+    frames, lowest = _on_common_frames(runs, "score_min")
+    _, highest = _on_common_frames(runs, "score_max")
+    axes.fill_between(frames / MILLION, lowest.min(0), highest.max(0), color=colour, alpha=0.13, linewidth=0)
+    if len(runs) > 1:
+        for run in runs:
+            axes.plot(
+                _column(run, "frames") / MILLION,
+                _column(run, "score"),
+                color=colour,
+                alpha=0.55,
+                linewidth=0.9,
+            )
+        name = f"{name}: median of {len(runs)} runs"
+    frames, scores = _on_common_frames(runs, "score")
+    marker = "o" if len(frames) == 1 else ""
+    axes.plot(frames / MILLION, np.median(scores, 0), marker=marker, color=colour, linewidth=2.2, label=name)
+
+
+def _draw_guides(
+    axes: Axes, guides: Mapping[str, float], threshold: float | None, runs: Sequence[Run]
+) -> None:
+    """Horizontal lines for named scores, and for the target, with what became of it."""
+    for word, score in guides.items():
+        guide(axes, score, word)
+    if threshold is not None:
+        guide(axes, threshold, f"target {threshold:g}\n{_outcome(runs, threshold)}", style.LIMIT)
+
+
+def _reached(run: Run, threshold: float) -> Record | None:
+    """The first record whose mean score is at least `threshold`."""
+    return next((record for record in run if record["score"] >= threshold), None)
+
+
+def _outcome(runs: Sequence[Run], threshold: float) -> str:
+    """How many runs reached the threshold, and after how long (the median of those that did)."""
+    hits = [record["seconds"] for run in runs if (record := _reached(run, threshold))]
+    if not hits:
+        return "not reached"
+    duration = _duration(float(np.median(hits)))
+    return (
+        f"reached after {duration}"
+        if len(runs) == 1
+        else f"{len(hits)} of {len(runs)} runs,\nmedian {duration}"
+    )
+
+
+def _duration(seconds: float) -> str:
+    """Seconds below three minutes, minutes above."""
+    return f"{seconds:.0f} s" if seconds < 180 else f"{seconds / 60:.1f} min"

@@ -1,0 +1,86 @@
+"""One place for what pictures look like: colours, sizes and the look of a matplotlib axes.
+
+The colours are the eight of Okabe and Ito (2008), "Color Universal Design", which stay distinct for
+colour-blind readers; figures and the animation give one meaning one colour. Figures are built through
+matplotlib's object API, so nothing here touches pyplot or global settings.
+"""
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+BLUE = "#0072B2"
+VERMILLION = "#D55E00"
+GREEN = "#009E73"
+PURPLE = "#CC79A7"
+ORANGE = "#E69F00"
+SKY = "#56B4E9"
+BROWN = "#8C5109"  # darker than Okabe and Ito's yellow, which vanishes on white
+BLACK = "#000000"
+
+INK = "#222222"  # text
+MUTED = "#6B6B6B"  # secondary text, guide lines
+FAINT = "#E3E3E3"  # grid
+PAPER = "#FFFFFF"
+
+POLE = BLUE  # the angle
+CART = PURPLE  # the position
+MOTOR = ORANGE  # the action
+UPRIGHT = GREEN  # |theta| below the upright angle
+LIMIT = VERMILLION  # the ends of the track
+
+SERIES = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY, BROWN, BLACK)
+"""Colours of unrelated series, in the order in which they are given out."""
+
+WIDTH = 8.0  # inch, of every figure
+DPI = 150  # of saved pictures
+TITLE_SIZE = 13.0  # points
+LABEL_SIZE = 11.0
+NOTE_SIZE = 9.5
+
+
+def series_colour(index: int) -> str:
+    """Colour of the series `index`; after eight they begin again."""
+    return SERIES[index % len(SERIES)]
+
+
+def new_figure(height: float, width: float = WIDTH) -> Figure:
+    """An empty white figure of `width` by `height` inches that keeps labels from being cut off."""
+    return Figure(figsize=(width, height), layout="constrained", facecolor=PAPER)
+
+
+def dress(axes: Axes, grid: str = "both") -> None:
+    """Give `axes` the common look: two spines, a faint grid ("both", "x", "y" or "none") behind the data."""
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    for side in ("left", "bottom"):
+        axes.spines[side].set_color(MUTED)
+    axes.tick_params(colors=MUTED, labelcolor=INK, labelsize=NOTE_SIZE)
+    axes.set_axisbelow(True)
+    axes.grid(False)
+    if grid != "none":
+        axes.grid(True, axis=grid, color=FAINT, linewidth=0.8)  # type: ignore[arg-type]
+
+
+def label(axes: Axes, x: str | None = None, y: str | None = None) -> None:
+    """Name the axes, each with its unit."""
+    if x is not None:
+        axes.set_xlabel(x, fontsize=LABEL_SIZE, color=INK)
+    if y is not None:
+        axes.set_ylabel(y, fontsize=LABEL_SIZE, color=INK)
+
+
+def title(axes: Axes, text: str, note: str = "") -> None:
+    """A title over `axes`; `note` stands below it, smaller and grey."""
+    room = 1.9 * NOTE_SIZE if note else 0.8 * NOTE_SIZE
+    axes.set_title(text, loc="left", fontsize=TITLE_SIZE, color=INK, fontweight="bold", pad=room)
+    if note:
+        axes.annotate(
+            note,
+            in_layout=False,  # the pad above makes room for it
+            xy=(0, 1),
+            xycoords="axes fraction",
+            xytext=(0, 0.6 * NOTE_SIZE),
+            textcoords="offset points",
+            fontsize=NOTE_SIZE,
+            color=MUTED,
+        )

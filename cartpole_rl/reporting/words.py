@@ -1,0 +1,17 @@
+"""Words that several pictures use."""
+
+from cartpole_rl.tasks.endings import Ending
+from cartpole_rl.tasks.episode import Episode
+
+ENDINGS = {
+    Ending.TIME: "time was up",
+    Ending.TRACK: "left the track",
+    Ending.ANGLE: "the pole fell",
+    Ending.FAULT: "the cart reported a fault",
+    Ending.LINK: "the link was lost",
+}
+
+
+def ending_text(episode: Episode) -> str:
+    """Why and when an episode ended: "left the track after 6.6 s"."""
+    return f"{ENDINGS[Ending(episode.ended_by)]} after {episode.time[-1] - episode.time[0]:.1f} s"

@@ -1,0 +1,22 @@
+"""Action sets: which motor values an agent chooses among, and what they mean to the simulated motor."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from cartpole_rl.settings import Settings
+
+Motor = Annotated[int, Field(ge=-255, le=255)]
+
+
+class ActionSettings(Settings):
+    """Motor values by action index, and the simulated actuator that they are meant for."""
+
+    motors: tuple[Motor, ...]
+    actuator: Literal["newtons", "force_curve"]
+
+    @model_validator(mode="after")
+    def _distinct(self) -> "ActionSettings":
+        if len(set(self.motors)) != len(self.motors) or len(self.motors) < 2:
+            raise ValueError(f"motors {list(self.motors)} must be two or more different values")
+        return self

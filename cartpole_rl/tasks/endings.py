@@ -1,0 +1,20 @@
+"""Why an episode ends. The track's end, faults and a lost link are the plant's; angle and time are the task's."""
+
+from enum import StrEnum
+
+from torch import Tensor
+
+
+class Ending(StrEnum):
+    """Reasons, as they stand in metrics.json."""
+
+    TIME = "time"  # truncated: the time limit
+    ANGLE = "angle"  # terminated: the balance task's pole fell
+    TRACK = "track"  # terminated: the cart left the track
+    FAULT = "fault"  # terminated: the cart latched a fault
+    LINK = "link"  # truncated: the cart stopped answering
+
+
+def fallen(state: Tensor, angle_limit: float | None) -> Tensor:
+    """Whether |theta| of the measured state [N, 4] is beyond `angle_limit` rad, [N] bool; None is no limit."""
+    return state[:, 2].abs() > (float("inf") if angle_limit is None else angle_limit)

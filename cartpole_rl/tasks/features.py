@@ -1,0 +1,71 @@
+"""From encoder counts to what an agent sees. All tensors [N] or [N, k] float32; angles rad, positions m."""
+
+import math
+from enum import StrEnum
+
+import torch
+from torch import Tensor
+
+CART_METRES_PER_COUNT = 2.2749e-5  # Quanser IP02: pinion 6.35e-3 m, gear, 4096 counts a turn
+POLE_COUNTS_PER_TURN = 4096
+POLE_RADIANS_PER_COUNT = 2 * math.pi / POLE_COUNTS_PER_TURN
+
+# Scales that bring each measured quantity to about one; the velocities' are those of a vigorous swing-up.
+POSITION_SCALE = 0.38  # m
+SPEED_SCALE = 1.0  # m/s
+ANGULAR_SPEED_SCALE = 8.0  # rad/s
+MOTOR_SCALE = 255.0
+LENGTH_SCALE = 0.5  # m
+
+
+class ObservationKind(StrEnum):
+    """How the measured state is shown to the agent."""
+
+    RAW = "raw"  # x, x_dot, theta wrapped, theta_dot: the thesis's four numbers
+    COS_SIN = "cos_sin"  # x, x_dot, cos theta, sin theta, theta_dot, each scaled to about one
+
+
+def wrap_angle(theta: Tensor) -> Tensor:
+    """The angle in [-pi, pi)."""
+    return torch.remainder(theta + math.pi, 2 * math.pi) - math.pi
+
+
+def measured_position(counts: Tensor) -> tuple[Tensor, Tensor]:
+    """(x m, theta rad) from counts [N, 2] int64; theta is wrapped before it loses precision as a float."""
+    half_turn = POLE_COUNTS_PER_TURN // 2
+    pole = torch.remainder(counts[:, 1] + half_turn, POLE_COUNTS_PER_TURN) - half_turn
+    return counts[:, 0] * CART_METRES_PER_COUNT, pole * POLE_RADIANS_PER_COUNT
+
+
+def measured_velocity(counts: Tensor, previous: Tensor, dt: Tensor) -> tuple[Tensor, Tensor]:
+    """(x_dot m/s, theta_dot rad/s): difference of counts [N, 2] over `dt` [N] s.
+
+    One count in 20 ms is 1.1 mm/s and 0.077 rad/s; the difference is the velocity half a period ago.
+    """
+    change = (counts - previous).to(dt.dtype)
+    return (
+        change[:, 0] * CART_METRES_PER_COUNT / dt,
+        change[:, 1] * POLE_RADIANS_PER_COUNT / dt,
+    )
+
+
+def observe(state: Tensor, kind: ObservationKind) -> Tensor:
+    """Observation of the measured state [N, 4] (x, x_dot, theta, theta_dot): [N, 4] raw or [N, 5] cos/sin."""
+    if kind is ObservationKind.RAW:
+        return state
+    x, x_dot, theta, theta_dot = state.unbind(-1)
+    return torch.stack(
+        (
+            x / POSITION_SCALE,
+            x_dot / SPEED_SCALE,
+            torch.cos(theta),
+            torch.sin(theta),
+            theta_dot / ANGULAR_SPEED_SCALE,
+        ),
+        -1,
+    )
+
+
+def observation_size(kind: ObservationKind) -> int:
+    """Numbers that `observe` gives."""
+    return 4 if kind is ObservationKind.RAW else 5

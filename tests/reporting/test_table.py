@@ -1,0 +1,63 @@
+"""Tables line up, and their numbers are rounded to what a reader can use."""
+
+import math
+
+import pytest
+
+from cartpole_rl.reporting.table import interval_text, number_text, table
+
+
+def test_a_table_looks_like_this() -> None:
+    rows = [
+        {"plant": "simulated", "score": "4210 ± 85", "ratio": None, "episodes": 20, "rms": 0.01234},
+        {"plant": "emulated", "score": "912 ± 5", "ratio": 0.2166, "episodes": 5, "rms": 0.3},
+    ]
+    columns = {"plant": "plant", "score": "score", "ratio": "ratio", "episodes": "n", "rms": "rms (rad)"}
+    assert table(rows, columns).splitlines() == [
+        "plant          score  ratio   n  rms (rad)",
+        "─────────  ─────────  ─────  ──  ─────────",
+        "simulated  4210 ± 85      –  20      0.012",
+        "emulated     912 ± 5  0.217   5      0.300",
+    ]
+
+
+def test_columns_may_be_just_keys_and_rows_may_lack_them() -> None:
+    assert table([{"a": True}, {"b": "x"}], ["a", "b"]).splitlines() == [
+        "a    b",
+        "───  ─",
+        "yes  –",
+        "–    x",
+    ]
+
+
+def test_no_rows_leave_the_heading() -> None:
+    assert table([], ["a", "b"]).splitlines() == ["a  b", "─  ─"]
+
+
+def test_nan_is_missing_and_does_not_spoil_its_column() -> None:
+    assert table([{"a": math.nan}, {"a": 4210.37}], ["a"]).splitlines()[2:] == ["   –", "4210"]
+
+
+@pytest.mark.parametrize(
+    ("mean", "low", "high", "text"),
+    [
+        (4210.3, 4125.1, 4295.5, "4210 ± 85"),
+        (0.9432, 0.9309, 0.9555, "0.943 ± 0.012"),
+        (12.0, 10.6, 13.4, "12.0 ± 1.4"),
+        (3517.0, 2200.0, 4834.0, "3517 ± 1317"),
+        (4350.0, 4110.0, 4420.0, "4350 (4110 to 4420)"),
+        (4210.3, math.nan, math.nan, "4210"),
+        (500.0, 500.0, 500.0, "500 ± 0"),
+        (0.0, 0.0, 0.0, "0 ± 0"),
+    ],
+)
+def test_interval_text(mean: float, low: float, high: float, text: str) -> None:
+    assert interval_text(mean, low, high) == text
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(4210.4, "4210"), (12.345, "12.3"), (0.004561, "0.00456"), (0.0, "0"), (-7.0, "-7.00"), (math.nan, "–")],
+)
+def test_number_text(value: float, text: str) -> None:
+    assert number_text(value) == text
