@@ -3,6 +3,7 @@
 import copy
 from typing import Annotated
 
+import numpy as np
 import torch
 from pydantic import Field
 from tensordict.nn import TensorDictModule
@@ -49,9 +50,9 @@ class QAgent(nn.Module):
             action_space="categorical",
         )
         self.loss.make_value_estimator(gamma=settings.gamma)
+        self.target_updater = self._make_target_updater()  # call its `step` once after each gradient step
 
-    def target_updater(self) -> TargetNetUpdater:
-        """Call its `step` once after each gradient step."""
+    def _make_target_updater(self) -> TargetNetUpdater:
         if self.settings.target_tau is not None:
             return SoftUpdate(self.loss, tau=self.settings.target_tau)
         assert self.settings.target_period is not None
@@ -73,7 +74,5 @@ class QAgent(nn.Module):
 
 def seed_everything(seed: int) -> None:
     """Seed what draws without a generator of its own: weights, exploration (torch), prioritized replay (NumPy)."""
-    import numpy as np
-
     torch.manual_seed(seed)
     np.random.seed(seed % 2**32)  # noqa: NPY002 - TorchRL's sampler draws from NumPy's global generator

@@ -1,0 +1,1 @@
+"""The commands: compose, build, run, save. The only place that knows Hydra."""

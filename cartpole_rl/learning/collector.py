@@ -15,8 +15,6 @@ COLLECTED = (
     ("next", "reward"),
     ("next", "terminated"),
     ("next", "done"),
-    ("next", "score"),
-    ("next", "step_count"),
 )
 
 
@@ -29,6 +27,8 @@ class Collector:
         self._generator = torch.Generator(device=env.device)
         self._generator.manual_seed(seed)
         self._present = env.reset()
+        self._score = torch.zeros(env.batch_size, device=env.device)  # of the episodes under way
+        self._finished: list[tuple[float, int]] = []  # score and length of those that ended since last asked
 
     @torch.no_grad()
     def collect(self, periods: int) -> TensorDictBase:
@@ -38,7 +38,24 @@ class Collector:
             self._act(self._present)
             transition, self._present = self.env.step_and_maybe_reset(self._present)
             taken.append(transition.select(*COLLECTED))
+            self._tally(transition["next"])
         return torch.stack(taken, 1)
+
+    def finished(self) -> dict[str, float]:
+        """Mean score (6.2) and length of the episodes that ended since this was last asked; empty for none."""
+        if not self._finished:
+            return {}
+        scores, lengths = zip(*self._finished, strict=True)
+        self._finished.clear()
+        return {"score": sum(scores) / len(scores), "episode_length": sum(lengths) / len(lengths)}
+
+    def _tally(self, following: TensorDictBase) -> None:
+        self._score += following["score"].squeeze(-1)
+        done = following["done"].squeeze(-1)
+        if done.any():
+            lengths = following["step_count"].squeeze(-1)[done].tolist()
+            self._finished += zip(self._score[done].tolist(), lengths, strict=True)
+            self._score.masked_fill_(done, 0)
 
     def _act(self, present: TensorDictBase) -> None:
         carts = self.env.batch_size
@@ -52,9 +69,14 @@ class Collector:
 
     def snapshot(self) -> dict[str, Any]:
         """All that the next chunk depends on, beside the environment's own snapshot."""
-        return {"present": self._present.to_dict(), "generator": self._generator.get_state()}
+        return {
+            "present": self._present.to_dict(),
+            "score": self._score.clone(),
+            "generator": self._generator.get_state(),
+        }
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         """Go on from `snapshot`."""
         self._present = TensorDict(snapshot["present"], batch_size=self.env.batch_size)
+        self._score = snapshot["score"].clone()
         self._generator.set_state(snapshot["generator"])

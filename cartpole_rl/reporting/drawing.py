@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageColor, ImageDraw, ImageFont
 
 from cartpole_rl.reporting import style
-from cartpole_rl.reporting.upright import is_upright
+from cartpole_rl.tasks.upright import is_upright
 from cartpole_rl.reporting.words import ending_text
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode

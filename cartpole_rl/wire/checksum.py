@@ -1,4 +1,4 @@
-"""CRC-16/CCITT-FALSE: polynomial 0x1021, start 0xFFFF, no reflection, no final xor; "123456789" gives 0x29B1."""
+"""CRC-16/CCITT-FALSE: polynomial 0x1021, start 0xFFFF, not reflected, no final xor; "123456789" is 0x29B1."""
 
 import binascii
 

@@ -11,13 +11,16 @@ LONGEST_BLOCK = 0xFF  # a code byte of 0xFF: 254 data bytes follow and no zero s
 def encode(data: bytes) -> bytes:
     """`data` with every zero replaced; one byte longer for data of up to 254 bytes."""
     stuffed = bytearray()
-    for part in data.split(b"\x00"):
+    parts = data.split(b"\x00")
+    for part in parts:
         while len(part) >= LONGEST_BLOCK - 1:
             stuffed.append(LONGEST_BLOCK)
             stuffed += part[: LONGEST_BLOCK - 1]
             part = part[LONGEST_BLOCK - 1 :]
         stuffed.append(len(part) + 1)
         stuffed += part
+    if parts[-1] and not part:  # a full block ends the data: no block after it
+        del stuffed[-1]
     return bytes(stuffed)
 
 

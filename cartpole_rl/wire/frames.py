@@ -1,4 +1,4 @@
-"""Frames: COBS of (version u8, type u8, sequence u8, flags u8, payload, CRC-16 little-endian), ended by 0x00."""
+"""Frames: COBS of (version u8, type u8, sequence u8, flags u8, payload, CRC-16 little-endian), then 0x00."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -24,17 +24,28 @@ class Frame:
     flags: int = 0
 
 
+@dataclass(frozen=True)
+class Envelope:
+    """A frame whose checksum is right, before its version, type and payload are judged."""
+
+    version: int
+    kind: int
+    sequence: int
+    flags: int
+    payload: bytes
+
+
 def encode_frame(message: Message, sequence: int, flags: int = 0) -> bytes:
     """Bytes for the wire, the ending 0x00 included. `sequence` is taken modulo 256."""
     body = bytes((VERSION, message.TYPE, sequence & 0xFF, flags)) + message.pack()
     return cobs.encode(body + crc16(body).to_bytes(CRC_BYTES, "little")) + END
 
 
-def decode_frame(stuffed: bytes) -> Frame:
-    """The frame in `stuffed`, which comes without its ending 0x00.
+def open_envelope(stuffed: bytes) -> Envelope:
+    """The undamaged header and payload in `stuffed`, which comes without its ending 0x00.
 
-    Raises FrameError for bad stuffing, a frame cut short, a bad checksum, a foreign version,
-    an unknown type or a wrong payload length.
+    A device that refuses a frame with a reason starts here. Raises FrameError for bad stuffing, a frame
+    cut short or a bad checksum.
     """
     data = cobs.decode(stuffed)
     if len(data) < HEADER_BYTES + CRC_BYTES:
@@ -43,15 +54,25 @@ def decode_frame(stuffed: bytes) -> Frame:
     if crc16(body) != checksum:
         raise FrameError(f"checksum {checksum:#06x} is not {crc16(body):#06x}")
     version, kind, sequence, flags = body[:HEADER_BYTES]
-    if version != VERSION:
-        raise FrameError(f"protocol version {version}; this side speaks {VERSION}")
-    if kind not in MESSAGES:
-        raise FrameError(f"unknown message type {kind:#04x}")
-    return Frame(MESSAGES[kind].unpack(body[HEADER_BYTES:]), sequence, flags)
+    return Envelope(version, kind, sequence, flags, body[HEADER_BYTES:])
+
+
+def decode_frame(stuffed: bytes) -> Frame:
+    """The frame in `stuffed`, which comes without its ending 0x00.
+
+    Raises FrameError for bad stuffing, a frame cut short, a bad checksum, a foreign version,
+    an unknown type or a wrong payload length.
+    """
+    envelope = open_envelope(stuffed)
+    if envelope.version != VERSION:
+        raise FrameError(f"protocol version {envelope.version}; this side speaks {VERSION}")
+    if envelope.kind not in MESSAGES:
+        raise FrameError(f"unknown message type {envelope.kind:#04x}")
+    return Frame(MESSAGES[envelope.kind].unpack(envelope.payload), envelope.sequence, envelope.flags)
 
 
 class FrameSplitter:
-    """Cuts a byte stream at each 0x00. Memory stays bounded: an overlong run is dropped up to the next 0x00."""
+    """Cuts a byte stream at each 0x00. Memory is bounded: an overlong run is dropped up to the next 0x00."""
 
     def __init__(self) -> None:
         self._pending = bytearray()

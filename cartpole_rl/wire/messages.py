@@ -1,11 +1,11 @@
-"""The messages of protocol version 1. Every number is little-endian; `LAYOUT` is the payload in `struct`'s letters.
+"""The messages of protocol version 1. Numbers are little-endian; `LAYOUT` is the payload in struct's letters.
 
 Host to cart: HELLO, START, STOP, SET_MOTOR, HOME, CLEAR_FAULT, SET_PERIOD.
 Cart to host: INFO, STATE (each period), ACK, NACK, FAULT.
 """
 
 import struct
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 from enum import IntEnum, IntFlag
 from typing import ClassVar, Self
 
@@ -73,7 +73,7 @@ class Message:
     def pack(self) -> bytes:
         """Payload bytes. Raises FrameError where a field does not fit its width."""
         try:
-            return struct.pack("<" + self.LAYOUT, *astuple(self))  # type: ignore[call-overload]
+            return struct.pack("<" + self.LAYOUT, *vars(self).values())
         except struct.error as error:
             raise FrameError(f"{self.TYPE.name} does not fit its layout {self.LAYOUT!r}: {error}") from None
 
@@ -129,7 +129,7 @@ class Home(Message):
 
 @dataclass(frozen=True)
 class ClearFault(Message):
-    """Clears the latched faults whose cause is gone."""
+    """Clears the latched faults. One whose cause still holds is latched again once the cart is armed."""
 
     TYPE = MessageType.CLEAR_FAULT
 
@@ -162,7 +162,7 @@ class Info(Message):
 
 @dataclass(frozen=True)
 class State(Message):
-    """What the cart measures, once a period. Counts are 0 in the middle of the track and at the upright pole."""
+    """What the cart measures, once a period. Counts are 0 in the middle of the track and at upright."""
 
     TYPE = MessageType.STATE
     LAYOUT = "IIiihBHH"

@@ -1,4 +1,4 @@
-"""When a pole counts as upright, for the marks in pictures: the first band of score (6.2)."""
+"""When a pole counts as upright: the first band of score (6.2), and how long it has to be held."""
 
 import math
 

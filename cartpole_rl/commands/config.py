@@ -1,0 +1,168 @@
+"""The shape of each command's config: what Hydra composes is checked against it before any work is done."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+from pydantic import Field, ValidationError, model_validator
+
+from cartpole_rl.agents import AgentSettings
+from cartpole_rl.emulator.settings import EmulatorSettings
+from cartpole_rl.envs.hardware import ObservationSettings, RewardSettings, TaskSettings
+from cartpole_rl.errors import ConfigError
+from cartpole_rl.learning.settings import LearningSettings, OptimizerSettings, ReplaySettings
+from cartpole_rl.physics.actuator import Actuator
+from cartpole_rl.physics.dynamics import Integrator, Models
+from cartpole_rl.physics.friction import CartFriction, PoleFriction
+from cartpole_rl.randomization import PoleSettings, Randomizer, Range
+from cartpole_rl.settings import Count, Finite, Positive, Settings
+from cartpole_rl.tasks.actions import ActionSettings
+
+Seed = Annotated[int, Field(ge=0, lt=2**31)]
+
+
+class CartFrictionSettings(Settings):
+    """Model of the cart's friction, and numbers that go with it in place of the cart's own."""
+
+    model: CartFriction
+    parameters: dict[str, Finite]
+
+
+class PoleFrictionSettings(Settings):
+    """Model of the pole's friction, and numbers that go with it in place of the cart's own."""
+
+    model: PoleFriction
+    parameters: dict[str, Finite]
+
+
+class SimulatedSettings(Settings):
+    """plant=simulated."""
+
+    kind: Literal["simulated"]
+    integrator: Integrator
+    substeps: Annotated[int, Field(ge=1, le=200)]
+    pole_presses: bool
+
+
+class EmulatedSettings(Settings):
+    """plant=emulated."""
+
+    kind: Literal["emulated"]
+
+
+class RealSettings(Settings):
+    """plant=serial."""
+
+    kind: Literal["serial"]
+    port: str
+    baud: Count
+    pole_length: Positive | None
+
+
+class CartPoleSettings(Settings):
+    """What a cart is and what is asked of it: the part that training and evaluation share."""
+
+    cart: dict[str, Finite]
+    cart_friction: CartFrictionSettings
+    pole_friction: PoleFrictionSettings
+    pole: PoleSettings
+    actions: ActionSettings
+    task: TaskSettings
+    reward: RewardSettings
+    observation: ObservationSettings
+    randomization: dict[str, Range]
+    control_period: Annotated[float, Field(ge=0.005, le=0.1)]
+
+    @property
+    def nominal(self) -> dict[str, float]:
+        """Nominal parameters of the cart, without the pole's."""
+        return {**self.cart, **self.cart_friction.parameters, **self.pole_friction.parameters}
+
+    def randomizer(self) -> Randomizer:
+        """Draws carts of this kind. Raises ConfigError where the numbers make no sense."""
+        return Randomizer(self.nominal, self.pole, self.randomization)
+
+    def models(self, plant: SimulatedSettings) -> Models:
+        """The laws that the simulated cart obeys."""
+        return Models(
+            self.cart_friction.model,
+            self.pole_friction.model,
+            Actuator(self.actions.actuator),
+            plant.integrator,
+            plant.pole_presses,
+        )
+
+
+class TrainConfig(CartPoleSettings):
+    """cartpole-train."""
+
+    plant: SimulatedSettings
+    agent: AgentSettings
+    replay: ReplaySettings
+    optimizer: OptimizerSettings
+    learning: LearningSettings
+    experiment: None = None
+    seed: Seed
+    label: str
+    threads: Count | None
+    compile: bool
+    resume: str | None
+
+    @model_validator(mode="after")
+    def _memory_holds_a_batch(self) -> "TrainConfig":
+        if self.replay.size < self.learning.batch_size:
+            raise ValueError(
+                f"replay.size {self.replay.size} is smaller than learning.batch_size {self.learning.batch_size}"
+            )
+        return self
+
+
+class EvaluateConfig(Settings):
+    """cartpole-evaluate, before the agent's own config is known."""
+
+    run: Path
+    episodes: Annotated[int, Field(ge=1, le=100_000)]
+    plant: Annotated[SimulatedSettings | EmulatedSettings | RealSettings, Field(discriminator="kind")]
+    emulator: EmulatorSettings
+    randomization: dict[str, Range]
+    parameters: dict[str, Finite]
+    cart: dict[str, Finite] | None = None
+    cart_friction: CartFrictionSettings | None = None
+    pole_friction: PoleFrictionSettings | None = None
+    pole: PoleSettings | None = None
+    task: TaskSettings | None = None
+    reward: RewardSettings | None = None
+    seed: Seed
+    label: str
+    threads: Count | None
+
+
+class EmulateConfig(Settings):
+    """cartpole-emulate."""
+
+    emulator: EmulatorSettings
+
+
+Config = TypeVar("Config", bound=Settings)
+
+
+def checked(schema: type[Config], values: Mapping[str, Any]) -> Config:
+    """`values` as `schema`. Raises ConfigError that names each key that is wrong, and what would be right."""
+    try:
+        return schema(**values)
+    except ValidationError as error:
+        raise ConfigError("; ".join(_complaint(detail) for detail in error.errors())) from None
+
+
+def _complaint(detail: Mapping[str, Any]) -> str:
+    key = ".".join(str(part) for part in detail["loc"])
+    reason = detail["msg"].removeprefix("Value error, ")
+    if detail["type"] == "extra_forbidden":
+        return f"{key}: there is no such setting"
+    if detail["type"] == "missing":
+        return f"{key}: this setting is missing"
+    if not key:
+        return reason
+    if isinstance(detail["input"], (int, float, str, bool)) or detail["input"] is None:
+        return f"{key}={detail['input']}: {reason[0].lower()}{reason[1:]}"
+    return f"{key}: {reason[0].lower()}{reason[1:]}"

@@ -1,0 +1,42 @@
+"""Writes what episodes were worth: metrics.json, and figures of them."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from cartpole_rl.commands.run_folder import write_json
+from cartpole_rl.evaluation import episode_metrics, summarize
+from cartpole_rl.randomization import PoleSettings
+from cartpole_rl.reporting.animation import write_gif
+from cartpole_rl.reporting.figures import behaviour, learning_curve, save
+from cartpole_rl.tasks.episode import Episode
+
+METRICS = "metrics.json"
+
+
+def report(
+    folder: Path,
+    episodes: Sequence[Episode],
+    plant: str,
+    pole: PoleSettings,
+    x_max: float,
+    link: Mapping[str, Any] | None = None,
+    history: Sequence[Mapping[str, float]] = (),
+) -> dict[str, float | None]:
+    """Write metrics.json and figures/ into `folder`; returns the mean of each figure.
+
+    The behaviour and the animation show the first episode; `history` adds the learning curve.
+    """
+    figures = [episode_metrics(episode, x_max) for episode in episodes]
+    summary = summarize(figures)
+    write_json(
+        folder / METRICS,
+        {"plant": plant, "pole": pole.name, **dict(link or {}), **summary, "episodes": figures},
+    )
+    pictures = folder / "figures"
+    pictures.mkdir(exist_ok=True)
+    save(behaviour(episodes[0], f"First episode, plant={plant}", x_max), pictures / "behaviour.png")
+    write_gif(episodes[0], pictures / "episode.gif", 2 * pole.nominal.pole_com, x_max, f"plant={plant}")
+    if history:
+        save(learning_curve([("score", list(history))]), pictures / "learning_curve.png")
+    return {key: value["mean"] for key, value in summary.items() if isinstance(value, dict) and "mean" in value}

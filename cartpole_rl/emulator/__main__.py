@@ -1,0 +1,46 @@
+"""``python -m cartpole_rl.emulator '{"clock": "real"}'``: start an emulated cart and print its port.
+
+One JSON line, ``{"port": "/dev/pts/3", "pid": 4711}``, goes to stdout when a host may open the port. Exit
+status: 0 after SIGINT or SIGTERM, 2 for settings that are wrong, 1 where the cart cannot be emulated here.
+"""
+
+import argparse
+import os
+import sys
+
+from pydantic import ValidationError
+
+from cartpole_rl.emulator.process import end_with_parent, run
+from cartpole_rl.emulator.settings import EmulatorSettings
+from cartpole_rl.errors import CartPoleError, ConfigError
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run an emulated cart until it is interrupted; returns the exit status."""
+    parent = os.getppid()
+    parser = argparse.ArgumentParser(prog="python -m cartpole_rl.emulator", description="Emulate a cart.")
+    parser.add_argument("settings", nargs="?", default="{}", help="EmulatorSettings as JSON")
+    parser.add_argument("--exit-with-parent", action="store_true", help="stop when the starter is gone")
+    options = parser.parse_args(arguments)
+    try:
+        settings = read_settings(options.settings)
+        if options.exit_with_parent:
+            end_with_parent(parent)
+        run(settings)
+    except CartPoleError as error:
+        print(error, file=sys.stderr)
+        return error.exit_code
+    return 0
+
+
+def read_settings(text: str) -> EmulatorSettings:
+    """Settings from JSON. Raises ConfigError, one line, that names every wrong key."""
+    try:
+        return EmulatorSettings.model_validate_json(text)
+    except ValidationError as error:
+        wrong = [f"{'.'.join(map(str, item['loc'])) or 'settings'}: {item['msg']}" for item in error.errors()]
+        raise ConfigError("emulator settings: " + "; ".join(wrong)) from None
+
+
+if __name__ == "__main__":
+    sys.exit(main())

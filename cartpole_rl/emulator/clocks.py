@@ -1,0 +1,53 @@
+"""The two clocks of the emulated cart. Both run until they are interrupted."""
+
+import time
+from collections import deque
+from typing import NoReturn
+
+from cartpole_rl.emulator.device import CartDevice
+from cartpole_rl.emulator.link import Channel
+
+
+def run_lockstep(cart: CartDevice, channel: Channel) -> NoReturn:
+    """One period for each frame from the host, lost and damaged ones included; no clock of any kind.
+
+    Where a STATE is lost or damaged on its way, further periods pass until one gets through, so a host that
+    sends a frame and waits for a STATE never waits in vain. While homing, the cart runs on by itself.
+    """
+    waiting: deque[bytes | None] = deque()
+    while True:
+        homing = cart.firmware.homing
+        if not waiting:
+            waiting.extend(channel.receive(0) if homing else channel.receive())
+        if waiting:
+            take(cart, channel, waiting.popleft(), cart.now_us)
+        elif not homing:
+            continue
+        while not send_all(channel, cart.pass_period(cart.period_end_us)):
+            pass
+
+
+def run_real(cart: CartDevice, channel: Channel) -> NoReturn:
+    """A period every 20 ms of the monotonic clock, on deadlines that do not drift.
+
+    Commands are stamped as they arrive; the physics of a period is worked out at its end, when all are known.
+    """
+    boot = time.monotonic()
+    while True:
+        end_us = cart.period_end_us
+        while (left := boot + end_us / 1e6 - time.monotonic()) > 0:
+            for frame in channel.receive(left):
+                arrival_us = int((time.monotonic() - boot) * 1e6)
+                take(cart, channel, frame, min(max(arrival_us, cart.now_us), end_us))
+        send_all(channel, cart.pass_period(end_us))
+
+
+def take(cart: CartDevice, channel: Channel, frame: bytes | None, now_us: int) -> None:
+    """Give the cart a frame that was not lost, and send its answer."""
+    if frame is not None:
+        send_all(channel, cart.receive(frame, now_us))
+
+
+def send_all(channel: Channel, frames: list[bytes]) -> bool:
+    """Send frames in order; returns whether the last one left undamaged."""
+    return [channel.send(frame) for frame in frames][-1:] == [True]

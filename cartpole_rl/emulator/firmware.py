@@ -1,0 +1,253 @@
+"""The firmware of the emulated cart: protocol version 1 as a state machine, free of I/O and of real clocks.
+
+Frames come in with the time at which they arrived, frames go out, and the caller lets time pass. A period is
+`drive` (which motor value is in force when), then `tick` (read the encoders, keep the rules, report).
+The cart is idle, homing or armed; a latched fault disarms it. ``docs/protocol.md`` has the rules.
+All times are whole microseconds since boot.
+"""
+
+from collections.abc import Callable, Generator
+
+from cartpole_rl.emulator.guards import FASTEST_CART, FASTEST_POLE, JumpWatch, StallWatch
+from cartpole_rl.emulator.homing import CART_METRES, POLE_COUNTS, SPAN, HomingError, Reading, Zeros, home
+from cartpole_rl.emulator.motor_line import MotorLine
+from cartpole_rl.errors import FrameError
+from cartpole_rl.wire import (
+    Ack,
+    ClearFault,
+    Fault,
+    FaultReport,
+    Flags,
+    Hello,
+    Home,
+    Info,
+    Message,
+    Nack,
+    Reason,
+    SetMotor,
+    SetPeriod,
+    Start,
+    State,
+    Stop,
+    encode_frame,
+)
+from cartpole_rl.wire.frames import VERSION, Envelope, open_envelope
+
+FIRMWARE = (1, 0, 0)
+PERIOD_US = 20_000
+SHORTEST_US, LONGEST_US = 5_000, 100_000
+MOTOR_LIMIT = 255
+SOFT_LIMIT = round(0.027 / CART_METRES)  # counts inside a stop
+HARD_LIMIT = round(0.008 / CART_METRES)  # counts inside a stop
+WATCHDOG_PERIODS = 3
+NO_AGE = 65535
+U32 = 0xFFFFFFFF
+NOMINAL_HALF_SPAN = round(SPAN / 2 / CART_METRES)
+HOST_MESSAGES: dict[int, type[Message]] = {
+    kind.TYPE: kind for kind in (Hello, Start, Stop, SetMotor, Home, ClearFault, SetPeriod)
+}
+
+
+class Firmware:
+    """One cart's firmware, just booted: idle, not homed, motor 0."""
+
+    def __init__(self, delay_us: Callable[[], int], zero_error: int = 0) -> None:
+        """`delay_us` draws a command's latency; homing sets the pole's zero `zero_error` counts too low."""
+        self.period_us = PERIOD_US
+        self.armed = False
+        self.homed = False
+        self.fault = Fault.NONE
+        self._delay_us = delay_us
+        self._zero_error = zero_error
+        self._line = MotorLine()
+        self._homing: Generator[int, Reading, Zeros] | None = None
+        self._zeros = Zeros(-NOMINAL_HALF_SPAN, NOMINAL_HALF_SPAN, hanging=0)
+        self._pole_zero = 0  # raw count that is reported as 0
+        self._command_us: int | None = None  # when the newest SET_MOTOR arrived
+        self._watchdog_us = 0  # when the watchdog was last fed
+        self._last_sequence = 0  # of the host
+        self._sequence = 0  # of the next frame sent
+        self._ticks = 0
+        self._ticked_us = 0
+        self._watch_anew()
+
+    @property
+    def homing(self) -> bool:
+        """Whether it moves by itself to find its zeros."""
+        return self._homing is not None
+
+    def receive(self, stuffed: bytes, now_us: int) -> list[bytes]:
+        """Take one frame, without its ending 0x00; returns the answer, which is at most one frame."""
+        try:
+            envelope = open_envelope(stuffed)
+        except FrameError:
+            return []  # nothing in a damaged frame can be trusted, not even whom to answer
+        answer = self._obey(envelope, now_us)
+        if isinstance(answer, Reason):
+            return [self._frame(Nack(envelope.sequence, envelope.kind, answer))]
+        self._last_sequence = envelope.sequence
+        return [self._frame(answer)] if answer else []
+
+    def drive(self, start_us: int, end_us: int) -> list[tuple[int, int]]:
+        """The motor values in force in a period, as (since, value); the last one holds to its end."""
+        return self._line.over(start_us, end_us)
+
+    def tick(self, now_us: int, cart: int, pole: int) -> list[bytes]:
+        """End a period at two raw counts: keep the rules, and return the frames to send, STATE last."""
+        reading = Reading(cart, pole, (now_us - self._ticked_us) / 1e6)
+        self._ticks, self._ticked_us = self._ticks + 1, now_us
+        faults_before = self.fault
+        expired = self.armed and now_us - self._watchdog_us >= WATCHDOG_PERIODS * self.period_us
+        if expired:
+            self._line.hold(0)
+        if self.armed or self.homing:
+            self._look_for_faults(reading)
+        if self._homing:
+            self._step_homing(self._homing, reading)
+        self._line.blocked = self._beyond(SOFT_LIMIT, cart) if self.armed else 0
+        flags = self._flags() | (Flags.WATCHDOG if expired and self.armed else Flags(0))
+        frames = [self._frame(self._state(cart, pole), flags)]
+        if self.fault != faults_before:
+            frames.insert(0, self._frame(FaultReport(self.fault, self._ticks & U32), flags))
+        return frames
+
+    def _obey(self, envelope: Envelope, now_us: int) -> Message | Reason | None:
+        """Carry a frame out and return the answer; None where the next STATE is answer enough."""
+        if envelope.version != VERSION:
+            return Reason.BAD_VERSION
+        if envelope.kind not in HOST_MESSAGES:
+            return Reason.UNKNOWN_TYPE
+        try:
+            message = HOST_MESSAGES[envelope.kind].unpack(envelope.payload)
+        except FrameError:
+            return Reason.BAD_LENGTH
+        reason = self._objection(message)
+        if reason is not None:
+            return reason
+        self._carry_out(message, now_us)
+        if isinstance(message, SetMotor):
+            return None
+        if isinstance(message, Hello | SetPeriod):
+            return self._info()
+        return Ack(envelope.sequence, envelope.kind)
+
+    def _objection(self, message: Message) -> Reason | None:
+        """Why a message is refused now, if it is."""
+        match message:
+            case SetMotor(motor) if abs(motor) > MOTOR_LIMIT:
+                return Reason.OUT_OF_RANGE
+            case SetPeriod(period_us) if not SHORTEST_US <= period_us <= LONGEST_US:
+                return Reason.OUT_OF_RANGE
+            case SetMotor() | Start() | Home() | SetPeriod() if self.homing:
+                return Reason.BUSY
+            case Home() | SetPeriod() if self.armed:
+                return Reason.BUSY
+            case SetMotor() | Start() | Home() if self.fault:
+                return Reason.FAULT_LATCHED
+            case Start() if not self.homed:
+                return Reason.NOT_HOMED
+            case SetMotor() if not self.armed:
+                return Reason.NOT_ARMED
+        return None
+
+    def _carry_out(self, message: Message, now_us: int) -> None:
+        match message:
+            case SetMotor(motor):
+                self._command_us = self._watchdog_us = now_us
+                self._line.command(now_us + self._delay_us(), motor)
+            case Start() if not self.armed:
+                self.armed, self._watchdog_us = True, now_us
+                self._watch_anew()
+            case Stop():
+                self.armed, self._homing = False, None
+                self._line.stop(now_us)
+            case Home():
+                self.homed, self._homing = False, home(self._zeros.hanging)
+                next(self._homing)
+                self._watch_anew()
+            case ClearFault():
+                self.fault = Fault.NONE
+            case SetPeriod(period_us):
+                self.period_us = period_us
+
+    def _step_homing(self, homing: Generator[int, Reading, Zeros], reading: Reading) -> None:
+        """Let homing choose the motor value, or end with its zeros or a fault."""
+        try:
+            self._line.hold(homing.send(reading))
+        except StopIteration as end:
+            self._zeros = end.value
+            self._pole_zero = self._zeros.hanging - POLE_COUNTS // 2 - self._zero_error
+            self.homed, self._homing = True, None
+            self._line.hold(0)
+        except HomingError:
+            self._latch(Fault.HOMING)
+
+    def _look_for_faults(self, reading: Reading) -> None:
+        """Latch what is wrong. A cart under homing may touch the stops, and finds a stall by itself."""
+        if self._cart_watch.jumped(reading.cart, reading.seconds):
+            self._latch(Fault.CART_ENCODER)
+        if self._pole_watch.jumped(reading.pole, reading.seconds):
+            self._latch(Fault.POLE_ENCODER)
+        if self.armed and self._beyond(HARD_LIMIT, reading.cart):
+            self._latch(Fault.HARD_LIMIT)
+        if self.armed and self._stall_watch.stalled(reading.cart, self._line.value, reading.seconds):
+            self._latch(Fault.STALL)
+
+    def _latch(self, fault: Fault) -> None:
+        """Disarm, motor 0, and remember why. What an encoder counted before it failed is worth nothing."""
+        self.fault |= fault
+        self.armed, self._homing = False, None
+        self._line.hold(0)
+        if fault in Fault.CART_ENCODER | Fault.POLE_ENCODER:
+            self.homed = False
+
+    def _watch_anew(self) -> None:
+        """Forget what the guards saw while the motor was off: a hand may have moved everything since."""
+        self._cart_watch, self._pole_watch = JumpWatch(FASTEST_CART), JumpWatch(FASTEST_POLE)
+        self._stall_watch = StallWatch()
+
+    def _beyond(self, inside: int, cart: int) -> int:
+        """1 or -1 where the cart is within `inside` counts of the right or left stop, or past it, else 0."""
+        from_middle = cart - self._zeros.middle
+        if abs(from_middle) < self._zeros.half_span - inside:
+            return 0
+        return 1 if from_middle > 0 else -1
+
+    def _info(self) -> Info:
+        half_span = self._zeros.half_span
+        return Info(
+            *FIRMWARE,
+            POLE_COUNTS,
+            round(CART_METRES * 1e9),
+            MOTOR_LIMIT,
+            half_span - SOFT_LIMIT,
+            half_span - HARD_LIMIT,
+            self.period_us,
+        )
+
+    def _state(self, cart: int, pole: int) -> State:
+        age = NO_AGE if self._command_us is None else (self._ticked_us - self._command_us) // 1000
+        return State(
+            self._ticks & U32,
+            self._ticked_us & U32,
+            cart - self._zeros.middle,
+            pole - self._pole_zero,
+            self._line.value,
+            self._last_sequence,
+            self.fault,
+            min(age, NO_AGE),
+        )
+
+    def _flags(self) -> Flags:
+        return (
+            (Flags.ARMED if self.armed else Flags(0))
+            | (Flags.HOMED if self.homed else Flags(0))
+            | (Flags.HOMING if self.homing else Flags(0))
+            | (Flags.FAULTED if self.fault else Flags(0))
+            | (Flags.SOFT_LIMIT if self._line.limited else Flags(0))
+        )
+
+    def _frame(self, message: Message, flags: Flags | None = None) -> bytes:
+        frame = encode_frame(message, self._sequence, self._flags() if flags is None else flags)
+        self._sequence = (self._sequence + 1) & 0xFF
+        return frame

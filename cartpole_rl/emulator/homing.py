@@ -1,0 +1,182 @@
+"""How the cart finds its zeros: touch both stops, check the span, centre, wait until the pole hangs still.
+
+Works on raw encoder counts, one reading a tick, and needs to know the cart only roughly. A procedure here is
+a generator: it is sent a `Reading`, yields the motor value until the next one, and returns what it found.
+The pole's zero is the middle of its last small swing. Waiting for a dead stop would not be better: friction
+in the bearing holds a pole that has stopped up to a count off the vertical.
+"""
+
+import math
+from collections import deque
+from collections.abc import Generator
+from dataclasses import dataclass
+
+from cartpole_rl.emulator.servo import PUSH, SpeedServo, SwingBrake, rough_motor
+from cartpole_rl.errors import CartPoleError
+
+CART_METRES = 22749e-9  # a count
+POLE_COUNTS = 4096  # a turn
+POLE_RADIANS = 2 * math.pi / POLE_COUNTS  # a count
+QUARTER_TURN = POLE_COUNTS // 4
+SPAN = 0.814  # m, stop to stop, as the drawing says
+SPAN_TOLERANCE = 0.03  # of the span
+
+SEARCH_SPEED = 0.08  # m/s, towards a stop
+TRAVEL_SPEED = 0.2  # m/s, where the way is known to be free
+TOUCH_ZONE = 0.06  # m before a stop whose place is known
+AGAINST_STOP = 0.4  # s that the cart stands still however hard it pushes
+STANDS = 3e-4  # m
+LONGEST_SEARCH = 30.0  # s for one stop
+CENTRED = 0.001  # m
+LONGEST_CENTRING = 20.0  # s
+
+WHOLE_SWING = 2.0  # s: one period of a pole of 2 m
+STILL = 8  # counts peak to peak, 0.7 degree
+BRAKED = 30  # counts peak to peak: below this the brake would do more harm than good
+LONGEST_BRAKING = 20.0  # s
+PATIENCE = 20.0  # s, after which a pole with next to no friction ...
+NEARLY_STILL = 40  # ... may swing by so many counts, peak to peak
+LONGEST_WAIT = 60.0  # s
+
+
+@dataclass(frozen=True)
+class Reading:
+    """Raw counts at a tick, and the time since the last one."""
+
+    cart: int
+    pole: int
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Zeros:
+    """What homing found, in raw counts."""
+
+    left_stop: int
+    right_stop: int
+    hanging: int
+
+    @property
+    def middle(self) -> int:
+        """Cart count in the middle of the track."""
+        return (self.left_stop + self.right_stop) // 2
+
+    @property
+    def half_span(self) -> int:
+        """Counts from the middle to a stop."""
+        return (self.right_stop - self.left_stop) // 2
+
+
+class HomingError(CartPoleError):
+    """A stop was not found, the span was wrong, or the pole did not come to rest."""
+
+
+Procedure = Generator[int, Reading, Reading]
+
+
+class Window:
+    """The newest counts of one encoder, over a fixed time."""
+
+    def __init__(self, seconds: float) -> None:
+        self._seconds = seconds
+        self._counts: deque[int] = deque()
+        self._full = False
+
+    def add(self, count: int, seconds: float) -> None:
+        """Take one count; `seconds` lie between two of them."""
+        self._counts.append(count)
+        length = math.ceil(self._seconds / seconds) + 1
+        self._full = len(self._counts) >= length
+        while len(self._counts) > length:
+            self._counts.popleft()
+
+    @property
+    def spread(self) -> float:
+        """Largest less smallest count; infinite until the window is full."""
+        return max(self._counts) - min(self._counts) if self._full else math.inf
+
+    @property
+    def centre(self) -> int:
+        """Middle between the largest and the smallest count."""
+        return round((max(self._counts) + min(self._counts)) / 2)
+
+
+def home(hanging: int) -> Generator[int, Reading, Zeros]:
+    """The whole homing; `hanging` is the pole count at which the pole hung last. Raises HomingError."""
+    reading = yield 0
+    reading = yield from touch_stop(-1, None, reading)
+    left = reading.cart
+    reading = yield from touch_stop(+1, left + round(SPAN / CART_METRES), reading)
+    right = reading.cart
+    span = (right - left) * CART_METRES
+    if abs(span / SPAN - 1) > SPAN_TOLERANCE:
+        raise HomingError(f"the stops are {span:.3f} m apart, not {SPAN} m")
+    middle = (left + right) // 2
+    reading = yield from centre(middle, reading)
+    reading = yield from brake_swing(middle, hanging, reading)
+    reading = yield from centre(middle, reading)
+    return Zeros(left, right, (yield from wait_until_still(reading)))
+
+
+def touch_stop(direction: int, expected: int | None, reading: Reading) -> Procedure:
+    """Move until a stop holds the cart. `expected` is the stop's raw count where it is known."""
+    servo, window, elapsed, before = SpeedServo(), Window(AGAINST_STOP), 0.0, reading.cart
+    while elapsed < LONGEST_SEARCH:
+        far = expected is not None and abs(expected - reading.cart) * CART_METRES > TOUCH_ZONE
+        speed = (reading.cart - before) * CART_METRES / reading.seconds
+        before = reading.cart
+        window.add(reading.cart, reading.seconds)
+        motor = servo.motor(direction * (TRAVEL_SPEED if far else SEARCH_SPEED), speed, reading.seconds)
+        if window.spread * CART_METRES < STANDS and motor == direction * abs(rough_motor(PUSH)):
+            return reading
+        reading = yield motor
+        elapsed += reading.seconds
+    raise HomingError(f"no {'right' if direction > 0 else 'left'} stop within {LONGEST_SEARCH:.0f} s")
+
+
+def centre(middle: int, reading: Reading) -> Procedure:
+    """Move to the middle, gently, and let go."""
+    servo, elapsed, before = SpeedServo(), 0.0, reading.cart
+    while elapsed < LONGEST_CENTRING:
+        away = (middle - reading.cart) * CART_METRES
+        if abs(away) < CENTRED:
+            return reading
+        target = max(-TRAVEL_SPEED, min(TRAVEL_SPEED, away / 1.0))  # slows down over the last second
+        speed = (reading.cart - before) * CART_METRES / reading.seconds
+        before = reading.cart
+        reading = yield servo.motor(target, speed, reading.seconds)
+        elapsed += reading.seconds
+    raise HomingError(f"not in the middle after {LONGEST_CENTRING:.0f} s")
+
+
+def brake_swing(middle: int, hanging: int, reading: Reading) -> Procedure:
+    """Take the swing out of the pole, or most of it, by moving the cart about the middle."""
+    brake, window, elapsed, before = SwingBrake(), Window(WHOLE_SWING), 0.0, reading
+    while elapsed < LONGEST_BRAKING:
+        window.add(reading.pole, reading.seconds)
+        if window.spread <= BRAKED:
+            return reading
+        if window.spread < QUARTER_TURN:  # a swing as small as this has the hanging pole in its middle
+            hanging = window.centre
+        motor = brake.motor(
+            (reading.cart - middle) * CART_METRES,
+            (reading.cart - before.cart) * CART_METRES / reading.seconds,
+            (reading.pole - hanging) * POLE_RADIANS,
+            (reading.pole - before.pole) * POLE_RADIANS / reading.seconds,
+        )
+        before = reading
+        reading = yield motor
+        elapsed += reading.seconds
+    return reading
+
+
+def wait_until_still(reading: Reading) -> Generator[int, Reading, int]:
+    """Wait with the motor off until the pole's swing is small; returns the count in its middle."""
+    window, elapsed = Window(WHOLE_SWING), 0.0
+    while elapsed < LONGEST_WAIT:
+        window.add(reading.pole, reading.seconds)
+        if window.spread <= (STILL if elapsed < PATIENCE else NEARLY_STILL):
+            return window.centre
+        reading = yield 0
+        elapsed += reading.seconds
+    raise HomingError(f"the pole still swings by {window.spread} counts after {LONGEST_WAIT:.0f} s")

@@ -1,0 +1,124 @@
+"""The emulated cart's physics: a MuJoCo model of a cart on a rail with a pole, stepped at 1 kHz or finer.
+
+Coordinates: x in m from the middle of the rail, angle in rad from upright; both positive to the right.
+A tilt of the rail is a turn of gravity, so MuJoCo's own joint angle, which counts from the rail's normal,
+is the angle less the tilt.
+Dry friction is MuJoCo's friction loss, held almost rigidly (its default is soft: a cart at rest would creep);
+the stops are stiff limits of the joint.
+"""
+
+import math
+from types import ModuleType
+
+from cartpole_rl.emulator.motor import Motor
+from cartpole_rl.emulator.settings import EmulatorSettings
+from cartpole_rl.errors import EmulatorError
+
+GRAVITY = 9.81  # m/s^2
+AT_REST = 1e-4  # m/s: slower than this the breakaway friction holds
+MODEL = """
+<mujoco>
+  <compiler angle="radian" autolimits="true"/>
+  <option integrator="Euler" tolerance="1e-14">
+    <flag contact="disable"/>
+  </option>
+  <default>
+    <joint solreffriction="0.003 1" solimpfriction="0.9999 0.9999 0.001"
+           solreflimit="0.003 1" solimplimit="0.99 0.9999 0.0001"/>
+  </default>
+  <worldbody>
+    <body>
+      <joint type="slide" axis="1 0 0" damping="{cart_viscous}"
+             range="-{track_half_length} {track_half_length}"/>
+      <inertial pos="0 0 0" mass="{cart_mass}" diaginertia="0.001 0.001 0.001"/>
+      <body>
+        <joint type="hinge" axis="0 1 0" damping="{pole_viscous}" frictionloss="{pole_coulomb}"/>
+        <inertial pos="0 0 {pole_com}" mass="{pole_mass}"
+                  diaginertia="{pole_inertia} {pole_inertia} {thin_inertia}"/>
+      </body>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def load_mujoco() -> ModuleType:
+    """The mujoco package. Raises EmulatorError where it is not installed."""
+    try:
+        import mujoco
+    except ImportError:
+        raise EmulatorError(
+            'the emulated cart needs MuJoCo, which is not installed: pip install "cartpole_rl[emulator]"'
+        ) from None
+    return mujoco
+
+
+class CartPhysics:
+    """One cart and its pole, at rest in the middle with the pole hanging until it is placed."""
+
+    def __init__(self, settings: EmulatorSettings) -> None:
+        mujoco = load_mujoco()
+        thin = settings.pole_inertia * 1e-3  # about the pole's own axis, which nothing turns about
+        model = MODEL.format(thin_inertia=thin, **settings.model_dump())
+        self._model = mujoco.MjModel.from_xml_string(model)
+        tilt = settings.track_tilt
+        self._model.opt.gravity[:] = (GRAVITY * math.sin(tilt), 0.0, -GRAVITY * math.cos(tilt))
+        self._data = mujoco.MjData(self._model)
+        self._mj_step = mujoco.mj_step
+        self._settings = settings
+        self._motor = Motor(settings)
+        self.place(0.0, math.pi)
+
+    @property
+    def x(self) -> float:
+        """Cart position, m from the middle of the rail."""
+        return float(self._data.qpos[0])
+
+    @property
+    def x_dot(self) -> float:
+        """Cart velocity, m/s."""
+        return float(self._data.qvel[0])
+
+    @property
+    def angle(self) -> float:
+        """Pole angle, rad from where gravity would balance it upright; not wrapped."""
+        return float(self._data.qpos[1]) + self._settings.track_tilt
+
+    @property
+    def angle_dot(self) -> float:
+        """Pole angular velocity, rad/s."""
+        return float(self._data.qvel[1])
+
+    def place(self, x: float, angle: float) -> None:
+        """Put the cart at x and the pole at an angle, both at rest."""
+        self._data.qpos[0] = x
+        self._data.qvel[0] = 0.0
+        self.place_pole(angle)
+
+    def place_pole(self, angle: float) -> None:
+        """Put the pole at an angle, at rest, and leave the cart alone."""
+        self._data.qpos[1] = angle - self._settings.track_tilt
+        self._data.qvel[1] = 0.0
+
+    def advance(self, motor: int, seconds: float) -> None:
+        """Let `seconds` pass under one motor value, in equal steps of `physics_step` or just under."""
+        steps = math.ceil(seconds / self._settings.physics_step - 1e-9)
+        if steps == 0:
+            return
+        step = seconds / steps
+        self._model.opt.timestep = step
+        drag, friction = self._settings.pole_drag, self._model.dof_frictionloss
+        applied, velocity = self._data.qfrc_applied, self._data.qvel
+        for _ in range(steps):
+            applied[0] = self._motor.step(motor, step)
+            applied[1] = -drag * velocity[1] * abs(velocity[1])
+            friction[0] = self._cart_friction(velocity[0])
+            self._mj_step(self._model, self._data)
+
+    def _cart_friction(self, x_dot: float) -> float:
+        """Dry friction in N that the rail can hold against the cart now."""
+        settings = self._settings
+        at_rest = abs(x_dot) < AT_REST
+        pull = self._data.qacc_smooth[0] if at_rest else x_dot  # at rest: where all else would move the cart
+        coulomb = settings.cart_coulomb_right if pull > 0 else settings.cart_coulomb_left
+        return coulomb * settings.cart_stiction_ratio if at_rest else coulomb

@@ -1,0 +1,57 @@
+"""The emulated cart as a program: from settings to a port that a host can open."""
+
+import json
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+from cartpole_rl.emulator.clocks import run_lockstep, run_real
+from cartpole_rl.emulator.device import CartDevice
+from cartpole_rl.emulator.link import Channel, PtyLink
+from cartpole_rl.emulator.settings import EmulatorSettings
+
+PARENT_POLL = 0.5  # s
+
+
+def run(settings: EmulatorSettings) -> None:
+    """Print one JSON line with `port` and `pid`, and emulate until SIGINT or SIGTERM. Main thread only.
+
+    Raises EmulatorError where MuJoCo or pseudo-terminals are missing.
+    """
+    cart = CartDevice(settings)
+    with until_stopped(), PtyLink() as link:
+        print(json.dumps({"port": link.port, "pid": os.getpid()}), flush=True)
+        clock = run_lockstep if settings.clock == "lockstep" else run_real
+        clock(cart, Channel(link, settings))
+
+
+@contextmanager
+def until_stopped() -> Iterator[None]:
+    """Let SIGINT and SIGTERM end the block quietly, wherever it waits."""
+
+    def interrupt(signum: int, frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    before = {number: signal.signal(number, interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    except KeyboardInterrupt:
+        return
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def end_with_parent(parent: int) -> None:
+    """From now on, stop as on SIGTERM once process `parent` is no longer the parent."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(PARENT_POLL)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=watch, name="parent watch", daemon=True).start()

@@ -1,0 +1,91 @@
+"""Run whole episodes of a policy on any plant.
+
+A batched plant runs as many episodes at once as it has carts, each from one reset to its own end, so that short
+episodes do not come round more often than long ones.
+"""
+
+import math
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+
+from cartpole_rl.envs import CartPoleEnv
+from cartpole_rl.tasks.endings import Ending
+from cartpole_rl.tasks.episode import Episode
+
+Policy = Callable[[TensorDictBase], TensorDictBase]  # reads `observation`, writes `action`
+
+
+def run_episodes(env: CartPoleEnv, policy: Policy, episodes: int) -> Iterator[Episode]:
+    """Yield `episodes` episodes. Raises what the plant raises when it cannot be reset."""
+    for _ in range(math.ceil(episodes / env.plant.carts)):
+        batch = run_batch(env, policy)
+        yield from batch[:episodes]
+        episodes -= len(batch)
+
+
+@torch.no_grad()
+def run_batch(env: CartPoleEnv, policy: Policy) -> list[Episode]:
+    """One episode on each cart, all from one reset."""
+    present = env.reset()
+    states, times = [present["state"]], [torch.zeros_like(present["dt"])]
+    steps: dict[str, list[torch.Tensor]] = {key: [] for key in ("motor", *_FROM_NEXT)}
+    endings: list[str | None] = [None] * env.plant.carts
+    while None in endings:
+        present["action"] = policy(present.select("observation"))["action"]
+        following = env.step(present)["next"]
+        steps["motor"].append(env.hardware.motors[present["action"]].unsqueeze(-1))
+        for key in _FROM_NEXT:
+            steps[key].append(following[key])
+        states.append(following["state"])
+        times.append(times[-1] + following["dt"])
+        _note_endings(env, following, endings)
+        present = following.exclude("reward")
+    columns = {key: torch.cat(values, 1).cpu().numpy() for key, values in steps.items()}
+    state, time = torch.stack(states, 1).cpu().numpy(), torch.cat(times, 1).cpu().numpy()
+    return [_episode(row, state[row], time[row], columns, ending) for row, ending in enumerate(endings) if ending]
+
+
+_FROM_NEXT = ("score", "score_upright", "reward", "done")
+
+
+def _note_endings(env: CartPoleEnv, following: TensorDictBase, endings: list[str | None]) -> None:
+    """Fill in the reason for each cart whose first episode ends now."""
+    for row in following["done"].squeeze(-1).nonzero().squeeze(-1).tolist():
+        if endings[row] is None:
+            endings[row] = _ending(env, following[row])
+
+
+def _ending(env: CartPoleEnv, last: TensorDictBase) -> str:
+    reported = getattr(env.plant, "ended_by", "")
+    if reported:
+        return str(Ending(reported))
+    if last["truncated"].item():
+        return str(Ending.TIME)
+    limit = env.hardware.task.angle_limit
+    fallen = limit is not None and abs(last["state"][2].item()) > limit
+    return str(Ending.ANGLE if fallen else Ending.TRACK)
+
+
+def _episode(
+    row: int, state: np.ndarray, time: np.ndarray, columns: dict[str, np.ndarray], ended_by: str
+) -> Episode:
+    steps = 1 + int(np.argmax(columns["done"][row]))
+    x, x_dot, theta, theta_dot = state[: steps + 1].astype(np.float64).T
+    step = {key: values[row, :steps] for key, values in columns.items()}
+    return Episode(
+        time=time[: steps + 1].astype(np.float64),
+        x=x,
+        x_dot=x_dot,
+        theta=np.unwrap(theta),
+        theta_dot=theta_dot,
+        motor=step["motor"].astype(np.int64),
+        score=step["score"].astype(np.float64),
+        score_upright=step["score_upright"].astype(np.float64),
+        reward=step["reward"].astype(np.float64),
+        ended_by=ended_by,
+    )
+
+

@@ -1,0 +1,77 @@
+"""What an episode is worth, and what several are worth together."""
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.tasks.upright import is_upright, upright_since, wrap
+
+CONFIDENCE = 0.95
+
+
+def episode_metrics(episode: Episode, track_half_length: float) -> dict[str, Any]:
+    """Figures of one episode, as they stand in metrics.json; None where a figure has no meaning.
+
+    `score` and `score_upright` are the sums of (6.2) and (6.1); `time_to_upright_s` the first time from which the
+    pole stays within 5 degrees for 1 s; `upright_fraction` the share of periods within 5 degrees, over which
+    the two RMS values of angle and position are taken; `rms_motor_change` the step from one motor value to the next, in motor values;
+    `min_track_margin_m` how near the cart came to where the episode would end.
+    """
+    upright = is_upright(episode.theta[1:])
+    change = np.diff(episode.motor)
+    return {
+        "score": float(episode.score.sum()),
+        "score_upright": float(episode.score_upright.sum()),
+        "reward": float(episode.reward.sum()),
+        "steps": episode.steps,
+        "ended_by": episode.ended_by,
+        "time_to_upright_s": upright_since(episode.time, episode.theta),
+        "upright_fraction": float(upright.mean()),
+        "rms_angle_rad": _rms(wrap(episode.theta[1:])[upright]),
+        "rms_position_m": _rms(episode.x[1:][upright]),
+        "rms_motor_change": _rms(change),
+        "min_track_margin_m": float(track_half_length - np.abs(episode.x).max()),
+    }
+
+
+def _rms(values: np.ndarray) -> float | None:
+    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else None
+
+
+def interval(values: Sequence[float]) -> tuple[float, float, float]:
+    """(mean, low, high) with a 95 % interval of the mean: BCa bootstrap; the mean alone where all are equal."""
+    data = np.asarray(values, dtype=float)
+    mean = float(data.mean())
+    if len(data) < 2 or np.ptp(data) == 0:
+        return mean, mean, mean
+    result = stats.bootstrap(
+        (data,), np.mean, confidence_level=CONFIDENCE, rng=np.random.default_rng(0), n_resamples=5000
+    )
+    low, high = (float(edge) for edge in result.confidence_interval)
+    # BCa is not defined for some degenerate samples; Student's t then
+    if not (math.isfinite(low) and math.isfinite(high)):
+        half = float(stats.sem(data) * stats.t.ppf((1 + CONFIDENCE) / 2, len(data) - 1))
+        return mean, mean - half, mean + half
+    return mean, low, high
+
+
+def summarize(episodes: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Mean of each figure with its interval, over the episodes that have it; endings are counted."""
+    summary: dict[str, Any] = {}
+    for key in episodes[0]:
+        values = [episode[key] for episode in episodes]
+        if key == "ended_by":
+            summary[key] = dict(Counter(values))
+            continue
+        present = [value for value in values if value is not None]
+        if not present:
+            summary[key] = None
+            continue
+        mean, low, high = interval(present)
+        summary[key] = {"mean": mean, "low": low, "high": high, "count": len(present)}
+    return summary

@@ -1,0 +1,198 @@
+"""The training loop: collect, learn, evaluate, in that order, from the first frame to the last.
+
+Everything that the next iteration depends on is in `snapshot`, so that a run that was killed goes on as if it
+had not been. Schedules are functions of the frames seen.
+"""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from torch import nn
+
+from cartpole_rl.agents import QAgent
+from cartpole_rl.envs import CartPoleEnv
+from cartpole_rl.learning.collector import Collector
+from cartpole_rl.learning.replay import make_replay, n_step_transitions
+from cartpole_rl.learning.schedules import half_cosine, linear
+from cartpole_rl.learning.settings import LearningSettings, OptimizerSettings, ReplaySettings
+from cartpole_rl.tasks.episode import Episode
+
+Scalars = dict[str, float]
+OPTIMIZERS = {"adam": torch.optim.Adam, "adamw": torch.optim.AdamW}
+
+
+class Monitor(Protocol):
+    """Who is told how training goes."""
+
+    def learned(self, frames: int, scalars: Scalars) -> None:
+        """After an iteration; not after each one."""
+
+    def evaluated(self, frames: int, seconds: float, episodes: Sequence[Episode], is_best: bool) -> None:
+        """After an evaluation."""
+
+    def checkpoint(self, training: "Training") -> None:
+        """When the state of the training should be written."""
+
+
+class Training:
+    """A DQN training of `agent` on `env`; `evaluate` runs the greedy policy on a plant of its own."""
+
+    def __init__(
+        self,
+        settings: LearningSettings,
+        replay: ReplaySettings,
+        optimizer: OptimizerSettings,
+        agent: QAgent,
+        env: CartPoleEnv,
+        evaluate: Callable[[], list[Episode]],
+        monitor: Monitor,
+        seed: int,
+        compiled: bool = False,
+    ) -> None:
+        self.settings, self.agent, self.env = settings, agent, env
+        self.evaluate, self.monitor = evaluate, monitor
+        self.collector = Collector(env, agent.actor, len(env.hardware.motors), seed)
+        self.replay_settings, self.optimizer_settings = replay, optimizer
+        self.replay = make_replay(replay, settings.batch_size)
+        self.weights = [weight for weight in agent.loss.parameters() if weight.requires_grad]
+        self.optimizer = OPTIMIZERS[optimizer.kind](
+            self.weights, lr=optimizer.learning_rate, weight_decay=optimizer.weight_decay, fused=True
+        )
+        self.target_updater = agent.target_updater
+        self.loss = torch.compile(agent.loss.forward, fullgraph=True) if compiled else agent.loss.forward
+        self.iteration, self.updates, self.seconds = 0, 0, 0.0
+        self.best_score = -float("inf")
+        self.last_score: float | None = None
+
+    @property
+    def frames(self) -> int:
+        """Transitions collected so far."""
+        return self.iteration * self.settings.carts * self.settings.chunk
+
+    @property
+    def progress(self) -> float:
+        """Share of the training that is done, 0 to 1."""
+        return self.iteration / self.settings.iterations
+
+    def run(self) -> None:
+        """Train from where this stands to the end."""
+        settings = self.settings
+        evaluate_at = evenly_spaced(settings.evaluations, settings.iterations)
+        checkpoint_at = evaluate_at[:: -settings.checkpoint_interval]  # counted back, so that the end is one
+        while self.iteration < settings.iterations:
+            started = time.perf_counter()
+            self.collector.epsilon = self.epsilon()
+            chunk = self.collector.collect(settings.chunk)
+            self.replay.extend(n_step_transitions(chunk, settings.n_step, self.agent.settings.gamma))
+            self.iteration += 1
+            scalars = self.learn() if self.frames > settings.warmup_frames else {}
+            self.seconds += time.perf_counter() - started
+            if self.iteration % max(1, settings.iterations // 200) == 0:
+                self.monitor.learned(self.frames, scalars | self.describe(chunk))
+            if self.iteration in evaluate_at:
+                self.judge()
+            if self.iteration in checkpoint_at:
+                self.monitor.checkpoint(self)
+
+    def learn(self) -> Scalars:
+        """One iteration's gradient steps; the mean loss and gradient norm, and the learning rate."""
+        optimizer, beta = self.optimizer_settings, self.replay_settings.beta
+        rate = half_cosine(
+            optimizer.learning_rate, optimizer.learning_rate * optimizer.learning_rate_end, self.progress
+        )
+        for group in self.optimizer.param_groups:
+            group["lr"] = rate
+        if self.replay_settings.kind == "prioritized":
+            self.replay.sampler.beta = linear(*beta, self.progress)
+        losses, norms = [], []
+        for _ in range(self.settings.updates):
+            loss, norm = self.update(self.replay.sample())
+            losses.append(loss)
+            norms.append(norm)
+        return {
+            "learning/loss": torch.stack(losses).mean().item(),
+            "learning/gradient_norm": torch.stack(norms).mean().item(),
+            "learning/learning_rate": rate,
+        }
+
+    def update(self, batch: TensorDictBase) -> tuple[torch.Tensor, torch.Tensor]:
+        """One gradient step; the loss and the norm of its gradient."""
+        loss = self.loss(batch)["loss"]
+        self.optimizer.zero_grad()
+        loss.backward()
+        norm = nn.utils.clip_grad_norm_(self.weights, self.optimizer_settings.max_grad_norm)
+        self.optimizer.step()
+        self.target_updater.step()
+        if self.replay_settings.kind == "prioritized":
+            self.replay.update_tensordict_priority(batch)
+        self.updates += 1
+        return loss.detach(), norm
+
+    def epsilon(self) -> float:
+        """Share of random actions now."""
+        settings = self.settings
+        if self.frames < settings.warmup_frames:
+            return 1.0
+        return linear(*settings.epsilon, (self.frames - settings.warmup_frames) / settings.epsilon_frames)
+
+    @torch.no_grad()
+    def describe(self, chunk: TensorDictBase) -> Scalars:
+        """What is worth a curve beside the losses."""
+        value = self.agent.actor(chunk[:, 0].select("observation"))["chosen_action_value"]
+        scalars = {
+            "learning/q_mean": value.mean().item(),
+            "learning/q_max": value.max().item(),
+            "learning/epsilon": self.collector.epsilon,
+            "learning/updates": float(self.updates),
+            "speed/frames_per_second": self.frames / self.seconds,
+        }
+        return scalars | {f"exploration/{key}": value for key, value in self.collector.finished().items()}
+
+    def judge(self) -> None:
+        """Evaluate, and tell the monitor."""
+        episodes = self.evaluate()
+        self.last_score = float(np.mean([episode.score.sum() for episode in episodes]))
+        is_best = self.last_score > self.best_score
+        self.best_score = max(self.best_score, self.last_score)
+        self.monitor.evaluated(self.frames, self.seconds, episodes, is_best)
+
+    def snapshot(self) -> dict[str, Any]:
+        """All that the next iteration depends on."""
+        _, keys, position, has_gauss, gauss = np.random.get_state()  # noqa: NPY002 - TorchRL's sampler draws from it
+        return {
+            "counters": [self.iteration, self.updates],
+            "seconds": self.seconds,
+            "scores": [self.best_score, self.last_score],
+            "agent": self.agent.state_dict(),
+            "target_updater": self.target_updater.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "replay": self.replay.state_dict(),
+            "collector": self.collector.snapshot(),
+            "plant": self.env.plant.snapshot(),
+            "torch_random": torch.get_rng_state(),
+            "numpy_random": [torch.from_numpy(keys.astype(np.int64)), position, has_gauss, gauss],
+        }
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        """Go on from `snapshot` as if nothing had happened."""
+        self.iteration, self.updates = snapshot["counters"]
+        self.seconds = snapshot["seconds"]
+        self.best_score, self.last_score = snapshot["scores"]
+        self.agent.load_state_dict(snapshot["agent"])
+        self.target_updater.load_state_dict(snapshot["target_updater"])
+        self.optimizer.load_state_dict(snapshot["optimizer"])
+        self.replay.load_state_dict(snapshot["replay"])
+        self.collector.restore(snapshot["collector"])
+        self.env.plant.restore(snapshot["plant"])
+        torch.set_rng_state(snapshot["torch_random"])
+        keys, position, has_gauss, gauss = snapshot["numpy_random"]
+        np.random.set_state(("MT19937", keys.numpy().astype(np.uint32), position, has_gauss, gauss))  # noqa: NPY002
+
+
+def evenly_spaced(count: int, end: int) -> list[int]:
+    """`count` rising integers up to and with `end`."""
+    return [round(end * (index + 1) / count) for index in range(count)]

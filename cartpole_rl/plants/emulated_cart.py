@@ -1,0 +1,109 @@
+"""The emulated cart as a process of its own. It needs no torch, as `serial_cart` does not."""
+
+import json
+import os
+import select
+import subprocess
+import sys
+import tempfile
+import time
+from types import TracebackType
+from typing import Self
+
+from cartpole_rl.emulator.settings import EmulatorSettings
+from cartpole_rl.errors import EmulatorError
+
+READY_TIMEOUT = 60.0  # s for the first line; the process loads MuJoCo before it
+GRACE = 3.0  # s from SIGTERM to SIGKILL
+STDERR_BYTES = 2000  # of its last words in an error
+
+
+class EmulatedCart:
+    """A running emulator: `port` to open with pyserial, `pid`. A context manager that ends the process.
+
+    The process ends by itself when this one dies. Ctrl-C in a terminal reaches this process alone, so that
+    the cart is still there to be stopped. Raises EmulatorError if it does not get ready, and on the way out
+    of a `with` that has no error of its own if it had died before.
+    """
+
+    def __init__(self, settings: EmulatorSettings) -> None:
+        self._stderr = tempfile.TemporaryFile()  # noqa: SIM115 - open as long as the process
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "cartpole_rl.emulator", settings.model_dump_json(), "--exit-with-parent"],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=self._stderr,
+            start_new_session=True,
+        )
+        try:
+            self.port = self._read_port()
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def pid(self) -> int:
+        """Process id of the emulator."""
+        return self._process.pid
+
+    @property
+    def died(self) -> str:
+        """How the process ended by itself, in one line with its last words; empty while it runs."""
+        code = self._process.poll()
+        return "" if code is None else f"the emulated cart ended with exit code {code}: {self._last_words()}"
+
+    def close(self) -> None:
+        """End the process: SIGTERM, and SIGKILL after a grace."""
+        process = self._process
+        if process.poll() is None:
+            process.terminate()
+            try:
+                process.wait(GRACE)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+        assert process.stdout is not None  # a pipe was asked for
+        process.stdout.close()
+        self._stderr.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        died = self.died
+        self.close()
+        if died and error is None:
+            raise EmulatorError(died)
+
+    def _read_port(self) -> str:
+        """The port in the JSON line that the process prints when it is ready."""
+        assert self._process.stdout is not None  # a pipe was asked for
+        output = self._process.stdout.fileno()
+        deadline = time.monotonic() + READY_TIMEOUT
+        line = b""
+        while not line.endswith(b"\n"):
+            if not select.select([output], [], [], max(0.0, deadline - time.monotonic()))[0]:
+                raise EmulatorError(f"the emulated cart was not ready after {READY_TIMEOUT:g} s")
+            data = os.read(output, 4096)
+            if not data:
+                self._process.wait(GRACE)
+                raise EmulatorError(self.died)
+            line += data
+        try:
+            return str(json.loads(line)["port"])
+        except (ValueError, KeyError, TypeError) as error:
+            raise EmulatorError(
+                f"the emulated cart's first line is not JSON with `port`: {line!r}"
+            ) from error
+
+    def _last_words(self) -> str:
+        if self._stderr.closed:
+            return "stderr is closed"
+        length = self._stderr.seek(0, os.SEEK_END)
+        self._stderr.seek(max(0, length - STDERR_BYTES))
+        return self._stderr.read().decode(errors="replace").strip() or "it wrote nothing to stderr"

@@ -1,0 +1,230 @@
+"""The plant at the end of a serial port: one cart, [1], with the contract of `specs.Plant`.
+
+Time is the cart's: `dt` comes from STATE's clock. Every reset homes the cart, and every ending, by the track,
+a fault, the link or `close`, sets the motor to 0 and disarms first.
+"""
+
+import math
+import time
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Literal, Protocol
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from cartpole_rl.errors import ConfigError, FaultError, LinkError, PlantError, PortError
+from cartpole_rl.plants.serial_cart import SerialCart, SerialSettings
+from cartpole_rl.plants.serial_errors import RefusedError, fault_error
+from cartpole_rl.plants.specs import Plant
+from cartpole_rl.settings import Positive
+from cartpole_rl.wire import Fault, Flags, State
+
+CLOCK_WRAP = 2**32  # us; STATE's clock begins anew after 71.6 minutes
+UPRIGHT_TOLERANCE = math.radians(3)
+HANGING_TOLERANCE = math.radians(5)
+UPRIGHT_SWAY = math.radians(1.5)  # a hand is never quite still
+HANGING_SWAY = math.radians(1)  # homing is content with eight counts of 4096 a turn
+STILL_SECONDS = 0.3  # for so long the pole has to stay, by the cart's clock
+
+
+class SerialPlantSettings(SerialSettings):
+    """A cart on a port, and how its episodes begin. Times in s."""
+
+    start: Literal["hanging", "upright"] = "hanging"
+    control_period: Positive = 0.02  # set on the cart before an episode, if it has another
+    home_timeout: Positive = 120.0
+    start_timeout: Positive = 60.0  # for the pole to come into its start position
+    pole_length: Positive | None = None  # m, twice pivot to centre of mass; for an agent that observes it
+
+
+class Owned(Protocol):
+    """What a plant may own: an emulated cart, closed with it."""
+
+    @property
+    def died(self) -> str:
+        """How it ended by itself, in words; empty while it lives."""
+
+    def close(self) -> None:
+        """End it."""
+
+
+class SerialPlant(Plant):
+    """One cart on a wire. It connects when it is made, and again in a reset after the link was lost.
+
+    A reset stops, clears faults, homes, waits for the start (for `upright` it asks a person by `prompt` to
+    hold the pole up), arms, and returns the first state. `terminated`: the cart is beyond its soft limit, or
+    latched a fault. `truncated`: the link was lost, or the cart restarted; the counts are then the last that
+    came. `ended_by` is the last ending, "track", "fault" or "link", and empty while an episode runs;
+    `last_error` is the error behind "fault" or "link".
+
+    Raises PortError or LinkError when it cannot connect; a reset raises LinkError after a loss that stays,
+    FaultError for a fault that does not clear or a homing that fails, and PlantError if the start is not
+    reached in time. `owned` is closed with the plant.
+    """
+
+    def __init__(
+        self,
+        settings: SerialPlantSettings,
+        prompt: Callable[[str], None] = print,
+        owned: Owned | None = None,
+    ) -> None:
+        super().__init__(carts=1)
+        self.settings = settings
+        self.cart = SerialCart(settings)
+        self.ended_by = ""
+        self.last_error: PlantError | None = None
+        self._prompt = prompt
+        self._owned = owned
+        self._state = State(0, 0, 0, 0, 0, 0, 0, 0)
+        try:
+            self.cart.open()
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def pole_length(self) -> Tensor:
+        """m, [1]: the length in the settings; nothing measures it. Raises ConfigError if it is not set."""
+        if self.settings.pole_length is None:
+            raise ConfigError("this agent observes the pole's length: set plant.pole_length, in m")
+        return torch.tensor([self.settings.pole_length])
+
+    def halt(self) -> None:
+        """Motor to 0 and disarm, between episodes; does not raise."""
+        with suppress(PlantError):  # the cart's watchdog does it where the link cannot
+            self.cart.stop()
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """Motor to 0, disarm, give the port back, close what is owned."""
+        try:
+            self.cart.close()
+        finally:
+            if self._owned is not None:
+                self._owned.close()
+            super().close(raise_if_closed=raise_if_closed)
+
+    def _set_seed(self, seed: int | None) -> None:
+        """Nothing to do: a real cart draws its own chances, an emulated one has its seed in its settings."""
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDict:
+        if tensordict is not None and "_reset" in tensordict and not tensordict["_reset"].any():
+            return self.frame(*self._report(self.settings.control_period))
+        self._reach()
+        self._make_ready()
+        self.cart.start()
+        self._state = self.cart.get_state()
+        self.ended_by = ""
+        self.last_error = None
+        return self.frame(*self._report(self.settings.control_period))
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDict:
+        before = self._state
+        try:
+            self.cart.set_motor(int(tensordict["motor"]))
+            self._state = self.cart.get_state()
+        except (LinkError, RefusedError, FaultError) as error:
+            self._break_off(error)
+            return self.step_frame(*self._report(self.settings.control_period))
+        self._end_if_due()
+        return self.step_frame(*self._report(((self._state.time_us - before.time_us) % CLOCK_WRAP) * 1e-6))
+
+    def _end_if_due(self) -> None:
+        """Set `ended_by` and stop the motor if the new state ends the episode."""
+        state, limit = self._state, self.cart.information.soft_limit_counts
+        if state.fault & ~int(Fault.HARD_LIMIT):
+            self.ended_by, self.last_error = "fault", fault_error(state.fault)
+        elif abs(state.cart_counts) >= limit or state.fault:
+            self.ended_by = "track"
+        elif not self.cart.flags & Flags.ARMED:
+            self.ended_by = "link"
+            self.last_error = LinkError("the cart is not armed any more: it has restarted; check its power")
+        if self.ended_by:
+            self.halt()
+
+    def _break_off(self, error: PlantError) -> None:
+        """End the episode for want of a state: with the counts that came last, the motor taken as 0."""
+        self.ended_by, self.last_error = "fault" if isinstance(error, FaultError) else "link", error
+        if isinstance(error, LinkError):
+            self.cart.close()
+        else:
+            self.halt()
+        last = self._state
+        self._state = State(
+            last.tick, last.time_us, last.cart_counts, last.pole_counts, 0, last.last_sequence, last.fault, 0
+        )
+
+    def _report(self, dt: float) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """What the cart says: counts, dt, motor_applied, terminated, truncated; `dt` in s."""
+        state = self._state
+        return (
+            torch.tensor([[state.cart_counts, state.pole_counts]]),
+            torch.tensor([[dt]], dtype=torch.float32),
+            torch.tensor([[state.motor_applied]]),
+            torch.tensor([[self.ended_by in ("track", "fault")]]),
+            torch.tensor([[self.ended_by == "link"]]),
+        )
+
+    def _reach(self) -> None:
+        """A stopped cart that answers; connects anew after a loss. Raises LinkError."""
+        if self.cart.is_open:
+            with suppress(LinkError):
+                self.cart.stop()
+                return
+            self.cart.close()
+        try:
+            self.cart.open()
+        except (PortError, LinkError) as error:
+            lost = f" ({self.last_error})" if self.last_error else ""
+            why = self._owned.died if self._owned is not None and self._owned.died else error
+            raise LinkError(f"the link to the cart was lost{lost} and is not there again: {why}") from error
+
+    def _make_ready(self) -> None:
+        """Clear faults, home, set the period, and wait for the pole in its start position."""
+        if self.cart.poll_state().fault:
+            self.cart.clear_fault()
+        self.cart.home(self.settings.home_timeout)
+        period_us = round(self.settings.control_period * 1e6)
+        if self.cart.info().period_us != period_us:  # and its limits are those of the span just measured
+            self.cart.set_period(period_us)
+        self.cart.get_state()  # read before more is asked, so that a lockstep run is the same each time
+        if self.settings.start == "upright":
+            self._prompt("Hold the pole upright and still; let go when the cart begins to move.")
+            self._await_pole(0.0, UPRIGHT_TOLERANCE, UPRIGHT_SWAY)
+        else:
+            self._await_pole(math.pi, HANGING_TOLERANCE, HANGING_SWAY)
+
+    def _await_pole(self, angle: float, tolerance: float, sway: float) -> None:
+        """Wait until the pole stays within `tolerance` of `angle` and moves less than `sway`, in rad."""
+        turn = self.cart.information.pole_counts_per_turn
+        window: deque[tuple[int, float]] = deque()  # (us, rad) of the last STILL_SECONDS
+        deadline = time.perf_counter() + self.settings.start_timeout
+        while True:
+            state = self.cart.poll_state()
+            pole = 2 * math.pi * state.pole_counts / turn
+            off = math.remainder(pole - angle, 2 * math.pi)
+            window.append((state.time_us, pole))
+            if abs(off) > tolerance or _spread(window) > sway:
+                window.clear()
+            elif (state.time_us - window[0][0]) % CLOCK_WRAP >= STILL_SECONDS * 1e6:
+                return
+            if time.perf_counter() > deadline:
+                raise PlantError(
+                    f"waited {self.settings.start_timeout:g} s for the pole to be still within "
+                    f"{math.degrees(tolerance):.0f} deg of {self.settings.start}; "
+                    f"it is {math.degrees(off):+.1f} deg off: {_REMEDY[self.settings.start]}"
+                )
+
+
+_REMEDY = {
+    "upright": "hold it up by hand until the cart begins to move",
+    "hanging": "let it hang until it is still; it may not be touched during homing",
+}
+
+
+def _spread(window: deque[tuple[int, float]]) -> float:
+    """Largest minus smallest angle in rad."""
+    angles = [angle for _, angle in window]
+    return max(angles) - min(angles)

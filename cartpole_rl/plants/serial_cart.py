@@ -1,0 +1,405 @@
+"""The host's side of a cart on a serial port: the original four calls, and what a careful lab adds.
+
+Which state counts. The cart dictates the pace: it sends a STATE each period, the host answers with one
+command. `get_state` returns the newest state, and only one that was measured after the cart had taken the
+last frame (STATE tells its sequence), so that a loop never acts on the past and never looks for a command's
+effect in a state from before it. A state passed over for that is a late tick. A command that was lost on the
+way is never acknowledged: one and a half periods after it the newest state is taken as it is.
+
+When nothing comes. After `nudge_after` seconds of silence the host says HELLO. That is harmless to a cart
+with a clock of its own, and lets a lockstep emulator, which moves once per frame, go on after a lost frame.
+
+The protocol is written out in `docs/protocol.md`.
+"""
+
+import logging
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from types import TracebackType
+from typing import Annotated, Self, TypeVar
+
+from pydantic import Field
+
+from cartpole_rl.errors import LinkError, PlantError
+from cartpole_rl.plants.link_statistics import LinkStatistics
+from cartpole_rl.plants.serial_errors import RefusedError, fault_error, refusal
+from cartpole_rl.plants.serial_link import SerialLink
+from cartpole_rl.plants.serial_port import open_port
+from cartpole_rl.settings import Count, Positive, Settings
+from cartpole_rl.wire import (
+    Ack,
+    ClearFault,
+    Flags,
+    Hello,
+    Home,
+    Info,
+    Message,
+    MessageType,
+    Nack,
+    Reason,
+    SetMotor,
+    SetPeriod,
+    Start,
+    State,
+    Stop,
+)
+from cartpole_rl.wire.frames import END
+
+LOGGER = logging.getLogger(__name__)
+
+Answer = TypeVar("Answer", bound=Message)
+
+TICKS = 2**32  # STATE's tick wraps here
+BACKLOG_BYTES = 1000  # with more waiting, the system's buffer (4096) may have thrown newer bytes away
+UNACKNOWLEDGED_PERIODS = 1.5  # of a frame: by then the state after it has come, if the frame has
+
+
+class SerialSettings(Settings):
+    """How to reach a cart. Times in s."""
+
+    port: str  # /dev/ttyUSB0, COM3, or a URL of pyserial
+    baud: Count = 921600  # 115200 is allowed too
+    timeout: Positive = 1.0  # without a state for so long, the link is lost
+    connect_timeout: Positive = 3.0  # for the first answer; a board that restarts when opened needs about 1 s
+    answer_timeout: Positive = 0.5  # for ACK or NACK, then the question is repeated
+    retries: Annotated[int, Field(ge=0)] = 3  # repetitions of a question without an answer
+    write_timeout: Positive = 0.2
+    nudge_after: Positive = 0.5  # silence after which the host says HELLO
+
+
+class SerialCart:
+    """One cart on a serial port. A context manager: every way out first sets the motor to 0 and disarms.
+
+        with SerialCart(SerialSettings(port="/dev/ttyUSB0")) as cart:
+            cart.home()
+            cart.start()
+            for _ in range(50):
+                print(cart.set_motor(100), cart.get_state())
+
+    Counts and motor values are positive to the right. SIGTERM ends a Python process without leaving a `with`;
+    a program that wants the cart disarmed at once turns it into an exception. If it does not, the cart's own
+    watchdog sets the motor to 0 after three periods.
+
+    Every method raises LinkError when the cart no longer answers.
+    """
+
+    def __init__(self, settings: SerialSettings) -> None:
+        self.settings = settings
+        self.statistics = LinkStatistics()
+        self.flags = Flags(0)  # of the newest state
+        self._open_link: SerialLink | None = None
+        self._information: Info | None = None
+        self._newest: State | None = None  # arrived, and not yet given to anyone
+        self._newest_at = 0.0
+        self._last_tick: int | None = None
+        self._answers: deque[Message] = deque(maxlen=64)
+        self._refused: Nack | None = None  # of a SET_MOTOR
+        self._refused_sequence = -1  # of the newest frame that was refused; no state will acknowledge it
+        self._state_since_refusal = True
+        self._driving = False  # states are being answered with motor values
+        self._unanswered = False  # a state was returned and its command is not sent yet
+
+    def __enter__(self) -> Self:
+        self.open()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def open(self) -> Info:
+        """Open the port, shake hands, disarm; returns what the cart is.
+
+        Raises PortError if the port cannot be opened, LinkError if no cart answers on it.
+        """
+        if self._open_link is not None:
+            return self.information
+        settings = self.settings
+        port = open_port(settings.port, settings.baud, settings.write_timeout)
+        self._open_link = SerialLink(port, self.statistics)
+        try:
+            self._information = self._shake_hands()
+            self.stop()
+        except BaseException:
+            self._abandon()
+            raise
+        self.statistics.clear()  # a boot banner is no fault of the link
+        return self.information
+
+    def close(self) -> None:
+        """Motor to 0, disarm, give the port back. Never raises, so that no error hides another."""
+        if self._open_link is None:
+            return
+        try:
+            self.stop()
+        except PlantError as error:
+            LOGGER.warning("the cart did not confirm that it is disarmed (%s); its watchdog stops it", error)
+        finally:
+            self._let_go(self._open_link)
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the port is open."""
+        return self._open_link is not None
+
+    @property
+    def information(self) -> Info:
+        """What the cart told when it last sent INFO, without asking again."""
+        if self._information is None:
+            raise LinkError(f"the cart on {self.settings.port} was never reached: open() it first")
+        return self._information
+
+    def info(self) -> Info:
+        """Ask the cart what it is: firmware, counts, limits, period."""
+        self._information = self._request(Hello(), Info)
+        return self._information
+
+    def start(self) -> None:
+        """Arm the motor. Raises RefusedError if the cart is not homed, FaultError if a fault is latched."""
+        self._request(Start(), Ack)
+
+    def stop(self) -> None:
+        """Motor to 0 and disarm; ends a homing. The bytes go out before anything that can block."""
+        self._request(Stop(), Ack, before=(SetMotor(0),))
+
+    def clear_fault(self) -> None:
+        """Clear the latched faults. Raises FaultError, naming them, if the cause of one is still there."""
+        self._request(ClearFault(), Ack)
+        state = self.get_state()
+        if state.fault:
+            raise fault_error(state.fault)
+
+    def set_period(self, period_us: int) -> Info:
+        """Set the control period in us, 5000 to 100000, while disarmed. Raises RefusedError otherwise."""
+        answer = self._request(SetPeriod(period_us), Info, lambda info: info.period_us == period_us)
+        self._information = answer
+        return answer
+
+    def home(self, timeout: float = 120.0) -> State:
+        """Home, and wait until it is done: zeros set, the cart in the middle, the pole hanging still.
+
+        Raises FaultError if homing fails, PlantError if it takes longer than `timeout` seconds.
+        """
+        try:
+            self._request(Home(), Ack)
+        except RefusedError as error:
+            if error.reason != Reason.BUSY or not self._is_homing():
+                raise  # otherwise only the ACK was lost
+        deadline = time.perf_counter() + timeout
+        while True:
+            state = self._current_state()
+            if state.fault:
+                raise fault_error(state.fault)
+            if self.flags & Flags.HOMED and not self.flags & Flags.HOMING:
+                return state
+            if time.perf_counter() > deadline:
+                self.stop()
+                raise PlantError(
+                    f"homing was not done after {timeout:g} s: clear the track, let the pole hang"
+                )
+
+    def set_motor(self, value: int) -> int:
+        """Send a motor value; returns what was sent, which is `value` within the cart's limits."""
+        link = self._link
+        limit = self.information.motor_limit
+        sent = max(-limit, min(limit, int(value)))
+        self._refused_sequence = -1
+        link.send(SetMotor(sent))
+        if self._unanswered:
+            self._driving = True
+            self.statistics.latency.add(link.sent_at - self._newest_at)
+            self._unanswered = False
+        return sent
+
+    def get_state(self) -> State:
+        """Wait for the newest state that was measured after the cart took the last frame sent.
+
+        A state with a latched fault is returned, not raised. Raises RefusedError or FaultError if the cart
+        refused the last motor value, LinkError if no state comes within `timeout`.
+        """
+        if self._link.waiting() > BACKLOG_BYTES:
+            self._last_tick = None  # what is missing after this was the host's own delay
+            self._link.send(Hello())  # and only a state that acknowledges it is newer than the backlog
+        return self._current_state()
+
+    def poll_state(self) -> State:
+        """Say HELLO and wait for a state: for waiting at a cart that moves only when spoken to."""
+        self._link.send(Hello())
+        return self.get_state()
+
+    def _is_homing(self) -> bool:
+        self.poll_state()
+        return bool(self.flags & Flags.HOMING)
+
+    @property
+    def _link(self) -> SerialLink:
+        if self._open_link is None:
+            raise LinkError(f"the port {self.settings.port} is not open: use `with SerialCart(...) as cart`")
+        return self._open_link
+
+    def _abandon(self) -> None:
+        """`close` without waiting for an answer: whatever is there may be no cart."""
+        link = self._link
+        try:
+            with suppress(LinkError):
+                link.send(SetMotor(0), Stop())
+        finally:
+            self._let_go(link)
+
+    def _let_go(self, link: SerialLink) -> None:
+        self._open_link = self._newest = self._last_tick = self._refused = None
+        link.close()
+
+    def _shake_hands(self) -> Info:
+        """Say hello until the cart answers; whatever a booting board prints before is passed over."""
+        deadline = time.perf_counter() + self.settings.connect_timeout
+        pause = min(self.settings.answer_timeout, self.settings.connect_timeout)
+        while time.perf_counter() < deadline:
+            self._answers.clear()
+            self._link.write(END)  # ends whatever the cart has taken for the beginning of a frame
+            self._link.send(Hello())
+            until = min(deadline, time.perf_counter() + pause)
+            answer = self._await_answer(until, (), Info, lambda info: True)
+            if answer is not None:
+                return answer
+        raise LinkError(f"no cart answers on {self.settings.port}: {self._what_came()}")
+
+    def _what_came(self) -> str:
+        link = self._link
+        if link.bytes_received == 0:
+            return "nothing came; is it powered, and is this the right port?"
+        if not link.why_bad:
+            return f"{link.bytes_received} bytes came but no frame; is {self.settings.baud} its baud rate?"
+        return (
+            f"{link.bytes_received} bytes came, the last bad frame: {link.why_bad}; right port, right baud?"
+        )
+
+    def _request(
+        self,
+        message: Message,
+        kind: type[Answer],
+        fits: Callable[[Answer], bool] = lambda answer: True,
+        before: tuple[Message, ...] = (),
+    ) -> Answer:
+        """Send `message` until the cart answers it. Raises what a NACK says; LinkError without an answer."""
+        self._driving = self._unanswered = False
+        self._refused_sequence = -1
+        self._answers.clear()
+        asked: list[int] = []
+        for _ in range(1 + self.settings.retries):
+            asked.append(self._link.send(*before, message))
+            answer = self._await_answer(time.perf_counter() + self.settings.answer_timeout, asked, kind, fits)
+            if answer is not None:
+                self._refused = None  # of a motor value from before; it has no meaning any more
+                return answer
+        raise LinkError(
+            f"the cart on {self.settings.port} did not answer {message.TYPE.name}, asked {len(asked)} times: "
+            "check its cable and power"
+        )
+
+    def _await_answer(
+        self, deadline: float, asked: Sequence[int], kind: type[Answer], fits: Callable[[Answer], bool]
+    ) -> Answer | None:
+        while True:
+            for answer in self._answers:
+                if isinstance(answer, Ack | Nack) and answer.sequence not in asked:
+                    continue
+                if isinstance(answer, Nack):
+                    raise refusal(answer)
+                if isinstance(answer, kind) and fits(answer):
+                    return answer
+            if time.perf_counter() >= deadline:
+                return None
+            self._answers.clear()
+            self._pump()
+
+    def _current_state(self) -> State:
+        """`get_state` without the question after a backlog."""
+        state = self._await_current(time.perf_counter() + self.settings.timeout)
+        refused, self._refused = self._refused, None
+        if refused is not None and not state.fault:
+            raise refusal(refused)
+        self._unanswered = True
+        return state
+
+    def _await_current(self, deadline: float) -> State:
+        """The newest state that acknowledges the last frame; when that is overdue, the newest there is."""
+        older: State | None = None
+        while True:
+            while self._link.waiting():
+                self._pump()
+            if self._newest is None:
+                self._pump()
+            state, self._newest = self._newest, None
+            if state is not None and older is not None:
+                self._count_late()
+            older = state or older
+            if older is None:
+                self._endure_silence(deadline)
+            elif self._is_current(older):
+                return older
+
+    def _is_current(self, state: State) -> bool:
+        """Whether the state was measured after the cart took the last frame, or that frame must be lost."""
+        link = self._link
+        if link.sequence == state.last_sequence:
+            return True
+        if link.sequence == self._refused_sequence and self._state_since_refusal:
+            return True
+        waited = time.perf_counter() - link.sent_at
+        return waited > UNACKNOWLEDGED_PERIODS * self.information.period_us * 1e-6
+
+    def _endure_silence(self, deadline: float) -> None:
+        """Raise LinkError after the deadline; say HELLO after each `nudge_after` seconds without a byte."""
+        now = time.perf_counter()
+        if now > deadline:
+            raise LinkError(
+                f"no state came from {self.settings.port} for {self.settings.timeout:g} s: "
+                "check the cart's cable and power"
+            )
+        if now - max(self._link.received_at, self._link.sent_at) > self.settings.nudge_after:
+            self._link.send(Hello())
+
+    def _pump(self) -> None:
+        """Take in what has come; wait a little for a first byte."""
+        for frame in self._link.receive():
+            message = frame.message
+            if isinstance(message, State):
+                self._take_state(message, Flags(frame.flags))
+            elif isinstance(message, Nack):
+                self._take_refusal(message)
+            else:
+                self._answers.append(message)
+
+    def _take_refusal(self, nack: Nack) -> None:
+        self._refused_sequence = nack.sequence
+        self._state_since_refusal = False
+        if nack.type == MessageType.SET_MOTOR:
+            self._refused = nack  # nobody waits for its answer
+        else:
+            self._answers.append(nack)
+
+    def _take_state(self, state: State, flags: Flags) -> None:
+        """Keep the state as the newest; count those that are missing before it."""
+        if self._newest is not None:
+            self._count_late()
+        if self._last_tick is not None:
+            missing = (state.tick - self._last_tick - 1) % TICKS
+            if missing < TICKS // 2:  # otherwise the tick went back: the cart has restarted
+                self.statistics.lost_frames += missing
+        self._last_tick = state.tick
+        self._newest = state
+        self._state_since_refusal = True
+        self._newest_at = self._link.received_at
+        self.flags = flags
+
+    def _count_late(self) -> None:
+        """A state nobody acted on; while the host asks other things than motor values, that is no delay."""
+        if self._driving:
+            self.statistics.late_ticks += 1

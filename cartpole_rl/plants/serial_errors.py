@@ -1,0 +1,52 @@
+"""What the cart's refusals and faults mean, in words, each with its remedy."""
+
+from cartpole_rl.errors import FaultError, PlantError
+from cartpole_rl.wire import Fault, MessageType, Nack, Reason
+
+
+class RefusedError(PlantError):
+    """The cart answered NACK. `reason` is the protocol's, or its bare number where it is unknown here."""
+
+    def __init__(self, text: str, reason: Reason | int) -> None:
+        super().__init__(text)
+        self.reason = reason
+
+
+REASONS: dict[int, str] = {
+    Reason.UNKNOWN_TYPE: "it does not know this message: update its firmware",
+    Reason.BAD_LENGTH: "the payload has the wrong length: update its firmware, or this program",
+    Reason.OUT_OF_RANGE: "the value is out of range",
+    Reason.NOT_HOMED: "it is not homed: call home() first",
+    Reason.NOT_ARMED: "its motor is not armed: call start() first",
+    Reason.FAULT_LATCHED: "a fault is latched: remove its cause, then call clear_fault()",
+    Reason.BUSY: "it is busy, armed or homing: call stop() first, or wait until it is homed",
+    Reason.BAD_VERSION: "it speaks another protocol version: update its firmware, or this program",
+}
+
+FAULTS: dict[Fault, str] = {
+    Fault.HARD_LIMIT: "the cart ran into the end of the track (push it back towards the middle)",
+    Fault.STALL: "the motor was driven but the cart did not move (free the cart, check the motor's cable)",
+    Fault.CART_ENCODER: "the cart's encoder does not answer (check its cable)",
+    Fault.POLE_ENCODER: "the pole's encoder does not answer (check its cable)",
+    Fault.HOMING: "homing failed: a stop was not found, the span was off by over 3 %, or the pole did not "
+    "come to rest (clear the track, let the pole hang, home again)",
+}
+
+
+def refusal(nack: Nack) -> PlantError:
+    """The error for a NACK: FaultError if a fault is latched, otherwise RefusedError."""
+    known = nack.type in MessageType.__members__.values()
+    what = MessageType(nack.type).name if known else f"message {nack.type:#04x}"
+    text = f"the cart refused {what}: {REASONS.get(nack.reason, f'reason {nack.reason}, unknown here')}"
+    if nack.reason == Reason.FAULT_LATCHED:
+        return FaultError(text)
+    return RefusedError(text, Reason(nack.reason) if nack.reason in REASONS else nack.reason)
+
+
+def fault_error(bits: int) -> FaultError:
+    """The error that names every fault in `bits`, each with its remedy."""
+    named = [words for fault, words in FAULTS.items() if bits & fault]
+    unknown = bits & ~sum(FAULTS)
+    if unknown:
+        named.append(f"bits {unknown:#06x}, unknown here")
+    return FaultError(f"the cart latched a fault: {'; '.join(named)}; then clear_fault()")

@@ -1,0 +1,86 @@
+"""Frames over an open serial port: bytes out at once, bytes in as they come, bad frames passed over.
+
+A receiver that starts in the middle of a frame, or meets noise, is right again at the next 0x00.
+"""
+
+import time
+from contextlib import suppress
+
+import serial
+
+from cartpole_rl.errors import FrameError, LinkError
+from cartpole_rl.plants.link_statistics import LinkStatistics
+from cartpole_rl.wire import Frame, FrameSplitter, Message, decode_frame, encode_frame
+
+
+class SerialLink:
+    """Both directions of one port. Times are those of `time.perf_counter`, in s."""
+
+    def __init__(self, port: serial.SerialBase, statistics: LinkStatistics) -> None:
+        self._port = port
+        self._splitter = FrameSplitter()
+        self.statistics = statistics
+        self.sequence = 0  # of the newest frame sent
+        self.sent_at = self.received_at = time.perf_counter()
+        self.bytes_received = 0
+        self.why_bad = ""  # what was wrong with the newest bad frame
+
+    def send(self, *messages: Message) -> int:
+        """Write the messages at once and return the sequence of the last. Raises LinkError."""
+        data = b""
+        for message in messages:
+            self.sequence = (self.sequence + 1) & 0xFF
+            data += encode_frame(message, self.sequence)
+        self.write(data)
+        return self.sequence
+
+    def write(self, data: bytes) -> None:
+        """Write bytes as they are, within the port's write timeout. Raises LinkError."""
+        try:
+            self._port.write(data)
+        except OSError as error:
+            raise self._broken("written to", error) from error
+        self.sent_at = time.perf_counter()
+
+    def waiting(self) -> int:
+        """Bytes that have come and are not read yet. Raises LinkError."""
+        try:
+            return self._port.in_waiting
+        except OSError as error:
+            raise self._broken("asked for bytes", error) from error
+
+    def receive(self) -> list[Frame]:
+        """The frames that are here, in order; waits one read slice for a first byte. Raises LinkError."""
+        try:
+            data = self._port.read(self._port.in_waiting or 1)
+        except OSError as error:
+            raise self._broken("read", error) from error
+        if not data:
+            return []
+        self.received_at = time.perf_counter()
+        self.bytes_received += len(data)
+        overlong = self._splitter.overlong
+        frames = [
+            frame for stuffed in self._splitter.feed(data) if (frame := self._decode(stuffed)) is not None
+        ]
+        self.statistics.bad_frames += self._splitter.overlong - overlong
+        self.statistics.frames_received += len(frames)
+        return frames
+
+    def close(self) -> None:
+        """Give the port back; never raises."""
+        with suppress(OSError):  # an unplugged port is as closed as it can be
+            self._port.close()
+
+    def _decode(self, stuffed: bytes) -> Frame | None:
+        try:
+            return decode_frame(stuffed)
+        except FrameError as error:
+            self.why_bad = str(error)
+            self.statistics.bad_frames += 1
+            return None
+
+    def _broken(self, what: str, error: OSError) -> LinkError:
+        return LinkError(
+            f"{self._port.port} cannot be {what} any more: {error}; is the cart unplugged or without power?"
+        )

@@ -1,0 +1,73 @@
+"""The emulator's end of the cable: whole frames or none, and damage by chance and by seed."""
+
+import os
+import tty
+
+import pytest
+
+from cartpole_rl.emulator.disturbance import Disturbance
+from cartpole_rl.emulator.link import PtyLink
+from cartpole_rl.errors import FrameError
+from cartpole_rl.wire import FrameSplitter, SetMotor, decode_frame, encode_frame
+
+FRAME = encode_frame(SetMotor(-200), 4)[:-1]
+
+
+def test_a_host_that_does_not_read_loses_whole_frames_and_never_half_of_one():
+    with PtyLink() as link:
+        host = os.open(link.port, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+        tty.setraw(host)
+        for number in range(5000):
+            link.offer(encode_frame(SetMotor(number), number))
+        came = []
+        splitter = FrameSplitter()
+        for number in range(5000, 5100):  # the line drains, and what is new gets through again
+            while True:
+                try:
+                    came += [decode_frame(stuffed) for stuffed in splitter.feed(os.read(host, 4096))]
+                except BlockingIOError:
+                    break
+            link.offer(encode_frame(SetMotor(number), number))
+        os.close(host)
+    motors = [frame.message.motor for frame in came]
+    assert motors == sorted(set(motors))
+    assert motors[0] == 0
+    assert 100 < len(motors) < 5000
+    assert motors[-1] > 5000
+
+
+def test_what_a_host_writes_arrives_and_nothing_is_nothing():
+    with PtyLink() as link:
+        assert link.read(0) == b""
+        host = os.open(link.port, os.O_RDWR | os.O_NOCTTY)
+        os.write(host, bytes(range(256)))
+        assert link.read(5) == bytes(range(256))
+        os.close(host)
+        assert link.read(0) == b""  # a closed port is a silent one
+
+
+def test_a_sound_cable_changes_nothing():
+    cable = Disturbance(0.0, 0.0, "seed")
+    assert all(cable.carry(FRAME) == FRAME for _ in range(100))
+
+
+def test_shares_of_lost_and_damaged_frames_are_as_asked():
+    cable = Disturbance(0.2, 0.3, "seed")
+    came = [cable.carry(FRAME) for _ in range(4000)]
+    arrived = [frame for frame in came if frame is not None]
+    damaged = [frame for frame in arrived if frame != FRAME]
+    assert 1 - len(arrived) / len(came) == pytest.approx(0.2, abs=0.03)
+    assert len(damaged) / len(arrived) == pytest.approx(0.3, abs=0.03)
+    for frame in damaged:
+        assert 0 not in frame
+        with pytest.raises(FrameError):
+            decode_frame(frame)
+
+
+def test_the_seed_decides():
+    def pattern(seed: str) -> list[bytes | None]:
+        cable = Disturbance(0.3, 0.3, seed)
+        return [cable.carry(FRAME) for _ in range(50)]
+
+    assert pattern("a") == pattern("a")
+    assert pattern("a") != pattern("b")

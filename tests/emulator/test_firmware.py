@@ -1,0 +1,338 @@
+"""The firmware's rules one by one, on made-up encoder counts and without physics."""
+
+import pytest
+
+from cartpole_rl.emulator.firmware import Firmware
+from cartpole_rl.wire import (
+    Ack,
+    ClearFault,
+    Fault,
+    FaultReport,
+    Flags,
+    Hello,
+    Home,
+    Info,
+    Message,
+    MessageType,
+    Nack,
+    Reason,
+    SetMotor,
+    SetPeriod,
+    Start,
+    State,
+    Stop,
+    cobs,
+    decode_frame,
+    encode_frame,
+)
+from cartpole_rl.wire.checksum import crc16
+from cartpole_rl.wire.frames import Frame
+
+SOFT, HARD = 16704, 17539  # counts, of the nominal track
+HANGING = 0
+
+
+class Bench:
+    """A firmware whose encoders are turned by hand."""
+
+    def __init__(self, latency_us: int = 0, homed: bool = True) -> None:
+        self.firmware = Firmware(lambda: latency_us)
+        self.firmware.homed = homed
+        self.now_us = 0
+        self.sequence = 0
+
+    def send(self, message: Message) -> Message | None:
+        """The answer to a message, if it has one."""
+        frame = encode_frame(message, self.sequence)[:-1]
+        self.sequence = (self.sequence + 1) & 0xFF
+        answers = [decode_frame(answer[:-1]).message for answer in self.firmware.receive(frame, self.now_us)]
+        assert len(answers) <= 1
+        return answers[0] if answers else None
+
+    def refusal(self, message: Message) -> Reason | None:
+        """Why a message is refused, if it is."""
+        answer = self.send(message)
+        return Reason(answer.reason) if isinstance(answer, Nack) else None
+
+    def frames(self, cart: int = 0, pole: int = HANGING) -> list[Frame]:
+        """What the cart sends at the end of a period."""
+        end = self.now_us + self.firmware.period_us
+        self.motors = self.firmware.drive(self.now_us, end)
+        self.now_us = end
+        return [decode_frame(frame[:-1]) for frame in self.firmware.tick(end, cart, pole)]
+
+    def tick(self, cart: int = 0, pole: int = HANGING) -> tuple[State, Flags]:
+        """The STATE of a period, and its flags."""
+        last = self.frames(cart, pole)[-1]
+        assert isinstance(last.message, State)
+        return last.message, Flags(last.flags)
+
+
+@pytest.fixture
+def bench() -> Bench:
+    """A cart that is homed and armed."""
+    bench = Bench()
+    assert bench.send(Start()) == Ack(0, MessageType.START)
+    return bench
+
+
+def test_a_cart_boots_idle_with_the_motor_at_zero():
+    state, flags = Bench(homed=False).tick()
+    assert state == State(1, 20_000, 0, 0, 0, 0, 0, 65535)
+    assert flags == Flags(0)
+
+
+def test_hello_tells_what_the_cart_is():
+    assert Bench().send(Hello()) == Info(1, 0, 0, 4096, 22749, 255, SOFT, HARD, 20_000)
+
+
+def test_start_needs_homing():
+    bench = Bench(homed=False)
+    assert bench.refusal(Start()) == Reason.NOT_HOMED
+    assert bench.tick()[1] == Flags(0)
+
+
+def test_start_arms_and_stop_disarms(bench):
+    assert bench.tick()[1] == Flags.ARMED | Flags.HOMED
+    bench.send(SetMotor(100))
+    assert bench.tick()[0].motor_applied == 100
+    assert bench.send(Stop()) == Ack(2, MessageType.STOP)
+    state, flags = bench.tick()
+    assert state.motor_applied == 0
+    assert flags == Flags.HOMED
+    assert bench.motors[-1] == (40_000, 0)
+
+
+def test_motor_is_refused_unless_armed_and_in_range(bench):
+    assert Bench().refusal(SetMotor(1)) == Reason.NOT_ARMED
+    assert bench.refusal(SetMotor(256)) == bench.refusal(SetMotor(-256)) == Reason.OUT_OF_RANGE
+    assert bench.send(SetMotor(255)) is None
+    assert bench.send(SetMotor(-255)) is None
+
+
+def test_state_tells_the_newest_accepted_frame_and_its_age(bench):
+    bench.send(SetMotor(10))
+    state, _ = bench.tick()
+    assert (state.last_sequence, state.command_age_ms) == (1, 20)
+    assert bench.refusal(SetMotor(1000)) == Reason.OUT_OF_RANGE
+    state, _ = bench.tick()
+    assert (state.last_sequence, state.command_age_ms) == (1, 40)
+    bench.send(Hello())
+    assert bench.tick()[0].last_sequence == 3
+
+
+def test_a_command_comes_into_force_after_its_latency():
+    bench = Bench(latency_us=3_000)
+    bench.send(Start())
+    bench.send(SetMotor(100))
+    bench.tick()
+    assert bench.motors == [(0, 0), (3_000, 100)]
+    bench.send(SetMotor(-50))
+    bench.tick()
+    assert bench.motors == [(20_000, 100), (23_000, -50)]
+
+
+def test_a_latency_of_more_than_a_period_keeps_the_order():
+    latencies = iter([50_000, 10_000])
+    bench = Bench()
+    bench.firmware = Firmware(lambda: next(latencies))
+    bench.firmware.homed = True
+    bench.send(Start())
+    bench.send(SetMotor(100))
+    bench.tick()
+    bench.send(SetMotor(-100))
+    motors = []
+    for _ in range(3):
+        bench.tick()
+        motors += bench.motors
+    assert (50_000, 100) in motors
+    assert motors[-1] == (60_000, -100)
+
+
+def test_stop_forgets_commands_that_are_still_due():
+    bench = Bench(latency_us=30_000)
+    bench.send(Start())
+    bench.send(SetMotor(100))
+    bench.send(Stop())
+    for _ in range(3):
+        assert bench.tick()[0].motor_applied == 0
+
+
+def test_watchdog_stops_the_motor_after_three_periods_and_a_command_revives_it(bench):
+    bench.send(SetMotor(100))
+    told = [bench.tick() for _ in range(5)]
+    assert [state.motor_applied for state, _ in told] == [100, 100, 0, 0, 0]
+    assert [bool(flags & Flags.WATCHDOG) for _, flags in told] == [False, False, True, True, True]
+    assert told[-1][1] & Flags.ARMED
+    bench.send(SetMotor(-100))
+    state, flags = bench.tick()
+    assert state.motor_applied == -100
+    assert not flags & Flags.WATCHDOG
+
+
+def test_watchdog_is_not_fed_by_other_or_refused_frames(bench):
+    bench.send(SetMotor(100))
+    for message in (Hello(), SetMotor(300), Start()):
+        bench.send(message)
+        state, _ = bench.tick()
+    assert state.motor_applied == 0
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_soft_limit_lets_the_cart_in_and_not_out(bench, side):
+    bench.send(SetMotor(side * 100))
+    state, flags = bench.tick(side * (SOFT - 1))
+    assert state.motor_applied == side * 100
+    assert not flags & Flags.SOFT_LIMIT
+    bench.send(SetMotor(side * 100))
+    state, flags = bench.tick(side * SOFT)
+    assert state.motor_applied == 0
+    assert flags & Flags.SOFT_LIMIT
+    bench.send(SetMotor(-side * 100))
+    state, flags = bench.tick(side * (SOFT + 5))
+    assert state.motor_applied == -side * 100
+    assert not flags & Flags.SOFT_LIMIT
+    assert state.fault == 0
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_hard_limit_latches_until_it_is_cleared(bench, side):
+    bench.send(SetMotor(100))
+    bench.tick(side * (HARD - 1))
+    bench.send(SetMotor(-side * 100))
+    report, state = bench.frames(side * HARD)
+    assert report.message == FaultReport(Fault.HARD_LIMIT, 2)
+    assert state.message.fault == Fault.HARD_LIMIT
+    assert state.message.motor_applied == 0
+    assert Flags(state.flags) == Flags.HOMED | Flags.FAULTED
+    assert len(bench.frames(0)) == 1  # told once, though still latched in the middle
+    assert bench.refusal(Start()) == Reason.FAULT_LATCHED
+    assert bench.refusal(SetMotor(1)) == Reason.FAULT_LATCHED
+    assert bench.refusal(Home()) == Reason.FAULT_LATCHED
+    assert isinstance(bench.send(ClearFault()), Ack)
+    assert isinstance(bench.send(Start()), Ack)
+    state, flags = bench.tick(0)
+    assert state.fault == 0
+    assert flags == Flags.ARMED | Flags.HOMED
+
+
+def test_a_disarmed_cart_may_be_anywhere():
+    assert Bench().tick(HARD + 100)[0].fault == 0
+
+
+def push(bench: Bench, motors: list[int], counts: list[int]) -> State:
+    """The last STATE under motor values that move the cart to given counts."""
+    for motor, cart in zip(motors, counts, strict=True):
+        bench.send(SetMotor(motor))
+        state, _ = bench.tick(cart)
+    return state
+
+
+def test_stall_is_a_hard_push_that_moves_nothing(bench):
+    assert push(bench, [255] * 25, [3] * 25).fault == 0
+    assert push(bench, [255] * 2, [3] * 2).fault == Fault.STALL
+
+
+@pytest.mark.parametrize(
+    ("motors", "counts"),
+    [
+        ([255] * 100, [10 * tick for tick in range(100)]),  # it creeps at 1 cm/s
+        ([150] * 100, [0] * 100),  # not hard enough to be sure
+        ([255, -255] * 50, [0] * 100),  # to and fro too fast to move
+        (([255] * 20 + [0] * 2) * 4, [0] * 88),  # short pushes
+    ],
+)
+def test_stall_is_not_cried_over_less(bench, motors, counts):
+    assert push(bench, motors, counts).fault == 0
+
+
+@pytest.mark.parametrize(
+    ("counts", "fault"), [((5_000, 0), Fault.CART_ENCODER), ((0, 2_000), Fault.POLE_ENCODER)]
+)
+def test_a_count_that_jumps_is_a_fault_and_costs_the_homing(bench, counts, fault):
+    bench.tick(0, 0)
+    state, flags = bench.tick(*counts)
+    assert state.fault == fault
+    assert flags == Flags.FAULTED
+    bench.send(ClearFault())
+    assert bench.refusal(Start()) == Reason.NOT_HOMED
+
+
+def test_the_fastest_cart_and_pole_are_no_fault(bench):
+    for tick in range(20):
+        bench.send(SetMotor(0))
+        state, _ = bench.tick(-16_000 + 1_600 * tick, 500 * tick)  # 1.8 m/s, 38 rad/s
+        assert state.fault == 0
+
+
+def test_homing_is_busy_moves_by_itself_and_is_ended_by_stop():
+    bench = Bench(homed=True)
+    assert isinstance(bench.send(Home()), Ack)
+    motors = []
+    for _ in range(10):
+        state, flags = bench.tick()
+        motors.append(state.motor_applied)
+    assert flags == Flags.HOMING
+    assert motors[-1] < 0
+    for message in (Start(), SetMotor(5), Home(), SetPeriod(10_000)):
+        assert bench.refusal(message) == Reason.BUSY
+    assert isinstance(bench.send(Hello()), Info)
+    assert isinstance(bench.send(Stop()), Ack)
+    state, flags = bench.tick()
+    assert state.motor_applied == 0
+    assert flags == Flags(0)
+    assert bench.refusal(Start()) == Reason.NOT_HOMED
+
+
+def test_a_cart_that_cannot_move_fails_to_home():
+    bench = Bench(homed=False)
+    bench.send(Home())
+    faults = [bench.tick()[0].fault for _ in range(600)]
+    assert faults[0] == 0
+    assert faults[-1] == Fault.HOMING
+    assert bench.refusal(Home()) == Reason.FAULT_LATCHED
+
+
+def test_an_armed_cart_is_not_homed_or_retimed(bench):
+    assert bench.refusal(Home()) == Reason.BUSY
+    assert bench.refusal(SetPeriod(10_000)) == Reason.BUSY
+
+
+def test_period_can_be_set_within_bounds():
+    bench = Bench()
+    assert bench.send(SetPeriod(10_000)).period_us == 10_000
+    assert bench.tick()[0].time_us == 10_000
+    assert bench.refusal(SetPeriod(4_999)) == bench.refusal(SetPeriod(100_001)) == Reason.OUT_OF_RANGE
+    assert bench.send(Hello()).period_us == 10_000
+    assert bench.tick()[0].time_us == 20_000
+
+
+def answer_to(body: bytes) -> list[Message]:
+    stuffed = cobs.encode(body + crc16(body).to_bytes(2, "little"))
+    return [decode_frame(frame[:-1]).message for frame in Firmware(lambda: 0).receive(stuffed, 0)]
+
+
+def test_strange_frames_are_refused_with_a_reason():
+    assert answer_to(b"\x02\x01\x07\x00") == [Nack(7, 0x01, Reason.BAD_VERSION)]
+    assert answer_to(b"\x01\x7f\x07\x00") == [Nack(7, 0x7F, Reason.UNKNOWN_TYPE)]
+    assert answer_to(b"\x01\x82\x07\x00") == [Nack(7, 0x82, Reason.UNKNOWN_TYPE)]
+    assert answer_to(b"\x01\x04\x07\x00\x01") == [Nack(7, 0x04, Reason.BAD_LENGTH)]
+    assert answer_to(b"\x01\x02\x07\x00\x01") == [Nack(7, 0x02, Reason.BAD_LENGTH)]
+
+
+def test_damaged_frames_are_passed_over(bench):
+    frame = bytearray(encode_frame(SetMotor(100), 9)[:-1])
+    frame[-1] ^= 0x10
+    for garbage in (bytes(frame), b"\x01", b"\xff" * 60, b"ets Jul 29 2019"):
+        assert bench.firmware.receive(garbage, bench.now_us) == []
+    state, _ = bench.tick()
+    assert (state.motor_applied, state.last_sequence) == (0, 0)
+
+
+def test_the_cart_numbers_its_frames_modulo_256():
+    bench = Bench()
+    sequences = []
+    for _ in range(150):
+        bench.send(Hello())
+        sequences.append(bench.frames()[0].sequence)
+    assert sequences == [(2 * number + 1) % 256 for number in range(150)]

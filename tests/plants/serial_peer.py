@@ -1,0 +1,140 @@
+"""The other end of a pseudo-terminal: answers byte for byte like a cart, so far as a test wants it to."""
+
+import os
+import select
+import threading
+import tty
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+
+from cartpole_rl.wire import (
+    Ack,
+    Flags,
+    Frame,
+    FrameSplitter,
+    Hello,
+    Home,
+    Info,
+    Message,
+    SetMotor,
+    SetPeriod,
+    Start,
+    State,
+    Stop,
+    decode_frame,
+    encode_frame,
+)
+
+INFO = Info(1, 2, 3, 4096, 22749, 255, 14000, 17000, 20000)
+HANGING = 2048  # pole counts
+
+
+class Peer:
+    """Reads frames from the port and writes what `answer` gives for each. Silent itself."""
+
+    def __init__(self, boot: bytes = b"") -> None:
+        self.master, self._slave = os.openpty()
+        tty.setraw(self._slave)
+        self.port = os.ttyname(self._slave)
+        self.received: list[Frame] = []
+        self._sequence = 0
+        self._wake_read, self._wake_write = os.pipe()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        if boot:
+            os.write(self.master, boot)
+
+    def answer(self, frame: Frame) -> Iterable[bytes]:
+        """Bytes to send for a frame of the host."""
+        return ()
+
+    def encode(self, message: Message, flags: int = 0) -> bytes:
+        self._sequence += 1
+        return encode_frame(message, self._sequence, flags)
+
+    def send(self, data: bytes) -> None:
+        os.write(self.master, data)
+
+    def messages(self, kind: type[Message]) -> list[Message]:
+        return [frame.message for frame in self.received if isinstance(frame.message, kind)]
+
+    def _run(self) -> None:
+        splitter = FrameSplitter()
+        while True:
+            ready = select.select([self.master, self._wake_read], [], [])[0]
+            if self._wake_read in ready:
+                return
+            for stuffed in splitter.feed(os.read(self.master, 4096)):
+                frame = decode_frame(stuffed)
+                self.received.append(frame)
+                for data in self.answer(frame):
+                    self.send(data)
+
+    def __enter__(self) -> "Peer":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        os.write(self._wake_write, b"x")
+        self._thread.join()
+        for descriptor in (self.master, self._slave, self._wake_read, self._wake_write):
+            if descriptor >= 0:
+                os.close(descriptor)
+
+    def unplug(self) -> None:
+        """Close both ends, as a pulled cable does; the thread ends."""
+        os.write(self._wake_write, b"x")
+        self._thread.join()
+        os.close(self.master)
+        os.close(self._slave)
+        self.master = self._slave = -1
+
+
+class CartPeer(Peer):
+    """HELLO gives INFO, the rest ACK, and each frame a state; if `paced`, only `tick` gives one."""
+
+    def __init__(self, boot: bytes = b"", paced: bool = False) -> None:
+        super().__init__(boot)
+        self.paced = paced
+        self.flags = Flags(0)
+        self.state = State(0, 0, 0, HANGING, 0, 0, 0, 65535)
+        self.info = INFO
+
+    def answer(self, frame: Frame) -> Iterable[bytes]:
+        message = frame.message
+        self.state = replace(self.state, last_sequence=frame.sequence)
+        if isinstance(message, SetPeriod):
+            self.info = replace(self.info, period_us=message.period_us)
+        if isinstance(message, Hello | SetPeriod):
+            yield self.encode(self.info)
+        elif isinstance(message, SetMotor):
+            self.state = replace(self.state, motor_applied=message.motor)
+        else:
+            self._carry_out(message)
+            yield self.encode(Ack(frame.sequence, message.TYPE))
+        if not self.paced:
+            yield self.next_state()
+
+    def next_state(self, **changes: int) -> bytes:
+        """The bytes of the state of the next tick."""
+        ticked = {"tick": self.state.tick + 1, "time_us": (self.state.time_us + self.info.period_us) % 2**32}
+        self.state = replace(self.state, **(ticked | changes))
+        return self.encode(self.state, self.flags)
+
+    def tick(self, **changes: int) -> None:
+        """A period passes: the state goes out."""
+        self.send(self.next_state(**changes))
+
+    def _carry_out(self, message: Message) -> None:
+        if isinstance(message, Home):
+            self.flags |= Flags.HOMED
+        elif isinstance(message, Start):
+            self.flags |= Flags.ARMED
+        elif isinstance(message, Stop):
+            self.flags &= ~Flags.ARMED
+            self.state = replace(self.state, motor_applied=0)
+
+
+def open_descriptors() -> int:
+    """File descriptors that this process holds."""
+    return len(list(Path("/proc/self/fd").iterdir()))

@@ -1,0 +1,237 @@
+"""The plant on a scripted cart: endings, clocks and starts. On the emulated cart: test_emulated_plant.py."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import pytest
+import torch
+from serial_peer import HANGING, CartPeer
+from tensordict import TensorDict
+
+from cartpole_rl.errors import FaultError, LinkError, PlantError, PortError
+from cartpole_rl.plants.serial import SerialPlant, SerialPlantSettings
+from cartpole_rl.wire import ClearFault, Fault, Flags, Frame, Home, SetMotor, Start, Stop
+
+
+def settings(port: str, **changes) -> SerialPlantSettings:
+    quick = {"timeout": 0.4, "connect_timeout": 0.8, "answer_timeout": 0.2, "retries": 1, "nudge_after": 0.1}
+    return SerialPlantSettings(port=port, **(quick | changes))
+
+
+@pytest.fixture
+def peer() -> Iterator[CartPeer]:
+    with CartPeer() as peer:
+        yield peer
+
+
+@pytest.fixture
+def plant(peer: CartPeer) -> Iterator[SerialPlant]:
+    plant = SerialPlant(settings(peer.port))
+    yield plant
+    plant.close()
+
+
+def step(plant: SerialPlant, motor: int) -> TensorDict:
+    return plant.step(TensorDict({"motor": torch.tensor([[motor]])}, [1]))["next"]
+
+
+def test_a_reset_homes_and_arms(peer: CartPeer, plant: SerialPlant) -> None:
+    first = plant.reset()
+    assert first["counts"].tolist() == [[0, HANGING]]
+    assert first["dt"].item() == pytest.approx(0.02)
+    assert peer.flags & Flags.ARMED
+    assert [type(frame.message) for frame in peer.received if isinstance(frame.message, Home | Start)] == [
+        Home,
+        Start,
+    ]
+
+
+def test_a_step_carries_the_carts_own_numbers(peer: CartPeer, plant: SerialPlant) -> None:
+    plant.reset()
+    peer.state = replace(peer.state, cart_counts=-123, pole_counts=-5000)
+    frame = step(plant, 77)
+    assert frame["counts"].tolist() == [[-123, -5000]]
+    assert frame["motor_applied"].item() == 77
+    assert not frame["done"]
+
+
+def test_dt_is_the_carts_clock_across_its_wrap(peer: CartPeer, plant: SerialPlant) -> None:
+    plant.reset()
+    peer.state = replace(peer.state, time_us=2**32 - 25_000)
+    step(plant, 0)
+    assert step(plant, 0)["dt"].item() == pytest.approx(0.02, abs=1e-6)
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_beyond_the_soft_limit_the_episode_ends_on_the_track(
+    peer: CartPeer, plant: SerialPlant, side: int
+) -> None:
+    plant.reset()
+    peer.state = replace(peer.state, cart_counts=side * (peer.info.soft_limit_counts - 1))
+    assert not step(plant, 100)["done"]
+    peer.state = replace(peer.state, cart_counts=side * peer.info.soft_limit_counts)
+    frame = step(plant, 100)
+    assert frame["terminated"]
+    assert not frame["truncated"]
+    assert plant.ended_by == "track"
+    assert_stopped(peer)
+
+
+def test_a_hard_limit_is_an_ending_on_the_track(peer: CartPeer, plant: SerialPlant) -> None:
+    plant.reset()
+    peer.state = replace(peer.state, fault=int(Fault.HARD_LIMIT))
+    assert step(plant, 0)["terminated"]
+    assert plant.ended_by == "track"
+
+
+def test_a_fault_ends_the_episode_and_is_cleared_in_the_next_reset(
+    peer: CartPeer, plant: SerialPlant
+) -> None:
+    plant.reset()
+    peer.state = replace(peer.state, fault=int(Fault.STALL))
+    frame = step(plant, 0)
+    assert frame["terminated"]
+    assert plant.ended_by == "fault"
+    assert isinstance(plant.last_error, FaultError)
+    assert_stopped(peer)
+    with pytest.raises(FaultError, match="motor"):
+        plant.reset()
+    peer._carry_out = lambda message: clear(peer, message)
+    assert not plant.reset()["done"]
+    assert plant.ended_by == ""
+
+
+def test_a_cart_that_restarts_is_a_lost_link(peer: CartPeer, plant: SerialPlant) -> None:
+    plant.reset()
+    peer.flags = Flags(0)
+    frame = step(plant, 0)
+    assert frame["truncated"]
+    assert not frame["terminated"]
+    assert plant.ended_by == "link"
+    assert "restarted" in str(plant.last_error)
+
+
+def test_a_silent_cart_truncates_with_the_last_counts_and_can_come_back(
+    peer: CartPeer, plant: SerialPlant
+) -> None:
+    plant.reset()
+    peer.state = replace(peer.state, cart_counts=42)
+    step(plant, 100)
+    talk, peer.answer = peer.answer, lambda frame: ()
+    frame = step(plant, 100)
+    assert frame["truncated"]
+    assert not frame["terminated"]
+    assert frame["counts"].tolist() == [[42, HANGING]]
+    assert frame["motor_applied"].item() == 0
+    assert plant.ended_by == "link"
+    with pytest.raises(LinkError, match=r"was lost \(no state came.*no cart answers"):
+        plant.reset()
+    peer.answer = talk
+    assert plant.reset()["counts"].tolist() == [[42, HANGING]]
+
+
+def test_upright_asks_a_person_and_waits_for_the_pole(peer: CartPeer) -> None:
+    said: list[str] = []
+
+    def hold(text: str) -> None:
+        said.append(text)
+        peer.state = replace(peer.state, pole_counts=4096 + 30)  # a turn further is upright too
+
+    plant = SerialPlant(settings(peer.port, start="upright"), prompt=hold)
+    assert plant.reset()["counts"][0, 1] == 4126
+    assert "upright" in said[0]
+    plant.close()
+
+
+@pytest.mark.parametrize(
+    ("start", "counts", "words"),
+    [("upright", 45, r"\+4\.0 deg off: hold it up"), ("hanging", 1900, r"-13\.0 deg off: let it hang")],
+)
+def test_a_pole_that_is_not_there_is_waited_for_in_vain(
+    peer: CartPeer, start: str, counts: int, words: str
+) -> None:
+    peer.state = replace(peer.state, pole_counts=counts)
+    plant = SerialPlant(settings(peer.port, start=start, start_timeout=0.05), prompt=lambda text: None)
+    with pytest.raises(PlantError, match=words):
+        plant.reset()
+    assert not peer.messages(Start)
+    plant.close()
+
+
+def test_a_swinging_pole_does_not_start(peer: CartPeer) -> None:
+    class Swinging:
+        def __init__(self) -> None:
+            self.talk, self.side = peer.answer, 1
+
+        def __call__(self, frame: Frame) -> Iterator[bytes]:
+            self.side = -self.side
+            peer.state = replace(peer.state, pole_counts=HANGING + 30 * self.side)
+            yield from self.talk(frame)
+
+    peer.answer = Swinging()
+    plant = SerialPlant(settings(peer.port, start_timeout=0.1))
+    with pytest.raises(PlantError, match="let it hang until it is still"):
+        plant.reset()
+    plant.close()
+
+
+def test_another_control_period_is_set_on_the_cart(peer: CartPeer) -> None:
+    plant = SerialPlant(settings(peer.port, control_period=0.01))
+    plant.reset()
+    assert peer.info.period_us == 10_000
+    assert step(plant, 0)["dt"].item() == pytest.approx(0.01)
+    peer.info = replace(peer.info, period_us=20_000)  # as after a restart
+    plant.reset()
+    assert peer.info.period_us == 10_000
+    plant.close()
+
+
+def test_a_reset_mask_of_false_leaves_the_cart_alone(peer: CartPeer, plant: SerialPlant) -> None:
+    plant.reset()
+    began = len(peer.received)
+    plant._reset(TensorDict({"_reset": torch.zeros(1, 1, dtype=torch.bool)}, [1]))
+    assert len(peer.received) == began
+
+
+def test_close_stops_the_motor_and_closes_what_is_owned(peer: CartPeer) -> None:
+    class Owned:
+        closed = False
+        died = ""
+
+        def close(self) -> None:
+            self.closed = True
+
+    owned = Owned()
+    plant = SerialPlant(settings(peer.port), owned=owned)
+    plant.reset()
+    step(plant, 200)
+    plant.close()
+    assert_stopped(peer)
+    assert owned.closed
+    assert plant.is_closed
+
+
+def test_what_is_owned_is_closed_when_the_port_cannot_be_opened() -> None:
+    class Owned:
+        closed = False
+        died = ""
+
+        def close(self) -> None:
+            self.closed = True
+
+    owned = Owned()
+    with pytest.raises(PortError):
+        SerialPlant(settings("/dev/nosuch0"), owned=owned)
+    assert owned.closed
+
+
+def clear(peer: CartPeer, message: object) -> None:
+    if isinstance(message, ClearFault):
+        peer.state = replace(peer.state, fault=0)
+    CartPeer._carry_out(peer, message)
+
+
+def assert_stopped(peer: CartPeer) -> None:
+    assert [type(frame.message) for frame in peer.received[-2:]] == [SetMotor, Stop]
+    assert peer.messages(SetMotor)[-1] == SetMotor(0)
+    assert peer.state.motor_applied == 0

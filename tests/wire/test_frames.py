@@ -1,0 +1,122 @@
+"""Frames and messages: round trips, damage that is noticed, and a splitter that stays in step and bounded."""
+
+from dataclasses import fields
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cartpole_rl.errors import FrameError
+from cartpole_rl.wire import Frame, FrameSplitter, Hello, SetMotor, State, cobs, decode_frame, encode_frame
+from cartpole_rl.wire.checksum import crc16
+from cartpole_rl.wire.frames import LONGEST_FRAME, open_envelope
+from cartpole_rl.wire.messages import MESSAGES, Message, MessageType
+
+LIMITS = {"B": (0, 255), "h": (-(2**15), 2**15 - 1), "H": (0, 2**16 - 1)}
+LIMITS |= {"i": (-(2**31), 2**31 - 1), "I": (0, 2**32 - 1)}
+
+
+def messages() -> st.SearchStrategy[Message]:
+    kinds = [
+        st.builds(kind, *(st.integers(*LIMITS[letter]) for letter in kind.LAYOUT))
+        for kind in MESSAGES.values()
+    ]
+    return st.one_of(kinds)
+
+
+def frame_of(body: bytes) -> bytes:
+    return cobs.encode(body + crc16(body).to_bytes(2, "little"))
+
+
+@given(messages(), st.integers(0, 255), st.integers(0, 255))
+def test_every_message_comes_back_as_it_went(message, sequence, flags):
+    frame = encode_frame(message, sequence, flags)
+    assert frame.count(0) == 1
+    assert frame[-1] == 0
+    assert len(frame) - 1 <= LONGEST_FRAME
+    assert decode_frame(frame[:-1]) == Frame(message, sequence, flags)
+
+
+def test_each_type_has_one_message_and_a_layout_as_long_as_its_fields():
+    assert set(MESSAGES) == set(MessageType)
+    for kind in MESSAGES.values():
+        assert len(kind.LAYOUT) == len(fields(kind))
+
+
+def test_sequence_is_taken_modulo_256():
+    assert decode_frame(encode_frame(Hello(), 256 + 7)[:-1]).sequence == 7
+
+
+def test_a_value_too_wide_for_its_field_is_refused():
+    with pytest.raises(FrameError, match="SET_MOTOR"):
+        encode_frame(SetMotor(40000), 0)
+
+
+@given(messages(), st.data())
+def test_every_wrong_byte_is_noticed(message, data):
+    body = bytearray(cobs.decode(encode_frame(message, 3)[:-1]))
+    body[data.draw(st.integers(0, len(body) - 1))] ^= data.draw(st.integers(1, 255))
+    with pytest.raises(FrameError):
+        decode_frame(cobs.encode(bytes(body)))
+
+
+@pytest.mark.parametrize(
+    "message", [Hello(), SetMotor(-200), State(1169, 23380000, 43, 2051, -200, 4, 0, 20)]
+)
+def test_every_cut_is_noticed(message):
+    stuffed = encode_frame(message, 3)[:-1]
+    for length in range(len(stuffed)):
+        with pytest.raises(FrameError):
+            decode_frame(stuffed[:length])
+
+
+@pytest.mark.parametrize(
+    ("body", "complaint"),
+    [
+        (b"\x02\x01\x00\x00", "version 2"),
+        (b"\x01\x7f\x00\x00", "unknown message type 0x7f"),
+        (b"\x01\x04\x00\x00\x01", "SET_MOTOR has 1 payload bytes, not 2"),
+        (b"\x01\x01", "cut short"),
+    ],
+)
+def test_sound_frames_with_a_wrong_content_are_refused_by_name(body, complaint):
+    with pytest.raises(FrameError, match=complaint):
+        decode_frame(frame_of(body))
+
+
+def test_an_envelope_opens_where_only_the_content_is_wrong():
+    envelope = open_envelope(frame_of(b"\x02\x7f\x09\x00\x01"))
+    assert (envelope.version, envelope.kind, envelope.sequence, envelope.payload) == (2, 0x7F, 9, b"\x01")
+
+
+@given(st.lists(messages(), min_size=1, max_size=8), st.data())
+def test_splitter_does_not_care_how_bytes_arrive(sent, data):
+    stream = b"".join(encode_frame(message, number) for number, message in enumerate(sent))
+    splitter, came, at = FrameSplitter(), [], 0
+    while at < len(stream):
+        size = data.draw(st.integers(1, 40))
+        came += [decode_frame(stuffed).message for stuffed in splitter.feed(stream[at : at + size])]
+        at += size
+    assert came == sent
+
+
+@given(st.binary(max_size=300))
+def test_splitter_is_in_step_after_one_zero_behind_any_garbage(garbage):
+    splitter = FrameSplitter()
+    list(splitter.feed(garbage + b"\x00"))
+    assert list(splitter.feed(encode_frame(SetMotor(5), 1) * 2)) == [encode_frame(SetMotor(5), 1)[:-1]] * 2
+
+
+def test_splitter_skips_empty_runs_and_stays_bounded():
+    splitter = FrameSplitter()
+    assert list(splitter.feed(b"\x00\x00\x00")) == []
+    for _ in range(100):
+        assert list(splitter.feed(b"\x55" * 1000)) == []
+    assert len(splitter._pending) <= LONGEST_FRAME
+    assert splitter.overlong == 1
+    assert list(splitter.feed(b"\x00" + encode_frame(Hello(), 0))) == [encode_frame(Hello(), 0)[:-1]]
+
+
+def test_state_has_the_bytes_that_the_protocol_says():
+    state = State(1, 2, -3, 4, -5, 6, 7, 8)
+    assert state.pack().hex() == "0100000002000000fdffffff04000000fbff0607000800"

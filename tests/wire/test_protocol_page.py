@@ -1,0 +1,74 @@
+"""What docs/protocol.md states in numbers is what the code does."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from cartpole_rl.wire import (
+    Ack,
+    ClearFault,
+    Fault,
+    FaultReport,
+    Flags,
+    Hello,
+    Home,
+    Info,
+    Message,
+    MessageType,
+    Nack,
+    Reason,
+    SetMotor,
+    SetPeriod,
+    Start,
+    State,
+    Stop,
+    encode_frame,
+)
+
+PAGE = (Path(__file__).parents[2] / "docs" / "protocol.md").read_text(encoding="utf-8")
+HOMED = Flags.HOMED
+EXAMPLES: dict[str, tuple[Message, int, int]] = {
+    "HELLO": (Hello(), 0, 0),
+    "INFO": (Info(1, 0, 0, 4096, 22749, 255, 16704, 17539, 20000), 0, 0),
+    "SET_PERIOD": (SetPeriod(20000), 1, 0),
+    "HOME": (Home(), 2, 0),
+    "ACK": (Ack(2, MessageType.HOME), 5, Flags.HOMING),
+    "START": (Start(), 3, 0),
+    "SET_MOTOR": (SetMotor(-200), 4, 0),
+    "STATE": (State(1169, 23380000, 43, 2051, -200, 4, 0, 20), 148, Flags.ARMED | HOMED),
+    "STOP": (Stop(), 5, 0),
+    "NACK": (Nack(6, MessageType.SET_MOTOR, Reason.NOT_ARMED), 150, HOMED),
+    "FAULT": (FaultReport(Fault.HARD_LIMIT, 1200), 160, HOMED | Flags.FAULTED),
+    "CLEAR_FAULT": (ClearFault(), 7, 0),
+}
+ROWS = dict(re.findall(r"^\| ([A-Z_]+)\b.*\| `((?:[0-9a-f]{2} )+00)` \|$", PAGE, re.MULTILINE))
+
+
+def test_every_type_has_one_example():
+    assert set(ROWS) == set(EXAMPLES) == {kind.name for kind in MessageType}
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_example_is_what_the_encoder_makes(name):
+    assert ROWS[name] == encode_frame(*EXAMPLES[name]).hex(" ")
+
+
+@pytest.mark.parametrize("kind", MessageType)
+def test_type_is_listed(kind):
+    assert re.search(rf"^\| {kind.value:#04x} \| {kind.name}\b".replace("0X", "0x"), PAGE, re.MULTILINE)
+
+
+@pytest.mark.parametrize("flag", Flags)
+def test_flag_is_listed(flag):
+    assert f"| {flag.name} | {flag.value:#04x} |" in PAGE
+
+
+@pytest.mark.parametrize("fault", Fault)
+def test_fault_is_listed(fault):
+    assert f"| {fault.name} | {fault.value:#06x} |" in PAGE
+
+
+@pytest.mark.parametrize("reason", Reason)
+def test_reason_is_listed(reason):
+    assert f"| {reason.value} {reason.name} |" in PAGE
