@@ -28,7 +28,8 @@ def main() -> None:
     intervals = {name: (result["score"]["low"], result["score"]["high"]) for name, result in results.items()}
     save(comparison(scores, "The same agent on two carts", intervals), folder / "comparison.png")
     print(f"\nratio of the scores, emulated over simulated: {ratio:.2f}")
-    print(f"figures: {folder}/comparison.png, {folder}/*/figures/ (learning_curve.png, behaviour.png, episode.gif)")
+    print(f"figures: {folder}/comparison.png")
+    print(f"         {folder}/*/figures/: learning_curve.png, behaviour.png, episode.gif")
     print(f"curves:  .venv/bin/tensorboard --logdir {folder}")
     print(f"the whole took {time.perf_counter() - started:.0f} s")
 
@@ -43,9 +44,15 @@ def command(name: str, *arguments: str) -> None:
 
 def evaluate(folder: Path, plant: str) -> dict:
     """The last checkpoint's metrics on `plant`."""
-    into = folder / plant
-    command("evaluate", f"hydra.run.dir={into}", f"run={folder}/train", f"plant={plant}", f"episodes={EPISODES}")
-    return json.loads((into / "metrics.json").read_text())
+    into = f"{folder}/{plant}"
+    run = f"{folder}/train"
+    command("evaluate", f"hydra.run.dir={into}", f"run={run}", f"plant={plant}", f"episodes={EPISODES}")
+    return json.loads(Path(into, "metrics.json").read_text())
+
+
+def mean_text(figure: dict | None) -> str:
+    """A mean with its interval; "never" where no episode has it."""
+    return "never" if figure is None else interval_text(figure["mean"], figure["low"], figure["high"])
 
 
 def show(results: dict[str, dict]) -> None:
@@ -58,11 +65,7 @@ def show(results: dict[str, dict]) -> None:
         "min_track_margin_m": "nearest to the track's end, m",
     }
     rows = [
-        {"figure": label}
-        | {
-            plant: interval_text(*(result[key][part] for part in ("mean", "low", "high"))) if result[key] else "never"
-            for plant, result in results.items()
-        }
+        {"figure": label} | {plant: mean_text(result[key]) for plant, result in results.items()}
         for key, label in figures.items()
     ]
     print("\nThe last checkpoint, 10 episodes each, mean and 95 % interval")

@@ -20,6 +20,7 @@ from cartpole_rl.reporting.tensorboard import TensorBoardLog
 from cartpole_rl.tasks.episode import Episode
 
 HISTORY = "history.jsonl"  # a line an evaluation
+COMPARED = ("score", "score_upright", "steps", "time_to_upright_s", "upright_fraction")  # on the HPARAMS page
 PICTURES = 4  # behaviour figures and animations in TensorBoard, over the whole training
 
 
@@ -99,9 +100,8 @@ class TrainingMonitor:
 
     def finished(self, metrics: dict[str, float | None]) -> None:
         """The run's line on TensorBoard's HPARAMS page."""
-        self._log.hparams(
-            self.config.model_dump(mode="json"), {key: value for key, value in metrics.items() if value is not None}
-        )
+        shown = {key: value for key in COMPARED if (value := metrics.get(key)) is not None}
+        self._log.hparams(self.config.model_dump(mode="json"), shown)
 
     def _show(self, episode: Episode, frames: int) -> None:
         half = self.config.task.x_max

@@ -1,8 +1,8 @@
 """The hardware transform: a cart that speaks counts and motor values becomes an environment to learn in.
 
-One transform, the same over a simulated and over a serial plant, keeps the stack short (each TorchRL transform
-costs more time than the arithmetic in it) and holds no state of its own: what it needs of the past stands in the
-tensordict, so a step depends on nothing else.
+One transform, the same over a simulated and over a serial plant, keeps the stack short (each TorchRL
+transform costs more time than the arithmetic in it) and holds no state of its own: what it needs of the past
+stands in the tensordict, so a step depends on nothing else.
 
 Keys, each [N, ...]: in `action` int64 index; out `observation` float32, `state` (measured x m, x_dot m/s,
 theta rad, theta_dot rad/s), `reward` [N, 1], `score` (6.2) and `score_upright` (6.1) of this step [N, 1],
@@ -32,7 +32,7 @@ from cartpole_rl.tasks.features import (
     observation_size,
     observe,
 )
-from cartpole_rl.tasks.rewards import REWARDS, Reward, score, score_upright
+from cartpole_rl.tasks.rewards import REWARDS, SCORE, SCORE_UPRIGHT, Reward
 from cartpole_rl.tasks.starts import StartSettings
 
 
@@ -45,11 +45,22 @@ class ObservationSettings(Settings):
     pole_length: bool  # the length of the pole, known from a label on it
 
     @property
+    def past_size(self) -> int:
+        """Numbers of the past: motor values, newest first, then velocities, newest first."""
+        return self.past_motors + 2 * self.past_velocities
+
+    @property
     def size(self) -> int:
         """Numbers in an observation."""
-        return (
-            observation_size(self.kind) + self.past_motors + 2 * self.past_velocities + int(self.pole_length)
-        )
+        return observation_size(self.kind) + self.past_size + int(self.pole_length)
+
+    @property
+    def kept_columns(self) -> list[int]:
+        """What a step keeps of (newest motor value, past, newest velocities): the past of the next step."""
+        motors = range(self.past_motors)
+        older_velocities = range(1 + self.past_motors, 1 + self.past_size)
+        velocities = (1 + self.past_size, 2 + self.past_size, *older_velocities)
+        return [*motors, *velocities[: 2 * self.past_velocities]]
 
 
 class RewardSettings(Settings):
@@ -75,11 +86,17 @@ class HardwareTransform(Transform):
     """Counts and motor values of a `Plant` to observations, rewards and scores, and back from actions."""
 
     def __init__(
-        self, motors: Sequence[int], task: TaskSettings, observation: ObservationSettings, reward: RewardSettings
+        self,
+        motors: Sequence[int],
+        task: TaskSettings,
+        observation: ObservationSettings,
+        reward: RewardSettings,
     ) -> None:
         super().__init__()
         self.task, self.observation_settings, self.reward = task, observation, reward
         self.register_buffer("motors", torch.tensor(list(motors), dtype=torch.int64))
+        self.register_buffer("_velocity_scales", torch.tensor([SPEED_SCALE, ANGULAR_SPEED_SCALE]))
+        self.register_buffer("_kept", torch.tensor(observation.kept_columns, dtype=torch.int64))
 
     @property
     def plant(self) -> Plant:
@@ -100,16 +117,12 @@ class HardwareTransform(Transform):
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Adds the keys that this transform writes."""
         carts, device = observation_spec.shape[0], observation_spec.device
-        floats = {"state": 4, "observation": self.observation_settings.size, "past": self._past_size}
+        settings = self.observation_settings
+        floats = {"state": 4, "observation": settings.size, "past": settings.past_size}
         for key, size in {**floats, "score": 1, "score_upright": 1}.items():
             observation_spec[key] = Unbounded((carts, size), dtype=torch.float32, device=device)
         observation_spec["step_count"] = Unbounded((carts, 1), dtype=torch.int64, device=device)
         return observation_spec
-
-    @property
-    def _past_size(self) -> int:
-        settings = self.observation_settings
-        return settings.past_motors + 2 * settings.past_velocities
 
     # actions down
 
@@ -124,7 +137,7 @@ class HardwareTransform(Transform):
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         counts, dt = tensordict_reset.get("counts"), tensordict_reset.get("dt")
         state = self._measure(counts, counts, dt)
-        past = dt.new_zeros(len(counts), self._past_size)
+        past = dt.new_zeros(len(counts), self.observation_settings.past_size)
         tensordict_reset.update(
             {
                 "state": state,
@@ -138,21 +151,26 @@ class HardwareTransform(Transform):
         return tensordict_reset
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        state = self._measure(next_tensordict.get("counts"), tensordict.get("counts"), next_tensordict.get("dt"))
+        counts, dt = next_tensordict.get("counts"), next_tensordict.get("dt")
+        state = self._measure(counts, tensordict.get("counts"), dt)
         past = self._remember(tensordict)
         step_count = tensordict.get("step_count") + 1
         off_track = next_tensordict.get("terminated")
         terminated = off_track | fallen(state, self.task.angle_limit).unsqueeze(-1)
         truncated = next_tensordict.get("truncated") | (step_count >= self.task.time_limit)
-        reward = self.reward.scale * REWARDS[self.reward.kind](state, self.task.x_max).unsqueeze(-1)
+        judged = {  # each once: what the agent learns from is often a score
+            kind: REWARDS[kind](state, self.task.x_max).unsqueeze(-1)
+            for kind in {self.reward.kind, SCORE, SCORE_UPRIGHT}
+        }
+        reward = self.reward.scale * judged[self.reward.kind]
         next_tensordict.update(
             {
                 "state": state,
                 "past": past,
                 "observation": self._observe(state, past),
                 "reward": reward - self.reward.track_penalty * off_track,
-                "score": score(state, self.task.x_max).unsqueeze(-1),
-                "score_upright": score_upright(state, self.task.x_max).unsqueeze(-1),
+                "score": judged[SCORE],
+                "score_upright": judged[SCORE_UPRIGHT],
                 "step_count": step_count,
                 "terminated": terminated,
                 "truncated": truncated & ~terminated,
@@ -169,20 +187,10 @@ class HardwareTransform(Transform):
         return torch.stack((x, x_dot, theta, theta_dot), -1)
 
     def _remember(self, tensordict: TensorDictBase) -> Tensor:
-        """`past` one step on: the newest motor value, then older ones; the newest velocities, then older ones."""
-        settings, past = self.observation_settings, tensordict.get("past")
-        motors = past[:, : settings.past_motors]
-        velocities = past[:, settings.past_motors :]
-        newest_motor = tensordict.get("motor").to(past.dtype) / MOTOR_SCALE
-        state = tensordict.get("state")
-        newest_velocities = torch.stack((state[:, 1] / SPEED_SCALE, state[:, 3] / ANGULAR_SPEED_SCALE), -1)
-        return torch.cat(
-            (
-                torch.cat((newest_motor, motors), -1)[:, : settings.past_motors],
-                torch.cat((newest_velocities, velocities), -1)[:, : 2 * settings.past_velocities],
-            ),
-            -1,
-        )
+        """`past` one step on."""
+        motor = tensordict.get("motor").to(torch.float32) / MOTOR_SCALE
+        velocities = tensordict.get("state")[:, 1::2] / self._velocity_scales
+        return torch.cat((motor, tensordict.get("past"), velocities), -1).index_select(1, self._kept)
 
     def _observe(self, state: Tensor, past: Tensor) -> Tensor:
         parts = [observe(state, self.observation_settings.kind), past]

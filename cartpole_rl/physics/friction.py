@@ -1,7 +1,7 @@
 """Friction of the cart on its track and of the pole in its bearing: pure functions of the velocity.
 
-Each returns the friction's coefficient or torque so that the power it takes out, force times velocity, is never
-negative. Dry friction is given per newton of normal force, because the pole may press on the cart.
+The power that each takes out, force or torque times velocity, is never negative. Dry friction is that of the
+resting pole's normal force; where the pole's motion changes that force, the dynamics scale it.
 """
 
 from enum import StrEnum
@@ -31,6 +31,7 @@ class PoleFriction(StrEnum):
 
 
 STICKING = (CartFriction.STEP, CartFriction.STRIBECK)  # models with a force at rest
+DRY = (CartFriction.SIGMOID, *STICKING)  # models with more than the viscous term
 
 
 def coulomb_force(x_dot: Tensor, cart: CartParameters) -> Tensor:
@@ -44,7 +45,7 @@ def dry_friction(x_dot: Tensor, cart: CartParameters, model: CartFriction) -> Te
     Equations (5.6) and (5.8); Stribeck: Armstrong-Helouvry et al., Automatica 30(7), 1994,
     F_c + (F_s - F_c) exp(-(v / v_s)^2).
     """
-    if model in (CartFriction.NONE, CartFriction.LINEAR):
+    if model not in DRY:
         return torch.zeros_like(x_dot)
     coulomb = coulomb_force(x_dot, cart)
     if model is CartFriction.SIGMOID:

@@ -4,13 +4,14 @@ Every field is a tensor of shape [N], float32 or float64, in SI units; N is the 
 batch of one. What can be derived (total mass, pivot inertia) is a property, so it cannot go stale.
 """
 
+import dataclasses
 import difflib
 import math
 from collections.abc import Iterable, Mapping
 from typing import NamedTuple, Self
 
 import torch
-from tensordict import tensorclass
+from tensordict import TensorClass
 from torch import Tensor
 
 from cartpole_rl.errors import ConfigError
@@ -21,8 +22,7 @@ GRAVITY = 9.81  # m/s^2
 POLE_DENSITY = 0.7  # kg/m
 
 
-@tensorclass(frozen=True)
-class CartParameters:
+class CartParameters(TensorClass["frozen", "tensor_only"]):  # type: ignore[name-defined]
     """N carts: masses, friction, actuator, and what stands between the state and the host.
 
     Nominal numbers and their sources are in ``conf/cart/ip02.yaml`` and ``conf/pole/``.
@@ -82,7 +82,7 @@ class CartParameters:
     @classmethod
     def names(cls) -> tuple[str, ...]:
         """The fields, in order."""
-        return tuple(cls.__dataclass_fields__)
+        return tuple(field.name for field in dataclasses.fields(cls))
 
     @classmethod
     def from_table(cls, table: Tensor) -> Self:

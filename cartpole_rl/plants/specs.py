@@ -28,7 +28,9 @@ class Plant(EnvBase):
         self.observation_spec = Composite(
             counts=Unbounded(shape=(carts, 2), dtype=torch.int64, device=device),
             dt=Unbounded(shape=(carts, 1), dtype=torch.float32, device=device),
-            motor_applied=Bounded(-MOTOR_LIMIT, MOTOR_LIMIT, shape=(carts, 1), dtype=torch.int64, device=device),
+            motor_applied=Bounded(
+                -MOTOR_LIMIT, MOTOR_LIMIT, shape=(carts, 1), dtype=torch.int64, device=device
+            ),
             shape=(carts,),
         )
         self.reward_spec = Unbounded(shape=(carts, 1), device=device)

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from PIL import Image, ImageColor, ImageDraw, ImageFont
 
 from cartpole_rl.reporting import style
-from cartpole_rl.tasks.upright import is_upright
 from cartpole_rl.reporting.words import ending_text
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.tasks.upright import is_upright
 
 SIZE = (480, 320)  # pixels
 FINER = 2

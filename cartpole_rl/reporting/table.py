@@ -26,7 +26,7 @@ def table(rows: Sequence[Mapping[str, Cell]], columns: Mapping[str, str] | Seque
 
 
 def interval_text(mean: float, low: float, high: float) -> str:
-    """A mean with the half width of its interval, rounded to two digits of that: "4210 ± 85".
+    """A mean with the half width of its interval, to two digits of that, or three of the mean: "4210 ± 85".
 
     An interval that leans to one side shows its ends instead, "4350 (4110 to 4420)"; one that is not finite,
     as that of a single episode, leaves the mean alone.
@@ -34,7 +34,8 @@ def interval_text(mean: float, low: float, high: float) -> str:
     below, above = mean - low, high - mean
     if not (math.isfinite(below) and math.isfinite(above)):
         return number_text(mean)
-    decimals = _decimals(max(below, above) or abs(mean), figures=2)
+    finest = _decimals(mean or max(below, above), FIGURES)
+    decimals = min(_decimals(max(below, above), figures=2) if above > 0 or below > 0 else finest, finest)
     if abs(below - above) <= LEANING * max(below, above):
         return f"{mean:.{decimals}f} ± {(below + above) / 2:.{decimals}f}"
     return f"{mean:.{decimals}f} ({low:.{decimals}f} to {high:.{decimals}f})"

@@ -1,7 +1,8 @@
-"""Why an episode ends. The track's end, faults and a lost link are the plant's; angle and time are the task's."""
+"""Why an episode ends. Track's end, faults and a lost link are the plant's; angle and time are the task's."""
 
 from enum import StrEnum
 
+import torch
 from torch import Tensor
 
 
@@ -16,5 +17,7 @@ class Ending(StrEnum):
 
 
 def fallen(state: Tensor, angle_limit: float | None) -> Tensor:
-    """Whether |theta| of the measured state [N, 4] is beyond `angle_limit` rad, [N] bool; None is no limit."""
-    return state[:, 2].abs() > (float("inf") if angle_limit is None else angle_limit)
+    """Whether |theta| of the measured state [N, 4] is over `angle_limit` rad, [N] bool; None is no limit."""
+    if angle_limit is None:
+        return torch.zeros(len(state), dtype=torch.bool, device=state.device)
+    return state[:, 2].abs() > angle_limit

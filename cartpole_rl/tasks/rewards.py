@@ -44,7 +44,7 @@ def linear_angle(state: Tensor, x_max: float) -> Tensor:
 
 
 def position(state: Tensor, x_max: float) -> Tensor:
-    """(5.4) and (6.1): cos(theta / 2) (x_max - |x|) / x_max, not below 0."""
+    """(5.4) and (6.1): cos(theta / 2) (x_max - |x|) / x_max, not below 0, at most 1 a step."""
     return cosine(state, x_max) * (1 - state[:, 0].abs() / x_max).clamp(min=0)
 
 
@@ -53,13 +53,8 @@ def upright_bonus(state: Tensor, x_max: float) -> Tensor:
     return position(state, x_max) + UPRIGHT_BONUS * (state[:, 2].abs() < BALANCE_ANGLE)
 
 
-def score_upright(state: Tensor, x_max: float) -> Tensor:
-    """(6.1), at most 1 a step."""
-    return position(state, x_max)
-
-
 def score(state: Tensor, x_max: float) -> Tensor:
-    """(6.2): (6.1), 5 while |theta| < 5 degrees, 5 more if also |theta_dot| < 6 degrees/s; at most 11 a step."""
+    """(6.2): (6.1), 5 while |theta| < 5 degrees, 5 more if also |theta_dot| < 6 degrees/s; at most 11."""
     upright = state[:, 2].abs() < UPRIGHT_ANGLE
     still = upright & (state[:, 3].abs() < UPRIGHT_SPEED)
     return position(state, x_max) + BONUS * (upright.to(state.dtype) + still.to(state.dtype))
@@ -73,3 +68,5 @@ REWARDS: dict[Reward, Callable[[Tensor, float], Tensor]] = {
     Reward.UPRIGHT_BONUS: upright_bonus,
     Reward.SCORE: score,
 }
+SCORE_UPRIGHT = Reward.POSITION  # (6.1) is (5.4)
+SCORE = Reward.SCORE  # (6.2)

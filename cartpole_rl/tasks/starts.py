@@ -6,7 +6,7 @@ from enum import StrEnum
 import torch
 from torch import Tensor
 
-from cartpole_rl.settings import NonNegative, Settings
+from cartpole_rl.settings import Fraction, NonNegative, Settings
 
 
 class Start(StrEnum):
@@ -25,6 +25,7 @@ class StartSettings(Settings):
     angle_spread: NonNegative  # rad, about upright or hanging
     speed_spread: NonNegative  # m/s
     angular_speed_spread: NonNegative  # rad/s
+    resting_share: Fraction = 0.0  # of the episodes: the pole hangs and everything is at rest
 
 
 def draw_start(count: int, start: StartSettings, generator: torch.Generator) -> Tensor:
@@ -35,4 +36,11 @@ def draw_start(count: int, start: StartSettings, generator: torch.Generator) -> 
     spread = unit.new_tensor(
         [start.position_spread, start.speed_spread, angle_spread, start.angular_speed_spread]
     )
-    return unit * spread + unit.new_tensor([0.0, 0.0, about, 0.0])
+    state = unit * spread + unit.new_tensor([0.0, 0.0, about, 0.0])
+    if start.resting_share == 0:
+        return state
+    rests = torch.rand((count, 1), generator=generator, device=generator.device) < start.resting_share
+    at_rest = unit * unit.new_tensor([start.position_spread, 0.0, 0.0, 0.0]) + unit.new_tensor(
+        [0, 0, math.pi, 0]
+    )
+    return torch.where(rests, at_rest, state)

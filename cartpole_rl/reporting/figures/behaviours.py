@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from cartpole_rl.reporting import style
 from cartpole_rl.reporting.figures.notes import at_moment, beside
-from cartpole_rl.tasks.upright import is_upright, upright_since
 from cartpole_rl.reporting.words import ending_text
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.tasks.rewards import UPRIGHT_ANGLE
+from cartpole_rl.tasks.upright import is_upright, upright_since
 
 SMALL_SWING = 40.0  # deg; a pole that never leaned further is shown enlarged
 MOTOR_LIMIT = 255

@@ -1,0 +1,139 @@
+"""Every command of the README does what it says: run as a process, with budgets that take seconds."""
+
+import json
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+BIN = Path(sys.executable).parent
+BUDGET = [
+    "compile=false",
+    "learning.frames=1024",
+    "learning.carts=16",
+    "learning.chunk=8",
+    "learning.updates=1",
+    "learning.batch_size=16",
+    "learning.warmup_frames=64",
+    "learning.evaluations=1",
+    "learning.evaluation_episodes=2",
+    "replay.size=2000",
+]
+COMMANDS = re.findall(r"^    ((?:cartpole-|tensorboard|\./scripts/|pip ).*?)(?:\s+#.*)?$", (ROOT / "README.md").read_text(), re.M)
+
+
+def run(command: str, *more: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    name, *words = command.split()
+    return subprocess.run([BIN / name, *words, *more], cwd=cwd, capture_output=True, text=True, timeout=200)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder in which `cartpole-train` has made runs/train/<run>."""
+    folder = tmp_path_factory.mktemp("user")
+    result = run("cartpole-train experiment=medium hydra.run.dir=runs/train/first", *BUDGET, cwd=folder)
+    assert result.returncode == 0, result.stderr
+    return folder
+
+
+def listed(start: str) -> list[str]:
+    return [command for command in COMMANDS if command.startswith(start)]
+
+
+def test_the_readme_opens_with_the_two_commands() -> None:
+    assert COMMANDS[:2] == ["./scripts/demo", "./scripts/test"]
+    for command in COMMANDS[:2]:
+        assert (ROOT / command).stat().st_mode & 0o100
+
+
+def test_every_command_is_one_that_a_test_here_runs() -> None:
+    known = {"./scripts/demo", "./scripts/test", "pip", "tensorboard"}
+    known |= {"cartpole-train", "cartpole-evaluate", "cartpole-emulate"}
+    assert {command.split()[0] for command in COMMANDS} == known
+
+
+@pytest.mark.parametrize("command", [c for c in listed("cartpole-train") if "resume" not in c])
+def test_train(command: str, tmp_path: Path) -> None:
+    budget = [word for word in BUDGET if word.split("=")[0] not in command]
+    if "learning.frames=" in command:
+        command = re.sub(r"learning.frames=\d+", "learning.frames=1024", command)
+    result = run(command, *budget, cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    runs = list(tmp_path.glob("runs/train/**/metrics.json"))
+    assert len(runs) == (6 if " -m " in command else 1)
+
+
+def test_resume(trained: Path) -> None:
+    (command,) = [command for command in listed("cartpole-train") if "resume" in command]
+    result = run(command.replace("<run>", "first"), cwd=trained)
+    assert result.returncode == 0, result.stderr
+
+
+@pytest.mark.parametrize("command", listed("cartpole-evaluate"))
+def test_evaluate(command: str, trained: Path, serial_port: Callable[[], str]) -> None:
+    command = command.replace("<run>", "first").replace("/dev/ttyUSB0", "PORT")
+    if "PORT" in command:
+        command = command.replace("PORT", serial_port())
+    folder = f"runs/evaluate/{abs(hash(command))}"
+    more = [] if "episodes" in command else ["episodes=1"]
+    result = run(command, f"hydra.run.dir={folder}", *more, cwd=trained)
+    assert result.returncode == 0, result.stderr
+    metrics = json.loads((trained / folder / "metrics.json").read_text())
+    assert metrics["plant"] in ("simulated", "emulated", "serial")
+    assert len(metrics["episodes"]) == (20 if "episodes=20" in command else 1)
+
+
+@pytest.fixture
+def serial_port() -> Callable[[], str]:
+    """Starts `cartpole-emulate` when called; gives its port, and interrupts it afterwards."""
+    running: list[subprocess.Popen[str]] = []
+
+    def start() -> str:
+        process = subprocess.Popen([BIN / "cartpole-emulate"], stdout=subprocess.PIPE, text=True)
+        running.append(process)
+        assert process.stdout is not None
+        return json.loads(process.stdout.readline())["port"]
+
+    yield start
+    for process in running:
+        process.send_signal(signal.SIGINT)
+        assert process.wait(timeout=20) in (0, 130)
+
+
+def test_emulate() -> None:
+    (command,) = listed("cartpole-emulate")
+    name, *words = command.split()
+    with subprocess.Popen([BIN / name, *words], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        port = json.loads(process.stdout.readline())["port"]
+        assert Path(port).exists()
+        process.send_signal(signal.SIGINT)
+        assert process.wait(timeout=20) in (0, 130)
+
+
+def test_tensorboard_reads_the_runs(trained: Path) -> None:
+    (command,) = listed("tensorboard")
+    name, *words = command.split()
+    result = subprocess.run(
+        [BIN / name, *words, "--inspect"], cwd=trained, capture_output=True, text=True, timeout=100
+    )
+    assert "evaluation/score" in result.stdout, result.stderr
+
+
+def test_the_demo_after_its_installation(tmp_path: Path) -> None:
+    result = subprocess.run(
+        [sys.executable, ROOT / "scripts/demo.py", *BUDGET],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=280,
+    )
+    assert result.returncode == 0, result.stderr
+    assert "ratio of the scores" in result.stdout
+    (comparison,) = tmp_path.glob("runs/demo/*/comparison.png")
+    assert comparison.stat().st_size > 10_000
