@@ -1,11 +1,9 @@
 """A DQN agent: the Q-network as a TorchRL actor, its loss with a target network, and its greedy policy."""
 
 import copy
-from typing import Annotated
+from typing import Annotated, Literal
 
-import numpy as np
-import torch
-from pydantic import Field
+from pydantic import Field, model_validator
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.data import Categorical
@@ -14,7 +12,7 @@ from torchrl.objectives import DQNLoss, HardUpdate, SoftUpdate
 from torchrl.objectives.utils import TargetNetUpdater
 
 from cartpole_rl.agents.network import QNetwork
-from cartpole_rl.settings import Count, Fraction, Settings
+from cartpole_rl.settings import Count, Settings
 
 
 class AgentSettings(Settings):
@@ -24,14 +22,15 @@ class AgentSettings(Settings):
     layer_norm: bool
     gamma: Annotated[float, Field(ge=0, lt=1)]
     double: bool  # van Hasselt et al., 2016
-    loss: Annotated[str, Field(pattern="^(l2|smooth_l1)$")]
-    target_tau: Fraction | None  # Polyak averaging each update
+    loss: Literal["l2", "smooth_l1"]
+    target_tau: Annotated[float, Field(gt=0, le=1)] | None  # Polyak averaging each update
     target_period: Count | None  # or a copy every so many updates
 
-    def model_post_init(self, _: object) -> None:
-        """One way to move the target network, not two."""
+    @model_validator(mode="after")
+    def _one_way_to_move_the_target(self) -> "AgentSettings":
         if (self.target_tau is None) == (self.target_period is None):
-            raise ValueError("give either target_tau or target_period")
+            raise ValueError("give either target_tau or target_period, and null for the other")
+        return self
 
 
 class QAgent(nn.Module):
@@ -70,9 +69,3 @@ class QAgent(nn.Module):
         averaged = copy.deepcopy(self.actor)
         self.loss.target_value_network_params.to_module(averaged)
         return averaged
-
-
-def seed_everything(seed: int) -> None:
-    """Seed what draws without a generator of its own: weights, exploration (torch), prioritized replay (NumPy)."""
-    torch.manual_seed(seed)
-    np.random.seed(seed % 2**32)  # noqa: NPY002 - TorchRL's sampler draws from NumPy's global generator

@@ -7,6 +7,7 @@ import logging
 import os
 import signal
 import sys
+import warnings
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -17,7 +18,7 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from cartpole_rl.commands.complaints import dashed_setting, in_one_line
@@ -45,6 +46,7 @@ def application(name: str, schema: type[Config]) -> Callable[[Body[Config]], Cal
 
     def decorate(body: Body[Config]) -> Callable[[], None]:
         def task(composed: DictConfig) -> None:
+            quieten()  # here, since a launcher may have brought the job to another process
             folder = Path(HydraConfig.get().runtime.output_dir)
             try:
                 body(checked(schema, as_mapping(composed)), folder)
@@ -58,7 +60,6 @@ def application(name: str, schema: type[Config]) -> Callable[[Body[Config]], Cal
 
         def main() -> None:
             signal.signal(signal.SIGTERM, _terminate)
-            logging.getLogger("torchrl").setLevel(logging.WARNING)
             os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra's errors come here, not to the screen
             try:
                 if dashed := dashed_setting(sys.argv[1:]):
@@ -80,19 +81,34 @@ def application(name: str, schema: type[Config]) -> Callable[[Body[Config]], Cal
 
 def as_mapping(composed: DictConfig) -> dict[str, Any]:
     """The composed config, resolved, as plain mappings; what is still missing (`???`) is left out."""
-    for key in OmegaConf.missing_keys(composed):
-        parent, _, child = key.rpartition(".")
-        del (OmegaConf.select(composed, parent) if parent else composed)[child]
-    return OmegaConf.to_container(composed, resolve=True)  # type: ignore[return-value]
+    return _without_missing(OmegaConf.to_container(composed, resolve=True))
+
+
+def _without_missing(tree: Any) -> Any:
+    if not isinstance(tree, dict):
+        return tree
+    return {key: _without_missing(value) for key, value in tree.items() if value != MISSING}
 
 
 def leave(name: str, error: Exception) -> NoReturn:
-    """Tell an error and exit."""
-    if isinstance(error, OSError) and not error.filename:
+    """Tell an error and exit. Raises one that names nothing a user could look at."""
+    code = CartPoleError.exit_code
+    if isinstance(error, CartPoleError):
+        code = error.exit_code
+    elif isinstance(error, HydraException | OmegaConfBaseException):  # some of which are OSErrors too
+        code = ConfigError.exit_code
+    elif isinstance(error, OSError) and not error.filename:
         raise error
     tell(name, in_one_line(error, name))
-    ours = CartPoleError if isinstance(error, OSError) else ConfigError
-    sys.exit(error.exit_code if isinstance(error, CartPoleError) else ours.exit_code)
+    sys.exit(code)
+
+
+def quieten() -> None:
+    """Silence what libraries say of themselves and no user can do anything about."""
+    logging.getLogger("torchrl").setLevel(logging.WARNING)
+    logging.getLogger("torch.utils.cpp_extension").setLevel(logging.ERROR)  # CUDA's compiler without a GPU
+    # tensordict 0.14 asks torch 2.15 for a setting that is on its way out
+    warnings.filterwarnings("ignore", r"torch\._dynamo\.config\.inline_inbuilt_nn_modules", FutureWarning)
 
 
 def tell(name: str, message: str) -> None:

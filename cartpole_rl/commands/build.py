@@ -1,12 +1,17 @@
 """Build plants, environments and agents from checked configs."""
 
-from collections.abc import Callable
+import os
+import shutil
+import sys
+import sysconfig
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Literal
 
 import torch
 
-from cartpole_rl.agents import AgentSettings, QAgent
+from cartpole_rl.agents import QAgent
 from cartpole_rl.commands.config import (
     CartPoleSettings,
     EmulatedSettings,
@@ -15,16 +20,20 @@ from cartpole_rl.commands.config import (
     TrainConfig,
     checked,
 )
+from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.envs import CartPoleEnv, make_env
 from cartpole_rl.errors import CheckpointError, ConfigError
 from cartpole_rl.evaluation.episodes import Policy
-from cartpole_rl.learning.checkpoints import AgentCheckpoint, load_agent
+from cartpole_rl.learning.checkpoints import load_agent
 from cartpole_rl.physics.parameters import check_names
 from cartpole_rl.plants.emulated import emulated_plant
 from cartpole_rl.plants.serial import SerialPlant, SerialPlantSettings
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.plants.specs import Plant
+from cartpole_rl.randomization import Pole, PoleSettings
 from cartpole_rl.tasks.starts import Start, StartSettings
+
+REPLACEABLE = ("cart", "cart_friction", "pole_friction", "pole", "reward")  # by an evaluation; and the task
 
 
 def simulated_env(
@@ -55,11 +64,18 @@ def new_agent(config: TrainConfig) -> QAgent:
     return QAgent(config.agent, config.observation.size, len(config.actions.motors))
 
 
+def recorded_config(config: Mapping[str, Any], source: str) -> TrainConfig:
+    """The config in a checkpoint. Raises CheckpointError where this version has other settings."""
+    try:
+        return checked(TrainConfig, config)
+    except ConfigError as error:
+        raise CheckpointError(f"{source} is of another version of this package: {error}") from None
+
+
 @dataclass(frozen=True)
 class TrainedAgent:
     """A policy from a checkpoint, and the settings it was trained with."""
 
-    checkpoint: AgentCheckpoint
     training: TrainConfig
     policy: Policy
 
@@ -67,31 +83,50 @@ class TrainedAgent:
 def trained_agent(run: Path) -> TrainedAgent:
     """The agent of a run folder or checkpoint file. Raises CheckpointError."""
     checkpoint = load_agent(run)
+    training = recorded_config(checkpoint.config, f"run={run}")
+    agent = new_agent(training)
     try:
-        training = checked(TrainConfig, checkpoint.config)
-        agent = new_agent(training)
         agent.load_state_dict(checkpoint.weights)
-    except (ConfigError, RuntimeError) as error:
+    except RuntimeError as error:
         reason = str(error).splitlines()[0]
-        raise CheckpointError(f"{checkpoint.path} was written by another version of this package: {reason}") from None
-    return TrainedAgent(checkpoint, training, agent.greedy_policy())
+        raise CheckpointError(f"run={run} is of another version of this package: {reason}") from None
+    return TrainedAgent(training, agent.greedy_policy())
 
 
-def evaluated_settings(agent: TrainedAgent, config: EvaluateConfig) -> CartPoleSettings:
-    """What the agent was trained on, with what `config` puts in its place."""
-    given = {
-        name: value
-        for name in ("cart", "cart_friction", "pole_friction", "pole", "task", "reward")
-        if (value := getattr(config, name)) is not None
-    }
-    shared = {name: getattr(agent.training, name) for name in CartPoleSettings.model_fields}
-    settings = CartPoleSettings(**{**shared, **given, "randomization": config.randomization})
-    check_names(config.parameters)
+def evaluated_settings(training: TrainConfig, config: EvaluateConfig) -> CartPoleSettings:
+    """What the agent was trained on, with what `config` puts in its place. Raises ConfigError."""
+    own = {name: getattr(training, name) for name in CartPoleSettings.model_fields}
+    given = {name: value for name in REPLACEABLE if (value := getattr(config, name)) is not None}
+    if config.task is not None:
+        given["task"] = {**config.task, "x_max": config.task.get("x_max") or training.task.x_max}
+    if isinstance(config.plant, EmulatedSettings):
+        given["pole"] = emulated_pole(config.emulator)
+    settings = checked(CartPoleSettings, {**own, **given, "randomization": config.randomization})
+    return with_parameters(settings, config.parameters or {})
+
+
+def emulated_pole(truth: EmulatorSettings) -> PoleSettings:
+    """The pole that the emulated cart carries, named by its length."""
+    pole = Pole(**truth.model_dump(include=set(Pole.model_fields)))
+    return PoleSettings(choices={f"{2 * pole.pole_com:.2f} m": pole})
+
+
+def with_parameters(settings: CartPoleSettings, parameters: Mapping[str, float]) -> CartPoleSettings:
+    """`settings` with `parameters` of cart and pole in place of their own. Raises ConfigError."""
+    check_names(parameters)
+    of_pole = {name: value for name, value in parameters.items() if name in Pole.model_fields}
+    of_cart = {name: value for name, value in parameters.items() if name not in Pole.model_fields}
+    if of_pole and settings.pole.choices is None:
+        raise ConfigError(
+            f"parameters: the rod's length gives its {', '.join(of_pole)}; choose one pole, as pole=medium"
+        )
+    poles = {name: pole.model_copy(update=of_pole) for name, pole in (settings.pole.choices or {}).items()}
     return settings.model_copy(
         update={
-            "cart": {**settings.nominal, **config.parameters},
+            "cart": {**settings.nominal, **of_cart},
             "cart_friction": settings.cart_friction.model_copy(update={"parameters": {}}),
             "pole_friction": settings.pole_friction.model_copy(update={"parameters": {}}),
+            "pole": PoleSettings(choices=poles) if poles else settings.pole,
         }
     )
 
@@ -105,9 +140,11 @@ def evaluated_env(
         return simulated_env(settings, config.plant, min(config.episodes, 1024), start, config.seed)
     if start.angle is Start.ANY:
         raise ConfigError("task.evaluation_start.angle=any: a cart can start only upright or hanging")
-    angle = "upright" if start.angle is Start.UPRIGHT else "hanging"
+    angle: Literal["hanging", "upright"] = "upright" if start.angle is Start.UPRIGHT else "hanging"
     if isinstance(config.plant, EmulatedSettings):
-        truth = config.emulator.model_copy(update={"start": angle, "seed": config.emulator.seed + config.seed})
+        truth = config.emulator.model_copy(
+            update={"start": angle, "seed": config.emulator.seed + config.seed}
+        )
         return environment(settings, emulated_plant(truth, settings.control_period, prompt))
     serial = SerialPlantSettings(
         port=config.plant.port,
@@ -117,6 +154,16 @@ def evaluated_env(
         control_period=settings.control_period,
     )
     return environment(settings, SerialPlant(serial, prompt))
+
+
+def check_compiler() -> None:
+    """Raise ConfigError where torch.compile has no C++ compiler or no header of Python to build with."""
+    compiler = os.environ.get("CXX", {"darwin": "clang++", "win32": "cl"}.get(sys.platform, "g++"))
+    header = Path(sysconfig.get_path("include"), "Python.h")
+    if shutil.which(compiler) is None:
+        raise ConfigError(f"compile=true finds no C++ compiler {compiler}: install it, or give compile=false")
+    if not header.exists():
+        raise ConfigError(f"compile=true finds no {header}: install Python's headers, or give compile=false")
 
 
 def use_threads(threads: int | None) -> None:

@@ -1,4 +1,4 @@
-"""What Hydra, OmegaConf and the operating system complain about, in one line that says what would be right."""
+"""What Hydra, OmegaConf and the operating system complain about, in one line with what would be right."""
 
 import difflib
 import re
@@ -12,6 +12,8 @@ from omegaconf import OmegaConf
 
 from cartpole_rl.commands.composition import conf_folder
 
+NEAR = 0.8  # likeness of two names, 0 to 1, from which one may stand for the other
+SAME_PLACE = 0.15  # likeness that a name gains in the same group
 HYDRA_OPTIONS = ("--config-", "--package", "--info", "--cfg", "--experimental-rerun")
 
 
@@ -30,20 +32,28 @@ def hydra_complaint(text: str, command: str) -> str:
     """Hydra's message, put shorter where it is one of those that users meet."""
     if unknown := re.match(r"Could not override '([^']+)'", text):
         return no_such_setting(unknown[1], known_settings(command))
-    if choice := re.search(r"Could not find '([^']+)'(?:.*?Available options in '[^']+': (.*))?", text):
-        group, _, wrong = choice[1].rpartition("/")
-        there_are = (choice[2] or "").split(" Config search")[0].split()
-        return f"{group}={wrong}: there is no such choice; there are {', '.join(there_are) or 'none'}"
+    if choice := re.search(r"Could not find '([^']+)' Available options in '([^']+)': (.*)", text):
+        wrong = choice[1].removeprefix(f"{choice[2]}/")
+        there_are = choice[3].split(" Config search")[0].split()
+        return f"{choice[2]}={wrong}: there is no such choice; there are {', '.join(there_are)}"
     if several := re.match(r"Ambiguous value for argument '([^']+)'", text):
         return f"{several[1]}: -m runs each of several values; a list is one value if written [a,b]"
     return text
 
 
 def no_such_setting(key: str, known: Iterable[str]) -> str:
-    """That there is no setting `key`, and the nearest one that there is."""
-    nearest = difflib.get_close_matches(key, sorted(known), n=1, cutoff=0.5)
-    hint = f"did you mean {nearest[0]}?" if nearest else "--cfg job shows the settings"
-    return f"{key}: there is no such setting; {hint}"
+    """That there is no setting `key`, and the one that was meant, if one is near."""
+    above, _, wrong = key.rpartition(".")
+
+    def likeness(setting: str) -> float:
+        place, _, name = setting.rpartition(".")
+        return difflib.SequenceMatcher(None, wrong, name).ratio() + SAME_PLACE * (place == above)
+
+    nearest = max(sorted(known), key=likeness, default="")
+    near = bool(nearest) and likeness(nearest) > NEAR
+    return f"{key}: there is no such setting; " + (
+        f"did you mean {nearest}?" if near else "--cfg job shows the settings"
+    )
 
 
 def known_settings(command: str) -> set[str]:

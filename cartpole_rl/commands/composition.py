@@ -1,4 +1,4 @@
-"""What Hydra has to know before it composes: where conf/ is, how run folders are named, the emulated carts."""
+"""What Hydra has to know before it composes: where conf/ is, how folders are named, the emulated cart."""
 
 import re
 import sys
@@ -9,6 +9,7 @@ from itertools import count
 from pathlib import Path
 
 from hydra.core.config_store import ConfigStore
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from cartpole_rl.emulator.settings import EmulatorSettings
@@ -43,7 +44,10 @@ def job_name(number: int, overrides: Sequence[str]) -> str:
 
     Signs that a shell or Hydra would take for something else become "-".
     """
-    swept = [word for word in overrides if word not in sys.argv]
+    words = [word for word in sys.argv[1:] if "=" in word and not word.startswith("-")]
+    parsed = OverridesParser.create().parse_overrides(words)
+    constant = {given.get_key_element() for given in parsed if not given.is_sweep_override()}
+    swept = (word for word in overrides if "=" in word and word.split("=")[0] not in constant)
     plain = (re.sub(r"[^\w.+-]+", "-", word).strip("-") for word in swept)
     return "_".join((str(number), *plain))[:LONGEST_NAME]
 

@@ -1,12 +1,14 @@
 """The shape of each command's config: what Hydra composes is checked against it before any work is done."""
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 
 from cartpole_rl.agents import AgentSettings
+from cartpole_rl.commands.complaints import no_such_setting, setting_names
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.envs.hardware import ObservationSettings, RewardSettings, TaskSettings
 from cartpole_rl.errors import ConfigError
@@ -19,6 +21,7 @@ from cartpole_rl.settings import Count, Finite, Positive, Settings
 from cartpole_rl.tasks.actions import ActionSettings
 
 Seed = Annotated[int, Field(ge=0, lt=2**31)]
+OF_SIMULATION = ("parameters", "randomization", "cart", "cart_friction", "pole_friction")
 
 
 class CartFrictionSettings(Settings):
@@ -108,11 +111,22 @@ class TrainConfig(CartPoleSettings):
     compile: bool
     resume: str | None
 
+    @field_validator("plant", mode="before")
+    @classmethod
+    def _trains_in_simulation(cls, plant: Any) -> Any:
+        kind = plant.get("kind") if isinstance(plant, Mapping) else None
+        if kind in ("emulated", "serial"):
+            raise ValueError(
+                f"training is in simulation, plant=simulated; cartpole-evaluate takes plant={kind}"
+            )
+        return plant
+
     @model_validator(mode="after")
     def _memory_holds_a_batch(self) -> "TrainConfig":
         if self.replay.size < self.learning.batch_size:
             raise ValueError(
-                f"replay.size {self.replay.size} is smaller than learning.batch_size {self.learning.batch_size}"
+                f"replay.size {self.replay.size} must be at least learning.batch_size "
+                f"{self.learning.batch_size}"
             )
         return self
 
@@ -125,16 +139,30 @@ class EvaluateConfig(Settings):
     plant: Annotated[SimulatedSettings | EmulatedSettings | RealSettings, Field(discriminator="kind")]
     emulator: EmulatorSettings
     randomization: dict[str, Range]
-    parameters: dict[str, Finite]
+    parameters: dict[str, Finite] | None
     cart: dict[str, Finite] | None = None
     cart_friction: CartFrictionSettings | None = None
     pole_friction: PoleFrictionSettings | None = None
     pole: PoleSettings | None = None
-    task: TaskSettings | None = None
+    task: dict[str, Any] | None = None  # a TaskSettings, once x_max is filled in from the agent's own
     reward: RewardSettings | None = None
     seed: Seed
     label: str
     threads: Count | None
+
+    @model_validator(mode="after")
+    def _the_plant_reads_it_all(self) -> "EvaluateConfig":
+        """What the chosen plant would not read is refused, so that nothing is silently without effect."""
+        kind = self.plant.kind
+        unread = [] if kind == "simulated" else [name for name in OF_SIMULATION if getattr(self, name)]
+        if kind == "emulated" and self.pole is not None:
+            unread.append("pole")
+        if unread:
+            remedy = "; its own are emulator.*, emulator=large" if kind == "emulated" else ""
+            raise ValueError(f"{', '.join(unread)}: plant={kind} does not read it{remedy}")
+        if kind != "emulated" and self.emulator != EmulatorSettings():
+            raise ValueError(f"emulator: plant={kind} does not read it; give plant=emulated")
+        return self
 
 
 class EmulateConfig(Settings):
@@ -151,18 +179,19 @@ def checked(schema: type[Config], values: Mapping[str, Any]) -> Config:
     try:
         return schema(**values)
     except ValidationError as error:
-        raise ConfigError("; ".join(_complaint(detail) for detail in error.errors())) from None
+        complaints = (_complaint(detail, values) for detail in error.errors())
+        raise ConfigError("; ".join(complaints)) from None
 
 
-def _complaint(detail: Mapping[str, Any]) -> str:
-    key = ".".join(str(part) for part in detail["loc"])
-    reason = detail["msg"].removeprefix("Value error, ")
+def _complaint(detail: Mapping[str, Any], values: Mapping[str, Any]) -> str:
+    key = re.sub(r"^plant\.(simulated|emulated|serial)\.", "plant.", ".".join(map(str, detail["loc"])))
     if detail["type"] == "extra_forbidden":
-        return f"{key}: there is no such setting"
+        return no_such_setting(key, (name for name in setting_names(values) if not name.startswith(key)))
     if detail["type"] == "missing":
-        return f"{key}: this setting is missing"
+        return f"{key} is missing; give {key}=..."
+    reason = detail["msg"].removeprefix("Value error, ")
     if not key:
         return reason
-    if isinstance(detail["input"], (int, float, str, bool)) or detail["input"] is None:
-        return f"{key}={detail['input']}: {reason[0].lower()}{reason[1:]}"
-    return f"{key}: {reason[0].lower()}{reason[1:]}"
+    reason = reason[0].lower() + reason[1:]
+    value = "null" if detail["input"] is None else detail["input"]
+    return f"{key}={value}: {reason}" if isinstance(value, int | float | str) else f"{key}: {reason}"

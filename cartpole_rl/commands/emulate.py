@@ -1,7 +1,7 @@
 """cartpole-emulate: run the emulated cart until it is interrupted.
 
-    cartpole-emulate emulator.clock=real
-    cartpole-emulate emulator.latency=0.02 emulator.cart_coulomb_left=0.8
+cartpole-emulate emulator.clock=real
+cartpole-emulate emulator.latency=0.02 emulator.cart_coulomb_left=0.8
 """
 
 from pathlib import Path

@@ -1,76 +1,28 @@
 """cartpole-evaluate: run whole episodes of a trained agent, in simulation or on a cart.
 
-    cartpole-evaluate run=runs/train/2026-11-21_12-00-00 episodes=20
-    cartpole-evaluate run=runs/train/2026-11-21_12-00-00 plant=emulated emulator.latency=0.02
-    cartpole-evaluate run=runs/train/2026-11-21_12-00-00 plant=serial plant.port=/dev/ttyUSB0
+cartpole-evaluate run=runs/train/2026-11-21_12-00-00 episodes=20
+cartpole-evaluate run=runs/train/2026-11-21_12-00-00 plant=emulated emulator.latency=0.02
+cartpole-evaluate run=runs/train/2026-11-21_12-00-00 plant=serial plant.port=/dev/ttyUSB0
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
-from cartpole_rl.agents.dqn import seed_everything
 from cartpole_rl.commands.application import application
 from cartpole_rl.commands.build import evaluated_env, evaluated_settings, trained_agent, use_threads
 from cartpole_rl.commands.config import EvaluateConfig
 from cartpole_rl.commands.report import METRICS, report
 from cartpole_rl.commands.run_folder import write_config
 from cartpole_rl.envs import CartPoleEnv
-from cartpole_rl.evaluation.episodes import run_episodes
+from cartpole_rl.evaluation.episodes import Policy, run_episodes
+from cartpole_rl.learning.randomness import seed_everything
 from cartpole_rl.plants.serial import SerialPlant
-from cartpole_rl.reporting.table import interval_text, table
+from cartpole_rl.reporting.table import interval_text, number_text, table
 from cartpole_rl.tasks.episode import Episode
-
-
-@application("evaluate", EvaluateConfig)
-def main(config: EvaluateConfig, folder: Path) -> None:
-    """Load, build, run, report."""
-    use_threads(config.threads)
-    seed_everything(config.seed)
-    agent = trained_agent(config.run)
-    settings = evaluated_settings(agent, config)
-    env = evaluated_env(settings, config, prompt=tqdm.write)
-    try:
-        write_config(folder, {**config.model_dump(mode="json"), "agent": settings.model_dump(mode="json")})
-        progress = tqdm(run_episodes(env, agent.policy, config.episodes), total=config.episodes, unit=" episodes")
-        episodes = list(with_scores(progress))
-        link = link_figures(env)
-    finally:
-        env.close()
-    report(folder, episodes, config.plant.kind, settings.pole, settings.task.x_max, link)
-    print(score_table(folder))
-    print(f"{folder}/{METRICS} and figures/ are written")
-
-
-def with_scores(progress: Any) -> Iterator[Episode]:
-    """The episodes, each one's score shown on the progress bar."""
-    for episode in progress:
-        progress.set_postfix_str(f"score {episode.score.sum():.0f}")
-        yield episode
-
-
-def link_figures(env: CartPoleEnv) -> dict[str, int]:
-    """Frames lost, spoilt and late on the wire; none where there is no wire."""
-    if not isinstance(env.plant, SerialPlant):
-        return {"late_ticks": 0, "lost_frames": 0, "bad_frames": 0}
-    seen = env.plant.cart.statistics
-    return {"late_ticks": seen.late_ticks, "lost_frames": seen.lost_frames, "bad_frames": seen.bad_frames}
-
-
-def score_table(folder: Path) -> str:
-    """The figures of metrics.json that a person asks for first."""
-    import json
-
-    metrics = json.loads((folder / METRICS).read_text())
-    rows = [
-        {"figure": label, "mean": interval_text(value["mean"], value["low"], value["high"])}
-        for key, label in SHOWN.items()
-        if (value := metrics[key]) is not None
-    ]
-    return table(rows, {"figure": f"plant={metrics['plant']}, {len(metrics['episodes'])} episodes", "mean": "mean"})
-
 
 SHOWN = {
     "score": "score (6.2)",
@@ -81,6 +33,68 @@ SHOWN = {
     "rms_position_m": "RMS position while upright, m",
     "min_track_margin_m": "nearest to the track's end, m",
 }
+
+
+@application("evaluate", EvaluateConfig)
+def main(config: EvaluateConfig, folder: Path) -> None:
+    """Load, build, run, report."""
+    use_threads(config.threads)
+    seed_everything(config.seed)
+    agent = trained_agent(config.run)
+    settings = evaluated_settings(agent.training, config)
+    env = evaluated_env(settings, config, prompt=tqdm.write)
+    episodes: list[Episode] = []
+    try:
+        with closing(env):
+            recorded = {**config.model_dump(mode="json"), "evaluated": settings.model_dump(mode="json")}
+            write_config(folder, recorded)
+            for episode in with_progress(env, agent.policy, config.episodes):
+                episodes.append(episode)
+    finally:  # what a broken link or Ctrl-C leaves is worth its figures
+        if episodes:
+            plant, x_max = config.plant.kind, settings.task.x_max
+            summary = report(folder, episodes, plant, settings.pole, x_max, link_figures(env))
+            print(score_table(summary, f"plant={plant}, {count_text(len(episodes))}"))
+            print(f"{folder}/{METRICS} and figures/ are written")
+
+
+def with_progress(env: CartPoleEnv, policy: Policy, episodes: int) -> Iterator[Episode]:
+    """The episodes as they end, with a progress bar that shows each one's score."""
+    with tqdm(total=episodes, unit=" episodes") as progress:
+        for episode in run_episodes(env, policy, episodes):
+            progress.set_postfix_str(f"score {episode.score.sum():.0f}")
+            progress.update()
+            yield episode
+
+
+def link_figures(env: CartPoleEnv) -> dict[str, int]:
+    """Frames lost, spoilt and late on the wire; none where there is no wire."""
+    if not isinstance(env.plant, SerialPlant):
+        return {"late_ticks": 0, "lost_frames": 0, "bad_frames": 0}
+    seen = env.plant.cart.statistics
+    return {"late_ticks": seen.late_ticks, "lost_frames": seen.lost_frames, "bad_frames": seen.bad_frames}
+
+
+def score_table(summary: Mapping[str, Any], heading: str) -> str:
+    """The figures that a person asks for first."""
+    rows = [
+        {"figure": label, "mean": mean_text(value)}
+        for key, label in SHOWN.items()
+        if (value := summary[key]) is not None
+    ]
+    return table(rows, {"figure": heading, "mean": "mean"})
+
+
+def count_text(episodes: int) -> str:
+    """One in the singular: "1 episode", "20 episodes"."""
+    return f"{episodes} episode{'s' if episodes > 1 else ''}"
+
+
+def mean_text(figure: Mapping[str, Any]) -> str:
+    """A mean with its interval, which a single episode has not."""
+    if figure["low"] is None:
+        return number_text(figure["mean"])
+    return interval_text(figure["mean"], figure["low"], figure["high"])
 
 
 if __name__ == "__main__":

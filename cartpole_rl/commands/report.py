@@ -20,23 +20,20 @@ def report(
     plant: str,
     pole: PoleSettings,
     x_max: float,
-    link: Mapping[str, Any] | None = None,
+    link: Mapping[str, int] | None = None,
     history: Sequence[Mapping[str, float]] = (),
-) -> dict[str, float | None]:
-    """Write metrics.json and figures/ into `folder`; returns the mean of each figure.
+) -> dict[str, Any]:
+    """Write metrics.json and figures/ into `folder`; returns what `summarize` makes of the episodes.
 
     The behaviour and the animation show the first episode; `history` adds the learning curve.
     """
     figures = [episode_metrics(episode, x_max) for episode in episodes]
     summary = summarize(figures)
-    write_json(
-        folder / METRICS,
-        {"plant": plant, "pole": pole.name, **dict(link or {}), **summary, "episodes": figures},
-    )
+    head = {"plant": plant, "pole": pole.name, **(link or {})}
+    write_json(folder / METRICS, {**head, **summary, "episodes": figures})
     pictures = folder / "figures"
-    pictures.mkdir(exist_ok=True)
     save(behaviour(episodes[0], f"First episode, plant={plant}", x_max), pictures / "behaviour.png")
     write_gif(episodes[0], pictures / "episode.gif", 2 * pole.nominal.pole_com, x_max, f"plant={plant}")
     if history:
         save(learning_curve([("score", list(history))]), pictures / "learning_curve.png")
-    return {key: value["mean"] for key, value in summary.items() if isinstance(value, dict) and "mean" in value}
+    return summary

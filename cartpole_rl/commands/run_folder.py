@@ -11,21 +11,33 @@ from typing import Any
 
 import yaml
 
+from cartpole_rl.errors import ConfigError
+
+CONFIG, PROVENANCE = "config.yaml", "provenance.json"
 PACKAGES = ("cartpole_rl", "torch", "torchrl", "tensordict", "numpy", "hydra-core", "mujoco", "pyserial")
 
 
-def write_config(folder: Path, config: Mapping[str, Any]) -> None:
-    """config.yaml (resolved) and provenance.json (command, versions, git commit)."""
+def write_config(folder: Path, config: Mapping[str, Any], resumed: bool = False) -> None:
+    """config.yaml (resolved) and provenance.json; a resumed run adds to the latter what resumed it.
+
+    Raises ConfigError where the folder holds another run: none is ever overwritten.
+    """
+    if resumed:
+        first = json.loads((folder / PROVENANCE).read_text())
+        resumptions = [*first.get("resumed", []), provenance()]
+        write_json(folder / PROVENANCE, {**first, "resumed": resumptions})
+        return
+    if (folder / CONFIG).exists():
+        raise ConfigError(f"hydra.run.dir={folder}: it holds a run already; give another folder")
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "config.yaml").write_text(yaml.safe_dump(dict(config), sort_keys=False))
-    write_json(folder / "provenance.json", provenance(config.get("seed")))
+    (folder / CONFIG).write_text(yaml.safe_dump(dict(config), sort_keys=False))
+    write_json(folder / PROVENANCE, {"seed": config["seed"], **provenance()})
 
 
-def provenance(seed: int | None) -> dict[str, Any]:
-    """Seed, versions and commit that a result depends on."""
+def provenance() -> dict[str, Any]:
+    """Command, versions and commit that a result depends on."""
     return {
         "command": sys.argv,
-        "seed": seed,
         "python": platform.python_version(),
         "packages": {name: _version(name) for name in PACKAGES},
         "git_commit": git_commit(),
@@ -34,9 +46,12 @@ def provenance(seed: int | None) -> dict[str, Any]:
 
 def git_commit() -> str | None:
     """Commit of the checkout the package runs from, "-dirty" if changed; None outside a checkout."""
+    checkout = Path(__file__).resolve().parents[2]
+    if not (checkout / ".git").exists():  # an installed package may lie in somebody else's repository
+        return None
     command = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
     try:
-        found = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, check=False)
+        found = subprocess.run(command, cwd=checkout, capture_output=True, text=True, check=False)
     except OSError:
         return None
     return found.stdout.strip() or None

@@ -136,7 +136,9 @@ class HardwareTransform(Transform):
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         counts, dt = tensordict_reset.get("counts"), tensordict_reset.get("dt")
-        state = self._measure(counts, counts, dt)
+        x, theta = measured_position(counts)
+        unknown = torch.zeros_like(x)  # nothing precedes that a velocity could be taken from
+        state = torch.stack((x, unknown, theta, unknown), -1)
         past = dt.new_zeros(len(counts), self.observation_settings.past_size)
         tensordict_reset.update(
             {
@@ -152,7 +154,9 @@ class HardwareTransform(Transform):
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         counts, dt = next_tensordict.get("counts"), next_tensordict.get("dt")
-        state = self._measure(counts, tensordict.get("counts"), dt)
+        x, theta = measured_position(counts)
+        x_dot, theta_dot = measured_velocity(counts, tensordict.get("counts"), dt.squeeze(-1))
+        state = torch.stack((x, x_dot, theta, theta_dot), -1)
         past = self._remember(tensordict)
         step_count = tensordict.get("step_count") + 1
         off_track = next_tensordict.get("terminated")
@@ -178,13 +182,6 @@ class HardwareTransform(Transform):
             }
         )
         return next_tensordict
-
-    @staticmethod
-    def _measure(counts: Tensor, previous: Tensor, dt: Tensor) -> Tensor:
-        """Measured state [N, 4]; velocities 0 where nothing precedes."""
-        x, theta = measured_position(counts)
-        x_dot, theta_dot = measured_velocity(counts, previous, dt.squeeze(-1))
-        return torch.stack((x, x_dot, theta, theta_dot), -1)
 
     def _remember(self, tensordict: TensorDictBase) -> Tensor:
         """`past` one step on."""

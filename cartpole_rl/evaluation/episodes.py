@@ -1,7 +1,7 @@
 """Run whole episodes of a policy on any plant.
 
-A batched plant runs as many episodes at once as it has carts, each from one reset to its own end, so that short
-episodes do not come round more often than long ones.
+A batched plant runs as many episodes at once as it has carts, each from one reset to its own end, so that
+short episodes do not come round more often than long ones.
 """
 
 import math
@@ -16,6 +16,7 @@ from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
 
 Policy = Callable[[TensorDictBase], TensorDictBase]  # reads `observation`, writes `action`
+_FROM_NEXT = ("score", "score_upright", "reward", "done")
 
 
 def run_episodes(env: CartPoleEnv, policy: Policy, episodes: int) -> Iterator[Episode]:
@@ -45,10 +46,9 @@ def run_batch(env: CartPoleEnv, policy: Policy) -> list[Episode]:
         present = following.exclude("reward")
     columns = {key: torch.cat(values, 1).cpu().numpy() for key, values in steps.items()}
     state, time = torch.stack(states, 1).cpu().numpy(), torch.cat(times, 1).cpu().numpy()
-    return [_episode(row, state[row], time[row], columns, ending) for row, ending in enumerate(endings) if ending]
-
-
-_FROM_NEXT = ("score", "score_upright", "reward", "done")
+    return [
+        _episode(row, state[row], time[row], columns, ending) for row, ending in enumerate(endings) if ending
+    ]
 
 
 def _note_endings(env: CartPoleEnv, following: TensorDictBase, endings: list[str | None]) -> None:
@@ -87,5 +87,3 @@ def _episode(
         reward=step["reward"].astype(np.float64),
         ended_by=ended_by,
     )
-
-

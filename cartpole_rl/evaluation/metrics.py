@@ -1,6 +1,7 @@
 """What an episode is worth, and what several are worth together."""
 
 import math
+import warnings
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -12,15 +13,16 @@ from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.tasks.upright import is_upright, upright_since, wrap
 
 CONFIDENCE = 0.95
+RESAMPLES = 5000
 
 
 def episode_metrics(episode: Episode, track_half_length: float) -> dict[str, Any]:
     """Figures of one episode, as they stand in metrics.json; None where a figure has no meaning.
 
-    `score` and `score_upright` are the sums of (6.2) and (6.1); `time_to_upright_s` the first time from which the
-    pole stays within 5 degrees for 1 s; `upright_fraction` the share of periods within 5 degrees, over which
-    the two RMS values of angle and position are taken; `rms_motor_change` the step from one motor value to the next, in motor values;
-    `min_track_margin_m` how near the cart came to where the episode would end.
+    `score` and `score_upright` are the sums of (6.2) and (6.1); `time_to_upright_s` the first time from which
+    the pole stays within 5 degrees for 1 s; `upright_fraction` the share of periods within 5 degrees, over
+    which the RMS of angle and position are taken; `rms_motor_change` that of the step from one motor value to
+    the next; `min_track_margin_m` how near the cart came to `track_half_length`, negative beyond it.
     """
     upright = is_upright(episode.theta[1:])
     change = np.diff(episode.motor)
@@ -43,21 +45,24 @@ def _rms(values: np.ndarray) -> float | None:
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else None
 
 
-def interval(values: Sequence[float]) -> tuple[float, float, float]:
-    """(mean, low, high) with a 95 % interval of the mean: BCa bootstrap; the mean alone where all are equal."""
+def interval(values: Sequence[float]) -> tuple[float, float] | tuple[None, None]:
+    """95 % interval of the mean by BCa bootstrap (Efron, 1987); none for one value, which shows no spread."""
     data = np.asarray(values, dtype=float)
-    mean = float(data.mean())
-    if len(data) < 2 or np.ptp(data) == 0:
-        return mean, mean, mean
-    result = stats.bootstrap(
-        (data,), np.mean, confidence_level=CONFIDENCE, rng=np.random.default_rng(0), n_resamples=5000
-    )
+    if len(data) < 2:
+        return None, None
+    if np.ptp(data) == 0:
+        return float(data[0]), float(data[0])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # said of samples that are equal but for rounding
+        result = stats.bootstrap(
+            (data,), np.mean, confidence_level=CONFIDENCE, rng=np.random.default_rng(0), n_resamples=RESAMPLES
+        )
     low, high = (float(edge) for edge in result.confidence_interval)
-    # BCa is not defined for some degenerate samples; Student's t then
-    if not (math.isfinite(low) and math.isfinite(high)):
-        half = float(stats.sem(data) * stats.t.ppf((1 + CONFIDENCE) / 2, len(data) - 1))
-        return mean, mean - half, mean + half
-    return mean, low, high
+    if math.isfinite(low) and math.isfinite(high):
+        return low, high
+    # BCa is not defined for those; Student's t is
+    half = float(stats.sem(data) * stats.t.ppf((1 + CONFIDENCE) / 2, len(data) - 1))
+    return float(data.mean()) - half, float(data.mean()) + half
 
 
 def summarize(episodes: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -72,6 +77,6 @@ def summarize(episodes: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         if not present:
             summary[key] = None
             continue
-        mean, low, high = interval(present)
-        summary[key] = {"mean": mean, "low": low, "high": high, "count": len(present)}
+        low, high = interval(present)
+        summary[key] = {"mean": float(np.mean(present)), "low": low, "high": high, "count": len(present)}
     return summary

@@ -1,10 +1,11 @@
 """Checkpoints: an agent with all that is needed to use it, and the state that training resumes from.
 
-Files are written beside their place and renamed into it, so that a kill at any moment leaves the old one whole.
+Files are written beside their place and renamed into it, so that a kill at any moment leaves the old one
+whole.
 """
 
-import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,59 +23,74 @@ FOLDER, LAST, BEST, RESUME = "checkpoints", "last.pt", "best.pt", "resume.pt"
 class AgentCheckpoint:
     """An agent's weights and the run that made them."""
 
-    path: Path
     config: dict[str, Any]  # the resolved config of the training
     weights: dict[str, Any]
     frames: int
     score: float | None  # mean score of the evaluation before the checkpoint
 
 
-def write_atomically(content: Any, path: Path) -> None:
-    """`torch.save` that leaves either the old file or the new one."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_suffix(".partial")
-    torch.save(content, beside)
-    os.replace(beside, path)
+@dataclass(frozen=True)
+class TrainingCheckpoint:
+    """All that a training goes on from."""
+
+    config: dict[str, Any]
+    state: dict[str, Any]  # what `Training.snapshot` gave
+    frames: int
 
 
-def save_agent(path: Path, config: Mapping[str, Any], weights: Any, frames: int, score: float | None) -> None:
-    """Write an AgentCheckpoint."""
-    write_atomically(
-        {"format": AGENT_FORMAT, "config": dict(config), "weights": weights, "frames": frames, "score": score},
-        path,
-    )
+def save_agent(path: Path, agent: AgentCheckpoint) -> None:
+    """Write what `load_agent` reads."""
+    _save(path, AGENT_FORMAT, vars(agent))
+
+
+def load_agent(run: Path) -> AgentCheckpoint:
+    """Read the agent of a run folder or a checkpoint file. Raises CheckpointError."""
+    return AgentCheckpoint(**_load(find_agent(run), AGENT_FORMAT, "an agent"))
 
 
 def find_agent(run: Path) -> Path:
     """The checkpoint file that `run` means: itself, or the last one of a run folder."""
     if not run.exists():
-        raise CheckpointError(f"run={run}: there is no such file or folder; give a run folder or a checkpoint")
+        raise CheckpointError(
+            f"run={run}: there is no such file or folder; give a run folder or a checkpoint"
+        )
     if run.is_file():
         return run
     path = run / FOLDER / LAST
     if not path.exists():
-        raise CheckpointError(f"run={run}: it holds no {FOLDER}/{LAST}; give the folder of a finished training")
+        raise CheckpointError(f"run={run}: it holds no {FOLDER}/{LAST}; give the folder of a training")
     return path
 
 
-def load_agent(run: Path) -> AgentCheckpoint:
-    """Read the agent of a run folder or a checkpoint file. Raises CheckpointError."""
-    path = find_agent(run)
-    content = _load(path, AGENT_FORMAT, "an agent")
-    return AgentCheckpoint(path, content["config"], content["weights"], content["frames"], content["score"])
+def save_training(run: Path, training: TrainingCheckpoint) -> None:
+    """Write what `load_training` reads."""
+    _save(run / FOLDER / RESUME, TRAINING_FORMAT, vars(training))
 
 
-def load_training(run: Path) -> dict[str, Any]:
+def load_training(run: Path) -> TrainingCheckpoint:
     """The state that the training in the folder `run` can go on from. Raises CheckpointError."""
+    if not run.is_dir():
+        raise CheckpointError(f"resume={run}: there is no such folder; give the run folder of a training")
     path = run / FOLDER / RESUME
     if not path.exists():
-        raise CheckpointError(f"resume={run}: it holds no {FOLDER}/{RESUME}; only a training leaves one")
-    return _load(path, TRAINING_FORMAT, "a training")["state"]
+        raise CheckpointError(
+            f"resume={run}: it holds no {FOLDER}/{RESUME}; give the folder of a training that came so far"
+        )
+    return TrainingCheckpoint(**_load(path, TRAINING_FORMAT, "a training"))
 
 
-def save_training(run: Path, state: Mapping[str, Any]) -> None:
-    """Write what `load_training` reads."""
-    write_atomically({"format": TRAINING_FORMAT, "state": dict(state)}, run / FOLDER / RESUME)
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A file beside `path` to write to; it takes the place of `path` at the end, whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside = path.with_name(f"{path.name}.partial")
+    yield beside
+    beside.replace(path)
+
+
+def _save(path: Path, file_format: str, content: Mapping[str, Any]) -> None:
+    with replacing(path) as beside:
+        torch.save({"format": file_format, **content}, beside)
 
 
 def _load(path: Path, expected: str, what: str) -> dict[str, Any]:
@@ -85,7 +101,9 @@ def _load(path: Path, expected: str, what: str) -> dict[str, Any]:
             f"{path} is no checkpoint of this package, or it is damaged ({type(error).__name__}); "
             f"give one that cartpole-train wrote"
         ) from None
-    found = content.get("format") if isinstance(content, dict) else None
+    found = content.pop("format", None) if isinstance(content, dict) else None
     if found != expected:
-        raise CheckpointError(f"{path} is not {what} of this package: its format is {found!r}, not {expected!r}")
+        raise CheckpointError(
+            f"{path} is not {what} of this package: its format is {found!r}, not {expected!r}"
+        )
     return content

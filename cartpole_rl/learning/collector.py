@@ -42,7 +42,7 @@ class Collector:
         return torch.stack(taken, 1)
 
     def finished(self) -> dict[str, float]:
-        """Mean score (6.2) and length of the episodes that ended since this was last asked; empty for none."""
+        """Mean score (6.2) and length of the episodes that ended since the last call; empty for none."""
         if not self._finished:
             return {}
         scores, lengths = zip(*self._finished, strict=True)
@@ -72,6 +72,7 @@ class Collector:
         return {
             "present": self._present.to_dict(),
             "score": self._score.clone(),
+            "finished": list(self._finished),
             "generator": self._generator.get_state(),
         }
 
@@ -79,4 +80,5 @@ class Collector:
         """Go on from `snapshot`."""
         self._present = TensorDict(snapshot["present"], batch_size=self.env.batch_size)
         self._score = snapshot["score"].clone()
+        self._finished = list(snapshot["finished"])
         self._generator.set_state(snapshot["generator"])

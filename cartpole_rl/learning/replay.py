@@ -1,13 +1,19 @@
 """Replay: n-step transitions in, batches out."""
 
+from collections.abc import Mapping
+from typing import Any
+
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import LazyTensorStorage, PrioritizedSampler, RandomSampler, TensorDictReplayBuffer
 
 from cartpole_rl.learning.settings import ReplaySettings
 
+TREES = ("_sum_tree", "_min_tree")  # of priorities, by their names in TorchRL's state of a PrioritizedSampler
+
+
 def make_replay(settings: ReplaySettings, batch_size: int) -> TensorDictReplayBuffer:
-    """An empty buffer. Its prioritized sampler draws from NumPy's global generator."""
+    """An empty buffer. A prioritized one draws from NumPy's global generator, a uniform one from torch's."""
     if settings.kind == "prioritized":
         sampler = PrioritizedSampler(
             settings.size, alpha=settings.alpha, beta=settings.beta[0], eps=settings.priority_eps
@@ -22,12 +28,36 @@ def make_replay(settings: ReplaySettings, batch_size: int) -> TensorDictReplayBu
     )
 
 
+def replay_snapshot(replay: TensorDictReplayBuffer) -> dict[str, Any]:
+    """All that the buffer's next batch depends on, as tensors and plain values.
+
+    TorchRL gives its trees as compiled objects, which `torch.load` rightly refuses to read from a file.
+    """
+    state = replay.state_dict()
+    sampler = state["_sampler"]
+    leaves = torch.arange(replay.storage.max_size)
+    trees = {name: torch.as_tensor(sampler[name][leaves]) for name in TREES if name in sampler}
+    return {**state, "_sampler": {**sampler, **trees}}
+
+
+def restore_replay(replay: TensorDictReplayBuffer, snapshot: Mapping[str, Any]) -> None:
+    """Go on from `snapshot`. A tree's nodes follow from its leaves, so it comes back to the bit."""
+    sampler = dict(snapshot["_sampler"])
+    own = replay.sampler.state_dict()
+    for name in TREES:
+        if name in sampler:
+            tree = own[name]
+            tree[torch.arange(len(sampler[name]))] = sampler[name]
+            sampler[name] = tree
+    replay.load_state_dict({**snapshot, "_sampler": sampler})
+
+
 def n_step_transitions(chunk: TensorDictBase, n: int, gamma: float) -> TensorDict:
     """One-step transitions [N, T] to n-step ones [N * T] with the keys that are learned from.
 
-    Return, next observation and end flags are those of the step that is reached: n steps on, or the end of the
-    episode, or of the chunk; `steps_to_next_obs` says how many, and the loss discounts by it. TorchRL's MultiStep
-    does the same but keeps the flags of the first step, and so bootstraps through an ending.
+    Return, next observation and end flags are those of the step that is reached: n steps on, or the end of
+    the episode, or of the chunk; `steps_to_next_obs` says how many, and the loss discounts by it. TorchRL's
+    MultiStep does the same but keeps the flags of the first step, and so bootstraps through an ending.
     """
     carts, periods = chunk.batch_size
     reward, done = chunk["next", "reward"].squeeze(-1), chunk["next", "done"].squeeze(-1)  # [N, T]
@@ -39,21 +69,19 @@ def n_step_transitions(chunk: TensorDictBase, n: int, gamma: float) -> TensorDic
         reach[:, :-ahead] += alive
     reached = torch.arange(periods, device=reward.device) + reach
     row = torch.arange(carts, device=reward.device).unsqueeze(1)
-    flat = [carts * periods]
-    return TensorDict(
+    following = chunk["next"][row, reached]
+    transitions = TensorDict(
         {
-            "observation": chunk["observation"].flatten(0, 1),
-            "action": chunk["action"].flatten(0, 1),
-            "steps_to_next_obs": (reach + 1).reshape(-1, 1),
-            "next": TensorDict(
-                {
-                    "observation": chunk["next", "observation"][row, reached].flatten(0, 1),
-                    "reward": total.reshape(-1, 1),
-                    "terminated": chunk["next", "terminated"][row, reached].reshape(-1, 1),
-                    "done": chunk["next", "done"][row, reached].reshape(-1, 1),
-                },
-                batch_size=flat,
-            ),
+            "observation": chunk["observation"],
+            "action": chunk["action"],
+            "steps_to_next_obs": (reach + 1).unsqueeze(-1),
+            "next": {
+                "observation": following["observation"],
+                "reward": total.unsqueeze(-1),
+                "terminated": following["terminated"],
+                "done": following["done"],
+            },
         },
-        batch_size=flat,
+        batch_size=[carts, periods],
     )
+    return transitions.flatten(0, 1)

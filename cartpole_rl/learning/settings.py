@@ -28,7 +28,7 @@ class OptimizerSettings(Settings):
 
 
 class LearningSettings(Settings):
-    """The training loop. One iteration collects `chunk` periods on every cart, then makes `updates` updates."""
+    """The training loop: an iteration collects `chunk` periods on every cart, then makes `updates` updates."""
 
     frames: Count  # transitions in all
     carts: Count  # simulated in parallel
@@ -58,3 +58,8 @@ class LearningSettings(Settings):
     def iterations(self) -> int:
         """Rounds of collecting and learning."""
         return self.frames // (self.carts * self.chunk)
+
+    @property
+    def collected_frames(self) -> int:
+        """Transitions that whole iterations collect: `frames`, or a little less."""
+        return self.iterations * self.carts * self.chunk

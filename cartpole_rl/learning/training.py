@@ -16,7 +16,8 @@ from torch import nn
 from cartpole_rl.agents import QAgent
 from cartpole_rl.envs import CartPoleEnv
 from cartpole_rl.learning.collector import Collector
-from cartpole_rl.learning.replay import make_replay, n_step_transitions
+from cartpole_rl.learning.randomness import random_state, restore_random_state
+from cartpole_rl.learning.replay import make_replay, n_step_transitions, replay_snapshot, restore_replay
 from cartpole_rl.learning.schedules import half_cosine, linear
 from cartpole_rl.learning.settings import LearningSettings, OptimizerSettings, ReplaySettings
 from cartpole_rl.tasks.episode import Episode
@@ -31,7 +32,7 @@ class Monitor(Protocol):
     def learned(self, frames: int, scalars: Scalars) -> None:
         """After an iteration; not after each one."""
 
-    def evaluated(self, frames: int, seconds: float, episodes: Sequence[Episode], is_best: bool) -> None:
+    def evaluated(self, training: "Training", episodes: Sequence[Episode], is_best: bool) -> None:
         """After an evaluation."""
 
     def checkpoint(self, training: "Training") -> None:
@@ -158,11 +159,10 @@ class Training:
         self.last_score = float(np.mean([episode.score.sum() for episode in episodes]))
         is_best = self.last_score > self.best_score
         self.best_score = max(self.best_score, self.last_score)
-        self.monitor.evaluated(self.frames, self.seconds, episodes, is_best)
+        self.monitor.evaluated(self, episodes, is_best)
 
     def snapshot(self) -> dict[str, Any]:
-        """All that the next iteration depends on."""
-        _, keys, position, has_gauss, gauss = np.random.get_state()  # noqa: NPY002 - TorchRL's sampler draws from it
+        """All that the next iteration depends on, to be saved at once: it shares memory with the training."""
         return {
             "counters": [self.iteration, self.updates],
             "seconds": self.seconds,
@@ -170,11 +170,10 @@ class Training:
             "agent": self.agent.state_dict(),
             "target_updater": self.target_updater.state_dict(),
             "optimizer": self.optimizer.state_dict(),
-            "replay": self.replay.state_dict(),
+            "replay": replay_snapshot(self.replay),
             "collector": self.collector.snapshot(),
             "plant": self.env.plant.snapshot(),
-            "torch_random": torch.get_rng_state(),
-            "numpy_random": [torch.from_numpy(keys.astype(np.int64)), position, has_gauss, gauss],
+            "random": random_state(),
         }
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
@@ -185,12 +184,10 @@ class Training:
         self.agent.load_state_dict(snapshot["agent"])
         self.target_updater.load_state_dict(snapshot["target_updater"])
         self.optimizer.load_state_dict(snapshot["optimizer"])
-        self.replay.load_state_dict(snapshot["replay"])
+        restore_replay(self.replay, snapshot["replay"])
         self.collector.restore(snapshot["collector"])
         self.env.plant.restore(snapshot["plant"])
-        torch.set_rng_state(snapshot["torch_random"])
-        keys, position, has_gauss, gauss = snapshot["numpy_random"]
-        np.random.set_state(("MT19937", keys.numpy().astype(np.uint32), position, has_gauss, gauss))  # noqa: NPY002
+        restore_random_state(snapshot["random"])
 
 
 def evenly_spaced(count: int, end: int) -> list[int]:

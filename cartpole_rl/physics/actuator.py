@@ -12,7 +12,7 @@ from torch import Tensor
 
 from cartpole_rl.physics.parameters import CartParameters
 
-SHORTEST_TIME_CONSTANT = 1e-9  # s; stands in for no lag at all
+SHORTEST_TIME_CONSTANT = 1e-12  # s; stands in for no lag at all
 
 
 class Actuator(StrEnum):

@@ -10,7 +10,6 @@ import math
 from collections.abc import Iterable, Mapping
 from typing import NamedTuple, Self
 
-import torch
 from tensordict import TensorClass
 from torch import Tensor
 
@@ -88,13 +87,6 @@ class CartParameters(TensorClass["frozen", "tensor_only"]):  # type: ignore[name
     def from_table(cls, table: Tensor) -> Self:
         """N carts from `table` [P, N], a row a field in the order of `names`; the fields share its memory."""
         return cls(**dict(zip(cls.names(), table.unbind(0), strict=True)), batch_size=[table.shape[1]])
-
-    @classmethod
-    def from_values(cls, values: Mapping[str, float], carts: int, device: torch.device | str = "cpu") -> Self:
-        """`carts` equal carts from one float a field. Raises ConfigError as `check_values` does."""
-        check_values(values)
-        column = torch.tensor([float(values[name]) for name in cls.names()], device=device)
-        return cls.from_table(column.unsqueeze(1).repeat(1, carts))
 
 
 class Bound(NamedTuple):

@@ -45,7 +45,7 @@ class PoleSettings(Settings):
 
     @property
     def name(self) -> str:
-        """For tables and file names: "medium", "medium or large", "0.2 to 1.0 m"."""
+        """For tables and file names: "medium", "medium or large", "0.2 to 1 m"."""
         if self.choices is not None:
             return " or ".join(self.choices)
         assert self.lengths is not None

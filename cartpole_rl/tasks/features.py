@@ -25,11 +25,6 @@ class ObservationKind(StrEnum):
     COS_SIN = "cos_sin"  # x, x_dot, cos theta, sin theta, theta_dot, each scaled to about one
 
 
-def wrap_angle(theta: Tensor) -> Tensor:
-    """The angle in [-pi, pi)."""
-    return torch.remainder(theta + math.pi, 2 * math.pi) - math.pi
-
-
 def measured_position(counts: Tensor) -> tuple[Tensor, Tensor]:
     """(x m, theta rad) from counts [N, 2] int64; theta is wrapped before it loses precision as a float."""
     half_turn = POLE_COUNTS_PER_TURN // 2

@@ -1,0 +1,34 @@
+"""The global random generators: torch's (weights, uniform replay) and NumPy's (prioritized replay).
+
+What else draws, carts and exploration, has a generator of its own.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+
+
+def seed_everything(seed: int) -> None:
+    """Seed both."""
+    torch.manual_seed(seed)
+    np.random.seed(seed % 2**32)  # noqa: NPY002 - TorchRL's sampler draws from NumPy's global generator
+
+
+def random_state() -> dict[str, Any]:
+    """The state of both, in tensors and plain values."""
+    state = np.random.get_state(legacy=False)  # noqa: NPY002
+    numbers = torch.from_numpy(state["state"]["key"].astype(np.int64))  # torch has few operations for uint32
+    return {
+        "torch": torch.get_rng_state(),
+        "numpy": {**state, "state": {**state["state"], "key": numbers}},
+    }
+
+
+def restore_random_state(snapshot: Mapping[str, Any]) -> None:
+    """Go on from what `random_state` gave."""
+    torch.set_rng_state(snapshot["torch"])
+    state = snapshot["numpy"]
+    numbers = state["state"]["key"].numpy().astype(np.uint32)
+    np.random.set_state({**state, "state": {**state["state"], "key": numbers}})  # noqa: NPY002

@@ -1,0 +1,198 @@
+"""The Q-network, DQN's target computed by hand, and the ways in which the target network moves."""
+
+import copy
+
+import pytest
+import torch
+from pydantic import ValidationError
+from tensordict import TensorDict
+from torch import Tensor
+
+from cartpole_rl.agents import AgentSettings, QAgent
+from cartpole_rl.agents.network import QNetwork
+
+DQN = {
+    "hidden": [16],
+    "layer_norm": True,
+    "gamma": 0.9,
+    "double": True,
+    "loss": "l2",
+    "target_tau": 0.25,
+    "target_period": None,
+}
+
+
+def make_agent(observation_size: int = 3, actions: int = 4, **changes: object) -> QAgent:
+    torch.manual_seed(0)
+    return QAgent(AgentSettings(**{**DQN, **changes}), observation_size, actions)
+
+
+def disturb(agent: QAgent) -> None:
+    """Move the online weights, so that online and target networks differ."""
+    with torch.no_grad():
+        for weight in agent.actor.parameters():
+            weight.add_(torch.randn_like(weight))
+
+
+def online_weights(agent: QAgent) -> Tensor:
+    return torch.cat(
+        [weight.detach().flatten() for weight in agent.loss.value_network_params.values(True, True)]
+    )
+
+
+def target_weights(agent: QAgent) -> Tensor:
+    params = agent.loss.target_value_network_params
+    return torch.cat([weight.detach().flatten() for weight in params.values(True, True)])
+
+
+def values_of(agent: QAgent, observation: Tensor, target: bool) -> Tensor:
+    """Q-values [N, A] of the online or the target network."""
+    network = copy.deepcopy(agent.actor)
+    params = agent.loss.target_value_network_params if target else agent.loss.value_network_params
+    with params.to_module(network), torch.no_grad():
+        return network(TensorDict({"observation": observation}, [len(observation)]))["action_value"]
+
+
+def transitions(count: int, **changes: Tensor) -> TensorDict:
+    """Random transitions as the replay gives them."""
+    batch = TensorDict(
+        {
+            "observation": torch.randn(count, 3),
+            "action": torch.randint(4, (count,)),
+            "steps_to_next_obs": torch.randint(1, 6, (count, 1)),
+            "next": {
+                "observation": torch.randn(count, 3),
+                "reward": torch.randn(count, 1),
+                "terminated": torch.rand(count, 1) < 0.3,
+                "done": torch.zeros(count, 1, dtype=torch.bool),
+            },
+        },
+        [count],
+    )
+    batch["next", "done"] = batch["next", "terminated"] | (torch.rand(count, 1) < 0.3)
+    return batch.update(changes)
+
+
+@pytest.mark.parametrize("layer_norm", [True, False])
+def test_network_has_the_layers_asked_for(layer_norm: bool) -> None:
+    network = QNetwork(5, 9, (16, 8), layer_norm)
+    assert network(torch.randn(7, 5)).shape == (7, 9)
+    norms = [layer for layer in network.layers if isinstance(layer, torch.nn.LayerNorm)]
+    assert [norm.normalized_shape for norm in norms] == ([(16,), (8,)] if layer_norm else [])
+
+
+def test_the_actor_takes_the_action_of_the_highest_value() -> None:
+    agent = make_agent()
+    chosen = agent.actor(TensorDict({"observation": torch.randn(50, 3)}, [50]))
+    assert torch.equal(chosen["action"], chosen["action_value"].argmax(-1))
+    assert torch.equal(chosen["chosen_action_value"].squeeze(-1), chosen["action_value"].max(-1).values)
+
+
+@pytest.mark.parametrize("double", [True, False])
+def test_loss_is_that_of_the_target_computed_by_hand(double: bool) -> None:
+    agent = make_agent(double=double)
+    disturb(agent)
+    batch = transitions(64)
+    following = batch["next", "observation"]
+    chooser = values_of(agent, following, target=not double)
+    next_value = values_of(agent, following, target=True).gather(1, chooser.argmax(1, keepdim=True))
+    alive = ~batch["next", "terminated"]  # and not `done`: a time limit is no ending of the world
+    target = batch["next", "reward"] + 0.9 ** batch["steps_to_next_obs"] * next_value * alive
+    value = values_of(agent, batch["observation"], target=False).gather(1, batch["action"].unsqueeze(1))
+    loss = agent.loss(batch)["loss"]
+    assert loss.item() == pytest.approx(((value - target) ** 2).mean().item(), rel=1e-5)
+    assert torch.allclose(batch["td_error"], (value - target) ** 2, rtol=1e-4, atol=1e-5)
+
+
+def test_double_and_single_differ_where_the_networks_disagree() -> None:
+    losses = []
+    for double in (True, False):
+        agent = make_agent(double=double)
+        disturb(agent)
+        torch.manual_seed(1)
+        losses.append(agent.loss(transitions(64))["loss"].item())
+    assert losses[0] != pytest.approx(losses[1], rel=1e-3)
+
+
+def test_importance_weights_scale_each_transition() -> None:
+    agent = make_agent()
+    batch = transitions(8)
+    agent.loss(batch)
+    errors = batch["td_error"].squeeze(-1)
+    weights = torch.linspace(0.1, 1, 8)
+    loss = agent.loss(batch.set("priority_weight", weights))["loss"]
+    assert loss.item() == pytest.approx((weights * errors).sum().item() / weights.sum().item(), rel=1e-5)
+
+
+def test_the_target_begins_as_a_copy() -> None:
+    agent = make_agent()
+    assert torch.equal(online_weights(agent), target_weights(agent))
+
+
+@pytest.mark.parametrize("period", [1, 2, 5])
+def test_a_hard_update_copies_at_each_period_and_never_between(period: int) -> None:
+    agent = make_agent(target_tau=None, target_period=period)
+    for update in range(1, 4 * period + 1):
+        disturb(agent)
+        before = target_weights(agent)
+        agent.target_updater.step()
+        expected = online_weights(agent) if update % period == 0 else before
+        assert torch.equal(target_weights(agent), expected), update
+
+
+def test_a_soft_update_moves_by_tau() -> None:
+    agent = make_agent(target_tau=0.25)
+    disturb(agent)
+    before = target_weights(agent)
+    agent.target_updater.step()
+    assert torch.allclose(target_weights(agent), 0.75 * before + 0.25 * online_weights(agent), atol=1e-6)
+
+
+def test_the_greedy_policy_follows_the_averaged_weights_as_they_move() -> None:
+    agent = make_agent()
+    policy = agent.greedy_policy()
+    observation = torch.randn(200, 3)
+    for _ in range(3):
+        disturb(agent)
+        agent.target_updater.step()
+        taken = policy(TensorDict({"observation": observation}, [200]))["action"]
+        assert torch.equal(taken, values_of(agent, observation, target=True).argmax(1))
+        assert not torch.equal(taken, values_of(agent, observation, target=False).argmax(1))
+
+
+def test_the_greedy_policy_follows_weights_that_are_loaded_later() -> None:
+    trained, agent = make_agent(), make_agent()
+    disturb(trained)
+    trained.target_updater.step()
+    policy = agent.greedy_policy()
+    agent.load_state_dict(trained.state_dict())
+    observation = torch.randn(200, 3)
+    taken = policy(TensorDict({"observation": observation}, [200]))["action"]
+    assert torch.equal(taken, values_of(trained, observation, target=True).argmax(1))
+
+
+def test_with_periodic_copies_the_greedy_policy_is_the_online_network() -> None:
+    agent = make_agent(target_tau=None, target_period=5)
+    policy = agent.greedy_policy()
+    disturb(agent)
+    observation = torch.randn(200, 3)
+    taken = policy(TensorDict({"observation": observation}, [200]))["action"]
+    assert torch.equal(taken, values_of(agent, observation, target=False).argmax(1))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"target_period": 10},
+        {"target_tau": None},
+        {"target_tau": 0.0},
+        {"target_tau": None, "target_period": 0},
+        {"gamma": 1.0},
+        {"loss": "l3"},
+        {"hidden": [0]},
+        {"dropout": 0.1},
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(wrong: dict) -> None:
+    with pytest.raises(ValidationError):
+        AgentSettings(**{**DQN, **wrong})

@@ -1,0 +1,85 @@
+"""Runs the commands as a user does, in this process (torch takes long to import) or in one of their own."""
+
+import contextlib
+import importlib
+import io
+import signal
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from unittest.mock import patch
+
+from hydra.core.global_hydra import GlobalHydra
+
+BIN = Path(sys.executable).parent
+TINY = (
+    "learning.frames=2048",
+    "learning.carts=32",
+    "learning.chunk=8",
+    "learning.updates=2",
+    "learning.batch_size=32",
+    "learning.warmup_frames=256",
+    "learning.evaluations=2",
+    "learning.evaluation_episodes=2",
+    "learning.checkpoint_interval=1",
+    "replay.size=1500",
+    "compile=false",
+)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a user sees of a command."""
+
+    code: int
+    out: str
+    err: str
+
+    @property
+    def complaint(self) -> str:
+        """The one line that a failed command leaves on stderr."""
+        lines = self.err.splitlines()
+        assert len(lines) == 1, self.err
+        return lines[0]
+
+
+def in_process(command: str, *words: str, folder: Path) -> Outcome:
+    """`cartpole-<command> words...`, with `folder` as the working directory."""
+    GlobalHydra.instance().clear()
+    handler = signal.getsignal(signal.SIGTERM)
+    out, err, code = io.StringIO(), io.StringIO(), 0
+    main = importlib.import_module(f"cartpole_rl.commands.{command}").main
+    with (
+        patch.object(sys, "argv", [f"cartpole-{command}", *words]),
+        contextlib.chdir(folder),
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+    ):
+        try:
+            main()
+        except SystemExit as exit_:
+            code = int(exit_.code or 0)
+        finally:
+            signal.signal(signal.SIGTERM, handler)
+    return Outcome(code, out.getvalue(), err.getvalue())
+
+
+def console_script(command: str, *words: str, folder: Path) -> "subprocess.Popen[str]":
+    """The installed `cartpole-<command>`, just started."""
+    return subprocess.Popen(
+        [BIN / f"cartpole-{command}", *words],
+        cwd=folder,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def outcome(process: "subprocess.Popen[str]", timeout: float = 120) -> Outcome:
+    """What a started command comes to."""
+    try:
+        out, err = process.communicate(timeout=timeout)
+    finally:
+        process.kill()
+    return Outcome(process.returncode, out, err)

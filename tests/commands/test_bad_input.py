@@ -1,0 +1,255 @@
+"""Each kind of wrong input is told in one line with its remedy, before any work and without a trace."""
+
+import os
+import signal
+import subprocess
+from pathlib import Path
+
+import pytest
+import serial
+import torch
+from command_line import TINY, console_script, in_process, outcome
+
+WRONG_TRAINING = [
+    # the words, and what the line has to say
+    ("agent.gama=0.9", "agent.gama", "did you mean agent.gamma?"),
+    ("+agent.gama=0.9", "agent.gama", "did you mean agent.gamma?"),
+    ("+agent.foo=1", "agent.foo", "there is no such setting"),
+    ("gamma=0.9", "gamma", "did you mean agent.gamma?"),
+    ("polee=large", "polee", "did you mean pole?"),
+    ("cart.cart_mas=1", "cart.cart_mas", "did you mean cart.cart_mass?"),
+    ("~agent.gamma", "agent.gamma is missing", "give agent.gamma=..."),
+    ("seed=abc", "seed=abc", "valid integer"),
+    ("seed=-1", "seed=-1", "greater than or equal to 0"),
+    ("compile=maybe", "compile=maybe", "valid boolean"),
+    ("agent.hidden=64", "agent.hidden=64", "tuple"),
+    ("agent.gamma=1.5", "agent.gamma=1.5", "less than 1"),
+    ("agent.loss=l1", "agent.loss=l1", "'l2' or 'smooth_l1'"),
+    ("control_period=1", "control_period=1", "less than or equal to 0.1"),
+    ("pole=tiny", "pole=tiny", "both, large, medium, range"),
+    ("experiment=nope", "experiment=nope", "medium"),
+    ("pole=medium,large", "pole=medium,large", "-m runs each"),
+    ("seed", "seed", "key=value"),
+    ("agent.hidden=[64", "agent.hidden=[64", "key=value"),
+    ("--seed=1", "--seed=1", "without dashes: seed=1"),
+    ("+seed=1", "seed", "Either remove + prefix"),
+    ("--config-dir=nowhere", "nowhere", "not found"),
+    ("pole=range pole.lengths=[0,1]", "pole.lengths", "greater than 0"),
+    ("pole=range pole.lengths=[1,0.5]", "pole", "must rise"),
+    ("cart.cart_mass=-1", "cart_mass is -1", "above 0"),
+    ("pole.choices.medium.pole_mass=-0.1", "pole.choices.medium.pole_mass=-0.1", "greater than 0"),
+    ("+cart.pole_mass=1", "pole_mass", "belongs to the pole"),
+    ("+randomization.cart_masss={absolute:[1,2]}", "cart_masss", "did you mean 'cart_mass'?"),
+    ("randomization.cart_mass.relative=[-1.5,0]", "cart_mass", "above 0"),
+    ("randomization.cart_mass.relative=[0.2,-0.2]", "randomization.cart_mass", "wrong order"),
+    ("randomization=none +randomization.track_tilt={relative:[-1,1]}", "track_tilt", "give absolute bounds"),
+    ("learning.frames=100", "learning", "must be at least"),
+    ("learning.batch_size=64 replay.size=32", "replay.size 32", "at least learning.batch_size 64"),
+    ("agent.target_period=10", "agent", "either target_tau or target_period"),
+    ("actions.motors=[100,100]", "actions", "two or more different values"),
+    ("actions.motors=[0,300]", "actions.motors.1=300", "less than or equal to 255"),
+    ("plant=emulated", "plant", "cartpole-evaluate takes plant=emulated"),
+    ("plant=serial", "plant", "cartpole-evaluate takes plant=serial"),
+    ("resume=nowhere", "resume=nowhere", "give the run folder of a training"),
+]
+
+
+@pytest.mark.parametrize(
+    ("words", "named", "remedy"), WRONG_TRAINING, ids=[case[0] for case in WRONG_TRAINING]
+)
+def test_training(words: str, named: str, remedy: str, tmp_path: Path) -> None:
+    done = in_process("train", *words.split(), folder=tmp_path)
+    assert done.complaint.startswith("cartpole-train: ")
+    assert named in done.complaint
+    assert remedy in done.complaint
+    assert done.code == (1 if words.startswith("resume") else 2)
+    assert done.out == ""
+    assert not list(tmp_path.glob("runs/train/*"))
+
+
+WRONG_EVALUATION = [
+    ("", "run is missing", "give run=...", 2),
+    ("run=nowhere", "run=nowhere", "give a run folder or a checkpoint", 1),
+    ("run=text.pt", "text.pt", "give one that cartpole-train wrote", 1),
+    ("run=cut.pt", "cut.pt", "damaged", 1),
+    ("run=other.pt", "other.pt", "not an agent of this package", 1),
+    ("run=empty", "run=empty", "holds no checkpoints/last.pt", 1),
+    ("run=run/checkpoints/resume.pt", "resume.pt", "not an agent", 1),
+    ("run=run episodes=0", "episodes=0", "greater than or equal to 1", 2),
+    ("run=run plant.substeps=0", "plant.substeps=0", "greater than or equal to 1", 2),
+    ("run=run parameters={cart_mas:1}", "cart_mas", "did you mean 'cart_mass'?", 2),
+    ("run=run parameters={cart_mass:-1}", "cart_mass is -1", "above 0", 2),
+    ("run=run parameters={pole_mass:0.2} pole=range", "pole_mass", "choose one pole", 2),
+    ("run=run task=balance task.time_limit=0", "task.time_limit=0", "greater than or equal to 1", 2),
+    ("run=run plant=emulated parameters={cart_mass:1}", "parameters", "its own are emulator.*", 2),
+    ("run=run plant=emulated pole=large", "pole", "emulator=large", 2),
+    ("run=run plant=emulated emulator.latencyy=1", "emulator.latencyy", "did you mean emulator.latency?", 2),
+    ("run=run plant=emulated emulator.cart_mass=-1", "emulator.cart_mass=-1", "greater than 0", 2),
+    ("run=run plant=emulated emulator=huge", "emulator=huge", "large, medium", 2),
+    ("run=run plant=emulated task=swingup task.evaluation_start.angle=any", "angle=any", "hanging", 2),
+    ("run=run emulator.latency=0.01", "emulator", "give plant=emulated", 2),
+    ("run=run plant=serial", "plant.port is missing", "give plant.port=...", 2),
+    ("run=run plant=serial plant.prot=/dev/ttyUSB0", "plant.prot", "did you mean plant.port?", 2),
+    ("run=run plant=serial plant.port=nowhere", "nowhere does not exist", "plug the cart in", 1),
+    ("run=run plant=serial plant.port=/dev/null", "/dev/null", "cannot be opened as a serial port", 1),
+]
+
+
+@pytest.fixture(scope="module")
+def files(trained: Path) -> Path:
+    """A folder with a trained run, and files that are none."""
+    folder = trained.parent
+    (folder / "text.pt").write_text("no checkpoint at all\n")
+    (folder / "cut.pt").write_bytes((trained / "checkpoints/last.pt").read_bytes()[:2000])
+    torch.save({"model": torch.zeros(3)}, folder / "other.pt")
+    (folder / "empty").mkdir()
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("words", "named", "remedy", "code"), WRONG_EVALUATION, ids=[case[0] for case in WRONG_EVALUATION]
+)
+def test_evaluation(words: str, named: str, remedy: str, code: int, files: Path) -> None:
+    done = in_process("evaluate", *words.split(), folder=files)
+    assert done.complaint.startswith("cartpole-evaluate: ")
+    assert named in done.complaint
+    assert remedy in done.complaint
+    assert done.code == code
+    assert done.out == ""
+    assert not list(files.glob("runs/evaluate/*"))
+
+
+@pytest.fixture
+def port() -> str:
+    """A serial port with nobody at its other end."""
+    host, device = os.openpty()
+    yield os.ttyname(device)
+    os.close(host)
+    os.close(device)
+
+
+def test_a_port_that_another_program_has_open(port: str, files: Path) -> None:
+    with serial.Serial(port, exclusive=True):
+        done = in_process("evaluate", "run=run", "plant=serial", f"plant.port={port}", folder=files)
+    assert f"{port} is busy" in done.complaint
+    assert done.code == 1
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may open everything")
+def test_a_port_that_may_not_be_opened(port: str, files: Path) -> None:
+    Path(port).chmod(0)
+    done = in_process("evaluate", "run=run", "plant=serial", f"plant.port={port}", folder=files)
+    assert "dialout" in done.complaint
+    assert done.code == 1
+
+
+@pytest.mark.parametrize(
+    ("words", "named"), [("emulator.clock=fast", "'lockstep' or 'real'"), ("seed=1", "seed")]
+)
+def test_emulation(words: str, named: str, tmp_path: Path) -> None:
+    done = in_process("emulate", words, folder=tmp_path)
+    assert named in done.complaint
+    assert done.code == 2
+
+
+def test_a_folder_that_cannot_be_made(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    done = in_process("train", "hydra.run.dir=file/run", folder=tmp_path)
+    assert "file" in done.complaint
+    assert done.code == 1
+
+
+def test_a_run_is_never_overwritten(trained: Path) -> None:
+    before = (trained / "config.yaml").read_text()
+    done = in_process("train", *TINY, "seed=1", f"hydra.run.dir={trained}", folder=trained.parent)
+    assert "holds a run already; give another folder" in done.complaint
+    assert done.code == 2
+    assert (trained / "config.yaml").read_text() == before
+
+
+@pytest.mark.parametrize(
+    ("words", "remedy"),
+    [("seed=1", "leave out seed=1"), ("hydra.run.dir=elsewhere", "leave out hydra.run.dir")],
+)
+def test_resuming_takes_no_other_setting(words: str, remedy: str, trained: Path) -> None:
+    done = in_process("train", f"resume={trained}", words, folder=trained.parent)
+    assert remedy in done.complaint
+    assert done.code == 2
+    assert not (trained.parent / "elsewhere").exists()
+
+
+def test_resuming_what_is_no_training(files: Path) -> None:
+    done = in_process("train", "resume=run/checkpoints/resume.pt", folder=files)
+    assert "give the run folder of a training" in done.complaint
+    assert done.code == 1
+    (files / "an_evaluation").mkdir()
+    (files / "an_evaluation/metrics.json").write_text("{}")
+    done = in_process("train", "resume=an_evaluation", folder=files)
+    assert "holds no checkpoints/resume.pt" in done.complaint
+    assert done.code == 1
+
+
+def test_a_checkpoint_of_another_version(trained: Path, files: Path) -> None:
+    content = torch.load(trained / "checkpoints/last.pt", weights_only=True)
+    torch.save({**content, "config": {**content["config"], "new_setting": 1}}, files / "newer.pt")
+    done = in_process("evaluate", "run=newer.pt", folder=files)
+    assert "another version of this package: new_setting" in done.complaint
+    assert done.code == 1
+
+
+def test_without_a_compiler_the_remedy_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CXX", "no-such-compiler")
+    done = in_process("train", "compile=true", folder=tmp_path)
+    assert "no-such-compiler" in done.complaint
+    assert "compile=false" in done.complaint
+    assert done.code == 2
+    assert not list(tmp_path.glob("runs/train/*"))
+
+
+def test_in_a_multirun_the_other_jobs_run(tmp_path: Path) -> None:
+    done = in_process("train", "-m", *TINY, "agent.gamma=1.5,0.9", folder=tmp_path)
+    assert done.code == 2
+    assert "agent.gamma=1.5: input should be less than 1" in done.err.splitlines()[0]
+    assert "Traceback" not in done.err
+    finished = list(tmp_path.glob("runs/train/*_multirun/*/metrics.json"))
+    assert [path.parent.name for path in finished] == ["1_agent.gamma-0.9"]
+
+
+def test_any_reward_goes_with_any_task(tmp_path: Path) -> None:
+    done = in_process("train", *TINY, "task=swingup", "reward=constant", folder=tmp_path)
+    assert done.code == 0, done.err
+
+
+def test_through_real_processes(tmp_path: Path) -> None:
+    """As above, with nothing around the command that could hide a trace."""
+    wrong = [console_script("train", "agent.gama=0.9", folder=tmp_path)]
+    wrong += [console_script("evaluate", "run=nowhere", folder=tmp_path)]
+    codes = []
+    for process in wrong:
+        done = outcome(process)
+        assert "agent.gamma" in done.complaint or "run=nowhere" in done.complaint
+        assert done.out == ""
+        codes.append(done.code)
+    assert codes == [2, 1]
+
+
+def started_training(folder: Path, name: str) -> "subprocess.Popen[str]":
+    """A training that would go on for minutes."""
+    longer = ("learning.frames=2000000", "learning.evaluations=2000", f"hydra.run.dir={name}")
+    return console_script("train", *TINY, *longer, folder=folder)
+
+
+def test_signals_stop_a_training_with_one_line(tmp_path: Path) -> None:
+    signals = {signal.SIGINT: ("interrupted", 130), signal.SIGTERM: ("terminated", 143)}
+    running = {number: started_training(tmp_path, number.name) for number in signals}
+    for number, process in running.items():
+        while not (tmp_path / number.name / "checkpoints/resume.pt").exists():
+            assert process.poll() is None, process.communicate()
+        process.send_signal(number)
+    for number, process in running.items():
+        word, code = signals[number]
+        done = outcome(process, timeout=30)
+        assert done.code == code
+        assert done.err.splitlines()[-1] == f"cartpole-train: {word}"
+        assert "Traceback" not in done.err
+        assert done.out == ""

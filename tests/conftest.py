@@ -1,0 +1,116 @@
+"""What tests share: the nominal cart and pole of conf/, and builders of carts, plants and environments."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import yaml
+
+from cartpole_rl.envs import CartPoleEnv, make_env
+from cartpole_rl.envs.hardware import ObservationSettings, RewardSettings, TaskSettings
+from cartpole_rl.physics.dynamics import Models
+from cartpole_rl.physics.parameters import CartParameters
+from cartpole_rl.plants.simulated import SimulatedPlant
+from cartpole_rl.plants.specs import Plant
+from cartpole_rl.randomization import PoleSettings, Randomizer, Range
+from cartpole_rl.tasks.actions import ActionSettings
+from cartpole_rl.tasks.starts import Start, StartSettings
+
+CONF = Path(__file__).parents[1] / "conf"
+
+
+def conf(choice: str) -> dict[str, Any]:
+    """A file of conf/, as it stands there."""
+    return yaml.safe_load((CONF / f"{choice}.yaml").read_text())
+
+
+@pytest.fixture(autouse=True, scope="session")
+def one_thread() -> None:
+    torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="session")
+def ip02() -> dict[str, float]:
+    """Nominal numbers of the cart, without a pole."""
+    return conf("cart/ip02")
+
+
+@pytest.fixture(scope="session")
+def medium() -> PoleSettings:
+    return PoleSettings(**conf("pole/medium"))
+
+
+@pytest.fixture(scope="session")
+def both_poles() -> PoleSettings:
+    return PoleSettings(choices={**conf("pole/medium")["choices"], **conf("pole/large")["choices"]})
+
+
+@pytest.fixture(scope="session")
+def make_cart(ip02: dict[str, float], medium: PoleSettings) -> Callable[..., CartParameters]:
+    """Carts in float64; each keyword replaces a nominal number, by a number or a tensor [N]."""
+
+    def build(carts: int = 1, **changes: float | torch.Tensor) -> CartParameters:
+        values = {**ip02, **medium.nominal.model_dump(), **changes}
+        rows = [
+            torch.as_tensor(values[name], dtype=torch.float64).expand(carts)
+            for name in CartParameters.names()
+        ]
+        return CartParameters.from_table(torch.stack(rows))
+
+    return build
+
+
+STILL = StartSettings(
+    angle=Start.HANGING, position_spread=0, angle_spread=0, speed_spread=0, angular_speed_spread=0
+)
+
+
+@pytest.fixture(scope="session")
+def make_plant(ip02: dict[str, float], medium: PoleSettings) -> Callable[..., SimulatedPlant]:
+    """Simulated carts that start hanging, at rest, in the middle, unless `start` says otherwise."""
+
+    def build(
+        carts: int = 1,
+        cart: dict[str, float] | None = None,
+        poles: PoleSettings = medium,
+        ranges: dict[str, Range] | None = None,
+        start: StartSettings = STILL,
+        models: Models = Models(),  # noqa: B008 - immutable
+        **settings: Any,
+    ) -> SimulatedPlant:
+        randomizer = Randomizer({**ip02, **(cart or {})}, poles, ranges or {})
+        return SimulatedPlant(carts, randomizer, start, models, **settings)
+
+    return build
+
+
+@pytest.fixture(scope="session")
+def make_environment() -> Callable[..., CartPoleEnv]:
+    """The swing-up over `plant`, each keyword in place of one of its settings."""
+
+    def build(
+        plant: Plant,
+        motors: tuple[int, ...] = (-200, 0, 200),
+        time_limit: int = 500,
+        angle_limit: float | None = None,
+        reward: dict[str, Any] | None = None,
+        **observation: Any,
+    ) -> CartPoleEnv:
+        return make_env(
+            plant,
+            ActionSettings(motors=motors, actuator="force_curve"),
+            TaskSettings(
+                name="test",
+                start=STILL,
+                evaluation_start=STILL,
+                time_limit=time_limit,
+                angle_limit=angle_limit,
+                x_max=0.38,
+            ),
+            ObservationSettings(**{**conf("observation/history"), **observation}),
+            RewardSettings(**{**conf("reward/score"), **(reward or {})}),
+        )
+
+    return build

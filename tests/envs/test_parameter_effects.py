@@ -1,0 +1,149 @@
+"""Every randomized parameter has an effect, through the environment, in the first episode and in the next.
+
+32 carts start alike and get the same actions; one parameter is drawn for each. The two carts whose values lie
+farthest apart have to end in different states. Parameters of chance are judged by the spread that they cause.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import pytest
+import torch
+from torch import Tensor
+
+from cartpole_rl.envs import CartPoleEnv
+from cartpole_rl.physics.dynamics import Models
+from cartpole_rl.physics.friction import CartFriction, PoleFriction
+from cartpole_rl.physics.parameters import CartParameters
+from cartpole_rl.plants.simulated import SimulatedPlant
+from cartpole_rl.randomization import Range
+from cartpole_rl.tasks.starts import Start, StartSettings
+
+MakePlant = Callable[..., SimulatedPlant]
+MakeEnvironment = Callable[..., CartPoleEnv]
+CARTS, STEPS = 32, 40
+UPRIGHT = StartSettings(
+    angle=Start.UPRIGHT, position_spread=0, angle_spread=0, speed_spread=0, angular_speed_spread=0
+)
+
+
+@dataclass(frozen=True)
+class Case:
+    """Between which bounds a parameter is drawn, and where it acts."""
+
+    low: float
+    high: float
+    friction: CartFriction = CartFriction.SIGMOID
+    motor: int = 200
+    cart: dict[str, float] = field(default_factory=dict)
+
+
+CASES = {
+    "cart_mass": Case(0.5, 0.9),
+    "pole_mass": Case(0.05, 0.3),
+    "pole_com": Case(0.1, 0.3),
+    "pole_inertia": Case(1e-4, 5e-3),
+    "track_tilt": Case(-0.05, 0.05),
+    "cart_viscous": Case(0.1, 3.0),
+    "cart_coulomb": Case(0.25, 0.9),
+    "cart_coulomb_asymmetry": Case(-0.3, 0.3),
+    "cart_stiction_ratio": Case(1.0, 1.5, CartFriction.STRIBECK, motor=80),
+    "stribeck_velocity": Case(0.001, 0.1, CartFriction.STRIBECK, cart={"cart_stiction_ratio": 1.5}),
+    "sigmoid_slope": Case(20.0, 200.0),
+    "pole_viscous": Case(1e-4, 5e-3),
+    "pole_drag": Case(0.0, 1e-3),
+    "force_quadratic": Case(-1e-5, 1e-5),
+    "force_linear": Case(0.015, 0.025),
+    "force_offset": Case(-1.5, 0.0),
+    "force_asymmetry": Case(-0.2, 0.2),
+    "deadband_left": Case(0.0, 200.0, motor=100),
+    "deadband_right": Case(0.0, 200.0, motor=100),
+    "motor_time_constant": Case(0.0, 0.05),
+    "latency": Case(0.0, 0.06),
+    "angle_offset": Case(-0.05, 0.05),
+}
+CHANCE = {
+    "latency_jitter": Case(0.0, 0.05, cart={"latency": 0.05}),
+    "position_noise": Case(0.0, 0.01),
+    "angle_noise": Case(0.0, 0.05),
+}
+
+
+def test_no_parameter_is_forgotten() -> None:
+    assert {*CASES, *CHANCE, "track_half_length"} == set(CartParameters.names())
+
+
+@pytest.fixture(scope="module")
+def environment(make_plant: MakePlant, make_environment: MakeEnvironment) -> Callable[..., CartPoleEnv]:
+    def build(name: str, case: Case, carts: int = CARTS, time_limit: int = STEPS) -> CartPoleEnv:
+        plant = make_plant(
+            carts,
+            cart={"track_half_length": 10.0, **case.cart},
+            ranges={name: Range(absolute=(case.low, case.high))},
+            start=UPRIGHT,
+            models=Models(case.friction, PoleFriction.EXPONENTIAL_DRAG),
+        )
+        return make_environment(plant, motors=(-case.motor, case.motor), time_limit=time_limit)
+
+    return build
+
+
+def two_episodes(env: CartPoleEnv) -> list[tuple[CartParameters, Tensor]]:
+    """Of each episode: the parameters in force, and the counts [T, N, 2] under the same actions for all."""
+    present, episodes = env.reset(), []
+    for _ in range(2):
+        drawn, counts = env.plant.parameters.clone(), []
+        for step in range(STEPS):
+            rightward = torch.full((env.plant.carts,), int((step // 6) % 2 == 0))
+            transition, present = env.step_and_maybe_reset(present.set("action", rightward))
+            counts.append(transition["next", "counts"])
+        assert transition["next", "truncated"].all()
+        episodes.append((drawn, torch.stack(counts)))
+    return episodes
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_another_value_ends_in_another_state(environment: Callable[..., CartPoleEnv], name: str) -> None:
+    episodes = two_episodes(environment(name, CASES[name]))
+    for drawn, counts in episodes:
+        value = getattr(drawn, name)
+        least, most = value.argmin(), value.argmax()
+        assert value[most] > value[least]
+        assert (counts[-1, least] != counts[-1, most]).any()
+    assert (getattr(episodes[0][0], name) != getattr(episodes[1][0], name)).all()
+
+
+def test_equal_values_end_in_equal_states(environment: Callable[..., CartPoleEnv]) -> None:
+    """What the test above would miss: a difference that comes from elsewhere."""
+    for _, counts in two_episodes(environment("cart_mass", Case(0.7, 0.7))):
+        assert (counts == counts[:, :1]).all()
+
+
+@pytest.mark.parametrize("name", CHANCE)
+def test_more_chance_spreads_wider(environment: Callable[..., CartPoleEnv], name: str) -> None:
+    """The half of the carts with larger values strays half as far again, or more, from the middle course."""
+    for drawn, counts in two_episodes(environment(name, CHANCE[name], carts=256)):
+        large = getattr(drawn, name) > (CHANCE[name].low + CHANCE[name].high) / 2
+        stray = (counts - counts.median(1, keepdim=True).values).abs().float().mean((0, 2))
+        assert stray[large].mean() > 1.5 * stray[~large].mean()
+
+
+def test_a_shorter_track_ends_sooner(environment: Callable[..., CartPoleEnv]) -> None:
+    env = environment("track_half_length", Case(0.05, 0.3), time_limit=500)
+    present, lengths = env.reset(), [[] for _ in range(CARTS)]
+    limits = [[limit] for limit in env.plant.parameters.track_half_length.tolist()]
+    for _ in range(120):
+        rightward = torch.ones(CARTS, dtype=torch.long)
+        transition, present = env.step_and_maybe_reset(present.set("action", rightward))
+        following = transition["next"]
+        for row in following["terminated"].flatten().nonzero().flatten().tolist():
+            lengths[row].append(following["step_count"][row].item())
+            limits[row].append(env.plant.parameters.track_half_length[row].item())
+    for episode in (0, 1):
+        by_limit = sorted(
+            (limit[episode], length[episode]) for limit, length in zip(limits, lengths, strict=True)
+        )
+        steps = [length for _, length in by_limit]
+        assert steps == sorted(steps)
+        assert steps[0] < steps[-1]
+    assert all(limit[0] != limit[1] for limit in limits)

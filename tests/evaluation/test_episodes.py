@@ -1,0 +1,124 @@
+"""Episodes run from one reset to their first end, on many carts at once, none favoured."""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict, TensorDictBase
+
+from cartpole_rl.envs import CartPoleEnv
+from cartpole_rl.evaluation import run_episodes
+from cartpole_rl.plants.simulated import SimulatedPlant
+from cartpole_rl.tasks.starts import Start, StartSettings
+
+RIGHT, NONE = 2, 1  # of the motor values -200, 0, 200
+
+
+def always(action: int) -> Callable[[TensorDictBase], TensorDictBase]:
+    return lambda seen: seen.set("action", torch.full(seen.batch_size, action))
+
+
+def scattered(angle: Start = Start.HANGING, **spreads: float) -> StartSettings:
+    none = dict.fromkeys(("position_spread", "angle_spread", "speed_spread", "angular_speed_spread"), 0.0)
+    return StartSettings(angle=angle, **{**none, **spreads})
+
+
+def test_as_many_as_asked_whatever_the_batch(make_plant: Callable, make_environment: Callable) -> None:
+    env = make_environment(make_plant(4), time_limit=3)
+    for count in (1, 4, 6):
+        assert len(list(run_episodes(env, always(NONE), count))) == count
+
+
+def test_time_ends_an_episode(make_plant: Callable, make_environment: Callable) -> None:
+    env = make_environment(make_plant(1), time_limit=30)
+    (episode,) = run_episodes(env, always(NONE), 1)
+    assert (episode.steps, episode.ended_by) == (30, "time")
+    assert episode.time == pytest.approx(np.arange(31) * 0.02, abs=1e-5)
+    assert all(len(getattr(episode, key)) == 31 for key in ("x", "x_dot", "theta", "theta_dot"))
+    assert all(len(getattr(episode, key)) == 30 for key in ("motor", "score", "score_upright", "reward"))
+
+
+def test_the_track_ends_an_episode_at_the_first_step_beyond_it(
+    make_plant: Callable, make_environment: Callable
+) -> None:
+    env = make_environment(make_plant(1))
+    (episode,) = run_episodes(env, always(RIGHT), 1)
+    assert episode.ended_by == "track"
+    assert episode.x[-1] > 0.38 - 1e-4
+    assert (np.abs(episode.x[:-1]) < 0.38 + 1e-4).all()
+    assert (episode.motor == 200).all()
+
+
+def test_a_fall_ends_an_episode_of_the_balance(make_plant: Callable, make_environment: Callable) -> None:
+    limit = math.radians(12)
+    start = scattered(Start.UPRIGHT, angle_spread=0.05)
+    env = make_environment(make_plant(1, start=start, seed=3), angle_limit=limit)
+    (episode,) = run_episodes(env, always(NONE), 1)
+    assert episode.ended_by == "angle"
+    assert abs(episode.theta[-1]) > limit
+    assert (np.abs(episode.theta[:-1]) <= limit).all()
+
+
+def test_each_row_is_cut_at_its_own_first_end(make_plant: Callable, make_environment: Callable) -> None:
+    """Carts pushed from different places leave the track one after the other, each once."""
+    start = scattered(position_spread=0.3)
+    together = make_environment(make_plant(16, start=start, seed=1))
+    episodes = list(run_episodes(together, always(RIGHT), 16))
+    assert len({episode.steps for episode in episodes}) > 4
+    by_place = sorted(episodes, key=lambda episode: episode.x[0])
+    assert [episode.steps for episode in by_place] == sorted((e.steps for e in episodes), reverse=True)
+    assert all(episode.ended_by == "track" for episode in episodes)
+    assert all((np.abs(episode.x[:-1]) < 0.38 + 1e-4).all() for episode in episodes)
+
+
+def test_short_episodes_do_not_come_round_more_often(
+    make_plant: Callable, make_environment: Callable
+) -> None:
+    """The mean length of 64 episodes on 8 carts is that of 64 carts with an episode each."""
+    start = scattered(position_spread=0.3)
+    means = []
+    for carts in (8, 64):
+        env = make_environment(make_plant(carts, start=start, seed=2))
+        episodes = list(run_episodes(env, always(RIGHT), 128))
+        means.append(np.mean([episode.steps for episode in episodes]))
+        error = np.std([episode.steps for episode in episodes]) / math.sqrt(128)
+    assert abs(means[0] - means[1]) < 4 * math.sqrt(2) * error
+
+
+def test_scores_are_those_of_the_states_that_were_reached(
+    make_plant: Callable, make_environment: Callable
+) -> None:
+    env = make_environment(make_plant(1, start=scattered(Start.ANY)), time_limit=100)
+    (episode,) = run_episodes(env, always(NONE), 1)
+    upright = np.cos(episode.theta[1:] / 2)
+    assert episode.score_upright == pytest.approx(
+        np.abs(upright) * (1 - np.abs(episode.x[1:]) / 0.38), abs=1e-4
+    )
+    assert episode.reward == pytest.approx(0.1 * episode.score, abs=1e-5)
+
+
+def test_the_angle_of_a_pole_that_turns_over_is_not_wrapped(
+    make_plant: Callable, make_environment: Callable
+) -> None:
+    env = make_environment(make_plant(1, start=scattered(angular_speed_spread=0.0), seed=0), time_limit=60)
+
+    def spin(seen: TensorDict) -> TensorDictBase:
+        plant: SimulatedPlant = env.plant
+        plant.place(plant.true_state._replace(theta_dot=torch.full((1,), 15.0)))
+        return always(NONE)(seen)
+
+    (episode,) = run_episodes(env, spin, 1)
+    assert episode.theta[-1] - episode.theta[0] > 4 * math.pi
+    assert np.abs(np.diff(episode.theta)).max() < math.pi
+
+
+def test_the_same_seed_gives_the_same_episodes(make_plant: Callable, make_environment: Callable) -> None:
+    env: CartPoleEnv = make_environment(make_plant(8, start=scattered(Start.ANY)), time_limit=20)
+    runs = []
+    for seed in (5, 5, 6):
+        env.set_seed(seed)
+        runs.append(np.concatenate([episode.theta for episode in run_episodes(env, always(RIGHT), 8)]))
+    assert np.array_equal(runs[0], runs[1])
+    assert not np.array_equal(runs[0], runs[2])

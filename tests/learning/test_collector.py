@@ -1,0 +1,86 @@
+"""Transitions hang together, epsilon is the share of random actions, and a snapshot goes on to the bit."""
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from tensordict.nn import TensorDictModule
+
+from cartpole_rl.envs import CartPoleEnv
+from cartpole_rl.learning.collector import COLLECTED, Collector
+
+CARTS, LIMIT = 64, 20
+
+
+@pytest.fixture
+def env(make_plant: Callable, make_environment: Callable) -> CartPoleEnv:
+    return make_environment(make_plant(CARTS, seed=5), time_limit=LIMIT)
+
+
+def always(action: int) -> TensorDictModule:
+    """A policy."""
+    return TensorDictModule(
+        lambda seen: torch.full(seen.shape[:1], action), in_keys=["observation"], out_keys=["action"]
+    )
+
+
+def collector(env: CartPoleEnv, action: int = 1, seed: int = 0) -> Collector:
+    return Collector(env, always(action), actions=3, seed=seed)
+
+
+def test_shapes_and_keys(env: CartPoleEnv) -> None:
+    chunk = collector(env).collect(4)
+    assert chunk.batch_size == (CARTS, 4)
+    assert set(chunk.keys(True, True)) == set(COLLECTED)
+
+
+def test_each_transition_begins_where_the_last_one_ended(env: CartPoleEnv) -> None:
+    chunk = collector(env).collect(3 * LIMIT)
+    ended = chunk["next", "done"].squeeze(-1)[:, :-1]
+    follows = (chunk["next", "observation"][:, :-1] == chunk["observation"][:, 1:]).all(-1)
+    assert ended.any()
+    assert follows[~ended].all()
+    assert not follows[ended].any()  # a new episode begins at a state of its own
+
+
+def test_epsilon_is_the_share_of_random_actions(env: CartPoleEnv) -> None:
+    acting = collector(env, action=1)
+    shares = []
+    for epsilon in (0.0, 0.5, 1.0):
+        acting.epsilon = epsilon
+        shares.append((acting.collect(60)["action"] != 1).float().mean().item())
+    assert shares == pytest.approx([0.0, 0.5 * 2 / 3, 2 / 3], abs=0.03)  # a third of the random ones is 1 too
+
+
+def test_finished_episodes_are_told_once(env: CartPoleEnv) -> None:
+    acting = collector(env)
+    acting.epsilon = 0.0
+    acting.collect(LIMIT - 1)
+    assert acting.finished() == {}
+    acting.collect(1)
+    finished = acting.finished()
+    assert finished["episode_length"] == LIMIT
+    assert abs(finished["score"]) < 1e-4  # a still, hanging pole has cos(theta / 2) = 0
+    assert acting.finished() == {}
+
+
+def test_equal_seeds_act_alike_and_others_do_not(make_plant: Callable, make_environment: Callable) -> None:
+    chunks = [
+        collector(make_environment(make_plant(CARTS, seed=5)), seed=seed).collect(5) for seed in (1, 1, 2)
+    ]
+    assert (chunks[0] == chunks[1]).all()
+    assert not torch.equal(chunks[0]["action"], chunks[2]["action"])
+
+
+def test_a_snapshot_goes_on_to_the_bit(make_plant: Callable, make_environment: Callable) -> None:
+    def build(seed: int) -> Collector:
+        return collector(make_environment(make_plant(CARTS, seed=seed), time_limit=LIMIT), seed=seed)
+
+    first, second = build(1), build(2)
+    first.collect(LIMIT + 3)
+    acting, plant = first.snapshot(), first.env.plant.snapshot()
+    ahead = first.collect(2 * LIMIT)
+    second.restore(acting)
+    second.env.plant.restore(plant)
+    assert (second.collect(2 * LIMIT) == ahead).all()
+    assert second.finished() == first.finished()

@@ -1,0 +1,219 @@
+"""The training loop: what it counts, when it evaluates, what it converges to, that it resumes to the bit."""
+
+import io
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+
+from cartpole_rl.agents import AgentSettings, QAgent
+from cartpole_rl.learning.randomness import seed_everything
+from cartpole_rl.learning.settings import LearningSettings, OptimizerSettings, ReplaySettings
+from cartpole_rl.learning.training import Scalars, Training
+from cartpole_rl.tasks.episode import Episode
+
+LEARNING = {
+    "frames": 1024,
+    "carts": 16,
+    "chunk": 4,
+    "updates": 2,
+    "batch_size": 32,
+    "n_step": 3,
+    "warmup_frames": 128,
+    "epsilon": (0.5, 0.1),
+    "epsilon_frames": 400,
+    "evaluations": 4,
+    "evaluation_episodes": 2,
+    "checkpoint_interval": 2,
+}
+REPLAY = {"kind": "prioritized", "size": 500, "alpha": 0.3, "beta": (0.4, 1.0), "priority_eps": 1e-3}
+OPTIMIZER = {
+    "kind": "adam",
+    "learning_rate": 1e-3,
+    "learning_rate_end": 0.05,
+    "weight_decay": 0.0,
+    "max_grad_norm": 10.0,
+}
+AGENT = {
+    "hidden": (16,),
+    "layer_norm": True,
+    "gamma": 0.9,
+    "double": True,
+    "loss": "smooth_l1",
+    "target_tau": 0.05,
+    "target_period": None,
+}
+
+
+def episode(score: float) -> Episode:
+    """One that is worth `score`."""
+    rest, step = np.zeros(2), np.zeros(1)
+    return Episode(rest, rest, rest, rest, rest, step.astype(int), step + score, step, step, "time")
+
+
+class Listener:
+    """A monitor that keeps what it is told."""
+
+    def __init__(self) -> None:
+        self.scalars: list[tuple[int, Scalars]] = []
+        self.judged: list[tuple[int, bool]] = []
+        self.snapshots: list[tuple[int, bytes]] = []
+
+    def learned(self, frames: int, scalars: Scalars) -> None:
+        self.scalars.append((frames, scalars))
+
+    def evaluated(self, training: Training, episodes: Sequence[Episode], is_best: bool) -> None:
+        self.judged.append((training.frames, is_best))
+
+    def checkpoint(self, training: Training) -> None:
+        file = io.BytesIO()
+        torch.save(training.snapshot(), file)
+        self.snapshots.append((training.frames, file.getvalue()))
+
+
+@pytest.fixture
+def make_training(make_plant: Callable, make_environment: Callable) -> Callable[..., Training]:
+    def build(
+        learning: dict | None = None,
+        replay: dict | None = None,
+        optimizer: dict | None = None,
+        agent: dict | None = None,
+        evaluate: Callable[[], list[Episode]] = lambda: [episode(1.0)],
+        seed: int = 0,
+        **environment: Any,
+    ) -> Training:
+        seed_everything(seed)
+        env = make_environment(make_plant(16, seed=seed), **{"time_limit": 30, **environment})
+        q_agent = QAgent(
+            AgentSettings(**{**AGENT, **(agent or {})}),
+            env.observation_spec["observation"].shape[-1],
+            len(env.hardware.motors),
+        )
+        return Training(
+            LearningSettings(**{**LEARNING, **(learning or {})}),
+            ReplaySettings(**{**REPLAY, **(replay or {})}),
+            OptimizerSettings(**{**OPTIMIZER, **(optimizer or {})}),
+            q_agent,
+            env,
+            evaluate,
+            Listener(),
+            seed,
+        )
+
+    return build
+
+
+def test_it_counts_frames_and_updates(make_training: Callable[..., Training]) -> None:
+    training = make_training()
+    training.run()
+    assert training.frames == 1024
+    assert len(training.replay) == 500
+    iterations, warmed_up = 1024 // 64, 128 // 64
+    assert training.updates == 2 * (iterations - warmed_up)
+    assert training.progress == 1
+
+
+def test_it_evaluates_evenly_and_checkpoints_every_second_time(
+    make_training: Callable[..., Training],
+) -> None:
+    training = make_training()
+    training.run()
+    assert [frames for frames, _ in training.monitor.judged] == [256, 512, 768, 1024]
+    assert [frames for frames, _ in training.monitor.snapshots] == [512, 1024]
+
+
+def test_the_best_is_the_first_of_the_highest_scores(make_training: Callable[..., Training]) -> None:
+    scores = iter([1.0, 3.0, 2.0, 3.0])
+    training = make_training(evaluate=lambda: [episode(next(scores))])
+    training.run()
+    assert [best for _, best in training.monitor.judged] == [True, True, False, False]
+    assert (training.best_score, training.last_score) == (3.0, 3.0)
+
+
+def test_exploration_falls_from_all_to_the_last_share(make_training: Callable[..., Training]) -> None:
+    training = make_training()
+    training.run()
+    told = {frames: scalars["learning/epsilon"] for frames, scalars in training.monitor.scalars}
+    assert told[64] == told[128] == 1.0  # acted before an update could be made
+    assert told[192] == pytest.approx(0.5)  # 128 frames were seen
+    assert told[192 + 64] == pytest.approx(0.5 - 0.4 * 64 / 400)
+    assert told[1024] == pytest.approx(0.1)
+
+
+def test_learning_rate_and_beta_reach_their_ends(make_training: Callable[..., Training]) -> None:
+    training = make_training()
+    training.run()
+    assert training.optimizer.param_groups[0]["lr"] == pytest.approx(5e-5)
+    assert training.replay.sampler.beta == pytest.approx(1.0)
+
+
+def test_gradients_are_clipped(make_training: Callable[..., Training]) -> None:
+    training = make_training(optimizer={"max_grad_norm": 1e-6})
+    training.run()
+    squares = [(weight.grad**2).sum() for weight in training.weights]
+    assert torch.stack(squares).sum().sqrt().item() <= 1.001e-6
+
+
+def test_a_time_limit_does_not_end_the_world(make_training: Callable[..., Training]) -> None:
+    """With 1 a step and gamma = 0.5 every state is worth 2, since episodes of 6 steps are only cut short."""
+    training = make_training(
+        learning={"frames": 6400, "updates": 4, "n_step": 2},
+        agent={"gamma": 0.5},
+        optimizer={"learning_rate": 1e-2},
+        reward={"kind": "constant", "scale": 1.0, "track_penalty": 0.0},
+        time_limit=6,
+    )
+    training.run()
+    seen = training.replay.sample()["observation"]
+    values = training.agent.actor(TensorDict({"observation": seen}, [len(seen)]))["action_value"]
+    assert values.mean().item() == pytest.approx(2.0, abs=0.02)
+    assert values.std().item() < 0.05
+
+
+@pytest.mark.parametrize(
+    ("replay", "agent", "optimizer"),
+    [
+        ("prioritized", {}, "adam"),
+        ("uniform", {}, "adamw"),
+        ("prioritized", {"target_tau": None, "target_period": 7, "double": False}, "adamw"),
+    ],
+)
+def test_a_resumed_training_ends_with_the_same_weights(
+    make_training: Callable[..., Training], replay: str, agent: dict, optimizer: str
+) -> None:
+    def build(seed: int) -> Training:
+        kinds = {"replay": {"kind": replay}, "optimizer": {"kind": optimizer}, "agent": agent}
+        return make_training(seed=seed, **kinds)
+
+    whole = build(seed=0)
+    whole.run()
+    frames, state = whole.monitor.snapshots[0]
+    assert frames == 512
+
+    resumed = build(seed=1)  # every generator stands elsewhere
+    resumed.restore(torch.load(io.BytesIO(state), weights_only=True))
+    resumed.run()
+    assert resumed.updates == whole.updates
+    ends = [training.agent.state_dict() for training in (whole, resumed)]
+    assert ends[0].keys() == ends[1].keys()
+    for name, weight in ends[0].items():
+        assert torch.equal(weight, ends[1][name]), name
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"frames": 100},
+        {"n_step": 5},
+        {"carts": 0},
+        {"epsilon": (1.5, 0.1)},
+        {"evaluations": 17},
+        {"speed": 1},
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(wrong: dict) -> None:
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        LearningSettings(**{**LEARNING, **wrong})

@@ -1,0 +1,130 @@
+"""What the integrators and the frictions do to the energy."""
+
+import math
+from collections.abc import Callable
+from itertools import pairwise, product
+
+import pytest
+import torch
+from torch import Tensor
+
+from cartpole_rl.physics.actuator import Actuator
+from cartpole_rl.physics.dynamics import Integrator, Models, State, advance, energy, mechanism
+from cartpole_rl.physics.friction import CartFriction, PoleFriction
+from cartpole_rl.physics.parameters import CartParameters
+
+MakeCart = Callable[..., CartParameters]
+FRICTIONLESS = Models(CartFriction.NONE, PoleFriction.NONE, Actuator.NEWTONS)
+EXPLICIT = FRICTIONLESS._replace(integrator=Integrator.EXPLICIT)
+
+
+def random_states(count: int) -> State:
+    generator = torch.Generator().manual_seed(0)
+    unit = 2 * torch.rand((count, 4), generator=generator, dtype=torch.float64) - 1
+    return State(*(unit * torch.tensor([0.2, 0.5, math.pi, 6.0], dtype=torch.float64)).unbind(1))
+
+
+def coast(state: State, cart: CartParameters, models: Models, step: float, seconds: float) -> list[State]:
+    """The states that follow when nothing drives the cart, the first one included."""
+    body, no_force, states = mechanism(cart), torch.zeros_like(state.x), [state]
+    for _ in range(round(seconds / step)):
+        states.append(advance(states[-1], no_force, cart, body, models, step))
+    return states
+
+
+def energies(states: list[State], cart: CartParameters) -> Tensor:
+    """[T, N], J."""
+    return torch.stack([energy(state, cart) for state in states])
+
+
+class TestIntegrators:
+    def swings(self, make_cart: MakeCart) -> tuple[State, CartParameters]:
+        """Swings about hanging, without horizontal momentum."""
+        state, cart = random_states(64), make_cart(64)
+        share = cart.first_moment / cart.total_mass
+        state = state._replace(x_dot=-share * torch.cos(state.theta) * state.theta_dot)
+        below_the_top = energy(state, cart) < 0.8 * energy(State(*torch.zeros(4, 64).unbind()), cart)
+        count = int(below_the_top.sum())
+        assert count > 30
+        return State(*(value[below_the_top] for value in state)), make_cart(count)
+
+    @pytest.mark.parametrize(("step", "bound"), [(0.02, 0.1), (0.01, 0.05), (0.005, 0.025)])
+    def test_semi_implicit_drift_is_bounded_and_falls_with_the_step(
+        self, make_cart: MakeCart, step: float, bound: float
+    ) -> None:
+        """In 10 s, the pole being worth 0.22 J upright and -0.22 J hanging. It drifts down rather than up."""
+        state, cart = self.swings(make_cart)
+        drift = energies(coast(state, cart, FRICTIONLESS, step, 10), cart) - energy(state, cart)
+        assert drift.abs().max() < bound
+        assert drift.max() < 0.4 * bound
+
+    def test_semi_implicit_never_gives_a_swing_energy(self, make_cart: MakeCart) -> None:
+        state, cart = self.swings(make_cart)
+        drift = energies(coast(state, cart, FRICTIONLESS, 0.02, 60), cart) - energy(state, cart)
+        assert drift.max() < 0.04
+
+    def test_explicit_energy_grows_without_end(self, make_cart: MakeCart) -> None:
+        state, cart = random_states(64), make_cart(64)
+        drift = energies(coast(state, cart, EXPLICIT, 0.02, 60), cart)[:: round(20 / 0.02)] - energy(
+            state, cart
+        )
+        for earlier, later in pairwise(drift):
+            assert (later > earlier + 0.1).all()
+
+    def test_a_hanging_pole_reaches_the_top_by_itself_under_explicit_euler_alone(
+        self, make_cart: MakeCart
+    ) -> None:
+        """Thesis 3.1.3. It starts 3 degrees from hanging, at rest, at the control period of 0.02 s."""
+        cart, zero = make_cart(), torch.zeros(1, dtype=torch.float64)
+        start = State(zero, zero, zero + math.pi + 0.05, zero)
+        farthest = {
+            models.integrator: max(
+                abs(state.theta.item() - math.pi) for state in coast(start, cart, models, 0.02, 20)
+            )
+            for models in (FRICTIONLESS, EXPLICIT)
+        }
+        assert farthest[Integrator.EXPLICIT] > math.pi
+        assert farthest[Integrator.SEMI_IMPLICIT] == pytest.approx(0.05, rel=0.01)
+
+
+POLES = [
+    {"pole_friction": PoleFriction.NONE},
+    {"pole_friction": PoleFriction.EXPONENTIAL},
+    {"pole_friction": PoleFriction.EXPONENTIAL_DRAG, "pole_presses": True},
+]
+
+
+@pytest.mark.parametrize(("step", "seconds"), [(0.02, 8), (0.01, 4), (0.002, 2)])
+def test_a_coasting_cart_never_gains_energy(make_cart: MakeCart, step: float, seconds: float) -> None:
+    """But for what the integrator errs by: 1.5 times what the same start errs by without friction."""
+    cart, start = make_cart(64), random_states(64)
+    frictionless = energies(coast(start, cart, FRICTIONLESS, step, seconds), cart)
+    error = frictionless.max(0).values - frictionless.min(0).values
+    for law, pole in product(CartFriction, POLES):
+        models = FRICTIONLESS._replace(cart_friction=law, **pole)
+        if models == FRICTIONLESS:
+            continue
+        course = energies(coast(start, cart, models, step, seconds), cart)
+        rise = (course - torch.cummin(course, 0).values).max(0).values
+        assert (rise <= 1.5 * error).all(), models
+        assert course[-1].mean() < frictionless[-1].mean(), models
+
+
+@pytest.mark.parametrize("model", [CartFriction.STEP, CartFriction.STRIBECK])
+@pytest.mark.parametrize("step", [0.02, 0.01, 0.002])
+def test_sticking_friction_takes_kinetic_energy_out_of_every_single_step(
+    make_cart: MakeCart, model: CartFriction, step: float
+) -> None:
+    """Exactly: the velocities it leaves, in the configuration they act in, hold no more than without it."""
+    cart, start = make_cart(4000, cart_viscous=0.0), random_states(4000)
+    slow = start._replace(x_dot=0.02 * start.x_dot)  # where the cart stops or turns within the step
+    for state in (start, slow):
+        (_, free), (_, rubbed) = (
+            coast(state, cart, FRICTIONLESS._replace(cart_friction=law), step, step)
+            for law in (CartFriction.NONE, model)
+        )
+        before, after = (
+            energy(state._replace(x_dot=end.x_dot, theta_dot=end.theta_dot), cart) for end in (free, rubbed)
+        )
+        assert (after <= before + 1e-15).all()
+        assert (after < before - 1e-6).any()

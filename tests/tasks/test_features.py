@@ -1,0 +1,81 @@
+"""From encoder counts to the measured state and the observation."""
+
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cartpole_rl.tasks.features import (
+    CART_METRES_PER_COUNT,
+    POLE_COUNTS_PER_TURN,
+    ObservationKind,
+    measured_position,
+    measured_velocity,
+    observation_size,
+    observe,
+)
+
+
+def counts(cart: int, pole: int) -> torch.Tensor:
+    return torch.tensor([[cart, pole]])
+
+
+class TestPosition:
+    def test_a_turn_is_4096_counts(self) -> None:
+        x, theta = measured_position(counts(1000, 1024))
+        assert x.item() == pytest.approx(1000 * 2.2749e-5)
+        assert theta.item() == pytest.approx(math.pi / 2)
+
+    def test_travel_is_that_of_the_real_cart(self) -> None:
+        travel = 35782 * CART_METRES_PER_COUNT
+        assert travel == pytest.approx(0.814, abs=1e-4)
+
+    @given(
+        angle=st.integers(-2048, 2047), turns=st.integers(-(2**30), 2**30), cart=st.integers(-(2**20), 2**20)
+    )
+    def test_turns_do_not_matter(self, angle: int, turns: int, cart: int) -> None:
+        x, theta = measured_position(counts(cart, angle + turns * POLE_COUNTS_PER_TURN))
+        assert theta.item() == pytest.approx(angle * 2 * math.pi / 4096, abs=1e-6)
+        assert x.item() == pytest.approx(cart * CART_METRES_PER_COUNT, rel=1e-6)
+
+    @pytest.mark.parametrize("pole", [2048, -2048, 2048 + 4096])
+    def test_hanging_is_half_a_turn(self, pole: int) -> None:
+        assert abs(measured_position(counts(0, pole))[1].item()) == pytest.approx(math.pi)
+
+    @given(cart=st.integers(-(2**20), 2**20), pole=st.integers(-2047, 2047))
+    def test_left_mirrors_right(self, cart: int, pole: int) -> None:
+        right, left = measured_position(counts(cart, pole)), measured_position(counts(-cart, -pole))
+        assert (right[0] + left[0]).item() == 0
+        assert (right[1] + left[1]).item() == 0
+
+
+class TestVelocity:
+    def test_one_count_in_a_period(self) -> None:
+        x_dot, theta_dot = measured_velocity(counts(1, 1), counts(0, 0), torch.tensor([0.02]))
+        assert x_dot.item() == pytest.approx(1.14e-3, abs=1e-5)
+        assert theta_dot.item() == pytest.approx(0.0767, abs=1e-4)
+
+    def test_is_over_the_time_that_passed(self) -> None:
+        x_dot, _ = measured_velocity(counts(100, 0), counts(-100, 0), torch.tensor([0.04]))
+        assert x_dot.item() == pytest.approx(200 * CART_METRES_PER_COUNT / 0.04)
+
+    def test_does_not_jump_where_the_angle_wraps(self) -> None:
+        _, theta_dot = measured_velocity(counts(0, 2049), counts(0, 2047), torch.tensor([0.02]))
+        assert theta_dot.item() == pytest.approx(2 * 2 * math.pi / 4096 / 0.02)
+
+
+class TestObservation:
+    state = torch.tensor([[0.19, -0.5, math.pi / 6, 4.0], [0.0, 0.0, -3.0, -8.0]])
+
+    def test_raw_is_the_four_numbers(self) -> None:
+        torch.testing.assert_close(observe(self.state, ObservationKind.RAW), self.state)
+
+    def test_cos_sin_is_scaled_to_about_one(self) -> None:
+        first = observe(self.state, ObservationKind.COS_SIN)[0]
+        torch.testing.assert_close(first, torch.tensor([0.5, -0.5, math.sqrt(3) / 2, 0.5, 0.5]))
+
+    @pytest.mark.parametrize("kind", ObservationKind)
+    def test_size(self, kind: ObservationKind) -> None:
+        assert observe(self.state, kind).shape == (2, observation_size(kind))

@@ -1,0 +1,81 @@
+"""Rewards (5.1) to (5.5) and scores (6.1), (6.2), by hand."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from cartpole_rl.tasks.rewards import REWARDS, SCORE, SCORE_UPRIGHT, Reward
+
+X_MAX = 0.4
+DEGREE = math.pi / 180
+
+
+def value(
+    kind: Reward, x: float = 0.0, theta: float = 0.0, theta_dot: float = 0.0, x_dot: float = 0.0
+) -> float:
+    state = torch.tensor([[x, x_dot, theta, theta_dot]], dtype=torch.float64)
+    return REWARDS[kind](state, X_MAX).item()
+
+
+def random_states(count: int) -> Tensor:
+    unit = 2 * torch.rand((count, 4), generator=torch.Generator().manual_seed(0), dtype=torch.float64) - 1
+    return unit * torch.tensor([X_MAX, 2.0, math.pi, 10.0], dtype=torch.float64)
+
+
+@pytest.mark.parametrize(
+    ("kind", "state", "expected"),
+    [
+        (Reward.CONSTANT, {"x": 0.3, "theta": 2.0}, 1.0),
+        (Reward.COSINE, {"theta": math.pi / 3}, math.sqrt(3) / 2),
+        (Reward.COSINE, {"theta": math.pi}, 0.0),
+        (Reward.LINEAR_ANGLE, {"theta": math.pi / 4}, 0.75),
+        (Reward.LINEAR_ANGLE, {"theta": -math.pi}, 0.0),
+        (Reward.POSITION, {"theta": math.pi / 3, "x": 0.1}, math.sqrt(3) / 2 * 0.75),
+        (Reward.POSITION, {"x": X_MAX}, 0.0),
+        (Reward.POSITION, {"x": 1.5 * X_MAX}, 0.0),
+        (Reward.UPRIGHT_BONUS, {"theta": 11.9 * DEGREE, "x": 0.1}, math.cos(5.95 * DEGREE) * 0.75 + 10),
+        (Reward.UPRIGHT_BONUS, {"theta": 12.1 * DEGREE, "x": 0.1}, math.cos(6.05 * DEGREE) * 0.75),
+        (Reward.SCORE, {"theta": 4.9 * DEGREE, "theta_dot": 5.9 * DEGREE}, math.cos(2.45 * DEGREE) + 10),
+        (Reward.SCORE, {"theta": 4.9 * DEGREE, "theta_dot": 6.1 * DEGREE}, math.cos(2.45 * DEGREE) + 5),
+        (Reward.SCORE, {"theta": 5.1 * DEGREE, "theta_dot": 0.0}, math.cos(2.55 * DEGREE)),
+        (Reward.SCORE, {"theta": math.pi}, 0.0),
+    ],
+)
+def test_value(kind: Reward, state: dict[str, float], expected: float) -> None:
+    assert value(kind, **state) == pytest.approx(expected, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("kind", "most"),
+    [
+        (Reward.CONSTANT, 1),
+        (Reward.COSINE, 1),
+        (Reward.LINEAR_ANGLE, 1),
+        (Reward.POSITION, 1),
+        (Reward.UPRIGHT_BONUS, 11),
+        (Reward.SCORE, 11),
+    ],
+)
+def test_most_is_earned_upright_in_the_middle_and_least_is_zero(kind: Reward, most: float) -> None:
+    assert value(kind) == most
+    values = REWARDS[kind](random_states(10_000), X_MAX)
+    assert values.max() <= most
+    assert values.min() >= 0
+
+
+def test_scores_of_an_episode_are_at_most_500_and_5500() -> None:
+    """The thesis says 5000 for (6.2); 500 steps of 11 are 5500."""
+    assert 500 * value(SCORE_UPRIGHT) == 500
+    assert 500 * value(SCORE) == 5500
+
+
+@pytest.mark.parametrize("kind", Reward)
+def test_left_and_right_are_worth_the_same(kind: Reward) -> None:
+    states = random_states(1000)
+    torch.testing.assert_close(REWARDS[kind](states, X_MAX), REWARDS[kind](-states, X_MAX))
+
+
+def test_every_reward_has_its_function() -> None:
+    assert set(REWARDS) == set(Reward)
