@@ -1,11 +1,10 @@
 """A DQN agent: the Q-network as a TorchRL actor, its loss with a target network, and its greedy policy."""
 
-import copy
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
-from tensordict.nn import TensorDictModule
 from torch import nn
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torchrl.data import Categorical
 from torchrl.modules import QValueActor
 from torchrl.objectives import DQNLoss, HardUpdate, SoftUpdate
@@ -25,6 +24,7 @@ class AgentSettings(Settings):
     loss: Literal["l2", "smooth_l1"]
     target_tau: Annotated[float, Field(gt=0, le=1)] | None  # Polyak averaging each update
     target_period: Count | None  # or a copy every so many updates
+    average_decay: Annotated[float, Field(gt=0, lt=1)] | None  # of the weights that the greedy policy acts with
 
     @model_validator(mode="after")
     def _one_way_to_move_the_target(self) -> "AgentSettings":
@@ -49,7 +49,8 @@ class QAgent(nn.Module):
             action_space="categorical",
         )
         self.loss.make_value_estimator(gamma=settings.gamma)
-        self.target_updater = self._make_target_updater()  # call its `step` once after each gradient step
+        self.target_updater = self._make_target_updater()
+        self.average = self._make_average()
 
     def _make_target_updater(self) -> TargetNetUpdater:
         if self.settings.target_tau is not None:
@@ -58,14 +59,23 @@ class QAgent(nn.Module):
         # HardUpdate fires on every (interval + 1)th step
         return HardUpdate(self.loss, value_network_update_interval=self.settings.target_period - 1)
 
-    def greedy_policy(self) -> TensorDictModule:
+    def _make_average(self) -> AveragedModel | None:
+        decay = self.settings.average_decay
+        if decay is None:
+            return None
+        return AveragedModel(self.actor, multi_avg_fn=get_ema_multi_avg_fn(decay))
+
+    def follow(self) -> None:
+        """Move the target network and the average towards the online network; once after each gradient step."""
+        self.target_updater.step()
+        if self.average is not None:
+            self.average.update_parameters(self.actor)
+
+    def greedy_policy(self) -> nn.Module:
         """The policy that is evaluated and exported; it follows the weights as they learn.
 
-        With Polyak averaging this is the averaged (target) network, which forgets less from one update to the
-        next; with periodic copies the online one, since the copy is stale.
+        With `average_decay` it acts with an exponential average of the online weights over about
+        1 / (1 - decay) updates: single updates make the policy lose a start here and there, their mean does
+        not (Izmailov et al., "Averaging weights leads to wider optima", 2018). Without, it is the online network.
         """
-        if self.settings.target_tau is None:
-            return self.actor
-        averaged = copy.deepcopy(self.actor)
-        self.loss.target_value_network_params.to_module(averaged)
-        return averaged
+        return self.actor if self.average is None else self.average.module

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from hydra.core.hydra_config import HydraConfig
 
-from cartpole_rl.commands.application import application
+from cartpole_rl.commands.application import application, tell
 from cartpole_rl.commands.build import check_compiler, new_agent, recorded_config, simulated_env, use_threads
 from cartpole_rl.commands.config import TrainConfig
 from cartpole_rl.commands.monitor import TrainingMonitor
@@ -22,6 +22,7 @@ from cartpole_rl.evaluation.episodes import Policy, run_episodes
 from cartpole_rl.learning.checkpoints import TrainingCheckpoint, load_training
 from cartpole_rl.learning.randomness import seed_everything
 from cartpole_rl.learning.training import Training
+from cartpole_rl.physics.dynamics import unused_parameters
 from cartpole_rl.randomization import PoleSettings
 from cartpole_rl.tasks.episode import Episode
 
@@ -39,6 +40,7 @@ def main(config: TrainConfig, folder: Path) -> None:
     use_threads(config.threads)
     seed_everything(config.seed)
     env = simulated_env(config, config.plant, config.learning.carts, config.task.start, config.seed)
+    note_unused_randomization(config)
     agent = new_agent(config)
     evaluate = partial(judge, nominal_envs(config), agent.greedy_policy(), config.seed + EVALUATION_SEED)
     write_config(folder, config.model_dump(mode="json"), resumed=resumed is not None)
@@ -77,6 +79,13 @@ def resumed_training(config: TrainConfig, folder: Path) -> TrainingCheckpoint | 
     if not folder.samefile(config.resume):
         raise ConfigError("resume goes on in that run's own folder; leave out hydra.run.dir")
     return checkpoint
+
+
+def note_unused_randomization(config: TrainConfig) -> None:
+    """Say which randomized parameters the chosen laws do not read; drawing them has no effect."""
+    if unused := sorted(unused_parameters(config.models(config.plant)) & set(config.randomization)):
+        chosen = f"{config.cart_friction.model}, {config.pole_friction.model}, {config.actions.actuator}"
+        tell("train", f"note: randomization of {', '.join(unused)} has no effect with {chosen}")
 
 
 def nominal_envs(config: TrainConfig) -> list[CartPoleEnv]:

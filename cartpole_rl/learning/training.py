@@ -63,7 +63,6 @@ class Training:
         self.optimizer = OPTIMIZERS[optimizer.kind](
             self.weights, lr=optimizer.learning_rate, weight_decay=optimizer.weight_decay, fused=True
         )
-        self.target_updater = agent.target_updater
         self.loss = torch.compile(agent.loss.forward, fullgraph=True) if compiled else agent.loss.forward
         self.iteration, self.updates, self.seconds = 0, 0, 0.0
         self.best_score = -float("inf")
@@ -127,7 +126,7 @@ class Training:
         loss.backward()
         norm = nn.utils.clip_grad_norm_(self.weights, self.optimizer_settings.max_grad_norm)
         self.optimizer.step()
-        self.target_updater.step()
+        self.agent.follow()
         if self.replay_settings.kind == "prioritized":
             self.replay.update_tensordict_priority(batch)
         self.updates += 1
@@ -168,7 +167,7 @@ class Training:
             "seconds": self.seconds,
             "scores": [self.best_score, self.last_score],
             "agent": self.agent.state_dict(),
-            "target_updater": self.target_updater.state_dict(),
+            "target_updater": self.agent.target_updater.state_dict(),
             "optimizer": self.optimizer.state_dict(),
             "replay": replay_snapshot(self.replay),
             "collector": self.collector.snapshot(),
@@ -182,7 +181,7 @@ class Training:
         self.seconds = snapshot["seconds"]
         self.best_score, self.last_score = snapshot["scores"]
         self.agent.load_state_dict(snapshot["agent"])
-        self.target_updater.load_state_dict(snapshot["target_updater"])
+        self.agent.target_updater.load_state_dict(snapshot["target_updater"])
         self.optimizer.load_state_dict(snapshot["optimizer"])
         restore_replay(self.replay, snapshot["replay"])
         self.collector.restore(snapshot["collector"])

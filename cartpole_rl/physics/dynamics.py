@@ -23,6 +23,8 @@ from cartpole_rl.physics.friction import (
 )
 from cartpole_rl.physics.parameters import GRAVITY, CartParameters
 
+SHAPES = ("cart_stiction_ratio", "stribeck_velocity", "sigmoid_slope")  # of the dry friction's curve
+
 
 class State(NamedTuple):
     """True state of N carts, [N] each: m, m/s, rad, rad/s."""
@@ -55,6 +57,41 @@ class Models(NamedTuple):
     actuator: Actuator = Actuator.FORCE_CURVE
     integrator: Integrator = Integrator.SEMI_IMPLICIT
     pole_presses: bool = False  # the pole's vertical force changes the cart's normal force
+
+
+UNUSED_BY_CART_FRICTION = {
+    CartFriction.NONE: {"cart_viscous", "cart_coulomb", "cart_coulomb_asymmetry", *SHAPES},
+    CartFriction.LINEAR: {"cart_coulomb", "cart_coulomb_asymmetry", *SHAPES},
+    CartFriction.STEP: set(SHAPES),
+    CartFriction.SIGMOID: {"cart_stiction_ratio", "stribeck_velocity"},
+    CartFriction.STRIBECK: {"sigmoid_slope"},
+}
+UNUSED_BY_POLE_FRICTION = {
+    PoleFriction.NONE: {"pole_viscous", "pole_drag"},
+    PoleFriction.EXPONENTIAL: {"pole_drag"},
+    PoleFriction.EXPONENTIAL_DRAG: set(),
+}
+UNUSED_BY_ACTUATOR = {
+    Actuator.NEWTONS: {
+        "force_quadratic",
+        "force_linear",
+        "force_offset",
+        "force_asymmetry",
+        "deadband_left",
+        "deadband_right",
+        "motor_time_constant",
+    },
+    Actuator.FORCE_CURVE: set(),
+}
+
+
+def unused_parameters(models: Models) -> set[str]:
+    """Fields of CartParameters that these laws do not read, so that drawing them changes nothing."""
+    return (
+        UNUSED_BY_CART_FRICTION[models.cart_friction]
+        | UNUSED_BY_POLE_FRICTION[models.pole_friction]
+        | UNUSED_BY_ACTUATOR[models.actuator]
+    )
 
 
 class Mechanism(NamedTuple):

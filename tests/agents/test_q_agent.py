@@ -6,7 +6,7 @@ import pytest
 import torch
 from pydantic import ValidationError
 from tensordict import TensorDict
-from torch import Tensor
+from torch import Tensor, nn
 
 from cartpole_rl.agents import AgentSettings, QAgent
 from cartpole_rl.agents.network import QNetwork
@@ -19,6 +19,7 @@ DQN = {
     "loss": "l2",
     "target_tau": 0.25,
     "target_period": None,
+    "average_decay": 0.5,
 }
 
 
@@ -148,33 +149,51 @@ def test_a_soft_update_moves_by_tau() -> None:
     assert torch.allclose(target_weights(agent), 0.75 * before + 0.25 * online_weights(agent), atol=1e-6)
 
 
-def test_the_greedy_policy_follows_the_averaged_weights_as_they_move() -> None:
-    agent = make_agent()
+def policy_weights(policy: nn.Module) -> Tensor:
+    return torch.cat([weight.detach().flatten() for weight in policy.parameters()])
+
+
+def actor_weights(agent: QAgent) -> Tensor:
+    return policy_weights(agent.actor)
+
+
+def test_the_greedy_policy_acts_with_the_average_of_the_weights_as_they_move() -> None:
+    agent = make_agent(average_decay=0.75)
     policy = agent.greedy_policy()
-    observation = torch.randn(200, 3)
+    disturb(agent)
+    agent.follow()
+    expected = actor_weights(agent)  # the first update is the average itself
     for _ in range(3):
+        assert torch.allclose(policy_weights(policy), expected, atol=1e-6)
         disturb(agent)
-        agent.target_updater.step()
-        taken = policy(TensorDict({"observation": observation}, [200]))["action"]
-        assert torch.equal(taken, values_of(agent, observation, target=True).argmax(1))
-        assert not torch.equal(taken, values_of(agent, observation, target=False).argmax(1))
+        agent.follow()
+        expected = 0.75 * expected + 0.25 * actor_weights(agent)
+
+
+def test_following_moves_the_target_network_too() -> None:
+    agent = make_agent(target_tau=0.25)
+    disturb(agent)
+    before = target_weights(agent)
+    agent.follow()
+    assert torch.allclose(target_weights(agent), 0.75 * before + 0.25 * online_weights(agent), atol=1e-6)
 
 
 def test_the_greedy_policy_follows_weights_that_are_loaded_later() -> None:
     trained, agent = make_agent(), make_agent()
-    disturb(trained)
-    trained.target_updater.step()
+    for _ in range(2):
+        disturb(trained)
+        trained.follow()
     policy = agent.greedy_policy()
     agent.load_state_dict(trained.state_dict())
-    observation = torch.randn(200, 3)
-    taken = policy(TensorDict({"observation": observation}, [200]))["action"]
-    assert torch.equal(taken, values_of(trained, observation, target=True).argmax(1))
+    assert torch.equal(policy_weights(policy), policy_weights(trained.greedy_policy()))
+    assert not torch.equal(policy_weights(policy), actor_weights(trained))
 
 
-def test_with_periodic_copies_the_greedy_policy_is_the_online_network() -> None:
-    agent = make_agent(target_tau=None, target_period=5)
+def test_without_an_average_the_greedy_policy_is_the_online_network() -> None:
+    agent = make_agent(target_tau=None, target_period=5, average_decay=None)
     policy = agent.greedy_policy()
     disturb(agent)
+    agent.follow()
     observation = torch.randn(200, 3)
     taken = policy(TensorDict({"observation": observation}, [200]))["action"]
     assert torch.equal(taken, values_of(agent, observation, target=False).argmax(1))

@@ -44,6 +44,7 @@ AGENT = {
     "double": True,
     "loss": "smooth_l1",
     "target_tau": 0.05,
+    "average_decay": 0.9,
     "target_period": None,
 }
 

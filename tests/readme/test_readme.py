@@ -24,7 +24,11 @@ BUDGET = [
     "learning.evaluation_episodes=2",
     "replay.size=2000",
 ]
-COMMANDS = re.findall(r"^    ((?:cartpole-|tensorboard|\./scripts/|pip ).*?)(?:\s+#.*)?$", (ROOT / "README.md").read_text(), re.M)
+COMMANDS = re.findall(
+    r"^    ((?:cartpole-|tensorboard|\./scripts/|pip ).*?)(?:\s+#.*)?$",
+    (ROOT / "README.md").read_text(),
+    re.M,
+)
 
 
 def run(command: str, *more: str, cwd: Path) -> subprocess.CompletedProcess[str]:

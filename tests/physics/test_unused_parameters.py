@@ -1,0 +1,47 @@
+"""What `unused_parameters` names has no effect, and everything else has one somewhere."""
+
+import pytest
+import torch
+
+from cartpole_rl.physics.actuator import Actuator
+from cartpole_rl.physics.dynamics import Drive, Models, State, run_period, unused_parameters
+from cartpole_rl.physics.friction import CartFriction, PoleFriction
+from cartpole_rl.physics.parameters import CartParameters
+
+MODELS = [
+    Models(cart, pole, actuator) for cart in CartFriction for pole in PoleFriction for actuator in Actuator
+]
+
+
+def end_state(cart: CartParameters, models: Models) -> torch.Tensor:
+    carts = cart.batch_size[0]
+    state = State(*(torch.full((carts,), value, dtype=torch.float64) for value in (0.0, 0.3, 2.0, 4.0)))
+    motors = torch.tensor([120.0, -180.0], dtype=torch.float64).unsqueeze(1).repeat(1, carts)
+    drive = Drive(torch.zeros(carts, dtype=torch.float64), motors)
+    latency = torch.full((carts,), 0.005, dtype=torch.float64)
+    state, _ = run_period(state, drive, latency, cart, models, 0.02, 4)
+    return torch.stack(state)
+
+
+@pytest.mark.parametrize("models", MODELS, ids=lambda models: "-".join(models[:3]))
+def test_a_parameter_that_is_named_changes_nothing(models: Models, make_cart) -> None:
+    reference = end_state(make_cart(), models)
+    for name in unused_parameters(models):
+        changed = make_cart(**{name: 1.5 * float(getattr(make_cart(), name)[0]) + 0.01})
+        assert torch.equal(end_state(changed, models), reference), name
+
+
+@pytest.mark.parametrize(
+    ("name", "models"),
+    [
+        ("cart_coulomb", Models(cart_friction=CartFriction.STEP)),
+        ("cart_viscous", Models(cart_friction=CartFriction.LINEAR)),
+        ("sigmoid_slope", Models(cart_friction=CartFriction.SIGMOID)),
+        ("pole_drag", Models(pole_friction=PoleFriction.EXPONENTIAL_DRAG)),
+        ("force_linear", Models(actuator=Actuator.FORCE_CURVE)),
+    ],
+)
+def test_a_parameter_that_is_not_named_acts(name: str, models: Models, make_cart) -> None:
+    assert name not in unused_parameters(models)
+    changed = make_cart(**{name: 1.5 * float(getattr(make_cart(), name)[0]) + 0.01})
+    assert not torch.equal(end_state(changed, models), end_state(make_cart(), models))
