@@ -1,0 +1,98 @@
+"""Every choice of every group composes, is read to the last key, and describes a cart that can be made."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import hydra
+import pytest
+import yaml
+from hydra.core.global_hydra import GlobalHydra
+from omegaconf import OmegaConf
+
+from cartpole_rl.commands.application import as_mapping
+from cartpole_rl.commands.build import evaluated_settings
+from cartpole_rl.commands.composition import conf_folder
+from cartpole_rl.commands.config import EmulateConfig, EvaluateConfig, TrainConfig, checked
+
+CONF = conf_folder()
+GROUPS = sorted(path.name for path in CONF.iterdir() if path.is_dir() and path.name != "hydra")
+CHOICES = [f"{group}={path.stem}" for group in GROUPS for path in sorted((CONF / group).glob("*.yaml"))]
+OF_EVALUATION = ("emulator", "plant")  # groups with choices that training does not take
+REPLACEABLE = ("task", "pole", "cart_friction", "pole_friction", "reward", "randomization", "cart")
+
+
+def group_of(choice: str) -> str:
+    return choice.split("=")[0]
+
+
+@pytest.fixture(autouse=True, scope="module")
+def composer() -> Iterator[None]:
+    GlobalHydra.instance().clear()
+    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
+        yield
+
+
+def composed(name: str, *overrides: str) -> dict[str, Any]:
+    return as_mapping(hydra.compose(name, list(overrides)))
+
+
+@pytest.fixture(scope="module")
+def trained() -> TrainConfig:
+    return checked(TrainConfig, composed("train"))
+
+
+@pytest.mark.parametrize("chosen", [case for case in CHOICES if group_of(case) not in OF_EVALUATION])
+def test_training_takes_it(chosen: str) -> None:
+    config = checked(TrainConfig, composed("train", chosen))
+    randomizer = config.randomizer()
+    assert float(randomizer.nominal.abs().sum()) > 0
+    assert config.models(config.plant).integrator
+
+
+@pytest.mark.parametrize("chosen", [case for case in CHOICES if group_of(case) in REPLACEABLE])
+def test_an_evaluation_takes_it_in_place_of_the_agents_own(chosen: str, trained: TrainConfig) -> None:
+    config = checked(EvaluateConfig, composed("evaluate", "run=somewhere", chosen))
+    settings = evaluated_settings(trained, config)
+    settings.randomizer()
+    wanted = checked(TrainConfig, composed("train", chosen))
+    group = group_of(chosen)
+    if group not in ("cart_friction", "pole_friction"):  # whose numbers are then the cart's
+        assert getattr(settings, group) == getattr(wanted, group)
+    assert settings.nominal == wanted.nominal
+
+
+@pytest.mark.parametrize("plant", ["simulated", "emulated", "serial plant.port=/dev/ttyUSB0"])
+def test_an_evaluation_takes_each_plant(plant: str) -> None:
+    config = checked(EvaluateConfig, composed("evaluate", "run=somewhere", *f"plant={plant}".split()))
+    assert config.plant.kind == plant.split()[0]
+
+
+def test_the_emulated_carts_differ_in_the_pole_alone() -> None:
+    medium, large = (
+        checked(EmulateConfig, composed("emulate", f"emulator={choice}")).emulator.model_dump()
+        for choice in ("medium", "large")
+    )
+    assert {key for key in medium if medium[key] != large[key]} == {"pole_mass", "pole_com", "pole_inertia"}
+
+
+@pytest.mark.parametrize("name", ["train", "evaluate", "emulate"])
+def test_each_command_has_a_help_page_with_examples(name: str) -> None:
+    page = yaml.safe_load((CONF / f"hydra/help/{name}.yaml").read_text())
+    assert page["app_name"] == f"cartpole-{name}"
+    assert f"cartpole-{name} " in page["template"].split("Examples")[1]
+
+
+@pytest.mark.parametrize("experiment", sorted(path.stem for path in (CONF / "experiment").glob("*.yaml")))
+def test_an_experiment_holds_only_choices_and_differences(experiment: str) -> None:
+    """A line that says what the default says anyway is an error, but for the choices that define it."""
+    content = yaml.safe_load((CONF / f"experiment/{experiment}.yaml").read_text())
+    plain = OmegaConf.create({key: value for key, value in content.items() if key != "defaults"})
+    default = hydra.compose("train")
+    for key in plain:
+        assert plain[key] != default[key], key
+
+
+def test_every_file_says_what_it_is() -> None:
+    for path in CONF.rglob("*.yaml"):
+        if "help" not in path.parts:
+            assert path.read_text().lstrip().startswith("#"), path
