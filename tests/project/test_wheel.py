@@ -1,0 +1,90 @@
+"""The wheel holds conf/ and the console scripts, and what it installs trains and evaluates by itself."""
+
+import json
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+BUDGET = [
+    "learning.frames=512",
+    "learning.carts=16",
+    "learning.chunk=8",
+    "learning.updates=1",
+    "learning.batch_size=16",
+    "learning.warmup_frames=64",
+    "learning.evaluations=1",
+    "learning.evaluation_episodes=1",
+    "replay.size=1000",
+    "compile=false",
+]
+
+
+def pip(*words: str | Path) -> None:
+    done = subprocess.run([sys.executable, "-m", "pip", "--quiet", *words], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("wheel")
+    pip("wheel", "--no-deps", "--no-build-isolation", "--wheel-dir", folder, ROOT)
+    (built,) = folder.glob("*.whl")
+    return built
+
+
+@pytest.fixture(scope="module")
+def installed(wheel: Path) -> Path:
+    """A folder that holds the package as a user's site-packages would."""
+    target = wheel.parent / "site-packages"
+    pip("install", "--no-deps", "--target", target, wheel)
+    return target
+
+
+def run(installed: Path, command: str, *words: str) -> str:
+    """A command of the installed package, in a process that has no other copy of it; its stdout."""
+    environment = {**os.environ, "PYTHONPATH": str(installed), "PYTHONSAFEPATH": "1"}
+    home = installed.parent / "home"
+    home.mkdir(exist_ok=True)
+    done = subprocess.run(
+        [sys.executable, "-m", f"cartpole_rl.commands.{command}", *words],
+        cwd=home,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=200,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_it_holds_the_package_conf_and_the_scripts(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        names = set(archive.namelist())
+        (scripts,) = (archive.read(name).decode() for name in names if name.endswith("entry_points.txt"))
+    shipped = {
+        f"cartpole_rl/conf/{path.relative_to(ROOT / 'conf')}" for path in (ROOT / "conf").rglob("*.yaml")
+    }
+    modules = {str(path.relative_to(ROOT)) for path in (ROOT / "cartpole_rl").rglob("*.py")}
+    assert shipped <= names
+    assert modules <= names
+    assert {name.split("/")[0] for name in names if ".dist-info" not in name} == {"cartpole_rl"}
+    for command in ("train", "evaluate", "emulate"):
+        assert f"cartpole-{command} = cartpole_rl.commands.{command}:main" in scripts
+
+
+def test_what_it_installs_trains_and_evaluates_by_its_own_conf(installed: Path) -> None:
+    """Its own, as is seen by a seed that is changed there alone."""
+    conf = installed / "cartpole_rl/conf/train.yaml"
+    conf.write_text(conf.read_text().replace("\nseed: 0\n", "\nseed: 7\n"))
+    run(installed, "train", *BUDGET, "hydra.run.dir=trained")
+    run(installed, "evaluate", "run=trained", "plant=emulated", "episodes=1", "hydra.run.dir=evaluated")
+    home = installed.parent / "home"
+    assert json.loads((home / "evaluated/metrics.json").read_text())["plant"] == "emulated"
+    provenance = json.loads((home / "trained/provenance.json").read_text())
+    assert provenance["seed"] == 7
+    assert provenance["git_commit"] is None  # it did not run from the checkout
