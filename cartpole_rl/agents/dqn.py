@@ -24,7 +24,9 @@ class AgentSettings(Settings):
     loss: Literal["l2", "smooth_l1"]
     target_tau: Annotated[float, Field(gt=0, le=1)] | None  # Polyak averaging each update
     target_period: Count | None  # or a copy every so many updates
-    average_decay: Annotated[float, Field(gt=0, lt=1)] | None  # of the weights that the greedy policy acts with
+    average_decay: (
+        Annotated[float, Field(gt=0, lt=1)] | None
+    )  # of the weights that the greedy policy acts with
 
     @model_validator(mode="after")
     def _one_way_to_move_the_target(self) -> "AgentSettings":
