@@ -1,4 +1,4 @@
-"""The error tree. Every error that a user can cause says in one line what is wrong and what would be right."""
+"""The error tree. An error that a user can cause says in one line what is wrong and what would be right."""
 
 
 class CartPoleError(Exception):

@@ -68,7 +68,7 @@ class QAgent(nn.Module):
         return AveragedModel(self.actor, multi_avg_fn=get_ema_multi_avg_fn(decay))
 
     def follow(self) -> None:
-        """Move the target network and the average towards the online network; once after each gradient step."""
+        """Move the target network and the average towards the online one; once after each gradient step."""
         self.target_updater.step()
         if self.average is not None:
             self.average.update_parameters(self.actor)
@@ -78,6 +78,6 @@ class QAgent(nn.Module):
 
         With `average_decay` it acts with an exponential average of the online weights over about
         1 / (1 - decay) updates: single updates make the policy lose a start here and there, their mean does
-        not (Izmailov et al., "Averaging weights leads to wider optima", 2018). Without, it is the online network.
+        not (Izmailov et al., "Averaging weights leads to wider optima", 2018). Without, it is the online one.
         """
         return self.actor if self.average is None else self.average.module

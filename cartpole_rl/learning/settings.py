@@ -28,7 +28,7 @@ class OptimizerSettings(Settings):
 
 
 class LearningSettings(Settings):
-    """The training loop: an iteration collects `chunk` periods on every cart, then makes `updates` updates."""
+    """The training loop: an iteration collects `chunk` periods on each cart, then makes `updates` updates."""
 
     frames: Count  # transitions in all
     carts: Count  # simulated in parallel

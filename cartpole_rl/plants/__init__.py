@@ -1,0 +1,1 @@
+"""Plants: simulated carts, and one cart on a serial port, under one contract (`specs.py`)."""

@@ -26,6 +26,7 @@ TINY = (
     "replay.size=1500",
     "compile=false",
 )
+ONCE = "learning.evaluations=1"  # most of a tiny training's time goes into pictures of its evaluations
 
 
 @dataclass(frozen=True)

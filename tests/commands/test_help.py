@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from command_line import TINY, console_script, in_process, outcome
+from command_line import in_process
 
 COMMANDS = ("train", "evaluate", "emulate")
 
@@ -40,20 +40,9 @@ def test_a_folder_of_ones_own_choices_is_added(tmp_path: Path) -> None:
     (tmp_path / "mine/experiment/broom.yaml").write_text(
         "# @package _global_\ndefaults: [override /pole: broomstick]\nagent: {gamma: 0.95}\n"
     )
-    words = ["--config-dir=mine", "experiment=broom", "hydra.run.dir=run"]
-    done = in_process("train", *words, *TINY, folder=tmp_path)
+    done = in_process("train", "--config-dir=mine", "experiment=broom", "--cfg", "job", folder=tmp_path)
     assert done.code == 0, done.err
-    config = yaml.safe_load((tmp_path / "run/config.yaml").read_text())
+    config = yaml.safe_load(done.out)
     assert list(config["pole"]["choices"]) == ["broomstick"]
     assert config["agent"]["gamma"] == 0.95
-    evaluated = in_process("evaluate", "run=run", "episodes=1", folder=tmp_path)  # needs no --config-dir
-    assert evaluated.code == 0, evaluated.err
-
-
-def test_the_emulated_cart_ends_quietly_when_it_is_interrupted(tmp_path: Path) -> None:
-    process = console_script("emulate", "emulator.clock=real", folder=tmp_path)
-    assert process.stdout is not None
-    assert '"port"' in process.stdout.readline()
-    process.terminate()
-    done = outcome(process, timeout=20)
-    assert (done.code, done.err) == (0, "")
+    assert config["task"]["name"] == "swingup"

@@ -10,12 +10,10 @@ from typing import Any
 import pytest
 import torch
 import yaml
-from command_line import TINY, in_process, outcome
+from command_line import ONCE, TINY, Outcome, console_script, in_process, outcome
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from cartpole_rl.commands.composition import job_name, run_folder
-
-RESUMABLE = (*TINY, "learning.frames=4096", "learning.evaluations=8", "learning.checkpoint_interval=2")
 
 
 def read(path: Path) -> Any:
@@ -81,23 +79,24 @@ def test_the_last_evaluation_is_that_of_the_metrics(trained: Path) -> None:
     assert curves(trained)["Final/score"][0][1] == pytest.approx(last["score"])
 
 
-def test_a_training_says_nothing_but_how_it_goes(tmp_path: Path) -> None:
-    done = in_process("train", *TINY, folder=tmp_path)
-    assert len(done.out.splitlines()) == 1
-    lines = done.err.replace("\r", "\n").splitlines()
-    assert all("frames/s" in line for line in lines if line.strip()), done.err
-
-
 def test_equal_seeds_give_equal_runs_and_another_seed_another(trained: Path, tmp_path: Path) -> None:
     for name, seed in (("same", 0), ("other", 1)):
         done = in_process("train", *TINY, f"seed={seed}", f"hydra.run.dir={name}", folder=tmp_path)
         assert done.code == 0, done.err
+        assert_tells_only_how_it_goes(done)
     assert read(tmp_path / "same/metrics.json") == read(trained / "metrics.json")
     assert history(tmp_path / "same") == history(trained)
     assert all(
         torch.equal(weight, weights(trained)[name]) for name, weight in weights(tmp_path / "same").items()
     )
     assert read(tmp_path / "other/metrics.json") != read(trained / "metrics.json")
+
+
+def assert_tells_only_how_it_goes(done: Outcome) -> None:
+    """No warning, no log of a library: a progress bar, and one line at the end."""
+    assert len(done.out.splitlines()) == 1
+    lines = done.err.replace("\r", "\n").splitlines()
+    assert all("frames/s" in line for line in lines if line.strip()), done.err
 
 
 @pytest.mark.parametrize("plant", [["simulated", "randomization=wide"], ["emulated"]])
@@ -155,16 +154,9 @@ def test_the_emulated_pole_is_the_one_that_is_told(trained: Path, tmp_path: Path
     assert read(tmp_path / "it/metrics.json")["pole"] == "0.66 m"
 
 
-def test_a_checkpoint_file_will_do_as_a_run(trained: Path, tmp_path: Path) -> None:
-    words = [f"run={trained / 'checkpoints/best.pt'}", "episodes=1"]
-    assert in_process("evaluate", *words, folder=tmp_path).code == 0
-    (folder,) = tmp_path.glob("runs/evaluate/*")
-    assert (folder / "metrics.json").exists()
-
-
 def test_a_sweep_makes_a_folder_a_job(tmp_path: Path) -> None:
     swept = ["randomization=friction_3,friction_6", "seed=0,1"]
-    done = in_process("train", "-m", *TINY, *swept, folder=tmp_path)
+    done = in_process("train", "-m", *TINY, ONCE, *swept, folder=tmp_path)
     assert done.code == 0, done.err
     (sweep,) = tmp_path.glob("runs/train/*_multirun")
     jobs = sorted(path for path in sweep.iterdir() if path.is_dir())
@@ -176,7 +168,7 @@ def test_a_sweep_makes_a_folder_a_job(tmp_path: Path) -> None:
     ]
     for job in jobs:
         assert len(read(job / "metrics.json")["episodes"]) == 2
-        assert len(history(job)) == 2
+        assert len(history(job)) == 1
         assert (job / "checkpoints/last.pt").exists()
         assert {path.name for path in (job / "figures").iterdir()} >= {"learning_curve.png", "behaviour.png"}
         assert "Final/score" in curves(job)
@@ -185,8 +177,9 @@ def test_a_sweep_makes_a_folder_a_job(tmp_path: Path) -> None:
         ]
         assert spread == ([-0.03, 0.03] if "friction_3" in job.name else [-0.06, 0.06])
     assert read(jobs[0] / "metrics.json") != read(jobs[1] / "metrics.json")
-    evaluated = in_process("evaluate", f"run={jobs[0]}", "episodes=1", folder=tmp_path)
-    assert evaluated.code == 0, evaluated.err  # the name needs no quotes
+    run = f"run={jobs[0]}/checkpoints/best.pt"  # the name needs no quotes
+    evaluated = in_process("evaluate", run, "episodes=1", folder=tmp_path)
+    assert evaluated.code == 0, evaluated.err
 
 
 def test_names_of_jobs_tell_what_differs(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -206,30 +199,37 @@ def test_runs_that_start_in_the_same_second_do_not_share_a_folder(
     assert all(Path(folder).is_dir() and "_mine" in folder for folder in folders)
 
 
-def train_process(*words: str, folder: Path) -> "subprocess.Popen[str]":
-    return subprocess.Popen(
-        [sys.executable, "-m", "cartpole_rl.commands.train", *words],
-        cwd=folder,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-
-
-def test_a_killed_training_goes_on_as_if_it_had_not_been(tmp_path: Path) -> None:
-    words = (*RESUMABLE, "replay=prioritized", "pole=both")
-    killed = train_process(*words, "hydra.run.dir=killed", folder=tmp_path)
-    while not (tmp_path / "killed/checkpoints/resume.pt").exists():
-        assert killed.poll() is None, killed.communicate()
+def when_saved(process: "subprocess.Popen[str]", checkpoint: Path) -> None:
+    """Wait until the process replaces a checkpoint, or writes it for the first time."""
+    before = checkpoint.stat().st_mtime_ns if checkpoint.exists() else 0
+    while not checkpoint.exists() or checkpoint.stat().st_mtime_ns == before:
+        assert process.poll() is None, process.communicate()
         time.sleep(0.002)
+
+
+def test_a_training_that_was_stopped_goes_on_as_if_it_had_not_been(tmp_path: Path) -> None:
+    """Killed, resumed, terminated, resumed: the same to the bit as one that ran through."""
+    words = (*TINY, "learning.frames=4096", "learning.evaluations=8", "replay=prioritized", "pole=both")
+    checkpoint = tmp_path / "stopped/checkpoints/resume.pt"
+
+    killed = console_script("train", *words, "hydra.run.dir=stopped", folder=tmp_path)
+    when_saved(killed, checkpoint)
     killed.kill()
     killed.communicate()
-    assert not (tmp_path / "killed/metrics.json").exists()
-    done = outcome(train_process("resume=killed", folder=tmp_path))
-    assert done.code == 0, done.err
+    assert len(history(tmp_path / "stopped")) < 8
 
+    terminated = console_script("train", "resume=stopped", folder=tmp_path)
+    when_saved(terminated, checkpoint)
+    terminated.terminate()
+    done = outcome(terminated)
+    assert done.code == 143
+    assert done.err.splitlines()[-1] == "cartpole-train: terminated"
+    assert "Traceback" not in done.err
+    assert not (tmp_path / "stopped/metrics.json").exists()
+
+    assert in_process("train", "resume=stopped", folder=tmp_path).code == 0
     assert in_process("train", *words, "hydra.run.dir=whole", folder=tmp_path).code == 0
-    runs = tmp_path / "whole", tmp_path / "killed"
+    runs = tmp_path / "whole", tmp_path / "stopped"
     whole, resumed = map(weights, runs)
     assert whole.keys() == resumed.keys()
     assert all(torch.equal(weight, resumed[name]) for name, weight in whole.items())
@@ -237,4 +237,4 @@ def test_a_killed_training_goes_on_as_if_it_had_not_been(tmp_path: Path) -> None
     assert len(history(runs[0])) == 8
     assert read(runs[0] / "metrics.json") == read(runs[1] / "metrics.json")
     assert curves(runs[0]) == curves(runs[1])
-    assert len(read(runs[1] / "provenance.json")["resumed"]) == 1
+    assert len(read(runs[1] / "provenance.json")["resumed"]) == 2

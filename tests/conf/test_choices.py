@@ -13,6 +13,7 @@ from cartpole_rl.commands.application import as_mapping
 from cartpole_rl.commands.build import evaluated_settings
 from cartpole_rl.commands.composition import conf_folder
 from cartpole_rl.commands.config import EmulateConfig, EvaluateConfig, TrainConfig, checked
+from cartpole_rl.tasks.rewards import Reward
 
 CONF = conf_folder()
 GROUPS = sorted(path.name for path in CONF.iterdir() if path.is_dir() and path.name != "hydra")
@@ -59,6 +60,13 @@ def test_an_evaluation_takes_it_in_place_of_the_agents_own(chosen: str, trained:
     if group not in ("cart_friction", "pole_friction"):  # whose numbers are then the cart's
         assert getattr(settings, group) == getattr(wanted, group)
     assert settings.nominal == wanted.nominal
+
+
+@pytest.mark.parametrize("task", ["balance", "swingup"])
+def test_any_reward_goes_with_any_task(task: str) -> None:
+    for reward in Reward:
+        config = checked(TrainConfig, composed("train", f"task={task}", f"reward={reward}"))
+        assert (config.task.name, config.reward.kind) == (task, reward)
 
 
 @pytest.mark.parametrize("plant", ["simulated", "emulated", "serial plant.port=/dev/ttyUSB0"])
