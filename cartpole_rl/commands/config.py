@@ -104,7 +104,6 @@ class TrainConfig(CartPoleSettings):
     replay: ReplaySettings
     optimizer: OptimizerSettings
     learning: LearningSettings
-    experiment: None = None
     seed: Seed
     label: str
     threads: Count | None

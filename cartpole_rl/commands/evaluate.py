@@ -21,7 +21,7 @@ from cartpole_rl.envs import CartPoleEnv
 from cartpole_rl.evaluation.episodes import Policy, run_episodes
 from cartpole_rl.learning.randomness import seed_everything
 from cartpole_rl.plants.serial import SerialPlant
-from cartpole_rl.reporting.table import interval_text, number_text, table
+from cartpole_rl.reporting.table import interval_text, table
 from cartpole_rl.tasks.episode import Episode
 
 SHOWN = {
@@ -78,7 +78,7 @@ def link_figures(env: CartPoleEnv) -> dict[str, int]:
 def score_table(summary: Mapping[str, Any], heading: str) -> str:
     """The figures that a person asks for first."""
     rows = [
-        {"figure": label, "mean": mean_text(value)}
+        {"figure": label, "mean": interval_text(value["mean"], value["low"], value["high"])}
         for key, label in SHOWN.items()
         if (value := summary[key]) is not None
     ]
@@ -88,13 +88,6 @@ def score_table(summary: Mapping[str, Any], heading: str) -> str:
 def count_text(episodes: int) -> str:
     """One in the singular: "1 episode", "20 episodes"."""
     return f"{episodes} episode{'s' if episodes > 1 else ''}"
-
-
-def mean_text(figure: Mapping[str, Any]) -> str:
-    """A mean with its interval, which a single episode has not."""
-    if figure["low"] is None:
-        return number_text(figure["mean"])
-    return interval_text(figure["mean"], figure["low"], figure["high"])
 
 
 if __name__ == "__main__":

@@ -25,15 +25,15 @@ def table(rows: Sequence[Mapping[str, Cell]], columns: Mapping[str, str] | Seque
     return "\n".join(GAP.join(cells).rstrip() for cells in zip(*shown, strict=True))
 
 
-def interval_text(mean: float, low: float, high: float) -> str:
+def interval_text(mean: float, low: float | None, high: float | None) -> str:
     """A mean with the half width of its interval, to two digits of that, or three of the mean: "4210 ± 85".
 
     An interval that leans to one side shows its ends instead, "4350 (4110 to 4420)"; one that is not finite,
-    as that of a single episode, leaves the mean alone.
+    and None, as that of a single episode, leave the mean alone.
     """
-    below, above = mean - low, high - mean
-    if not (math.isfinite(below) and math.isfinite(above)):
+    if low is None or high is None or not math.isfinite(high - low):
         return number_text(mean)
+    below, above = mean - low, high - mean
     finest = _decimals(mean or max(below, above), FIGURES)
     decimals = min(_decimals(max(below, above), figures=2) if above > 0 or below > 0 else finest, finest)
     if abs(below - above) <= LEANING * max(below, above):

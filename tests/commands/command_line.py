@@ -24,6 +24,7 @@ TINY = (
     "learning.evaluation_episodes=2",
     "learning.checkpoint_interval=1",
     "replay.size=1500",
+    "task.time_limit=60",
     "compile=false",
 )
 ONCE = "learning.evaluations=1"  # most of a tiny training's time goes into pictures of its evaluations
@@ -84,3 +85,10 @@ def outcome(process: "subprocess.Popen[str]", timeout: float = 120) -> Outcome:
     finally:
         process.kill()
     return Outcome(process.returncode, out, err)
+
+
+def tells_only_how_it_goes(done: Outcome, trainings: int = 1) -> bool:
+    """Whether trainings left no warning and no log of a library: progress bars, a line each at the end."""
+    lines = done.err.replace("\r", "\n").splitlines()
+    bars = all("frames/s" in line for line in lines if line.strip())
+    return bars and len(done.out.splitlines()) == trainings

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from command_line import TINY, in_process
+from command_line import TINY, in_process, tells_only_how_it_goes
 
 
 @pytest.fixture(scope="session")
@@ -12,4 +12,5 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("trained")
     done = in_process("train", *TINY, "hydra.run.dir=run", folder=folder)
     assert done.code == 0, done.err
+    assert tells_only_how_it_goes(done), done
     return folder / "run"

@@ -4,16 +4,21 @@ import json
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 import yaml
-from command_line import ONCE, TINY, Outcome, console_script, in_process, outcome
+from command_line import TINY, console_script, in_process, outcome, tells_only_how_it_goes
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from cartpole_rl.commands.composition import job_name, run_folder
+from cartpole_rl.envs import CartPoleEnv
+from cartpole_rl.errors import LinkError
+from cartpole_rl.evaluation.episodes import Policy, run_episodes
+from cartpole_rl.tasks.episode import Episode
 
 
 def read(path: Path) -> Any:
@@ -79,39 +84,29 @@ def test_the_last_evaluation_is_that_of_the_metrics(trained: Path) -> None:
     assert curves(trained)["Final/score"][0][1] == pytest.approx(last["score"])
 
 
-def test_equal_seeds_give_equal_runs_and_another_seed_another(trained: Path, tmp_path: Path) -> None:
-    for name, seed in (("same", 0), ("other", 1)):
-        done = in_process("train", *TINY, f"seed={seed}", f"hydra.run.dir={name}", folder=tmp_path)
+@pytest.mark.parametrize("plant", ["simulated", "emulated"])
+def test_an_evaluation_can_be_repeated(plant: str, trained: Path, tmp_path: Path) -> None:
+    words = [f"run={trained}", "episodes=2", f"plant={plant}"]
+    for name in ("first", "second"):
+        done = in_process("evaluate", *words, f"hydra.run.dir={name}", folder=tmp_path)
         assert done.code == 0, done.err
-        assert_tells_only_how_it_goes(done)
-    assert read(tmp_path / "same/metrics.json") == read(trained / "metrics.json")
-    assert history(tmp_path / "same") == history(trained)
-    assert all(
-        torch.equal(weight, weights(trained)[name]) for name, weight in weights(tmp_path / "same").items()
-    )
-    assert read(tmp_path / "other/metrics.json") != read(trained / "metrics.json")
-
-
-def assert_tells_only_how_it_goes(done: Outcome) -> None:
-    """No warning, no log of a library: a progress bar, and one line at the end."""
-    assert len(done.out.splitlines()) == 1
-    lines = done.err.replace("\r", "\n").splitlines()
-    assert all("frames/s" in line for line in lines if line.strip()), done.err
-
-
-@pytest.mark.parametrize("plant", [["simulated", "randomization=wide"], ["emulated"]])
-def test_an_evaluation_can_be_repeated(plant: list[str], trained: Path, tmp_path: Path) -> None:
-    words = [f"run={trained}", "episodes=2", f"plant={plant[0]}", *plant[1:]]
-    for name, seed in (("first", 0), ("second", 0), ("other", 1)):
-        done = in_process("evaluate", *words, f"seed={seed}", f"hydra.run.dir={name}", folder=tmp_path)
-        assert done.code == 0, done.err
-    first, second, other = (read(tmp_path / name / "metrics.json") for name in ("first", "second", "other"))
+    first, second = (read(tmp_path / name / "metrics.json") for name in ("first", "second"))
     assert first == second
-    assert first != other
     assert timeless(first)
-    assert first["plant"] == plant[0]
+    assert first["plant"] == plant
     assert len(first["episodes"]) == 2
     assert {first[key] for key in ("late_ticks", "lost_frames", "bad_frames")} == {0}
+
+
+def test_seed_and_explicit_parameters_have_an_effect(trained: Path, tmp_path: Path) -> None:
+    scores = set()
+    changes = ("seed=0", "seed=1", "parameters={cart_mass:1.5}", "parameters={pole_com:0.3}")
+    for index, change in enumerate(changes):
+        words = [change, "episodes=1", f"hydra.run.dir={index}"]
+        done = in_process("evaluate", f"run={trained}", *words, folder=tmp_path)
+        assert done.code == 0, done.err
+        scores.add(read(tmp_path / f"{index}/metrics.json")["score"]["mean"])
+    assert len(scores) == len(changes)
 
 
 def test_an_evaluation_may_take_another_task_cart_and_pole(trained: Path, tmp_path: Path) -> None:
@@ -137,16 +132,6 @@ def test_an_evaluation_may_take_another_task_cart_and_pole(trained: Path, tmp_pa
     assert evaluated["task"]["x_max"] == 0.38
 
 
-def test_each_explicit_parameter_has_an_effect(trained: Path, tmp_path: Path) -> None:
-    scores = set()
-    for index, parameters in enumerate(("null", "{cart_mass:1.5}", "{pole_com:0.3}", "{cart_viscous:5}")):
-        words = [f"parameters={parameters}", "episodes=1", f"hydra.run.dir={index}"]
-        done = in_process("evaluate", f"run={trained}", *words, folder=tmp_path)
-        assert done.code == 0, done.err
-        scores.add(read(tmp_path / f"{index}/metrics.json")["score"]["mean"])
-    assert len(scores) == 4
-
-
 def test_the_emulated_pole_is_the_one_that_is_told(trained: Path, tmp_path: Path) -> None:
     words = ["plant=emulated", "emulator=large", "episodes=1", "hydra.run.dir=it"]
     done = in_process("evaluate", f"run={trained}", *words, folder=tmp_path)
@@ -154,32 +139,48 @@ def test_the_emulated_pole_is_the_one_that_is_told(trained: Path, tmp_path: Path
     assert read(tmp_path / "it/metrics.json")["pole"] == "0.66 m"
 
 
-def test_a_sweep_makes_a_folder_a_job(tmp_path: Path) -> None:
-    swept = ["randomization=friction_3,friction_6", "seed=0,1"]
-    done = in_process("train", "-m", *TINY, ONCE, *swept, folder=tmp_path)
+@pytest.fixture(scope="module")
+def sweep(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """The run folders of four jobs, the first of which has the settings of `trained`."""
+    folder = tmp_path_factory.mktemp("sweep")
+    swept = ["randomization=wide,friction_6", "seed=0,1"]
+    done = in_process("train", "-m", *TINY, *swept, folder=folder)
     assert done.code == 0, done.err
-    (sweep,) = tmp_path.glob("runs/train/*_multirun")
-    jobs = sorted(path for path in sweep.iterdir() if path.is_dir())
-    assert [job.name for job in jobs] == [
-        "0_randomization-friction_3_seed-0",
-        "1_randomization-friction_3_seed-1",
+    assert tells_only_how_it_goes(done, trainings=4)
+    (made,) = folder.glob("runs/train/*_multirun")
+    return sorted(path for path in made.iterdir() if path.is_dir())
+
+
+def test_a_sweep_makes_a_folder_a_job(sweep: list[Path]) -> None:
+    assert [job.name for job in sweep] == [
+        "0_randomization-wide_seed-0",
+        "1_randomization-wide_seed-1",
         "2_randomization-friction_6_seed-0",
         "3_randomization-friction_6_seed-1",
     ]
-    for job in jobs:
+    for job in sweep:
+        config = yaml.safe_load((job / "config.yaml").read_text())
+        assert config["seed"] == int(job.name[-1])
+        assert ("track_tilt" in config["randomization"]) == ("wide" in job.name)
         assert len(read(job / "metrics.json")["episodes"]) == 2
-        assert len(history(job)) == 1
+        assert len(history(job)) == 2
         assert (job / "checkpoints/last.pt").exists()
         assert {path.name for path in (job / "figures").iterdir()} >= {"learning_curve.png", "behaviour.png"}
         assert "Final/score" in curves(job)
-        spread = yaml.safe_load((job / "config.yaml").read_text())["randomization"]["cart_coulomb"][
-            "relative"
-        ]
-        assert spread == ([-0.03, 0.03] if "friction_3" in job.name else [-0.06, 0.06])
-    assert read(jobs[0] / "metrics.json") != read(jobs[1] / "metrics.json")
-    run = f"run={jobs[0]}/checkpoints/best.pt"  # the name needs no quotes
-    evaluated = in_process("evaluate", run, "episodes=1", folder=tmp_path)
-    assert evaluated.code == 0, evaluated.err
+
+
+def test_equal_seeds_give_equal_runs_and_another_seed_another(trained: Path, sweep: list[Path]) -> None:
+    same, other, *_ = sweep
+    assert read(same / "metrics.json") == read(trained / "metrics.json")
+    assert history(same) == history(trained)
+    assert all(torch.equal(weight, weights(trained)[name]) for name, weight in weights(same).items())
+    assert read(other / "metrics.json") != read(trained / "metrics.json")
+
+
+def test_the_name_of_a_job_needs_no_quotes(sweep: list[Path], tmp_path: Path) -> None:
+    done = in_process("evaluate", f"run={sweep[2]}/checkpoints/best.pt", "episodes=1", folder=tmp_path)
+    assert done.code == 0, done.err
+    assert len(list(tmp_path.glob("runs/evaluate/*/metrics.json"))) == 1
 
 
 def test_names_of_jobs_tell_what_differs(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -238,3 +239,23 @@ def test_a_training_that_was_stopped_goes_on_as_if_it_had_not_been(tmp_path: Pat
     assert read(runs[0] / "metrics.json") == read(runs[1] / "metrics.json")
     assert curves(runs[0]) == curves(runs[1])
     assert len(read(runs[1] / "provenance.json")["resumed"]) == 2
+
+
+def test_what_a_broken_link_leaves_is_reported(
+    trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One episode ran when the cable was pulled out."""
+
+    def pulled(env: CartPoleEnv, policy: Policy, episodes: int) -> Iterator[Episode]:
+        yield next(run_episodes(env, policy, episodes))
+        raise LinkError("the cart was unplugged")
+
+    monkeypatch.setattr("cartpole_rl.commands.evaluate.run_episodes", pulled)
+    done = in_process("evaluate", f"run={trained}", "hydra.run.dir=it", folder=tmp_path)
+    assert done.code == 1
+    assert done.err.splitlines()[-1] == "cartpole-evaluate: the cart was unplugged"
+    assert "plant=simulated, 1 episode " in done.out
+    assert "±" not in done.out  # one episode shows no spread
+    metrics = read(tmp_path / "it/metrics.json")
+    assert len(metrics["episodes"]) == 1
+    assert metrics["score"]["low"] is None

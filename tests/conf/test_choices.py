@@ -1,6 +1,7 @@
 """Every choice of every group composes, is read to the last key, and describes a cart that can be made."""
 
 from collections.abc import Iterator
+from functools import cache
 from typing import Any
 
 import hydra
@@ -33,6 +34,7 @@ def composer() -> Iterator[None]:
         yield
 
 
+@cache
 def composed(name: str, *overrides: str) -> dict[str, Any]:
     return as_mapping(hydra.compose(name, list(overrides)))
 

@@ -20,6 +20,7 @@ BUDGET = [
     "learning.evaluations=1",
     "learning.evaluation_episodes=1",
     "replay.size=1000",
+    "task.time_limit=60",
     "compile=false",
 ]
 
@@ -45,21 +46,19 @@ def installed(wheel: Path) -> Path:
     return target
 
 
-def run(installed: Path, command: str, *words: str) -> str:
-    """A command of the installed package, in a process that has no other copy of it; its stdout."""
+def run(installed: Path, *commands: list[str]) -> Path:
+    """Run commands of the installed package in a process that has no other copy of it; their folder."""
     environment = {**os.environ, "PYTHONPATH": str(installed), "PYTHONSAFEPATH": "1"}
     home = installed.parent / "home"
-    home.mkdir(exist_ok=True)
+    home.mkdir()
+    script = "import sys\nfrom cartpole_rl.commands import evaluate, train\n" + "".join(
+        f"sys.argv = {['cartpole-' + name, *words]!r}\n{name}.main()\n" for name, *words in commands
+    )
     done = subprocess.run(
-        [sys.executable, "-m", f"cartpole_rl.commands.{command}", *words],
-        cwd=home,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=200,
+        [sys.executable, "-c", script], cwd=home, env=environment, capture_output=True, text=True, timeout=200
     )
     assert done.returncode == 0, done.stderr
-    return done.stdout
+    return home
 
 
 def test_it_holds_the_package_conf_and_the_scripts(wheel: Path) -> None:
@@ -81,9 +80,11 @@ def test_what_it_installs_trains_and_evaluates_by_its_own_conf(installed: Path) 
     """Its own, as is seen by a seed that is changed there alone."""
     conf = installed / "cartpole_rl/conf/train.yaml"
     conf.write_text(conf.read_text().replace("\nseed: 0\n", "\nseed: 7\n"))
-    run(installed, "train", *BUDGET, "hydra.run.dir=trained")
-    run(installed, "evaluate", "run=trained", "plant=emulated", "episodes=1", "hydra.run.dir=evaluated")
-    home = installed.parent / "home"
+    home = run(
+        installed,
+        ["train", *BUDGET, "hydra.run.dir=trained"],
+        ["evaluate", "run=trained", "plant=emulated", "episodes=1", "hydra.run.dir=evaluated"],
+    )
     assert json.loads((home / "evaluated/metrics.json").read_text())["plant"] == "emulated"
     provenance = json.loads((home / "trained/provenance.json").read_text())
     assert provenance["seed"] == 7
