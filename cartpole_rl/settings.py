@@ -16,6 +16,6 @@ Count = Annotated[int, Field(ge=1)]
 
 
 class Settings(BaseModel):
-    """A frozen pydantic model that refuses unknown keys and does not turn strings into numbers."""
+    """A frozen pydantic model that refuses unknown keys."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=False, validate_default=True)

@@ -1,4 +1,4 @@
-"""Agents: Q-networks, exploration, and the policy that leaves training."""
+"""Agents: Q-networks, their loss, and the policy that leaves training."""
 
 from cartpole_rl.agents.dqn import AgentSettings, QAgent
 
