@@ -51,7 +51,8 @@ def comparison(
         interval = (intervals or {}).get(name) or student_interval(each)
         _draw_result(axes, column, each, interval)
     _name_columns(axes, scores)
-    axes.set_ylim(bottom=min(0.0, axes.get_ylim()[0]))
+    low, high = min(0.0, axes.get_ylim()[0]), axes.get_ylim()[1]
+    axes.set_ylim(low, high + 0.05 * (high - low))  # else dots that lie close together are cut at the top
     style.label(axes, y="score of an episode")
     style.title(axes, title, "dots: episodes,  line and box: their mean and its 95 % interval")
     return figure
