@@ -1,16 +1,18 @@
-"""The Q-network: a multilayer perceptron, with layer normalization or without."""
+"""Q-networks: multilayer perceptrons, free or bound to the mirror symmetry of cart and pole.
+
+Layer normalization after each hidden layer keeps a learned swing-up from being unlearned
+(Gallici et al., "Simplifying deep temporal difference learning", 2024).
+"""
 
 from collections.abc import Sequence
 
+import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
 
 class QNetwork(nn.Module):
-    """Observation [..., K] float32 to one value an action [..., A].
-
-    Layer normalization after each hidden layer keeps a learned swing-up from being unlearned
-    (Gallici et al., "Simplifying Deep Temporal Difference Learning", 2024).
-    """
+    """Observation [..., K] float32 to one value an action [..., A]."""
 
     def __init__(self, observation_size: int, actions: int, hidden: Sequence[int], layer_norm: bool) -> None:
         super().__init__()
@@ -27,3 +29,61 @@ class QNetwork(nn.Module):
     def forward(self, observation: Tensor) -> Tensor:
         """Values of the actions."""
         return self.layers(observation)
+
+
+class MirrorQNetwork(nn.Module):
+    """A QNetwork that values an action as it values the mirrored action in the mirrored observation.
+
+    Swapping left and right multiplies the numbers of an observation by `signs` [K], +1 or -1, and reverses
+    the order of the actions. What is learned on one side then holds on the other, with half the weights
+    (van der Pol et al., "MDP homomorphic networks", 2020). Carts may differ from left to right as long as
+    an agent meets both kinds equally often.
+
+    Each layer has half its units for the scene and half, with the same weights, for its mirror image. Their
+    half sum (even: the image is the same) and half difference (odd: it is the negative) never mix in a linear
+    layer, so that two of half the width do the work.
+    """
+
+    signs: Tensor
+
+    def __init__(self, signs: Sequence[int], actions: int, hidden: Sequence[int], layer_norm: bool) -> None:
+        super().__init__()
+        self.register_buffer("signs", torch.tensor(signs, dtype=torch.float32))
+        width = len(signs)
+        layers: list[MirrorLayer] = []
+        for size in hidden:
+            layers.append(MirrorLayer(width, size // 2, layer_norm))
+            width = size // 2
+        self.layers = nn.ModuleList(layers)
+        self.even_values = nn.Linear(width, actions)
+        self.odd_values = nn.Linear(width, actions, bias=False)
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """Values of the actions."""
+        even, odd = halves(observation, observation * self.signs)
+        for layer in self.layers:
+            even, odd = layer(even, odd)
+        same, opposite = self.even_values(even), self.odd_values(odd)
+        return (same + same.flip(-1) + opposite - opposite.flip(-1)) / 2
+
+
+class MirrorLayer(nn.Module):
+    """A linear layer, layer normalization and ReLU on `units` units and on their mirror images."""
+
+    def __init__(self, width: int, units: int, layer_norm: bool) -> None:
+        super().__init__()
+        self.even = nn.Linear(width, units)
+        self.odd = nn.Linear(width, units, bias=False)
+        self.norm = nn.LayerNorm(units) if layer_norm else nn.Identity()
+
+    def forward(self, even: Tensor, odd: Tensor) -> tuple[Tensor, Tensor]:
+        """Even and odd parts [..., units] from those of the layer before, [..., width]."""
+        same, opposite = self.even(even), self.odd(odd)
+        scene = functional.relu(self.norm(same + opposite))
+        image = functional.relu(self.norm(same - opposite))
+        return halves(scene, image)
+
+
+def halves(scene: Tensor, image: Tensor) -> tuple[Tensor, Tensor]:
+    """Even and odd part: half the sum and half the difference of a scene and its mirror image."""
+    return (scene + image) / 2, (scene - image) / 2

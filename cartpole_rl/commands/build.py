@@ -61,7 +61,7 @@ def environment(config: CartPoleSettings, plant: Plant) -> CartPoleEnv:
 
 def new_agent(config: TrainConfig) -> QAgent:
     """An untrained agent."""
-    return QAgent(config.agent, config.observation.size, len(config.actions.motors))
+    return QAgent(config.agent, config.observation.mirror_signs, len(config.actions.motors))
 
 
 def recorded_config(config: Mapping[str, Any], source: str) -> TrainConfig:

@@ -121,6 +121,16 @@ class TrainConfig(CartPoleSettings):
         return plant
 
     @model_validator(mode="after")
+    def _a_mirror_has_two_sides(self) -> "TrainConfig":
+        motors = self.actions.motors
+        if self.agent.mirrored and any(a != -b for a, b in zip(motors, reversed(motors), strict=True)):
+            raise ValueError(
+                f"agent.mirrored=true needs actions.motors that read backwards are their negatives, not "
+                f"{list(motors)}; give agent.mirrored=false, or symmetric values"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _memory_holds_a_batch(self) -> "TrainConfig":
         if self.replay.size < self.learning.batch_size:
             raise ValueError(

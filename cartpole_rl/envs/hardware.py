@@ -24,6 +24,7 @@ from cartpole_rl.tasks.endings import fallen
 from cartpole_rl.tasks.features import (
     ANGULAR_SPEED_SCALE,
     LENGTH_SCALE,
+    MIRROR_SIGNS,
     MOTOR_SCALE,
     SPEED_SCALE,
     ObservationKind,
@@ -53,6 +54,11 @@ class ObservationSettings(Settings):
     def size(self) -> int:
         """Numbers in an observation."""
         return observation_size(self.kind) + self.past_size + int(self.pole_length)
+
+    @property
+    def mirror_signs(self) -> list[int]:
+        """What each number of an observation is multiplied by when left and right are swapped, [size]."""
+        return [*MIRROR_SIGNS[self.kind], *[-1] * self.past_size, *[1] * self.pole_length]
 
     @property
     def kept_columns(self) -> list[int]:

@@ -13,7 +13,10 @@ TREES = ("_sum_tree", "_min_tree")  # of priorities, by their names in TorchRL's
 
 
 def make_replay(settings: ReplaySettings, batch_size: int) -> TensorDictReplayBuffer:
-    """An empty buffer. A prioritized one draws from NumPy's global generator, a uniform one from torch's."""
+    """An empty buffer whose `sample` gives `batch_size` transitions.
+
+    A prioritized one draws from NumPy's global generator, a uniform one from torch's.
+    """
     if settings.kind == "prioritized":
         sampler = PrioritizedSampler(
             settings.size, alpha=settings.alpha, beta=settings.beta[0], eps=settings.priority_eps

@@ -58,13 +58,13 @@ class Training:
         self.evaluate, self.monitor = evaluate, monitor
         self.collector = Collector(env, agent.actor, len(env.hardware.motors), seed)
         self.replay_settings, self.optimizer_settings = replay, optimizer
-        self.replay = make_replay(replay, settings.batch_size)
+        self.replay = make_replay(replay, settings.updates * settings.batch_size)
         self.weights = [weight for weight in agent.loss.parameters() if weight.requires_grad]
         self.optimizer = OPTIMIZERS[optimizer.kind](
             self.weights, lr=optimizer.learning_rate, weight_decay=optimizer.weight_decay, fused=True
         )
         self.loss = torch.compile(agent.loss.forward, fullgraph=True) if compiled else agent.loss.forward
-        self.iteration, self.updates, self.seconds = 0, 0, 0.0
+        self.iteration, self.seconds = 0, 0.0
         self.best_score = -float("inf")
         self.last_score: float | None = None
 
@@ -72,6 +72,11 @@ class Training:
     def frames(self) -> int:
         """Transitions collected so far."""
         return self.iteration * self.settings.carts * self.settings.chunk
+
+    @property
+    def updates(self) -> int:
+        """Gradient steps so far."""
+        return int(self.agent.updates)
 
     @property
     def progress(self) -> float:
@@ -109,8 +114,8 @@ class Training:
         if self.replay_settings.kind == "prioritized":
             self.replay.sampler.beta = linear(*beta, self.progress)
         losses, norms = [], []
-        for _ in range(self.settings.updates):
-            loss, norm = self.update(self.replay.sample())
+        for batch in self.replay.sample().split(self.settings.batch_size):
+            loss, norm = self.update(batch)
             losses.append(loss)
             norms.append(norm)
         return {
@@ -129,7 +134,6 @@ class Training:
         self.agent.follow()
         if self.replay_settings.kind == "prioritized":
             self.replay.update_tensordict_priority(batch)
-        self.updates += 1
         return loss.detach(), norm
 
     def epsilon(self) -> float:
@@ -163,11 +167,10 @@ class Training:
     def snapshot(self) -> dict[str, Any]:
         """All that the next iteration depends on, to be saved at once: it shares memory with the training."""
         return {
-            "counters": [self.iteration, self.updates],
+            "iteration": self.iteration,
             "seconds": self.seconds,
             "scores": [self.best_score, self.last_score],
             "agent": self.agent.state_dict(),
-            "target_updater": self.agent.target_updater.state_dict(),
             "optimizer": self.optimizer.state_dict(),
             "replay": replay_snapshot(self.replay),
             "collector": self.collector.snapshot(),
@@ -177,11 +180,10 @@ class Training:
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         """Go on from `snapshot` as if nothing had happened."""
-        self.iteration, self.updates = snapshot["counters"]
+        self.iteration = snapshot["iteration"]
         self.seconds = snapshot["seconds"]
         self.best_score, self.last_score = snapshot["scores"]
         self.agent.load_state_dict(snapshot["agent"])
-        self.agent.target_updater.load_state_dict(snapshot["target_updater"])
         self.optimizer.load_state_dict(snapshot["optimizer"])
         restore_replay(self.replay, snapshot["replay"])
         self.collector.restore(snapshot["collector"])

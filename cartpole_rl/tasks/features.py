@@ -25,6 +25,10 @@ class ObservationKind(StrEnum):
     COS_SIN = "cos_sin"  # x, x_dot, cos theta, sin theta, theta_dot, each scaled to about one
 
 
+# What each number of an observation is multiplied by when left and right are swapped.
+MIRROR_SIGNS = {ObservationKind.RAW: (-1, -1, -1, -1), ObservationKind.COS_SIN: (-1, -1, 1, -1, -1)}
+
+
 def measured_position(counts: Tensor) -> tuple[Tensor, Tensor]:
     """(x m, theta rad) from counts [N, 2] int64; theta is wrapped before it loses precision as a float."""
     half_turn = POLE_COUNTS_PER_TURN // 2

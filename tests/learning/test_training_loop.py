@@ -40,6 +40,7 @@ OPTIMIZER = {
 AGENT = {
     "hidden": (16,),
     "layer_norm": True,
+    "mirrored": False,
     "gamma": 0.9,
     "double": True,
     "loss": "smooth_l1",
@@ -90,7 +91,7 @@ def make_training(make_plant: Callable, make_environment: Callable) -> Callable[
         env = make_environment(make_plant(16, seed=seed), **{"time_limit": 30, **environment})
         q_agent = QAgent(
             AgentSettings(**{**AGENT, **(agent or {})}),
-            env.observation_spec["observation"].shape[-1],
+            env.hardware.observation_settings.mirror_signs,
             len(env.hardware.motors),
         )
         return Training(
