@@ -1,12 +1,13 @@
 """A DQN agent: the Q-network as a TorchRL actor, its loss with a target network, and its greedy policy."""
 
-from collections.abc import Callable, Sequence
+import copy
+from collections.abc import Sequence
 from typing import Annotated, Literal
 
 import torch
 from pydantic import Field, model_validator
+from tensordict import TensorDictBase
 from torch import Tensor, nn
-from torch.optim.swa_utils import AveragedModel
 from torchrl.data import Categorical
 from torchrl.modules import QValueActor
 from torchrl.objectives import DQNLoss
@@ -24,6 +25,7 @@ class AgentSettings(Settings):
     mirrored: bool  # the network knows that left and right are one problem, reflected
     gamma: Annotated[float, Field(ge=0, lt=1)]
     double: bool  # van Hasselt et al., 2016
+    action_gap: Annotated[float, Field(ge=0, lt=1)]  # alpha of advantage learning, 0 for plain Q-learning
     loss: Literal["l2", "smooth_l1"]
     target_tau: Annotated[float, Field(gt=0, le=1)] | None  # Polyak averaging each update
     target_period: Count | None  # or a copy every so many updates
@@ -72,16 +74,31 @@ class QAgent(nn.Module):
         )
         self.loss.make_value_estimator(gamma=settings.gamma)
         TargetNetUpdater(self.loss)  # copies the weights, and tells the loss that `follow` moves its target
-        self.average = self._make_average()
+        decay = settings.average_decay
+        self.average = None if decay is None else copy.deepcopy(self.actor).requires_grad_(False)
         self.register_buffer("updates", torch.zeros((), dtype=torch.int64))
         self._online, self._target = (
             list(params.values(include_nested=True, leaves_only=True))
             for params in (self.loss.value_network_params, self.loss.target_value_network_params)
         )
 
-    def _make_average(self) -> AveragedModel | None:
-        decay = self.settings.average_decay
-        return None if decay is None else AveragedModel(self.actor, multi_avg_fn=moving_average(decay))
+    @torch.no_grad()
+    def widen_gap(self, batch: TensorDictBase) -> TensorDictBase:
+        """`batch` with `action_gap` alpha's share taken off its rewards; the same where alpha is 0.
+
+        The share is alpha times what the action taken is worth less than the best one, by the target network.
+        So the best action stays the best one and the others fall back 1 / (1 - alpha) times as far: at 50 Hz
+        a single action changes little, and a network that is a little wrong would take the wrong one
+        (Bellemare et al., "Increasing the action gap", 2016, equation 9).
+        """
+        gap = self.settings.action_gap
+        if gap == 0:
+            return batch
+        with self.loss.target_value_network_params.to_module(self.loss.value_network):
+            values = self.loss.value_network(batch.select("observation"))["action_value"]
+        shortfall = values.max(-1, keepdim=True).values - values.gather(-1, batch["action"].unsqueeze(-1))
+        reward = batch["next", "reward"] - gap * shortfall
+        return batch.clone(recurse=False).set(("next", "reward"), reward)
 
     @torch.no_grad()
     def follow(self) -> None:
@@ -93,7 +110,16 @@ class QAgent(nn.Module):
         elif period is not None and self.updates % period == 0:
             torch._foreach_copy_(self._target, self._online)
         if self.average is not None:
-            self.average.update_parameters(self.actor)
+            averaged, current = list(self.average.parameters()), list(self.actor.parameters())
+            torch._foreach_lerp_(averaged, current, self._newest_share())
+
+    def _newest_share(self) -> float:
+        """Weight of the newest weights in the average, which spans at most a tenth of the updates so far.
+
+        So the untrained weights are forgotten at once, not after 1 / (1 - decay) updates.
+        """
+        assert self.settings.average_decay is not None
+        return max(1 - self.settings.average_decay, 10 / (9 + int(self.updates)))
 
     def greedy_policy(self) -> nn.Module:
         """The policy that is evaluated and exported; it follows the weights as they learn.
@@ -102,18 +128,4 @@ class QAgent(nn.Module):
         1 / (1 - decay) updates: single updates make the policy lose a start here and there, their mean does
         not (Izmailov et al., "Averaging weights leads to wider optima", 2018). Without, it is the online one.
         """
-        return self.actor if self.average is None else self.average.module
-
-
-def moving_average(decay: float) -> Callable[[Sequence[Tensor], Sequence[Tensor], Tensor | int], None]:
-    """How weights are averaged: exponentially with `decay`, but over at most the first tenth of the past.
-
-    So the average follows from the first update on, and does not hold the untrained weights for
-    1 / (1 - decay) updates.
-    """
-
-    def update(averaged: Sequence[Tensor], current: Sequence[Tensor], averages: Tensor | int) -> None:
-        weight = max(1 - decay, 9 / (10 + int(averages)))
-        torch._foreach_lerp_(list(averaged), list(current), weight)
-
-    return update
+        return self.actor if self.average is None else self.average

@@ -37,7 +37,12 @@ REPLACEABLE = ("cart", "cart_friction", "pole_friction", "pole", "reward")  # by
 
 
 def simulated_env(
-    config: CartPoleSettings, plant: SimulatedSettings, carts: int, start: StartSettings, seed: int
+    config: CartPoleSettings,
+    plant: SimulatedSettings,
+    carts: int,
+    start: StartSettings,
+    seed: int,
+    compiled: bool = False,
 ) -> CartPoleEnv:
     """An environment over `carts` simulated carts that start as `start` says."""
     return environment(
@@ -50,6 +55,7 @@ def simulated_env(
             config.control_period,
             plant.substeps,
             seed,
+            compiled=compiled,
         ),
     )
 

@@ -39,7 +39,8 @@ def main(config: TrainConfig, folder: Path) -> None:
         check_compiler()
     use_threads(config.threads)
     seed_everything(config.seed)
-    env = simulated_env(config, config.plant, config.learning.carts, config.task.start, config.seed)
+    carts, start = config.learning.carts, config.task.start
+    env = simulated_env(config, config.plant, carts, start, config.seed, config.compile)
     note_unused_randomization(config)
     agent = new_agent(config)
     evaluate = partial(judge, nominal_envs(config), agent.greedy_policy(), config.seed + EVALUATION_SEED)

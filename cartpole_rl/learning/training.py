@@ -63,7 +63,7 @@ class Training:
         self.optimizer = OPTIMIZERS[optimizer.kind](
             self.weights, lr=optimizer.learning_rate, weight_decay=optimizer.weight_decay, fused=True
         )
-        self.loss = torch.compile(agent.loss.forward, fullgraph=True) if compiled else agent.loss.forward
+        self.loss = torch.compile(agent.loss, fullgraph=True, dynamic=False) if compiled else agent.loss
         self.iteration, self.seconds = 0, 0.0
         self.best_score = -float("inf")
         self.last_score: float | None = None
@@ -114,7 +114,8 @@ class Training:
         if self.replay_settings.kind == "prioritized":
             self.replay.sampler.beta = linear(*beta, self.progress)
         losses, norms = [], []
-        for batch in self.replay.sample().split(self.settings.batch_size):
+        sample = self.agent.widen_gap(self.replay.sample())
+        for batch in sample.split(self.settings.batch_size):
             loss, norm = self.update(batch)
             losses.append(loss)
             norms.append(norm)

@@ -33,17 +33,17 @@ def static_force(motor: Tensor, cart: CartParameters, model: Actuator) -> Tensor
     return curve * (rightward - leftward.to(curve.dtype))
 
 
-def in_force_share(latency: Tensor, commands: int, period: float, substeps: int) -> Tensor:
-    """Share of each step of a period in which each command is in force, 0 to 1, [substeps, commands, N].
+def mean_commands(held: Tensor, latency: Tensor, period: float, substeps: int) -> Tensor:
+    """Mean over each step of a period of what the commands in force hold, [substeps, N].
 
-    The newest command comes first, each next one is a period older, the oldest has been in force for ever. A
-    command takes effect `latency` s, [N], after its period began and is replaced a period later by the next.
+    `held` [D, N] is what each command settles at, newest first, each next one a period older, the oldest in
+    force for ever. A command takes effect `latency` s, [N], after its period began and is replaced a period
+    later by the next.
     """
     step = torch.arange(substeps, dtype=latency.dtype, device=latency.device).reshape(-1, 1, 1)
-    age = substeps * torch.arange(commands - 1, dtype=latency.dtype, device=latency.device).unsqueeze(1)
-    onset = (latency * (substeps / period) - age - step).clamp(0, 1)  # in steps, from the start of each
-    ends = torch.ones_like(latency).expand(substeps, 1, -1), torch.zeros_like(latency).expand(substeps, 1, -1)
-    return -torch.diff(onset, dim=1, prepend=ends[0], append=ends[1])
+    age = substeps * torch.arange(len(held) - 1, dtype=latency.dtype, device=latency.device).unsqueeze(1)
+    older = (latency * (substeps / period) - age - step).clamp(0, 1)  # share of the step, [substeps, D-1, N]
+    return held[0] + (older * (held[1:] - held[:-1])).sum(1)
 
 
 def lagged_force(force: Tensor, target: Tensor, time_constant: Tensor, step: float) -> tuple[Tensor, Tensor]:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from cartpole_rl.physics.actuator import Actuator, in_force_share, lagged_force, static_force
+from cartpole_rl.physics.actuator import Actuator, lagged_force, mean_commands, static_force
 from cartpole_rl.physics.friction import (
     DRY,
     STICKING,
@@ -100,6 +100,8 @@ class Mechanism(NamedTuple):
     total_mass: Tensor  # kg
     first_moment: Tensor  # m_p l, kg m
     pivot_inertia: Tensor  # kg m^2
+    sin_tilt: Tensor
+    cos_tilt: Tensor
     gravity_force: Tensor  # N along a tilted track
     resting_normal_force: Tensor  # N, of the track on the cart while the pole is at rest
 
@@ -108,12 +110,15 @@ def mechanism(cart: CartParameters) -> Mechanism:
     """Evaluate the constants of a cart."""
     total_mass = cart.total_mass
     weight = total_mass * GRAVITY
+    sin_tilt, cos_tilt = torch.sin(cart.track_tilt), torch.cos(cart.track_tilt)
     return Mechanism(
         total_mass,
         cart.first_moment,
         cart.pivot_inertia,
-        weight * torch.sin(cart.track_tilt),
-        weight * torch.cos(cart.track_tilt),
+        sin_tilt,
+        cos_tilt,
+        weight * sin_tilt,
+        weight * cos_tilt,
     )
 
 
@@ -129,11 +134,12 @@ class Coupling(NamedTuple):
 def coupling(state: State, cart: CartParameters, body: Mechanism) -> Coupling:
     """Evaluate the shared terms. On a track tilted by t the pole stands theta - t from the track's normal."""
     from_normal = state.theta - cart.track_tilt
-    cos = torch.cos(from_normal)
+    sin, cos = torch.sin(from_normal), torch.cos(from_normal)
+    sin_theta = sin * body.cos_tilt + cos * body.sin_tilt  # costs less than a third function of an angle
     return Coupling(
-        sin=torch.sin(from_normal),
+        sin=sin,
         cos=cos,
-        gravity_torque=body.first_moment * GRAVITY * torch.sin(state.theta),
+        gravity_torque=body.first_moment * GRAVITY * sin_theta,
         determinant=body.total_mass * body.pivot_inertia - (body.first_moment * cos) ** 2,
     )
 
@@ -219,7 +225,7 @@ def run_period(
     step = period / substeps
     body = mechanism(cart)
     held = static_force(drive.motors, cart, models.actuator)  # [D, N]
-    targets = (in_force_share(latency, len(held), period, substeps) * held).sum(1)  # [substeps, N]
+    targets = mean_commands(held, latency, period, substeps)  # [substeps, N]
     force = drive.force
     for target in targets:
         if models.actuator is Actuator.NEWTONS:

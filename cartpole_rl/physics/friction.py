@@ -49,8 +49,7 @@ def dry_friction(x_dot: Tensor, cart: CartParameters, model: CartFriction) -> Te
         return torch.zeros_like(x_dot)
     coulomb = coulomb_force(x_dot, cart)
     if model is CartFriction.SIGMOID:
-        # 2 / (1 + exp(-rho v)) - 1 is tanh(rho v / 2)
-        return coulomb * torch.tanh(0.5 * cart.sigmoid_slope * x_dot)
+        return coulomb * (2 * torch.sigmoid(cart.sigmoid_slope * x_dot) - 1)
     if model is CartFriction.STRIBECK:
         excess = (cart.cart_stiction_ratio - 1) * torch.exp(-((x_dot / cart.stribeck_velocity) ** 2))
         coulomb = coulomb * (1 + excess)

@@ -1,30 +1,34 @@
-"""N simulated carts as one plant: physics, encoders, delays, and parameters drawn anew for each episode.
+"""N simulated carts as one plant: parameters and starts drawn anew for each episode, physics, encoders.
 
 The true state lives here and stays here; what leaves is what a cart's serial port would say.
 """
 
 import math
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from cartpole_rl.physics.dynamics import Drive, Models, State, run_period
+from cartpole_rl.compilation import Compiled
+from cartpole_rl.physics.dynamics import Drive, Models, State
 from cartpole_rl.physics.parameters import CartParameters
+from cartpole_rl.plants.simulation import Cart, Chance, Command, Encoders, encoder_counts, run_carts
 from cartpole_rl.plants.specs import Plant
 from cartpole_rl.randomization import Randomizer
-from cartpole_rl.tasks.features import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 from cartpole_rl.tasks.starts import StartSettings, draw_start
+
+OF_CHANCE = ("latency_jitter", "position_noise", "angle_noise")  # drawn anew in each period
 
 
 class SimulatedPlant(Plant):
     """N simulated carts.
 
     `period` s is one control period, integrated in `substeps` steps. Parameters and the start are drawn
-    inside the reset, for the rows that reset; `parameters` reads the values in force. `compiled` physics is
-    several times as fast, needs a C++ compiler and costs some seconds once.
+    inside the reset, for the rows that reset; `parameters` reads the values in force. A `compiled` plant and
+    the hardware transform over it are several times as fast, need a C++ compiler and cost some seconds once.
     """
 
     def __init__(
@@ -40,21 +44,23 @@ class SimulatedPlant(Plant):
         compiled: bool = False,
     ) -> None:
         super().__init__(carts, device)
+        self.compiled = compiled
         self.randomizer, self.start, self.models = randomizer, start, models
         self.period, self.substeps = period, substeps
-        self._run_period = torch.compile(run_period, fullgraph=True) if compiled else run_period
+        run = partial(run_carts, models=models, period=period, substeps=substeps)
+        self._run = Compiled(run) if compiled else run
         self._generator = torch.Generator(device=self.device)
         self.set_seed(seed)
         delay = randomizer.longest_delay()
-        self._commands = 1 + max(1, math.ceil(delay / period - 1e-9))  # motor values that can be under way
-        self._jitters = randomizer.can_differ_from_zero("latency_jitter")
-        self._noisy = randomizer.can_differ_from_zero("position_noise") or randomizer.can_differ_from_zero(
-            "angle_noise"
-        )
+        commands = 1 + max(1, math.ceil(delay / period - 1e-9))  # motor values that can be under way
+        self._chancy = any(randomizer.can_differ_from_zero(name) for name in OF_CHANCE)
         self._table = randomizer.nominal.unsqueeze(1).repeat(1, carts)  # [P, N]
         self._cart = CartParameters.from_table(self._table)  # its fields share the table's memory
-        self._state = State(*torch.zeros(4, carts, device=self.device).unbind(0))
-        self._drive = Drive(self._zeros(), torch.zeros(self._commands, carts, device=self.device))
+        self._encoder_rows = [CartParameters.names().index(name) for name in Encoders._fields]
+        zeros = partial(torch.zeros, device=self.device)
+        self._no_chance = Chance(*zeros(3, carts))
+        self._state = State(*zeros(4, carts))
+        self._drive = Drive(zeros(carts), zeros(commands, carts))
 
     @property
     def parameters(self) -> CartParameters:
@@ -92,69 +98,49 @@ class SimulatedPlant(Plant):
         self._drive = Drive(snapshot["force"].clone(), snapshot["motors"].clone())
         self._generator.set_state(snapshot["generator"])
 
-    def _zeros(self) -> Tensor:
-        return torch.zeros(self.carts, device=self.device)
-
     def _set_seed(self, seed: int | None) -> None:
         self._generator.manual_seed(0 if seed is None else seed)
 
-    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDict:
-        mask = None if tensordict is None else tensordict.get("_reset", None)
-        rows = (
-            torch.arange(self.carts, device=self.device)
-            if mask is None
-            else mask.reshape(self.carts).nonzero().squeeze(-1)
-        )
-        self._table[:, rows] = self.randomizer.draw(len(rows), self._generator)
-        drawn = draw_start(len(rows), self.start, self._generator)
+    def restart(self, rows: Tensor) -> TensorDict:
+        """Draw new parameters and a new start for the carts `rows` [R]; their first frame, [R]."""
+        count = len(rows)
+        table = self.randomizer.draw(count, self._generator)
+        start = draw_start(count, self.start, self._generator)
+        state = State(*start.unbind(1))
+        self._table.index_copy_(1, rows, table)
         self._state = State(
-            *(old.index_copy(0, rows, new) for old, new in zip(self._state, drawn.unbind(1), strict=True))
+            *(old.index_copy(0, rows, new) for old, new in zip(self._state, state, strict=True))
         )
-        force, motors = self._drive
-        self._drive = Drive(force.index_fill(0, rows, 0), motors.index_fill(1, rows, 0))
-        return self.frame(*self._report(self._zeros().bool()))
+        self._drive = Drive(*(old.index_fill(-1, rows, 0) for old in self._drive))
+        counts = encoder_counts(state, Encoders(*table[self._encoder_rows]), self._chance(count))
+        no_motor = counts.new_zeros(count, 1)
+        return self.frame(*self._report(counts, no_motor, no_motor.bool()))
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDict:
+        """The first frame of the carts that reset; TorchRL keeps the others', which are zeros here."""
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        if mask is None:
+            return self.restart(torch.arange(self.carts, device=self.device))
+        rows = mask.reshape(self.carts).nonzero().squeeze(-1)
+        first = self.restart(rows)
+        frame = first.new_zeros(self.batch_size)
+        frame[rows] = first
+        return frame
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        motor = tensordict.get("motor").T.to(self._drive.motors.dtype)
-        motors = torch.cat((motor, self._drive.motors[:-1]))
-        cart = self.parameters
-        self._state, self._drive = self._run_period(
-            self._state,
-            Drive(self._drive.force, motors),
-            self._latency(cart),
-            cart,
-            self.models,
-            self.period,
-            self.substeps,
-        )
-        return self.step_frame(*self._report(self._state.x.abs() > cart.track_half_length))
+        command = Command(tensordict.get("motor"))
+        after = self._run(self._state, self._drive, command, Cart(self._table), self._chance(self.carts))
+        self._state, self._drive = after.state, after.drive
+        return self.step_frame(*self._report(after.counts, after.motor_applied, after.off_track))
 
-    def _latency(self, cart: CartParameters) -> Tensor:
-        if not self._jitters:
-            return cart.latency
-        unit = 2 * torch.rand(self.carts, generator=self._generator, device=self.device) - 1
-        return (cart.latency + unit * cart.latency_jitter).clamp(min=0)
+    def _report(self, counts: Tensor, motor_applied: Tensor, off_track: Tensor) -> tuple[Tensor, ...]:
+        """The arguments of `frame`."""
+        dt = torch.full(off_track.shape, self.period, device=self.device)
+        return counts, dt, motor_applied, off_track, torch.zeros_like(off_track)
 
-    def _report(self, off_track: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """What the carts would say now: counts, dt, motor_applied, terminated, truncated."""
-        return (
-            self._encoders(),
-            torch.full((self.carts, 1), self.period, device=self.device),
-            self._motor_in_force(),
-            off_track.unsqueeze(1),
-            torch.zeros(self.carts, 1, dtype=torch.bool, device=self.device),
-        )
-
-    def _motor_in_force(self) -> Tensor:
-        """Motor value [N, 1] whose delay has passed by now."""
-        age = (self.parameters.latency / self.period - 1).ceil().clamp(min=0).long()
-        return self._drive.motors.gather(0, age.unsqueeze(0)).T.long()
-
-    def _encoders(self) -> Tensor:
-        """Counts [N, 2] of the true state, with the zero's error and noise."""
-        cart = self.parameters
-        x, theta = self._state.x, self._state.theta + cart.angle_offset
-        if self._noisy:
-            noise = torch.randn((2, self.carts), generator=self._generator, device=self.device)
-            x, theta = x + noise[0] * cart.position_noise, theta + noise[1] * cart.angle_noise
-        return torch.stack((x / CART_METRES_PER_COUNT, theta / POLE_RADIANS_PER_COUNT), 1).round().long()
+    def _chance(self, count: int) -> Chance:
+        """The draws for one period of `count` carts, or 0 where nothing is left to chance."""
+        if not self._chancy:
+            return Chance(*(value[:count] for value in self._no_chance))
+        draws = {"generator": self._generator, "device": self.device}
+        return Chance(2 * torch.rand(count, **draws) - 1, *torch.randn(2, count, **draws))

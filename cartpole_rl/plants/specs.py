@@ -1,5 +1,7 @@
 """The contract that every plant keeps: what goes in, what comes out, in which shape and type."""
 
+from typing import Any
+
 import torch
 from tensordict import TensorDict
 from torchrl.data import Binary, Bounded, Composite, Unbounded
@@ -18,6 +20,8 @@ class Plant(EnvBase):
     `truncated` [N, 1] bool (link lost; time limits belong to the task).
     A plant has no reward of its own and gives zeros.
     """
+
+    compiled = False  # whether what stands above may compile its arithmetic as well
 
     def __init__(self, carts: int, device: torch.device | str = "cpu") -> None:
         super().__init__(device=torch.device(device), batch_size=torch.Size([carts]))
@@ -44,6 +48,12 @@ class Plant(EnvBase):
         """m, [N]: twice the distance from pivot to centre of mass; what a length-aware agent observes."""
         raise NotImplementedError
 
+    def restart(self, rows: torch.Tensor) -> TensorDict:
+        """Begin a new episode on the carts `rows`, [R] int64; their first frame, [R]."""
+        mask = torch.zeros(self.carts, 1, dtype=torch.bool, device=self.device)
+        mask[rows] = True
+        return self._reset(TensorDict({"_reset": mask}, self.batch_size))[rows]
+
     @property
     def carts(self) -> int:
         """N, the number of carts in the batch."""
@@ -57,8 +67,8 @@ class Plant(EnvBase):
         terminated: torch.Tensor,
         truncated: torch.Tensor,
     ) -> TensorDict:
-        """What `_reset` returns; `done` is `terminated | truncated`."""
-        return TensorDict(
+        """What `_reset` returns, of all carts or some; `done` is `terminated | truncated`."""
+        return tensordict_of(
             {
                 "counts": counts,
                 "dt": dt,
@@ -66,15 +76,22 @@ class Plant(EnvBase):
                 "terminated": terminated,
                 "truncated": truncated,
                 "done": terminated | truncated,
-            },
-            batch_size=self.batch_size,
-            device=self.device,
+            }
         )
 
     def step_frame(self, *frame: torch.Tensor) -> TensorDict:
         """What `_step` returns: `frame` of the same arguments, and the reward 0, which TorchRL asks for."""
         result = self.frame(*frame)
         return result.set("reward", torch.zeros_like(result.get("dt")))
+
+
+def tensordict_of(entries: dict[str, Any]) -> TensorDict:
+    """A tensordict of entries [N, ...] that are known to fit together; `counts` is one of them.
+
+    What TensorDict's constructor checks takes longer than the physics of a thousand carts.
+    """
+    counts = entries["counts"]
+    return TensorDict._new_unsafe(entries, batch_size=counts.shape[:1], device=counts.device)
 
 
 DONE_KEYS = ("done", "terminated", "truncated")

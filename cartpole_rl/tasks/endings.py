@@ -5,6 +5,8 @@ from enum import StrEnum
 import torch
 from torch import Tensor
 
+from cartpole_rl.tasks.features import Measured
+
 
 class Ending(StrEnum):
     """Reasons, as they stand in metrics.json."""
@@ -16,8 +18,8 @@ class Ending(StrEnum):
     LINK = "link"  # truncated: the cart stopped answering
 
 
-def fallen(state: Tensor, angle_limit: float | None) -> Tensor:
-    """Whether |theta| of the measured state [N, 4] is over `angle_limit` rad, [N] bool; None is no limit."""
+def fallen(state: Measured, angle_limit: float | None) -> Tensor:
+    """Whether the measured |theta| is over `angle_limit` rad, [N] bool; None is no limit."""
     if angle_limit is None:
-        return torch.zeros(len(state), dtype=torch.bool, device=state.device)
-    return state[:, 2].abs() > angle_limit
+        return torch.zeros_like(state.theta, dtype=torch.bool)
+    return state.theta.abs() > angle_limit

@@ -2,6 +2,7 @@
 
 import math
 from enum import StrEnum
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -16,6 +17,15 @@ SPEED_SCALE = 1.0  # m/s
 ANGULAR_SPEED_SCALE = 8.0  # rad/s
 MOTOR_SCALE = 255.0
 LENGTH_SCALE = 0.5  # m
+
+
+class Measured(NamedTuple):
+    """State of N carts as a host measures it, [N] each."""
+
+    x: Tensor  # m
+    x_dot: Tensor  # m/s
+    theta: Tensor  # rad, wrapped
+    theta_dot: Tensor  # rad/s
 
 
 class ObservationKind(StrEnum):
@@ -48,20 +58,16 @@ def measured_velocity(counts: Tensor, previous: Tensor, dt: Tensor) -> tuple[Ten
     )
 
 
-def observe(state: Tensor, kind: ObservationKind) -> Tensor:
-    """Observation of the measured state [N, 4] (x, x_dot, theta, theta_dot): [N, 4] raw or [N, 5] cos/sin."""
+def observe(state: Measured, kind: ObservationKind) -> tuple[Tensor, ...]:
+    """The numbers of an observation, [N] each: 4 raw or 5 cos/sin."""
     if kind is ObservationKind.RAW:
         return state
-    x, x_dot, theta, theta_dot = state.unbind(-1)
-    return torch.stack(
-        (
-            x / POSITION_SCALE,
-            x_dot / SPEED_SCALE,
-            torch.cos(theta),
-            torch.sin(theta),
-            theta_dot / ANGULAR_SPEED_SCALE,
-        ),
-        -1,
+    return (
+        state.x / POSITION_SCALE,
+        state.x_dot / SPEED_SCALE,
+        torch.cos(state.theta),
+        torch.sin(state.theta),
+        state.theta_dot / ANGULAR_SPEED_SCALE,
     )
 
 

@@ -10,6 +10,8 @@ from enum import StrEnum
 import torch
 from torch import Tensor
 
+from cartpole_rl.tasks.features import Measured
+
 UPRIGHT_ANGLE = math.radians(5)  # rad
 UPRIGHT_SPEED = math.radians(6)  # rad/s
 BONUS = 5.0  # (6.2), given once for the angle and once more for angle and speed
@@ -28,39 +30,39 @@ class Reward(StrEnum):
     SCORE = "score"
 
 
-def constant(state: Tensor, x_max: float) -> Tensor:
+def constant(state: Measured, x_max: float) -> Tensor:
     """(5.1): 1."""
-    return torch.ones_like(state[:, 0])
+    return torch.ones_like(state.x)
 
 
-def cosine(state: Tensor, x_max: float) -> Tensor:
+def cosine(state: Measured, x_max: float) -> Tensor:
     """(5.2): cos(theta / 2)."""
-    return torch.cos(0.5 * state[:, 2])
+    return torch.cos(0.5 * state.theta)
 
 
-def linear_angle(state: Tensor, x_max: float) -> Tensor:
+def linear_angle(state: Measured, x_max: float) -> Tensor:
     """(5.3): (pi - |theta|) / pi."""
-    return 1 - state[:, 2].abs() / math.pi
+    return 1 - state.theta.abs() / math.pi
 
 
-def position(state: Tensor, x_max: float) -> Tensor:
+def position(state: Measured, x_max: float) -> Tensor:
     """(5.4) and (6.1): cos(theta / 2) (x_max - |x|) / x_max, not below 0, at most 1 a step."""
-    return cosine(state, x_max) * (1 - state[:, 0].abs() / x_max).clamp(min=0)
+    return cosine(state, x_max) * (1 - state.x.abs() / x_max).clamp(min=0)
 
 
-def upright_bonus(state: Tensor, x_max: float) -> Tensor:
+def upright_bonus(state: Measured, x_max: float) -> Tensor:
     """(5.5): (5.4) and 10 while |theta| < 12 degrees."""
-    return position(state, x_max) + UPRIGHT_BONUS * (state[:, 2].abs() < BALANCE_ANGLE)
+    return position(state, x_max) + UPRIGHT_BONUS * (state.theta.abs() < BALANCE_ANGLE)
 
 
-def score(state: Tensor, x_max: float) -> Tensor:
+def score(state: Measured, x_max: float) -> Tensor:
     """(6.2): (6.1), 5 while |theta| < 5 degrees, 5 more if also |theta_dot| < 6 degrees/s; at most 11."""
-    upright = state[:, 2].abs() < UPRIGHT_ANGLE
-    still = upright & (state[:, 3].abs() < UPRIGHT_SPEED)
-    return position(state, x_max) + BONUS * (upright.to(state.dtype) + still.to(state.dtype))
+    upright = state.theta.abs() < UPRIGHT_ANGLE
+    still = upright & (state.theta_dot.abs() < UPRIGHT_SPEED)
+    return position(state, x_max) + BONUS * (upright.to(state.theta.dtype) + still.to(state.theta.dtype))
 
 
-REWARDS: dict[Reward, Callable[[Tensor, float], Tensor]] = {
+REWARDS: dict[Reward, Callable[[Measured, float], Tensor]] = {
     Reward.CONSTANT: constant,
     Reward.COSINE: cosine,
     Reward.LINEAR_ANGLE: linear_angle,

@@ -18,6 +18,7 @@ DQN = {
     "mirrored": False,
     "gamma": 0.9,
     "double": True,
+    "action_gap": 0.0,
     "loss": "l2",
     "target_tau": 0.25,
     "target_period": None,
@@ -135,6 +136,41 @@ def test_loss_is_that_of_the_target_computed_by_hand(double: bool) -> None:
     assert torch.allclose(batch["td_error"], (value - target) ** 2, rtol=1e-4, atol=1e-5)
 
 
+def test_the_action_gap_takes_the_shortfall_off_the_reward() -> None:
+    agent, plain = make_agent(action_gap=0.5), make_agent()
+    disturb(agent)
+    plain.load_state_dict(agent.state_dict())
+    batch = transitions(64)
+    values = values_of(agent, batch["observation"], target=True)
+    shortfall = values.max(1).values - values.gather(1, batch["action"].unsqueeze(1)).squeeze(1)
+    assert shortfall.max() > 0
+    reward = batch["next", "reward"] - 0.5 * shortfall.unsqueeze(1)
+    assert torch.allclose(agent.widen_gap(batch)["next", "reward"], reward, atol=1e-6)
+    assert not torch.allclose(batch["next", "reward"], reward)  # what was given stays as it was
+    assert plain.widen_gap(batch) is batch
+
+
+def test_the_action_gap_widens_and_keeps_the_best_action() -> None:
+    """One state, two actions worth 1 and 0.9, the end: what is left is 1 and 1 - 0.1 / (1 - 0.5)."""
+    learned = {}
+    for gap in (0.0, 0.5):
+        agent = make_agent(actions=2, action_gap=gap, target_tau=0.1, layer_norm=False)
+        optimizer = torch.optim.Adam(agent.loss.parameters(), lr=1e-2)
+        batch = transitions(2)
+        batch["observation"][:] = 0.5
+        batch["action"] = torch.tensor([0, 1])
+        batch["next", "reward"] = torch.tensor([[1.0], [0.9]])
+        batch["next", "terminated"][:] = True
+        for _ in range(600):
+            optimizer.zero_grad()
+            agent.loss(agent.widen_gap(batch))["loss"].backward()
+            optimizer.step()
+            agent.follow()
+        learned[gap] = values_of(agent, batch["observation"][:1], target=False)[0]
+    assert torch.allclose(learned[0.0], torch.tensor([1.0, 0.9]), atol=0.01)
+    assert torch.allclose(learned[0.5], torch.tensor([1.0, 0.8]), atol=0.01)
+
+
 def test_double_and_single_differ_where_the_networks_disagree() -> None:
     losses = []
     for double in (True, False):
@@ -197,7 +233,7 @@ def test_the_greedy_policy_acts_with_the_average_of_the_weights_as_they_move() -
         assert torch.allclose(policy_weights(policy), expected, atol=1e-5)
         disturb(agent)
         agent.follow()
-        share = max(0.25, 9 / (10 + averages))  # of the newest: the untrained weights are soon forgotten
+        share = max(0.25, 10 / (10 + averages))  # of the newest: the untrained weights are soon forgotten
         expected = (1 - share) * expected + share * actor_weights(agent)
 
 
@@ -230,6 +266,7 @@ def test_without_an_average_the_greedy_policy_is_the_online_network() -> None:
         {"target_tau": 0.0},
         {"target_tau": None, "target_period": 0},
         {"gamma": 1.0},
+        {"action_gap": 1.0},
         {"loss": "l3"},
         {"hidden": [0]},
         {"hidden": [15], "mirrored": True},

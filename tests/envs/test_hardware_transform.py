@@ -19,6 +19,7 @@ from cartpole_rl.tasks.features import (
     LENGTH_SCALE,
     MOTOR_SCALE,
     SPEED_SCALE,
+    Measured,
     ObservationKind,
     observe,
 )
@@ -114,7 +115,8 @@ class TestObservation:
                 expected.append(state[:, 3:4] / ANGULAR_SPEED_SCALE)
             following = taken[time]["next"]
             torch.testing.assert_close(following["past"], torch.cat(expected, -1))
-            parts = (observe(following["state"], ObservationKind.COS_SIN), following["past"])
+            seen = observe(Measured(*following["state"].unbind(1)), ObservationKind.COS_SIN)
+            parts = (torch.stack(seen, 1), following["past"])
             torch.testing.assert_close(following["observation"], torch.cat(parts, -1))
 
     def test_pole_length_comes_last(
@@ -208,7 +210,7 @@ def test_rewards_and_scores_are_of_the_measured_state(
         ("score", Reward.SCORE, 1.0),
         ("score_upright", Reward.POSITION, 1.0),
     ):
-        expected = scale * REWARDS[law](following["state"], 0.38)
+        expected = scale * REWARDS[law](Measured(*following["state"].unbind(1)), 0.38)
         torch.testing.assert_close(following[key].squeeze(-1), expected)
 
 

@@ -43,6 +43,7 @@ AGENT = {
     "mirrored": False,
     "gamma": 0.9,
     "double": True,
+    "action_gap": 0.0,
     "loss": "smooth_l1",
     "target_tau": 0.05,
     "average_decay": 0.9,
@@ -162,7 +163,7 @@ def test_gradients_are_clipped(make_training: Callable[..., Training]) -> None:
 def test_a_time_limit_does_not_end_the_world(make_training: Callable[..., Training]) -> None:
     """With 1 a step and gamma = 0.5 every state is worth 2, since episodes of 6 steps are only cut short."""
     training = make_training(
-        learning={"frames": 6400, "updates": 4, "n_step": 2},
+        learning={"frames": 6400, "updates": 8, "n_step": 2},
         agent={"gamma": 0.5},
         optimizer={"learning_rate": 1e-2},
         reward={"kind": "constant", "scale": 1.0, "track_penalty": 0.0},

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from cartpole_rl.physics.actuator import Actuator, in_force_share, lagged_force, static_force
+from cartpole_rl.physics.actuator import Actuator, lagged_force, mean_commands, static_force
 from cartpole_rl.physics.dynamics import Drive, Models, State, advance, mechanism, run_period
 from cartpole_rl.physics.friction import CartFriction, PoleFriction
 from cartpole_rl.physics.parameters import CartParameters
@@ -92,6 +92,11 @@ class TestLag:
         assert end == 4.0
 
 
+def shares(latency: float, commands: int, period: float, substeps: int) -> Tensor:
+    """Share of each step in which each command is in force, [substeps, commands]: the mean of ones."""
+    return mean_commands(torch.eye(commands, dtype=torch.float64), at(latency), period, substeps)
+
+
 class TestLatency:
     @given(
         latency=st.floats(0, 0.1),
@@ -100,22 +105,23 @@ class TestLatency:
         more=st.integers(0, 3),
     )
     def test_shares_sum_to_one(self, latency: float, period: float, substeps: int, more: int) -> None:
-        commands = 2 + math.ceil(latency / period) + more
-        share = in_force_share(at(latency), commands, period, substeps)
-        assert share.shape == (substeps, commands, 1)
+        share = shares(latency, 2 + math.ceil(latency / period) + more, period, substeps)
         assert ((share >= 0) & (share <= 1)).all()
-        torch.testing.assert_close(share.sum(1), torch.ones(substeps, 1, dtype=torch.float64))
+        torch.testing.assert_close(share.sum(1), torch.ones(substeps, dtype=torch.float64))
 
-    def test_a_command_takes_over_when_its_latency_has_passed(self) -> None:
-        share = in_force_share(at(0.0, 0.005, 0.02, 0.034), 3, 0.02, 2)[..., :].unbind(-1)
-        expected = [
-            [[1, 0, 0], [1, 0, 0]],
-            [[0.5, 0.5, 0], [1, 0, 0]],
-            [[0, 1, 0], [0, 1, 0]],
-            [[0, 0, 1], [0, 0.6, 0.4]],
-        ]
-        for measured, values in zip(share, expected, strict=True):
-            torch.testing.assert_close(measured, torch.tensor(values, dtype=torch.float64))
+    @pytest.mark.parametrize(
+        ("latency", "expected"),
+        [
+            (0.0, [[1, 0, 0], [1, 0, 0]]),
+            (0.005, [[0.5, 0.5, 0], [1, 0, 0]]),
+            (0.02, [[0, 1, 0], [0, 1, 0]]),
+            (0.034, [[0, 0, 1], [0, 0.6, 0.4]]),
+        ],
+    )
+    def test_a_command_takes_over_when_its_latency_has_passed(
+        self, latency: float, expected: list[list[float]]
+    ) -> None:
+        torch.testing.assert_close(shares(latency, 3, 0.02, 2), torch.tensor(expected, dtype=torch.float64))
 
     @pytest.mark.parametrize("actuator", Actuator)
     @pytest.mark.parametrize("periods", [0.0, 0.5, 1.0, 1.7])

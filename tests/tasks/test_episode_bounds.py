@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from cartpole_rl.tasks.endings import fallen
+from cartpole_rl.tasks.features import Measured
 from cartpole_rl.tasks.rewards import BALANCE_ANGLE
 from cartpole_rl.tasks.starts import Start, StartSettings, draw_start
 from cartpole_rl.tasks.upright import is_upright, upright_since, wrap
@@ -50,7 +51,8 @@ class TestStarts:
 
 
 class TestFallen:
-    state = torch.tensor([[0.0, 0, angle, 0] for angle in (0.0, 0.2, 0.21, -0.2, -0.21, math.pi)])
+    still = torch.zeros(6)
+    state = Measured(still, still, torch.tensor([0.0, 0.2, 0.21, -0.2, -0.21, math.pi]), still)
 
     def test_beyond_twelve_degrees_on_either_side(self) -> None:
         assert math.degrees(BALANCE_ANGLE) == pytest.approx(12)

@@ -4,8 +4,8 @@ import math
 
 import pytest
 import torch
-from torch import Tensor
 
+from cartpole_rl.tasks.features import Measured
 from cartpole_rl.tasks.rewards import REWARDS, SCORE, SCORE_UPRIGHT, Reward
 
 X_MAX = 0.4
@@ -16,12 +16,12 @@ def value(
     kind: Reward, x: float = 0.0, theta: float = 0.0, theta_dot: float = 0.0, x_dot: float = 0.0
 ) -> float:
     state = torch.tensor([[x, x_dot, theta, theta_dot]], dtype=torch.float64)
-    return REWARDS[kind](state, X_MAX).item()
+    return REWARDS[kind](Measured(*state.unbind(1)), X_MAX).item()
 
 
-def random_states(count: int) -> Tensor:
+def random_states(count: int, side: int = 1) -> Measured:
     unit = 2 * torch.rand((count, 4), generator=torch.Generator().manual_seed(0), dtype=torch.float64) - 1
-    return unit * torch.tensor([X_MAX, 2.0, math.pi, 10.0], dtype=torch.float64)
+    return Measured(*(side * unit * torch.tensor([X_MAX, 2.0, math.pi, 10.0])).unbind(1))
 
 
 @pytest.mark.parametrize(
@@ -73,8 +73,8 @@ def test_scores_of_an_episode_are_at_most_500_and_5500() -> None:
 
 @pytest.mark.parametrize("kind", Reward)
 def test_left_and_right_are_worth_the_same(kind: Reward) -> None:
-    states = random_states(1000)
-    torch.testing.assert_close(REWARDS[kind](states, X_MAX), REWARDS[kind](-states, X_MAX))
+    right, left = (REWARDS[kind](random_states(1000, side), X_MAX) for side in (1, -1))
+    torch.testing.assert_close(right, left)
 
 
 def test_every_reward_has_its_function() -> None:

@@ -1,0 +1,57 @@
+"""Compiles a pure function of tensors for the shapes that it is first called with.
+
+The function is traced to a flat graph, which TorchInductor gets as it is. `torch.compile` would also guard
+every Python object that the function reads, in every call, and that takes longer than the arithmetic of a
+thousand carts; where nothing but the tensors changes between two calls, there is nothing to guard.
+"""
+
+from collections.abc import Callable, Sequence
+from itertools import chain, islice
+from typing import Any, Generic, TypeVar
+
+import torch
+from torch import Tensor
+from torch._inductor import standalone_compile
+from torch.fx.experimental.proxy_tensor import make_fx
+
+OPTIONS = {"cpp.enable_floating_point_contract_flag": "fast"}  # a product and a sum may be rounded as one
+
+Result = TypeVar("Result", bound=tuple)
+
+
+class Compiled(Generic[Result]):
+    """`function` of named tuples of tensors, which returns another, compiled in its first call.
+
+    Shapes, types and devices have to stay as they are in that call, and so has all that `function` reads
+    beside its arguments. It needs a C++ compiler; what was compiled is kept on disk by TorchInductor, where
+    the next process finds it. No gradient flows through it.
+    """
+
+    def __init__(self, function: Callable[..., Result]) -> None:
+        self._function = function
+        self._call: Callable[..., Any] | None = None
+        self._result: Callable[..., Result] = function
+
+    @torch.no_grad()
+    def __call__(self, *arguments: tuple[Tensor, ...]) -> Result:
+        """The function's value."""
+        tensors = [tensor.contiguous() for tensor in chain.from_iterable(arguments)]
+        if self._call is None:
+            self._call = self._compile(arguments, tensors)
+        return self._result(*self._call(*tensors))
+
+    def _compile(
+        self, arguments: Sequence[tuple[Tensor, ...]], tensors: Sequence[Tensor]
+    ) -> Callable[..., Any]:
+        def flat(*tensors: Tensor) -> tuple[Tensor, ...]:
+            rest = iter(tensors)
+            value = self._function(*(type(each)(*islice(rest, len(each))) for each in arguments))
+            self._result = type(value)
+            return tuple(value)
+
+        return standalone_compile(
+            make_fx(flat)(*tensors),
+            list(tensors),
+            dynamic_shapes="from_example_inputs",
+            options={"config_patches": OPTIONS},
+        )

@@ -1,0 +1,51 @@
+"""What can be set about an environment: what the agent sees and learns from, what is asked of the cart."""
+
+from pydantic import Field
+
+from cartpole_rl.settings import Count, Finite, NonNegative, Positive, Settings
+from cartpole_rl.tasks.features import MIRROR_SIGNS, ObservationKind, observation_size
+from cartpole_rl.tasks.rewards import Reward
+from cartpole_rl.tasks.starts import StartSettings
+
+
+class ObservationSettings(Settings):
+    """What the agent sees beside the present measured state."""
+
+    kind: ObservationKind
+    past_motors: int = Field(ge=0, le=16)  # the last so many motor values
+    past_velocities: int = Field(ge=0, le=16)  # the velocities so many periods back
+    pole_length: bool  # the length of the pole, known from a label on it
+
+    @property
+    def past_size(self) -> int:
+        """Numbers of the past: motor values, newest first, then velocities, newest first."""
+        return self.past_motors + 2 * self.past_velocities
+
+    @property
+    def size(self) -> int:
+        """Numbers in an observation."""
+        return observation_size(self.kind) + self.past_size + int(self.pole_length)
+
+    @property
+    def mirror_signs(self) -> list[int]:
+        """What each number of an observation is multiplied by when left and right are swapped, [size]."""
+        return [*MIRROR_SIGNS[self.kind], *[-1] * self.past_size, *[1] * self.pole_length]
+
+
+class RewardSettings(Settings):
+    """What the agent learns from: `kind` times `scale`, less `track_penalty` for leaving the track."""
+
+    kind: Reward
+    scale: Positive
+    track_penalty: NonNegative
+
+
+class TaskSettings(Settings):
+    """What is asked of the cart."""
+
+    name: str
+    start: StartSettings  # where training starts
+    evaluation_start: StartSettings
+    time_limit: Count  # control periods
+    angle_limit: Finite | None  # rad; None: the pole may hang
+    x_max: Positive  # m, of (5.4), (6.1), (6.2)

@@ -1,0 +1,141 @@
+#!/usr/bin/env python
+"""Learning, seed by seed: trains each row of docs/learning.md and judges the last checkpoint of every seed.
+
+    scripts/bench/learning.py medium large --seeds 10 --jobs 2 --json learning.json
+
+A row is an experiment of conf/experiment. Runs go to runs/bench/<row>/<seed> and are not trained again when they
+are there. A fraction is the mean score over 20 starts on a nominal cart over the best score that the search of
+scripts/bench/reference.py, or any agent in this table, has reached there (references.json). Seconds are those of
+collecting and learning, compilation included, evaluations left out.
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from cartpole_rl.commands.build import simulated_env, trained_agent, use_threads
+from cartpole_rl.evaluation.episodes import run_batch
+from cartpole_rl.randomization import Pole, PoleSettings
+from cartpole_rl.physics.parameters import uniform_rod
+from cartpole_rl.reporting.table import table
+
+REFERENCES = Path(__file__).with_name("references.json")
+ROWS = {  # experiment: plants that it is judged on
+    "medium": ("medium",),
+    "large": ("large",),
+    "both": ("medium", "large"),
+    "both_blind": ("medium", "large"),
+    "range": tuple(f"{length:.1f} m" for length in np.arange(0.2, 1.01, 0.1)),
+    "balance": ("medium",),
+    "recurrent": ("medium",),
+}
+REACHED, KEPT = 0.9, 0.85  # fractions: of the time to it, and over which later evaluations count as kept
+STARTS = 20
+
+
+def train(row: str, seed: int, overrides: list[str]) -> Path:
+    """Train one seed unless that was done."""
+    folder = Path("runs/bench", row, str(seed))
+    if not (folder / "metrics.json").exists():
+        command = [Path(sys.executable).with_name("cartpole-train"), f"experiment={row}", f"seed={seed}"]
+        done = subprocess.run(
+            [*command, *overrides, f"hydra.run.dir={folder}"], capture_output=True, text=True, check=False
+        )
+        if done.returncode:
+            sys.exit(f"{row} seed {seed}: {done.stderr.strip().splitlines()[-1]}")
+    return folder
+
+
+def judge(folder: Path, plant: str) -> dict[str, float]:
+    """Mean scores of the last checkpoint over STARTS starts on the nominal cart with the pole `plant`."""
+    agent = trained_agent(folder)
+    settings = agent.training.model_copy(
+        update={"randomization": {}, "pole": pole(plant, agent.training.pole)}
+    )
+    env = simulated_env(settings, settings.plant, STARTS, settings.task.evaluation_start, 1)
+    episodes = run_batch(env, agent.policy)
+    return {
+        "score": float(np.mean([episode.score.sum() for episode in episodes])),
+        "score_upright": float(np.mean([episode.score_upright.sum() for episode in episodes])),
+        "worst_start": float(min(episode.score.sum() for episode in episodes)),
+    }
+
+
+def pole(plant: str, trained: PoleSettings) -> PoleSettings:
+    """The pole of a plant: one of the agent's choices by name, or a rod by its length."""
+    if trained.choices is not None:
+        return PoleSettings(choices={plant: trained.choices[plant]})
+    rod = uniform_rod(torch.tensor(float(plant.split()[0])))
+    return PoleSettings(choices={plant: Pole(**{name: float(value) for name, value in rod.items()})})
+
+
+def result(row: str, folder: Path, references: dict[str, float]) -> dict[str, Any]:
+    """One seed's figures."""
+    history = [json.loads(line) for line in (folder / "history.jsonl").read_text().splitlines()]
+    scores = {plant: judge(folder, plant) for plant in ROWS[row]}
+    reference = float(np.mean([references[plant] for plant in ROWS[row]]))
+    course = [record["score"] / reference for record in history]
+    first = next((index for index, fraction in enumerate(course) if fraction >= REACHED), None)
+    later = [] if first is None else course[first + 1 :]
+    return {
+        "seconds": history[-1]["seconds"],
+        "seconds_to_reached": None if first is None else history[first]["seconds"],
+        "kept": float(np.mean([fraction > KEPT for fraction in later])) if later else None,
+        "plants": {
+            plant: {**figures, "fraction": figures["score"] / references[plant]}
+            for plant, figures in scores.items()
+        },
+    }
+
+
+def summary(row: str, results: dict[int, dict[str, Any]]) -> list[dict[str, str]]:
+    """Table lines: minimum, median and maximum over the seeds."""
+    lines = {}
+    for plant in ROWS[row]:
+        for key in ("score_upright",) if row == "balance" else ("fraction", "score"):
+            lines[f"{key}, {plant}"] = [each["plants"][plant][key] for each in results.values()]
+    if row != "balance":
+        lines["seconds to 0.9"] = [each["seconds_to_reached"] or float("inf") for each in results.values()]
+        lines["kept over 0.85"] = [each["kept"] or 0.0 for each in results.values()]
+    lines["seconds"] = [each["seconds"] for each in results.values()]
+    return [
+        {"row": row, "figure": name, "seeds": str(len(values))}
+        | {
+            column: f"{of(values):.3f}" if max(values) < 2 else f"{of(values):.0f}"
+            for column, of in (("min", np.min), ("median", np.median), ("max", np.max))
+        }
+        for name, values in lines.items()
+    ]
+
+
+def main() -> None:
+    """Train, judge, print a table, write what was seen."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("rows", nargs="+", choices=list(ROWS))
+    parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--jobs", type=int, default=1, help="trainings at once; 1 where time is measured")
+    parser.add_argument("--json", type=Path, help="file for all figures")
+    parser.add_argument("overrides", nargs="*", default=[], help=argparse.SUPPRESS)
+    given, overrides = parser.parse_known_args()
+    use_threads(1)
+    references = json.loads(REFERENCES.read_text())
+    everything, lines = {}, []
+    for row in given.rows:
+        with ThreadPoolExecutor(given.jobs) as pool:
+            folders = list(pool.map(lambda seed, row=row: train(row, seed, overrides), range(given.seeds)))
+        everything[row] = {seed: result(row, folder, references) for seed, folder in enumerate(folders)}
+        lines += summary(row, everything[row])
+        print(table(lines, {key: key for key in lines[0]}), flush=True)
+    if given.json:
+        given.json.write_text(json.dumps(everything, indent=1))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,86 @@
+"""The environment's own step with resets does what TorchRL's does, key by key and to the bit."""
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDictBase
+from torchrl.envs import EnvBase, TransformedEnv
+
+from cartpole_rl.envs import CartPoleEnv, HardwareTransform
+from cartpole_rl.plants.simulated import SimulatedPlant
+from cartpole_rl.randomization import PoleSettings, Range
+from cartpole_rl.tasks.starts import Start, StartSettings
+
+CARTS, STEPS, LIMIT = 16, 400, 60
+ANYWHERE = StartSettings(
+    angle=Start.ANY, position_spread=0.2, angle_spread=0, speed_spread=0.5, angular_speed_spread=1.0
+)
+RANGES = {
+    "cart_mass": Range(relative=(-0.2, 0.2)),
+    "latency": Range(absolute=(0.0, 0.03)),
+    "latency_jitter": Range(absolute=(0.001, 0.005)),
+    "position_noise": Range(absolute=(1e-5, 1e-4)),
+    "angle_noise": Range(absolute=(1e-3, 1e-2)),
+    "track_half_length": Range(relative=(-0.5, 0.0)),
+}
+
+
+@pytest.fixture
+def environments(
+    make_plant: Callable[..., SimulatedPlant],
+    make_environment: Callable[..., CartPoleEnv],
+    both_poles: PoleSettings,
+) -> tuple[CartPoleEnv, TransformedEnv]:
+    """Ours, and the same parts under TorchRL's own."""
+
+    def plant() -> SimulatedPlant:
+        return make_plant(CARTS, poles=both_poles, ranges=RANGES, start=ANYWHERE, seed=7)
+
+    ours = make_environment(plant(), time_limit=LIMIT, past_velocities=2, pole_length=True)
+    parts = ours.hardware
+    hardware = HardwareTransform(parts.motors.tolist(), parts.task, parts.observation_settings, parts.reward)
+    return ours, TransformedEnv(plant(), hardware)
+
+
+def course(env: EnvBase) -> list[tuple[TensorDictBase, TensorDictBase]]:
+    """What each step returns, under actions that drive the carts about."""
+    generator = torch.Generator().manual_seed(0)
+    present, course = env.reset(), []
+    for _ in range(STEPS):
+        present["action"] = torch.randint(3, (CARTS,), generator=generator)
+        transition, present = env.step_and_maybe_reset(present)
+        course.append((transition.clone(), present.clone()))
+    return course
+
+
+def assert_equal(ours: TensorDictBase, theirs: TensorDictBase, but: tuple[str, ...] = ()) -> None:
+    assert set(ours.keys(True, True)) == set(theirs.keys(True, True))
+    assert (ours.batch_size, ours.device) == (theirs.batch_size, theirs.device)
+    for key in ours.keys(True, True):
+        if key not in but:
+            assert ours[key].dtype == theirs[key].dtype
+            assert torch.equal(ours[key], theirs[key]), key
+
+
+def test_is_that_of_torchrl(environments: tuple[CartPoleEnv, TransformedEnv]) -> None:
+    endings: dict[str, Any] = {"terminated": [], "truncated": []}
+    for ours, theirs in zip(*(course(env) for env in environments), strict=True):
+        assert_equal(ours[0], theirs[0])
+        assert_equal(ours[1], theirs[1], but=("action",))  # of the step that was made
+        for key, rows in endings.items():
+            rows.append(ours[0]["next", key].sum().item())
+    for rows in endings.values():
+        assert sum(rows) > 20
+        assert any(0 < count < CARTS for count in rows)
+
+
+def test_carries_on_what_a_policy_wrote(environments: tuple[CartPoleEnv, TransformedEnv]) -> None:
+    env = environments[0]
+    present = env.reset().set("action", torch.ones(CARTS, dtype=torch.int64))
+    present["memory"] = torch.arange(CARTS)
+    _, present = env.step_and_maybe_reset(present)
+    assert torch.equal(present["memory"], torch.arange(CARTS))
+    assert "next" not in present
+    assert "reward" not in present
