@@ -31,6 +31,7 @@ class Compiled(Generic[Result]):
         self._function = function
         self._call: Callable[..., Any] | None = None
         self._result: Callable[..., Result] = function
+        self._types: list[torch.dtype] = []
 
     @torch.no_grad()
     def __call__(self, *arguments: tuple[Tensor, ...]) -> Result:
@@ -38,16 +39,17 @@ class Compiled(Generic[Result]):
         tensors = [tensor.contiguous() for tensor in chain.from_iterable(arguments)]
         if self._call is None:
             self._call = self._compile(arguments, tensors)
-        return self._result(*self._call(*tensors))
+        values = self._call(*tensors)
+        return self._result(*map(Tensor.view, values, self._types))
 
     def _compile(
         self, arguments: Sequence[tuple[Tensor, ...]], tensors: Sequence[Tensor]
     ) -> Callable[..., Any]:
-        def flat(*tensors: Tensor) -> tuple[Tensor, ...]:
+        def flat(*tensors: Tensor) -> list[Tensor]:
             rest = iter(tensors)
             value = self._function(*(type(each)(*islice(rest, len(each))) for each in arguments))
-            self._result = type(value)
-            return tuple(value)
+            self._result, self._types = type(value), [part.dtype for part in value]
+            return [as_byte(part) if part.dtype is torch.bool else part for part in value]
 
         return standalone_compile(
             make_fx(flat)(*tensors),
@@ -55,3 +57,8 @@ class Compiled(Generic[Result]):
             dynamic_shapes="from_example_inputs",
             options={"config_patches": OPTIONS},
         )
+
+
+def as_byte(flags: Tensor) -> Tensor:
+    """1 or 0 for each flag: compiled code stores bytes eight at a time, but booleans one by one."""
+    return torch.where(flags, 1.0, 0.0).to(torch.uint8)

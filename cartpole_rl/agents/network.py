@@ -4,6 +4,7 @@ Layer normalization after each hidden layer keeps a learned swing-up from being 
 (Gallici et al., "Simplifying deep temporal difference learning", 2024).
 """
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -40,8 +41,8 @@ class MirrorQNetwork(nn.Module):
     an agent meets both kinds equally often.
 
     Each layer has half its units for the scene and half, with the same weights, for its mirror image. Their
-    half sum (even: the image is the same) and half difference (odd: it is the negative) never mix in a linear
-    layer, so that two of half the width do the work.
+    sum (even: the image is the same) and difference (odd: it is the negative) never mix in a linear layer, so
+    that two of half the width do the work.
     """
 
     signs: Tensor
@@ -85,5 +86,5 @@ class MirrorLayer(nn.Module):
 
 
 def halves(scene: Tensor, image: Tensor) -> tuple[Tensor, Tensor]:
-    """Even and odd part: half the sum and half the difference of a scene and its mirror image."""
-    return (scene + image) / 2, (scene - image) / 2
+    """Even and odd part: sum and difference of a scene and its mirror image, of the same length together."""
+    return (scene + image) * math.sqrt(0.5), (scene - image) * math.sqrt(0.5)

@@ -21,8 +21,9 @@ from hydra.types import RunMode
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+import cartpole_rl.commands.composition  # noqa: F401 - what Hydra's configs refer to is registered there
+from cartpole_rl.choices import conf_folder
 from cartpole_rl.commands.complaints import dashed_setting, in_one_line
-from cartpole_rl.commands.composition import conf_folder
 from cartpole_rl.commands.config import checked
 from cartpole_rl.errors import CartPoleError, ConfigError
 from cartpole_rl.settings import Settings

@@ -10,7 +10,7 @@ import hydra
 from hydra.errors import HydraException, OverrideParseException
 from omegaconf import OmegaConf
 
-from cartpole_rl.commands.composition import conf_folder
+from cartpole_rl.choices import conf_folder
 
 NEAR = 0.8  # likeness of two names, 0 to 1, from which one may stand for the other
 SAME_PLACE = 0.15  # likeness that a name gains in the same group

@@ -1,4 +1,4 @@
-"""What Hydra has to know before it composes: where conf/ is, how folders are named, the emulated cart."""
+"""What Hydra has to know before it composes: how folders are named, the emulated cart."""
 
 import re
 import sys
@@ -15,12 +15,6 @@ from omegaconf import OmegaConf
 from cartpole_rl.emulator.settings import EmulatorSettings
 
 LONGEST_NAME = 150  # characters; file systems take 255
-
-
-def conf_folder() -> Path:
-    """The shipped conf/: inside the package when it was installed as a wheel, beside it in a checkout."""
-    package = Path(__file__).resolve().parent.parent
-    return package / "conf" if (package / "conf").is_dir() else package.parent / "conf"
 
 
 def run_folder(command: str, label: str, resume: str | None = None) -> str:

@@ -23,7 +23,6 @@ from cartpole_rl.learning.checkpoints import TrainingCheckpoint, load_training
 from cartpole_rl.learning.randomness import seed_everything
 from cartpole_rl.learning.training import Training
 from cartpole_rl.physics.dynamics import unused_parameters
-from cartpole_rl.randomization import PoleSettings
 from cartpole_rl.tasks.episode import Episode
 
 EVALUATION_SEED = 10_000  # added to the seed, so that no evaluation starts where training did
@@ -91,10 +90,7 @@ def note_unused_randomization(config: TrainConfig) -> None:
 
 def nominal_envs(config: TrainConfig) -> list[CartPoleEnv]:
     """Where the agent is judged: the nominal cart with each pole in turn, starting as the task says."""
-    if config.pole.choices is not None:
-        poles = [PoleSettings(choices={name: pole}) for name, pole in config.pole.choices.items()]
-    else:
-        poles = [config.pole]
+    poles = config.pole.each
     carts = max(1, config.learning.evaluation_episodes // len(poles))
     settings = [config.model_copy(update={"pole": pole, "randomization": {}}) for pole in poles]
     return [simulated_env(each, config.plant, carts, config.task.evaluation_start, 0) for each in settings]

@@ -19,7 +19,7 @@ from torchrl.data import Categorical, Composite, Unbounded
 from torchrl.envs import Transform
 
 from cartpole_rl.compilation import Compiled
-from cartpole_rl.envs.perception import Before, Frame, perceive, perceive_first
+from cartpole_rl.envs.perception import Before, First, Frame, Perceived, perceive, perceive_first
 from cartpole_rl.envs.settings import ObservationSettings, RewardSettings, TaskSettings
 from cartpole_rl.plants.specs import Plant, tensordict_of
 from cartpole_rl.tasks.features import LENGTH_SCALE
@@ -72,8 +72,8 @@ class HardwareTransform(Transform):
 
     def command(self, tensordict: TensorDictBase) -> TensorDict:
         """The `motor` values [N, 1] of the actions."""
-        motor = self.motors[tensordict.get("action")].unsqueeze(-1)
-        return TensorDict({"motor": motor}, tensordict.batch_size)
+        motor = self.motors.index_select(0, tensordict.get("action"))
+        return tensordict_of({"motor": motor.unsqueeze(-1)})
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         return tensordict.update(self.command(tensordict)) if "action" in tensordict else tensordict
@@ -82,24 +82,23 @@ class HardwareTransform(Transform):
 
     def begin(self, first: TensorDictBase, rows: Tensor | None = None) -> TensorDictBase:
         """Add to the first frames of the carts `rows` [R] what they mean; None is all carts."""
-        label = self._label() if rows is None else self._label()[rows]
-        meaning = perceive_first(first.get("counts"), label, self.observation_settings)
-        return tensordict_of({**first, **meaning._asdict()})
+        counts, label = first.get("counts").T, self._label(rows)
+        return added(first, perceive_first(counts, label, self.observation_settings))
 
     def perceive(
         self, present: TensorDictBase, command: TensorDictBase, following: TensorDictBase
     ) -> TensorDictBase:
         """Add to the frames that followed a `command` given in `present` what they mean."""
         before = Before(
-            present.get("counts"),
-            present.get("state"),
-            present.get("past"),
-            present.get("step_count"),
-            command.get("motor"),
+            present.get("counts").T,
+            present.get("state").T,
+            present.get("past").T,
+            present.get("step_count").T,
+            command.get("motor").T,
             self._label(),
         )
-        frame = Frame(*(following.get(key) for key in Frame._fields))
-        return tensordict_of({**following, **self._perceive(before, frame)._asdict()})
+        frame = Frame(*(following.get(key).T for key in Frame._fields))
+        return added(following, self._perceive(before, frame))
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         return self.begin(tensordict_reset)
@@ -107,8 +106,16 @@ class HardwareTransform(Transform):
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         return self.perceive(tensordict, tensordict, next_tensordict)
 
-    def _label(self) -> Tensor:
-        """What is read off the cart: the scaled length of its pole, [N, 1]; [N, 0] if nobody looks."""
+    def _label(self, rows: Tensor | None = None) -> Tensor:
+        """What is read off the carts `rows`: their poles' scaled lengths, [1, R]; [0, R] if nobody looks."""
         if not self.observation_settings.pole_length:
-            return torch.empty(self.plant.carts, 0, device=self.plant.device)
-        return (self.plant.pole_length / LENGTH_SCALE).unsqueeze(1)
+            return self.motors.new_empty(
+                0, self.plant.carts if rows is None else len(rows), dtype=torch.float32
+            )
+        lengths = self.plant.pole_length if rows is None else self.plant.pole_length[rows]
+        return (lengths / LENGTH_SCALE).unsqueeze(0)
+
+
+def added(frame: TensorDictBase, meaning: First | Perceived) -> TensorDict:
+    """The frame [N] with what it means."""
+    return tensordict_of(dict(frame.items()) | {key: rows.T for key, rows in meaning._asdict().items()})

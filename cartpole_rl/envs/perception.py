@@ -1,7 +1,8 @@
 """What a host makes of the frames that a cart sends: pure functions, the same for every cart.
 
 Measured state, memory, observation, reward, scores and endings of N carts. Nothing here knows whether a cart
-is simulated.
+is simulated. Every tensor is [k, N], a row a number, which is the transpose of what stands in the tensordict:
+compiled code then runs along the carts.
 """
 
 from typing import NamedTuple
@@ -26,47 +27,47 @@ from cartpole_rl.tasks.rewards import REWARDS, SCORE, SCORE_UPRIGHT
 class Before(NamedTuple):
     """What the host knew when it chose the motor value that led to a frame."""
 
-    counts: Tensor  # [N, 2] int64
-    state: Tensor  # [N, 4]: x m, x_dot m/s, theta rad, theta_dot rad/s
-    past: Tensor  # [N, past_size]
-    step_count: Tensor  # [N, 1] int64
-    motor: Tensor  # [N, 1] int64, the value chosen
-    label: Tensor  # [N, 1] scaled length of the pole if the agent observes it, or else [N, 0]
+    counts: Tensor  # [2, N] int64
+    state: Tensor  # [4, N]: x m, x_dot m/s, theta rad, theta_dot rad/s
+    past: Tensor  # [past_size, N]
+    step_count: Tensor  # [1, N] int64
+    motor: Tensor  # [1, N] int64, the value chosen
+    label: Tensor  # [1, N] scaled length of the pole if the agent observes it, or else [0, N]
 
 
 class Frame(NamedTuple):
     """What the plant says after the period: see `plants.specs.Plant`."""
 
-    counts: Tensor  # [N, 2] int64
-    dt: Tensor  # [N, 1] s
-    terminated: Tensor  # [N, 1] bool
-    truncated: Tensor  # [N, 1] bool
+    counts: Tensor  # [2, N] int64
+    dt: Tensor  # [1, N] s
+    terminated: Tensor  # [1, N] bool
+    truncated: Tensor  # [1, N] bool
 
 
 class First(NamedTuple):
     """What a host makes of the first frame of an episode."""
 
-    state: Tensor  # [N, 4]
-    past: Tensor  # [N, past_size]
-    observation: Tensor  # [N, size]
-    score: Tensor  # [N, 1], as the next
+    state: Tensor  # [4, N]
+    past: Tensor  # [past_size, N]
+    observation: Tensor  # [size, N]
+    score: Tensor  # [1, N], as the next
     score_upright: Tensor
-    step_count: Tensor  # [N, 1] int64
+    step_count: Tensor  # [1, N] int64
 
 
 class Perceived(NamedTuple):
     """What a host makes of a later frame."""
 
-    state: Tensor  # [N, 4]
-    past: Tensor  # [N, past_size]
-    observation: Tensor  # [N, size]
-    reward: Tensor  # [N, 1]
-    score: Tensor  # [N, 1] equation (6.2)
-    score_upright: Tensor  # [N, 1] equation (6.1)
-    step_count: Tensor  # [N, 1] int64
-    terminated: Tensor  # [N, 1] bool
-    truncated: Tensor  # [N, 1] bool
-    done: Tensor  # [N, 1] bool
+    state: Tensor  # [4, N]
+    past: Tensor  # [past_size, N]
+    observation: Tensor  # [size, N]
+    reward: Tensor  # [1, N]
+    score: Tensor  # [1, N] equation (6.2)
+    score_upright: Tensor  # [1, N] equation (6.1)
+    step_count: Tensor  # [1, N] int64
+    terminated: Tensor  # [1, N] bool
+    truncated: Tensor  # [1, N] bool
+    done: Tensor  # [1, N] bool
 
 
 def perceive_first(counts: Tensor, label: Tensor, sight: ObservationSettings) -> First:
@@ -74,15 +75,15 @@ def perceive_first(counts: Tensor, label: Tensor, sight: ObservationSettings) ->
     x, theta = measured_position(counts)
     unknown = torch.zeros_like(x)
     state = Measured(x, unknown, theta, unknown)
-    past = x.new_zeros(len(counts), sight.past_size)
-    none = unknown.unsqueeze(1)
+    past = x.new_zeros(sight.past_size, len(x))
+    nothing = unknown.unsqueeze(0)
     return First(
-        torch.stack(state, 1),
+        torch.stack(state),
         past,
         observation(state, past, label, sight),
-        score=none,
-        score_upright=none.clone(),
-        step_count=torch.zeros_like(counts[:, :1]),
+        score=nothing,
+        score_upright=nothing.clone(),
+        step_count=torch.zeros_like(counts[:1]),
     )
 
 
@@ -91,21 +92,21 @@ def perceive(
 ) -> Perceived:
     """What the frame that followed means."""
     x, theta = measured_position(frame.counts)
-    x_dot, theta_dot = measured_velocity(frame.counts, before.counts, frame.dt.squeeze(1))
+    x_dot, theta_dot = measured_velocity(frame.counts, before.counts, frame.dt[0])
     state = Measured(x, x_dot, theta, theta_dot)
     past = remember(before, sight)
     step_count = before.step_count + 1
     off_track = frame.terminated
-    terminated = off_track | fallen(state, task.angle_limit).unsqueeze(1)
+    terminated = off_track | fallen(state, task.angle_limit)
     ended = terminated | frame.truncated | (step_count >= task.time_limit)
     judged = {  # each once: what the agent learns from is often a score
-        kind: REWARDS[kind](state, task.x_max).unsqueeze(1) for kind in {learned.kind, SCORE, SCORE_UPRIGHT}
+        kind: REWARDS[kind](state, task.x_max).unsqueeze(0) for kind in {learned.kind, SCORE, SCORE_UPRIGHT}
     }
     return Perceived(
-        torch.stack(state, 1),
+        torch.stack(state),
         past,
         observation(state, past, before.label, sight),
-        learned.scale * judged[learned.kind] - learned.track_penalty * off_track,
+        learned.scale * judged[learned.kind] - track_cost(x, off_track, task, learned),
         judged[SCORE],
         judged[SCORE_UPRIGHT],
         step_count,
@@ -116,19 +117,23 @@ def perceive(
 
 
 def remember(before: Before, sight: ObservationSettings) -> Tensor:
-    """`past` one period on, [N, past_size]: motor values, then pairs of velocities, each newest first."""
-    motor = before.motor / MOTOR_SCALE
-    velocities = before.state[:, 1::2] / before.state.new_tensor([SPEED_SCALE, ANGULAR_SPEED_SCALE])
-    motors, older = before.past.split([sight.past_motors, 2 * sight.past_velocities], 1)
+    """`past` one period on, [past_size, N]: motor values, then pairs of velocities, each newest first."""
+    motors, velocities = before.past.split([sight.past_motors, 2 * sight.past_velocities])
+    newest = before.state[1:2] / SPEED_SCALE, before.state[3:4] / ANGULAR_SPEED_SCALE
     return torch.cat(
         (
-            torch.cat((motor, motors), 1)[:, : sight.past_motors],
-            torch.cat((velocities, older), 1)[:, : 2 * sight.past_velocities],
-        ),
-        1,
+            torch.cat((before.motor / MOTOR_SCALE, motors))[: sight.past_motors],
+            torch.cat((*newest, velocities))[: 2 * sight.past_velocities],
+        )
     )
 
 
 def observation(state: Measured, past: Tensor, label: Tensor, sight: ObservationSettings) -> Tensor:
-    """What the agent sees, [N, size]."""
-    return torch.cat((torch.stack(observe(state, sight.kind), 1), past, label), 1)
+    """What the agent sees, [size, N]."""
+    return torch.cat((torch.stack(observe(state, sight.kind)), past, label))
+
+
+def track_cost(x: Tensor, off_track: Tensor, task: TaskSettings, learned: RewardSettings) -> Tensor:
+    """What nearing and leaving the track's end take off the reward, [1, N]."""
+    nearness = (x / task.x_max).square().unsqueeze(0)
+    return learned.track_penalty * off_track + learned.track_price * nearness

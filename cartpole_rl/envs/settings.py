@@ -33,11 +33,12 @@ class ObservationSettings(Settings):
 
 
 class RewardSettings(Settings):
-    """What the agent learns from: `kind` times `scale`, less `track_penalty` for leaving the track."""
+    """What the agent learns from: `kind` times `scale`, less what the track costs; scores know no price."""
 
     kind: Reward
     scale: Positive
-    track_penalty: NonNegative
+    track_penalty: NonNegative  # for leaving the track
+    track_price: NonNegative  # of each step, times (x / x_max)^2: of nearing the track's end
 
 
 class TaskSettings(Settings):

@@ -5,7 +5,9 @@ asymmetry, and a dead-band per direction. Plain newtons are the thesis's eyeball
 100, 150, 200, 250.
 """
 
+from collections.abc import Sequence
 from enum import StrEnum
+from itertools import pairwise
 
 import torch
 from torch import Tensor
@@ -23,7 +25,7 @@ class Actuator(StrEnum):
 
 
 def static_force(motor: Tensor, cart: CartParameters, model: Actuator) -> Tensor:
-    """Force that a held motor value settles at, N. `motor`: [N] or [..., N], -255 to 255."""
+    """Force that a held motor value settles at, N. `motor`: [N], -255 to 255."""
     size = motor.abs()
     if model is Actuator.NEWTONS:
         return torch.sign(motor) * (0.02 * size - 1).clamp(min=0)
@@ -33,17 +35,22 @@ def static_force(motor: Tensor, cart: CartParameters, model: Actuator) -> Tensor
     return curve * (rightward - leftward.to(curve.dtype))
 
 
-def mean_commands(held: Tensor, latency: Tensor, period: float, substeps: int) -> Tensor:
-    """Mean over each step of a period of what the commands in force hold, [substeps, N].
+def mean_commands(held: Sequence[Tensor], latency: Tensor, period: float, substeps: int) -> list[Tensor]:
+    """Mean over each step of a period of what the commands in force hold, [N] each.
 
-    `held` [D, N] is what each command settles at, newest first, each next one a period older, the oldest in
-    force for ever. A command takes effect `latency` s, [N], after its period began and is replaced a period
-    later by the next.
+    `held` is what each command settles at, [N] each, newest first, each next one a period older, the oldest
+    in force for ever. A command takes effect `latency` s, [N], after its period began and is replaced a
+    period later by the next.
     """
-    step = torch.arange(substeps, dtype=latency.dtype, device=latency.device).reshape(-1, 1, 1)
-    age = substeps * torch.arange(len(held) - 1, dtype=latency.dtype, device=latency.device).unsqueeze(1)
-    older = (latency * (substeps / period) - age - step).clamp(0, 1)  # share of the step, [substeps, D-1, N]
-    return held[0] + (older * (held[1:] - held[:-1])).sum(1)
+    onset = latency * (substeps / period)  # in steps
+    means = []
+    for step in range(substeps):
+        mean = held[0]
+        for age, (newer, older) in enumerate(pairwise(held)):
+            share_of_older = (onset - (substeps * age + step)).clamp(0, 1)
+            mean = mean + share_of_older * (older - newer)
+        means.append(mean)
+    return means
 
 
 def lagged_force(force: Tensor, target: Tensor, time_constant: Tensor, step: float) -> tuple[Tensor, Tensor]:

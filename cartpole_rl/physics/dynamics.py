@@ -5,6 +5,7 @@ to the right. Every tensor is [N]; the four numbers of the state stay separate, 
 compiled code be fast. Functions are pure: parameters and random draws are passed in.
 """
 
+from collections.abc import Sequence
 from enum import StrEnum
 from typing import NamedTuple
 
@@ -39,7 +40,7 @@ class Drive(NamedTuple):
     """What the actuator carries from one period to the next."""
 
     force: Tensor  # [N] N, behind the lag
-    motors: Tensor  # [D, N] motor values of this and the D - 1 periods before, newest first
+    motors: Sequence[Tensor]  # [N] motor values of this and the D - 1 periods before, newest first; or [D, N]
 
 
 class Integrator(StrEnum):
@@ -224,10 +225,9 @@ def run_period(
     """
     step = period / substeps
     body = mechanism(cart)
-    held = static_force(drive.motors, cart, models.actuator)  # [D, N]
-    targets = mean_commands(held, latency, period, substeps)  # [substeps, N]
+    held = [static_force(motor, cart, models.actuator) for motor in drive.motors]
     force = drive.force
-    for target in targets:
+    for target in mean_commands(held, latency, period, substeps):
         if models.actuator is Actuator.NEWTONS:
             mean = force = target
         else:

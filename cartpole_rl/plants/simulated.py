@@ -4,31 +4,40 @@ The true state lives here and stays here; what leaves is what a cart's serial po
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from cartpole_rl.compilation import Compiled
-from cartpole_rl.physics.dynamics import Drive, Models, State
+from cartpole_rl.physics.dynamics import Models, State
 from cartpole_rl.physics.parameters import CartParameters
-from cartpole_rl.plants.simulation import Cart, Chance, Command, Encoders, encoder_counts, run_carts
+from cartpole_rl.plants.simulation import Carts, Given, encoder_counts, run_carts
 from cartpole_rl.plants.specs import Plant
 from cartpole_rl.randomization import Randomizer
 from cartpole_rl.tasks.starts import StartSettings, draw_start
 
 OF_CHANCE = ("latency_jitter", "position_noise", "angle_noise")  # drawn anew in each period
+DRAWN_AT_ONCE = 1024  # episodes; a few at a time would take about as long
+
+
+class Episodes(NamedTuple):
+    """Beginnings of episodes, drawn and not yet begun."""
+
+    table: Tensor  # [P, M]
+    motion: Tensor  # [4, M]
+    counts: Tensor  # [2, M] int64, of the first frame
 
 
 class SimulatedPlant(Plant):
     """N simulated carts.
 
-    `period` s is one control period, integrated in `substeps` steps. Parameters and the start are drawn
-    inside the reset, for the rows that reset; `parameters` reads the values in force. A `compiled` plant and
-    the hardware transform over it are several times as fast, need a C++ compiler and cost some seconds once.
+    `period` s is one control period, integrated in `substeps` steps. Parameters and the start are new in each
+    episode, for the rows that reset; `parameters` reads the values in force. A `compiled` plant and the
+    hardware transform over it are several times as fast, need a C++ compiler and cost some seconds once.
     """
 
     def __init__(
@@ -50,17 +59,17 @@ class SimulatedPlant(Plant):
         run = partial(run_carts, models=models, period=period, substeps=substeps)
         self._run = Compiled(run) if compiled else run
         self._generator = torch.Generator(device=self.device)
-        self.set_seed(seed)
+        self._chancy = any(randomizer.can_differ_from_zero(name) for name in OF_CHANCE)
+        self._no_chance = torch.zeros(3, carts, device=self.device)
         delay = randomizer.longest_delay()
         commands = 1 + max(1, math.ceil(delay / period - 1e-9))  # motor values that can be under way
-        self._chancy = any(randomizer.can_differ_from_zero(name) for name in OF_CHANCE)
-        self._table = randomizer.nominal.unsqueeze(1).repeat(1, carts)  # [P, N]
-        self._cart = CartParameters.from_table(self._table)  # its fields share the table's memory
-        self._encoder_rows = [CartParameters.names().index(name) for name in Encoders._fields]
-        zeros = partial(torch.zeros, device=self.device)
-        self._no_chance = Chance(*zeros(3, carts))
-        self._state = State(*zeros(4, carts))
-        self._drive = Drive(zeros(carts), zeros(commands, carts))
+        self._carts = Carts(
+            randomizer.nominal.unsqueeze(1).repeat(1, carts),
+            torch.zeros(4, carts, device=self.device),
+            torch.zeros(1 + commands, carts, device=self.device),
+        )
+        self._cart = CartParameters.from_table(self._carts.table)  # its fields share the table's memory
+        self.set_seed(seed)
 
     @property
     def parameters(self) -> CartParameters:
@@ -70,7 +79,7 @@ class SimulatedPlant(Plant):
     @property
     def true_state(self) -> State:
         """The state that no encoder sees, [N] each."""
-        return self._state
+        return State(*self._carts.motion.unbind(0))
 
     @property
     def pole_length(self) -> Tensor:
@@ -79,42 +88,49 @@ class SimulatedPlant(Plant):
 
     def place(self, state: State) -> None:
         """Put the carts into `state`; for tests, knocks and replay."""
-        self._state = State(*(value.to(self.device).clone() for value in state))
+        self._carts = self._carts._replace(motion=torch.stack(state).to(self._carts.motion))
 
     def snapshot(self) -> dict[str, Any]:
         """All that the next step depends on; `restore` takes it back."""
-        return {
-            "table": self._table.clone(),
-            "state": torch.stack(self._state),
-            "force": self._drive.force.clone(),
-            "motors": self._drive.motors.clone(),
-            "generator": self._generator.get_state(),
-        }
+        coming = {f"next_{name}": value.clone() for name, value in self._coming._asdict().items()}
+        now = {name: value.clone() for name, value in self._carts._asdict().items()}
+        return {**now, **coming, "generator": self._generator.get_state()}
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         """Go on from `snapshot` as if nothing had happened."""
-        self._table.copy_(snapshot["table"])
-        self._state = State(*snapshot["state"].clone().unbind(0))
-        self._drive = Drive(snapshot["force"].clone(), snapshot["motors"].clone())
+        self._carts.table.copy_(snapshot["table"])
+        self._carts = Carts(self._carts.table, snapshot["motion"].clone(), snapshot["drive"].clone())
+        self._coming = Episodes(*(snapshot[f"next_{name}"].clone() for name in Episodes._fields))
         self._generator.set_state(snapshot["generator"])
 
     def _set_seed(self, seed: int | None) -> None:
         self._generator.manual_seed(0 if seed is None else seed)
+        self._coming = self._draw_episodes(0)
 
     def restart(self, rows: Tensor) -> TensorDict:
-        """Draw new parameters and a new start for the carts `rows` [R]; their first frame, [R]."""
-        count = len(rows)
-        table = self.randomizer.draw(count, self._generator)
-        start = draw_start(count, self.start, self._generator)
-        state = State(*start.unbind(1))
-        self._table.index_copy_(1, rows, table)
-        self._state = State(
-            *(old.index_copy(0, rows, new) for old, new in zip(self._state, state, strict=True))
+        """Begin a new episode on the carts `rows` [R]; their first frame, [R]."""
+        table, motion, counts = self._next_episodes(len(rows))
+        self._carts.table.index_copy_(1, rows, table)
+        self._carts = Carts(
+            self._carts.table,
+            self._carts.motion.index_copy(1, rows, motion),
+            self._carts.drive.index_fill(1, rows, 0),
         )
-        self._drive = Drive(*(old.index_fill(-1, rows, 0) for old in self._drive))
-        counts = encoder_counts(state, Encoders(*table[self._encoder_rows]), self._chance(count))
-        no_motor = counts.new_zeros(count, 1)
-        return self.frame(*self._report(counts, no_motor, no_motor.bool()))
+        no_motor = torch.zeros_like(counts[:1])
+        return self._report(self.frame, counts, no_motor, no_motor.bool())
+
+    def _next_episodes(self, count: int) -> Episodes:
+        if count > self._coming.counts.shape[1]:
+            self._coming = self._draw_episodes(max(count, DRAWN_AT_ONCE))
+        taken = Episodes(*(value[:, :count] for value in self._coming))
+        self._coming = Episodes(*(value[:, count:] for value in self._coming))
+        return taken
+
+    def _draw_episodes(self, count: int) -> Episodes:
+        table = self.randomizer.draw(count, self._generator)
+        motion = draw_start(count, self.start, self._generator).T
+        counts = encoder_counts(State(*motion), CartParameters.from_table(table), self._chance(count))
+        return Episodes(table, motion, counts)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDict:
         """The first frame of the carts that reset; TorchRL keeps the others', which are zeros here."""
@@ -128,19 +144,21 @@ class SimulatedPlant(Plant):
         return frame
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        command = Command(tensordict.get("motor"))
-        after = self._run(self._state, self._drive, command, Cart(self._table), self._chance(self.carts))
-        self._state, self._drive = after.state, after.drive
-        return self.step_frame(*self._report(after.counts, after.motor_applied, after.off_track))
+        given = Given(tensordict.get("motor").T, self._chance(self.carts))
+        after = self._run(self._carts, given)
+        self._carts = Carts(self._carts.table, after.motion, after.drive)
+        return self._report(self.step_frame, after.counts, after.motor_applied, after.off_track)
 
-    def _report(self, counts: Tensor, motor_applied: Tensor, off_track: Tensor) -> tuple[Tensor, ...]:
-        """The arguments of `frame`."""
-        dt = torch.full(off_track.shape, self.period, device=self.device)
-        return counts, dt, motor_applied, off_track, torch.zeros_like(off_track)
-
-    def _chance(self, count: int) -> Chance:
-        """The draws for one period of `count` carts, or 0 where nothing is left to chance."""
+    def _chance(self, count: int) -> Tensor:
+        """The draws for one period of `count` carts, [3, count]; 0 where nothing is left to chance."""
         if not self._chancy:
-            return Chance(*(value[:count] for value in self._no_chance))
+            return self._no_chance if count == self.carts else self._no_chance.new_zeros(3, count)
         draws = {"generator": self._generator, "device": self.device}
-        return Chance(2 * torch.rand(count, **draws) - 1, *torch.randn(2, count, **draws))
+        return torch.cat((2 * torch.rand(1, count, **draws) - 1, torch.randn(2, count, **draws)))
+
+    def _report(
+        self, frame: Callable[..., TensorDict], counts: Tensor, motor_applied: Tensor, off_track: Tensor
+    ) -> TensorDict:
+        """The frame of what is transposed here."""
+        dt = torch.full(off_track.shape, self.period, device=self.device)
+        return frame(counts.T, dt.T, motor_applied.T, off_track.T, torch.zeros_like(off_track).T)

@@ -1,8 +1,10 @@
 """One control period of N simulated carts as pure functions: a motor value in, encoder counts out.
 
-All that chance has a part in comes in drawn, so that this can be compiled.
+What chance has a part in comes in drawn, so that this can be compiled. Tensors are [N] or [k, N], the
+transpose of what stands in the tensordict: compiled code then runs along the carts.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -13,95 +15,58 @@ from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.tasks.features import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 
 
-class Cart(NamedTuple):
-    """What stays as it is for an episode."""
+class Carts(NamedTuple):
+    """All that the next period depends on, in few tensors: each one more costs time in every call."""
 
     table: Tensor  # [P, N], a row a parameter, for `CartParameters.from_table`
+    motion: Tensor  # [4, N], the true `State`
+    drive: Tensor  # [1 + D, N], the `Drive`: force, then motor values, newest first
 
 
-class Chance(NamedTuple):
-    """Draws for one period, [N] each."""
+class Given(NamedTuple):
+    """What comes in with a period."""
 
-    latency: Tensor  # uniform in -1 to 1
-    position: Tensor  # standard normal, as the next
-    angle: Tensor
-
-
-class Encoders(NamedTuple):
-    """What stands between the true state and its counts, [N] each, by the names of CartParameters."""
-
-    angle_offset: Tensor
-    position_noise: Tensor
-    angle_noise: Tensor
-
-
-class Command(NamedTuple):
-    """What the host sent."""
-
-    motor: Tensor  # [N, 1] int64
+    motor: Tensor  # [1, N] int64
+    chance: Tensor  # [3, N]: of the latency, uniform in -1 to 1; of position and angle, standard normal
 
 
 class Period(NamedTuple):
-    """What a period leads to: State, Drive, and what the cart says."""
+    """What a period leads to."""
 
-    x: Tensor
-    x_dot: Tensor
-    theta: Tensor
-    theta_dot: Tensor
-    force: Tensor
-    motors: Tensor
-    counts: Tensor  # [N, 2] int64
-    motor_applied: Tensor  # [N, 1] int64
-    off_track: Tensor  # [N, 1] bool
-
-    @property
-    def state(self) -> State:
-        """The true state at the period's end."""
-        return State(self.x, self.x_dot, self.theta, self.theta_dot)
-
-    @property
-    def drive(self) -> Drive:
-        """The actuator at the period's end."""
-        return Drive(self.force, self.motors)
+    motion: Tensor  # [4, N]
+    drive: Tensor  # [1 + D, N]
+    counts: Tensor  # [2, N] int64
+    motor_applied: Tensor  # [1, N] int64
+    off_track: Tensor  # [1, N] bool
 
 
-def run_carts(
-    state: State,
-    drive: Drive,
-    command: Command,
-    cart: Cart,
-    chance: Chance,
-    *,
-    models: Models,
-    period: float,
-    substeps: int,
-) -> Period:
-    """Run every cart for `period` s in `substeps` steps under a new command."""
-    parameters = CartParameters.from_table(cart.table)
-    motors = torch.cat((command.motor.T.to(drive.motors.dtype), drive.motors[:-1]))
-    latency = (parameters.latency + chance.latency * parameters.latency_jitter).clamp(min=0)
-    state, drive = run_period(
-        state, drive._replace(motors=motors), latency, parameters, models, period, substeps
-    )
+def run_carts(carts: Carts, given: Given, *, models: Models, period: float, substeps: int) -> Period:
+    """Run every cart for `period` s in `substeps` steps under a new motor value."""
+    cart = CartParameters.from_table(carts.table)
+    before = State(*carts.motion.unbind(0))
+    force, *motors = carts.drive.unbind(0)
+    drive = Drive(force, [given.motor[0].to(force.dtype), *motors[:-1]])
+    latency = (cart.latency + given.chance[0] * cart.latency_jitter).clamp(min=0)
+    state, drive = run_period(before, drive, latency, cart, models, period, substeps)
     return Period(
-        *state,
-        *drive,
-        encoder_counts(state, Encoders(*(getattr(parameters, name) for name in Encoders._fields)), chance),
-        motor_in_force(drive.motors, parameters.latency, period),
-        (state.x.abs() > parameters.track_half_length).unsqueeze(1),
+        torch.stack(state),
+        torch.stack((drive.force, *drive.motors)),
+        encoder_counts(state, cart, given.chance),
+        motor_in_force(drive.motors, cart.latency, period),
+        (state.x.abs() > cart.track_half_length).unsqueeze(0),
     )
 
 
-def encoder_counts(state: State, encoders: Encoders, chance: Chance) -> Tensor:
-    """Counts [N, 2] int64 of the true state, with the zero's error and noise."""
-    x = state.x + chance.position * encoders.position_noise
-    theta = state.theta + encoders.angle_offset + chance.angle * encoders.angle_noise
-    return torch.stack((x / CART_METRES_PER_COUNT, theta / POLE_RADIANS_PER_COUNT), 1).round().long()
+def encoder_counts(state: State, cart: CartParameters, chance: Tensor) -> Tensor:
+    """Counts [2, N] int64 of the true state, with the zero's error and the noise of `chance` [3, N]."""
+    x = state.x + chance[1] * cart.position_noise
+    theta = state.theta + cart.angle_offset + chance[2] * cart.angle_noise
+    return torch.stack((x / CART_METRES_PER_COUNT, theta / POLE_RADIANS_PER_COUNT)).round().long()
 
 
-def motor_in_force(motors: Tensor, latency: Tensor, period: float) -> Tensor:
-    """The motor value [N, 1] int64 in force at a period's end, of `motors` [D, N], newest first."""
+def motor_in_force(motors: Sequence[Tensor], latency: Tensor, period: float) -> Tensor:
+    """The motor value [1, N] int64 in force at a period's end, of `motors` [N] each, newest first."""
     applied = motors[0]
     for age in range(1, len(motors)):
         applied = torch.where(latency > age * period, motors[age], applied)
-    return applied.unsqueeze(1).long()
+    return applied.unsqueeze(0).long()

@@ -86,12 +86,12 @@ class Plant(EnvBase):
 
 
 def tensordict_of(entries: dict[str, Any]) -> TensorDict:
-    """A tensordict of entries [N, ...] that are known to fit together; `counts` is one of them.
+    """A tensordict of entries [N, ...] on one device that are known to fit together.
 
     What TensorDict's constructor checks takes longer than the physics of a thousand carts.
     """
-    counts = entries["counts"]
-    return TensorDict._new_unsafe(entries, batch_size=counts.shape[:1], device=counts.device)
+    first = next(iter(entries.values()))
+    return TensorDict._new_unsafe(entries, batch_size=first.shape[:1], device=first.device)
 
 
 DONE_KEYS = ("done", "terminated", "truncated")

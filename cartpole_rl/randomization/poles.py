@@ -5,6 +5,8 @@ from pydantic import model_validator
 from cartpole_rl.physics.parameters import uniform_rod
 from cartpole_rl.settings import NonNegative, Positive, Settings
 
+JUDGED_LENGTHS = 5  # rods that an agent of a range of lengths is judged on
+
 
 class Pole(Settings):
     """A rigid pole."""
@@ -42,6 +44,16 @@ class PoleSettings(Settings):
             return next(iter(self.choices.values()))
         assert self.lengths is not None
         return Pole.rod(sum(self.lengths) / 2)
+
+    @property
+    def each(self) -> list["PoleSettings"]:
+        """The single poles that stand for all: every choice, or rods from the shortest to the longest."""
+        if self.choices is not None:
+            return [PoleSettings(choices={name: pole}) for name, pole in self.choices.items()]
+        assert self.lengths is not None
+        low, high = self.lengths
+        lengths = [low + (high - low) * index / (JUDGED_LENGTHS - 1) for index in range(JUDGED_LENGTHS)]
+        return [PoleSettings(choices={f"{length:.2f} m": Pole.rod(length)}) for length in lengths]
 
     @property
     def name(self) -> str:

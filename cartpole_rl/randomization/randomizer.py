@@ -54,7 +54,8 @@ class Randomizer:
             unit = torch.rand((len(self._rows), count), generator=generator, device=self.nominal.device)
             value = self._low + unit * self._width
             value = torch.where(self._logarithmic, value.exp(), value)
-            table[self._rows] = torch.where(self._scales, table[self._rows] * value, value)
+            scaled = table.index_select(0, self._rows) * value
+            table.index_copy_(0, self._rows, torch.where(self._scales, scaled, value))
         return table
 
     def longest_delay(self) -> float:

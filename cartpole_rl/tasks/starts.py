@@ -2,6 +2,7 @@
 
 import math
 from enum import StrEnum
+from functools import cache
 
 import torch
 from torch import Tensor
@@ -30,17 +31,24 @@ class StartSettings(Settings):
 
 def draw_start(count: int, start: StartSettings, generator: torch.Generator) -> Tensor:
     """True states [count, 4]: x m, x_dot m/s, theta rad, theta_dot rad/s."""
-    unit = 2 * torch.rand((count, 4), generator=generator, device=generator.device) - 1
-    about = math.pi if start.angle is Start.HANGING else 0.0
-    angle_spread = math.pi if start.angle is Start.ANY else start.angle_spread
-    spread = unit.new_tensor(
-        [start.position_spread, start.speed_spread, angle_spread, start.angular_speed_spread]
-    )
-    state = unit * spread + unit.new_tensor([0.0, 0.0, about, 0.0])
+    device = generator.device
+    unit = 2 * torch.rand((count, 4), generator=generator, device=device) - 1
+    state = torch.addcmul(*bounds(start, device, resting=False), unit)
     if start.resting_share == 0:
         return state
-    rests = torch.rand((count, 1), generator=generator, device=generator.device) < start.resting_share
-    at_rest = unit * unit.new_tensor([start.position_spread, 0.0, 0.0, 0.0]) + unit.new_tensor(
-        [0, 0, math.pi, 0]
-    )
-    return torch.where(rests, at_rest, state)
+    rests = torch.rand((count, 1), generator=generator, device=device) < start.resting_share
+    return torch.where(rests, torch.addcmul(*bounds(start, device, resting=True), unit), state)
+
+
+@cache
+def bounds(start: StartSettings, device: torch.device, resting: bool) -> tuple[Tensor, Tensor]:
+    """Middle and spread of the states [4] that an episode starts from; `resting`: of those at rest."""
+    angle, angle_spread = {
+        Start.UPRIGHT: (0.0, start.angle_spread),
+        Start.HANGING: (math.pi, start.angle_spread),
+        Start.ANY: (0.0, math.pi),
+    }[start.angle]
+    spread = [start.position_spread, start.speed_spread, angle_spread, start.angular_speed_spread]
+    if resting:
+        angle, spread = math.pi, [start.position_spread, 0.0, 0.0, 0.0]
+    return torch.tensor([0.0, 0.0, angle, 0.0], device=device), torch.tensor(spread, device=device)

@@ -37,7 +37,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_each_seed_is_judged_by_its_last_checkpoint(trained: Path) -> None:
     seed = json.loads((trained / "learning.json").read_text())["medium"]["0"]
-    reference = json.loads((BENCH / "references.json").read_text())["medium"]
+    reference = json.loads((BENCH / "references.json").read_text())["medium"]["score"]
     figures = seed["plants"]["medium"]
     assert figures["fraction"] == pytest.approx(figures["score"] / reference)
     assert figures["worst_start"] <= figures["score"] < 1500  # hardly trained at all

@@ -10,9 +10,9 @@ import yaml
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
+from cartpole_rl.choices import conf_folder
 from cartpole_rl.commands.application import as_mapping
 from cartpole_rl.commands.build import evaluated_settings
-from cartpole_rl.commands.composition import conf_folder
 from cartpole_rl.commands.config import EmulateConfig, EvaluateConfig, TrainConfig, checked
 from cartpole_rl.tasks.rewards import Reward
 

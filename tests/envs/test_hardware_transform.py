@@ -202,7 +202,7 @@ class TestEndings:
 def test_rewards_and_scores_are_of_the_measured_state(
     make_plant: MakePlant, make_environment: MakeEnvironment, kind: Reward
 ) -> None:
-    reward: dict[str, Any] = {"kind": kind, "scale": 0.3, "track_penalty": 0.0}
+    reward: dict[str, Any] = {"kind": kind, "scale": 0.3, "track_penalty": 0.0, "track_price": 0.0}
     env = make_environment(make_plant(32, start=ANYWHERE), MOTORS, reward=reward)
     following = course(env, actions(10, 32))["next"].flatten()
     for key, law, scale in (
@@ -212,6 +212,17 @@ def test_rewards_and_scores_are_of_the_measured_state(
     ):
         expected = scale * REWARDS[law](Measured(*following["state"].unbind(1)), 0.38)
         torch.testing.assert_close(following[key].squeeze(-1), expected)
+
+
+def test_nearing_the_tracks_end_has_its_price(
+    make_plant: MakePlant, make_environment: MakeEnvironment
+) -> None:
+    reward: dict[str, Any] = {"kind": "constant", "scale": 1.0, "track_penalty": 0.0, "track_price": 0.4}
+    env = make_environment(make_plant(32, start=ANYWHERE), MOTORS, reward=reward)
+    following = course(env, actions(10, 32))["next"].flatten()
+    expected = 1 - 0.4 * (following["state"][:, 0] / 0.38) ** 2
+    torch.testing.assert_close(following["reward"].squeeze(-1), expected)
+    assert expected.min() < 0.9
 
 
 class TestAutoReset:

@@ -166,7 +166,7 @@ def test_a_time_limit_does_not_end_the_world(make_training: Callable[..., Traini
         learning={"frames": 6400, "updates": 8, "n_step": 2},
         agent={"gamma": 0.5},
         optimizer={"learning_rate": 1e-2},
-        reward={"kind": "constant", "scale": 1.0, "track_penalty": 0.0},
+        reward={"kind": "constant", "scale": 1.0, "track_penalty": 0.0, "track_price": 0.0},
         time_limit=6,
     )
     training.run()

@@ -94,7 +94,8 @@ class TestLag:
 
 def shares(latency: float, commands: int, period: float, substeps: int) -> Tensor:
     """Share of each step in which each command is in force, [substeps, commands]: the mean of ones."""
-    return mean_commands(torch.eye(commands, dtype=torch.float64), at(latency), period, substeps)
+    held = torch.eye(commands, dtype=torch.float64).unbind()
+    return torch.stack(mean_commands(held, at(latency), period, substeps))
 
 
 class TestLatency:

@@ -20,7 +20,7 @@ from cartpole_rl.tasks.features import (
 
 
 def counts(cart: int, pole: int) -> torch.Tensor:
-    return torch.tensor([[cart, pole]])
+    return torch.tensor([[cart], [pole]])
 
 
 class TestPosition:

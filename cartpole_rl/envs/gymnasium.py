@@ -1,0 +1,199 @@
+"""The simulated environment by Gymnasium's rules: one cart, or many at once.
+
+    gymnasium.make("cartpole_rl/SwingUp-v0")
+    gymnasium.make_vec("cartpole_rl/Balance-v0", num_envs=1024, vectorization_mode="vector_entry_point")
+
+Both are shells over the same `CartPoleEnv` as everything else, with conf/'s nominal cart and medium pole.
+
+| task    | actions                                     | reward                             | ends          |
+|---------|---------------------------------------------|------------------------------------|---------------|
+| swingup | nine motor values, conf/actions/nine_levels | (6.2), as conf/reward/score has it | track         |
+| balance | left, none, right, conf/actions/three       | (6.1), as conf/reward/position     | track, 12 deg |
+
+An episode is cut off after 10 s. Observations are those of `envs.settings.ObservationSettings` as in
+conf/train.yaml; `info` has the step's scores (6.1) `score_upright` and (6.2) `score`.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+from tensordict import TensorDictBase
+
+from cartpole_rl.choices import choice, default_choices
+from cartpole_rl.envs.make import CartPoleEnv, make_env
+from cartpole_rl.envs.settings import ObservationSettings, RewardSettings, TaskSettings
+from cartpole_rl.physics.actuator import Actuator
+from cartpole_rl.physics.dynamics import Integrator, Models
+from cartpole_rl.physics.friction import CartFriction, PoleFriction
+from cartpole_rl.plants.simulated import SimulatedPlant
+from cartpole_rl.randomization import PoleSettings, Randomizer, Range
+from cartpole_rl.tasks.actions import ActionSettings
+
+OF_TASK = {
+    "swingup": {"task": "swingup", "actions": "nine_levels", "reward": "score"},
+    "balance": {"task": "balance", "actions": "three", "reward": "position"},
+}
+SCORES = ("score", "score_upright")
+
+Array = NDArray[Any]
+Randomization = str | Mapping[str, Mapping[str, Any]]
+
+
+def simulated_environment(
+    task: str, carts: int, randomization: Randomization = "none", compiled: bool = False
+) -> CartPoleEnv:
+    """The environment of `task`, "swingup" or "balance", with what conf/train.yaml chooses for all else.
+
+    `randomization` is the name of a file in conf/randomization/, or the lines of one. Raises ConfigError.
+    """
+    chosen = {**default_choices("train"), "pole": "medium", **OF_TASK[task]}
+    chosen.pop("randomization")
+    part = {group: choice(f"{group}/{name}") for group, name in chosen.items() if name and "/" not in group}
+    lines = choice(f"randomization/{randomization}") if isinstance(randomization, str) else randomization
+    cart = {**part["cart"], **part["cart_friction"]["parameters"], **part["pole_friction"]["parameters"]}
+    actions = ActionSettings(**part["actions"])
+    asked = TaskSettings(**{**part["task"], "x_max": cart["track_half_length"]})
+    plant = SimulatedPlant(
+        carts,
+        Randomizer(cart, PoleSettings(**part["pole"]), {name: Range(**line) for name, line in lines.items()}),
+        asked.start,
+        Models(
+            CartFriction(part["cart_friction"]["model"]),
+            PoleFriction(part["pole_friction"]["model"]),
+            Actuator(actions.actuator),
+            Integrator(part["plant"]["integrator"]),
+            part["plant"]["pole_presses"],
+        ),
+        choice("train")["control_period"],
+        part["plant"]["substeps"],
+        compiled=compiled,
+    )
+    observation, reward = ObservationSettings(**part["observation"]), RewardSettings(**part["reward"])
+    return make_env(plant, actions, asked, observation, reward)
+
+
+def observation_space(env: CartPoleEnv) -> spaces.Box:
+    """Of one cart."""
+    return spaces.Box(-np.inf, np.inf, (env.hardware.observation_settings.size,), np.float32)
+
+
+def action_space(env: CartPoleEnv) -> spaces.Discrete:
+    """Of one cart: an index of its motor values."""
+    return spaces.Discrete(len(env.hardware.motors))
+
+
+class CartPoleGymnasium(gymnasium.Env[Array, np.int64]):
+    """One simulated cart."""
+
+    metadata = {"render_modes": []}  # noqa: RUF012 - Gymnasium declares it so
+
+    def __init__(self, task: str, randomization: Randomization = "none", render_mode: None = None) -> None:
+        self.env = simulated_environment(task, 1, randomization)
+        self.observation_space, self.action_space = observation_space(self.env), action_space(self.env)
+        self.render_mode = render_mode
+        self._present: TensorDictBase
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Array, dict[str, Any]]:
+        """Begin an episode."""
+        fresh = self._np_random is None
+        super().reset(seed=seed)
+        if fresh or seed is not None:
+            seed_plant(self.env, self.np_random)
+        self._present = self.env.reset()
+        return first_row(self._present, "observation"), {}
+
+    def step(self, action: np.int64) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+        """One control period."""
+        self._present.set("action", torch.tensor([int(action)]))
+        following = self.env.step(self._present).pop("next")
+        self._present = following.exclude("reward")
+        return (
+            first_row(following, "observation"),
+            float(first_row(following, "reward")[0]),
+            bool(first_row(following, "terminated")[0]),
+            bool(first_row(following, "truncated")[0]),
+            {key: float(first_row(following, key)[0]) for key in SCORES},
+        )
+
+
+class CartPoleVector(VectorEnv[Array, Array, Array]):
+    """Many simulated carts at once; a cart whose episode ends begins the next in the same step.
+
+    `info` then holds the last observation under `final_obs`, as in Gymnasium's own vector environments.
+    """
+
+    metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
+
+    def __init__(
+        self,
+        task: str,
+        num_envs: int = 1,
+        randomization: Randomization = "none",
+        compiled: bool = False,
+        render_mode: None = None,
+    ) -> None:
+        self.env = simulated_environment(task, num_envs, randomization, compiled)
+        self.num_envs, self.render_mode = num_envs, render_mode
+        self.single_observation_space = observation_space(self.env)
+        self.single_action_space = action_space(self.env)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._present: TensorDictBase
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Array, dict[str, Any]]:
+        """Begin an episode on each cart; one seed serves all."""
+        fresh = self._np_random is None
+        super().reset(seed=seed)
+        if fresh or seed is not None:
+            seed_plant(self.env, self.np_random)
+        self._present = self.env.reset()
+        return self._present["observation"].numpy().copy(), {}
+
+    def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
+        """One control period of every cart."""
+        self._present.set("action", torch.as_tensor(np.asarray(actions, dtype=np.int64)))
+        transition, self._present = self.env.step_and_maybe_reset(self._present)
+        last = {key: value.numpy() for key, value in transition["next"].items()}
+        return (
+            self._present["observation"].numpy().copy(),
+            last["reward"][:, 0],
+            last["terminated"][:, 0],
+            last["truncated"][:, 0],
+            vector_info(last),
+        )
+
+
+def vector_info(last: Mapping[str, Array]) -> dict[str, Any]:
+    """Scores of all carts, and the end of those whose episode ended; a mask "_key" goes with each key."""
+    ended = last["done"][:, 0]
+    everyone = np.ones_like(ended)
+    scores = {key: last[key][:, 0] for key in SCORES}
+    info: dict[str, Any] = {**scores, **{f"_{key}": everyone for key in SCORES}}
+    if ended.any():
+        final = np.full(len(ended), None, dtype=object)
+        for row in np.flatnonzero(ended):
+            final[row] = last["observation"][row]
+        info |= {"final_obs": final, "_final_obs": ended}
+        info |= {"final_info": {**scores, **{f"_{key}": ended for key in SCORES}}, "_final_info": ended}
+    return info
+
+
+def first_row(tensordict: TensorDictBase, key: str) -> Array:
+    """The one cart's own, as an array."""
+    return tensordict.get(key)[0].numpy().copy()
+
+
+def seed_plant(env: CartPoleEnv, source: np.random.Generator) -> None:
+    """Seed the carts' draws from Gymnasium's generator; TorchRL's `set_seed` would seed torch itself."""
+    env.plant._set_seed(int(source.integers(2**31)))

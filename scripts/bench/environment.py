@@ -1,0 +1,267 @@
+#!/usr/bin/env python
+"""Speed of the simulated environment beside its peers', in one process and in turns.
+
+    scripts/bench/environment.py [--json environment.json] [--threads 1 2] [--seconds 30] [--quick]
+
+*Dynamics*: friction, force curve, latency, lag, score (6.2) and reset, compiled, on 8192 carts, one control
+period a call or several fused in one; beside Gymnasium's CartPole vector entry point, which has a constant
+force, no friction and reward 1. Random actions are drawn beforehand, and so are our start states, one for
+each cart and call. Substeps are integration steps a period: 1 is Gymnasium's (and the thesis's own 0.02 s), 4
+is what training takes.
+
+*Environment*: all that training steps through, on 4096 carts: encoders, delays, the hardware transform,
+randomization as in conf/randomization/wide, reset of single carts; beside TorchRL's PendulumEnv, which has
+none of that and never ends. Both by `step_and_maybe_reset` with actions drawn beforehand, and both by
+`rollout` of 32 steps, which draws the actions and stacks what happened.
+
+Speed is that of the fastest of many short rounds, in which the rows take turns: other work on the machine
+slows single rounds, not the fastest. Before, every row runs until its episodes end at any time.
+"""
+
+import argparse
+import json
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs import EnvBase, PendulumEnv
+
+from cartpole_rl.compilation import Compiled
+from cartpole_rl.envs.gymnasium import simulated_environment
+from cartpole_rl.physics.dynamics import Drive, Models, State, run_period
+from cartpole_rl.physics.parameters import CartParameters
+from cartpole_rl.reporting.table import table
+from cartpole_rl.tasks.features import Measured
+from cartpole_rl.tasks.rewards import score
+from cartpole_rl.tasks.starts import draw_start
+
+PERIOD, TIME_LIMIT = 0.02, 500  # s; periods
+ROLLOUT = 32  # steps
+CARTPOLE = "Gymnasium CartPole"
+PENDULUM_STEP, PENDULUM_ROLLOUT = "PendulumEnv, step", "PendulumEnv, rollout"
+MIXING = 300  # periods until the ends of the carts' episodes are spread over time
+Step = Callable[[], object]
+
+
+class Row(NamedTuple):
+    """One thing whose speed is measured."""
+
+    name: str
+    carts: int
+    periods: int  # in one call
+    step: Step
+    peer: str  # the row that it is compared with
+    compile_seconds: float
+
+
+# the dynamics
+
+
+class Inputs(NamedTuple):
+    """What a call is given."""
+
+    table: Tensor  # [P, N] parameters
+    motors: Tensor  # [K, N] a period's motor value each
+    starts: Tensor  # [4, N] where an episode begins that follows one which ended
+
+
+class Carts(NamedTuple):
+    """What goes on from one call to the next, [N] each."""
+
+    x: Tensor
+    x_dot: Tensor
+    theta: Tensor
+    theta_dot: Tensor
+    force: Tensor
+    motor: Tensor  # of the period before
+    steps: Tensor  # of the episode
+    score: Tensor  # of the last call's periods
+
+
+def run_dynamics(carts: Carts, inputs: Inputs, *, substeps: int) -> Carts:
+    """K control periods of N carts, each with its score and the reset of what ended."""
+    parameters = CartParameters.from_table(inputs.table)
+    state, force, motor, steps, total = State(*carts[:4]), carts.force, carts.motor, carts.steps, 0.0
+    start = State(*inputs.starts.unbind(0))
+    for given in inputs.motors.unbind(0):
+        drive = Drive(force, (given, motor))
+        state, drive = run_period(state, drive, parameters.latency, parameters, Models(), PERIOD, substeps)
+        total = total + score(Measured(*state), x_max=0.38)
+        steps = steps + 1
+        ended = (state.x.abs() > parameters.track_half_length) | (steps >= TIME_LIMIT)
+        again = torch.where(ended, 1.0, 0.0)
+        state = State(*(torch.where(again > 0, new, old) for new, old in zip(start, state, strict=True)))
+        force, motor, steps = ((1 - again) * value for value in (drive.force, given, steps))
+    return Carts(*state, force, motor, steps, total)
+
+
+def dynamics(carts: int, periods: int, substeps: int) -> Row:
+    """The row of our dynamics."""
+    plant = simulated_environment("swingup", carts, "wide").plant
+    generator = torch.Generator().manual_seed(0)
+    table = plant.randomizer.draw(carts, generator)
+    draws = [
+        Inputs(
+            table,
+            50.0 * torch.randint(-5, 6, (periods, carts), generator=generator),
+            draw_start(carts, plant.start, generator).T.contiguous(),
+        )
+        for _ in range(4)
+    ]
+    run = Compiled(partial(run_dynamics, substeps=substeps))
+    now = Carts(*draws[0].starts, *torch.zeros(4, carts))
+    calls = 0
+
+    def step() -> None:
+        nonlocal now, calls
+        now = run(now, draws[calls % len(draws)])
+        calls += 1
+
+    fused = f"{periods} periods a call" if periods > 1 else "1 period a call"
+    name = f"dynamics, {fused}, {substeps} substep{'s' if substeps > 1 else ''}"
+    return Row(name, carts, periods, step, CARTPOLE, seconds(step))
+
+
+def cartpole(carts: int) -> Row:
+    """The row of Gymnasium's cart-pole."""
+    env = gymnasium.make_vec("CartPole-v1", num_envs=carts, vectorization_mode="vector_entry_point")
+    env.reset(seed=0)
+    actions = np.random.default_rng(0).integers(2, size=(16, carts))
+    calls = iter(range(10**9))
+    return Row(CARTPOLE, carts, 1, lambda: env.step(actions[next(calls) % 16]), CARTPOLE, 0.0)
+
+
+# the environment
+
+
+def stepper(env: EnvBase, present: TensorDictBase, actions: Tensor) -> Step:
+    """Steps with resets from `present` on, through `actions` [K, N, ...] again and again."""
+    calls = 0
+
+    @torch.no_grad()
+    def step() -> TensorDictBase:
+        nonlocal present, calls
+        present["action"] = actions[calls % len(actions)]
+        transition, present = env.step_and_maybe_reset(present)
+        calls += 1
+        return transition
+
+    return step
+
+
+def environments(carts: int) -> list[Row]:
+    """The rows of our environment."""
+    compiled, plain = (simulated_environment("swingup", carts, "wide", each) for each in (True, False))
+    actions = torch.randint(len(plain.hardware.motors), (16, carts))
+    step, plain_step = (stepper(env, env.reset(), actions) for env in (compiled, plain))
+    rollout = partial(compiled.rollout, ROLLOUT, break_when_any_done=False)
+    return [
+        Row("environment, step", carts, 1, step, PENDULUM_STEP, seconds(step)),
+        Row("environment, rollout", carts, ROLLOUT, rollout, PENDULUM_ROLLOUT, 0.0),
+        Row("environment, step, not compiled", carts, 1, plain_step, PENDULUM_STEP, 0.0),
+    ]
+
+
+def pendulums(carts: int) -> list[Row]:
+    """The rows of TorchRL's pendulum."""
+    env = PendulumEnv()
+    first = env.reset(env.gen_params(batch_size=[carts]), set_state=False)
+    step = stepper(env, first.clone(), 4 * torch.rand(16, carts, 1) - 2)
+
+    def rollout() -> TensorDictBase:
+        return env.rollout(ROLLOUT, tensordict=first.clone(), auto_reset=False, break_when_any_done=False)
+
+    return [
+        Row(PENDULUM_STEP, carts, 1, step, PENDULUM_STEP, 0.0),
+        Row(PENDULUM_ROLLOUT, carts, ROLLOUT, rollout, PENDULUM_ROLLOUT, 0.0),
+    ]
+
+
+# measuring
+
+
+def seconds(step: Step) -> float:
+    """How long one call takes."""
+    started = time.perf_counter()
+    step()
+    return time.perf_counter() - started
+
+
+def fastest(rows: list[Row], budget: float) -> dict[str, float]:
+    """Periods of one cart a second, by the row's name, from rounds of a few periods over `budget` s."""
+    best = dict.fromkeys((row.name for row in rows), np.inf)
+    ends = time.perf_counter() + budget
+    while time.perf_counter() < ends or np.inf in best.values():
+        for row in rows:
+            started = time.perf_counter()
+            for _ in range(max(1, 3 // row.periods)):
+                row.step()
+            seconds_a_call = (time.perf_counter() - started) / max(1, 3 // row.periods)
+            best[row.name] = min(best[row.name], seconds_a_call)
+    return {row.name: row.carts * row.periods / best[row.name] for row in rows}
+
+
+def measure(threads: int, budget: float, quick: bool) -> list[dict[str, Any]]:
+    """All rows with `threads` threads of torch; Gymnasium's NumPy takes one."""
+    torch.set_num_threads(threads)
+    wide, whole = (64, 32) if quick else (8192, 4096)
+    rows = [cartpole(wide), *(dynamics(wide, *fused) for fused in ((1, 1), (1, 4), (8, 1)))]
+    rows += [*pendulums(whole), *environments(whole)]
+    for row in rows:
+        for _ in range(1 if quick else MIXING // row.periods):
+            row.step()
+    speed = fastest(rows, 0.0 if quick else budget)
+    return [
+        {
+            "name": row.name,
+            "threads": threads,
+            "carts": row.carts,
+            "steps_per_second": speed[row.name],
+            "peer": row.peer,
+            "ratio": speed[row.name] / speed[row.peer],
+            "compile_seconds": row.compile_seconds,
+        }
+        for row in rows
+    ]
+
+
+def show(results: list[dict[str, Any]]) -> str:
+    """The table of the results."""
+    lines = [{**result, "millions": result["steps_per_second"] / 1e6} for result in results]
+    columns = {
+        "name": "",
+        "carts": "carts",
+        "threads": "threads",
+        "millions": "million steps/s",
+        "ratio": "ratio",
+        "peer": "to",
+        "compile_seconds": "first call, s",
+    }
+    return table(lines, columns)
+
+
+def main() -> None:
+    """Measure, print, write."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the results there")
+    parser.add_argument(
+        "--threads", type=int, nargs="+", default=[1, 2], help="threads of torch (default: 1 2)"
+    )
+    parser.add_argument("--seconds", type=float, default=30.0, help="of rounds for each number of threads")
+    parser.add_argument("--quick", action="store_true", help="few carts and rounds: only that it runs")
+    options = parser.parse_args()
+    results = [row for threads in options.threads for row in measure(threads, options.seconds, options.quick)]
+    print(show(results))
+    if options.json:
+        options.json.write_text(json.dumps(results, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()

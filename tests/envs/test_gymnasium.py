@@ -1,0 +1,120 @@
+"""By Gymnasium's rules: its checker is content, seeds repeat, and one cart does what a batch of one does."""
+
+import warnings
+from collections.abc import Iterator
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode, VectorEnv
+
+from cartpole_rl.envs.gymnasium import simulated_environment
+from cartpole_rl.errors import ConfigError
+from cartpole_rl.registration import ENVIRONMENTS, register
+
+STEPS = 520  # longer than an episode may be
+
+
+@pytest.fixture(autouse=True, scope="module")
+def registered() -> None:
+    register()
+    register()  # what is there already is left alone
+
+
+def vector(name: str, carts: int = 8, **options: object) -> VectorEnv:
+    return gymnasium.make_vec(name, num_envs=carts, vectorization_mode="vector_entry_point", **options)
+
+
+def course(env: VectorEnv, seed: int) -> Iterator[tuple]:
+    """The reset and the steps under actions of the seed."""
+    yield env.reset(seed=seed)
+    env.action_space.seed(seed)
+    for _ in range(STEPS):
+        yield env.step(env.action_space.sample())
+
+
+@pytest.mark.parametrize("name", ENVIRONMENTS)
+def test_gymnasiums_checker_is_content(name: str) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", message=".*infinity.*")  # a measured state has no bounds
+        warnings.filterwarnings("ignore", message=".*render.*")
+        check_env(gymnasium.make(name).unwrapped, skip_render_check=True)
+
+
+@pytest.mark.parametrize(("name", "actions", "limit"), [("SwingUp", 9, None), ("Balance", 3, np.radians(12))])
+def test_the_tasks_are_conf_s(name: str, actions: int, limit: float | None) -> None:
+    env = gymnasium.make(f"cartpole_rl/{name}-v0").unwrapped
+    assert env.action_space.n == actions
+    assert env.env.hardware.task.angle_limit == pytest.approx(limit)
+    assert env.env.plant.parameters.pole_com.item() == pytest.approx(0.1778)
+    assert env.env.hardware.task.x_max == pytest.approx(env.env.plant.parameters.track_half_length.item())
+
+
+def test_an_episode_is_cut_off_after_ten_seconds() -> None:
+    env = gymnasium.make("cartpole_rl/SwingUp-v0")
+    env.reset(seed=0)
+    ends = [env.step(4)[2:4] for _ in range(500)]  # the middle action: no motor
+    assert ends == [(False, False)] * 499 + [(False, True)]
+
+
+@pytest.mark.parametrize("name", ENVIRONMENTS)
+class TestVector:
+    def test_spaces_hold(self, name: str) -> None:
+        env = vector(name)
+        for outcome in course(env, 0):
+            assert env.observation_space.contains(outcome[0])
+            if len(outcome) > 2:
+                assert [part.shape for part in outcome[1:4]] == [(8,)] * 3
+                assert [part.dtype for part in outcome[1:4]] == [np.float32, np.bool_, np.bool_]
+
+    def test_seeds_repeat(self, name: str) -> None:
+        env = vector(name, randomization="wide")
+        first, again, other = (np.stack([outcome[0] for outcome in course(env, seed)]) for seed in (1, 1, 2))
+        assert (first == again).all()
+        assert (first != other).any()
+
+    def test_leaves_torchs_own_random_numbers_alone(self, name: str) -> None:
+        env = vector(name)
+        before = torch.random.get_rng_state()
+        env.reset(seed=3)
+        assert torch.equal(torch.random.get_rng_state(), before)
+
+    def test_an_ended_episode_shows_its_end_and_begins_anew(self, name: str) -> None:
+        env = vector(name)
+        assert env.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
+        ends = 0
+        outcomes = course(env, 0)
+        next(outcomes)
+        for observation, _, terminated, truncated, info in outcomes:
+            ended = terminated | truncated
+            assert (info.get("_final_obs", np.zeros(8, bool)) == ended).all()
+            for row in np.flatnonzero(ended):
+                assert env.single_observation_space.contains(info["final_obs"][row])
+                assert (info["final_obs"][row] != observation[row]).any()
+                ends += 1
+        assert ends >= 8
+
+    def test_one_of_many_is_the_one_alone(self, name: str) -> None:
+        alone, batch = gymnasium.make(name), vector(name, carts=1)
+        first = alone.reset(seed=5)[0], batch.reset(seed=5)[0][0]
+        assert (first[0] == first[1]).all()
+        batch.action_space.seed(0)
+        for _ in range(200):
+            action = batch.action_space.sample()
+            one, many = alone.step(action[0]), batch.step(action)
+            assert one[1:4] == tuple(part[0] for part in many[1:4])
+            if one[2] or one[3]:
+                return
+            assert (one[0] == many[0][0]).all()
+
+
+def test_randomization_is_by_name_or_by_lines() -> None:
+    for given in ("wide", {"cart_mass": {"relative": [-0.2, 0.2]}}):
+        env = simulated_environment("swingup", 8, given)
+        env.reset()
+        assert len(env.plant.parameters.cart_mass.unique()) == 8
+    with pytest.raises(ConfigError, match=r"no choice 'randomization/wild' in conf/; there is .*wide"):
+        simulated_environment("swingup", 8, "wild")
