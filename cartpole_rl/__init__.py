@@ -1,6 +1,11 @@
 """Train a cart-pole agent in simulation, drive a serial cart with it, and fine-tune it there.
 
-The floors of the house, and what may import what, are drawn in ``docs/house.md``.
+The floors of the house, and what may import what, are drawn in ``docs/house.md``. Importing the package
+registers its environments with Gymnasium.
 """
 
+from cartpole_rl.registration import register
+
 __version__ = "0.1.0"
+
+register()

@@ -5,7 +5,7 @@ every Python object that the function reads, in every call, and that takes longe
 thousand carts; where nothing but the tensors changes between two calls, there is nothing to guard.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from itertools import chain, islice
 from typing import Any, Generic, TypeVar
 
@@ -20,17 +20,17 @@ Result = TypeVar("Result", bound=tuple)
 
 
 class Compiled(Generic[Result]):
-    """`function` of named tuples of tensors, which returns another, compiled in its first call.
+    """`function` of tuples of tensors, named or plain, which returns another, compiled in its first call.
 
     Shapes, types and devices have to stay as they are in that call, and so has all that `function` reads
     beside its arguments. It needs a C++ compiler; what was compiled is kept on disk by TorchInductor, where
-    the next process finds it. No gradient flows through it.
+    the next process finds it. No gradient flows through it; the function may well compute one.
     """
 
     def __init__(self, function: Callable[..., Result]) -> None:
         self._function = function
         self._call: Callable[..., Any] | None = None
-        self._result: Callable[..., Result] = function
+        self._result: Callable[..., Result]
         self._types: list[torch.dtype] = []
 
     @torch.no_grad()
@@ -40,15 +40,15 @@ class Compiled(Generic[Result]):
         if self._call is None:
             self._call = self._compile(arguments, tensors)
         values = self._call(*tensors)
-        return self._result(*map(Tensor.view, values, self._types))
+        return self._result(map(Tensor.view, values, self._types))
 
     def _compile(
         self, arguments: Sequence[tuple[Tensor, ...]], tensors: Sequence[Tensor]
     ) -> Callable[..., Any]:
         def flat(*tensors: Tensor) -> list[Tensor]:
             rest = iter(tensors)
-            value = self._function(*(type(each)(*islice(rest, len(each))) for each in arguments))
-            self._result, self._types = type(value), [part.dtype for part in value]
+            value = self._function(*(rebuild(each)(islice(rest, len(each))) for each in arguments))
+            self._result, self._types = rebuild(value), [part.dtype for part in value]
             return [as_byte(part) if part.dtype is torch.bool else part for part in value]
 
         return standalone_compile(
@@ -57,6 +57,11 @@ class Compiled(Generic[Result]):
             dynamic_shapes="from_example_inputs",
             options={"config_patches": OPTIONS},
         )
+
+
+def rebuild(example: tuple[Tensor, ...]) -> Callable[[Iterable[Tensor]], Any]:
+    """What makes a tuple like `example` of as many tensors."""
+    return getattr(type(example), "_make", tuple)
 
 
 def as_byte(flags: Tensor) -> Tensor:

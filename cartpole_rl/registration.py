@@ -1,7 +1,7 @@
 """Tells Gymnasium which environments there are, without importing them.
 
-Gymnasium calls `register` by itself where this package is installed (the entry point `gymnasium.envs` in
-pyproject.toml), so that ``gymnasium.make("cartpole_rl/SwingUp-v0")`` needs no import.
+``import cartpole_rl`` calls `register`, as Gymnasium expects of a package: after it, or in one go by
+``gymnasium.make("cartpole_rl:cartpole_rl/SwingUp-v0")``, the environments are found by their names.
 """
 
 import gymnasium

@@ -6,14 +6,13 @@ from typing import Annotated, Literal
 
 import torch
 from pydantic import Field, model_validator
-from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.data import Categorical
 from torchrl.modules import QValueActor
-from torchrl.objectives import DQNLoss
 from torchrl.objectives.utils import TargetNetUpdater
 
-from cartpole_rl.agents.network import MirrorQNetwork, QNetwork
+from cartpole_rl.agents.loss import AdvantageLoss
+from cartpole_rl.agents.network import MirrorQNetwork, QNetwork, RecurrentQNetwork
 from cartpole_rl.settings import Count, Settings
 
 
@@ -21,6 +20,7 @@ class AgentSettings(Settings):
     """The agent and its loss."""
 
     hidden: tuple[Count, ...]
+    recurrent: Count | None  # units of a recurrent layer below the hidden ones, which reads the last frames
     layer_norm: bool
     mirrored: bool  # the network knows that left and right are one problem, reflected
     gamma: Annotated[float, Field(ge=0, lt=1)]
@@ -40,6 +40,12 @@ class AgentSettings(Settings):
         return self
 
     @model_validator(mode="after")
+    def _either_mirrored_or_recurrent(self) -> "AgentSettings":
+        if self.mirrored and self.recurrent is not None:
+            raise ValueError("a recurrent network is not mirrored: give mirrored=false or recurrent=null")
+        return self
+
+    @model_validator(mode="after")
     def _halves_for_the_mirror(self) -> "AgentSettings":
         if self.mirrored and any(size % 2 for size in self.hidden):
             raise ValueError(f"hidden {list(self.hidden)}: a mirrored network needs even numbers of units")
@@ -50,23 +56,32 @@ class QAgent(nn.Module):
     """Online and target Q-network of `actions` outputs.
 
     `mirror_signs` [K] has +1 or -1 for each number of an observation: what it is multiplied by when left and
-    right are swapped.
+    right are swapped. `frames` [T, F] says where a recurrent network finds its frames in an observation.
     """
 
     updates: Tensor  # gradient steps followed so far, []
 
-    def __init__(self, settings: AgentSettings, mirror_signs: Sequence[int], actions: int) -> None:
+    def __init__(
+        self,
+        settings: AgentSettings,
+        mirror_signs: Sequence[int],
+        actions: int,
+        frames: Sequence[Sequence[int]] = (),
+    ) -> None:
         super().__init__()
         self.settings = settings
         layers = actions, settings.hidden, settings.layer_norm
-        network = (
-            MirrorQNetwork(mirror_signs, *layers)
-            if settings.mirrored
-            else QNetwork(len(mirror_signs), *layers)
-        )
+        network: nn.Module
+        if settings.recurrent is not None:
+            network = RecurrentQNetwork(len(mirror_signs), frames, settings.recurrent, *layers)
+        elif settings.mirrored:
+            network = MirrorQNetwork(mirror_signs, *layers)
+        else:
+            network = QNetwork(len(mirror_signs), *layers)
         self.actor = QValueActor(network, in_keys=["observation"], spec=Categorical(actions))
-        self.loss = DQNLoss(
+        self.loss = AdvantageLoss(
             self.actor,
+            action_gap=settings.action_gap,
             loss_function=settings.loss,
             delay_value=True,
             double_dqn=settings.double,
@@ -77,28 +92,9 @@ class QAgent(nn.Module):
         decay = settings.average_decay
         self.average = None if decay is None else copy.deepcopy(self.actor).requires_grad_(False)
         self.register_buffer("updates", torch.zeros((), dtype=torch.int64))
-        self._online, self._target = (
-            list(params.values(include_nested=True, leaves_only=True))
-            for params in (self.loss.value_network_params, self.loss.target_value_network_params)
-        )
-
-    @torch.no_grad()
-    def widen_gap(self, batch: TensorDictBase) -> TensorDictBase:
-        """`batch` with `action_gap` alpha's share taken off its rewards; the same where alpha is 0.
-
-        The share is alpha times what the action taken is worth less than the best one, by the target network.
-        So the best action stays the best one and the others fall back 1 / (1 - alpha) times as far: at 50 Hz
-        a single action changes little, and a network that is a little wrong would take the wrong one
-        (Bellemare et al., "Increasing the action gap", 2016, equation 9).
-        """
-        gap = self.settings.action_gap
-        if gap == 0:
-            return batch
-        with self.loss.target_value_network_params.to_module(self.loss.value_network):
-            values = self.loss.value_network(batch.select("observation"))["action_value"]
-        shortfall = values.max(-1, keepdim=True).values - values.gather(-1, batch["action"].unsqueeze(-1))
-        reward = batch["next", "reward"] - gap * shortfall
-        return batch.clone(recurse=False).set(("next", "reward"), reward)
+        online, target = self.loss.value_network_params, self.loss.target_value_network_params
+        learned = [name for name, weight in online.items(True, True) if weight.requires_grad]
+        self._online, self._target = ([params[name] for name in learned] for params in (online, target))
 
     @torch.no_grad()
     def follow(self) -> None:

@@ -1,4 +1,4 @@
-"""Q-networks: multilayer perceptrons, free or bound to the mirror symmetry of cart and pole.
+"""Q-networks: multilayer perceptrons, free or bound to the mirror symmetry of cart and pole; recurrent ones.
 
 Layer normalization after each hidden layer keeps a learned swing-up from being unlearned
 (Gallici et al., "Simplifying deep temporal difference learning", 2024).
@@ -66,6 +66,45 @@ class MirrorQNetwork(nn.Module):
             even, odd = layer(even, odd)
         same, opposite = self.even_values(even), self.odd_values(odd)
         return (same + same.flip(-1) + opposite - opposite.flip(-1)) / 2
+
+
+class RecurrentQNetwork(nn.Module):
+    """A QNetwork behind a gated recurrent unit that reads the last frames of an observation, oldest first.
+
+    `frames` [T, F] says where in an observation the numbers of each frame stand. The state begins at zero
+    with the oldest frame, so that a policy needs to carry nothing from step to step and replay holds all that
+    a gradient needs (Hausknecht and Stone, "Deep recurrent Q-learning", 2015: random updates, T steps long).
+    Numbers that stand in no frame join behind the recurrent unit.
+    """
+
+    frames: Tensor
+    rest: Tensor
+
+    def __init__(
+        self,
+        observation_size: int,
+        frames: Sequence[Sequence[int]],
+        units: int,
+        actions: int,
+        hidden: Sequence[int],
+        layer_norm: bool,
+    ) -> None:
+        super().__init__()
+        used = {place for frame in frames for place in frame}
+        rest = [place for place in range(observation_size) if place not in used]
+        self.register_buffer("frames", torch.tensor([list(frame) for frame in frames]))
+        self.register_buffer("rest", torch.tensor(rest, dtype=torch.int64))
+        self.cell = nn.GRUCell(len(frames[0]), units)
+        self.head = QNetwork(units + len(rest), actions, hidden, layer_norm)
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """Values of the actions."""
+        batch = observation.flatten(0, -2) if observation.ndim > 1 else observation.unsqueeze(0)
+        state = batch.new_zeros(len(batch), self.cell.hidden_size)
+        for frame in batch[:, self.frames].unbind(1):
+            state = self.cell(frame, state)
+        values = self.head(torch.cat((state, batch[:, self.rest]), -1))
+        return values.reshape(*observation.shape[:-1], -1)
 
 
 class MirrorLayer(nn.Module):

@@ -67,7 +67,8 @@ def environment(config: CartPoleSettings, plant: Plant) -> CartPoleEnv:
 
 def new_agent(config: TrainConfig) -> QAgent:
     """An untrained agent."""
-    return QAgent(config.agent, config.observation.mirror_signs, len(config.actions.motors))
+    sight = config.observation
+    return QAgent(config.agent, sight.mirror_signs, len(config.actions.motors), sight.frames)
 
 
 def recorded_config(config: Mapping[str, Any], source: str) -> TrainConfig:

@@ -131,6 +131,15 @@ class TrainConfig(CartPoleSettings):
         return self
 
     @model_validator(mode="after")
+    def _a_recurrent_network_has_frames(self) -> "TrainConfig":
+        if self.agent.recurrent is not None and not self.observation.frames:
+            raise ValueError(
+                "agent.recurrent reads frames: it needs observation.kind=positions and more past_motors than "
+                "past_positions; give observation=positions"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _memory_holds_a_batch(self) -> "TrainConfig":
         if self.replay.size < self.learning.batch_size:
             raise ValueError(

@@ -17,6 +17,7 @@ from cartpole_rl.tasks.features import (
     MOTOR_SCALE,
     SPEED_SCALE,
     Measured,
+    ObservationKind,
     measured_position,
     measured_velocity,
     observe,
@@ -117,13 +118,16 @@ def perceive(
 
 
 def remember(before: Before, sight: ObservationSettings) -> Tensor:
-    """`past` one period on, [past_size, N]: motor values, then pairs of velocities, each newest first."""
-    motors, velocities = before.past.split([sight.past_motors, 2 * sight.past_velocities])
+    """`past` one period on, [past_size, N]: motor values, velocities, positions, each newest first."""
+    sizes = sight.past_motors, 2 * sight.past_velocities
+    motors, velocities, positions = before.past.split([*sizes, len(before.past) - sum(sizes)])
     newest = before.state[1:2] / SPEED_SCALE, before.state[3:4] / ANGULAR_SPEED_SCALE
+    place = torch.stack(observe(Measured(*before.state), ObservationKind.POSITIONS))
     return torch.cat(
         (
-            torch.cat((before.motor / MOTOR_SCALE, motors))[: sight.past_motors],
-            torch.cat((*newest, velocities))[: 2 * sight.past_velocities],
+            torch.cat((before.motor / MOTOR_SCALE, motors))[: len(motors)],
+            torch.cat((*newest, velocities))[: len(velocities)],
+            torch.cat((place, positions))[: len(positions)],
         )
     )
 

@@ -13,7 +13,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import nn
 
-from cartpole_rl.agents import QAgent
+from cartpole_rl.agents import LossGradient, QAgent
 from cartpole_rl.envs import CartPoleEnv
 from cartpole_rl.learning.collector import Collector
 from cartpole_rl.learning.randomness import random_state, restore_random_state
@@ -59,11 +59,11 @@ class Training:
         self.collector = Collector(env, agent.actor, len(env.hardware.motors), seed)
         self.replay_settings, self.optimizer_settings = replay, optimizer
         self.replay = make_replay(replay, settings.updates * settings.batch_size)
-        self.weights = [weight for weight in agent.loss.parameters() if weight.requires_grad]
+        self.gradient = LossGradient(agent.loss, compiled)
+        self.weights = self.gradient.weights
         self.optimizer = OPTIMIZERS[optimizer.kind](
             self.weights, lr=optimizer.learning_rate, weight_decay=optimizer.weight_decay, fused=True
         )
-        self.loss = torch.compile(agent.loss, fullgraph=True, dynamic=False) if compiled else agent.loss
         self.iteration, self.seconds = 0, 0.0
         self.best_score = -float("inf")
         self.last_score: float | None = None
@@ -114,8 +114,7 @@ class Training:
         if self.replay_settings.kind == "prioritized":
             self.replay.sampler.beta = linear(*beta, self.progress)
         losses, norms = [], []
-        sample = self.agent.widen_gap(self.replay.sample())
-        for batch in sample.split(self.settings.batch_size):
+        for batch in self.replay.sample().split(self.settings.batch_size):
             loss, norm = self.update(batch)
             losses.append(loss)
             norms.append(norm)
@@ -127,15 +126,13 @@ class Training:
 
     def update(self, batch: TensorDictBase) -> tuple[torch.Tensor, torch.Tensor]:
         """One gradient step; the loss and the norm of its gradient."""
-        loss = self.loss(batch)["loss"]
-        self.optimizer.zero_grad()
-        loss.backward()
+        loss = self.gradient(batch)
         norm = nn.utils.clip_grad_norm_(self.weights, self.optimizer_settings.max_grad_norm)
         self.optimizer.step()
         self.agent.follow()
         if self.replay_settings.kind == "prioritized":
             self.replay.update_tensordict_priority(batch)
-        return loss.detach(), norm
+        return loss, norm
 
     def epsilon(self) -> float:
         """Share of random actions now."""

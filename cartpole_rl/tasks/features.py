@@ -33,10 +33,15 @@ class ObservationKind(StrEnum):
 
     RAW = "raw"  # x, x_dot, theta wrapped, theta_dot: the thesis's four numbers
     COS_SIN = "cos_sin"  # x, x_dot, cos theta, sin theta, theta_dot, each scaled to about one
+    POSITIONS = "positions"  # x, cos theta, sin theta: as cos_sin, velocities hidden
 
 
 # What each number of an observation is multiplied by when left and right are swapped.
-MIRROR_SIGNS = {ObservationKind.RAW: (-1, -1, -1, -1), ObservationKind.COS_SIN: (-1, -1, 1, -1, -1)}
+MIRROR_SIGNS = {
+    ObservationKind.RAW: (-1, -1, -1, -1),
+    ObservationKind.COS_SIN: (-1, -1, 1, -1, -1),
+    ObservationKind.POSITIONS: (-1, 1, -1),
+}
 
 
 def measured_position(counts: Tensor) -> tuple[Tensor, Tensor]:
@@ -56,18 +61,15 @@ def measured_velocity(counts: Tensor, previous: Tensor, dt: Tensor) -> tuple[Ten
 
 
 def observe(state: Measured, kind: ObservationKind) -> tuple[Tensor, ...]:
-    """The numbers of an observation, [N] each: 4 raw or 5 cos/sin."""
+    """The numbers of an observation, [N] each: 4 raw, 5 cos/sin or 3 positions."""
     if kind is ObservationKind.RAW:
         return state
-    return (
-        state.x / POSITION_SCALE,
-        state.x_dot / SPEED_SCALE,
-        torch.cos(state.theta),
-        torch.sin(state.theta),
-        state.theta_dot / ANGULAR_SPEED_SCALE,
-    )
+    x, cosine, sine = state.x / POSITION_SCALE, torch.cos(state.theta), torch.sin(state.theta)
+    if kind is ObservationKind.POSITIONS:
+        return x, cosine, sine
+    return x, state.x_dot / SPEED_SCALE, cosine, sine, state.theta_dot / ANGULAR_SPEED_SCALE
 
 
 def observation_size(kind: ObservationKind) -> int:
     """Numbers that `observe` gives."""
-    return 4 if kind is ObservationKind.RAW else 5
+    return len(MIRROR_SIGNS[kind])

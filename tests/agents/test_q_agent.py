@@ -9,11 +9,12 @@ from pydantic import ValidationError
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from cartpole_rl.agents import AgentSettings, QAgent
-from cartpole_rl.agents.network import MirrorQNetwork, QNetwork
+from cartpole_rl.agents import AgentSettings, LossGradient, QAgent
+from cartpole_rl.agents.network import MirrorQNetwork, QNetwork, RecurrentQNetwork
 
 DQN = {
     "hidden": [16],
+    "recurrent": None,
     "layer_norm": True,
     "mirrored": False,
     "gamma": 0.9,
@@ -26,9 +27,14 @@ DQN = {
 }
 
 
-def make_agent(mirror_signs: Sequence[int] = (-1, 1, -1), actions: int = 4, **changes: object) -> QAgent:
+def make_agent(
+    mirror_signs: Sequence[int] = (-1, 1, -1),
+    actions: int = 4,
+    frames: Sequence[Sequence[int]] = (),
+    **changes: object,
+) -> QAgent:
     torch.manual_seed(0)
-    return QAgent(AgentSettings(**{**DQN, **changes}), mirror_signs, actions)
+    return QAgent(AgentSettings(**{**DQN, **changes}), mirror_signs, actions, frames)
 
 
 def disturb(agent: QAgent) -> None:
@@ -113,6 +119,37 @@ def test_network_has_the_layers_asked_for(layer_norm: bool) -> None:
     assert [norm.normalized_shape for norm in norms] == ([(16,), (8,)] if layer_norm else [])
 
 
+def recurrent_network(units: int = 16) -> RecurrentQNetwork:
+    """Three frames of two numbers, and one number beside them."""
+    torch.manual_seed(0)
+    return RecurrentQNetwork(7, [[5, 6], [2, 4], [0, 1]], units, 3, (8,), layer_norm=True)
+
+
+def test_a_recurrent_network_reads_its_frames_from_the_oldest_to_the_newest() -> None:
+    network = recurrent_network()
+    scene = torch.randn(5, 7)
+    state = torch.zeros(5, 16)
+    for frame in (scene[:, [5, 6]], scene[:, [2, 4]], scene[:, [0, 1]]):
+        state = network.cell(frame, state)
+    torch.testing.assert_close(network(scene), network.head(torch.cat((state, scene[:, 3:4]), -1)))
+    torch.testing.assert_close(network(scene.view(5, 1, 7)), network(scene).view(5, 1, 3))
+    torch.testing.assert_close(network(scene[0]), network(scene)[0])
+
+
+def test_a_recurrent_network_learns_a_velocity_from_positions() -> None:
+    """The difference of two frames, of which each alone says nothing."""
+    network = recurrent_network()
+    optimizer = torch.optim.Adam(network.parameters(), lr=1e-2)
+    for _ in range(300):
+        scene = torch.randn(128, 7)
+        wanted = scene[:, 0] - scene[:, 2]
+        error = (network(scene)[:, 0] - wanted).square().mean()
+        optimizer.zero_grad()
+        error.backward()
+        optimizer.step()
+    assert error.item() < 0.1 * wanted.var().item()
+
+
 def test_the_actor_takes_the_action_of_the_highest_value() -> None:
     agent = make_agent()
     chosen = agent.actor(TensorDict({"observation": torch.randn(50, 3)}, [50]))
@@ -145,9 +182,9 @@ def test_the_action_gap_takes_the_shortfall_off_the_reward() -> None:
     shortfall = values.max(1).values - values.gather(1, batch["action"].unsqueeze(1)).squeeze(1)
     assert shortfall.max() > 0
     reward = batch["next", "reward"] - 0.5 * shortfall.unsqueeze(1)
-    assert torch.allclose(agent.widen_gap(batch)["next", "reward"], reward, atol=1e-6)
+    assert torch.allclose(agent.loss.widen_gap(batch)["next", "reward"], reward, atol=1e-6)
     assert not torch.allclose(batch["next", "reward"], reward)  # what was given stays as it was
-    assert plain.widen_gap(batch) is batch
+    assert plain.loss.widen_gap(batch) is batch
 
 
 def test_the_action_gap_widens_and_keeps_the_best_action() -> None:
@@ -163,7 +200,7 @@ def test_the_action_gap_widens_and_keeps_the_best_action() -> None:
         batch["next", "terminated"][:] = True
         for _ in range(600):
             optimizer.zero_grad()
-            agent.loss(agent.widen_gap(batch))["loss"].backward()
+            agent.loss(batch)["loss"].backward()
             optimizer.step()
             agent.follow()
         learned[gap] = values_of(agent, batch["observation"][:1], target=False)[0]
@@ -189,6 +226,36 @@ def test_importance_weights_scale_each_transition() -> None:
     weights = torch.linspace(0.1, 1, 8)
     loss = agent.loss(batch.set("priority_weight", weights))["loss"]
     assert loss.item() == pytest.approx((weights * errors).sum().item() / weights.sum().item(), rel=1e-5)
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+@pytest.mark.parametrize("compiled", [False, True])
+@pytest.mark.parametrize("network", [{"mirrored": True}, {"recurrent": 8}])
+def test_the_gradient_is_that_of_the_loss(network: dict, compiled: bool, weighted: bool) -> None:
+    agent = make_agent(action_gap=0.5, frames=[[1], [0]], **network)
+    disturb(agent)
+    gradient = LossGradient(agent.loss, compiled)
+    for seed in range(2):  # the second batch meets what was traced for the first, and other weights
+        torch.manual_seed(seed)
+        batch = transitions(64)
+        if weighted:
+            batch["priority_weight"] = torch.rand(64)
+        wanted = batch.clone()
+        loss = agent.loss(wanted)["loss"]
+        expected = torch.autograd.grad(loss, gradient.weights)
+        assert gradient(batch).item() == pytest.approx(loss.item(), rel=1e-5)
+        assert torch.allclose(batch["td_error"], wanted["td_error"], rtol=1e-4, atol=1e-5)
+        for weight, value in zip(gradient.weights, expected, strict=True):
+            assert weight.grad is not None
+            assert torch.allclose(weight.grad, value, rtol=1e-4, atol=1e-5)
+        disturb(agent)
+        agent.follow()
+
+
+def test_every_weight_of_the_online_network_is_learned() -> None:
+    agent = make_agent(mirrored=True)
+    learned = {weight.data_ptr() for weight in LossGradient(agent.loss).weights}
+    assert learned == {weight.data_ptr() for weight in agent.actor.parameters()}
 
 
 def test_the_target_begins_as_a_copy() -> None:

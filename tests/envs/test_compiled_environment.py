@@ -23,7 +23,7 @@ RANGES = {"cart_mass": Range(relative=(-0.2, 0.2)), "angle_noise": Range(absolut
 pytestmark = pytest.mark.skipif(shutil.which("g++") is None, reason="needs a C++ compiler")
 
 
-@pytest.fixture(params=["history", "raw"])
+@pytest.fixture(params=["history", "raw", "positions"])
 def course(
     request: pytest.FixtureRequest,
     make_plant: Callable[..., SimulatedPlant],
@@ -33,6 +33,7 @@ def course(
     observation: dict[str, Any] = {
         "history": {"pole_length": True},
         "raw": {"kind": "raw", "past_motors": 0, "past_velocities": 0},
+        "positions": {"kind": "positions", "past_motors": 3, "past_velocities": 0, "past_positions": 2},
     }[request.param]
 
     def run(compiled: bool) -> list[TensorDictBase]:

@@ -17,10 +17,13 @@ from cartpole_rl.registration import ENVIRONMENTS, register
 STEPS = 520  # longer than an episode may be
 
 
-@pytest.fixture(autouse=True, scope="module")
-def registered() -> None:
+def test_importing_the_package_registers_and_again_changes_nothing() -> None:
+    known = {name: gymnasium.registry[name] for name in ENVIRONMENTS}
     register()
-    register()  # what is there already is left alone
+    assert {name: gymnasium.registry[name] for name in ENVIRONMENTS} == known
+    with gymnasium.make("cartpole_rl:cartpole_rl/Balance-v0") as env:
+        assert env.spec is not None
+        assert env.spec.id == "cartpole_rl/Balance-v0"
 
 
 def vector(name: str, carts: int = 8, **options: object) -> VectorEnv:

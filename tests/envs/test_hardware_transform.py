@@ -52,19 +52,20 @@ def course(env: CartPoleEnv, chosen: Tensor) -> TensorDict:
 
 @pytest.mark.parametrize("kind", ObservationKind)
 @pytest.mark.parametrize("pole_length", [True, False])
-@pytest.mark.parametrize("past", [(0, 0), (3, 0), (0, 2), (2, 1)])
+@pytest.mark.parametrize("past", [(0, 0, 0), (3, 0, 0), (0, 2, 0), (2, 1, 0), (3, 0, 2), (0, 1, 1)])
 def test_specs(
     make_plant: MakePlant,
     make_environment: MakeEnvironment,
     kind: str,
     pole_length: bool,
-    past: tuple[int, int],
+    past: tuple[int, int, int],
 ) -> None:
     observation = {
         "kind": kind,
         "pole_length": pole_length,
         "past_motors": past[0],
         "past_velocities": past[1],
+        "past_positions": past[2],
     }
     env = make_environment(make_plant(3, start=ANYWHERE), **observation)
     check_env_specs(env)
@@ -96,12 +97,23 @@ class TestObservation:
         error[:, 2] = torch.remainder(error[:, 2] + 1, 2 * math.pi) - 1
         assert (error.abs() < torch.tensor([2e-5, 0.2, 1e-3, 2.0])).all()
 
-    @pytest.mark.parametrize(("motors", "velocities"), [(3, 2), (0, 2), (2, 0), (1, 1)])
+    @pytest.mark.parametrize(
+        ("motors", "velocities", "positions"), [(3, 2, 0), (0, 2, 1), (2, 0, 3), (1, 1, 0)]
+    )
     def test_remembers_the_newest_first(
-        self, make_plant: MakePlant, make_environment: MakeEnvironment, motors: int, velocities: int
+        self,
+        make_plant: MakePlant,
+        make_environment: MakeEnvironment,
+        motors: int,
+        velocities: int,
+        positions: int,
     ) -> None:
         env = make_environment(
-            make_plant(2, start=ANYWHERE), MOTORS, past_motors=motors, past_velocities=velocities
+            make_plant(2, start=ANYWHERE),
+            MOTORS,
+            past_motors=motors,
+            past_velocities=velocities,
+            past_positions=positions,
         )
         taken = course(env, actions(6, 2))
         for time in range(6):
@@ -113,11 +125,38 @@ class TestObservation:
                 state = taken[time - age]["state"] if age <= time else torch.zeros(2, 4)
                 expected.append(state[:, 1:2] / SPEED_SCALE)
                 expected.append(state[:, 3:4] / ANGULAR_SPEED_SCALE)
+            for age in range(positions):
+                if age > time:
+                    expected.append(torch.zeros(2, 3))
+                else:
+                    state = Measured(*taken[time - age]["state"].unbind(1))
+                    expected.append(torch.stack(observe(state, ObservationKind.POSITIONS), 1))
             following = taken[time]["next"]
             torch.testing.assert_close(following["past"], torch.cat(expected, -1))
             seen = observe(Measured(*following["state"].unbind(1)), ObservationKind.COS_SIN)
             parts = (torch.stack(seen, 1), following["past"])
             torch.testing.assert_close(following["observation"], torch.cat(parts, -1))
+
+    @pytest.mark.parametrize("pole_length", [True, False])
+    def test_frames_pair_positions_with_the_motor_value_before_them(
+        self, make_plant: MakePlant, make_environment: MakeEnvironment, pole_length: bool
+    ) -> None:
+        env = make_environment(
+            make_plant(2, start=ANYWHERE),
+            MOTORS,
+            kind="positions",
+            past_motors=4,
+            past_positions=2,
+            pole_length=pole_length,
+        )
+        chosen = actions(6, 2)
+        taken = course(env, chosen)
+        seen = taken[4]["next", "observation"][:, env.hardware.observation_settings.frames]
+        for frame, time in enumerate((2, 3, 4)):
+            following = Measured(*taken[time]["next", "state"].unbind(1))
+            position = torch.stack(observe(following, ObservationKind.POSITIONS), 1)
+            motor = torch.tensor(MOTORS)[chosen[time]].unsqueeze(1) / MOTOR_SCALE
+            torch.testing.assert_close(seen[:, frame], torch.cat((position, motor), 1))
 
     def test_pole_length_comes_last(
         self, make_plant: MakePlant, make_environment: MakeEnvironment, both_poles: PoleSettings
