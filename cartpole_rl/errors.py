@@ -17,6 +17,10 @@ class CheckpointError(CartPoleError):
     """A checkpoint is missing, damaged, or not one of ours."""
 
 
+class RecordingError(CartPoleError):
+    """A recording is missing, damaged, or says too little."""
+
+
 class PlantError(CartPoleError):
     """A cart cannot be driven."""
 

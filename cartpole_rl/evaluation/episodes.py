@@ -31,7 +31,7 @@ def run_episodes(env: CartPoleEnv, policy: Policy, episodes: int) -> Iterator[Ep
 def run_batch(env: CartPoleEnv, policy: Policy) -> list[Episode]:
     """One episode on each cart, all from one reset."""
     present = env.reset()
-    states, times = [present["state"]], [torch.zeros_like(present["dt"])]
+    states, times, counts = [present["state"]], [torch.zeros_like(present["dt"])], [present["counts"]]
     steps: dict[str, list[torch.Tensor]] = {key: [] for key in ("motor", *_FROM_NEXT)}
     endings: list[str | None] = [None] * env.plant.carts
     while None in endings:
@@ -41,13 +41,17 @@ def run_batch(env: CartPoleEnv, policy: Policy) -> list[Episode]:
         for key in _FROM_NEXT:
             steps[key].append(following[key])
         states.append(following["state"])
+        counts.append(following["counts"])
         times.append(times[-1] + following["dt"])
         _note_endings(env, following, endings)
         present = following.exclude("reward")
     columns = {key: torch.cat(values, 1).cpu().numpy() for key, values in steps.items()}
-    state, time = torch.stack(states, 1).cpu().numpy(), torch.cat(times, 1).cpu().numpy()
+    columns["state"], columns["counts"] = (torch.stack(each, 1).cpu().numpy() for each in (states, counts))
+    columns["time"] = torch.cat(times, 1).cpu().numpy()
     return [
-        _episode(row, state[row], time[row], columns, ending) for row, ending in enumerate(endings) if ending
+        _episode({key: values[row] for key, values in columns.items()}, ending)
+        for row, ending in enumerate(endings)
+        if ending
     ]
 
 
@@ -69,18 +73,18 @@ def _ending(env: CartPoleEnv, last: TensorDictBase) -> str:
     return str(Ending.ANGLE if fallen else Ending.TRACK)
 
 
-def _episode(
-    row: int, state: np.ndarray, time: np.ndarray, columns: dict[str, np.ndarray], ended_by: str
-) -> Episode:
-    steps = 1 + int(np.argmax(columns["done"][row]))
-    x, x_dot, theta, theta_dot = state[: steps + 1].astype(np.float64).T
-    step = {key: values[row, :steps] for key, values in columns.items()}
+def _episode(columns: dict[str, np.ndarray], ended_by: str) -> Episode:
+    """One row's episode, cut where it ended."""
+    steps = 1 + int(np.argmax(columns["done"]))
+    x, x_dot, theta, theta_dot = columns["state"][: steps + 1].astype(np.float64).T
+    step = {key: values[:steps] for key, values in columns.items()}
     return Episode(
-        time=time[: steps + 1].astype(np.float64),
+        time=columns["time"][: steps + 1].astype(np.float64),
         x=x,
         x_dot=x_dot,
         theta=np.unwrap(theta),
         theta_dot=theta_dot,
+        counts=columns["counts"][: steps + 1].astype(np.int64),
         motor=step["motor"].astype(np.int64),
         score=step["score"].astype(np.float64),
         score_upright=step["score_upright"].astype(np.float64),

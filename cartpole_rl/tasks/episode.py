@@ -20,6 +20,7 @@ class Episode:
     x_dot: Array  # [T+1] m/s
     theta: Array  # [T+1] rad, 0 upright, positive to the right, not wrapped
     theta_dot: Array  # [T+1] rad/s
+    counts: NDArray[np.int64]  # [T+1, 2] encoder counts of cart and pole, as the cart sent them
     motor: NDArray[np.int64]  # [T] motor value that the agent asked for, -255 to 255
     score: Array  # [T] equation (6.2) of each step, at state t+1
     score_upright: Array  # [T] equation (6.1) of each step, at state t+1

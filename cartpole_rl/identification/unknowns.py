@@ -1,0 +1,93 @@
+"""What is not known about a cart, and what is thought of it before any measurement.
+
+A cart is a point u of as many numbers as there are unknowns; each is 0 with standard deviation 1 before
+measurement. A logarithmic unknown multiplies its nominal value by exp(spread u), another adds spread u.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from cartpole_rl.physics.dynamics import Models, unused_parameters
+from cartpole_rl.physics.parameters import BOUNDS, CartParameters
+
+Array = NDArray[np.floating]
+POLE_LENGTH = "pole_length"  # not a parameter of its own: see `parameters_at`
+
+
+class Unknown(NamedTuple):
+    """One number to be found."""
+
+    name: str  # of CartParameters, or POLE_LENGTH
+    spread: float  # standard deviation before measurement: of the logarithm, or in the parameter's unit
+    logarithmic: bool = False
+    middle: float | None = None  # before measurement; None is the nominal value
+
+
+UNKNOWNS: tuple[Unknown, ...] = (
+    Unknown("cart_mass", 0.15, logarithmic=True),
+    Unknown(POLE_LENGTH, 0.5, logarithmic=True),
+    Unknown("pole_mass", 0.1, logarithmic=True),
+    Unknown("pole_inertia", 0.1, logarithmic=True),
+    Unknown("cart_viscous", 1.0, logarithmic=True),
+    Unknown("cart_coulomb", 0.5, logarithmic=True),
+    Unknown("cart_coulomb_asymmetry", 0.15),
+    Unknown("cart_stiction_ratio", 0.3),
+    Unknown("pole_viscous", 1.0, logarithmic=True),
+    Unknown("pole_drag", 1.0, logarithmic=True),
+    Unknown("force_linear", 0.2, logarithmic=True),
+    Unknown("force_offset", 0.3),
+    Unknown("force_asymmetry", 0.1),
+    Unknown("motor_time_constant", 0.01, middle=0.008),
+    Unknown("latency", 0.012, middle=0.012),
+    Unknown("track_tilt", 0.006),
+    Unknown("angle_offset", 0.012),
+)
+
+
+def unknowns_of(models: Models, unknowns: Sequence[Unknown] = UNKNOWNS) -> list[Unknown]:
+    """Those that the chosen laws read."""
+    unread = unused_parameters(models)
+    return [unknown for unknown in unknowns if unknown.name not in unread]
+
+
+def limits(unknowns: Sequence[Unknown], nominal: Mapping[str, float]) -> tuple[Array, Array]:
+    """Lowest and highest point, [U] each, at which every parameter is what it can be."""
+    low, high = np.full(len(unknowns), -np.inf), np.full(len(unknowns), np.inf)
+    for index, unknown in enumerate(unknowns):
+        if not unknown.logarithmic:
+            middle = nominal[unknown.name] if unknown.middle is None else unknown.middle
+            bound = BOUNDS[unknown.name]
+            low[index] = (bound.low - middle) / unknown.spread
+            high[index] = (bound.high - middle) / unknown.spread
+    return low, high
+
+
+def parameters_at(
+    points: Array, unknowns: Sequence[Unknown], nominal: Mapping[str, float]
+) -> Tensor:
+    """Carts [P, N] float64 at `points` [U, N], a row a parameter in the order of `CartParameters.names()`.
+
+    A pole of another length is the nominal one scaled: its mass goes with the length, its centre of mass too,
+    its inertia with the third power. Values stay within what a parameter can be.
+    """
+    values = {
+        name: np.full(points.shape[1], float(nominal[name]), dtype=np.float64)
+        for name in CartParameters.names()
+    }
+    for unknown, point in zip(unknowns, points, strict=True):
+        if unknown.name == POLE_LENGTH:
+            scale = np.exp(unknown.spread * point)
+            for name, power in (("pole_mass", 1), ("pole_com", 1), ("pole_inertia", 3)):
+                values[name] = values[name] * scale**power
+        elif unknown.logarithmic:
+            values[unknown.name] = values[unknown.name] * np.exp(unknown.spread * point)
+        else:
+            middle = values[unknown.name] if unknown.middle is None else unknown.middle
+            values[unknown.name] = middle + unknown.spread * point
+    table = [np.clip(values[name], BOUNDS[name].low, BOUNDS[name].high) for name in values]
+    return torch.from_numpy(np.stack(table))
