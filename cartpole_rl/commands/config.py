@@ -12,6 +12,7 @@ from cartpole_rl.commands.complaints import no_such_setting, setting_names
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.envs.hardware import ObservationSettings, RewardSettings, TaskSettings
 from cartpole_rl.errors import ConfigError
+from cartpole_rl.learning.finetuning import FinetuningSettings
 from cartpole_rl.learning.settings import LearningSettings, OptimizerSettings, ReplaySettings
 from cartpole_rl.physics.actuator import Actuator
 from cartpole_rl.physics.dynamics import Integrator, Models
@@ -181,6 +182,22 @@ class EvaluateConfig(Settings):
         if kind != "emulated" and self.emulator != EmulatorSettings():
             raise ValueError(f"emulator: plant={kind} does not read it; give plant=emulated")
         return self
+
+
+class FinetuneConfig(Settings):
+    """cartpole-finetune."""
+
+    run: Path | None
+    plant: Annotated[EmulatedSettings | RealSettings, Field(discriminator="kind")]
+    emulator: EmulatorSettings
+    episodes: Annotated[int, Field(ge=1, le=1000)]
+    evaluation_episodes: Annotated[int, Field(ge=1, le=1000)]
+    finetuning: FinetuningSettings
+    seed: Seed
+    label: str
+    threads: Count | None
+    compile: bool
+    resume: str | None
 
 
 class EmulateConfig(Settings):

@@ -18,7 +18,7 @@ from cartpole_rl.commands.report import report
 from cartpole_rl.commands.run_folder import write_config
 from cartpole_rl.envs import CartPoleEnv
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.evaluation.episodes import Policy, run_episodes
+from cartpole_rl.evaluation.episodes import Policy, run_batch
 from cartpole_rl.learning.checkpoints import TrainingCheckpoint, load_training
 from cartpole_rl.learning.randomness import seed_everything
 from cartpole_rl.learning.training import Training
@@ -42,7 +42,7 @@ def main(config: TrainConfig, folder: Path) -> None:
     env = simulated_env(config, config.plant, carts, start, config.seed, config.compile)
     note_unused_randomization(config)
     agent = new_agent(config)
-    evaluate = partial(judge, nominal_envs(config), agent.greedy_policy(), config.seed + EVALUATION_SEED)
+    evaluate = partial(judge, nominal_env(config), agent.greedy_policy(), config.seed + EVALUATION_SEED)
     write_config(folder, config.model_dump(mode="json"), resumed=resumed is not None)
     with TrainingMonitor(folder, config, resumed.frames if resumed else None) as monitor:
         training = Training(
@@ -88,21 +88,19 @@ def note_unused_randomization(config: TrainConfig) -> None:
         tell("train", f"note: randomization of {', '.join(unused)} has no effect with {chosen}")
 
 
-def nominal_envs(config: TrainConfig) -> list[CartPoleEnv]:
+def nominal_env(config: TrainConfig) -> CartPoleEnv:
     """Where the agent is judged: the nominal cart with each pole in turn, starting as the task says."""
     poles = config.pole.each
-    carts = max(1, config.learning.evaluation_episodes // len(poles))
-    settings = [config.model_copy(update={"pole": pole, "randomization": {}}) for pole in poles]
-    return [simulated_env(each, config.plant, carts, config.task.evaluation_start, 0) for each in settings]
+    assert poles.choices is not None
+    carts = len(poles.choices) * max(1, config.learning.evaluation_episodes // len(poles.choices))
+    nominal = config.model_copy(update={"pole": poles, "randomization": {}})
+    return simulated_env(nominal, config.plant, carts, config.task.evaluation_start, 0, config.compile)
 
 
-def judge(envs: list[CartPoleEnv], policy: Policy, seed: int) -> list[Episode]:
+def judge(env: CartPoleEnv, policy: Policy, seed: int) -> list[Episode]:
     """Episodes of the greedy policy, from the same starts each time."""
-    episodes: list[Episode] = []
-    for env in envs:
-        env.set_seed(seed)
-        episodes += run_episodes(env, policy, env.plant.carts)
-    return episodes
+    env.set_seed(seed)
+    return run_batch(env, policy)
 
 
 if __name__ == "__main__":

@@ -67,9 +67,7 @@ def limits(unknowns: Sequence[Unknown], nominal: Mapping[str, float]) -> tuple[A
     return low, high
 
 
-def parameters_at(
-    points: Array, unknowns: Sequence[Unknown], nominal: Mapping[str, float]
-) -> Tensor:
+def parameters_at(points: Array, unknowns: Sequence[Unknown], nominal: Mapping[str, float]) -> Tensor:
     """Carts [P, N] float64 at `points` [U, N], a row a parameter in the order of `CartParameters.names()`.
 
     A pole of another length is the nominal one scaled: its mass goes with the length, its centre of mass too,

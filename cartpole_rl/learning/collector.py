@@ -26,9 +26,13 @@ class Collector:
         self.epsilon = 1.0
         self._generator = torch.Generator(device=env.device)
         self._generator.manual_seed(seed)
-        self._present = env.reset()
-        self._score = torch.zeros(env.batch_size, device=env.device)  # of the episodes under way
         self._finished: list[tuple[float, int]] = []  # score and length of those that ended since last asked
+        self.begin()
+
+    def begin(self) -> None:
+        """Start a new episode on every cart."""
+        self._present = self.env.reset()
+        self._score = torch.zeros(self.env.batch_size, device=self.env.device)  # of the episodes under way
 
     @torch.no_grad()
     def collect(self, periods: int) -> TensorDictBase:

@@ -89,19 +89,28 @@ class Training:
         evaluate_at = evenly_spaced(settings.evaluations, settings.iterations)
         checkpoint_at = evaluate_at[:: -settings.checkpoint_interval]  # counted back, so that the end is one
         while self.iteration < settings.iterations:
-            started = time.perf_counter()
-            self.collector.epsilon = self.epsilon()
-            chunk = self.collector.collect(settings.chunk)
-            self.replay.extend(n_step_transitions(chunk, settings.n_step, self.agent.settings.gamma))
-            self.iteration += 1
-            scalars = self.learn() if self.frames > settings.warmup_frames else {}
-            self.seconds += time.perf_counter() - started
+            chunk, scalars = self.iterate()
             if self.iteration % max(1, settings.iterations // 200) == 0:
                 self.monitor.learned(self.frames, scalars | self.describe(chunk))
             if self.iteration in evaluate_at:
                 self.judge()
             if self.iteration in checkpoint_at:
                 self.monitor.checkpoint(self)
+
+    def iterate(self) -> tuple[TensorDictBase, Scalars]:
+        """Collect a chunk and learn; what was collected, and what is worth a curve of the learning."""
+        started = time.perf_counter()
+        self.collector.epsilon = self.epsilon()
+        chunk = self.collector.collect(self.settings.chunk)
+        self.replay.extend(n_step_transitions(chunk, self.settings.n_step, self.agent.settings.gamma))
+        self.iteration += 1
+        scalars = self.learn() if self.frames > self.settings.warmup_frames else {}
+        self.seconds += time.perf_counter() - started
+        return chunk, scalars
+
+    def sample(self) -> TensorDictBase:
+        """What one iteration learns from, `updates` batches long."""
+        return self.replay.sample()
 
     def learn(self) -> Scalars:
         """One iteration's gradient steps; the mean loss and gradient norm, and the learning rate."""
@@ -114,7 +123,7 @@ class Training:
         if self.replay_settings.kind == "prioritized":
             self.replay.sampler.beta = linear(*beta, self.progress)
         losses, norms = [], []
-        for batch in self.replay.sample().split(self.settings.batch_size):
+        for batch in self.sample().split(self.settings.batch_size):
             loss, norm = self.update(batch)
             losses.append(loss)
             norms.append(norm)

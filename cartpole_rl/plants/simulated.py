@@ -17,7 +17,7 @@ from cartpole_rl.physics.dynamics import Models, State
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.simulation import Carts, Given, encoder_counts, run_carts
 from cartpole_rl.plants.specs import Plant
-from cartpole_rl.randomization import Randomizer
+from cartpole_rl.randomization import Draws
 from cartpole_rl.tasks.starts import StartSettings, draw_start
 
 OF_CHANCE = ("latency_jitter", "position_noise", "angle_noise")  # drawn anew in each period
@@ -43,7 +43,7 @@ class SimulatedPlant(Plant):
     def __init__(
         self,
         carts: int,
-        randomizer: Randomizer,
+        randomizer: Draws,
         start: StartSettings,
         models: Models,
         period: float = 0.02,
@@ -89,6 +89,11 @@ class SimulatedPlant(Plant):
     def place(self, state: State) -> None:
         """Put the carts into `state`; for tests, knocks and replay."""
         self._carts = self._carts._replace(motion=torch.stack(state).to(self._carts.motion))
+
+    def replace_randomizer(self, randomizer: Draws) -> None:
+        """Draw the next episodes from another one, whose delays are no longer than those of the first."""
+        self.randomizer = randomizer
+        self._coming = self._draw_episodes(0)
 
     def snapshot(self) -> dict[str, Any]:
         """All that the next step depends on; `restore` takes it back."""

@@ -22,10 +22,14 @@ class Pole(Settings):
 
 
 class PoleSettings(Settings):
-    """`choices` by name, one drawn an episode, or `lengths` [low, high) in m of a uniform rod."""
+    """`choices` by name, one drawn an episode, or `lengths` [low, high) in m of a uniform rod.
+
+    Choices `in_turn` are not drawn: each cart carries the next one, and the first one follows the last.
+    """
 
     choices: dict[str, Pole] | None = None
     lengths: tuple[Positive, Positive] | None = None
+    in_turn: bool = False
 
     @model_validator(mode="after")
     def _one_way(self) -> "PoleSettings":
@@ -46,14 +50,15 @@ class PoleSettings(Settings):
         return Pole.rod(sum(self.lengths) / 2)
 
     @property
-    def each(self) -> list["PoleSettings"]:
-        """The single poles that stand for all: every choice, or rods from the shortest to the longest."""
+    def each(self) -> "PoleSettings":
+        """The poles that stand for all, in turn: every choice, or rods from the shortest to the longest."""
         if self.choices is not None:
-            return [PoleSettings(choices={name: pole}) for name, pole in self.choices.items()]
+            return PoleSettings(choices=self.choices, in_turn=True)
         assert self.lengths is not None
         low, high = self.lengths
         lengths = [low + (high - low) * index / (JUDGED_LENGTHS - 1) for index in range(JUDGED_LENGTHS)]
-        return [PoleSettings(choices={f"{length:.2f} m": Pole.rod(length)}) for length in lengths]
+        rods = {f"{length:.2f} m": Pole.rod(length) for length in lengths}
+        return PoleSettings(choices=rods, in_turn=True)
 
     @property
     def name(self) -> str:

@@ -77,8 +77,10 @@ class Randomizer:
         """Mass, centre of mass and inertia, [3, count]."""
         device = self.nominal.device
         if self.poles.lengths is None:
-            which = torch.randint(self._choices.shape[1], (count,), generator=generator, device=device)
-            return self._choices[:, which]
+            number = self._choices.shape[1]
+            if self.poles.in_turn:
+                return self._choices[:, torch.arange(count, device=device) % number]
+            return self._choices[:, torch.randint(number, (count,), generator=generator, device=device)]
         low, high = self.poles.lengths
         rods = uniform_rod(low + (high - low) * torch.rand(count, generator=generator, device=device))
         return torch.stack([torch.as_tensor(rods[name]) for name in POLE_FIELDS])

@@ -24,6 +24,7 @@ def episode(theta: list[float], x: list[float] | None = None, motor: list[int] |
         x_dot=rest,
         theta=np.array(theta) * DEGREE,
         theta_dot=rest,
+        counts=np.zeros((steps + 1, 2), int),
         motor=np.array(motor or [0] * steps),
         score=score,
         score_upright=score / 10,

@@ -39,6 +39,7 @@ OPTIMIZER = {
 }
 AGENT = {
     "hidden": (16,),
+    "recurrent": None,
     "layer_norm": True,
     "mirrored": False,
     "gamma": 0.9,
@@ -54,7 +55,8 @@ AGENT = {
 def episode(score: float) -> Episode:
     """One that is worth `score`."""
     rest, step = np.zeros(2), np.zeros(1)
-    return Episode(rest, rest, rest, rest, rest, step.astype(int), step + score, step, step, "time")
+    counts = np.zeros((2, 2), int)
+    return Episode(rest, rest, rest, rest, rest, counts, step.astype(int), step + score, step, step, "time")
 
 
 class Listener:

@@ -1,17 +1,29 @@
-"""Which single poles stand for a choice of poles."""
+"""Which poles stand for a choice of poles, and in which order carts carry them."""
 
 import pytest
+import torch
 
-from cartpole_rl.randomization import Pole, PoleSettings
+from cartpole_rl.choices import choice
+from cartpole_rl.physics.parameters import CartParameters
+from cartpole_rl.randomization import Pole, PoleSettings, Randomizer
 
 
 def test_each_choice_stands_for_itself() -> None:
     poles = {"short": Pole.rod(0.3), "long": Pole.rod(0.8)}
     each = PoleSettings(choices=poles).each
-    assert [single.choices for single in each] == [{name: pole} for name, pole in poles.items()]
+    assert each.choices == poles
+    assert each.in_turn
 
 
 def test_rods_from_the_shortest_to_the_longest_stand_for_a_range() -> None:
     each = PoleSettings(lengths=(0.2, 1.0)).each
-    assert [2 * single.nominal.pole_com for single in each] == pytest.approx([0.2, 0.4, 0.6, 0.8, 1.0])
-    assert [single.name for single in each] == ["0.20 m", "0.40 m", "0.60 m", "0.80 m", "1.00 m"]
+    assert each.choices is not None
+    assert [2 * pole.pole_com for pole in each.choices.values()] == pytest.approx([0.2, 0.4, 0.6, 0.8, 1.0])
+    assert list(each.choices) == ["0.20 m", "0.40 m", "0.60 m", "0.80 m", "1.00 m"]
+
+
+def test_poles_in_turn_come_round_and_round() -> None:
+    poles = PoleSettings(choices={"short": Pole.rod(0.3), "long": Pole.rod(0.8)}, in_turn=True)
+    table = Randomizer(choice("cart/ip02"), poles, {}).draw(5, torch.Generator().manual_seed(0))
+    lengths = CartParameters.from_table(table).pole_length
+    assert lengths.tolist() == pytest.approx([0.3, 0.8, 0.3, 0.8, 0.3])

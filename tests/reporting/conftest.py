@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.tasks.features import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 
 PERIOD = 0.02  # s
 SUBSTEPS = 20
@@ -70,6 +71,7 @@ def as_episode(states: np.ndarray, motor: np.ndarray, ended_by: str) -> Episode:
         x_dot=x_dot,
         theta=theta,
         theta_dot=theta_dot,
+        counts=np.stack((x / CART_METRES_PER_COUNT, theta / POLE_RADIANS_PER_COUNT), 1).round().astype(int),
         motor=motor,
         score=score,
         score_upright=upright,

@@ -33,7 +33,7 @@ def places(picture: Image.Image, colour: str) -> np.ndarray:
 
 def part(episode: Episode, start: int, steps: int, **other: object) -> Episode:
     """`steps` periods of an episode from row `start` on."""
-    long = {"time", "x", "x_dot", "theta", "theta_dot"}
+    long = {"time", "x", "x_dot", "theta", "theta_dot", "counts"}
     values = {
         field.name: getattr(episode, field.name)[start : start + steps + (field.name in long)]
         for field in dataclasses.fields(episode)

@@ -1,0 +1,367 @@
+"""cartpole-finetune: a trained agent learns on, on the cart that it drives.
+
+cartpole-finetune run=runs/train/2026-11-21_12-00-00 plant=serial plant.port=/dev/ttyUSB0 episodes=20
+cartpole-finetune run=runs/train/2026-11-21_12-00-00 plant=emulated emulator.cart_viscous=2
+cartpole-finetune resume=runs/finetune/2026-11-21_12-30-00
+
+Three stages: episodes without exploration (before), episodes to learn from (tune), episodes without
+exploration (after). The cart is driven by a process of its own; this one learns meanwhile. Each finished
+episode is on disk before the next begins, so that Ctrl-C, a power cut or a pulled cable cost at most the one
+under way.
+"""
+
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from hydra.core.hydra_config import HydraConfig
+from torch import nn
+from tqdm import tqdm
+
+from cartpole_rl.agents import QAgent
+from cartpole_rl.commands.application import application, tell
+from cartpole_rl.commands.build import (
+    check_compiler,
+    environment,
+    evaluated_env,
+    evaluated_settings,
+    new_agent,
+    trained_agent,
+    use_threads,
+)
+from cartpole_rl.commands.config import (
+    CartPoleSettings,
+    EvaluateConfig,
+    FinetuneConfig,
+    TrainConfig,
+    checked,
+)
+from cartpole_rl.commands.evaluate import score_table
+from cartpole_rl.commands.report import METRICS, report
+from cartpole_rl.commands.run_folder import write_config, write_json
+from cartpole_rl.envs import CartPoleEnv
+from cartpole_rl.errors import ConfigError
+from cartpole_rl.evaluation import episode_metrics, summarize
+from cartpole_rl.evaluation.driver import Drive, Driver, as_weights
+from cartpole_rl.evaluation.recordings import read_recording, write_recording
+from cartpole_rl.identification import Fit, cut_windows, fit_cart
+from cartpole_rl.learning.checkpoints import (
+    FOLDER,
+    LAST,
+    AgentCheckpoint,
+    TrainingCheckpoint,
+    load_agent,
+    load_training,
+    save_agent,
+    save_training,
+)
+from cartpole_rl.learning.finetuning import Finetuning, recorded_chunk
+from cartpole_rl.learning.randomness import seed_everything
+from cartpole_rl.learning.training import Scalars, Training
+from cartpole_rl.physics.dynamics import Models
+from cartpole_rl.physics.friction import CartFriction
+from cartpole_rl.plants.link_statistics import LinkSummary
+from cartpole_rl.plants.recorded import RecordedPlant
+from cartpole_rl.plants.simulated import SimulatedPlant
+from cartpole_rl.randomization import FoundCarts
+from cartpole_rl.reporting.tensorboard import TensorBoardLog
+from cartpole_rl.tasks.episode import Episode
+
+BEFORE, TUNE, AFTER = "before", "tune", "after"
+RECORDINGS = "recordings"
+DRAWN = 4096  # carts of each fit
+LONGEST_DELAY = 0.06  # s, of a fitted cart; so that the simulator need not be built anew
+
+
+@application("finetune", FinetuneConfig)
+def main(config: FinetuneConfig, folder: Path) -> None:
+    """Compose, drive and learn, compare, report."""
+    resumed = resumed_state(config, folder)
+    if resumed:
+        config = checked(FinetuneConfig, {**resumed.config, "resume": config.resume})
+    if config.run is None:
+        raise ConfigError("run is missing; give run=..., the run folder of a training")
+    if config.compile:
+        check_compiler()
+    use_threads(config.threads)
+    seed_everything(config.seed)
+    training = trained_agent(config.run).training
+    evaluation = as_evaluation(config)
+    settings = evaluated_settings(training, evaluation)
+    if not resumed:
+        write_config(folder, config.model_dump(mode="json"))
+        save_training(folder, TrainingCheckpoint(config.model_dump(mode="json"), {}, 0))
+    else:
+        write_config(folder, config.model_dump(mode="json"), resumed=True)
+    make_env = partial(evaluated_env, settings, evaluation, print)
+    with (
+        TensorBoardLog(folder) as log,
+        Driver(make_env, partial(greedy_network, training)) as driver,
+    ):
+        session = Session(config, training, settings, folder, driver, log)
+        if resumed and resumed.state:
+            session.restore(resumed.state)
+        session.run()
+
+
+def resumed_state(config: FinetuneConfig, folder: Path) -> TrainingCheckpoint | None:
+    """The fine-tuning to go on with; None for a new one. Raises ConfigError, CheckpointError."""
+    if config.resume is None:
+        return None
+    given = HydraConfig.get().overrides.task
+    if others := [word for word in given if not word.startswith("resume=")]:
+        raise ConfigError(f"resume goes on with that run's own config; leave out {', '.join(others)}")
+    return load_training(Path(config.resume))
+
+
+def as_evaluation(config: FinetuneConfig) -> EvaluateConfig:
+    """How the cart is driven."""
+    shared = config.model_dump(include={"run", "plant", "emulator", "seed", "label", "threads"})
+    episodes = config.evaluation_episodes
+    return checked(EvaluateConfig, {**shared, "episodes": episodes, "randomization": {}, "parameters": None})
+
+
+def greedy_network(training: TrainConfig) -> nn.Module:
+    """The network that drives, for weights of `as_weights`."""
+    return new_agent(training).greedy_policy()
+
+
+class Unheard:
+    """A monitor of a training that is watched by its episodes."""
+
+    def learned(self, frames: int, scalars: Scalars) -> None:
+        """Nobody looks."""
+
+    def evaluated(self, training: Training, episodes: Sequence[Episode], is_best: bool) -> None:
+        """There are no evaluations in simulation."""
+
+    def checkpoint(self, training: Training) -> None:
+        """The session writes its own."""
+
+
+class Session:
+    """One fine-tuning: what is on disk, what is learned, and what is driven next."""
+
+    def __init__(
+        self,
+        config: FinetuneConfig,
+        training: TrainConfig,
+        settings: CartPoleSettings,
+        folder: Path,
+        driver: Driver,
+        log: TensorBoardLog,
+    ) -> None:
+        assert config.run is not None
+        self.config, self.training, self.settings = config, training, settings
+        self.folder, self.driver, self.log = folder, driver, log
+        self.start = load_agent(config.run)
+        self.agent: QAgent = new_agent(training)
+        self.agent.load_state_dict(self.start.weights)
+        self.first_weights = as_weights(self.agent.greedy_policy())
+        self.learner: Finetuning | None = None
+        self.learned = 0  # episodes whose learning is done
+        self.models = [training.models(training.plant)]
+        if self.models[0].cart_friction is CartFriction.SIGMOID:
+            self.models.append(self.models[0]._replace(cart_friction=CartFriction.STEP))
+        self.link: LinkSummary | None = None
+
+    def run(self) -> None:
+        """All stages, from where the disk says that they stand."""
+        config = self.config
+        self.drive_all(BEFORE, config.evaluation_episodes)
+        self.tune()
+        before = summarize([self.figures(episode) for episode in self.episodes(BEFORE)])
+        self.drive_all(AFTER, config.evaluation_episodes)
+        after_episodes = self.episodes(AFTER)
+        after = summarize([self.figures(episode) for episode in after_episodes])
+        better = after["score"]["mean"] >= before["score"]["mean"]
+        self.keep(better, after if better else before)
+        shown = after_episodes if better else self.episodes(BEFORE)
+        link = {} if self.link is None else self.link_figures(self.link)
+        plant, x_max = config.plant.kind, self.settings.task.x_max
+        report(self.folder, shown, plant, self.settings.pole, x_max, link)
+        kept = AFTER if better else BEFORE
+        write_json(self.folder / "comparison.json", {BEFORE: before, AFTER: after, "kept": kept})
+        print(score_table(before, f"before, {config.evaluation_episodes} episodes"))
+        print(score_table(after, f"after {config.episodes} episodes of learning"))
+        print(
+            f"kept: the policy {kept} fine-tuning; "
+            f"{self.folder}/{METRICS}, checkpoints/{LAST}, recordings/ are written"
+        )
+
+    def tune(self) -> None:
+        """Drive and learn at once, episode by episode."""
+        count = self.config.episodes
+        if self.learned >= count:
+            return
+        self.begin_learning()
+        assert self.learner is not None
+        while self.learned < count:
+            number = self.learned
+            driving = number >= len(self.episodes(TUNE))
+            if driving:
+                weights = as_weights(self.agent.greedy_policy())
+                self.driver.start(Drive(weights, self.config.finetuning.epsilon, self.config.seed + number))
+            scalars = self.learner.round()
+            if driving:
+                self.finish(TUNE, number)
+            episode = self.episodes(TUNE)[number]
+            self.learner.add(self.chunk(episode))
+            self.learned += 1
+            if self.learned % self.config.finetuning.refit == 0 and self.learned < count:
+                self.refit()
+            self.log.scalars(scalars, self.learned)
+            self.save()
+
+    def begin_learning(self) -> None:
+        """Build the learner on the first fit; after a resumption, on all that was recorded."""
+        recorded = self.episodes(BEFORE) + self.episodes(TUNE)[: self.learned]
+        fit, models = self.best_fit(recorded)
+        training, finetuning = self.training, self.config.finetuning
+        learning = training.learning
+        iterations = self.config.episodes * finetuning.iterations
+        plant = SimulatedPlant(
+            learning.carts,
+            self.carts(fit),
+            training.task.start,
+            models,
+            training.control_period,
+            training.plant.substeps,
+            self.config.seed,
+            compiled=self.config.compile,
+        )
+        learner = Finetuning(
+            finetuning,
+            learning.model_copy(
+                update={
+                    "frames": iterations * learning.carts * learning.chunk,
+                    "warmup_frames": 4 * learning.carts * learning.chunk,
+                    "epsilon": (0.1, 0.02),
+                    "epsilon_frames": iterations * learning.carts * learning.chunk // 2,
+                }
+            ),
+            training.replay,
+            training.optimizer.model_copy(update={"learning_rate": finetuning.learning_rate}),
+            self.agent,
+            environment(training, plant),
+            lambda: [],
+            Unheard(),
+            self.config.seed,
+            self.config.compile,
+        )
+        learner.iteration = self.learned * finetuning.iterations
+        for episode in recorded:
+            learner.add(self.chunk(episode))
+        if self.optimizer_state is not None:
+            learner.optimizer.load_state_dict(self.optimizer_state)
+        self.models, self.learner = [models], learner
+
+    optimizer_state: dict[str, Any] | None = None
+
+    def refit(self) -> None:
+        """Fit anew to all recordings, and go on with carts of that fit."""
+        assert self.learner is not None
+        fit, _ = self.best_fit(self.episodes(BEFORE) + self.episodes(TUNE))
+        self.learner.simulate(self.carts(fit))
+
+    def best_fit(self, episodes: list[Episode]) -> tuple[Fit, Models]:
+        """The fit, and the laws of those tried under which it is best."""
+        windows = cut_windows(episodes, self.settings.control_period)
+        nominal = {**self.training.nominal, **self.training.pole.nominal.model_dump()}
+        fits = [
+            (fit_cart(windows, nominal, models, self.settings.control_period), models)
+            for models in self.models
+        ]
+        fit, models = min(fits, key=lambda each: each[0].cost)
+        tell(
+            "finetune",
+            f"the simulator follows {windows.number} recorded half seconds within "
+            f"{fit.rms[0] * 0.022749:.2f} mm and {fit.rms[1] * 0.0879:.2f} deg",
+        )
+        return fit, models
+
+    def carts(self, fit: Fit) -> FoundCarts:
+        """Carts of the fit, and some as in training."""
+        random = np.random.default_rng(self.config.seed)
+        table = torch.from_numpy(fit.draw(DRAWN, random, self.config.finetuning.widen)).float()
+        others = self.training.model_copy(update={"pole": self.training.pole}).randomizer()
+        return FoundCarts(table, others, self.config.finetuning.elsewhere)
+
+    def drive_all(self, stage: str, count: int) -> None:
+        """Drive what is missing of a stage, without exploration."""
+        weights = self.first_weights if stage == BEFORE else as_weights(self.agent.greedy_policy())
+        for number in range(len(self.episodes(stage)), count):
+            self.driver.start(Drive(weights, 0.0, self.config.seed))
+            self.finish(stage, number)
+
+    def finish(self, stage: str, number: int) -> None:
+        """Wait for an episode, and write it down."""
+        driven = self.driver.result()
+        self.link = driven.link.summary()
+        write_recording(self.path(stage, number), driven.episode, {"stage": stage, "number": number})
+        figures = self.figures(driven.episode)
+        step = number + 1
+        self.log.scalars({f"cart/{stage}_score": figures["score"]}, step)
+        self.log.scalars({f"link/{key}": float(value) for key, value in vars(self.link).items()}, step)
+        self.log.flush()
+        tqdm.write(f"{stage} {step}: score {figures['score']:.0f}, ended by {driven.episode.ended_by}")
+
+    def path(self, stage: str, number: int) -> Path:
+        """Where an episode is kept."""
+        return self.folder / RECORDINGS / f"{stage}_{number:03d}.csv"
+
+    def episodes(self, stage: str) -> list[Episode]:
+        """What is on disk of a stage, in order."""
+        found: list[Episode] = []
+        while (path := self.path(stage, len(found))).exists():
+            found.append(read_recording(path))
+        return found
+
+    def figures(self, episode: Episode) -> dict[str, Any]:
+        """What an episode is worth."""
+        return episode_metrics(episode, self.settings.task.x_max)
+
+    def chunk(self, episode: Episode) -> Any:
+        """An episode's transitions, as the agent sees them."""
+
+        def over(plant: RecordedPlant) -> CartPoleEnv:
+            return environment(self.settings, plant)
+
+        return recorded_chunk(episode, over, self.settings.actions.motors)
+
+    def save(self) -> None:
+        """The state to resume from."""
+        assert self.learner is not None
+        state = {
+            "learned": self.learned,
+            "agent": self.agent.state_dict(),
+            "optimizer": self.learner.optimizer.state_dict(),
+        }
+        save_training(
+            self.folder, TrainingCheckpoint(self.config.model_dump(mode="json"), state, self.learned)
+        )
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from `save`."""
+        self.learned = state["learned"]
+        self.agent.load_state_dict(state["agent"])
+        self.optimizer_state = state["optimizer"]
+
+    def keep(self, tuned: bool, summary: dict[str, Any]) -> None:
+        """Write the better policy as the run's last checkpoint."""
+        weights = self.agent.state_dict() if tuned else self.start.weights
+        score = summary["score"]["mean"]
+        checkpoint = AgentCheckpoint(self.start.config, weights, self.start.frames, score)
+        save_agent(self.folder / FOLDER / LAST, checkpoint)
+
+    @staticmethod
+    def link_figures(link: LinkSummary) -> dict[str, Any]:
+        """Frames lost, spoilt and late on the wire, and the time from a state to its command."""
+        return vars(link)
+
+
+if __name__ == "__main__":
+    main()

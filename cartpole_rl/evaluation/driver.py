@@ -1,0 +1,170 @@
+"""Drives a cart in a process of its own, so that nothing that learns, draws or writes can delay a tick.
+
+The process does one thing at a time: it waits for a policy's weights, runs one episode, and sends it back. It
+ends when the process that started it does, in the middle of an episode too, and every way out of it sets the
+motor to 0 and disarms.
+"""
+
+import gc
+import multiprocessing
+import os
+import signal
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from types import FrameType, TracebackType
+from typing import Any, NoReturn
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict import TensorDictBase
+from torch import nn
+
+from cartpole_rl.envs import CartPoleEnv
+from cartpole_rl.errors import CartPoleError, LinkError
+from cartpole_rl.evaluation.episodes import run_batch
+from cartpole_rl.plants.link_statistics import LinkStatistics
+from cartpole_rl.plants.serial import SerialPlant
+from cartpole_rl.tasks.episode import Episode
+
+Weights = dict[str, NDArray[Any]]
+GRACE = 5.0  # s from SIGTERM to SIGKILL
+
+
+@dataclass(frozen=True)
+class Drive:
+    """One episode to be driven."""
+
+    weights: Weights  # of the greedy policy
+    epsilon: float  # share of random actions
+    seed: int
+
+
+@dataclass(frozen=True)
+class Driven:
+    """One episode that was driven, and what the link went through since the process began."""
+
+    episode: Episode
+    link: LinkStatistics
+
+
+def as_weights(policy: nn.Module) -> Weights:
+    """The weights of a policy, copied."""
+    return {name: value.detach().cpu().numpy().copy() for name, value in policy.state_dict().items()}
+
+
+class Driver:
+    """A process that drives the cart of `make_env` with the network of `make_policy`; a context manager.
+
+    Both are called in that process. Raises what making the environment raises there.
+    """
+
+    def __init__(self, make_env: Callable[[], CartPoleEnv], make_policy: Callable[[], nn.Module]) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._ours, theirs = context.Pipe()
+        self._process = context.Process(
+            target=_serve, args=(theirs, make_env, make_policy, os.getpid()), daemon=True
+        )
+        self._process.start()
+        theirs.close()
+        try:
+            self._receive()
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def pid(self) -> int:
+        """Process id."""
+        assert self._process.pid is not None
+        return self._process.pid
+
+    def start(self, drive: Drive) -> None:
+        """Begin an episode, and return at once."""
+        self._ours.send(drive)
+
+    def result(self) -> Driven:
+        """Wait for the episode that was begun. Raises what ended it before it had begun, LinkError if the
+        process died.
+        """
+        driven = self._receive()
+        assert isinstance(driven, Driven)
+        return driven
+
+    def close(self) -> None:
+        """Motor to 0, disarm, end the process."""
+        self._process.terminate()
+        self._process.join(GRACE)
+        if self._process.is_alive():
+            self._process.kill()
+            self._process.join()
+        self._ours.close()
+
+    def __enter__(self) -> "Driver":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _receive(self) -> Any:
+        try:
+            answer = self._ours.recv()
+        except (EOFError, ConnectionResetError):
+            raise LinkError("the process that drives the cart has died; start again with resume=") from None
+        if isinstance(answer, BaseException):
+            raise answer
+        return answer
+
+
+class _Ended(BaseException):
+    """SIGTERM, or the parent is gone: unwinds, so that the motor is stopped."""
+
+
+def _end(number: int, frame: FrameType | None) -> NoReturn:
+    raise _Ended
+
+
+def _serve(
+    pipe: Connection, make_env: Callable[[], CartPoleEnv], make_policy: Callable[[], nn.Module], parent: int
+) -> None:
+    signal.signal(signal.SIGTERM, _end)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent gets it too, and ends this one
+    torch.set_num_threads(1)
+    try:
+        policy = make_policy()
+        with closing(make_env()) as env:
+            pipe.send("ready")
+            while True:
+                pipe.send(_drive(env, policy, pipe.recv(), parent))
+    except CartPoleError as error:
+        pipe.send(type(error)(*error.args))
+    except (_Ended, EOFError, BrokenPipeError, ConnectionResetError):
+        pass
+
+
+def _drive(env: CartPoleEnv, policy: nn.Module, drive: Drive, parent: int) -> Driven:
+    policy.load_state_dict({name: torch.from_numpy(value) for name, value in drive.weights.items()})
+    random = np.random.default_rng(drive.seed)
+    actions = len(env.hardware.motors)
+
+    def act(present: TensorDictBase) -> TensorDictBase:
+        if os.getppid() != parent:
+            raise _Ended
+        chosen = policy(present)
+        if random.random() < drive.epsilon:
+            chosen["action"] = torch.tensor([int(random.integers(actions))])
+        return chosen
+
+    gc.collect()
+    gc.disable()  # a collection in the middle of an episode takes longer than a tick allows
+    try:
+        (episode,) = run_batch(env, act)
+    finally:
+        gc.enable()
+    assert isinstance(env.plant, SerialPlant)
+    env.plant.halt()
+    return Driven(episode, env.plant.cart.statistics)

@@ -1,0 +1,81 @@
+"""Episodes as files that other programs open: CSV with a unit in each column's name.
+
+Lines that begin with # hold what is true of the whole episode, as `# key: value`. A row is a control period:
+the state as it was measured, then the motor value chosen on it; the last row, where the episode ended, has no
+motor value and what follows from it.
+"""
+
+import csv
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cartpole_rl.errors import RecordingError
+from cartpole_rl.tasks.endings import Ending
+from cartpole_rl.tasks.episode import Episode
+
+FORMAT = "cartpole_rl recording 1"
+STATE = {  # column: field of Episode
+    "time_s": "time",
+    "x_m": "x",
+    "x_dot_m_per_s": "x_dot",
+    "theta_rad": "theta",
+    "theta_dot_rad_per_s": "theta_dot",
+}
+STEP = {"score": "score", "score_upright": "score_upright", "reward": "reward"}
+COUNTS = ("cart_counts", "pole_counts")
+COLUMNS = (*STATE, *COUNTS, "motor", *STEP)
+
+
+def write_recording(path: Path, episode: Episode, facts: Mapping[str, Any] | None = None) -> None:
+    """Write one episode, whole or not at all; `facts` are added to the heading."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside = path.with_name(f"{path.name}.partial")
+    with beside.open("w", newline="") as file:
+        for key, value in {"format": FORMAT, "ended_by": episode.ended_by, **(facts or {})}.items():
+            file.write(f"# {key}: {value}\n")
+        lines = csv.writer(file)
+        lines.writerow(COLUMNS)
+        for row in range(episode.steps + 1):
+            state = [repr(float(getattr(episode, field)[row])) for field in STATE.values()]
+            counts = [int(count) for count in episode.counts[row]]
+            if row < episode.steps:
+                step = [repr(float(getattr(episode, field)[row])) for field in STEP.values()]
+                lines.writerow([*state, *counts, int(episode.motor[row]), *step])
+            else:
+                lines.writerow([*state, *counts, "", *[""] * len(STEP)])
+    beside.replace(path)
+
+
+def read_recording(path: Path) -> Episode:
+    """The episode in a file. Raises RecordingError where it is no recording, or a damaged one."""
+    facts, text = {}, []
+    try:
+        for line in path.read_text().splitlines():
+            if line.startswith("#"):
+                key, _, value = line[1:].partition(":")
+                facts[key.strip()] = value.strip()
+            else:
+                text.append(line)
+    except (OSError, UnicodeDecodeError) as error:
+        raise RecordingError(f"{path} cannot be read: {error}") from None
+    if facts.get("format") != FORMAT:
+        raise RecordingError(f"{path} is no recording: its first line is not '# format: {FORMAT}'")
+    rows = list(csv.DictReader(text))
+    if missing := [name for name in COLUMNS if not rows or name not in rows[0]]:
+        raise RecordingError(f"{path} lacks {', '.join(missing)}")
+    if len(rows) < 2:
+        raise RecordingError(f"{path} holds no control period")
+    if rows[-1]["motor"] != "":
+        raise RecordingError(f"{path} is damaged: its last row is missing")
+    try:
+        ended_by = str(Ending(facts.get("ended_by", "")))
+        columns = {field: np.array([float(row[name]) for row in rows]) for name, field in STATE.items()}
+        steps = {field: np.array([float(row[name]) for row in rows[:-1]]) for name, field in STEP.items()}
+        counts = np.array([[int(row[name]) for name in COUNTS] for row in rows])
+        motor = np.array([int(row["motor"]) for row in rows[:-1]])
+    except (ValueError, TypeError) as error:
+        raise RecordingError(f"{path} is damaged: {error}") from None
+    return Episode(**columns, **steps, counts=counts, motor=motor, ended_by=ended_by)

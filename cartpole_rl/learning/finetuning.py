@@ -1,0 +1,90 @@
+"""Fine-tuning: a trained agent learns on, from one cart's recordings and from simulations of that cart.
+
+Each round fits the simulator to all that was recorded, draws carts from what the fit leaves open, and learns
+from both. The rest of the agent's life in simulation goes on as it was: same loop, same loss.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Annotated, Any
+
+import torch
+from pydantic import Field
+from tensordict import TensorDictBase
+
+from cartpole_rl.envs import CartPoleEnv
+from cartpole_rl.learning.collector import COLLECTED
+from cartpole_rl.learning.replay import n_step_transitions
+from cartpole_rl.learning.training import Scalars, Training
+from cartpole_rl.plants.recorded import RecordedPlant
+from cartpole_rl.plants.simulated import SimulatedPlant
+from cartpole_rl.randomization import Draws
+from cartpole_rl.settings import Count, Fraction, Positive, Settings
+from cartpole_rl.tasks.episode import Episode
+
+
+class FinetuningSettings(Settings):
+    """How a trained agent learns on a cart."""
+
+    iterations: Count  # of learning while one episode is driven
+    refit: Count  # episodes between two fits of the simulator
+    cart_share: Fraction  # of each batch from the cart itself, the rest is simulated
+    elsewhere: Fraction  # of the simulated carts drawn as in training, and not from the fit
+    widen: Positive  # the fit's uncertainty is multiplied by it
+    epsilon: Annotated[float, Field(ge=0, le=0.2)]  # share of random actions on the cart
+    learning_rate: Positive  # at the start; it falls along half a cosine
+
+
+def recorded_chunk(
+    episode: Episode, over: Callable[[RecordedPlant], CartPoleEnv], motors: Sequence[int]
+) -> TensorDictBase:
+    """The one-step transitions [1, T] of an episode, as the environment `over` a recording sees them."""
+    env, index = over(RecordedPlant(episode)), {motor: action for action, motor in enumerate(motors)}
+    present, taken = env.reset(), []
+    for motor in episode.motor.tolist():
+        present["action"] = torch.tensor([index[motor]])
+        transition, present = env.step_and_maybe_reset(present)
+        taken.append(transition.select(*COLLECTED))
+    return torch.stack(taken, 1)
+
+
+class Finetuning(Training):
+    """A training that goes on from an agent's weights, on carts of a fit and on a cart's recordings."""
+
+    def __init__(self, finetuning: FinetuningSettings, *arguments: Any, **named: Any) -> None:
+        super().__init__(*arguments, **named)
+        self.finetuning = finetuning
+        self.recorded: TensorDictBase | None = None
+        self._chooser = torch.Generator().manual_seed(0)
+
+    def add(self, chunk: TensorDictBase) -> None:
+        """Learn from one more recorded episode."""
+        transitions = n_step_transitions(chunk, self.settings.n_step, self.agent.settings.gamma)
+        known = self.recorded
+        self.recorded = transitions if known is None else torch.cat((known, transitions))
+
+    def simulate(self, carts: Draws) -> None:
+        """Go on with simulated carts drawn from `carts`; what older ones taught is forgotten."""
+        assert isinstance(self.env.plant, SimulatedPlant)
+        self.env.plant.replace_randomizer(carts)
+        self.collector.begin()
+        self.replay.empty()
+
+    def round(self) -> Scalars:
+        """Learn while one episode is driven."""
+        scalars: Scalars = {}
+        for _ in range(self.finetuning.iterations):
+            chunk, learned = self.iterate()
+            scalars = learned | self.describe(chunk)
+        return scalars
+
+    def sample(self) -> TensorDictBase:
+        """Simulated transitions, with recorded ones in `cart_share` of the places, scattered."""
+        simulated = self.replay.sample()
+        if self.recorded is None or self.finetuning.cart_share == 0:
+            return simulated
+        count = len(simulated)
+        places = torch.rand(count, generator=self._chooser) < self.finetuning.cart_share
+        which = torch.randint(len(self.recorded), (int(places.sum()),), generator=self._chooser)
+        mixed = simulated.select(*self.recorded.keys(True, True)).clone()
+        mixed[places] = self.recorded[which]
+        return mixed

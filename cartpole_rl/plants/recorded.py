@@ -1,0 +1,51 @@
+"""A recorded episode as a plant: it plays back what a cart said, whatever it is told.
+
+Under the hardware transform it gives the observations, rewards and endings that the same code gave, or would
+have given, while the cart was driven.
+"""
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from cartpole_rl.plants.specs import Plant
+from cartpole_rl.tasks.episode import Episode
+
+
+class RecordedPlant(Plant):
+    """One cart, [1]; each step returns the next recorded frame, the last of which ends the episode."""
+
+    def __init__(self, episode: Episode, pole_length: float | None = None) -> None:
+        super().__init__(carts=1)
+        self.episode = episode
+        self._pole_length = pole_length
+        self._row = 0
+
+    @property
+    def pole_length(self) -> Tensor:
+        """m, [1]."""
+        return torch.tensor([float("nan") if self._pole_length is None else self._pole_length])
+
+    def _set_seed(self, seed: int | None) -> None:
+        """Nothing is left to chance."""
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDict:
+        self._row = 0
+        return self.frame(*self._report())
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDict:
+        self._row += 1
+        return self.step_frame(*self._report())
+
+    def _report(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        episode, row = self.episode, self._row
+        last = row == episode.steps
+        since = episode.time[row] - episode.time[max(0, row - 1)]
+        motor = int(episode.motor[row - 1]) if row else 0
+        return (
+            torch.from_numpy(episode.counts[row : row + 1].copy()),
+            torch.tensor([[since]], dtype=torch.float32),
+            torch.tensor([[motor]]),
+            torch.tensor([[last and episode.ended_by in ("track", "fault")]]),
+            torch.tensor([[last and episode.ended_by == "link"]]),
+        )

@@ -1,0 +1,102 @@
+"""Fine-tuning over the real path: an emulated cart behind its port, one process drives, one learns."""
+
+import json
+import os
+import signal
+import time
+from pathlib import Path
+
+import pytest
+from command_line import Outcome, console_script, in_process, outcome
+
+from cartpole_rl.commands.build import trained_agent
+from cartpole_rl.evaluation.recordings import read_recording
+
+SHORT = (
+    "plant=emulated",
+    "episodes=2",
+    "evaluation_episodes=1",
+    "finetuning.iterations=2",
+    "finetuning.refit=1",
+    "compile=false",
+)
+
+
+def finetune(trained: Path, folder: Path, *words: str) -> Outcome:
+    return in_process(
+        "finetune", f"run={trained}", *SHORT, *words, f"hydra.run.dir={folder}/run", folder=folder
+    )
+
+
+def recordings(run: Path) -> list[str]:
+    return sorted(path.name for path in (run / "recordings").iterdir())
+
+
+@pytest.fixture(scope="module")
+def tuned(trained: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Outcome]:
+    """The run folder of a short fine-tuning, and what was seen of it."""
+    folder = tmp_path_factory.mktemp("tuned")
+    done = finetune(trained, folder)
+    assert done.code == 0, done.err
+    return folder / "run", done
+
+
+def test_every_episode_is_on_disk_once(tuned: tuple[Path, Outcome]) -> None:
+    run, _ = tuned
+    assert recordings(run) == ["after_000.csv", "before_000.csv", "tune_000.csv", "tune_001.csv"]
+    assert all(read_recording(path).steps > 1 for path in (run / "recordings").iterdir())
+
+
+def test_the_better_policy_is_kept_and_said(tuned: tuple[Path, Outcome]) -> None:
+    run, done = tuned
+    compared = json.loads((run / "comparison.json").read_text())
+    better = (
+        "after" if compared["after"]["score"]["mean"] >= compared["before"]["score"]["mean"] else "before"
+    )
+    assert compared["kept"] == better
+    assert f"kept: the policy {better} fine-tuning" in done.out
+    assert trained_agent(run).training.seed == 0
+    metrics = json.loads((run / "metrics.json").read_text())
+    assert metrics["score"]["mean"] == compared[better]["score"]["mean"]
+    assert metrics["latency_samples"] > 0
+
+
+def test_a_tuned_agent_is_evaluated_like_any_other(tuned: tuple[Path, Outcome], tmp_path: Path) -> None:
+    run, _ = tuned
+    done = in_process(
+        "evaluate", f"run={run}", "episodes=2", f"hydra.run.dir={tmp_path}/evaluated", folder=tmp_path
+    )
+    assert done.code == 0, done.err
+
+
+@pytest.mark.parametrize("stop", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_run_goes_on(trained: Path, tmp_path: Path, stop: signal.Signals) -> None:
+    words = (f"run={trained}", *SHORT, f"hydra.run.dir={tmp_path}/run")
+    process = console_script("finetune", *words, folder=tmp_path)
+    first = tmp_path / "run" / "recordings" / "tune_000.csv"
+    deadline = time.monotonic() + 100
+    while not first.exists() and time.monotonic() < deadline:
+        time.sleep(0.02)
+    os.kill(process.pid, stop)
+    interrupted = outcome(process)
+    assert interrupted.code == {signal.SIGKILL: -9, signal.SIGINT: 130, signal.SIGTERM: 143}[stop]
+    kept = {
+        name: (tmp_path / "run" / "recordings" / name).read_bytes() for name in recordings(tmp_path / "run")
+    }
+    done = in_process("finetune", f"resume={tmp_path}/run", folder=tmp_path)
+    assert done.code == 0, done.err
+    assert recordings(tmp_path / "run") == ["after_000.csv", "before_000.csv", "tune_000.csv", "tune_001.csv"]
+    for name, content in kept.items():
+        assert (tmp_path / "run" / "recordings" / name).read_bytes() == content
+
+
+def test_a_run_is_needed(tmp_path: Path) -> None:
+    done = in_process("finetune", "run=null", "hydra.run.dir=run", folder=tmp_path)
+    assert done.code == 2
+    assert "run" in done.complaint
+
+
+def test_it_is_done_on_a_cart(trained: Path, tmp_path: Path) -> None:
+    done = in_process("finetune", f"run={trained}", "plant=simulated", "hydra.run.dir=run", folder=tmp_path)
+    assert done.code == 2
+    assert "plant" in done.complaint

@@ -1,0 +1,76 @@
+"""Recordings come back as they were written, other programs read them, and damaged ones are named."""
+
+import csv
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from cartpole_rl.envs import CartPoleEnv
+from cartpole_rl.errors import RecordingError
+from cartpole_rl.evaluation.episodes import run_batch
+from cartpole_rl.evaluation.recordings import COLUMNS, read_recording, write_recording
+from cartpole_rl.plants.simulated import SimulatedPlant
+from cartpole_rl.tasks.episode import Episode
+
+
+@pytest.fixture(scope="module")
+def episode(
+    make_plant: Callable[..., SimulatedPlant], make_environment: Callable[..., CartPoleEnv]
+) -> Episode:
+    """Forty periods of random motor values."""
+    random = torch.Generator().manual_seed(0)
+    env = make_environment(make_plant(1), time_limit=40)
+    (recorded,) = run_batch(env, lambda td: td.set("action", torch.randint(3, (1,), generator=random)))
+    return recorded
+
+
+def test_a_recording_comes_back_as_it_was(tmp_path: Path, episode: Episode) -> None:
+    write_recording(tmp_path / "deep" / "one.csv", episode)
+    again = read_recording(tmp_path / "deep" / "one.csv")
+    for field in dataclasses.fields(Episode):
+        np.testing.assert_array_equal(getattr(again, field.name), getattr(episode, field.name))
+    assert [path.name for path in (tmp_path / "deep").iterdir()] == ["one.csv"]
+
+
+def test_any_reader_of_csv_sees_columns_with_units(tmp_path: Path, episode: Episode) -> None:
+    write_recording(tmp_path / "one.csv", episode, {"pole": "medium"})
+    lines = (tmp_path / "one.csv").read_text().splitlines()
+    assert "# pole: medium" in lines
+    rows = list(csv.DictReader(line for line in lines if not line.startswith("#")))
+    assert tuple(rows[0]) == COLUMNS
+    assert len(rows) == episode.steps + 1
+    assert float(rows[7]["x_m"]) == episode.x[7]
+    assert rows[-1]["motor"] == ""
+
+
+@pytest.mark.parametrize(
+    ("harm", "named"),
+    [
+        (lambda text: "nonsense", "no recording"),
+        (lambda text: text.replace("recording 1", "recording 9"), "no recording"),
+        (lambda text: text.replace("theta_rad", "theta"), "lacks theta_rad"),
+        (lambda text: "\n".join(text.splitlines()[:3]), "lacks"),
+        (lambda text: "\n".join(text.splitlines()[:4]), "no control period"),
+        (lambda text: text.replace("ended_by: time", "ended_by: luck"), "damaged"),
+        (lambda text: text[: len(text) // 2], "damaged"),
+    ],
+)
+def test_a_damaged_file_is_named(
+    tmp_path: Path, episode: Episode, harm: Callable[[str], str], named: str
+) -> None:
+    path = tmp_path / "one.csv"
+    write_recording(path, episode)
+    path.write_text(harm(path.read_text()))
+    with pytest.raises(RecordingError, match=named) as raised:
+        read_recording(path)
+    assert str(path) in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match="cannot be read"):
+        read_recording(tmp_path / "none.csv")

@@ -1,0 +1,143 @@
+"""Prediction is the simulator's, and a fit finds the cart that was simulated."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+
+from cartpole_rl.envs import CartPoleEnv
+from cartpole_rl.errors import RecordingError
+from cartpole_rl.evaluation.episodes import run_batch
+from cartpole_rl.identification import cut_windows, fit_cart
+from cartpole_rl.identification.prediction import predict
+from cartpole_rl.identification.unknowns import limits, parameters_at, unknowns_of
+from cartpole_rl.identification.windows import HISTORY
+from cartpole_rl.physics.dynamics import Models
+from cartpole_rl.physics.friction import CartFriction
+from cartpole_rl.physics.parameters import CartParameters
+from cartpole_rl.plants.simulated import SimulatedPlant
+from cartpole_rl.randomization import PoleSettings
+from cartpole_rl.tasks.episode import Episode
+
+PERIOD = 0.02
+MOTORS = (-250, -150, 0, 150, 250)
+STEP = Models(cart_friction=CartFriction.STEP)
+TRUTH = {
+    "cart_viscous": 1.2,
+    "cart_coulomb": 0.35,
+    "cart_coulomb_asymmetry": 0.1,
+    "pole_viscous": 6e-4,
+    "force_asymmetry": -0.08,
+    "latency": 0.013,
+    "motor_time_constant": 0.006,
+    "track_tilt": 0.004,
+    "angle_offset": 0.008,
+    "track_half_length": 2.0,
+}
+
+MakePlant = Callable[..., SimulatedPlant]
+MakeEnvironment = Callable[..., CartPoleEnv]
+
+
+@pytest.fixture(scope="module")
+def episodes(make_plant: MakePlant, make_environment: MakeEnvironment) -> list[Episode]:
+    """Four times ten seconds of a cart that is shaken: each motor value is held for 0.2 s."""
+    random = torch.Generator().manual_seed(0)
+    held: list[torch.Tensor] = []
+
+    def shake(present: object) -> object:
+        if len(held) % 10 == 0:
+            held.append(torch.randint(len(MOTORS), (4,), generator=random))
+        else:
+            held.append(held[-1])
+        return present.set("action", held[-1])  # type: ignore[attr-defined]
+
+    env = make_environment(make_plant(4, cart=TRUTH, models=STEP), MOTORS)
+    return run_batch(env, shake)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def nominal(ip02: dict[str, float], medium: PoleSettings) -> dict[str, float]:
+    return {**ip02, **medium.nominal.model_dump()}
+
+
+def test_the_true_cart_predicts_every_count(episodes: list[Episode], nominal: dict[str, float]) -> None:
+    """From true beginnings at rest, to the rounding of the encoders."""
+    first = episodes[0]
+    motors = np.concatenate((np.zeros(HISTORY), first.motor[:50]))
+    values = {**nominal, **TRUTH}
+    table = torch.tensor([[values[name]] for name in CartParameters.names()], dtype=torch.float64)
+    motion = torch.tensor([[0.0], [0.0], [np.pi], [0.0]], dtype=torch.float64)
+    counts = predict(table, motion, torch.from_numpy(motors).unsqueeze(1), STEP, PERIOD, 4)[..., 0]
+    assert np.abs(counts.numpy() - first.counts[:51]).max() < 0.6
+
+
+def test_a_fit_finds_the_cart(episodes: list[Episode], nominal: dict[str, float]) -> None:
+    fit = fit_cart(cut_windows(episodes, PERIOD), nominal, STEP, PERIOD)
+    found = fit.parameters
+    assert (fit.rms < [2.0, 0.6]).all()  # counts
+    force = 0.02 * 200 - 1  # N at motor value 200
+    gain = (found["force_linear"] * 200 + found["force_offset"]) / (found["cart_mass"] + found["pole_mass"])
+    assert gain == pytest.approx(force / 0.83, rel=0.02)
+    mass = (found["cart_mass"] + found["pole_mass"]) / 0.83
+    assert found["cart_viscous"] / mass == pytest.approx(1.2, rel=0.03)
+    assert found["cart_coulomb"] / mass == pytest.approx(0.35, rel=0.05)
+    assert found["latency"] == pytest.approx(0.013, abs=0.002)
+    assert found["motor_time_constant"] == pytest.approx(0.006, abs=0.003)
+    assert found["angle_offset"] == pytest.approx(0.008, abs=0.002)
+    assert found["force_asymmetry"] == pytest.approx(-0.08, abs=0.02)
+
+
+def test_a_fit_finds_another_pole(
+    make_plant: MakePlant,
+    make_environment: MakeEnvironment,
+    both_poles: PoleSettings,
+    nominal: dict[str, float],
+) -> None:
+    random = torch.Generator().manual_seed(0)
+    large = PoleSettings(choices={"large": (both_poles.choices or {})["large"]})
+    env = make_environment(make_plant(2, poles=large, models=STEP, cart={"track_half_length": 2.0}), MOTORS)
+    recorded = run_batch(env, lambda present: present.set("action", torch.randint(5, (2,), generator=random)))
+    found = fit_cart(cut_windows(recorded, PERIOD), nominal, STEP, PERIOD).parameters
+    assert found["pole_com"] == pytest.approx(large.nominal.pole_com, rel=0.05)
+
+
+def test_draws_stay_what_carts_can_be(episodes: list[Episode], nominal: dict[str, float]) -> None:
+    fit = fit_cart(cut_windows(episodes, PERIOD, most=10), nominal, STEP, PERIOD, iterations=3)
+    drawn = dict(
+        zip(CartParameters.names(), fit.draw(500, np.random.default_rng(0), widen=20.0), strict=True)
+    )
+    assert (drawn["latency"] >= 0).all()
+    assert (drawn["cart_mass"] > 0).all()
+    assert drawn["cart_viscous"].std() > 0
+
+
+def test_limits_are_where_parameters_end(nominal: dict[str, float]) -> None:
+    unknowns = unknowns_of(STEP)
+    low, _ = limits(unknowns, nominal)
+    at_low = np.where(np.isfinite(low), low, 0.0)[:, None]
+    cart = CartParameters.from_table(parameters_at(at_low, unknowns, nominal))
+    assert cart.latency.item() == pytest.approx(0, abs=1e-12)
+    assert cart.motor_time_constant.item() == pytest.approx(0, abs=1e-12)
+    assert "cart_stiction_ratio" not in {unknown.name for unknown in unknowns}
+
+
+class TestWindows:
+    def test_lost_frames_are_left_out(self, episodes: list[Episode]) -> None:
+        whole = cut_windows(episodes[:1], PERIOD)
+        gap = episodes[0].time.copy()
+        gap[30:] += PERIOD
+        broken = Episode(**{**vars(episodes[0]), "time": gap})
+        assert cut_windows([broken], PERIOD).number < whole.number
+
+    def test_another_rate_is_named(self, episodes: list[Episode]) -> None:
+        with pytest.raises(RecordingError, match=r"every 20\.0 ms, and not every 10\.0 ms"):
+            cut_windows(episodes, 0.01)
+
+    def test_too_short_is_named(self, episodes: list[Episode]) -> None:
+        with pytest.raises(RecordingError, match="record longer"):
+            cut_windows(episodes, PERIOD, periods=600)
+
+    def test_windows_are_thinned_evenly(self, episodes: list[Episode]) -> None:
+        assert cut_windows(episodes, PERIOD, most=7).number == 7
