@@ -32,6 +32,7 @@ ROWS = {  # experiment: plants that it is judged on
     "both_blind": ("medium", "large"),
     "range": tuple(f"{length:.1f} m" for length in np.arange(0.2, 1.01, 0.1)),
     "balance": ("medium",),
+    "recurrent": ("medium",),
 }
 REACHED, KEPT = 0.9, 0.85  # fractions: of the time to it, and over which later evaluations count as kept
 STARTS = 20
