@@ -47,7 +47,7 @@ from cartpole_rl.errors import ConfigError
 from cartpole_rl.evaluation import episode_metrics, summarize
 from cartpole_rl.evaluation.driver import Drive, Driver, as_weights
 from cartpole_rl.evaluation.recordings import read_recording, write_recording
-from cartpole_rl.identification import Fit, cut_windows, fit_cart
+from cartpole_rl.identification import LONGEST_LATENCY, Fit, cut_windows, fit_cart
 from cartpole_rl.learning.checkpoints import (
     FOLDER,
     LAST,
@@ -73,7 +73,6 @@ from cartpole_rl.tasks.episode import Episode
 BEFORE, TUNE, AFTER = "before", "tune", "after"
 RECORDINGS = "recordings"
 DRAWN = 4096  # carts of each fit
-LONGEST_DELAY = 0.06  # s, of a fitted cart; so that the simulator need not be built anew
 
 
 @application("finetune", FinetuneConfig)
@@ -163,6 +162,7 @@ class Session:
         self.first_weights = as_weights(self.agent.greedy_policy())
         self.learner: Finetuning | None = None
         self.learned = 0  # episodes whose learning is done
+        self.optimizer_state: dict[str, Any] | None = None  # of a run that is resumed
         self.models = [training.models(training.plant)]
         if self.models[0].cart_friction is CartFriction.SIGMOID:
             self.models.append(self.models[0]._replace(cart_friction=CartFriction.STEP))
@@ -259,8 +259,6 @@ class Session:
             learner.optimizer.load_state_dict(self.optimizer_state)
         self.models, self.learner = [models], learner
 
-    optimizer_state: dict[str, Any] | None = None
-
     def refit(self) -> None:
         """Fit anew to all recordings, and go on with carts of that fit."""
         assert self.learner is not None
@@ -287,8 +285,8 @@ class Session:
         """Carts of the fit, and some as in training."""
         random = np.random.default_rng(self.config.seed)
         table = torch.from_numpy(fit.draw(DRAWN, random, self.config.finetuning.widen)).float()
-        others = self.training.model_copy(update={"pole": self.training.pole}).randomizer()
-        return FoundCarts(table, others, self.config.finetuning.elsewhere)
+        elsewhere = self.config.finetuning.elsewhere
+        return FoundCarts(table, self.training.randomizer(), elsewhere, LONGEST_LATENCY)
 
     def drive_all(self, stage: str, count: int) -> None:
         """Drive what is missing of a stage, without exploration."""

@@ -9,7 +9,7 @@ from cartpole_rl.physics.dynamics import Drive, Models, State, run_period
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.tasks.features import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 
-UNDER_WAY = 4  # motor values that can be: latencies of up to three periods
+UNDER_WAY = 4  # motor values that can be: LONGEST_LATENCY is three periods
 
 
 @torch.no_grad()

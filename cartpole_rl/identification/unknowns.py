@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cartpole_rl.physics.dynamics import Models, unused_parameters
-from cartpole_rl.physics.parameters import BOUNDS, CartParameters
+from cartpole_rl.physics.parameters import BOUNDS, Bound, CartParameters
 
 Array = NDArray[np.floating]
+LONGEST_LATENCY = 0.06  # s, that is looked for
 POLE_LENGTH = "pole_length"  # not a parameter of its own: see `parameters_at`
 
 
@@ -55,13 +56,18 @@ def unknowns_of(models: Models, unknowns: Sequence[Unknown] = UNKNOWNS) -> list[
     return [unknown for unknown in unknowns if unknown.name not in unread]
 
 
+def bound_of(name: str) -> Bound:
+    """What a parameter can be, as far as it is looked for."""
+    return Bound(0, LONGEST_LATENCY) if name == "latency" else BOUNDS[name]
+
+
 def limits(unknowns: Sequence[Unknown], nominal: Mapping[str, float]) -> tuple[Array, Array]:
     """Lowest and highest point, [U] each, at which every parameter is what it can be."""
     low, high = np.full(len(unknowns), -np.inf), np.full(len(unknowns), np.inf)
     for index, unknown in enumerate(unknowns):
         if not unknown.logarithmic:
             middle = nominal[unknown.name] if unknown.middle is None else unknown.middle
-            bound = BOUNDS[unknown.name]
+            bound = bound_of(unknown.name)
             low[index] = (bound.low - middle) / unknown.spread
             high[index] = (bound.high - middle) / unknown.spread
     return low, high
@@ -87,5 +93,5 @@ def parameters_at(points: Array, unknowns: Sequence[Unknown], nominal: Mapping[s
         else:
             middle = values[unknown.name] if unknown.middle is None else unknown.middle
             values[unknown.name] = middle + unknown.spread * point
-    table = [np.clip(values[name], BOUNDS[name].low, BOUNDS[name].high) for name in values]
+    table = [np.clip(values[name], bound_of(name).low, bound_of(name).high) for name in values]
     return torch.from_numpy(np.stack(table))

@@ -30,8 +30,9 @@ class FoundCarts:
     It stands where a Randomizer stands; `others` keep an agent from trusting what was found too much.
     """
 
-    def __init__(self, found: Tensor, others: Randomizer, elsewhere: float) -> None:
+    def __init__(self, found: Tensor, others: Randomizer, elsewhere: float, longest_delay: float) -> None:
         self.found, self.others, self.elsewhere = found.to(others.nominal), others, elsewhere
+        self._longest_delay = longest_delay  # s, of this table and of all that may take its place
         self.nominal = self.found.median(1).values
 
     def draw(self, count: int, generator: torch.Generator) -> Tensor:
@@ -44,8 +45,7 @@ class FoundCarts:
 
     def longest_delay(self) -> float:
         """The longest latency that a draw can have, jitter included, s."""
-        rows = [CartParameters.names().index(name) for name in ("latency", "latency_jitter")]
-        return max(self.others.longest_delay(), float(self.found[rows].sum(0).max()))
+        return max(self.others.longest_delay(), self._longest_delay)
 
     def can_differ_from_zero(self, name: str) -> bool:
         """Whether a draw of `name` can be anything but 0."""

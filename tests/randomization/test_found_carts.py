@@ -1,0 +1,40 @@
+"""Carts drawn from a table of carts keep its rows together; some come from elsewhere."""
+
+from collections.abc import Callable
+
+import torch
+
+from cartpole_rl.physics.parameters import CartParameters
+from cartpole_rl.plants.simulated import SimulatedPlant
+from cartpole_rl.randomization import FoundCarts, PoleSettings, Randomizer, Range
+
+MASS, VISCOUS = (CartParameters.names().index(name) for name in ("cart_mass", "cart_viscous"))
+
+
+def found_carts(ip02: dict[str, float], medium: PoleSettings, elsewhere: float) -> FoundCarts:
+    others = Randomizer(ip02, medium, {"cart_mass": Range(absolute=(5.0, 6.0))})
+    table = others.nominal.unsqueeze(1).repeat(1, 100)
+    table[MASS] = torch.linspace(0.5, 1.0, 100)
+    table[VISCOUS] = 2 * table[MASS]
+    return FoundCarts(table, others, elsewhere, longest_delay=0.03)
+
+
+def test_rows_stay_together(ip02: dict[str, float], medium: PoleSettings) -> None:
+    drawn = found_carts(ip02, medium, 0.0).draw(500, torch.Generator().manual_seed(0))
+    assert torch.equal(drawn[VISCOUS], 2 * drawn[MASS])
+    assert len(drawn[MASS].unique()) > 50
+
+
+def test_the_share_from_elsewhere(ip02: dict[str, float], medium: PoleSettings) -> None:
+    drawn = found_carts(ip02, medium, 0.2).draw(5000, torch.Generator().manual_seed(0))
+    assert 0.17 < (drawn[MASS] >= 5).float().mean() < 0.23
+
+
+def test_a_plant_goes_on_with_other_carts(
+    ip02: dict[str, float], medium: PoleSettings, make_plant: Callable[..., SimulatedPlant]
+) -> None:
+    plant = make_plant(8)
+    plant.replace_randomizer(found_carts(ip02, medium, 0.0))
+    plant.reset()
+    assert torch.equal(plant.parameters.cart_viscous, 2 * plant.parameters.cart_mass)
+    assert found_carts(ip02, medium, 0.0).longest_delay() == 0.03
