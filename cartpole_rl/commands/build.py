@@ -9,9 +9,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import hydra
 import torch
 
 from cartpole_rl.agents import QAgent
+from cartpole_rl.agents.baseline import EnergyAndRegulator
+from cartpole_rl.commands.application import as_mapping
 from cartpole_rl.commands.config import (
     CartPoleSettings,
     EmulatedSettings,
@@ -33,6 +36,7 @@ from cartpole_rl.plants.specs import Plant
 from cartpole_rl.randomization import Pole, PoleSettings
 from cartpole_rl.tasks.starts import Start, StartSettings
 
+BASELINE = Path("lqr")  # run=lqr is no folder: the controller that learned nothing
 REPLACEABLE = ("cart", "cart_friction", "pole_friction", "pole", "reward")  # by an evaluation; and the task
 
 
@@ -98,6 +102,34 @@ def trained_agent(run: Path) -> TrainedAgent:
         reason = str(error).splitlines()[0]
         raise CheckpointError(f"run={run} is of another version of this package: {reason}") from None
     return TrainedAgent(training, agent.greedy_policy())
+
+
+def evaluated_agent(config: EvaluateConfig) -> TrainedAgent:
+    """The agent of config.run, or the baseline. Raises CheckpointError, ConfigError."""
+    return baseline_agent(config) if config.run == BASELINE else trained_agent(config.run)
+
+
+def baseline_agent(config: EvaluateConfig) -> TrainedAgent:
+    """Energy and LQR, for the nominal cart of conf/ with the pole that `config` puts on it.
+
+    Only within a command, where Hydra knows conf/. Raises ConfigError where there may be several poles.
+    """
+    composed = hydra.compose("train", ["observation=raw", "observation.past_motors=1"])
+    training = checked(TrainConfig, as_mapping(composed))
+    poles = evaluated_settings(training, config.model_copy(update={"parameters": None})).pole
+    if poles.choices is None or len(poles.choices) > 1:
+        raise ConfigError(
+            f"run={BASELINE} is made for one pole, not {poles.name}; choose one, as pole=medium"
+        )
+    policy = EnergyAndRegulator(
+        {**training.nominal, **poles.nominal.model_dump()},
+        training.models(training.plant),
+        training.actions.motors,
+        training.observation.kind,
+        training.observation.past_motors,
+        training.control_period,
+    )
+    return TrainedAgent(training, policy)
 
 
 def evaluated_settings(training: TrainConfig, config: EvaluateConfig) -> CartPoleSettings:

@@ -1,8 +1,11 @@
 """cartpole-evaluate: run whole episodes of a trained agent, in simulation or on a cart.
 
+run=lqr is no agent but energy and LQR, a controller that learned nothing, to compare with.
+
 cartpole-evaluate run=runs/train/2026-11-21_12-00-00 episodes=20
 cartpole-evaluate run=runs/train/2026-11-21_12-00-00 plant=emulated emulator.latency=0.02
 cartpole-evaluate run=runs/train/2026-11-21_12-00-00 plant=serial plant.port=/dev/ttyUSB0
+cartpole-evaluate run=lqr plant=emulated
 """
 
 from collections.abc import Iterator, Mapping
@@ -13,7 +16,7 @@ from typing import Any
 from tqdm import tqdm
 
 from cartpole_rl.commands.application import application
-from cartpole_rl.commands.build import evaluated_env, evaluated_settings, trained_agent, use_threads
+from cartpole_rl.commands.build import evaluated_agent, evaluated_env, evaluated_settings, use_threads
 from cartpole_rl.commands.config import EvaluateConfig
 from cartpole_rl.commands.report import METRICS, report
 from cartpole_rl.commands.run_folder import write_config
@@ -40,7 +43,7 @@ def main(config: EvaluateConfig, folder: Path) -> None:
     """Load, build, run, report."""
     use_threads(config.threads)
     seed_everything(config.seed)
-    agent = trained_agent(config.run)
+    agent = evaluated_agent(config)
     settings = evaluated_settings(agent.training, config)
     env = evaluated_env(settings, config, prompt=tqdm.write)
     episodes: list[Episode] = []

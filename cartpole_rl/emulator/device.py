@@ -2,18 +2,24 @@
 
 import math
 import random
+from typing import Literal
 
-from cartpole_rl.emulator.firmware import Firmware
+from cartpole_rl.emulator.firmware import BANNER, Firmware
 from cartpole_rl.emulator.homing import CART_METRES, POLE_RADIANS
 from cartpole_rl.emulator.physics import CartPhysics
 from cartpole_rl.emulator.settings import EmulatorSettings
 
 FARTHEST_BOOT = 0.3  # share of the half length: the cart wakes up this near to the middle
+ANYWHERE = 0.99  # share of the half length, where it may wake up anywhere ...
+FASTEST_BOOT = 8.0  # rad/s, ... and how fast the pole may turn then
 HAND_ERROR = 0.03  # rad: how near to upright a hand holds the pole
 
 
 class CartDevice:
-    """A cart just switched on, somewhere on its track, the pole hanging. Time passes only when told to."""
+    """A cart just switched on, somewhere on its track, as `boot` says. Time passes only when told to.
+
+    Times are whole microseconds since the start; the firmware counts its own since it booted.
+    """
 
     def __init__(self, settings: EmulatorSettings) -> None:
         """Raises EmulatorError where MuJoCo is not installed."""
@@ -23,16 +29,21 @@ class CartDevice:
         self._people = random.Random(f"people {settings.seed}")
         self._held: float | None = None  # rad, where the hand holds the pole
         self.now_us = 0
-        self.physics.place(
-            settings.track_half_length * self._people.uniform(-FARTHEST_BOOT, FARTHEST_BOOT), math.pi
-        )
-        self._boot = (0, 0)
-        self._boot = self._counts()
-        self.firmware = Firmware(self._latency_us, round(settings.angle_offset / POLE_RADIANS))
+        self._place_cart()
+        self._reset_us = microseconds(settings.reset_at)
+        self._unplug_us = microseconds(settings.unplug_at)
+        self._stuck_us = None if settings.stuck_encoder == "none" else microseconds(settings.stuck_at)
+        self._stuck_count: int | None = None
+        self._boot_firmware()
 
     def receive(self, stuffed: bytes, now_us: int) -> list[bytes]:
         """Give the cart a frame that arrived at a time, which is not before `now_us`; returns its answer."""
-        return self.firmware.receive(stuffed, now_us)
+        return self.firmware.receive(stuffed, now_us - self._booted_us)
+
+    @property
+    def unplugged(self) -> bool:
+        """Whether the cable has been pulled."""
+        return self._unplug_us is not None and self.now_us >= self._unplug_us
 
     @property
     def period_end_us(self) -> int:
@@ -40,27 +51,65 @@ class CartDevice:
         return self.now_us + self.firmware.period_us
 
     def pass_period(self, end_us: int) -> list[bytes]:
-        """Let the time until `end_us` pass as one period; returns the frames sent at its end, STATE last."""
+        """Let the time until `end_us` pass as one period; returns the frames sent at its end, STATE last.
+
+        A reset that is due comes first, and its banner, which ends in 0x00 too, before the frames.
+        """
+        banner = []
+        if self._reset_us is not None and self.now_us >= self._reset_us:
+            self._reset_us = None
+            self._boot_firmware()
+            banner = [BANNER]
         self._move_hand()
-        values = self.firmware.drive(self.now_us, end_us)
-        for (since, motor), (until, _) in zip(values, [*values[1:], (end_us, 0)], strict=True):
+        start, end = self.now_us - self._booted_us, end_us - self._booted_us
+        values = self.firmware.drive(start, end)
+        for (since, motor), (until, _) in zip(values, [*values[1:], (end, 0)], strict=True):
             self.physics.advance(motor, (until - since) / 1e6)
         if self._held is not None:
             self.physics.place_pole(self._held)
         self.now_us = end_us
-        frames = self.firmware.tick(end_us, *self._counts())
+        frames = self.firmware.tick(end, *self._counts())
         self._move_hand()
-        return frames
+        return banner + frames
+
+    def _place_cart(self) -> None:
+        settings, draw = self._settings, self._people.uniform
+        if settings.boot == "hanging":
+            self.physics.place(settings.track_half_length * draw(-FARTHEST_BOOT, FARTHEST_BOOT), math.pi)
+            return
+        x = settings.track_half_length * draw(-ANYWHERE, ANYWHERE)
+        self.physics.place(x, draw(-math.pi, math.pi), draw(-FASTEST_BOOT, FASTEST_BOOT))
+
+    def _boot_firmware(self) -> None:
+        """Start the firmware, which takes the counts of this moment as 0."""
+        self._booted_us = self.now_us
+        self._boot = (0, 0)
+        self._boot = self._counts()
+        self.firmware = Firmware(self._latency_us, round(self._settings.angle_offset / POLE_RADIANS))
 
     def _counts(self) -> tuple[int, int]:
-        """Raw counts of cart and pole since boot; a count changes where a line of the disc passes.
+        """Raw counts of cart and pole since boot, as the encoders tell them."""
+        cart, pole = self._disc_counts()
+        cart, pole = self._stick("cart", cart), self._stick("pole", pole)
+        return cart - self._boot[0], pole - self._boot[1]
+
+    def _stick(self, encoder: Literal["cart", "pole"], count: int) -> int:
+        """The count, or the one at which a stuck encoder froze."""
+        if encoder != self._settings.stuck_encoder or self._stuck_us is None or self.now_us < self._stuck_us:
+            return count
+        if self._stuck_count is None:
+            self._stuck_count = count
+        return self._stuck_count
+
+    def _disc_counts(self) -> tuple[int, int]:
+        """Counts of cart and pole; a count changes where a line of the disc passes.
 
         The pole's disc sits so that its lines carry the part of `angle_offset` below a count; the firmware's
         zero, a whole number, carries the rest.
         """
         cart = math.floor(self.physics.x / CART_METRES)
         pole = math.floor((self.physics.angle + self._settings.angle_offset) / POLE_RADIANS + 0.5)
-        return cart - self._boot[0], pole - self._boot[1]
+        return cart, pole
 
     def _latency_us(self) -> int:
         jitter = self._settings.latency_jitter
@@ -84,3 +133,8 @@ class CartDevice:
 def nearest_upright(angle: float) -> float:
     """The upright angle to which a hand lifts the pole; one that hangs near pi goes to 0, not to two pi."""
     return 2 * math.pi * round((angle - 0.5) / (2 * math.pi))
+
+
+def microseconds(seconds: float | None) -> int | None:
+    """Whole microseconds; None stays None, which is never."""
+    return None if seconds is None else round(seconds * 1e6)

@@ -8,7 +8,14 @@ All times are whole microseconds since boot.
 
 from collections.abc import Callable, Generator
 
-from cartpole_rl.emulator.guards import FASTEST_CART, FASTEST_POLE, JumpWatch, StallWatch
+from cartpole_rl.emulator.guards import (
+    FASTEST_CART,
+    FASTEST_POLE,
+    FrozenCartWatch,
+    FrozenPoleWatch,
+    JumpWatch,
+    StallWatch,
+)
 from cartpole_rl.emulator.homing import CART_METRES, POLE_COUNTS, SPAN, HomingError, Reading, Zeros, home
 from cartpole_rl.emulator.motor_line import MotorLine
 from cartpole_rl.errors import FrameError
@@ -34,6 +41,8 @@ from cartpole_rl.wire import (
 from cartpole_rl.wire.frames import VERSION, Envelope, open_envelope
 
 FIRMWARE = (1, 0, 0)
+BANNER = b"ets Jul 29 2019 12:21:46\r\n\r\nrst:0x1 (POWERON_RESET),boot:0x13\r\ncart 1.0.0\r\n\x00"
+# as an ESP32 prints, and one 0x00, so that it is no part of the first frame
 PERIOD_US = 20_000
 SHORTEST_US, LONGEST_US = 5_000, 100_000
 MOTOR_LIMIT = 255
@@ -61,7 +70,7 @@ class Firmware:
         self._zero_error = zero_error
         self._line = MotorLine()
         self._homing: Generator[int, Reading, Zeros] | None = None
-        self._zeros = Zeros(-NOMINAL_HALF_SPAN, NOMINAL_HALF_SPAN, hanging=0)
+        self._zeros = Zeros(-NOMINAL_HALF_SPAN, NOMINAL_HALF_SPAN, hanging=None)
         self._pole_zero = 0  # raw count that is reported as 0
         self._command_us: int | None = None  # when the newest SET_MOTOR arrived
         self._watchdog_us = 0  # when the watchdog was last fed
@@ -176,7 +185,7 @@ class Firmware:
             self._line.hold(homing.send(reading))
         except StopIteration as end:
             self._zeros = end.value
-            self._pole_zero = self._zeros.hanging - POLE_COUNTS // 2 - self._zero_error
+            self._pole_zero = end.value.hanging - POLE_COUNTS // 2 - self._zero_error
             self.homed, self._homing = True, None
             self._line.hold(0)
         except HomingError:
@@ -184,13 +193,16 @@ class Firmware:
 
     def _look_for_faults(self, reading: Reading) -> None:
         """Latch what is wrong. A cart under homing may touch the stops, and finds a stall by itself."""
-        if self._cart_watch.jumped(reading.cart, reading.seconds):
+        motor = self._line.value
+        jumped = self._cart_jumps.jumped(reading.cart, reading.seconds)
+        if self._cart_freezes.frozen(reading.cart, motor, reading.seconds) or jumped:
             self._latch(Fault.CART_ENCODER)
-        if self._pole_watch.jumped(reading.pole, reading.seconds):
+        jumped = self._pole_jumps.jumped(reading.pole, reading.seconds)
+        if self._pole_freezes.frozen(reading.pole, reading.cart, reading.seconds) or jumped:
             self._latch(Fault.POLE_ENCODER)
         if self.armed and self._beyond(HARD_LIMIT, reading.cart):
             self._latch(Fault.HARD_LIMIT)
-        if self.armed and self._stall_watch.stalled(reading.cart, self._line.value, reading.seconds):
+        if self.armed and self._stalls.stalled(reading.cart, motor, reading.seconds):
             self._latch(Fault.STALL)
 
     def _latch(self, fault: Fault) -> None:
@@ -203,8 +215,9 @@ class Firmware:
 
     def _watch_anew(self) -> None:
         """Forget what the guards saw while the motor was off: a hand may have moved everything since."""
-        self._cart_watch, self._pole_watch = JumpWatch(FASTEST_CART), JumpWatch(FASTEST_POLE)
-        self._stall_watch = StallWatch()
+        self._cart_jumps, self._pole_jumps = JumpWatch(FASTEST_CART), JumpWatch(FASTEST_POLE)
+        self._cart_freezes, self._pole_freezes = FrozenCartWatch(), FrozenPoleWatch()
+        self._stalls = StallWatch()
 
     def _beyond(self, inside: int, cart: int) -> int:
         """1 or -1 where the cart is within `inside` counts of the right or left stop, or past it, else 0."""

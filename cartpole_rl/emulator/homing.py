@@ -54,7 +54,7 @@ class Zeros:
 
     left_stop: int
     right_stop: int
-    hanging: int
+    hanging: int | None  # None: not known yet
 
     @property
     def middle(self) -> int:
@@ -101,8 +101,11 @@ class Window:
         return round((max(self._counts) + min(self._counts)) / 2)
 
 
-def home(hanging: int) -> Generator[int, Reading, Zeros]:
-    """The whole homing; `hanging` is the pole count at which the pole hung last. Raises HomingError."""
+def home(hanging: int | None) -> Generator[int, Reading, Zeros]:
+    """The whole homing; `hanging` is the pole count at which the pole hung last, None after a boot.
+
+    Raises HomingError.
+    """
     reading = yield 0
     reading = yield from touch_stop(-1, None, reading)
     left = reading.cart
@@ -149,8 +152,13 @@ def centre(middle: int, reading: Reading) -> Procedure:
     raise HomingError(f"not in the middle after {LONGEST_CENTRING:.0f} s")
 
 
-def brake_swing(middle: int, hanging: int, reading: Reading) -> Procedure:
-    """Take the swing out of the pole, or most of it, by moving the cart about the middle."""
+def brake_swing(middle: int, hanging: int | None, reading: Reading) -> Procedure:
+    """Take the swing out of the pole, or most of it, by moving the cart about the middle.
+
+    Where the pole hangs, if that is not known, is where it is fastest.
+    """
+    if hanging is None:
+        hanging, reading = yield from find_hanging(reading)
     brake, window, elapsed, before = SwingBrake(), Window(WHOLE_SWING), 0.0, reading
     while elapsed < LONGEST_BRAKING:
         window.add(reading.pole, reading.seconds)
@@ -168,6 +176,19 @@ def brake_swing(middle: int, hanging: int, reading: Reading) -> Procedure:
         reading = yield motor
         elapsed += reading.seconds
     return reading
+
+
+def find_hanging(reading: Reading) -> Generator[int, Reading, tuple[int, Reading]]:
+    """Watch the pole for a whole swing with the motor off; returns the count at which it was fastest."""
+    hanging, fastest, elapsed = reading.pole, 0.0, 0.0
+    while elapsed < WHOLE_SWING:
+        before = reading
+        reading = yield 0
+        elapsed += reading.seconds
+        speed = abs(reading.pole - before.pole) / reading.seconds
+        if speed > fastest:
+            hanging, fastest = (reading.pole + before.pole) // 2, speed
+    return hanging, reading
 
 
 def wait_until_still(reading: Reading) -> Generator[int, Reading, int]:

@@ -2,10 +2,12 @@
 
 import os
 import select
+import struct
 from types import TracebackType
 from typing import Self
 
 from cartpole_rl.emulator.disturbance import Disturbance
+from cartpole_rl.emulator.firmware import BANNER
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import EmulatorError
 from cartpole_rl.wire.frames import END, FrameSplitter
@@ -15,12 +17,18 @@ LONGEST_WAIT = 0.5  # s; a signal that arrives just before a wait begins is noti
 
 
 class PtyLink:
-    """A pseudo-terminal in raw mode; a host opens `port` as it would open a serial port, again and again."""
+    """A pseudo-terminal in raw mode; a host opens `port` as it would open a serial port, again and again.
+
+    It is in packet mode (tty_ioctl(4)): each read begins with a byte that is 0 before data, and else tells
+    what the host did. One who opens a serial port throws away what came before, which is how it is noticed.
+    """
 
     def __init__(self) -> None:
         """Raises EmulatorError on systems without pseudo-terminals."""
         try:
+            import fcntl
             import pty
+            import termios
             import tty
         except ImportError:
             raise EmulatorError(
@@ -28,6 +36,9 @@ class PtyLink:
             ) from None
         self._master, self._slave = pty.openpty()  # the slave stays open: else a closed port ends the master
         tty.setraw(self._slave)
+        fcntl.ioctl(self._master, termios.TIOCPKT, struct.pack("i", 1))
+        self._flushed = termios.TIOCPKT_FLUSHREAD
+        self.opened = False  # a host has opened the port
         os.set_blocking(self._master, False)
         self.port = os.ttyname(self._slave)
         self._unsent = b""
@@ -47,8 +58,13 @@ class PtyLink:
 
     def read(self, timeout: float = LONGEST_WAIT) -> bytes:
         """What the host wrote, after waiting for it for at most `timeout` seconds; b"" for nothing."""
-        ready, _, _ = select.select([self._master], [], [], min(timeout, LONGEST_WAIT))
-        return os.read(self._master, READ_BYTES) if ready else b""
+        while select.select([self._master], [], [], min(timeout, LONGEST_WAIT))[0]:
+            packet = os.read(self._master, READ_BYTES)
+            if packet[0] == 0:
+                return packet[1:]
+            self.opened = self.opened or bool(packet[0] & self._flushed)
+            timeout = 0.0
+        return b""
 
     def write(self, data: bytes) -> None:
         """Write all of it, and wait for as long as the host does not read."""
@@ -73,23 +89,34 @@ class PtyLink:
 
 
 class Channel:
-    """Frames over a pseudo-terminal, with the settings' losses in both directions."""
+    """Frames over a pseudo-terminal, with the settings' disturbances in both directions."""
 
     def __init__(self, link: PtyLink, settings: EmulatorSettings) -> None:
         self._link = link
         self._splitter = FrameSplitter()
         self._send = link.write if settings.clock == "lockstep" else link.offer
-        loss, corruption, seed = settings.frame_loss, settings.frame_corruption, settings.seed
-        self._inward = Disturbance(loss, corruption, f"inward {seed}")
-        self._outward = Disturbance(loss, corruption, f"outward {seed}")
+        self._inward = Disturbance(settings, "inward")
+        self._outward = Disturbance(settings, "outward")
+        self._greeted = False
 
     def receive(self, timeout: float = LONGEST_WAIT) -> list[bytes | None]:
-        """Frames from the host, without their 0x00, after waiting at most `timeout` s; None is a lost one."""
-        return [self._inward.carry(frame) for frame in self._splitter.feed(self._link.read(timeout))]
+        """Frames from the host, without their 0x00, after waiting at most `timeout` s; None is a lost one.
+
+        One that is held back for its successor counts as lost until that comes. The first host to open the
+        port is sent the boot banner.
+        """
+        data = self._link.read(timeout)
+        if self._link.opened and not self._greeted:
+            self._greeted = True
+            self._send(BANNER)
+        frames: list[bytes | None] = []
+        for frame in self._splitter.feed(data):
+            frames += self._inward.carry(frame) or [None]
+        return frames
 
     def send(self, frame: bytes) -> bool:
-        """Send one frame that ends with its 0x00; returns whether it left undamaged."""
+        """Send one frame that ends with its 0x00; returns whether it left at once and undamaged."""
         arriving = self._outward.carry(frame[:-1])
-        if arriving is not None:
-            self._send(arriving + END)
-        return arriving == frame[:-1]
+        for stuffed in arriving:
+            self._send(stuffed + END)
+        return frame[:-1] in arriving

@@ -89,16 +89,16 @@ class CartPhysics:
         """Pole angular velocity, rad/s."""
         return float(self._data.qvel[1])
 
-    def place(self, x: float, angle: float) -> None:
-        """Put the cart at x and the pole at an angle, both at rest."""
+    def place(self, x: float, angle: float, angle_dot: float = 0.0) -> None:
+        """Put the cart at x, at rest, and the pole at an angle, turning at `angle_dot` rad/s."""
         self._data.qpos[0] = x
         self._data.qvel[0] = 0.0
-        self.place_pole(angle)
+        self.place_pole(angle, angle_dot)
 
-    def place_pole(self, angle: float) -> None:
-        """Put the pole at an angle, at rest, and leave the cart alone."""
+    def place_pole(self, angle: float, angle_dot: float = 0.0) -> None:
+        """Put the pole at an angle, at rest unless told otherwise, and leave the cart alone."""
         self._data.qpos[1] = angle - self._settings.track_tilt
-        self._data.qvel[1] = 0.0
+        self._data.qvel[1] = angle_dot
 
     def advance(self, motor: int, seconds: float) -> None:
         """Let `seconds` pass under one motor value, in equal steps of `physics_step` or just under."""

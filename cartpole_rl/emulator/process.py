@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -18,15 +19,16 @@ PARENT_POLL = 0.5  # s
 
 
 def run(settings: EmulatorSettings) -> None:
-    """Print one JSON line with `port` and `pid`, and emulate until SIGINT or SIGTERM. Main thread only.
+    """Print one JSON line with `port` and `pid`, and emulate until SIGINT, SIGTERM or `unplug_at`.
 
-    Raises EmulatorError where MuJoCo or pseudo-terminals are missing.
+    Main thread only. Raises EmulatorError where MuJoCo or pseudo-terminals are missing.
     """
     cart = CartDevice(settings)
     with until_stopped(), PtyLink() as link:
         print(json.dumps({"port": link.port, "pid": os.getpid()}), flush=True)
         clock = run_lockstep if settings.clock == "lockstep" else run_real
         clock(cart, Channel(link, settings))
+        print(f"the cable was pulled after {settings.unplug_at:g} s, as unplug_at says", file=sys.stderr)
 
 
 @contextmanager

@@ -5,9 +5,9 @@ as much as a cart that was weighed and measured by hand would. ``docs/emulator.m
 Signs: x, motor and angles are positive to the right, angle 0 is upright.
 """
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from cartpole_rl.settings import NonNegative, Positive, Settings
 
@@ -50,6 +50,20 @@ class EmulatorSettings(Settings):
 
     frame_loss: Share = 0.0  # share of frames that vanish, in both directions
     frame_corruption: Share = 0.0  # share of frames that arrive with a wrong byte, in both directions
+    frame_duplication: Share = 0.0  # share of frames that arrive twice, in both directions
+    frame_reordering: Share = 0.0  # share of frames that arrive after the one sent next, in both directions
 
+    unplug_at: Positive | None = None  # s since the start: the cable is pulled and the process ends
+    reset_at: Positive | None = None  # s since the start: the firmware boots again
+    stuck_encoder: Literal["none", "cart", "pole"] = "none"  # whose count freezes
+    stuck_at: NonNegative = 0.0  # s since the start: from here on
+
+    boot: Literal["hanging", "anywhere"] = "hanging"  # near the middle and hanging, or anywhere and swinging
     start: Literal["hanging", "upright"] = "hanging"  # what a person's hand does to the pole before START
     physics_step: Annotated[float, Field(ge=1e-5, le=1e-3)] = 5e-4  # s, or just under to fit a period
+
+    @model_validator(mode="after")
+    def _stuck_at_needs_an_encoder(self) -> Self:
+        if self.stuck_at > 0 and self.stuck_encoder == "none":
+            raise ValueError("stuck_at has no effect without an encoder: give stuck_encoder=cart or pole")
+        return self

@@ -13,13 +13,14 @@ from omegaconf import OmegaConf
 from cartpole_rl.choices import conf_folder
 from cartpole_rl.commands.application import as_mapping
 from cartpole_rl.commands.build import evaluated_settings
-from cartpole_rl.commands.config import EmulateConfig, EvaluateConfig, TrainConfig, checked
+from cartpole_rl.commands.config import EmulateConfig, EvaluateConfig, FinetuneConfig, TrainConfig, checked
 from cartpole_rl.tasks.rewards import Reward
 
 CONF = conf_folder()
 GROUPS = sorted(path.name for path in CONF.iterdir() if path.is_dir() and path.name != "hydra")
 CHOICES = [f"{group}={path.stem}" for group in GROUPS for path in sorted((CONF / group).glob("*.yaml"))]
-OF_EVALUATION = ("emulator", "plant")  # groups with choices that training does not take
+NOT_OF_TRAINING = ("emulator", "plant", "finetuning")  # groups with choices that training does not take
+NEEDED = {"agent=recurrent": ["observation=positions"]}  # beside a choice
 REPLACEABLE = ("task", "pole", "cart_friction", "pole_friction", "reward", "randomization", "cart")
 
 
@@ -44,9 +45,9 @@ def trained() -> TrainConfig:
     return checked(TrainConfig, composed("train"))
 
 
-@pytest.mark.parametrize("chosen", [case for case in CHOICES if group_of(case) not in OF_EVALUATION])
+@pytest.mark.parametrize("chosen", [case for case in CHOICES if group_of(case) not in NOT_OF_TRAINING])
 def test_training_takes_it(chosen: str) -> None:
-    config = checked(TrainConfig, composed("train", chosen))
+    config = checked(TrainConfig, composed("train", chosen, *NEEDED.get(chosen, [])))
     randomizer = config.randomizer()
     assert float(randomizer.nominal.abs().sum()) > 0
     assert config.models(config.plant).integrator
@@ -62,6 +63,11 @@ def test_an_evaluation_takes_it_in_place_of_the_agents_own(chosen: str, trained:
     if group not in ("cart_friction", "pole_friction"):  # whose numbers are then the cart's
         assert getattr(settings, group) == getattr(wanted, group)
     assert settings.nominal == wanted.nominal
+
+
+@pytest.mark.parametrize("chosen", [case for case in CHOICES if group_of(case) == "finetuning"])
+def test_fine_tuning_takes_it(chosen: str) -> None:
+    assert checked(FinetuneConfig, composed("finetune", "run=somewhere", chosen)).finetuning.iterations > 0
 
 
 @pytest.mark.parametrize("task", ["balance", "swingup"])

@@ -254,6 +254,8 @@ OTHER = {
     "latency_jitter": 0.003,
     "track_tilt": -0.004,
     "angle_offset": 0.0045,
+    "reset_at": 1.0,
+    "boot": "anywhere",
     "start": "upright",
     "physics_step": 5e-4,
 }
@@ -275,7 +277,14 @@ def test_another_value_sends_other_bytes(base, name):
 
 def test_every_setting_is_tried_here_or_on_the_wire():
     on_the_wire = {"clock", "frame_loss", "frame_corruption"}  # test_emulator_process.py
-    assert set(OTHER) | on_the_wire == set(EmulatorSettings.model_fields)
+    faults = {
+        "frame_duplication",
+        "frame_reordering",
+        "unplug_at",
+        "stuck_encoder",
+        "stuck_at",
+    }  # ..._faults.py
+    assert set(OTHER) | on_the_wire | faults == set(EmulatorSettings.model_fields)
 
 
 def test_latency_and_jitter_delay_the_force_by_as_much_as_they_say():

@@ -4,9 +4,11 @@ import os
 import tty
 
 import pytest
+import serial
 
 from cartpole_rl.emulator.disturbance import Disturbance
 from cartpole_rl.emulator.link import PtyLink
+from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import FrameError
 from cartpole_rl.wire import FrameSplitter, SetMotor, decode_frame, encode_frame
 
@@ -47,14 +49,14 @@ def test_what_a_host_writes_arrives_and_nothing_is_nothing():
 
 
 def test_a_sound_cable_changes_nothing():
-    cable = Disturbance(0.0, 0.0, "seed")
-    assert all(cable.carry(FRAME) == FRAME for _ in range(100))
+    cable = Disturbance(EmulatorSettings(), "inward")
+    assert all(cable.carry(FRAME) == [FRAME] for _ in range(100))
 
 
 def test_shares_of_lost_and_damaged_frames_are_as_asked():
-    cable = Disturbance(0.2, 0.3, "seed")
+    cable = Disturbance(EmulatorSettings(frame_loss=0.2, frame_corruption=0.3), "inward")
     came = [cable.carry(FRAME) for _ in range(4000)]
-    arrived = [frame for frame in came if frame is not None]
+    arrived = [frame for frames in came for frame in frames]
     damaged = [frame for frame in arrived if frame != FRAME]
     assert 1 - len(arrived) / len(came) == pytest.approx(0.2, abs=0.03)
     assert len(damaged) / len(arrived) == pytest.approx(0.3, abs=0.03)
@@ -65,9 +67,25 @@ def test_shares_of_lost_and_damaged_frames_are_as_asked():
 
 
 def test_the_seed_decides():
-    def pattern(seed: str) -> list[bytes | None]:
-        cable = Disturbance(0.3, 0.3, seed)
+    def pattern(seed: int, direction: str = "inward") -> list[list[bytes]]:
+        cable = Disturbance(
+            EmulatorSettings(
+                seed=seed, frame_loss=0.3, frame_corruption=0.3, frame_duplication=0.3, frame_reordering=0.3
+            ),
+            direction,
+        )
         return [cable.carry(FRAME) for _ in range(50)]
 
-    assert pattern("a") == pattern("a")
-    assert pattern("a") != pattern("b")
+    assert pattern(1) == pattern(1)
+    assert pattern(1) != pattern(2)
+    assert pattern(1) != pattern(1, "outward")
+
+
+def test_a_host_that_opens_the_port_is_noticed():
+    with PtyLink() as link:
+        assert link.read(0) == b""
+        assert not link.opened
+        with serial.Serial(link.port) as host:
+            host.write(b"hello")
+            assert link.read(5) == b"hello"
+            assert link.opened

@@ -14,9 +14,11 @@ TRUTH = {
     "pole": ["pole_viscous", "pole_coulomb", "pole_drag", "angle_offset"],
     "motor": ["force_curve", "force_asymmetry", "deadband_left", "deadband_right", "motor_time_constant"],
     "link": ["latency", "latency_jitter", "frame_loss", "frame_corruption"],
+    "order": ["frame_duplication", "frame_reordering"],
 }
 NAMES = sorted(name for names in TRUTH.values() for name in names)
-OURS = ["clock", "physics_step", "seed", "start"]
+FAULTS = ["unplug_at", "reset_at", "stuck_encoder", "stuck_at"]
+OURS = ["boot", "clock", "physics_step", "seed", "start", *FAULTS]
 
 
 def test_the_names_are_the_ones_that_users_know():
@@ -39,6 +41,13 @@ def test_the_names_are_the_ones_that_users_know():
         {"start": "sideways"},
         {"physics_step": 0.002},
         {"seed": -1},
+        {"frame_duplication": 1.0},
+        {"frame_reordering": -0.1},
+        {"unplug_at": 0.0},
+        {"reset_at": -1.0},
+        {"stuck_encoder": "motor"},
+        {"stuck_at": 3.0},
+        {"boot": "upright"},
     ],
 )
 def test_wrong_settings_are_refused_by_name(wrong):
@@ -51,10 +60,19 @@ def test_settings_survive_json():
     assert EmulatorSettings.model_validate_json(settings.model_dump_json()) == settings
 
 
+@pytest.mark.parametrize("name", [*FAULTS, *OURS])
+def test_the_page_names(name):
+    assert f"`{name}`" in PAGE
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_the_page_tells_the_default(name):
     value = getattr(EmulatorSettings(), name)
-    named = {"deadband_right": "_right"}.get(name, name)
+    named = {
+        "deadband_right": "_right",
+        "frame_corruption": "_corruption",
+        "frame_reordering": "_reordering",
+    }.get(name, name)
     row = next(line for line in PAGE.splitlines() if line.startswith("| `") and f"`{named}`" in line)
     truths = {float(cell) for cell in row.split("|")[3].split(",")}
     assert set(value if isinstance(value, tuple) else (value,)) <= truths

@@ -1,0 +1,175 @@
+"""A controller that learned nothing, to judge agents by: energy swings the pole up, LQR balances it.
+
+Swing-up: Astrom and Furuta, "Swinging up a pendulum by energy control", Automatica 36, 2000: the pivot is
+accelerated so that the pole's energy rises to that of standing upright. Balance: a discrete linear-quadratic
+regulator of the linearized nominal cart (Anderson and Moore, "Optimal control", 1990). Both act on the state
+in which the chosen force will find the cart: the measured velocities are half a period old, and the motor
+obeys after the cart's latency.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.linalg import solve_discrete_are
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from cartpole_rl.errors import ConfigError
+from cartpole_rl.physics.actuator import static_force
+from cartpole_rl.physics.dynamics import Models, State, advance, coupling, mechanism
+from cartpole_rl.physics.friction import CartFriction, dry_friction, pole_torque, viscous_coefficient
+from cartpole_rl.physics.parameters import GRAVITY, CartParameters
+from cartpole_rl.tasks.features import (
+    ANGULAR_SPEED_SCALE,
+    MOTOR_SCALE,
+    POSITION_SCALE,
+    SPEED_SCALE,
+    ObservationKind,
+    observation_size,
+)
+
+Array = NDArray[np.float64]
+STATE_COST = (10.0, 1.0, 100.0, 1.0)  # of 1 m, 1 m/s, 1 rad, 1 rad/s, squared
+FORCE_COST = 0.05  # of 1 N, squared
+SUBSTEPS = 4  # of the linearized period
+CATCH_ANGLE = math.radians(35)  # from upright; nearer, the regulator takes over if its force is enough
+CATCH_FORCE = 1.0  # of the largest force: what the regulator may ask for when it acts
+PUMP = 3.8  # m/s^2, of the pivot while energy is far from what is aimed at
+NEAR = 0.1  # of the weight times the length: missing energy below which the pivot accelerates less
+SURPLUS = 1.06  # of the pole's weight and length: the energy that is aimed at, friction takes the rest
+CENTRE = (8.0, 1.5)  # m/s^2 per m and per m/s: back to the middle while swinging up
+MARGIN = 0.04  # m, from the track's end: from where braking stops the cart
+
+
+class EnergyAndRegulator:
+    """A policy: `observation` [N, K] to `action` [N], the index of the motor value of the nearest force.
+
+    `nominal` are the parameters of the cart and pole that it is made for. It reads measured positions and
+    velocities (`kind` raw or cos_sin) and the motor value before (`past_motors` of at least 1). Raises
+    ConfigError where the observation holds something else.
+    """
+
+    def __init__(
+        self,
+        nominal: Mapping[str, float],
+        models: Models,
+        motors: Sequence[int],
+        kind: ObservationKind,
+        past_motors: int,
+        period: float,
+    ) -> None:
+        if kind is ObservationKind.POSITIONS or past_motors < 1:
+            raise ConfigError(
+                f"observation.kind={kind}, past_motors={past_motors}: the baseline reads velocities and the "
+                "last motor value; give kind raw or cos_sin, and past_motors of at least 1"
+            )
+        row = [float(nominal[name]) for name in CartParameters.names()]
+        self.models, self.kind, self.period = models, kind, period
+        self.gain = regulator(torch.tensor(row, dtype=torch.float64).unsqueeze(1), models, period)
+        self.cart = CartParameters.from_table(torch.tensor(row).unsqueeze(1))
+        self.body = mechanism(self.cart)
+        self.motors = torch.tensor(list(motors), dtype=torch.float32)
+        self.forces = static_force(self.motors, self.cart, models.actuator)
+        self.strongest = float(self.forces.abs().max())
+
+    def __call__(self, present: TensorDictBase) -> TensorDictBase:
+        """Add `action` to `present`."""
+        state, motor = decoded(present["observation"], self.kind)
+        force = self.force(self.expected(state, motor))
+        return present.set("action", self.nearest(force))
+
+    def expected(self, measured: State, motor: Tensor) -> State:
+        """The state [N] when the next motor value takes effect, while the last one, `motor` [N], is held."""
+        force = static_force(motor, self.cart, self.models.actuator)
+        now = self._after(measured, force, self.period / 2)._replace(x=measured.x, theta=measured.theta)
+        return self._after(now, force, float(self.cart.latency))
+
+    def _after(self, state: State, force: Tensor, step: float) -> State:
+        return advance(state, force, self.cart, self.body, self.models, step)
+
+    def force(self, state: State) -> Tensor:
+        """The force that is wanted in `state`, N, [N]."""
+        balance = self.balance(state)
+        caught = (state.theta.abs() < CATCH_ANGLE) & (balance.abs() < CATCH_FORCE * self.strongest)
+        return self.on_track(state, torch.where(caught, balance, self.swing_up(state)))
+
+    def balance(self, state: State) -> Tensor:
+        """The regulator's force, and what dry friction will take of it, N, [N]."""
+        force = -sum(float(gain) * value for gain, value in zip(self.gain, state, strict=True))
+        return force + dry_friction(
+            state.x_dot + self.period * force / self.cart.total_mass, self.cart, self.models.cart_friction
+        )
+
+    def swing_up(self, state: State) -> Tensor:
+        """The force that gives the pivot the acceleration that energy asks for, N, [N]."""
+        lift = self.body.first_moment * GRAVITY  # J per cos(theta)
+        kinetic = 0.5 * self.body.pivot_inertia * state.theta_dot**2
+        missing = SURPLUS - torch.cos(state.theta) - kinetic / lift  # of the energy upright, in lifts
+        phase = state.theta_dot * torch.cos(state.theta)
+        side = torch.where(phase == 0, torch.ones_like(phase), phase.sign())
+        pumped = -PUMP * (missing / NEAR).clamp(-1, 1) * side
+        wanted = pumped - CENTRE[0] * state.x - CENTRE[1] * state.x_dot
+        return self.force_for(state, wanted)
+
+    def force_for(self, state: State, x_ddot: Tensor) -> Tensor:
+        """The force under which the cart accelerates by `x_ddot` m/s^2, N, [N]: (3.5) and (3.6) inverted."""
+        terms = coupling(state, self.cart, self.body)
+        moment = self.body.first_moment * terms.cos
+        torque = terms.gravity_torque + pole_torque(state.theta_dot, self.cart, self.models.pole_friction)
+        theta_ddot = (torque - moment * x_ddot) / self.body.pivot_inertia
+        reaction = moment * theta_ddot - self.body.first_moment * state.theta_dot**2 * terms.sin
+        viscous = viscous_coefficient(self.cart, self.models.cart_friction) * state.x_dot
+        dry = dry_friction(state.x_dot + self.period * x_ddot, self.cart, self.models.cart_friction)
+        return self.body.total_mass * x_ddot + reaction + viscous + dry
+
+    def on_track(self, state: State, force: Tensor) -> Tensor:
+        """`force` [N], or full braking where the cart could otherwise not be stopped on the track."""
+        braking = (self.strongest / self.cart.total_mass).clamp(min=1e-6)
+        stop = state.x + state.x_dot * state.x_dot.abs() / (2 * braking)  # m, where braking would end
+        end = self.cart.track_half_length - MARGIN
+        return torch.where(stop.abs() > end, -stop.sign() * self.strongest, force)
+
+    def nearest(self, force: Tensor) -> Tensor:
+        """Index [N] of the motor value of the nearest force; of several, the smallest motor value."""
+        distance = (force.unsqueeze(-1) - self.forces).abs() + 1e-6 * self.motors.abs()
+        return distance.argmin(-1)
+
+
+def decoded(observation: Tensor, kind: ObservationKind) -> tuple[State, Tensor]:
+    """Measured state [N] and last motor value [N] of observations [N, K]: `tasks.features` backwards."""
+    size = observation_size(kind)
+    numbers, motor = observation[:, :size].unbind(-1), observation[:, size] * MOTOR_SCALE
+    if kind is ObservationKind.RAW:
+        return State(*numbers), motor
+    x, x_dot, cosine, sine, theta_dot = numbers
+    theta = torch.atan2(sine, cosine)
+    return State(x * POSITION_SCALE, x_dot * SPEED_SCALE, theta, theta_dot * ANGULAR_SPEED_SCALE), motor
+
+
+def regulator(table: Tensor, models: Models, period: float) -> Array:
+    """N per m, m/s, rad and rad/s, [4]: the force is minus their sum. `table` [P, 1] float64 is the cart."""
+    transition, effect = linearized(table, models, period)
+    state_cost, force_cost = np.diag(STATE_COST), np.array([[FORCE_COST]])
+    worth = solve_discrete_are(transition, effect, state_cost, force_cost)
+    gain = np.linalg.solve(force_cost + effect.T @ worth @ effect, effect.T @ worth @ transition)
+    return gain[0]
+
+
+def linearized(table: Tensor, models: Models, period: float) -> tuple[Array, Array]:
+    """(A [4, 4], B [4, 1]) of one period about upright under a held force, dry friction left out."""
+    cart = CartParameters.from_table(table)
+    smooth = CartFriction.NONE if models.cart_friction is CartFriction.NONE else CartFriction.LINEAR
+    body, laws = mechanism(cart), models._replace(cart_friction=smooth)
+
+    def after_a_period(numbers: Tensor) -> Tensor:
+        *motion, force = numbers.unsqueeze(-1)
+        state = State(*motion)
+        for _ in range(SUBSTEPS):
+            state = advance(state, force, cart, body, laws, period / SUBSTEPS)
+        return torch.cat(state)
+
+    slopes = torch.autograd.functional.jacobian(after_a_period, torch.zeros(5, dtype=table.dtype)).numpy()
+    return slopes[:, :4], slopes[:, 4:]

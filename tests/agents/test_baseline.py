@@ -1,0 +1,140 @@
+"""Energy and LQR: the regulator is one, the state is read and led on rightly, and it masters the task."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+
+from cartpole_rl.agents.baseline import EnergyAndRegulator, decoded, linearized, regulator
+from cartpole_rl.choices import choice
+from cartpole_rl.emulator.settings import EmulatorSettings
+from cartpole_rl.envs import CartPoleEnv
+from cartpole_rl.errors import ConfigError
+from cartpole_rl.evaluation.episodes import run_batch
+from cartpole_rl.physics.dynamics import Models, State
+from cartpole_rl.physics.parameters import CartParameters
+from cartpole_rl.plants.emulated import emulated_plant
+from cartpole_rl.plants.simulated import SimulatedPlant
+from cartpole_rl.randomization import PoleSettings
+from cartpole_rl.tasks.features import Measured, ObservationKind, observe
+from cartpole_rl.tasks.starts import Start, StartSettings
+from cartpole_rl.tasks.upright import is_upright
+
+PERIOD = 0.02
+MOTORS = tuple(choice("actions/nine_levels")["motors"])
+HANGING = StartSettings(
+    angle=Start.HANGING, position_spread=0.1, angle_spread=0, speed_spread=0, angular_speed_spread=0
+)
+MakePlant = Callable[..., SimulatedPlant]
+MakeEnvironment = Callable[..., CartPoleEnv]
+
+
+def poles(name: str) -> PoleSettings:
+    return PoleSettings(**choice(f"pole/{name}"))
+
+
+def baseline(
+    ip02: dict[str, float], pole: str, kind: ObservationKind = ObservationKind.COS_SIN, **changes: Any
+) -> EnergyAndRegulator:
+    settings = {"motors": MOTORS, "kind": kind, "past_motors": 3, "period": PERIOD, **changes}
+    return EnergyAndRegulator({**ip02, **poles(pole).nominal.model_dump()}, Models(), **settings)
+
+
+def table(ip02: dict[str, float], pole: str) -> torch.Tensor:
+    nominal = {**ip02, **poles(pole).nominal.model_dump()}
+    return torch.tensor([[nominal[name]] for name in CartParameters.names()], dtype=torch.float64)
+
+
+@pytest.mark.parametrize("pole", ["medium", "large"])
+def test_the_regulator_makes_upright_stable(ip02: dict[str, float], pole: str) -> None:
+    cart = table(ip02, pole)
+    transition, effect = linearized(cart, Models(), PERIOD)
+    assert np.abs(np.linalg.eigvals(transition)).max() > 1.05  # left alone, the pole falls
+    gain = regulator(cart, Models(), PERIOD)
+    assert np.abs(np.linalg.eigvals(transition - effect @ gain[None])).max() < 0.99
+
+
+@pytest.mark.parametrize("kind", [ObservationKind.RAW, ObservationKind.COS_SIN])
+def test_an_observation_is_read_backwards(kind: ObservationKind) -> None:
+    state = Measured(*torch.tensor([[0.1, -0.2], [-0.5, 0.7], [3.0, -1.2], [4.0, -9.0]]))
+    motors = torch.tensor([[200.0, 0.0], [-150.0, 50.0]])
+    seen = torch.cat((torch.stack(observe(state, kind), 1), motors / 255), 1)
+    found, motor = decoded(seen, kind)
+    torch.testing.assert_close(torch.stack(found), torch.stack(state))
+    torch.testing.assert_close(motor, motors[:, 0])
+
+
+def test_what_it_expects_comes_true(ip02: dict[str, float], make_plant: MakePlant) -> None:
+    """Measured velocities are half a period old; led on, they are those that the command will find."""
+    plant = make_plant(1, cart={"latency": 0.0, "track_half_length": 2.0})
+    plant.reset()
+    plant.place(State(*torch.tensor([[0.0], [0.3], [0.8], [2.0]])))
+    before = plant.true_state
+    plant.step(TensorDict({"motor": torch.tensor([[250]])}, [1]))
+    after = plant.true_state
+    velocities = {
+        "x_dot": (after.x - before.x) / PERIOD,
+        "theta_dot": (after.theta - before.theta) / PERIOD,
+    }
+    policy = baseline({**ip02, "latency": 0.0}, "medium")
+    expected = policy.expected(after._replace(**velocities), torch.tensor([250.0]))
+    for name, measured in velocities.items():
+        truth, led_on = getattr(after, name), getattr(expected, name)
+        assert abs(led_on - truth) < 0.5 * abs(measured - truth)
+
+
+def test_the_nearest_force_is_chosen(ip02: dict[str, float]) -> None:
+    policy = baseline(ip02, "medium")  # 1, 2, 3, 4 N at 100, 150, 200, 250
+    wanted = torch.tensor([0.4, 0.6, -2.6, 99.0, -99.0])
+    assert policy.motors[policy.nearest(wanted)].tolist() == [0, 100, -200, 250, -250]
+
+
+def test_it_brakes_before_the_end_of_the_track(ip02: dict[str, float]) -> None:
+    policy = baseline(ip02, "medium")
+    x, x_dot = torch.tensor([0.33, -0.33, 0.1, 0.1]), torch.tensor([1.0, -1.0, 2.0, 0.1])
+    hanging, still = torch.full((4,), 3.0), torch.zeros(4)
+    force = policy.force(State(x, x_dot, hanging, still))
+    assert force[:3].tolist() == [-policy.strongest, policy.strongest, -policy.strongest]
+    assert abs(force[3]) < policy.strongest * 2
+
+
+@pytest.mark.parametrize(
+    "changes", [{"kind": ObservationKind.POSITIONS}, {"past_motors": 0}], ids=["positions", "no motors"]
+)
+def test_what_it_cannot_read_is_told(ip02: dict[str, float], changes: dict[str, Any]) -> None:
+    with pytest.raises(ConfigError, match="the baseline reads velocities and the last motor value"):
+        baseline(ip02, "medium", **changes)
+
+
+@pytest.mark.parametrize(("pole", "score"), [("medium", 3300), ("large", 2900)])
+def test_it_swings_up_and_balances_the_simulated_cart(
+    pole: str,
+    score: float,
+    ip02: dict[str, float],
+    make_plant: MakePlant,
+    make_environment: MakeEnvironment,
+) -> None:
+    env = make_environment(make_plant(20, poles=poles(pole), start=HANGING), MOTORS)
+    episodes = run_batch(env, baseline(ip02, pole))
+    assert {episode.ended_by for episode in episodes} == {"time"}
+    assert all(is_upright(episode.theta[-100:]).all() for episode in episodes)
+    assert min(episode.score.sum() for episode in episodes) > score
+
+
+@pytest.mark.parametrize(("pole", "score"), [("medium", 3000), ("large", 2600)])
+def test_it_swings_up_and_balances_the_emulated_cart(
+    pole: str, score: float, ip02: dict[str, float], make_environment: MakeEnvironment
+) -> None:
+    truth = choice("emulator/large") if pole == "large" else {}
+    truth.pop("defaults", None)
+    env = make_environment(emulated_plant(EmulatorSettings(**truth)), MOTORS)
+    try:
+        (episode,) = run_batch(env, baseline(ip02, pole))
+    finally:
+        env.close()
+    assert episode.ended_by == "time"
+    assert is_upright(episode.theta[-100:]).all()
+    assert episode.score.sum() > score

@@ -1,0 +1,102 @@
+"""What cartpole-record leaves, on every kind of cart, and when it is interrupted; what run=lqr is."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import yaml
+from command_line import in_process
+
+from cartpole_rl.evaluation.recordings import read_recording
+
+
+def headings(path: Path) -> set[str]:
+    return {line for line in path.read_text().splitlines() if line.startswith("#")}
+
+
+def test_every_episode_of_an_agent_is_a_file(trained: Path, tmp_path: Path) -> None:
+    done = in_process("record", f"run={trained}", "episodes=3", "hydra.run.dir=run", folder=tmp_path)
+    assert done.code == 0, done.err
+    assert done.out.endswith("run/recordings/ holds 3 episodes\n")
+    paths = sorted((tmp_path / "run/recordings").iterdir())
+    assert [path.name for path in paths] == [f"episode_00{number}.csv" for number in range(3)]
+    assert all(read_recording(path).steps > 1 for path in paths)
+    assert {
+        "# plant: simulated",
+        "# pole: medium",
+        "# pole_length_m: 0.3556",
+        "# control_period_s: 0.02",
+        f"# run: {trained}",
+    } <= headings(paths[0])
+    config = yaml.safe_load((tmp_path / "run/config.yaml").read_text())
+    assert config["recorded"]["task"]["time_limit"] == 60
+    assert (tmp_path / "run/provenance.json").exists()
+
+
+def test_the_baseline_drives_the_emulated_cart_with_its_own_pole(tmp_path: Path) -> None:
+    words = ("run=lqr", "plant=emulated", "emulator=large", "episodes=1", "hydra.run.dir=run")
+    done = in_process("record", *words, folder=tmp_path)
+    assert done.code == 0, done.err
+    path = tmp_path / "run/recordings/episode_000.csv"
+    assert {"# plant: emulated", "# pole_length_m: 0.6560", "# run: lqr"} <= headings(path)
+    assert abs(read_recording(path).theta[-1]) % 6.2831853 == pytest.approx(0, abs=0.1)
+
+
+def test_an_evaluation_takes_the_baseline(tmp_path: Path) -> None:
+    done = in_process("evaluate", "run=lqr", "pole=large", "episodes=2", "hydra.run.dir=run", folder=tmp_path)
+    assert done.code == 0, done.err
+    metrics = json.loads((tmp_path / "run/metrics.json").read_text())
+    assert metrics["pole"] == "large"
+    assert metrics["score"]["mean"] > 2900
+
+
+def test_the_baseline_knows_the_nominal_cart_and_not_the_simulated_one(tmp_path: Path) -> None:
+    for run, parameters in {"nominal": "null", "other": "{force_linear:0.03}"}.items():
+        words = ("run=lqr", "episodes=1", f"parameters={parameters}", f"hydra.run.dir={run}")
+        assert in_process("record", *words, folder=tmp_path).code == 0
+    first = [read_recording(tmp_path / run / "recordings/episode_000.csv") for run in ("nominal", "other")]
+    assert first[0].motor[0] == first[1].motor[0]
+    assert abs(first[1].x[3] - first[1].x[0]) > 1.3 * abs(first[0].x[3] - first[0].x[0])
+
+
+@pytest.mark.parametrize("pole", ["both", "range"])
+def test_the_baseline_has_one_pole(pole: str, tmp_path: Path) -> None:
+    done = in_process("record", "run=lqr", f"pole={pole}", folder=tmp_path)
+    assert done.code == 2
+    assert "run=lqr is" in done.complaint
+    assert "choose one, as pole=medium" in done.complaint
+    assert not list(tmp_path.glob("runs/record/*"))
+
+
+def test_nothing_is_recorded_of_no_run(tmp_path: Path) -> None:
+    assert "run is missing; give run=..." in in_process("record", folder=tmp_path).complaint
+
+
+def test_an_interrupt_keeps_what_has_ended(tmp_path: Path) -> None:
+    words = ("run=lqr", "plant=emulated", "episodes=1000", "hydra.run.dir=run")
+    recorder = subprocess.Popen(
+        [sys.executable, "-m", "cartpole_rl.commands.record", *words],
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        end = time.monotonic() + 120
+        while not (tmp_path / "run/recordings/episode_000.csv").exists():
+            assert time.monotonic() < end
+            assert recorder.poll() is None
+            time.sleep(0.05)
+        recorder.send_signal(signal.SIGINT)
+        out, err = recorder.communicate(timeout=60)
+    finally:
+        recorder.kill()
+    assert recorder.returncode == 130
+    assert err.endswith("cartpole-record: interrupted\n")
+    paths = sorted((tmp_path / "run/recordings").glob("*.csv"))
+    assert f"holds {len(paths)} episode" in out
+    assert all(read_recording(path).ended_by == "time" for path in paths)

@@ -1,0 +1,29 @@
+"""tests/wire/vectors.json on the firmware: a cart that has just booted gives these answers, byte for byte."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from cartpole_rl.emulator.firmware import Firmware
+from cartpole_rl.wire import FrameSplitter
+
+PATH = Path(__file__).parents[1] / "wire" / "vectors.json"
+VECTORS = json.loads(PATH.read_text(encoding="utf-8"))
+
+
+def test_a_booted_cart_answers_as_the_vectors_say():
+    firmware, splitter = Firmware(lambda: 0), FrameSplitter()
+    for vector in VECTORS["dialogue"]:
+        runs = splitter.feed(bytes.fromhex(vector["send"]))
+        answer = b"".join(frame for stuffed in runs for frame in firmware.receive(stuffed, 0))
+        assert answer.hex(" ") == vector["answer"], vector["name"]
+
+
+@pytest.mark.parametrize("vector", [pytest.param(one, id=one["name"]) for one in VECTORS["damaged"]])
+def test_a_damaged_frame_gets_no_answer(vector):
+    firmware = Firmware(lambda: 0)
+    firmware.homed = True
+    for stuffed in FrameSplitter().feed(bytes.fromhex(vector["hex"])):
+        assert firmware.receive(stuffed, 0) == []
+    assert not firmware.armed

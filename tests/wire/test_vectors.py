@@ -1,0 +1,77 @@
+"""tests/wire/vectors.json, for firmware writers: the host's encoder and decoder agree with every frame in it.
+
+The checksum and the stuffing are worked out a second time here, bit by bit as docs/protocol.md tells them.
+"""
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import pytest
+
+from cartpole_rl.errors import FrameError
+from cartpole_rl.wire import FrameSplitter, MessageType, Reason, decode_frame, encode_frame
+from cartpole_rl.wire.messages import MESSAGES
+
+VECTORS = json.loads((Path(__file__).parent / "vectors.json").read_text(encoding="utf-8"))
+GOOD, DAMAGED, DIALOGUE = VECTORS["good"], VECTORS["damaged"], VECTORS["dialogue"]
+
+
+def named(vectors: list[dict]) -> list:
+    return [pytest.param(vector, id=vector["name"]) for vector in vectors]
+
+
+def by_hand(stuffed: bytes) -> tuple[bytes, int, int]:
+    """Body, checksum as sent, and checksum by the long way."""
+    data, rest = b"", stuffed
+    while rest:
+        code = rest[0]
+        data += rest[1:code]
+        rest = rest[code:]
+        if rest and code != 255:
+            data += b"\x00"
+    register = 0xFFFF
+    for byte in data[:-2]:
+        for bit in range(7, -1, -1):
+            carry = (register >> 15) ^ (byte >> bit & 1)
+            register = (register << 1 & 0xFFFF) ^ (0x1021 if carry else 0)
+    return data[:-2], data[-2] | data[-1] << 8, register
+
+
+@pytest.mark.parametrize("vector", named(GOOD))
+def test_a_good_frame_is_encoded_and_decoded(vector):
+    wire = bytes.fromhex(vector["hex"])
+    message = MESSAGES[MessageType[vector["type"]]](**vector["fields"])
+    assert encode_frame(message, vector["sequence"], vector["flags"]) == wire
+    frame = decode_frame(wire[:-1])
+    assert (frame.message, frame.sequence, frame.flags) == (message, vector["sequence"], vector["flags"])
+    assert asdict(frame.message) == vector["fields"]
+
+
+@pytest.mark.parametrize("vector", named(GOOD))
+def test_a_good_frame_is_good_by_hand(vector):
+    body, sent, worked_out = by_hand(bytes.fromhex(vector["hex"])[:-1])
+    assert sent == worked_out
+    assert body[:4] == bytes((1, MessageType[vector["type"]], vector["sequence"], vector["flags"]))
+
+
+@pytest.mark.parametrize("vector", named(DAMAGED))
+def test_a_damaged_frame_is_dropped_and_the_next_one_is_not(vector):
+    splitter = FrameSplitter()
+    hello = encode_frame(MESSAGES[MessageType.HELLO](), 9)
+    *damaged, last = splitter.feed(bytes.fromhex(vector["hex"]) + hello)
+    assert last == hello[:-1]
+    for stuffed in damaged:
+        with pytest.raises(FrameError):
+            decode_frame(stuffed)
+
+
+@pytest.mark.parametrize("vector", named([vector for vector in DIALOGUE if vector["answer"]]))
+def test_an_answer_can_be_read(vector):
+    decode_frame(bytes.fromhex(vector["answer"])[:-1])
+
+
+def test_every_type_and_every_refusal_is_there():
+    assert {vector["type"] for vector in GOOD} == {kind.name for kind in MessageType}
+    reasons = {vector["fields"]["reason"] for vector in GOOD if vector["type"] == "NACK"}
+    assert reasons == {reason.value for reason in Reason}
