@@ -57,7 +57,7 @@ def test_the_readme_opens_with_the_two_commands() -> None:
 
 def test_every_command_is_one_that_a_test_here_runs() -> None:
     known = {"./scripts/demo", "./scripts/test", "pip", "tensorboard"}
-    known |= {"cartpole-train", "cartpole-evaluate", "cartpole-emulate"}
+    known |= {f"cartpole-{verb}" for verb in ("train", "evaluate", "record", "replay", "finetune", "emulate")}
     assert {command.split()[0] for command in COMMANDS} == known
 
 
@@ -107,6 +107,27 @@ def serial_port() -> Callable[[], str]:
     for process in running:
         process.send_signal(signal.SIGINT)
         assert process.wait(timeout=20) in (0, 130)
+
+
+def test_record_and_replay(trained: Path) -> None:
+    (record,), (replay,) = listed("cartpole-record"), listed("cartpole-replay")
+    recorded = run(record.replace("<run>", "first"), "hydra.run.dir=runs/record/first", cwd=trained)
+    assert recorded.returncode == 0, recorded.stderr
+    replayed = run(replay.replace("<run>", "first"), "hydra.run.dir=runs/replay/first", cwd=trained)
+    assert replayed.returncode == 0, replayed.stderr
+    assert (trained / "runs/replay/first/replay.json").exists()
+
+
+@pytest.mark.parametrize("command", listed("cartpole-finetune"))
+def test_finetune(command: str, trained: Path, serial_port: Callable[[], str]) -> None:
+    command = command.replace("<run>", "first").replace("episodes=20", "")
+    if "/dev/ttyUSB0" in command:
+        command = command.replace("/dev/ttyUSB0", serial_port())
+    short = ["episodes=1", "evaluation_episodes=1", "finetuning.iterations=1", "compile=false"]
+    folder = f"runs/finetune/{abs(hash(command))}"
+    result = run(command, *short, f"hydra.run.dir={folder}", cwd=trained)
+    assert result.returncode == 0, result.stderr
+    assert (trained / folder / "checkpoints/last.pt").exists()
 
 
 def test_emulate() -> None:
