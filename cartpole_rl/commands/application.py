@@ -114,7 +114,7 @@ def quieten() -> None:
 
 def tell(name: str, message: str) -> None:
     """One line on stderr."""
-    print(f"cartpole-{name}: {message}", file=sys.stderr)
+    print(f"cartpole-{name.replace('_', '-')}: {message}", file=sys.stderr)
 
 
 def remove_if_empty(folder: Path) -> None:

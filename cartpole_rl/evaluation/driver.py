@@ -166,5 +166,4 @@ def _drive(env: CartPoleEnv, policy: nn.Module, drive: Drive, parent: int) -> Dr
     finally:
         gc.enable()
     assert isinstance(env.plant, SerialPlant)
-    env.plant.halt()
     return Driven(episode, env.plant.cart.statistics)

@@ -45,6 +45,7 @@ def run_batch(env: CartPoleEnv, policy: Policy) -> list[Episode]:
         times.append(times[-1] + following["dt"])
         _note_endings(env, following, endings)
         present = following.exclude("reward")
+    env.plant.halt()  # a real cart keeps its last motor value
     columns = {key: torch.cat(values, 1).cpu().numpy() for key, values in steps.items()}
     columns["state"], columns["counts"] = (torch.stack(each, 1).cpu().numpy() for each in (states, counts))
     columns["time"] = torch.cat(times, 1).cpu().numpy()

@@ -21,7 +21,7 @@ def emulated_plant(
     add a period to a lockstep run, which is then repeatable; with them, a lost answer costs little time.
     """
     cart = EmulatedCart(emulator)
-    disturbed = emulator.frame_loss > 0 or emulator.frame_corruption > 0
+    disturbed = bool(emulator.frame_loss or emulator.frame_corruption or emulator.frame_reordering)
     settings = SerialPlantSettings(
         port=cart.port,
         start=emulator.start,

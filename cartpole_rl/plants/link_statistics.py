@@ -5,7 +5,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-LATENCY_SAMPLES = 4096  # the newest 82 s at 50 Hz
+from cartpole_rl.errors import PlantError
+
+LATENCY_SAMPLES = 65536  # the newest 22 minutes at 50 Hz; 512 KiB
 
 
 class LatencyRing:
@@ -38,8 +40,9 @@ class LinkSummary:
     lost_frames: int
     late_ticks: int
     latency_samples: int
-    latency_median_ms: float  # nan without samples, as the two below
+    latency_median_ms: float  # nan without samples, as the three below
     latency_p99_ms: float
+    latency_p999_ms: float
     latency_max_ms: float
 
 
@@ -50,23 +53,41 @@ class LinkStatistics:
     frames_received: int = 0  # whole frames of the cart, of every type
     bad_frames: int = 0  # bytes between two 0x00 that are no frame: checksum, stuffing, type, length
     lost_frames: int = 0  # states that never arrived whole, by the gaps in STATE's tick
-    late_ticks: int = 0  # states that came while the host was busy with an older one
+    late_ticks: int = 0  # states passed over, or answered later than a period after they came
     latency: LatencyRing = field(default_factory=LatencyRing)
 
     def summary(self) -> LinkSummary:
-        """The counts and the latency's median, 99th percentile and maximum."""
+        """The counts and the latency's median, 99th and 99.9th percentile and maximum."""
         times = self.latency.samples() * 1e3
-        median, p99, longest = np.percentile(times, (50, 99, 100)) if len(times) else (np.nan,) * 3
+        percentiles = np.percentile(times, (50, 99, 99.9, 100)) if len(times) else np.full(4, np.nan)
+        median, p99, p999, longest = percentiles.tolist()
         return LinkSummary(
             self.frames_received,
             self.bad_frames,
             self.lost_frames,
             self.late_ticks,
             len(times),
-            float(median),
-            float(p99),
-            float(longest),
+            median,
+            p99,
+            p999,
+            longest,
         )
+
+    def state_to_command(self, share: float = 0.98) -> tuple[float, float]:
+        """[low, high] in s between which the middle `share` of the measured latencies lie.
+
+        The bounds of `latency` in the simulator's randomization (`absolute: [low, high]`), so far as the
+        host's part goes: from a state's arrival here to the end of its command. The time on the wire and that
+        which the motor takes come on top; `cartpole-preflight` measures them. Raises PlantError without a
+        sample, ValueError for a share outside 0 to 1.
+        """
+        if not 0 <= share <= 1:
+            raise ValueError(f"a share is between 0 and 1, not {share:g}")
+        times = self.latency.samples()
+        if not len(times):
+            raise PlantError("no latency was measured yet: drive the cart first")
+        low, high = np.quantile(times, ((1 - share) / 2, (1 + share) / 2)).tolist()
+        return low, high
 
     def clear(self) -> None:
         """Begin to count anew."""

@@ -23,6 +23,7 @@ from cartpole_rl.settings import Positive
 from cartpole_rl.wire import Fault, Flags, State
 
 CLOCK_WRAP = 2**32  # us; STATE's clock begins anew after 71.6 minutes
+TICK_WRAP = 2**32  # periods
 UPRIGHT_TOLERANCE = math.radians(3)
 HANGING_TOLERANCE = math.radians(5)
 UPRIGHT_SWAY = math.radians(1.5)  # a hand is never quite still
@@ -124,7 +125,10 @@ class SerialPlant(Plant):
         before = self._state
         try:
             self.cart.set_motor(int(tensordict["motor"]))
-            self._state = self.cart.get_state()
+            state = self.cart.get_state()
+            if (state.tick - before.tick) % TICK_WRAP > TICK_WRAP // 2:
+                raise LinkError("the cart has restarted; check its power")
+            self._state = state
         except (LinkError, RefusedError, FaultError) as error:
             self._break_off(error)
             return self.step_frame(*self._report(self.settings.control_period))

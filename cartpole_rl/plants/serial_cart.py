@@ -3,8 +3,12 @@
 Which state counts. The cart dictates the pace: it sends a STATE each period, the host answers with one
 command. `get_state` returns the newest state, and only one that was measured after the cart had taken the
 last frame (STATE tells its sequence), so that a loop never acts on the past and never looks for a command's
-effect in a state from before it. A state passed over for that is a late tick. A command that was lost on the
-way is never acknowledged: one and a half periods after it the newest state is taken as it is.
+effect in a state from before it. A command that was lost on the way is never acknowledged: one and a half
+periods after it the newest state is taken as it is.
+
+Late ticks, while states are answered with motor values: each state that is passed over, and each one whose
+command went out later than a period after it came. The second is counted only where the cart's tick went on
+meanwhile: a lockstep emulator waits for the host, and nothing is late there.
 
 When nothing comes. After `nudge_after` seconds of silence the host says HELLO. That is harmless to a cart
 with a clock of its own, and lets a lockstep emulator, which moves once per frame, go on after a lost frame.
@@ -26,7 +30,7 @@ from cartpole_rl.errors import LinkError, PlantError
 from cartpole_rl.plants.link_statistics import LinkStatistics
 from cartpole_rl.plants.serial_errors import RefusedError, fault_error, refusal
 from cartpole_rl.plants.serial_link import SerialLink
-from cartpole_rl.plants.serial_port import open_port
+from cartpole_rl.plants.serial_port import open_port, resolved_port
 from cartpole_rl.settings import Count, Positive, Settings
 from cartpole_rl.wire import (
     Ack,
@@ -59,7 +63,7 @@ UNACKNOWLEDGED_PERIODS = 1.5  # of a frame: by then the state after it has come,
 class SerialSettings(Settings):
     """How to reach a cart. Times in s."""
 
-    port: str  # /dev/ttyUSB0, COM3, or a URL of pyserial
+    port: str  # /dev/ttyUSB0, COM3, a URL of pyserial, or auto: the only cart that is plugged in
     baud: Count = 921600  # 115200 is allowed too
     timeout: Positive = 1.0  # without a state for so long, the link is lost
     connect_timeout: Positive = 3.0  # for the first answer; a board that restarts when opened needs about 1 s
@@ -87,6 +91,7 @@ class SerialCart:
 
     def __init__(self, settings: SerialSettings) -> None:
         self.settings = settings
+        self.port = settings.port  # once opened, the one that "auto" was found to be
         self.statistics = LinkStatistics()
         self.flags = Flags(0)  # of the newest state
         self._open_link: SerialLink | None = None
@@ -100,6 +105,9 @@ class SerialCart:
         self._state_since_refusal = True
         self._driving = False  # states are being answered with motor values
         self._unanswered = False  # a state was returned and its command is not sent yet
+        self._answering: State | None = None  # the state that was returned last
+        self._overdue: State | None = None  # its command went out later than a period after it came
+        self._catching_up = False  # what is missing now was thrown away while the host did something else
 
     def __enter__(self) -> Self:
         self.open()
@@ -121,7 +129,8 @@ class SerialCart:
         if self._open_link is not None:
             return self.information
         settings = self.settings
-        port = open_port(settings.port, settings.baud, settings.write_timeout)
+        self.port = resolved_port(settings.port)
+        port = open_port(self.port, settings.baud, settings.write_timeout)
         self._open_link = SerialLink(port, self.statistics)
         try:
             self._information = self._shake_hands()
@@ -152,7 +161,7 @@ class SerialCart:
     def information(self) -> Info:
         """What the cart told when it last sent INFO, without asking again."""
         if self._information is None:
-            raise LinkError(f"the cart on {self.settings.port} was never reached: open() it first")
+            raise LinkError(f"the cart on {self.port} was never reached: open() it first")
         return self._information
 
     def info(self) -> Info:
@@ -213,7 +222,9 @@ class SerialCart:
         link.send(SetMotor(sent))
         if self._unanswered:
             self._driving = True
-            self.statistics.latency.add(link.sent_at - self._newest_at)
+            delay = link.sent_at - self._newest_at
+            self.statistics.latency.add(delay)
+            self._overdue = self._answering if delay > self.information.period_us * 1e-6 else None
             self._unanswered = False
         return sent
 
@@ -224,7 +235,7 @@ class SerialCart:
         refused the last motor value, LinkError if no state comes within `timeout`.
         """
         if self._link.waiting() > BACKLOG_BYTES:
-            self._last_tick = None  # what is missing after this was the host's own delay
+            self._catching_up = True
             self._link.send(Hello())  # and only a state that acknowledges it is newer than the backlog
         return self._current_state()
 
@@ -240,7 +251,7 @@ class SerialCart:
     @property
     def _link(self) -> SerialLink:
         if self._open_link is None:
-            raise LinkError(f"the port {self.settings.port} is not open: use `with SerialCart(...) as cart`")
+            raise LinkError(f"the port {self.port} is not open: use `with SerialCart(...) as cart`")
         return self._open_link
 
     def _abandon(self) -> None:
@@ -268,7 +279,7 @@ class SerialCart:
             answer = self._await_answer(until, (), Info, lambda info: True)
             if answer is not None:
                 return answer
-        raise LinkError(f"no cart answers on {self.settings.port}: {self._what_came()}")
+        raise LinkError(f"no cart answers on {self.port}: {self._what_came()}")
 
     def _what_came(self) -> str:
         link = self._link
@@ -289,6 +300,7 @@ class SerialCart:
     ) -> Answer:
         """Send `message` until the cart answers it. Raises what a NACK says; LinkError without an answer."""
         self._driving = self._unanswered = False
+        self._overdue = None
         self._refused_sequence = -1
         self._answers.clear()
         asked: list[int] = []
@@ -299,7 +311,7 @@ class SerialCart:
                 self._refused = None  # of a motor value from before; it has no meaning any more
                 return answer
         raise LinkError(
-            f"the cart on {self.settings.port} did not answer {message.TYPE.name}, asked {len(asked)} times: "
+            f"the cart on {self.port} did not answer {message.TYPE.name}, asked {len(asked)} times: "
             "check its cable and power"
         )
 
@@ -325,7 +337,8 @@ class SerialCart:
         refused, self._refused = self._refused, None
         if refused is not None and not state.fault:
             raise refusal(refused)
-        self._unanswered = True
+        self._count_overdue(state)
+        self._catching_up, self._unanswered, self._answering = False, True, state
         return state
 
     def _await_current(self, deadline: float) -> State:
@@ -360,7 +373,7 @@ class SerialCart:
         now = time.perf_counter()
         if now > deadline:
             raise LinkError(
-                f"no state came from {self.settings.port} for {self.settings.timeout:g} s: "
+                f"no state came from {self.port} for {self.settings.timeout:g} s: "
                 "check the cart's cable and power"
             )
         if now - max(self._link.received_at, self._link.sent_at) > self.settings.nudge_after:
@@ -392,12 +405,25 @@ class SerialCart:
         if self._last_tick is not None:
             missing = (state.tick - self._last_tick - 1) % TICKS
             if missing < TICKS // 2:  # otherwise the tick went back: the cart has restarted
-                self.statistics.lost_frames += missing
+                self._count_missing(missing)
         self._last_tick = state.tick
         self._newest = state
         self._state_since_refusal = True
         self._newest_at = self._link.received_at
         self.flags = flags
+
+    def _count_missing(self, states: int) -> None:
+        """States that never came: lost on the way, or thrown away here while the host was busy."""
+        if not self._catching_up:
+            self.statistics.lost_frames += states
+        elif self._driving:
+            self.statistics.late_ticks += states
+
+    def _count_overdue(self, state: State) -> None:
+        """A state whose command took over a period, if by the cart's clock too more than one lies between."""
+        overdue, self._overdue = self._overdue, None
+        if overdue is not None and state.tick != (overdue.tick + 1) % TICKS:
+            self.statistics.late_ticks += 1
 
     def _count_late(self) -> None:
         """A state nobody acted on; while the host asks other things than motor values, that is no delay."""

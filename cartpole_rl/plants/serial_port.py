@@ -1,4 +1,4 @@
-"""Opens a serial port for a cart, and says in words why one cannot be opened.
+"""Finds and opens the serial port of a cart, and says in words why one cannot be found or opened.
 
 An ESP32 board restarts when DTR or RTS rise, so both are set low before the port is opened. The operating
 system may still pulse them for a moment; `SerialCart` therefore says hello until the cart has booted.
@@ -6,13 +6,16 @@ Source: Espressif, "Boot Mode Selection", esptool documentation; pyserial 3.5.
 """
 
 import errno
+from collections.abc import Iterable
 
 import serial
 from serial.tools import list_ports
 
 from cartpole_rl.errors import PortError
+from cartpole_rl.plants.serial_ports import UsbPort, cart_like, described, usb_ports
 
 READ_SLICE = 0.01  # s that one read blocks at most; callers look at their own clocks in between
+AUTO = "auto"
 
 
 def open_port(port: str, baud: int, write_timeout: float) -> serial.SerialBase:
@@ -37,11 +40,39 @@ def open_port(port: str, baud: int, write_timeout: float) -> serial.SerialBase:
     return line
 
 
+def resolved_port(port: str) -> str:
+    """`port`, or for "auto" the only one of this computer that may be a cart. Raises PortError."""
+    return only_cart(found_ports()) if port == AUTO else port
+
+
+def only_cart(ports: Iterable[UsbPort]) -> str:
+    """Path of the only port that may be a cart. Raises PortError, which names those there are."""
+    ports = list(ports)
+    carts = cart_like(ports)
+    if len(carts) == 1:
+        return carts[0].device
+    if carts:
+        raise PortError(
+            f"port=auto: {len(carts)} of the ports may be the cart: {named(carts)}; choose one, as "
+            f"plant.port={carts[0].device}; `cartpole-find-port watch=true` tells which it is"
+        )
+    others = f"; there are {named(ports)}" if ports else ""
+    raise PortError(f"port=auto: no port looks like a cart{others}; plug the cart in, or give plant.port=...")
+
+
+def found_ports() -> list[UsbPort]:
+    """The USB serial ports of this computer."""
+    return usb_ports(list_ports.comports())
+
+
 def why_not_open(port: str, error: OSError | ValueError) -> str:
     """One line: the port, what is wrong with it, and the remedy."""
     number = getattr(error, "errno", None)
     if number in (errno.ENOENT, errno.ENODEV, errno.ENXIO):
-        return f"{port} does not exist: plug the cart in, or choose one of the ports found: {ports_found()}"
+        return (
+            f"{port} does not exist: plug the cart in, or choose one of the ports found: "
+            f"{named(found_ports()) or 'none'}"
+        )
     if number in (errno.EACCES, errno.EPERM):
         return (
             f"{port} may not be opened by this user: join the group that owns it, on most systems "
@@ -52,8 +83,6 @@ def why_not_open(port: str, error: OSError | ValueError) -> str:
     return f"{port} cannot be opened as a serial port: {error}"
 
 
-def ports_found() -> str:
-    """Paths of the USB serial ports of this computer, or "none"."""
-    return (
-        ", ".join(sorted(found.device for found in list_ports.comports() if found.vid is not None)) or "none"
-    )
+def named(ports: Iterable[UsbPort]) -> str:
+    """The ports in one line: "/dev/ttyUSB0 (CH340), /dev/ttyUSB1 (FTDI)"."""
+    return ", ".join(f"{port.device} ({described(port)})" for port in ports)

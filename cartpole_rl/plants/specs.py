@@ -48,6 +48,9 @@ class Plant(EnvBase):
         """m, [N]: twice the distance from pivot to centre of mass; what a length-aware agent observes."""
         raise NotImplementedError
 
+    def halt(self) -> None:
+        """Motor to 0 until the next reset. A simulated cart stands still anyway when nobody steps it."""
+
     def restart(self, rows: torch.Tensor) -> TensorDict:
         """Begin a new episode on the carts `rows`, [R] int64; their first frame, [R]."""
         mask = torch.zeros(self.carts, 1, dtype=torch.bool, device=self.device)

@@ -135,6 +135,63 @@ class CartPeer(Peer):
             self.state = replace(self.state, motor_applied=0)
 
 
+class Between:
+    """A cable to a cart's port with an end of its own, `port`: frames pass, some with a sign turned.
+
+    `motor`, `cart` and `pole` are 1, or -1 for a motor or an encoder that is connected the wrong way round.
+    """
+
+    def __init__(self, cart_port: str, motor: int = 1, cart: int = 1, pole: int = 1) -> None:
+        self.signs = motor, cart, pole
+        self._master, self._slave = os.openpty()
+        self._cart = os.open(cart_port, os.O_RDWR | os.O_NOCTTY)
+        for line in (self._slave, self._cart):
+            tty.setraw(line)
+        self.port = os.ttyname(self._slave)
+        self._wake_read, self._wake_write = os.pipe()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def cut(self) -> None:
+        """Pull the cable: both sides are gone."""
+        if self._thread.is_alive():
+            os.write(self._wake_write, b"x")
+            self._thread.join()
+            for descriptor in (self._master, self._slave, self._cart, self._wake_read, self._wake_write):
+                os.close(descriptor)
+
+    def __enter__(self) -> "Between":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.cut()
+
+    def _run(self) -> None:
+        ways = {self._master: (FrameSplitter(), self._cart), self._cart: (FrameSplitter(), self._master)}
+        while True:
+            ready = select.select([*ways, self._wake_read], [], [])[0]
+            if self._wake_read in ready:
+                return
+            for source in ready:
+                splitter, target = ways[source]
+                for stuffed in splitter.feed(os.read(source, 4096)):
+                    frame = decode_frame(stuffed)
+                    os.write(target, encode_frame(self._turned(frame.message), frame.sequence, frame.flags))
+
+    def _turned(self, message: Message) -> Message:
+        motor, cart, pole = self.signs
+        if isinstance(message, SetMotor):
+            return replace(message, motor=motor * message.motor)
+        if isinstance(message, State):
+            return replace(
+                message,
+                motor_applied=motor * message.motor_applied,
+                cart_counts=cart * message.cart_counts,
+                pole_counts=message.pole_counts if pole > 0 else 2 * HANGING - message.pole_counts,
+            )
+        return message
+
+
 def open_descriptors() -> int:
     """File descriptors that this process holds."""
     return len(list(Path("/proc/self/fd").iterdir()))

@@ -130,3 +130,19 @@ def test_closing_ends_the_process() -> None:
     plant.close()
     with pytest.raises(ProcessLookupError):
         os.kill(emulated.pid, 0)
+
+
+def test_a_restart_of_the_cart_ends_the_episode_with_what_came_last() -> None:
+    with contextlib.closing(emulated_plant(fast(reset_at=45.0))) as plant:
+        plant.reset()
+        last = None
+        for step in range(2000):
+            frame = push(plant, 100 if step % 20 < 10 else -100)
+            if frame["done"]:
+                break
+            last = frame
+        assert plant.ended_by == "link"
+        assert last is not None
+        assert frame["truncated"]
+        assert frame["counts"].tolist() == last["counts"].tolist()
+        assert frame["dt"].item() == pytest.approx(0.02)

@@ -24,6 +24,7 @@ BUDGET = [
     "learning.evaluation_episodes=2",
     "replay.size=2000",
 ]
+VERBS = ("train", "evaluate", "record", "replay", "finetune", "emulate", "find-port", "preflight")
 COMMANDS = re.findall(
     r"^    ((?:cartpole-|tensorboard|\./scripts/|pip ).*?)(?:\s+#.*)?$",
     (ROOT / "README.md").read_text(),
@@ -57,7 +58,7 @@ def test_the_readme_opens_with_the_two_commands() -> None:
 
 def test_every_command_is_one_that_a_test_here_runs() -> None:
     known = {"./scripts/demo", "./scripts/test", "pip", "tensorboard"}
-    known |= {f"cartpole-{verb}" for verb in ("train", "evaluate", "record", "replay", "finetune", "emulate")}
+    known |= {f"cartpole-{verb}" for verb in VERBS}
     assert {command.split()[0] for command in COMMANDS} == known
 
 
@@ -128,6 +129,18 @@ def test_finetune(command: str, trained: Path, serial_port: Callable[[], str]) -
     result = run(command, *short, f"hydra.run.dir={folder}", cwd=trained)
     assert result.returncode == 0, result.stderr
     assert (trained / folder / "checkpoints/last.pt").exists()
+
+
+def test_find_port_tells_what_there_is(tmp_path: Path) -> None:
+    (command,) = listed("cartpole-find-port")
+    result = run(command, cwd=tmp_path)
+    assert "USB serial port" in result.stdout + result.stderr
+
+
+def test_preflight(tmp_path: Path, serial_port: Callable[[], str]) -> None:
+    (command,) = listed("cartpole-preflight")
+    result = run(command.replace("/dev/ttyUSB0", serial_port()), cwd=tmp_path)
+    assert result.returncode == 0, result.stdout + result.stderr
 
 
 def test_emulate() -> None:

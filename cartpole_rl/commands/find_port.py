@@ -1,0 +1,70 @@
+"""cartpole-find-port: which serial ports there are, and which of them is the cart.
+
+cartpole-find-port                  lists the USB serial ports, each with the chip that tells boards apart
+cartpole-find-port watch=true       names the port that vanishes when the cart is unplugged, or appears
+"""
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from cartpole_rl.commands.application import application
+from cartpole_rl.errors import PortError
+from cartpole_rl.plants.serial_port import found_ports
+from cartpole_rl.plants.serial_ports import UsbPort, cart_like, changes, described
+from cartpole_rl.settings import Positive, Settings
+
+LOOK_EVERY = 0.2  # s
+REMEDY = (
+    "plug the cart in and switch it on; if it is, try another cable (many only charge), another USB socket, "
+    "and install the driver of its chip (CP210x, CH340, FTDI)"
+)
+
+PortList = Callable[[], list[UsbPort]]
+
+
+class FindPortConfig(Settings):
+    """cartpole-find-port."""
+
+    watch: bool
+    timeout: Positive  # s that `watch` waits for a change
+
+
+@application("find_port", FindPortConfig)
+def main(config: FindPortConfig, folder: Path) -> None:
+    """List the ports, or watch them change. Raises PortError where there is none to tell of."""
+    print(listing(found_ports()) if not config.watch else watched(found_ports, config.timeout))
+
+
+def listing(ports: list[UsbPort]) -> str:
+    """One line a port, and the one to give to a command. Raises PortError where there is none."""
+    if not ports:
+        raise PortError(f"no USB serial port was found: {REMEDY}")
+    lines = [f"{port.device}  {described(port)}" for port in ports]
+    carts = cart_like(ports)
+    if len(carts) == 1:
+        lines.append(f"The cart is probably on it: plant.port={carts[0].device}, or plant.port=auto")
+    elif carts:
+        lines.append("`cartpole-find-port watch=true` tells which of them is the cart")
+    else:
+        lines.append("None of them has a chip that carts have (CP210x, CH340, FTDI, Espressif)")
+    return "\n".join(lines)
+
+
+def watched(ports: PortList, timeout: float) -> str:
+    """Wait until a port vanishes or appears, and name it. Raises PortError after `timeout` s."""
+    before = ports()
+    print(f"{len(before)} found. Unplug the cart now, or plug it in if it is not yet ...", flush=True)
+    end = time.monotonic() + timeout
+    while time.monotonic() < end:
+        vanished, appeared = changes(before, ports())
+        if changed := [*vanished, *appeared]:
+            what = "vanished" if vanished else "appeared"
+            lines = [f"{port.device} {what}: plant.port={port.device}  {described(port)}" for port in changed]
+            return "\n".join([*lines, *(["Plug it in again before you use it."] if vanished else [])])
+        time.sleep(LOOK_EVERY)
+    raise PortError(f"no port came or went within {timeout:g} s: {REMEDY}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,76 @@
+"""cartpole-find-port, and what it says of lists of ports."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from command_line import in_process
+
+from cartpole_rl.commands.find_port import listing, watched
+from cartpole_rl.errors import PortError
+from cartpole_rl.plants.serial_port import found_ports
+from cartpole_rl.plants.serial_ports import UsbPort
+
+CH340 = UsbPort("/dev/ttyUSB0", 0x1A86, 0x7523)
+FTDI = UsbPort("/dev/ttyUSB1", 0x0403, 0x6001)
+MODEM = UsbPort("/dev/ttyACM0", 0x2C7C, 0x0125)
+
+
+def test_the_command_lists_what_there_is(tmp_path: Path) -> None:
+    ports = found_ports()
+    done = in_process("find_port", folder=tmp_path)
+    if ports:
+        assert done.code == 0
+        assert all(port.device in done.out for port in ports)
+    else:
+        assert done.code == 1
+        assert "no USB serial port was found: plug the cart in" in done.complaint
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_watch_in_which_nothing_happens_ends(tmp_path: Path) -> None:
+    done = in_process("find_port", "watch=true", "timeout=0.3", folder=tmp_path)
+    assert done.code == 1
+    assert "Unplug the cart now" in done.out
+    assert "no port came or went within 0.3 s" in done.complaint
+
+
+def test_a_wrong_setting_is_told(tmp_path: Path) -> None:
+    assert in_process("find_port", "timeout=-1", folder=tmp_path).code == 2
+
+
+def test_help_has_examples(tmp_path: Path) -> None:
+    assert "cartpole-find-port watch=true" in in_process("find_port", "--help", folder=tmp_path).out
+
+
+@pytest.mark.parametrize(
+    ("ports", "last"),
+    [
+        ([CH340, MODEM], "The cart is probably on it: plant.port=/dev/ttyUSB0, or plant.port=auto"),
+        ([CH340, FTDI], "`cartpole-find-port watch=true` tells which of them is the cart"),
+        ([MODEM], "None of them has a chip that carts have (CP210x, CH340, FTDI, Espressif)"),
+    ],
+)
+def test_a_listing_ends_in_what_to_do(ports: list[UsbPort], last: str) -> None:
+    *lines, end = listing(ports).splitlines()
+    assert end == last
+    assert [line.split()[0] for line in lines] == [port.device for port in ports]
+
+
+def test_nothing_to_list() -> None:
+    with pytest.raises(PortError, match="no USB serial port was found"):
+        listing([])
+
+
+@pytest.mark.parametrize(
+    ("lists", "words"),
+    [
+        (([CH340, FTDI], [CH340, FTDI], [CH340]), "/dev/ttyUSB1 vanished: plant.port=/dev/ttyUSB1"),
+        (([FTDI], [CH340, FTDI]), "/dev/ttyUSB0 appeared: plant.port=/dev/ttyUSB0"),
+    ],
+)
+def test_the_port_that_changes_is_the_cart(lists: tuple[list[UsbPort], ...], words: str) -> None:
+    following: Iterator[list[UsbPort]] = iter(lists)
+    said = watched(lambda: next(following), timeout=10)
+    assert said.startswith(words)
+    assert ("Plug it in again" in said) == ("vanished" in words)

@@ -1,0 +1,83 @@
+"""Which port is the cart: pure functions of a list of ports as pyserial gives it."""
+
+import pytest
+from serial.tools.list_ports_common import ListPortInfo
+
+from cartpole_rl.errors import PortError
+from cartpole_rl.plants.serial_cart import SerialCart, SerialSettings
+from cartpole_rl.plants.serial_port import found_ports, only_cart, resolved_port
+from cartpole_rl.plants.serial_ports import UsbPort, cart_like, changes, described, usb_ports
+
+
+def listed(device: str, vid: int | None, product: str | None = None) -> ListPortInfo:
+    port = ListPortInfo(device)
+    port.vid, port.pid, port.product = vid, 0x7523 if vid else None, product
+    return port
+
+
+CH340 = UsbPort("/dev/ttyUSB0", 0x1A86, 0x7523, "USB Serial")
+FTDI = UsbPort("/dev/ttyUSB1", 0x0403, 0x6001, "FT232R", "A50285BI")
+MODEM = UsbPort("/dev/ttyACM0", 0x2C7C, 0x0125)
+
+
+def test_a_computers_own_lines_are_left_out() -> None:
+    ports = [
+        listed("/dev/ttyUSB1", 0x0403, "FT232R"),
+        listed("/dev/ttyS0", None),
+        listed("/dev/ttyACM0", 0x303A),
+    ]
+    assert usb_ports(ports) == [
+        UsbPort("/dev/ttyACM0", 0x303A, 0x7523),
+        UsbPort("/dev/ttyUSB1", 0x0403, 0x7523, "FT232R"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("vendor", "words"),
+    [(0x10C4, "CP210x"), (0x1A86, "CH340"), (0x0403, "FTDI"), (0x303A, "Espressif"), (0x2C7C, "no chip")],
+)
+def test_a_board_is_told_by_its_chip(vendor: int, words: str) -> None:
+    port = UsbPort("/dev/ttyUSB0", vendor, 1)
+    assert words in described(port)
+    assert cart_like([port]) == ([] if words == "no chip" else [port])
+
+
+def test_a_description_has_what_tells_two_of_a_kind_apart() -> None:
+    assert described(FTDI) == "FTDI 'FT232R', id 0403:6001, serial number A50285BI"
+
+
+def test_what_came_and_went() -> None:
+    assert changes([CH340, FTDI], [FTDI]) == ([CH340], [])
+    assert changes([FTDI], [CH340, FTDI]) == ([], [CH340])
+    assert changes([FTDI], [FTDI]) == ([], [])
+
+
+def test_the_only_cart_is_taken_whatever_else_there_is() -> None:
+    assert only_cart([MODEM, CH340]) == "/dev/ttyUSB0"
+
+
+def test_of_several_a_person_chooses() -> None:
+    with pytest.raises(PortError, match=r"2 of the ports .*ttyUSB0 \(WCH CH340.*ttyUSB1 \(FTDI.*watch=true"):
+        only_cart([CH340, FTDI, MODEM])
+
+
+@pytest.mark.parametrize(
+    ("ports", "words"),
+    [
+        ([], "looks like a cart; plug the cart in"),
+        ([MODEM], r"looks like a cart; there are /dev/ttyACM0 \(no"),
+    ],
+)
+def test_none_that_looks_like_a_cart(ports: list[UsbPort], words: str) -> None:
+    with pytest.raises(PortError, match=words):
+        only_cart(ports)
+
+
+def test_a_named_port_is_taken_as_it_is() -> None:
+    assert resolved_port("/dev/nosuch0") == "/dev/nosuch0"
+
+
+@pytest.mark.skipif(len(cart_like(found_ports())) == 1, reason="a cart is plugged in")
+def test_a_cart_on_auto_says_why_it_finds_none() -> None:
+    with pytest.raises(PortError, match=r"port=auto: .*plant\.port="):
+        SerialCart(SerialSettings(port="auto")).open()

@@ -1,0 +1,48 @@
+"""What a link's statistics keep, and what they come to."""
+
+import math
+
+import numpy as np
+import pytest
+
+from cartpole_rl.errors import PlantError
+from cartpole_rl.plants.link_statistics import LATENCY_SAMPLES, LatencyRing, LinkStatistics
+from cartpole_rl.randomization import Range
+
+
+def test_the_newest_samples_stay() -> None:
+    ring = LatencyRing()
+    for number in range(LATENCY_SAMPLES + 10):
+        ring.add(number)
+    assert LATENCY_SAMPLES >= 65536
+    assert sorted(ring.samples()) == list(range(10, LATENCY_SAMPLES + 10))
+
+
+def test_percentiles_in_milliseconds() -> None:
+    seen = LinkStatistics()
+    for number in range(10_001):
+        seen.latency.add(number * 1e-6)
+    summary = seen.summary()
+    assert summary.latency_median_ms == pytest.approx(5.0)
+    assert summary.latency_p99_ms == pytest.approx(9.9)
+    assert summary.latency_p999_ms == pytest.approx(9.99)
+    assert summary.latency_max_ms == pytest.approx(10.0)
+
+
+def test_nothing_measured_is_nan_in_the_summary_and_an_error_as_a_distribution() -> None:
+    seen = LinkStatistics()
+    assert math.isnan(seen.summary().latency_p999_ms)
+    with pytest.raises(PlantError, match="drive the cart first"):
+        seen.state_to_command()
+
+
+def test_the_distribution_is_one_that_the_randomization_takes() -> None:
+    seen = LinkStatistics()
+    for seconds in np.random.default_rng(0).uniform(0.002, 0.012, 5000):
+        seen.latency.add(seconds)
+    low, high = seen.state_to_command()
+    assert (low, high) == (pytest.approx(0.0021, abs=1e-4), pytest.approx(0.0119, abs=1e-4))
+    assert seen.state_to_command(share=0) == (pytest.approx(0.007, abs=2e-4),) * 2
+    Range(absolute=(low, high)).check("latency", 0.005)
+    with pytest.raises(ValueError, match="between 0 and 1"):
+        seen.state_to_command(share=98)

@@ -1,0 +1,253 @@
+"""However a host ends, the motor is at 0 soon after its last command: told by the emulated cart itself.
+
+The cart runs on the wall clock and writes down, by its own clock, which commands it took and which motor
+value was in force from when on. It homes at once, and is too heavy for full motor to take it off the track.
+"""
+
+import json
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from serial_peer import Between
+from tensordict import TensorDictBase
+
+from cartpole_rl.evaluation.episodes import run_batch
+from cartpole_rl.plants.serial import SerialPlant, SerialPlantSettings
+from cartpole_rl.plants.serial_cart import SerialCart, SerialSettings
+from cartpole_rl.wire import Flags
+
+PERIOD_MS = 20
+WATCHDOG_MS = 4 * PERIOD_MS  # it looks each period whether three are over since the newest command
+FULL = 255
+
+EMULATOR = """
+import json, math, sys
+from cartpole_rl.emulator import firmware, process
+from cartpole_rl.emulator.device import CartDevice
+from cartpole_rl.emulator.homing import CART_METRES, SPAN, Zeros
+from cartpole_rl.emulator.settings import EmulatorSettings
+
+def home_at_once(hanging):
+    reading = yield 0
+    half = round(SPAN / 2 / CART_METRES)
+    return Zeros(reading.cart - half, reading.cart + half, reading.pole)
+
+class Telling(CartDevice):
+    def __init__(self, settings):
+        super().__init__(settings)
+        self.motor = 0
+        self.drive, self.carry_out = self.firmware.drive, self.firmware._carry_out
+        self.firmware.drive, self.firmware._carry_out = self.tell_motor, self.tell_command
+
+    def tell_motor(self, start, end):
+        values = self.drive(start, end)
+        for since, motor in values:
+            if motor != self.motor:
+                self.motor = motor
+                self.tell(us=since, in_force=motor)
+        return values
+
+    def tell_command(self, message, now):
+        self.carry_out(message, now)
+        self.tell(us=now, took=message.TYPE.name, **vars(message))
+        if self.firmware.homing:
+            self.physics.place(0.0, math.pi)
+
+    def tell(self, **what):
+        print(json.dumps(what), file=sys.stderr, flush=True)
+
+firmware.home = home_at_once
+process.CartDevice = Telling
+process.run(EmulatorSettings(clock="real", cart_mass=20.0, physics_step=1e-3))
+"""
+
+HOST = """
+import itertools, signal, sys
+from cartpole_rl.plants.serial_cart import SerialCart, SerialSettings
+
+class Terminated(BaseException):
+    "What the commands of this package make of SIGTERM."
+
+def terminate(number, frame):
+    raise Terminated
+
+if sys.argv[2] == "unwinds":
+    signal.signal(signal.SIGTERM, terminate)
+with SerialCart(SerialSettings(port=sys.argv[1])) as cart:
+    cart.home()
+    cart.start()
+    for period in itertools.count():
+        cart.get_state()
+        cart.set_motor(255)
+        if period == 3:
+            print("driving", flush=True)
+"""
+
+
+class TellingCart:
+    """The emulated cart, and what it has told since `listen`."""
+
+    def __init__(self) -> None:
+        with tempfile.NamedTemporaryFile() as written:
+            self._told = Path(written.name).open("rb")  # noqa: SIM115 - a place of its own in the file
+            self.process = subprocess.Popen(
+                [sys.executable, "-c", EMULATOR], stdout=subprocess.PIPE, stderr=written
+            )
+        assert self.process.stdout is not None
+        self.port = json.loads(self.process.stdout.readline())["port"]
+        self.listen()
+
+    def listen(self) -> None:
+        """Forget what was told so far."""
+        self._from = self._told.seek(0, 2)
+
+    def told(self) -> list[dict[str, Any]]:
+        self._told.seek(self._from)
+        *lines, _ = self._told.read().split(b"\n")
+        return [json.loads(line) for line in lines]
+
+    def stopped(self) -> tuple[float, str]:
+        """Wait until the motor is at 0 after full motor: ms from the last command until then, and by what."""
+        end = time.monotonic() + 10
+        while time.monotonic() < end:
+            told = self.told()
+            full = [line["us"] for line in told if line.get("in_force") == FULL]
+            zero = [
+                line["us"] for line in told if line.get("in_force") == 0 and full and line["us"] > full[0]
+            ]
+            if zero:
+                commands = [line["us"] for line in told if line.get("motor") == FULL]
+                stops = [line["us"] for line in told if line.get("took") == "STOP" and line["us"] > full[0]]
+                return (zero[0] - commands[-1]) / 1000, "STOP" if stops else "watchdog"
+            time.sleep(0.01)
+        raise AssertionError(f"the motor was never at 0 again: {self.told()}")
+
+    def close(self) -> None:
+        self.process.terminate()
+        self.process.wait(10)
+        assert self.process.stdout is not None
+        self.process.stdout.close()
+        self._told.close()
+
+
+@pytest.fixture(scope="module")
+def running() -> Iterator[TellingCart]:
+    with closing(TellingCart()) as cart:
+        yield cart
+
+
+@pytest.fixture
+def cart(running: TellingCart) -> TellingCart:
+    running.listen()
+    return running
+
+
+@pytest.fixture
+def host() -> Iterator[Callable[..., "subprocess.Popen[bytes]"]]:
+    """Starts a program that drives with full motor; it drives when it is returned."""
+    started: list[subprocess.Popen[bytes]] = []
+
+    def start(port: str, manner: str = "plain") -> "subprocess.Popen[bytes]":
+        process = subprocess.Popen(
+            [sys.executable, "-c", HOST, port, manner], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+        )
+        started.append(process)
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"driving\n"
+        return process
+
+    yield start
+    for process in started:
+        process.kill()
+        process.communicate()
+
+
+@pytest.mark.parametrize(
+    ("ending", "manner", "by"),
+    [
+        (signal.SIGKILL, "plain", "watchdog"),
+        (signal.SIGSTOP, "plain", "watchdog"),
+        (signal.SIGTERM, "plain", "watchdog"),
+        (signal.SIGTERM, "unwinds", "STOP"),
+        (signal.SIGINT, "plain", "STOP"),
+    ],
+)
+def test_a_signal(
+    cart: TellingCart,
+    host: Callable[..., "subprocess.Popen[bytes]"],
+    ending: signal.Signals,
+    manner: str,
+    by: str,
+) -> None:
+    host(cart.port, manner).send_signal(ending)
+    after, through = cart.stopped()
+    assert 0 < after <= WATCHDOG_MS
+    assert through == by
+
+
+def test_a_pulled_cable(cart: TellingCart, host: Callable[..., "subprocess.Popen[bytes]"]) -> None:
+    with Between(cart.port) as cable:
+        process = host(cable.port)
+        cable.cut()
+        after, through = cart.stopped()
+        assert 0 < after <= WATCHDOG_MS
+        assert through == "watchdog"
+        _, said = process.communicate(timeout=10)
+        assert b"is the cart unplugged" in said
+
+
+def always_right(seen: TensorDictBase) -> TensorDictBase:
+    return seen.set("action", torch.full(seen.batch_size, 2))
+
+
+def serial_plant(cart: TellingCart) -> SerialPlant:
+    return SerialPlant(SerialPlantSettings(port=cart.port))
+
+
+def test_an_exception_in_the_policy(cart: TellingCart, make_environment: Callable) -> None:
+    decided: list[int] = []
+
+    def fails(seen: TensorDictBase) -> TensorDictBase:
+        decided.append(1)
+        if len(decided) == 6:
+            raise ZeroDivisionError
+        return always_right(seen)
+
+    with (
+        pytest.raises(ZeroDivisionError),
+        closing(make_environment(serial_plant(cart), motors=(-FULL, 0, FULL))) as env,
+    ):
+        run_batch(env, fails)
+    after, through = cart.stopped()
+    assert 0 < after <= WATCHDOG_MS
+    assert through == "STOP"
+
+
+def test_the_end_of_an_episode(cart: TellingCart, make_environment: Callable) -> None:
+    with closing(make_environment(serial_plant(cart), motors=(-FULL, 0, FULL), time_limit=6)) as env:
+        (episode,) = run_batch(env, always_right)
+        assert episode.ended_by == "time"
+        after, through = cart.stopped()  # though the port is still open
+        assert 0 < after <= WATCHDOG_MS
+        assert through == "STOP"
+
+
+def test_the_cart_can_be_driven_again_after_all_that(
+    cart: TellingCart, host: Callable[..., "subprocess.Popen[bytes]"]
+) -> None:
+    host(cart.port).kill()
+    cart.stopped()
+    with SerialCart(SerialSettings(port=cart.port)) as again:
+        state = again.get_state()
+        assert state.motor_applied == 0
+        assert not again.flags & Flags.ARMED
+        assert again.flags & Flags.HOMED
