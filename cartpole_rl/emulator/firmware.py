@@ -106,7 +106,8 @@ class Firmware:
         reading = Reading(cart, pole, (now_us - self._ticked_us) / 1e6)
         self._ticks, self._ticked_us = self._ticks + 1, now_us
         faults_before = self.fault
-        expired = self.armed and now_us - self._watchdog_us >= WATCHDOG_PERIODS * self.period_us
+        # looked at once a period: what is not over at the next look would be over too late
+        expired = self.armed and now_us - self._watchdog_us > (WATCHDOG_PERIODS - 1) * self.period_us
         if expired:
             self._line.hold(0)
         if self.armed or self.homing:

@@ -37,7 +37,7 @@ class Flags(IntFlag):
     HOMING = 0x04
     FAULTED = 0x08
     SOFT_LIMIT = 0x10  # this period's command was outward beyond the soft limit and was held at 0
-    WATCHDOG = 0x20  # no valid command for three periods: motor 0
+    WATCHDOG = 0x20  # no valid command for more than two periods: motor 0
 
 
 class Fault(IntFlag):

@@ -26,7 +26,7 @@ from cartpole_rl.plants.serial_cart import SerialCart, SerialSettings
 from cartpole_rl.wire import Flags
 
 PERIOD_MS = 20
-WATCHDOG_MS = 4 * PERIOD_MS  # it looks each period whether three are over since the newest command
+WATCHDOG_MS = 3 * PERIOD_MS
 FULL = 255
 
 EMULATOR = """
