@@ -23,6 +23,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 import cartpole_rl.commands.composition  # noqa: F401 - what Hydra's configs refer to is registered there
 from cartpole_rl.choices import conf_folder
+from cartpole_rl.commands.choice_files import with_choice_files
 from cartpole_rl.commands.complaints import dashed_setting, in_one_line
 from cartpole_rl.commands.config import checked
 from cartpole_rl.errors import CartPoleError, ConfigError
@@ -46,7 +47,10 @@ def application(name: str, schema: type[Config]) -> Callable[[Body[Config]], Cal
     """
 
     def decorate(body: Body[Config]) -> Callable[[], None]:
+        given: list[str] = []
+
         def task(composed: DictConfig) -> None:
+            sys.argv[1:] = given  # what was typed is what the run's folder keeps
             quieten()  # here, since a launcher may have brought the job to another process
             folder = Path(HydraConfig.get().runtime.output_dir)
             try:
@@ -60,12 +64,15 @@ def application(name: str, schema: type[Config]) -> Callable[[Body[Config]], Cal
                 remove_if_empty(folder)
 
         def main() -> None:
+            given[:] = sys.argv[1:]
             signal.signal(signal.SIGTERM, _terminate)
             os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra's errors come here, not to the screen
             try:
                 if dashed := dashed_setting(sys.argv[1:]):
                     raise ConfigError(f"{dashed}: settings are given without dashes: {dashed.lstrip('-')}")
-                hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=name)(task)()
+                with with_choice_files(given) as words:
+                    sys.argv[1:] = words
+                    hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=name)(task)()
             except EXPECTED as error:
                 leave(name, error)
             except KeyboardInterrupt:

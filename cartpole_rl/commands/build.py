@@ -1,5 +1,6 @@
 """Build plants, environments and agents from checked configs."""
 
+import math
 import os
 import shutil
 import sys
@@ -19,6 +20,7 @@ from cartpole_rl.commands.config import (
     CartPoleSettings,
     EmulatedSettings,
     EvaluateConfig,
+    LearnedSettings,
     SimulatedSettings,
     TrainConfig,
     checked,
@@ -28,27 +30,34 @@ from cartpole_rl.envs import CartPoleEnv, make_env
 from cartpole_rl.errors import CheckpointError, ConfigError
 from cartpole_rl.evaluation.episodes import Policy
 from cartpole_rl.learning.checkpoints import load_agent
-from cartpole_rl.physics.parameters import check_names
+from cartpole_rl.physics.parameters import CartParameters, check_names
+from cartpole_rl.physics.residual import UNDER_WAY
 from cartpole_rl.plants.emulated import emulated_plant
+from cartpole_rl.plants.learned import LearnedPlant
+from cartpole_rl.plants.learned_model import load_model
 from cartpole_rl.plants.serial import SerialPlant, SerialPlantSettings
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.plants.specs import Plant
-from cartpole_rl.randomization import Pole, PoleSettings
+from cartpole_rl.randomization import FoundCarts, Pole, PoleSettings
 from cartpole_rl.tasks.starts import Start, StartSettings
 
 BASELINE = Path("lqr")  # run=lqr is no folder: the controller that learned nothing
+LATER = {"pole_coulomb": 0.0}  # parameters that older checkpoints do not know, as they were then
+SIMILAR = 0.1  # share by which a pole's length may differ from a learned model's
 REPLACEABLE = ("cart", "cart_friction", "pole_friction", "pole", "reward")  # by an evaluation; and the task
 
 
 def simulated_env(
     config: CartPoleSettings,
-    plant: SimulatedSettings,
+    plant: SimulatedSettings | LearnedSettings,
     carts: int,
     start: StartSettings,
     seed: int,
     compiled: bool = False,
 ) -> CartPoleEnv:
-    """An environment over `carts` simulated carts that start as `start` says."""
+    """An environment over `carts` simulated carts that start as `start` says. Raises CheckpointError."""
+    if isinstance(plant, LearnedSettings):
+        return environment(config, learned_plant(config, plant, carts, start, seed, compiled))
     return environment(
         config,
         SimulatedPlant(
@@ -62,6 +71,32 @@ def simulated_env(
             compiled=compiled,
         ),
     )
+
+
+def learned_plant(
+    config: CartPoleSettings,
+    plant: LearnedSettings,
+    carts: int,
+    start: StartSettings,
+    seed: int,
+    compiled: bool,
+) -> LearnedPlant:
+    """Carts of a learned model. Raises ConfigError where it is of another cart than `config` describes."""
+    model = load_model(plant.model)
+    own, length = model.parameters, 2 * config.pole.nominal.pole_com
+    if not math.isclose(model.period, config.control_period, rel_tol=1e-6):
+        raise ConfigError(f"control_period={config.control_period}: plant.model has {model.period} s")
+    if model.models.actuator != config.actions.actuator:
+        raise ConfigError(f"actions: plant.model has actuator {model.models.actuator}")
+    if config.pole.choices is None or len(config.pole.choices) > 1:
+        raise ConfigError(
+            f"pole: plant.model has one pole, not {config.pole.name}; choose it, as pole=medium"
+        )
+    if abs(2 * own["pole_com"] / length - 1) > SIMILAR:
+        raise ConfigError(f"pole: plant.model has one of {2 * own['pole_com']:.2f} m, not {length:.2f} m")
+    found = torch.tensor([[own[name]] for name in CartParameters.names()])
+    draws = FoundCarts(found, config.randomizer(), plant.elsewhere, UNDER_WAY * model.period)
+    return LearnedPlant(carts, model, draws, start, seed, compiled=compiled)
 
 
 def environment(config: CartPoleSettings, plant: Plant) -> CartPoleEnv:
@@ -78,7 +113,7 @@ def new_agent(config: TrainConfig) -> QAgent:
 def recorded_config(config: Mapping[str, Any], source: str) -> TrainConfig:
     """The config in a checkpoint. Raises CheckpointError where this version has other settings."""
     try:
-        return checked(TrainConfig, config)
+        return checked(TrainConfig, {**config, "cart": LATER | config["cart"]})
     except ConfigError as error:
         raise CheckpointError(f"{source} is of another version of this package: {error}") from None
 
@@ -140,13 +175,20 @@ def evaluated_settings(training: TrainConfig, config: EvaluateConfig) -> CartPol
         given["task"] = {**config.task, "x_max": config.task.get("x_max") or training.task.x_max}
     if isinstance(config.plant, EmulatedSettings):
         given["pole"] = emulated_pole(config.emulator)
+    if isinstance(config.plant, LearnedSettings):
+        found = load_model(config.plant.model).parameters
+        given["pole"] = one_pole(Pole(**{name: found[name] for name in Pole.model_fields}))
     settings = checked(CartPoleSettings, {**own, **given, "randomization": config.randomization})
     return with_parameters(settings, config.parameters or {})
 
 
 def emulated_pole(truth: EmulatorSettings) -> PoleSettings:
     """The pole that the emulated cart carries, named by its length."""
-    pole = Pole(**truth.model_dump(include=set(Pole.model_fields)))
+    return one_pole(Pole(**truth.model_dump(include=set(Pole.model_fields))))
+
+
+def one_pole(pole: Pole) -> PoleSettings:
+    """The choice of this pole, named by its length."""
     return PoleSettings(choices={f"{2 * pole.pole_com:.2f} m": pole})
 
 
@@ -175,6 +217,9 @@ def evaluated_env(
 ) -> CartPoleEnv:
     """The environment to evaluate on: simulated with a cart an episode, or one cart behind a port."""
     start = settings.task.evaluation_start
+    if isinstance(config.plant, LearnedSettings):
+        found = config.plant.model_copy(update={"elsewhere": 0.0})
+        return simulated_env(settings, found, min(config.episodes, 1024), start, config.seed)
     if isinstance(config.plant, SimulatedSettings):
         return simulated_env(settings, config.plant, min(config.episodes, 1024), start, config.seed)
     if start.angle is Start.ANY:
@@ -184,11 +229,13 @@ def evaluated_env(
         truth = config.emulator.model_copy(
             update={"start": angle, "seed": config.emulator.seed + config.seed}
         )
-        return environment(settings, emulated_plant(truth, settings.control_period, prompt))
+        plant = emulated_plant(truth, settings.control_period, prompt, config.plant.rehome)
+        return environment(settings, plant)
     serial = SerialPlantSettings(
         port=config.plant.port,
         baud=config.plant.baud,
         pole_length=config.plant.pole_length,
+        rehome=config.plant.rehome,
         start=angle,
         control_period=settings.control_period,
     )

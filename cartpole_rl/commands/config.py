@@ -3,9 +3,9 @@
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
-from pydantic import Field, ValidationError, field_validator, model_validator
+from pydantic import Discriminator, Field, Tag, ValidationError, field_validator, model_validator
 
 from cartpole_rl.agents import AgentSettings
 from cartpole_rl.commands.complaints import no_such_setting, setting_names
@@ -17,12 +17,26 @@ from cartpole_rl.learning.settings import LearningSettings, OptimizerSettings, R
 from cartpole_rl.physics.actuator import Actuator
 from cartpole_rl.physics.dynamics import Integrator, Models
 from cartpole_rl.physics.friction import CartFriction, PoleFriction
-from cartpole_rl.randomization import PoleSettings, Randomizer, Range
-from cartpole_rl.settings import Count, Finite, Positive, Settings
+from cartpole_rl.randomization import Draws, FoundSettings, PoleSettings, Randomizer, Range
+from cartpole_rl.settings import Count, Finite, Fraction, Positive, Settings
 from cartpole_rl.tasks.actions import ActionSettings
 
 Seed = Annotated[int, Field(ge=0, lt=2**31)]
+KINDS = re.compile(
+    r"(?<=^plant\.)(simulated|emulated|serial|learned)\.|(?<=^randomization\.)(ranges|found)\."
+)
 OF_SIMULATION = ("parameters", "randomization", "cart", "cart_friction", "pole_friction")
+
+
+def _kind_of_randomization(given: Any) -> str:
+    """A posterior of an identification, or else ranges by the parameters' names."""
+    return "found" if isinstance(given, FoundSettings) or "posterior" in given else "ranges"
+
+
+Randomization = Annotated[
+    Annotated[dict[str, Range], Tag("ranges")] | Annotated[FoundSettings, Tag("found")],
+    Discriminator(_kind_of_randomization),
+]
 
 
 class CartFrictionSettings(Settings):
@@ -48,10 +62,22 @@ class SimulatedSettings(Settings):
     pole_presses: bool
 
 
+class LearnedSettings(Settings):
+    """plant=learned; a residual is learned on top of these choices of the physics, and of no others."""
+
+    kind: Literal["learned"]
+    model: Path
+    elsewhere: Fraction
+    integrator: ClassVar = Integrator.SEMI_IMPLICIT
+    substeps: ClassVar = 4
+    pole_presses: ClassVar = False
+
+
 class EmulatedSettings(Settings):
     """plant=emulated."""
 
     kind: Literal["emulated"]
+    rehome: Literal["once", "always"] = "once"
 
 
 class RealSettings(Settings):
@@ -61,6 +87,7 @@ class RealSettings(Settings):
     port: str
     baud: Count
     pole_length: Positive | None
+    rehome: Literal["once", "always"] = "once"
 
 
 class CartPoleSettings(Settings):
@@ -74,7 +101,7 @@ class CartPoleSettings(Settings):
     task: TaskSettings
     reward: RewardSettings
     observation: ObservationSettings
-    randomization: dict[str, Range]
+    randomization: Randomization
     control_period: Annotated[float, Field(ge=0.005, le=0.1)]
 
     @property
@@ -82,11 +109,19 @@ class CartPoleSettings(Settings):
         """Nominal parameters of the cart, without the pole's."""
         return {**self.cart, **self.cart_friction.parameters, **self.pole_friction.parameters}
 
-    def randomizer(self) -> Randomizer:
+    def randomizer(self) -> Draws:
         """Draws carts of this kind. Raises ConfigError where the numbers make no sense."""
+        if isinstance(self.randomization, FoundSettings):
+            return self.randomization.carts(self.nominal, self.pole)
         return Randomizer(self.nominal, self.pole, self.randomization)
 
-    def models(self, plant: SimulatedSettings) -> Models:
+    @property
+    def ranges(self) -> dict[str, Range]:
+        """What is randomized by ranges; of carts that were found, what they leave open."""
+        given = self.randomization
+        return given.ranges if isinstance(given, FoundSettings) else given
+
+    def models(self, plant: SimulatedSettings | LearnedSettings) -> Models:
         """The laws that the simulated cart obeys."""
         return Models(
             self.cart_friction.model,
@@ -100,7 +135,7 @@ class CartPoleSettings(Settings):
 class TrainConfig(CartPoleSettings):
     """cartpole-train."""
 
-    plant: SimulatedSettings
+    plant: Annotated[SimulatedSettings | LearnedSettings, Field(discriminator="kind")]
     agent: AgentSettings
     replay: ReplaySettings
     optimizer: OptimizerSettings
@@ -155,9 +190,11 @@ class EvaluateConfig(Settings):
 
     run: Path
     episodes: Annotated[int, Field(ge=1, le=100_000)]
-    plant: Annotated[SimulatedSettings | EmulatedSettings | RealSettings, Field(discriminator="kind")]
+    plant: Annotated[
+        SimulatedSettings | LearnedSettings | EmulatedSettings | RealSettings, Field(discriminator="kind")
+    ]
     emulator: EmulatorSettings
-    randomization: dict[str, Range]
+    randomization: Randomization
     parameters: dict[str, Finite] | None
     cart: dict[str, Finite] | None = None
     cart_friction: CartFrictionSettings | None = None
@@ -174,7 +211,7 @@ class EvaluateConfig(Settings):
         """What the chosen plant would not read is refused, so that nothing is silently without effect."""
         kind = self.plant.kind
         unread = [] if kind == "simulated" else [name for name in OF_SIMULATION if getattr(self, name)]
-        if kind == "emulated" and self.pole is not None:
+        if kind in ("emulated", "learned") and self.pole is not None:
             unread.append("pole")
         if unread:
             remedy = "; its own are emulator.*, emulator=large" if kind == "emulated" else ""
@@ -219,7 +256,7 @@ def checked(schema: type[Config], values: Mapping[str, Any]) -> Config:
 
 
 def _complaint(detail: Mapping[str, Any], values: Mapping[str, Any]) -> str:
-    key = re.sub(r"^plant\.(simulated|emulated|serial)\.", "plant.", ".".join(map(str, detail["loc"])))
+    key = KINDS.sub("", ".".join(map(str, detail["loc"])))
     if detail["type"] == "extra_forbidden":
         return no_such_setting(key, (name for name in setting_names(values) if not name.startswith(key)))
     if detail["type"] == "missing":

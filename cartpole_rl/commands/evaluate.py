@@ -56,8 +56,11 @@ def main(config: EvaluateConfig, folder: Path) -> None:
     finally:  # what a broken link or Ctrl-C leaves is worth its figures
         if episodes:
             plant, x_max = config.plant.kind, settings.task.x_max
-            summary = report(folder, episodes, plant, settings.pole, x_max, link_figures(env))
+            link = link_figures(env)
+            summary = report(folder, episodes, plant, settings.pole, x_max, link)
             print(score_table(summary, f"plant={plant}, {count_text(len(episodes))}"))
+            if link.get("latency_override"):
+                print(f"latency as measured, for cartpole-train: '{link['latency_override']}'")
             print(f"{folder}/{METRICS} and figures/ are written")
 
 
@@ -70,12 +73,17 @@ def with_progress(env: CartPoleEnv, policy: Policy, episodes: int) -> Iterator[E
             yield episode
 
 
-def link_figures(env: CartPoleEnv) -> dict[str, int]:
-    """Frames lost, spoilt and late on the wire; none where there is no wire."""
+def link_figures(env: CartPoleEnv) -> dict[str, Any]:
+    """Frames lost, spoilt and late on the wire, none where there is no wire; what it says of the latency."""
     if not isinstance(env.plant, SerialPlant):
         return {"late_ticks": 0, "lost_frames": 0, "bad_frames": 0}
     seen = env.plant.cart.statistics
-    return {"late_ticks": seen.late_ticks, "lost_frames": seen.lost_frames, "bad_frames": seen.bad_frames}
+    return {
+        "late_ticks": seen.late_ticks,
+        "lost_frames": seen.lost_frames,
+        "bad_frames": seen.bad_frames,
+        "latency_override": seen.latency_override(),
+    }
 
 
 def score_table(summary: Mapping[str, Any], heading: str) -> str:

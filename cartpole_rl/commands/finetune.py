@@ -29,6 +29,7 @@ from cartpole_rl.commands.build import (
     evaluated_env,
     evaluated_settings,
     new_agent,
+    simulated_env,
     trained_agent,
     use_threads,
 )
@@ -46,6 +47,7 @@ from cartpole_rl.envs import CartPoleEnv
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.evaluation import episode_metrics, summarize
 from cartpole_rl.evaluation.driver import Drive, Driver, as_weights
+from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.evaluation.recordings import read_recording, write_recording
 from cartpole_rl.identification import LONGEST_LATENCY, Fit, cut_windows, fit_cart
 from cartpole_rl.learning.checkpoints import (
@@ -63,7 +65,7 @@ from cartpole_rl.learning.randomness import seed_everything
 from cartpole_rl.learning.training import Scalars, Training
 from cartpole_rl.physics.dynamics import Models
 from cartpole_rl.physics.friction import CartFriction
-from cartpole_rl.plants.link_statistics import LinkSummary
+from cartpole_rl.plants.link_statistics import LinkStatistics
 from cartpole_rl.plants.recorded import RecordedPlant
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.randomization import FoundCarts
@@ -73,6 +75,8 @@ from cartpole_rl.tasks.episode import Episode
 BEFORE, TUNE, AFTER = "before", "tune", "after"
 RECORDINGS = "recordings"
 DRAWN = 4096  # carts of each fit
+SIMULATED_SCORE = "cart/score_in_simulation"  # TensorBoard's curve beside those of the cart
+SIMULATED_CARTS = 10
 
 
 @application("finetune", FinetuneConfig)
@@ -166,7 +170,7 @@ class Session:
         self.models = [training.models(training.plant)]
         if self.models[0].cart_friction is CartFriction.SIGMOID:
             self.models.append(self.models[0]._replace(cart_friction=CartFriction.STEP))
-        self.link: LinkSummary | None = None
+        self.link: LinkStatistics | None = None  # of the newest episode's process
 
     def run(self) -> None:
         """All stages, from where the disk says that they stand."""
@@ -187,6 +191,8 @@ class Session:
         write_json(self.folder / "comparison.json", {BEFORE: before, AFTER: after, "kept": kept})
         print(score_table(before, f"before, {config.evaluation_episodes} episodes"))
         print(score_table(after, f"after {config.episodes} episodes of learning"))
+        if link.get("latency_override"):
+            print(f"latency as measured, for cartpole-train: '{link['latency_override']}'")
         print(
             f"kept: the policy {kept} fine-tuning; "
             f"{self.folder}/{METRICS}, checkpoints/{LAST}, recordings/ are written"
@@ -199,13 +205,15 @@ class Session:
             return
         self.begin_learning()
         assert self.learner is not None
+        if not self.learned:
+            self.log.scalars({SIMULATED_SCORE: self.simulated_score()}, self.step(TUNE, 0))
         while self.learned < count:
             number = self.learned
             driving = number >= len(self.episodes(TUNE))
             if driving:
                 weights = as_weights(self.agent.greedy_policy())
                 self.driver.start(Drive(weights, self.config.finetuning.epsilon, self.config.seed + number))
-            scalars = self.learner.round()
+            scalars = {**self.learner.round(), SIMULATED_SCORE: self.simulated_score()}
             if driving:
                 self.finish(TUNE, number)
             episode = self.episodes(TUNE)[number]
@@ -213,7 +221,7 @@ class Session:
             self.learned += 1
             if self.learned % self.config.finetuning.refit == 0 and self.learned < count:
                 self.refit()
-            self.log.scalars(scalars, self.learned)
+            self.log.scalars(scalars, self.step(TUNE, self.learned))
             self.save()
 
     def begin_learning(self) -> None:
@@ -298,14 +306,33 @@ class Session:
     def finish(self, stage: str, number: int) -> None:
         """Wait for an episode, and write it down."""
         driven = self.driver.result()
-        self.link = driven.link.summary()
+        self.link = driven.link
         write_recording(self.path(stage, number), driven.episode, {"stage": stage, "number": number})
         figures = self.figures(driven.episode)
-        step = number + 1
-        self.log.scalars({f"cart/{stage}_score": figures["score"]}, step)
-        self.log.scalars({f"link/{key}": float(value) for key, value in vars(self.link).items()}, step)
+        step = self.step(stage, number + 1)
+        self.log.scalars({f"cart/score_{stage}": figures["score"]}, step)
+        self.log.scalars(
+            {f"link/{key}": float(value) for key, value in vars(self.link.summary()).items()}, step
+        )
         self.log.flush()
-        tqdm.write(f"{stage} {step}: score {figures['score']:.0f}, ended by {driven.episode.ended_by}")
+        tqdm.write(f"{stage} {number + 1}: score {figures['score']:.0f}, ended by {driven.episode.ended_by}")
+
+    def step(self, stage: str, number: int) -> int:
+        """TensorBoard's step of a stage's `number`th episode, from 1: all stages in one row."""
+        config = self.config
+        ahead = {
+            BEFORE: 0,
+            TUNE: config.evaluation_episodes,
+            AFTER: config.evaluation_episodes + config.episodes,
+        }
+        return ahead[stage] + number
+
+    def simulated_score(self) -> float:
+        """Mean score of the agent as it is now, on the same carts of its training's simulation each time."""
+        training = self.training
+        start = training.task.evaluation_start
+        env = simulated_env(training, training.plant, SIMULATED_CARTS, start, self.config.seed)
+        return float(np.mean([each.score.sum() for each in run_batch(env, self.agent.greedy_policy())]))
 
     def path(self, stage: str, number: int) -> Path:
         """Where an episode is kept."""
@@ -356,9 +383,9 @@ class Session:
         save_agent(self.folder / FOLDER / LAST, checkpoint)
 
     @staticmethod
-    def link_figures(link: LinkSummary) -> dict[str, Any]:
+    def link_figures(link: LinkStatistics) -> dict[str, Any]:
         """Frames lost, spoilt and late on the wire, and the time from a state to its command."""
-        return vars(link)
+        return {**vars(link.summary()), "latency_override": link.latency_override()}
 
 
 if __name__ == "__main__":

@@ -91,7 +91,7 @@ class TrainingMonitor:
 
     def randomization(self, plant: SimulatedPlant) -> None:
         """Histograms of the parameters in force on all carts."""
-        for name in (*self.config.randomization, "pole_length"):
+        for name in (*self.config.ranges, "pole_length"):
             values = getattr(plant.parameters, name).cpu().numpy()
             self._log.histogram(f"randomization/{name}", values, self._seen)
 

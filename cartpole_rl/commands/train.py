@@ -12,7 +12,7 @@ from hydra.core.hydra_config import HydraConfig
 
 from cartpole_rl.commands.application import application, tell
 from cartpole_rl.commands.build import check_compiler, new_agent, recorded_config, simulated_env, use_threads
-from cartpole_rl.commands.config import TrainConfig
+from cartpole_rl.commands.config import LearnedSettings, TrainConfig
 from cartpole_rl.commands.monitor import TrainingMonitor
 from cartpole_rl.commands.report import report
 from cartpole_rl.commands.run_folder import write_config
@@ -62,7 +62,7 @@ def main(config: TrainConfig, folder: Path) -> None:
             monitor.randomization(env.plant)
         training.run()
         metrics = report(
-            folder, evaluate(), "simulated", config.pole, config.task.x_max, history=monitor.history
+            folder, evaluate(), config.plant.kind, config.pole, config.task.x_max, history=monitor.history
         )
         monitor.finished(metrics)
     print(f"trained for {training.seconds:.0f} s; {folder}/metrics.json, figures/, checkpoints/ are written")
@@ -83,7 +83,7 @@ def resumed_training(config: TrainConfig, folder: Path) -> TrainingCheckpoint | 
 
 def note_unused_randomization(config: TrainConfig) -> None:
     """Say which randomized parameters the chosen laws do not read; drawing them has no effect."""
-    if unused := sorted(unused_parameters(config.models(config.plant)) & set(config.randomization)):
+    if unused := sorted(unused_parameters(config.models(config.plant)) & set(config.ranges)):
         chosen = f"{config.cart_friction.model}, {config.pole_friction.model}, {config.actions.actuator}"
         tell("train", f"note: randomization of {', '.join(unused)} has no effect with {chosen}")
 
@@ -94,7 +94,10 @@ def nominal_env(config: TrainConfig) -> CartPoleEnv:
     assert poles.choices is not None
     carts = len(poles.choices) * max(1, config.learning.evaluation_episodes // len(poles.choices))
     nominal = config.model_copy(update={"pole": poles, "randomization": {}})
-    return simulated_env(nominal, config.plant, carts, config.task.evaluation_start, 0, config.compile)
+    plant = config.plant
+    if isinstance(plant, LearnedSettings):
+        plant = plant.model_copy(update={"elsewhere": 0.0})
+    return simulated_env(nominal, plant, carts, config.task.evaluation_start, 0, config.compile)
 
 
 def judge(env: CartPoleEnv, policy: Policy, seed: int) -> list[Episode]:

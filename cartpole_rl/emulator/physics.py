@@ -110,10 +110,15 @@ class CartPhysics:
         drag, friction = self._settings.pole_drag, self._model.dof_frictionloss
         applied, velocity = self._data.qfrc_applied, self._data.qvel
         for _ in range(steps):
-            applied[0] = self._motor.step(motor, step)
+            applied[0] = self._motor.step(motor, step) + self._cogging(self._data.qpos[0])
             applied[1] = -drag * velocity[1] * abs(velocity[1])
             friction[0] = self._cart_friction(velocity[0])
             self._mj_step(self._model, self._data)
+
+    def _cogging(self, x: float) -> float:
+        """Force in N with which gears and magnets pull the cart toward their nearest resting place."""
+        settings = self._settings
+        return -settings.cogging * math.sin(math.tau * x / settings.cogging_pitch)
 
     def _cart_friction(self, x_dot: float) -> float:
         """Dry friction in N that the rail can hold against the cart now."""

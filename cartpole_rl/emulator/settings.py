@@ -32,6 +32,8 @@ class EmulatorSettings(Settings):
     cart_coulomb_left: NonNegative = 0.58  # N, while the cart moves left
     cart_coulomb_right: NonNegative = 0.53  # N, while the cart moves right
     cart_stiction_ratio: Annotated[float, Field(ge=1, le=10)] = 1.2  # breakaway force / Coulomb friction
+    cogging: NonNegative = 0.0  # N, amplitude of a force ripple along the track
+    cogging_pitch: Positive = 0.04  # m, of that ripple: a turn of the pinion
     pole_viscous: NonNegative = 3.0e-4  # N m s
     pole_coulomb: NonNegative = 2.0e-4  # N m
     pole_drag: NonNegative = 2.5e-5  # N m s^2, against the square of the speed

@@ -22,10 +22,13 @@ from cartpole_rl.tasks.features import CART_METRES_PER_COUNT, POLE_RADIANS_PER_C
 
 Array = NDArray[np.floating]
 SCALE = np.array([20.0, 3.0])  # counts: errors of cart and pole that count as one, 0.5 mm and 0.26 degrees
+FINEST = np.array([1.0, 0.5])  # counts: what quantization alone leaves, about
 ROBUST = 3.0  # scaled residuals beyond this count linearly (Huber)
 LOST = 1e6  # scaled residual of a prediction that ran away
-STEP = 1e-3  # of an unknown, for its derivative; unknowns are scaled to about one
-STATE_STEP = np.array([1e-5, 1e-4, 1e-4, 1e-3])  # m, m/s, rad, rad/s
+STEP = (
+    1e-5  # of an unknown, for its derivative; larger ones find what no data can tell, the scale of all forces
+)
+STATE_STEP = np.array([1e-7, 1e-6, 1e-6, 1e-5])  # m, m/s, rad, rad/s
 STATE_SPREAD = np.array([5e-4, 0.1, 5e-3, 1.0])  # of a window's beginning about its first guess
 POLE_STARTS = (0.0, 1.25, -1.0)  # of POLE_LENGTH: a pole of another length looks like a pole of no kind
 CONVERGED = 1e-4  # relative fall of the cost
@@ -41,6 +44,7 @@ class Fit:
     covariance: Array  # [U, U] of `point`
     nominal: dict[str, float]
     rms: Array  # [2] counts: of the residuals of cart and pole, robustly
+    correlation: Array  # [2] of each residual with the next one in its window
     cost: float
     iterations: int
 
@@ -64,10 +68,19 @@ def fit_cart(
     period: float,
     substeps: int = 4,
     iterations: int = 25,
+    known: Sequence[str] = (),
+    sharpened: bool = False,
+    lead: float = 0.0,
 ) -> Fit:
-    """The most probable cart, from several beginnings of the pole's length."""
-    unknowns = unknowns_of(models)
-    problem = Problem(windows, dict(nominal), models, period, substeps, unknowns)
+    """The most probable cart, from several beginnings of the pole's length.
+
+    The names `known`, of UNKNOWNS, keep their nominal values. Nothing but ratios of forces and masses shows
+    in motion: without WEIGHED among them the scale is that of the prior.
+    `lead` is that of `predict`.
+    `sharpened`: once found, it is looked for again with errors counted by the size that they have.
+    """
+    unknowns = unknowns_of(models, known)
+    problem = Problem(windows, dict(nominal), models, period, substeps, unknowns, SCALE, lead)
     lengths = [index for index, unknown in enumerate(unknowns) if unknown.name == POLE_LENGTH]
     starts = []
     for start in POLE_STARTS if lengths else (0.0,):
@@ -75,7 +88,12 @@ def fit_cart(
         point[lengths] = start
         starts.append(problem.minimize(point, problem.beginnings(), 4))
     best = min(starts, key=lambda each: each.cost)
-    return problem.report(problem.minimize(best.point, best.motion, iterations))
+    best = problem.minimize(best.point, best.motion, iterations)
+    if sharpened:
+        scale = np.maximum(problem.report(best).rms, FINEST)
+        problem = Problem(windows, dict(nominal), models, period, substeps, unknowns, scale, lead)
+        best = problem.minimize(best.point, best.motion, iterations)
+    return problem.report(best)
 
 
 @dataclass(frozen=True)
@@ -99,7 +117,10 @@ class Problem:
         period: float,
         substeps: int,
         unknowns: Sequence[Unknown],
+        scale: Array,
+        lead: float,
     ) -> None:
+        self.scale, self.lead = scale, lead
         self.windows, self.nominal, self.models = windows, nominal, models
         self.period, self.substeps, self.unknowns = period, substeps, list(unknowns)
         self.first, self.limits = self.beginnings(), limits(unknowns, nominal)
@@ -123,9 +144,10 @@ class Problem:
             self.models,
             self.period,
             self.substeps,
+            self.lead,
         ).numpy()
         error = predicted.reshape(-1, 2, variants, count) - self.windows.positions[:, :, None]
-        scaled = (error / SCALE[:, None, None]).transpose(2, 3, 0, 1).reshape(variants, count, -1)
+        scaled = (error / self.scale[:, None, None]).transpose(2, 3, 0, 1).reshape(variants, count, -1)
         return np.nan_to_num(scaled, nan=LOST, posinf=LOST, neginf=-LOST).clip(-LOST, LOST)
 
     def cost(self, residuals: Array, point: Array, motion: Array) -> float:
@@ -178,11 +200,12 @@ class Problem:
         strayed = (motion - self.first).T / STATE_SPREAD**2 / CORRELATED  # [W, 4]
         weighted_point, weighted_state = by_point * weights[..., None], by_state * weights[..., None]
         return NormalEquations(
-            point_point=np.einsum("wmi,wmj->ij", weighted_point, by_point) + np.eye(len(point)),
+            point_points=np.einsum("wmi,wmj->wij", weighted_point, by_point),
             point_state=np.einsum("wmi,wmj->wij", weighted_point, by_state),
             state_state=np.einsum("wmi,wmj->wij", weighted_state, by_state)
             + np.diag(1 / STATE_SPREAD**2) / CORRELATED,
-            point_slope=np.einsum("wmi,wm->i", weighted_point, residuals) + point,
+            point_slopes=np.einsum("wmi,wm->wi", weighted_point, residuals),
+            prior_slope=point,
             state_slope=np.einsum("wmi,wm->wi", weighted_state, residuals) + strayed,
         )
 
@@ -192,41 +215,80 @@ class Problem:
         normal = self.normal_equations(found.point, found.motion)
         by_channel = residuals.reshape(self.windows.number, -1, 2)
         spread = 1.4826 * np.median(np.abs(by_channel), axis=(0, 1))
-        inflation = max(1.0, float(np.mean(np.minimum(np.abs(residuals), ROBUST) ** 2)))
         return Fit(
             self.unknowns,
             found.point,
-            np.linalg.inv(normal.reduced(0.0)[0]) * inflation,
+            normal.covariance(self.windows.episode),
             self.nominal,
-            spread * SCALE,
+            spread * self.scale,
+            np.array([neighbours_correlate(by_channel[..., channel]) for channel in range(2)]),
             found.cost,
             found.iterations,
         )
+
+
+def neighbours_correlate(residuals: Array) -> float:
+    """Correlation of each residual with the next one of its window; `residuals` [W, T + 1]."""
+    small = np.clip(residuals, -ROBUST, ROBUST)
+    return float(np.corrcoef(small[:, :-1].ravel(), small[:, 1:].ravel())[0, 1])
 
 
 @dataclass(frozen=True)
 class NormalEquations:
     """Blocks of the normal equations; the windows' beginnings see each other only through the point."""
 
-    point_point: Array  # [U, U]
+    point_points: Array  # [W, U, U], of each window
     point_state: Array  # [W, U, 4]
     state_state: Array  # [W, 4, 4]
-    point_slope: Array  # [U]
+    point_slopes: Array  # [W, U], of each window
+    prior_slope: Array  # [U]
     state_slope: Array  # [W, 4]
 
     def reduced(self, damping: float) -> tuple[Array, Array, Array]:
-        """The equations of the point alone, [U, U] and [U], and the inverse blocks [W, 4, 4]."""
+        """The equations of the point alone: [U, U], each window's share [W, U]; inverse blocks [W, 4, 4]."""
         diagonal = np.einsum("wii->wi", self.state_state)
         damped = self.state_state + damping * diagonal[:, :, None] * np.eye(4)
         inverse = np.linalg.inv(damped)
         carried = self.point_state @ inverse
-        matrix = self.point_point + damping * np.diag(np.diag(self.point_point))
-        matrix = matrix - np.einsum("wis,wjs->ij", carried, self.point_state)
-        return matrix, self.point_slope - np.einsum("wis,ws->i", carried, self.state_slope), inverse
+        matrix = self.point_points.sum(0) + np.eye(len(self.prior_slope))
+        matrix += damping * np.diag(np.diag(matrix))
+        matrix -= np.einsum("wis,wjs->ij", carried, self.point_state)
+        slopes = self.point_slopes - np.einsum("wis,ws->wi", carried, self.state_slope)
+        return matrix, slopes, inverse
+
+    def each_reduced(self) -> Array:
+        """Each window's share of the equations of the point alone, [W, U, U]."""
+        carried = self.point_state @ np.linalg.inv(self.state_state)
+        return self.point_points - np.einsum("wis,wjs->wij", carried, self.point_state)
 
     def solve(self, damping: float) -> tuple[Array, Array]:
         """The step of the point [U] and of the beginnings [4, W]."""
-        matrix, slope, inverse = self.reduced(damping)
-        step = -np.linalg.solve(matrix, slope)
+        matrix, slopes, inverse = self.reduced(damping)
+        step = -np.linalg.solve(matrix, slopes.sum(0) + self.prior_slope)
         rest = self.state_slope + np.einsum("wis,i->ws", self.point_state, step)
         return step, -np.einsum("wst,wt->sw", inverse, rest)
+
+    def covariance(self, episode: NDArray[np.int64]) -> Array:
+        """Of the point, [U, U]: prior, and by how much windows and episodes (`episode` [W]) disagree.
+
+        Errors within a window resemble each other, so that a window counts as one observation (White, 1980).
+        What the laws of the cart lack shows as episodes that would each have another cart: the point moves
+        when one is left out, which is the jackknife's variance (Tukey, 1958), to first order.
+        """
+        matrix, slopes, _ = self.reduced(0.0)
+        inverse, count = np.linalg.inv(matrix), len(slopes)
+        centred = slopes - slopes.mean(0)
+        spread = centred.T @ centred * count / max(1, count - 1)
+        sampled = inverse @ (spread + np.eye(len(matrix))) @ inverse
+        groups = np.unique(episode)
+        if len(groups) < 2:
+            return sampled
+        per_window = self.each_reduced()
+        moves = np.stack(
+            [
+                np.linalg.solve(matrix - per_window[episode == group].sum(0), slopes[episode == group].sum(0))
+                for group in groups
+            ]
+        )
+        moves -= moves.mean(0)
+        return sampled + (len(groups) - 1) / len(groups) * moves.T @ moves

@@ -14,12 +14,19 @@ UNDER_WAY = 4  # motor values that can be: LONGEST_LATENCY is three periods
 
 @torch.no_grad()
 def predict(
-    table: Tensor, motion: Tensor, motors: Tensor, models: Models, period: float, substeps: int
+    table: Tensor,
+    motion: Tensor,
+    motors: Tensor,
+    models: Models,
+    period: float,
+    substeps: int,
+    lead: float = 0.0,
 ) -> Tensor:
     """Counts [T + 1, 2, N], not rounded, of N carts `table` [P, N] that begin in `motion` [4, N].
 
     `motors` [HISTORY + T, N] holds the values chosen before the window as well: the actuator runs through
-    them first, since its force lags behind.
+    them first, since its force lags behind. `lead`, s, is added to each latency: (3.8) moves a cart half a
+    step early, so that with half a step of it a latency means the same however long the step.
     """
     cart = CartParameters.from_table(table)
     state, force = State(*motion.unbind(0)), torch.zeros_like(motion[0])
@@ -30,7 +37,7 @@ def predict(
             force = run_actuator(force, under_way, cart, models, period, substeps)
             continue
         state, drive = run_period(
-            state, Drive(force, under_way), cart.latency, cart, models, period, substeps
+            state, Drive(force, under_way), cart.latency + lead, cart, models, period, substeps
         )
         force = drive.force
         counts.append(as_counts(state, cart))

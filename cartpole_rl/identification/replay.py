@@ -47,14 +47,18 @@ def replay(
     period: float,
     substeps: int,
     restart: float,
+    lead: float = 0.0,
 ) -> list[Replayed]:
     """Each episode beside a cart of `parameters` that is put back onto it every `restart` s.
 
+    `lead` is that of `predict`.
     Raises RecordingError where an episode is of another rate than `period` s, or too short.
     """
     cart = torch.tensor([[float(parameters[name])] for name in CartParameters.names()], dtype=torch.float64)
     periods = max(1, round(restart / period))
-    return [_replayed(episode, cart, models, period, substeps, periods) for episode in episodes]
+    return [
+        _replayed(episode, _Simulation(cart, models, period, substeps, lead), periods) for episode in episodes
+    ]
 
 
 def recorded_period(episode: Episode) -> float:
@@ -62,9 +66,8 @@ def recorded_period(episode: Episode) -> float:
     return round(float(np.median(np.diff(episode.time))), 4)
 
 
-def _replayed(
-    episode: Episode, cart: torch.Tensor, models: Models, period: float, substeps: int, periods: int
-) -> Replayed:
+def _replayed(episode: Episode, run: "_Simulation", periods: int) -> Replayed:
+    period = run.period
     gaps = np.diff(episode.time)
     if abs(np.median(gaps) / period - 1) > IRREGULAR:
         raise RecordingError(
@@ -78,7 +81,6 @@ def _replayed(
             "late or lost"
         )
 
-    run = _Simulation(cart, models, period, substeps)
     first = _beginnings(positions[: LEAD + 1], motors[: HISTORY + LEAD], run)
     simulated, measured = run(first, motors)[LEAD:], positions[LEAD:]
     simulated = np.where(np.isnan(measured), np.nan, simulated)
@@ -101,9 +103,13 @@ class _Simulation(NamedTuple):
     models: Models
     period: float
     substeps: int
+    lead: float
 
     def __call__(self, motion: Array, motors: Array) -> Array:
-        table, laws = self.cart.expand(-1, motion.shape[1]), (self.models, self.period, self.substeps)
+        table, laws = (
+            self.cart.expand(-1, motion.shape[1]),
+            (self.models, self.period, self.substeps, self.lead),
+        )
         return predict(table, torch.from_numpy(motion), torch.from_numpy(motors), *laws).numpy() * UNIT
 
 

@@ -38,8 +38,10 @@ UNKNOWNS: tuple[Unknown, ...] = (
     Unknown("cart_coulomb", 0.5, logarithmic=True),
     Unknown("cart_coulomb_asymmetry", 0.15),
     Unknown("cart_stiction_ratio", 0.3),
+    Unknown("stribeck_velocity", 1.0, logarithmic=True),
     Unknown("pole_viscous", 1.0, logarithmic=True),
     Unknown("pole_drag", 1.0, logarithmic=True),
+    Unknown("pole_coulomb", 3e-4, middle=1e-4),
     Unknown("force_linear", 0.2, logarithmic=True),
     Unknown("force_offset", 0.3),
     Unknown("force_asymmetry", 0.1),
@@ -50,10 +52,13 @@ UNKNOWNS: tuple[Unknown, ...] = (
 )
 
 
-def unknowns_of(models: Models, unknowns: Sequence[Unknown] = UNKNOWNS) -> list[Unknown]:
-    """Those that the chosen laws read."""
-    unread = unused_parameters(models)
-    return [unknown for unknown in unknowns if unknown.name not in unread]
+WEIGHED = (POLE_LENGTH, "pole_mass")  # known where the pole is: then all forces and masses have a scale
+
+
+def unknowns_of(models: Models, known: Sequence[str] = ()) -> list[Unknown]:
+    """Those that the chosen laws read and nobody has measured."""
+    without = {*unused_parameters(models), *known}
+    return [unknown for unknown in UNKNOWNS if unknown.name not in without]
 
 
 def bound_of(name: str) -> Bound:

@@ -22,6 +22,7 @@ class Windows(NamedTuple):
 
     positions: NDArray[np.float64]  # [T + 1, 2, W] encoder counts of cart and pole, as measured
     motors: NDArray[np.float64]  # [HISTORY + T, W] motor values chosen, oldest first
+    episode: NDArray[np.int64]  # [W] number of the episode that each was cut from
 
     @property
     def periods(self) -> int:
@@ -40,8 +41,8 @@ def cut_windows(episodes: Sequence[Episode], period: float, periods: int = 25, m
     A window over a lost or late frame is left out. Raises RecordingError where nothing is left, or where the
     recordings are of another rate.
     """
-    counts, motors = [], []
-    for episode in episodes:
+    counts, motors, origins = [], [], []
+    for number, episode in enumerate(episodes):
         gaps = np.diff(episode.time)
         if len(gaps) and abs(np.median(gaps) / period - 1) > IRREGULAR:
             raise RecordingError(
@@ -54,6 +55,7 @@ def cut_windows(episodes: Sequence[Episode], period: float, periods: int = 25, m
             if regular[max(0, first - HISTORY) : first + periods].all():
                 counts.append(episode.counts[first : first + periods + 1])
                 motors.append(padded[first : first + HISTORY + periods])
+                origins.append(number)
     if not counts:
         raise RecordingError(
             f"no recording holds {periods * period:g} s without a lost frame: record longer, check the cable"
@@ -62,4 +64,5 @@ def cut_windows(episodes: Sequence[Episode], period: float, periods: int = 25, m
     return Windows(
         np.stack([counts[index] for index in chosen], -1).astype(np.float64),
         np.stack([motors[index] for index in chosen], -1).astype(np.float64),
+        np.array([origins[index] for index in chosen]),
     )

@@ -68,9 +68,10 @@ UNUSED_BY_CART_FRICTION = {
     CartFriction.STRIBECK: {"sigmoid_slope"},
 }
 UNUSED_BY_POLE_FRICTION = {
-    PoleFriction.NONE: {"pole_viscous", "pole_drag"},
-    PoleFriction.EXPONENTIAL: {"pole_drag"},
-    PoleFriction.EXPONENTIAL_DRAG: set(),
+    PoleFriction.NONE: {"pole_viscous", "pole_drag", "pole_coulomb"},
+    PoleFriction.EXPONENTIAL: {"pole_drag", "pole_coulomb"},
+    PoleFriction.EXPONENTIAL_DRAG: {"pole_coulomb"},
+    PoleFriction.BEARING: set(),
 }
 UNUSED_BY_ACTUATOR = {
     Actuator.NEWTONS: {

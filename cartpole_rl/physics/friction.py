@@ -28,10 +28,12 @@ class PoleFriction(StrEnum):
     NONE = "none"
     EXPONENTIAL = "exponential"  # viscous: a small swing decays exponentially
     EXPONENTIAL_DRAG = "exponential_drag"  # viscous and quadratic air drag
+    BEARING = "bearing"  # viscous, air drag, and the bearing's Coulomb friction
 
 
 STICKING = (CartFriction.STEP, CartFriction.STRIBECK)  # models with a force at rest
 DRY = (CartFriction.SIGMOID, *STICKING)  # models with more than the viscous term
+SLOW_POLE = 0.05  # rad/s, two thirds of a count a period: slower, the bearing's Coulomb friction fades
 
 
 def coulomb_force(x_dot: Tensor, cart: CartParameters) -> Tensor:
@@ -66,6 +68,8 @@ def pole_torque(theta_dot: Tensor, cart: CartParameters, model: PoleFriction) ->
     if model is PoleFriction.NONE:
         return torch.zeros_like(theta_dot)
     torque = -cart.pole_viscous * theta_dot
-    if model is PoleFriction.EXPONENTIAL_DRAG:
+    if model in (PoleFriction.EXPONENTIAL_DRAG, PoleFriction.BEARING):
         torque = torque - cart.pole_drag * theta_dot * theta_dot.abs()
+    if model is PoleFriction.BEARING:
+        torque = torque - cart.pole_coulomb * torch.tanh(theta_dot / SLOW_POLE)
     return torque

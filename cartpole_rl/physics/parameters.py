@@ -43,6 +43,7 @@ class CartParameters(TensorClass["frozen", "tensor_only"]):  # type: ignore[name
 
     pole_viscous: Tensor  # N m s/rad; alone it gives the exponential decay of a small swing
     pole_drag: Tensor  # N m s^2/rad^2, quadratic air drag
+    pole_coulomb: Tensor  # N m, dry friction of the bearing
 
     force_quadratic: Tensor  # N per motor value squared
     force_linear: Tensor  # N per motor value
@@ -128,6 +129,7 @@ BOUNDS: dict[str, Bound] = {
     "sigmoid_slope": POSITIVE,
     "pole_viscous": NON_NEGATIVE,
     "pole_drag": NON_NEGATIVE,
+    "pole_coulomb": NON_NEGATIVE,
     "force_quadratic": ANY,
     "force_linear": ANY,
     "force_offset": ANY,

@@ -4,6 +4,7 @@ Nothing but the port's name comes from the emulator: what drives it is the same 
 """
 
 from collections.abc import Callable
+from typing import Literal
 
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.plants.emulated_cart import EmulatedCart
@@ -14,6 +15,7 @@ def emulated_plant(
     emulator: EmulatorSettings,
     control_period: float = 0.02,
     prompt: Callable[[str], None] = lambda text: None,
+    rehome: Literal["once", "always"] = "once",
 ) -> SerialPlant:
     """A serial plant on an emulated cart that lives as long as the plant. The start is the emulator's.
 
@@ -26,6 +28,7 @@ def emulated_plant(
         port=cart.port,
         start=emulator.start,
         control_period=control_period,
+        rehome=rehome,
         timeout=5.0,
         connect_timeout=10.0,
         answer_timeout=0.1 if disturbed else 2.0,

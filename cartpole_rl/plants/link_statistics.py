@@ -1,4 +1,8 @@
-"""What a serial link has been through: frames counted, and the host's time from a state to its command."""
+"""What a serial link has been through: frames counted, and the time from a state to its command.
+
+The host's own share of that time is told to the microsecond, by its clock. The whole, from the measurement to
+the command's arrival at the cart, is told by the cart: its STATEs carry the age of the newest command.
+"""
 
 from dataclasses import dataclass, field
 
@@ -38,6 +42,8 @@ class LinkSummary:
     frames_received: int
     bad_frames: int
     lost_frames: int
+    overtaken_frames: int
+    repeated_frames: int
     late_ticks: int
     latency_samples: int
     latency_median_ms: float  # nan without samples, as the three below
@@ -53,8 +59,11 @@ class LinkStatistics:
     frames_received: int = 0  # whole frames of the cart, of every type
     bad_frames: int = 0  # bytes between two 0x00 that are no frame: checksum, stuffing, type, length
     lost_frames: int = 0  # states that never arrived whole, by the gaps in STATE's tick
+    overtaken_frames: int = 0  # states that arrived after a newer one, and were dropped
+    repeated_frames: int = 0  # states that arrived once more, and were dropped
     late_ticks: int = 0  # states passed over, or answered later than a period after they came
     latency: LatencyRing = field(default_factory=LatencyRing)
+    loop_times: LatencyRing = field(default_factory=LatencyRing)  # see `loop`
 
     def summary(self) -> LinkSummary:
         """The counts and the latency's median, 99th and 99.9th percentile and maximum."""
@@ -65,6 +74,8 @@ class LinkStatistics:
             self.frames_received,
             self.bad_frames,
             self.lost_frames,
+            self.overtaken_frames,
+            self.repeated_frames,
             self.late_ticks,
             len(times),
             median,
@@ -73,23 +84,38 @@ class LinkStatistics:
             longest,
         )
 
-    def state_to_command(self, share: float = 0.98) -> tuple[float, float]:
-        """[low, high] in s between which the middle `share` of the measured latencies lie.
+    def loop(self, share: float = 0.98) -> tuple[float, float]:
+        """[low, high] in s between which the middle `share` of the loop times lie.
 
-        The bounds of `latency` in the simulator's randomization (`absolute: [low, high]`), so far as the
-        host's part goes: from a state's arrival here to the end of its command. The time on the wire and that
-        which the motor takes come on top; `cartpole-preflight` measures them. Raises PlantError without a
-        sample, ValueError for a share outside 0 to 1.
+        From a state's measurement to the arrival of the command chosen on it, by the cart's clock: the wire
+        both ways, and the host between. What the cart takes from there to a force is not in it; the
+        `latency` of `cartpole-preflight` is that part. Raises PlantError without a sample, ValueError for a
+        share outside 0 to 1.
         """
         if not 0 <= share <= 1:
             raise ValueError(f"a share is between 0 and 1, not {share:g}")
-        times = self.latency.samples()
+        times = self.loop_times.samples()
         if not len(times):
             raise PlantError("no latency was measured yet: drive the cart first")
         low, high = np.quantile(times, ((1 - share) / 2, (1 + share) / 2)).tolist()
         return low, high
 
+    def latency_override(self) -> str | None:
+        """What hands the measured loop times to `cartpole-train`, as a word of its command line.
+
+        None where there is nothing to hand on: without a sample, or where every command came at once, as to
+        a lockstep emulator.
+        """
+        if not len(self.loop_times.samples()):
+            return None
+        low, high = (round(seconds, 4) for seconds in self.loop())
+        if high <= 0:
+            return None
+        return f"++randomization.latency={{distribution: uniform, absolute: [{low}, {high}]}}"
+
     def clear(self) -> None:
         """Begin to count anew."""
         self.frames_received = self.bad_frames = self.lost_frames = self.late_ticks = 0
+        self.overtaken_frames = self.repeated_frames = 0
         self.latency.clear()
+        self.loop_times.clear()

@@ -1,9 +1,11 @@
 """The plant at the end of a serial port: one cart, [1], with the contract of `specs.Plant`.
 
-Time is the cart's: `dt` comes from STATE's clock. Every reset homes the cart, and every ending, by the track,
-a fault, the link or `close`, sets the motor to 0 and disarms first.
+Time is the cart's: `dt` comes from STATE's clock. The first reset homes the cart, later ones bring it back
+to the middle; after a fault, a restart or a lost link it is homed again. Every ending, by the track, a fault,
+the link or `close`, sets the motor to 0 and disarms first.
 """
 
+import logging
 import math
 import time
 from collections import deque
@@ -18,9 +20,12 @@ from torch import Tensor
 from cartpole_rl.errors import ConfigError, FaultError, LinkError, PlantError, PortError
 from cartpole_rl.plants.serial_cart import SerialCart, SerialSettings
 from cartpole_rl.plants.serial_errors import RefusedError, fault_error
+from cartpole_rl.plants.serial_recentring import recentre
 from cartpole_rl.plants.specs import Plant
 from cartpole_rl.settings import Positive
 from cartpole_rl.wire import Fault, Flags, State
+
+LOGGER = logging.getLogger(__name__)
 
 CLOCK_WRAP = 2**32  # us; STATE's clock begins anew after 71.6 minutes
 TICK_WRAP = 2**32  # periods
@@ -36,6 +41,7 @@ class SerialPlantSettings(SerialSettings):
 
     start: Literal["hanging", "upright"] = "hanging"
     control_period: Positive = 0.02  # set on the cart before an episode, if it has another
+    rehome: Literal["once", "always"] = "once"  # once a connection and after what may cost a zero, or always
     home_timeout: Positive = 120.0
     start_timeout: Positive = 60.0  # for the pole to come into its start position
     pole_length: Positive | None = None  # m, twice pivot to centre of mass; for an agent that observes it
@@ -55,11 +61,11 @@ class Owned(Protocol):
 class SerialPlant(Plant):
     """One cart on a wire. It connects when it is made, and again in a reset after the link was lost.
 
-    A reset stops, clears faults, homes, waits for the start (for `upright` it asks a person by `prompt` to
-    hold the pole up), arms, and returns the first state. `terminated`: the cart is beyond its soft limit, or
-    latched a fault. `truncated`: the link was lost, or the cart restarted; the counts are then the last that
-    came. `ended_by` is the last ending, "track", "fault" or "link", and empty while an episode runs;
-    `last_error` is the error behind "fault" or "link".
+    A reset stops, clears faults, homes or re-centres the cart (`settings.rehome`), waits for the start (for
+    `upright` it asks a person by `prompt` to hold the pole up), arms, and returns the first state.
+    `terminated`: the cart is beyond its soft limit, or latched a fault. `truncated`: the link was lost, or
+    the cart restarted; the counts are then the last that came. `ended_by` is the last ending, "track",
+    "fault" or "link", and empty while an episode runs; `last_error` is the error behind "fault" or "link".
 
     Raises PortError or LinkError when it cannot connect; a reset raises LinkError after a loss that stays,
     FaultError for a fault that does not clear or a homing that fails, and PlantError if the start is not
@@ -77,6 +83,8 @@ class SerialPlant(Plant):
         self.cart = SerialCart(settings)
         self.ended_by = ""
         self.last_error: PlantError | None = None
+        self._hanging: int | None = None  # pole count after homing; None before it, and once it may be wrong
+        self._turns = 0  # pole counts of the whole turns that the pole has made before this episode
         self._prompt = prompt
         self._owned = owned
         self._state = State(0, 0, 0, 0, 0, 0, 0, 0)
@@ -117,6 +125,7 @@ class SerialPlant(Plant):
         self._make_ready()
         self.cart.start()
         self._state = self.cart.get_state()
+        self._turns = self._whole_turns()
         self.ended_by = ""
         self.last_error = None
         return self.frame(*self._report(self.settings.control_period))
@@ -164,12 +173,18 @@ class SerialPlant(Plant):
         """What the cart says: counts, dt, motor_applied, terminated, truncated; `dt` in s."""
         state = self._state
         return (
-            torch.tensor([[state.cart_counts, state.pole_counts]]),
+            torch.tensor([[state.cart_counts, state.pole_counts - self._turns]]),
             torch.tensor([[dt]], dtype=torch.float32),
             torch.tensor([[state.motor_applied]]),
             torch.tensor([[self.ended_by in ("track", "fault")]]),
             torch.tensor([[self.ended_by == "link"]]),
         )
+
+    def _whole_turns(self) -> int:
+        """Pole counts by which the newest state is whole turns from where an episode begins."""
+        turn = self.cart.information.pole_counts_per_turn
+        begins = 0 if self.settings.start == "upright" else turn // 2
+        return turn * round((self._state.pole_counts - begins) / turn)
 
     def _reach(self) -> None:
         """A stopped cart that answers; connects anew after a loss. Raises LinkError."""
@@ -178,6 +193,7 @@ class SerialPlant(Plant):
                 self.cart.stop()
                 return
             self.cart.close()
+        self._hanging = None
         try:
             self.cart.open()
         except (PortError, LinkError) as error:
@@ -186,10 +202,13 @@ class SerialPlant(Plant):
             raise LinkError(f"the link to the cart was lost{lost} and is not there again: {why}") from error
 
     def _make_ready(self) -> None:
-        """Clear faults, home, set the period, and wait for the pole in its start position."""
+        """Clear faults, find the middle, set the period, and wait for the pole in its start position."""
         if self.cart.poll_state().fault:
+            self._hanging = None
             self.cart.clear_fault()
-        self.cart.home(self.settings.home_timeout)
+        if not self._is_recentred():
+            self._hanging = None
+            self._hanging = self.cart.home(self.settings.home_timeout).pole_counts
         period_us = round(self.settings.control_period * 1e6)
         if self.cart.info().period_us != period_us:  # and its limits are those of the span just measured
             self.cart.set_period(period_us)
@@ -199,6 +218,25 @@ class SerialPlant(Plant):
             self._await_pole(0.0, UPRIGHT_TOLERANCE, UPRIGHT_SWAY)
         else:
             self._await_pole(math.pi, HANGING_TOLERANCE, HANGING_SWAY)
+
+    def _is_recentred(self) -> bool:
+        """Whether the cart is in the middle again without homing. False if it has to be homed.
+
+        Raises LinkError.
+        """
+        homed = bool(self.cart.flags & Flags.HOMED)
+        if self.settings.rehome == "always" or self._hanging is None or not homed:
+            return False
+        try:
+            recentre(self.cart, self._hanging)
+        except LinkError:
+            raise
+        except PlantError as error:
+            LOGGER.warning("homing, as the cart could not be brought back to the middle: %s", error)
+            if self.cart.poll_state().fault:
+                self.cart.clear_fault()
+            return False
+        return True
 
     def _await_pole(self, angle: float, tolerance: float, sway: float) -> None:
         """Wait until the pole stays within `tolerance` of `angle` and moves less than `sway`, in rad."""

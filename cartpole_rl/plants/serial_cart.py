@@ -6,6 +6,9 @@ last frame (STATE tells its sequence), so that a loop never acts on the past and
 effect in a state from before it. A command that was lost on the way is never acknowledged: one and a half
 periods after it the newest state is taken as it is.
 
+A STATE that comes again, or after a newer one, is never taken for the newest. It is told by its tick, which
+is at or a little below the newest one's; a tick that is far below is a cart that has restarted.
+
 Late ticks, while states are answered with motor values: each state that is passed over, and each one whose
 command went out later than a period after it came. The second is counted only where the cart's tick went on
 meanwhile: a lockstep emulator waits for the host, and nothing is late there.
@@ -19,8 +22,8 @@ The protocol is written out in `docs/protocol.md`.
 import logging
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from types import TracebackType
 from typing import Annotated, Self, TypeVar
 
@@ -56,7 +59,11 @@ LOGGER = logging.getLogger(__name__)
 Answer = TypeVar("Answer", bound=Message)
 
 TICKS = 2**32  # STATE's tick wraps here
+TIMES = 2**32  # us, and its time
+HALF_MILLISECOND = 500  # us
+OVERTAKEN_TICKS = 16  # 0.3 s: nothing keeps a frame back for longer, and no cart boots and is driven so soon
 BACKLOG_BYTES = 1000  # with more waiting, the system's buffer (4096) may have thrown newer bytes away
+LONGEST_PERIOD_US = 100_000  # that the protocol allows, whatever INFO says
 UNACKNOWLEDGED_PERIODS = 1.5  # of a frame: by then the state after it has come, if the frame has
 
 
@@ -99,15 +106,19 @@ class SerialCart:
         self._newest: State | None = None  # arrived, and not yet given to anyone
         self._newest_at = 0.0
         self._last_tick: int | None = None
+        self._missing: set[int] = set()  # ticks that were counted as lost, and may still come late
         self._answers: deque[Message] = deque(maxlen=64)
         self._refused: Nack | None = None  # of a SET_MOTOR
         self._refused_sequence = -1  # of the newest frame that was refused; no state will acknowledge it
         self._state_since_refusal = True
+        self._asked_sequence = 0  # of the newest question; a refusal of a motor value from before it is void
         self._driving = False  # states are being answered with motor values
         self._unanswered = False  # a state was returned and its command is not sent yet
         self._answering: State | None = None  # the state that was returned last
         self._overdue: State | None = None  # its command went out later than a period after it came
         self._catching_up = False  # what is missing now was thrown away while the host did something else
+        self._measured = True  # latency and late ticks are counted
+        self._commanded: tuple[int, State] | None = None  # sequence of a motor value, the state it answers
 
     def __enter__(self) -> Self:
         self.open()
@@ -216,17 +227,28 @@ class SerialCart:
     def set_motor(self, value: int) -> int:
         """Send a motor value; returns what was sent, which is `value` within the cart's limits."""
         link = self._link
-        limit = self.information.motor_limit
+        limit = max(0, self.information.motor_limit)  # whatever INFO says, 0 stays 0
         sent = max(-limit, min(limit, int(value)))
         self._refused_sequence = -1
         link.send(SetMotor(sent))
         if self._unanswered:
-            self._driving = True
-            delay = link.sent_at - self._newest_at
-            self.statistics.latency.add(delay)
-            self._overdue = self._answering if delay > self.information.period_us * 1e-6 else None
             self._unanswered = False
+            if self._measured:
+                self._driving = True
+                self._commanded = None if self._answering is None else (link.sequence, self._answering)
+                delay = link.sent_at - self._newest_at
+                self.statistics.latency.add(delay)
+                self._overdue = self._answering if delay > self.information.period_us * 1e-6 else None
         return sent
+
+    @contextmanager
+    def unmeasured(self) -> Iterator[None]:
+        """Within it, commands count neither as latencies nor as late: the host's own small moves."""
+        self._measured = False
+        try:
+            yield
+        finally:
+            self._measured = True
 
     def get_state(self) -> State:
         """Wait for the newest state that was measured after the cart took the last frame sent.
@@ -265,6 +287,7 @@ class SerialCart:
 
     def _let_go(self, link: SerialLink) -> None:
         self._open_link = self._newest = self._last_tick = self._refused = None
+        self._missing.clear()
         link.close()
 
     def _shake_hands(self) -> Info:
@@ -300,12 +323,13 @@ class SerialCart:
     ) -> Answer:
         """Send `message` until the cart answers it. Raises what a NACK says; LinkError without an answer."""
         self._driving = self._unanswered = False
-        self._overdue = None
+        self._overdue = self._commanded = None
         self._refused_sequence = -1
         self._answers.clear()
         asked: list[int] = []
         for _ in range(1 + self.settings.retries):
             asked.append(self._link.send(*before, message))
+            self._asked_sequence = asked[-1]
             answer = self._await_answer(time.perf_counter() + self.settings.answer_timeout, asked, kind, fits)
             if answer is not None:
                 self._refused = None  # of a motor value from before; it has no meaning any more
@@ -338,6 +362,7 @@ class SerialCart:
         if refused is not None and not state.fault:
             raise refusal(refused)
         self._count_overdue(state)
+        self._time_loop(state)
         self._catching_up, self._unanswered, self._answering = False, True, state
         return state
 
@@ -366,7 +391,7 @@ class SerialCart:
         if link.sequence == self._refused_sequence and self._state_since_refusal:
             return True
         waited = time.perf_counter() - link.sent_at
-        return waited > UNACKNOWLEDGED_PERIODS * self.information.period_us * 1e-6
+        return waited > UNACKNOWLEDGED_PERIODS * min(self.information.period_us, LONGEST_PERIOD_US) * 1e-6
 
     def _endure_silence(self, deadline: float) -> None:
         """Raise LinkError after the deadline; say HELLO after each `nudge_after` seconds without a byte."""
@@ -394,36 +419,67 @@ class SerialCart:
         self._refused_sequence = nack.sequence
         self._state_since_refusal = False
         if nack.type == MessageType.SET_MOTOR:
-            self._refused = nack  # nobody waits for its answer
+            if (nack.sequence - self._asked_sequence) % 256 < 128:
+                self._refused = nack  # nobody waits for its answer
         else:
             self._answers.append(nack)
 
     def _take_state(self, state: State, flags: Flags) -> None:
-        """Keep the state as the newest; count those that are missing before it."""
-        if self._newest is not None:
-            self._count_late()
+        """Keep the state as the newest, unless a newer one is here; count those missing before it."""
         if self._last_tick is not None:
+            if (self._last_tick - state.tick) % TICKS < OVERTAKEN_TICKS:
+                self._count_overtaken(state.tick)
+                return
             missing = (state.tick - self._last_tick - 1) % TICKS
             if missing < TICKS // 2:  # otherwise the tick went back: the cart has restarted
-                self._count_missing(missing)
+                self._count_missing(state.tick, missing)
+        if self._newest is not None:
+            self._count_late()
         self._last_tick = state.tick
         self._newest = state
         self._state_since_refusal = True
         self._newest_at = self._link.received_at
         self.flags = flags
 
-    def _count_missing(self, states: int) -> None:
-        """States that never came: lost on the way, or thrown away here while the host was busy."""
+    def _count_missing(self, tick: int, states: int) -> None:
+        """States before `tick` that did not come: lost on the way, or thrown away while the host was busy."""
         if not self._catching_up:
             self.statistics.lost_frames += states
+            newest = min(states, OVERTAKEN_TICKS)
+            missing = self._missing | {(tick - age) % TICKS for age in range(1, newest + 1)}
+            self._missing = {each for each in missing if (tick - each) % TICKS < OVERTAKEN_TICKS}
         elif self._driving:
             self.statistics.late_ticks += states
+
+    def _count_overtaken(self, tick: int) -> None:
+        """A state that a newer one has overtaken, and so was not lost; or one that came before, once more."""
+        if tick in self._missing:
+            self._missing.remove(tick)
+            self.statistics.lost_frames = max(
+                0, self.statistics.lost_frames - 1
+            )  # 0 where it was cleared since
+            self.statistics.overtaken_frames += 1
+        else:
+            self.statistics.repeated_frames += 1
 
     def _count_overdue(self, state: State) -> None:
         """A state whose command took over a period, if by the cart's clock too more than one lies between."""
         overdue, self._overdue = self._overdue, None
         if overdue is not None and state.tick != (overdue.tick + 1) % TICKS:
             self.statistics.late_ticks += 1
+
+    def _time_loop(self, state: State) -> None:
+        """Note how long after a state was measured the command chosen on it came to the cart.
+
+        The state tells the command's age in whole milliseconds, half of one less than it is on average.
+        """
+        commanded, self._commanded = self._commanded, None
+        if commanded is None or state.last_sequence != commanded[0]:
+            return
+        passed_us = (state.time_us - commanded[1].time_us) % TIMES
+        if passed_us < TIMES // 2:  # otherwise the cart has restarted
+            since_us = passed_us - 1000 * state.command_age_ms
+            self.statistics.loop_times.add(max(0, since_us - HALF_MILLISECOND) * 1e-6)
 
     def _count_late(self) -> None:
         """A state nobody acted on; while the host asks other things than motor values, that is no delay."""

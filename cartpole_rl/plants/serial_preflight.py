@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 
 from cartpole_rl.errors import PlantError
 from cartpole_rl.plants.serial_cart import SerialCart
-from cartpole_rl.plants.serial_errors import fault_error
+from cartpole_rl.plants.serial_moves import GENTLE_MOTOR, ArmedCart, NotReadyError, metres
 from cartpole_rl.tasks.features import CART_METRES_PER_COUNT, POLE_COUNTS_PER_TURN
 from cartpole_rl.wire import Flags, Info, State
 
@@ -36,7 +36,6 @@ RETURN_SECONDS = 0.5  # the way back is covered as fast as if it took so long, b
 SLOWEST_RETURN, FASTEST_RETURN = 0.03, 0.1  # m/s ... slower and faster than this
 RETURN_GAIN = 150.0  # motor values per m/s that the cart is too slow
 RETURN_INTEGRAL = 1250.0  # motor values per m of way that it is behind
-LARGEST_RAMP = 199  # motor value; from 200 on the cart watches for stalls
 RAMP_STEP = 1  # motor values a period
 MOVED = 4  # counts, 0.09 mm: more than a pole that swings can press into the gears' play
 SURELY_MOVED = 44  # counts, 1 mm
@@ -44,23 +43,11 @@ POLE_MOVED = 14  # counts; more, where the pole still swings
 PUSH = 60  # motor values above the dead-band: about 1.5 m/s^2
 LONGEST_PUSH, FARTHEST_PUSH = 0.3, 0.035  # s, m
 DRIFT = 4  # periods over which a swing that is left is measured
-REST_SECONDS = 0.3
-REST_COUNTS = 2  # of the cart
-LONGEST_REST = 10.0  # s
-SWING_SECONDS = 1.5  # a whole swing of the large pole takes 1.3 s
 NO_SWING, LONG_PATIENCE = 6, 15.0  # counts peak to peak, s
 SMALL_SWING, SHORT_PATIENCE = 40, 5.0  # presses the cart as much as three motor values do
 LARGEST_DEADBAND = 150  # motor value; the weakest motor value that agents use is 100, the usual one 200
 STEPS = 4  # for the latency, two to each side
 LONGEST_LATENCY_PERIODS = 2.0  # what agents are trained on reaches about one period
-
-
-class NotReadyError(PlantError):
-    """A check failed: `found` says what is wrong, `remedy` what to do."""
-
-    def __init__(self, found: str, remedy: str) -> None:
-        super().__init__(f"{found}: {remedy}")
-        self.found, self.remedy = found, remedy
 
 
 @dataclass(frozen=True)
@@ -76,55 +63,18 @@ class Finding:
 
 
 @dataclass
-class Moves:
+class Moves(ArmedCart):
     """An armed cart that is moved a little at a time, and what it has shown of itself.
 
     Every move raises NotReadyError when the cart gets too far from the middle, and FaultError when it latches
     a fault. Positions in counts, times by the cart's clock.
     """
 
-    cart: SerialCart
     deadband: dict[int, int] = field(
         default_factory=dict
     )  # motor value that moves it, right (1) and left (-1)
     farthest: int = 0  # counts from the middle
     limited: bool = False  # the soft limit has held a motor value back
-
-    def arm(self) -> State:
-        """Arm the motor, at rest."""
-        self.cart.start()
-        return self._seen(self.cart.get_state())
-
-    def drive(self, motor: int) -> State:
-        """One period under a motor value; the state at its end."""
-        self.cart.set_motor(motor)
-        return self._seen(self.cart.get_state())
-
-    def rest(self) -> State:
-        """Motor 0 until the cart stands. Raises NotReadyError if it never does."""
-        states = [self.drive(0)]
-        for _ in range(self.periods(LONGEST_REST)):
-            states.append(self.drive(0))
-            counts = [state.cart_counts for state in states[-self.periods(REST_SECONDS) - 1 :]]
-            if len(counts) > self.periods(REST_SECONDS) and spread(counts) <= REST_COUNTS:
-                return states[-1]
-        raise NotReadyError(
-            f"the cart does not come to rest within {LONGEST_REST:g} s with the motor at 0",
-            "put the track level, check that the motor driver gives no voltage at 0",
-        )
-
-    def calm(self, swing: int, patience: float) -> tuple[list[State], int]:
-        """Motor 0 until the pole swings by `swing` counts or less, peak to peak; no longer than `patience` s.
-
-        The states, and the swing that is left. A pole with little friction takes minutes to be still.
-        """
-        states = [self.rest()]
-        for _ in range(self.periods(max(patience, SWING_SECONDS))):
-            states.append(self.drive(0))
-            poles = [state.pole_counts for state in states[-self.periods(SWING_SECONDS) - 1 :]]
-            if len(poles) > self.periods(SWING_SECONDS) and spread(poles) <= swing:
-                break
-        return states, spread(poles)
 
     def ramp(self, side: int) -> tuple[int, State, State]:
         """Raise the motor value to one side until the cart moves; the value, and the states before and after.
@@ -132,12 +82,12 @@ class Moves:
         Raises NotReadyError if it never moves.
         """
         before = self.calm(SMALL_SWING, SHORT_PATIENCE)[0][-1]
-        for size in range(RAMP_STEP, LARGEST_RAMP + 1, RAMP_STEP):
+        for size in range(RAMP_STEP, GENTLE_MOTOR + 1, RAMP_STEP):
             after = self.drive(side * size)
             if abs(after.cart_counts - before.cart_counts) >= MOVED:
                 return size, before, after
         raise NotReadyError(
-            f"motor values up to {side * LARGEST_RAMP:+d} do not move the cart's count",
+            f"motor values up to {side * GENTLE_MOTOR:+d} do not move the cart's count",
             "switch the motor's supply on, check the cables of the motor and of the cart's encoder, "
             "free the cart",
         )
@@ -159,27 +109,18 @@ class Moves:
             push += RETURN_INTEGRAL * lag * self.period
             base = self.deadband.get(side) or self.deadband.get(-side, 0)
             motor = side * base + RETURN_GAIN * lag + push
-            before, state = state, self.drive(round(max(-LARGEST_RAMP, min(LARGEST_RAMP, motor))))
+            before, state = state, self.drive(round(max(-GENTLE_MOTOR, min(GENTLE_MOTOR, motor))))
             speed = metres(state.cart_counts - before.cart_counts) / self.period
         raise NotReadyError(
             f"the cart does not come back to the middle; it is {metres(state.cart_counts) * 1e3:+.0f} mm off",
             "free the cart, put the track level",
         )
 
-    @property
-    def period(self) -> float:
-        """Control period in s."""
-        return self.cart.information.period_us * 1e-6
-
-    def periods(self, seconds: float) -> int:
-        """Control periods in a time."""
-        return math.ceil(seconds / self.period)
-
-    def _seen(self, state: State) -> State:
+    def seen(self, state: State) -> State:
+        """Note where the cart is; raise what is wrong with that."""
         self.farthest = max(self.farthest, abs(state.cart_counts))
         self.limited = self.limited or bool(self.cart.flags & Flags.SOFT_LIMIT)
-        if state.fault:
-            raise fault_error(state.fault)
+        super().seen(state)
         if metres(abs(state.cart_counts)) > FARTHEST:
             self.cart.stop()
             raise NotReadyError(
@@ -327,7 +268,7 @@ def pole_direction(moves: Moves) -> str:
     states, swing = moves.calm(NO_SWING, LONG_PATIENCE)
     before, drift = states[-1], (states[-1].pole_counts - states[-1 - DRIFT].pole_counts) / DRIFT
     enough = max(POLE_MOVED, NO_SWING + swing // 2)
-    value = min(LARGEST_RAMP, moves.deadband[+1] + PUSH)
+    value = min(GENTLE_MOTOR, moves.deadband[+1] + PUSH)
     for period in range(1, moves.periods(LONGEST_PUSH) + 1):
         after = moves.drive(value)
         swung = round(after.pole_counts - before.pole_counts - drift * period)
@@ -386,7 +327,7 @@ def step_latency(moves: Moves, side: int) -> tuple[float, float]:
     since then; two states under way tell that moment more finely than a period.
     """
     before = moves.calm(SMALL_SWING, SHORT_PATIENCE)[0][-1]
-    value = side * min(LARGEST_RAMP, moves.deadband[side] + PUSH)
+    value = side * min(GENTLE_MOTOR, moves.deadband[side] + PUSH)
     states = [moves.drive(value)]
     age = states[0].command_age_ms * 1e-3
     taken_us = states[0].time_us - states[0].command_age_ms * 1000
@@ -415,13 +356,3 @@ def soft_limit(moves: Moves) -> str:
             "check the firmware's limits and the zero that homing set",
         )
     return f"not reached; the cart stayed within {metres(moves.farthest) * 1e3:.0f} mm of the middle"
-
-
-def metres(counts: int) -> float:
-    """Cart counts in m."""
-    return counts * CART_METRES_PER_COUNT
-
-
-def spread(counts: list[int]) -> int:
-    """Largest less smallest count."""
-    return max(counts) - min(counts)

@@ -15,7 +15,7 @@ from torch import Tensor
 from cartpole_rl.compilation import Compiled
 from cartpole_rl.physics.dynamics import Models, State
 from cartpole_rl.physics.parameters import CartParameters
-from cartpole_rl.plants.simulation import Carts, Given, encoder_counts, run_carts
+from cartpole_rl.plants.simulation import Carts, Given, Period, encoder_counts, run_carts
 from cartpole_rl.plants.specs import Plant
 from cartpole_rl.randomization import Draws
 from cartpole_rl.tasks.starts import StartSettings, draw_start
@@ -57,7 +57,7 @@ class SimulatedPlant(Plant):
         self.randomizer, self.start, self.models = randomizer, start, models
         self.period, self.substeps = period, substeps
         run = partial(run_carts, models=models, period=period, substeps=substeps)
-        self._run = Compiled(run) if compiled else run
+        self._run: Callable[[Carts, Given], Period] = Compiled(run) if compiled else run
         self._generator = torch.Generator(device=self.device)
         self._chancy = any(randomizer.can_differ_from_zero(name) for name in OF_CHANCE)
         self._no_chance = torch.zeros(3, carts, device=self.device)

@@ -4,7 +4,7 @@ What chance has a part in comes in drawn, so that this can be compiled. Tensors 
 transpose of what stands in the tensordict: compiled code then runs along the carts.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -40,14 +40,22 @@ class Period(NamedTuple):
     off_track: Tensor  # [1, N] bool
 
 
-def run_carts(carts: Carts, given: Given, *, models: Models, period: float, substeps: int) -> Period:
-    """Run every cart for `period` s in `substeps` steps under a new motor value."""
+def run_carts(
+    carts: Carts,
+    given: Given,
+    *,
+    models: Models,
+    period: float,
+    substeps: int,
+    run: Callable[..., tuple[State, Drive]] = run_period,
+) -> Period:
+    """Run every cart for `period` s in `substeps` steps under a new motor value, as `run` does."""
     cart = CartParameters.from_table(carts.table)
     before = State(*carts.motion.unbind(0))
     force, *motors = carts.drive.unbind(0)
     drive = Drive(force, [given.motor[0].to(force.dtype), *motors[:-1]])
     latency = (cart.latency + given.chance[0] * cart.latency_jitter).clamp(min=0)
-    state, drive = run_period(before, drive, latency, cart, models, period, substeps)
+    state, drive = run(before, drive, latency, cart, models, period, substeps)
     return Period(
         torch.stack(state),
         torch.stack((drive.force, *drive.motors)),

@@ -1,12 +1,19 @@
 """Draws carts from a table of carts: what an identification found, correlations included."""
 
+from collections.abc import Collection, Mapping
+from pathlib import Path
 from typing import Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from cartpole_rl.physics.parameters import CartParameters
+from cartpole_rl.errors import ConfigError
+from cartpole_rl.physics.parameters import BOUNDS, CartParameters
+from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.randomization.randomizer import Randomizer
+from cartpole_rl.randomization.ranges import Range
+from cartpole_rl.settings import Fraction, Positive, Settings
 
 
 class Draws(Protocol):
@@ -24,14 +31,53 @@ class Draws(Protocol):
         """Whether a draw of `name` can be anything but 0."""
 
 
+class FoundSettings(Settings):
+    """Carts as an identification found them, in place of ranges about the nominal cart."""
+
+    posterior: Path  # posterior.npz of cartpole-identify
+    widen: Positive  # its uncertainty is multiplied by it
+    elsewhere: Fraction  # of the carts are nominal ones within `ranges`
+    ranges: dict[str, Range]  # of what the identification does not tell
+
+    def carts(self, cart: Mapping[str, float], poles: PoleSettings) -> "FoundCarts":
+        """What draws such carts. Raises ConfigError where the file is missing or damaged."""
+        others = Randomizer(cart, poles, self.ranges)
+        try:
+            with np.load(self.posterior) as stored:
+                table = dict(zip(stored["names"].tolist(), stored["carts"], strict=True))
+                told = [str(name) for name in stored["told"]]
+        except (OSError, ValueError, KeyError) as error:
+            raise ConfigError(f"randomization.posterior={self.posterior} cannot be read: {error}") from None
+        rows = []
+        for name, usual in zip(CartParameters.names(), others.nominal.tolist(), strict=True):
+            values = np.asarray(table.get(name, [usual]), dtype=np.float64)
+            values = np.median(values) + self.widen * (values - np.median(values))
+            rows.append(np.clip(values, BOUNDS[name].low, BOUNDS[name].high))
+        found = torch.from_numpy(np.stack(np.broadcast_arrays(*rows))).float()
+        return FoundCarts(found, others, self.elsewhere, float(found[LATENCY].max()), told)
+
+
+LATENCY = CartParameters.names().index("latency")
+
+
 class FoundCarts:
     """Draws with replacement from `found` [P, M], and for `elsewhere` of all draws from `others` instead.
 
-    It stands where a Randomizer stands; `others` keep an agent from trusting what was found too much.
+    It stands where a Randomizer stands; `others` keep an agent from trusting what was found too much. Of the
+    parameters that are not `told` every draw is the others'; None tells all.
     """
 
-    def __init__(self, found: Tensor, others: Randomizer, elsewhere: float, longest_delay: float) -> None:
+    def __init__(
+        self,
+        found: Tensor,
+        others: Draws,
+        elsewhere: float,
+        longest_delay: float,
+        told: Collection[str] | None = None,
+    ) -> None:
         self.found, self.others, self.elsewhere = found.to(others.nominal), others, elsewhere
+        telling = [told is None or name in told for name in CartParameters.names()]
+        self._told = torch.tensor(telling, device=self.found.device).unsqueeze(1)
         self._longest_delay = longest_delay  # s, of this table and of all that may take its place
         self.nominal = self.found.median(1).values
 
@@ -41,7 +87,7 @@ class FoundCarts:
         which = torch.randint(self.found.shape[1], (count,), generator=generator, device=device)
         table = self.found[:, which]
         strangers = torch.rand(count, generator=generator, device=device) < self.elsewhere
-        return torch.where(strangers, self.others.draw(count, generator), table)
+        return torch.where(self._told & ~strangers, table, self.others.draw(count, generator))
 
     def longest_delay(self) -> float:
         """The longest latency that a draw can have, jitter included, s."""

@@ -4,10 +4,12 @@ import json
 import os
 import signal
 import time
+from collections import defaultdict
 from pathlib import Path
 
 import pytest
 from command_line import Outcome, console_script, in_process, outcome
+from tensorboard.backend.event_processing.event_file_loader import EventFileLoader
 
 from cartpole_rl.commands.build import trained_agent
 from cartpole_rl.evaluation.recordings import read_recording
@@ -59,6 +61,20 @@ def test_the_better_policy_is_kept_and_said(tuned: tuple[Path, Outcome]) -> None
     metrics = json.loads((run / "metrics.json").read_text())
     assert metrics["score"]["mean"] == compared[better]["score"]["mean"]
     assert metrics["latency_samples"] > 0
+
+
+def test_tensorboard_shows_cart_and_simulation_side_by_side(tuned: tuple[Path, Outcome]) -> None:
+    run, _ = tuned
+    steps: dict[str, list[int]] = defaultdict(list)
+    for file in sorted(run.glob("events*")):
+        for event in EventFileLoader(str(file)).Load():
+            for value in event.summary.value:
+                steps[value.tag].append(event.step)
+    assert steps["cart/score_before"] == [1]
+    assert steps["cart/score_tune"] == [2, 3]
+    assert steps["cart/score_after"] == [4]
+    assert steps["cart/score_in_simulation"] == [1, 2, 3]
+    assert steps["link/late_ticks"] == [1, 2, 3, 4]
 
 
 def test_a_tuned_agent_is_evaluated_like_any_other(tuned: tuple[Path, Outcome], tmp_path: Path) -> None:

@@ -284,7 +284,8 @@ def test_every_setting_is_tried_here_or_on_the_wire():
         "stuck_encoder",
         "stuck_at",
     }  # ..._faults.py
-    assert set(OTHER) | on_the_wire | faults == set(EmulatorSettings.model_fields)
+    cogging = {"cogging", "cogging_pitch"}  # test_cogging.py
+    assert set(OTHER) | on_the_wire | faults | cogging == set(EmulatorSettings.model_fields)
 
 
 def test_latency_and_jitter_delay_the_force_by_as_much_as_they_say():

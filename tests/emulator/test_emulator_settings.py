@@ -11,6 +11,7 @@ PAGE = (Path(__file__).parents[2] / "docs" / "emulator.md").read_text(encoding="
 TRUTH = {
     "masses": ["cart_mass", "pole_mass", "pole_com", "pole_inertia", "track_half_length", "track_tilt"],
     "cart": ["cart_viscous", "cart_coulomb_left", "cart_coulomb_right", "cart_stiction_ratio"],
+    "gears": ["cogging", "cogging_pitch"],
     "pole": ["pole_viscous", "pole_coulomb", "pole_drag", "angle_offset"],
     "motor": ["force_curve", "force_asymmetry", "deadband_left", "deadband_right", "motor_time_constant"],
     "link": ["latency", "latency_jitter", "frame_loss", "frame_corruption"],

@@ -52,6 +52,7 @@ CASES = {
     "sigmoid_slope": Case(20.0, 200.0),
     "pole_viscous": Case(1e-4, 5e-3),
     "pole_drag": Case(0.0, 1e-3),
+    "pole_coulomb": Case(0.0, 1e-2),
     "force_quadratic": Case(-1e-5, 1e-5),
     "force_linear": Case(0.015, 0.025),
     "force_offset": Case(-1.5, 0.0),
@@ -81,7 +82,7 @@ def environment(make_plant: MakePlant, make_environment: MakeEnvironment) -> Cal
             cart={"track_half_length": 10.0, **case.cart},
             ranges={name: Range(absolute=(case.low, case.high))},
             start=UPRIGHT,
-            models=Models(case.friction, PoleFriction.EXPONENTIAL_DRAG),
+            models=Models(case.friction, PoleFriction.BEARING),
         )
         return make_environment(plant, motors=(-case.motor, case.motor), time_limit=time_limit)
 

@@ -109,6 +109,11 @@ class TestLaws:
         torque = pole_torque(at(2.0, -4.0), cart, PoleFriction.EXPONENTIAL_DRAG)
         torch.testing.assert_close(torque, at(-4e-3, 16e-3))
 
+    def test_a_bearing_takes_the_same_at_any_speed_but_the_slowest(self, make_cart: MakeCart) -> None:
+        cart = make_cart(3, pole_viscous=0.0, pole_drag=0.0, pole_coulomb=1e-3)
+        torque = pole_torque(at(0.0, 0.5, -4.0), cart, PoleFriction.BEARING)
+        torch.testing.assert_close(torque, at(0.0, -1e-3, 1e-3))
+
 
 class TestCart:
     @pytest.mark.parametrize("step", [0.02, 0.01, 0.002])
@@ -187,7 +192,8 @@ def test_drag_shows_at_large_swings_and_bearing_friction_at_small_ones(make_cart
     small, large = at(0.1), at(10.0)
 
     def share_of_drag(speed: Tensor) -> float:
-        viscous, both = (pole_torque(speed, cart, model) for model in list(PoleFriction)[1:])
+        laws = (PoleFriction.EXPONENTIAL, PoleFriction.EXPONENTIAL_DRAG)
+        viscous, both = (pole_torque(speed, cart, law) for law in laws)
         return 1 - (viscous / both).item()
 
     assert share_of_drag(small) < 0.02

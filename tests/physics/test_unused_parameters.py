@@ -38,6 +38,7 @@ def test_a_parameter_that_is_named_changes_nothing(models: Models, make_cart) ->
         ("cart_viscous", Models(cart_friction=CartFriction.LINEAR)),
         ("sigmoid_slope", Models(cart_friction=CartFriction.SIGMOID)),
         ("pole_drag", Models(pole_friction=PoleFriction.EXPONENTIAL_DRAG)),
+        ("pole_coulomb", Models(pole_friction=PoleFriction.BEARING)),
         ("force_linear", Models(actuator=Actuator.FORCE_CURVE)),
     ],
 )

@@ -6,6 +6,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -250,6 +251,17 @@ class TestStates:
             assert cart.get_state().tick == peer.state.tick
             assert cart.statistics.lost_frames == 0
 
+    def test_an_info_that_makes_no_sense_neither_moves_the_cart_nor_holds_the_loop_up(self) -> None:
+        with CartPeer(paced=True) as peer:
+            peer.info = replace(peer.info, period_us=2**32 - 1, motor_limit=-5)
+            with SerialCart(settings(peer.port)) as cart:
+                assert cart.set_motor(0) == 0
+                peer.answer = lambda frame: ()
+                cart.set_motor(50)  # is lost
+                peer.tick(cart_counts=5, last_sequence=0)
+                assert cart.get_state().cart_counts == 5
+                peer.answer = lambda frame: CartPeer.answer(peer, frame)
+
     def test_gaps_in_the_tick_are_lost_frames(self) -> None:
         with CartPeer(paced=True) as peer, SerialCart(settings(peer.port)) as cart:
             peer.tick(tick=2**32 - 2)
@@ -257,6 +269,42 @@ class TestStates:
             peer.tick(tick=3)
             cart.get_state()
             assert cart.statistics.lost_frames == 4  # the last before the wrap, 0, 1 and 2
+
+    def test_a_state_that_was_overtaken_is_neither_taken_nor_lost(self) -> None:
+        with CartPeer(paced=True) as peer, SerialCart(settings(peer.port)) as cart:
+            peer.tick(cart_counts=1)
+            assert cart.get_state().cart_counts == 1
+            overtaken, newer = peer.next_state(cart_counts=2), peer.next_state(cart_counts=3)
+            peer.send(newer)
+            assert cart.get_state().cart_counts == 3
+            assert cart.statistics.lost_frames == 1
+            peer.send(overtaken)
+            peer.tick(cart_counts=4)
+            assert cart.get_state().cart_counts == 4
+            seen = cart.statistics
+            assert (seen.overtaken_frames, seen.repeated_frames, seen.lost_frames) == (1, 0, 0)
+
+    def test_a_state_that_comes_twice_is_taken_once(self) -> None:
+        with CartPeer(paced=True) as peer, SerialCart(settings(peer.port)) as cart:
+            peer.tick(tick=2**32 - 1)
+            tick = peer.next_state(tick=0, cart_counts=7)  # across the wrap
+            peer.send(tick + tick)
+            assert cart.get_state().cart_counts == 7
+            wait_for(lambda: cart._link.waiting() == 0)
+            peer.send(tick)
+            peer.tick(cart_counts=8)
+            assert cart.get_state().cart_counts == 8
+            seen = cart.statistics
+            assert (seen.overtaken_frames, seen.repeated_frames, seen.lost_frames) == (0, 2, 0)
+
+    def test_a_tick_that_goes_far_back_is_a_restart_and_is_taken(self) -> None:
+        with CartPeer(paced=True) as peer, SerialCart(settings(peer.port)) as cart:
+            peer.tick(tick=500, cart_counts=5)
+            assert cart.get_state().cart_counts == 5
+            peer.tick(tick=1, time_us=20_000, cart_counts=0)
+            assert cart.get_state().cart_counts == 0
+            seen = cart.statistics
+            assert (seen.overtaken_frames, seen.repeated_frames, seen.lost_frames) == (0, 0, 0)
 
     def test_silence_is_broken_by_a_hello(self) -> None:
         with Forgetful(SetMotor, 0) as peer, SerialCart(settings(peer.port)) as cart:
@@ -297,6 +345,21 @@ class TestStates:
             assert times[0] > 0
             assert times == sorted(times)
             assert (summary.bad_frames, summary.lost_frames, summary.late_ticks) == (0, 0, 0)
+
+    def test_the_loop_is_timed_by_the_carts_clock(self) -> None:
+        with CartPeer(paced=True) as peer, SerialCart(settings(peer.port)) as cart:
+            peer.tick()
+            cart.get_state()
+            for age in (13, 20):
+                peer.answer = lambda frame, age=age: [
+                    peer.next_state(last_sequence=frame.sequence, command_age_ms=age)
+                ]
+                cart.set_motor(50)
+                cart.get_state()
+            peer.answer = lambda frame: [peer.next_state(last_sequence=frame.sequence - 1)]
+            cart.set_motor(50)  # is lost
+            cart.get_state()
+            assert sorted(cart.statistics.loop_times.samples()) == pytest.approx([0, 0.0065])
 
 
 class TestAnswers:
@@ -341,24 +404,32 @@ class TestAnswers:
                 cart.get_state()
             assert cart.get_state()
 
+    def test_a_refusal_of_what_was_sent_before_the_last_question_is_void(self) -> None:
+        with CartPeer() as peer, SerialCart(settings(peer.port)) as cart:
+            cart.start()
+            cart.set_motor(50)
+            cart.get_state()
+            cart.stop()
+            before = next(frame for frame in reversed(peer.received) if isinstance(frame.message, SetMotor))
+            peer.send(peer.encode(Nack(before.sequence, SetMotor.TYPE, Reason.NOT_ARMED)))
+            assert cart.poll_state()  # the frames of the STOP changed places on their way
+
     def test_a_state_with_a_fault_is_returned_rather_than_raised(self) -> None:
         with Refusing(SetMotor, Reason.FAULT_LATCHED) as peer, SerialCart(settings(peer.port)) as cart:
-            peer.state = peer.state.__class__(0, 0, 9, 0, 0, 0, int(Fault.STALL), 0)
+            peer.state = replace(peer.state, fault=int(Fault.STALL))
             cart.set_motor(10)
             assert cart.get_state().fault == Fault.STALL
 
     def test_a_fault_that_stays_is_named_with_its_remedy(self) -> None:
         with CartPeer() as peer, SerialCart(settings(peer.port)) as cart:
             cart.clear_fault()
-            peer.state = peer.state.__class__(
-                0, 0, 9, 0, 0, 0, int(Fault.POLE_ENCODER | Fault.STALL) | 0x8000, 0
-            )
+            peer.state = replace(peer.state, fault=int(Fault.POLE_ENCODER | Fault.STALL) | 0x8000)
             with pytest.raises(FaultError, match=r"motor's cable.*pole's encoder.*check its cable.*0x8000"):
                 cart.clear_fault()
 
     def test_a_homing_that_fails_names_the_fault(self) -> None:
         with CartPeer() as peer, SerialCart(settings(peer.port)) as cart:
-            peer.state = peer.state.__class__(0, 0, 9, 0, 0, 0, int(Fault.HOMING), 0)
+            peer.state = replace(peer.state, fault=int(Fault.HOMING))
             with pytest.raises(FaultError, match="homing failed"):
                 cart.home()
 

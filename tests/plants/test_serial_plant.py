@@ -138,7 +138,7 @@ def test_upright_asks_a_person_and_waits_for_the_pole(peer: CartPeer) -> None:
         peer.state = replace(peer.state, pole_counts=4096 + 30)  # a turn further is upright too
 
     plant = SerialPlant(settings(peer.port, start="upright"), prompt=hold)
-    assert plant.reset()["counts"][0, 1] == 4126
+    assert plant.reset()["counts"][0, 1] == 30
     assert "upright" in said[0]
     plant.close()
 

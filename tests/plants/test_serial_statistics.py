@@ -2,9 +2,14 @@
 
 import math
 
+import hydra
 import numpy as np
 import pytest
+from hydra.core.global_hydra import GlobalHydra
 
+from cartpole_rl.choices import conf_folder
+from cartpole_rl.commands.application import as_mapping
+from cartpole_rl.commands.config import TrainConfig, checked
 from cartpole_rl.errors import PlantError
 from cartpole_rl.plants.link_statistics import LATENCY_SAMPLES, LatencyRing, LinkStatistics
 from cartpole_rl.randomization import Range
@@ -33,16 +38,39 @@ def test_nothing_measured_is_nan_in_the_summary_and_an_error_as_a_distribution()
     seen = LinkStatistics()
     assert math.isnan(seen.summary().latency_p999_ms)
     with pytest.raises(PlantError, match="drive the cart first"):
-        seen.state_to_command()
+        seen.loop()
+    assert seen.latency_override() is None
 
 
 def test_the_distribution_is_one_that_the_randomization_takes() -> None:
     seen = LinkStatistics()
     for seconds in np.random.default_rng(0).uniform(0.002, 0.012, 5000):
-        seen.latency.add(seconds)
-    low, high = seen.state_to_command()
+        seen.loop_times.add(seconds)
+    low, high = seen.loop()
     assert (low, high) == (pytest.approx(0.0021, abs=1e-4), pytest.approx(0.0119, abs=1e-4))
-    assert seen.state_to_command(share=0) == (pytest.approx(0.007, abs=2e-4),) * 2
+    assert seen.loop(share=0) == (pytest.approx(0.007, abs=2e-4),) * 2
     Range(absolute=(low, high)).check("latency", 0.005)
     with pytest.raises(ValueError, match="between 0 and 1"):
-        seen.state_to_command(share=98)
+        seen.loop(share=98)
+
+
+def test_the_override_is_a_word_that_cartpole_train_takes() -> None:
+    seen = LinkStatistics()
+    for seconds in np.linspace(0.002, 0.012, 1001):
+        seen.loop_times.add(seconds)
+    word = seen.latency_override()
+    assert word == "++randomization.latency={distribution: uniform, absolute: [0.0021, 0.0119]}"
+    GlobalHydra.instance().clear()
+    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(conf_folder())):
+        for group in ("none", "wide"):
+            composed = as_mapping(hydra.compose("train", [f"randomization={group}", word]))
+            config = checked(TrainConfig, composed)
+            assert config.randomization["latency"].limits() == (0.0021, 0.0119)
+            assert config.randomizer().longest_delay() == pytest.approx(0.0119)
+
+
+def test_commands_that_come_at_once_leave_nothing_to_hand_on() -> None:
+    seen = LinkStatistics()
+    seen.loop_times.add(0.0)
+    assert seen.loop() == (0.0, 0.0)
+    assert seen.latency_override() is None

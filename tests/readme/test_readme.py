@@ -24,7 +24,18 @@ BUDGET = [
     "learning.evaluation_episodes=2",
     "replay.size=2000",
 ]
-VERBS = ("train", "evaluate", "record", "replay", "finetune", "emulate", "find-port", "preflight")
+VERBS = (
+    "train",
+    "evaluate",
+    "record",
+    "replay",
+    "identify",
+    "model",
+    "finetune",
+    "emulate",
+    "find-port",
+    "preflight",
+)
 COMMANDS = re.findall(
     r"^    ((?:cartpole-|tensorboard|\./scripts/|pip ).*?)(?:\s+#.*)?$",
     (ROOT / "README.md").read_text(),
@@ -62,7 +73,7 @@ def test_every_command_is_one_that_a_test_here_runs() -> None:
     assert {command.split()[0] for command in COMMANDS} == known
 
 
-@pytest.mark.parametrize("command", [c for c in listed("cartpole-train") if "resume" not in c])
+@pytest.mark.parametrize("command", [c for c in listed("cartpole-train") if "<run>" not in c])
 def test_train(command: str, tmp_path: Path) -> None:
     budget = [word for word in BUDGET if word.split("=")[0] not in command]
     if "learning.frames=" in command:
@@ -108,6 +119,22 @@ def serial_port() -> Callable[[], str]:
     for process in running:
         process.send_signal(signal.SIGINT)
         assert process.wait(timeout=20) in (0, 130)
+
+
+def test_identify_train_on_it_and_model_it(trained: Path, serial_port: Callable[[], str]) -> None:
+    (identify,) = listed("cartpole-identify")
+    identify = identify.replace("/dev/ttyUSB0", serial_port())
+    short = ["windows=20", "substeps=2", "carts=100"]
+    identified = run(identify, *short, "hydra.run.dir=runs/identify/first", cwd=trained)
+    assert identified.returncode == 0, identified.stderr
+    (train,) = [command for command in listed("cartpole-train") if "identify" in command]
+    result = run(train.replace("<run>", "first"), *BUDGET, cwd=trained)
+    assert result.returncode == 0, result.stderr
+    (model,) = listed("cartpole-model")
+    short = ["ensemble.updates=2", "ensemble.members=1", "windows=20", "hydra.run.dir=runs/model/first"]
+    modelled = run(model.replace("<run>", "first"), *short, cwd=trained)
+    assert modelled.returncode == 0, modelled.stderr
+    assert (trained / "runs/model/first/model.pt").exists()
 
 
 def test_record_and_replay(trained: Path) -> None:

@@ -1,0 +1,283 @@
+"""What is asked of a cart to learn what it is: motor values that make each of its numbers show.
+
+An experiment is a generator: it yields the motor value of the next period and is sent what was seen at its
+end. Nothing but motor values and encoder positions goes in or out, so that any plant will do. The cart keeps
+clear of the track's ends by a guard, which brakes whatever an experiment asks for.
+"""
+
+import math
+from collections.abc import Callable, Generator, Iterator
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+
+from cartpole_rl.plants.specs import Plant
+from cartpole_rl.tasks.endings import Ending
+from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.tasks.features import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
+
+REACH = 0.27  # m from the middle; the shortest track ends at 0.3
+SIDE = 0.2  # m, where the cart is put to have way before it
+FORESIGHT = 0.12  # s, in which the guard stops a cart
+BRAKE = 220  # motor value of the guard
+BREAKAWAY = 90  # motor value that moves most carts, before it is known
+STRONGEST = 255
+BROKEN_AWAY = 0.002  # m
+CLOSE, SLOW = 0.02, 0.05  # m, m/s: there, and at rest
+LONGEST_WAY = 4.0  # s
+RIGHT, LEFT = 1, -1
+
+
+class Seen(NamedTuple):
+    """What the encoders tell after a period."""
+
+    x: float  # m
+    x_dot: float  # m/s, a difference
+    theta: float  # rad, 0 upright
+    theta_dot: float  # rad/s, a difference
+
+
+Moves = Generator[int, Seen, int | None]
+
+
+class Task(NamedTuple):
+    """What an experiment has to go by."""
+
+    period: float  # s, of control
+    random: np.random.Generator
+    breakaway: int  # motor value that moves the cart from rest
+
+    def periods(self, seconds: float) -> int:
+        """Control periods in a time."""
+        return round(seconds / self.period)
+
+    def moving(self, more: int) -> int:
+        """A motor value that moves the cart, by `more` than it needs."""
+        return min(STRONGEST, self.breakaway + more)
+
+
+class Experiment(NamedTuple):
+    """Something to be asked of a cart; its moves return a motor value that moves the cart, if they tell."""
+
+    name: str
+    shows: str  # in words
+    moves: Callable[[Task], Moves]
+
+
+def ramps(task: Task) -> Moves:
+    """Raise the motor value to each side until the cart breaks away; returns a value that always moves it."""
+    needed = 0
+    yield from hold(0, 0.6, task)  # the pole at rest: where its zero is
+    for side in 3 * (RIGHT, LEFT):
+        yield from go_to(-side * 0.08, task)
+        yield from hold(0, 0.4, task)
+        start = seen = yield 0
+        size = 20
+        while abs(seen.x - start.x) < BROKEN_AWAY and size < STRONGEST:
+            size += 1
+            seen = yield side * size
+        needed = max(needed, size)
+    yield from hold(0, 0.2, task)
+    return needed
+
+
+def free_swing(task: Task, swing: float = 1.6, seconds: float = 24.0) -> Moves:
+    """Swing the pole up to `swing` rad by the cart's own moves, then let it swing, `seconds` s."""
+    seen = yield 0
+    for _ in range(task.periods(15)):
+        if abs(math.remainder(seen.theta - math.pi, math.tau)) > swing and abs(seen.theta_dot) < 2:
+            break
+        side = -np.sign(seen.theta_dot * np.cos(seen.theta)) or RIGHT
+        seen = yield round(side * task.moving(50) - 120 * seen.x)
+    yield from hold(0, seconds, task)
+    return None
+
+
+def coast(task: Task) -> Moves:
+    """Push the cart to each side, weakly and strongly, and let it run out."""
+    for more in (20, 50, 90, 140):
+        for side in (RIGHT, LEFT):
+            yield from go_to(-side * SIDE, task)
+            yield from push(side * task.moving(more), 0.9, task)
+            yield from until_stopped(0, side, task)
+    return None
+
+
+def levels(task: Task) -> Moves:
+    """Hold small motor values on a cart that moves: the force near the dead-band shows there, not at rest."""
+    for size in (40, 50, 55, 60, 65, 70, 80, 95):
+        for side in (RIGHT, LEFT):
+            yield from go_to(-side * SIDE, task)
+            yield from push(side * task.moving(110), 0.5, task)
+            yield from until_stopped(side * size, side, task)
+    return None
+
+
+def square(task: Task) -> Moves:
+    """Turn the force round at a steady pace: the delay shows."""
+    for more in (50, 100):
+        yield from go_to(0.0, task)
+        for half in (0.1, 0.14, 0.2):
+            for turn in range(14):
+                side = RIGHT if turn % 2 == 0 else LEFT
+                yield from hold(side * task.moving(more), half / 2 if turn == 0 else half, task)
+    return None
+
+
+def excite(task: Task, seconds: float = 60.0) -> Moves:
+    """Motor values and durations at random, so that cart and pole go through all they can do."""
+    left = task.periods(seconds)
+    while left > 0:
+        size, periods = int(task.random.integers(50, 256)), int(task.random.integers(2, 18))
+        side = RIGHT if task.random.random() < 0.5 else LEFT
+        for _ in range(min(left, periods)):
+            yield side * size
+        left -= periods
+    return None
+
+
+EXPERIMENTS = (
+    Experiment("ramps", "where the cart breaks away", ramps),
+    Experiment("swing", "the pole's period and what damps it", free_swing),
+    Experiment("coast", "the cart's friction", coast),
+    Experiment("levels", "the force of small motor values", levels),
+    Experiment("square", "latency and lag", square),
+    Experiment("excite", "everything at once", excite),
+    Experiment("held_out", "nothing: kept to judge the fit by", partial(excite, seconds=40.0)),
+)
+HELD_OUT = "held_out"
+
+
+# the moves that experiments are made of
+
+
+def hold(motor: int, seconds: float, task: Task) -> Moves:
+    """One motor value for `seconds` s."""
+    for _ in range(task.periods(seconds)):
+        yield motor
+    return None
+
+
+def push(motor: int, speed: float, task: Task) -> Moves:
+    """One motor value until the cart has that speed, m/s, or has come 0.1 m, or half a second has passed."""
+    start = seen = yield motor
+    for _ in range(task.periods(0.5)):
+        if abs(seen.x - start.x) > 0.1 or abs(seen.x_dot) > speed:
+            break
+        seen = yield motor
+    return None
+
+
+def until_stopped(motor: int, side: int, task: Task) -> Moves:
+    """One motor value until the cart stops or has used its way to `side`, then a short rest."""
+    seen = yield motor
+    for _ in range(task.periods(LONGEST_WAY)):
+        if abs(seen.x_dot) < SLOW / 5 or side * seen.x > SIDE + 0.03:
+            break
+        seen = yield motor
+    yield from hold(0, 0.2, task)
+    return None
+
+
+def go_to(target: float, task: Task) -> Moves:
+    """Bring the cart to `target` m, about."""
+    seen = yield 0
+    for _ in range(task.periods(LONGEST_WAY)):
+        away = target - seen.x
+        if abs(away) < CLOSE and abs(seen.x_dot) < SLOW:
+            break
+        wish = np.clip(6 * away, -0.5, 0.5) - seen.x_dot  # m/s
+        seen = yield round(np.sign(wish) * 0.8 * task.breakaway + 250 * wish)
+    yield 0
+    return None
+
+
+# and what makes a recording of them
+
+
+def conduct(
+    plant: Plant, period: float, seed: int = 0, experiments: tuple[Experiment, ...] = EXPERIMENTS
+) -> Iterator[tuple[Experiment, Episode]]:
+    """Each experiment with its recording, on a plant of one cart; they follow each other without a break.
+
+    After an ending by the plant the next one begins with a reset.
+    """
+    task, present = Task(period, np.random.default_rng(seed), BREAKAWAY), plant.reset()
+    for experiment in experiments:
+        recorded, present, breakaway = run(plant, present, experiment.moves(task))
+        task = task._replace(breakaway=breakaway or task.breakaway)
+        yield experiment, recorded
+        if recorded.ended_by != Ending.TIME:
+            present = plant.reset()
+    plant.halt()
+
+
+def run(plant: Plant, present: TensorDictBase, moves: Moves) -> tuple[Episode, TensorDictBase, int | None]:
+    """Make the moves from the frame `present` on: the recording, the last frame, what the moves return."""
+    counts, gaps, motors, ended = [counts_of(present)], [float(present["dt"])], [], str(Ending.TIME)
+    wanted, told = next(moves), None
+    while True:
+        seen = as_seen(counts, gaps)
+        motor = guarded(wanted, seen)
+        following = plant.step(present.set("motor", torch.tensor([[motor]])))["next"]
+        motors.append(motor)
+        counts.append(counts_of(following))
+        gaps.append(float(following["dt"]))
+        present = following
+        if following["terminated"] or following["truncated"]:
+            ended = str(getattr(plant, "ended_by", "") or Ending.TRACK)
+            break
+        try:
+            wanted = moves.send(as_seen(counts, gaps))
+        except StopIteration as end:
+            told = end.value
+            break
+    return recording(np.array(counts), np.array(gaps[1:]), np.array(motors), ended), present, told
+
+
+def counts_of(frame: TensorDictBase) -> tuple[int, int]:
+    """Encoder counts of cart and pole."""
+    cart, pole = frame["counts"][0].tolist()
+    return cart, pole
+
+
+def as_seen(counts: list[tuple[int, int]], gaps: list[float]) -> Seen:
+    """The newest positions, and speeds from the two newest."""
+    (x_before, theta_before), (x, theta) = counts[-2:] if len(counts) > 1 else (counts[0], counts[0])
+    return Seen(
+        x * CART_METRES_PER_COUNT,
+        (x - x_before) * CART_METRES_PER_COUNT / gaps[-1],
+        theta * POLE_RADIANS_PER_COUNT,
+        (theta - theta_before) * POLE_RADIANS_PER_COUNT / gaps[-1],
+    )
+
+
+def guarded(motor: float, seen: Seen) -> int:
+    """The motor value, unless the cart would get beyond REACH: then what brings it back."""
+    ahead = seen.x + FORESIGHT * seen.x_dot * (1 + abs(seen.x_dot))
+    if abs(ahead) > REACH and ahead * (motor + BRAKE * np.sign(ahead)) > 0:
+        return int(-np.sign(ahead) * BRAKE)
+    return int(np.clip(motor, -255, 255))
+
+
+def recording(counts: np.ndarray, gaps: np.ndarray, motors: np.ndarray, ended_by: str) -> Episode:
+    """An episode without a task: nothing is scored."""
+    positions = counts * np.array([CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT])
+    speeds = np.vstack((np.zeros((1, 2)), np.diff(positions, axis=0) / gaps[:, None]))
+    nothing = np.zeros(len(motors))
+    return Episode(
+        time=np.concatenate((np.zeros(1), np.cumsum(gaps))),
+        x=positions[:, 0],
+        x_dot=speeds[:, 0],
+        theta=positions[:, 1],
+        theta_dot=speeds[:, 1],
+        counts=counts.astype(np.int64),
+        motor=motors.astype(np.int64),
+        score=nothing,
+        score_upright=nothing,
+        reward=nothing,
+        ended_by=ended_by,
+    )

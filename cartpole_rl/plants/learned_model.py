@@ -1,0 +1,96 @@
+"""A learned model of one cart as a file: identified numbers, the laws that they belong to, residuals."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from cartpole_rl.errors import CheckpointError
+from cartpole_rl.physics.actuator import Actuator
+from cartpole_rl.physics.dynamics import Integrator, Models
+from cartpole_rl.physics.friction import CartFriction, PoleFriction
+from cartpole_rl.physics.parameters import check_values
+from cartpole_rl.physics.residual import PLACES, Residual
+
+FORMAT = "cartpole_rl learned model 1"
+MODEL = "model.pt"  # in a run folder
+REMEDY = "give what cartpole-model wrote"
+
+
+@dataclass(frozen=True)
+class LearnedModel:
+    """What a plant needs to move as a recorded cart did."""
+
+    parameters: Mapping[str, float]  # of the identified cart, by name
+    models: Models
+    period: float  # s; a residual is of one control period
+    substeps: int
+    residual: Residual  # float32
+
+
+def save_model(path: Path, model: LearnedModel) -> None:
+    """Write what `load_model` reads, whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside = path.with_name(f"{path.name}.partial")
+    laws = {
+        name: value if isinstance(value, bool) else str(value)
+        for name, value in model.models._asdict().items()
+    }
+    content = {
+        "parameters": dict(model.parameters),
+        "models": laws,
+        "period": model.period,
+        "substeps": model.substeps,
+        "residual": {name: part.detach() for name, part in model.residual._asdict().items()},
+    }
+    torch.save({"format": FORMAT, **content}, beside)
+    beside.replace(path)
+
+
+def load_model(source: Path) -> LearnedModel:
+    """The model in a file or a run folder. Raises CheckpointError where there is none, or a damaged one."""
+    path = source / MODEL if source.is_dir() else source
+    if not path.exists():
+        missing = f"it holds no {MODEL}" if source.exists() else "there is no such file or folder"
+        raise CheckpointError(f"plant.model={source}: {missing}; {REMEDY}")
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # torch raises whatever the damaged bytes lead it to
+        raise CheckpointError(
+            f"plant.model={source} is no learned model, or it is damaged ({type(error).__name__}); {REMEDY}"
+        ) from None
+    found = content.get("format") if isinstance(content, dict) else None
+    if found != FORMAT:
+        raise CheckpointError(
+            f"plant.model={source} is no learned model: its format is {found!r}, not {FORMAT!r}; {REMEDY}"
+        )
+    try:
+        return _as_model(content)
+    except Exception as error:  # of another version, or edited by hand
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise CheckpointError(
+            f"plant.model={source} is of another version of this package: {reason}; learn it anew"
+        ) from None
+
+
+def _as_model(content: Mapping[str, Any]) -> LearnedModel:
+    laws = content["models"]
+    check_values(content["parameters"])
+    residual = Residual(**content["residual"])
+    if residual.places.shape[1] != PLACES:
+        raise ValueError(f"its tables have {residual.places.shape[1]} places, not {PLACES}")
+    return LearnedModel(
+        content["parameters"],
+        Models(
+            CartFriction(laws["cart_friction"]),
+            PoleFriction(laws["pole_friction"]),
+            Actuator(laws["actuator"]),
+            Integrator(laws["integrator"]),
+            bool(laws["pole_presses"]),
+        ),
+        float(content["period"]),
+        int(content["substeps"]),
+        residual,
+    )

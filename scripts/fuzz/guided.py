@@ -1,0 +1,267 @@
+#!/usr/bin/env python
+"""Coverage-guided fuzzing of both sides of the wire.
+
+    pip install atheris       # libFuzzer for Python; no dependency of this project
+    scripts/fuzz/guided.py cart corpus/cart -max_total_time=300
+    scripts/fuzz/guided.py host corpus/host -max_total_time=300
+    coverage run --branch scripts/fuzz/guided.py --replay cart corpus/cart     # needs no atheris
+
+An input is a list of steps for one side: raw bytes, sound frames of any type with any payload, and between
+them periods that pass with any encoder counts (cart), or calls of any method (host). Sound frames get the
+fuzzer past the checksum, to the state machines. What libFuzzer prints says what was reached (`cov`, `ft`)
+and the memory (`rss`); options that begin with `-` are its own. An input that breaks a rule is left as
+`crash-...`.
+
+The rules. Cart: no exception; the motor is 0 unless it is armed or homing; 0 in the third period without a
+command; what is no sound frame changes nothing and is not answered. Host: no exception but those of
+`errors.py`; no motor value other than 0 goes out but one that was asked for; what it keeps stays small.
+"""
+
+import contextlib
+import importlib
+import logging
+import sys
+from pathlib import Path
+from typing import Any
+
+LIBRARIES = ("cartpole_rl.wire", "cartpole_rl.emulator", "cartpole_rl.plants")
+fuzzer: Any = None
+if "--replay" not in sys.argv:
+    try:
+        fuzzer = importlib.import_module("atheris")
+    except ImportError:
+        sys.exit("guided.py needs atheris: pip install atheris")
+
+with fuzzer.instrument_imports(include=LIBRARIES) if fuzzer else contextlib.nullcontext():
+    from cartpole_rl.emulator.firmware import HOST_MESSAGES, WATCHDOG_PERIODS, Firmware
+    from cartpole_rl.plants import serial_cart, serial_link
+    from cartpole_rl.wire import Flags, FrameSplitter, SetMotor, Start, State, cobs, decode_frame
+    from cartpole_rl.wire.checksum import crc16
+    from cartpole_rl.wire.frames import END, LONGEST_FRAME, open_envelope
+
+from cartpole_rl.errors import CartPoleError, FrameError  # noqa: E402 - after what is instrumented
+
+CART_TYPES = (0x81, 0x82, 0x83, 0x84, 0x85)
+MOST_STEPS = 200
+
+
+class Steps:
+    """Reads an input as numbers and bytes; past its end everything is 0."""
+
+    def __init__(self, data: bytes) -> None:
+        self._data, self._at = data, 0
+
+    @property
+    def left(self) -> bool:
+        """Whether there is more."""
+        return self._at < len(self._data)
+
+    def take(self, count: int) -> bytes:
+        """The next bytes, zeros past the end."""
+        taken = self._data[self._at : self._at + count]
+        self._at += count
+        return taken.ljust(count, b"\0")
+
+    def number(self, count: int = 1) -> int:
+        """The next number, signed where it has more than a byte."""
+        return int.from_bytes(self.take(count), "little", signed=count > 1)
+
+
+def sound(version: int, kind: int, sequence: int, flags: int, payload: bytes) -> bytes:
+    """A frame with a right checksum, without its ending 0x00."""
+    body = bytes((version, kind, sequence, flags)) + payload
+    return cobs.encode(body + crc16(body).to_bytes(2, "little"))
+
+
+def cart(data: bytes) -> None:
+    """One input to a firmware."""
+    steps, firmware, splitter = Steps(data), Firmware(lambda: 3_000), FrameSplitter()
+    firmware.homed = bool(steps.number() & 1)
+    now_us = carts = poles = silent = 0
+    for _ in range(MOST_STEPS):
+        if not steps.left:
+            return
+        match steps.number() % 4:
+            case 0:
+                for stuffed in splitter.feed(steps.take(steps.number() % 80)):
+                    before = (firmware.armed, firmware.homing, firmware.fault)
+                    answers = firmware.receive(stuffed, now_us)
+                    if not opens(stuffed):
+                        assert not answers
+                        assert before == (firmware.armed, firmware.homing, firmware.fault)
+                assert len(splitter._pending) <= LONGEST_FRAME
+            case 1:
+                kinds = tuple(HOST_MESSAGES)
+                kind, size = kinds[steps.number() % len(kinds)], (0, 0, 2, 2, 4, 4, 1, 3)[steps.number() % 8]
+                fed = firmware.armed
+                for answer in firmware.receive(sound(1, kind, steps.number(), 0, steps.take(size)), now_us):
+                    decode_frame(answer[:-1])
+                if fed and kind in (SetMotor.TYPE, Start.TYPE):
+                    silent = 0
+                if firmware.armed and not fed:
+                    silent = 0
+            case 2:
+                version, kind, size = steps.number(), steps.number(), steps.number() % 12
+                firmware.receive(
+                    sound(version, kind, steps.number(), steps.number(), steps.take(size)), now_us
+                )
+            case _:
+                periods, step_cart, step_pole = 1 + steps.number() % 32, steps.number(2), steps.number(2)
+                for _ in range(periods):
+                    armed = firmware.armed or firmware.homing
+                    end_us = now_us + firmware.period_us
+                    driven = in_force(firmware.drive(now_us, end_us), end_us)
+                    carts, poles = carts + step_cart // 64, poles + step_pole // 16
+                    frames = [decode_frame(frame[:-1]) for frame in firmware.tick(end_us, carts, poles)]
+                    state = frames[-1].message
+                    now_us, silent = end_us, silent + 1
+                    assert armed or driven == {0}, "the motor ran while it was neither armed nor homing"
+                    if firmware.armed and not firmware.homing and silent > WATCHDOG_PERIODS:
+                        assert driven == {0}, "the watchdog slept"
+                    if not firmware.armed and not firmware.homing:
+                        assert isinstance(state, State)
+                        assert state.motor_applied == 0
+
+
+def in_force(values: list[tuple[int, int]], end_us: int) -> set[int]:
+    """The motor values that hold for longer than nothing."""
+    ends = [since for since, _ in values[1:]] + [end_us]
+    return {value for (since, value), end in zip(values, ends, strict=True) if end > since}
+
+
+def opens(stuffed: bytes) -> bool:
+    """Whether the checksum lets a run of bytes through."""
+    try:
+        open_envelope(stuffed)
+    except FrameError:
+        return False
+    return True
+
+
+class Wire:
+    """A port in memory whose cart answers each write with the input's next bytes and frames."""
+
+    port = "memory"
+
+    def __init__(self, steps: Steps) -> None:
+        self._steps, self._inward = steps, b""
+        self._splitter = FrameSplitter()
+        self.asked = 0  # the motor value that may go out
+        self._tick = 0
+
+    @property
+    def in_waiting(self) -> int:
+        """Bytes that can be read."""
+        return len(self._inward)
+
+    def read(self, count: int) -> bytes:
+        """Bytes that have come; none where none have."""
+        data, self._inward = self._inward[:count], self._inward[count:]
+        return data
+
+    def write(self, data: bytes) -> None:
+        """Look at what the host sends, and answer it."""
+        sequence = 0
+        for stuffed in self._splitter.feed(data):
+            frame = decode_frame(stuffed)
+            sequence = frame.sequence
+            if isinstance(frame.message, SetMotor):
+                assert frame.message.motor in (0, self.asked), "a motor value that nobody asked for"
+        for _ in range(self._steps.number() % 4):
+            self._inward += self._answer(sequence)
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+    def _answer(self, sequence: int) -> bytes:
+        steps = self._steps
+        match steps.number() % 6:
+            case 0:
+                return steps.take(steps.number() % 40)
+            case 1:
+                kind, size = CART_TYPES[steps.number() % 5], steps.number() % 32
+                return sound(1, kind, steps.number(), steps.number(), steps.take(size)) + END
+            case 2:
+                info = bytes((1, 0, 0)) + (4096).to_bytes(2, "little") + (22749).to_bytes(4, "little")
+                return sound(1, 0x81, 0, 0, info + steps.take(14)) + END
+            case 3:
+                return sound(1, 0x83, 0, 0, bytes((sequence, steps.number() % 8))) + END
+            case 4:
+                return sound(1, 0x84, 0, 0, bytes((sequence, steps.number() % 8, steps.number() % 12))) + END
+            case _:
+                self._tick = (self._tick + steps.number() % 40 - 4) % 2**32
+                counts = steps.take(8) + (0).to_bytes(2, "little") + bytes((sequence,))
+                times = self._tick.to_bytes(4, "little") + (self._tick * 20_000 % 2**32).to_bytes(4, "little")
+                state = times + counts + bytes((steps.number() & 1, 0)) + steps.take(2)
+                return sound(1, 0x82, 0, steps.number() & int(~Flags(0)), state) + END
+
+
+def host(data: bytes) -> None:
+    """One input to a SerialCart, whose times are so short that nothing is waited for."""
+    serial_cart.UNACKNOWLEDGED_PERIODS = 1e-3
+    steps = Steps(data)
+    wire = Wire(steps)
+    settings = serial_cart.SerialSettings(
+        port="memory", timeout=2e-4, connect_timeout=2e-4, answer_timeout=1e-4, retries=1, nudge_after=5e-5
+    )
+    driven = serial_cart.SerialCart(settings)
+    driven._open_link = serial_link.SerialLink(wire, driven.statistics)
+    with contextlib.suppress(CartPoleError):
+        driven._information = driven._shake_hands()
+    for _ in range(MOST_STEPS):
+        if not steps.left or not driven.is_open:
+            break
+        with contextlib.suppress(CartPoleError):
+            call(driven, wire, steps)
+        assert len(driven._answers) <= 64
+        assert len(driven._missing) <= serial_cart.OVERTAKEN_TICKS
+        seen = driven.statistics
+        assert min(seen.lost_frames, seen.late_ticks, seen.overtaken_frames, seen.repeated_frames) >= 0
+    driven.close()
+
+
+def call(driven: "serial_cart.SerialCart", wire: Wire, steps: Steps) -> None:
+    """Call one method."""
+    match steps.number() % 8:
+        case 0:
+            driven.start()
+        case 1 | 2:
+            wire.asked = steps.number(2)
+            limit = max(0, driven.information.motor_limit)
+            wire.asked = max(-limit, min(limit, wire.asked))
+            driven.set_motor(wire.asked)
+        case 3 | 4:
+            driven.get_state()
+        case 5:
+            driven.home(2e-4)
+        case 6:
+            driven.clear_fault()
+        case _:
+            driven.set_period(20_000)
+
+
+SIDES = {"cart": cart, "host": host}
+
+
+def main() -> None:
+    """Fuzz, or replay a corpus."""
+    words = [word for word in sys.argv[1:] if word != "--replay"]
+    if not words or words[0] not in SIDES:
+        sys.exit(f"give the side first: {' or '.join(SIDES)}")
+    side, rest = SIDES[words[0]], words[1:]
+    logging.disable()  # every input ends with a cart that may not answer
+    if fuzzer:
+        for folder in rest:
+            if not folder.startswith("-"):
+                Path(folder).mkdir(parents=True, exist_ok=True)
+        fuzzer.Setup([sys.argv[0], *rest], side)
+        fuzzer.Fuzz()
+    for folder in rest:
+        files = sorted(path for path in Path(folder).rglob("*") if path.is_file())
+        for path in files:
+            side(path.read_bytes())
+        print(f"{len(files)} inputs of {folder} broke no rule")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,184 @@
+"""A residual learned from recordings: it finds what the physics lacks, and leaves right physics alone."""
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+import pytest
+import torch
+
+from cartpole_rl.envs import CartPoleEnv
+from cartpole_rl.evaluation.episodes import run_batch
+from cartpole_rl.identification import Windows, cut_windows
+from cartpole_rl.identification.held_out import LEAD, errors_at, predict_held_out
+from cartpole_rl.identification.learned import (
+    Dynamics,
+    Ensemble,
+    LearningSettings,
+    best_beginnings,
+    first_guess,
+)
+from cartpole_rl.physics.dynamics import Models
+from cartpole_rl.physics.friction import CartFriction
+from cartpole_rl.physics.residual import PLACES, SPACING, UNITS, Residual
+from cartpole_rl.plants.learned import LearnedPlant
+from cartpole_rl.plants.learned_model import LearnedModel
+from cartpole_rl.plants.simulated import SimulatedPlant
+from cartpole_rl.randomization import PoleSettings, Randomizer
+from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.tasks.starts import Start, StartSettings
+
+PERIOD = 0.02
+MOTORS = (-250, -150, 0, 150, 250)
+STEP = Models(cart_friction=CartFriction.STEP)
+START = StartSettings(
+    angle=Start.HANGING, position_spread=0.2, angle_spread=0.5, speed_spread=0, angular_speed_spread=0
+)
+TRACK = {"track_half_length": 2.0}
+RIPPLE = 0.6  # N
+PITCH = 0.08  # m
+SETTINGS = LearningSettings(
+    members=2,
+    hidden=6,
+    updates=60,
+    learning_rate=0.05,
+    refresh=10,
+    validation=0.2,
+    price=3.0,
+    price_of_places=0.1,
+)
+
+MakeEnvironment = Callable[..., CartPoleEnv]
+
+
+def rippled() -> Residual:
+    """One member that adds a force ripple along the track, and no more."""
+    places = SPACING * (torch.arange(PLACES) - PLACES // 2)
+    zeros = Residual.untrained(1, 6, torch.Generator().manual_seed(0))
+    return zeros._replace(places=(RIPPLE / UNITS[0] * torch.sin(2 * torch.pi * places / PITCH)).unsqueeze(0))
+
+
+def shaken(env: CartPoleEnv, seed: int) -> list[Episode]:
+    """An episode of each cart, with motor values held for 0.2 s."""
+    random, held, carts = torch.Generator().manual_seed(seed), [], env.batch_size[0]
+
+    def shake(present):
+        again = held and len(held) % 10
+        held.append(held[-1] if again else torch.randint(len(MOTORS), (carts,), generator=random))
+        return present.set("action", held[-1])
+
+    return run_batch(env, shake)
+
+
+@pytest.fixture(scope="module")
+def parameters(ip02: dict[str, float], medium: PoleSettings) -> dict[str, float]:
+    return {**ip02, **medium.nominal.model_dump(), **TRACK}
+
+
+@pytest.fixture(scope="module")
+def dynamics(parameters: dict[str, float]) -> Dynamics:
+    return Dynamics.of(parameters, STEP, PERIOD, 4)
+
+
+@pytest.fixture(scope="module")
+def record(
+    ip02: dict[str, float],
+    medium: PoleSettings,
+    parameters: Mapping[str, float],
+    make_environment: MakeEnvironment,
+) -> Callable[[bool], tuple[Windows, Windows]]:
+    """Windows to learn from and windows held out, of a cart whose track ripples, or not."""
+
+    def build(ripples: bool) -> tuple[Windows, Windows]:
+        randomizer = Randomizer({**ip02, **TRACK}, medium, {})
+        if ripples:
+            model = LearnedModel(parameters, STEP, PERIOD, 4, rippled())
+            plant: SimulatedPlant = LearnedPlant(8, model, randomizer, START, seed=1)
+        else:
+            plant = SimulatedPlant(8, randomizer, START, STEP, seed=1)
+        recorded = shaken(make_environment(plant, MOTORS, time_limit=300), seed=0)
+        held_out = cut_windows(recorded[6:], PERIOD, periods=LEAD + 50)
+        return cut_windows(recorded[:6], PERIOD, most=60), held_out
+
+    return build
+
+
+def judged(
+    windows: Windows, dynamics: Dynamics, residual: Residual | None, moment: float = 0.5
+) -> dict[str, float]:
+    (told,) = errors_at(predict_held_out(windows, dynamics, residual), [moment], PERIOD)
+    return told
+
+
+def test_an_effect_that_the_physics_lacks_is_learned(
+    record: Callable[[bool], tuple[Windows, Windows]], dynamics: Dynamics
+) -> None:
+    windows, held_out = record(True)
+    ensemble = Ensemble(windows, dynamics, np.array([20.0, 3.0]), SETTINGS, seed=0)
+    residual = ensemble.learn()
+    physics, learned = (judged(held_out, dynamics, each) for each in (None, residual))
+    assert physics["rms_x_mm"] > 3  # so that there is something to be learned
+    assert learned["rms_x_mm"] < 0.6 * physics["rms_x_mm"]
+    assert learned["rms_spread_x_mm"] > 0
+    assert physics["rms_spread_x_mm"] == 0
+    assert min(ensemble.history[0]) > max(min(each) for each in zip(*ensemble.history, strict=True))
+    near = slice(PLACES // 2 - 40, PLACES // 2 + 41)  # 16 cm to each side, where the carts are most
+    mean = residual.places.mean(0)[near].numpy()
+    assert np.corrcoef(mean, rippled().places[0, near].numpy())[0, 1] > 0.5
+
+
+def test_right_physics_is_left_alone(
+    record: Callable[[bool], tuple[Windows, Windows]], dynamics: Dynamics
+) -> None:
+    windows, held_out = record(False)
+    settings = SETTINGS.model_copy(update={"updates": 20})
+    residual = Ensemble(windows, dynamics, np.array([1.0, 0.4]), settings, seed=0).learn()
+    physics, learned = (judged(held_out, dynamics, each) for each in (None, residual))
+    for key in ("rms_x_mm", "median_x_mm", "rms_theta_deg", "median_theta_deg"):
+        assert learned[key] < 1.2 * physics[key]
+
+
+def test_the_true_model_knows_the_rest(
+    record: Callable[[bool], tuple[Windows, Windows]], dynamics: Dynamics
+) -> None:
+    _, held_out = record(True)
+    true, physics = (judged(held_out, dynamics, each) for each in (rippled().as_type(torch.float64), None))
+    assert true["rms_x_mm"] < 0.1 * physics["rms_x_mm"]
+
+
+def test_nothing_after_the_lead_has_a_part_in_a_beginning(
+    record: Callable[[bool], tuple[Windows, Windows]], dynamics: Dynamics
+) -> None:
+    _, windows = record(False)
+    changed = windows.positions.copy()
+    changed[LEAD + 1 :] += 1000
+    before = predict_held_out(windows, dynamics, None).error
+    after = predict_held_out(windows._replace(positions=changed), dynamics, None).error
+    assert np.array_equal(before[0], after[0])
+
+
+def test_beginnings_are_found(record: Callable[[bool], tuple[Windows, Windows]], dynamics: Dynamics) -> None:
+    """Those of a cart whose motion they were, from encoder counts alone."""
+    windows, _ = record(False)
+    positions, motors = torch.from_numpy(windows.positions), torch.from_numpy(windows.motors)
+    guess = first_guess(positions, PERIOD)
+
+    def simulate(motion: torch.Tensor) -> torch.Tensor:
+        return dynamics.counts(motion, motors.repeat(1, motion.shape[2] // motors.shape[1]), None)
+
+    true = best_beginnings(simulate, positions, guess, guess.unsqueeze(1), 4).motion
+    counts = simulate(true).squeeze(2).detach()
+    again = best_beginnings(simulate, counts, guess, guess.unsqueeze(1), 4)
+    assert (again.motion - true).abs().squeeze(1)[1].median() < 1e-3  # m/s
+    assert (again.motion - true).abs().squeeze(1)[3].median() < 1e-2  # rad/s
+    form = again.form[0]
+    assert torch.allclose(form, form.mT, atol=1e-8)
+    assert (torch.linalg.eigvalsh(form) > -1e-9).all()
+
+
+def test_the_same_seed_learns_the_same(
+    record: Callable[[bool], tuple[Windows, Windows]], dynamics: Dynamics
+) -> None:
+    windows, _ = record(False)
+    settings = SETTINGS.model_copy(update={"updates": 3, "refresh": 3})
+    first, second = (Ensemble(windows, dynamics, np.array([1.0, 0.4]), settings, 5).learn() for _ in range(2))
+    assert all(map(torch.equal, first, second))

@@ -1,0 +1,99 @@
+"""What is added to the physics adds nothing while it is zero, and what it says otherwise."""
+
+from collections.abc import Callable
+
+import pytest
+import torch
+
+from cartpole_rl.physics.dynamics import Drive, Models, State, run_period
+from cartpole_rl.physics.friction import CartFriction
+from cartpole_rl.physics.parameters import CartParameters
+from cartpole_rl.physics.residual import (
+    PLACES,
+    SPACING,
+    UNDER_WAY,
+    UNITS,
+    Residual,
+    chosen_members,
+    members_in_turn,
+    run_corrected_period,
+)
+
+MakeCart = Callable[..., CartParameters]
+STEP = Models(cart_friction=CartFriction.STEP)
+LAWS = (STEP, 0.02, 4)
+
+
+def residual(members: int = 2, changed: bool = True) -> Residual:
+    generator = torch.Generator().manual_seed(0)
+    made = Residual.untrained(members, 6, generator).as_type(torch.float64)
+    if not changed:
+        return made
+    return made._replace(
+        places=torch.randn(members, PLACES, generator=generator, dtype=torch.float64),
+        last=torch.randn(members, 2, 6, generator=generator, dtype=torch.float64),
+    )
+
+
+def motion(carts: int) -> tuple[State, Drive]:
+    random = torch.Generator().manual_seed(1)
+    draws = torch.rand(6, carts, generator=random, dtype=torch.float64) - 0.5
+    motors = [200 * torch.sign(draws[5])] * UNDER_WAY
+    return State(0.6 * draws[0], 2 * draws[1], 6 * draws[2], 10 * draws[3]), Drive(6 * draws[4], motors)
+
+
+def stacked(state: State, drive: Drive) -> torch.Tensor:
+    return torch.stack((*state, drive.force))
+
+
+def test_zero_adds_nothing(make_cart: MakeCart) -> None:
+    cart, (state, drive) = make_cart(8, latency=0.013, motor_time_constant=0.005), motion(8)
+    addition = members_in_turn(residual(changed=False), 4)
+    plain = run_period(state, drive, cart.latency, cart, *LAWS)
+    corrected = run_corrected_period(state, drive, cart.latency, cart, *LAWS, addition)
+    assert torch.equal(stacked(*plain), stacked(*corrected))
+
+
+def test_members_in_turn_are_the_members_chosen(make_cart: MakeCart) -> None:
+    cart, (state, drive) = make_cart(8), motion(8)
+    learned, member = residual(), torch.arange(2).repeat_interleave(4)
+    in_turn, chosen = (
+        run_corrected_period(state, drive, cart.latency, cart, *LAWS, addition)
+        for addition in (members_in_turn(learned, 4), chosen_members(learned, member))
+    )
+    assert torch.allclose(stacked(*in_turn), stacked(*chosen), rtol=1e-12)
+    exchanged = run_corrected_period(
+        state, drive, cart.latency, cart, *LAWS, chosen_members(learned, 1 - member)
+    )
+    assert not torch.allclose(stacked(*in_turn), stacked(*exchanged), rtol=1e-3)
+
+
+def test_places_are_joined_by_straight_lines() -> None:
+    learned = residual()
+    middle, member = PLACES // 2, torch.tensor([1, 1, 1, 1])
+    x = SPACING * torch.tensor([3.0, 3.5, 4.0, 1e3], dtype=torch.float64)
+    table = UNITS[0] * learned.places[1]
+    force = learned.place_force(x, member)
+    at, after = table[middle + 3], table[middle + 4]
+    assert torch.allclose(force[:3], torch.stack((at, (at + after) / 2, after)))
+    assert force[3].item() == pytest.approx(table[-1].item(), abs=0.01)  # beyond the end: that of the end
+
+
+def test_a_force_that_friction_holds_does_not_move_a_cart(make_cart: MakeCart) -> None:
+    """Which a change of velocity, added after the physics, would."""
+    zero = torch.zeros(1, dtype=torch.float64)
+    hanging = State(zero, zero, zero + torch.pi, zero)
+    places = torch.full((1, PLACES), 0.4 / UNITS[0], dtype=torch.float64)
+    learned = residual(1, changed=False)._replace(places=places)
+    moved = {}
+    for coulomb in (0.5, 0.3):
+        cart = make_cart(cart_coulomb=coulomb)
+        drive = Drive(zero, [zero] * UNDER_WAY)
+        after, _ = run_corrected_period(
+            hanging, drive, cart.latency, cart, *LAWS, members_in_turn(learned, 1)
+        )
+        moved[coulomb] = after.x_dot.item()
+    assert moved[0.5] == 0
+    pull = make_cart()
+    mass = (pull.cart_mass + pull.pole_mass).item()
+    assert 0.1 * 0.02 / mass < moved[0.3] < 0.1 * 0.02 / pull.cart_mass.item()  # the pole follows in part

@@ -1,0 +1,199 @@
+"""Between episodes the emulated cart is brought back to the middle, and homed where that will not do."""
+
+import contextlib
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import pytest
+import torch
+from serial_peer import HANGING, CartPeer
+from tensordict import TensorDict
+
+from cartpole_rl.emulator.settings import EmulatorSettings
+from cartpole_rl.plants.emulated import emulated_plant
+from cartpole_rl.plants.serial import SerialPlant, SerialPlantSettings
+from cartpole_rl.plants.serial_cart import SerialCart
+from cartpole_rl.plants.serial_moves import NotReadyError
+from cartpole_rl.plants.serial_recentring import recentre
+from cartpole_rl.wire import Fault, Flags
+
+TURN = 4096
+MIDDLE = 100  # counts, 2.3 mm
+HOMING = 20.0  # s; no homing is done sooner, no re-centring of the default cart takes so long
+fast = partial(EmulatorSettings, physics_step=1e-3)
+
+
+def push(plant: SerialPlant, motor: int) -> TensorDict:
+    return plant.step(TensorDict({"motor": torch.full((1, 1), motor)}, [1]))["next"]
+
+
+def swing_up(plant: SerialPlant, steps: int = 90) -> None:
+    """Wild but within the track: the pole is left turning or swinging far, the cart off the middle."""
+    motor = 200
+    for step in range(steps):
+        counts = push(plant, motor)["counts"][0, 0].item()
+        if step % 12 == 0:
+            motor = -motor
+        if abs(counts) > 5000:
+            motor = -200 if counts > 0 else 200
+    assert plant.ended_by == ""
+
+
+def reset(plant: SerialPlant) -> tuple[float, TensorDict]:
+    """Seconds that a reset takes by the cart's clock, and the first frame."""
+    before = plant._state.time_us
+    plant.cart.statistics.latency.clear()
+    frame = plant.reset()
+    return (plant._state.time_us - before) * 1e-6, frame
+
+
+def hangs_in_the_middle(frame: TensorDict) -> bool:
+    cart, pole = frame["counts"][0].tolist()
+    return abs(cart) < MIDDLE and abs(pole - TURN // 2) < 16
+
+
+@pytest.fixture
+def plant() -> Iterator[SerialPlant]:
+    with contextlib.closing(emulated_plant(fast())) as plant:
+        yield plant
+
+
+@pytest.mark.parametrize(
+    "truth",
+    [
+        {},
+        {"cart_coulomb_left": 0.8, "cart_coulomb_right": 0.6},
+        {"force_curve": (0, 0.01584, -0.792)},
+        {"latency": 0.023},
+        {"track_tilt": 0.0087},
+        {"pole_mass": 0.23, "pole_com": 0.3302, "pole_inertia": 0.0079},
+        {"pole_viscous": 1e-5, "pole_coulomb": 0.0, "pole_drag": 0.0},
+    ],
+    ids=["default", "friction", "force", "latency", "tilt", "large", "no pole friction"],
+)
+def test_many_carts_come_back_to_the_middle_sooner_than_homing(truth: dict[str, Any]) -> None:
+    with contextlib.closing(emulated_plant(fast(**truth))) as plant:
+        homing, frame = reset(plant)
+        assert hangs_in_the_middle(frame)
+        swing_up(plant)
+        plant.halt()
+        seconds, frame = reset(plant)
+        assert hangs_in_the_middle(frame)
+        assert seconds < 0.6 * homing
+        assert not frame["done"]
+
+
+def test_moves_of_the_host_are_no_latencies_of_the_policy(plant: SerialPlant) -> None:
+    plant.reset()
+    swing_up(plant)
+    seconds, _ = reset(plant)
+    assert seconds < HOMING
+    assert plant.cart.statistics.summary().latency_samples == 0
+    push(plant, 0)
+    assert plant.cart.statistics.summary().latency_samples == 1
+
+
+def test_rehome_always_homes_each_time() -> None:
+    with contextlib.closing(emulated_plant(fast(), rehome="always")) as plant:
+        for _ in range(2):
+            seconds, frame = reset(plant)
+            assert seconds > HOMING
+            assert hangs_in_the_middle(frame)
+            push(plant, 100)
+
+
+def test_after_the_end_of_the_track_the_cart_is_homed(plant: SerialPlant) -> None:
+    plant.reset()
+    while not push(plant, 250)["done"]:
+        pass
+    for _ in range(50):
+        plant.cart.poll_state()  # it rolls on to the stop
+    seconds, frame = reset(plant)
+    assert seconds > HOMING
+    assert hangs_in_the_middle(frame)
+
+
+def test_a_cart_that_has_restarted_is_homed() -> None:
+    with contextlib.closing(emulated_plant(fast(reset_at=26.0))) as plant:
+        plant.reset()
+        for _ in range(150):
+            if push(plant, 0)["done"]:
+                break
+        assert plant.ended_by == "link"
+        plant.reset()
+        assert plant._state.time_us > HOMING * 1e6
+        assert plant.cart.flags & Flags.HOMED
+
+
+def test_whole_turns_of_the_pole_do_not_add_up(plant: SerialPlant) -> None:
+    for _ in range(3):
+        _, frame = reset(plant)
+        assert hangs_in_the_middle(frame)
+        swing_up(plant, 150)
+
+
+def test_disturbed_frames_do_not_hinder_it() -> None:
+    disturbed = fast(frame_loss=0.03, frame_corruption=0.03, frame_reordering=0.03, frame_duplication=0.03)
+    with contextlib.closing(emulated_plant(disturbed)) as plant:
+        plant.reset()
+        swing_up(plant)
+        _, frame = reset(plant)
+        assert hangs_in_the_middle(frame)
+        seen = plant.cart.statistics.summary()
+        assert min(seen.overtaken_frames, seen.repeated_frames, seen.lost_frames) > 5
+
+
+def test_overtaken_states_end_no_episode() -> None:
+    with contextlib.closing(emulated_plant(fast(frame_reordering=0.2))) as plant:
+        plant.reset()
+        ticks = [plant._state.tick]
+        for _ in range(200):
+            push(plant, 0)
+            ticks.append(plant._state.tick)
+        assert plant.ended_by == ""
+        assert ticks == sorted(set(ticks))
+        assert plant.cart.statistics.overtaken_frames > 20
+        assert plant.cart.statistics.lost_frames == 0
+
+
+class TestRefusals:
+    """On a scripted cart: what makes re-centring give up, before it moves or after."""
+
+    def test_a_cart_at_the_end_of_the_track(self) -> None:
+        with CartPeer() as peer, SerialCart(quick(peer.port)) as cart:
+            peer.state = replace(peer.state, cart_counts=peer.info.hard_limit_counts)
+            with pytest.raises(NotReadyError, match="stands at the end of the track"):
+                recentre(cart, HANGING)
+            assert not peer.flags & Flags.ARMED
+
+    def test_a_pole_that_lost_its_zero(self) -> None:
+        with CartPeer() as peer, SerialCart(quick(peer.port)) as cart:
+            peer.state = replace(peer.state, pole_counts=HANGING + 3 * TURN - 40)
+            with pytest.raises(NotReadyError, match=r"rests -3\.5 deg from where it did"):
+                recentre(cart, HANGING)
+            assert not peer.flags & Flags.ARMED
+            recentre(cart, HANGING - 40)
+
+    def test_a_fault_on_the_way_is_answered_by_homing(self, caplog: pytest.LogCaptureFixture) -> None:
+        with CartPeer() as peer:
+            plant = SerialPlant(quick(peer.port))
+            plant.reset()
+            carry_out = peer._carry_out
+
+            def fail_once(message: object) -> None:
+                carry_out(message)
+                stalled = type(message).__name__ == "Start"
+                peer.state = replace(peer.state, fault=int(Fault.STALL) if stalled else 0)
+                if type(message).__name__ == "Home":
+                    peer._carry_out = carry_out
+
+            peer._carry_out = fail_once
+            assert not plant.reset()["done"]
+            assert "homing, as the cart could not be brought back" in caplog.text
+            plant.close()
+
+
+def quick(port: str) -> SerialPlantSettings:
+    return SerialPlantSettings(port=port, timeout=2, answer_timeout=1, nudge_after=0.5)
