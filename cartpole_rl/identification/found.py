@@ -82,12 +82,13 @@ def no_force_up_to(cart: Mapping[str, float]) -> float:
 
 
 def intervals(fit: Fit, carts: Array) -> list[Quantity]:
-    """The fit's quantities with 95 % intervals, from carts [P, N] drawn from it."""
+    """The quantities that were looked for with 95 % intervals, from carts [P, N] drawn from the fit."""
     names = CartParameters.names()
     drawn = [quantities(dict(zip(names, cart.tolist(), strict=True))) for cart in carts.T]
     tail = 100 * (1 - CONFIDENCE) / 2
     told = []
     for index, each in enumerate(quantities(fit.parameters)):
         low, high = np.percentile([quantity[index].value for quantity in drawn], [tail, 100 - tail])
-        told.append(each._replace(low=float(low), high=float(high)))
+        if high > low:  # what the laws do not read has no interval
+            told.append(each._replace(low=float(low), high=float(high)))
     return told

@@ -150,7 +150,7 @@ def _draw_course(axes: Axes, course: Course, start: float, angle: bool) -> None:
     episode, colour = course.episode, style.POLE if angle else style.CART
     if angle:
         axes.plot(
-            *wrapped_line(episode.time, episode.theta),
+            *wrapped_line(episode.time, episode.theta - np.pi),
             color=colour,
             linewidth=3,
             alpha=0.45,
