@@ -30,8 +30,8 @@ from cartpole_rl.errors import ConfigError, RecordingError
 from cartpole_rl.evaluation.recordings import read_recording, write_recording
 from cartpole_rl.identification.checks import check_recordings
 from cartpole_rl.identification.experiments import EXPERIMENTS, HELD_OUT, conduct
-from cartpole_rl.identification.found import Quantity, intervals, quantities
 from cartpole_rl.identification.identify import Identification, identify, predicted, prediction_errors
+from cartpole_rl.identification.quantities import Quantity, intervals, quantities
 from cartpole_rl.identification.unknowns import WEIGHED
 from cartpole_rl.physics.actuator import Actuator, static_force
 from cartpole_rl.physics.dynamics import Models

@@ -20,7 +20,7 @@ import yaml
 
 from cartpole_rl.choices import choice
 from cartpole_rl.emulator.settings import EmulatorSettings
-from cartpole_rl.identification.found import quantities
+from cartpole_rl.identification.quantities import quantities
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.reporting.table import table
 

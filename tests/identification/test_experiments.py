@@ -19,8 +19,8 @@ from cartpole_rl.identification.experiments import (
     free_swing,
     guarded,
 )
-from cartpole_rl.identification.found import quantities
 from cartpole_rl.identification.identify import Identification, identify, prediction_errors
+from cartpole_rl.identification.quantities import quantities
 from cartpole_rl.physics.dynamics import Models
 from cartpole_rl.physics.friction import CartFriction, PoleFriction
 from cartpole_rl.physics.parameters import CartParameters
