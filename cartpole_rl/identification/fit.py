@@ -25,12 +25,16 @@ SCALE = np.array([20.0, 3.0])  # counts: errors of cart and pole that count as o
 FINEST = np.array([1.0, 0.5])  # counts: what quantization alone leaves, about
 ROBUST = 3.0  # scaled residuals beyond this count linearly (Huber)
 LOST = 1e6  # scaled residual of a prediction that ran away
-STEP = (
-    1e-5  # of an unknown, for its derivative; larger ones find what no data can tell, the scale of all forces
-)
+STEP = 1e-5  # of an unknown, for its derivative; larger ones find what no data can tell: all forces' scale
 STATE_STEP = np.array([1e-7, 1e-6, 1e-6, 1e-5])  # m, m/s, rad, rad/s
 STATE_SPREAD = np.array([5e-4, 0.1, 5e-3, 1.0])  # of a window's beginning about its first guess
-POLE_STARTS = (0.0, 1.25, -1.0)  # of POLE_LENGTH: a pole of another length looks like a pole of no kind
+STARTS: tuple[Mapping[str, float], ...] = (  # points to search from; what a start does not name is 0
+    {},
+    {POLE_LENGTH: 1.25},  # a pole of another length looks like a pole of no kind
+    {POLE_LENGTH: -1.0},
+    {"latency": 1.5, "motor_time_constant": -0.7},  # a delay looks much like a lag
+    {"latency": -0.7, "motor_time_constant": 1.5},
+)
 CONVERGED = 1e-4  # relative fall of the cost
 CORRELATED = 10.0  # residuals of one window resemble each other: so many say as much as one
 
@@ -72,7 +76,7 @@ def fit_cart(
     sharpened: bool = False,
     lead: float = 0.0,
 ) -> Fit:
-    """The most probable cart, from several beginnings of the pole's length.
+    """The most probable cart, from several starts.
 
     The names `known`, of UNKNOWNS, keep their nominal values. Nothing but ratios of forces and masses shows
     in motion: without WEIGHED among them the scale is that of the prior.
@@ -81,12 +85,12 @@ def fit_cart(
     """
     unknowns = unknowns_of(models, known)
     problem = Problem(windows, dict(nominal), models, period, substeps, unknowns, SCALE, lead)
-    lengths = [index for index, unknown in enumerate(unknowns) if unknown.name == POLE_LENGTH]
-    starts = []
-    for start in POLE_STARTS if lengths else (0.0,):
-        point = np.zeros(len(unknowns))
-        point[lengths] = start
-        starts.append(problem.minimize(point, problem.beginnings(), 4))
+    names = [unknown.name for unknown in unknowns]
+    starts = [
+        problem.minimize(np.array([start.get(name, 0.0) for name in names]), problem.beginnings(), 4)
+        for start in STARTS
+        if start.keys() <= {*names}
+    ]
     best = min(starts, key=lambda each: each.cost)
     best = problem.minimize(best.point, best.motion, iterations)
     if sharpened:
