@@ -95,6 +95,8 @@ class QAgent(nn.Module):
         online, target = self.loss.value_network_params, self.loss.target_value_network_params
         learned = [name for name, weight in online.items(True, True) if weight.requires_grad]
         self._online, self._target = ([params[name] for name in learned] for params in (online, target))
+        self._acting = [] if self.average is None else list(self.average.parameters())
+        self._learning = list(self.actor.parameters())  # in the order of `_acting`
 
     @torch.no_grad()
     def follow(self) -> None:
@@ -106,8 +108,7 @@ class QAgent(nn.Module):
         elif period is not None and self.updates % period == 0:
             torch._foreach_copy_(self._target, self._online)
         if self.average is not None:
-            averaged, current = list(self.average.parameters()), list(self.actor.parameters())
-            torch._foreach_lerp_(averaged, current, self._newest_share())
+            torch._foreach_lerp_(self._acting, self._learning, self._newest_share())
 
     def _newest_share(self) -> float:
         """Weight of the newest weights in the average, which spans at most a tenth of the updates so far.

@@ -21,6 +21,7 @@ LEARNED_FROM: tuple[NestedKey, ...] = (
     ("next", "done"),
 )
 IMPORTANCE: NestedKey = "priority_weight"  # what a prioritized replay adds
+Columns = tuple[Tensor, ...]  # of a batch of transitions, in the order LEARNED_FROM, IMPORTANCE
 NETWORKS = ("value_network_params", "target_value_network_params")  # their names in TorchRL's loss
 
 
@@ -58,33 +59,30 @@ class AdvantageLoss(DQNLoss):
 
 
 class LossGradient:
-    """The gradient of a loss, forward and backward in one call; where `compiled`, without any guards.
+    """The gradient of a loss, clipped, in one call; where `compiled`, without any guards.
 
-    `weights` are the names of what is learned, in both networks of the loss.
+    `weights` are what is learned; a gradient longer than `max_norm` is shortened to it.
     """
 
-    def __init__(self, loss: DQNLoss, compiled: bool = False) -> None:
-        self.loss = loss
+    def __init__(self, loss: DQNLoss, max_norm: float, compiled: bool = False) -> None:
+        self.loss, self.max_norm = loss, max_norm
         online, target = (getattr(loss, name) for name in NETWORKS)
         self.names = [key for key, weight in online.items(True, True) if weight.requires_grad]
         self.weights: list[Tensor] = [online[name] for name in self.names]
         self.target: list[Tensor] = [target[name] for name in self.names]
         self._gradient = Compiled(self._pure) if compiled else self._pure
 
-    def __call__(self, batch: TensorDictBase) -> Tensor:
-        """The loss [] of transitions [B]; sets their `td_error` [B, 1], and the gradient of each weight."""
-        keys = [*LEARNED_FROM, *([IMPORTANCE] if IMPORTANCE in batch else [])]
-        columns = tuple(batch.get(key) for key in keys)
-        loss, errors, *gradients = self._gradient(tuple(self.weights), tuple(self.target), columns)
-        batch.set("td_error", errors)
+    def __call__(self, columns: Columns) -> tuple[Tensor, Tensor, Tensor]:
+        """Sets the gradient of each weight; the loss [], the unclipped norm [], the `td_error` [B, 1]."""
+        loss, norm, errors, *gradients = self._gradient(tuple(self.weights), tuple(self.target), columns)
         for weight, gradient in zip(self.weights, gradients, strict=True):
             weight.grad = gradient
-        return loss
+        return loss, norm, errors
 
     def _pure(
-        self, weights: Sequence[Tensor], target: Sequence[Tensor], columns: Sequence[Tensor]
+        self, weights: Sequence[Tensor], target: Sequence[Tensor], columns: Columns
     ) -> tuple[Tensor, ...]:
-        """Loss, errors and gradients as a function of its arguments alone."""
+        """Loss, norm, errors and gradients as a function of its arguments alone."""
         leaves = [weight.detach().requires_grad_() for weight in weights]
         loss = copy.copy(self.loss)
         for name, values in zip(NETWORKS, (leaves, target), strict=True):
@@ -95,4 +93,12 @@ class LossGradient:
         with torch.enable_grad():
             value = loss(batch)["loss"]
             gradients = torch.autograd.grad(value, leaves)
-        return value.detach(), batch["td_error"].detach(), *gradients
+        norm = torch.stack([gradient.square().sum() for gradient in gradients]).sum().sqrt()
+        share = (self.max_norm / norm).clamp(max=1)
+        return value.detach(), norm, batch["td_error"].detach(), *(share * each for each in gradients)
+
+
+def columns_of(transitions: TensorDictBase) -> Columns:
+    """What a LossGradient learns from; the importance of each transition is the last, where there is one."""
+    keys = [*LEARNED_FROM, *([IMPORTANCE] if IMPORTANCE in transitions else [])]
+    return tuple(transitions.get(key) for key in keys)

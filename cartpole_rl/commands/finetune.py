@@ -10,6 +10,7 @@ episode is on disk before the next begins, so that Ctrl-C, a power cut or a pull
 under way.
 """
 
+import os
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -46,7 +47,8 @@ from cartpole_rl.commands.run_folder import write_config, write_json
 from cartpole_rl.envs import CartPoleEnv
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.evaluation import episode_metrics, summarize
-from cartpole_rl.evaluation.driver import Drive, Driver, as_weights
+from cartpole_rl.evaluation.driver import Drive, Driver
+from cartpole_rl.evaluation.driving_policy import as_weights
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.evaluation.recordings import read_recording, write_recording
 from cartpole_rl.identification import LONGEST_LATENCY, Fit, cut_windows, fit_cart
@@ -102,8 +104,10 @@ def main(config: FinetuneConfig, folder: Path) -> None:
     make_env = partial(evaluated_env, settings, evaluation, print)
     with (
         TensorBoardLog(folder) as log,
-        Driver(make_env, partial(greedy_network, training)) as driver,
+        Driver(make_env, partial(greedy_network, training), config.compile) as driver,
     ):
+        if config.plant.kind == "serial" or config.emulator.clock == "real":
+            yield_to_others()  # but not the process that drives, nor an emulated cart: those have begun
         session = Session(config, training, settings, folder, driver, log)
         if resumed and resumed.state:
             session.restore(resumed.state)
@@ -130,6 +134,14 @@ def as_evaluation(config: FinetuneConfig) -> EvaluateConfig:
 def greedy_network(training: TrainConfig) -> nn.Module:
     """The network that drives, for weights of `as_weights`."""
     return new_agent(training).greedy_policy()
+
+
+def yield_to_others() -> None:
+    """Let this process compute only where no other wants to, so that learning never holds up a tick."""
+    if hasattr(os, "SCHED_IDLE"):
+        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+    elif hasattr(os, "nice"):
+        os.nice(19)
 
 
 class Unheard:
@@ -246,12 +258,12 @@ class Session:
             learning.model_copy(
                 update={
                     "frames": iterations * learning.carts * learning.chunk,
-                    "warmup_frames": 4 * learning.carts * learning.chunk,
+                    "warmup_frames": 0,
                     "epsilon": (0.1, 0.02),
                     "epsilon_frames": iterations * learning.carts * learning.chunk // 2,
                 }
             ),
-            training.replay,
+            training.replay.model_copy(update={"kind": "uniform"}),
             training.optimizer.model_copy(update={"learning_rate": finetuning.learning_rate}),
             self.agent,
             environment(training, plant),
@@ -265,6 +277,7 @@ class Session:
             learner.add(self.chunk(episode))
         if self.optimizer_state is not None:
             learner.optimizer.load_state_dict(self.optimizer_state)
+        learner.fill()
         self.models, self.learner = [models], learner
 
     def refit(self) -> None:

@@ -9,7 +9,7 @@ theta rad, theta_dot rad/s), `reward` [N, 1], `score` (6.2) and `score_upright` 
 `step_count` int64 [N, 1], `past` (what the observation remembers), and the plant's own keys.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import torch
@@ -39,8 +39,15 @@ class HardwareTransform(Transform):
         super().__init__()
         self.task, self.observation_settings, self.reward = task, observation, reward
         self.register_buffer("motors", torch.tensor(list(motors), dtype=torch.int64))
-        understand = partial(perceive, sight=observation, task=task, learned=reward)
-        self._perceive = Compiled(understand) if compiled else understand
+        self._perceive: Callable[[Before, Frame], Perceived] = partial(
+            perceive, sight=observation, task=task, learned=reward
+        )
+        if compiled:
+            self.compile_arithmetic()
+
+    def compile_arithmetic(self) -> None:
+        """Compile what makes observations and rewards of frames, in the next step."""
+        self._perceive = Compiled(self._perceive)
 
     @property
     def plant(self) -> Plant:

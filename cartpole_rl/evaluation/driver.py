@@ -18,18 +18,17 @@ from typing import Any, NoReturn
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torch import nn
 
 from cartpole_rl.envs import CartPoleEnv
 from cartpole_rl.errors import CartPoleError, LinkError
-from cartpole_rl.evaluation.episodes import run_batch
+from cartpole_rl.evaluation.driving_policy import DrivingPolicy, Weights
+from cartpole_rl.evaluation.episodes import rehearse, run_batch
 from cartpole_rl.plants.link_statistics import LinkStatistics
 from cartpole_rl.plants.serial import SerialPlant
 from cartpole_rl.tasks.episode import Episode
 
-Weights = dict[str, NDArray[Any]]
 GRACE = 5.0  # s from SIGTERM to SIGKILL
 
 
@@ -50,22 +49,20 @@ class Driven:
     link: LinkStatistics
 
 
-def as_weights(policy: nn.Module) -> Weights:
-    """The weights of a policy, copied."""
-    return {name: value.detach().cpu().numpy().copy() for name, value in policy.state_dict().items()}
-
-
 class Driver:
     """A process that drives the cart of `make_env` with the network of `make_policy`; a context manager.
 
-    Both are called in that process. Raises what making the environment raises there.
+    Both are called in that process, and their arithmetic is compiled there if `compiled`, before the first
+    episode. Raises what making the environment raises there.
     """
 
-    def __init__(self, make_env: Callable[[], CartPoleEnv], make_policy: Callable[[], nn.Module]) -> None:
+    def __init__(
+        self, make_env: Callable[[], CartPoleEnv], make_policy: Callable[[], nn.Module], compiled: bool
+    ) -> None:
         context = multiprocessing.get_context("spawn")
         self._ours, theirs = context.Pipe()
         self._process = context.Process(
-            target=_serve, args=(theirs, make_env, make_policy, os.getpid()), daemon=True
+            target=_serve, args=(theirs, make_env, make_policy, compiled, os.getpid()), daemon=True
         )
         self._process.start()
         theirs.close()
@@ -129,14 +126,21 @@ def _end(number: int, frame: FrameType | None) -> NoReturn:
 
 
 def _serve(
-    pipe: Connection, make_env: Callable[[], CartPoleEnv], make_policy: Callable[[], nn.Module], parent: int
+    pipe: Connection,
+    make_env: Callable[[], CartPoleEnv],
+    make_policy: Callable[[], nn.Module],
+    compiled: bool,
+    parent: int,
 ) -> None:
     signal.signal(signal.SIGTERM, _end)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent gets it too, and ends this one
     torch.set_num_threads(1)
     try:
-        policy = make_policy()
+        policy = DrivingPolicy(make_policy(), compiled)
         with closing(make_env()) as env:
+            if compiled:
+                env.hardware.compile_arithmetic()
+            rehearse(env, policy)
             pipe.send("ready")
             while True:
                 pipe.send(_drive(env, policy, pipe.recv(), parent))
@@ -146,8 +150,8 @@ def _serve(
         pass
 
 
-def _drive(env: CartPoleEnv, policy: nn.Module, drive: Drive, parent: int) -> Driven:
-    policy.load_state_dict({name: torch.from_numpy(value) for name, value in drive.weights.items()})
+def _drive(env: CartPoleEnv, policy: DrivingPolicy, drive: Drive, parent: int) -> Driven:
+    policy.load(drive.weights)
     random = np.random.default_rng(drive.seed)
     actions = len(env.hardware.motors)
 

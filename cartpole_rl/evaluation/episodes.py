@@ -21,10 +21,19 @@ _FROM_NEXT = ("score", "score_upright", "reward", "done")
 
 def run_episodes(env: CartPoleEnv, policy: Policy, episodes: int) -> Iterator[Episode]:
     """Yield `episodes` episodes. Raises what the plant raises when it cannot be reset."""
+    rehearse(env, policy)
     for _ in range(math.ceil(episodes / env.plant.carts)):
         batch = run_batch(env, policy)
         yield from batch[:episodes]
         episodes -= len(batch)
+
+
+@torch.no_grad()
+def rehearse(env: CartPoleEnv, policy: Policy) -> None:
+    """Think a step through on zeros, so that what is compiled or loaded at first use delays no tick."""
+    blank = env.fake_tensordict()
+    policy(blank.select("observation"))
+    env.hardware.perceive(blank, env.hardware.command(blank), blank["next"])
 
 
 @torch.no_grad()

@@ -68,6 +68,12 @@ class Finetuning(Training):
         self.env.plant.replace_randomizer(carts)
         self.collector.begin()
         self.replay.empty()
+        self.fill()
+
+    def fill(self) -> None:
+        """Drive the simulated carts for a whole episode, so that the first updates see all of one."""
+        for _ in range(self.env.hardware.task.time_limit // self.settings.chunk):
+            self.collect()
 
     def round(self) -> Scalars:
         """Learn while one episode is driven."""

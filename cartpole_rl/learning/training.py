@@ -11,9 +11,8 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 from tensordict import TensorDictBase
-from torch import nn
 
-from cartpole_rl.agents import LossGradient, QAgent
+from cartpole_rl.agents import Columns, LossGradient, QAgent, columns_of
 from cartpole_rl.envs import CartPoleEnv
 from cartpole_rl.learning.collector import Collector
 from cartpole_rl.learning.randomness import random_state, restore_random_state
@@ -59,7 +58,7 @@ class Training:
         self.collector = Collector(env, agent.actor, len(env.hardware.motors), seed)
         self.replay_settings, self.optimizer_settings = replay, optimizer
         self.replay = make_replay(replay, settings.updates * settings.batch_size)
-        self.gradient = LossGradient(agent.loss, compiled)
+        self.gradient = LossGradient(agent.loss, optimizer.max_grad_norm, compiled)
         self.weights = self.gradient.weights
         self.optimizer = OPTIMIZERS[optimizer.kind](
             self.weights, lr=optimizer.learning_rate, weight_decay=optimizer.weight_decay, fused=True
@@ -100,13 +99,18 @@ class Training:
     def iterate(self) -> tuple[TensorDictBase, Scalars]:
         """Collect a chunk and learn; what was collected, and what is worth a curve of the learning."""
         started = time.perf_counter()
-        self.collector.epsilon = self.epsilon()
-        chunk = self.collector.collect(self.settings.chunk)
-        self.replay.extend(n_step_transitions(chunk, self.settings.n_step, self.agent.settings.gamma))
+        chunk = self.collect()
         self.iteration += 1
         scalars = self.learn() if self.frames > self.settings.warmup_frames else {}
         self.seconds += time.perf_counter() - started
         return chunk, scalars
+
+    def collect(self) -> TensorDictBase:
+        """A chunk from all carts, which replay has as well from now on."""
+        self.collector.epsilon = self.epsilon()
+        chunk = self.collector.collect(self.settings.chunk)
+        self.replay.extend(n_step_transitions(chunk, self.settings.n_step, self.agent.settings.gamma))
+        return chunk
 
     def sample(self) -> TensorDictBase:
         """What one iteration learns from, `updates` batches long."""
@@ -122,26 +126,23 @@ class Training:
             group["lr"] = rate
         if self.replay_settings.kind == "prioritized":
             self.replay.sampler.beta = linear(*beta, self.progress)
-        losses, norms = [], []
-        for batch in self.sample().split(self.settings.batch_size):
-            loss, norm = self.update(batch)
-            losses.append(loss)
-            norms.append(norm)
+        sample = self.sample()
+        batches = zip(*(column.split(self.settings.batch_size) for column in columns_of(sample)), strict=True)
+        losses, norms, errors = zip(*map(self.update, batches), strict=True)
+        if self.replay_settings.kind == "prioritized":
+            self.replay.update_tensordict_priority(sample.set("td_error", torch.cat(errors)))
         return {
             "learning/loss": torch.stack(losses).mean().item(),
             "learning/gradient_norm": torch.stack(norms).mean().item(),
             "learning/learning_rate": rate,
         }
 
-    def update(self, batch: TensorDictBase) -> tuple[torch.Tensor, torch.Tensor]:
-        """One gradient step; the loss and the norm of its gradient."""
-        loss = self.gradient(batch)
-        norm = nn.utils.clip_grad_norm_(self.weights, self.optimizer_settings.max_grad_norm)
+    def update(self, batch: Columns) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """One gradient step; the loss, the norm of its gradient, the error of each transition."""
+        found = self.gradient(batch)
         self.optimizer.step()
         self.agent.follow()
-        if self.replay_settings.kind == "prioritized":
-            self.replay.update_tensordict_priority(batch)
-        return loss, norm
+        return found
 
     def epsilon(self) -> float:
         """Share of random actions now."""

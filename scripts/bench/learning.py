@@ -38,9 +38,8 @@ REACHED, KEPT = 0.9, 0.85  # fractions: of the time to it, and over which later 
 STARTS = 20
 
 
-def train(row: str, seed: int, overrides: list[str]) -> Path:
-    """Train one seed unless that was done."""
-    folder = Path("runs/bench", row, str(seed))
+def train(row: str, seed: int, overrides: list[str], folder: Path) -> Path:
+    """`folder`, with one seed trained in it unless that was done."""
     if not (folder / "metrics.json").exists():
         command = [Path(sys.executable).with_name("cartpole-train"), f"experiment={row}", f"seed={seed}"]
         done = subprocess.run(
@@ -83,7 +82,8 @@ def result(row: str, folder: Path, references: dict[str, float]) -> dict[str, An
     later = [] if first is None else course[first + 1 :]
     return {
         "seconds": history[-1]["seconds"],
-        "seconds_to_reached": None if first is None else history[first]["seconds"],
+        "seconds_to_reached": float("inf") if first is None else history[first]["seconds"],
+        "frames_to_reached": float("inf") if first is None else history[first]["frames"],
         "kept": float(np.mean([fraction > KEPT for fraction in later])) if later else None,
         "plants": {
             plant: {**figures, "fraction": figures["score"] / references[plant]}
@@ -99,7 +99,7 @@ def summary(row: str, results: dict[int, dict[str, Any]]) -> list[dict[str, str]
         for key in ("score_upright",) if row == "balance" else ("fraction", "score"):
             lines[f"{key}, {plant}"] = [each["plants"][plant][key] for each in results.values()]
     if row != "balance":
-        lines["seconds to 0.9"] = [each["seconds_to_reached"] or float("inf") for each in results.values()]
+        lines["seconds to 0.9"] = [each["seconds_to_reached"] for each in results.values()]
         lines["kept over 0.85"] = [each["kept"] or 0.0 for each in results.values()]
     lines["seconds"] = [each["seconds"] for each in results.values()]
     return [
@@ -126,8 +126,12 @@ def main() -> None:
     references = {plant: figures["score"] for plant, figures in found.items()}
     everything, lines = {}, []
     for row in given.rows:
+
+        def folder_of(seed: int, row: str = row) -> Path:
+            return train(row, seed, overrides, Path("runs/bench", row, str(seed)))
+
         with ThreadPoolExecutor(given.jobs) as pool:
-            folders = list(pool.map(lambda seed, row=row: train(row, seed, overrides), range(given.seeds)))
+            folders = list(pool.map(folder_of, range(given.seeds)))
         everything[row] = {seed: result(row, folder, references) for seed, folder in enumerate(folders)}
         lines += summary(row, everything[row])
         print(table(lines, {key: key for key in lines[0]}), flush=True)

@@ -9,7 +9,7 @@ from pydantic import ValidationError
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from cartpole_rl.agents import AgentSettings, LossGradient, QAgent
+from cartpole_rl.agents import AgentSettings, LossGradient, QAgent, columns_of
 from cartpole_rl.agents.network import MirrorQNetwork, QNetwork, RecurrentQNetwork
 
 DQN = {
@@ -231,10 +231,13 @@ def test_importance_weights_scale_each_transition() -> None:
 @pytest.mark.parametrize("weighted", [False, True])
 @pytest.mark.parametrize("compiled", [False, True])
 @pytest.mark.parametrize("network", [{"mirrored": True}, {"recurrent": 8}])
-def test_the_gradient_is_that_of_the_loss(network: dict, compiled: bool, weighted: bool) -> None:
+@pytest.mark.parametrize("max_norm", [100.0, 1e-2])
+def test_the_gradient_is_that_of_the_loss(
+    network: dict, compiled: bool, weighted: bool, max_norm: float
+) -> None:
     agent = make_agent(action_gap=0.5, frames=[[1], [0]], **network)
     disturb(agent)
-    gradient = LossGradient(agent.loss, compiled)
+    gradient = LossGradient(agent.loss, max_norm, compiled)
     for seed in range(2):  # the second batch meets what was traced for the first, and other weights
         torch.manual_seed(seed)
         batch = transitions(64)
@@ -243,18 +246,22 @@ def test_the_gradient_is_that_of_the_loss(network: dict, compiled: bool, weighte
         wanted = batch.clone()
         loss = agent.loss(wanted)["loss"]
         expected = torch.autograd.grad(loss, gradient.weights)
-        assert gradient(batch).item() == pytest.approx(loss.item(), rel=1e-5)
-        assert torch.allclose(batch["td_error"], wanted["td_error"], rtol=1e-4, atol=1e-5)
-        for weight, value in zip(gradient.weights, expected, strict=True):
+        length = nn.utils.get_total_norm(expected).item()
+        value, norm, errors = gradient(columns_of(batch))
+        assert value.item() == pytest.approx(loss.item(), rel=1e-5)
+        assert norm.item() == pytest.approx(length, rel=1e-4)
+        assert torch.allclose(errors, wanted["td_error"], rtol=1e-4, atol=1e-5)
+        share = min(1.0, max_norm / length)
+        for weight, part in zip(gradient.weights, expected, strict=True):
             assert weight.grad is not None
-            assert torch.allclose(weight.grad, value, rtol=1e-4, atol=1e-5)
+            assert torch.allclose(weight.grad, share * part, rtol=1e-4, atol=1e-5)
         disturb(agent)
         agent.follow()
 
 
 def test_every_weight_of_the_online_network_is_learned() -> None:
     agent = make_agent(mirrored=True)
-    learned = {weight.data_ptr() for weight in LossGradient(agent.loss).weights}
+    learned = {weight.data_ptr() for weight in LossGradient(agent.loss, 1.0).weights}
     assert learned == {weight.data_ptr() for weight in agent.actor.parameters()}
 
 

@@ -1,0 +1,47 @@
+"""The policy that drives a cart in real time: a network of which the weights come from elsewhere."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from numpy.typing import NDArray
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
+from torch.func import functional_call
+
+from cartpole_rl.compilation import Compiled
+
+Weights = dict[str, NDArray[Any]]
+
+
+def as_weights(policy: nn.Module) -> Weights:
+    """The weights of a policy, copied."""
+    return {name: value.detach().cpu().numpy().copy() for name, value in policy.state_dict().items()}
+
+
+class DrivingPolicy:
+    """The policy `network`, reads `observation`, writes `action`; where `compiled`, as one call.
+
+    TorchRL's modules take most of a small network's time to look up what is where.
+    """
+
+    def __init__(self, network: nn.Module, compiled: bool) -> None:
+        self.network = network
+        self.names = list(network.state_dict())
+        self._choose = Compiled(self._pure) if compiled else self._pure
+        self.load(as_weights(network))
+
+    def load(self, weights: Weights) -> None:
+        """Act with these from now on."""
+        self._weights = tuple(torch.from_numpy(weights[name]) for name in self.names)
+
+    def __call__(self, present: TensorDictBase) -> TensorDictBase:
+        """`present` [N] with its `action` [N]."""
+        (action,) = self._choose(self._weights, (present["observation"],))
+        return present.set("action", action)
+
+    def _pure(self, weights: Sequence[Tensor], seen: Sequence[Tensor]) -> tuple[Tensor]:
+        """Actions as a function of its arguments alone."""
+        present = TensorDict({"observation": seen[0]}, batch_size=seen[0].shape[:1])
+        state = dict(zip(self.names, weights, strict=True))
+        return (functional_call(self.network, state, (present,))["action"],)

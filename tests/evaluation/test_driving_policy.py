@@ -1,0 +1,51 @@
+"""The policy that drives chooses what the trained one would."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import nn
+
+from cartpole_rl.agents import AgentSettings, QAgent
+from cartpole_rl.evaluation.driving_policy import DrivingPolicy, as_weights
+
+SETTINGS = {
+    "hidden": (8,),
+    "recurrent": None,
+    "layer_norm": True,
+    "mirrored": False,
+    "gamma": 0.9,
+    "double": True,
+    "action_gap": 0.0,
+    "loss": "l2",
+    "target_tau": 0.1,
+    "target_period": None,
+    "average_decay": None,
+}
+
+
+def network(seed: int, **changes: object) -> nn.Module:
+    torch.manual_seed(seed)
+    agent = QAgent(AgentSettings(**{**SETTINGS, **changes}), [1, -1, -1, 1], 5, [[2, 3], [0, 1]])
+    return agent.greedy_policy()
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+@pytest.mark.parametrize("changes", [{}, {"mirrored": True}, {"recurrent": 4}])
+def test_it_acts_as_the_network_whose_weights_it_was_given(compiled: bool, changes: dict) -> None:
+    policy = DrivingPolicy(network(0, **changes), compiled)
+    observations = torch.randn(200, 1, 4, generator=torch.Generator().manual_seed(5))
+    for seed in (0, 1):  # the second has other weights than the one that was compiled
+        wanted = network(seed, **changes)
+        policy.load(as_weights(wanted))
+        for observation in observations:
+            present = TensorDict({"observation": observation}, batch_size=[1])
+            assert torch.equal(policy(present.clone())["action"], wanted(present.clone())["action"])
+
+
+def test_weights_are_copies() -> None:
+    chosen = network(0)
+    weights = as_weights(chosen)
+    before = {name: value.copy() for name, value in weights.items()}
+    for weight in chosen.parameters():
+        weight.data.add_(1)
+    assert all((weights[name] == before[name]).all() for name in weights)
