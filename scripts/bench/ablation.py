@@ -9,11 +9,10 @@ shrink with them. Runs go to runs/bench/ablation/<arm>/<seed> and are not traine
 
 import argparse
 import json
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
-from learning import REFERENCES, result, train
+from learning import REFERENCES, result, train_all
 
 from cartpole_rl.commands.build import use_threads
 from cartpole_rl.reporting.table import table
@@ -48,16 +47,11 @@ def main() -> None:
     for arm in given.arms:
         words = [f"learning.frames={FRAMES}", *ARMS[arm]]
         parent = Path("runs/bench/ablation", arm.replace(" ", "_"))
-
-        def folder_of(seed: int, parent: Path = parent, words: list[str] = words) -> Path:
-            return train("medium", seed, words, parent / str(seed))
-
-        with ThreadPoolExecutor(given.jobs) as pool:
-            folders = list(pool.map(folder_of, range(given.seeds)))
+        folders = train_all("medium", given.seeds, given.jobs, words, parent)
         results = [result("medium", folder, references) for folder in folders]
         everything[arm] = results
         fractions = [each["plants"]["medium"]["fraction"] for each in results]
-        reached = [each["frames_to_reached"] for each in results]
+        reached = [each["frames_to_reached"] or float("inf") for each in results]
         rows.append(
             {
                 "arm": arm,

@@ -50,6 +50,12 @@ def train(row: str, seed: int, overrides: list[str], folder: Path) -> Path:
     return folder
 
 
+def train_all(row: str, seeds: int, jobs: int, overrides: list[str], parent: Path) -> list[Path]:
+    """A folder in `parent` for each seed, `jobs` trained at once."""
+    with ThreadPoolExecutor(jobs) as pool:
+        return list(pool.map(lambda seed: train(row, seed, overrides, parent / str(seed)), range(seeds)))
+
+
 def judge(folder: Path, plant: str) -> dict[str, float]:
     """Mean scores of the last checkpoint over STARTS starts on the nominal cart with the pole `plant`."""
     agent = trained_agent(folder)
@@ -82,8 +88,8 @@ def result(row: str, folder: Path, references: dict[str, float]) -> dict[str, An
     later = [] if first is None else course[first + 1 :]
     return {
         "seconds": history[-1]["seconds"],
-        "seconds_to_reached": float("inf") if first is None else history[first]["seconds"],
-        "frames_to_reached": float("inf") if first is None else history[first]["frames"],
+        "seconds_to_reached": None if first is None else history[first]["seconds"],
+        "frames_to_reached": None if first is None else history[first]["frames"],
         "kept": float(np.mean([fraction > KEPT for fraction in later])) if later else None,
         "plants": {
             plant: {**figures, "fraction": figures["score"] / references[plant]}
@@ -99,7 +105,7 @@ def summary(row: str, results: dict[int, dict[str, Any]]) -> list[dict[str, str]
         for key in ("score_upright",) if row == "balance" else ("fraction", "score"):
             lines[f"{key}, {plant}"] = [each["plants"][plant][key] for each in results.values()]
     if row != "balance":
-        lines["seconds to 0.9"] = [each["seconds_to_reached"] for each in results.values()]
+        lines["seconds to 0.9"] = [each["seconds_to_reached"] or float("inf") for each in results.values()]
         lines["kept over 0.85"] = [each["kept"] or 0.0 for each in results.values()]
     lines["seconds"] = [each["seconds"] for each in results.values()]
     return [
@@ -126,12 +132,7 @@ def main() -> None:
     references = {plant: figures["score"] for plant, figures in found.items()}
     everything, lines = {}, []
     for row in given.rows:
-
-        def folder_of(seed: int, row: str = row) -> Path:
-            return train(row, seed, overrides, Path("runs/bench", row, str(seed)))
-
-        with ThreadPoolExecutor(given.jobs) as pool:
-            folders = list(pool.map(folder_of, range(given.seeds)))
+        folders = train_all(row, given.seeds, given.jobs, overrides, Path("runs/bench", row))
         everything[row] = {seed: result(row, folder, references) for seed, folder in enumerate(folders)}
         lines += summary(row, everything[row])
         print(table(lines, {key: key for key in lines[0]}), flush=True)

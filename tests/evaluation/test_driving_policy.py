@@ -6,26 +6,15 @@ from tensordict import TensorDict
 from torch import nn
 
 from cartpole_rl.agents import AgentSettings, QAgent
+from cartpole_rl.choices import choice
 from cartpole_rl.evaluation.driving_policy import DrivingPolicy, as_weights
 
-SETTINGS = {
-    "hidden": (8,),
-    "recurrent": None,
-    "layer_norm": True,
-    "mirrored": False,
-    "gamma": 0.9,
-    "double": True,
-    "action_gap": 0.0,
-    "loss": "l2",
-    "target_tau": 0.1,
-    "target_period": None,
-    "average_decay": None,
-}
+SETTINGS = choice("agent/dqn") | {"hidden": [8], "mirrored": False}
 
 
 def network(seed: int, **changes: object) -> nn.Module:
     torch.manual_seed(seed)
-    agent = QAgent(AgentSettings(**{**SETTINGS, **changes}), [1, -1, -1, 1], 5, [[2, 3], [0, 1]])
+    agent = QAgent(AgentSettings(**(SETTINGS | changes)), [1, -1, -1, 1], 5, [[2, 3], [0, 1]])
     return agent.greedy_policy()
 
 
