@@ -10,7 +10,6 @@ episode is on disk before the next begins, so that Ctrl-C, a power cut or a pull
 under way.
 """
 
-import os
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -72,6 +71,7 @@ from cartpole_rl.plants.recorded import RecordedPlant
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.randomization import FoundCarts
 from cartpole_rl.reporting.tensorboard import TensorBoardLog
+from cartpole_rl.scheduling import compute_last
 from cartpole_rl.tasks.episode import Episode
 
 BEFORE, TUNE, AFTER = "before", "tune", "after"
@@ -102,12 +102,13 @@ def main(config: FinetuneConfig, folder: Path) -> None:
     else:
         write_config(folder, config.model_dump(mode="json"), resumed=True)
     make_env = partial(evaluated_env, settings, evaluation, print)
+    real_time = config.plant.kind == "serial" or config.emulator.clock == "real"
     with (
         TensorBoardLog(folder) as log,
-        Driver(make_env, partial(greedy_network, training), config.compile) as driver,
+        Driver(make_env, partial(greedy_network, training), config.compile, real_time) as driver,
     ):
-        if config.plant.kind == "serial" or config.emulator.clock == "real":
-            yield_to_others()  # but not the process that drives, nor an emulated cart: those have begun
+        if real_time:
+            compute_last()  # but not the process that drives, nor an emulated cart: those have begun
         session = Session(config, training, settings, folder, driver, log)
         if resumed and resumed.state:
             session.restore(resumed.state)
@@ -134,14 +135,6 @@ def as_evaluation(config: FinetuneConfig) -> EvaluateConfig:
 def greedy_network(training: TrainConfig) -> nn.Module:
     """The network that drives, for weights of `as_weights`."""
     return new_agent(training).greedy_policy()
-
-
-def yield_to_others() -> None:
-    """Let this process compute only where no other wants to, so that learning never holds up a tick."""
-    if hasattr(os, "SCHED_IDLE"):
-        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
-    elif hasattr(os, "nice"):
-        os.nice(19)
 
 
 class Unheard:

@@ -27,6 +27,10 @@ class CartPoleEnv(TransformedEnv):
         """The transform above it."""
         return self.transform
 
+    def step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """`tensordict` with the outcome of one step of all carts under "next"."""
+        return tensordict.set("next", self._step(tensordict))
+
     def step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
         """One step, and the first frame of a new episode for each cart whose episode ended.
 

@@ -27,6 +27,7 @@ from cartpole_rl.evaluation.driving_policy import DrivingPolicy, Weights
 from cartpole_rl.evaluation.episodes import rehearse, run_batch
 from cartpole_rl.plants.link_statistics import LinkStatistics
 from cartpole_rl.plants.serial import SerialPlant
+from cartpole_rl.scheduling import compute_first
 from cartpole_rl.tasks.episode import Episode
 
 GRACE = 5.0  # s from SIGTERM to SIGKILL
@@ -53,16 +54,23 @@ class Driver:
     """A process that drives the cart of `make_env` with the network of `make_policy`; a context manager.
 
     Both are called in that process, and their arithmetic is compiled there if `compiled`, before the first
-    episode. Raises what making the environment raises there.
+    episode. Where the cart keeps its own clock, `real_time`, the process goes ahead of others if it may.
+    Raises what making the environment raises there.
     """
 
     def __init__(
-        self, make_env: Callable[[], CartPoleEnv], make_policy: Callable[[], nn.Module], compiled: bool
+        self,
+        make_env: Callable[[], CartPoleEnv],
+        make_policy: Callable[[], nn.Module],
+        compiled: bool,
+        real_time: bool,
     ) -> None:
         context = multiprocessing.get_context("spawn")
         self._ours, theirs = context.Pipe()
         self._process = context.Process(
-            target=_serve, args=(theirs, make_env, make_policy, compiled, os.getpid()), daemon=True
+            target=_serve,
+            args=(theirs, make_env, make_policy, compiled, real_time, os.getpid()),
+            daemon=True,
         )
         self._process.start()
         theirs.close()
@@ -130,6 +138,7 @@ def _serve(
     make_env: Callable[[], CartPoleEnv],
     make_policy: Callable[[], nn.Module],
     compiled: bool,
+    real_time: bool,
     parent: int,
 ) -> None:
     signal.signal(signal.SIGTERM, _end)
@@ -141,6 +150,8 @@ def _serve(
             if compiled:
                 env.hardware.compile_arithmetic()
             rehearse(env, policy)
+            if real_time:
+                compute_first()
             pipe.send("ready")
             while True:
                 pipe.send(_drive(env, policy, pipe.recv(), parent))

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch.func import functional_call
 
 from cartpole_rl.compilation import Compiled
+from cartpole_rl.plants.specs import tensordict_of
 
 Weights = dict[str, NDArray[Any]]
 
@@ -20,7 +21,7 @@ def as_weights(policy: nn.Module) -> Weights:
 
 
 class DrivingPolicy:
-    """The policy `network`, reads `observation`, writes `action`; where `compiled`, as one call.
+    """The policy `network`, from `observation` to `action`; where `compiled`, as one call.
 
     TorchRL's modules take most of a small network's time to look up what is where.
     """
@@ -36,9 +37,9 @@ class DrivingPolicy:
         self._weights = tuple(torch.from_numpy(weights[name]) for name in self.names)
 
     def __call__(self, present: TensorDictBase) -> TensorDictBase:
-        """`present` [N] with its `action` [N]."""
-        (action,) = self._choose(self._weights, (present["observation"],))
-        return present.set("action", action)
+        """The `action` [N] for the `observation` of `present` [N]."""
+        (action,) = self._choose(self._weights, (present.get("observation"),))
+        return tensordict_of({"action": action})
 
     def _pure(self, weights: Sequence[Tensor], seen: Sequence[Tensor]) -> tuple[Tensor]:
         """Actions as a function of its arguments alone."""

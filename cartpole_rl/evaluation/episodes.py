@@ -40,26 +40,26 @@ def rehearse(env: CartPoleEnv, policy: Policy) -> None:
 def run_batch(env: CartPoleEnv, policy: Policy) -> list[Episode]:
     """One episode on each cart, all from one reset."""
     present = env.reset()
-    states, times, counts = [present["state"]], [torch.zeros_like(present["dt"])], [present["counts"]]
-    steps: dict[str, list[torch.Tensor]] = {key: [] for key in ("motor", *_FROM_NEXT)}
+    frames, actions = [present], []
     endings: list[str | None] = [None] * env.plant.carts
-    while None in endings:
-        present["action"] = policy(present.select("observation"))["action"]
-        following = env.step(present)["next"]
-        steps["motor"].append(env.hardware.motors[present["action"]].unsqueeze(-1))
-        for key in _FROM_NEXT:
-            steps[key].append(following[key])
-        states.append(following["state"])
-        counts.append(following["counts"])
-        times.append(times[-1] + following["dt"])
-        _note_endings(env, following, endings)
+    while None in endings:  # a cart waits for what happens here; all that can wait is done below
+        action = policy(present.select("observation")).get("action")
+        following = env.step(present.set("action", action)).get("next")
+        actions.append(action)
+        frames.append(following)
+        if following.get("done").any():
+            _note_endings(env, following, endings)
         present = following.exclude("reward")
     env.plant.halt()  # a real cart keeps its last motor value
-    columns = {key: torch.cat(values, 1).cpu().numpy() for key, values in steps.items()}
-    columns["state"], columns["counts"] = (torch.stack(each, 1).cpu().numpy() for each in (states, counts))
-    columns["time"] = torch.cat(times, 1).cpu().numpy()
+    begin, steps = frames[0], frames[1:]
+    columns = {key: torch.cat([step[key] for step in steps], 1) for key in _FROM_NEXT}
+    columns |= {key: torch.stack([frame[key] for frame in frames], 1) for key in ("state", "counts")}
+    columns["motor"] = env.hardware.motors[torch.stack(actions, 1)]
+    dt = torch.cat([torch.zeros_like(begin["dt"]), *(step["dt"] for step in steps)], 1)
+    columns["time"] = dt.cumsum(1)
+    arrays = {key: values.cpu().numpy() for key, values in columns.items()}
     return [
-        _episode({key: values[row] for key, values in columns.items()}, ending)
+        _episode({key: values[row] for key, values in arrays.items()}, ending)
         for row, ending in enumerate(endings)
         if ending
     ]
