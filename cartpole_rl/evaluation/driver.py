@@ -54,8 +54,8 @@ class Driver:
     """A process that drives the cart of `make_env` with the network of `make_policy`; a context manager.
 
     Both are called in that process, and their arithmetic is compiled there if `compiled`, before the first
-    episode. Where the cart keeps its own clock, `real_time`, the process goes ahead of others if it may.
-    Raises what making the environment raises there.
+    episode. Where the cart keeps its own clock, `real_time`, the process goes ahead of others if it may;
+    `goes_first` is whether it does. Raises what making the environment raises there.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class Driver:
         self._process.start()
         theirs.close()
         try:
-            self._receive()
+            self.goes_first: bool = self._receive()
         except BaseException:
             self.close()
             raise
@@ -150,9 +150,7 @@ def _serve(
             if compiled:
                 env.hardware.compile_arithmetic()
             rehearse(env, policy)
-            if real_time:
-                compute_first()
-            pipe.send("ready")
+            pipe.send(real_time and compute_first())
             while True:
                 pipe.send(_drive(env, policy, pipe.recv(), parent))
     except CartPoleError as error:
