@@ -18,6 +18,7 @@ from cartpole_rl.commands.report import report
 from cartpole_rl.commands.run_folder import write_config
 from cartpole_rl.envs import CartPoleEnv
 from cartpole_rl.errors import ConfigError
+from cartpole_rl.evaluation.driving_policy import DrivingPolicy
 from cartpole_rl.evaluation.episodes import Policy, run_batch
 from cartpole_rl.learning.checkpoints import TrainingCheckpoint, load_training
 from cartpole_rl.learning.randomness import seed_everything
@@ -42,7 +43,8 @@ def main(config: TrainConfig, folder: Path) -> None:
     env = simulated_env(config, config.plant, carts, start, config.seed, config.compile)
     note_unused_randomization(config)
     agent = new_agent(config)
-    evaluate = partial(judge, nominal_env(config), agent.greedy_policy(), config.seed + EVALUATION_SEED)
+    policy = DrivingPolicy(agent.greedy_policy(), config.compile)
+    evaluate = partial(judge, nominal_env(config), policy, config.seed + EVALUATION_SEED)
     write_config(folder, config.model_dump(mode="json"), resumed=resumed is not None)
     with TrainingMonitor(folder, config, resumed.frames if resumed else None) as monitor:
         training = Training(

@@ -1,4 +1,4 @@
-"""The policy that drives a cart in real time: a network of which the weights come from elsewhere."""
+"""The policy that drives: a network as a function of its weights, which may come from elsewhere."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -23,14 +23,15 @@ def as_weights(policy: nn.Module) -> Weights:
 class DrivingPolicy:
     """The policy `network`, from `observation` to `action`; where `compiled`, as one call.
 
-    TorchRL's modules take most of a small network's time to look up what is where.
+    It follows the network's weights as they change, until others are loaded. TorchRL's modules take most of
+    a small network's time to look up what is where.
     """
 
     def __init__(self, network: nn.Module, compiled: bool) -> None:
         self.network = network
-        self.names = list(network.state_dict())
+        state = network.state_dict()  # shares memory with the network
+        self.names, self._weights = list(state), tuple(state.values())
         self._choose = Compiled(self._pure) if compiled else self._pure
-        self.load(as_weights(network))
 
     def load(self, weights: Weights) -> None:
         """Act with these from now on."""

@@ -5,7 +5,8 @@ had not been. Schedules are functions of the frames seen.
 """
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any, Protocol
 
 import numpy as np
@@ -88,7 +89,8 @@ class Training:
         evaluate_at = evenly_spaced(settings.evaluations, settings.iterations)
         checkpoint_at = evaluate_at[:: -settings.checkpoint_interval]  # counted back, so that the end is one
         while self.iteration < settings.iterations:
-            chunk, scalars = self.iterate()
+            with self.timed():
+                chunk, scalars = self.iterate()
             if self.iteration % max(1, settings.iterations // 200) == 0:
                 self.monitor.learned(self.frames, scalars | self.describe(chunk))
             if self.iteration in evaluate_at:
@@ -98,12 +100,9 @@ class Training:
 
     def iterate(self) -> tuple[TensorDictBase, Scalars]:
         """Collect a chunk and learn; what was collected, and what is worth a curve of the learning."""
-        started = time.perf_counter()
         chunk = self.collect()
         self.iteration += 1
-        scalars = self.learn() if self.frames > self.settings.warmup_frames else {}
-        self.seconds += time.perf_counter() - started
-        return chunk, scalars
+        return chunk, self.learn() if self.frames > self.settings.warmup_frames else {}
 
     def collect(self) -> TensorDictBase:
         """A chunk from all carts, which replay has as well from now on."""
@@ -166,11 +165,19 @@ class Training:
 
     def judge(self) -> None:
         """Evaluate, and tell the monitor."""
-        episodes = self.evaluate()
+        with self.timed():
+            episodes = self.evaluate()
         self.last_score = float(np.mean([episode.score.sum() for episode in episodes]))
         is_best = self.last_score > self.best_score
         self.best_score = max(self.best_score, self.last_score)
         self.monitor.evaluated(self, episodes, is_best)
+
+    @contextmanager
+    def timed(self) -> Iterator[None]:
+        """Add the time that passes within it to `seconds`: collecting, learning and evaluating count."""
+        started = time.perf_counter()
+        yield
+        self.seconds += time.perf_counter() - started
 
     def snapshot(self) -> dict[str, Any]:
         """All that the next iteration depends on, to be saved at once: it shares memory with the training."""

@@ -38,3 +38,15 @@ def test_weights_are_copies() -> None:
     for weight in chosen.parameters():
         weight.data.add_(1)
     assert all((weights[name] == before[name]).all() for name in weights)
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_it_follows_its_network_until_others_are_loaded(compiled: bool) -> None:
+    learning, present = network(0), TensorDict({"observation": torch.randn(50, 4)}, batch_size=[50])
+    policy = DrivingPolicy(learning, compiled)
+    policy(present)
+    for weight in learning.parameters():
+        weight.data.neg_()
+    assert torch.equal(policy(present)["action"], learning(present.clone())["action"])
+    policy.load(as_weights(network(1)))
+    assert torch.equal(policy(present)["action"], network(1)(present.clone())["action"])
