@@ -89,8 +89,7 @@ class Training:
         evaluate_at = evenly_spaced(settings.evaluations, settings.iterations)
         checkpoint_at = evaluate_at[:: -settings.checkpoint_interval]  # counted back, so that the end is one
         while self.iteration < settings.iterations:
-            with self.timed():
-                chunk, scalars = self.iterate()
+            chunk, scalars = self.iterate()
             if self.iteration % max(1, settings.iterations // 200) == 0:
                 self.monitor.learned(self.frames, scalars | self.describe(chunk))
             if self.iteration in evaluate_at:
@@ -100,9 +99,10 @@ class Training:
 
     def iterate(self) -> tuple[TensorDictBase, Scalars]:
         """Collect a chunk and learn; what was collected, and what is worth a curve of the learning."""
-        chunk = self.collect()
-        self.iteration += 1
-        return chunk, self.learn() if self.frames > self.settings.warmup_frames else {}
+        with self.timed():
+            chunk = self.collect()
+            self.iteration += 1
+            return chunk, self.learn() if self.frames > self.settings.warmup_frames else {}
 
     def collect(self) -> TensorDictBase:
         """A chunk from all carts, which replay has as well from now on."""
@@ -176,8 +176,10 @@ class Training:
     def timed(self) -> Iterator[None]:
         """Add the time that passes within it to `seconds`: collecting, learning and evaluating count."""
         started = time.perf_counter()
-        yield
-        self.seconds += time.perf_counter() - started
+        try:
+            yield
+        finally:
+            self.seconds += time.perf_counter() - started
 
     def snapshot(self) -> dict[str, Any]:
         """All that the next iteration depends on, to be saved at once: it shares memory with the training."""
