@@ -16,7 +16,7 @@ floors:
 	$(BIN)/lint-imports
 
 test:
-	$(BIN)/pytest -n 2 --dist loadfile
+	$(BIN)/pytest -n 2 --dist worksteal
 
 format:
 	$(BIN)/ruff format .

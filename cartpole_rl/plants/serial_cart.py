@@ -256,8 +256,7 @@ class SerialCart:
         A state with a latched fault is returned, not raised. Raises RefusedError or FaultError if the cart
         refused the last motor value, LinkError if no state comes within `timeout`.
         """
-        if self._link.waiting() > BACKLOG_BYTES:
-            self._catching_up = True
+        if self._is_behind():
             self._link.send(Hello())  # and only a state that acknowledges it is newer than the backlog
         return self._current_state()
 
@@ -265,6 +264,12 @@ class SerialCart:
         """Say HELLO and wait for a state: for waiting at a cart that moves only when spoken to."""
         self._link.send(Hello())
         return self.get_state()
+
+    def _is_behind(self) -> bool:
+        """Whether so much is waiting that newer states may have been thrown away; they are not lost then."""
+        behind = self._link.waiting() > BACKLOG_BYTES
+        self._catching_up |= behind
+        return behind
 
     def _is_homing(self) -> bool:
         self.poll_state()
@@ -329,6 +334,7 @@ class SerialCart:
         asked: list[int] = []
         for _ in range(1 + self.settings.retries):
             asked.append(self._link.send(*before, message))
+            self._is_behind()
             self._asked_sequence = asked[-1]
             answer = self._await_answer(time.perf_counter() + self.settings.answer_timeout, asked, kind, fits)
             if answer is not None:

@@ -251,6 +251,29 @@ class TestStates:
             assert cart.get_state().tick == peer.state.tick
             assert cart.statistics.lost_frames == 0
 
+    def test_states_that_did_not_fit_between_two_episodes_are_neither_lost_nor_late(self) -> None:
+        with CartPeer(paced=True) as peer, SerialCart(settings(peer.port)) as cart:
+            cart.start()
+            peer.tick()
+            cart.get_state()
+            cart.set_motor(50)
+            cart.stop()
+            for _ in range(100):
+                peer.tick()
+            wait_for(lambda: cart._link.waiting() > 2000)
+            for _ in range(200):
+                peer.next_state()  # the system's buffer is full
+            peer.paced = False
+            cart.stop()
+            cart.start()
+            cart.get_state()
+            seen = cart.statistics
+            assert (seen.lost_frames, seen.late_ticks) == (0, 0)
+            for _ in range(3):
+                peer.next_state()  # and these are lost
+            cart.poll_state()
+            assert seen.lost_frames == 3
+
     def test_an_info_that_makes_no_sense_neither_moves_the_cart_nor_holds_the_loop_up(self) -> None:
         with CartPeer(paced=True) as peer:
             peer.info = replace(peer.info, period_us=2**32 - 1, motor_limit=-5)
