@@ -68,7 +68,7 @@ def with_progress(env: CartPoleEnv, policy: Policy, episodes: int) -> Iterator[E
     """The episodes as they end, with a progress bar that shows each one's score."""
     with tqdm(total=episodes, unit=" episodes") as progress:
         for episode in run_episodes(env, policy, episodes):
-            progress.set_postfix_str(f"score {episode.score.sum():.0f}")
+            progress.set_postfix_str(f"score {episode.score.sum():.0f}", refresh=False)
             progress.update()
             yield episode
 
