@@ -107,10 +107,12 @@ def main(config: FinetuneConfig, folder: Path) -> None:
         TensorBoardLog(folder) as log,
         Driver(make_env, partial(greedy_network, training), config.compile, real_time) as driver,
     ):
-        if real_time and not driver.goes_first:
-            tell("finetune", "other processes may delay the cart: no real-time priority (see `ulimit -r`)")
         if real_time:
             compute_last()  # but not the process that drives, nor an emulated cart: those have begun
+            if not driver.goes_first:
+                tell(
+                    "finetune", "other processes may delay the cart: no real-time priority (see `ulimit -r`)"
+                )
         session = Session(config, training, settings, folder, driver, log)
         if resumed and resumed.state:
             session.restore(resumed.state)

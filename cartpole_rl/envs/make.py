@@ -28,7 +28,7 @@ class CartPoleEnv(TransformedEnv):
         return self.transform
 
     def step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """`tensordict` with the outcome of one step of all carts under "next"."""
+        """`tensordict` with the outcome of one step of all carts under "next"; nothing is checked."""
         return tensordict.set("next", self._step(tensordict))
 
     def step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:

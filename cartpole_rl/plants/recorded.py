@@ -8,7 +8,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from cartpole_rl.plants.specs import Plant
+from cartpole_rl.plants.specs import Plant, one_cart
 from cartpole_rl.tasks.episode import Episode
 
 
@@ -37,15 +37,9 @@ class RecordedPlant(Plant):
         self._row += 1
         return self.step_frame(*self._report())
 
-    def _report(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    def _report(self) -> tuple[Tensor, ...]:
         episode, row = self.episode, self._row
         last = row == episode.steps
         since = episode.time[row] - episode.time[max(0, row - 1)]
         motor = int(episode.motor[row - 1]) if row else 0
-        return (
-            torch.from_numpy(episode.counts[row : row + 1].copy()),
-            torch.tensor([[since]], dtype=torch.float32),
-            torch.tensor([[motor]]),
-            torch.tensor([[last and episode.ended_by in ("track", "fault")]]),
-            torch.tensor([[last and episode.ended_by == "link"]]),
-        )
+        return one_cart(episode.counts[row].tolist(), since, motor, episode.ended_by if last else "")

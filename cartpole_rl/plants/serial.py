@@ -13,7 +13,6 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Literal, Protocol
 
-import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -22,7 +21,7 @@ from cartpole_rl.errors import ConfigError, FaultError, LinkError, PlantError, P
 from cartpole_rl.plants.serial_cart import SerialCart, SerialSettings
 from cartpole_rl.plants.serial_errors import RefusedError, fault_error
 from cartpole_rl.plants.serial_recentring import recentre
-from cartpole_rl.plants.specs import Plant
+from cartpole_rl.plants.specs import Plant, one_cart
 from cartpole_rl.settings import Positive
 from cartpole_rl.wire import Fault, Flags, State
 
@@ -170,16 +169,11 @@ class SerialPlant(Plant):
             last.tick, last.time_us, last.cart_counts, last.pole_counts, 0, last.last_sequence, last.fault, 0
         )
 
-    def _report(self, dt: float) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    def _report(self, dt: float) -> tuple[Tensor, ...]:
         """What the cart says: counts, dt, motor_applied, terminated, truncated; `dt` in s."""
         state = self._state
-        return (
-            one_row(np.int64, state.cart_counts, state.pole_counts - self._turns),
-            one_row(np.float32, dt),
-            one_row(np.int64, state.motor_applied),
-            one_row(np.bool_, self.ended_by in ("track", "fault")),
-            one_row(np.bool_, self.ended_by == "link"),
-        )
+        counts = (state.cart_counts, state.pole_counts - self._turns)
+        return one_cart(counts, dt, state.motor_applied, self.ended_by)
 
     def _whole_turns(self) -> int:
         """Pole counts by which the newest state is whole turns from where an episode begins."""
@@ -271,8 +265,3 @@ def _spread(window: deque[tuple[int, float]]) -> float:
     """Largest minus smallest angle in rad."""
     angles = [angle for _, angle in window]
     return max(angles) - min(angles)
-
-
-def one_row(kind: type[np.generic], *values: float) -> Tensor:
-    """[1, k] of k values; a cart waits for it, and torch.tensor takes five times as long."""
-    return torch.from_numpy(np.array([values], kind))

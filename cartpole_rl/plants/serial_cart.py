@@ -256,7 +256,7 @@ class SerialCart:
         A state with a latched fault is returned, not raised. Raises RefusedError or FaultError if the cart
         refused the last motor value, LinkError if no state comes within `timeout`.
         """
-        if self._is_behind():
+        if self._notice_backlog():
             self._link.send(Hello())  # and only a state that acknowledges it is newer than the backlog
         return self._current_state()
 
@@ -265,11 +265,11 @@ class SerialCart:
         self._link.send(Hello())
         return self.get_state()
 
-    def _is_behind(self) -> bool:
-        """Whether so much is waiting that newer states may have been thrown away; they are not lost then."""
-        behind = self._link.waiting() > BACKLOG_BYTES
-        self._catching_up |= behind
-        return behind
+    def _notice_backlog(self) -> bool:
+        """Whether so much waits that newer states may have been thrown away: those do not count as lost."""
+        backlog = self._link.waiting() > BACKLOG_BYTES
+        self._catching_up |= backlog
+        return backlog
 
     def _is_homing(self) -> bool:
         self.poll_state()
@@ -334,7 +334,7 @@ class SerialCart:
         asked: list[int] = []
         for _ in range(1 + self.settings.retries):
             asked.append(self._link.send(*before, message))
-            self._is_behind()
+            self._notice_backlog()
             self._asked_sequence = asked[-1]
             answer = self._await_answer(time.perf_counter() + self.settings.answer_timeout, asked, kind, fits)
             if answer is not None:

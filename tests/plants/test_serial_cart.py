@@ -24,6 +24,16 @@ def settings(port: str, **changes: float) -> SerialSettings:
     return SerialSettings(port=port, **(quick | changes))
 
 
+def leave_unread(peer: CartPeer, cart: SerialCart, waiting: int, thrown_away: int) -> None:
+    """States that nobody reads: some wait, the system had no room for others; then the cart is unpaced."""
+    for _ in range(waiting):
+        peer.tick()
+    wait_for(lambda: cart._link.waiting() > 30 * waiting)
+    for _ in range(thrown_away):
+        peer.next_state()
+    peer.paced = False
+
+
 class Refusing(CartPeer):
     """Refuses messages of one type with one reason."""
 
@@ -232,12 +242,7 @@ class TestStates:
             cart.get_state()
             cart.set_motor(50)
             wait_for(lambda: bool(peer.messages(SetMotor)))
-            for _ in range(50):
-                peer.tick()
-            wait_for(lambda: cart._link.waiting() > 1500)
-            for _ in range(30):
-                peer.next_state()  # the system's buffer is full
-            peer.paced = False
+            leave_unread(peer, cart, waiting=50, thrown_away=30)
             cart.get_state()
             assert cart.statistics.lost_frames == 0
             assert 80 <= cart.statistics.late_ticks <= 82  # and those that came while this was looked at
@@ -258,12 +263,7 @@ class TestStates:
             cart.get_state()
             cart.set_motor(50)
             cart.stop()
-            for _ in range(100):
-                peer.tick()
-            wait_for(lambda: cart._link.waiting() > 2000)
-            for _ in range(200):
-                peer.next_state()  # the system's buffer is full
-            peer.paced = False
+            leave_unread(peer, cart, waiting=100, thrown_away=200)
             cart.stop()
             cart.start()
             cart.get_state()
