@@ -309,7 +309,8 @@ class TestStates:
 
     def test_a_state_that_comes_twice_is_taken_once(self) -> None:
         with CartPeer(paced=True) as peer, SerialCart(settings(peer.port)) as cart:
-            peer.tick(tick=2**32 - 1)
+            peer.tick(tick=2**32 - 1, cart_counts=6)
+            assert cart.get_state().cart_counts == 6
             tick = peer.next_state(tick=0, cart_counts=7)  # across the wrap
             peer.send(tick + tick)
             assert cart.get_state().cart_counts == 7
