@@ -28,10 +28,11 @@ NETWORKS = ("value_network_params", "target_value_network_params")  # their name
 class AdvantageLoss(DQNLoss):
     """TorchRL's DQNLoss with `action_gap` alpha's share taken off the rewards; the same where alpha is 0.
 
-    The share is alpha times what the action taken is worth less than the best one, by the target network.
-    So the best action stays the best one and the others fall back 1 / (1 - alpha) times as far: at 50 Hz a
-    single action changes little, and a network that is a little wrong would take the wrong one (Bellemare et
-    al., "Increasing the action gap", 2016, equation 9).
+    The share is alpha times what the action taken is worth less than the best one, by the network that
+    learns: its values are at hand, and a compiled loss computes them once. So the best action stays the best
+    one and the others fall back 1 / (1 - alpha) times as far: at 50 Hz a single action changes little, and a
+    network that is a little wrong would take the wrong one (Bellemare et al., "Increasing the action gap",
+    2016, equation 9).
     """
 
     def __init__(self, *arguments: Any, action_gap: float, **named: Any) -> None:
@@ -51,7 +52,7 @@ class AdvantageLoss(DQNLoss):
         if self.action_gap == 0:
             return batch
         # with the module's state preserved, tensors would become new parameters, constants to a tracer
-        with self.target_value_network_params.to_module(self.value_network, preserve_module_state=False):
+        with self.value_network_params.to_module(self.value_network, preserve_module_state=False):
             values = self.value_network(batch.select("observation"))["action_value"]
         shortfall = values.max(-1, keepdim=True).values - values.gather(-1, batch["action"].unsqueeze(-1))
         reward = batch["next", "reward"] - self.action_gap * shortfall

@@ -42,7 +42,10 @@ from cartpole_rl.randomization import FoundCarts, Pole, PoleSettings
 from cartpole_rl.tasks.starts import Start, StartSettings
 
 BASELINE = Path("lqr")  # run=lqr is no folder: the controller that learned nothing
-LATER = {"pole_coulomb": 0.0}  # parameters that older checkpoints do not know, as they were then
+LATER: dict[str, dict[str, Any]] = {  # settings that older checkpoints do not know, as they were then
+    "cart": {"pole_coulomb": 0.0},
+    "learning": {"try_again": 0.0},
+}
 SIMILAR = 0.1  # share by which a pole's length may differ from a learned model's
 REPLACEABLE = ("cart", "cart_friction", "pole_friction", "pole", "reward")  # by an evaluation; and the task
 
@@ -113,7 +116,8 @@ def new_agent(config: TrainConfig) -> QAgent:
 def recorded_config(config: Mapping[str, Any], source: str) -> TrainConfig:
     """The config in a checkpoint. Raises CheckpointError where this version has other settings."""
     try:
-        return checked(TrainConfig, {**config, "cart": LATER | config["cart"]})
+        known = {group: LATER[group] | config[group] for group in LATER}
+        return checked(TrainConfig, {**config, **known})
     except ConfigError as error:
         raise CheckpointError(f"{source} is of another version of this package: {error}") from None
 

@@ -36,15 +36,25 @@ class CartPoleEnv(TransformedEnv):
 
         Returns `tensordict` with the step's outcome under "next", and what the next step starts from.
         """
-        following = self._step(tensordict)
-        present = dict(tensordict.items()) | dict(following.items())
+        stepped = self.step(tensordict)
+        return stepped, self.go_on(stepped)
+
+    def go_on(self, stepped: TensorDictBase, again: Tensor | None = None) -> TensorDictBase:
+        """What the step after `stepped` starts from: a new episode's first frame where the last one ended.
+
+        A cart whose episode ended and that is in `again`, [N] bool, stays the cart that it is; the others
+        become new ones. A real cart is always the same.
+        """
+        following = stepped.get("next")
+        present = dict(stepped.items()) | dict(following.items())
         del present["reward"]  # belongs to the step that was made
-        present.pop("next", None)
+        del present["next"]
         ended = following.get("done").squeeze(-1).nonzero().squeeze(-1)
         if len(ended):
-            first = self.hardware.begin(self.plant.restart(ended), ended)
+            frames = self.plant.restart(ended, None if again is None else again[ended])
+            first = self.hardware.begin(frames, ended)
             present |= {key: replaced(present[key], ended, value) for key, value in first.items()}
-        return tensordict.set("next", following), tensordict_of(present)
+        return tensordict_of(present)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         command = self.hardware.command(tensordict)

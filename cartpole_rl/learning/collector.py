@@ -1,4 +1,4 @@
-"""Collects experience: epsilon-greedy on all carts at once."""
+"""Collects experience: epsilon-greedy on all carts at once, more of it on carts that it fails with."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -6,7 +6,9 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torchrl.envs import EnvBase
+from torch import Tensor
+
+from cartpole_rl.envs import CartPoleEnv
 
 COLLECTED = (
     "observation",
@@ -16,14 +18,24 @@ COLLECTED = (
     ("next", "terminated"),
     ("next", "done"),
 )
+FAILED = 0.5  # of what a whole episode usually scores: one that scores less is a failure
+USUAL = 1000  # periods that the usual score is the mean of
 
 
 class Collector:
-    """Steps `env` with `policy`, resetting the carts whose episode ended; remembers where it stands."""
+    """Steps `env` with `policy`, resetting the carts whose episode ended; remembers where it stands.
 
-    def __init__(self, env: EnvBase, policy: TensorDictModuleBase, actions: int, seed: int) -> None:
+    A cart whose episode was a failure is not replaced by a new one but tries again, with probability
+    `try_again`: so carts that are hard to drive are met 1 / (1 - try_again) times as often (after Jiang et
+    al., "Prioritized level replay", 2021, and Rajeswaran et al., "EPOpt", 2017).
+    """
+
+    def __init__(
+        self, env: CartPoleEnv, policy: TensorDictModuleBase, actions: int, seed: int, try_again: float = 0.0
+    ) -> None:
         self.env, self.policy, self.actions = env, policy, actions
-        self.epsilon = 1.0
+        self.epsilon, self.try_again = 1.0, try_again
+        self._usual = 0.0  # score of a period
         self._generator = torch.Generator(device=env.device)
         self._generator.manual_seed(seed)
         self._finished: list[tuple[float, int]] = []  # score and length of those that ended since last asked
@@ -40,9 +52,9 @@ class Collector:
         taken = []
         for _ in range(periods):
             self._act(self._present)
-            transition, self._present = self.env.step_and_maybe_reset(self._present)
-            taken.append(transition.select(*COLLECTED))
-            self._tally(transition["next"])
+            stepped = self.env.step(self._present)
+            taken.append(stepped.select(*COLLECTED))
+            self._present = self.env.go_on(stepped, self._tally(stepped["next"]))
         return torch.stack(taken, 1)
 
     def finished(self) -> dict[str, float]:
@@ -53,13 +65,20 @@ class Collector:
         self._finished.clear()
         return {"score": sum(scores) / len(scores), "episode_length": sum(lengths) / len(lengths)}
 
-    def _tally(self, following: TensorDictBase) -> None:
-        self._score += following["score"].squeeze(-1)
-        done = following["done"].squeeze(-1)
-        if done.any():
-            lengths = following["step_count"].squeeze(-1)[done].tolist()
-            self._finished += zip(self._score[done].tolist(), lengths, strict=True)
-            self._score.masked_fill_(done, 0)
+    def _tally(self, following: TensorDictBase) -> Tensor | None:
+        """Count the step; the carts that try again, [N] bool, of those whose episode ended, if any."""
+        score, done = following["score"].squeeze(-1), following["done"].squeeze(-1)
+        self._score += score
+        self._usual += (score.mean().item() - self._usual) / USUAL
+        if not done.any():
+            return None
+        lengths = following["step_count"].squeeze(-1)[done]
+        self._finished += zip(self._score[done].tolist(), lengths.tolist(), strict=True)
+        chance = torch.rand(self.env.batch_size, generator=self._generator, device=self.env.device)
+        whole = self._usual * self.env.hardware.task.time_limit
+        again = (self._score < FAILED * whole) & (chance < self.try_again)
+        self._score.masked_fill_(done, 0)
+        return again
 
     def _act(self, present: TensorDictBase) -> None:
         carts = self.env.batch_size
@@ -76,6 +95,7 @@ class Collector:
         return {
             "present": self._present.to_dict(),
             "score": self._score.clone(),
+            "usual": self._usual,
             "finished": list(self._finished),
             "generator": self._generator.get_state(),
         }
@@ -83,6 +103,6 @@ class Collector:
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         """Go on from `snapshot`."""
         self._present = TensorDict(snapshot["present"], batch_size=self.env.batch_size)
-        self._score = snapshot["score"].clone()
+        self._score, self._usual = snapshot["score"].clone(), snapshot["usual"]
         self._finished = list(snapshot["finished"])
         self._generator.set_state(snapshot["generator"])

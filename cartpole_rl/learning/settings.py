@@ -33,6 +33,7 @@ class LearningSettings(Settings):
     frames: Count  # transitions in all
     carts: Count  # simulated in parallel
     chunk: Count  # periods
+    try_again: Fraction  # of the carts that the agent failed with: they are not replaced by new ones
     updates: Count  # gradient steps an iteration
     batch_size: Count
     n_step: Annotated[int, Field(ge=1, le=20)]

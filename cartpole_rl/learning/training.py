@@ -56,7 +56,7 @@ class Training:
     ) -> None:
         self.settings, self.agent, self.env = settings, agent, env
         self.evaluate, self.monitor = evaluate, monitor
-        self.collector = Collector(env, agent.actor, len(env.hardware.motors), seed)
+        self.collector = Collector(env, agent.actor, len(env.hardware.motors), seed, settings.try_again)
         self.replay_settings, self.optimizer_settings = replay, optimizer
         self.replay = make_replay(replay, settings.updates * settings.batch_size)
         self.gradient = LossGradient(agent.loss, optimizer.max_grad_norm, compiled)

@@ -84,13 +84,15 @@ class LearnedPlant(SimulatedPlant):
     def _run_members(self, carts: Carts, given: Given) -> Period:
         return self._run_learned(carts, given, Learned(self._member, *self._weights))
 
-    def restart(self, rows: Tensor) -> TensorDict:
-        """Begin a new episode on the carts `rows` [R], each with a member drawn for it."""
+    def restart(self, rows: Tensor, again: Tensor | None = None) -> TensorDict:
+        """Begin a new episode on the carts `rows` [R], each with a member drawn for it, but for `again`."""
         drawn = torch.randint(
             self._weights.members, (len(rows),), generator=self._generator, device=self.device
         )
+        if again is not None:
+            drawn = torch.where(again, self._member[rows], drawn)
         self._member.index_copy_(0, rows, drawn)
-        return super().restart(rows)
+        return super().restart(rows, again)
 
     def snapshot(self) -> dict[str, Any]:
         """All that the next step depends on; `restore` takes it back."""

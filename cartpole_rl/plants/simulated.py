@@ -112,9 +112,13 @@ class SimulatedPlant(Plant):
         self._generator.manual_seed(0 if seed is None else seed)
         self._coming = self._draw_episodes(0)
 
-    def restart(self, rows: Tensor) -> TensorDict:
-        """Begin a new episode on the carts `rows` [R]; their first frame, [R]."""
+    def restart(self, rows: Tensor, again: Tensor | None = None) -> TensorDict:
+        """Begin a new episode on the carts `rows` [R], new ones but for `again`; their first frame, [R]."""
         table, motion, counts = self._next_episodes(len(rows))
+        if again is not None and again.any():
+            table = torch.where(again, self._carts.table[:, rows], table)
+            cart = CartParameters.from_table(table)
+            counts = encoder_counts(State(*motion), cart, self._chance(len(rows)))
         self._carts.table.index_copy_(1, rows, table)
         self._carts = Carts(
             self._carts.table,

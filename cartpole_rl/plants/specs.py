@@ -53,8 +53,11 @@ class Plant(EnvBase):
     def halt(self) -> None:
         """Motor to 0 until the next reset. A simulated cart stands still anyway when nobody steps it."""
 
-    def restart(self, rows: torch.Tensor) -> TensorDict:
-        """Begin a new episode on the carts `rows`, [R] int64; their first frame, [R]."""
+    def restart(self, rows: torch.Tensor, again: torch.Tensor | None = None) -> TensorDict:
+        """Begin a new episode on the carts `rows`, [R] int64; their first frame, [R].
+
+        Where carts are drawn, those in `again`, [R] bool, stay as they are.
+        """
         mask = torch.zeros(self.carts, 1, dtype=torch.bool, device=self.device)
         mask[rows] = True
         return self._reset(TensorDict({"_reset": mask}, self.batch_size))[rows]

@@ -6,7 +6,7 @@
 A row is an experiment of conf/experiment; words like learning.frames=100000 are given on to cartpole-train.
 Runs go to runs/bench/<row>/<seed> and are not trained again when they are there. A fraction is the mean score
 over 20 starts on a nominal cart, divided by the best that scripts/bench/reference.py has found there
-(references.json). Seconds are those of collecting and learning, compilation included, evaluations left out.
+(references.json). Seconds are those of collecting, learning and evaluating, compilation included.
 """
 
 import argparse

@@ -178,7 +178,7 @@ def test_the_action_gap_takes_the_shortfall_off_the_reward() -> None:
     disturb(agent)
     plain.load_state_dict(agent.state_dict())
     batch = transitions(64)
-    values = values_of(agent, batch["observation"], target=True)
+    values = values_of(agent, batch["observation"], target=False)
     shortfall = values.max(1).values - values.gather(1, batch["action"].unsqueeze(1)).squeeze(1)
     assert shortfall.max() > 0
     reward = batch["next", "reward"] - 0.5 * shortfall.unsqueeze(1)

@@ -8,8 +8,11 @@ from tensordict.nn import TensorDictModule
 
 from cartpole_rl.envs import CartPoleEnv
 from cartpole_rl.learning.collector import COLLECTED, Collector
+from cartpole_rl.randomization import Range
+from cartpole_rl.tasks.starts import Start, StartSettings
 
 CARTS, LIMIT = 64, 20
+SCALE = {"scale": 0.1}  # of the reward
 
 
 @pytest.fixture
@@ -84,3 +87,37 @@ def test_a_snapshot_goes_on_to_the_bit(make_plant: Callable, make_environment: C
     second.env.plant.restore(plant)
     assert (second.collect(2 * LIMIT) == ahead).all()
     assert second.finished() == first.finished()
+
+
+@pytest.mark.parametrize("share", [0.0, 0.75])
+def test_a_cart_that_failed_tries_again(
+    make_plant: Callable, make_environment: Callable, share: float
+) -> None:
+    """Poles that start a little off upright: some have enough friction to stand for a second, some fall."""
+    viscous = Range(distribution="log_uniform", absolute=(1e-4, 10.0))
+    near = StartSettings(
+        angle=Start.UPRIGHT, position_spread=0, angle_spread=0.04, speed_spread=0, angular_speed_spread=0
+    )
+    plant = make_plant(CARTS, ranges={"pole_viscous": viscous}, start=near, seed=5)
+    acting = Collector(
+        make_environment(plant, time_limit=100, angle_limit=0.2, reward=SCALE), always(1), 3, 0, share
+    )
+    acting.epsilon = 0.0
+    acting.collect(1000)  # what is usual is known from here on
+    acting.begin()
+    score, failed, stood = torch.zeros(CARTS), [], []
+    for _ in range(500):
+        before = plant.parameters.pole_viscous.clone()
+        following = acting.collect(1)["next"][:, 0]
+        same = plant.parameters.pole_viscous == before
+        score += following["reward"].squeeze(-1) / SCALE["scale"] / 1100  # of the most that is possible
+        for row in following["done"].squeeze(-1).nonzero().squeeze(-1).tolist():
+            if score[row] < 0.25:
+                failed.append(float(same[row]))
+            elif score[row] > 0.75:
+                stood.append(float(same[row]))
+            score[row] = 0
+    assert len(failed) > 200
+    assert len(stood) > 50
+    assert sum(stood) == 0
+    assert sum(failed) / len(failed) == pytest.approx(share, abs=0.05)

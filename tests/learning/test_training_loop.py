@@ -19,6 +19,7 @@ LEARNING = {
     "frames": 1024,
     "carts": 16,
     "chunk": 4,
+    "try_again": 0.5,
     "updates": 2,
     "batch_size": 32,
     "n_step": 3,

@@ -89,6 +89,10 @@ def test_each_episode_has_a_member(make_learned: MakeLearned) -> None:
     others = plant.member[[1, 3, 4, 5]].clone()
     plant.restart(torch.tensor([0]))
     assert torch.equal(plant.member[[1, 3, 4, 5]], others)
+    own = plant.member[2].clone()
+    for _ in range(10):
+        plant.restart(torch.tensor([0, 2]), again=torch.tensor([False, True]))
+        assert plant.member[2] == own
 
 
 def test_members_move_apart(make_learned: MakeLearned) -> None:
