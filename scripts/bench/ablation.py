@@ -29,6 +29,8 @@ ARMS = {
     "no resting starts": ["task.start.resting_share=0"],
     "constant learning rate": ["optimizer.learning_rate_end=1"],
     "prioritized replay": ["replay=prioritized"],
+    "no second tries": ["learning.try_again=0"],
+    "rewards twice as large": ["reward.scale=0.1", "reward.track_penalty=10"],
     "without randomization": ["randomization=none"],
 }
 
@@ -51,6 +53,8 @@ def main() -> None:
         results = [result("medium", folder, references) for folder in folders]
         everything[arm] = results
         fractions = [each["plants"]["medium"]["fraction"] for each in results]
+        drawn = [each["plants"]["medium"]["drawn"] for each in results]
+        failed = [each["plants"]["medium"]["failed"] for each in results]
         reached = [each["frames_to_reached"] or float("inf") for each in results]
         rows.append(
             {
@@ -58,6 +62,8 @@ def main() -> None:
                 "min": f"{min(fractions):.3f}",
                 "median": f"{np.median(fractions):.3f}",
                 "max": f"{max(fractions):.3f}",
+                "drawn carts": f"{np.median(drawn):.0f}",
+                "failed": f"{100 * np.mean(failed):.1f} %",
                 "million frames to 0.9": f"{np.median(reached) / 1e6:.2f}",
                 "kept over 0.85": f"{np.mean([each['kept'] or 0.0 for each in results]):.2f}",
             }

@@ -6,7 +6,8 @@
 A row is an experiment of conf/experiment; words like learning.frames=100000 are given on to cartpole-train.
 Runs go to runs/bench/<row>/<seed> and are not trained again when they are there. A fraction is the mean score
 over 20 starts on a nominal cart, divided by the best that scripts/bench/reference.py has found there
-(references.json). Seconds are those of collecting, learning and evaluating, compilation included.
+(references.json). "Drawn" carts are a thousand of randomization=wide, each driven once; one that scores less
+than 500 has failed. Seconds are those of collecting, learning and evaluating, compilation included.
 """
 
 import argparse
@@ -18,11 +19,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from cartpole_rl.commands.build import simulated_env, trained_agent, use_threads
+from cartpole_rl.choices import choice
+from cartpole_rl.commands.build import TrainedAgent, simulated_env, trained_agent, use_threads
+from cartpole_rl.commands.config import TrainConfig
 from cartpole_rl.evaluation.episodes import run_batch
-from cartpole_rl.randomization import Pole, PoleSettings
+from cartpole_rl.randomization import Pole, PoleSettings, Range
 from cartpole_rl.reporting.table import table
+from cartpole_rl.tasks.episode import Episode
 
 REFERENCES = Path(__file__).with_name("references.json")
 ROWS = {  # experiment: plants that it is judged on
@@ -35,7 +40,7 @@ ROWS = {  # experiment: plants that it is judged on
     "recurrent": ("medium",),
 }
 REACHED, KEPT = 0.9, 0.85  # fractions: of the time to it, and over which later evaluations count as kept
-STARTS = 20
+STARTS, DRAWN, FAILURE = 20, 1000, 500
 
 
 def train(row: str, seed: int, overrides: list[str], folder: Path) -> Path:
@@ -57,18 +62,32 @@ def train_all(row: str, seeds: int, jobs: int, overrides: list[str], parent: Pat
 
 
 def judge(folder: Path, plant: str) -> dict[str, float]:
-    """Mean scores of the last checkpoint over STARTS starts on the nominal cart with the pole `plant`."""
+    """Scores of the last checkpoint with the pole `plant`, on the nominal cart and on drawn ones."""
     agent = trained_agent(folder)
-    settings = agent.training.model_copy(
+    nominal = agent.training.model_copy(
         update={"randomization": {}, "pole": pole(plant, agent.training.pole)}
     )
-    env = simulated_env(settings, settings.plant, STARTS, settings.task.evaluation_start, 1)
-    episodes = run_batch(env, agent.policy)
+    wide = {name: Range(**line) for name, line in choice("randomization/wide").items()}
+    episodes = driven(agent, nominal, STARTS)
+    drawn = scores(driven(agent, nominal.model_copy(update={"randomization": wide}), DRAWN))
     return {
-        "score": float(np.mean([episode.score.sum() for episode in episodes])),
+        "score": float(scores(episodes).mean()),
         "score_upright": float(np.mean([episode.score_upright.sum() for episode in episodes])),
-        "worst_start": float(min(episode.score.sum() for episode in episodes)),
+        "worst_start": float(scores(episodes).min()),
+        "drawn": float(drawn.mean()),
+        "failed": float((drawn < FAILURE).mean()),
     }
+
+
+def driven(agent: TrainedAgent, settings: TrainConfig, carts: int) -> list[Episode]:
+    """An episode on each of `carts` simulated carts, from the starts that an evaluation has."""
+    env = simulated_env(settings, settings.plant, carts, settings.task.evaluation_start, 1)
+    return run_batch(env, agent.policy)
+
+
+def scores(episodes: list[Episode]) -> NDArray[np.float64]:
+    """The score (6.2) of each."""
+    return np.array([episode.score.sum() for episode in episodes])
 
 
 def pole(plant: str, trained: PoleSettings) -> PoleSettings:
@@ -102,7 +121,7 @@ def summary(row: str, results: dict[int, dict[str, Any]]) -> list[dict[str, str]
     """Table lines: minimum, median and maximum over the seeds."""
     lines = {}
     for plant in ROWS[row]:
-        for key in ("score_upright",) if row == "balance" else ("fraction", "score"):
+        for key in ("score_upright",) if row == "balance" else ("fraction", "score", "drawn", "failed"):
             lines[f"{key}, {plant}"] = [each["plants"][plant][key] for each in results.values()]
     if row != "balance":
         lines["seconds to 0.9"] = [each["seconds_to_reached"] or float("inf") for each in results.values()]
