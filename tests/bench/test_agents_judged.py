@@ -65,3 +65,12 @@ def test_an_untrained_agent_comes_back_from_no_knock(trained: Path) -> None:
     bench(trained, "knocks.py", "runs/bench/medium/0", "--knocks", "4", "--json", "knocks.json")
     (result,) = json.loads((trained / "knocks.json").read_text())
     assert result["back"] == 0
+
+
+def test_the_time_of_a_training_is_told_apart(tmp_path: Path) -> None:
+    bench(tmp_path, "time_spent.py", "experiment=medium", "--json", "spent.json", *TINY)
+    spent = json.loads((tmp_path / "spent.json").read_text())
+    shares = {kind: each["share"] for kind, each in spent.items()}
+    assert set(shares) == {"stepping", "updating", "evaluating", "the rest", "compiling"}
+    assert sum(shares.values()) == pytest.approx(1)
+    assert min(spent[kind]["seconds"] for kind in ("stepping", "evaluating", "the rest")) > 0
