@@ -143,7 +143,7 @@ def test_the_emulated_pole_is_the_one_that_is_told(trained: Path, tmp_path: Path
 def sweep(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """The run folders of four jobs, the first of which has the settings of `trained`."""
     folder = tmp_path_factory.mktemp("sweep")
-    swept = ["randomization=wide,friction_6", "seed=0,1"]
+    swept = ["actions=two", "randomization=wide,friction_6", "seed=0,1"]  # as `trained`
     done = in_process("train", "-m", *TINY, *swept, folder=folder)
     assert done.code == 0, done.err
     assert tells_only_how_it_goes(done, trainings=4)
