@@ -90,13 +90,13 @@ def test_short_episodes_do_not_come_round_more_often(
 def test_scores_are_those_of_the_states_that_were_reached(
     make_plant: Callable, make_environment: Callable
 ) -> None:
-    env = make_environment(make_plant(1, start=scattered(Start.ANY)), time_limit=100)
+    env = make_environment(make_plant(1, start=scattered(Start.ANY)), time_limit=100, reward={"scale": 0.2})
     (episode,) = run_episodes(env, always(NONE), 1)
     upright = np.cos(episode.theta[1:] / 2)
     assert episode.score_upright == pytest.approx(
         np.abs(upright) * (1 - np.abs(episode.x[1:]) / 0.38), abs=1e-4
     )
-    assert episode.reward == pytest.approx(0.1 * episode.score, abs=1e-5)
+    assert episode.reward == pytest.approx(0.2 * episode.score, abs=1e-5)
 
 
 def test_the_angle_of_a_pole_that_turns_over_is_not_wrapped(
