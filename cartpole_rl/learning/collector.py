@@ -26,8 +26,8 @@ class Collector:
     """Steps `env` with `policy`, resetting the carts whose episode ended; remembers where it stands.
 
     A cart whose episode was a failure is not replaced by a new one but tries again, with probability
-    `try_again`: so carts that are hard to drive are met 1 / (1 - try_again) times as often (after Jiang et
-    al., "Prioritized level replay", 2021, and Rajeswaran et al., "EPOpt", 2017).
+    `try_again`: so carts that are hard to drive are met up to 1 / (1 - try_again) times as often (after Jiang
+    et al., "Prioritized level replay", 2021, and Rajeswaran et al., "EPOpt", 2017).
     """
 
     def __init__(
