@@ -66,11 +66,12 @@ def shares() -> dict[str, dict[str, float]]:
 def main() -> None:
     """Train, print a table, write what was seen."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("words", nargs="*", help="as for cartpole-train, as experiment=medium")
     parser.add_argument("--json", type=Path, help="file for all figures")
-    given, words = parser.parse_known_args()
+    given = parser.parse_intermixed_args()
     train.Training = TimedTraining  # type: ignore[misc]
     with tempfile.TemporaryDirectory() as folder:
-        sys.argv = ["cartpole-train", *words, f"hydra.run.dir={folder}/run"]
+        sys.argv = ["cartpole-train", *given.words, f"hydra.run.dir={folder}/run"]
         train.main()
     found = shares()
     rows = [
