@@ -14,8 +14,9 @@ randomization as in conf/randomization/wide, reset of single carts; beside Torch
 none of that and never ends. Both by `step_and_maybe_reset` with actions drawn beforehand, and both by
 `rollout` of 32 steps, which draws the actions and stacks what happened.
 
-Speed is that of the fastest of many short rounds, in which the rows take turns: other work on the machine
-slows single rounds, not the fastest. Before, every row runs until its episodes end at any time.
+Speed is that of the fastest of many rounds of 10 ms, in which the rows take turns: other work on the machine
+slows single rounds, not the fastest. A round begins with a call that is not counted, since the row before
+has left nothing of this one in the caches. Before, every row runs until its episodes end at any time.
 """
 
 import argparse
@@ -47,6 +48,7 @@ ROLLOUT = 32  # steps
 CARTPOLE = "Gymnasium CartPole"
 PENDULUM_STEP, PENDULUM_ROLLOUT = "PendulumEnv, step", "PendulumEnv, rollout"
 MIXING = 300  # periods until the ends of the carts' episodes are spread over time
+ROUND = 0.01  # s
 Step = Callable[[], object]
 
 
@@ -194,17 +196,23 @@ def seconds(step: Step) -> float:
     return time.perf_counter() - started
 
 
+def seconds_a_call(step: Step, length: float) -> float:
+    """Mean of the calls that fit into a round of `length` s, after one that fills the caches."""
+    step()
+    calls, started, passed = 0, time.perf_counter(), 0.0
+    while calls == 0 or passed < length:
+        step()
+        calls, passed = calls + 1, time.perf_counter() - started
+    return passed / calls
+
+
 def fastest(rows: list[Row], budget: float) -> dict[str, float]:
-    """Periods of one cart a second, by the row's name, from rounds of a few periods over `budget` s."""
+    """Periods of one cart a second, by the row's name, from rounds over `budget` s."""
     best = dict.fromkeys((row.name for row in rows), np.inf)
     ends = time.perf_counter() + budget
     while time.perf_counter() < ends or np.inf in best.values():
         for row in rows:
-            started = time.perf_counter()
-            for _ in range(max(1, 3 // row.periods)):
-                row.step()
-            seconds_a_call = (time.perf_counter() - started) / max(1, 3 // row.periods)
-            best[row.name] = min(best[row.name], seconds_a_call)
+            best[row.name] = min(best[row.name], seconds_a_call(row.step, ROUND if budget else 0.0))
     return {row.name: row.carts * row.periods / best[row.name] for row in rows}
 
 
