@@ -42,7 +42,7 @@ SETTINGS: dict[str, Any] = {
     "batch_size": 512,
     "tau": 0.01,
     "target_update_interval": 1,
-    "gamma": 0.985,
+    "gamma": 0.99,
     "n_steps": 5,
     "train_freq": 8,  # steps of all carts
     "exploration_initial_eps": 0.5,
