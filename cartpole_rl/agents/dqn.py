@@ -12,7 +12,7 @@ from torchrl.modules import QValueActor
 from torchrl.objectives.utils import TargetNetUpdater
 
 from cartpole_rl.agents.loss import AdvantageLoss
-from cartpole_rl.agents.network import MirrorQNetwork, QNetwork, RecurrentQNetwork
+from cartpole_rl.agents.network import FrameReader, MirrorQNetwork, QNetwork
 from cartpole_rl.settings import Count, Settings
 
 
@@ -40,12 +40,6 @@ class AgentSettings(Settings):
         return self
 
     @model_validator(mode="after")
-    def _either_mirrored_or_recurrent(self) -> "AgentSettings":
-        if self.mirrored and self.recurrent is not None:
-            raise ValueError("a recurrent network is not mirrored: give mirrored=false or recurrent=null")
-        return self
-
-    @model_validator(mode="after")
     def _halves_for_the_mirror(self) -> "AgentSettings":
         if self.mirrored and any(size % 2 for size in self.hidden):
             raise ValueError(f"hidden {list(self.hidden)}: a mirrored network needs even numbers of units")
@@ -70,14 +64,10 @@ class QAgent(nn.Module):
     ) -> None:
         super().__init__()
         self.settings = settings
-        layers = actions, settings.hidden, settings.layer_norm
-        network: nn.Module
-        if settings.recurrent is not None:
-            network = RecurrentQNetwork(len(mirror_signs), frames, settings.recurrent, *layers)
-        elif settings.mirrored:
-            network = MirrorQNetwork(mirror_signs, *layers)
-        else:
-            network = QNetwork(len(mirror_signs), *layers)
+        size = len(mirror_signs)
+        reader = None if settings.recurrent is None else FrameReader(size, frames, settings.recurrent)
+        layers = actions, settings.hidden, settings.layer_norm, reader
+        network = MirrorQNetwork(mirror_signs, *layers) if settings.mirrored else QNetwork(size, *layers)
         self.actor = QValueActor(network, in_keys=["observation"], spec=Categorical(actions))
         self.loss = AdvantageLoss(
             self.actor,

@@ -1,4 +1,6 @@
-"""Q-networks: multilayer perceptrons, free or bound to the mirror symmetry of cart and pole; recurrent ones.
+"""Q-networks: multilayer perceptrons, free or bound to the mirror symmetry of cart and pole.
+
+Either may stand behind a recurrent reader of the last frames.
 
 Layer normalization after each hidden layer keeps a learned swing-up from being unlearned
 (Gallici et al., "Simplifying deep temporal difference learning", 2024).
@@ -13,12 +15,20 @@ from torch.nn import functional
 
 
 class QNetwork(nn.Module):
-    """Observation [..., K] float32 to one value an action [..., A]."""
+    """Observation [..., K] float32 to one value an action [..., A], read by `reader` where there is one."""
 
-    def __init__(self, observation_size: int, actions: int, hidden: Sequence[int], layer_norm: bool) -> None:
+    def __init__(
+        self,
+        observation_size: int,
+        actions: int,
+        hidden: Sequence[int],
+        layer_norm: bool,
+        reader: "FrameReader | None" = None,
+    ) -> None:
         super().__init__()
+        self.reader = reader or nn.Identity()
         layers: list[nn.Module] = []
-        width = observation_size
+        width = reader.width if reader else observation_size
         for size in hidden:
             layers.append(nn.Linear(width, size))
             if layer_norm:
@@ -29,7 +39,7 @@ class QNetwork(nn.Module):
 
     def forward(self, observation: Tensor) -> Tensor:
         """Values of the actions."""
-        return self.layers(observation)
+        return self.layers(self.reader(observation))
 
 
 class MirrorQNetwork(nn.Module):
@@ -42,15 +52,23 @@ class MirrorQNetwork(nn.Module):
 
     Each layer has half its units for the scene and half, with the same weights, for its mirror image. Their
     sum (even: the image is the same) and difference (odd: it is the negative) never mix in a linear layer, so
-    that two of half the width do the work.
+    that two of half the width do the work. A `reader` reads the scene, and then its image.
     """
 
     signs: Tensor
 
-    def __init__(self, signs: Sequence[int], actions: int, hidden: Sequence[int], layer_norm: bool) -> None:
+    def __init__(
+        self,
+        signs: Sequence[int],
+        actions: int,
+        hidden: Sequence[int],
+        layer_norm: bool,
+        reader: "FrameReader | None" = None,
+    ) -> None:
         super().__init__()
         self.register_buffer("signs", torch.tensor(signs, dtype=torch.float32))
-        width = len(signs)
+        self.reader = reader or nn.Identity()
+        width = reader.width if reader else len(signs)
         layers: list[MirrorLayer] = []
         for size in hidden:
             layers.append(MirrorLayer(width, size // 2, layer_norm))
@@ -61,50 +79,41 @@ class MirrorQNetwork(nn.Module):
 
     def forward(self, observation: Tensor) -> Tensor:
         """Values of the actions."""
-        even, odd = halves(observation, observation * self.signs)
+        even, odd = halves(self.reader(observation), self.reader(observation * self.signs))
         for layer in self.layers:
             even, odd = layer(even, odd)
         same, opposite = self.even_values(even), self.odd_values(odd)
         return (same + same.flip(-1) + opposite - opposite.flip(-1)) / 2
 
 
-class RecurrentQNetwork(nn.Module):
-    """A QNetwork behind a gated recurrent unit that reads the last frames of an observation, oldest first.
+class FrameReader(nn.Module):
+    """A gated recurrent unit that reads the last frames of an observation [..., K], oldest first.
 
     `frames` [T, F] says where in an observation the numbers of each frame stand. The state begins at zero
     with the oldest frame, so that a policy needs to carry nothing from step to step and replay holds all that
     a gradient needs (Hausknecht and Stone, "Deep recurrent Q-learning", 2015: random updates, T steps long).
-    Numbers that stand in no frame join behind the recurrent unit.
+    What comes out, [..., width], is the last state and the numbers that stand in no frame.
     """
 
     frames: Tensor
     rest: Tensor
 
-    def __init__(
-        self,
-        observation_size: int,
-        frames: Sequence[Sequence[int]],
-        units: int,
-        actions: int,
-        hidden: Sequence[int],
-        layer_norm: bool,
-    ) -> None:
+    def __init__(self, observation_size: int, frames: Sequence[Sequence[int]], units: int) -> None:
         super().__init__()
         used = {place for frame in frames for place in frame}
         rest = [place for place in range(observation_size) if place not in used]
         self.register_buffer("frames", torch.tensor([list(frame) for frame in frames]))
         self.register_buffer("rest", torch.tensor(rest, dtype=torch.int64))
         self.cell = nn.GRUCell(len(frames[0]), units)
-        self.head = QNetwork(units + len(rest), actions, hidden, layer_norm)
+        self.width = units + len(rest)
 
     def forward(self, observation: Tensor) -> Tensor:
-        """Values of the actions."""
+        """The state after the newest frame, and the rest."""
         batch = observation.flatten(0, -2) if observation.ndim > 1 else observation.unsqueeze(0)
         state = batch.new_zeros(len(batch), self.cell.hidden_size)
         for frame in batch[:, self.frames].unbind(1):
             state = self.cell(frame, state)
-        values = self.head(torch.cat((state, batch[:, self.rest]), -1))
-        return values.reshape(*observation.shape[:-1], -1)
+        return torch.cat((state, batch[:, self.rest]), -1).reshape(*observation.shape[:-1], self.width)
 
 
 class MirrorLayer(nn.Module):

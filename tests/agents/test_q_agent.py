@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from cartpole_rl.agents import AgentSettings, LossGradient, QAgent, columns_of
-from cartpole_rl.agents.network import MirrorQNetwork, QNetwork, RecurrentQNetwork
+from cartpole_rl.agents.network import FrameReader, MirrorQNetwork, QNetwork
 
 DQN = {
     "hidden": [16],
@@ -85,10 +85,14 @@ def transitions(count: int, **changes: Tensor) -> TensorDict:
 
 @pytest.mark.parametrize("layer_norm", [True, False])
 @pytest.mark.parametrize("actions", [2, 3, 9])
-def test_a_mirrored_network_values_the_mirror_image_the_same(layer_norm: bool, actions: int) -> None:
+@pytest.mark.parametrize("recurrent", [False, True])
+def test_a_mirrored_network_values_the_mirror_image_the_same(
+    recurrent: bool, layer_norm: bool, actions: int
+) -> None:
     torch.manual_seed(0)
     signs = torch.tensor([-1.0, 1.0, -1.0, 1.0, -1.0])
-    network = MirrorQNetwork(signs.tolist(), actions, (16, 8), layer_norm)
+    reader = FrameReader(5, [[3, 4], [0, 1]], 4) if recurrent else None
+    network = MirrorQNetwork(signs.tolist(), actions, (16, 8), layer_norm, reader)
     observation = torch.randn(50, 5)
     values = network(observation)
     assert values.shape == (50, actions)
@@ -119,31 +123,36 @@ def test_network_has_the_layers_asked_for(layer_norm: bool) -> None:
     assert [norm.normalized_shape for norm in norms] == ([(16,), (8,)] if layer_norm else [])
 
 
-def recurrent_network(units: int = 16) -> RecurrentQNetwork:
+def frame_reader(units: int = 16) -> FrameReader:
     """Three frames of two numbers, and one number beside them."""
     torch.manual_seed(0)
-    return RecurrentQNetwork(7, [[5, 6], [2, 4], [0, 1]], units, 3, (8,), layer_norm=True)
+    return FrameReader(7, [[5, 6], [2, 4], [0, 1]], units)
 
 
-def test_a_recurrent_network_reads_its_frames_from_the_oldest_to_the_newest() -> None:
-    network = recurrent_network()
+def test_frames_are_read_from_the_oldest_to_the_newest() -> None:
+    reader = frame_reader()
     scene = torch.randn(5, 7)
     state = torch.zeros(5, 16)
     for frame in (scene[:, [5, 6]], scene[:, [2, 4]], scene[:, [0, 1]]):
-        state = network.cell(frame, state)
-    torch.testing.assert_close(network(scene), network.head(torch.cat((state, scene[:, 3:4]), -1)))
-    torch.testing.assert_close(network(scene.view(5, 1, 7)), network(scene).view(5, 1, 3))
-    torch.testing.assert_close(network(scene[0]), network(scene)[0])
+        state = reader.cell(frame, state)
+    torch.testing.assert_close(reader(scene), torch.cat((state, scene[:, 3:4]), -1))
+    torch.testing.assert_close(reader(scene.view(5, 1, 7)), reader(scene).view(5, 1, 17))
+    torch.testing.assert_close(reader(scene[0]), reader(scene)[0])
 
 
-def test_a_recurrent_network_learns_a_velocity_from_positions() -> None:
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_a_recurrent_network_learns_a_velocity_from_positions(mirrored: bool) -> None:
     """The difference of two frames, of which each alone says nothing."""
-    network = recurrent_network()
+    reader = frame_reader()
+    network = (
+        MirrorQNetwork([-1] * 7, 2, (8,), True, reader) if mirrored else QNetwork(7, 2, (8,), True, reader)
+    )
     optimizer = torch.optim.Adam(network.parameters(), lr=1e-2)
     for _ in range(300):
         scene = torch.randn(128, 7)
-        wanted = scene[:, 0] - scene[:, 2]
-        error = (network(scene)[:, 0] - wanted).square().mean()
+        velocity = scene[:, 0] - scene[:, 2]
+        wanted = torch.stack((velocity, -velocity), -1)
+        error = (network(scene) - wanted).square().mean()
         optimizer.zero_grad()
         error.backward()
         optimizer.step()
@@ -230,7 +239,7 @@ def test_importance_weights_scale_each_transition() -> None:
 
 @pytest.mark.parametrize("weighted", [False, True])
 @pytest.mark.parametrize("compiled", [False, True])
-@pytest.mark.parametrize("network", [{"mirrored": True}, {"recurrent": 8}])
+@pytest.mark.parametrize("network", [{"mirrored": True}, {"recurrent": 8, "mirrored": True}])
 @pytest.mark.parametrize("max_norm", [100.0, 1e-2])
 def test_the_gradient_is_that_of_the_loss(
     network: dict, compiled: bool, weighted: bool, max_norm: float

@@ -19,7 +19,9 @@ def network(seed: int, **changes: object) -> nn.Module:
 
 
 @pytest.mark.parametrize("compiled", [False, True])
-@pytest.mark.parametrize("changes", [{}, {"mirrored": True}, {"recurrent": 4}])
+@pytest.mark.parametrize(
+    "changes", [{}, {"mirrored": True}, {"recurrent": 4}, {"recurrent": 4, "mirrored": True}]
+)
 def test_it_acts_as_the_network_whose_weights_it_was_given(compiled: bool, changes: dict) -> None:
     policy = DrivingPolicy(network(0, **changes), compiled)
     observations = torch.randn(200, 1, 4, generator=torch.Generator().manual_seed(5))
