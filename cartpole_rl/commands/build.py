@@ -29,7 +29,7 @@ from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.envs import CartPoleEnv, make_env
 from cartpole_rl.errors import CheckpointError, ConfigError
 from cartpole_rl.evaluation.episodes import Policy
-from cartpole_rl.learning.checkpoints import load_agent
+from cartpole_rl.learning.checkpoints import load_agent, restore_weights
 from cartpole_rl.physics.parameters import CartParameters, check_names
 from cartpole_rl.physics.residual import UNDER_WAY
 from cartpole_rl.plants.emulated import emulated_plant
@@ -135,11 +135,7 @@ def trained_agent(run: Path) -> TrainedAgent:
     checkpoint = load_agent(run)
     training = recorded_config(checkpoint.config, f"run={run}")
     agent = new_agent(training)
-    try:
-        agent.load_state_dict(checkpoint.weights)
-    except RuntimeError as error:
-        reason = str(error).splitlines()[0]
-        raise CheckpointError(f"run={run} is of another version of this package: {reason}") from None
+    restore_weights(agent, checkpoint.weights, f"run={run}")
     return TrainedAgent(training, agent.greedy_policy())
 
 

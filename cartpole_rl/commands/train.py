@@ -20,7 +20,7 @@ from cartpole_rl.envs import CartPoleEnv
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.evaluation.driving_policy import DrivingPolicy
 from cartpole_rl.evaluation.episodes import Policy, run_batch
-from cartpole_rl.learning.checkpoints import TrainingCheckpoint, load_training
+from cartpole_rl.learning.checkpoints import TrainingCheckpoint, load_training, restore_weights
 from cartpole_rl.learning.randomness import seed_everything
 from cartpole_rl.learning.training import Training
 from cartpole_rl.physics.dynamics import unused_parameters
@@ -43,6 +43,8 @@ def main(config: TrainConfig, folder: Path) -> None:
     env = simulated_env(config, config.plant, carts, start, config.seed, config.compile)
     note_unused_randomization(config)
     agent = new_agent(config)
+    if resumed:
+        restore_weights(agent, resumed.state["agent"], f"resume={folder}")  # or complain before any work
     policy = DrivingPolicy(agent.greedy_policy(), config.compile)
     evaluate = partial(judge, nominal_env(config), policy, config.seed + EVALUATION_SEED)
     write_config(folder, config.model_dump(mode="json"), resumed=resumed is not None)

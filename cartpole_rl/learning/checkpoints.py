@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import nn
 
 from cartpole_rl.errors import CheckpointError
 
@@ -46,6 +47,16 @@ def save_agent(path: Path, agent: AgentCheckpoint) -> None:
 def load_agent(run: Path) -> AgentCheckpoint:
     """Read the agent of a run folder or a checkpoint file. Raises CheckpointError."""
     return AgentCheckpoint(**_load(find_agent(run), AGENT_FORMAT, "an agent"))
+
+
+def restore_weights(agent: nn.Module, weights: Mapping[str, Any], source: str) -> None:
+    """Load the weights of a checkpoint. Raises CheckpointError where they are those of another network."""
+    try:
+        agent.load_state_dict(weights)
+    except RuntimeError:  # a line for each weight
+        raise CheckpointError(
+            f"{source} is of another version of this package: its network has other weights; train it again"
+        ) from None
 
 
 def find_agent(run: Path) -> Path:

@@ -1,6 +1,7 @@
 """Each kind of wrong input is told in one line with its remedy, before any work and without a trace."""
 
 import os
+import shutil
 import signal
 import threading
 import time
@@ -184,6 +185,29 @@ def test_a_checkpoint_of_another_version(trained: Path, files: Path) -> None:
     done = in_process("evaluate", "run=newer.pt", folder=files)
     assert "another version of this package: new_setting" in done.complaint
     assert done.code == 1
+
+
+def test_a_checkpoint_with_another_network(trained: Path, files: Path) -> None:
+    content = torch.load(trained / "checkpoints/last.pt", weights_only=True)
+    weights = {f"{name}_of_before": weight for name, weight in content["weights"].items()}
+    torch.save({**content, "weights": weights}, files / "older.pt")
+    done = in_process("evaluate", "run=older.pt", folder=files)
+    assert done.complaint.endswith(
+        "run=older.pt is of another version of this package: its network has other weights; train it again"
+    )
+    assert done.code == 1
+
+
+def test_a_training_with_another_network_does_not_go_on(trained: Path, tmp_path: Path) -> None:
+    older = shutil.copytree(trained, tmp_path / "older")
+    content = torch.load(older / "checkpoints/resume.pt", weights_only=True)
+    agent = {f"{name}_of_before": weight for name, weight in content["state"]["agent"].items()}
+    torch.save({**content, "state": {**content["state"], "agent": agent}}, older / "checkpoints/resume.pt")
+    before = (older / "history.jsonl").read_text()
+    done = in_process("train", f"resume={older}", folder=tmp_path)
+    assert "its network has other weights; train it again" in done.complaint
+    assert done.code == 1
+    assert (older / "history.jsonl").read_text() == before
 
 
 def test_without_a_compiler_the_remedy_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
