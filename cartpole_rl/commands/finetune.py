@@ -58,7 +58,6 @@ from cartpole_rl.learning.checkpoints import (
     TrainingCheckpoint,
     load_agent,
     load_training,
-    restore_weights,
     save_agent,
     save_training,
 )
@@ -172,7 +171,7 @@ class Session:
         self.folder, self.driver, self.log = folder, driver, log
         self.start = load_agent(config.run)
         self.agent: QAgent = new_agent(training)
-        restore_weights(self.agent, self.start.weights, f"run={config.run}")
+        self.agent.load_state_dict(self.start.weights)
         self.first_weights = as_weights(self.agent.greedy_policy())
         self.learner: Finetuning | None = None
         self.learned = 0  # episodes whose learning is done
@@ -383,7 +382,7 @@ class Session:
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from `save`."""
         self.learned = state["learned"]
-        restore_weights(self.agent, state["agent"], f"resume={self.folder}")
+        self.agent.load_state_dict(state["agent"])
         self.optimizer_state = state["optimizer"]
 
     def keep(self, tuned: bool, summary: dict[str, Any]) -> None:

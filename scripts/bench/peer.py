@@ -22,15 +22,21 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from stable_baselines3 import DQN
-from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import VecEnv
 from tensordict import TensorDict
 
 from cartpole_rl.commands.build import use_threads
 from cartpole_rl.envs.gymnasium import simulated_environment
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.reporting.table import table
+
+try:
+    from stable_baselines3 import DQN
+    from stable_baselines3.common.callbacks import BaseCallback
+    from stable_baselines3.common.vec_env import VecEnv
+except ModuleNotFoundError as error:
+    sys.exit(
+        f'peer.py: {error}; the peer is no part of an installation: pip install "stable-baselines3>=2.7"'
+    )
 
 REFERENCE = json.loads(Path(__file__).with_name("references.json").read_text())["medium"]["score"]
 REACHED = 0.9

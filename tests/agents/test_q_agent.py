@@ -138,6 +138,10 @@ def test_frames_are_read_from_the_oldest_to_the_newest() -> None:
     torch.testing.assert_close(reader(scene), torch.cat((state, scene[:, 3:4]), -1))
     torch.testing.assert_close(reader(scene.view(5, 1, 7)), reader(scene).view(5, 1, 17))
     torch.testing.assert_close(reader(scene[0]), reader(scene)[0])
+    network = QNetwork(7, 3, (8,), True, reader)
+    torch.testing.assert_close(network(scene), network.layers(torch.cat((state, scene[:, 3:4]), -1)))
+    torch.testing.assert_close(network(scene.view(5, 1, 7)), network(scene).view(5, 1, 3))
+    torch.testing.assert_close(network(scene[0]), network(scene)[0])
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
@@ -239,7 +243,9 @@ def test_importance_weights_scale_each_transition() -> None:
 
 @pytest.mark.parametrize("weighted", [False, True])
 @pytest.mark.parametrize("compiled", [False, True])
-@pytest.mark.parametrize("network", [{"mirrored": True}, {"recurrent": 8, "mirrored": True}])
+@pytest.mark.parametrize(
+    "network", [{"mirrored": True}, {"recurrent": 8}, {"recurrent": 8, "mirrored": True}]
+)
 @pytest.mark.parametrize("max_norm", [100.0, 1e-2])
 def test_the_gradient_is_that_of_the_loss(
     network: dict, compiled: bool, weighted: bool, max_norm: float
