@@ -1,15 +1,16 @@
 """From encoder counts to what an agent sees. All tensors [N] or [N, k] float32; angles rad, positions m."""
 
-import math
 from enum import StrEnum
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-CART_METRES_PER_COUNT = 2.2749e-5  # Quanser IP02: pinion 6.35e-3 m, gear, 4096 counts a turn
-POLE_COUNTS_PER_TURN = 4096
-POLE_RADIANS_PER_COUNT = 2 * math.pi / POLE_COUNTS_PER_TURN
+from cartpole_rl.physics.encoders import (
+    CART_METRES_PER_COUNT,
+    POLE_COUNTS_PER_TURN,
+    POLE_RADIANS_PER_COUNT,
+)
 
 # Scales that bring each measured quantity to about one; the velocities' are those of a vigorous swing-up.
 POSITION_SCALE = 0.38  # m

@@ -1,5 +1,6 @@
 """Wire protocol, version 1: bytes <-> dataclasses, without I/O. Written out in ``docs/protocol.md``."""
 
+from cartpole_rl.wire.clock import microseconds_between, seconds_between, ticks_between, went_back
 from cartpole_rl.wire.frames import Frame, FrameSplitter, decode_frame, encode_frame
 from cartpole_rl.wire.messages import (
     Ack,
@@ -43,4 +44,8 @@ __all__ = [
     "Stop",
     "decode_frame",
     "encode_frame",
+    "microseconds_between",
+    "seconds_between",
+    "ticks_between",
+    "went_back",
 ]
