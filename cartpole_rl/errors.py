@@ -1,16 +1,32 @@
 """The error tree. An error that a user can cause says in one line what is wrong and what would be right."""
 
+from typing import Any
+
 
 class CartPoleError(Exception):
     """Anything this package raises on purpose. Commands print it as one line and exit with `exit_code`."""
 
     exit_code = 1
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Survive the way from one process to another, whatever arguments the class is made with."""
+        return _remade, (type(self), self.args), vars(self)
+
+
+def _remade(kind: type[CartPoleError], arguments: tuple[Any, ...]) -> CartPoleError:
+    error = kind.__new__(kind, *arguments)
+    error.args = arguments
+    return error
+
 
 class ConfigError(CartPoleError):
     """A setting is unknown, has the wrong type, is out of range, or contradicts another."""
 
     exit_code = 2
+
+
+class LearningError(CartPoleError):
+    """A training cannot go on."""
 
 
 class CheckpointError(CartPoleError):

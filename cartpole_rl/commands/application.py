@@ -1,6 +1,7 @@
 """What makes a function of a config into a command: Hydra in front, one line for each error, an exit code.
 
-Exit codes: 0; 1 where the work failed; 2 where the config is wrong; 130 after Ctrl-C; 143 after SIGTERM.
+Exit codes: 0; 1 where the work failed; 2 where the config is wrong; 130 after Ctrl-C; 143 after SIGTERM; 129
+after SIGHUP, which a closed terminal or a dropped ssh connection sends.
 """
 
 import logging
@@ -28,15 +29,20 @@ from cartpole_rl.commands.complaints import dashed_setting, in_one_line
 from cartpole_rl.commands.config import checked
 from cartpole_rl.errors import CartPoleError, ConfigError
 from cartpole_rl.settings import Settings
+from cartpole_rl.signals import ending_signals
 
-INTERRUPTED, TERMINATED = 130, 143  # what a shell reports for SIGINT and SIGTERM
+INTERRUPTED, SIGNALLED = 130, 128  # what a shell reports: for SIGINT, and plus its number for another signal
 Config = TypeVar("Config", bound=Settings)
 Body = Callable[[Config, Path], None]
 EXPECTED = (CartPoleError, HydraException, OmegaConfBaseException, OSError)  # told in a line, without a trace
 
 
 class Terminated(BaseException):
-    """SIGTERM came. It unwinds like an exception, so that every `with` stops its motor."""
+    """SIGTERM or SIGHUP came. It unwinds like an exception, so that every `with` stops its motor."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(number)
+        self.number = number
 
 
 def application(name: str, schema: type[Config]) -> Callable[[Body[Config]], Callable[[], None]]:
@@ -65,7 +71,8 @@ def application(name: str, schema: type[Config]) -> Callable[[Body[Config]], Cal
 
         def main() -> None:
             given[:] = sys.argv[1:]
-            signal.signal(signal.SIGTERM, _terminate)
+            for number in ending_signals():
+                signal.signal(number, _terminate)
             os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra's errors come here, not to the screen
             try:
                 if dashed := dashed_setting(sys.argv[1:]):
@@ -78,9 +85,9 @@ def application(name: str, schema: type[Config]) -> Callable[[Body[Config]], Cal
             except KeyboardInterrupt:
                 tell(name, "interrupted")
                 sys.exit(INTERRUPTED)
-            except Terminated:
+            except Terminated as ended:
                 tell(name, "terminated")
-                sys.exit(TERMINATED)
+                sys.exit(SIGNALLED + ended.number)
 
         return main
 
@@ -120,8 +127,9 @@ def quieten() -> None:
 
 
 def tell(name: str, message: str) -> None:
-    """One line on stderr."""
-    print(f"cartpole-{name.replace('_', '-')}: {message}", file=sys.stderr)
+    """One line on stderr, if that still leads anywhere: a closed terminal does not."""
+    with suppress(OSError):
+        print(f"cartpole-{name.replace('_', '-')}: {message}", file=sys.stderr)
 
 
 def remove_if_empty(folder: Path) -> None:
@@ -132,4 +140,4 @@ def remove_if_empty(folder: Path) -> None:
 
 
 def _terminate(number: int, frame: FrameType | None) -> NoReturn:
-    raise Terminated
+    raise Terminated(number)

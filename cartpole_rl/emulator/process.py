@@ -14,12 +14,13 @@ from cartpole_rl.emulator.clocks import run_lockstep, run_real
 from cartpole_rl.emulator.device import CartDevice
 from cartpole_rl.emulator.link import Channel, PtyLink
 from cartpole_rl.emulator.settings import EmulatorSettings
+from cartpole_rl.signals import ending_signals
 
 PARENT_POLL = 0.5  # s
 
 
 def run(settings: EmulatorSettings) -> None:
-    """Print one JSON line with `port` and `pid`, and emulate until SIGINT, SIGTERM or `unplug_at`.
+    """Print one JSON line with `port` and `pid`, and emulate until SIGINT, SIGTERM, SIGHUP or `unplug_at`.
 
     Main thread only. Raises EmulatorError where MuJoCo or pseudo-terminals are missing.
     """
@@ -33,12 +34,12 @@ def run(settings: EmulatorSettings) -> None:
 
 @contextmanager
 def until_stopped() -> Iterator[None]:
-    """Let SIGINT and SIGTERM end the block quietly, wherever it waits."""
+    """Let SIGINT, SIGTERM and SIGHUP end the block quietly, wherever it waits."""
 
     def interrupt(signum: int, frame: FrameType | None) -> None:
         raise KeyboardInterrupt
 
-    before = {number: signal.signal(number, interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.signal(number, interrupt) for number in (signal.SIGINT, *ending_signals())}
     try:
         yield
     except KeyboardInterrupt:

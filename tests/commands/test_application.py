@@ -1,0 +1,66 @@
+"""What every command makes of the signals that ask it to end."""
+
+import os
+import signal
+import time
+from pathlib import Path
+from unittest.mock import patch
+
+import pytest
+from hydra.core.global_hydra import GlobalHydra
+
+from cartpole_rl.commands.application import application
+from cartpole_rl.commands.find_port import FindPortConfig
+from cartpole_rl.signals import ending_signals
+
+
+def run_until_signalled(number: signal.Signals, folder: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Send `number` to a command in the middle of its work; what happened then."""
+    happened: list[str] = []
+
+    @application("find_port", FindPortConfig)
+    def main(config: FindPortConfig, run: Path) -> None:
+        try:
+            os.kill(os.getpid(), number)
+            time.sleep(5)
+            happened.append("went on")
+        finally:
+            happened.append("unwound")
+
+    GlobalHydra.instance().clear()
+    monkeypatch.chdir(folder)
+    with patch("sys.argv", ["cartpole-find-port"]):
+        try:
+            main()
+        except SystemExit as ended:
+            happened.append(f"exit code {ended.code}")
+    return happened
+
+
+@pytest.fixture(autouse=True)
+def handlers() -> object:
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+def test_a_signal_unwinds_the_work(
+    number: signal.Signals,
+    code: int,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """So that every `with` stops its motor."""
+    signal.signal(number, signal.SIG_DFL)
+    assert run_until_signalled(number, tmp_path, monkeypatch) == ["unwound", f"exit code {code}"]
+    assert capsys.readouterr().err == "cartpole-find-port: terminated\n"
+
+
+def test_a_hangup_that_nohup_ignores_stays_ignored() -> None:
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    assert ending_signals() == [signal.SIGTERM]
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    assert ending_signals() == [signal.SIGTERM, signal.SIGHUP]
