@@ -28,6 +28,7 @@ STRONGEST = 255
 BROKEN_AWAY = 0.002  # m
 CLOSE, SLOW = 0.02, 0.05  # m, m/s: there, and at rest
 LONGEST_WAY = 4.0  # s
+STANDING, LONGEST_STOP = 0.005, 3.0  # m/s, s: at the end of an experiment
 RIGHT, LEFT = 1, -1
 
 
@@ -201,28 +202,49 @@ def go_to(target: float, task: Task) -> Moves:
 def conduct(
     plant: Plant, period: float, seed: int = 0, experiments: tuple[Experiment, ...] = EXPERIMENTS
 ) -> Iterator[tuple[Experiment, Episode]]:
-    """Each experiment with its recording, on a plant of one cart; they follow each other without a break.
+    """Each experiment with its recording, on a plant of one cart.
 
-    After an ending by the plant the next one begins with a reset.
+    The cart stands, with the motor at 0, whenever a recording is handed out: nobody watches it while a file
+    is written. The next experiment goes on from there; after an ending by the plant it begins with a reset.
     """
     task, present = Task(period, np.random.default_rng(seed), BREAKAWAY), plant.reset()
     for experiment in experiments:
-        recorded, present, breakaway = run(plant, present, experiment.moves(task))
+        recorded, present, breakaway = run(plant, present, and_stop(experiment.moves(task), task))
         task = task._replace(breakaway=breakaway or task.breakaway)
         yield experiment, recorded
-        if recorded.ended_by != Ending.TIME:
+        if recorded.ended_by == Ending.TIME:
+            present = driven(plant, present, 0)  # a new frame: the last one is as old as the writing took
+        if recorded.ended_by != Ending.TIME or present["done"]:
             present = plant.reset()
     plant.halt()
 
 
+def and_stop(moves: Moves, task: Task) -> Moves:
+    """The moves, then motor 0 until the cart stands; returns what the moves return."""
+    told = yield from moves
+    for _ in range(task.periods(LONGEST_STOP)):
+        seen = yield 0
+        if abs(seen.x_dot) < STANDING:
+            break
+    return told
+
+
+def driven(plant: Plant, present: TensorDictBase, motor: int) -> TensorDictBase:
+    """The frame at the end of a period under a motor value."""
+    return plant.step(present.set("motor", torch.tensor([[motor]])))["next"]
+
+
 def run(plant: Plant, present: TensorDictBase, moves: Moves) -> tuple[Episode, TensorDictBase, int | None]:
-    """Make the moves from the frame `present` on: the recording, the last frame, what the moves return."""
+    """Make the moves from the frame `present` on: the recording, the last frame, what the moves return.
+
+    The motor is at 0 at the end, whatever the moves or the guard asked for last.
+    """
     counts, gaps, motors, ended = [counts_of(present)], [float(present["dt"])], [], str(Ending.TIME)
     wanted, told = next(moves), None
     while True:
         seen = as_seen(counts, gaps)
         motor = guarded(wanted, seen)
-        following = plant.step(present.set("motor", torch.tensor([[motor]])))["next"]
+        following = driven(plant, present, motor)
         motors.append(motor)
         counts.append(counts_of(following))
         gaps.append(float(following["dt"]))
@@ -234,6 +256,7 @@ def run(plant: Plant, present: TensorDictBase, moves: Moves) -> tuple[Episode, T
             wanted = moves.send(as_seen(counts, gaps))
         except StopIteration as end:
             told = end.value
+            present = driven(plant, present, 0) if motor else present
             break
     return recording(np.array(counts), np.array(gaps[1:]), np.array(motors), ended), present, told
 
