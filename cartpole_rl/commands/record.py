@@ -18,12 +18,12 @@ from cartpole_rl.commands.application import application
 from cartpole_rl.commands.build import evaluated_agent, evaluated_env, evaluated_settings, use_threads
 from cartpole_rl.commands.config import CartPoleSettings, EvaluateConfig
 from cartpole_rl.commands.evaluate import count_text, with_progress
+from cartpole_rl.commands.person import confirm
 from cartpole_rl.commands.run_folder import write_config
-from cartpole_rl.evaluation.recordings import write_recording
+from cartpole_rl.evaluation.recordings import LENGTH, write_recording
 from cartpole_rl.learning.randomness import seed_everything
 
 RECORDINGS = "recordings"
-LENGTH = "pole_length_m"  # in a recording's heading
 
 
 class RecordConfig(EvaluateConfig):
@@ -37,7 +37,7 @@ def main(config: RecordConfig, folder: Path) -> None:
     seed_everything(config.seed)
     agent = evaluated_agent(config)
     settings = evaluated_settings(agent.training, config)
-    env = evaluated_env(settings, config, prompt=tqdm.write)
+    env = evaluated_env(settings, config, prompt=tqdm.write, confirm=confirm)
     written = 0
     try:
         with closing(env):

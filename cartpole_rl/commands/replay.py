@@ -18,10 +18,10 @@ from cartpole_rl.choices import choice
 from cartpole_rl.commands.application import application
 from cartpole_rl.commands.config import CartFrictionSettings, PoleFrictionSettings, SimulatedSettings
 from cartpole_rl.commands.evaluate import count_text
-from cartpole_rl.commands.record import LENGTH, RECORDINGS
+from cartpole_rl.commands.record import RECORDINGS
 from cartpole_rl.commands.run_folder import write_config, write_json
 from cartpole_rl.errors import ConfigError, RecordingError
-from cartpole_rl.evaluation.recordings import read_recording
+from cartpole_rl.evaluation.recordings import LENGTH, read_recording
 from cartpole_rl.identification.replay import Array, Replayed, recorded_period, replay
 from cartpole_rl.physics.actuator import Actuator
 from cartpole_rl.physics.dynamics import Models

@@ -26,6 +26,7 @@ STATE = {  # column: field of Episode
 }
 STEP = {"score": "score", "score_upright": "score_upright", "reward": "reward"}
 COUNTS = ("cart_counts", "pole_counts")
+LENGTH = "pole_length_m"  # in the heading: twice pivot to centre of mass, empty if not known
 COLUMNS = (*STATE, *COUNTS, "motor", *STEP)
 
 
@@ -78,4 +79,8 @@ def read_recording(path: Path) -> Episode:
         motor = np.array([int(row["motor"]) for row in rows[:-1]])
     except (ValueError, TypeError) as error:
         raise RecordingError(f"{path} is damaged: {error}") from None
+    if not all(np.isfinite(values).all() for values in (*columns.values(), *steps.values())):
+        raise RecordingError(f"{path} is damaged: a number in it is not finite")
+    if not (np.diff(columns["time"]) > 0).all():
+        raise RecordingError(f"{path} is damaged: its time does not increase from row to row")
     return Episode(**columns, **steps, counts=counts, motor=motor, ended_by=ended_by)

@@ -40,13 +40,20 @@ class TrainingCheckpoint:
 
 
 def save_agent(path: Path, agent: AgentCheckpoint) -> None:
-    """Write what `load_agent` reads."""
+    """Write what `load_agent` reads.
+
+    Raises CheckpointError if a weight is not finite; the file then stays as it was.
+    """
+    check_finite(agent.weights, f"{path} is not written")
     _save(path, AGENT_FORMAT, vars(agent))
 
 
 def load_agent(run: Path) -> AgentCheckpoint:
     """Read the agent of a run folder or a checkpoint file. Raises CheckpointError."""
-    return AgentCheckpoint(**_load(find_agent(run), AGENT_FORMAT, "an agent"))
+    path = find_agent(run)
+    agent = AgentCheckpoint(**_load(path, AGENT_FORMAT, "an agent"))
+    check_finite(agent.weights, f"{path} is refused")
+    return agent
 
 
 def restore_weights(agent: nn.Module, weights: Mapping[str, Any], source: str) -> None:
@@ -57,6 +64,16 @@ def restore_weights(agent: nn.Module, weights: Mapping[str, Any], source: str) -
         raise CheckpointError(
             f"{source} is of another version of this package: its network has other weights; train it again"
         ) from None
+
+
+def check_finite(weights: Mapping[str, Any], consequence: str) -> None:
+    """Raise CheckpointError that names a weight which is not finite, if there is one."""
+    for name, weight in weights.items():
+        if isinstance(weight, torch.Tensor) and not weight.isfinite().all():
+            raise CheckpointError(
+                f"{consequence}: its weight {name} is not finite, the training has diverged; "
+                "take an earlier checkpoint, or train again with a smaller optimizer.learning_rate"
+            )
 
 
 def find_agent(run: Path) -> Path:
@@ -74,8 +91,10 @@ def find_agent(run: Path) -> Path:
 
 
 def save_training(run: Path, training: TrainingCheckpoint) -> None:
-    """Write what `load_training` reads."""
-    _save(run / FOLDER / RESUME, TRAINING_FORMAT, vars(training))
+    """Write what `load_training` reads. Raises CheckpointError if a weight is not finite."""
+    path = run / FOLDER / RESUME
+    check_finite(training.state.get("agent", {}), f"{path} is not written")
+    _save(path, TRAINING_FORMAT, vars(training))
 
 
 def load_training(run: Path) -> TrainingCheckpoint:
@@ -87,7 +106,9 @@ def load_training(run: Path) -> TrainingCheckpoint:
         raise CheckpointError(
             f"resume={run}: it holds no {FOLDER}/{RESUME}; give the folder of a training that came so far"
         )
-    return TrainingCheckpoint(**_load(path, TRAINING_FORMAT, "a training"))
+    training = TrainingCheckpoint(**_load(path, TRAINING_FORMAT, "a training"))
+    check_finite(training.state.get("agent", {}), f"{path} is refused")
+    return training
 
 
 @contextmanager

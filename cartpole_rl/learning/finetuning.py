@@ -35,10 +35,17 @@ class FinetuningSettings(Settings):
 
 
 def recorded_chunk(
-    episode: Episode, over: Callable[[RecordedPlant], CartPoleEnv], motors: Sequence[int]
+    episode: Episode,
+    over: Callable[[RecordedPlant], CartPoleEnv],
+    motors: Sequence[int],
+    pole_length: float | None,
 ) -> TensorDictBase:
-    """The one-step transitions [1, T] of an episode, as the environment `over` a recording sees them."""
-    env, index = over(RecordedPlant(episode)), {motor: action for action, motor in enumerate(motors)}
+    """The one-step transitions [1, T] of an episode, as the environment `over` a recording sees them.
+
+    `pole_length` m is that of the cart which was driven, None if it is not known.
+    """
+    env = over(RecordedPlant(episode, pole_length))
+    index = {motor: action for action, motor in enumerate(motors)}
     present, taken = env.reset(), []
     for motor in episode.motor.tolist():
         present["action"] = torch.tensor([index[motor]])

@@ -4,6 +4,7 @@ Everything that the next iteration depends on is in `snapshot`, so that a run th
 had not been. Schedules are functions of the frames seen.
 """
 
+import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -15,6 +16,7 @@ from tensordict import TensorDictBase
 
 from cartpole_rl.agents import Columns, LossGradient, QAgent, columns_of
 from cartpole_rl.envs import CartPoleEnv
+from cartpole_rl.errors import LearningError
 from cartpole_rl.learning.collector import Collector
 from cartpole_rl.learning.randomness import random_state, restore_random_state
 from cartpole_rl.learning.replay import make_replay, n_step_transitions, replay_snapshot, restore_replay
@@ -137,11 +139,20 @@ class Training:
         }
 
     def update(self, batch: Columns) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """One gradient step; the loss, the norm of its gradient, the error of each transition."""
-        found = self.gradient(batch)
+        """One gradient step; the loss, the norm of its gradient, the error of each transition.
+
+        Raises LearningError, with the weights as they were, if the loss or its gradient is not finite.
+        """
+        loss, norm, errors = self.gradient(batch)
+        if not math.isfinite(loss.item() + norm.item()):
+            raise LearningError(
+                f"learning diverged after {self.frames} transitions: the loss is {loss.item():g}, its "
+                f"gradient's norm {norm.item():g}; the checkpoints from before are kept; try a smaller "
+                f"optimizer.learning_rate than {self.optimizer_settings.learning_rate:g}"
+            )
         self.optimizer.step()
         self.agent.follow()
-        return found
+        return loss, norm, errors
 
     def epsilon(self) -> float:
         """Share of random actions now."""

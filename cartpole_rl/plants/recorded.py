@@ -8,14 +8,19 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from cartpole_rl.errors import ConfigError
 from cartpole_rl.plants.specs import Plant, one_cart
 from cartpole_rl.tasks.episode import Episode
 
 
 class RecordedPlant(Plant):
-    """One cart, [1]; each step returns the next recorded frame, the last of which ends the episode."""
+    """One cart, [1]; each step returns the next recorded frame, the last of which ends the episode.
 
-    def __init__(self, episode: Episode, pole_length: float | None = None) -> None:
+    `pole_length` m is twice the distance from pivot to centre of mass of the recorded pole, None if nobody
+    knows it.
+    """
+
+    def __init__(self, episode: Episode, pole_length: float | None) -> None:
         super().__init__(carts=1)
         self.episode = episode
         self._pole_length = pole_length
@@ -23,8 +28,10 @@ class RecordedPlant(Plant):
 
     @property
     def pole_length(self) -> Tensor:
-        """m, [1]."""
-        return torch.tensor([float("nan") if self._pole_length is None else self._pole_length])
+        """m, [1]. Raises ConfigError where it is not known."""
+        if self._pole_length is None:
+            raise ConfigError("this agent observes the pole's length, which the recording does not have")
+        return torch.tensor([self._pole_length])
 
     def _set_seed(self, seed: int | None) -> None:
         """Nothing is left to chance."""

@@ -43,6 +43,30 @@ def test_a_training_comes_back(tmp_path: Path) -> None:
     assert load_training(tmp_path) == TRAINING
 
 
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_weights_that_are_not_finite_are_neither_written_nor_read(value: float, tmp_path: Path) -> None:
+    save_agent(tmp_path / LAST, AGENT)
+    whole = (tmp_path / LAST).read_bytes()
+    diverged = AgentCheckpoint({}, {"w": torch.tensor([1.0, value])}, frames=20, score=None)
+    with pytest.raises(CheckpointError, match=r"last\.pt is not written: its weight w is not finite"):
+        save_agent(tmp_path / LAST, diverged)
+    assert (tmp_path / LAST).read_bytes() == whole
+    with pytest.raises(CheckpointError, match=r"resume\.pt is not written: its weight w is not finite"):
+        save_training(tmp_path, TrainingCheckpoint({}, {"agent": diverged.weights}, frames=20))
+    torch.save({"format": "cartpole_rl agent 1", **vars(diverged)}, tmp_path / LAST)
+    assert "is refused: its weight w is not finite" in complaint(load_agent, tmp_path / LAST)
+    torch.save(
+        {
+            "format": "cartpole_rl training 1",
+            "config": {},
+            "state": {"agent": diverged.weights},
+            "frames": 20,
+        },
+        tmp_path / "checkpoints/resume.pt",
+    )
+    assert "is refused: its weight w is not finite" in complaint(load_training, tmp_path)
+
+
 def test_a_missing_path_is_named(tmp_path: Path) -> None:
     assert "there is no such file or folder" in complaint(load_agent, tmp_path / "nowhere")
     assert "there is no such folder" in complaint(load_training, tmp_path / "nowhere")

@@ -10,6 +10,7 @@ import torch
 from tensordict import TensorDict
 
 from cartpole_rl.agents import AgentSettings, QAgent
+from cartpole_rl.errors import LearningError
 from cartpole_rl.learning.randomness import seed_everything
 from cartpole_rl.learning.settings import LearningSettings, OptimizerSettings, ReplaySettings
 from cartpole_rl.learning.training import Scalars, Training
@@ -161,6 +162,23 @@ def test_gradients_are_clipped(make_training: Callable[..., Training]) -> None:
     training.run()
     squares = [(weight.grad**2).sum() for weight in training.weights]
     assert torch.stack(squares).sum().sqrt().item() <= 1.001e-6
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_learning_stops_at_the_first_loss_that_is_not_finite(
+    make_training: Callable[..., Training], value: float
+) -> None:
+    """One spoilt reward in replay: the weights stay those of the update before."""
+    training = make_training()
+    for _ in range(4):
+        training.iterate()
+    before = [weight.clone() for weight in training.weights]
+    sample = training.replay.sample()
+    sample["next", "reward"][0] = value
+    training.sample = lambda: sample
+    with pytest.raises(LearningError, match=r"diverged after 320 transitions.*a smaller optimizer"):
+        training.iterate()
+    assert all(torch.equal(weight, kept) for weight, kept in zip(training.weights, before, strict=True))
 
 
 def test_a_time_limit_does_not_end_the_world(make_training: Callable[..., Training]) -> None:

@@ -26,7 +26,7 @@ def test_played_back_frames_are_understood_as_the_first_time(
 
     (episode,) = run_batch(env, policy)
     assert episode.ended_by == "track"
-    again = make_environment(RecordedPlant(episode), MOTORS)
+    again = make_environment(RecordedPlant(episode, None), MOTORS)
     present = again.reset()
     for row, motor in enumerate(episode.motor.tolist()):
         torch.testing.assert_close(present["observation"], seen[row]["observation"])
@@ -43,4 +43,4 @@ def test_it_keeps_the_contract(
 ) -> None:
     env = make_environment(make_plant(1), MOTORS, time_limit=20)
     (episode,) = run_batch(env, lambda present: present.set("action", torch.tensor([0])))
-    check_env_specs(make_environment(RecordedPlant(episode), MOTORS))
+    check_env_specs(make_environment(RecordedPlant(episode, None), MOTORS))

@@ -1,0 +1,94 @@
+"""What fine-tuning learns from: a cart's own transitions are what the agent saw while it drove."""
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDictBase
+
+from cartpole_rl.agents import AgentSettings, QAgent
+from cartpole_rl.choices import choice
+from cartpole_rl.errors import ConfigError
+from cartpole_rl.evaluation.episodes import run_batch
+from cartpole_rl.learning.finetuning import Finetuning, FinetuningSettings, recorded_chunk
+from cartpole_rl.learning.settings import LearningSettings, OptimizerSettings, ReplaySettings
+
+MOTORS = (-250, -200, 0, 200, 250)
+LENGTH = 2 * 0.1778  # m, the medium pole
+KINDS = ("history", "history_length", "positions", "raw")
+LEARNING = choice("learning/fast") | {
+    "frames": 2560,
+    "carts": 16,
+    "chunk": 8,
+    "updates": 2,
+    "batch_size": 64,
+    "warmup_frames": 0,
+}
+
+
+def observation_settings(kind: str) -> dict[str, Any]:
+    """A file of conf/observation, which may build on `history`."""
+    own = choice(f"observation/{kind}")
+    base = choice("observation/history") if own.pop("defaults", None) else {}
+    return {**base, **own}
+
+
+def drive(make_plant: Callable, make_environment: Callable, observation: dict[str, Any]) -> tuple[Any, Any]:
+    """An episode of random motor values, and the observations [T, K] that they were chosen on."""
+    env = make_environment(make_plant(1), MOTORS, time_limit=40, **observation)
+    random, seen = torch.Generator().manual_seed(0), []
+
+    def policy(present: TensorDictBase) -> TensorDictBase:
+        seen.append(present["observation"].clone())
+        return present.set("action", torch.randint(len(MOTORS), (1,), generator=random))
+
+    (episode,) = run_batch(env, policy)
+    return episode, torch.cat(seen)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_recording_has_what_the_agent_saw_and_tunes_it(
+    make_plant: Callable, make_environment: Callable, kind: str
+) -> None:
+    """Of every kind of observation, the length of the pole included; no weight turns into something else."""
+    observation = observation_settings(kind)
+    episode, seen = drive(make_plant, make_environment, observation)
+
+    def over(plant: Any) -> Any:
+        return make_environment(plant, MOTORS, time_limit=40, **observation)
+
+    chunk = recorded_chunk(episode, over, MOTORS, LENGTH)
+    torch.testing.assert_close(chunk["observation"][0], seen)
+    assert all(value.isfinite().all() for value in chunk.values(True, True) if value.is_floating_point())
+
+    env = make_environment(make_plant(16), MOTORS, time_limit=40, **observation)
+    sight = env.hardware.observation_settings
+    agent = QAgent(AgentSettings(**choice("agent/dqn")), sight.mirror_signs, len(MOTORS), sight.frames)
+    learner = Finetuning(
+        FinetuningSettings(**choice("finetuning/gentle") | {"iterations": 3, "cart_share": 0.5}),
+        LearningSettings(**LEARNING),
+        ReplaySettings(**choice("replay/uniform") | {"size": 5000}),
+        OptimizerSettings(**choice("optimizer/adam")),
+        agent,
+        env,
+        list,
+        None,
+        0,
+    )
+    learner.add(chunk)
+    learner.fill()
+    before = {name: weight.clone() for name, weight in agent.named_parameters()}
+    learner.round()
+    after = dict(agent.named_parameters())
+    assert any(not torch.equal(after[name], weight) for name, weight in before.items())
+    assert all(weight.isfinite().all() for weight in after.values())
+
+
+def test_a_length_that_is_observed_but_not_known_is_an_error(
+    make_plant: Callable, make_environment: Callable
+) -> None:
+    observation = observation_settings("history_length")
+    episode, _ = drive(make_plant, make_environment, observation)
+    with pytest.raises(ConfigError, match="observes the pole's length"):
+        recorded_chunk(episode, lambda plant: make_environment(plant, MOTORS, **observation), MOTORS, None)
