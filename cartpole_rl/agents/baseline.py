@@ -76,10 +76,10 @@ class EnergyAndRegulator:
         self.strongest = float(self.forces.abs().max())
 
     def __call__(self, present: TensorDictBase) -> TensorDictBase:
-        """Add `action` to `present`."""
+        """Add `action` [N] and `action_value` [N, A] to `present`."""
         state, motor = decoded(present["observation"], self.kind)
-        force = self.force(self.expected(state, motor))
-        return present.set("action", self.nearest(force))
+        value = self.value(self.force(self.expected(state, motor)))
+        return present.set("action_value", value).set("action", value.argmax(-1))
 
     def expected(self, measured: State, motor: Tensor) -> State:
         """The state [N] when the next motor value takes effect, while the last one, `motor` [N], is held."""
@@ -132,10 +132,12 @@ class EnergyAndRegulator:
         end = self.cart.track_half_length - MARGIN
         return torch.where(stop.abs() > end, -stop.sign() * self.strongest, force)
 
-    def nearest(self, force: Tensor) -> Tensor:
-        """Index [N] of the motor value of the nearest force; of several, the smallest motor value."""
-        distance = (force.unsqueeze(-1) - self.forces).abs() + 1e-6 * self.motors.abs()
-        return distance.argmin(-1)
+    def value(self, force: Tensor) -> Tensor:
+        """How near each motor value comes to a force, [N, A]: largest for the nearest one.
+
+        Of several that are equally near, the smallest motor value is the largest.
+        """
+        return -(force.unsqueeze(-1) - self.forces).abs() - 1e-6 * self.motors.abs()
 
 
 def decoded(observation: Tensor, kind: ObservationKind) -> tuple[State, Tensor]:

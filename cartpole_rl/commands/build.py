@@ -36,6 +36,7 @@ from cartpole_rl.plants.emulated import emulated_plant
 from cartpole_rl.plants.learned import LearnedPlant
 from cartpole_rl.plants.learned_model import load_model
 from cartpole_rl.plants.serial import SerialPlant, SerialPlantSettings
+from cartpole_rl.plants.serial_faults import Confirm, nobody
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.plants.specs import Plant
 from cartpole_rl.randomization import FoundCarts, Pole, PoleSettings
@@ -213,9 +214,15 @@ def with_parameters(settings: CartPoleSettings, parameters: Mapping[str, float])
 
 
 def evaluated_env(
-    settings: CartPoleSettings, config: EvaluateConfig, prompt: Callable[[str], None]
+    settings: CartPoleSettings,
+    config: EvaluateConfig,
+    prompt: Callable[[str], None],
+    confirm: Confirm = nobody,
 ) -> CartPoleEnv:
-    """The environment to evaluate on: simulated with a cart an episode, or one cart behind a port."""
+    """The environment to evaluate on: simulated with a cart an episode, or one cart behind a port.
+
+    `prompt` shows a person what to do, `confirm` asks whether a latched fault may be cleared.
+    """
     start = settings.task.evaluation_start
     if isinstance(config.plant, LearnedSettings):
         found = config.plant.model_copy(update={"elsewhere": 0.0})
@@ -236,10 +243,11 @@ def evaluated_env(
         baud=config.plant.baud,
         pole_length=config.plant.pole_length,
         rehome=config.plant.rehome,
+        clear_faults=config.plant.clear_faults,
         start=angle,
         control_period=settings.control_period,
     )
-    return environment(settings, SerialPlant(serial, prompt))
+    return environment(settings, SerialPlant(serial, prompt, confirm=confirm))
 
 
 def check_compiler() -> None:

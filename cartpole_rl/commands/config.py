@@ -88,6 +88,7 @@ class RealSettings(Settings):
     baud: Count
     pole_length: Positive | None
     rehome: Literal["once", "always"] = "once"
+    clear_faults: Annotated[int, Field(ge=0)] = 0
 
 
 class CartPoleSettings(Settings):

@@ -18,6 +18,7 @@ from tqdm import tqdm
 from cartpole_rl.commands.application import application
 from cartpole_rl.commands.build import evaluated_agent, evaluated_env, evaluated_settings, use_threads
 from cartpole_rl.commands.config import EvaluateConfig
+from cartpole_rl.commands.person import confirm
 from cartpole_rl.commands.report import METRICS, report
 from cartpole_rl.commands.run_folder import write_config
 from cartpole_rl.envs import CartPoleEnv
@@ -45,7 +46,7 @@ def main(config: EvaluateConfig, folder: Path) -> None:
     seed_everything(config.seed)
     agent = evaluated_agent(config)
     settings = evaluated_settings(agent.training, config)
-    env = evaluated_env(settings, config, prompt=tqdm.write)
+    env = evaluated_env(settings, config, prompt=tqdm.write, confirm=confirm)
     episodes: list[Episode] = []
     try:
         with closing(env):

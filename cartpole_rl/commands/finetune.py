@@ -37,19 +37,21 @@ from cartpole_rl.commands.config import (
     CartPoleSettings,
     EvaluateConfig,
     FinetuneConfig,
+    RealSettings,
     TrainConfig,
     checked,
 )
 from cartpole_rl.commands.evaluate import score_table
+from cartpole_rl.commands.person import confirm
 from cartpole_rl.commands.report import METRICS, report
 from cartpole_rl.commands.run_folder import write_config, write_json
 from cartpole_rl.envs import CartPoleEnv
-from cartpole_rl.errors import ConfigError
+from cartpole_rl.errors import ConfigError, LearningError
 from cartpole_rl.evaluation import episode_metrics, summarize
 from cartpole_rl.evaluation.driver import Drive, Driver
 from cartpole_rl.evaluation.driving_policy import as_weights
 from cartpole_rl.evaluation.episodes import run_batch
-from cartpole_rl.evaluation.recordings import read_recording, write_recording
+from cartpole_rl.evaluation.recordings import LENGTH, read_recording, write_recording
 from cartpole_rl.identification import LONGEST_LATENCY, Fit, cut_windows, fit_cart
 from cartpole_rl.learning.checkpoints import (
     FOLDER,
@@ -72,6 +74,7 @@ from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.randomization import FoundCarts
 from cartpole_rl.reporting.tensorboard import TensorBoardLog
 from cartpole_rl.scheduling import compute_last
+from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
 
 BEFORE, TUNE, AFTER = "before", "tune", "after"
@@ -101,11 +104,11 @@ def main(config: FinetuneConfig, folder: Path) -> None:
         save_training(folder, TrainingCheckpoint(config.model_dump(mode="json"), {}, 0))
     else:
         write_config(folder, config.model_dump(mode="json"), resumed=True)
-    make_env = partial(evaluated_env, settings, evaluation, print)
+    make_env = partial(evaluated_env, settings, evaluation, print)  # takes who confirms, too
     real_time = config.plant.kind == "serial" or config.emulator.clock == "real"
     with (
         TensorBoardLog(folder) as log,
-        Driver(make_env, partial(greedy_network, training), config.compile, real_time) as driver,
+        Driver(make_env, partial(greedy_network, training), config.compile, real_time, confirm) as driver,
     ):
         if real_time:
             compute_last()  # but not the process that drives, nor an emulated cart: those have begun
@@ -139,6 +142,12 @@ def as_evaluation(config: FinetuneConfig) -> EvaluateConfig:
 def greedy_network(training: TrainConfig) -> nn.Module:
     """The network that drives, for weights of `as_weights`."""
     return new_agent(training).greedy_policy()
+
+
+def driven_length(config: FinetuneConfig) -> float | None:
+    """m, the length of the pole on the cart that is driven; None where nobody has said it."""
+    plant = config.plant
+    return plant.pole_length if isinstance(plant, RealSettings) else 2 * config.emulator.pole_com
 
 
 class Unheard:
@@ -317,7 +326,14 @@ class Session:
         """Wait for an episode, and write it down."""
         driven = self.driver.result()
         self.link = driven.link
-        write_recording(self.path(stage, number), driven.episode, {"stage": stage, "number": number})
+        if driven.episode.ended_by == Ending.NON_FINITE:
+            raise LearningError(
+                f"{stage} {number + 1}: an observation or an action value was not finite, so the cart was "
+                "stopped; nothing is learned from this episode"
+            )
+        length = driven_length(self.config)
+        facts = {"stage": stage, "number": number, LENGTH: "" if length is None else f"{length:.4f}"}
+        write_recording(self.path(stage, number), driven.episode, facts)
         figures = self.figures(driven.episode)
         step = self.step(stage, number + 1)
         self.log.scalars({f"cart/score_{stage}": figures["score"]}, step)
@@ -365,7 +381,7 @@ class Session:
         def over(plant: RecordedPlant) -> CartPoleEnv:
             return environment(self.settings, plant)
 
-        return recorded_chunk(episode, over, self.settings.actions.motors)
+        return recorded_chunk(episode, over, self.settings.actions.motors, driven_length(self.config))
 
     def save(self) -> None:
         """The state to resume from."""

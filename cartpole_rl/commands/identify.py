@@ -23,6 +23,7 @@ from tqdm import tqdm
 from cartpole_rl.commands.application import application, tell
 from cartpole_rl.commands.build import use_threads
 from cartpole_rl.commands.config import EmulatedSettings, PoleFrictionSettings, RealSettings, Seed
+from cartpole_rl.commands.person import confirm
 from cartpole_rl.commands.record import RECORDINGS
 from cartpole_rl.commands.run_folder import write_config, write_json
 from cartpole_rl.emulator.settings import EmulatorSettings
@@ -154,11 +155,15 @@ def the_plant(config: IdentifyConfig) -> SerialPlant:
     """The cart to be identified."""
     if isinstance(config.plant, EmulatedSettings):
         truth = config.emulator.model_copy(update={"start": "hanging"})
-        return emulated_plant(truth, config.control_period, tqdm.write)
+        return emulated_plant(truth, config.control_period, tqdm.write, config.plant.rehome)
     settings = SerialPlantSettings(
-        port=config.plant.port, baud=config.plant.baud, control_period=config.control_period
+        port=config.plant.port,
+        baud=config.plant.baud,
+        control_period=config.control_period,
+        rehome=config.plant.rehome,
+        clear_faults=config.plant.clear_faults,
     )
-    return SerialPlant(settings, tqdm.write)
+    return SerialPlant(settings, tqdm.write, confirm=confirm)
 
 
 def read(source: Path) -> dict[str, Episode]:

@@ -14,10 +14,12 @@ from pydantic import Field
 
 from cartpole_rl.commands.application import application
 from cartpole_rl.commands.config import EmulatedSettings, RealSettings
+from cartpole_rl.commands.person import confirm
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import PlantError
 from cartpole_rl.plants.emulated_cart import EmulatedCart
 from cartpole_rl.plants.serial_cart import SerialCart, SerialSettings
+from cartpole_rl.plants.serial_faults import FaultClearing
 from cartpole_rl.plants.serial_preflight import Finding, preflight
 from cartpole_rl.settings import Positive, Settings
 
@@ -35,13 +37,18 @@ def main(config: PreflightConfig, folder: Path) -> None:
     """A line for each check. Raises PlantError, for exit code 1, after the first that is not OK."""
     with the_cart(config) as cart:
         finding: Finding | None = None
-        for finding in preflight(cart, config.home_timeout):
+        for finding in preflight(cart, config.home_timeout, faults(config.plant)):
             print(finding, flush=True)
     if finding is None or not finding.ready:
         raise PlantError(
             f"the cart is not ready: {finding.check if finding else 'nothing was checked'} is off"
         )
     print("The cart is ready.")
+
+
+def faults(plant: EmulatedSettings | RealSettings) -> FaultClearing:
+    """The rule by which latched faults are cleared."""
+    return FaultClearing(plant.clear_faults if isinstance(plant, RealSettings) else None, confirm)
 
 
 @contextmanager

@@ -4,9 +4,10 @@ One transform, the same over a simulated and over a serial plant, keeps the stac
 transform costs more time than the arithmetic in it) and holds no state of its own: what it needs of the past
 stands in the tensordict, so a step depends on nothing else.
 
-Keys, each [N, ...]: in `action` int64 index; out `observation` float32, `state` (measured x m, x_dot m/s,
-theta rad, theta_dot rad/s), `reward` [N, 1], `score` (6.2) and `score_upright` (6.1) of this step [N, 1],
-`step_count` int64 [N, 1], `past` (what the observation remembers), and the plant's own keys.
+Keys, each [N, ...]: in `action` int64 index (or NO_ACTION, which sets the motor to 0 and ends the episode);
+out `observation` float32, `state` (measured x m, x_dot m/s, theta rad, theta_dot rad/s), `reward` [N, 1],
+`score` (6.2) and `score_upright` (6.1) of this step [N, 1], `step_count` int64 [N, 1], `past` (what the
+observation remembers), and the plant's own keys.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,6 +23,7 @@ from cartpole_rl.compilation import Compiled
 from cartpole_rl.envs.perception import Before, First, Frame, Perceived, perceive, perceive_first
 from cartpole_rl.envs.settings import ObservationSettings, RewardSettings, TaskSettings
 from cartpole_rl.plants.specs import Plant, tensordict_of
+from cartpole_rl.tasks.actions import NO_ACTION
 from cartpole_rl.tasks.features import LENGTH_SCALE
 
 
@@ -39,6 +41,7 @@ class HardwareTransform(Transform):
         super().__init__()
         self.task, self.observation_settings, self.reward = task, observation, reward
         self.register_buffer("motors", torch.tensor(list(motors), dtype=torch.int64))
+        self.register_buffer("_by_action", torch.tensor([0, *motors], dtype=torch.int64))  # from NO_ACTION on
         self._perceive: Callable[[Before, Frame], Perceived] = partial(
             perceive, sight=observation, task=task, learned=reward
         )
@@ -77,10 +80,16 @@ class HardwareTransform(Transform):
 
     # actions down
 
+    def motor_values(self, action: Tensor) -> Tensor:
+        """The motor values of actions, int64 of the same shape; 0 for NO_ACTION.
+
+        Raises IndexError for an action that does not exist.
+        """
+        return self._by_action.index_select(0, action.reshape(-1) - NO_ACTION).reshape(action.shape)
+
     def command(self, tensordict: TensorDictBase) -> TensorDict:
         """The `motor` values [N, 1] of the actions."""
-        motor = self.motors.index_select(0, tensordict.get("action"))
-        return tensordict_of({"motor": motor.unsqueeze(-1)})
+        return tensordict_of({"motor": self.motor_values(tensordict.get("action")).unsqueeze(-1)})
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         return tensordict.update(self.command(tensordict)) if "action" in tensordict else tensordict
@@ -105,6 +114,7 @@ class HardwareTransform(Transform):
             self._label(),
         )
         frame = Frame(*(following.get(key).T for key in Frame._fields))
+        frame = frame._replace(truncated=frame.truncated | (present.get("action") == NO_ACTION))
         return added(following, self._perceive(before, frame))
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:

@@ -12,6 +12,7 @@ import signal
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from multiprocessing.connection import Connection
 from types import FrameType, TracebackType
 from typing import Any, NoReturn
@@ -27,10 +28,13 @@ from cartpole_rl.evaluation.driving_policy import DrivingPolicy, Weights
 from cartpole_rl.evaluation.episodes import rehearse, run_batch
 from cartpole_rl.plants.link_statistics import LinkStatistics
 from cartpole_rl.plants.serial import SerialPlant
+from cartpole_rl.plants.serial_faults import Confirm, nobody
 from cartpole_rl.scheduling import compute_first
+from cartpole_rl.signals import ending_signals
 from cartpole_rl.tasks.episode import Episode
 
 GRACE = 5.0  # s from SIGTERM to SIGKILL
+MakeEnv = Callable[[Confirm], CartPoleEnv]  # over a cart whose faults are cleared if a person agrees
 
 
 @dataclass(frozen=True)
@@ -50,21 +54,31 @@ class Driven:
     link: LinkStatistics
 
 
+@dataclass(frozen=True)
+class Question:
+    """A fault that a person should confirm before it is cleared: True or False is the answer."""
+
+    text: str
+
+
 class Driver:
     """A process that drives the cart of `make_env` with the network of `make_policy`; a context manager.
 
     Both are called in that process, and their arithmetic is compiled there if `compiled`, before the first
-    episode. Where the cart keeps its own clock, `real_time`, the process goes ahead of others if it may;
-    `goes_first` is whether it does. Raises what making the environment raises there.
+    episode. `confirm` is called in this process, which has the terminal, while it waits for a result.
+    Where the cart keeps its own clock, `real_time`, the process goes ahead of others if it may; `goes_first`
+    is whether it does. Raises what making the environment raises there.
     """
 
     def __init__(
         self,
-        make_env: Callable[[], CartPoleEnv],
+        make_env: MakeEnv,
         make_policy: Callable[[], nn.Module],
         compiled: bool,
         real_time: bool,
+        confirm: Confirm = nobody,
     ) -> None:
+        self._confirm = confirm
         context = multiprocessing.get_context("spawn")
         self._ours, theirs = context.Pipe()
         self._process = context.Process(
@@ -117,7 +131,8 @@ class Driver:
 
     def _receive(self) -> Any:
         try:
-            answer = self._ours.recv()
+            while isinstance(answer := self._ours.recv(), Question):
+                self._ours.send(self._confirm(answer.text))
         except (EOFError, ConnectionResetError):
             raise LinkError("the process that drives the cart has died; start again with resume=") from None
         if isinstance(answer, BaseException):
@@ -126,7 +141,7 @@ class Driver:
 
 
 class _Ended(BaseException):
-    """SIGTERM, or the parent is gone: unwinds, so that the motor is stopped."""
+    """SIGTERM or SIGHUP came, or the parent is gone: unwinds, so that the motor is stopped."""
 
 
 def _end(number: int, frame: FrameType | None) -> NoReturn:
@@ -135,18 +150,19 @@ def _end(number: int, frame: FrameType | None) -> NoReturn:
 
 def _serve(
     pipe: Connection,
-    make_env: Callable[[], CartPoleEnv],
+    make_env: MakeEnv,
     make_policy: Callable[[], nn.Module],
     compiled: bool,
     real_time: bool,
     parent: int,
 ) -> None:
-    signal.signal(signal.SIGTERM, _end)
+    for number in ending_signals():
+        signal.signal(number, _end)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent gets it too, and ends this one
     torch.set_num_threads(1)
     try:
         policy = DrivingPolicy(make_policy(), compiled)
-        with closing(make_env()) as env:
+        with closing(make_env(partial(_ask, pipe))) as env:
             if compiled:
                 env.hardware.compile_arithmetic()
             rehearse(env, policy)
@@ -154,9 +170,15 @@ def _serve(
             while True:
                 pipe.send(_drive(env, policy, pipe.recv(), parent))
     except CartPoleError as error:
-        pipe.send(type(error)(*error.args))
+        pipe.send(error)
     except (_Ended, EOFError, BrokenPipeError, ConnectionResetError):
         pass
+
+
+def _ask(pipe: Connection, text: str) -> bool:
+    """Let the process that started this one ask the person at its terminal."""
+    pipe.send(Question(text))
+    return bool(pipe.recv())
 
 
 def _drive(env: CartPoleEnv, policy: DrivingPolicy, drive: Drive, parent: int) -> Driven:

@@ -38,12 +38,13 @@ class DrivingPolicy:
         self._weights = tuple(torch.from_numpy(weights[name]) for name in self.names)
 
     def __call__(self, present: TensorDictBase) -> TensorDictBase:
-        """The `action` [N] for the `observation` of `present` [N]."""
-        (action,) = self._choose(self._weights, (present.get("observation"),))
-        return tensordict_of({"action": action})
+        """The `action` [N] for the `observation` of `present` [N], and the `action_value` [N, A]."""
+        action, value = self._choose(self._weights, (present.get("observation"),))
+        return tensordict_of({"action": action, "action_value": value})
 
-    def _pure(self, weights: Sequence[Tensor], seen: Sequence[Tensor]) -> tuple[Tensor]:
-        """Actions as a function of its arguments alone."""
+    def _pure(self, weights: Sequence[Tensor], seen: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+        """Actions and action values as a function of its arguments alone."""
         present = TensorDict({"observation": seen[0]}, batch_size=seen[0].shape[:1])
         state = dict(zip(self.names, weights, strict=True))
-        return (functional_call(self.network, state, (present,))["action"],)
+        chosen = functional_call(self.network, state, (present,))
+        return chosen["action"], chosen["action_value"]

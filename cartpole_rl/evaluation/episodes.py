@@ -10,12 +10,15 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import torch
 from tensordict import TensorDictBase
+from torch import Tensor
 
 from cartpole_rl.envs import CartPoleEnv
+from cartpole_rl.tasks.actions import NO_ACTION
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
 
-Policy = Callable[[TensorDictBase], TensorDictBase]  # reads `observation`, writes `action`
+# reads `observation` [N, K], writes `action` [N] and `action_value` [N, A], which it chose by
+Policy = Callable[[TensorDictBase], TensorDictBase]
 _FROM_NEXT = ("score", "score_upright", "reward", "done")
 
 
@@ -32,8 +35,22 @@ def run_episodes(env: CartPoleEnv, policy: Policy, episodes: int) -> Iterator[Ep
 def rehearse(env: CartPoleEnv, policy: Policy) -> None:
     """Think a step through on zeros, so that what is compiled or loaded at first use delays no tick."""
     blank = env.fake_tensordict()
-    policy(blank.select("observation"))
+    choose(policy, blank)
     env.hardware.perceive(blank, env.hardware.command(blank), blank["next"])
+
+
+def choose(policy: Policy, present: TensorDictBase) -> Tensor:
+    """The policy's actions [N]; NO_ACTION where the observation or an action value is not finite.
+
+    The largest of values that are not numbers is the first one, which is full motor to the left.
+    """
+    seen = present.select("observation")
+    finite = seen.get("observation").isfinite().all(-1)
+    chosen = policy(seen)
+    values = chosen.get("action_value", None)
+    if values is not None:
+        finite &= values.isfinite().all(-1)
+    return chosen.get("action").where(finite, NO_ACTION)
 
 
 @torch.no_grad()
@@ -43,18 +60,18 @@ def run_batch(env: CartPoleEnv, policy: Policy) -> list[Episode]:
     frames, actions = [present], []
     endings: list[str | None] = [None] * env.plant.carts
     while None in endings:  # a cart waits for what happens here; all that can wait is done below
-        action = policy(present.select("observation")).get("action")
+        action = choose(policy, present)
         following = env.step(present.set("action", action)).get("next")
         actions.append(action)
         frames.append(following)
         if following.get("done").any():
-            _note_endings(env, following, endings)
+            _note_endings(env, action, following, endings)
         present = following.exclude("reward")
     env.plant.halt()  # a real cart keeps its last motor value
     begin, steps = frames[0], frames[1:]
     columns = {key: torch.cat([step[key] for step in steps], 1) for key in _FROM_NEXT}
     columns |= {key: torch.stack([frame[key] for frame in frames], 1) for key in ("state", "counts")}
-    columns["motor"] = env.hardware.motors[torch.stack(actions, 1)]
+    columns["motor"] = env.hardware.motor_values(torch.stack(actions, 1))
     dt = torch.cat([torch.zeros_like(begin["dt"]), *(step["dt"] for step in steps)], 1)
     columns["time"] = dt.cumsum(1)
     arrays = {key: values.cpu().numpy() for key, values in columns.items()}
@@ -65,17 +82,21 @@ def run_batch(env: CartPoleEnv, policy: Policy) -> list[Episode]:
     ]
 
 
-def _note_endings(env: CartPoleEnv, following: TensorDictBase, endings: list[str | None]) -> None:
+def _note_endings(
+    env: CartPoleEnv, action: Tensor, following: TensorDictBase, endings: list[str | None]
+) -> None:
     """Fill in the reason for each cart whose first episode ends now."""
     for row in following["done"].squeeze(-1).nonzero().squeeze(-1).tolist():
         if endings[row] is None:
-            endings[row] = _ending(env, following[row])
+            endings[row] = _ending(env, int(action[row]), following[row])
 
 
-def _ending(env: CartPoleEnv, last: TensorDictBase) -> str:
+def _ending(env: CartPoleEnv, action: int, last: TensorDictBase) -> str:
     reported = getattr(env.plant, "ended_by", "")
     if reported:
         return str(Ending(reported))
+    if action == NO_ACTION:
+        return str(Ending.NON_FINITE)
     if last["truncated"].item():
         return str(Ending.TIME)
     limit = env.hardware.task.angle_limit

@@ -35,5 +35,6 @@ def emulated_plant(
         nudge_after=2.0,
         retries=20 if disturbed else 2,
         pole_length=2 * emulator.pole_com,
+        clear_faults=None,
     )
     return SerialPlant(settings, prompt, owned=cart)

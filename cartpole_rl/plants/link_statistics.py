@@ -54,7 +54,7 @@ class LinkSummary:
 
 @dataclass
 class LinkStatistics:
-    """Running counts since the link was opened, or since `clear`."""
+    """Running counts of one cart over all its connections, without those of opening a port."""
 
     frames_received: int = 0  # whole frames of the cart, of every type
     bad_frames: int = 0  # bytes between two 0x00 that are no frame: checksum, stuffing, type, length

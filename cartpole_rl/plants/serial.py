@@ -11,24 +11,33 @@ import time
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Literal, Protocol
+from typing import Annotated, Literal, Protocol
 
 import torch
+from pydantic import Field
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from cartpole_rl.errors import ConfigError, FaultError, LinkError, PlantError, PortError
 from cartpole_rl.plants.serial_cart import SerialCart, SerialSettings
 from cartpole_rl.plants.serial_errors import RefusedError, fault_error
+from cartpole_rl.plants.serial_faults import Confirm, FaultClearing, nobody
+from cartpole_rl.plants.serial_information import check_scales
 from cartpole_rl.plants.serial_recentring import recentre
 from cartpole_rl.plants.specs import Plant, one_cart
 from cartpole_rl.settings import Positive
-from cartpole_rl.wire import Fault, Flags, State
+from cartpole_rl.wire import (
+    Fault,
+    Flags,
+    State,
+    microseconds_between,
+    seconds_between,
+    ticks_between,
+    went_back,
+)
 
 LOGGER = logging.getLogger(__name__)
 
-CLOCK_WRAP = 2**32  # us; STATE's clock begins anew after 71.6 minutes
-TICK_WRAP = 2**32  # periods
 UPRIGHT_TOLERANCE = math.radians(3)
 HANGING_TOLERANCE = math.radians(5)
 UPRIGHT_SWAY = math.radians(1.5)  # a hand is never quite still
@@ -44,6 +53,7 @@ class SerialPlantSettings(SerialSettings):
     rehome: Literal["once", "always"] = "once"  # once a connection and after what may cost a zero, or always
     home_timeout: Positive = 120.0
     start_timeout: Positive = 60.0  # for the pole to come into its start position
+    clear_faults: Annotated[int, Field(ge=0)] | None = 0  # cleared without asking a person; None: no limit
     pole_length: Positive | None = None  # m, twice pivot to centre of mass; for an agent that observes it
 
 
@@ -62,14 +72,18 @@ class SerialPlant(Plant):
     """One cart on a wire. It connects when it is made, and again in a reset after the link was lost.
 
     A reset stops, clears faults, homes or re-centres the cart (`settings.rehome`), waits for the start (for
-    `upright` it asks a person by `prompt` to hold the pole up), arms, and returns the first state.
+    `upright` it asks a person by `prompt` to hold the pole up), arms, and returns the first state. Faults are
+    cleared when a person agrees by `confirm`, and `settings.clear_faults` times without asking.
     `terminated`: the cart is beyond its soft limit, or latched a fault. `truncated`: the link was lost, or
     the cart restarted; the counts are then the last that came. `ended_by` is the last ending, "track",
     "fault" or "link", and empty while an episode runs; `last_error` is the error behind "fault" or "link".
 
-    Raises PortError or LinkError when it cannot connect; a reset raises LinkError after a loss that stays,
-    FaultError for a fault that does not clear or a homing that fails, and PlantError if the start is not
-    reached in time. `owned` is closed with the plant.
+    Once an episode has ended, steps send nothing until the next reset and repeat the last frame.
+
+    Raises PortError or LinkError when it cannot connect, NotReadyError if INFO describes another kind of
+    cart. A reset raises LinkError after a loss that stays, FaultError for a fault that does not clear or that
+    nobody agrees to clear, or for a homing that fails, and PlantError if the start is not reached in time.
+    `owned` is closed with the plant.
     """
 
     def __init__(
@@ -77,6 +91,7 @@ class SerialPlant(Plant):
         settings: SerialPlantSettings,
         prompt: Callable[[str], None] = print,
         owned: Owned | None = None,
+        confirm: Confirm = nobody,
     ) -> None:
         super().__init__(carts=1)
         self.settings = settings
@@ -86,10 +101,11 @@ class SerialPlant(Plant):
         self._hanging: int | None = None  # pole count after homing; None before it, and once it may be wrong
         self._turns = 0  # pole counts of the whole turns that the pole has made before this episode
         self._prompt = prompt
+        self._faults = FaultClearing(settings.clear_faults, confirm)
         self._owned = owned
         self._state = State(0, 0, 0, 0, 0, 0, 0, 0)
         try:
-            self.cart.open()
+            self._connect()
         except BaseException:
             self.close()
             raise
@@ -131,18 +147,20 @@ class SerialPlant(Plant):
         return self.frame(*self._report(self.settings.control_period))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
+        if self.ended_by:
+            return self.step_frame(*self._report(self.settings.control_period))
         before = self._state
         try:
             self.cart.set_motor(int(tensordict["motor"]))
             state = self.cart.get_state()
-            if (state.tick - before.tick) % TICK_WRAP > TICK_WRAP // 2:
+            if went_back(ticks_between(before.tick, state.tick)):
                 raise LinkError("the cart has restarted; check its power")
             self._state = state
         except (LinkError, RefusedError, FaultError) as error:
             self._break_off(error)
             return self.step_frame(*self._report(self.settings.control_period))
         self._end_if_due()
-        return self.step_frame(*self._report(((self._state.time_us - before.time_us) % CLOCK_WRAP) * 1e-6))
+        return self.step_frame(*self._report(seconds_between(before.time_us, self._state.time_us)))
 
     def _end_if_due(self) -> None:
         """Set `ended_by` and stop the motor if the new state ends the episode."""
@@ -190,22 +208,31 @@ class SerialPlant(Plant):
             self.cart.close()
         self._hanging = None
         try:
-            self.cart.open()
+            self._connect()
         except (PortError, LinkError) as error:
             lost = f" ({self.last_error})" if self.last_error else ""
             why = self._owned.died if self._owned is not None and self._owned.died else error
             raise LinkError(f"the link to the cart was lost{lost} and is not there again: {why}") from error
 
+    def _connect(self) -> None:
+        """Open the port and check the cart's scales. Raises PortError, LinkError, NotReadyError."""
+        self.cart.open()
+        check_scales(self.cart.information)
+
+    def _clear_faults(self) -> None:
+        """Clear latched faults if there are any and somebody agrees. Raises FaultError."""
+        if fault := self.cart.poll_state().fault:
+            self._hanging = None
+            self._faults.clear(self.cart, fault)
+
     def _make_ready(self) -> None:
         """Clear faults, find the middle, set the period, and wait for the pole in its start position."""
-        if self.cart.poll_state().fault:
-            self._hanging = None
-            self.cart.clear_fault()
+        self._clear_faults()
         if not self._is_recentred():
             self._hanging = None
             self._hanging = self.cart.home(self.settings.home_timeout).pole_counts
         period_us = round(self.settings.control_period * 1e6)
-        if self.cart.info().period_us != period_us:  # and its limits are those of the span just measured
+        if self.cart.info().period_us != period_us:  # the cart may have restarted since it was last asked
             self.cart.set_period(period_us)
         self.cart.get_state()  # read before more is asked, so that a lockstep run is the same each time
         if self.settings.start == "upright":
@@ -228,8 +255,7 @@ class SerialPlant(Plant):
             raise
         except PlantError as error:
             LOGGER.warning("homing, as the cart could not be brought back to the middle: %s", error)
-            if self.cart.poll_state().fault:
-                self.cart.clear_fault()
+            self._clear_faults()
             return False
         return True
 
@@ -245,7 +271,7 @@ class SerialPlant(Plant):
             window.append((state.time_us, pole))
             if abs(off) > tolerance or _spread(window) > sway:
                 window.clear()
-            elif (state.time_us - window[0][0]) % CLOCK_WRAP >= STILL_SECONDS * 1e6:
+            elif microseconds_between(window[0][0], state.time_us) >= STILL_SECONDS * 1e6:
                 return
             if time.perf_counter() > deadline:
                 raise PlantError(

@@ -32,6 +32,7 @@ from pydantic import Field
 from cartpole_rl.errors import LinkError, PlantError
 from cartpole_rl.plants.link_statistics import LinkStatistics
 from cartpole_rl.plants.serial_errors import RefusedError, fault_error, refusal
+from cartpole_rl.plants.serial_information import LONGEST_PERIOD_US, check_limits, check_scales
 from cartpole_rl.plants.serial_link import SerialLink
 from cartpole_rl.plants.serial_port import open_port, resolved_port
 from cartpole_rl.settings import Count, Positive, Settings
@@ -51,6 +52,9 @@ from cartpole_rl.wire import (
     Start,
     State,
     Stop,
+    microseconds_between,
+    ticks_between,
+    went_back,
 )
 from cartpole_rl.wire.frames import END
 
@@ -58,12 +62,9 @@ LOGGER = logging.getLogger(__name__)
 
 Answer = TypeVar("Answer", bound=Message)
 
-TICKS = 2**32  # STATE's tick wraps here
-TIMES = 2**32  # us, and its time
 HALF_MILLISECOND = 500  # us
 OVERTAKEN_TICKS = 16  # 0.3 s: nothing keeps a frame back for longer, and no cart boots and is driven so soon
 BACKLOG_BYTES = 1000  # with more waiting, the system's buffer (4096) may have thrown newer bytes away
-LONGEST_PERIOD_US = 100_000  # that the protocol allows, whatever INFO says
 UNACKNOWLEDGED_PERIODS = 1.5  # of a frame: by then the state after it has come, if the frame has
 
 
@@ -105,7 +106,7 @@ class SerialCart:
         self._information: Info | None = None
         self._newest: State | None = None  # arrived, and not yet given to anyone
         self._newest_at = 0.0
-        self._last_tick: int | None = None
+        self._last: State | None = None  # the newest that came, given out or not
         self._missing: set[int] = set()  # ticks that were counted as lost, and may still come late
         self._answers: deque[Message] = deque(maxlen=64)
         self._refused: Nack | None = None  # of a SET_MOTOR
@@ -142,6 +143,7 @@ class SerialCart:
         settings = self.settings
         self.port = resolved_port(settings.port)
         port = open_port(self.port, settings.baud, settings.write_timeout)
+        driving, self.statistics = self.statistics, LinkStatistics()  # a boot banner is no fault of the link
         self._open_link = SerialLink(port, self.statistics)
         try:
             self._information = self._shake_hands()
@@ -149,8 +151,10 @@ class SerialCart:
         except BaseException:
             self._abandon()
             raise
-        self.statistics.clear()  # a boot banner is no fault of the link
-        return self.information
+        finally:
+            self.statistics = driving
+        self._open_link.statistics = driving
+        return self._information
 
     def close(self) -> None:
         """Motor to 0, disarm, give the port back. Never raises, so that no error hides another."""
@@ -181,7 +185,13 @@ class SerialCart:
         return self._information
 
     def start(self) -> None:
-        """Arm the motor. Raises RefusedError if the cart is not homed, FaultError if a fault is latched."""
+        """Arm the motor. Every way to drive a cart goes through here.
+
+        Raises NotReadyError if INFO describes another kind of cart than the one that is driven here,
+        RefusedError if the cart is not homed, FaultError if a fault is latched.
+        """
+        check_scales(self.information)
+        check_limits(self.information)
         self._request(Start(), Ack)
 
     def stop(self) -> None:
@@ -204,6 +214,7 @@ class SerialCart:
     def home(self, timeout: float = 120.0) -> State:
         """Home, and wait until it is done: zeros set, the cart in the middle, the pole hanging still.
 
+        Returns the state after it; `information` then has the limits that follow from the measured span.
         Raises FaultError if homing fails, PlantError if it takes longer than `timeout` seconds.
         """
         try:
@@ -217,7 +228,8 @@ class SerialCart:
             if state.fault:
                 raise fault_error(state.fault)
             if self.flags & Flags.HOMED and not self.flags & Flags.HOMING:
-                return state
+                self.info()  # the limits are now those of the span that was measured
+                return self.get_state()
             if time.perf_counter() > deadline:
                 self.stop()
                 raise PlantError(
@@ -291,7 +303,7 @@ class SerialCart:
             self._let_go(link)
 
     def _let_go(self, link: SerialLink) -> None:
-        self._open_link = self._newest = self._last_tick = self._refused = None
+        self._open_link = self._newest = self._last = self._refused = None
         self._missing.clear()
         link.close()
 
@@ -432,28 +444,39 @@ class SerialCart:
 
     def _take_state(self, state: State, flags: Flags) -> None:
         """Keep the state as the newest, unless a newer one is here; count those missing before it."""
-        if self._last_tick is not None:
-            if (self._last_tick - state.tick) % TICKS < OVERTAKEN_TICKS:
+        last = self._last
+        if last is not None:
+            if ticks_between(state.tick, last.tick) < OVERTAKEN_TICKS:
                 self._count_overtaken(state.tick)
                 return
-            missing = (state.tick - self._last_tick - 1) % TICKS
-            if missing < TICKS // 2:  # otherwise the tick went back: the cart has restarted
-                self._count_missing(state.tick, missing)
+            ticks = ticks_between(last.tick, state.tick)
+            if not went_back(ticks):  # otherwise the cart has restarted
+                self._check_clock(last, state)
+                self._count_missing(state.tick, ticks - 1)
         if self._newest is not None:
             self._count_late()
-        self._last_tick = state.tick
+        self._last = state
         self._newest = state
         self._state_since_refusal = True
         self._newest_at = self._link.received_at
         self.flags = flags
+
+    def _check_clock(self, last: State, state: State) -> None:
+        """Raise LinkError if the cart's clock did not advance between two states: no velocity follows."""
+        passed = microseconds_between(last.time_us, state.time_us)
+        if passed == 0 or went_back(passed):
+            raise LinkError(
+                f"the clock of the cart on {self.port} does not advance: STATE {last.tick} is of "
+                f"{last.time_us} us, STATE {state.tick} of {state.time_us} us; correct its firmware"
+            )
 
     def _count_missing(self, tick: int, states: int) -> None:
         """States before `tick` that did not come: lost on the way, or thrown away while the host was busy."""
         if not self._catching_up:
             self.statistics.lost_frames += states
             newest = min(states, OVERTAKEN_TICKS)
-            missing = self._missing | {(tick - age) % TICKS for age in range(1, newest + 1)}
-            self._missing = {each for each in missing if (tick - each) % TICKS < OVERTAKEN_TICKS}
+            missing = self._missing | {ticks_between(age, tick) for age in range(1, newest + 1)}
+            self._missing = {each for each in missing if ticks_between(each, tick) < OVERTAKEN_TICKS}
         elif self._driving:
             self.statistics.late_ticks += states
 
@@ -461,9 +484,8 @@ class SerialCart:
         """A state that a newer one has overtaken, and so was not lost; or one that came before, once more."""
         if tick in self._missing:
             self._missing.remove(tick)
-            self.statistics.lost_frames = max(
-                0, self.statistics.lost_frames - 1
-            )  # 0 where it was cleared since
+            seen = self.statistics
+            seen.lost_frames = max(0, seen.lost_frames - 1)  # its loss may not have been counted
             self.statistics.overtaken_frames += 1
         else:
             self.statistics.repeated_frames += 1
@@ -471,7 +493,7 @@ class SerialCart:
     def _count_overdue(self, state: State) -> None:
         """A state whose command took over a period, if by the cart's clock too more than one lies between."""
         overdue, self._overdue = self._overdue, None
-        if overdue is not None and state.tick != (overdue.tick + 1) % TICKS:
+        if overdue is not None and ticks_between(overdue.tick, state.tick) != 1:
             self.statistics.late_ticks += 1
 
     def _time_loop(self, state: State) -> None:
@@ -482,8 +504,8 @@ class SerialCart:
         commanded, self._commanded = self._commanded, None
         if commanded is None or state.last_sequence != commanded[0]:
             return
-        passed_us = (state.time_us - commanded[1].time_us) % TIMES
-        if passed_us < TIMES // 2:  # otherwise the cart has restarted
+        passed_us = microseconds_between(commanded[1].time_us, state.time_us)
+        if not went_back(passed_us):  # otherwise the cart has restarted
             since_us = passed_us - 1000 * state.command_age_ms
             self.statistics.loop_times.add(max(0, since_us - HALF_MILLISECOND) * 1e-6)
 

@@ -12,6 +12,14 @@ class RefusedError(PlantError):
         self.reason = reason
 
 
+class NotReadyError(PlantError):
+    """A check or a move failed: `found` says what is wrong, `remedy` what to do."""
+
+    def __init__(self, found: str, remedy: str) -> None:
+        super().__init__(f"{found}: {remedy}")
+        self.found, self.remedy = found, remedy
+
+
 REASONS: dict[int, str] = {
     Reason.UNKNOWN_TYPE: "it does not know this message: update its firmware",
     Reason.BAD_LENGTH: "the payload has the wrong length: update its firmware, or this program",
@@ -43,10 +51,15 @@ def refusal(nack: Nack) -> PlantError:
     return RefusedError(text, Reason(nack.reason) if nack.reason in REASONS else nack.reason)
 
 
-def fault_error(bits: int) -> FaultError:
-    """The error that names every fault in `bits`, each with its remedy."""
+def fault_words(bits: int) -> str:
+    """Every fault in `bits` in words, each with its remedy."""
     named = [words for fault, words in FAULTS.items() if bits & fault]
     unknown = bits & ~sum(FAULTS)
     if unknown:
         named.append(f"bits {unknown:#06x}, unknown here")
-    return FaultError(f"the cart latched a fault: {'; '.join(named)}; then clear_fault()")
+    return "; ".join(named)
+
+
+def fault_error(bits: int) -> FaultError:
+    """The error that names every fault in `bits`, each with its remedy."""
+    return FaultError(f"the cart latched a fault: {fault_words(bits)}; then clear_fault()")

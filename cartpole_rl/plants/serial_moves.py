@@ -3,10 +3,9 @@
 import math
 from dataclasses import dataclass
 
-from cartpole_rl.errors import PlantError
+from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT
 from cartpole_rl.plants.serial_cart import SerialCart
-from cartpole_rl.plants.serial_errors import fault_error
-from cartpole_rl.tasks.features import CART_METRES_PER_COUNT
+from cartpole_rl.plants.serial_errors import NotReadyError, fault_error
 from cartpole_rl.wire import State
 
 GENTLE_MOTOR = 199  # motor value; from 200 on the cart watches for stalls
@@ -14,14 +13,6 @@ REST_SECONDS = 0.3
 REST_COUNTS = 2  # of the cart
 LONGEST_REST = 10.0  # s
 SWING_SECONDS = 1.5  # a whole swing of the large pole takes 1.3 s
-
-
-class NotReadyError(PlantError):
-    """A check or a move failed: `found` says what is wrong, `remedy` what to do."""
-
-    def __init__(self, found: str, remedy: str) -> None:
-        super().__init__(f"{found}: {remedy}")
-        self.found, self.remedy = found, remedy
 
 
 @dataclass

@@ -15,19 +15,18 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 
 from cartpole_rl.errors import PlantError
+from cartpole_rl.physics.encoders import POLE_COUNTS_PER_TURN
 from cartpole_rl.plants.serial_cart import SerialCart
-from cartpole_rl.plants.serial_moves import GENTLE_MOTOR, ArmedCart, NotReadyError, metres
-from cartpole_rl.tasks.features import CART_METRES_PER_COUNT, POLE_COUNTS_PER_TURN
-from cartpole_rl.wire import Flags, Info, State
+from cartpole_rl.plants.serial_errors import NotReadyError
+from cartpole_rl.plants.serial_faults import FaultClearing
+from cartpole_rl.plants.serial_information import NANOMETRES_PER_COUNT, check_limits, check_scales
+from cartpole_rl.plants.serial_moves import GENTLE_MOTOR, ArmedCart, metres
+from cartpole_rl.wire import Flags, Info, State, seconds_between, ticks_between
 
 QUESTIONS = 25  # asked over the link
 LOST_SHARE = 0.05  # of the frames; a good cable loses none
 PERIOD_TOLERANCE = 0.02  # of the period that INFO tells
 ROUND_TRIP_SHARE = 0.5  # of a period: a command that comes later acts in the next one
-
-HALF_SPAN = 0.407  # m, Quanser IP02: middle of the track to a stop
-SPAN_TOLERANCE = 0.05  # homing takes 3 %
-MOTOR_LIMIT = 255
 
 CENTRED = 0.004  # m
 FARTHEST = 0.08  # m from the middle: no check needs more
@@ -130,17 +129,20 @@ class Moves(ArmedCart):
         return state
 
 
-def preflight(cart: SerialCart, home_timeout: float = 120.0) -> Iterator[Finding]:
+def preflight(
+    cart: SerialCart, home_timeout: float = 120.0, faults: FaultClearing | None = None
+) -> Iterator[Finding]:
     """Check a cart, which need not be open yet, in an order in which no check builds on one that failed.
 
     Yields a finding each; ends after the first that is not ready. The cart is disarmed at the end, and left
-    open. Errors of the link and faults of the cart are findings too.
+    open. Errors of the link and faults of the cart are findings too. `faults` decides whether a latched fault
+    may be cleared; without it none is.
     """
-    moves = Moves(cart)
+    moves, clearing = Moves(cart), faults or FaultClearing(0)
     checks: dict[str, Callable[[], str]] = {
         "link": lambda: link(cart),
         "limits": lambda: limits(cart.information),
-        "homing": lambda: homing(cart, home_timeout),
+        "homing": lambda: homing(cart, home_timeout, clearing),
         "cart encoder": lambda: cart_direction(moves),
         "pole encoder": lambda: pole_direction(moves),
         "dead-band": lambda: deadband(moves),
@@ -172,7 +174,7 @@ def link(cart: SerialCart) -> str:
         trips.append(time.perf_counter() - asked)
         last = cart.poll_state()
     trip, period = statistics.median(trips), information.period_us * 1e-6
-    measured = ((last.time_us - first.time_us) % 2**32) * 1e-6 / max(1, (last.tick - first.tick) % 2**32)
+    measured = seconds_between(first.time_us, last.time_us) / max(1, ticks_between(first.tick, last.tick))
     seen = cart.statistics
     bad = seen.bad_frames + seen.lost_frames
     if bad > LOST_SHARE * (seen.frames_received + seen.lost_frames):
@@ -199,36 +201,23 @@ def link(cart: SerialCart) -> str:
 
 
 def limits(information: Info) -> str:
-    """Whether INFO describes a cart like the one that everything above the wire takes it for."""
-    nanometres = round(CART_METRES_PER_COUNT * 1e9)
-    constants = {
-        "cart nm a count": (information.cart_nanometres_per_count, nanometres),
-        "pole counts a turn": (information.pole_counts_per_turn, POLE_COUNTS_PER_TURN),
-        "motor limit": (information.motor_limit, MOTOR_LIMIT),
-    }
-    for name, (told, right) in constants.items():
-        if told != right:
-            raise NotReadyError(f"INFO says {name} {told}, not {right}", "correct the firmware's settings")
+    """Check that INFO describes the kind of cart that everything above the wire takes it for."""
+    check_scales(information)
+    check_limits(information)
     soft, hard = metres(information.soft_limit_counts), metres(information.hard_limit_counts)
-    if not 0.5 * HALF_SPAN < soft < hard < (1 + SPAN_TOLERANCE) * HALF_SPAN:
-        raise NotReadyError(
-            f"INFO says soft limit {soft * 1e3:.0f} mm, hard limit {hard * 1e3:.0f} mm from the middle; the "
-            f"soft one comes first, and both in the outer half of the {HALF_SPAN * 1e3:.0f} mm to a stop",
-            "correct the firmware's limits",
-        )
     return (
-        f"soft {soft * 1e3:.0f} mm, hard {hard * 1e3:.0f} mm from the middle; {nanometres} nm and "
+        f"soft {soft * 1e3:.0f} mm, hard {hard * 1e3:.0f} mm from the middle; {NANOMETRES_PER_COUNT} nm and "
         f"1/{POLE_COUNTS_PER_TURN} turn a count"
     )
 
 
-def homing(cart: SerialCart, timeout: float) -> str:
+def homing(cart: SerialCart, timeout: float, faults: FaultClearing) -> str:
     """Home; then the cart is in the middle, the pole hangs, and the limits fit the track."""
-    if cart.poll_state().fault:
-        cart.clear_fault()
+    if fault := cart.poll_state().fault:
+        faults.clear(cart, fault)
     began = cart.get_state().time_us
     state = cart.home(timeout)
-    limits(cart.info())
+    limits(cart.information)
     pole = (state.pole_counts - POLE_COUNTS_PER_TURN // 2) * 360 / POLE_COUNTS_PER_TURN
     if abs(metres(state.cart_counts)) > 0.01 or abs(pole) > 2:
         raise NotReadyError(
@@ -236,7 +225,7 @@ def homing(cart: SerialCart, timeout: float) -> str:
             f"the pole {pole:+.1f} deg from hanging",
             "keep hands off during homing, check that no gear slips",
         )
-    seconds = ((state.time_us - began) % 2**32) * 1e-6
+    seconds = seconds_between(began, state.time_us)
     off = metres(state.cart_counts) * 1e3
     return f"{seconds:.0f} s; the cart {off:+.1f} mm from the middle, the pole {pole:+.1f} deg from hanging"
 
@@ -342,7 +331,7 @@ def step_latency(moves: Moves, side: int) -> tuple[float, float]:
             f"motor value {value:+d} does not move the cart evenly within {LONGEST_PUSH:g} s",
             "free the cart; look for a ramp or a filter in the motor driver",
         )
-    first, second = (((state.time_us - taken_us) % 2**32) * 1e-6 for state in states[-2:])
+    first, second = (seconds_between(taken_us, state.time_us) for state in states[-2:])
     ratio = math.sqrt(ways[0] / ways[1])
     return max(0.0, (first - ratio * second) / (1 - ratio)), age
 

@@ -12,19 +12,18 @@ import math
 from contextlib import suppress
 
 from cartpole_rl.errors import PlantError
+from cartpole_rl.physics.encoders import POLE_RADIANS_PER_COUNT
 from cartpole_rl.plants.serial_cart import SerialCart
+from cartpole_rl.plants.serial_errors import NotReadyError
 from cartpole_rl.plants.serial_moves import (
     GENTLE_MOTOR,
     SWING_SECONDS,
     ArmedCart,
-    NotReadyError,
     metres,
     spread,
 )
-from cartpole_rl.tasks.features import POLE_RADIANS_PER_COUNT
-from cartpole_rl.wire import State
+from cartpole_rl.wire import State, seconds_between
 
-CLOCK_WRAP = 2**32  # us
 ROLLING_PERIODS, ROLLING = 10, 0.04  # m in so many periods, 0.2 m/s: a cart that still rolls
 LONGEST_ROLLING = 5.0  # s
 
@@ -91,7 +90,7 @@ def stop_rolling(cart: SerialCart) -> None:
     while len(counts) <= ROLLING_PERIODS or metres(spread(counts[-ROLLING_PERIODS - 1 :])) > ROLLING:
         newest = cart.poll_state()
         counts.append(newest.cart_counts)
-        if (newest.time_us - began) % CLOCK_WRAP > LONGEST_ROLLING * 1e6:
+        if seconds_between(began, newest.time_us) > LONGEST_ROLLING:
             raise NotReadyError("the cart rolls on with its motor off", "put the track level")
     if abs(newest.cart_counts) >= cart.information.hard_limit_counts:
         raise NotReadyError("the cart stands at the end of the track", "home it")
@@ -173,7 +172,7 @@ def rough_motor(force: float) -> int:
 
 def interval(before: State, state: State) -> float:
     """Seconds between two states by the cart's clock."""
-    return ((state.time_us - before.time_us) % CLOCK_WRAP) * 1e-6
+    return seconds_between(before.time_us, state.time_us)
 
 
 def within(limit: float, value: float) -> float:

@@ -14,6 +14,8 @@ from cartpole_rl.physics.dynamics import Drive, Models, State, run_period
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.tasks.features import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 
+LARGEST_COUNT = 2**30  # STATE's counts are 32-bit numbers
+
 
 class Carts(NamedTuple):
     """All that the next period depends on, in few tensors: each one more costs time in every call."""
@@ -61,7 +63,7 @@ def run_carts(
         torch.stack((drive.force, *drive.motors)),
         encoder_counts(state, cart, given.chance),
         motor_in_force(drive.motors, cart.latency, period),
-        (state.x.abs() > cart.track_half_length).unsqueeze(0),
+        ~(state.x.abs() <= cart.track_half_length).unsqueeze(0),  # also where it is not a number
     )
 
 
@@ -69,7 +71,8 @@ def encoder_counts(state: State, cart: CartParameters, chance: Tensor) -> Tensor
     """Counts [2, N] int64 of the true state, with the zero's error and the noise of `chance` [3, N]."""
     x = state.x + chance[1] * cart.position_noise
     theta = state.theta + cart.angle_offset + chance[2] * cart.angle_noise
-    return torch.stack((x / CART_METRES_PER_COUNT, theta / POLE_RADIANS_PER_COUNT)).round().long()
+    counts = torch.stack((x / CART_METRES_PER_COUNT, theta / POLE_RADIANS_PER_COUNT)).round()
+    return counts.nan_to_num(0.0).clamp(-LARGEST_COUNT, LARGEST_COUNT).long()
 
 
 def motor_in_force(motors: Sequence[Tensor], latency: Tensor, period: float) -> Tensor:

@@ -6,6 +6,8 @@ from pydantic import Field, model_validator
 
 from cartpole_rl.settings import Settings
 
+NO_ACTION = -1  # what a policy without a finite choice gives: the motor goes to 0 and the episode ends
+
 Motor = Annotated[int, Field(ge=-255, le=255)]
 
 

@@ -16,6 +16,7 @@ class Ending(StrEnum):
     TRACK = "track"  # terminated: the cart left the track
     FAULT = "fault"  # terminated: the cart latched a fault
     LINK = "link"  # truncated: the cart stopped answering
+    NON_FINITE = "non_finite"  # truncated: an observation or an action value was not finite
 
 
 def fallen(state: Measured, angle_limit: float | None) -> Tensor:

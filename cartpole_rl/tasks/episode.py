@@ -25,7 +25,7 @@ class Episode:
     score: Array  # [T] equation (6.2) of each step, at state t+1
     score_upright: Array  # [T] equation (6.1) of each step, at state t+1
     reward: Array  # [T]
-    ended_by: str  # "time", "track", "angle", "fault", "link"
+    ended_by: str  # an `endings.Ending`
 
     @property
     def steps(self) -> int:

@@ -89,7 +89,7 @@ def test_what_it_expects_comes_true(ip02: dict[str, float], make_plant: MakePlan
 def test_the_nearest_force_is_chosen(ip02: dict[str, float]) -> None:
     policy = baseline(ip02, "medium")  # 1, 2, 3, 4 N at 100, 150, 200, 250
     wanted = torch.tensor([0.4, 0.6, -2.6, 99.0, -99.0])
-    assert policy.motors[policy.nearest(wanted)].tolist() == [0, 100, -200, 250, -250]
+    assert policy.motors[policy.value(wanted).argmax(-1)].tolist() == [0, 100, -200, 250, -250]
 
 
 def test_it_brakes_before_the_end_of_the_track(ip02: dict[str, float]) -> None:

@@ -8,7 +8,8 @@ from collections import defaultdict
 from pathlib import Path
 
 import pytest
-from command_line import Outcome, console_script, in_process, outcome
+import torch
+from command_line import ONCE, TINY, Outcome, console_script, in_process, outcome
 from tensorboard.backend.event_processing.event_file_loader import EventFileLoader
 
 from cartpole_rl.commands.build import trained_agent
@@ -75,6 +76,18 @@ def test_tensorboard_shows_cart_and_simulation_side_by_side(tuned: tuple[Path, O
     assert steps["cart/score_after"] == [4]
     assert steps["cart/score_in_simulation"] == [1, 2, 3]
     assert steps["link/late_ticks"] == [1, 2, 3, 4]
+
+
+def test_an_agent_that_observes_the_poles_length_is_tuned(tmp_path: Path) -> None:
+    """Its own transitions on the cart have that length; without it every weight would be lost."""
+    words = (*TINY, ONCE, "actions=two", "observation=history_length", "hydra.run.dir=trained")
+    assert in_process("train", *words, folder=tmp_path).code == 0
+    done = finetune(tmp_path / "trained", tmp_path, "emulator.pole_com=0.18")
+    assert done.code == 0, done.err
+    tuned = torch.load(tmp_path / "run/checkpoints/last.pt", weights_only=True)["weights"]
+    assert all(weight.isfinite().all() for weight in tuned.values())
+    heading = (tmp_path / "run/recordings/tune_000.csv").read_text()
+    assert "# pole_length_m: 0.3600" in heading
 
 
 def test_a_tuned_agent_is_evaluated_like_any_other(tuned: tuple[Path, Outcome], tmp_path: Path) -> None:

@@ -114,6 +114,42 @@ def test_the_angle_of_a_pole_that_turns_over_is_not_wrapped(
     assert np.abs(np.diff(episode.theta)).max() < math.pi
 
 
+@pytest.mark.parametrize("unsound", [math.nan, math.inf, -math.inf])
+def test_an_action_value_that_is_not_finite_stops_the_motor_and_ends_the_episode(
+    make_plant: Callable, make_environment: Callable, unsound: float
+) -> None:
+    """On one cart of three, in the fifth period. Of values that are not numbers the first is the largest."""
+    env, periods = make_environment(make_plant(3), motors=(-200, 0, 200), time_limit=20), iter(range(100))
+
+    def policy(seen: TensorDictBase) -> TensorDictBase:
+        values = torch.zeros(3, 3)
+        values[:, RIGHT] = 1
+        if next(periods) == 5:  # the first call is a rehearsal
+            values[1, 0] = unsound
+        return seen.set("action_value", values).set("action", values.argmax(-1))
+
+    episodes = list(run_episodes(env, policy, 3))
+    assert [episode.ended_by for episode in episodes] == ["time", "non_finite", "time"]
+    assert episodes[1].motor.tolist() == [200] * 4 + [0]
+    assert (episodes[0].motor == 200).all()
+
+
+def test_an_observation_that_is_not_finite_stops_the_motor_and_ends_the_episode(
+    make_plant: Callable, make_environment: Callable
+) -> None:
+    env = make_environment(make_plant(1), motors=(-200, 0, 200))
+    perceive, periods = env.hardware._perceive, iter(range(100))
+
+    def spoil(*arguments: object) -> object:
+        seen = perceive(*arguments)
+        return seen._replace(observation=seen.observation * (math.nan if next(periods) == 4 else 1))
+
+    env.hardware._perceive = spoil
+    (episode,) = run_episodes(env, always(RIGHT), 1)
+    assert episode.ended_by == "non_finite"
+    assert episode.motor.tolist() == [200] * 4 + [0]
+
+
 def test_the_same_seed_gives_the_same_episodes(make_plant: Callable, make_environment: Callable) -> None:
     env: CartPoleEnv = make_environment(make_plant(8, start=scattered(Start.ANY)), time_limit=20)
     runs = []

@@ -285,6 +285,36 @@ class TestStates:
                 assert cart.get_state().cart_counts == 5
                 peer.answer = lambda frame: CartPeer.answer(peer, frame)
 
+    @pytest.mark.parametrize("passed_us", [0, -20_000, -1])
+    def test_a_clock_that_does_not_advance_with_the_tick_is_refused(self, passed_us: int) -> None:
+        with CartPeer(paced=True) as peer, SerialCart(settings(peer.port)) as cart:
+            peer.tick()
+            before = cart.get_state()
+            peer.tick(time_us=before.time_us + passed_us)
+            with pytest.raises(LinkError, match=rf"does not advance: STATE {before.tick} is of"):
+                cart.get_state()
+
+    def test_statistics_of_all_connections_are_kept(self) -> None:
+        """A reconnection adds to them, but neither a boot banner nor what was said before it does."""
+        with CartPeer(boot=b"ets Jul 29 2019\r\n\x00", paced=True) as peer:
+            with SerialCart(settings(peer.port)) as cart:
+                peer.tick()
+                peer.tick(tick=peer.state.tick + 3)
+                cart.get_state()
+                peer.send(b"no frame\x00")
+                peer.tick()
+                cart.get_state()
+            seen = cart.statistics
+            first = (seen.lost_frames, seen.bad_frames)
+            assert first == (2, 1)
+            with cart:
+                peer.tick(tick=peer.state.tick + 2)
+                cart.get_state()
+                peer.tick(tick=peer.state.tick + 2)
+                cart.get_state()
+            assert (seen.lost_frames, seen.bad_frames) == (3, 1)
+            assert cart.statistics is seen
+
     def test_gaps_in_the_tick_are_lost_frames(self) -> None:
         with CartPeer(paced=True) as peer, SerialCart(settings(peer.port)) as cart:
             peer.tick(tick=2**32 - 2)

@@ -10,6 +10,7 @@ from tensordict import TensorDict
 
 from cartpole_rl.errors import FaultError, LinkError, PlantError, PortError
 from cartpole_rl.plants.serial import SerialPlant, SerialPlantSettings
+from cartpole_rl.plants.serial_errors import NotReadyError
 from cartpole_rl.wire import ClearFault, Fault, Flags, Frame, Home, SetMotor, Start, Stop
 
 
@@ -84,9 +85,57 @@ def test_a_hard_limit_is_an_ending_on_the_track(peer: CartPeer, plant: SerialPla
     assert plant.ended_by == "track"
 
 
-def test_a_fault_ends_the_episode_and_is_cleared_in_the_next_reset(
-    peer: CartPeer, plant: SerialPlant
+@pytest.mark.parametrize("fault", list(Fault))
+def test_a_latched_fault_is_not_cleared_with_nobody_asked(
+    peer: CartPeer, plant: SerialPlant, fault: Fault
 ) -> None:
+    plant.reset()
+    peer.state = replace(peer.state, fault=int(fault))
+    assert step(plant, 100)["terminated"]
+    homings = len(peer.messages(Home))
+    with pytest.raises(FaultError, match=r"check the cart, then start again in a terminal and confirm"):
+        plant.reset()
+    assert not peer.messages(ClearFault)
+    assert len(peer.messages(Home)) == homings
+
+
+def test_a_person_who_agrees_lets_a_fault_be_cleared(peer: CartPeer) -> None:
+    asked: list[str] = []
+
+    def agree(text: str) -> bool:
+        asked.append(text)
+        return True
+
+    peer._carry_out = lambda message: clear(peer, message)
+    plant = SerialPlant(settings(peer.port), confirm=agree)
+    plant.reset()
+    for _ in range(2):
+        peer.state = replace(peer.state, fault=int(Fault.STALL))
+        step(plant, 100)
+        plant.reset()
+    assert len(asked) == 2
+    assert "the motor was driven but the cart did not move" in asked[0]
+    assert len(peer.messages(Home)) == 3  # once at first, and after each fault
+    plant.close()
+
+
+def test_unattended_work_gives_up_after_the_stated_number_of_faults(peer: CartPeer) -> None:
+    peer._carry_out = lambda message: clear(peer, message)
+    plant = SerialPlant(settings(peer.port, clear_faults=2))
+    plant.reset()
+    for _ in range(2):
+        peer.state = replace(peer.state, fault=int(Fault.POLE_ENCODER))
+        step(plant, 100)
+        plant.reset()
+    peer.state = replace(peer.state, fault=int(Fault.POLE_ENCODER))
+    step(plant, 100)
+    with pytest.raises(FaultError, match=r"2 faults were cleared unattended \(plant.clear_faults\): check"):
+        plant.reset()
+    plant.close()
+
+
+def test_a_fault_ends_the_episode_and_is_cleared_in_the_next_reset(peer: CartPeer) -> None:
+    plant = SerialPlant(settings(peer.port, clear_faults=2))
     plant.reset()
     peer.state = replace(peer.state, fault=int(Fault.STALL))
     frame = step(plant, 0)
@@ -99,6 +148,52 @@ def test_a_fault_ends_the_episode_and_is_cleared_in_the_next_reset(
     peer._carry_out = lambda message: clear(peer, message)
     assert not plant.reset()["done"]
     assert plant.ended_by == ""
+    plant.close()
+
+
+def test_a_clock_that_stands_still_ends_the_episode(peer: CartPeer, plant: SerialPlant) -> None:
+    """Two states of the same time have no velocity between them."""
+    plant.reset()
+    step(plant, 100)
+    peer.state = replace(peer.state, time_us=peer.state.time_us - peer.info.period_us)
+    frame = step(plant, 100)
+    assert frame["truncated"]
+    assert frame["dt"].item() > 0
+    assert plant.ended_by == "link"
+    assert "does not advance" in str(plant.last_error)
+    assert peer.state.motor_applied == 0
+
+
+@pytest.mark.parametrize("fault", [0, int(Fault.STALL)])
+def test_a_step_after_the_end_sends_nothing(peer: CartPeer, plant: SerialPlant, fault: int) -> None:
+    plant.reset()
+    peer.state = replace(peer.state, fault=fault, cart_counts=peer.info.soft_limit_counts)
+    ended = step(plant, 100)
+    sent = len(peer.received)
+    again = step(plant, 200)
+    assert len(peer.received) == sent
+    assert again["terminated"]
+    assert again["counts"].tolist() == ended["counts"].tolist()
+
+
+WRONG_INFO = [
+    ({"pole_counts_per_turn": 2048}, "pole counts per turn 2048, not 4096"),
+    ({"cart_nanometres_per_count": 45498}, "cart nm per count 45498, not 22749"),
+    ({"motor_limit": 100}, "motor limit 100, not 255"),
+    ({"period_us": 200_000}, "period 200000 us, not 5000 to 100000"),
+    ({"soft_limit_counts": 5000}, "soft limit 114 mm"),
+    ({"soft_limit_counts": 17500}, "soft limit 398 mm"),
+    ({"hard_limit_counts": 60000}, "hard limit 1365 mm"),
+]
+
+
+@pytest.mark.parametrize(("changes", "words"), WRONG_INFO)
+def test_a_cart_of_another_kind_is_never_armed(peer: CartPeer, changes: dict, words: str) -> None:
+    peer.info = replace(peer.info, **changes)
+    with pytest.raises(NotReadyError, match=words):
+        SerialPlant(settings(peer.port)).reset()
+    assert not peer.messages(Start)
+    assert not any(message.motor for message in peer.messages(SetMotor))
 
 
 def test_a_cart_that_restarts_is_a_lost_link(peer: CartPeer, plant: SerialPlant) -> None:

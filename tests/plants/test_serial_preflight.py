@@ -12,10 +12,10 @@ from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import FaultError
 from cartpole_rl.plants.emulated_cart import EmulatedCart
 from cartpole_rl.plants.serial_cart import SerialCart, SerialSettings
+from cartpole_rl.plants.serial_errors import NotReadyError
 from cartpole_rl.plants.serial_preflight import (
     Finding,
     Moves,
-    NotReadyError,
     cart_direction,
     deadband,
     latency,
@@ -184,8 +184,8 @@ def test_a_port_that_does_not_exist() -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"pole_counts_per_turn": 2048}, "INFO says pole counts a turn 2048, not 4096"),
-        ({"cart_nanometres_per_count": 45498}, "INFO says cart nm a count 45498, not 22749"),
+        ({"pole_counts_per_turn": 2048}, "INFO says pole counts per turn 2048, not 4096"),
+        ({"cart_nanometres_per_count": 45498}, "INFO says cart nm per count 45498, not 22749"),
         ({"motor_limit": 100}, "INFO says motor limit 100, not 255"),
         ({"soft_limit_counts": 18000}, "soft limit 409 mm, hard limit 399 mm"),
         ({"hard_limit_counts": 35000}, "hard limit 796 mm"),

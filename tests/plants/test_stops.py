@@ -21,6 +21,7 @@ from serial_peer import Between
 from tensordict import TensorDictBase
 
 from cartpole_rl.evaluation.episodes import run_batch
+from cartpole_rl.identification.experiments import Experiment, Moves, Task, conduct, hold
 from cartpole_rl.plants.serial import SerialPlant, SerialPlantSettings
 from cartpole_rl.plants.serial_cart import SerialCart, SerialSettings
 from cartpole_rl.wire import Flags
@@ -75,14 +76,17 @@ HOST = """
 import itertools, signal, sys
 from cartpole_rl.plants.serial_cart import SerialCart, SerialSettings
 
+from cartpole_rl.signals import ending_signals
+
 class Terminated(BaseException):
-    "What the commands of this package make of SIGTERM."
+    "What the commands of this package make of SIGTERM and SIGHUP."
 
 def terminate(number, frame):
     raise Terminated
 
 if sys.argv[2] == "unwinds":
-    signal.signal(signal.SIGTERM, terminate)
+    for ending in ending_signals():
+        signal.signal(ending, terminate)
 with SerialCart(SerialSettings(port=sys.argv[1])) as cart:
     cart.home()
     cart.start()
@@ -182,6 +186,8 @@ def host() -> Iterator[Callable[..., "subprocess.Popen[bytes]"]]:
         (signal.SIGSTOP, "plain", "watchdog"),
         (signal.SIGTERM, "plain", "watchdog"),
         (signal.SIGTERM, "unwinds", "STOP"),
+        (signal.SIGHUP, "plain", "watchdog"),
+        (signal.SIGHUP, "unwinds", "STOP"),
         (signal.SIGINT, "plain", "STOP"),
     ],
 )
@@ -234,6 +240,41 @@ def test_an_exception_in_the_policy(cart: TellingCart, make_environment: Callabl
     after, through = cart.stopped()
     assert 0 < after <= WATCHDOG_MS
     assert through == "STOP"
+
+
+def test_an_action_value_that_is_not_a_number(cart: TellingCart, make_environment: Callable) -> None:
+    decided: list[int] = []
+
+    def diverges(seen: TensorDictBase) -> TensorDictBase:
+        decided.append(1)
+        value = torch.full((1, 3), 0.0 if len(decided) < 6 else float("nan"))
+        return always_right(seen).set("action_value", value)
+
+    with closing(make_environment(serial_plant(cart), motors=(-FULL, 0, FULL))) as env:
+        (episode,) = run_batch(env, diverges)
+        assert episode.ended_by == "non_finite"
+        assert episode.motor.tolist() == [FULL] * 5 + [0]
+        after, through = cart.stopped()  # though the port is still open
+    assert 0 < after <= WATCHDOG_MS
+    assert through == "STOP"
+
+
+def test_an_experiment_of_the_identification(cart: TellingCart) -> None:
+    """The motor is at 0 by the host's own command before a recording is written, however long that takes."""
+
+    def push(task: Task) -> Moves:
+        yield from hold(FULL, 0.1, task)
+        return None
+
+    experiments = tuple(Experiment(name, "nothing", push) for name in ("first", "second"))
+    with closing(serial_plant(cart)) as plant:
+        for _, episode in conduct(plant, PERIOD_MS / 1000, experiments=experiments):
+            after, _ = cart.stopped()
+            assert 0 < after <= WATCHDOG_MS
+            commands = [line["motor"] for line in cart.told() if line.get("took") == "SET_MOTOR"]
+            assert commands[-1] == 0
+            assert episode.motor[-1] == 0
+            cart.listen()
 
 
 def test_the_end_of_an_episode(cart: TellingCart, make_environment: Callable) -> None:

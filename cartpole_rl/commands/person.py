@@ -1,0 +1,16 @@
+"""The person at the terminal."""
+
+import sys
+
+
+def confirm(text: str) -> bool:
+    """Show `text` and wait for Enter; False, at once, where nobody sits at a terminal."""
+    if sys.stdin is None or not sys.stdin.isatty():
+        return False
+    print(f"{text}.", file=sys.stderr)
+    print("Check the cart. It homes as soon as you confirm: keep the track clear.", file=sys.stderr)
+    try:
+        input("Press Enter to go on, Ctrl-C to stop. ")
+    except EOFError:
+        return False
+    return True

@@ -1,0 +1,51 @@
+"""Clearing latched faults: a cart that stopped itself moves again only when somebody has agreed to it."""
+
+import logging
+from collections.abc import Callable
+
+from cartpole_rl.errors import FaultError
+from cartpole_rl.plants.serial_cart import SerialCart
+from cartpole_rl.plants.serial_errors import fault_words
+
+LOGGER = logging.getLogger(__name__)
+
+Confirm = Callable[[str], bool]  # shows a person the text; True once the person says that the cart may move
+
+
+def nobody(text: str) -> bool:
+    """Confirm nothing: there is no person to ask."""
+    return False
+
+
+class FaultClearing:
+    """Clears latched faults after a person has confirmed, or the first `unattended` ones without asking.
+
+    `unattended` None is no limit, for carts that cannot be damaged.
+    """
+
+    def __init__(self, unattended: int | None, confirm: Confirm = nobody) -> None:
+        self.unattended = unattended
+        self.cleared = 0  # faults cleared without asking
+        self._confirm = confirm
+
+    def clear(self, cart: SerialCart, fault: int) -> None:
+        """Clear the latched `fault` bits of the cart.
+
+        Raises FaultError if nobody agrees, or if the cause of a fault is still there.
+        """
+        words = f"the cart latched a fault: {fault_words(fault)}"
+        if self.unattended is None or self.cleared < self.unattended:
+            self.cleared += 1
+            level = logging.INFO if self.unattended is None else logging.WARNING
+            LOGGER.log(level, "%s; cleared without asking, %s of %s", words, self.cleared, self.unattended)
+        elif not self._confirm(words):
+            raise FaultError(f"{words}; {self._remedy()}")
+        cart.clear_fault()
+
+    def _remedy(self) -> str:
+        if self.unattended:
+            return f"{self.cleared} faults were cleared unattended (plant.clear_faults): check the cart"
+        return (
+            "check the cart, then start again in a terminal and confirm; for unattended work, "
+            "plant.clear_faults=3 clears three faults without asking"
+        )

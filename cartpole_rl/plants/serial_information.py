@@ -1,0 +1,44 @@
+"""Checks that a cart is the kind of cart that everything above the wire takes it for, by its INFO.
+
+Positions, angles and forces are computed from constants: encoder counts a turn, metres a count, the range of
+motor values. A cart that uses other ones would be driven with every number off. It is therefore refused.
+"""
+
+from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_COUNTS_PER_TURN
+from cartpole_rl.plants.serial_errors import NotReadyError
+from cartpole_rl.wire import Info
+
+MOTOR_LIMIT = 255
+HALF_SPAN = 0.407  # m, Quanser IP02: middle of the track to a stop
+SPAN_TOLERANCE = 0.05  # share; homing accepts 3 %
+SHORTEST_PERIOD_US, LONGEST_PERIOD_US = 5_000, 100_000  # docs/protocol.md, SET_PERIOD
+NANOMETRES_PER_COUNT = round(CART_METRES_PER_COUNT * 1e9)
+
+
+def check_scales(information: Info) -> None:
+    """Raise NotReadyError if the cart's scales or its period are not the ones that this package uses."""
+    constants = {
+        "cart nm per count": (information.cart_nanometres_per_count, NANOMETRES_PER_COUNT),
+        "pole counts per turn": (information.pole_counts_per_turn, POLE_COUNTS_PER_TURN),
+        "motor limit": (information.motor_limit, MOTOR_LIMIT),
+    }
+    for name, (told, expected) in constants.items():
+        if told != expected:
+            raise NotReadyError(f"INFO says {name} {told}, not {expected}", "correct the firmware's settings")
+    if not SHORTEST_PERIOD_US <= information.period_us <= LONGEST_PERIOD_US:
+        raise NotReadyError(
+            f"INFO says period {information.period_us} us, not {SHORTEST_PERIOD_US} to {LONGEST_PERIOD_US}",
+            "correct the firmware's settings",
+        )
+
+
+def check_limits(information: Info) -> None:
+    """Raise NotReadyError if the soft and the hard limit do not fit the track."""
+    soft = information.soft_limit_counts * CART_METRES_PER_COUNT
+    hard = information.hard_limit_counts * CART_METRES_PER_COUNT
+    if not 0.5 * HALF_SPAN < soft < hard < (1 + SPAN_TOLERANCE) * HALF_SPAN:
+        raise NotReadyError(
+            f"INFO says soft limit {soft * 1e3:.0f} mm, hard limit {hard * 1e3:.0f} mm from the middle; the "
+            f"soft one comes first, and both in the outer half of the {HALF_SPAN * 1e3:.0f} mm to a stop",
+            "correct the firmware's limits",
+        )
