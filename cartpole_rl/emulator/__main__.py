@@ -30,6 +30,9 @@ def main(arguments: list[str] | None = None) -> int:
     except CartPoleError as error:
         print(error, file=sys.stderr)
         return error.exit_code
+    except OSError as error:
+        print(f"journal={error.filename}: {error.strerror}", file=sys.stderr)
+        return 1
     return 0
 
 

@@ -6,6 +6,7 @@ from typing import Literal
 
 from cartpole_rl.emulator.firmware import BANNER, Firmware
 from cartpole_rl.emulator.homing import CART_METRES, POLE_RADIANS
+from cartpole_rl.emulator.journal import Journal
 from cartpole_rl.emulator.physics import CartPhysics
 from cartpole_rl.emulator.settings import EmulatorSettings
 
@@ -22,9 +23,10 @@ class CartDevice:
     """
 
     def __init__(self, settings: EmulatorSettings) -> None:
-        """Raises EmulatorError where MuJoCo is not installed."""
+        """Raises EmulatorError where MuJoCo is not installed, OSError where the journal cannot be written."""
         self._settings = settings
         self.physics = CartPhysics(settings)
+        self._journal = Journal(settings.journal) if settings.journal else None
         self._latencies = random.Random(f"latency {settings.seed}")
         self._people = random.Random(f"people {settings.seed}")
         self._held: float | None = None  # rad, where the hand holds the pole
@@ -38,7 +40,10 @@ class CartDevice:
 
     def receive(self, stuffed: bytes, now_us: int) -> list[bytes]:
         """Give the cart a frame that arrived at a time, which is not before `now_us`; returns its answer."""
-        return self.firmware.receive(stuffed, now_us - self._booted_us)
+        answer = self.firmware.receive(stuffed, now_us - self._booted_us)
+        if self._journal and self.firmware.carried_out:
+            self._journal.took(now_us, self.firmware.carried_out)
+        return answer
 
     @property
     def unplugged(self) -> bool:
@@ -65,6 +70,8 @@ class CartDevice:
         values = self.firmware.drive(start, end)
         for (since, motor), (until, _) in zip(values, [*values[1:], (end, 0)], strict=True):
             self.physics.advance(motor, (until - since) / 1e6)
+            if self._journal:
+                self._journal.in_force(self._booted_us + since, motor)
         if self._held is not None:
             self.physics.place_pole(self._held)
         self.now_us = end_us

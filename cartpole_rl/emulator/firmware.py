@@ -66,6 +66,7 @@ class Firmware:
         self.armed = False
         self.homed = False
         self.fault = Fault.NONE
+        self.carried_out: Message | None = None  # by the newest frame, None where it was refused or damaged
         self._delay_us = delay_us
         self._zero_error = zero_error
         self._line = MotorLine()
@@ -87,6 +88,7 @@ class Firmware:
 
     def receive(self, stuffed: bytes, now_us: int) -> list[bytes]:
         """Take one frame, without its ending 0x00; returns the answer, which is at most one frame."""
+        self.carried_out = None
         try:
             envelope = open_envelope(stuffed)
         except FrameError:
@@ -135,6 +137,7 @@ class Firmware:
         if reason is not None:
             return reason
         self._carry_out(message, now_us)
+        self.carried_out = message
         if isinstance(message, SetMotor):
             return None
         if isinstance(message, Hello | SetPeriod):

@@ -5,6 +5,7 @@ as much as a cart that was weighed and measured by hand would. ``docs/emulator.m
 Signs: x, motor and angles are positive to the right, angle 0 is upright.
 """
 
+from pathlib import Path
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
@@ -62,6 +63,7 @@ class EmulatorSettings(Settings):
 
     boot: Literal["hanging", "anywhere"] = "hanging"  # near the middle and hanging, or anywhere and swinging
     start: Literal["hanging", "upright"] = "hanging"  # what a person's hand does to the pole before START
+    journal: Path | None = None  # file that gets a line for each command taken and motor value in force
     physics_step: Annotated[float, Field(ge=1e-5, le=1e-3)] = 5e-4  # s, or just under to fit a period
 
     @model_validator(mode="after")

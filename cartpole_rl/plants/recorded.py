@@ -49,4 +49,6 @@ class RecordedPlant(Plant):
         last = row == episode.steps
         since = episode.time[row] - episode.time[max(0, row - 1)]
         motor = int(episode.motor[row - 1]) if row else 0
-        return one_cart(episode.counts[row].tolist(), since, motor, episode.ended_by if last else "")
+        ended_by = episode.ended_by if last else ""
+        terminated, truncated = ended_by in ("track", "fault"), ended_by == "link"
+        return one_cart(episode.counts[row].tolist(), since, motor, terminated, truncated)

@@ -78,7 +78,8 @@ class SerialPlant(Plant):
     the cart restarted; the counts are then the last that came. `ended_by` is the last ending, "track",
     "fault" or "link", and empty while an episode runs; `last_error` is the error behind "fault" or "link".
 
-    Once an episode has ended, steps send nothing until the next reset and repeat the last frame.
+    After an ending or `halt`, steps send nothing until the next reset: they repeat the last frame, truncated
+    if nothing else has ended the episode.
 
     Raises PortError or LinkError when it cannot connect, NotReadyError if INFO describes another kind of
     cart. A reset raises LinkError after a loss that stays, FaultError for a fault that does not clear or that
@@ -99,6 +100,7 @@ class SerialPlant(Plant):
         self.ended_by = ""
         self.last_error: PlantError | None = None
         self._hanging: int | None = None  # pole count after homing; None before it, and once it may be wrong
+        self._driving = False  # an episode is under way
         self._turns = 0  # pole counts of the whole turns that the pole has made before this episode
         self._prompt = prompt
         self._faults = FaultClearing(settings.clear_faults, confirm)
@@ -119,6 +121,7 @@ class SerialPlant(Plant):
 
     def halt(self) -> None:
         """Motor to 0 and disarm, between episodes; does not raise."""
+        self._driving = False
         with suppress(PlantError):  # the cart's watchdog does it where the link cannot
             self.cart.stop()
 
@@ -144,10 +147,11 @@ class SerialPlant(Plant):
         self._turns = self._whole_turns()
         self.ended_by = ""
         self.last_error = None
+        self._driving = True
         return self.frame(*self._report(self.settings.control_period))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        if self.ended_by:
+        if not self._driving:
             return self.step_frame(*self._report(self.settings.control_period))
         before = self._state
         try:
@@ -178,6 +182,7 @@ class SerialPlant(Plant):
     def _break_off(self, error: PlantError) -> None:
         """End the episode for want of a state: with the counts that came last, the motor taken as 0."""
         self.ended_by, self.last_error = "fault" if isinstance(error, FaultError) else "link", error
+        self._driving = False
         if isinstance(error, LinkError):
             self.cart.close()
         else:
@@ -191,7 +196,9 @@ class SerialPlant(Plant):
         """What the cart says: counts, dt, motor_applied, terminated, truncated; `dt` in s."""
         state = self._state
         counts = (state.cart_counts, state.pole_counts - self._turns)
-        return one_cart(counts, dt, state.motor_applied, self.ended_by)
+        terminated, truncated = self.ended_by in ("track", "fault"), self.ended_by == "link"
+        halted = not self._driving and not self.ended_by
+        return one_cart(counts, dt, state.motor_applied, terminated, truncated or halted)
 
     def _whole_turns(self) -> int:
         """Pole counts by which the newest state is whole turns from where an episode begins."""

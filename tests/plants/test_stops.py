@@ -8,7 +8,6 @@ import json
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
@@ -32,7 +31,8 @@ FULL = 255
 QUIET = 0.3  # s without a word from the cart: whoever drove it does no more
 
 EMULATOR = """
-import json, math, sys
+import math, sys
+from pathlib import Path
 from cartpole_rl.emulator import firmware, process
 from cartpole_rl.emulator.device import CartDevice
 from cartpole_rl.emulator.homing import CART_METRES, SPAN, Zeros
@@ -43,33 +43,19 @@ def home_at_once(hanging):
     half = round(SPAN / 2 / CART_METRES)
     return Zeros(reading.cart - half, reading.cart + half, reading.pole)
 
-class Telling(CartDevice):
-    def __init__(self, settings):
-        super().__init__(settings)
-        self.motor = 0
-        self.drive, self.carry_out = self.firmware.drive, self.firmware._carry_out
-        self.firmware.drive, self.firmware._carry_out = self.tell_motor, self.tell_command
+class Centred(CartDevice):
+    "Stands in the middle when it homes."
 
-    def tell_motor(self, start, end):
-        values = self.drive(start, end)
-        for since, motor in values:
-            if motor != self.motor:
-                self.motor = motor
-                self.tell(us=since, in_force=motor)
-        return values
-
-    def tell_command(self, message, now):
-        self.carry_out(message, now)
-        self.tell(us=now, took=message.TYPE.name, **vars(message))
+    def receive(self, stuffed, now_us):
+        answer = super().receive(stuffed, now_us)
         if self.firmware.homing:
             self.physics.place(0.0, math.pi)
-
-    def tell(self, **what):
-        print(json.dumps(what), file=sys.stderr, flush=True)
+        return answer
 
 firmware.home = home_at_once
-process.CartDevice = Telling
-process.run(EmulatorSettings(clock="real", cart_mass=20.0, physics_step=1e-3))
+process.CartDevice = Centred
+journal = Path(sys.argv[1])
+process.run(EmulatorSettings(clock="real", cart_mass=20.0, physics_step=1e-3, journal=journal))
 """
 
 HOST = """
@@ -101,12 +87,12 @@ with SerialCart(SerialSettings(port=sys.argv[1])) as cart:
 class TellingCart:
     """The emulated cart, and what it has told since `listen`."""
 
-    def __init__(self) -> None:
-        with tempfile.NamedTemporaryFile() as written:
-            self._told = Path(written.name).open("rb")  # noqa: SIM115 - a place of its own in the file
-            self.process = subprocess.Popen(
-                [sys.executable, "-c", EMULATOR], stdout=subprocess.PIPE, stderr=written
-            )
+    def __init__(self, journal: Path) -> None:
+        journal.touch()
+        self._told = journal.open("rb")
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", EMULATOR, str(journal)], stdout=subprocess.PIPE
+        )
         assert self.process.stdout is not None
         self.port = json.loads(self.process.stdout.readline())["port"]
         self.listen()
@@ -148,8 +134,8 @@ class TellingCart:
 
 
 @pytest.fixture(scope="module")
-def running() -> Iterator[TellingCart]:
-    with closing(TellingCart()) as cart:
+def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TellingCart]:
+    with closing(TellingCart(tmp_path_factory.mktemp("cart") / "journal.jsonl")) as cart:
         yield cart
 
 

@@ -1,0 +1,32 @@
+"""What the emulated cart did, written down by itself: the truth about commands taken and the motor.
+
+A JSON line for each event, with `us` in microseconds since the emulator's start:
+{"us": 40210, "took": "SET_MOTOR", "motor": -200} and {"us": 43310, "in_force": -200}.
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from cartpole_rl.wire import Message
+
+
+class Journal:
+    """Appends to the file `path` as things happen."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("a", buffering=1)
+        self._motor = 0
+
+    def took(self, us: int, message: Message) -> None:
+        """Note a command that the cart carried out."""
+        self._write(us, took=message.TYPE.name, **vars(message))
+
+    def in_force(self, us: int, motor: int) -> None:
+        """Note the motor value in force if it is another one than before."""
+        if motor != self._motor:
+            self._motor = motor
+            self._write(us, in_force=motor)
+
+    def _write(self, us: int, **event: Any) -> None:
+        self._file.write(json.dumps({"us": us, **event}) + "\n")

@@ -1,0 +1,121 @@
+"""The process that drives: what a person is asked, what it refuses, and how it ends, on a scripted cart."""
+
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import pytest
+import torch
+from torch import nn
+
+from cartpole_rl.agents import AgentSettings, QAgent
+from cartpole_rl.choices import choice
+from cartpole_rl.envs import CartPoleEnv, make_env
+from cartpole_rl.envs.settings import ObservationSettings, RewardSettings, TaskSettings
+from cartpole_rl.errors import FaultError, LinkError
+from cartpole_rl.evaluation.driver import Drive, Driver
+from cartpole_rl.evaluation.driving_policy import as_weights
+from cartpole_rl.plants.serial import SerialPlant, SerialPlantSettings
+from cartpole_rl.plants.serial_errors import NotReadyError
+from cartpole_rl.plants.serial_faults import Confirm
+from cartpole_rl.tasks.actions import ActionSettings
+from cartpole_rl.wire import ClearFault, Fault, Message, SetMotor, Stop
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "plants"))
+from serial_peer import CartPeer
+
+LONG = 100_000  # periods
+
+
+def scripted_env(port: str, time_limit: int, confirm: Confirm) -> CartPoleEnv:
+    """Made in the driving process."""
+    plant = SerialPlant(SerialPlantSettings(port=port), confirm=confirm)
+    task = choice("task/swingup") | {"x_max": 0.38, "time_limit": time_limit}
+    return make_env(
+        plant,
+        ActionSettings(**choice("actions/two")),
+        TaskSettings(**task),
+        ObservationSettings(**choice("observation/history")),
+        RewardSettings(**choice("reward/score")),
+    )
+
+
+def network() -> nn.Module:
+    """An untrained one, the same each time."""
+    torch.manual_seed(0)
+    sight = ObservationSettings(**choice("observation/history"))
+    return QAgent(AgentSettings(**choice("agent/dqn")), sight.mirror_signs, 2).greedy_policy()
+
+
+class Faulty(CartPeer):
+    """Has a latched fault until it is cleared."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.state = replace(self.state, fault=int(Fault.STALL))
+
+    def _carry_out(self, message: Message) -> None:
+        if isinstance(message, ClearFault):
+            self.state = replace(self.state, fault=0)
+        super()._carry_out(message)
+
+
+@pytest.fixture
+def peer() -> Iterator[Faulty]:
+    with Faulty() as peer:
+        yield peer
+
+
+def driver(peer: CartPeer, confirm: Confirm, time_limit: int = LONG) -> Driver:
+    return Driver(partial(scripted_env, peer.port, time_limit), network, False, False, confirm)
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 60
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def test_a_person_is_asked_and_a_hangup_stops_the_motor(peer: Faulty) -> None:
+    """First the person says no, then yes; the terminal is closed while the cart is driven."""
+    drive, asked = Drive(as_weights(network()), 0.0, 0), []
+
+    def disagree(text: str) -> bool:
+        asked.append(text)
+        return False
+
+    with driver(peer, disagree) as driving:
+        driving.start(drive)
+        with pytest.raises(FaultError, match=r"the motor was driven but the cart did not move.*confirm"):
+            driving.result()
+
+    def agree(text: str) -> bool:
+        asked.append(text)
+        threading.Thread(target=hang_up).start()
+        return True
+
+    def hang_up() -> None:
+        wait_for(lambda: any(message.motor for message in peer.messages(SetMotor)))
+        os.kill(driving.pid, signal.SIGHUP)
+
+    with driver(peer, agree) as driving:
+        driving.start(drive)
+        with pytest.raises(LinkError, match="has died"):
+            driving.result()
+    assert len(asked) == 2
+    assert [type(frame.message) for frame in peer.received[-2:]] == [SetMotor, Stop]
+    assert peer.state.motor_applied == 0
+
+
+def test_a_refusal_keeps_its_words(peer: Faulty) -> None:
+    peer.info = replace(peer.info, motor_limit=100)
+    with pytest.raises(NotReadyError, match="INFO says motor limit 100, not 255") as refused:
+        driver(peer, lambda text: True)
+    assert refused.value.remedy == "correct the firmware's settings"

@@ -1,0 +1,189 @@
+"""Whatever a cart says, in whatever order: no observation is other than finite, no motor value is unsound.
+
+Hypothesis scripts the cart: counts, clock, ticks, flags, faults and acknowledgements are arbitrary, and so
+are the values by which the policy chooses. The wire is a real pseudo-terminal.
+"""
+
+import math
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from serial_peer import CartPeer
+from tensordict import TensorDictBase
+
+from cartpole_rl.errors import PlantError
+from cartpole_rl.evaluation.episodes import run_batch
+from cartpole_rl.physics.dynamics import State as TrueState
+from cartpole_rl.plants.serial import SerialPlant, SerialPlantSettings
+from cartpole_rl.wire import Flags, Frame, SetMotor, Start, State
+
+MOTORS = (-255, -100, 0, 255)
+PERIODS = 12
+RELAXED = settings(
+    max_examples=40,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
+QUICK = {
+    "timeout": 0.1,
+    "connect_timeout": 1.0,
+    "answer_timeout": 0.05,
+    "retries": 0,
+    "nudge_after": 0.02,
+    "start_timeout": 1.0,
+    "home_timeout": 1.0,
+}
+
+u32, i32 = st.integers(0, 2**32 - 1), st.integers(-(2**31), 2**31 - 1)
+sane = st.just(None)  # as a sound cart has it
+said = st.fixed_dictionaries(
+    {
+        "ticks": st.sampled_from([1, 1, 1, 1, 2, 0, -1, 40, 2**31]),  # from one state to the next
+        "time_us": sane | st.sampled_from([0, 1, -1, 2**31]) | u32,  # passed since the last state
+        "cart_counts": sane | i32,
+        "pole_counts": sane | i32,
+        "fault": sane | sane | st.integers(0, 2**16 - 1),
+        "flags": sane | sane | st.integers(0, 63),
+        "motor_applied": sane | st.integers(-(2**15), 2**15 - 1),
+        "last_sequence": sane | sane | st.integers(0, 255),
+    }
+)
+values = st.lists(st.floats(width=32), min_size=len(MOTORS), max_size=len(MOTORS))
+
+
+@dataclass
+class Script:
+    """What the cart says and the policy thinks in the periods of an episode."""
+
+    states: list[dict[str, int | None]]
+    values: list[list[float]]
+
+
+scripts = st.builds(
+    Script,
+    st.lists(said, min_size=1, max_size=PERIODS),
+    st.lists(values, min_size=PERIODS, max_size=PERIODS),
+)
+
+
+class ScriptedCart(CartPeer):
+    """Behaves until it is armed, and from then on says what the script has."""
+
+    def __init__(self, script: Script) -> None:
+        super().__init__()
+        self._coming = iter(script.states)
+
+    def answer(self, frame: Frame) -> Iterable[bytes]:
+        yield from super().answer(frame)
+        if isinstance(frame.message, Start):
+            self.next_state = self.scripted
+
+    def scripted(self) -> bytes:
+        """The next state of the script, and sound ones after its end."""
+        script = next(self._coming, None)
+        if script is None:
+            return CartPeer.next_state(self)
+        passed = self.info.period_us if script["time_us"] is None else script["time_us"]
+        changes = {
+            key: script[key]
+            for key in ("cart_counts", "pole_counts", "fault", "motor_applied", "last_sequence")
+            if script[key] is not None
+        }
+        self.state = replace(
+            self.state,
+            tick=(self.state.tick + script["ticks"]) % 2**32,
+            time_us=(self.state.time_us + passed) % 2**32,
+        )
+        state: State = replace(self.state, **changes)
+        return self.encode(state, self.flags if script["flags"] is None else Flags(script["flags"]))
+
+
+class Policy:
+    """Chooses by the script's values, and keeps what it saw."""
+
+    def __init__(self, script: Script) -> None:
+        self._values = script.values
+        self.seen: list[torch.Tensor] = []
+
+    def __call__(self, present: TensorDictBase) -> TensorDictBase:
+        value = torch.tensor(self._values[len(self.seen) % PERIODS]).expand(len(present), -1)
+        self.seen.append(present["observation"].clone())
+        return present.set("action_value", value).set("action", value.argmax(-1))
+
+
+@RELAXED
+@given(script=scripts)
+def test_a_serial_cart_that_says_anything(script: Script, make_environment: Callable) -> None:
+    with ScriptedCart(script) as peer:
+        plant = SerialPlant(SerialPlantSettings(port=peer.port, **QUICK))
+        env = make_environment(plant, MOTORS, time_limit=PERIODS)
+        policy, episode = Policy(script), None
+        try:
+            with suppress(PlantError):  # a reset may rightly fail
+                (episode,) = run_batch(env, policy)
+                ended_at = len(peer.received)
+                drive_on(env)
+        finally:
+            env.close()
+        sent = [frame.message.motor for frame in peer.received if isinstance(frame.message, SetMotor)]
+        assert all(seen.isfinite().all() for seen in policy.seen)
+        assert all(abs(motor) <= peer.info.motor_limit for motor in sent)
+        assert not sent or sent[-1] == 0
+        if episode is not None:
+            assert_sound(episode)
+            assert not any(motor_of(frame) for frame in peer.received[ended_at:])
+            finite = [all(map(math.isfinite, script.values[row])) for row in range(episode.steps)]
+            assert all(motor == 0 or known for motor, known in zip(episode.motor, finite, strict=True))
+
+
+def drive_on(env: Any) -> None:
+    """What a loop that overlooks the end of an episode does."""
+    present = env.fake_tensordict()
+    for _ in range(3):
+        env.step(present.set("action", torch.tensor([3])))
+
+
+def motor_of(frame: Frame) -> int:
+    """The motor value in a frame of the host, 0 in all but SET_MOTOR."""
+    return frame.message.motor if isinstance(frame.message, SetMotor) else 0
+
+
+def assert_sound(episode: Any) -> None:
+    """All numbers of an episode are finite, and its time increases."""
+    for name in ("time", "x", "x_dot", "theta", "theta_dot", "score", "score_upright", "reward"):
+        assert all(map(math.isfinite, getattr(episode, name))), name
+    assert (episode.time[1:] > episode.time[:-1]).all()
+
+
+anything = st.floats(width=32) | st.floats(-1, 1, width=32)
+
+
+@RELAXED
+@given(
+    motions=st.lists(st.tuples(anything, anything, anything, anything), min_size=1, max_size=4),
+    values=st.lists(values, min_size=PERIODS, max_size=PERIODS),
+)
+def test_a_simulated_cart_in_any_state(
+    motions: list[tuple[float, ...]],
+    values: list[list[float]],
+    make_plant: Callable,
+    make_environment: Callable,
+) -> None:
+    plant = make_plant(len(motions))
+    env = make_environment(plant, MOTORS, time_limit=PERIODS)
+    policy = Policy(Script([], values))
+
+    def misplaced(present: TensorDictBase) -> TensorDictBase:
+        if len(policy.seen) == 2:
+            plant.place(TrueState(*torch.tensor(motions).T))
+        return policy(present)
+
+    for episode in run_batch(env, misplaced):
+        assert_sound(episode)
+        assert (abs(episode.motor) <= max(MOTORS)).all()
+    assert all(seen.isfinite().all() for seen in policy.seen)
