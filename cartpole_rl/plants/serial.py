@@ -19,7 +19,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from cartpole_rl.errors import ConfigError, FaultError, LinkError, PlantError, PortError
-from cartpole_rl.plants.serial_cart import SerialCart, SerialSettings
+from cartpole_rl.plants.serial_cart import RESTARTED, SerialCart, SerialSettings
 from cartpole_rl.plants.serial_errors import RefusedError, fault_error
 from cartpole_rl.plants.serial_faults import Confirm, FaultClearing, nobody
 from cartpole_rl.plants.serial_information import check_scales
@@ -141,7 +141,14 @@ class SerialPlant(Plant):
         if tensordict is not None and "_reset" in tensordict and not tensordict["_reset"].any():
             return self.frame(*self._report(self.settings.control_period))
         self._reach()
-        self._make_ready()
+        restarts = self.cart.restarts
+        try:
+            self._make_ready()
+        except PlantError:
+            if self.cart.restarts == restarts:
+                raise
+            self._hanging = None
+            self._make_ready()  # a cart that restarts again is left alone
         self.cart.start()
         self._state = self.cart.get_state()
         self._turns = self._whole_turns()
@@ -158,7 +165,7 @@ class SerialPlant(Plant):
             self.cart.set_motor(int(tensordict["motor"]))
             state = self.cart.get_state()
             if went_back(ticks_between(before.tick, state.tick)):
-                raise LinkError("the cart has restarted; check its power")
+                raise LinkError(RESTARTED)
             self._state = state
         except (LinkError, RefusedError, FaultError) as error:
             self._break_off(error)
@@ -273,6 +280,8 @@ class SerialPlant(Plant):
         deadline = time.perf_counter() + self.settings.start_timeout
         while True:
             state = self.cart.poll_state()
+            if not self.cart.flags & Flags.HOMED:
+                raise LinkError(RESTARTED)
             pole = 2 * math.pi * state.pole_counts / turn
             off = math.remainder(pole - angle, 2 * math.pi)
             window.append((state.time_us, pole))

@@ -65,6 +65,7 @@ Answer = TypeVar("Answer", bound=Message)
 HALF_MILLISECOND = 500  # us
 OVERTAKEN_TICKS = 16  # 0.3 s: nothing keeps a frame back for longer, and no cart boots and is driven so soon
 BACKLOG_BYTES = 1000  # with more waiting, the system's buffer (4096) may have thrown newer bytes away
+RESTARTED = "the cart has restarted; check its power"
 UNACKNOWLEDGED_PERIODS = 1.5  # of a frame: by then the state after it has come, if the frame has
 
 
@@ -102,6 +103,7 @@ class SerialCart:
         self.port = settings.port  # once opened, the one that "auto" was found to be
         self.statistics = LinkStatistics()
         self.flags = Flags(0)  # of the newest state
+        self.restarts = 0  # of the cart, while the port was open
         self._open_link: SerialLink | None = None
         self._information: Info | None = None
         self._newest: State | None = None  # arrived, and not yet given to anyone
@@ -215,18 +217,21 @@ class SerialCart:
         """Home, and wait until it is done: zeros set, the cart in the middle, the pole hanging still.
 
         Returns the state after it; `information` then has the limits that follow from the measured span.
-        Raises FaultError if homing fails, PlantError if it takes longer than `timeout` seconds.
+        Raises FaultError if homing fails, PlantError if it takes longer than `timeout` seconds, LinkError if
+        the cart restarts meanwhile.
         """
         try:
             self._request(Home(), Ack)
         except RefusedError as error:
             if error.reason != Reason.BUSY or not self._is_homing():
                 raise  # otherwise only the ACK was lost
-        deadline = time.perf_counter() + timeout
+        deadline, restarts = time.perf_counter() + timeout, self.restarts
         while True:
             state = self._current_state()
             if state.fault:
                 raise fault_error(state.fault)
+            if self.restarts > restarts:
+                raise LinkError(RESTARTED)
             if self.flags & Flags.HOMED and not self.flags & Flags.HOMING:
                 self.info()  # the limits are now those of the span that was measured
                 return self.get_state()
@@ -450,7 +455,9 @@ class SerialCart:
                 self._count_overtaken(state.tick)
                 return
             ticks = ticks_between(last.tick, state.tick)
-            if not went_back(ticks):  # otherwise the cart has restarted
+            if went_back(ticks):
+                self.restarts += 1
+            else:
                 self._check_clock(last, state)
                 self._count_missing(state.tick, ticks - 1)
         if self._newest is not None:
