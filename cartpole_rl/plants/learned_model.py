@@ -79,6 +79,8 @@ def _as_model(content: Mapping[str, Any]) -> LearnedModel:
     laws = content["models"]
     check_values(content["parameters"])
     residual = Residual(**content["residual"])
+    if bad := [name for name, part in residual._asdict().items() if not part.isfinite().all()]:
+        raise ValueError(f"its residual's {', '.join(bad)} is not finite")
     if residual.places.shape[1] != PLACES:
         raise ValueError(f"its tables have {residual.places.shape[1]} places, not {PLACES}")
     return LearnedModel(

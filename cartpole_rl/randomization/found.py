@@ -64,7 +64,8 @@ class FoundCarts:
     """Draws with replacement from `found` [P, M], and for `elsewhere` of all draws from `others` instead.
 
     It stands where a Randomizer stands; `others` keep an agent from trusting what was found too much. Of the
-    parameters that are not `told` every draw is the others'; None tells all.
+    parameters that are not `told` every draw is the others'; None tells all. Raises ConfigError for a number
+    that is not finite.
     """
 
     def __init__(
@@ -75,6 +76,9 @@ class FoundCarts:
         longest_delay: float,
         told: Collection[str] | None = None,
     ) -> None:
+        if not found.isfinite().all():
+            row = int((~found.isfinite()).any(1).nonzero()[0])
+            raise ConfigError(f"carts to draw from: {CartParameters.names()[row]} is not finite")
         self.found, self.others, self.elsewhere = found.to(others.nominal), others, elsewhere
         telling = [told is None or name in told for name in CartParameters.names()]
         self._told = torch.tensor(telling, device=self.found.device).unsqueeze(1)

@@ -2,8 +2,10 @@
 
 from collections.abc import Callable
 
+import pytest
 import torch
 
+from cartpole_rl.errors import ConfigError
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.randomization import FoundCarts, PoleSettings, Randomizer, Range
@@ -23,6 +25,14 @@ def test_rows_stay_together(ip02: dict[str, float], medium: PoleSettings) -> Non
     drawn = found_carts(ip02, medium, 0.0).draw(500, torch.Generator().manual_seed(0))
     assert torch.equal(drawn[VISCOUS], 2 * drawn[MASS])
     assert len(drawn[MASS].unique()) > 50
+
+
+def test_a_number_that_is_not_finite_is_refused(ip02: dict[str, float], medium: PoleSettings) -> None:
+    others = Randomizer(ip02, medium, {})
+    table = others.nominal.unsqueeze(1).repeat(1, 100)
+    table[VISCOUS, 7] = float("nan")
+    with pytest.raises(ConfigError, match="cart_viscous is not finite"):
+        FoundCarts(table, others, 0.0, longest_delay=0.03)
 
 
 def test_the_share_from_elsewhere(ip02: dict[str, float], medium: PoleSettings) -> None:
