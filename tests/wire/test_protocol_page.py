@@ -72,3 +72,18 @@ def test_fault_is_listed(fault):
 @pytest.mark.parametrize("reason", Reason)
 def test_reason_is_listed(reason):
     assert f"| {reason.value} {reason.name} |" in PAGE
+
+
+@pytest.mark.parametrize("rule", ["Watchdog", "Soft limit", "Faults"])
+def test_each_rule_says_when_it_holds(rule):
+    """A homing touches the stops by itself: with a rule that held then too it could not."""
+    text = re.search(rf"^\d\. \*\*{rule}\*\*(.*?)(?=^\d\. |^$)", PAGE, re.MULTILINE | re.DOTALL).group(1)
+    assert "while armed" in text
+    assert "homing" in text
+
+
+def test_the_limits_before_the_first_homing_are_told():
+    """Those that tests/emulator/test_emulator_device.py finds."""
+    text = PAGE.split("**The limits in INFO**")[1].split("\n\n")[0]
+    assert "Before the\nfirst homing" in text
+    assert "16704 and 17539" in text
