@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-CART_METRES_PER_COUNT = 2.2749e-5  # Quanser IP02: pinion 6.35e-3 m, gear, 4096 counts a turn
+CART_METRES_PER_COUNT = 2.2749e-5  # Quanser IP02: encoder pinion of 14.83 mm radius, 4096 counts a turn
 POLE_COUNTS_PER_TURN = 4096
 POLE_RADIANS_PER_COUNT = 2 * math.pi / POLE_COUNTS_PER_TURN
 
