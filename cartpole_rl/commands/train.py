@@ -23,7 +23,8 @@ from cartpole_rl.evaluation.episodes import Policy, run_batch
 from cartpole_rl.learning.checkpoints import TrainingCheckpoint, load_training, restore_weights
 from cartpole_rl.learning.randomness import seed_everything
 from cartpole_rl.learning.training import Training
-from cartpole_rl.physics.dynamics import unused_parameters
+from cartpole_rl.plants.effects import without_effect
+from cartpole_rl.randomization import Draws
 from cartpole_rl.tasks.episode import Episode
 
 EVALUATION_SEED = 10_000  # added to the seed, so that no evaluation starts where training did
@@ -41,7 +42,7 @@ def main(config: TrainConfig, folder: Path) -> None:
     seed_everything(config.seed)
     carts, start = config.learning.carts, config.task.start
     env = simulated_env(config, config.plant, carts, start, config.seed, config.compile)
-    note_unused_randomization(config)
+    note_unused_randomization(config, env.plant.randomizer)
     agent = new_agent(config)
     if resumed:
         restore_weights(agent, resumed.state["agent"], f"resume={folder}")  # or complain before any work
@@ -85,10 +86,14 @@ def resumed_training(config: TrainConfig, folder: Path) -> TrainingCheckpoint | 
     return checkpoint
 
 
-def note_unused_randomization(config: TrainConfig) -> None:
-    """Say which randomized parameters the chosen laws do not read; drawing them has no effect."""
-    if unused := sorted(unused_parameters(config.models(config.plant)) & set(config.ranges)):
-        chosen = f"{config.cart_friction.model}, {config.pole_friction.model}, {config.actions.actuator}"
+def note_unused_randomization(config: TrainConfig, draws: Draws) -> None:
+    """Name the ranges that change nothing with the chosen actions and friction models, if there are any."""
+    models = config.models(config.plant)
+    if unused := without_effect(draws, config.ranges, config.actions.motors, models, config.control_period):
+        chosen = (
+            f"cart_friction={config.cart_friction.model}, pole_friction={config.pole_friction.model} and "
+            f"actuator {config.actions.actuator} with motor values {list(config.actions.motors)}"
+        )
         tell("train", f"note: randomization of {', '.join(unused)} has no effect with {chosen}")
 
 

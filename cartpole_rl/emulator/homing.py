@@ -30,7 +30,7 @@ LONGEST_SEARCH = 30.0  # s for one stop
 CENTRED = 0.001  # m
 LONGEST_CENTRING = 20.0  # s
 
-WHOLE_SWING = 2.0  # s: one period of a pole of 2 m
+WHOLE_SWING = 2.0  # s: one period of a rod of 1.5 m
 STILL = 8  # counts peak to peak, 0.7 degree
 BRAKED = 30  # counts peak to peak: below this the brake would do more harm than good
 LONGEST_BRAKING = 20.0  # s

@@ -1,7 +1,7 @@
 """The truth of the emulated cart: every number that its world is made of, in SI units.
 
-The defaults are a cart that is not the nominal one: each number differs from the simulator's nominal cart by
-as much as a cart that was weighed and measured by hand would. ``docs/emulator.md`` has them side by side.
+The defaults are a cart that is not the nominal one: they differ from the simulator's nominal cart by as much
+as a cart that was weighed and measured by hand would. ``docs/emulator.md`` has them side by side.
 Signs: x, motor and angles are positive to the right, angle 0 is upright.
 """
 
@@ -39,11 +39,11 @@ class EmulatorSettings(Settings):
     pole_coulomb: NonNegative = 2.0e-4  # N m
     pole_drag: NonNegative = 2.5e-5  # N m s^2, against the square of the speed
 
-    force_curve: tuple[Coefficient, Coefficient, Coefficient] = (1e-6, 0.0198, -0.99)
+    force_curve: tuple[Coefficient, Coefficient, Coefficient] = (0.0, 0.0198, -0.99)
     # [a, b, c]: F = sign(u) max(0, a u^2 + b |u| + c), N
     force_asymmetry: Annotated[float, Field(ge=-0.9, le=0.9)] = 0.03  # rightward force is (1 + it) times that
-    deadband_left: MotorValue = 40.0  # motor values down to minus this give no force
-    deadband_right: MotorValue = 45.0  # motor values up to this give no force
+    deadband_left: MotorValue = 55.0  # motor values down to minus this give no force
+    deadband_right: MotorValue = 60.0  # motor values up to this give no force
     motor_time_constant: Annotated[float, Field(ge=0, le=1)] = 0.005  # s, first-order lag of the force
     latency: Annotated[float, Field(ge=0, le=1)] = 0.003  # s, from a frame's arrival to its effect
     latency_jitter: Annotated[float, Field(ge=0, le=1)] = 0.001  # s, each latency is up to this more or less

@@ -195,5 +195,5 @@ def first_row(tensordict: TensorDictBase, key: str) -> Array:
 
 
 def seed_plant(env: CartPoleEnv, source: np.random.Generator) -> None:
-    """Seed the carts' draws from Gymnasium's generator; TorchRL's `set_seed` would seed torch itself."""
-    env.plant._set_seed(int(source.integers(2**31)))
+    """Seed the carts' draws, and nothing else, from Gymnasium's generator."""
+    env.set_seed(int(source.integers(2**31)))

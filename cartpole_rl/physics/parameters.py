@@ -17,7 +17,8 @@ from cartpole_rl.errors import ConfigError
 
 GRAVITY = 9.81  # m/s^2
 
-# Quanser's two poles weigh 0.127 kg / 0.3365 m and 0.230 kg / 0.6413 m; the thesis rounds both to this (6.4).
+# The thesis's (6.4). Quanser's poles have half of it, 0.127 kg on 0.3365 m and 0.230 kg on 0.6413 m: 0.7 kg/m
+# is their mass over the distance from pivot to centre of mass.
 POLE_DENSITY = 0.7  # kg/m
 
 

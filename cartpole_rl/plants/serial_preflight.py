@@ -44,7 +44,7 @@ LONGEST_PUSH, FARTHEST_PUSH = 0.3, 0.035  # s, m
 DRIFT = 4  # periods over which a swing that is left is measured
 NO_SWING, LONG_PATIENCE = 6, 15.0  # counts peak to peak, s
 SMALL_SWING, SHORT_PATIENCE = 40, 5.0  # presses the cart as much as three motor values do
-LARGEST_DEADBAND = 150  # motor value; the weakest motor value that agents use is 100, the usual one 200
+LARGEST_DEADBAND = 150  # motor value; of nine_levels the two weakest, 100 and 150, would not move such a cart
 STEPS = 4  # for the latency, two to each side
 LONGEST_LATENCY_PERIODS = 2.0  # what agents are trained on reaches about one period
 

@@ -24,6 +24,9 @@ class Draws(Protocol):
     def draw(self, count: int, generator: torch.Generator) -> Tensor:
         """Parameters of `count` carts, [P, count]."""
 
+    def ends(self, name: str, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """A draw with `name` at the low end of its range, and the same draw with it at the high end."""
+
     def longest_delay(self) -> float:
         """The longest latency that a draw can have, jitter included, s."""
 
@@ -87,11 +90,28 @@ class FoundCarts:
 
     def draw(self, count: int, generator: torch.Generator) -> Tensor:
         """Parameters of `count` carts, [P, count]."""
+        table, keeps = self._draw_found(count, generator, self.elsewhere)
+        return torch.where(keeps, table, self.others.draw(count, generator))
+
+    def ends(self, name: str, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """A draw with `name` at the low end of its range, and the same draw with it at the high end.
+
+        Two tables [P, count], equal where a cart has what was found of `name`. Where a share of the carts
+        comes from elsewhere, at least half do here, so that a small share is not overlooked.
+        """
+        table, keeps = self._draw_found(count, generator, max(self.elsewhere, 0.5) if self.elsewhere else 0.0)
+        low, high = self.others.ends(name, count, generator)
+        return torch.where(keeps, table, low), torch.where(keeps, table, high)
+
+    def _draw_found(self, count: int, generator: torch.Generator, elsewhere: float) -> tuple[Tensor, Tensor]:
+        """Carts of `found` [P, count], and which of their numbers are kept, [P, count] bool.
+
+        All numbers of a share `elsewhere` of the carts are given up.
+        """
         device = self.nominal.device
         which = torch.randint(self.found.shape[1], (count,), generator=generator, device=device)
-        table = self.found[:, which]
-        strangers = torch.rand(count, generator=generator, device=device) < self.elsewhere
-        return torch.where(self._told & ~strangers, table, self.others.draw(count, generator))
+        strangers = torch.rand(count, generator=generator, device=device) < elsewhere
+        return self.found[:, which], self._told & ~strangers
 
     def longest_delay(self) -> float:
         """The longest latency that a draw can have, jitter included, s."""

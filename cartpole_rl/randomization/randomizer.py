@@ -47,16 +47,18 @@ class Randomizer:
 
     def draw(self, count: int, generator: torch.Generator) -> Tensor:
         """Parameters of `count` carts, [P, count]."""
-        table = self.nominal.unsqueeze(1).repeat(1, count)
-        if self.poles.lengths is not None or self._choices.shape[1] > 1:
-            table[self._pole_rows] = self._draw_poles(count, generator)
-        if self.ranges:
-            unit = torch.rand((len(self._rows), count), generator=generator, device=self.nominal.device)
-            value = self._low + unit * self._width
-            value = torch.where(self._logarithmic, value.exp(), value)
-            scaled = table.index_select(0, self._rows) * value
-            table.index_copy_(0, self._rows, torch.where(self._scales, scaled, value))
-        return table
+        return self._table(*self._draw_parts(count, generator))
+
+    def ends(self, name: str, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """A draw with `name` at the low end of its range, and the same draw with it at the high end.
+
+        Two tables [P, count] that are equal in every other parameter. `name` must have a range.
+        """
+        poles, unit = self._draw_parts(count, generator)
+        row = list(self.ranges).index(name)
+        low, high = unit.clone(), unit.clone()
+        low[row], high[row] = 0, 1
+        return self._table(poles, low), self._table(poles, high)
 
     def longest_delay(self) -> float:
         """The longest latency that a draw can have, jitter included, s."""
@@ -72,6 +74,23 @@ class Randomizer:
     def can_differ_from_zero(self, name: str) -> bool:
         """Whether a draw of `name` can be anything but 0; what stays 0 need not be simulated."""
         return name in self.ranges or self._nominal_of(name) != 0
+
+    def _draw_parts(self, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Nominal carts with drawn poles, [P, count], and a number from 0 to 1 a range, [R, count]."""
+        table = self.nominal.unsqueeze(1).repeat(1, count)
+        if self.poles.lengths is not None or self._choices.shape[1] > 1:
+            table[self._pole_rows] = self._draw_poles(count, generator)
+        unit = table.new_zeros(0, count)
+        if self.ranges:
+            unit = torch.rand((len(self._rows), count), generator=generator, device=self.nominal.device)
+        return table, unit
+
+    def _table(self, poles: Tensor, unit: Tensor) -> Tensor:
+        """Parameters [P, N] of the carts that `_draw_parts` drew."""
+        value = self._low + unit * self._width
+        value = torch.where(self._logarithmic, value.exp(), value)
+        value = torch.where(self._scales, poles.index_select(0, self._rows) * value, value)
+        return poles.index_copy(0, self._rows, value)
 
     def _draw_poles(self, count: int, generator: torch.Generator) -> Tensor:
         """Mass, centre of mass and inertia, [3, count]."""

@@ -1,6 +1,6 @@
 """One episode as an animated GIF in real time, small enough for a page, a pull request or TensorBoard.
 
-All frames share one fixed palette of 32 colours, so that a frame holds only what changed.
+All frames share one fixed palette of at most 32 colours, so that a frame holds only what changed.
 """
 
 import io

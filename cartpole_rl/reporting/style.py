@@ -1,8 +1,8 @@
 """One place for what pictures look like: colours, sizes and the look of a matplotlib axes.
 
-The colours are the eight of Okabe and Ito (2008), "Color Universal Design", which stay distinct for
-colour-blind readers; figures and the animation give one meaning one colour. Figures are built through
-matplotlib's object API, so nothing here touches pyplot or global settings.
+The colours are those of Okabe and Ito (2008), "Color Universal Design", which stay distinct for colour-blind
+readers, with a brown in place of their yellow; figures and the animation give one meaning one colour. Figures
+are built through matplotlib's object API, so nothing here touches pyplot or global settings.
 """
 
 from matplotlib.axes import Axes

@@ -12,7 +12,7 @@ VERSION = 1
 END = b"\x00"
 HEADER_BYTES = 4
 CRC_BYTES = 2
-LONGEST_FRAME = 64  # stuffed bytes without the end; the longest message, INFO, takes 36
+LONGEST_FRAME = 64  # stuffed bytes without the end; the longest messages, INFO and STATE, take 30
 
 
 @dataclass(frozen=True)

@@ -129,7 +129,7 @@ class Home(Message):
 
 @dataclass(frozen=True)
 class ClearFault(Message):
-    """Clears the latched faults. One whose cause still holds is latched again once the cart is armed."""
+    """Clears the latched faults. One whose cause still holds comes again once the cart is armed or homes."""
 
     TYPE = MessageType.CLEAR_FAULT
 

@@ -39,7 +39,7 @@ def test_the_cart_is_found(told: dict[str, Any]) -> None:
     assert found["force_gain"] == pytest.approx(1e3 * 0.0198 * 1.015 / mass, rel=0.03)
     frequency = np.sqrt(moment * 9.81 / (1.22e-3 + moment * 0.1765)) / (2 * np.pi)
     assert found["pole_frequency"] == pytest.approx(frequency, rel=0.01)
-    assert found["deadband"] == pytest.approx(50, rel=0.15)
+    assert found["deadband"] == pytest.approx(50, rel=0.15)  # the curve's; 55 and 60 are too little above it
     assert found["latency"] + found["lag"] == pytest.approx(17, abs=3)
     assert found["angle_offset"] == pytest.approx(np.degrees(-0.01), abs=0.1)
 

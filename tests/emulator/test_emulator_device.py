@@ -27,6 +27,7 @@ from cartpole_rl.wire import (
 )
 
 COARSE = {"physics_step": 1e-3}
+NOMINAL_LIMITS = (16704, 17539)  # counts, as docs/protocol.md has them
 
 
 class Driven:
@@ -61,6 +62,10 @@ class Driven:
         ).message
         assert isinstance(message, Info)
         return message
+
+    def limits(self) -> tuple[int, int]:
+        """Soft and hard limit, counts from the middle, as INFO tells them."""
+        return self.info().soft_limit_counts, self.info().hard_limit_counts
 
     def home(self) -> State:
         state = self.ask(Home())
@@ -142,6 +147,50 @@ def test_limits_count_from_the_stops_that_were_found():
     driven.home()
     assert driven.info().soft_limit_counts * CART_METRES == pytest.approx(0.4 - 0.027, abs=1e-4)
     assert driven.info().hard_limit_counts * CART_METRES == pytest.approx(0.4 - 0.008, abs=1e-4)
+
+
+def test_before_the_first_homing_the_limits_are_those_of_the_drawing():
+    driven = Driven(track_half_length=0.4)
+    assert driven.limits() == NOMINAL_LIMITS
+    driven.ask(Home())
+    while driven.flags & Flags.HOMING:
+        assert driven.limits() == NOMINAL_LIMITS
+        driven.tick()
+    assert driven.limits() < NOMINAL_LIMITS
+
+
+def test_limits_and_zeros_last_until_another_homing_succeeds_or_the_cart_restarts():
+    driven = Driven(track_half_length=0.4, stuck_encoder="cart", stuck_at=28.0, reset_at=100.0)
+    driven.home()
+    found, state = driven.limits(), driven.ask(Home())
+    while driven.flags & Flags.HOMING:
+        if driven.cart.now_us < 28e6:
+            assert driven.measured(state)[0] == pytest.approx(driven.x, abs=2 * CART_METRES)
+        assert driven.limits() == found
+        state = driven.tick()
+    assert state.fault == Fault.HOMING
+    off = driven.measured(state)[1] - driven.angle - driven.settings.angle_offset
+    assert math.remainder(off, 2 * math.pi) == pytest.approx(0, abs=2 * POLE_RADIANS)
+    assert driven.limits() == found
+    while driven.cart.now_us <= 100e6:
+        driven.tick()
+    assert driven.limits() == NOMINAL_LIMITS
+
+
+def test_neither_watchdog_nor_limits_hold_while_homing():
+    """The cart moves on, without a SET_MOTOR, beyond both limits of a homing before, to the stops."""
+    driven = Driven()
+    driven.home()
+    soft, hard = driven.limits()
+    farthest, outward, state = 0, 0, driven.ask(Home())
+    while driven.flags & Flags.HOMING:
+        assert not driven.flags & (Flags.SOFT_LIMIT | Flags.WATCHDOG)
+        farthest = max(farthest, abs(state.cart_counts))
+        outward += abs(state.cart_counts) > soft and state.motor_applied * state.cart_counts > 0
+        state = driven.tick()
+    assert state.fault == 0
+    assert farthest > hard
+    assert outward > 10
 
 
 def test_counts_follow_the_truth_all_along():

@@ -224,7 +224,7 @@ def end_state(**changes: object) -> tuple[float, float]:
 @pytest.mark.parametrize("name", OTHER)
 def test_each_setting_has_an_effect(name):
     base, other = end_state(), end_state(**{name: OTHER[name]})
-    assert max(abs(a - b) for a, b in zip(base, other, strict=True)) > 1e-4
+    assert max(abs(a - b) for a, b in zip(base, other, strict=True)) > 1e-5
 
 
 def test_the_same_settings_end_in_the_same_state():

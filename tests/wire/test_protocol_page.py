@@ -25,6 +25,7 @@ from cartpole_rl.wire import (
     Stop,
     encode_frame,
 )
+from cartpole_rl.wire.frames import CRC_BYTES, HEADER_BYTES, LONGEST_FRAME
 
 PAGE = (Path(__file__).parents[2] / "docs" / "protocol.md").read_text(encoding="utf-8")
 HOMED = Flags.HOMED
@@ -72,3 +73,32 @@ def test_fault_is_listed(fault):
 @pytest.mark.parametrize("reason", Reason)
 def test_reason_is_listed(reason):
     assert f"| {reason.value} {reason.name} |" in PAGE
+
+
+@pytest.mark.parametrize("name", ["STATE", "SET_MOTOR"])
+def test_the_length_of_a_frame_is_told(name):
+    told = int(re.search(rf"\b{name} is (\d+) bytes", PAGE).group(1))
+    assert told == len(encode_frame(*EXAMPLES[name]))
+
+
+def test_the_longest_messages_fit_a_frame():
+    """INFO and STATE have 23 bytes of payload, and 6 of header and checksum; stuffing adds one."""
+    lengths = {name: len(encode_frame(*example)) - 1 for name, example in EXAMPLES.items()}
+    longest = max(lengths.values())
+    assert {name for name, length in lengths.items() if length == longest} == {"INFO", "STATE"}
+    assert longest == 23 + HEADER_BYTES + CRC_BYTES + 1 < LONGEST_FRAME
+
+
+@pytest.mark.parametrize("rule", ["Watchdog", "Soft limit", "Faults"])
+def test_each_rule_says_when_it_holds(rule):
+    """A homing touches the stops by itself: with a rule that held then too it could not."""
+    text = re.search(rf"^\d\. \*\*{rule}\*\*(.*?)(?=^\d\. |^$)", PAGE, re.MULTILINE | re.DOTALL).group(1)
+    assert "while armed" in text
+    assert "homing" in text
+
+
+def test_the_limits_before_the_first_homing_are_told():
+    """Those that tests/emulator/test_emulator_device.py finds."""
+    text = PAGE.split("**The limits in INFO**")[1].split("\n\n")[0]
+    assert "Before the\nfirst homing" in text
+    assert "16704 and 17539" in text

@@ -1,0 +1,201 @@
+"""experiment=thesis_balance and thesis_swingup are what the thesis says, each number with its source.
+
+Where the thesis is silent the number is ours; it is listed too, so that none of the settings is overlooked.
+"""
+
+import math
+from collections.abc import Iterator, Mapping
+from functools import cache
+from typing import Any
+
+import hydra
+import pytest
+from hydra.core.global_hydra import GlobalHydra
+
+from cartpole_rl.choices import conf_folder
+from cartpole_rl.commands.application import as_mapping
+from cartpole_rl.commands.config import TrainConfig, checked
+
+SILENT = "silent"
+UNREAD = "not read with these settings"
+Table = dict[str, tuple[Any, str]]  # setting: value, source in the thesis
+
+BOTH: Table = {
+    "control_period": (0.02, "5.2.2: 50 Hz"),
+    "plant.kind": ("simulated", "5.2"),
+    "plant.integrator": ("semi_implicit", "3.1, equation (3.8)"),
+    "plant.substeps": (4, SILENT),
+    "plant.pole_presses": (False, "5.2.3: friction of a constant normal force"),
+    "pole.choices.medium.pole_mass": (0.127, "table 6.3"),
+    "pole.choices.medium.pole_com": (pytest.approx(0.355 / 2, abs=5e-4), "table 6.3: length 0.355 m"),
+    "pole.choices.medium.pole_inertia": (1.199e-3, SILENT),
+    "pole.lengths": (None, "6.4: all but one experiment use one pole"),
+    "pole.in_turn": (False, UNREAD),
+    "actions.actuator": ("force_curve", "6.3; at the nominal cart also the forces of 6.1"),
+    "task.time_limit": (500, "6: ten seconds at 50 Hz"),
+    "task.x_max": (0.38, SILENT),
+    "task.start.angle_spread": (0.05, SILENT),
+    "task.start.position_spread": (0.05, "5.2: Gymnasium's environment"),
+    "task.start.speed_spread": (0.05, "5.2: Gymnasium's environment"),
+    "task.start.angular_speed_spread": (0.05, "5.2: Gymnasium's environment"),
+    "task.start.resting_share": (0.0, "6.2: any random position"),
+    "task.evaluation_start.resting_share": (0.0, UNREAD),
+    "reward.scale": (1.0, "equations (5.1) and (6.2)"),
+    "reward.track_penalty": (0.0, "equations (5.1) and (6.2)"),
+    "reward.track_price": (0.0, "equations (5.1) and (6.2)"),
+    "observation.kind": ("raw", "5.1.1"),
+    "observation.past_motors": (0, "5.1.1"),
+    "observation.past_velocities": (0, "5.1.1"),
+    "observation.past_positions": (0, "5.1.1"),
+    "observation.pole_length": (False, "5.1.1"),
+    "agent.hidden": ([64, 64], "tables 6.1 and 6.2"),
+    "agent.recurrent": (None, "5.1.1"),
+    "agent.layer_norm": (False, "not named"),
+    "agent.mirrored": (False, "not named"),
+    "agent.gamma": (0.99, "table 6.2"),
+    "agent.double": (False, "4.1.2"),
+    "agent.action_gap": (0.0, "equation (4.1)"),
+    "agent.loss": ("l2", SILENT),
+    "agent.target_tau": (None, "4.1.2: the network is copied"),
+    "agent.average_decay": (None, "not named"),
+    "replay.kind": ("uniform", "5: typically equally distributed"),
+    "replay.alpha": (0.0, UNREAD),
+    "replay.beta": ([1.0, 1.0], UNREAD),
+    "replay.priority_eps": (1e-3, UNREAD),
+    "optimizer.learning_rate": (0.001, "table 6.2"),
+    "optimizer.learning_rate_end": (1.0, "no schedule is named"),
+    "optimizer.max_grad_norm": (10.0, SILENT),
+    "learning.carts": (1, "5, figure 5.1"),
+    "learning.chunk": (1, SILENT),
+    "learning.try_again": (0.0, "5.2.1"),
+    "learning.updates": (1, SILENT),
+    "learning.n_step": (1, "equation (4.1)"),
+    "learning.warmup_frames": (1000, SILENT),
+    "learning.epsilon": ([0.1, 0.1], "table 6.2"),
+    "learning.epsilon_frames": (500_000, UNREAD),
+    "learning.evaluations": (10, SILENT),
+    "learning.evaluation_episodes": (20, SILENT),
+    "learning.checkpoint_interval": (2, SILENT),
+    "cart_friction.parameters": ({}, "6.3"),
+    "pole_friction.parameters": ({}, "6.3"),
+    "randomization": ({}, "6.4: only there"),
+}
+CART: Table = {
+    "latency": (0.0, "5.2.2"),
+    "latency_jitter": (0.0, "5.2.2"),
+    "motor_time_constant": (0.0, "5.2.2"),
+    "track_tilt": (0.0, "5.2"),
+    "angle_offset": (0.0, "5.2"),
+    "position_noise": (0.0, "5.2"),
+    "angle_noise": (0.0, "5.2"),
+    "force_quadratic": (0.0, "figure 5.5 without numbers; 6.2: 1, 2, 3, 4 N"),
+    "force_linear": (0.02, "figure 5.5 without numbers; 6.2: 1, 2, 3, 4 N at 100, 150, 200, 250"),
+    "force_offset": (-1.0, "figure 5.5 without numbers; 6.2: 1, 2, 3, 4 N"),
+    "force_asymmetry": (0.0, "6.3"),
+    "deadband_left": (0.0, "6.3"),
+    "deadband_right": (0.0, "6.3"),
+    "sigmoid_slope": (100.0, "6.3: rho"),
+    "cart_coulomb": (0.5, SILENT),
+    "cart_coulomb_asymmetry": (0.0, "equation (5.8)"),
+    "pole_viscous": (2.1e-4, SILENT),
+    "cart_mass": (0.703, SILENT),
+    "track_half_length": (0.38, SILENT),
+    **{
+        name: (value, UNREAD)
+        for name, value in {"cart_stiction_ratio": 1.2, "stribeck_velocity": 0.01}.items()
+    },
+    **{name: (value, UNREAD) for name, value in {"pole_drag": 2.5e-5, "pole_coulomb": 0.0}.items()},
+}
+OF: dict[str, Table] = {
+    "thesis_balance": {
+        "task.name": ("balance", "6.1"),
+        "task.angle_limit": (pytest.approx(math.radians(12)), "6.1"),
+        "task.start.angle": ("upright", "3.3"),
+        "task.evaluation_start.angle": ("upright", "3.3"),
+        "task.evaluation_start.position_spread": (0.05, "5.2: Gymnasium's environment"),
+        "task.evaluation_start.angle_spread": (0.05, "5.2: Gymnasium's environment"),
+        "task.evaluation_start.speed_spread": (0.05, "5.2: Gymnasium's environment"),
+        "task.evaluation_start.angular_speed_spread": (0.05, "5.2: Gymnasium's environment"),
+        "actions.motors": ([-200, 0, 200], "table 6.1: -1, 0, 1"),
+        "reward.kind": ("constant", "table 6.1"),
+        "cart_friction.model": ("none", "5.2.2, 6.1"),
+        "pole_friction.model": ("none", "5.2.2, 6.1"),
+        "cart.cart_viscous": (0.5, UNREAD),
+        "agent.target_period": (200, "table 6.1"),
+        "replay.size": (15_000, "table 6.1"),
+        "optimizer.kind": ("adam", "5.1.2, 6.2"),
+        "optimizer.weight_decay": (0.0, "5.1.2: plain Adam"),
+        "learning.frames": (200_000, "figure 6.1 counts 30000 episodes, of unknown length"),
+        "learning.batch_size": (128, "table 6.1"),
+    },
+    "thesis_swingup": {
+        "task.name": ("swingup", "6.3"),
+        "task.angle_limit": (None, "6.2"),
+        "task.start.angle": ("any", "6.2"),
+        "task.start.angle_spread": (0.0, UNREAD),
+        "task.evaluation_start.angle": ("hanging", "5.2.1"),
+        "task.evaluation_start.position_spread": (0.1, SILENT),
+        "task.evaluation_start.angle_spread": (0.0, SILENT),
+        "task.evaluation_start.speed_spread": (0.0, SILENT),
+        "task.evaluation_start.angular_speed_spread": (0.0, SILENT),
+        "actions.motors": ([-250, -200, -150, -100, 0, 100, 150, 200, 250], "6.3"),
+        "reward.kind": ("score", "6.2: equation (6.2)"),
+        "cart_friction.model": ("sigmoid", "6.3: one of three"),
+        "pole_friction.model": ("exponential", "6.3"),
+        "cart.cart_viscous": (0.0, "equation (5.8)"),
+        "agent.target_period": (2000, "table 6.2"),
+        "replay.size": (200_000, "table 6.2"),
+        "optimizer.kind": ("adamw", "6.3"),
+        "optimizer.weight_decay": (0.01, SILENT),
+        "learning.frames": (500_000, SILENT),
+        "learning.batch_size": (256, "table 6.2"),
+    },
+}
+OF_THE_RUN = {"seed", "label", "threads", "compile", "resume"}  # not of the experiment
+EXPECTED = {
+    name: {**BOTH, **{f"cart.{key}": row for key, row in CART.items()}, **own} for name, own in OF.items()
+}
+
+
+@pytest.fixture(autouse=True, scope="module")
+def composer() -> Iterator[None]:
+    GlobalHydra.instance().clear()
+    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(conf_folder())):
+        yield
+
+
+@cache
+def settings(experiment: str) -> dict[str, Any]:
+    """Each setting of an experiment by its whole name."""
+    config = checked(TrainConfig, as_mapping(hydra.compose("train", [f"experiment={experiment}"])))
+    return dict(leaves(config.model_dump(mode="json", exclude=OF_THE_RUN)))
+
+
+def leaves(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in config.items():
+        if isinstance(value, dict) and value:
+            yield from leaves(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
+
+
+CASES = [(experiment, name) for experiment, table in EXPECTED.items() for name in table]
+
+
+@pytest.mark.parametrize(("experiment", "name"), CASES)
+def test_a_number_is_that_of_the_thesis(experiment: str, name: str) -> None:
+    value, source = EXPECTED[experiment][name]
+    assert settings(experiment)[name] == value, f"{name}: {source}"
+
+
+@pytest.mark.parametrize("experiment", EXPECTED)
+def test_no_setting_is_overlooked(experiment: str) -> None:
+    assert set(settings(experiment)) == set(EXPECTED[experiment])
+
+
+@pytest.mark.parametrize("experiment", EXPECTED)
+def test_a_source_stands_beside_each_number_of_the_file(experiment: str) -> None:
+    lines = (conf_folder() / f"experiment/{experiment}.yaml").read_text().splitlines()
+    for line in lines[lines.index("defaults:") + 1 :]:
+        if not line.rstrip().endswith(":"):
+            assert "#" in line, line

@@ -1,0 +1,162 @@
+"""The default truth is what docs/emulator.md says of it, and each number that is off can be seen to be."""
+
+import math
+import re
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+pytest.importorskip("mujoco")
+
+from cartpole_rl.choices import choice
+from cartpole_rl.emulator.device import CartDevice
+from cartpole_rl.emulator.firmware import SOFT_LIMIT
+from cartpole_rl.emulator.homing import CART_METRES
+from cartpole_rl.emulator.motor import Motor
+from cartpole_rl.emulator.settings import EmulatorSettings
+from cartpole_rl.wire import Flags, Home, Message, SetMotor, Start, State, decode_frame, encode_frame
+
+PAGE = (Path(__file__).parents[2] / "docs" / "emulator.md").read_text(encoding="utf-8")
+LEVELS = choice("actions/nine_levels")["motors"]
+CART = {**choice("cart/ip02"), **choice("pole/medium")["choices"]["medium"]}
+CURVE = (CART["force_quadratic"], CART["force_linear"], CART["force_offset"])
+OTHERWISE = {  # what conf/ has under another name, or has not
+    "track_half_length": CART["track_half_length"] + SOFT_LIMIT * CART_METRES,
+    "cart_coulomb_left": CART["cart_coulomb"] * (1 - CART["cart_coulomb_asymmetry"]),
+    "cart_coulomb_right": CART["cart_coulomb"] * (1 + CART["cart_coulomb_asymmetry"]),
+    "force_curve": CURVE,
+    "cogging": 0.0,
+    **dict.fromkeys(("frame_loss", "frame_corruption", "frame_duplication", "frame_reordering"), 0.0),
+}
+
+
+class Row(NamedTuple):
+    """A line of the table."""
+
+    names: list[str]
+    nominal: list[float | None]  # None: the simulator has no such number
+    truth: list[float]
+    off_by: list[str]
+
+
+def row_of(line: str) -> Row:
+    setting, nominal, truth, off_by = [cell.strip() for cell in line.split("|")[1:5]]
+    names = re.findall(r"`(\w+)`", setting)
+    names = [names[0].rsplit("_", 1)[0] + name if name.startswith("_") else name for name in names]
+    values = [None if value == "none" else float(value) for value in nominal.split(", ")]
+    truths = [float(value) for value in truth.split(", ")]
+    return Row(names, values, truths, [off for off in off_by.split(", ") if off])
+
+
+TABLE = PAGE.split("| what stands behind it |\n")[1].split("\n\n")[0].splitlines()[1:]
+ROWS = [row_of(line) for line in TABLE]
+by_name = pytest.mark.parametrize("row", ROWS, ids=[row.names[0] for row in ROWS])
+
+
+def flat(values: list[object]) -> list[object]:
+    return [each for value in values for each in (value if isinstance(value, tuple) else (value,))]
+
+
+def nominal(name: str) -> object:
+    return OTHERWISE.get(name, CART.get(name))
+
+
+@by_name
+def test_the_nominal_cart_is_that_of_conf(row: Row) -> None:
+    expected = flat([nominal(name) for name in row.names])
+    assert row.nominal == [None if value is None else pytest.approx(value, abs=1e-5) for value in expected]
+
+
+@by_name
+def test_the_truth_is_that_of_the_settings(row: Row) -> None:
+    assert row.truth == flat([getattr(EmulatorSettings(), name) for name in row.names])
+
+
+@by_name
+def test_it_is_off_by_what_the_table_says(row: Row) -> None:
+    if row.names == ["force_curve"]:
+        shares = [
+            force(EmulatorSettings().force_curve, size) / force(CURVE, size) - 1 for size in LEVELS if size
+        ]
+        assert max(shares) - min(shares) < 1e-9
+        off = [shares[0]]
+    elif row.names == ["force_asymmetry"]:
+        off = row.truth
+    else:
+        off = [truth / usual - 1 for truth, usual in zip(row.truth, row.nominal, strict=True) if usual]
+    assert row.off_by == [shown(share, told) for share, told in zip(off, row.off_by, strict=True)]
+
+
+def force(curve: tuple[float, float, float], motor: int) -> float:
+    """N of a force curve, for a motor value of either sign."""
+    a, b, c = curve
+    return math.copysign(max(0.0, a * motor**2 + b * abs(motor) + c), motor)
+
+
+def shown(share: float, like: str) -> str:
+    """A share in per cent, with as many digits as `like` has."""
+    digits = len(like.partition(".")[2].removesuffix(" %"))
+    rounded = round(100 * share, digits)
+    return f"{rounded:+.{digits}f} %" if rounded else "0 %"
+
+
+def changed() -> list[str]:
+    """Settings of which the truth is not the nominal number."""
+    settings = EmulatorSettings()
+    return [
+        name for row in ROWS for name in row.names if nominal(name) not in (None, getattr(settings, name))
+    ]
+
+
+@cache
+def driven(name: str | None) -> list[tuple[int, int]]:
+    """Counts of a whole homing and of a drive after it, `name` being nominal and all else the truth."""
+    settings = EmulatorSettings(physics_step=1e-3, **({} if name is None else {name: nominal(name)}))
+    cart, seen = CartDevice(settings), []
+
+    def period(message: Message | None) -> Flags:
+        if message is not None:
+            cart.receive(encode_frame(message, 0)[:-1], cart.now_us)
+        frame = decode_frame(cart.pass_period(cart.period_end_us)[-1][:-1])
+        assert isinstance(frame.message, State)
+        seen.append((frame.message.cart_counts, frame.message.pole_counts))
+        return Flags(frame.flags)
+
+    flags = period(Home())
+    while flags & Flags.HOMING:
+        flags = period(None)
+    assert flags == Flags.HOMED
+    period(Start())
+    for motor in (200, 58, 57, -200, -200, -56, -55, 200, 100, 0, -100, -150, 150):
+        for _ in range(4):
+            assert period(SetMotor(motor)) & Flags.ARMED
+    return seen
+
+
+def test_the_same_cart_moves_alike() -> None:
+    """What the next test would miss: a difference that comes from elsewhere."""
+    assert driven.__wrapped__(None) == driven(None)
+
+
+@pytest.mark.parametrize("name", changed())
+def test_each_number_that_is_off_changes_the_motion(name: str) -> None:
+    assert driven(name) != driven(None)
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_the_dead_bands_show_in_the_force(side: int) -> None:
+    """Up to them there is none although the curve alone gives some, and then as much as the page says."""
+    settings = EmulatorSettings()
+    edge = int(settings.deadband_right if side > 0 else settings.deadband_left)
+    motor, curve = (
+        Motor(settings),
+        Motor(settings.model_copy(update={"deadband_left": 0, "deadband_right": 0})),
+    )
+    assert motor.static_force(side * edge) == 0
+    assert abs(curve.static_force(side * edge)) > 0.09
+    step = motor.static_force(side * (edge + 1))
+    assert step == curve.static_force(side * (edge + 1))
+    assert 0.1 < abs(step) < 0.23
+    assert f"{abs(step):.2f} N at {side * (edge + 1)}" in PAGE

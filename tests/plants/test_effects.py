@@ -1,0 +1,159 @@
+"""Ranges without effect are found by trying, whatever the reason."""
+
+from typing import Any
+
+import pytest
+import torch
+
+from cartpole_rl.choices import choice, conf_folder
+from cartpole_rl.physics.actuator import Actuator
+from cartpole_rl.physics.dynamics import Models, unused_parameters
+from cartpole_rl.physics.friction import CartFriction, PoleFriction
+from cartpole_rl.physics.parameters import CartParameters
+from cartpole_rl.plants.effects import without_effect
+from cartpole_rl.randomization import FoundCarts, PoleSettings, Randomizer, Range
+
+ACTIONS = sorted(path.stem for path in (conf_folder() / "actions").glob("*.yaml"))
+RANDOMIZATIONS = sorted(path.stem for path in (conf_folder() / "randomization").glob("*.yaml"))
+READ_BY = {  # where the default models do not
+    "cart_stiction_ratio": Models(CartFriction.STRIBECK),
+    "stribeck_velocity": Models(CartFriction.STRIBECK),
+    "pole_drag": Models(pole_friction=PoleFriction.BEARING),
+    "pole_coulomb": Models(pole_friction=PoleFriction.BEARING),
+}
+NARROW = {  # a per cent where nominal is not 0, and about as little where it is
+    "track_tilt": (0.0, 1e-4),
+    "cart_coulomb_asymmetry": (0.0, 0.01),
+    "pole_coulomb": (0.0, 1e-6),
+    "force_quadratic": (0.0, 1e-8),
+    "force_asymmetry": (0.0, 0.01),
+    "deadband_left": (90.0, 110.0),
+    "deadband_right": (90.0, 110.0),
+    "motor_time_constant": (0.0, 1e-3),
+    "latency_jitter": (0.0, 1e-4),
+    "angle_offset": (0.0, 1e-4),
+    "position_noise": (0.0, 1e-6),
+    "angle_noise": (0.0, 1e-4),
+}
+
+
+def ranges_of(name: str) -> dict[str, Range]:
+    return {key: Range(**line) for key, line in choice(f"randomization/{name}").items()}
+
+
+def idle(
+    ip02: dict[str, float],
+    ranges: dict[str, Range],
+    poles: PoleSettings,
+    actions: str = "nine_levels",
+    models: Models = Models(),  # noqa: B008 - immutable
+) -> set[str]:
+    """Ranges without effect for an action set of conf/."""
+    chosen: dict[str, Any] = choice(f"actions/{actions}")
+    models = models._replace(actuator=Actuator(chosen["actuator"]))
+    return set(without_effect(Randomizer(ip02, poles, ranges), ranges, chosen["motors"], models, 0.02))
+
+
+@pytest.mark.parametrize("actions", ACTIONS)
+@pytest.mark.parametrize("randomization", RANDOMIZATIONS)
+def test_every_shipped_range_has_an_effect(
+    ip02: dict[str, float], medium: PoleSettings, both_poles: PoleSettings, randomization: str, actions: str
+) -> None:
+    """But for what plain newtons leave out by definition."""
+    ranges = ranges_of(randomization)
+    left_out = {"force_asymmetry", "motor_time_constant"} & set(ranges)
+    for poles in (medium, both_poles, PoleSettings(lengths=(0.2, 1.1))):
+        found = idle(ip02, ranges, poles, actions)
+        assert found == (left_out if actions == "nine_newtons" else set())
+
+
+@pytest.mark.parametrize("law", [CartFriction.STEP, CartFriction.SIGMOID, CartFriction.STRIBECK])
+@pytest.mark.parametrize("randomization", [name for name in RANDOMIZATIONS if name.startswith("friction")])
+def test_the_thesis_perturbs_friction_that_is_read(
+    ip02: dict[str, float], medium: PoleSettings, randomization: str, law: CartFriction
+) -> None:
+    assert idle(ip02, ranges_of(randomization), medium, models=Models(law)) == set()
+
+
+@pytest.mark.parametrize("actions", [name for name in ACTIONS if name != "nine_newtons"])
+def test_a_dead_band_below_the_smallest_motor_value_has_none(
+    ip02: dict[str, float], medium: PoleSettings, actions: str
+) -> None:
+    names = ("deadband_left", "deadband_right")
+    small = {**ranges_of("wide"), **{name: Range(absolute=(0.0, 60.0)) for name in names}}
+    assert idle(ip02, small, medium, actions) == set(names)
+    smallest = min(motor for motor in choice(f"actions/{actions}")["motors"] if motor > 0)
+    large = {**small, **{name: Range(absolute=(0.0, smallest + 10.0)) for name in names}}
+    assert idle(ip02, large, medium, actions) == set()
+
+
+def test_one_side_may_have_none(ip02: dict[str, float], medium: PoleSettings) -> None:
+    bounds = {"deadband_left": (0.0, 110.0), "deadband_right": (0.0, 60.0)}
+    ranges = {name: Range(absolute=pair) for name, pair in bounds.items()}
+    assert idle(ip02, ranges, medium) == {"deadband_right"}
+
+
+@pytest.mark.parametrize("cart_friction", CartFriction)
+@pytest.mark.parametrize("pole_friction", PoleFriction)
+@pytest.mark.parametrize("actions", ["nine_levels", "nine_newtons"])
+def test_a_parameter_that_the_laws_do_not_read_has_none(
+    ip02: dict[str, float],
+    medium: PoleSettings,
+    cart_friction: CartFriction,
+    pole_friction: PoleFriction,
+    actions: str,
+) -> None:
+    """Measured and listed are the same, where every range is wide and reaches all motor values."""
+    models = Models(cart_friction, pole_friction, Actuator(choice(f"actions/{actions}")["actuator"]))
+    names = unused_parameters(Models(CartFriction.NONE, PoleFriction.NONE, Actuator.NEWTONS))
+    cart = {**ip02, "pole_coulomb": 1e-4}
+    ranges = {name: Range(absolute=wide(name, cart[name])) for name in names}
+    assert idle(cart, ranges, medium, actions, models) == unused_parameters(models) & names
+
+
+def wide(name: str, nominal: float) -> tuple[float, float]:
+    """A range of a parameter about its nominal value."""
+    if name.startswith("deadband"):
+        return (0.0, 210.0)
+    if nominal == 0:
+        return (0.0, 1e-6) if name == "force_quadratic" else (0.0, 0.02)
+    low, high = sorted((0.9 * nominal, 1.2 * nominal))
+    return (max(low, 1.0), high) if name == "cart_stiction_ratio" else (low, high)
+
+
+@pytest.mark.parametrize("name", CartParameters.names())
+def test_a_narrow_range_has_an_effect(ip02: dict[str, float], medium: PoleSettings, name: str) -> None:
+    """Each parameter alone, by a per cent, with everything else nominal."""
+    line = Range(absolute=NARROW[name]) if name in NARROW else Range(relative=(0.0, 0.01))
+    assert idle(ip02, {name: line}, medium, models=READ_BY.get(name, Models())) == set()
+
+
+def test_the_track_shows_at_its_end_alone(ip02: dict[str, float], medium: PoleSettings) -> None:
+    line = {"track_half_length": Range(absolute=(0.379, 0.38)), **ranges_of("friction_3")}
+    assert idle(ip02, line, medium) == set()
+
+
+def test_a_range_that_is_a_point_has_none(ip02: dict[str, float], medium: PoleSettings) -> None:
+    assert idle(ip02, {"cart_mass": Range(absolute=(0.7, 0.7))}, medium) == {"cart_mass"}
+
+
+def test_of_carts_that_were_found_only_what_is_drawn(ip02: dict[str, float], medium: PoleSettings) -> None:
+    """A range that no cart is drawn from has no effect."""
+    ranges = {"cart_mass": Range(relative=(-0.2, 0.2)), "latency": Range(absolute=(0.0, 0.02))}
+    others = Randomizer(ip02, medium, ranges)
+    found = others.nominal.unsqueeze(1).repeat(1, 5)
+
+    def unread(elsewhere: float, told: list[str] | None) -> list[str]:
+        carts = FoundCarts(found, others, elsewhere, longest_delay=0.02, told=told)
+        return without_effect(carts, ranges, (-200, 0, 200), Models(), 0.02)
+
+    assert unread(0.0, None) == ["cart_mass", "latency"]
+    assert unread(0.0, ["cart_mass"]) == ["cart_mass"]
+    assert unread(0.001, None) == []
+
+
+def test_asking_draws_nothing_from_elsewhere(ip02: dict[str, float], medium: PoleSettings) -> None:
+    before = torch.get_rng_state()
+    first, second = (idle(ip02, ranges_of("wide"), medium, "nine_newtons") for _ in range(2))
+    assert first == second
+    assert torch.equal(torch.get_rng_state(), before)
