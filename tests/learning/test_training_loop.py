@@ -23,6 +23,7 @@ LEARNING = {
     "updates": 2,
     "batch_size": 32,
     "n_step": 3,
+    "carry": False,
     "warmup_frames": 128,
     "epsilon": (0.5, 0.1),
     "epsilon_frames": 400,
