@@ -58,8 +58,8 @@ def restore_replay(replay: TensorDictReplayBuffer, snapshot: Mapping[str, Any]) 
 class NStepReturns:
     """Turns chunks of one-step transitions into transitions of up to n steps, in the order of collection.
 
-    Without `carry` a return ends where its chunk ends, so the last n - 1 periods of a chunk have shorter ones:
-    in a chunk of T >= n periods a return has n - n (n - 1) / (2 T) steps on average. With `carry` these
+    Without `carry` a return ends where its chunk ends, so the last n - 1 periods of a chunk have shorter
+    returns: in a chunk of T >= n periods they have n - n (n - 1) / (2 T) steps on average. With `carry` these
     periods are held back and get their whole returns from the next chunk of the same carts.
     """
 
@@ -73,7 +73,10 @@ class NStepReturns:
         self._waiting: TensorDictBase | None = None  # [N, held]
 
     def __call__(self, chunk: TensorDictBase) -> TensorDict:
-        """The n-step transitions [N * T] of `chunk` [N, T]; with `carry` n - 1 a cart fewer the first time."""
+        """Return the n-step transitions [N * T] of `chunk` [N, T].
+
+        With `carry` the first call gives [N * (T - n + 1)].
+        """
         steps = chunk if self._waiting is None else torch.cat((self._waiting, chunk), 1)
         if self.held:
             self._waiting = steps[:, -self.held :].clone()
