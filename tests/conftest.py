@@ -1,7 +1,17 @@
-"""What tests share: the nominal cart and pole of conf/, and builders of carts, plants and environments."""
+"""What tests share: the nominal cart and pole of conf/, and builders of carts, plants and environments.
 
+Tests may be started where signals are ignored: a script's `&` ignores SIGINT and SIGQUIT, nohup SIGHUP. A
+child inherits that, and no Ctrl-C of a test reaches it. So every ignored signal gets a handler here, before
+any child is started: exec sets a signal that has a handler back to its default. SIGINT gets Python's own
+handler, as tests interrupt their own process too. The handler of the others does nothing, so that pytest
+itself still outlives them, as nohup is meant to. SIGPIPE is left alone: Python ignores it, and subprocess
+restores it in children.
+"""
+
+import signal
 from collections.abc import Callable
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import pytest
@@ -19,6 +29,15 @@ from cartpole_rl.tasks.actions import ActionSettings
 from cartpole_rl.tasks.starts import Start, StartSettings
 
 CONF = Path(__file__).parents[1] / "conf"
+
+
+def outlive(number: int, frame: FrameType | None) -> None:
+    """Do nothing about a signal that was ignored."""
+
+
+for name in ("SIGINT", "SIGHUP", "SIGQUIT", "SIGTERM"):  # Windows has the first and the last
+    if hasattr(signal, name) and signal.getsignal(number := getattr(signal, name)) is signal.SIG_IGN:
+        signal.signal(number, signal.default_int_handler if number == signal.SIGINT else outlive)
 
 
 def conf(choice: str) -> dict[str, Any]:

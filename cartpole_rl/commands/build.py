@@ -45,7 +45,7 @@ from cartpole_rl.tasks.starts import Start, StartSettings
 BASELINE = Path("lqr")  # run=lqr is no folder: the controller that learned nothing
 LATER: dict[str, dict[str, Any]] = {  # settings that older checkpoints do not know, as they were then
     "cart": {"pole_coulomb": 0.0},
-    "learning": {"try_again": 0.0},
+    "learning": {"try_again": 0.0, "carry": False},
 }
 SIMILAR = 0.1  # share by which a pole's length may differ from a learned model's
 REPLACEABLE = ("cart", "cart_friction", "pole_friction", "pole", "reward")  # by an evaluation; and the task

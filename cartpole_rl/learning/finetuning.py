@@ -74,6 +74,7 @@ class Finetuning(Training):
         assert isinstance(self.env.plant, SimulatedPlant)
         self.env.plant.replace_randomizer(carts)
         self.collector.begin()
+        self.returns.reset()
         self.replay.empty()
         self.fill()
 

@@ -55,12 +55,52 @@ def restore_replay(replay: TensorDictReplayBuffer, snapshot: Mapping[str, Any]) 
     replay.load_state_dict({**snapshot, "_sampler": sampler})
 
 
-def n_step_transitions(chunk: TensorDictBase, n: int, gamma: float) -> TensorDict:
-    """One-step transitions [N, T] to n-step ones [N * T] with the keys that are learned from.
+class NStepReturns:
+    """Turns chunks of one-step transitions into transitions of up to n steps, in the order of collection.
+
+    Without `carry` a return ends where its chunk ends, so the last n - 1 periods of a chunk have shorter
+    returns: in a chunk of T >= n periods they have n - n (n - 1) / (2 T) steps on average. With `carry` these
+    periods are held back and get their whole returns from the next chunk of the same carts.
+    """
+
+    def __init__(self, n: int, gamma: float, carry: bool) -> None:
+        self.n, self.gamma = n, gamma
+        self.held = n - 1 if carry else 0  # periods
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the periods held back: the next chunk does not continue them."""
+        self._waiting: TensorDictBase | None = None  # [N, held]
+
+    def __call__(self, chunk: TensorDictBase) -> TensorDict:
+        """Return the n-step transitions [N * T] of `chunk` [N, T].
+
+        With `carry` the first call gives [N * (T - n + 1)].
+        """
+        steps = chunk if self._waiting is None else torch.cat((self._waiting, chunk), 1)
+        if self.held:
+            self._waiting = steps[:, -self.held :].clone()
+        return n_step_transitions(steps, self.n, self.gamma, self.held)
+
+    def snapshot(self) -> dict[str, Any] | None:
+        """The periods held back, if any."""
+        return None if self._waiting is None else self._waiting.to_dict()
+
+    def restore(self, snapshot: Mapping[str, Any] | None) -> None:
+        """Go on from `snapshot`."""
+        self.reset()
+        if snapshot is not None:
+            carts = len(snapshot["action"])
+            self._waiting = TensorDict(dict(snapshot), batch_size=[carts, self.held])
+
+
+def n_step_transitions(chunk: TensorDictBase, n: int, gamma: float, held: int = 0) -> TensorDict:
+    """One-step transitions [N, T] to n-step ones [N * (T - held)] with the keys that are learned from.
 
     Return, next observation and end flags are those of the step that is reached: n steps on, or the end of
     the episode, or of the chunk; `steps_to_next_obs` says how many, and the loss discounts by it. TorchRL's
     MultiStep does the same but keeps the flags of the first step, and so bootstraps through an ending.
+    The last `held` periods add to the returns of those before them, and give no transition themselves.
     """
     carts, periods = chunk.batch_size
     reward, done = chunk["next", "reward"].squeeze(-1), chunk["next", "done"].squeeze(-1)  # [N, T]
@@ -87,4 +127,4 @@ def n_step_transitions(chunk: TensorDictBase, n: int, gamma: float) -> TensorDic
         },
         batch_size=[carts, periods],
     )
-    return transitions.flatten(0, 1)
+    return transitions[:, : periods - held].flatten(0, 1)

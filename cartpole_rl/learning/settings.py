@@ -36,7 +36,8 @@ class LearningSettings(Settings):
     try_again: Fraction  # of the carts that the agent failed with: they are not replaced by new ones
     updates: Count  # gradient steps an iteration
     batch_size: Count
-    n_step: Annotated[int, Field(ge=1, le=20)]
+    n_step: Annotated[int, Field(ge=1, le=20)]  # the longest return
+    carry: bool  # the last n_step - 1 periods of a chunk wait for the next one, for whole returns
     warmup_frames: Annotated[int, Field(ge=0)]  # random actions before the first update
     epsilon: tuple[Fraction, Fraction]  # exploration, from first to last
     epsilon_frames: Count  # over which epsilon falls, linearly

@@ -19,7 +19,7 @@ from cartpole_rl.envs import CartPoleEnv
 from cartpole_rl.errors import LearningError
 from cartpole_rl.learning.collector import Collector
 from cartpole_rl.learning.randomness import random_state, restore_random_state
-from cartpole_rl.learning.replay import make_replay, n_step_transitions, replay_snapshot, restore_replay
+from cartpole_rl.learning.replay import NStepReturns, make_replay, replay_snapshot, restore_replay
 from cartpole_rl.learning.schedules import half_cosine, linear
 from cartpole_rl.learning.settings import LearningSettings, OptimizerSettings, ReplaySettings
 from cartpole_rl.tasks.episode import Episode
@@ -60,6 +60,7 @@ class Training:
         self.evaluate, self.monitor = evaluate, monitor
         self.collector = Collector(env, agent.actor, len(env.hardware.motors), seed, settings.try_again)
         self.replay_settings, self.optimizer_settings = replay, optimizer
+        self.returns = NStepReturns(settings.n_step, agent.settings.gamma, settings.carry)
         self.replay = make_replay(replay, settings.updates * settings.batch_size)
         self.gradient = LossGradient(agent.loss, optimizer.max_grad_norm, compiled)
         self.weights = self.gradient.weights
@@ -107,10 +108,10 @@ class Training:
             return chunk, self.learn() if self.frames > self.settings.warmup_frames else {}
 
     def collect(self) -> TensorDictBase:
-        """A chunk from all carts, which replay has as well from now on."""
+        """A chunk from all carts, whose transitions are in replay from now on, or wait for the next chunk."""
         self.collector.epsilon = self.epsilon()
         chunk = self.collector.collect(self.settings.chunk)
-        self.replay.extend(n_step_transitions(chunk, self.settings.n_step, self.agent.settings.gamma))
+        self.replay.extend(self.returns(chunk))
         return chunk
 
     def sample(self) -> TensorDictBase:
@@ -201,6 +202,7 @@ class Training:
             "agent": self.agent.state_dict(),
             "optimizer": self.optimizer.state_dict(),
             "replay": replay_snapshot(self.replay),
+            "returns": self.returns.snapshot(),
             "collector": self.collector.snapshot(),
             "plant": self.env.plant.snapshot(),
             "random": random_state(),
@@ -214,6 +216,7 @@ class Training:
         self.agent.load_state_dict(snapshot["agent"])
         self.optimizer.load_state_dict(snapshot["optimizer"])
         restore_replay(self.replay, snapshot["replay"])
+        self.returns.restore(snapshot.get("returns"))  # older checkpoints have none: nothing was held back
         self.collector.restore(snapshot["collector"])
         self.env.plant.restore(snapshot["plant"])
         restore_random_state(snapshot["random"])

@@ -26,6 +26,7 @@ ARMS = {
     "without averaged policy": ["agent.average_decay=null"],
     "single instead of double": ["agent.double=false"],
     "one-step returns": ["learning.n_step=1"],
+    "returns of five whole steps": ["learning.carry=true"],
     "no resting starts": ["task.start.resting_share=0"],
     "constant learning rate": ["optimizer.learning_rate_end=1"],
     "prioritized replay": ["replay=prioritized"],

@@ -53,12 +53,26 @@ def test_a_trained_seed_is_not_trained_again(trained: Path) -> None:
 
 
 def test_zero_shot_divides_by_the_nominal_score(trained: Path) -> None:
-    bench(trained, "zero_shot.py", "runs/bench/medium/0", "--truths", "1", "--json", "zero_shot.json")
+    words = ("zero_shot.py", "runs/bench/medium/0", "--truths", "2", "--starts", "2", "--jobs", "2")
+    shown = bench(trained, *words, "--json", "zero_shot.json")
+    assert "worst start" in shown
     (result,) = json.loads((trained / "zero_shot.json").read_text())
-    assert len(result["scores"]) == len(result["truths"]) == 1
-    truth = result["truths"][0]
-    assert 0.56 < truth["cart_mass"] < 0.85
-    assert truth["cart_coulomb_left"] != truth["cart_coulomb_right"]
+    assert (result["seed"], result["wider"], len(result["carts"])) == (1000, 0, 2)
+    for cart in result["carts"]:
+        scores = cart["scores"]
+        assert len(scores) == 2
+        assert cart["mean_ratio"] == pytest.approx(sum(scores) / 2 / result["nominal"])
+        assert cart["worst_ratio"] == pytest.approx(min(scores) / result["nominal"])
+        assert cart["lost"] == sum(score < 500 for score in scores)
+        assert cart["truth"]["cart_coulomb_left"] != cart["truth"]["cart_coulomb_right"]
+
+    before = (trained / "zero_shot.json").read_text()
+    assert "not driven" in bench(trained, *words, "--json", "zero_shot.json")  # at once: it is known
+    assert (trained / "zero_shot.json").read_text() == before
+    other = [sys.executable, BENCH / "zero_shot.py", *words[1:], "--seed", "0", "--json", "zero_shot.json"]
+    done = subprocess.run(other, cwd=trained, capture_output=True, text=True)
+    assert done.returncode == 1
+    assert done.stderr == "zero_shot.json is of --seed 1000: give the same, or another --json\n"
 
 
 def test_an_untrained_agent_comes_back_from_no_knock(trained: Path) -> None:

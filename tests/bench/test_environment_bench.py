@@ -11,7 +11,7 @@ import pytest
 SCRIPT = Path(__file__).parents[2] / "scripts/bench/environment.py"
 
 
-@pytest.mark.skipif(shutil.which("g++") is None, reason="needs a C++ compiler")
+@pytest.mark.skipif(shutil.which("g++") is None, reason="needs a C++ compiler: install g++")
 def test_all_rows_are_there(tmp_path: Path) -> None:
     file = tmp_path / "environment.json"
     command = [sys.executable, SCRIPT, "--quick", "--threads", "1", "--json", file]

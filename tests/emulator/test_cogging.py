@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-pytest.importorskip("mujoco")
+pytest.importorskip("mujoco", reason='pip install "cartpole_rl[emulator]"')
 
 from cartpole_rl.emulator.physics import CartPhysics
 from cartpole_rl.emulator.settings import EmulatorSettings

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-pytest.importorskip("mujoco")
+pytest.importorskip("mujoco", reason='pip install "cartpole_rl[emulator]"')
 
 from cartpole_rl.emulator.device import CartDevice
 from cartpole_rl.emulator.homing import CART_METRES, POLE_RADIANS

@@ -11,7 +11,7 @@ import re
 import pytest
 import serial
 
-pytest.importorskip("mujoco")
+pytest.importorskip("mujoco", reason='pip install "cartpole_rl[emulator]"')
 
 from emulator_host import SILENCE, EmulatorHost, emulator
 from test_emulator_device import Driven, check_homed

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-pytest.importorskip("mujoco")
+pytest.importorskip("mujoco", reason='pip install "cartpole_rl[emulator]"')
 
 import itertools
 

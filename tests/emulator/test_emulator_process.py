@@ -9,7 +9,7 @@ import time
 
 import pytest
 
-pytest.importorskip("mujoco")
+pytest.importorskip("mujoco", reason='pip install "cartpole_rl[emulator]"')
 
 from emulator_host import SILENCE, EmulatorHost, emulator
 

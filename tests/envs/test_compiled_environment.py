@@ -20,7 +20,7 @@ ANYWHERE = StartSettings(
 )
 RANGES = {"cart_mass": Range(relative=(-0.2, 0.2)), "angle_noise": Range(absolute=(1e-3, 1e-2))}
 
-pytestmark = pytest.mark.skipif(shutil.which("g++") is None, reason="needs a C++ compiler")
+pytestmark = pytest.mark.skipif(shutil.which("g++") is None, reason="needs a C++ compiler: install g++")
 
 
 @pytest.fixture(params=["history", "raw", "positions"])

@@ -7,7 +7,13 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from cartpole_rl.learning.replay import make_replay, n_step_transitions, replay_snapshot, restore_replay
+from cartpole_rl.learning.replay import (
+    NStepReturns,
+    make_replay,
+    n_step_transitions,
+    replay_snapshot,
+    restore_replay,
+)
 from cartpole_rl.learning.settings import ReplaySettings
 
 PRIORITIZED = {"kind": "prioritized", "size": 64, "alpha": 0.5, "beta": (1.0, 1.0), "priority_eps": 1e-6}
@@ -162,3 +168,51 @@ def test_a_return_ends_where_the_episode_ends(terminated: bool) -> None:
     assert result["next", "observation"].squeeze(-1).tolist() == [2.0, 2.0, 22.0, 22.0]
     assert result["next", "terminated"].squeeze(-1).tolist() == [terminated, terminated, False, False]
     assert result["next", "done"].squeeze(-1).tolist() == [True, True, False, False]
+
+
+def collected(returns: NStepReturns, chunk: TensorDict, size: int) -> list[TensorDict]:
+    """What `returns` gives of each part of `chunk`, `size` periods long."""
+    return [returns(part) for part in chunk.split(size, 1)]
+
+
+@pytest.mark.parametrize("size", [5, 8, 20])
+@pytest.mark.parametrize("n", [1, 2, 5])
+def test_carried_returns_are_those_of_one_long_chunk(n: int, size: int) -> None:
+    chunk = random_chunk(16, 40, seed=n)
+    long = n_step_transitions(chunk, n, 0.9).reshape(16, 40)[:, : 40 - (n - 1)]
+    parts = collected(NStepReturns(n, 0.9, carry=True), chunk, size)
+    assert [len(part) for part in parts] == [16 * (size - (n - 1))] + [16 * size] * (40 // size - 1)
+    together = torch.cat([part.reshape(16, -1) for part in parts], 1)
+    assert together.batch_size == long.batch_size
+    assert (together == long).all()
+
+
+def test_without_carry_returns_end_with_their_chunk() -> None:
+    chunk = random_chunk(16, 40, seed=0)
+    chunk["next", "done"] = torch.zeros(16, 40, 1, dtype=torch.bool)
+    for carry, mean in ((False, 3.75), (True, 5.0)):  # 5 - 5 * 4 / (2 * 8)
+        parts = collected(NStepReturns(5, 0.9, carry), chunk, 8)
+        assert torch.cat(parts)["steps_to_next_obs"].float().mean().item() == pytest.approx(mean)
+    alone = [n_step_transitions(part, 5, 0.9) for part in chunk.split(8, 1)]
+    assert (torch.cat(collected(NStepReturns(5, 0.9, carry=False), chunk, 8)) == torch.cat(alone)).all()
+
+
+def test_periods_held_back_are_forgotten_at_a_reset() -> None:
+    returns, chunk = NStepReturns(3, 0.9, carry=True), random_chunk(16, 8, seed=0)
+    first = returns(chunk)
+    returns.reset()
+    assert (returns(chunk) == first).all()
+    assert len(first) == 16 * 6
+
+
+@pytest.mark.parametrize("periods", [0, 8])
+def test_periods_held_back_are_in_the_snapshot(periods: int, tmp_path) -> None:
+    returns, chunk = NStepReturns(3, 0.9, carry=True), random_chunk(16, 16, seed=0)
+    if periods:
+        returns(chunk[:, :periods])
+    torch.save(returns.snapshot(), tmp_path / "returns.pt")
+    resumed = NStepReturns(3, 0.9, carry=True)
+    resumed(chunk[:, 8:])  # of another course
+    resumed.restore(torch.load(tmp_path / "returns.pt", weights_only=True))
+    for part in (chunk[:, periods : periods + 8], chunk[:, 8:]):
+        assert (resumed(part) == returns(part)).all()

@@ -2,6 +2,7 @@
 
 import io
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from tensordict import TensorDict
 
 from cartpole_rl.agents import AgentSettings, QAgent
 from cartpole_rl.errors import LearningError
+from cartpole_rl.learning.finetuning import Finetuning, FinetuningSettings
 from cartpole_rl.learning.randomness import seed_everything
 from cartpole_rl.learning.settings import LearningSettings, OptimizerSettings, ReplaySettings
 from cartpole_rl.learning.training import Scalars, Training
@@ -24,6 +26,7 @@ LEARNING = {
     "updates": 2,
     "batch_size": 32,
     "n_step": 3,
+    "carry": False,
     "warmup_frames": 128,
     "epsilon": (0.5, 0.1),
     "epsilon_frames": 400,
@@ -90,6 +93,7 @@ def make_training(make_plant: Callable, make_environment: Callable) -> Callable[
         agent: dict | None = None,
         evaluate: Callable[[], list[Episode]] = lambda: [episode(1.0)],
         seed: int = 0,
+        kind: Callable[..., Training] = Training,
         **environment: Any,
     ) -> Training:
         seed_everything(seed)
@@ -99,7 +103,7 @@ def make_training(make_plant: Callable, make_environment: Callable) -> Callable[
             env.hardware.observation_settings.mirror_signs,
             len(env.hardware.motors),
         )
-        return Training(
+        return kind(
             LearningSettings(**{**LEARNING, **(learning or {})}),
             ReplaySettings(**{**REPLAY, **(replay or {})}),
             OptimizerSettings(**{**OPTIMIZER, **(optimizer or {})}),
@@ -198,18 +202,23 @@ def test_a_time_limit_does_not_end_the_world(make_training: Callable[..., Traini
 
 
 @pytest.mark.parametrize(
-    ("replay", "agent", "optimizer"),
+    ("replay", "agent", "optimizer", "carry"),
     [
-        ("prioritized", {}, "adam"),
-        ("uniform", {}, "adamw"),
-        ("prioritized", {"target_tau": None, "target_period": 7, "double": False}, "adamw"),
+        ("prioritized", {}, "adam", False),
+        ("uniform", {}, "adamw", True),
+        ("prioritized", {"target_tau": None, "target_period": 7, "double": False}, "adamw", True),
     ],
 )
 def test_a_resumed_training_ends_with_the_same_weights(
-    make_training: Callable[..., Training], replay: str, agent: dict, optimizer: str
+    make_training: Callable[..., Training], replay: str, agent: dict, optimizer: str, carry: bool
 ) -> None:
     def build(seed: int) -> Training:
-        kinds = {"replay": {"kind": replay}, "optimizer": {"kind": optimizer}, "agent": agent}
+        kinds = {
+            "replay": {"kind": replay},
+            "optimizer": {"kind": optimizer},
+            "agent": agent,
+            "learning": {"carry": carry},
+        }
         return make_training(seed=seed, **kinds)
 
     whole = build(seed=0)
@@ -225,6 +234,22 @@ def test_a_resumed_training_ends_with_the_same_weights(
     assert ends[0].keys() == ends[1].keys()
     for name, weight in ends[0].items():
         assert torch.equal(weight, ends[1][name]), name
+
+
+def test_no_return_reaches_from_one_fit_of_the_cart_to_the_next(
+    make_training: Callable[..., Training],
+) -> None:
+    settings = FinetuningSettings(
+        iterations=1, refit=1, cart_share=0, elsewhere=0, widen=1, epsilon=0, learning_rate=1e-3
+    )
+    training = make_training(learning={"carry": True}, kind=partial(Finetuning, settings))
+    filled = []
+    for _ in range(2):
+        training.simulate(training.env.plant.randomizer)
+        filled.append(len(training.replay))
+    assert (
+        filled == [16 * (7 * 4 - 2)] * 2
+    )  # seven chunks of four periods, two of which wait for their returns
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,9 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+
+pytest.importorskip("mujoco", reason='pip install "cartpole_rl[emulator]"')
+
 from mujoco_reference import MujocoCart
 from torch import Tensor
 

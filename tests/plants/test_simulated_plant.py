@@ -215,7 +215,7 @@ def test_more_substeps_change_little(make_plant: MakePlant) -> None:
     assert abs(ends[0].theta - ends[1].theta).item() < math.radians(5)
 
 
-@pytest.mark.skipif(shutil.which("g++") is None, reason="needs a C++ compiler")
+@pytest.mark.skipif(shutil.which("g++") is None, reason="needs a C++ compiler: install g++")
 def test_compiled_physics_is_the_same(make_plant: MakePlant) -> None:
     plants = [make_plant(16, ranges=NOISY, start=ANYWHERE, compiled=compiled) for compiled in (False, True)]
     for plant in plants:

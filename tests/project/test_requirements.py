@@ -1,0 +1,60 @@
+"""Whatever tests are skipped without is there where `CI` is set; elsewhere the skip says what to install."""
+
+import importlib
+import os
+import shutil
+import sys
+import sysconfig
+from pathlib import Path
+
+import pytest
+
+REMEDIES = {
+    "mujoco": 'pip install "cartpole_rl[emulator]"',
+    "psutil": 'pip install "cartpole_rl[dev]"',
+    "g++": "install a C++ compiler",
+    "Python.h": "install Python's headers",
+}
+
+
+def is_there(what: str) -> bool:
+    """Whether a module can be imported, a program or Python's header be found."""
+    if what == "Python.h":
+        return Path(sysconfig.get_path("include"), what).exists()
+    if what == "g++":
+        return shutil.which(what) is not None
+    try:
+        importlib.import_module(what)
+    except ImportError:
+        return False
+    return True
+
+
+def require(what: str) -> None:
+    """Fail in CI, skip elsewhere, where it is missing."""
+    if is_there(what):
+        return
+    message = f"{what} is missing, and tests are skipped without it: {REMEDIES[what]}"
+    if os.environ.get("CI", "").lower() not in ("", "0", "false"):
+        pytest.fail(message)
+    pytest.skip(message)
+
+
+@pytest.mark.parametrize("what", list(REMEDIES))
+def test_what_tests_need_is_there(what: str) -> None:
+    require(what)
+
+
+@pytest.mark.parametrize("what", list(REMEDIES))
+def test_nothing_can_be_missing_in_ci(what: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setitem(sys.modules, what, None)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr(sysconfig, "get_path", lambda name: str(tmp_path))
+    assert not is_there(what)
+    monkeypatch.setenv("CI", "true")
+    with pytest.raises(pytest.fail.Exception, match="install"):
+        require(what)
+    for outside in ("", "false"):
+        monkeypatch.setenv("CI", outside)
+        with pytest.raises(pytest.skip.Exception, match="install"):
+            require(what)
