@@ -39,6 +39,7 @@ from cartpole_rl.plants.serial import SerialPlant, SerialPlantSettings
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.plants.specs import Plant
 from cartpole_rl.randomization import FoundCarts, Pole, PoleSettings
+from cartpole_rl.settings import evaluation_seed
 from cartpole_rl.tasks.starts import Start, StartSettings
 
 BASELINE = Path("lqr")  # run=lqr is no folder: the controller that learned nothing
@@ -217,11 +218,12 @@ def evaluated_env(
 ) -> CartPoleEnv:
     """The environment to evaluate on: simulated with a cart an episode, or one cart behind a port."""
     start = settings.task.evaluation_start
+    carts, seed = min(config.episodes, 1024), evaluation_seed(config.seed)
     if isinstance(config.plant, LearnedSettings):
         found = config.plant.model_copy(update={"elsewhere": 0.0})
-        return simulated_env(settings, found, min(config.episodes, 1024), start, config.seed)
+        return simulated_env(settings, found, carts, start, seed)
     if isinstance(config.plant, SimulatedSettings):
-        return simulated_env(settings, config.plant, min(config.episodes, 1024), start, config.seed)
+        return simulated_env(settings, config.plant, carts, start, seed)
     if start.angle is Start.ANY:
         raise ConfigError("task.evaluation_start.angle=any: a cart can start only upright or hanging")
     angle: Literal["hanging", "upright"] = "upright" if start.angle is Start.UPRIGHT else "hanging"

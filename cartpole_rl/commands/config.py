@@ -18,10 +18,9 @@ from cartpole_rl.physics.actuator import Actuator
 from cartpole_rl.physics.dynamics import Integrator, Models
 from cartpole_rl.physics.friction import CartFriction, PoleFriction
 from cartpole_rl.randomization import Draws, FoundSettings, PoleSettings, Randomizer, Range
-from cartpole_rl.settings import Count, Finite, Fraction, Positive, Settings
+from cartpole_rl.settings import Count, Finite, Fraction, Positive, Seed, Settings
 from cartpole_rl.tasks.actions import ActionSettings
 
-Seed = Annotated[int, Field(ge=0, lt=2**31)]
 KINDS = re.compile(
     r"(?<=^plant\.)(simulated|emulated|serial|learned)\.|(?<=^randomization\.)(ranges|found)\."
 )

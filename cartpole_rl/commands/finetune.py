@@ -72,6 +72,7 @@ from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.randomization import FoundCarts
 from cartpole_rl.reporting.tensorboard import TensorBoardLog
 from cartpole_rl.scheduling import compute_last
+from cartpole_rl.settings import evaluation_seed
 from cartpole_rl.tasks.episode import Episode
 
 BEFORE, TUNE, AFTER = "before", "tune", "after"
@@ -341,7 +342,9 @@ class Session:
         """Mean score of the agent as it is now, on the same carts of its training's simulation each time."""
         training = self.training
         start = training.task.evaluation_start
-        env = simulated_env(training, training.plant, SIMULATED_CARTS, start, self.config.seed)
+        env = simulated_env(
+            training, training.plant, SIMULATED_CARTS, start, evaluation_seed(self.config.seed)
+        )
         return float(np.mean([each.score.sum() for each in run_batch(env, self.agent.greedy_policy())]))
 
     def path(self, stage: str, number: int) -> Path:

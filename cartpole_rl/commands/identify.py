@@ -22,7 +22,7 @@ from tqdm import tqdm
 
 from cartpole_rl.commands.application import application, tell
 from cartpole_rl.commands.build import use_threads
-from cartpole_rl.commands.config import EmulatedSettings, PoleFrictionSettings, RealSettings, Seed
+from cartpole_rl.commands.config import EmulatedSettings, PoleFrictionSettings, RealSettings
 from cartpole_rl.commands.record import RECORDINGS
 from cartpole_rl.commands.run_folder import write_config, write_json
 from cartpole_rl.emulator.settings import EmulatorSettings
@@ -51,7 +51,7 @@ from cartpole_rl.reporting.figures.identified import (
 )
 from cartpole_rl.reporting.page import page
 from cartpole_rl.reporting.table import interval_text, number_text, table
-from cartpole_rl.settings import Count, Finite, Settings
+from cartpole_rl.settings import Count, Finite, Seed, Settings
 from cartpole_rl.tasks.episode import Episode
 
 CART, POLE, RANDOMIZATION, POSTERIOR = "cart.yaml", "pole.yaml", "randomization.yaml", "posterior.npz"

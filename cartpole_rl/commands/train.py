@@ -24,9 +24,8 @@ from cartpole_rl.learning.checkpoints import TrainingCheckpoint, load_training, 
 from cartpole_rl.learning.randomness import seed_everything
 from cartpole_rl.learning.training import Training
 from cartpole_rl.physics.dynamics import unused_parameters
+from cartpole_rl.settings import evaluation_seed
 from cartpole_rl.tasks.episode import Episode
-
-EVALUATION_SEED = 10_000  # added to the seed, so that no evaluation starts where training did
 
 
 @application("train", TrainConfig)
@@ -46,7 +45,7 @@ def main(config: TrainConfig, folder: Path) -> None:
     if resumed:
         restore_weights(agent, resumed.state["agent"], f"resume={folder}")  # or complain before any work
     policy = DrivingPolicy(agent.greedy_policy(), config.compile)
-    evaluate = partial(judge, nominal_env(config), policy, config.seed + EVALUATION_SEED)
+    evaluate = partial(judge, nominal_env(config), policy, config.seed)
     write_config(folder, config.model_dump(mode="json"), resumed=resumed is not None)
     with TrainingMonitor(folder, config, resumed.frames if resumed else None) as monitor:
         training = Training(
@@ -105,8 +104,8 @@ def nominal_env(config: TrainConfig) -> CartPoleEnv:
 
 
 def judge(env: CartPoleEnv, policy: Policy, seed: int) -> list[Episode]:
-    """Episodes of the greedy policy, from the same starts each time."""
-    env.set_seed(seed)
+    """Episodes of the greedy policy in a training with `seed`, from the same starts each time."""
+    env.set_seed(evaluation_seed(seed))
     return run_batch(env, policy)
 
 
