@@ -1,4 +1,4 @@
-"""The folder of a multirun: one for all of its jobs, in whichever process they run, and no other multirun's."""
+"""The folder of a multirun: one for all of its jobs, in whichever process they run, and for no other one."""
 
 import contextlib
 from collections.abc import Iterator
