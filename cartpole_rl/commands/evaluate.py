@@ -18,8 +18,8 @@ from tqdm import tqdm
 from cartpole_rl.commands.application import application
 from cartpole_rl.commands.build import evaluated_agent, evaluated_env, evaluated_settings, use_threads
 from cartpole_rl.commands.config import EvaluateConfig
-from cartpole_rl.commands.report import METRICS, report
-from cartpole_rl.commands.run_folder import write_config
+from cartpole_rl.commands.report import report
+from cartpole_rl.commands.run_folder import METRICS, write_config
 from cartpole_rl.envs import CartPoleEnv
 from cartpole_rl.evaluation.episodes import Policy, run_episodes
 from cartpole_rl.learning.randomness import seed_everything
@@ -50,7 +50,7 @@ def main(config: EvaluateConfig, folder: Path) -> None:
     try:
         with closing(env):
             recorded = {**config.model_dump(mode="json"), "evaluated": settings.model_dump(mode="json")}
-            write_config(folder, recorded)
+            write_config(folder, "evaluate", recorded)
             for episode in with_progress(env, agent.policy, config.episodes):
                 episodes.append(episode)
     finally:  # what a broken link or Ctrl-C leaves is worth its figures

@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from hydra.core.hydra_config import HydraConfig
 from torch import nn
 from tqdm import tqdm
 
@@ -41,8 +40,9 @@ from cartpole_rl.commands.config import (
     checked,
 )
 from cartpole_rl.commands.evaluate import score_table
-from cartpole_rl.commands.report import METRICS, report
-from cartpole_rl.commands.run_folder import write_config, write_json
+from cartpole_rl.commands.report import report
+from cartpole_rl.commands.resuming import resumed
+from cartpole_rl.commands.run_folder import METRICS, write_config, write_json
 from cartpole_rl.envs import CartPoleEnv
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.evaluation import episode_metrics, summarize
@@ -52,12 +52,13 @@ from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.evaluation.recordings import read_recording, write_recording
 from cartpole_rl.identification import LONGEST_LATENCY, Fit, cut_windows, fit_cart
 from cartpole_rl.learning.checkpoints import (
+    FINETUNING_FORMAT,
     FOLDER,
     LAST,
     AgentCheckpoint,
     TrainingCheckpoint,
+    forget_training,
     load_agent,
-    load_training,
     save_agent,
     save_training,
 )
@@ -85,9 +86,9 @@ SIMULATED_CARTS = 10
 @application("finetune", FinetuneConfig)
 def main(config: FinetuneConfig, folder: Path) -> None:
     """Compose, drive and learn, compare, report."""
-    resumed = resumed_state(config, folder)
-    if resumed:
-        config = checked(FinetuneConfig, {**resumed.config, "resume": config.resume})
+    checkpoint = resumed("finetune", config.resume, folder)
+    if checkpoint:
+        config = checked(FinetuneConfig, {**checkpoint.config, "resume": config.resume})
     if config.run is None:
         raise ConfigError("run is missing; give run=..., the run folder of a training")
     if config.compile:
@@ -97,11 +98,11 @@ def main(config: FinetuneConfig, folder: Path) -> None:
     training = trained_agent(config.run).training
     evaluation = as_evaluation(config)
     settings = evaluated_settings(training, evaluation)
-    if not resumed:
-        write_config(folder, config.model_dump(mode="json"))
-        save_training(folder, TrainingCheckpoint(config.model_dump(mode="json"), {}, 0))
+    if not checkpoint:
+        write_config(folder, "finetune", config.model_dump(mode="json"))
+        save_training(folder, TrainingCheckpoint(config.model_dump(mode="json"), {}, 0), FINETUNING_FORMAT)
     else:
-        write_config(folder, config.model_dump(mode="json"), resumed=True)
+        write_config(folder, "finetune", config.model_dump(mode="json"), resumed=True)
     make_env = partial(evaluated_env, settings, evaluation, print)
     real_time = config.plant.kind == "serial" or config.emulator.clock == "real"
     with (
@@ -115,19 +116,9 @@ def main(config: FinetuneConfig, folder: Path) -> None:
                     "finetune", "other processes may delay the cart: no real-time priority (see `ulimit -r`)"
                 )
         session = Session(config, training, settings, folder, driver, log)
-        if resumed and resumed.state:
-            session.restore(resumed.state)
+        if checkpoint and checkpoint.state:
+            session.restore(checkpoint.state)
         session.run()
-
-
-def resumed_state(config: FinetuneConfig, folder: Path) -> TrainingCheckpoint | None:
-    """The fine-tuning to go on with; None for a new one. Raises ConfigError, CheckpointError."""
-    if config.resume is None:
-        return None
-    given = HydraConfig.get().overrides.task
-    if others := [word for word in given if not word.startswith("resume=")]:
-        raise ConfigError(f"resume goes on with that run's own config; leave out {', '.join(others)}")
-    return load_training(Path(config.resume))
 
 
 def as_evaluation(config: FinetuneConfig) -> EvaluateConfig:
@@ -199,6 +190,7 @@ class Session:
         report(self.folder, shown, plant, self.settings.pole, x_max, link)
         kept = AFTER if better else BEFORE
         write_json(self.folder / "comparison.json", {BEFORE: before, AFTER: after, "kept": kept})
+        forget_training(self.folder)
         print(score_table(before, f"before, {config.evaluation_episodes} episodes"))
         print(score_table(after, f"after {config.episodes} episodes of learning"))
         if link.get("latency_override"):
@@ -378,9 +370,8 @@ class Session:
             "agent": self.agent.state_dict(),
             "optimizer": self.learner.optimizer.state_dict(),
         }
-        save_training(
-            self.folder, TrainingCheckpoint(self.config.model_dump(mode="json"), state, self.learned)
-        )
+        checkpoint = TrainingCheckpoint(self.config.model_dump(mode="json"), state, self.learned)
+        save_training(self.folder, checkpoint, FINETUNING_FORMAT)
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from `save`."""

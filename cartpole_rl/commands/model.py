@@ -88,7 +88,7 @@ def main(config: ModelConfig, folder: Path) -> None:
         LEARNED: predict_held_out(unseen, dynamics, residual),
     }
     errors = {model: errors_at(prediction, MARKED, period) for model, prediction in judged.items()}
-    write_config(folder, config.model_dump(mode="json", by_alias=True))
+    write_config(folder, "model", config.model_dump(mode="json", by_alias=True))
     model = LearnedModel(fit.parameters, models, period, dynamics.substeps, residual.as_float())
     save_model(folder / MODEL, model)
     told = {

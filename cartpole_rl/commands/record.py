@@ -23,6 +23,7 @@ from cartpole_rl.evaluation.recordings import write_recording
 from cartpole_rl.learning.randomness import seed_everything
 
 RECORDINGS = "recordings"
+RECORDING = ("record", "identify", "finetune")  # commands whose runs hold recordings
 LENGTH = "pole_length_m"  # in a recording's heading
 
 
@@ -42,7 +43,7 @@ def main(config: RecordConfig, folder: Path) -> None:
     try:
         with closing(env):
             recorded = {**config.model_dump(mode="json"), "recorded": settings.model_dump(mode="json")}
-            write_config(folder, recorded)
+            write_config(folder, "record", recorded)
             for episode in with_progress(env, agent.policy, config.episodes):
                 path = folder / RECORDINGS / f"episode_{written:03d}.csv"
                 write_recording(path, episode, facts(config, settings))

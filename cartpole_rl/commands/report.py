@@ -4,14 +4,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from cartpole_rl.commands.run_folder import write_json
+from cartpole_rl.commands.run_folder import METRICS, write_json
 from cartpole_rl.evaluation import episode_metrics, summarize
 from cartpole_rl.randomization import PoleSettings
 from cartpole_rl.reporting.animation import write_gif
 from cartpole_rl.reporting.figures import behaviour, learning_curve, save
 from cartpole_rl.tasks.episode import Episode
-
-METRICS = "metrics.json"
 
 
 def report(
