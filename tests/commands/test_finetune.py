@@ -77,6 +77,14 @@ def test_tensorboard_shows_cart_and_simulation_side_by_side(tuned: tuple[Path, O
     assert steps["link/late_ticks"] == [1, 2, 3, 4]
 
 
+def test_one_that_has_ended_is_not_resumed(tuned: tuple[Path, Outcome], tmp_path: Path) -> None:
+    run, _ = tuned
+    assert [path.name for path in (run / "checkpoints").iterdir()] == ["last.pt"]
+    done = in_process("finetune", f"resume={run}", folder=tmp_path)
+    assert done.code == 2
+    assert f"this run of cartpole-finetune has ended; cartpole-evaluate run={run}" in done.complaint
+
+
 def test_a_tuned_agent_is_evaluated_like_any_other(tuned: tuple[Path, Outcome], tmp_path: Path) -> None:
     run, _ = tuned
     done = in_process(
