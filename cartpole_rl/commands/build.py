@@ -48,6 +48,7 @@ LATER: dict[str, dict[str, Any]] = {  # settings that older checkpoints do not k
     "cart": {"pole_coulomb": 0.0},
     "learning": {"try_again": 0.0},
 }
+LARGEST_BATCH = 1024  # carts that an evaluation simulates at once
 SIMILAR = 0.1  # share by which a pole's length may differ from a learned model's
 REPLACEABLE = ("cart", "cart_friction", "pole_friction", "pole", "reward")  # by an evaluation; and the task
 
@@ -235,7 +236,7 @@ def evaluated_env(
 ) -> CartPoleEnv:
     """The environment to evaluate on: simulated with a cart an episode, or one cart behind a port."""
     start = settings.task.evaluation_start
-    carts, seed = min(config.episodes, 1024), evaluation_seed(config.seed)
+    carts, seed = simulated_carts(config), evaluation_seed(config.seed)
     if isinstance(config.plant, LearnedSettings):
         found = config.plant.model_copy(update={"elsewhere": 0.0})
         return simulated_env(settings, found, carts, start, seed)
@@ -259,6 +260,11 @@ def evaluated_env(
         control_period=settings.control_period,
     )
     return environment(settings, SerialPlant(serial, prompt))
+
+
+def simulated_carts(config: EvaluateConfig) -> int:
+    """How many carts an evaluation simulates at once: one an episode, up to LARGEST_BATCH."""
+    return min(config.episodes, LARGEST_BATCH)
 
 
 def check_compiler() -> None:

@@ -184,6 +184,13 @@ class TrainConfig(CartPoleSettings):
         return self
 
 
+class RepeatSettings(Settings):
+    """An episode of an earlier evaluation that is driven again."""
+
+    run: Path | None = None
+    episode: Annotated[int, Field(ge=0)] | None = None  # from 0, in the order of metrics.json
+
+
 class EvaluateConfig(Settings):
     """cartpole-evaluate, before the agent's own config is known."""
 
@@ -201,6 +208,7 @@ class EvaluateConfig(Settings):
     pole: PoleSettings | None = None
     task: dict[str, Any] | None = None  # a TaskSettings, once x_max is filled in from the agent's own
     reward: RewardSettings | None = None
+    repeat: RepeatSettings = RepeatSettings()
     seed: Seed
     label: str
     threads: Count | None
