@@ -33,12 +33,11 @@ def resumed(program: str, resume: str | None, folder: Path) -> TrainingCheckpoin
         raise ConfigError(f"resume goes on with that run's own config; leave out {', '.join(others)}")
     run = Path(resume)
     check_program("resume", run, program)
+    if run.is_dir() and not folder.samefile(run):
+        raise ConfigError("resume goes on in that run's own folder; leave out hydra.run.dir")
     if has_ended(run):
         raise ConfigError(
             f"resume={run}: this run of {PREFIX}{program} has ended; cartpole-evaluate run={run} drives its "
             f"agent, {LONGER[program].format(run)}"
         )
-    checkpoint = load_training(run, FORMATS[program])
-    if not folder.samefile(run):
-        raise ConfigError("resume goes on in that run's own folder; leave out hydra.run.dir")
-    return checkpoint
+    return load_training(run, FORMATS[program])

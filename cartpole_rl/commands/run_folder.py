@@ -15,7 +15,7 @@ from typing import Any
 import yaml
 
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.learning.checkpoints import FOLDER, RESUME
+from cartpole_rl.learning.checkpoints import FOLDER, LAST, RESUME
 
 CONFIG, PROVENANCE, MULTIRUN = "config.yaml", "provenance.json", "multirun.yaml"
 METRICS = "metrics.json"
@@ -95,7 +95,8 @@ def use_of(folder: Path, program: str) -> str:
 
 def has_ended(run: Path) -> bool:
     """Whether a training or fine-tuning came to its end: its results are there and nothing to resume from."""
-    return (run / METRICS).exists() and not (run / FOLDER / RESUME).exists()
+    results = (run / METRICS).exists() and (run / FOLDER / LAST).exists()
+    return results and not (run / FOLDER / RESUME).exists()
 
 
 def provenance() -> dict[str, Any]:

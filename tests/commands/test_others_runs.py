@@ -34,6 +34,7 @@ SETTINGS = {  # words, with the folder at {0} and an agent at {1}: what is taken
     "identify from={0}": (RECORDINGS, {}),
     "evaluate run={1} plant=learned plant.model={0}": ({"model"}, {}),
     "train compile=false plant=learned plant.model={0}": ({"model"}, {}),
+    "evaluate run={1} repeat.run={0} repeat.episode=0": ({"evaluate"}, {}),
     "train cart=./{0}": (set(), {"identify": "give cart={0}/cart.yaml"}),
     "train randomization=./{0}": (set(), {"identify": "give randomization={0}/randomization.yaml"}),
     "train pole={0}/config.yaml": ({"multirun"}, {"identify": "give pole={0}/pole.yaml"}),
