@@ -14,6 +14,18 @@ Fraction = Annotated[float, Field(ge=0, le=1)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=1)]
 
+NUM_SEEDS = 2**31
+Seed = Annotated[int, Field(ge=0, lt=NUM_SEEDS)]
+
+
+def evaluation_seed(seed: int) -> int:
+    """Return the seed of the carts and starts that an evaluation with `seed` draws: NUM_SEEDS and more.
+
+    It is no training's seed, so that no evaluation meets the carts that a training began with. It stays
+    below 2**32, since torch's generator on the CPU reads the lowest 32 bits alone.
+    """
+    return NUM_SEEDS + seed
+
 
 class Settings(BaseModel):
     """A frozen pydantic model that refuses unknown keys."""

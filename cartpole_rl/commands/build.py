@@ -25,21 +25,23 @@ from cartpole_rl.commands.config import (
     TrainConfig,
     checked,
 )
+from cartpole_rl.commands.run_folder import PREFIX, check_program, program_of, use_of
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.envs import CartPoleEnv, make_env
 from cartpole_rl.errors import CheckpointError, ConfigError
 from cartpole_rl.evaluation.episodes import Policy
-from cartpole_rl.learning.checkpoints import load_agent, restore_weights
+from cartpole_rl.learning.checkpoints import FOLDER, LAST, load_agent, restore_weights
 from cartpole_rl.physics.parameters import CartParameters, check_names
 from cartpole_rl.physics.residual import UNDER_WAY
 from cartpole_rl.plants.emulated import emulated_plant
 from cartpole_rl.plants.learned import LearnedPlant
-from cartpole_rl.plants.learned_model import load_model
+from cartpole_rl.plants.learned_model import LearnedModel, load_model
 from cartpole_rl.plants.serial import SerialPlant, SerialPlantSettings
 from cartpole_rl.plants.serial_faults import Confirm, nobody
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.plants.specs import Plant
 from cartpole_rl.randomization import FoundCarts, Pole, PoleSettings
+from cartpole_rl.settings import evaluation_seed
 from cartpole_rl.tasks.starts import Start, StartSettings
 
 BASELINE = Path("lqr")  # run=lqr is no folder: the controller that learned nothing
@@ -47,6 +49,7 @@ LATER: dict[str, dict[str, Any]] = {  # settings that older checkpoints do not k
     "cart": {"pole_coulomb": 0.0},
     "learning": {"try_again": 0.0, "carry": False},
 }
+LARGEST_BATCH = 1024  # carts that an evaluation simulates at once
 SIMILAR = 0.1  # share by which a pole's length may differ from a learned model's
 REPLACEABLE = ("cart", "cart_friction", "pole_friction", "pole", "reward")  # by an evaluation; and the task
 
@@ -86,7 +89,7 @@ def learned_plant(
     compiled: bool,
 ) -> LearnedPlant:
     """Carts of a learned model. Raises ConfigError where it is of another cart than `config` describes."""
-    model = load_model(plant.model)
+    model = model_of(plant)
     own, length = model.parameters, 2 * config.pole.nominal.pole_com
     if not math.isclose(model.period, config.control_period, rel_tol=1e-6):
         raise ConfigError(f"control_period={config.control_period}: plant.model has {model.period} s")
@@ -101,6 +104,12 @@ def learned_plant(
     found = torch.tensor([[own[name]] for name in CartParameters.names()])
     draws = FoundCarts(found, config.randomizer(), plant.elsewhere, UNDER_WAY * model.period)
     return LearnedPlant(carts, model, draws, start, seed, compiled=compiled)
+
+
+def model_of(plant: LearnedSettings) -> LearnedModel:
+    """The model that plant.model= names. Raises CheckpointError, ConfigError."""
+    check_program("plant.model", plant.model, "model")
+    return load_model(plant.model)
 
 
 def environment(config: CartPoleSettings, plant: Plant) -> CartPoleEnv:
@@ -133,11 +142,21 @@ class TrainedAgent:
 
 def trained_agent(run: Path) -> TrainedAgent:
     """The agent of a run folder or checkpoint file. Raises CheckpointError."""
+    check_has_agent(run)
     checkpoint = load_agent(run)
     training = recorded_config(checkpoint.config, f"run={run}")
     agent = new_agent(training)
     restore_weights(agent, checkpoint.weights, f"run={run}")
     return TrainedAgent(training, agent.greedy_policy())
+
+
+def check_has_agent(run: Path) -> None:
+    """Raise ConfigError where `run` is a run folder without an agent, with what can be done with it."""
+    check_program("run", run, "train", "finetune")
+    if (program := program_of(run)) and not (run / FOLDER / LAST).exists():
+        raise ConfigError(
+            f"run={run}: this run of {PREFIX}{program} has no agent yet; {use_of(run, program)}"
+        )
 
 
 def evaluated_agent(config: EvaluateConfig) -> TrainedAgent:
@@ -177,7 +196,7 @@ def evaluated_settings(training: TrainConfig, config: EvaluateConfig) -> CartPol
     if isinstance(config.plant, EmulatedSettings):
         given["pole"] = emulated_pole(config.emulator)
     if isinstance(config.plant, LearnedSettings):
-        found = load_model(config.plant.model).parameters
+        found = model_of(config.plant).parameters
         given["pole"] = one_pole(Pole(**{name: found[name] for name in Pole.model_fields}))
     settings = checked(CartPoleSettings, {**own, **given, "randomization": config.randomization})
     return with_parameters(settings, config.parameters or {})
@@ -224,11 +243,12 @@ def evaluated_env(
     `prompt` shows a person what to do, `confirm` asks whether a latched fault may be cleared.
     """
     start = settings.task.evaluation_start
+    carts, seed = simulated_carts(config), evaluation_seed(config.seed)
     if isinstance(config.plant, LearnedSettings):
         found = config.plant.model_copy(update={"elsewhere": 0.0})
-        return simulated_env(settings, found, min(config.episodes, 1024), start, config.seed)
+        return simulated_env(settings, found, carts, start, seed)
     if isinstance(config.plant, SimulatedSettings):
-        return simulated_env(settings, config.plant, min(config.episodes, 1024), start, config.seed)
+        return simulated_env(settings, config.plant, carts, start, seed)
     if start.angle is Start.ANY:
         raise ConfigError("task.evaluation_start.angle=any: a cart can start only upright or hanging")
     angle: Literal["hanging", "upright"] = "upright" if start.angle is Start.UPRIGHT else "hanging"
@@ -248,6 +268,11 @@ def evaluated_env(
         control_period=settings.control_period,
     )
     return environment(settings, SerialPlant(serial, prompt, confirm=confirm))
+
+
+def simulated_carts(config: EvaluateConfig) -> int:
+    """How many carts an evaluation simulates at once: one an episode, up to LARGEST_BATCH."""
+    return min(config.episodes, LARGEST_BATCH)
 
 
 def check_compiler() -> None:

@@ -12,10 +12,12 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from cartpole_rl.choices import conf_folder
+from cartpole_rl.commands.run_folder import PREFIX, USES, check_program, program_of, use_of
 from cartpole_rl.errors import ConfigError
 
 HERE = "${here}"
-WORD = re.compile(r"^([a-z_]+)=(.+\.ya?ml)$")
+WORD = re.compile(r"^([a-z_]+)=(.+)$")
+KEPT = ("config.yaml", "cart.yaml", "pole.yaml", "randomization.yaml")  # files of run folders
 
 
 @contextmanager
@@ -31,11 +33,34 @@ def _with_choices(word: str, folder: Path) -> str:
     match = WORD.match(word)
     if match is None or not (conf_folder() / match[1]).is_dir():
         return word
+    for value in match[2].split(","):
+        _check_run_folder(match[1], value)
+    if not match[2].endswith((".yaml", ".yml")):
+        return word
     names = (
         _copied(value, folder / match[1]) if "/" in value or value.endswith("ml") else value
         for value in match[2].split(",")
     )
     return f"{match[1]}={','.join(names)}"
+
+
+def _check_run_folder(group: str, value: str) -> None:
+    """Raise ConfigError where `value` is a folder, or a file of a run folder that is not for `group`."""
+    path = Path(value)
+    is_folder = "/" in value and path.is_dir()
+    folder = path if is_folder else path.parent
+    own, program = folder / f"{group}.yaml", program_of(folder)
+    other_file = program is not None and path.name in KEPT and path.name != own.name and path.is_file()
+    if not (is_folder or other_file):
+        return
+    check_program(group, folder, *USES)
+    what = f"is a folder, a run of {PREFIX}{program}" if program else "is a folder"
+    if other_file:
+        what = f"is no {group}, but another file of a run of {PREFIX}{program}"
+    if own.is_file():
+        raise ConfigError(f"{group}={path} {what}; give {group}={own}")
+    use = use_of(folder, program) if program else f"give a file: {group}=mine.yaml"
+    raise ConfigError(f"{group}={path} {what}; {use}")
 
 
 def _copied(value: str, group: Path) -> str:

@@ -24,6 +24,20 @@ def run_folder(command: str, label: str, resume: str | None = None) -> str:
     """
     if resume is not None and Path(resume).is_dir():
         return str(resume)
+    return new_folder(command, label)
+
+
+def sweep_folder(command: str) -> str:
+    """Folder of a multirun: a new one by date and time, made here for the same reason as that of a run.
+
+    Hydra composes the config of each job anew, and gives it the answers of its cached resolvers, also where
+    a launcher brings the job to another process: all jobs of a multirun share the folder.
+    """
+    return new_folder(command, "multirun")
+
+
+def new_folder(command: str, label: str) -> str:
+    """Make a folder that no other run has, named by date, time and `label`."""
     name = datetime.now().strftime("%Y-%m-%d_%H-%M-%S") + (f"_{label}" if label else "")
     for number in count(1):
         folder = Path("runs", command, name if number == 1 else f"{name}_{number}")
@@ -47,6 +61,7 @@ def job_name(number: int, overrides: Sequence[str]) -> str:
 
 
 OmegaConf.register_new_resolver("run_folder", run_folder, use_cache=True)
+OmegaConf.register_new_resolver("sweep_folder", sweep_folder, use_cache=True)
 OmegaConf.register_new_resolver("job_name", job_name)
 # conf/emulator/ builds on this one: the settings class is where its numbers stand
 ConfigStore.instance().store(group="emulator", name="medium", node=EmulatorSettings().model_dump(mode="json"))

@@ -18,10 +18,9 @@ from cartpole_rl.physics.actuator import Actuator
 from cartpole_rl.physics.dynamics import Integrator, Models
 from cartpole_rl.physics.friction import CartFriction, PoleFriction
 from cartpole_rl.randomization import Draws, FoundSettings, PoleSettings, Randomizer, Range
-from cartpole_rl.settings import Count, Finite, Fraction, Positive, Settings
+from cartpole_rl.settings import Count, Finite, Fraction, Positive, Seed, Settings
 from cartpole_rl.tasks.actions import ActionSettings
 
-Seed = Annotated[int, Field(ge=0, lt=2**31)]
 KINDS = re.compile(
     r"(?<=^plant\.)(simulated|emulated|serial|learned)\.|(?<=^randomization\.)(ranges|found)\."
 )
@@ -186,6 +185,13 @@ class TrainConfig(CartPoleSettings):
         return self
 
 
+class RepeatSettings(Settings):
+    """An episode of an earlier evaluation that is driven again."""
+
+    run: Path | None = None
+    episode: Annotated[int, Field(ge=0)] | None = None  # from 0, in the order of metrics.json
+
+
 class EvaluateConfig(Settings):
     """cartpole-evaluate, before the agent's own config is known."""
 
@@ -203,6 +209,7 @@ class EvaluateConfig(Settings):
     pole: PoleSettings | None = None
     task: dict[str, Any] | None = None  # a TaskSettings, once x_max is filled in from the agent's own
     reward: RewardSettings | None = None
+    repeat: RepeatSettings = RepeatSettings()
     seed: Seed
     label: str
     threads: Count | None

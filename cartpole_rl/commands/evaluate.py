@@ -6,6 +6,9 @@ cartpole-evaluate run=runs/train/2026-11-21_12-00-00 episodes=20
 cartpole-evaluate run=runs/train/2026-11-21_12-00-00 plant=emulated emulator.latency=0.02
 cartpole-evaluate run=runs/train/2026-11-21_12-00-00 plant=serial plant.port=/dev/ttyUSB0
 cartpole-evaluate run=lqr plant=emulated
+cartpole-evaluate run=runs/train/<run> repeat.run=runs/evaluate/<run> repeat.episode=17
+
+The last one drives an episode of an earlier evaluation again, the same simulated cart from the same start.
 """
 
 from collections.abc import Iterator, Mapping
@@ -19,8 +22,9 @@ from cartpole_rl.commands.application import application
 from cartpole_rl.commands.build import evaluated_agent, evaluated_env, evaluated_settings, use_threads
 from cartpole_rl.commands.config import EvaluateConfig
 from cartpole_rl.commands.person import confirm
-from cartpole_rl.commands.report import METRICS, report
-from cartpole_rl.commands.run_folder import write_config
+from cartpole_rl.commands.repeating import Repetition, repetition
+from cartpole_rl.commands.report import report
+from cartpole_rl.commands.run_folder import METRICS, write_config
 from cartpole_rl.envs import CartPoleEnv
 from cartpole_rl.evaluation.episodes import Policy, run_episodes
 from cartpole_rl.learning.randomness import seed_everything
@@ -42,6 +46,8 @@ SHOWN = {
 @application("evaluate", EvaluateConfig)
 def main(config: EvaluateConfig, folder: Path) -> None:
     """Load, build, run, report."""
+    if again := repetition(config):
+        config = again.config
     use_threads(config.threads)
     seed_everything(config.seed)
     agent = evaluated_agent(config)
@@ -51,8 +57,8 @@ def main(config: EvaluateConfig, folder: Path) -> None:
     try:
         with closing(env):
             recorded = {**config.model_dump(mode="json"), "evaluated": settings.model_dump(mode="json")}
-            write_config(folder, recorded)
-            for episode in with_progress(env, agent.policy, config.episodes):
+            write_config(folder, "evaluate", recorded)
+            for episode in driven(env, agent.policy, config.episodes, again):
                 episodes.append(episode)
     finally:  # what a broken link or Ctrl-C leaves is worth its figures
         if episodes:
@@ -60,9 +66,16 @@ def main(config: EvaluateConfig, folder: Path) -> None:
             link = link_figures(env)
             summary = report(folder, episodes, plant, settings.pole, x_max, link)
             print(score_table(summary, f"plant={plant}, {count_text(len(episodes))}"))
+            if again:
+                print(compared(again, episodes[0]))
             if link.get("latency_override"):
                 print(f"latency as measured, for cartpole-train: '{link['latency_override']}'")
             print(f"{folder}/{METRICS} and figures/ are written")
+
+
+def driven(env: CartPoleEnv, policy: Policy, episodes: int, again: Repetition | None) -> Iterator[Episode]:
+    """The episode that is repeated, or `episodes` new ones."""
+    return again.drive(env, policy) if again else with_progress(env, policy, episodes)
 
 
 def with_progress(env: CartPoleEnv, policy: Policy, episodes: int) -> Iterator[Episode]:
@@ -72,6 +85,16 @@ def with_progress(env: CartPoleEnv, policy: Policy, episodes: int) -> Iterator[E
             progress.set_postfix_str(f"score {episode.score.sum():.0f}", refresh=False)
             progress.update()
             yield episode
+
+
+def compared(again: Repetition, episode: Episode) -> str:
+    """Say how the score compares with that of the episode which was driven again."""
+    repeat, score = again.config.repeat, float(episode.score.sum())
+    then = f"episode {repeat.episode} of {repeat.run} had score {again.score:.1f}"
+    if again.left_to_chance:
+        chance = ", ".join(again.left_to_chance)
+        return f"{then}, now {score:.1f}: {chance} is left to chance, so it cannot be repeated exactly"
+    return f"{then}, now {'exactly the same' if score == again.score else f'{score:.1f}'}"
 
 
 def link_figures(env: CartPoleEnv) -> dict[str, Any]:

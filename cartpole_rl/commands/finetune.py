@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from hydra.core.hydra_config import HydraConfig
 from torch import nn
 from tqdm import tqdm
 
@@ -43,8 +42,9 @@ from cartpole_rl.commands.config import (
 )
 from cartpole_rl.commands.evaluate import score_table
 from cartpole_rl.commands.person import confirm
-from cartpole_rl.commands.report import METRICS, report
-from cartpole_rl.commands.run_folder import write_config, write_json
+from cartpole_rl.commands.report import report
+from cartpole_rl.commands.resuming import resumed
+from cartpole_rl.commands.run_folder import METRICS, write_config, write_json
 from cartpole_rl.envs import CartPoleEnv
 from cartpole_rl.errors import ConfigError, LearningError
 from cartpole_rl.evaluation import episode_metrics, summarize
@@ -54,12 +54,13 @@ from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.evaluation.recordings import LENGTH, read_recording, write_recording
 from cartpole_rl.identification import LONGEST_LATENCY, Fit, cut_windows, fit_cart
 from cartpole_rl.learning.checkpoints import (
+    FINETUNING_FORMAT,
     FOLDER,
     LAST,
     AgentCheckpoint,
     TrainingCheckpoint,
+    forget_training,
     load_agent,
-    load_training,
     save_agent,
     save_training,
 )
@@ -74,6 +75,7 @@ from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.randomization import FoundCarts
 from cartpole_rl.reporting.tensorboard import TensorBoardLog
 from cartpole_rl.scheduling import compute_last
+from cartpole_rl.settings import evaluation_seed
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
 
@@ -87,9 +89,9 @@ SIMULATED_CARTS = 10
 @application("finetune", FinetuneConfig)
 def main(config: FinetuneConfig, folder: Path) -> None:
     """Compose, drive and learn, compare, report."""
-    resumed = resumed_state(config, folder)
-    if resumed:
-        config = checked(FinetuneConfig, {**resumed.config, "resume": config.resume})
+    checkpoint = resumed("finetune", config.resume, folder)
+    if checkpoint:
+        config = checked(FinetuneConfig, {**checkpoint.config, "resume": config.resume})
     if config.run is None:
         raise ConfigError("run is missing; give run=..., the run folder of a training")
     if config.compile:
@@ -99,11 +101,11 @@ def main(config: FinetuneConfig, folder: Path) -> None:
     training = trained_agent(config.run).training
     evaluation = as_evaluation(config)
     settings = evaluated_settings(training, evaluation)
-    if not resumed:
-        write_config(folder, config.model_dump(mode="json"))
-        save_training(folder, TrainingCheckpoint(config.model_dump(mode="json"), {}, 0))
+    if not checkpoint:
+        write_config(folder, "finetune", config.model_dump(mode="json"))
+        save_training(folder, TrainingCheckpoint(config.model_dump(mode="json"), {}, 0), FINETUNING_FORMAT)
     else:
-        write_config(folder, config.model_dump(mode="json"), resumed=True)
+        write_config(folder, "finetune", config.model_dump(mode="json"), resumed=True)
     make_env = partial(evaluated_env, settings, evaluation, print)  # takes who confirms, too
     real_time = config.plant.kind == "serial" or config.emulator.clock == "real"
     with (
@@ -117,19 +119,9 @@ def main(config: FinetuneConfig, folder: Path) -> None:
                     "finetune", "other processes may delay the cart: no real-time priority (see `ulimit -r`)"
                 )
         session = Session(config, training, settings, folder, driver, log)
-        if resumed and resumed.state:
-            session.restore(resumed.state)
+        if checkpoint and checkpoint.state:
+            session.restore(checkpoint.state)
         session.run()
-
-
-def resumed_state(config: FinetuneConfig, folder: Path) -> TrainingCheckpoint | None:
-    """The fine-tuning to go on with; None for a new one. Raises ConfigError, CheckpointError."""
-    if config.resume is None:
-        return None
-    given = HydraConfig.get().overrides.task
-    if others := [word for word in given if not word.startswith("resume=")]:
-        raise ConfigError(f"resume goes on with that run's own config; leave out {', '.join(others)}")
-    return load_training(Path(config.resume))
 
 
 def as_evaluation(config: FinetuneConfig) -> EvaluateConfig:
@@ -207,6 +199,7 @@ class Session:
         report(self.folder, shown, plant, self.settings.pole, x_max, link)
         kept = AFTER if better else BEFORE
         write_json(self.folder / "comparison.json", {BEFORE: before, AFTER: after, "kept": kept})
+        forget_training(self.folder)
         print(score_table(before, f"before, {config.evaluation_episodes} episodes"))
         print(score_table(after, f"after {config.episodes} episodes of learning"))
         if link.get("latency_override"):
@@ -357,7 +350,9 @@ class Session:
         """Mean score of the agent as it is now, on the same carts of its training's simulation each time."""
         training = self.training
         start = training.task.evaluation_start
-        env = simulated_env(training, training.plant, SIMULATED_CARTS, start, self.config.seed)
+        env = simulated_env(
+            training, training.plant, SIMULATED_CARTS, start, evaluation_seed(self.config.seed)
+        )
         return float(np.mean([each.score.sum() for each in run_batch(env, self.agent.greedy_policy())]))
 
     def path(self, stage: str, number: int) -> Path:
@@ -391,9 +386,8 @@ class Session:
             "agent": self.agent.state_dict(),
             "optimizer": self.learner.optimizer.state_dict(),
         }
-        save_training(
-            self.folder, TrainingCheckpoint(self.config.model_dump(mode="json"), state, self.learned)
-        )
+        checkpoint = TrainingCheckpoint(self.config.model_dump(mode="json"), state, self.learned)
+        save_training(self.folder, checkpoint, FINETUNING_FORMAT)
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from `save`."""

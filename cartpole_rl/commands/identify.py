@@ -22,10 +22,10 @@ from tqdm import tqdm
 
 from cartpole_rl.commands.application import application, tell
 from cartpole_rl.commands.build import use_threads
-from cartpole_rl.commands.config import EmulatedSettings, PoleFrictionSettings, RealSettings, Seed
+from cartpole_rl.commands.config import EmulatedSettings, PoleFrictionSettings, RealSettings
 from cartpole_rl.commands.person import confirm
-from cartpole_rl.commands.record import RECORDINGS
-from cartpole_rl.commands.run_folder import write_config, write_json
+from cartpole_rl.commands.record import RECORDING, RECORDINGS
+from cartpole_rl.commands.run_folder import check_program, write_config, write_json
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import ConfigError, RecordingError
 from cartpole_rl.evaluation.recordings import read_recording, write_recording
@@ -52,7 +52,7 @@ from cartpole_rl.reporting.figures.identified import (
 )
 from cartpole_rl.reporting.page import page
 from cartpole_rl.reporting.table import interval_text, number_text, table
-from cartpole_rl.settings import Count, Finite, Settings
+from cartpole_rl.settings import Count, Finite, Seed, Settings
 from cartpole_rl.tasks.episode import Episode
 
 CART, POLE, RANDOMIZATION, POSTERIOR = "cart.yaml", "pole.yaml", "randomization.yaml", "posterior.npz"
@@ -107,10 +107,11 @@ def main(config: IdentifyConfig, folder: Path) -> None:
     """Drive or read, check, fit, write."""
     use_threads(config.threads)
     nominal = config.nominal
-    write_config(folder, config.model_dump(mode="json", by_alias=True))
+    recordings = {} if config.source is None else read(config.source)
+    write_config(folder, "identify", config.model_dump(mode="json", by_alias=True))
     if config.source is None:
         record(config, folder / RECORDINGS)
-    recordings = read(config.source or folder)
+        recordings = read(folder)
     fitted = {name: episode for name, episode in recordings.items() if name != HELD_OUT}
     held_out = recordings.get(HELD_OUT)
     if held_out is None:  # recordings of another kind: the last one judges the fit
@@ -167,7 +168,8 @@ def the_plant(config: IdentifyConfig) -> SerialPlant:
 
 
 def read(source: Path) -> dict[str, Episode]:
-    """Recordings by the names of their experiments, or of their files. Raises RecordingError."""
+    """Recordings by the names of their experiments, or of their files. Raises RecordingError, ConfigError."""
+    check_program("from", source, *RECORDING)
     inner = source / RECORDINGS
     paths = sorted((inner if inner.is_dir() else source).glob("*.csv"))
     if not paths:

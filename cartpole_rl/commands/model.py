@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 from cartpole_rl.commands.application import application
 from cartpole_rl.commands.build import use_threads
-from cartpole_rl.commands.config import LearnedSettings, PoleFrictionSettings, Seed
+from cartpole_rl.commands.config import LearnedSettings, PoleFrictionSettings
 from cartpole_rl.commands.evaluate import count_text
 from cartpole_rl.commands.replay import MARKED, recorded_pole, recordings
 from cartpole_rl.commands.run_folder import write_config, write_json
@@ -38,7 +38,7 @@ from cartpole_rl.randomization import Pole, PoleSettings
 from cartpole_rl.reporting.figures import save
 from cartpole_rl.reporting.figures.learned_models import learned_model_figure
 from cartpole_rl.reporting.table import number_text, table
-from cartpole_rl.settings import Count, Finite, Settings
+from cartpole_rl.settings import Count, Finite, Seed, Settings
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.tasks.features import CART_METRES_PER_COUNT
 
@@ -88,7 +88,7 @@ def main(config: ModelConfig, folder: Path) -> None:
         LEARNED: predict_held_out(unseen, dynamics, residual),
     }
     errors = {model: errors_at(prediction, MARKED, period) for model, prediction in judged.items()}
-    write_config(folder, config.model_dump(mode="json", by_alias=True))
+    write_config(folder, "model", config.model_dump(mode="json", by_alias=True))
     model = LearnedModel(fit.parameters, models, period, dynamics.substeps, residual.as_float())
     save_model(folder / MODEL, model)
     told = {

@@ -18,8 +18,8 @@ from cartpole_rl.choices import choice
 from cartpole_rl.commands.application import application
 from cartpole_rl.commands.config import CartFrictionSettings, PoleFrictionSettings, SimulatedSettings
 from cartpole_rl.commands.evaluate import count_text
-from cartpole_rl.commands.record import RECORDINGS
-from cartpole_rl.commands.run_folder import write_config, write_json
+from cartpole_rl.commands.record import RECORDING, RECORDINGS
+from cartpole_rl.commands.run_folder import check_program, write_config, write_json
 from cartpole_rl.errors import ConfigError, RecordingError
 from cartpole_rl.evaluation.recordings import LENGTH, read_recording
 from cartpole_rl.identification.replay import Array, Replayed, recorded_period, replay
@@ -70,7 +70,7 @@ def main(config: ReplayConfig, folder: Path) -> None:
     )
     replays = replay(episodes, parameters, models, period, config.plant.substeps, config.restart)
     errors = errors_at(replays, period)
-    write_config(folder, {**config.model_dump(mode="json", by_alias=True), "seed": None})
+    write_config(folder, "replay", {**config.model_dump(mode="json", by_alias=True), "seed": None})
     written = {"pole": name, "control_period_s": period, "parameters": parameters, "errors": errors}
     write_json(folder / REPLAY, {"recordings": [str(path) for path in paths], **written})
     note = f"above: {paths[0].name},  below: {count_text(len(episodes))},  pole={name}"
@@ -80,9 +80,13 @@ def main(config: ReplayConfig, folder: Path) -> None:
 
 
 def recordings(source: Path) -> list[Path]:
-    """The recordings that `source` means: itself, those in it, or those of a run. Raises RecordingError."""
+    """The recordings that `source` means: itself, those in it, or those of a run.
+
+    Raises RecordingError, and ConfigError where it is a run of a command that records nothing.
+    """
     if source.is_file():
         return [source]
+    check_program("from", source, *RECORDING)
     inner = source / RECORDINGS
     found = sorted((inner if inner.is_dir() else source).glob("*.csv"))
     if not found:

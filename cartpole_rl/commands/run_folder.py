@@ -1,4 +1,7 @@
-"""What every run folder holds beside its results: the resolved config, and what it was run with."""
+"""What every run folder holds beside its results: the resolved config, and what it was run with.
+
+A run folder says which command made it, so that a command can refuse the folder of another one.
+"""
 
 import json
 import platform
@@ -12,13 +15,28 @@ from typing import Any
 import yaml
 
 from cartpole_rl.errors import ConfigError
+from cartpole_rl.learning.checkpoints import FOLDER, LAST, RESUME
 
-CONFIG, PROVENANCE = "config.yaml", "provenance.json"
+CONFIG, PROVENANCE, MULTIRUN = "config.yaml", "provenance.json", "multirun.yaml"
+METRICS = "metrics.json"
+PREFIX = "cartpole-"
+USES = {  # command: what can be done with one of its runs
+    "train": "cartpole-evaluate, cartpole-record and cartpole-finetune take it as run={0}",
+    "finetune": "cartpole-evaluate, cartpole-record and cartpole-finetune take it as run={0}",
+    "evaluate": "cartpole-evaluate drives one of its episodes again: repeat.run={0}",
+    "record": "cartpole-replay, cartpole-identify and cartpole-model take it as from={0}",
+    "replay": "its replay.json and figures are its results; cartpole-replay from=... makes others",
+    "identify": "cartpole-train takes its files: cart={0}/cart.yaml pole={0}/pole.yaml "
+    "randomization={0}/randomization.yaml",
+    "model": "cartpole-train, cartpole-evaluate and cartpole-record take it as plant=learned plant.model={0}",
+}
 PACKAGES = ("cartpole_rl", "torch", "torchrl", "tensordict", "numpy", "hydra-core", "mujoco", "pyserial")
 
 
-def write_config(folder: Path, config: Mapping[str, Any], resumed: bool = False) -> None:
-    """config.yaml (resolved) and provenance.json; a resumed run adds to the latter what resumed it.
+def write_config(folder: Path, program: str, config: Mapping[str, Any], resumed: bool = False) -> None:
+    """Write config.yaml (resolved) and provenance.json of a run of cartpole-<program>.
+
+    A resumed run adds to the latter what resumed it.
 
     Raises ConfigError where the folder holds another run: none is ever overwritten.
     """
@@ -31,7 +49,54 @@ def write_config(folder: Path, config: Mapping[str, Any], resumed: bool = False)
         raise ConfigError(f"hydra.run.dir={folder}: it holds a run already; give another folder")
     folder.mkdir(parents=True, exist_ok=True)
     (folder / CONFIG).write_text(yaml.safe_dump(dict(config), sort_keys=False))
-    write_json(folder / PROVENANCE, {"seed": config["seed"], **provenance()})
+    head = {"program": f"{PREFIX}{program}", "seed": config["seed"]}
+    write_json(folder / PROVENANCE, {**head, **provenance()})
+
+
+def program_of(folder: Path) -> str | None:
+    """Return the command that made the run in `folder`, as a key of USES; None where none did.
+
+    Runs from before provenance.json named it have it in their command line.
+    """
+    try:
+        told = json.loads((folder / PROVENANCE).read_text())
+        named = told.get("program") or Path(told["command"][0]).stem
+    except (OSError, ValueError, AttributeError, LookupError, TypeError):
+        return None
+    name = str(named).removeprefix(PREFIX)
+    return name if name in USES else None
+
+
+def check_program(setting: str, folder: Path, *wanted: str) -> None:
+    """Raise ConfigError, with what can be done, where `folder` is a run of another command than `wanted`."""
+    if (folder / MULTIRUN).is_file():
+        jobs = sorted(path for path in folder.iterdir() if path.is_dir())
+        example = f": {setting}={jobs[0]}" if jobs else ""
+        raise ConfigError(
+            f"{setting}={folder} is a folder of a multirun; give that of one of its jobs{example}"
+        )
+    program = program_of(folder)
+    if program is None or program in wanted:
+        return
+    right = " or ".join(f"{PREFIX}{name}" for name in wanted)
+    raise ConfigError(
+        f"{setting}={folder} is a run of {PREFIX}{program}, not of {right}; {use_of(folder, program)}"
+    )
+
+
+def use_of(folder: Path, program: str) -> str:
+    """Say what can be done with a run of cartpole-<program>."""
+    if program in ("train", "finetune") and not (folder / METRICS).exists():
+        if (folder / FOLDER / RESUME).exists():
+            return f"{PREFIX}{program} resume={folder} goes on with it"
+        return f"it was stopped before its first checkpoint; start {PREFIX}{program} again"
+    return USES[program].format(folder)
+
+
+def has_ended(run: Path) -> bool:
+    """Whether a training or fine-tuning came to its end: its results are there and nothing to resume from."""
+    results = (run / METRICS).exists() and (run / FOLDER / LAST).exists()
+    return results and not (run / FOLDER / RESUME).exists()
 
 
 def provenance() -> dict[str, Any]:

@@ -8,34 +8,31 @@ cartpole-train resume=runs/train/2026-11-21_12-00-00
 from functools import partial
 from pathlib import Path
 
-from hydra.core.hydra_config import HydraConfig
-
 from cartpole_rl.commands.application import application, tell
 from cartpole_rl.commands.build import check_compiler, new_agent, recorded_config, simulated_env, use_threads
 from cartpole_rl.commands.config import LearnedSettings, TrainConfig
 from cartpole_rl.commands.monitor import TrainingMonitor
 from cartpole_rl.commands.report import report
+from cartpole_rl.commands.resuming import resumed
 from cartpole_rl.commands.run_folder import write_config
 from cartpole_rl.envs import CartPoleEnv
-from cartpole_rl.errors import ConfigError
 from cartpole_rl.evaluation.driving_policy import DrivingPolicy
 from cartpole_rl.evaluation.episodes import Policy, run_batch
-from cartpole_rl.learning.checkpoints import TrainingCheckpoint, load_training, restore_weights
+from cartpole_rl.learning.checkpoints import forget_training, restore_weights
 from cartpole_rl.learning.randomness import seed_everything
 from cartpole_rl.learning.training import Training
 from cartpole_rl.plants.effects import without_effect
 from cartpole_rl.randomization import Draws
+from cartpole_rl.settings import evaluation_seed
 from cartpole_rl.tasks.episode import Episode
-
-EVALUATION_SEED = 10_000  # added to the seed, so that no evaluation starts where training did
 
 
 @application("train", TrainConfig)
 def main(config: TrainConfig, folder: Path) -> None:
     """Compose, build, train, report."""
-    resumed = resumed_training(config, folder)
-    if resumed:
-        config = recorded_config(resumed.config, f"resume={folder}")
+    checkpoint = resumed("train", config.resume, folder)
+    if checkpoint:
+        config = recorded_config(checkpoint.config, f"resume={folder}")
     if config.compile:
         check_compiler()
     use_threads(config.threads)
@@ -44,12 +41,12 @@ def main(config: TrainConfig, folder: Path) -> None:
     env = simulated_env(config, config.plant, carts, start, config.seed, config.compile)
     note_unused_randomization(config, env.plant.randomizer)
     agent = new_agent(config)
-    if resumed:
-        restore_weights(agent, resumed.state["agent"], f"resume={folder}")  # or complain before any work
+    if checkpoint:
+        restore_weights(agent, checkpoint.state["agent"], f"resume={folder}")  # or complain before any work
     policy = DrivingPolicy(agent.greedy_policy(), config.compile)
-    evaluate = partial(judge, nominal_env(config), policy, config.seed + EVALUATION_SEED)
-    write_config(folder, config.model_dump(mode="json"), resumed=resumed is not None)
-    with TrainingMonitor(folder, config, resumed.frames if resumed else None) as monitor:
+    evaluate = partial(judge, nominal_env(config), policy, config.seed)
+    write_config(folder, "train", config.model_dump(mode="json"), resumed=checkpoint is not None)
+    with TrainingMonitor(folder, config, checkpoint.frames if checkpoint else None) as monitor:
         training = Training(
             config.learning,
             config.replay,
@@ -61,8 +58,8 @@ def main(config: TrainConfig, folder: Path) -> None:
             config.seed,
             config.compile,
         )
-        if resumed:
-            training.restore(resumed.state)
+        if checkpoint:
+            training.restore(checkpoint.state)
         else:
             monitor.randomization(env.plant)
         training.run()
@@ -70,20 +67,8 @@ def main(config: TrainConfig, folder: Path) -> None:
             folder, evaluate(), config.plant.kind, config.pole, config.task.x_max, history=monitor.history
         )
         monitor.finished(metrics)
+    forget_training(folder)
     print(f"trained for {training.seconds:.0f} s; {folder}/metrics.json, figures/, checkpoints/ are written")
-
-
-def resumed_training(config: TrainConfig, folder: Path) -> TrainingCheckpoint | None:
-    """The training to go on with; None for a new one. Raises ConfigError, CheckpointError."""
-    if config.resume is None:
-        return None
-    given = HydraConfig.get().overrides.task
-    if others := [word for word in given if not word.startswith("resume=")]:
-        raise ConfigError(f"resume goes on with that run's own config; leave out {', '.join(others)}")
-    checkpoint = load_training(Path(config.resume))
-    if not folder.samefile(config.resume):
-        raise ConfigError("resume goes on in that run's own folder; leave out hydra.run.dir")
-    return checkpoint
 
 
 def note_unused_randomization(config: TrainConfig, draws: Draws) -> None:
@@ -110,8 +95,8 @@ def nominal_env(config: TrainConfig) -> CartPoleEnv:
 
 
 def judge(env: CartPoleEnv, policy: Policy, seed: int) -> list[Episode]:
-    """Episodes of the greedy policy, from the same starts each time."""
-    env.set_seed(seed)
+    """Episodes of the greedy policy in a training with `seed`, from the same starts each time."""
+    env.set_seed(evaluation_seed(seed))
     return run_batch(env, policy)
 
 

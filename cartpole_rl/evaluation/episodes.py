@@ -6,6 +6,7 @@ short episodes do not come round more often than long ones.
 
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -57,6 +58,7 @@ def choose(policy: Policy, present: TensorDictBase) -> Tensor:
 def run_batch(env: CartPoleEnv, policy: Policy) -> list[Episode]:
     """One episode on each cart, all from one reset."""
     present = env.reset()
+    origins = env.plant.origins()
     frames, actions = [present], []
     endings: list[str | None] = [None] * env.plant.carts
     while None in endings:  # a cart waits for what happens here; all that can wait is done below
@@ -76,7 +78,7 @@ def run_batch(env: CartPoleEnv, policy: Policy) -> list[Episode]:
     columns["time"] = dt.cumsum(1)
     arrays = {key: values.cpu().numpy() for key, values in columns.items()}
     return [
-        _episode({key: values[row] for key, values in arrays.items()}, ending)
+        replace(_episode({key: values[row] for key, values in arrays.items()}, ending), origin=origins[row])
         for row, ending in enumerate(endings)
         if ending
     ]

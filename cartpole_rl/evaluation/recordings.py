@@ -73,8 +73,12 @@ def read_recording(path: Path) -> Episode:
         raise RecordingError(f"{path} is damaged: its last row is missing")
     try:
         ended_by = str(Ending(facts.get("ended_by", "")))
-        columns = {field: np.array([float(row[name]) for row in rows]) for name, field in STATE.items()}
-        steps = {field: np.array([float(row[name]) for row in rows[:-1]]) for name, field in STEP.items()}
+        columns: dict[str, Any] = {
+            field: np.array([float(row[name]) for row in rows]) for name, field in STATE.items()
+        }
+        steps: dict[str, Any] = {
+            field: np.array([float(row[name]) for row in rows[:-1]]) for name, field in STEP.items()
+        }
         counts = np.array([[int(row[name]) for name in COUNTS] for row in rows])
         motor = np.array([int(row["motor"]) for row in rows[:-1]])
     except (ValueError, TypeError) as error:

@@ -16,7 +16,13 @@ from torch import nn
 from cartpole_rl.errors import CheckpointError
 
 AGENT_FORMAT = "cartpole_rl agent 1"
-TRAINING_FORMAT = "cartpole_rl training 1"
+TRAINING_FORMAT = "cartpole_rl training 2"
+FINETUNING_FORMAT = "cartpole_rl fine-tuning 1"
+CONTENT = {  # format: what a file of it holds
+    AGENT_FORMAT: "an agent",
+    TRAINING_FORMAT: "the state that a training resumes from",
+    FINETUNING_FORMAT: "the state that a fine-tuning resumes from",
+}
 FOLDER, LAST, BEST, RESUME = "checkpoints", "last.pt", "best.pt", "resume.pt"
 
 
@@ -32,10 +38,10 @@ class AgentCheckpoint:
 
 @dataclass(frozen=True)
 class TrainingCheckpoint:
-    """All that a training goes on from."""
+    """All that a training or a fine-tuning goes on from."""
 
     config: dict[str, Any]
-    state: dict[str, Any]  # what `Training.snapshot` gave
+    state: dict[str, Any]  # of a training: what `Training.snapshot` gave
     frames: int
 
 
@@ -51,7 +57,7 @@ def save_agent(path: Path, agent: AgentCheckpoint) -> None:
 def load_agent(run: Path) -> AgentCheckpoint:
     """Read the agent of a run folder or a checkpoint file. Raises CheckpointError."""
     path = find_agent(run)
-    agent = AgentCheckpoint(**_load(path, AGENT_FORMAT, "an agent"))
+    agent = AgentCheckpoint(**_load(path, AGENT_FORMAT))
     check_finite(agent.weights, f"{path} is refused")
     return agent
 
@@ -90,14 +96,19 @@ def find_agent(run: Path) -> Path:
     return path
 
 
-def save_training(run: Path, training: TrainingCheckpoint) -> None:
+def save_training(run: Path, training: TrainingCheckpoint, file_format: str = TRAINING_FORMAT) -> None:
     """Write what `load_training` reads. Raises CheckpointError if a weight is not finite."""
     path = run / FOLDER / RESUME
     check_finite(training.state.get("agent", {}), f"{path} is not written")
-    _save(path, TRAINING_FORMAT, vars(training))
+    _save(path, file_format, vars(training))
 
 
-def load_training(run: Path) -> TrainingCheckpoint:
+def forget_training(run: Path) -> None:
+    """Remove what `save_training` wrote: the training has ended, and its replay buffer is large."""
+    (run / FOLDER / RESUME).unlink(missing_ok=True)
+
+
+def load_training(run: Path, file_format: str = TRAINING_FORMAT) -> TrainingCheckpoint:
     """The state that the training in the folder `run` can go on from. Raises CheckpointError."""
     if not run.is_dir():
         raise CheckpointError(f"resume={run}: there is no such folder; give the run folder of a training")
@@ -106,7 +117,7 @@ def load_training(run: Path) -> TrainingCheckpoint:
         raise CheckpointError(
             f"resume={run}: it holds no {FOLDER}/{RESUME}; give the folder of a training that came so far"
         )
-    training = TrainingCheckpoint(**_load(path, TRAINING_FORMAT, "a training"))
+    training = TrainingCheckpoint(**_load(path, file_format))
     check_finite(training.state.get("agent", {}), f"{path} is refused")
     return training
 
@@ -125,7 +136,7 @@ def _save(path: Path, file_format: str, content: Mapping[str, Any]) -> None:
         torch.save({"format": file_format, **content}, beside)
 
 
-def _load(path: Path, expected: str, what: str) -> dict[str, Any]:
+def _load(path: Path, expected: str) -> dict[str, Any]:
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch raises whatever the damaged bytes lead it to
@@ -135,7 +146,6 @@ def _load(path: Path, expected: str, what: str) -> dict[str, Any]:
         ) from None
     found = content.pop("format", None) if isinstance(content, dict) else None
     if found != expected:
-        raise CheckpointError(
-            f"{path} is not {what} of this package: its format is {found!r}, not {expected!r}"
-        )
+        held = f"it is {CONTENT[found]}" if found in CONTENT else f"its format is {found!r}, not {expected!r}"
+        raise CheckpointError(f"{path} is not {CONTENT[expected]} of this package: {held}")
     return content

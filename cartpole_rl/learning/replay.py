@@ -5,6 +5,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 from torchrl.data import LazyTensorStorage, PrioritizedSampler, RandomSampler, TensorDictReplayBuffer
 
 from cartpole_rl.learning.settings import ReplaySettings
@@ -32,27 +33,46 @@ def make_replay(settings: ReplaySettings, batch_size: int) -> TensorDictReplayBu
 
 
 def replay_snapshot(replay: TensorDictReplayBuffer) -> dict[str, Any]:
-    """All that the buffer's next batch depends on, as tensors and plain values.
+    """Return all that the buffer's next batch depends on, as tensors and plain values.
 
-    TorchRL gives its trees as compiled objects, which `torch.load` rightly refuses to read from a file.
+    Of the storage and the trees it holds the filled rows alone: a buffer has memory for all that it will ever
+    hold. A full buffer shares its memory with the snapshot. TorchRL gives its trees as compiled objects,
+    which `torch.load` rightly refuses to read from a file.
     """
-    state = replay.state_dict()
-    sampler = state["_sampler"]
-    leaves = torch.arange(replay.storage.max_size)
-    trees = {name: torch.as_tensor(sampler[name][leaves]) for name in TREES if name in sampler}
-    return {**state, "_sampler": {**sampler, **trees}}
+    filled = len(replay)
+    sampler = replay.sampler.state_dict()
+    trees = {name: torch.as_tensor(sampler[name][torch.arange(filled)]) for name in TREES if name in sampler}
+    return {
+        "transitions": _filled_rows(replay.storage, filled),
+        "writer": replay.writer.state_dict(),
+        "sampler": {**sampler, **trees},
+    }
 
 
 def restore_replay(replay: TensorDictReplayBuffer, snapshot: Mapping[str, Any]) -> None:
     """Go on from `snapshot`. A tree's nodes follow from its leaves, so it comes back to the bit."""
-    sampler = dict(snapshot["_sampler"])
+    replay.empty()
+    transitions = snapshot["transitions"]
+    if transitions:
+        filled = len(next(iter(transitions.values())))
+        replay.extend(TensorDict(transitions, [filled]).unflatten_keys("."))
+    sampler = dict(snapshot["sampler"])
     own = replay.sampler.state_dict()
     for name in TREES:
         if name in sampler:
             tree = own[name]
             tree[torch.arange(len(sampler[name]))] = sampler[name]
             sampler[name] = tree
-    replay.load_state_dict({**snapshot, "_sampler": sampler})
+    replay.sampler.load_state_dict(sampler)
+    replay.writer.load_state_dict(snapshot["writer"])
+
+
+def _filled_rows(storage: LazyTensorStorage, filled: int) -> dict[str, Tensor]:
+    """The columns of the first `filled` rows, with memory of their own unless these are all rows."""
+    if not filled:
+        return {}
+    rows = storage.get(range(filled)) if filled < storage.max_size else storage.get(slice(None))
+    return dict(rows.flatten_keys(".").items())
 
 
 class NStepReturns:

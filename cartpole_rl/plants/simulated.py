@@ -18,6 +18,7 @@ from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.simulation import Carts, Given, Period, encoder_counts, run_carts
 from cartpole_rl.plants.specs import Plant
 from cartpole_rl.randomization import Draws
+from cartpole_rl.tasks.episode import Origin
 from cartpole_rl.tasks.starts import StartSettings, draw_start
 
 OF_CHANCE = ("latency_jitter", "position_noise", "angle_noise")  # drawn anew in each period
@@ -89,6 +90,22 @@ class SimulatedPlant(Plant):
     def place(self, state: State) -> None:
         """Put the carts into `state`; for tests, knocks and replay."""
         self._carts = self._carts._replace(motion=torch.stack(state).to(self._carts.motion))
+
+    def origins(self) -> list[Origin]:
+        """The cart and the true state of each row as they are now; after a reset, as its episode began."""
+        names, states = CartParameters.names(), self._carts.motion.T.tolist()
+        return [
+            Origin(dict(zip(names, cart, strict=True)), dict(zip(State._fields, state, strict=True)))
+            for cart, state in zip(self._carts.table.T.tolist(), states, strict=True)
+        ]
+
+    def start_from(self, state: Mapping[str, float]) -> None:
+        """Let the next episode of every cart begin in this true state; `Origin` has the units."""
+        table = self.randomizer.draw(self.carts, self._generator)
+        column = torch.tensor([[state[name]] for name in State._fields], device=self.device)
+        motion = column.repeat(1, self.carts)
+        counts = encoder_counts(State(*motion), CartParameters.from_table(table), self._chance(self.carts))
+        self._coming = Episodes(table, motion, counts)
 
     def replace_randomizer(self, randomizer: Draws) -> None:
         """Draw the next episodes from another one, whose delays are no longer than those of the first."""

@@ -9,6 +9,8 @@ from tensordict import TensorDict
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from cartpole_rl.tasks.episode import Origin
+
 MOTOR_LIMIT = 255
 
 
@@ -52,6 +54,10 @@ class Plant(EnvBase):
 
     def halt(self) -> None:
         """Motor to 0 until the next reset. A simulated cart stands still anyway when nobody steps it."""
+
+    def origins(self) -> Sequence[Origin | None]:
+        """The cart and the true state of each row, [N], right after a reset; None where nobody knows them."""
+        return [None] * self.carts
 
     def restart(self, rows: torch.Tensor, again: torch.Tensor | None = None) -> TensorDict:
         """Begin a new episode on the carts `rows`, [R] int64; their first frame, [R].

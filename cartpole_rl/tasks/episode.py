@@ -1,11 +1,20 @@
 """One finished episode as arrays: what evaluation scores, figures draw and recordings store."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Origin:
+    """A simulated cart and the true state that an episode began in: enough to drive the episode again."""
+
+    parameters: Mapping[str, float]  # of cart and pole, by name
+    state: Mapping[str, float]  # x m, x_dot m/s, theta rad, theta_dot rad/s
 
 
 @dataclass(frozen=True)
@@ -26,6 +35,7 @@ class Episode:
     score_upright: Array  # [T] equation (6.1) of each step, at state t+1
     reward: Array  # [T]
     ended_by: str  # an `endings.Ending`
+    origin: Origin | None = None  # of an episode on a simulated cart
 
     @property
     def steps(self) -> int:

@@ -17,6 +17,7 @@ import torch
 
 from cartpole_rl.commands.build import TrainedAgent, simulated_env, trained_agent, use_threads
 from cartpole_rl.reporting.table import table
+from cartpole_rl.settings import evaluation_seed
 
 STRUCK_AT, PATIENCE, HOLD = 250, 150, 50  # periods of 0.02 s: 5 s, 3 s, 1 s
 SPEEDS = (6.0, 10.0)  # rad/s
@@ -27,7 +28,9 @@ UPRIGHT, FALLEN = math.radians(5), math.radians(90)
 def recoveries(agent: TrainedAgent, knocks: int, seed: int) -> dict[str, float]:
     """How many stood before the knock, fell after it, stayed on the track, and were back within 3 s."""
     settings = agent.training.model_copy(update={"randomization": {}})
-    env = simulated_env(settings, settings.plant, knocks, settings.task.evaluation_start, seed)
+    env = simulated_env(
+        settings, settings.plant, knocks, settings.task.evaluation_start, evaluation_seed(seed)
+    )
     generator = torch.Generator().manual_seed(seed)
     low, high = SPEEDS
     sign = torch.randint(2, (knocks,), generator=generator) * 2 - 1

@@ -27,6 +27,7 @@ from cartpole_rl.commands.config import TrainConfig
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.randomization import Pole, PoleSettings, Range
 from cartpole_rl.reporting.table import table
+from cartpole_rl.settings import evaluation_seed
 from cartpole_rl.tasks.episode import Episode
 
 REFERENCES = Path(__file__).with_name("references.json")
@@ -81,7 +82,7 @@ def judge(folder: Path, plant: str) -> dict[str, float]:
 
 def driven(agent: TrainedAgent, settings: TrainConfig, carts: int) -> list[Episode]:
     """An episode on each of `carts` simulated carts, from the starts that an evaluation has."""
-    env = simulated_env(settings, settings.plant, carts, settings.task.evaluation_start, 1)
+    env = simulated_env(settings, settings.plant, carts, settings.task.evaluation_start, evaluation_seed(1))
     return run_batch(env, agent.policy)
 
 

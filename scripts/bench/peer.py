@@ -28,6 +28,7 @@ from cartpole_rl.commands.build import use_threads
 from cartpole_rl.envs.gymnasium import simulated_environment
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.reporting.table import table
+from cartpole_rl.settings import evaluation_seed
 
 try:
     from stable_baselines3 import DQN
@@ -131,7 +132,7 @@ class Judge(BaseCallback):
             return True
         self.next += self.every
         now = time.perf_counter()
-        self.env.set_seed(10_000)
+        self.env.set_seed(evaluation_seed(0))
         episodes = run_batch(self.env, self.policy)
         score = float(np.mean([episode.score.sum() for episode in episodes]))
         seconds = now - self.started - self.judging

@@ -67,7 +67,7 @@ WRONG_EVALUATION = [
     ("run=cut.pt", "cut.pt", "damaged", 1),
     ("run=other.pt", "other.pt", "not an agent of this package", 1),
     ("run=empty", "run=empty", "holds no checkpoints/last.pt", 1),
-    ("run=run/checkpoints/resume.pt", "resume.pt", "not an agent", 1),
+    ("run=resume.pt", "resume.pt", "not an agent of this package: it is the state that a training", 1),
     ("run=run plant.substeps=0", "plant.substeps=0", "greater than or equal to 1", 2),
     ("run=run parameters={cart_mas:1}", "cart_mas", "did you mean 'cart_mass'?", 2),
     ("run=run parameters={cart_mass:-1}", "cart_mass is -1", "above 0", 2),
@@ -86,9 +86,10 @@ WRONG_EVALUATION = [
 
 
 @pytest.fixture(scope="module")
-def files(trained: Path) -> Path:
+def files(trained: Path, stopped: Path) -> Path:
     """A folder with a trained run, and files that are none."""
     folder = trained.parent
+    shutil.copy(stopped / "checkpoints/resume.pt", folder)
     (folder / "text.pt").write_text("no checkpoint at all\n")
     (folder / "cut.pt").write_bytes((trained / "checkpoints/last.pt").read_bytes()[:2000])
     torch.save({"model": torch.zeros(3)}, folder / "other.pt")
@@ -169,7 +170,7 @@ def test_resuming_takes_no_other_setting(words: str, remedy: str, trained: Path)
 
 
 def test_resuming_what_is_no_training(files: Path) -> None:
-    done = in_process("train", "resume=run/checkpoints/resume.pt", folder=files)
+    done = in_process("train", "resume=resume.pt", folder=files)
     assert "give the run folder of a training" in done.complaint
     assert done.code == 1
     (files / "an_evaluation").mkdir()
@@ -198,8 +199,19 @@ def test_a_checkpoint_with_another_network(trained: Path, files: Path) -> None:
     assert done.code == 1
 
 
-def test_a_training_with_another_network_does_not_go_on(trained: Path, tmp_path: Path) -> None:
-    older = shutil.copytree(trained, tmp_path / "older")
+def test_a_training_that_has_ended_is_not_resumed(trained: Path) -> None:
+    before = {path: path.read_bytes() for path in trained.rglob("*") if path.is_file()}
+    done = in_process("train", "resume=run", folder=trained.parent)
+    assert done.complaint == (
+        "cartpole-train: resume=run: this run of cartpole-train has ended; cartpole-evaluate run=run drives "
+        "its agent, cartpole-train with more learning.frames makes a longer training"
+    )
+    assert done.code == 2
+    assert {path: path.read_bytes() for path in trained.rglob("*") if path.is_file()} == before
+
+
+def test_a_training_with_another_network_does_not_go_on(stopped: Path, tmp_path: Path) -> None:
+    older = shutil.copytree(stopped, tmp_path / "older")
     content = torch.load(older / "checkpoints/resume.pt", weights_only=True)
     agent = {f"{name}_of_before": weight for name, weight in content["state"]["agent"].items()}
     torch.save({**content, "state": {**content["state"], "agent": agent}}, older / "checkpoints/resume.pt")

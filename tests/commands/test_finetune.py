@@ -90,6 +90,18 @@ def test_an_agent_that_observes_the_poles_length_is_tuned(tmp_path: Path) -> Non
     assert "# pole_length_m: 0.3600" in heading
 
 
+def test_one_that_has_ended_is_not_resumed(tuned: tuple[Path, Outcome], tmp_path: Path) -> None:
+    run, _ = tuned
+    assert [path.name for path in (run / "checkpoints").iterdir()] == ["last.pt"]
+    done = in_process("finetune", f"resume={run}", folder=tmp_path)
+    assert done.code == 2
+    assert f"this run of cartpole-finetune has ended; cartpole-evaluate run={run}" in done.complaint
+    done = in_process("finetune", f"resume={run}", "hydra.run.dir=elsewhere", folder=tmp_path)
+    assert done.code == 2
+    assert "leave out hydra.run.dir" in done.complaint
+    assert not (tmp_path / "elsewhere").exists()
+
+
 def test_a_tuned_agent_is_evaluated_like_any_other(tuned: tuple[Path, Outcome], tmp_path: Path) -> None:
     run, _ = tuned
     done = in_process(

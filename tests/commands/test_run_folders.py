@@ -60,7 +60,7 @@ def test_a_training_leaves_what_runs_readme_says(trained: Path) -> None:
         "provenance.json",
         "metrics.json",
         "history.jsonl",
-        *(f"checkpoints/{name}.pt" for name in ("last", "best", "resume")),
+        *(f"checkpoints/{name}.pt" for name in ("last", "best")),
         *(f"figures/{name}" for name in ("learning_curve.png", "behaviour.png", "episode.gif")),
     }
     metrics = read(trained / "metrics.json")
@@ -70,7 +70,7 @@ def test_a_training_leaves_what_runs_readme_says(trained: Path) -> None:
     assert config["learning"]["frames"] == 2048
     assert config["task"]["x_max"] == config["cart"]["track_half_length"]
     provenance = read(trained / "provenance.json")
-    assert provenance["seed"] == 0
+    assert (provenance["program"], provenance["seed"]) == ("cartpole-train", 0)
     assert "learning.frames=2048" in provenance["command"]
     assert provenance["packages"]["torch"] == torch.__version__.split("+")[0]
 
@@ -239,6 +239,15 @@ def test_a_training_that_was_stopped_goes_on_as_if_it_had_not_been(tmp_path: Pat
     assert read(runs[0] / "metrics.json") == read(runs[1] / "metrics.json")
     assert curves(runs[0]) == curves(runs[1])
     assert len(read(runs[1] / "provenance.json")["resumed"]) == 2
+    assert not any((run / "checkpoints/resume.pt").exists() for run in runs)
+
+
+def test_a_training_that_was_stopped_keeps_no_more_than_it_has_seen(stopped: Path) -> None:
+    """Its replay buffer has room for 1500 transitions, the default one for a million."""
+    state = torch.load(stopped / "checkpoints/resume.pt", weights_only=True)
+    kept = state["state"]["replay"]["transitions"]
+    assert {len(column) for column in kept.values()} == {min(state["frames"], 1500)}
+    assert not (stopped / "metrics.json").exists()
 
 
 def test_what_a_broken_link_leaves_is_reported(

@@ -31,8 +31,10 @@ def episode(
 def test_a_recording_comes_back_as_it_was(tmp_path: Path, episode: Episode) -> None:
     write_recording(tmp_path / "deep" / "one.csv", episode)
     again = read_recording(tmp_path / "deep" / "one.csv")
+    assert again.origin is None  # no column of it; cartpole-record writes it into the heading
     for field in dataclasses.fields(Episode):
-        np.testing.assert_array_equal(getattr(again, field.name), getattr(episode, field.name))
+        if field.name != "origin":
+            np.testing.assert_array_equal(getattr(again, field.name), getattr(episode, field.name))
     assert [path.name for path in (tmp_path / "deep").iterdir()] == ["one.csv"]
 
 

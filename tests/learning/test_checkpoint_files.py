@@ -7,8 +7,10 @@ import torch
 
 from cartpole_rl.errors import CheckpointError
 from cartpole_rl.learning.checkpoints import (
+    FINETUNING_FORMAT,
     AgentCheckpoint,
     TrainingCheckpoint,
+    forget_training,
     load_agent,
     load_training,
     replacing,
@@ -41,6 +43,16 @@ def test_an_agent_comes_back_from_its_folder_and_from_its_file(tmp_path: Path) -
 def test_a_training_comes_back(tmp_path: Path) -> None:
     save_training(tmp_path, TRAINING)
     assert load_training(tmp_path) == TRAINING
+    forget_training(tmp_path)
+    forget_training(tmp_path)  # once more does no harm
+    assert not list((tmp_path / "checkpoints").iterdir())
+
+
+def test_a_training_is_no_fine_tuning(tmp_path: Path) -> None:
+    save_training(tmp_path, TRAINING, FINETUNING_FORMAT)
+    assert load_training(tmp_path, FINETUNING_FORMAT) == TRAINING
+    with pytest.raises(CheckpointError, match="it is the state that a fine-tuning resumes from"):
+        load_training(tmp_path)
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])

@@ -103,6 +103,40 @@ def test_a_restored_buffer_draws_the_same_batches(settings: dict, filled: int, t
     assert use(restored) == use(original)
 
 
+@pytest.mark.parametrize("settings", [PRIORITIZED, UNIFORM])
+def test_a_snapshot_holds_the_filled_rows_alone(settings: dict, tmp_path) -> None:
+    """A small and a large buffer with the same transitions give files of the same size."""
+    sizes = []
+    for capacity in (1000, 100_000):
+        replay = make_replay(ReplaySettings(**{**settings, "size": capacity}), batch_size=8)
+        replay.extend(n_step_transitions(random_chunk(10, 50, seed=0), 3, 0.9))
+        torch.save(replay_snapshot(replay), tmp_path / "replay.pt")
+        sizes.append((tmp_path / "replay.pt").stat().st_size)
+    assert sizes[1] == pytest.approx(sizes[0], rel=0.01)
+    assert sizes[0] < 500 * 100  # bytes: what 500 transitions take, and a little more
+
+
+@pytest.mark.parametrize("settings", [PRIORITIZED, UNIFORM])
+@pytest.mark.parametrize("filled", [0, 30, 64, 90])
+def test_a_restored_buffer_holds_the_same_transitions_in_the_same_places(
+    settings: dict, filled: int, tmp_path
+) -> None:
+    """Also one that is wrapped round, and one that had other transitions before."""
+    transitions = n_step_transitions(random_chunk(10, 10, seed=1), 3, 0.9)
+    original, restored = (make_replay(ReplaySettings(**settings), batch_size=8) for _ in range(2))
+    restored.extend(transitions[-40:])
+    for first in range(0, filled, 30):
+        original.extend(transitions[first : min(first + 30, filled)])
+    torch.save(replay_snapshot(original), tmp_path / "replay.pt")
+    restore_replay(restored, torch.load(tmp_path / "replay.pt", weights_only=True))
+    for more in range(2):
+        assert len(restored) == len(original) == min(64, filled + 40 * more)
+        if len(original):
+            assert (restored[:] == original[:]).all()
+        for replay in (original, restored):
+            replay.extend(transitions[:40])
+
+
 def random_chunk(carts: int, periods: int, seed: int) -> TensorDict:
     """Transitions [N, T] in which a tenth of the periods terminate and a tenth are truncated."""
     generator = torch.Generator().manual_seed(seed)

@@ -5,6 +5,7 @@ import re
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -85,9 +86,30 @@ def test_train(command: str, tmp_path: Path) -> None:
 
 
 def test_resume(trained: Path) -> None:
+    """A training is interrupted, goes on, and is interrupted again."""
     (command,) = [command for command in listed("cartpole-train") if "resume" in command]
-    result = run(command.replace("<run>", "first"), cwd=trained)
-    assert result.returncode == 0, result.stderr
+    folder = trained / "runs/train/stopped"
+    longer = ["learning.frames=10000000", "learning.evaluations=5000", f"hydra.run.dir={folder}"]
+    interrupt_when_saved(["cartpole-train", *BUDGET, *longer], folder, trained)
+    seen = len((folder / "history.jsonl").read_text().splitlines())
+    interrupt_when_saved(command.replace("<run>", "stopped").split(), folder, trained)
+    assert len((folder / "history.jsonl").read_text().splitlines()) > seen
+    assert len(json.loads((folder / "provenance.json").read_text())["resumed"]) == 1
+
+
+def interrupt_when_saved(words: list[str], folder: Path, cwd: Path) -> None:
+    """Ctrl-C to a training in `folder` once it has written, in this process, what it can go on from."""
+    state = folder / "checkpoints/resume.pt"
+    before = state.stat().st_mtime_ns if state.exists() else None
+    with subprocess.Popen(
+        [BIN / words[0], *words[1:]], cwd=cwd, stderr=subprocess.PIPE, text=True
+    ) as process:
+        while not state.exists() or state.stat().st_mtime_ns == before:
+            assert process.poll() is None, process.communicate()
+            time.sleep(0.01)
+        process.send_signal(signal.SIGINT)
+        process.communicate()
+        assert process.returncode == 130
 
 
 @pytest.mark.parametrize("command", listed("cartpole-evaluate"))

@@ -1,0 +1,105 @@
+"""repeat=: one episode of an earlier evaluation again, the same simulated cart from the same start."""
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+from hydra.core.hydra_config import HydraConfig
+
+from cartpole_rl.commands.build import simulated_carts
+from cartpole_rl.commands.config import EvaluateConfig, checked
+from cartpole_rl.commands.report import read_origin
+from cartpole_rl.commands.run_folder import CONFIG, METRICS, check_program
+from cartpole_rl.envs import CartPoleEnv
+from cartpole_rl.errors import ConfigError
+from cartpole_rl.evaluation.episodes import Policy, run_batch
+from cartpole_rl.plants.simulated import OF_CHANCE, SimulatedPlant
+from cartpole_rl.randomization import Pole
+from cartpole_rl.tasks.episode import Episode, Origin
+
+FREE = ("run", "repeat.run", "repeat.episode", "label")  # settings that a repetition takes
+
+
+@dataclass(frozen=True)
+class Repetition:
+    """An episode to drive again."""
+
+    config: EvaluateConfig  # of that evaluation, on this cart alone
+    origin: Origin
+    row: int  # of the batch: sums of another batch, or in another row, are rounded in another order
+    score: float  # then
+
+    @property
+    def left_to_chance(self) -> list[str]:
+        """The parameters of this cart that keep it from being driven exactly alike."""
+        return [name for name in OF_CHANCE if self.origin.parameters[name] != 0]
+
+    def drive(self, env: CartPoleEnv, policy: Policy) -> Iterator[Episode]:
+        """The episode."""
+        assert isinstance(env.plant, SimulatedPlant)
+        env.plant.start_from(self.origin.state)
+        yield run_batch(env, policy)[self.row]
+
+
+def repetition(config: EvaluateConfig) -> Repetition | None:
+    """Return the episode that `config` repeats; None where it repeats none. Raises ConfigError."""
+    run, number = config.repeat.run, config.repeat.episode
+    if run is None and number is None:
+        return None
+    if run is None:
+        raise ConfigError("repeat.run is missing; give repeat.run=..., the run folder of an evaluation")
+    given = HydraConfig.get().overrides.task
+    if others := [word for word in given if word.lstrip("+").split("=")[0] not in FREE]:
+        raise ConfigError(f"repeat takes that evaluation's own settings; leave out {', '.join(others)}")
+    recorded, metrics = read_evaluation(run)
+    count = len(metrics["episodes"])
+    if number is None:
+        raise ConfigError(f"repeat.episode is missing; give repeat.episode=0 to {count - 1}")
+    if number >= count:
+        raise ConfigError(f"repeat.episode={number}: repeat.run={run} has episodes 0 to {count - 1}")
+    try:
+        origin = read_origin(metrics, number)
+    except LookupError:
+        raise ConfigError(
+            f"repeat.run={run}: its {METRICS} does not tell the cart of each episode; evaluate again"
+        ) from None
+    batch_number = (recorded.get("repeat") or {}).get("episode")
+    evaluation = as_then(config, recorded, origin)
+    row = (number if batch_number is None else batch_number) % simulated_carts(evaluation)
+    return Repetition(evaluation, origin, row, metrics["episodes"][number]["score"])
+
+
+def read_evaluation(run: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The config and the metrics of an evaluation in simulation. Raises ConfigError."""
+    check_program("repeat.run", run, "evaluate")
+    try:
+        recorded = yaml.safe_load((run / CONFIG).read_text())
+        metrics = json.loads((run / METRICS).read_text())
+        plant, _ = metrics["plant"], recorded["evaluated"]
+    except (OSError, ValueError, LookupError, TypeError, yaml.YAMLError):
+        raise ConfigError(
+            f"repeat.run={run}: it is no finished run of cartpole-evaluate; give the run folder of one"
+        ) from None
+    if plant != "simulated":
+        raise ConfigError(
+            f"repeat.run={run}: it drove plant={plant}, whose episodes cannot be driven again; give a run "
+            "with plant=simulated"
+        )
+    return recorded, metrics
+
+
+def as_then(config: EvaluateConfig, recorded: Mapping[str, Any], origin: Origin) -> EvaluateConfig:
+    """The recorded evaluation with the agent of `config`, on that cart alone. Raises ConfigError."""
+    then = {name: recorded[name] for name in EvaluateConfig.model_fields if name in recorded}
+    own = {name: getattr(config, name) for name in ("run", "label", "repeat")}
+    pole = {name: origin.parameters[name] for name in Pole.model_fields}
+    of_cart = {name: value for name, value in origin.parameters.items() if name not in pole}
+    one_cart = {
+        "parameters": of_cart,
+        "pole": {"choices": {f"{2 * pole['pole_com']:.2f} m": pole}},
+        "randomization": {},
+    }
+    return checked(EvaluateConfig, {**then, **own, **one_cart})

@@ -1,0 +1,143 @@
+"""An episode of an evaluation is found again by its cart and its start, and driven again."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from command_line import in_process
+
+from cartpole_rl.commands.report import as_stored, read_origin
+from cartpole_rl.evaluation.recordings import read_recording
+from cartpole_rl.physics.parameters import CartParameters
+
+SAME = ("score", "score_upright", "reward", "steps", "ended_by", "min_track_margin_m", "rms_motor_change")
+
+
+def read(run: Path) -> dict[str, Any]:
+    return json.loads((run / "metrics.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def evaluated(trained: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with evaluations: `wide` of drawn carts, `noisy` where much is left to chance."""
+    folder = tmp_path_factory.mktemp("evaluated")
+    noisy = "parameters={latency:0.01,latency_jitter:0.002,angle_noise:0.002}"
+    for name, words in {
+        "wide": ("randomization=wide", "pole=both", "task=swingup", "seed=5"),
+        "noisy": (noisy, "task=swingup"),
+        "emulated": ("plant=emulated", "episodes=1"),
+    }.items():
+        given = words if name == "emulated" else ("episodes=7", *words)
+        done = in_process("evaluate", f"run={trained}", *given, f"hydra.run.dir={name}", folder=folder)
+        assert done.code == 0, done.err
+    return folder
+
+
+def repeat(trained: Path, folder: Path, run: str, number: int, *words: str):
+    given = (f"repeat.run={run}", f"repeat.episode={number}", f"hydra.run.dir=again_{run}_{number}")
+    return in_process("evaluate", f"run={trained}", *given, *words, folder=folder)
+
+
+@pytest.mark.parametrize("number", [0, 3, 6])
+def test_the_same_cart_from_the_same_start_scores_the_same(
+    number: int, trained: Path, evaluated: Path
+) -> None:
+    done = repeat(trained, evaluated, "wide", number)
+    assert done.code == 0, done.err
+    then, now = read(evaluated / "wide"), read(evaluated / f"again_wide_{number}")
+    assert len(now["episodes"]) == 1
+    for key in SAME:
+        assert now["episodes"][0][key] == then["episodes"][number][key], key
+    assert read_origin(now, 0) == read_origin(then, number)
+    assert f"episode {number} of wide had score" in done.out
+    assert "now exactly the same" in done.out
+
+
+def test_the_carts_of_an_evaluation_differ_and_are_told_whole(evaluated: Path) -> None:
+    metrics = read(evaluated / "wide")
+    origins = [read_origin(metrics, number) for number in range(7)]
+    assert all(
+        tuple(sorted(origin.parameters)) == tuple(sorted(CartParameters.names())) for origin in origins
+    )
+    assert len({origin.parameters["cart_mass"] for origin in origins}) == 7
+    assert len({origin.state["x"] for origin in origins}) == 7
+    assert "cart_mass" not in metrics["cart"]
+    assert metrics["cart"]["force_linear"] == 0.02
+    scores = {episode["score"] for episode in metrics["episodes"]}
+    assert len(scores) == 7
+
+
+def test_a_repetition_can_be_repeated(trained: Path, evaluated: Path) -> None:
+    first = repeat(trained, evaluated, "wide", 4)
+    assert first.code == 0, first.err
+    again = repeat(trained, evaluated, "again_wide_4", 0)
+    assert again.code == 0, again.err
+    assert "now exactly the same" in again.out
+
+
+def test_what_is_left_to_chance_is_said(trained: Path, evaluated: Path) -> None:
+    done = repeat(trained, evaluated, "noisy", 2)
+    assert done.code == 0, done.err
+    assert "latency_jitter, angle_noise is left to chance, so it cannot be repeated exactly" in done.out
+    then, now = read(evaluated / "noisy"), read(evaluated / "again_noisy_2")
+    assert read_origin(now, 0) == read_origin(then, 2)
+
+
+def test_an_episode_is_recorded_again(trained: Path, evaluated: Path) -> None:
+    words = (f"run={trained}", "repeat.run=wide", "repeat.episode=5", "hydra.run.dir=recorded")
+    done = in_process("record", *words, folder=evaluated)
+    assert done.code == 0, done.err
+    (path,) = (evaluated / "recorded/recordings").iterdir()
+    then = read(evaluated / "wide")
+    assert read_recording(path).score.sum() == then["episodes"][5]["score"]
+    heading = dict(line[2:].split(": ", 1) for line in path.read_text().splitlines() if line[0] == "#")
+    origin = read_origin(then, 5)
+    assert json.loads(heading["cart"]) == origin.parameters
+    assert json.loads(heading["start"]) == origin.state
+
+
+def test_numbers_come_back_to_the_bit() -> None:
+    generator = np.random.default_rng(0)
+    bits = generator.integers(0, 2**32, 20_000, dtype=np.uint32).view(np.float32)
+    values = bits[np.isfinite(bits)]
+    stored = [json.loads(json.dumps(as_stored(float(value)))) for value in values]
+    assert (np.array(stored).astype(np.float32).view(np.uint32) == values.view(np.uint32)).all()
+    assert as_stored(float(np.float32(0.7))) == 0.7
+
+
+@pytest.mark.parametrize(
+    ("words", "named", "remedy"),
+    [
+        ("repeat.run=wide repeat.episode=7", "repeat.episode=7", "has episodes 0 to 6"),
+        ("repeat.run=wide repeat.episode=-1", "repeat.episode=-1", "greater than or equal to 0"),
+        ("repeat.run=wide", "repeat.episode is missing", "repeat.episode=0 to 6"),
+        ("repeat.episode=1", "repeat.run is missing", "the run folder of an evaluation"),
+        ("repeat.run=nowhere repeat.episode=1", "repeat.run=nowhere", "give the run folder of one"),
+        ("repeat.run=emulated repeat.episode=0", "plant=emulated", "give a run with plant=simulated"),
+        ("repeat.run=older repeat.episode=0", "repeat.run=older", "evaluate again"),
+        ("repeat.run=damaged repeat.episode=0", "repeat.run=damaged", "give the run folder of one"),
+        ("repeat.run=wide repeat.episode=1 seed=3", "leave out seed=3", "own settings"),
+        ("repeat.run=wide repeat.episode=1 plant=emulated", "leave out plant=emulated", "own settings"),
+    ],
+)
+def test_bad_input_is_told_in_a_line(
+    words: str, named: str, remedy: str, trained: Path, evaluated: Path
+) -> None:
+    for name in ("older", "damaged"):
+        (evaluated / name).mkdir(exist_ok=True)
+        config = yaml.safe_load((evaluated / "wide/config.yaml").read_text())
+        (evaluated / name / "config.yaml").write_text(yaml.safe_dump(config))
+    metrics = read(evaluated / "wide")
+    for episode in metrics["episodes"]:
+        del episode["cart"], episode["start"]
+    del metrics["cart"]
+    (evaluated / "older/metrics.json").write_text(json.dumps(metrics))
+    (evaluated / "damaged/metrics.json").write_text('{"plant": "simu')
+    done = in_process("evaluate", f"run={trained}", *words.split(), folder=evaluated)
+    assert done.code in (1, 2)
+    assert named in done.complaint
+    assert remedy in done.complaint
+    assert not list(evaluated.glob("runs/evaluate/*"))
