@@ -11,13 +11,13 @@ from tqdm import tqdm
 
 from cartpole_rl.commands.config import TrainConfig
 from cartpole_rl.evaluation import episode_metrics
+from cartpole_rl.files import replacing
 from cartpole_rl.learning.checkpoints import (
     BEST,
     FOLDER,
     LAST,
     AgentCheckpoint,
     TrainingCheckpoint,
-    replacing,
     save_agent,
     save_training,
 )

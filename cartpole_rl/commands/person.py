@@ -9,8 +9,22 @@ def confirm(text: str) -> bool:
         return False
     print(f"{text}.", file=sys.stderr)
     print("Check the cart. It homes as soon as you confirm: keep the track clear.", file=sys.stderr)
+    forget_typed()
     try:
         input("Press Enter to go on, Ctrl-C to stop. ")
     except EOFError:
         return False
     return True
+
+
+def forget_typed() -> None:
+    """Throw away what was typed before: it answers no question that is asked now."""
+    try:
+        import termios
+    except ImportError:  # Windows
+        import msvcrt
+
+        while msvcrt.kbhit():  # type: ignore[attr-defined]
+            msvcrt.getwch()  # type: ignore[attr-defined]
+        return
+    termios.tcflush(sys.stdin, termios.TCIFLUSH)

@@ -1,11 +1,9 @@
 """Checkpoints: an agent with all that is needed to use it, and the state that training resumes from.
 
-Files are written beside their place and renamed into it, so that a kill at any moment leaves the old one
-whole.
+A kill or a power cut at any moment leaves the old file whole (`cartpole_rl.files`).
 """
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +12,7 @@ import torch
 from torch import nn
 
 from cartpole_rl.errors import CheckpointError
+from cartpole_rl.files import replacing
 
 AGENT_FORMAT = "cartpole_rl agent 1"
 TRAINING_FORMAT = "cartpole_rl training 2"
@@ -120,15 +119,6 @@ def load_training(run: Path, file_format: str = TRAINING_FORMAT) -> TrainingChec
     training = TrainingCheckpoint(**_load(path, file_format))
     check_finite(training.state.get("agent", {}), f"{path} is refused")
     return training
-
-
-@contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """A file beside `path` to write to; it takes the place of `path` at the end, whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_name(f"{path.name}.partial")
-    yield beside
-    beside.replace(path)
 
 
 def _save(path: Path, file_format: str, content: Mapping[str, Any]) -> None:
