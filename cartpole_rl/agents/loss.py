@@ -54,7 +54,7 @@ class AdvantageLearningLoss(DQNLoss):
         values = self._values(tensordict, self.value_network_params)  # Q(s, .; theta) [B, A]
         value = values.gather(-1, index.view_as(reward))  # Q(s, a; theta) [B, 1]
         with torch.no_grad():
-            # Double DQN: van Hasselt et al. 2016 (arXiv:1509.06461), eq. 4, theta' being theta-; or DQN, eq. 3
+            # Double DQN: van Hasselt et al. 2016 (arXiv:1509.06461), eq. 4 (theta' is theta-); or DQN: eq. 3
             next_values = self._values(following, self.target_value_network_params)  # Q(s', .; theta-) [B, A]
             chooser = self._values(following, self.value_network_params) if self.double_dqn else next_values
             next_value = next_values.gather(-1, chooser.argmax(-1, keepdim=True))

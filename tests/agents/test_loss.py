@@ -1,7 +1,5 @@
 """The loss against TorchRL's own, and in a loop of TorchRL's own parts."""
 
-import itertools
-
 import pytest
 import torch
 from tensordict import TensorDict
@@ -164,10 +162,21 @@ def test_actions_without_an_index_are_refused() -> None:
         AdvantageLearningLoss(actor, action_space="binary")
 
 
-def test_another_target_than_that_of_one_step_of_n_is_refused() -> None:
+def test_another_target_than_that_of_td0_is_refused() -> None:
     loss = make_loss(AdvantageLearningLoss)
-    for estimator, named in itertools.product(
-        (ValueEstimators.TDLambda, ValueEstimators.TD1), ({}, {"gamma": 0.9})
-    ):
+    for estimator in (ValueEstimators.TDLambda, ValueEstimators.TD1):
         with pytest.raises(NotImplementedError, match="TD0"):
-            loss.make_value_estimator(estimator, **named)
+            loss.make_value_estimator(estimator, gamma=0.9)
+    with pytest.raises(TypeError, match="average_rewards"):
+        loss.make_value_estimator(gamma=0.9, average_rewards=True)
+
+
+def test_the_discount_factor_is_that_of_torchrl_where_none_is_set() -> None:
+    losses = []
+    for kind in (AdvantageLearningLoss, DQNLoss):
+        torch.manual_seed(0)
+        actor = QValueActor(nn.Linear(3, 4), in_keys=["observation"], spec=Categorical(4))
+        loss = kind(actor, delay_value=True)
+        TargetNetUpdater(loss)
+        losses.append(loss(transitions(64))["loss"])
+    torch.testing.assert_close(*losses)

@@ -283,6 +283,17 @@ def test_every_weight_of_the_online_network_is_learned() -> None:
     assert learned == {weight.data_ptr() for weight in agent.actor.parameters()}
 
 
+def test_the_names_of_the_weights_in_a_checkpoint_stay() -> None:
+    """Checkpoints of every version so far have these; a new name would need a mapping from the old one."""
+    layers = [f"module.0.module.layers.{layer}.{part}" for layer in (0, 2) for part in ("weight", "bias")]
+    networks = ("actor", "loss.value_network_params", "loss.target_value_network_params", "average")
+    weights = {f"{network}.{layer}" for network in networks for layer in layers}
+    assert make_agent(layer_norm=False).state_dict().keys() == weights | {
+        "updates",
+        "loss._value_estimator.gamma",
+    }
+
+
 def test_the_target_begins_as_a_copy() -> None:
     agent = make_agent()
     assert torch.equal(online_weights(agent), target_weights(agent))
