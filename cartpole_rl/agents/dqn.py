@@ -6,12 +6,13 @@ from typing import Annotated, Literal
 
 import torch
 from pydantic import Field, model_validator
+from tensordict import TensorDict
 from torch import Tensor, nn
 from torchrl.data import Categorical
 from torchrl.modules import QValueActor
 from torchrl.objectives.utils import TargetNetUpdater
 
-from cartpole_rl.agents.loss import AdvantageLoss
+from cartpole_rl.agents.loss import AdvantageLearningLoss
 from cartpole_rl.agents.network import FrameReader, MirrorQNetwork, QNetwork
 from cartpole_rl.settings import Count, Settings
 
@@ -69,7 +70,7 @@ class QAgent(nn.Module):
         layers = actions, settings.hidden, settings.layer_norm, reader
         network = MirrorQNetwork(mirror_signs, *layers) if settings.mirrored else QNetwork(size, *layers)
         self.actor = QValueActor(network, in_keys=["observation"], spec=Categorical(actions))
-        self.loss = AdvantageLoss(
+        self.loss = AdvantageLearningLoss(
             self.actor,
             action_gap=settings.action_gap,
             loss_function=settings.loss,
@@ -84,9 +85,9 @@ class QAgent(nn.Module):
         self.register_buffer("updates", torch.zeros((), dtype=torch.int64))
         online, target = self.loss.value_network_params, self.loss.target_value_network_params
         learned = [name for name, weight in online.items(True, True) if weight.requires_grad]
-        self._online, self._target = ([params[name] for name in learned] for params in (online, target))
-        self._acting = [] if self.average is None else list(self.average.parameters())
-        self._learning = list(self.actor.parameters())  # in the order of `_acting`
+        networks = online, target, TensorDict.from_module(self.greedy_policy())
+        weights = [TensorDict({name: network[name] for name in learned}).lock_() for network in networks]
+        self._online, self._target, self._average = weights
 
     @torch.no_grad()
     def follow(self) -> None:
@@ -94,11 +95,11 @@ class QAgent(nn.Module):
         self.updates += 1
         tau, period = self.settings.target_tau, self.settings.target_period
         if tau is not None:
-            torch._foreach_lerp_(self._target, self._online, tau)
+            self._target.lerp_(self._online, tau)
         elif period is not None and self.updates % period == 0:
-            torch._foreach_copy_(self._target, self._online)
+            self._target.update_(self._online)
         if self.average is not None:
-            torch._foreach_lerp_(self._acting, self._learning, self._newest_share())
+            self._average.lerp_(self._online, self._newest_share())
 
     def _newest_share(self) -> float:
         """Weight of the newest weights in the average, which spans at most a tenth of the updates so far.

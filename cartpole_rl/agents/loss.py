@@ -1,13 +1,14 @@
-"""The loss of deep Q-learning, and its gradient as one call."""
+"""The loss of deep Q-learning with an action gap, and its gradient as one call."""
 
-import copy
 from collections.abc import Sequence
 from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict.nn import dispatch
 from torch import Tensor
-from torchrl.objectives import DQNLoss
+from torchrl.objectives import DQNLoss, ValueEstimators
+from torchrl.objectives.utils import dispatch_value_estimator, distance_loss
 
 from cartpole_rl.compilation import Compiled
 
@@ -18,45 +19,73 @@ LEARNED_FROM: tuple[NestedKey, ...] = (
     ("next", "observation"),
     ("next", "reward"),
     ("next", "terminated"),
-    ("next", "done"),
 )
-IMPORTANCE: NestedKey = "priority_weight"  # what a prioritized replay adds
+IMPORTANCE: NestedKey = "priority_weight"  # of a transition; a prioritized replay adds it
 Columns = tuple[Tensor, ...]  # of a batch of transitions, in the order LEARNED_FROM, IMPORTANCE
-NETWORKS = ("value_network_params", "target_value_network_params")  # their names in TorchRL's loss
 
 
-class AdvantageLoss(DQNLoss):
-    """TorchRL's DQNLoss with `action_gap` alpha's share taken off the rewards; the same where alpha is 0.
+class AdvantageLearningLoss(DQNLoss):
+    """TorchRL's DQNLoss with the target of advantage learning; the same loss where `action_gap` is 0.
 
-    The share is alpha times what the action taken is worth less than the best one, by the network that
-    learns: its values are at hand, and a compiled loss computes them once. So the best action stays the best
-    one and the others fall back 1 / (1 - alpha) times as far: at 50 Hz a single action changes little, and a
-    network that is a little wrong would take the wrong one (Bellemare et al., "Increasing the action gap",
-    2016, equation 9).
+    It takes the arguments of DQNLoss and `action_gap`, alpha in [0, 1). Advantage learning keeps the value of
+    the best action and widens its lead over each other action 1 / (1 - alpha) times: at 50 Hz one action
+    changes little, and small errors of the network would hide which one is best.
     """
 
-    def __init__(self, *arguments: Any, action_gap: float, **named: Any) -> None:
+    def __init__(self, *arguments: Any, action_gap: float = 0.0, **named: Any) -> None:
         super().__init__(*arguments, **named)
+        if not 0 <= action_gap < 1:
+            raise ValueError(f"action_gap={action_gap}: give at least 0 and less than 1")
+        if self.action_space not in ("categorical", "one_hot"):
+            raise ValueError(f"action_space={self.action_space}: give categorical or one-hot")
         self.action_gap = action_gap
 
+    @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
-        """`loss` [] of transitions [B], and their `td_error` [B, 1] set in `tensordict`."""
-        widened = self.widen_gap(tensordict)
-        loss = super().forward(widened)
-        tensordict.set("td_error", widened["td_error"])
-        return loss
+        """Return the `loss` [] of transitions [B]; set their squared TD errors `td_error` [B, 1] in them.
 
-    @torch.no_grad()
-    def widen_gap(self, batch: TensorDictBase) -> TensorDictBase:
-        """`batch` with the rewards that are learned from."""
-        if self.action_gap == 0:
-            return batch
+        A transition spans n = `steps_to_next_obs` [B, 1] steps, 1 where that is missing; its reward is their
+        discounted sum. theta are the online weights, theta- those of the target network.
+        """
+        keys, following = self.tensor_keys, tensordict["next"]
+        reward, alive = following[keys.reward], ~following[keys.terminated]  # [B, 1]
+        action = tensordict[keys.action]
+        index = action.long().argmax(-1) if self.action_space == "one_hot" else action
+        values = self._values(tensordict, self.value_network_params)  # Q(s, .; theta) [B, A]
+        value = values.gather(-1, index.view_as(reward))  # Q(s, a; theta) [B, 1]
+        with torch.no_grad():
+            # Double DQN: van Hasselt et al. 2016 (arXiv:1509.06461), eq. 4 (theta' is theta-); or DQN: eq. 3
+            next_values = self._values(following, self.target_value_network_params)  # Q(s', .; theta-) [B, A]
+            chooser = self._values(following, self.value_network_params) if self.double_dqn else next_values
+            next_value = next_values.gather(-1, chooser.argmax(-1, keepdim=True))
+            # n steps: Sutton and Barto 2018, eq. 7.1. No value after the end: Mnih et al. 2015, algorithm 1
+            steps = tensordict.get("steps_to_next_obs", torch.ones_like(reward)).view_as(reward)
+            discount = alive * self.value_estimator.gamma**steps
+            # Advantage learning: Bellemare et al. 2016 (arXiv:1512.04860), eq. 9; V - Q by theta
+            shortfall = values.max(-1, keepdim=True).values - value
+            target = reward - self.action_gap * shortfall + discount * next_value
+        tensordict.set(keys.priority, (value - target).detach().square())
+        # Squared error, or Huber's with delta 1 (Huber 1964; "error clipping" in Mnih et al. 2015, Methods)
+        loss = distance_loss(value, target, self.loss_function).squeeze(-1)  # [B]
+        # Mean, or sum(w loss) / sum(w) with importance weights w: Schaul et al. 2016 (arXiv:1511.05952), 3.4.
+        # All losses of TorchRL apply masks and `reduction` by `_reduce_loss`; no public function does
+        weights = tensordict.get(keys.priority_weight, None) if self.use_prioritized_weights else None
+        return TensorDict(loss=self._reduce_loss(loss, tensordict=tensordict, weights=weights))
+
+    def _values(self, tensordict: TensorDictBase, weights: TensorDictBase) -> Tensor:
+        """Return the values of all actions [B, A] by the network with `weights`."""
         # with the module's state preserved, tensors would become new parameters, constants to a tracer
-        with self.value_network_params.to_module(self.value_network, preserve_module_state=False):
-            values = self.value_network(batch.select("observation"))["action_value"]
-        shortfall = values.max(-1, keepdim=True).values - values.gather(-1, batch["action"].unsqueeze(-1))
-        reward = batch["next", "reward"] - self.action_gap * shortfall
-        return batch.clone(recurse=False).set(("next", "reward"), reward)
+        with weights.to_module(self.value_network, preserve_module_state=False):
+            observed = tensordict.select(*self.value_network.in_keys)
+            return self.value_network(observed)[self.tensor_keys.action_value]
+
+    def make_value_estimator(
+        self, value_type: Any = ValueEstimators.TD0, *, gamma: float = 0.99, device: Any = None
+    ) -> None:
+        """Set the discount factor. Raises NotImplementedError for another estimator than TD0."""
+        dispatch_value_estimator(
+            self, value_type, supported=[ValueEstimators.TD0], gamma=gamma, device=device
+        )
 
 
 class LossGradient:
@@ -67,36 +96,33 @@ class LossGradient:
 
     def __init__(self, loss: DQNLoss, max_norm: float, compiled: bool = False) -> None:
         self.loss, self.max_norm = loss, max_norm
-        online, target = (getattr(loss, name) for name in NETWORKS)
-        self.names = [key for key, weight in online.items(True, True) if weight.requires_grad]
-        self.weights: list[Tensor] = [online[name] for name in self.names]
-        self.target: list[Tensor] = [target[name] for name in self.names]
+        state = dict(TensorDict.from_module(loss).items(True, True))
+        self._learned = {name: weight for name, weight in state.items() if weight.requires_grad}
+        self._fixed = {name: weight for name, weight in state.items() if not weight.requires_grad}
+        self.weights: list[Tensor] = list(self._learned.values())
         self._gradient = Compiled(self._pure) if compiled else self._pure
 
     def __call__(self, columns: Columns) -> tuple[Tensor, Tensor, Tensor]:
-        """Sets the gradient of each weight; the loss [], the unclipped norm [], the `td_error` [B, 1]."""
-        loss, norm, errors, *gradients = self._gradient(tuple(self.weights), tuple(self.target), columns)
+        """Set the gradient of each weight; return loss [], unclipped norm [] and `td_error` [B, 1]."""
+        fixed = tuple(self._fixed.values())
+        loss, norm, errors, *gradients = self._gradient(tuple(self.weights), fixed, columns)
         for weight, gradient in zip(self.weights, gradients, strict=True):
             weight.grad = gradient
         return loss, norm, errors
 
     def _pure(
-        self, weights: Sequence[Tensor], target: Sequence[Tensor], columns: Columns
+        self, learned: Sequence[Tensor], fixed: Sequence[Tensor], columns: Columns
     ) -> tuple[Tensor, ...]:
-        """Loss, norm, errors and gradients as a function of its arguments alone."""
-        leaves = [weight.detach().requires_grad_() for weight in weights]
-        loss = copy.copy(self.loss)
-        for name, values in zip(NETWORKS, (leaves, target), strict=True):
-            network = getattr(self.loss, name).data.clone()
-            network.update(dict(zip(self.names, values, strict=True)))
-            vars(loss)[name] = network  # found before the module's own
+        """Loss, norm, errors and gradients as a function of the online weights, all others, and a batch."""
+        leaves = [weight.detach().requires_grad_() for weight in learned]
+        state = TensorDict(dict(zip((*self._learned, *self._fixed), (*leaves, *fixed), strict=True)))
         batch = TensorDict(dict(zip((*LEARNED_FROM, IMPORTANCE), columns)), batch_size=columns[0].shape[:1])  # noqa: B905
-        with torch.enable_grad():
-            value = loss(batch)["loss"]
-            gradients = torch.autograd.grad(value, leaves)
+        with state.to_module(self.loss, preserve_module_state=False), torch.enable_grad():
+            loss = self.loss(batch)["loss"]
+            gradients = torch.autograd.grad(loss, leaves)
         norm = torch.stack([gradient.square().sum() for gradient in gradients]).sum().sqrt()
         share = (self.max_norm / norm).clamp(max=1)
-        return value.detach(), norm, batch["td_error"].detach(), *(share * each for each in gradients)
+        return loss.detach(), norm, batch["td_error"], *(share * each for each in gradients)
 
 
 def columns_of(transitions: TensorDictBase) -> Columns:
