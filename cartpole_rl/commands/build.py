@@ -13,8 +13,8 @@ from typing import Any, Literal
 import hydra
 import torch
 
-from cartpole_rl.agents import QAgent
 from cartpole_rl.agents.baseline import EnergyAndRegulator
+from cartpole_rl.agents.dqn import QAgent
 from cartpole_rl.commands.application import as_mapping
 from cartpole_rl.commands.config import (
     CartPoleSettings,
@@ -27,22 +27,28 @@ from cartpole_rl.commands.config import (
 )
 from cartpole_rl.commands.run_folder import PREFIX, check_program, program_of, use_of
 from cartpole_rl.emulator.settings import EmulatorSettings
-from cartpole_rl.envs import CartPoleEnv, make_env
+from cartpole_rl.envs.make import CartPoleEnv, make_env
 from cartpole_rl.errors import CheckpointError, ConfigError
 from cartpole_rl.evaluation.episodes import Policy
-from cartpole_rl.learning.checkpoints import FOLDER, LAST, load_agent, restore_weights
-from cartpole_rl.physics.parameters import CartParameters, check_names
+from cartpole_rl.learning.checkpoint_files import FOLDER, LAST
+from cartpole_rl.learning.checkpoints import load_agent, restore_weights
+from cartpole_rl.physics.bounds import check_names
+from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.physics.residual import UNDER_WAY
 from cartpole_rl.plants.emulated import emulated_plant
 from cartpole_rl.plants.learned import LearnedPlant
 from cartpole_rl.plants.learned_model import LearnedModel, load_model
-from cartpole_rl.plants.serial import SerialPlant, SerialPlantSettings
+from cartpole_rl.plants.serial import SerialPlant
 from cartpole_rl.plants.serial_faults import Confirm, nobody
+from cartpole_rl.plants.serial_settings import SerialPlantSettings
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.plants.specs import Plant
-from cartpole_rl.randomization import FoundCarts, Pole, PoleSettings
+from cartpole_rl.randomization.found import Draws, FoundCarts, found_carts
+from cartpole_rl.randomization.poles import Pole, PoleSettings
+from cartpole_rl.randomization.randomizer import Randomizer
+from cartpole_rl.randomization.settings import FoundSettings
 from cartpole_rl.settings import evaluation_seed
-from cartpole_rl.tasks.starts import Start, StartSettings
+from cartpole_rl.tasks.settings import Start, StartSettings
 
 BASELINE = Path("lqr")  # run=lqr is no folder: the controller that learned nothing
 LATER: dict[str, dict[str, Any]] = {  # settings that older checkpoints do not know, as they were then
@@ -52,6 +58,13 @@ LATER: dict[str, dict[str, Any]] = {  # settings that older checkpoints do not k
 LARGEST_BATCH = 1024  # carts that an evaluation simulates at once
 SIMILAR = 0.1  # share by which a pole's length may differ from a learned model's
 REPLACEABLE = ("cart", "cart_friction", "pole_friction", "pole", "reward")  # by an evaluation; and the task
+
+
+def randomizer(config: CartPoleSettings) -> Draws:
+    """What draws the carts that `config` describes. Raises ConfigError where its numbers make no sense."""
+    if isinstance(config.randomization, FoundSettings):
+        return found_carts(config.randomization, config.nominal, config.pole)
+    return Randomizer(config.nominal, config.pole, config.randomization)
 
 
 def simulated_env(
@@ -69,7 +82,7 @@ def simulated_env(
         config,
         SimulatedPlant(
             carts,
-            config.randomizer(),
+            randomizer(config),
             start,
             config.models(plant),
             config.control_period,
@@ -102,7 +115,7 @@ def learned_plant(
     if abs(2 * own["pole_com"] / length - 1) > SIMILAR:
         raise ConfigError(f"pole: plant.model has one of {2 * own['pole_com']:.2f} m, not {length:.2f} m")
     found = torch.tensor([[own[name]] for name in CartParameters.names()])
-    draws = FoundCarts(found, config.randomizer(), plant.elsewhere, UNDER_WAY * model.period)
+    draws = FoundCarts(found, randomizer(config), plant.elsewhere, UNDER_WAY * model.period)
     return LearnedPlant(carts, model, draws, start, seed, compiled=compiled)
 
 

@@ -7,17 +7,21 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 from pydantic import Discriminator, Field, Tag, ValidationError, field_validator, model_validator
 
-from cartpole_rl.agents import AgentSettings
+from cartpole_rl.agents.settings import AgentSettings
 from cartpole_rl.commands.complaints import no_such_setting, setting_names
 from cartpole_rl.emulator.settings import EmulatorSettings
-from cartpole_rl.envs.hardware import ObservationSettings, RewardSettings, TaskSettings
+from cartpole_rl.envs.settings import ObservationSettings, RewardSettings, TaskSettings
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.learning.finetuning import FinetuningSettings
-from cartpole_rl.learning.settings import LearningSettings, OptimizerSettings, ReplaySettings
-from cartpole_rl.physics.actuator import Actuator
-from cartpole_rl.physics.dynamics import Integrator, Models
-from cartpole_rl.physics.friction import CartFriction, PoleFriction
-from cartpole_rl.randomization import Draws, FoundSettings, PoleSettings, Randomizer, Range
+from cartpole_rl.learning.settings import (
+    FinetuningSettings,
+    LearningSettings,
+    OptimizerSettings,
+    ReplaySettings,
+)
+from cartpole_rl.physics.models import Actuator, CartFriction, Integrator, Models, PoleFriction
+from cartpole_rl.randomization.poles import PoleSettings
+from cartpole_rl.randomization.ranges import Range
+from cartpole_rl.randomization.settings import FoundSettings
 from cartpole_rl.settings import Count, Finite, Fraction, Positive, Seed, Settings
 from cartpole_rl.tasks.actions import ActionSettings
 
@@ -108,12 +112,6 @@ class CartPoleSettings(Settings):
     def nominal(self) -> dict[str, float]:
         """Nominal parameters of the cart, without the pole's."""
         return {**self.cart, **self.cart_friction.parameters, **self.pole_friction.parameters}
-
-    def randomizer(self) -> Draws:
-        """Draws carts of this kind. Raises ConfigError where the numbers make no sense."""
-        if isinstance(self.randomization, FoundSettings):
-            return self.randomization.carts(self.nominal, self.pole)
-        return Randomizer(self.nominal, self.pole, self.randomization)
 
     @property
     def ranges(self) -> dict[str, Range]:

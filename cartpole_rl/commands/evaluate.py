@@ -25,7 +25,7 @@ from cartpole_rl.commands.person import confirm
 from cartpole_rl.commands.repeating import Repetition, repetition
 from cartpole_rl.commands.report import report
 from cartpole_rl.commands.run_folder import METRICS, write_config
-from cartpole_rl.envs import CartPoleEnv
+from cartpole_rl.envs.make import CartPoleEnv
 from cartpole_rl.evaluation.episodes import Policy, run_episodes
 from cartpole_rl.learning.randomness import seed_everything
 from cartpole_rl.plants.serial import SerialPlant

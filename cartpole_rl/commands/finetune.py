@@ -20,7 +20,7 @@ import torch
 from torch import nn
 from tqdm import tqdm
 
-from cartpole_rl.agents import QAgent
+from cartpole_rl.agents.dqn import QAgent
 from cartpole_rl.commands.application import application, tell
 from cartpole_rl.commands.build import (
     check_compiler,
@@ -28,6 +28,7 @@ from cartpole_rl.commands.build import (
     evaluated_env,
     evaluated_settings,
     new_agent,
+    randomizer,
     simulated_env,
     trained_agent,
     use_threads,
@@ -45,18 +46,19 @@ from cartpole_rl.commands.person import confirm
 from cartpole_rl.commands.report import report
 from cartpole_rl.commands.resuming import resumed
 from cartpole_rl.commands.run_folder import METRICS, write_config, write_json
-from cartpole_rl.envs import CartPoleEnv
+from cartpole_rl.envs.make import CartPoleEnv
 from cartpole_rl.errors import ConfigError, LearningError
-from cartpole_rl.evaluation import episode_metrics, summarize
 from cartpole_rl.evaluation.driver import Drive, Driver
 from cartpole_rl.evaluation.driving_policy import as_weights
 from cartpole_rl.evaluation.episodes import run_batch
+from cartpole_rl.evaluation.metrics import episode_metrics, summarize
 from cartpole_rl.evaluation.recordings import LENGTH, read_recording, write_recording
-from cartpole_rl.identification import LONGEST_LATENCY, Fit, cut_windows, fit_cart
+from cartpole_rl.identification.fit import Fit, fit_cart
+from cartpole_rl.identification.unknowns import LONGEST_LATENCY
+from cartpole_rl.identification.windows import cut_windows
+from cartpole_rl.learning.checkpoint_files import FOLDER, LAST
 from cartpole_rl.learning.checkpoints import (
     FINETUNING_FORMAT,
-    FOLDER,
-    LAST,
     AgentCheckpoint,
     TrainingCheckpoint,
     forget_training,
@@ -67,12 +69,11 @@ from cartpole_rl.learning.checkpoints import (
 from cartpole_rl.learning.finetuning import Finetuning, recorded_chunk
 from cartpole_rl.learning.randomness import seed_everything
 from cartpole_rl.learning.training import Scalars, Training
-from cartpole_rl.physics.dynamics import Models
-from cartpole_rl.physics.friction import CartFriction
+from cartpole_rl.physics.models import CartFriction, Models
 from cartpole_rl.plants.link_statistics import LinkStatistics
 from cartpole_rl.plants.recorded import RecordedPlant
 from cartpole_rl.plants.simulated import SimulatedPlant
-from cartpole_rl.randomization import FoundCarts
+from cartpole_rl.randomization.found import FoundCarts
 from cartpole_rl.reporting.tensorboard import TensorBoardLog
 from cartpole_rl.scheduling import compute_last
 from cartpole_rl.settings import evaluation_seed
@@ -306,7 +307,7 @@ class Session:
         random = np.random.default_rng(self.config.seed)
         table = torch.from_numpy(fit.draw(DRAWN, random, self.config.finetuning.widen)).float()
         elsewhere = self.config.finetuning.elsewhere
-        return FoundCarts(table, self.training.randomizer(), elsewhere, LONGEST_LATENCY)
+        return FoundCarts(table, randomizer(self.training), elsewhere, LONGEST_LATENCY)
 
     def drive_all(self, stage: str, count: int) -> None:
         """Drive what is missing of a stage, without exploration."""

@@ -34,13 +34,15 @@ from cartpole_rl.identification.experiments import EXPERIMENTS, HELD_OUT, conduc
 from cartpole_rl.identification.identify import Identification, identify, predicted, prediction_errors
 from cartpole_rl.identification.quantities import Quantity, intervals, quantities
 from cartpole_rl.identification.unknowns import WEIGHED
-from cartpole_rl.physics.actuator import Actuator, static_force
-from cartpole_rl.physics.dynamics import Models
-from cartpole_rl.physics.friction import CartFriction, dry_friction, viscous_coefficient
-from cartpole_rl.physics.parameters import CartParameters, check_values
+from cartpole_rl.physics.actuator import static_force
+from cartpole_rl.physics.bounds import check_values
+from cartpole_rl.physics.friction import dry_friction, viscous_coefficient
+from cartpole_rl.physics.models import Actuator, CartFriction, Models
+from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.emulated import emulated_plant
-from cartpole_rl.plants.serial import SerialPlant, SerialPlantSettings
-from cartpole_rl.randomization import Pole, PoleSettings
+from cartpole_rl.plants.serial import SerialPlant
+from cartpole_rl.plants.serial_settings import SerialPlantSettings
+from cartpole_rl.randomization.poles import Pole, PoleSettings
 from cartpole_rl.reporting.figures import save
 from cartpole_rl.reporting.figures.identified import (
     Known,

@@ -24,17 +24,17 @@ from cartpole_rl.commands.replay import MARKED, recorded_pole, recordings
 from cartpole_rl.commands.run_folder import write_config, write_json
 from cartpole_rl.errors import ConfigError, RecordingError
 from cartpole_rl.evaluation.recordings import read_recording
-from cartpole_rl.identification import Fit, cut_windows, fit_cart
+from cartpole_rl.identification.fit import Fit, fit_cart
 from cartpole_rl.identification.held_out import CERTAIN, LEAD, Prediction, errors_at, predict_held_out
-from cartpole_rl.identification.learned import Dynamics, Ensemble, LearningSettings
+from cartpole_rl.identification.learned import Dynamics, Ensemble
 from cartpole_rl.identification.replay import recorded_period
-from cartpole_rl.identification.windows import HISTORY, Windows
-from cartpole_rl.physics.actuator import Actuator
-from cartpole_rl.physics.dynamics import Models
-from cartpole_rl.physics.friction import CartFriction
+from cartpole_rl.identification.settings import LearningSettings
+from cartpole_rl.identification.windows import HISTORY, Windows, cut_windows
+from cartpole_rl.physics.models import Actuator, CartFriction, Models
 from cartpole_rl.physics.residual import SPACING, UNITS, Residual
-from cartpole_rl.plants.learned_model import MODEL, LearnedModel, save_model
-from cartpole_rl.randomization import Pole, PoleSettings
+from cartpole_rl.plants.learned_model import LearnedModel, save_model
+from cartpole_rl.plants.model_file import MODEL
+from cartpole_rl.randomization.poles import Pole, PoleSettings
 from cartpole_rl.reporting.figures import save
 from cartpole_rl.reporting.figures.learned_models import learned_model_figure
 from cartpole_rl.reporting.table import number_text, table

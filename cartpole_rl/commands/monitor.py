@@ -10,17 +10,9 @@ import numpy as np
 from tqdm import tqdm
 
 from cartpole_rl.commands.config import TrainConfig
-from cartpole_rl.evaluation import episode_metrics
-from cartpole_rl.learning.checkpoints import (
-    BEST,
-    FOLDER,
-    LAST,
-    AgentCheckpoint,
-    TrainingCheckpoint,
-    replacing,
-    save_agent,
-    save_training,
-)
+from cartpole_rl.evaluation.metrics import episode_metrics
+from cartpole_rl.learning.checkpoint_files import BEST, FOLDER, LAST, replacing
+from cartpole_rl.learning.checkpoints import AgentCheckpoint, TrainingCheckpoint, save_agent, save_training
 from cartpole_rl.learning.training import Scalars, Training
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.reporting.animation import gif

@@ -13,11 +13,11 @@ from cartpole_rl.commands.build import simulated_carts
 from cartpole_rl.commands.config import EvaluateConfig, checked
 from cartpole_rl.commands.report import read_origin
 from cartpole_rl.commands.run_folder import CONFIG, METRICS, check_program
-from cartpole_rl.envs import CartPoleEnv
+from cartpole_rl.envs.make import CartPoleEnv
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.evaluation.episodes import Policy, run_batch
 from cartpole_rl.plants.simulated import OF_CHANCE, SimulatedPlant
-from cartpole_rl.randomization import Pole
+from cartpole_rl.randomization.poles import Pole
 from cartpole_rl.tasks.episode import Episode, Origin
 
 FREE = ("run", "repeat.run", "repeat.episode", "label")  # settings that a repetition takes

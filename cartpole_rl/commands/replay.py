@@ -23,10 +23,9 @@ from cartpole_rl.commands.run_folder import check_program, write_config, write_j
 from cartpole_rl.errors import ConfigError, RecordingError
 from cartpole_rl.evaluation.recordings import LENGTH, read_recording
 from cartpole_rl.identification.replay import Array, Replayed, recorded_period, replay
-from cartpole_rl.physics.actuator import Actuator
-from cartpole_rl.physics.dynamics import Models
-from cartpole_rl.physics.parameters import check_names, check_values
-from cartpole_rl.randomization import Pole, PoleSettings
+from cartpole_rl.physics.bounds import check_names, check_values
+from cartpole_rl.physics.models import Actuator, Models
+from cartpole_rl.randomization.poles import Pole, PoleSettings
 from cartpole_rl.reporting.figures import save
 from cartpole_rl.reporting.figures.replays import replay_figure, root_mean_square
 from cartpole_rl.reporting.table import number_text, table

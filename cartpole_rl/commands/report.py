@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from cartpole_rl.commands.run_folder import METRICS, write_json
-from cartpole_rl.evaluation import episode_metrics, summarize
-from cartpole_rl.randomization import PoleSettings
+from cartpole_rl.evaluation.metrics import episode_metrics, summarize
+from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.reporting.animation import write_gif
 from cartpole_rl.reporting.figures import behaviour, learning_curve, save
 from cartpole_rl.tasks.episode import Episode, Origin

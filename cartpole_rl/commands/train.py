@@ -15,14 +15,14 @@ from cartpole_rl.commands.monitor import TrainingMonitor
 from cartpole_rl.commands.report import report
 from cartpole_rl.commands.resuming import resumed
 from cartpole_rl.commands.run_folder import write_config
-from cartpole_rl.envs import CartPoleEnv
+from cartpole_rl.envs.make import CartPoleEnv
 from cartpole_rl.evaluation.driving_policy import DrivingPolicy
 from cartpole_rl.evaluation.episodes import Policy, run_batch
 from cartpole_rl.learning.checkpoints import forget_training, restore_weights
 from cartpole_rl.learning.randomness import seed_everything
 from cartpole_rl.learning.training import Training
 from cartpole_rl.plants.effects import without_effect
-from cartpole_rl.randomization import Draws
+from cartpole_rl.randomization.found import Draws
 from cartpole_rl.settings import evaluation_seed
 from cartpole_rl.tasks.episode import Episode
 

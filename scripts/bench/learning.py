@@ -25,7 +25,8 @@ from cartpole_rl.choices import choice
 from cartpole_rl.commands.build import TrainedAgent, simulated_env, trained_agent, use_threads
 from cartpole_rl.commands.config import TrainConfig
 from cartpole_rl.evaluation.episodes import run_batch
-from cartpole_rl.randomization import Pole, PoleSettings, Range
+from cartpole_rl.randomization.poles import Pole, PoleSettings
+from cartpole_rl.randomization.ranges import Range
 from cartpole_rl.reporting.table import table
 from cartpole_rl.settings import evaluation_seed
 from cartpole_rl.tasks.episode import Episode

@@ -15,7 +15,7 @@ from cartpole_rl.commands.application import as_mapping
 from cartpole_rl.commands.build import evaluated_env, evaluated_settings, simulated_env
 from cartpole_rl.commands.config import EvaluateConfig, TrainConfig, checked
 from cartpole_rl.commands.train import judge, nominal_env
-from cartpole_rl.envs import CartPoleEnv
+from cartpole_rl.envs.make import CartPoleEnv
 from cartpole_rl.settings import NUM_SEEDS, evaluation_seed
 
 CARTS = 64

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from cartpole_rl.errors import CheckpointError
+from cartpole_rl.learning.checkpoint_files import replacing
 from cartpole_rl.learning.checkpoints import (
     FINETUNING_FORMAT,
     AgentCheckpoint,
@@ -13,7 +14,6 @@ from cartpole_rl.learning.checkpoints import (
     forget_training,
     load_agent,
     load_training,
-    replacing,
     save_agent,
     save_training,
 )
