@@ -23,7 +23,7 @@ from torch import Tensor
 
 from cartpole_rl.identification.fit import ROBUST, SCALE, STATE_STEP
 from cartpole_rl.identification.prediction import as_counts, run_actuator
-from cartpole_rl.identification.settings import LearningSettings
+from cartpole_rl.identification.settings import EnsembleSettings
 from cartpole_rl.identification.windows import HISTORY, Windows
 from cartpole_rl.physics.dynamics import Drive, State, run_period
 from cartpole_rl.physics.models import Models
@@ -203,7 +203,7 @@ class Ensemble:
     """The learning of one ensemble on one set of windows."""
 
     def __init__(
-        self, windows: Windows, dynamics: Dynamics, scale: np.ndarray, settings: LearningSettings, seed: int
+        self, windows: Windows, dynamics: Dynamics, scale: np.ndarray, settings: EnsembleSettings, seed: int
     ) -> None:
         self.dynamics, self.settings = dynamics, settings
         self.scale = torch.from_numpy(np.clip(scale, FINEST, SCALE)).reshape(2, 1)

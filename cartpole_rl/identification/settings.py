@@ -7,7 +7,7 @@ from pydantic import Field
 from cartpole_rl.settings import Count, NonNegative, Positive, Settings
 
 
-class LearningSettings(Settings):
+class EnsembleSettings(Settings):
     """How an ensemble is learned."""
 
     members: Count

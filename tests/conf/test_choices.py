@@ -11,10 +11,11 @@ from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
 from cartpole_rl.choices import conf_folder
-from cartpole_rl.commands.application import as_mapping
-from cartpole_rl.commands.build import evaluated_settings, randomizer
-from cartpole_rl.commands.config import EmulateConfig, EvaluateConfig, FinetuneConfig, TrainConfig, checked
+from cartpole_rl.commands.composition import as_mapping
 from cartpole_rl.tasks.settings import Reward
+from cartpole_rl.workflows.build import evaluated_settings, randomizer
+from cartpole_rl.workflows.checking import checked
+from cartpole_rl.workflows.config import EmulateConfig, EvaluateConfig, FinetuneConfig, TrainConfig
 
 CONF = conf_folder()
 GROUPS = sorted(path.name for path in CONF.iterdir() if path.is_dir() and path.name != "hydra")

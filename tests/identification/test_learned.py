@@ -10,7 +10,7 @@ from cartpole_rl.envs.make import CartPoleEnv
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.identification.held_out import LEAD, errors_at, predict_held_out
 from cartpole_rl.identification.learned import Dynamics, Ensemble, best_beginnings, first_guess
-from cartpole_rl.identification.settings import LearningSettings
+from cartpole_rl.identification.settings import EnsembleSettings
 from cartpole_rl.identification.windows import Windows, cut_windows
 from cartpole_rl.physics.models import CartFriction, Models
 from cartpole_rl.physics.residual import PLACES, SPACING, UNITS, Residual
@@ -31,7 +31,7 @@ START = StartSettings(
 TRACK = {"track_half_length": 2.0}
 RIPPLE = 0.6  # N
 PITCH = 0.08  # m
-SETTINGS = LearningSettings(
+SETTINGS = EnsembleSettings(
     members=2,
     hidden=6,
     updates=60,

@@ -1,6 +1,7 @@
 """The person at the terminal."""
 
 import sys
+from contextlib import suppress
 
 
 def confirm(text: str) -> bool:
@@ -14,3 +15,9 @@ def confirm(text: str) -> bool:
     except EOFError:
         return False
     return True
+
+
+def tell(name: str, message: str) -> None:
+    """One line on stderr, if that still leads anywhere: a closed terminal does not."""
+    with suppress(OSError):
+        print(f"cartpole-{name.replace('_', '-')}: {message}", file=sys.stderr)

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from cartpole_rl.commands.config import TrainConfig
 from cartpole_rl.evaluation.metrics import episode_metrics
 from cartpole_rl.learning.checkpoint_files import BEST, FOLDER, LAST, replacing
 from cartpole_rl.learning.checkpoints import AgentCheckpoint, TrainingCheckpoint, save_agent, save_training
@@ -19,6 +18,7 @@ from cartpole_rl.reporting.animation import gif
 from cartpole_rl.reporting.figures import behaviour
 from cartpole_rl.reporting.tensorboard import TensorBoardLog
 from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.workflows.config import TrainConfig
 
 HISTORY = "history.jsonl"  # a line an evaluation
 COMPARED = ("score", "score_upright", "steps", "time_to_upright_s", "upright_fraction")  # on the HPARAMS page
