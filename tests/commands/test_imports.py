@@ -95,6 +95,11 @@ def test_a_missing_run_is_told_without_work(name: str, tmp_path: Path) -> None:
     assert f"{words}: there is no such" in told
 
 
+def test_a_missing_port_is_told_without_pytorch(tmp_path: Path) -> None:
+    modules, _ = modules_after(command("preflight"), "plant.port=nowhere", folder=tmp_path, code=1)
+    assert not modules & WORK
+
+
 @pytest.mark.parametrize(
     ("name", "words", "said"),
     [
