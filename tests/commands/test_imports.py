@@ -7,6 +7,7 @@ import pkgutil
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -14,17 +15,42 @@ import pytest
 import cartpole_rl
 from cartpole_rl.settings import Settings
 
-COMMANDS = {  # command: words that name a run folder which is not there
-    "emulate": None,
-    "evaluate": "run=nowhere",
-    "find_port": None,
-    "finetune": "run=nowhere",
-    "identify": "from=nowhere",
-    "model": "from=nowhere",
-    "preflight": None,
-    "record": "run=nowhere",
-    "replay": "from=nowhere",
-    "train": "resume=nowhere",
+SHOWS = (("--help", 0, ""), ("--cfg job", 0, ""), ("seeed=1", 2, "seeed: there is no such setting"))
+COMPLAINS = {  # command: words, exit code, part of the line on stderr
+    "emulate": [("emulator.latency=2", 2, "less than or equal to 1")],
+    "evaluate": [
+        ("run=nowhere", 1, "run=nowhere: there is no such file or folder"),
+        ("run=lqr repeat.run=nowhere seed=1", 2, "leave out seed=1"),
+        ("run=lqr parameters={latency:1}", 2, "latency is 1"),
+        ("run=lqr parameters={latencyy:1}", 2, "did you mean 'latency'?"),
+        ("run=lqr plant=learned plant.model=nowhere", 1, "plant.model=nowhere: there is no such file"),
+    ],
+    "find_port": [("timeout=0", 2, "greater than 0")],
+    "finetune": [
+        ("run=nowhere", 1, "run=nowhere: there is no such file or folder"),
+        ("resume=nowhere", 1, "resume=nowhere: there is no such folder"),
+        ("finetuning.epsilon=0.5", 2, "less than or equal to 0.2"),
+    ],
+    "identify": [
+        ("from=nowhere", 1, "from=nowhere: there is no such folder"),
+        ("pole=range", 2, "choose it, as pole=medium"),
+    ],
+    "model": [
+        ("from=nowhere", 1, "from=nowhere: there is no such file or folder"),
+        ("from=nowhere windows=1", 2, "greater than or equal to 10"),
+    ],
+    "preflight": [("plant.port=nowhere home_timeout=0", 2, "greater than 0")],
+    "record": [("run=nowhere", 1, "run=nowhere: there is no such file or folder")],
+    "replay": [("from=nowhere", 1, "from=nowhere: there is no such file or folder")],
+    "train": [
+        ("resume=nowhere", 1, "resume=nowhere: there is no such folder"),
+        ("seed=abc", 2, "valid integer"),
+        ("agent.gamma=1.5", 2, "less than 1"),
+        ("agent.hidden=[7]", 2, "even numbers of units"),
+        ("cart.cart_mass=-1", 2, "cart_mass is -1"),
+        ("randomization.cart_mass.relative=[-1.5,0]", 2, "it must be above 0"),
+        ("pole=tiny", 2, "both, large, medium, range"),
+    ],
 }
 WORK = {  # what only work needs
     "gymnasium",
@@ -36,105 +62,97 @@ WORK = {  # what only work needs
     "torch",
     "torchrl",
 }
-SHOW_MODULES = """
-import json, sys
-try:
-    {0}
-finally:
-    print(json.dumps(sorted({{name.partition(".")[0] for name in sys.modules}})))
+RUN_IN_TURN = """
+import contextlib, io, json, sys
+from hydra.core.global_hydra import GlobalHydra
+from cartpole_rl.commands.{command} import main
+
+runs = []
+for words in {words}:
+    GlobalHydra.instance().clear()
+    sys.argv[1:] = words.split()
+    code, said = 0, io.StringIO()
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(said):
+        try:
+            main()
+        except SystemExit as ended:
+            code = ended.code
+    runs.append((code, said.getvalue(), sorted({{name.partition(".")[0] for name in sys.modules}})))
+print(json.dumps(runs))
 """
-RUN_COMMAND = "from cartpole_rl.commands.{0} import main; main()"
+IMPORT = """
+import json, sys
+{statement}
+print(json.dumps(sorted({{name.partition(".")[0] for name in sys.modules}})))
+"""
 
 
-def modules_after(
-    statement: str, *words: str, folder: Path, code: int = 0, **environment: str
-) -> tuple[set[str], str]:
-    """Top-level modules of a process after `statement` with `words` as arguments; what it said on stderr."""
+@dataclass(frozen=True)
+class Run:
+    """What a command came to, and the top-level modules of its process by then."""
+
+    code: int
+    said: str
+    modules: set[str]
+
+
+def process(script: str, folder: Path, **environment: str) -> str:
+    """The last line that a script prints in a process of its own."""
     done = subprocess.run(
-        [sys.executable, "-c", SHOW_MODULES.format(statement), *words],
+        [sys.executable, "-c", script],
         cwd=folder,
         env={**os.environ, **environment},
         capture_output=True,
         text=True,
     )
-    assert done.returncode == code, done.stderr
-    return set(json.loads(done.stdout.splitlines()[-1])), done.stderr
+    assert done.returncode == 0, done.stderr
+    return done.stdout.splitlines()[-1]
 
 
-def command(name: str) -> str:
-    """What the console script of a command does."""
-    return RUN_COMMAND.format(name)
+def in_turn(command: str, *words: str, folder: Path, **environment: str) -> list[Run]:
+    """What `cartpole-<command>` comes to with each of `words`, in one process."""
+    script = RUN_IN_TURN.format(command=command, words=repr(words))
+    runs = json.loads(process(script, folder, **environment))
+    return [Run(code, said, set(modules)) for code, said, modules in runs]
 
 
-@pytest.mark.parametrize("name", COMMANDS)
-def test_every_command_is_here(name: str) -> None:
-    assert (Path(cartpole_rl.__file__).parent / f"commands/{name}.py").is_file()
+def modules_after(statement: str, folder: Path) -> set[str]:
+    """Top-level modules of a process after `statement`."""
+    return set(json.loads(process(IMPORT.format(statement=statement), folder)))
 
 
-@pytest.mark.parametrize("words", [("--help",), ("--cfg", "job")], ids=" ".join)
-@pytest.mark.parametrize("name", COMMANDS)
-def test_what_it_shows_of_itself_needs_no_work(name: str, words: tuple[str, ...], tmp_path: Path) -> None:
-    modules, told = modules_after(command(name), *words, folder=tmp_path)
-    assert not modules & {*WORK, "numpy"}
-    assert told == ""
+def test_every_command_is_here() -> None:
+    folder = Path(cartpole_rl.__file__).parent / "commands"
+    assert {path.stem for path in folder.glob("*.py") if "__main__" in path.read_text()} == {*COMPLAINS}
 
 
-@pytest.mark.parametrize("name", COMMANDS)
-def test_a_misspelt_key_is_told_without_work(name: str, tmp_path: Path) -> None:
-    modules, told = modules_after(command(name), "seeed=1", folder=tmp_path, code=2)
-    assert not modules & {*WORK, "numpy"}
-    assert "seeed: there is no such setting" in told
-
-
-@pytest.mark.parametrize("name", [name for name, words in COMMANDS.items() if words])
-def test_a_missing_run_is_told_without_work(name: str, tmp_path: Path) -> None:
-    words = COMMANDS[name]
-    assert words is not None
-    modules, told = modules_after(command(name), words, folder=tmp_path, code=1)
-    assert not modules & {*WORK, "numpy"}
-    assert f"{words}: there is no such" in told
+@pytest.mark.parametrize("command", COMPLAINS)
+def test_it_helps_and_complains_without_what_work_needs(command: str, tmp_path: Path) -> None:
+    cases = [*SHOWS, *COMPLAINS[command]]
+    runs = in_turn(command, *(words for words, _, _ in cases), folder=tmp_path)
+    for (words, code, said), run in zip(cases, runs, strict=True):
+        assert run.code == code, words
+        assert said in run.said, words
+        assert not run.modules & {*WORK, "numpy"}, words
 
 
 def test_a_missing_port_is_told_without_pytorch(tmp_path: Path) -> None:
-    modules, _ = modules_after(command("preflight"), "plant.port=nowhere", folder=tmp_path, code=1)
-    assert not modules & WORK
-
-
-@pytest.mark.parametrize(
-    ("name", "words", "said"),
-    [
-        ("train", "seed=abc", "valid integer"),
-        ("train", "agent.gamma=1.5", "less than 1"),
-        ("train", "agent.hidden=[7]", "even numbers of units"),
-        ("train", "cart.cart_mass=-1", "cart_mass is -1"),
-        ("train", "randomization.cart_mass.relative=[-1.5,0]", "it must be above 0"),
-        ("train", "pole=tiny", "both, large, medium, range"),
-        ("evaluate", "run=lqr parameters={latency:1}", "latency is 1"),
-        ("evaluate", "run=lqr parameters={latencyy:1}", "did you mean 'latency'?"),
-        ("finetune", "finetuning.epsilon=0.5", "less than or equal to 0.2"),
-        ("identify", "pole=range", "choose it, as pole=medium"),
-        ("emulate", "emulator.latency=2", "less than or equal to 1"),
-        ("preflight", "home_timeout=0", "greater than 0"),
-    ],
-)
-def test_a_wrong_value_is_told_without_work(name: str, words: str, said: str, tmp_path: Path) -> None:
-    modules, told = modules_after(command(name), *words.split(), folder=tmp_path, code=2)
-    assert not modules & {*WORK, "numpy"}
-    assert said in told
+    (run,) = in_turn("preflight", "plant.port=nowhere", folder=tmp_path)
+    assert run.code == 1
+    assert not run.modules & WORK
 
 
 def test_completion_needs_no_work(tmp_path: Path) -> None:
     line = {"COMP_LINE": "cartpole-train opt", "COMP_POINT": "18", "COMP_CWORD": "1"}
-    modules, _ = modules_after(command("train"), "-sc", "query=bash", folder=tmp_path, **line)
-    assert not modules & {*WORK, "numpy"}
+    (run,) = in_turn("train", "-sc query=bash", folder=tmp_path, **line)
+    assert run.code == 0
+    assert not run.modules & {*WORK, "numpy"}
 
 
 def test_what_is_imported_for_the_work_is_quiet_too(tmp_path: Path) -> None:
-    quiet = "import logging; from cartpole_rl.commands.application import quieten; quieten(); import torchrl"
+    quiet = "from cartpole_rl.commands.application import quieten; quieten(); import logging, torchrl"
     level = "assert logging.getLogger('torchrl').getEffectiveLevel() == logging.WARNING"
-    modules, told = modules_after(f"{quiet}; {level}", folder=tmp_path)
-    assert "torchrl" in modules
-    assert told == ""
+    assert "torchrl" in modules_after(f"{quiet}; {level}", tmp_path)
 
 
 def settings_classes() -> Iterator[type[Settings]]:
@@ -153,5 +171,4 @@ def test_a_settings_class_needs_no_work(tmp_path: Path) -> None:
     """All modules that define one are imported together."""
     names = {kind.__module__ for kind in settings_classes() if kind.__module__.startswith("cartpole_rl.")}
     assert len(names) > 10
-    modules, _ = modules_after(f"import {', '.join(sorted(names))}", folder=tmp_path)
-    assert not modules & WORK
+    assert not modules_after(f"import {', '.join(sorted(names))}", tmp_path) & WORK
