@@ -4,8 +4,8 @@ The floors of the house, and what may import what, are drawn in ``docs/house.md`
 registers its environments with Gymnasium.
 """
 
-from cartpole_rl.registration import register
+from cartpole_rl.registration import register_with_gymnasium
 
 __version__ = "0.1.0"
 
-register()
+register_with_gymnasium()

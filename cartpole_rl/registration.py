@@ -1,16 +1,24 @@
-"""Tells Gymnasium which environments there are, without importing them.
+"""Tells Gymnasium which environments there are, without importing them, and without importing Gymnasium.
 
-``import cartpole_rl`` calls `register`, as Gymnasium expects of a package: after it, or in one go by
-``gymnasium.make("cartpole_rl:cartpole_rl/SwingUp-v0")``, the environments are found by their names.
+``import cartpole_rl`` calls `register_with_gymnasium`, as Gymnasium expects of a package: after it, or in one
+go by ``gymnasium.make("cartpole_rl:cartpole_rl/SwingUp-v0")``, the environments are found by their names.
+Gymnasium takes long to import and most of this package never uses it, so that it is not imported for this.
+Where it is there already, the environments are registered at once; otherwise as soon as it is imported.
 """
 
-import gymnasium
+import sys
+from collections.abc import Sequence
+from importlib.abc import Loader, MetaPathFinder
+from importlib.machinery import ModuleSpec
+from types import ModuleType
 
 ENVIRONMENTS = {"cartpole_rl/SwingUp-v0": "swingup", "cartpole_rl/Balance-v0": "balance"}  # id: task
 
 
 def register() -> None:
     """Register what is not registered yet."""
+    import gymnasium
+
     for name, task in ENVIRONMENTS.items():
         if name not in gymnasium.registry:
             gymnasium.register(
@@ -19,3 +27,39 @@ def register() -> None:
                 vector_entry_point="cartpole_rl.envs.gymnasium:CartPoleVector",
                 kwargs={"task": task},
             )
+
+
+def register_with_gymnasium() -> None:
+    """Register now if Gymnasium is imported, or else right after it will be."""
+    if "gymnasium" in sys.modules:
+        register()
+    else:
+        sys.meta_path.insert(0, _WhenGymnasiumIsImported())
+
+
+class _WhenGymnasiumIsImported(MetaPathFinder):
+    """Lets whatever loads Gymnasium register the environments after it."""
+
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        """Return Gymnasium's spec as other finders have it; None for every other module."""
+        if fullname != "gymnasium":
+            return None
+        others = (finder for finder in sys.meta_path if finder is not self)
+        specs = (finder.find_spec(fullname, path, target) for finder in others)
+        spec = next((spec for spec in specs if spec is not None), None)
+        if spec is not None and spec.loader is not None:
+            self._register_after(spec.loader)
+        return spec
+
+    def _register_after(self, loader: Loader) -> None:
+        """Make `loader` register the environments once it has run the module."""
+        run_module = loader.exec_module
+
+        def run_and_register(module: ModuleType) -> None:
+            sys.meta_path.remove(self)
+            run_module(module)
+            register()
+
+        loader.exec_module = run_and_register  # type: ignore[method-assign]

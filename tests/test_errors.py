@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 import pytest
 
-import cartpole_rl.commands.finetune  # noqa: F401 - imports every module that defines an error
+import cartpole_rl.workflows.finetune  # noqa: F401 - imports every module that defines an error
 from cartpole_rl.errors import CartPoleError
 from cartpole_rl.plants.serial_errors import NotReadyError, RefusedError
 from cartpole_rl.wire import Reason

@@ -19,17 +19,12 @@ from torch import Tensor
 
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.physics.actuator import static_force
-from cartpole_rl.physics.dynamics import Models, State, advance, coupling, mechanism
-from cartpole_rl.physics.friction import CartFriction, dry_friction, pole_torque, viscous_coefficient
+from cartpole_rl.physics.dynamics import State, advance, coupling, mechanism
+from cartpole_rl.physics.friction import dry_friction, pole_torque, viscous_coefficient
+from cartpole_rl.physics.models import CartFriction, Models
 from cartpole_rl.physics.parameters import GRAVITY, CartParameters
-from cartpole_rl.tasks.features import (
-    ANGULAR_SPEED_SCALE,
-    MOTOR_SCALE,
-    POSITION_SCALE,
-    SPEED_SCALE,
-    ObservationKind,
-    observation_size,
-)
+from cartpole_rl.tasks.features import ANGULAR_SPEED_SCALE, MOTOR_SCALE, POSITION_SCALE, SPEED_SCALE
+from cartpole_rl.tasks.settings import ObservationKind, observation_size
 
 Array = NDArray[np.float64]
 STATE_COST = (10.0, 1.0, 100.0, 1.0)  # of 1 m, 1 m/s, 1 rad, 1 rad/s, squared

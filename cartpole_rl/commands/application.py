@@ -12,23 +12,24 @@ import warnings
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, NoReturn, TypeVar
+from typing import NoReturn, TypeVar
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.types import RunMode
-from omegaconf import MISSING, DictConfig, OmegaConf
+from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
-import cartpole_rl.commands.composition  # noqa: F401 - what Hydra's configs refer to is registered there
 from cartpole_rl.choices import conf_folder
 from cartpole_rl.commands.choice_files import with_choice_files
 from cartpole_rl.commands.complaints import dashed_setting, in_one_line
-from cartpole_rl.commands.config import checked
+from cartpole_rl.commands.composition import as_mapping
 from cartpole_rl.errors import CartPoleError, ConfigError
 from cartpole_rl.settings import Settings
 from cartpole_rl.signals import RaiseOnce, ending_signals
+from cartpole_rl.workflows.checking import checked
+from cartpole_rl.workflows.person import tell
 
 INTERRUPTED, SIGNALLED = 130, 128  # what a shell reports: for SIGINT, and plus its number for another signal
 Config = TypeVar("Config", bound=Settings)
@@ -95,17 +96,6 @@ def application(name: str, schema: type[Config]) -> Callable[[Body[Config]], Cal
     return decorate
 
 
-def as_mapping(composed: DictConfig) -> dict[str, Any]:
-    """The composed config, resolved, as plain mappings; what is still missing (`???`) is left out."""
-    return _without_missing(OmegaConf.to_container(composed, resolve=True))
-
-
-def _without_missing(tree: Any) -> Any:
-    if not isinstance(tree, dict):
-        return tree
-    return {key: _without_missing(value) for key, value in tree.items() if value != MISSING}
-
-
 def leave(name: str, error: Exception) -> NoReturn:
     """Tell an error and exit. Raises one that names nothing a user could look at."""
     code = CartPoleError.exit_code
@@ -121,16 +111,11 @@ def leave(name: str, error: Exception) -> NoReturn:
 
 def quieten() -> None:
     """Silence what libraries say of themselves and no user can do anything about."""
-    logging.getLogger("torchrl").setLevel(logging.WARNING)
+    os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")  # TorchRL reads it when it is imported
+    logging.getLogger("torchrl").setLevel(logging.WARNING)  # where it is imported already
     logging.getLogger("torch.utils.cpp_extension").setLevel(logging.ERROR)  # CUDA's compiler without a GPU
     # tensordict 0.14 asks torch 2.15 for a setting that is on its way out
     warnings.filterwarnings("ignore", r"torch\._dynamo\.config\.inline_inbuilt_nn_modules", FutureWarning)
-
-
-def tell(name: str, message: str) -> None:
-    """One line on stderr, if that still leads anywhere: a closed terminal does not."""
-    with suppress(OSError):
-        print(f"cartpole-{name.replace('_', '-')}: {message}", file=sys.stderr)
 
 
 def remove_if_empty(folder: Path) -> None:

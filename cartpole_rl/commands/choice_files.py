@@ -12,8 +12,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from cartpole_rl.choices import conf_folder
-from cartpole_rl.commands.run_folder import PREFIX, USES, check_program, program_of, use_of
 from cartpole_rl.errors import ConfigError
+from cartpole_rl.workflows.run_folder import PREFIX, USES, check_program, program_of, use_of
 
 HERE = "${here}"
 WORD = re.compile(r"^([a-z_]+)=(.+)$")

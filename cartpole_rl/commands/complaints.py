@@ -1,19 +1,16 @@
 """What Hydra, OmegaConf and the operating system complain about, in one line with what would be right."""
 
-import difflib
 import re
 import sys
 from collections.abc import Iterable
-from typing import Any
 
 import hydra
 from hydra.errors import HydraException, OverrideParseException
 from omegaconf import OmegaConf
 
 from cartpole_rl.choices import conf_folder
+from cartpole_rl.workflows.checking import no_such_setting, setting_names
 
-NEAR = 0.8  # likeness of two names, 0 to 1, from which one may stand for the other
-SAME_PLACE = 0.15  # likeness that a name gains in the same group
 HYDRA_OPTIONS = ("--config-", "--package", "--info", "--cfg", "--experimental-rerun")
 
 
@@ -41,21 +38,6 @@ def hydra_complaint(text: str, command: str) -> str:
     return text
 
 
-def no_such_setting(key: str, known: Iterable[str]) -> str:
-    """That there is no setting `key`, and the one that was meant, if one is near."""
-    above, _, wrong = key.rpartition(".")
-
-    def likeness(setting: str) -> float:
-        place, _, name = setting.rpartition(".")
-        return difflib.SequenceMatcher(None, wrong, name).ratio() + SAME_PLACE * (place == above)
-
-    nearest = max(sorted(known), key=likeness, default="")
-    near = bool(nearest) and likeness(nearest) > NEAR
-    return f"{key}: there is no such setting; " + (
-        f"did you mean {nearest}?" if near else "--cfg job shows the settings"
-    )
-
-
 def known_settings(command: str) -> set[str]:
     """Settings of a command, with the choices on the command line as far as they can be composed."""
     groups = [word for word in sys.argv[1:] if re.fullmatch(r"\w+=[\w.-]+", word)]
@@ -66,14 +48,6 @@ def known_settings(command: str) -> set[str]:
         except HydraException:
             continue
     return set()
-
-
-def setting_names(tree: Any, prefix: str = "") -> set[str]:
-    """Dotted names of all groups and settings in nested mappings."""
-    if not isinstance(tree, dict):
-        return set()
-    own = {f"{prefix}{key}" for key in tree}
-    return own.union(*(setting_names(value, f"{prefix}{key}.") for key, value in tree.items()))
 
 
 def dashed_setting(words: Iterable[str]) -> str | None:

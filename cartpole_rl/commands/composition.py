@@ -1,4 +1,4 @@
-"""What Hydra has to know before it composes: how folders are named, the emulated cart."""
+"""What Hydra has to know before it composes: names of folders, choices for --help, the emulated cart."""
 
 import re
 import sys
@@ -7,11 +7,14 @@ from contextlib import suppress
 from datetime import datetime
 from itertools import count
 from pathlib import Path
+from typing import Any
 
 from hydra.core.config_store import ConfigStore
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from omegaconf import OmegaConf
+from omegaconf import MISSING, DictConfig, OmegaConf
 
+from cartpole_rl.choices import default_choices
 from cartpole_rl.emulator.settings import EmulatorSettings
 
 LONGEST_NAME = 150  # characters; file systems take 255
@@ -60,8 +63,30 @@ def job_name(number: int, overrides: Sequence[str]) -> str:
     return "_".join((str(number), *plain))[:LONGEST_NAME]
 
 
+def choices_of(command: str) -> str:
+    """Return the groups that cartpole-<command> reads, for its --help: a line each, with all choices.
+
+    Choices in folders of a user's own are among them.
+    """
+    loader = GlobalHydra.instance().config_loader()
+    groups = sorted(group for group in default_choices(command) if "/" not in group)
+    return "".join(f"{group}: {', '.join(sorted(loader.get_group_options(group)))}\n" for group in groups)
+
+
+def as_mapping(composed: DictConfig) -> dict[str, Any]:
+    """The composed config, resolved, as plain mappings; what is still missing (`???`) is left out."""
+    return _without_missing(OmegaConf.to_container(composed, resolve=True))
+
+
+def _without_missing(tree: Any) -> Any:
+    if not isinstance(tree, dict):
+        return tree
+    return {key: _without_missing(value) for key, value in tree.items() if value != MISSING}
+
+
 OmegaConf.register_new_resolver("run_folder", run_folder, use_cache=True)
 OmegaConf.register_new_resolver("sweep_folder", sweep_folder, use_cache=True)
 OmegaConf.register_new_resolver("job_name", job_name)
+OmegaConf.register_new_resolver("choices_of", choices_of)
 # conf/emulator/ builds on this one: the settings class is where its numbers stand
 ConfigStore.instance().store(group="emulator", name="medium", node=EmulatorSettings().model_dump(mode="json"))

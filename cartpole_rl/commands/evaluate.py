@@ -11,118 +11,24 @@ cartpole-evaluate run=runs/train/<run> repeat.run=runs/evaluate/<run> repeat.epi
 The last one drives an episode of an earlier evaluation again, the same simulated cart from the same start.
 """
 
-from collections.abc import Iterator, Mapping
-from contextlib import closing
 from pathlib import Path
-from typing import Any
-
-from tqdm import tqdm
 
 from cartpole_rl.commands.application import application
-from cartpole_rl.commands.build import evaluated_agent, evaluated_env, evaluated_settings, use_threads
-from cartpole_rl.commands.config import EvaluateConfig
-from cartpole_rl.commands.person import confirm
-from cartpole_rl.commands.repeating import Repetition, repetition
-from cartpole_rl.commands.report import report
-from cartpole_rl.commands.run_folder import METRICS, write_config
-from cartpole_rl.envs import CartPoleEnv
-from cartpole_rl.evaluation.episodes import Policy, run_episodes
-from cartpole_rl.learning.randomness import seed_everything
-from cartpole_rl.plants.serial import SerialPlant
-from cartpole_rl.reporting.table import interval_text, table
-from cartpole_rl.tasks.episode import Episode
-
-SHOWN = {
-    "score": "score (6.2)",
-    "score_upright": "score upright (6.1)",
-    "time_to_upright_s": "time to upright, s",
-    "upright_fraction": "share of time upright",
-    "rms_angle_rad": "RMS angle while upright, rad",
-    "rms_position_m": "RMS position while upright, m",
-    "min_track_margin_m": "nearest to the track's end, m",
-}
+from cartpole_rl.commands.baseline import baseline_training
+from cartpole_rl.commands.overrides import check_repetition
+from cartpole_rl.workflows.checks import BASELINE, check_evaluation
+from cartpole_rl.workflows.config import EvaluateConfig
 
 
 @application("evaluate", EvaluateConfig)
 def main(config: EvaluateConfig, folder: Path) -> None:
-    """Load, build, run, report."""
-    if again := repetition(config):
-        config = again.config
-    use_threads(config.threads)
-    seed_everything(config.seed)
-    agent = evaluated_agent(config)
-    settings = evaluated_settings(agent.training, config)
-    env = evaluated_env(settings, config, prompt=tqdm.write, confirm=confirm)
-    episodes: list[Episode] = []
-    try:
-        with closing(env):
-            recorded = {**config.model_dump(mode="json"), "evaluated": settings.model_dump(mode="json")}
-            write_config(folder, "evaluate", recorded)
-            for episode in driven(env, agent.policy, config.episodes, again):
-                episodes.append(episode)
-    finally:  # what a broken link or Ctrl-C leaves is worth its figures
-        if episodes:
-            plant, x_max = config.plant.kind, settings.task.x_max
-            link = link_figures(env)
-            summary = report(folder, episodes, plant, settings.pole, x_max, link)
-            print(score_table(summary, f"plant={plant}, {count_text(len(episodes))}"))
-            if again:
-                print(compared(again, episodes[0]))
-            if link.get("latency_override"):
-                print(f"latency as measured, for cartpole-train: '{link['latency_override']}'")
-            print(f"{folder}/{METRICS} and figures/ are written")
+    """Check, then evaluate."""
+    check_repetition(config)
+    check_evaluation(config)
+    baseline = baseline_training() if config.run == BASELINE else None
+    from cartpole_rl.workflows.evaluate import evaluate
 
-
-def driven(env: CartPoleEnv, policy: Policy, episodes: int, again: Repetition | None) -> Iterator[Episode]:
-    """The episode that is repeated, or `episodes` new ones."""
-    return again.drive(env, policy) if again else with_progress(env, policy, episodes)
-
-
-def with_progress(env: CartPoleEnv, policy: Policy, episodes: int) -> Iterator[Episode]:
-    """The episodes as they end, with a progress bar that shows each one's score."""
-    with tqdm(total=episodes, unit=" episodes") as progress:
-        for episode in run_episodes(env, policy, episodes):
-            progress.set_postfix_str(f"score {episode.score.sum():.0f}", refresh=False)
-            progress.update()
-            yield episode
-
-
-def compared(again: Repetition, episode: Episode) -> str:
-    """Say how the score compares with that of the episode which was driven again."""
-    repeat, score = again.config.repeat, float(episode.score.sum())
-    then = f"episode {repeat.episode} of {repeat.run} had score {again.score:.1f}"
-    if again.left_to_chance:
-        chance = ", ".join(again.left_to_chance)
-        return f"{then}, now {score:.1f}: {chance} is left to chance, so it cannot be repeated exactly"
-    return f"{then}, now {'exactly the same' if score == again.score else f'{score:.1f}'}"
-
-
-def link_figures(env: CartPoleEnv) -> dict[str, Any]:
-    """Frames lost, spoilt and late on the wire, none where there is no wire; what it says of the latency."""
-    if not isinstance(env.plant, SerialPlant):
-        return {"late_ticks": 0, "lost_frames": 0, "bad_frames": 0}
-    seen = env.plant.cart.statistics
-    return {
-        "late_ticks": seen.late_ticks,
-        "lost_frames": seen.lost_frames,
-        "bad_frames": seen.bad_frames,
-        "latency_override": seen.latency_override(),
-    }
-
-
-def score_table(summary: Mapping[str, Any], heading: str) -> str:
-    """The figures that a person asks for first."""
-    rows = [
-        {"figure": label, "mean": interval_text(value["mean"], value["low"], value["high"])}
-        for key, label in SHOWN.items()
-        if (value := summary[key]) is not None
-    ]
-    return table(rows, {"figure": heading, "mean": "mean"})
-
-
-def count_text(episodes: int) -> str:
-    """One in the singular: "1 episode", "20 episodes"."""
-    return f"{episodes} episode{'s' if episodes > 1 else ''}"
+    evaluate(config, folder, baseline)
 
 
 if __name__ == "__main__":

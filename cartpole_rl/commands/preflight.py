@@ -5,71 +5,18 @@ cartpole-preflight plant.port=auto
 cartpole-preflight plant=emulated emulator.deadband_right=90
 """
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
-
-from pydantic import Field
 
 from cartpole_rl.commands.application import application
-from cartpole_rl.commands.config import EmulatedSettings, RealSettings
-from cartpole_rl.commands.person import confirm
-from cartpole_rl.emulator.settings import EmulatorSettings
-from cartpole_rl.errors import PlantError
-from cartpole_rl.plants.emulated_cart import EmulatedCart
-from cartpole_rl.plants.serial_cart import SerialCart, SerialSettings
-from cartpole_rl.plants.serial_faults import FaultClearing
-from cartpole_rl.plants.serial_preflight import Finding, preflight
-from cartpole_rl.settings import Positive, Settings
-
-
-class PreflightConfig(Settings):
-    """cartpole-preflight."""
-
-    plant: Annotated[EmulatedSettings | RealSettings, Field(discriminator="kind")]
-    emulator: EmulatorSettings
-    home_timeout: Positive  # s
+from cartpole_rl.workflows.config import PreflightConfig
 
 
 @application("preflight", PreflightConfig)
 def main(config: PreflightConfig, folder: Path) -> None:
-    """A line for each check. Raises PlantError, for exit code 1, after the first that is not OK."""
-    with the_cart(config) as cart:
-        finding: Finding | None = None
-        for finding in preflight(cart, config.home_timeout, faults(config.plant)):
-            print(finding, flush=True)
-    if finding is None or not finding.ready:
-        raise PlantError(
-            f"the cart is not ready: {finding.check if finding else 'nothing was checked'} is off"
-        )
-    print("The cart is ready.")
+    """A line for each check; exit code 1 after the first that is not OK."""
+    from cartpole_rl.workflows.preflight import check_cart
 
-
-def faults(plant: EmulatedSettings | RealSettings) -> FaultClearing:
-    """The rule by which latched faults are cleared."""
-    return FaultClearing(plant.clear_faults if isinstance(plant, RealSettings) else None, confirm)
-
-
-@contextmanager
-def the_cart(config: PreflightConfig) -> Iterator[SerialCart]:
-    """The cart to check, not open yet; disarmed and closed at the end, and an emulated one ended."""
-    if isinstance(config.plant, RealSettings):
-        cart = SerialCart(SerialSettings(port=config.plant.port, baud=config.plant.baud))
-        try:
-            yield cart
-        finally:
-            cart.close()
-        return
-    with EmulatedCart(config.emulator.model_copy(update={"start": "hanging"})) as emulated:
-        patient = SerialSettings(
-            port=emulated.port, timeout=5, connect_timeout=10, answer_timeout=2, nudge_after=2
-        )
-        cart = SerialCart(patient)
-        try:
-            yield cart
-        finally:
-            cart.close()
+    check_cart(config)
 
 
 if __name__ == "__main__":

@@ -8,74 +8,24 @@ An episode's file is there, whole, as soon as the episode ends; simulated carts 
 together. Ctrl-C or a pulled cable cost at most the one under way.
 """
 
-import json
-from contextlib import closing
 from pathlib import Path
-from typing import Any
-
-from tqdm import tqdm
 
 from cartpole_rl.commands.application import application
-from cartpole_rl.commands.build import evaluated_agent, evaluated_env, evaluated_settings, use_threads
-from cartpole_rl.commands.config import CartPoleSettings, EvaluateConfig
-from cartpole_rl.commands.evaluate import count_text, driven
-from cartpole_rl.commands.person import confirm
-from cartpole_rl.commands.repeating import repetition
-from cartpole_rl.commands.report import stored_origin
-from cartpole_rl.commands.run_folder import write_config
-from cartpole_rl.evaluation.recordings import LENGTH, write_recording
-from cartpole_rl.learning.randomness import seed_everything
-from cartpole_rl.tasks.episode import Episode
-
-RECORDINGS = "recordings"
-RECORDING = ("record", "identify", "finetune")  # commands whose runs hold recordings
-
-
-class RecordConfig(EvaluateConfig):
-    """cartpole-record: what is run is said as for an evaluation."""
+from cartpole_rl.commands.baseline import baseline_training
+from cartpole_rl.commands.overrides import check_repetition
+from cartpole_rl.workflows.checks import BASELINE, check_evaluation
+from cartpole_rl.workflows.config import RecordConfig
 
 
 @application("record", RecordConfig)
 def main(config: RecordConfig, folder: Path) -> None:
-    """Load, build, run, write each."""
-    evaluation: EvaluateConfig = config
-    if again := repetition(config):
-        evaluation = again.config
-    use_threads(evaluation.threads)
-    seed_everything(evaluation.seed)
-    agent = evaluated_agent(evaluation)
-    settings = evaluated_settings(agent.training, evaluation)
-    env = evaluated_env(settings, evaluation, prompt=tqdm.write, confirm=confirm)
-    written = 0
-    try:
-        with closing(env):
-            recorded = {**evaluation.model_dump(mode="json"), "recorded": settings.model_dump(mode="json")}
-            write_config(folder, "record", recorded)
-            for episode in driven(env, agent.policy, evaluation.episodes, again):
-                path = folder / RECORDINGS / f"episode_{written:03d}.csv"
-                write_recording(path, episode, facts(evaluation, settings, episode))
-                written += 1
-    finally:
-        if written:
-            print(f"{folder}/{RECORDINGS}/ holds {count_text(written)}")
+    """Check, then record."""
+    check_repetition(config)
+    check_evaluation(config)
+    baseline = baseline_training() if config.run == BASELINE else None
+    from cartpole_rl.workflows.record import record
 
-
-def facts(config: EvaluateConfig, settings: CartPoleSettings, episode: Episode) -> dict[str, Any]:
-    """What a recording's heading says of where it comes from; of a simulated cart, which one it was."""
-    origin = stored_origin(episode.origin) if episode.origin else {}
-    return {
-        "plant": config.plant.kind,
-        "pole": settings.pole.name,
-        LENGTH: f"{2 * settings.pole.nominal.pole_com:.4f}" if one_pole(settings) else "",
-        "control_period_s": settings.control_period,
-        "run": config.run,
-        **{name: json.dumps(values) for name, values in origin.items()},
-    }
-
-
-def one_pole(settings: CartPoleSettings) -> bool:
-    """Whether all episodes have the same pole."""
-    return settings.pole.choices is not None and len(settings.pole.choices) == 1
+    record(config, folder, baseline)
 
 
 if __name__ == "__main__":

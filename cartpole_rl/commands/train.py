@@ -5,99 +5,24 @@ cartpole-train -m randomization=friction_3,friction_6,friction_12 seed=0,1
 cartpole-train resume=runs/train/2026-11-21_12-00-00
 """
 
-from functools import partial
 from pathlib import Path
 
-from cartpole_rl.commands.application import application, tell
-from cartpole_rl.commands.build import check_compiler, new_agent, recorded_config, simulated_env, use_threads
-from cartpole_rl.commands.config import LearnedSettings, TrainConfig
-from cartpole_rl.commands.monitor import TrainingMonitor
-from cartpole_rl.commands.report import report
-from cartpole_rl.commands.resuming import resumed
-from cartpole_rl.commands.run_folder import write_config
-from cartpole_rl.envs import CartPoleEnv
-from cartpole_rl.evaluation.driving_policy import DrivingPolicy
-from cartpole_rl.evaluation.episodes import Policy, run_batch
-from cartpole_rl.learning.checkpoints import forget_training, restore_weights
-from cartpole_rl.learning.randomness import seed_everything
-from cartpole_rl.learning.training import Training
-from cartpole_rl.plants.effects import without_effect
-from cartpole_rl.randomization import Draws
-from cartpole_rl.settings import evaluation_seed
-from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.commands.application import application
+from cartpole_rl.commands.overrides import check_resumption
+from cartpole_rl.workflows.checks import check_training
+from cartpole_rl.workflows.config import TrainConfig
 
 
 @application("train", TrainConfig)
 def main(config: TrainConfig, folder: Path) -> None:
-    """Compose, build, train, report."""
-    checkpoint = resumed("train", config.resume, folder)
-    if checkpoint:
-        config = recorded_config(checkpoint.config, f"resume={folder}")
-    if config.compile:
-        check_compiler()
-    use_threads(config.threads)
-    seed_everything(config.seed)
-    carts, start = config.learning.carts, config.task.start
-    env = simulated_env(config, config.plant, carts, start, config.seed, config.compile)
-    note_unused_randomization(config, env.plant.randomizer)
-    agent = new_agent(config)
-    if checkpoint:
-        restore_weights(agent, checkpoint.state["agent"], f"resume={folder}")  # or complain before any work
-    policy = DrivingPolicy(agent.greedy_policy(), config.compile)
-    evaluate = partial(judge, nominal_env(config), policy, config.seed)
-    write_config(folder, "train", config.model_dump(mode="json"), resumed=checkpoint is not None)
-    with TrainingMonitor(folder, config, checkpoint.frames if checkpoint else None) as monitor:
-        training = Training(
-            config.learning,
-            config.replay,
-            config.optimizer,
-            agent,
-            env,
-            evaluate,
-            monitor,
-            config.seed,
-            config.compile,
-        )
-        if checkpoint:
-            training.restore(checkpoint.state)
-        else:
-            monitor.randomization(env.plant)
-        training.run()
-        metrics = report(
-            folder, evaluate(), config.plant.kind, config.pole, config.task.x_max, history=monitor.history
-        )
-        monitor.finished(metrics)
-    forget_training(folder)
-    print(f"trained for {training.seconds:.0f} s; {folder}/metrics.json, figures/, checkpoints/ are written")
+    """Check, then train."""
+    if config.resume is None:
+        check_training(config)
+    else:
+        check_resumption("train", config.resume, folder)
+    from cartpole_rl.workflows.train import train
 
-
-def note_unused_randomization(config: TrainConfig, draws: Draws) -> None:
-    """Name the ranges that change nothing with the chosen actions and friction models, if there are any."""
-    models = config.models(config.plant)
-    if unused := without_effect(draws, config.ranges, config.actions.motors, models, config.control_period):
-        chosen = (
-            f"cart_friction={config.cart_friction.model}, pole_friction={config.pole_friction.model} and "
-            f"actuator {config.actions.actuator} with motor values {list(config.actions.motors)}"
-        )
-        tell("train", f"note: randomization of {', '.join(unused)} has no effect with {chosen}")
-
-
-def nominal_env(config: TrainConfig) -> CartPoleEnv:
-    """Where the agent is judged: the nominal cart with each pole in turn, starting as the task says."""
-    poles = config.pole.each
-    assert poles.choices is not None
-    carts = len(poles.choices) * max(1, config.learning.evaluation_episodes // len(poles.choices))
-    nominal = config.model_copy(update={"pole": poles, "randomization": {}})
-    plant = config.plant
-    if isinstance(plant, LearnedSettings):
-        plant = plant.model_copy(update={"elsewhere": 0.0})
-    return simulated_env(nominal, plant, carts, config.task.evaluation_start, 0, config.compile)
-
-
-def judge(env: CartPoleEnv, policy: Policy, seed: int) -> list[Episode]:
-    """Episodes of the greedy policy in a training with `seed`, from the same starts each time."""
-    env.set_seed(evaluation_seed(seed))
-    return run_batch(env, policy)
+    train(config, folder)
 
 
 if __name__ == "__main__":

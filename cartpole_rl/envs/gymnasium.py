@@ -29,11 +29,11 @@ from tensordict import TensorDictBase
 from cartpole_rl.choices import choice, default_choices
 from cartpole_rl.envs.make import CartPoleEnv, make_env
 from cartpole_rl.envs.settings import ObservationSettings, RewardSettings, TaskSettings
-from cartpole_rl.physics.actuator import Actuator
-from cartpole_rl.physics.dynamics import Integrator, Models
-from cartpole_rl.physics.friction import CartFriction, PoleFriction
+from cartpole_rl.physics.models import Actuator, CartFriction, Integrator, Models, PoleFriction
 from cartpole_rl.plants.simulated import SimulatedPlant
-from cartpole_rl.randomization import PoleSettings, Randomizer, Range
+from cartpole_rl.randomization.poles import PoleSettings
+from cartpole_rl.randomization.randomizer import Randomizer
+from cartpole_rl.randomization.ranges import Range
 from cartpole_rl.tasks.actions import ActionSettings
 
 OF_TASK = {

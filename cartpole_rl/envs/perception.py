@@ -17,12 +17,12 @@ from cartpole_rl.tasks.features import (
     MOTOR_SCALE,
     SPEED_SCALE,
     Measured,
-    ObservationKind,
     measured_position,
     measured_velocity,
     observe,
 )
 from cartpole_rl.tasks.rewards import REWARDS, SCORE, SCORE_UPRIGHT
+from cartpole_rl.tasks.settings import ObservationKind
 
 
 class Before(NamedTuple):

@@ -3,9 +3,7 @@
 from pydantic import Field
 
 from cartpole_rl.settings import Count, Finite, NonNegative, Positive, Settings
-from cartpole_rl.tasks.features import MIRROR_SIGNS, ObservationKind, observation_size
-from cartpole_rl.tasks.rewards import Reward
-from cartpole_rl.tasks.starts import StartSettings
+from cartpole_rl.tasks.settings import MIRROR_SIGNS, ObservationKind, Reward, StartSettings, observation_size
 
 POSITIONS = MIRROR_SIGNS[ObservationKind.POSITIONS]
 

@@ -13,7 +13,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from cartpole_rl.envs import CartPoleEnv
+from cartpole_rl.envs.make import CartPoleEnv
 from cartpole_rl.tasks.actions import NO_ACTION
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from cartpole_rl.identification.prediction import predict
 from cartpole_rl.identification.unknowns import POLE_LENGTH, Unknown, limits, parameters_at, unknowns_of
 from cartpole_rl.identification.windows import Windows
-from cartpole_rl.physics.dynamics import Models
+from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.tasks.features import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 

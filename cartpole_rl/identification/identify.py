@@ -11,8 +11,7 @@ from cartpole_rl.identification.fit import Fit, fit_cart
 from cartpole_rl.identification.replay import Replayed, replay
 from cartpole_rl.identification.unknowns import WEIGHED, limits
 from cartpole_rl.identification.windows import cut_windows
-from cartpole_rl.physics.dynamics import Models
-from cartpole_rl.physics.friction import CartFriction
+from cartpole_rl.physics.models import CartFriction, Models
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.tasks.upright import wrap
 

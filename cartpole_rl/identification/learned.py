@@ -15,17 +15,18 @@ at random motions.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from pydantic import Field
 from torch import Tensor
 
 from cartpole_rl.identification.fit import ROBUST, SCALE, STATE_STEP
 from cartpole_rl.identification.prediction import as_counts, run_actuator
+from cartpole_rl.identification.settings import EnsembleSettings
 from cartpole_rl.identification.windows import HISTORY, Windows
-from cartpole_rl.physics.dynamics import Drive, Models, State, run_period
+from cartpole_rl.physics.dynamics import Drive, State, run_period
+from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.physics.residual import (
     INPUTS,
@@ -35,7 +36,6 @@ from cartpole_rl.physics.residual import (
     members_in_turn,
     run_corrected_period,
 )
-from cartpole_rl.settings import Count, NonNegative, Positive, Settings
 from cartpole_rl.tasks.features import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 
 FINEST = np.array([1.0, 0.4])  # counts: no residual is told from rounding below that
@@ -48,21 +48,6 @@ SPREAD = torch.tensor([5e-4, 0.5, 5e-3, 3.0], dtype=torch.float64).reshape(
     4, 1, 1
 )  # of it: m, m/s, rad, rad/s
 CORRELATED = 10.0  # residuals of one window resemble each other: so many say as much as one
-
-
-class LearningSettings(Settings):
-    """How an ensemble is learned."""
-
-    members: Count
-    hidden: Count  # units of each of two layers
-    updates: Count
-    learning_rate: Positive  # at first; it falls along half a cosine
-    refresh: Count  # updates between two searches for the windows' beginnings
-    validation: Annotated[
-        float, Field(gt=0, lt=1)
-    ]  # of the windows, drawn for each member, by which it is stopped
-    price: NonNegative  # of outputs of 1 at random motions
-    price_of_places: NonNegative  # of a force of 1 at each place, and ten times that of a step between two
 
 
 @dataclass(frozen=True)
@@ -218,7 +203,7 @@ class Ensemble:
     """The learning of one ensemble on one set of windows."""
 
     def __init__(
-        self, windows: Windows, dynamics: Dynamics, scale: np.ndarray, settings: LearningSettings, seed: int
+        self, windows: Windows, dynamics: Dynamics, scale: np.ndarray, settings: EnsembleSettings, seed: int
     ) -> None:
         self.dynamics, self.settings = dynamics, settings
         self.scale = torch.from_numpy(np.clip(scale, FINEST, SCALE)).reshape(2, 1)

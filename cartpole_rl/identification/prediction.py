@@ -4,8 +4,9 @@ import torch
 from torch import Tensor
 
 from cartpole_rl.identification.windows import HISTORY
-from cartpole_rl.physics.actuator import Actuator, lagged_force, mean_commands, static_force
-from cartpole_rl.physics.dynamics import Drive, Models, State, run_period
+from cartpole_rl.physics.actuator import lagged_force, mean_commands, static_force
+from cartpole_rl.physics.dynamics import Drive, State, run_period
+from cartpole_rl.physics.models import Actuator, Models
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.tasks.features import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 

@@ -16,7 +16,7 @@ from cartpole_rl.errors import RecordingError
 from cartpole_rl.identification.fit import STATE_SPREAD, STATE_STEP
 from cartpole_rl.identification.prediction import predict
 from cartpole_rl.identification.windows import HISTORY, IRREGULAR
-from cartpole_rl.physics.dynamics import Models
+from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.tasks.features import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT

@@ -12,8 +12,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from cartpole_rl.physics.dynamics import Models, unused_parameters
-from cartpole_rl.physics.parameters import BOUNDS, Bound, CartParameters
+from cartpole_rl.physics.bounds import BOUNDS, Bound
+from cartpole_rl.physics.models import Models, unused_parameters
+from cartpole_rl.physics.parameters import CartParameters
 
 Array = NDArray[np.floating]
 LONGEST_LATENCY = 0.06  # s, that is looked for

@@ -13,6 +13,7 @@ from torch import nn
 
 from cartpole_rl.errors import CheckpointError
 from cartpole_rl.files import replacing
+from cartpole_rl.learning.checkpoint_files import FOLDER, RESUME, find_agent, find_training
 
 AGENT_FORMAT = "cartpole_rl agent 1"
 TRAINING_FORMAT = "cartpole_rl training 2"
@@ -22,7 +23,6 @@ CONTENT = {  # format: what a file of it holds
     TRAINING_FORMAT: "the state that a training resumes from",
     FINETUNING_FORMAT: "the state that a fine-tuning resumes from",
 }
-FOLDER, LAST, BEST, RESUME = "checkpoints", "last.pt", "best.pt", "resume.pt"
 
 
 @dataclass(frozen=True)
@@ -81,20 +81,6 @@ def check_finite(weights: Mapping[str, Any], consequence: str) -> None:
             )
 
 
-def find_agent(run: Path) -> Path:
-    """The checkpoint file that `run` means: itself, or the last one of a run folder."""
-    if not run.exists():
-        raise CheckpointError(
-            f"run={run}: there is no such file or folder; give a run folder or a checkpoint"
-        )
-    if run.is_file():
-        return run
-    path = run / FOLDER / LAST
-    if not path.exists():
-        raise CheckpointError(f"run={run}: it holds no {FOLDER}/{LAST}; give the folder of a training")
-    return path
-
-
 def save_training(run: Path, training: TrainingCheckpoint, file_format: str = TRAINING_FORMAT) -> None:
     """Write what `load_training` reads. Raises CheckpointError if a weight is not finite."""
     path = run / FOLDER / RESUME
@@ -109,13 +95,7 @@ def forget_training(run: Path) -> None:
 
 def load_training(run: Path, file_format: str = TRAINING_FORMAT) -> TrainingCheckpoint:
     """The state that the training in the folder `run` can go on from. Raises CheckpointError."""
-    if not run.is_dir():
-        raise CheckpointError(f"resume={run}: there is no such folder; give the run folder of a training")
-    path = run / FOLDER / RESUME
-    if not path.exists():
-        raise CheckpointError(
-            f"resume={run}: it holds no {FOLDER}/{RESUME}; give the folder of a training that came so far"
-        )
+    path = find_training(run)
     training = TrainingCheckpoint(**_load(path, file_format))
     check_finite(training.state.get("agent", {}), f"{path} is refused")
     return training

@@ -5,33 +5,20 @@ from both. The rest of the agent's life in simulation goes on as it was: same lo
 """
 
 from collections.abc import Callable, Sequence
-from typing import Annotated, Any
+from typing import Any
 
 import torch
-from pydantic import Field
 from tensordict import TensorDictBase
 
-from cartpole_rl.envs import CartPoleEnv
+from cartpole_rl.envs.make import CartPoleEnv
 from cartpole_rl.learning.collector import COLLECTED
 from cartpole_rl.learning.replay import n_step_transitions
+from cartpole_rl.learning.settings import FinetuningSettings
 from cartpole_rl.learning.training import Scalars, Training
 from cartpole_rl.plants.recorded import RecordedPlant
 from cartpole_rl.plants.simulated import SimulatedPlant
-from cartpole_rl.randomization import Draws
-from cartpole_rl.settings import Count, Fraction, Positive, Settings
+from cartpole_rl.randomization.found import Draws
 from cartpole_rl.tasks.episode import Episode
-
-
-class FinetuningSettings(Settings):
-    """How a trained agent learns on a cart."""
-
-    iterations: Count  # of learning while one episode is driven
-    refit: Count  # episodes between two fits of the simulator
-    cart_share: Fraction  # of each batch from the cart itself, the rest is simulated
-    elsewhere: Fraction  # of the simulated carts drawn as in training, and not from the fit
-    widen: Positive  # the fit's uncertainty is multiplied by it
-    epsilon: Annotated[float, Field(ge=0, le=0.2)]  # share of random actions on the cart
-    learning_rate: Positive  # at the start; it falls along half a cosine
 
 
 def recorded_chunk(

@@ -65,3 +65,15 @@ class LearningSettings(Settings):
     def collected_frames(self) -> int:
         """Transitions that whole iterations collect: `frames`, or a little less."""
         return self.iterations * self.carts * self.chunk
+
+
+class FinetuningSettings(Settings):
+    """How a trained agent learns on a cart."""
+
+    iterations: Count  # of learning while one episode is driven
+    refit: Count  # episodes between two fits of the simulator
+    cart_share: Fraction  # of each batch from the cart itself, the rest is simulated
+    elsewhere: Fraction  # of the simulated carts drawn as in training, and not from the fit
+    widen: Positive  # the fit's uncertainty is multiplied by it
+    epsilon: Annotated[float, Field(ge=0, le=0.2)]  # share of random actions on the cart
+    learning_rate: Positive  # at the start; it falls along half a cosine

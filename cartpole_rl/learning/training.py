@@ -14,8 +14,9 @@ import numpy as np
 import torch
 from tensordict import TensorDictBase
 
-from cartpole_rl.agents import Columns, LossGradient, QAgent, columns_of
-from cartpole_rl.envs import CartPoleEnv
+from cartpole_rl.agents.dqn import QAgent
+from cartpole_rl.agents.loss import Columns, LossGradient, columns_of
+from cartpole_rl.envs.make import CartPoleEnv
 from cartpole_rl.errors import LearningError
 from cartpole_rl.learning.collector import Collector
 from cartpole_rl.learning.randomness import random_state, restore_random_state

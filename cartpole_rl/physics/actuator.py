@@ -6,22 +6,15 @@ asymmetry, and a dead-band per direction. Plain newtons are the thesis's eyeball
 """
 
 from collections.abc import Sequence
-from enum import StrEnum
 from itertools import pairwise
 
 import torch
 from torch import Tensor
 
+from cartpole_rl.physics.models import Actuator
 from cartpole_rl.physics.parameters import CartParameters
 
 SHORTEST_TIME_CONSTANT = 1e-12  # s; stands in for no lag at all
-
-
-class Actuator(StrEnum):
-    """How a motor value becomes a force."""
-
-    NEWTONS = "newtons"  # exactly, without lag, dead-band or asymmetry, whatever the cart's own are
-    FORCE_CURVE = "force_curve"
 
 
 def static_force(motor: Tensor, cart: CartParameters, model: Actuator) -> Tensor:

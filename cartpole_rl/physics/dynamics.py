@@ -6,25 +6,21 @@ compiled code be fast. Functions are pure: parameters and random draws are passe
 """
 
 from collections.abc import Sequence
-from enum import StrEnum
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from cartpole_rl.physics.actuator import Actuator, lagged_force, mean_commands, static_force
+from cartpole_rl.physics.actuator import lagged_force, mean_commands, static_force
 from cartpole_rl.physics.friction import (
     DRY,
     STICKING,
-    CartFriction,
-    PoleFriction,
     dry_friction,
     pole_torque,
     viscous_coefficient,
 )
+from cartpole_rl.physics.models import Actuator, CartFriction, Integrator, Models
 from cartpole_rl.physics.parameters import GRAVITY, CartParameters
-
-SHAPES = ("cart_stiction_ratio", "stribeck_velocity", "sigmoid_slope")  # of the dry friction's curve
 
 
 class State(NamedTuple):
@@ -41,59 +37,6 @@ class Drive(NamedTuple):
 
     force: Tensor  # [N] N, behind the lag
     motors: Sequence[Tensor]  # [N] motor values of this and the D - 1 periods before, newest first; or [D, N]
-
-
-class Integrator(StrEnum):
-    """Explicit Euler (3.7) or semi-implicit Euler (3.8)."""
-
-    EXPLICIT = "explicit"
-    SEMI_IMPLICIT = "semi_implicit"
-
-
-class Models(NamedTuple):
-    """Which laws hold; fixed for a run, so that compiled code has no branches left."""
-
-    cart_friction: CartFriction = CartFriction.SIGMOID
-    pole_friction: PoleFriction = PoleFriction.EXPONENTIAL
-    actuator: Actuator = Actuator.FORCE_CURVE
-    integrator: Integrator = Integrator.SEMI_IMPLICIT
-    pole_presses: bool = False  # the pole's vertical force changes the cart's normal force
-
-
-UNUSED_BY_CART_FRICTION = {
-    CartFriction.NONE: {"cart_viscous", "cart_coulomb", "cart_coulomb_asymmetry", *SHAPES},
-    CartFriction.LINEAR: {"cart_coulomb", "cart_coulomb_asymmetry", *SHAPES},
-    CartFriction.STEP: set(SHAPES),
-    CartFriction.SIGMOID: {"cart_stiction_ratio", "stribeck_velocity"},
-    CartFriction.STRIBECK: {"sigmoid_slope"},
-}
-UNUSED_BY_POLE_FRICTION = {
-    PoleFriction.NONE: {"pole_viscous", "pole_drag", "pole_coulomb"},
-    PoleFriction.EXPONENTIAL: {"pole_drag", "pole_coulomb"},
-    PoleFriction.EXPONENTIAL_DRAG: {"pole_coulomb"},
-    PoleFriction.BEARING: set(),
-}
-UNUSED_BY_ACTUATOR = {
-    Actuator.NEWTONS: {
-        "force_quadratic",
-        "force_linear",
-        "force_offset",
-        "force_asymmetry",
-        "deadband_left",
-        "deadband_right",
-        "motor_time_constant",
-    },
-    Actuator.FORCE_CURVE: set(),
-}
-
-
-def unused_parameters(models: Models) -> set[str]:
-    """Fields of CartParameters that these laws do not read, so that drawing them changes nothing."""
-    return (
-        UNUSED_BY_CART_FRICTION[models.cart_friction]
-        | UNUSED_BY_POLE_FRICTION[models.pole_friction]
-        | UNUSED_BY_ACTUATOR[models.actuator]
-    )
 
 
 class Mechanism(NamedTuple):

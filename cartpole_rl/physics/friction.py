@@ -4,32 +4,11 @@ The power that each takes out, force or torque times velocity, is never negative
 resting pole's normal force; where the pole's motion changes that force, the dynamics scale it.
 """
 
-from enum import StrEnum
-
 import torch
 from torch import Tensor
 
+from cartpole_rl.physics.models import CartFriction, PoleFriction
 from cartpole_rl.physics.parameters import CartParameters
-
-
-class CartFriction(StrEnum):
-    """Model of the cart's friction. All but NONE add the viscous term."""
-
-    NONE = "none"
-    LINEAR = "linear"  # (5.7): viscous alone
-    STEP = "step"  # (5.6)
-    SIGMOID = "sigmoid"  # (5.8)
-    STRIBECK = "stribeck"  # static friction above Coulomb, falling with speed
-
-
-class PoleFriction(StrEnum):
-    """Model of the pole's friction."""
-
-    NONE = "none"
-    EXPONENTIAL = "exponential"  # viscous: a small swing decays exponentially
-    EXPONENTIAL_DRAG = "exponential_drag"  # viscous and quadratic air drag
-    BEARING = "bearing"  # viscous, air drag, and the bearing's Coulomb friction
-
 
 STICKING = (CartFriction.STEP, CartFriction.STRIBECK)  # models with a force at rest
 DRY = (CartFriction.SIGMOID, *STICKING)  # models with more than the viscous term

@@ -5,21 +5,12 @@ batch of one. What can be derived (total mass, pivot inertia) is a property, so 
 """
 
 import dataclasses
-import difflib
-import math
-from collections.abc import Iterable, Mapping
-from typing import NamedTuple, Self
+from typing import Self
 
 from tensordict import TensorClass
 from torch import Tensor
 
-from cartpole_rl.errors import ConfigError
-
 GRAVITY = 9.81  # m/s^2
-
-# The thesis's (6.4). Quanser's poles have half of it, 0.127 kg on 0.3365 m and 0.230 kg on 0.6413 m: 0.7 kg/m
-# is their mass over the distance from pivot to centre of mass.
-POLE_DENSITY = 0.7  # kg/m
 
 
 class CartParameters(TensorClass["frozen", "tensor_only"]):  # type: ignore[name-defined]
@@ -89,82 +80,3 @@ class CartParameters(TensorClass["frozen", "tensor_only"]):  # type: ignore[name
     def from_table(cls, table: Tensor) -> Self:
         """N carts from `table` [P, N], a row a field in the order of `names`; the fields share its memory."""
         return cls(**dict(zip(cls.names(), table.unbind(0), strict=True)), batch_size=[table.shape[1]])
-
-
-class Bound(NamedTuple):
-    """What a parameter can physically be."""
-
-    low: float
-    high: float
-    low_allowed: bool = True
-
-    def holds(self, value: float) -> bool:
-        """Whether `value` is within."""
-        return (value >= self.low if self.low_allowed else value > self.low) and value <= self.high
-
-    def __str__(self) -> str:
-        return f"{'at least' if self.low_allowed else 'above'} {self.low:g}" + (
-            "" if math.isinf(self.high) else f" and at most {self.high:g}"
-        )
-
-
-POSITIVE = Bound(0, math.inf, low_allowed=False)
-NON_NEGATIVE = Bound(0, math.inf)
-ANY = Bound(-math.inf, math.inf)
-LESS_THAN_ALL = Bound(-0.99, 0.99)
-DELAY = Bound(0, 0.1)  # s; more than five periods is no cart that one can balance
-SMALL_ANGLE = Bound(-0.2, 0.2)  # rad
-
-BOUNDS: dict[str, Bound] = {
-    "cart_mass": POSITIVE,
-    "pole_mass": POSITIVE,
-    "pole_com": POSITIVE,
-    "pole_inertia": NON_NEGATIVE,
-    "track_half_length": POSITIVE,
-    "track_tilt": SMALL_ANGLE,
-    "cart_viscous": NON_NEGATIVE,
-    "cart_coulomb": NON_NEGATIVE,
-    "cart_coulomb_asymmetry": LESS_THAN_ALL,
-    "cart_stiction_ratio": Bound(1, math.inf),
-    "stribeck_velocity": POSITIVE,
-    "sigmoid_slope": POSITIVE,
-    "pole_viscous": NON_NEGATIVE,
-    "pole_drag": NON_NEGATIVE,
-    "pole_coulomb": NON_NEGATIVE,
-    "force_quadratic": ANY,
-    "force_linear": ANY,
-    "force_offset": ANY,
-    "force_asymmetry": LESS_THAN_ALL,
-    "deadband_left": Bound(0, 255),
-    "deadband_right": Bound(0, 255),
-    "motor_time_constant": DELAY,
-    "latency": DELAY,
-    "latency_jitter": DELAY,
-    "angle_offset": SMALL_ANGLE,
-    "position_noise": NON_NEGATIVE,
-    "angle_noise": NON_NEGATIVE,
-}
-
-
-def check_names(names: Iterable[str]) -> None:
-    """Raise ConfigError for a name that is no parameter, with the nearest one that is."""
-    for name in names:
-        if name not in BOUNDS:
-            nearest = difflib.get_close_matches(name, BOUNDS, n=1, cutoff=0)[0]
-            raise ConfigError(f"unknown cart parameter {name!r}; did you mean {nearest!r}?")
-
-
-def check_values(values: Mapping[str, float]) -> None:
-    """Raise ConfigError for an unknown, missing, or physically impossible value."""
-    check_names(values)
-    for name, bound in BOUNDS.items():
-        if name not in values:
-            raise ConfigError(f"the cart parameter {name!r} is missing")
-        if not bound.holds(values[name]):
-            raise ConfigError(f"{name} is {values[name]:g}; it must be {bound}")
-
-
-def uniform_rod(length: Tensor | float) -> dict[str, Tensor | float]:
-    """Mass, centre of mass and inertia of a rod of `length` m and POLE_DENSITY: one choice sets all three."""
-    mass = POLE_DENSITY * length
-    return {"pole_mass": mass, "pole_com": length / 2, "pole_inertia": mass * length**2 / 12}

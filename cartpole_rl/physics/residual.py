@@ -11,8 +11,9 @@ from typing import NamedTuple, Self
 import torch
 from torch import Tensor
 
-from cartpole_rl.physics.actuator import Actuator, lagged_force, mean_commands, static_force
-from cartpole_rl.physics.dynamics import Drive, Models, State, advance, mechanism
+from cartpole_rl.physics.actuator import lagged_force, mean_commands, static_force
+from cartpole_rl.physics.dynamics import Drive, State, advance, mechanism
+from cartpole_rl.physics.models import Actuator, Models
 from cartpole_rl.physics.parameters import CartParameters
 
 UNDER_WAY = 4  # motor values that the network reads, newest first

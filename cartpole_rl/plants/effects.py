@@ -12,10 +12,10 @@ from collections.abc import Collection, Sequence
 import torch
 from torch import Tensor
 
-from cartpole_rl.physics.dynamics import Models
+from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.simulation import Carts, Given, Period, run_carts
-from cartpole_rl.randomization import Draws
+from cartpole_rl.randomization.found import Draws
 
 TRIED = 256  # carts for each parameter
 PERIODS = 6

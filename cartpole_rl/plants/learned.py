@@ -16,8 +16,8 @@ from cartpole_rl.physics.residual import UNDER_WAY, Residual, chosen_members, ru
 from cartpole_rl.plants.learned_model import LearnedModel
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.plants.simulation import Carts, Given, Period, run_carts
-from cartpole_rl.randomization import Draws
-from cartpole_rl.tasks.starts import StartSettings
+from cartpole_rl.randomization.found import Draws
+from cartpole_rl.tasks.settings import StartSettings
 
 
 class Learned(NamedTuple):

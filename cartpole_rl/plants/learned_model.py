@@ -9,15 +9,12 @@ import torch
 
 from cartpole_rl.errors import CheckpointError
 from cartpole_rl.files import replacing
-from cartpole_rl.physics.actuator import Actuator
-from cartpole_rl.physics.dynamics import Integrator, Models
-from cartpole_rl.physics.friction import CartFriction, PoleFriction
-from cartpole_rl.physics.parameters import check_values
+from cartpole_rl.physics.bounds import check_values
+from cartpole_rl.physics.models import Actuator, CartFriction, Integrator, Models, PoleFriction
 from cartpole_rl.physics.residual import PLACES, Residual
+from cartpole_rl.plants.model_file import REMEDY, find_model
 
 FORMAT = "cartpole_rl learned model 1"
-MODEL = "model.pt"  # in a run folder
-REMEDY = "give what cartpole-model wrote"
 
 
 @dataclass(frozen=True)
@@ -50,10 +47,7 @@ def save_model(path: Path, model: LearnedModel) -> None:
 
 def load_model(source: Path) -> LearnedModel:
     """The model in a file or a run folder. Raises CheckpointError where there is none, or a damaged one."""
-    path = source / MODEL if source.is_dir() else source
-    if not path.exists():
-        missing = f"it holds no {MODEL}" if source.exists() else "there is no such file or folder"
-        raise CheckpointError(f"plant.model={source}: {missing}; {REMEDY}")
+    path = find_model(source)
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch raises whatever the damaged bytes lead it to

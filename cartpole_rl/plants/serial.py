@@ -11,21 +11,20 @@ import time
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Annotated, Literal, Protocol
+from typing import Protocol
 
 import torch
-from pydantic import Field
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from cartpole_rl.errors import ConfigError, FaultError, LinkError, PlantError, PortError
-from cartpole_rl.plants.serial_cart import RESTARTED, SerialCart, SerialSettings
+from cartpole_rl.plants.serial_cart import RESTARTED, SerialCart
 from cartpole_rl.plants.serial_errors import RefusedError, fault_error
 from cartpole_rl.plants.serial_faults import Confirm, FaultClearing, nobody
 from cartpole_rl.plants.serial_information import check_scales
 from cartpole_rl.plants.serial_recentring import recentre
+from cartpole_rl.plants.serial_settings import SerialPlantSettings
 from cartpole_rl.plants.specs import Plant, one_cart
-from cartpole_rl.settings import Positive
 from cartpole_rl.wire import (
     Fault,
     Flags,
@@ -43,18 +42,6 @@ HANGING_TOLERANCE = math.radians(5)
 UPRIGHT_SWAY = math.radians(1.5)  # a hand is never quite still
 HANGING_SWAY = math.radians(1)  # homing is content with eight counts of 4096 a turn
 STILL_SECONDS = 0.3  # for so long the pole has to stay, by the cart's clock
-
-
-class SerialPlantSettings(SerialSettings):
-    """A cart on a port, and how its episodes begin. Times in s."""
-
-    start: Literal["hanging", "upright"] = "hanging"
-    control_period: Positive = 0.02  # set on the cart before an episode, if it has another
-    rehome: Literal["once", "always"] = "once"  # once a connection and after what may cost a zero, or always
-    home_timeout: Positive = 120.0
-    start_timeout: Positive = 60.0  # for the pole to come into its start position
-    clear_faults: Annotated[int, Field(ge=0)] | None = 0  # cleared without asking a person; None: no limit
-    pole_length: Positive | None = None  # m, twice pivot to centre of mass; for an agent that observes it
 
 
 class Owned(Protocol):

@@ -13,13 +13,15 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from cartpole_rl.compilation import Compiled
-from cartpole_rl.physics.dynamics import Models, State
+from cartpole_rl.physics.dynamics import State
+from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.simulation import Carts, Given, Period, encoder_counts, run_carts
 from cartpole_rl.plants.specs import Plant
-from cartpole_rl.randomization import Draws
+from cartpole_rl.randomization.found import Draws
 from cartpole_rl.tasks.episode import Origin
-from cartpole_rl.tasks.starts import StartSettings, draw_start
+from cartpole_rl.tasks.settings import StartSettings
+from cartpole_rl.tasks.starts import draw_start
 
 OF_CHANCE = ("latency_jitter", "position_noise", "angle_noise")  # drawn anew in each period
 DRAWN_AT_ONCE = 1024  # episodes; a few at a time would take about as long

@@ -1,7 +1,6 @@
 """Draws carts from a table of carts: what an identification found, correlations included."""
 
 from collections.abc import Collection, Mapping
-from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -9,11 +8,11 @@ import torch
 from torch import Tensor
 
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.physics.parameters import BOUNDS, CartParameters
+from cartpole_rl.physics.bounds import BOUNDS
+from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.randomization.randomizer import Randomizer
-from cartpole_rl.randomization.ranges import Range
-from cartpole_rl.settings import Fraction, Positive, Settings
+from cartpole_rl.randomization.settings import FoundSettings
 
 
 class Draws(Protocol):
@@ -32,32 +31,6 @@ class Draws(Protocol):
 
     def can_differ_from_zero(self, name: str) -> bool:
         """Whether a draw of `name` can be anything but 0."""
-
-
-class FoundSettings(Settings):
-    """Carts as an identification found them, in place of ranges about the nominal cart."""
-
-    posterior: Path  # posterior.npz of cartpole-identify
-    widen: Positive  # its uncertainty is multiplied by it
-    elsewhere: Fraction  # of the carts are nominal ones within `ranges`
-    ranges: dict[str, Range]  # of what the identification does not tell
-
-    def carts(self, cart: Mapping[str, float], poles: PoleSettings) -> "FoundCarts":
-        """What draws such carts. Raises ConfigError where the file is missing or damaged."""
-        others = Randomizer(cart, poles, self.ranges)
-        try:
-            with np.load(self.posterior) as stored:
-                table = dict(zip(stored["names"].tolist(), stored["carts"], strict=True))
-                told = [str(name) for name in stored["told"]]
-        except (OSError, ValueError, KeyError) as error:
-            raise ConfigError(f"randomization.posterior={self.posterior} cannot be read: {error}") from None
-        rows = []
-        for name, usual in zip(CartParameters.names(), others.nominal.tolist(), strict=True):
-            values = np.asarray(table.get(name, [usual]), dtype=np.float64)
-            values = np.median(values) + self.widen * (values - np.median(values))
-            rows.append(np.clip(values, BOUNDS[name].low, BOUNDS[name].high))
-        found = torch.from_numpy(np.stack(np.broadcast_arrays(*rows))).float()
-        return FoundCarts(found, others, self.elsewhere, float(found[LATENCY].max()), told)
 
 
 LATENCY = CartParameters.names().index("latency")
@@ -121,3 +94,21 @@ class FoundCarts:
         """Whether a draw of `name` can be anything but 0."""
         row = self.found[CartParameters.names().index(name)]
         return self.others.can_differ_from_zero(name) or bool((row != 0).any())
+
+
+def found_carts(settings: FoundSettings, cart: Mapping[str, float], poles: PoleSettings) -> FoundCarts:
+    """What draws the carts of `settings`. Raises ConfigError where the file is missing or damaged."""
+    others = Randomizer(cart, poles, settings.ranges)
+    try:
+        with np.load(settings.posterior) as stored:
+            table = dict(zip(stored["names"].tolist(), stored["carts"], strict=True))
+            told = [str(name) for name in stored["told"]]
+    except (OSError, ValueError, KeyError) as error:
+        raise ConfigError(f"randomization.posterior={settings.posterior} cannot be read: {error}") from None
+    rows = []
+    for name, usual in zip(CartParameters.names(), others.nominal.tolist(), strict=True):
+        values = np.asarray(table.get(name, [usual]), dtype=np.float64)
+        values = np.median(values) + settings.widen * (values - np.median(values))
+        rows.append(np.clip(values, BOUNDS[name].low, BOUNDS[name].high))
+    found = torch.from_numpy(np.stack(np.broadcast_arrays(*rows))).float()
+    return FoundCarts(found, others, settings.elsewhere, float(found[LATENCY].max()), told)

@@ -2,7 +2,7 @@
 
 from pydantic import model_validator
 
-from cartpole_rl.physics.parameters import uniform_rod
+from cartpole_rl.physics.rod import uniform_rod
 from cartpole_rl.settings import NonNegative, Positive, Settings
 
 JUDGED_LENGTHS = 5  # rods that an agent of a range of lengths is judged on
@@ -18,7 +18,7 @@ class Pole(Settings):
     @classmethod
     def rod(cls, length: float) -> "Pole":
         """A uniform rod of `length` m and the thesis's 0.7 kg/m."""
-        return cls(**uniform_rod(length))  # type: ignore[arg-type]
+        return cls(**uniform_rod(length))
 
 
 class PoleSettings(Settings):

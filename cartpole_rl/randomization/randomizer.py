@@ -9,8 +9,9 @@ from collections.abc import Iterable, Mapping
 import torch
 from torch import Tensor
 
-from cartpole_rl.errors import ConfigError
-from cartpole_rl.physics.parameters import CartParameters, check_names, check_values, uniform_rod
+from cartpole_rl.physics.parameters import CartParameters
+from cartpole_rl.physics.rod import uniform_rod
+from cartpole_rl.randomization.checks import check_carts, possible_poles
 from cartpole_rl.randomization.poles import Pole, PoleSettings
 from cartpole_rl.randomization.ranges import Distribution, Range
 
@@ -32,8 +33,8 @@ class Randomizer:
         device: torch.device | str = "cpu",
     ) -> None:
         self.poles, self.ranges = poles, dict(ranges)
+        check_carts(cart, poles, ranges)
         nominal = {**cart, **poles.nominal.model_dump()}
-        self._check(cart, nominal)
         self.nominal = torch.tensor([float(nominal[name]) for name in CartParameters.names()], device=device)
         lines = list(self.ranges.values())
         self._rows = self._row_numbers(self.ranges)
@@ -42,7 +43,7 @@ class Randomizer:
         self._logarithmic = self._flags([line.distribution is Distribution.LOG_UNIFORM for line in lines])
         self._scales = self._flags([line.scales_nominal for line in lines])
         self._pole_rows = self._row_numbers(POLE_FIELDS)
-        choices = [list(pole.model_dump().values()) for pole in self._possible_poles()]
+        choices = [list(pole.model_dump().values()) for pole in possible_poles(poles)]
         self._choices = self.nominal.new_tensor(choices).T  # [3, poles]
 
     def draw(self, count: int, generator: torch.Generator) -> Tensor:
@@ -103,20 +104,6 @@ class Randomizer:
         low, high = self.poles.lengths
         rods = uniform_rod(low + (high - low) * torch.rand(count, generator=generator, device=device))
         return torch.stack([torch.as_tensor(rods[name]) for name in POLE_FIELDS])
-
-    def _check(self, cart: Mapping[str, float], nominal: Mapping[str, float]) -> None:
-        for name in POLE_FIELDS:
-            if name in cart:
-                raise ConfigError(f"{name} belongs to the pole, not to the cart: choose another pole")
-        check_values(nominal)
-        check_names(self.ranges)
-        for name, line in self.ranges.items():
-            for pole in self._possible_poles():
-                line.check(name, {**nominal, **pole.model_dump()}[name])
-
-    def _possible_poles(self) -> list[Pole]:
-        """The choices; a rod of random length is as possible as the one of middle length."""
-        return [self.poles.nominal] if self.poles.choices is None else list(self.poles.choices.values())
 
     def _nominal_of(self, name: str) -> float:
         return float(self.nominal[CartParameters.names().index(name)])

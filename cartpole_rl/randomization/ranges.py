@@ -9,7 +9,7 @@ from enum import StrEnum
 from pydantic import model_validator
 
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.physics.parameters import BOUNDS
+from cartpole_rl.physics.bounds import BOUNDS
 from cartpole_rl.settings import Finite, Settings
 
 Bounds = tuple[Finite, Finite]

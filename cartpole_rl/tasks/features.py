@@ -1,6 +1,5 @@
 """From encoder counts to what an agent sees. All tensors [N] or [N, k] float32; angles rad, positions m."""
 
-from enum import StrEnum
 from typing import NamedTuple
 
 import torch
@@ -11,6 +10,7 @@ from cartpole_rl.physics.encoders import (
     POLE_COUNTS_PER_TURN,
     POLE_RADIANS_PER_COUNT,
 )
+from cartpole_rl.tasks.settings import ObservationKind
 
 # Scales that bring each measured quantity to about one; the velocities' are those of a vigorous swing-up.
 POSITION_SCALE = 0.38  # m
@@ -27,22 +27,6 @@ class Measured(NamedTuple):
     x_dot: Tensor  # m/s
     theta: Tensor  # rad, wrapped
     theta_dot: Tensor  # rad/s
-
-
-class ObservationKind(StrEnum):
-    """How the measured state is shown to the agent."""
-
-    RAW = "raw"  # x, x_dot, theta wrapped, theta_dot: the thesis's four numbers
-    COS_SIN = "cos_sin"  # x, x_dot, cos theta, sin theta, theta_dot, each scaled to about one
-    POSITIONS = "positions"  # x, cos theta, sin theta: as cos_sin, velocities hidden
-
-
-# What each number of an observation is multiplied by when left and right are swapped.
-MIRROR_SIGNS = {
-    ObservationKind.RAW: (-1, -1, -1, -1),
-    ObservationKind.COS_SIN: (-1, -1, 1, -1, -1),
-    ObservationKind.POSITIONS: (-1, 1, -1),
-}
 
 
 def measured_position(counts: Tensor) -> tuple[Tensor, Tensor]:
@@ -69,8 +53,3 @@ def observe(state: Measured, kind: ObservationKind) -> tuple[Tensor, ...]:
     if kind is ObservationKind.POSITIONS:
         return x, cosine, sine
     return x, state.x_dot / SPEED_SCALE, cosine, sine, state.theta_dot / ANGULAR_SPEED_SCALE
-
-
-def observation_size(kind: ObservationKind) -> int:
-    """Numbers that `observe` gives."""
-    return len(MIRROR_SIGNS[kind])

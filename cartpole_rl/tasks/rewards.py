@@ -5,29 +5,18 @@ Every agent is judged by both scores, whatever reward it learned from.
 
 import math
 from collections.abc import Callable
-from enum import StrEnum
 
 import torch
 from torch import Tensor
 
 from cartpole_rl.tasks.features import Measured
+from cartpole_rl.tasks.settings import Reward
 
 UPRIGHT_ANGLE = math.radians(5)  # rad
 UPRIGHT_SPEED = math.radians(6)  # rad/s
 BONUS = 5.0  # (6.2), given once for the angle and once more for angle and speed
 UPRIGHT_BONUS = 10.0  # (5.5)
 BALANCE_ANGLE = math.radians(12)  # rad, theta_thr of (5.5): where the classical task ends
-
-
-class Reward(StrEnum):
-    """What the agent learns from."""
-
-    CONSTANT = "constant"
-    COSINE = "cosine"
-    LINEAR_ANGLE = "linear_angle"
-    POSITION = "position"
-    UPRIGHT_BONUS = "upright_bonus"
-    SCORE = "score"
 
 
 def constant(state: Measured, x_max: float) -> Tensor:

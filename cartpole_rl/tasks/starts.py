@@ -1,32 +1,12 @@
 """Where an episode starts: draws of the true state."""
 
 import math
-from enum import StrEnum
 from functools import cache
 
 import torch
 from torch import Tensor
 
-from cartpole_rl.settings import Fraction, NonNegative, Settings
-
-
-class Start(StrEnum):
-    """Which angle of the pole an episode starts from."""
-
-    UPRIGHT = "upright"
-    HANGING = "hanging"
-    ANY = "any"  # uniform in (-180, 180] degrees
-
-
-class StartSettings(Settings):
-    """How an episode starts: everything is drawn uniformly within plus or minus its spread."""
-
-    angle: Start
-    position_spread: NonNegative  # m, of the cart about the middle
-    angle_spread: NonNegative  # rad, about upright or hanging
-    speed_spread: NonNegative  # m/s
-    angular_speed_spread: NonNegative  # rad/s
-    resting_share: Fraction = 0.0  # of the episodes: the pole hangs and everything is at rest
+from cartpole_rl.tasks.settings import Start, StartSettings
 
 
 def draw_start(count: int, start: StartSettings, generator: torch.Generator) -> Tensor:

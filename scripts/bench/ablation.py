@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 from learning import REFERENCES, result, train_all
 
-from cartpole_rl.commands.build import use_threads
 from cartpole_rl.reporting.table import table
+from cartpole_rl.workflows.build import use_threads
 
 FRAMES = 2_500_000
 ARMS = {

@@ -36,7 +36,8 @@ from torchrl.envs import EnvBase, PendulumEnv
 
 from cartpole_rl.compilation import Compiled
 from cartpole_rl.envs.gymnasium import simulated_environment
-from cartpole_rl.physics.dynamics import Drive, Models, State, run_period
+from cartpole_rl.physics.dynamics import Drive, State, run_period
+from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.reporting.table import table
 from cartpole_rl.tasks.features import Measured

@@ -24,11 +24,11 @@ import gymnasium
 import numpy as np
 from tensordict import TensorDict
 
-from cartpole_rl.commands.build import use_threads
 from cartpole_rl.envs.gymnasium import simulated_environment
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.reporting.table import table
 from cartpole_rl.settings import evaluation_seed
+from cartpole_rl.workflows.build import use_threads
 
 try:
     from stable_baselines3 import DQN

@@ -42,15 +42,13 @@ from omegaconf.errors import OmegaConfBaseException
 from torch import Tensor
 
 from cartpole_rl.choices import conf_folder
-from cartpole_rl.commands.application import as_mapping
-from cartpole_rl.commands.build import simulated_env
-from cartpole_rl.commands.config import TrainConfig, checked
+from cartpole_rl.commands.composition import as_mapping
 from cartpole_rl.errors import CartPoleError, ConfigError
 from cartpole_rl.physics.actuator import static_force
 from cartpole_rl.physics.dynamics import Drive, State, run_period
 from cartpole_rl.physics.parameters import GRAVITY, CartParameters
 from cartpole_rl.plants.simulated import SimulatedPlant
-from cartpole_rl.randomization import Pole, PoleSettings
+from cartpole_rl.randomization.poles import Pole, PoleSettings
 from cartpole_rl.tasks.features import (
     CART_METRES_PER_COUNT,
     POLE_RADIANS_PER_COUNT,
@@ -59,8 +57,11 @@ from cartpole_rl.tasks.features import (
     measured_velocity,
 )
 from cartpole_rl.tasks.rewards import BONUS, UPRIGHT_ANGLE, UPRIGHT_SPEED, score
-from cartpole_rl.tasks.starts import Start, StartSettings
+from cartpole_rl.tasks.settings import Start, StartSettings
 from cartpole_rl.tasks.upright import upright_since
+from cartpole_rl.workflows.build import randomizer, simulated_env
+from cartpole_rl.workflows.checking import checked
+from cartpole_rl.workflows.config import TrainConfig
 
 STARTS = (-0.1, -0.05, 0.0, 0.05, 0.1)  # m: an evaluation draws the cart within 0.1 m of the middle
 POLES = ("medium", "large")
@@ -104,7 +105,7 @@ class KnownCart:
 
     def __init__(self, config: TrainConfig) -> None:
         self.config = config
-        self.randomizer = config.randomizer()
+        self.randomizer = randomizer(config)
         self.models = config.models(config.plant)
         self.motors = torch.tensor(config.actions.motors, dtype=torch.float32)
         self.forces = static_force(self.motors, self.carts(len(self.motors)), self.models.actuator)

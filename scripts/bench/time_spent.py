@@ -19,9 +19,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from cartpole_rl.commands import train
+from cartpole_rl.commands.train import main as train_command
 from cartpole_rl.learning.training import Training
 from cartpole_rl.reporting.table import table
+from cartpole_rl.workflows import train
 
 KINDS = {"collect": "stepping", "learn": "updating", "evaluate": "evaluating"}
 spent: dict[str, list[float]] = defaultdict(list)  # s, of each call
@@ -72,7 +73,7 @@ def main() -> None:
     train.Training = TimedTraining  # type: ignore[misc]
     with tempfile.TemporaryDirectory() as folder:
         sys.argv = ["cartpole-train", *given.words, f"hydra.run.dir={folder}/run"]
-        train.main()
+        train_command()
     found = shares()
     rows = [
         {"kind": kind, "seconds": f"{each['seconds']:.1f}", "share": f"{each['share']:.3f}"}

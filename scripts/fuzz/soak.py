@@ -28,7 +28,7 @@ from tensordict import TensorDictBase
 
 from cartpole_rl.choices import choice
 from cartpole_rl.emulator.settings import EmulatorSettings
-from cartpole_rl.envs import CartPoleEnv, make_env
+from cartpole_rl.envs.make import CartPoleEnv, make_env
 from cartpole_rl.envs.settings import ObservationSettings, RewardSettings, TaskSettings
 from cartpole_rl.errors import PlantError
 from cartpole_rl.evaluation.episodes import run_batch

@@ -11,16 +11,17 @@ from tensordict import TensorDict
 from cartpole_rl.agents.baseline import EnergyAndRegulator, decoded, linearized, regulator
 from cartpole_rl.choices import choice
 from cartpole_rl.emulator.settings import EmulatorSettings
-from cartpole_rl.envs import CartPoleEnv
+from cartpole_rl.envs.make import CartPoleEnv
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.evaluation.episodes import run_batch
-from cartpole_rl.physics.dynamics import Models, State
+from cartpole_rl.physics.dynamics import State
+from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.emulated import emulated_plant
 from cartpole_rl.plants.simulated import SimulatedPlant
-from cartpole_rl.randomization import PoleSettings
-from cartpole_rl.tasks.features import Measured, ObservationKind, observe
-from cartpole_rl.tasks.starts import Start, StartSettings
+from cartpole_rl.randomization.poles import PoleSettings
+from cartpole_rl.tasks.features import Measured, observe
+from cartpole_rl.tasks.settings import ObservationKind, Start, StartSettings
 from cartpole_rl.tasks.upright import is_upright
 
 PERIOD = 0.02

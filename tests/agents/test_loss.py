@@ -16,7 +16,7 @@ from torchrl.modules import QValueActor
 from torchrl.objectives import DQNLoss, HardUpdate, SoftUpdate, ValueEstimators
 from torchrl.objectives.utils import TargetNetUpdater
 
-from cartpole_rl.agents import AdvantageLearningLoss
+from cartpole_rl.agents.loss import AdvantageLearningLoss
 
 SPECS = {"categorical": Categorical(4), "one-hot": OneHot(4)}
 

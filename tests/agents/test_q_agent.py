@@ -9,8 +9,10 @@ from pydantic import ValidationError
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from cartpole_rl.agents import AgentSettings, LossGradient, QAgent, columns_of
+from cartpole_rl.agents.dqn import QAgent
+from cartpole_rl.agents.loss import LossGradient, columns_of
 from cartpole_rl.agents.network import FrameReader, MirrorQNetwork, QNetwork
+from cartpole_rl.agents.settings import AgentSettings
 
 DQN = {
     "hidden": [16],

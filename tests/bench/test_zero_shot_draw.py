@@ -10,7 +10,7 @@ import pytest
 
 from cartpole_rl.choices import choice
 from cartpole_rl.emulator.settings import EmulatorSettings
-from cartpole_rl.randomization import Range
+from cartpole_rl.randomization.ranges import Range
 
 SCRIPT = Path(__file__).parents[2] / "scripts/bench/zero_shot.py"
 CARTS = 200

@@ -1,12 +1,35 @@
 """What a command says of itself, and choices of a user's own."""
 
+import re
 from pathlib import Path
 
 import pytest
 import yaml
 from command_line import in_process
 
+from cartpole_rl.choices import conf_folder
+from cartpole_rl.commands.find_port import FindPortConfig
+from cartpole_rl.settings import Settings
+from cartpole_rl.workflows import config
+
 COMMANDS = ("train", "evaluate", "emulate")
+SHOWN = {
+    "train": "pole: both, large, medium, range",
+    **dict.fromkeys(COMMANDS[1:], "emulator: large, medium"),
+}
+SCHEMAS: dict[str, type[Settings]] = {
+    "emulate": config.EmulateConfig,
+    "evaluate": config.EvaluateConfig,
+    "find_port": FindPortConfig,
+    "finetune": config.FinetuneConfig,
+    "identify": config.IdentifyConfig,
+    "model": config.ModelConfig,
+    "preflight": config.PreflightConfig,
+    "record": config.RecordConfig,
+    "replay": config.ReplayConfig,
+    "train": config.TrainConfig,
+}
+WITHOUT_A_SETTING = {"train": {"experiment"}}  # groups that set other groups
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -15,8 +38,27 @@ def test_help_shows_examples_and_choices(command: str, tmp_path: Path) -> None:
     assert done.code == 0
     assert done.err == ""
     assert f"Examples\n  cartpole-{command}" in done.out
-    assert "\nemulator: large, medium" in done.out
+    assert f"\n{SHOWN[command]}\n" in done.out
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("command", SCHEMAS)
+def test_help_shows_the_groups_that_the_command_reads_and_no_other(command: str, tmp_path: Path) -> None:
+    """By the fields of its config: each group of conf/ fills the field of its name."""
+    done = in_process(command, "--help", folder=tmp_path)
+    assert done.code == 0
+    groups = {path.name for path in conf_folder().iterdir() if path.is_dir()}
+    shown = {line.partition(":")[0] for line in done.out.splitlines() if re.match(r"\w+: \w", line)}
+    assert shown & groups == groups & SCHEMAS[command].model_fields.keys() | WITHOUT_A_SETTING.get(
+        command, set()
+    )
+
+
+def test_help_shows_choices_of_ones_own(tmp_path: Path) -> None:
+    (tmp_path / "mine/pole").mkdir(parents=True)
+    (tmp_path / "mine/pole/broomstick.yaml").write_text("choices: {}\n")
+    done = in_process("train", "--config-dir=mine", "--help", folder=tmp_path)
+    assert "\npole: both, broomstick, large, medium, range\n" in done.out
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -42,7 +84,7 @@ def test_a_folder_of_ones_own_choices_is_added(tmp_path: Path) -> None:
     )
     done = in_process("train", "--config-dir=mine", "experiment=broom", "--cfg", "job", folder=tmp_path)
     assert done.code == 0, done.err
-    config = yaml.safe_load(done.out)
-    assert list(config["pole"]["choices"]) == ["broomstick"]
-    assert config["agent"]["gamma"] == 0.95
-    assert config["task"]["name"] == "swingup"
+    composed = yaml.safe_load(done.out)
+    assert list(composed["pole"]["choices"]) == ["broomstick"]
+    assert composed["agent"]["gamma"] == 0.95
+    assert composed["task"]["name"] == "swingup"

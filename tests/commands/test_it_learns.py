@@ -16,10 +16,10 @@ from cartpole_rl.agents.baseline import EnergyAndRegulator
 from cartpole_rl.choices import choice
 from cartpole_rl.evaluation.episodes import Policy, run_batch
 from cartpole_rl.evaluation.metrics import episode_metrics
-from cartpole_rl.physics.dynamics import Models, State
-from cartpole_rl.randomization import PoleSettings
-from cartpole_rl.tasks.features import ObservationKind
-from cartpole_rl.tasks.starts import StartSettings
+from cartpole_rl.physics.dynamics import State
+from cartpole_rl.physics.models import Models
+from cartpole_rl.randomization.poles import PoleSettings
+from cartpole_rl.tasks.settings import ObservationKind, StartSettings
 
 MOTORS = tuple(choice("actions/nine_levels")["motors"])
 SHORT = [

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from command_line import in_process
 
-from cartpole_rl.commands.run_folder import USES, program_of
+from cartpole_rl.workflows.run_folder import USES, program_of
 
 MADE_BY = (*USES, "unfinished", "multirun")
 WHAT_TO_DO = {  # with a folder, by what made it

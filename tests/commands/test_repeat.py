@@ -9,9 +9,9 @@ import pytest
 import yaml
 from command_line import in_process
 
-from cartpole_rl.commands.report import as_stored, read_origin
 from cartpole_rl.evaluation.recordings import read_recording
 from cartpole_rl.physics.parameters import CartParameters
+from cartpole_rl.workflows.origins import as_stored, read_origin
 
 SAME = ("score", "score_upright", "reward", "steps", "ended_by", "min_track_margin_m", "rms_motor_change")
 

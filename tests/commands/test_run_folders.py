@@ -15,7 +15,7 @@ from command_line import TINY, console_script, in_process, outcome, tells_only_h
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from cartpole_rl.commands.composition import job_name, run_folder
-from cartpole_rl.envs import CartPoleEnv
+from cartpole_rl.envs.make import CartPoleEnv
 from cartpole_rl.errors import LinkError
 from cartpole_rl.evaluation.episodes import Policy, run_episodes
 from cartpole_rl.tasks.episode import Episode
@@ -259,7 +259,7 @@ def test_what_a_broken_link_leaves_is_reported(
         yield next(run_episodes(env, policy, episodes))
         raise LinkError("the cart was unplugged")
 
-    monkeypatch.setattr("cartpole_rl.commands.evaluate.run_episodes", pulled)
+    monkeypatch.setattr("cartpole_rl.workflows.evaluate.run_episodes", pulled)
     done = in_process("evaluate", f"run={trained}", "hydra.run.dir=it", folder=tmp_path)
     assert done.code == 1
     assert done.err.splitlines()[-1] == "cartpole-evaluate: the cart was unplugged"

@@ -11,10 +11,11 @@ from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
 from cartpole_rl.choices import conf_folder
-from cartpole_rl.commands.application import as_mapping
-from cartpole_rl.commands.build import evaluated_settings
-from cartpole_rl.commands.config import EmulateConfig, EvaluateConfig, FinetuneConfig, TrainConfig, checked
-from cartpole_rl.tasks.rewards import Reward
+from cartpole_rl.commands.composition import as_mapping
+from cartpole_rl.tasks.settings import Reward
+from cartpole_rl.workflows.build import evaluated_settings, randomizer
+from cartpole_rl.workflows.checking import checked
+from cartpole_rl.workflows.config import EmulateConfig, EvaluateConfig, FinetuneConfig, TrainConfig
 
 CONF = conf_folder()
 GROUPS = sorted(path.name for path in CONF.iterdir() if path.is_dir() and path.name != "hydra")
@@ -48,8 +49,8 @@ def trained() -> TrainConfig:
 @pytest.mark.parametrize("chosen", [case for case in CHOICES if group_of(case) not in NOT_OF_TRAINING])
 def test_training_takes_it(chosen: str) -> None:
     config = checked(TrainConfig, composed("train", chosen, *NEEDED.get(chosen, [])))
-    randomizer = config.randomizer()
-    assert float(randomizer.nominal.abs().sum()) > 0
+    draws = randomizer(config)
+    assert float(draws.nominal.abs().sum()) > 0
     assert config.models(config.plant).integrator
 
 
@@ -57,7 +58,7 @@ def test_training_takes_it(chosen: str) -> None:
 def test_an_evaluation_takes_it_in_place_of_the_agents_own(chosen: str, trained: TrainConfig) -> None:
     config = checked(EvaluateConfig, composed("evaluate", "run=somewhere", chosen))
     settings = evaluated_settings(trained, config)
-    settings.randomizer()
+    randomizer(settings)
     wanted = checked(TrainConfig, composed("train", chosen))
     group = group_of(chosen)
     if group not in ("cart_friction", "pole_friction"):  # whose numbers are then the cart's

@@ -13,8 +13,9 @@ import pytest
 from hydra.core.global_hydra import GlobalHydra
 
 from cartpole_rl.choices import conf_folder
-from cartpole_rl.commands.application import as_mapping
-from cartpole_rl.commands.config import TrainConfig, checked
+from cartpole_rl.commands.composition import as_mapping
+from cartpole_rl.workflows.checking import checked
+from cartpole_rl.workflows.config import TrainConfig
 
 SILENT = "silent"
 UNREAD = "not read with these settings"

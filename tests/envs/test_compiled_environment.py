@@ -9,10 +9,10 @@ import pytest
 import torch
 from tensordict import TensorDictBase
 
-from cartpole_rl.envs import CartPoleEnv
+from cartpole_rl.envs.make import CartPoleEnv
 from cartpole_rl.plants.simulated import SimulatedPlant
-from cartpole_rl.randomization import Range
-from cartpole_rl.tasks.starts import Start, StartSettings
+from cartpole_rl.randomization.ranges import Range
+from cartpole_rl.tasks.settings import Start, StartSettings
 
 CARTS, STEPS = 16, 25
 ANYWHERE = StartSettings(

@@ -1,5 +1,7 @@
 """By Gymnasium's rules: its checker is content, seeds repeat, and one cart does what a batch of one does."""
 
+import subprocess
+import sys
 import warnings
 from collections.abc import Iterator
 
@@ -24,6 +26,23 @@ def test_importing_the_package_registers_and_again_changes_nothing() -> None:
     with gymnasium.make("cartpole_rl:cartpole_rl/Balance-v0") as env:
         assert env.spec is not None
         assert env.spec.id == "cartpole_rl/Balance-v0"
+
+
+@pytest.mark.parametrize(
+    "imports",
+    [
+        "import cartpole_rl; assert 'gymnasium' not in sys.modules; import gymnasium",
+        "import gymnasium, cartpole_rl",
+        "import cartpole_rl, importlib.util; importlib.util.find_spec('gymnasium'); import gymnasium",
+        "import cartpole_rl, torchrl.envs, gymnasium",
+    ],
+)
+def test_the_order_of_imports_does_not_matter(imports: str) -> None:
+    """Looking whether Gymnasium is there, as TorchRL does, is no import of it."""
+    known = f"import sys; {imports}; print(sorted(name for name in gymnasium.registry if 'cartpole' in name))"
+    done = subprocess.run([sys.executable, "-c", known], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == f"{sorted(ENVIRONMENTS)}\n"
 
 
 def vector(name: str, carts: int = 8, **options: object) -> VectorEnv:

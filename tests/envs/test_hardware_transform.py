@@ -10,21 +10,21 @@ from tensordict import TensorDict
 from torch import Tensor
 from torchrl.envs.utils import check_env_specs
 
-from cartpole_rl.envs import CartPoleEnv
+from cartpole_rl.envs.make import CartPoleEnv
 from cartpole_rl.physics.dynamics import State
 from cartpole_rl.plants.simulated import SimulatedPlant
-from cartpole_rl.randomization import PoleSettings, Range
+from cartpole_rl.randomization.poles import PoleSettings
+from cartpole_rl.randomization.ranges import Range
 from cartpole_rl.tasks.features import (
     ANGULAR_SPEED_SCALE,
     LENGTH_SCALE,
     MOTOR_SCALE,
     SPEED_SCALE,
     Measured,
-    ObservationKind,
     observe,
 )
-from cartpole_rl.tasks.rewards import REWARDS, Reward
-from cartpole_rl.tasks.starts import Start, StartSettings
+from cartpole_rl.tasks.rewards import REWARDS
+from cartpole_rl.tasks.settings import ObservationKind, Reward, Start, StartSettings
 
 MakePlant = Callable[..., SimulatedPlant]
 MakeEnvironment = Callable[..., CartPoleEnv]

@@ -11,13 +11,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from cartpole_rl.envs import CartPoleEnv
-from cartpole_rl.physics.dynamics import Models
-from cartpole_rl.physics.friction import CartFriction, PoleFriction
+from cartpole_rl.envs.make import CartPoleEnv
+from cartpole_rl.physics.models import CartFriction, Models, PoleFriction
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.simulated import SimulatedPlant
-from cartpole_rl.randomization import Range
-from cartpole_rl.tasks.starts import Start, StartSettings
+from cartpole_rl.randomization.ranges import Range
+from cartpole_rl.tasks.settings import Start, StartSettings
 
 MakePlant = Callable[..., SimulatedPlant]
 MakeEnvironment = Callable[..., CartPoleEnv]

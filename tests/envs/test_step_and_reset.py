@@ -8,10 +8,12 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase, TransformedEnv
 
-from cartpole_rl.envs import CartPoleEnv, HardwareTransform
+from cartpole_rl.envs.hardware import HardwareTransform
+from cartpole_rl.envs.make import CartPoleEnv
 from cartpole_rl.plants.simulated import SimulatedPlant
-from cartpole_rl.randomization import PoleSettings, Range
-from cartpole_rl.tasks.starts import Start, StartSettings
+from cartpole_rl.randomization.poles import PoleSettings
+from cartpole_rl.randomization.ranges import Range
+from cartpole_rl.tasks.settings import Start, StartSettings
 
 CARTS, STEPS, LIMIT = 16, 400, 60
 ANYWHERE = StartSettings(

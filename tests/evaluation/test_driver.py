@@ -14,16 +14,18 @@ import pytest
 import torch
 from torch import nn
 
-from cartpole_rl.agents import AgentSettings, QAgent
+from cartpole_rl.agents.dqn import QAgent
+from cartpole_rl.agents.settings import AgentSettings
 from cartpole_rl.choices import choice
-from cartpole_rl.envs import CartPoleEnv, make_env
+from cartpole_rl.envs.make import CartPoleEnv, make_env
 from cartpole_rl.envs.settings import ObservationSettings, RewardSettings, TaskSettings
 from cartpole_rl.errors import FaultError, LinkError
 from cartpole_rl.evaluation.driver import Drive, Driver
 from cartpole_rl.evaluation.driving_policy import as_weights
-from cartpole_rl.plants.serial import SerialPlant, SerialPlantSettings
+from cartpole_rl.plants.serial import SerialPlant
 from cartpole_rl.plants.serial_errors import NotReadyError
 from cartpole_rl.plants.serial_faults import Confirm
+from cartpole_rl.plants.serial_settings import SerialPlantSettings
 from cartpole_rl.tasks.actions import ActionSettings
 from cartpole_rl.wire import ClearFault, Fault, Message, SetMotor, Stop
 

@@ -8,10 +8,10 @@ import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
 
-from cartpole_rl.envs import CartPoleEnv
-from cartpole_rl.evaluation import run_episodes
+from cartpole_rl.envs.make import CartPoleEnv
+from cartpole_rl.evaluation.episodes import run_episodes
 from cartpole_rl.plants.simulated import SimulatedPlant
-from cartpole_rl.tasks.starts import Start, StartSettings
+from cartpole_rl.tasks.settings import Start, StartSettings
 
 RIGHT, NONE = 2, 1  # of the motor values -200, 0, 200
 

@@ -5,8 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from cartpole_rl.evaluation import episode_metrics, summarize
-from cartpole_rl.evaluation.metrics import interval
+from cartpole_rl.evaluation.metrics import episode_metrics, interval, summarize
 from cartpole_rl.tasks.episode import Episode
 
 PERIOD = 0.02

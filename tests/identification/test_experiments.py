@@ -25,13 +25,12 @@ from cartpole_rl.identification.experiments import (
 )
 from cartpole_rl.identification.identify import Identification, identify, prediction_errors
 from cartpole_rl.identification.quantities import quantities
-from cartpole_rl.physics.dynamics import Models
-from cartpole_rl.physics.friction import CartFriction, PoleFriction
+from cartpole_rl.physics.models import CartFriction, Models, PoleFriction
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.simulated import SimulatedPlant
-from cartpole_rl.randomization import PoleSettings
+from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.tasks.episode import Episode
-from cartpole_rl.tasks.starts import Start, StartSettings
+from cartpole_rl.tasks.settings import Start, StartSettings
 
 PERIOD = 0.02
 LAWS = Models(CartFriction.STEP, PoleFriction.BEARING)

@@ -6,18 +6,17 @@ import numpy as np
 import pytest
 import torch
 
-from cartpole_rl.envs import CartPoleEnv
+from cartpole_rl.envs.make import CartPoleEnv
 from cartpole_rl.errors import RecordingError
 from cartpole_rl.evaluation.episodes import run_batch
-from cartpole_rl.identification import cut_windows, fit_cart
+from cartpole_rl.identification.fit import fit_cart
 from cartpole_rl.identification.prediction import predict
 from cartpole_rl.identification.unknowns import limits, parameters_at, unknowns_of
-from cartpole_rl.identification.windows import HISTORY
-from cartpole_rl.physics.dynamics import Models
-from cartpole_rl.physics.friction import CartFriction
+from cartpole_rl.identification.windows import HISTORY, cut_windows
+from cartpole_rl.physics.models import CartFriction, Models
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.simulated import SimulatedPlant
-from cartpole_rl.randomization import PoleSettings
+from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.tasks.episode import Episode
 
 PERIOD = 0.02

@@ -6,26 +6,21 @@ import numpy as np
 import pytest
 import torch
 
-from cartpole_rl.envs import CartPoleEnv
+from cartpole_rl.envs.make import CartPoleEnv
 from cartpole_rl.evaluation.episodes import run_batch
-from cartpole_rl.identification import Windows, cut_windows
 from cartpole_rl.identification.held_out import LEAD, errors_at, predict_held_out
-from cartpole_rl.identification.learned import (
-    Dynamics,
-    Ensemble,
-    LearningSettings,
-    best_beginnings,
-    first_guess,
-)
-from cartpole_rl.physics.dynamics import Models
-from cartpole_rl.physics.friction import CartFriction
+from cartpole_rl.identification.learned import Dynamics, Ensemble, best_beginnings, first_guess
+from cartpole_rl.identification.settings import EnsembleSettings
+from cartpole_rl.identification.windows import Windows, cut_windows
+from cartpole_rl.physics.models import CartFriction, Models
 from cartpole_rl.physics.residual import PLACES, SPACING, UNITS, Residual
 from cartpole_rl.plants.learned import LearnedPlant
 from cartpole_rl.plants.learned_model import LearnedModel
 from cartpole_rl.plants.simulated import SimulatedPlant
-from cartpole_rl.randomization import PoleSettings, Randomizer
+from cartpole_rl.randomization.poles import PoleSettings
+from cartpole_rl.randomization.randomizer import Randomizer
 from cartpole_rl.tasks.episode import Episode
-from cartpole_rl.tasks.starts import Start, StartSettings
+from cartpole_rl.tasks.settings import Start, StartSettings
 
 PERIOD = 0.02
 MOTORS = (-250, -150, 0, 150, 250)
@@ -36,7 +31,7 @@ START = StartSettings(
 TRACK = {"track_half_length": 2.0}
 RIPPLE = 0.6  # N
 PITCH = 0.08  # m
-SETTINGS = LearningSettings(
+SETTINGS = EnsembleSettings(
     members=2,
     hidden=6,
     updates=60,

@@ -6,10 +6,10 @@ import pytest
 import torch
 from tensordict.nn import TensorDictModule
 
-from cartpole_rl.envs import CartPoleEnv
+from cartpole_rl.envs.make import CartPoleEnv
 from cartpole_rl.learning.collector import COLLECTED, Collector
-from cartpole_rl.randomization import Range
-from cartpole_rl.tasks.starts import Start, StartSettings
+from cartpole_rl.randomization.ranges import Range
+from cartpole_rl.tasks.settings import Start, StartSettings
 
 CARTS, LIMIT = 64, 20
 SCALE = {"scale": 0.1}  # of the reward

@@ -8,12 +8,18 @@ import pytest
 import torch
 from tensordict import TensorDictBase
 
-from cartpole_rl.agents import AgentSettings, QAgent
+from cartpole_rl.agents.dqn import QAgent
+from cartpole_rl.agents.settings import AgentSettings
 from cartpole_rl.choices import choice
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.evaluation.episodes import run_batch
-from cartpole_rl.learning.finetuning import Finetuning, FinetuningSettings, recorded_chunk
-from cartpole_rl.learning.settings import LearningSettings, OptimizerSettings, ReplaySettings
+from cartpole_rl.learning.finetuning import Finetuning, recorded_chunk
+from cartpole_rl.learning.settings import (
+    FinetuningSettings,
+    LearningSettings,
+    OptimizerSettings,
+    ReplaySettings,
+)
 
 MOTORS = (-250, -200, 0, 200, 250)
 LENGTH = 2 * 0.1778  # m, the medium pole

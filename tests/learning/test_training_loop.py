@@ -10,11 +10,17 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from cartpole_rl.agents import AgentSettings, QAgent
+from cartpole_rl.agents.dqn import QAgent
+from cartpole_rl.agents.settings import AgentSettings
 from cartpole_rl.errors import LearningError
-from cartpole_rl.learning.finetuning import Finetuning, FinetuningSettings
+from cartpole_rl.learning.finetuning import Finetuning
 from cartpole_rl.learning.randomness import seed_everything
-from cartpole_rl.learning.settings import LearningSettings, OptimizerSettings, ReplaySettings
+from cartpole_rl.learning.settings import (
+    FinetuningSettings,
+    LearningSettings,
+    OptimizerSettings,
+    ReplaySettings,
+)
 from cartpole_rl.learning.training import Scalars, Training
 from cartpole_rl.tasks.episode import Episode
 

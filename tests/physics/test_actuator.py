@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from cartpole_rl.physics.actuator import Actuator, lagged_force, mean_commands, static_force
-from cartpole_rl.physics.dynamics import Drive, Models, State, advance, mechanism, run_period
-from cartpole_rl.physics.friction import CartFriction, PoleFriction
+from cartpole_rl.physics.actuator import lagged_force, mean_commands, static_force
+from cartpole_rl.physics.dynamics import Drive, State, advance, mechanism, run_period
+from cartpole_rl.physics.models import Actuator, CartFriction, Models, PoleFriction
 from cartpole_rl.physics.parameters import CartParameters
 
 MakeCart = Callable[..., CartParameters]

@@ -8,9 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from cartpole_rl.physics.actuator import Actuator
-from cartpole_rl.physics.dynamics import Integrator, Models, State, advance, energy, mechanism
-from cartpole_rl.physics.friction import CartFriction, PoleFriction
+from cartpole_rl.physics.dynamics import State, advance, energy, mechanism
+from cartpole_rl.physics.models import Actuator, CartFriction, Integrator, Models, PoleFriction
 from cartpole_rl.physics.parameters import CartParameters
 
 MakeCart = Callable[..., CartParameters]

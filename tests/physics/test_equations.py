@@ -14,11 +14,8 @@ from mujoco_reference import MujocoCart
 from torch import Tensor
 
 from cartpole_rl.physics import dynamics
-from cartpole_rl.physics.actuator import Actuator
 from cartpole_rl.physics.dynamics import (
     Drive,
-    Integrator,
-    Models,
     State,
     accelerations,
     advance,
@@ -27,7 +24,7 @@ from cartpole_rl.physics.dynamics import (
     normal_force_ratio,
     run_period,
 )
-from cartpole_rl.physics.friction import CartFriction, PoleFriction
+from cartpole_rl.physics.models import Actuator, CartFriction, Integrator, Models, PoleFriction
 from cartpole_rl.physics.parameters import GRAVITY, CartParameters
 
 MakeCart = Callable[..., CartParameters]

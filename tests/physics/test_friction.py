@@ -7,16 +7,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from cartpole_rl.physics.actuator import Actuator
-from cartpole_rl.physics.dynamics import Models, State, advance, mechanism, speed_lost
-from cartpole_rl.physics.friction import (
-    CartFriction,
-    PoleFriction,
-    coulomb_force,
-    dry_friction,
-    pole_torque,
-    viscous_coefficient,
-)
+from cartpole_rl.physics.dynamics import State, advance, mechanism, speed_lost
+from cartpole_rl.physics.friction import coulomb_force, dry_friction, pole_torque, viscous_coefficient
+from cartpole_rl.physics.models import Actuator, CartFriction, Models, PoleFriction
 from cartpole_rl.physics.parameters import GRAVITY, CartParameters
 
 MakeCart = Callable[..., CartParameters]

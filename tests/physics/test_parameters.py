@@ -7,15 +7,10 @@ import pytest
 import torch
 
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.physics.parameters import (
-    BOUNDS,
-    POLE_DENSITY,
-    CartParameters,
-    check_names,
-    check_values,
-    uniform_rod,
-)
-from cartpole_rl.randomization import PoleSettings
+from cartpole_rl.physics.bounds import BOUNDS, check_names, check_values
+from cartpole_rl.physics.parameters import CartParameters
+from cartpole_rl.physics.rod import POLE_DENSITY, uniform_rod
+from cartpole_rl.randomization.poles import PoleSettings
 
 MakeCart = Callable[..., CartParameters]
 

@@ -5,8 +5,8 @@ from collections.abc import Callable
 import pytest
 import torch
 
-from cartpole_rl.physics.dynamics import Drive, Models, State, run_period
-from cartpole_rl.physics.friction import CartFriction
+from cartpole_rl.physics.dynamics import Drive, State, run_period
+from cartpole_rl.physics.models import CartFriction, Models
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.physics.residual import (
     PLACES,

@@ -3,9 +3,8 @@
 import pytest
 import torch
 
-from cartpole_rl.physics.actuator import Actuator
-from cartpole_rl.physics.dynamics import Drive, Models, State, run_period, unused_parameters
-from cartpole_rl.physics.friction import CartFriction, PoleFriction
+from cartpole_rl.physics.dynamics import Drive, State, run_period
+from cartpole_rl.physics.models import Actuator, CartFriction, Models, PoleFriction, unused_parameters
 from cartpole_rl.physics.parameters import CartParameters
 
 MODELS = [

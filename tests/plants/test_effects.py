@@ -6,12 +6,13 @@ import pytest
 import torch
 
 from cartpole_rl.choices import choice, conf_folder
-from cartpole_rl.physics.actuator import Actuator
-from cartpole_rl.physics.dynamics import Models, unused_parameters
-from cartpole_rl.physics.friction import CartFriction, PoleFriction
+from cartpole_rl.physics.models import Actuator, CartFriction, Models, PoleFriction, unused_parameters
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.effects import without_effect
-from cartpole_rl.randomization import FoundCarts, PoleSettings, Randomizer, Range
+from cartpole_rl.randomization.found import FoundCarts
+from cartpole_rl.randomization.poles import PoleSettings
+from cartpole_rl.randomization.randomizer import Randomizer
+from cartpole_rl.randomization.ranges import Range
 
 ACTIONS = sorted(path.stem for path in (conf_folder() / "actions").glob("*.yaml"))
 RANDOMIZATIONS = sorted(path.stem for path in (conf_folder() / "randomization").glob("*.yaml"))

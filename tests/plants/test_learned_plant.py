@@ -7,15 +7,16 @@ import pytest
 import torch
 
 from cartpole_rl.errors import CheckpointError
-from cartpole_rl.physics.dynamics import Models, State
-from cartpole_rl.physics.friction import CartFriction
+from cartpole_rl.physics.dynamics import State
+from cartpole_rl.physics.models import CartFriction, Models
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.physics.residual import PLACES, Residual
 from cartpole_rl.plants.learned import LearnedPlant
 from cartpole_rl.plants.learned_model import FORMAT, LearnedModel, load_model, save_model
 from cartpole_rl.plants.simulated import SimulatedPlant
-from cartpole_rl.randomization import PoleSettings, Randomizer
-from cartpole_rl.tasks.starts import Start, StartSettings
+from cartpole_rl.randomization.poles import PoleSettings
+from cartpole_rl.randomization.randomizer import Randomizer
+from cartpole_rl.tasks.settings import Start, StartSettings
 
 STEP = Models(cart_friction=CartFriction.STEP)
 START = StartSettings(

@@ -8,11 +8,13 @@ import pytest
 from hydra.core.global_hydra import GlobalHydra
 
 from cartpole_rl.choices import conf_folder
-from cartpole_rl.commands.application import as_mapping
-from cartpole_rl.commands.config import TrainConfig, checked
+from cartpole_rl.commands.composition import as_mapping
 from cartpole_rl.errors import PlantError
 from cartpole_rl.plants.link_statistics import LATENCY_SAMPLES, LatencyRing, LinkStatistics
-from cartpole_rl.randomization import Range
+from cartpole_rl.randomization.ranges import Range
+from cartpole_rl.workflows.build import randomizer
+from cartpole_rl.workflows.checking import checked
+from cartpole_rl.workflows.config import TrainConfig
 
 
 def test_the_newest_samples_stay() -> None:
@@ -66,7 +68,7 @@ def test_the_override_is_a_word_that_cartpole_train_takes() -> None:
             composed = as_mapping(hydra.compose("train", [f"randomization={group}", word]))
             config = checked(TrainConfig, composed)
             assert config.randomization["latency"].limits() == (0.0021, 0.0119)
-            assert config.randomizer().longest_delay() == pytest.approx(0.0119)
+            assert randomizer(config).longest_delay() == pytest.approx(0.0119)
 
 
 def test_commands_that_come_at_once_leave_nothing_to_hand_on() -> None:

@@ -21,8 +21,9 @@ from tensordict import TensorDictBase
 
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.identification.experiments import Experiment, Moves, Task, conduct, hold
-from cartpole_rl.plants.serial import SerialPlant, SerialPlantSettings
+from cartpole_rl.plants.serial import SerialPlant
 from cartpole_rl.plants.serial_cart import SerialCart, SerialSettings
+from cartpole_rl.plants.serial_settings import SerialPlantSettings
 from cartpole_rl.wire import Flags
 
 PERIOD_MS = 20

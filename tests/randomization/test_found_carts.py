@@ -8,7 +8,10 @@ import torch
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.simulated import SimulatedPlant
-from cartpole_rl.randomization import FoundCarts, PoleSettings, Randomizer, Range
+from cartpole_rl.randomization.found import FoundCarts
+from cartpole_rl.randomization.poles import PoleSettings
+from cartpole_rl.randomization.randomizer import Randomizer
+from cartpole_rl.randomization.ranges import Range
 
 MASS, VISCOUS = (CartParameters.names().index(name) for name in ("cart_mass", "cart_viscous"))
 

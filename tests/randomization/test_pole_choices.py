@@ -5,7 +5,8 @@ import torch
 
 from cartpole_rl.choices import choice
 from cartpole_rl.physics.parameters import CartParameters
-from cartpole_rl.randomization import Pole, PoleSettings, Randomizer
+from cartpole_rl.randomization.poles import Pole, PoleSettings
+from cartpole_rl.randomization.randomizer import Randomizer
 
 
 def test_each_choice_stands_for_itself() -> None:

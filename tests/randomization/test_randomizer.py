@@ -8,8 +8,11 @@ from pydantic import ValidationError
 from torch import Tensor
 
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.physics.parameters import POLE_DENSITY, CartParameters
-from cartpole_rl.randomization import Pole, PoleSettings, Randomizer, Range
+from cartpole_rl.physics.parameters import CartParameters
+from cartpole_rl.physics.rod import POLE_DENSITY
+from cartpole_rl.randomization.poles import Pole, PoleSettings
+from cartpole_rl.randomization.randomizer import Randomizer
+from cartpole_rl.randomization.ranges import Range
 
 COUNT = 20_000
 POLE_FIELDS = ("pole_mass", "pole_com", "pole_inertia")

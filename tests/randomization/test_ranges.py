@@ -6,7 +6,7 @@ import pytest
 from pydantic import ValidationError
 
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.randomization import Range
+from cartpole_rl.randomization.ranges import Range
 
 
 @pytest.mark.parametrize(

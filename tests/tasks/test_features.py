@@ -11,12 +11,11 @@ from cartpole_rl.tasks.features import (
     CART_METRES_PER_COUNT,
     POLE_COUNTS_PER_TURN,
     Measured,
-    ObservationKind,
     measured_position,
     measured_velocity,
-    observation_size,
     observe,
 )
+from cartpole_rl.tasks.settings import ObservationKind, observation_size
 
 
 def counts(cart: int, pole: int) -> torch.Tensor:

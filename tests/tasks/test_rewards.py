@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from cartpole_rl.tasks.features import Measured
-from cartpole_rl.tasks.rewards import REWARDS, SCORE, SCORE_UPRIGHT, Reward
+from cartpole_rl.tasks.rewards import REWARDS, SCORE, SCORE_UPRIGHT
+from cartpole_rl.tasks.settings import Reward
 
 X_MAX = 0.4
 DEGREE = math.pi / 180

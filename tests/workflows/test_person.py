@@ -7,11 +7,11 @@ import sys
 import time
 from pathlib import Path
 
-from cartpole_rl.commands.person import confirm
+from cartpole_rl.workflows.person import confirm
 
 ASK = """
 import sys
-from cartpole_rl.commands.person import confirm
+from cartpole_rl.workflows.person import confirm
 print("ready", flush=True)
 open(sys.argv[1]).read()  # waits until the test has typed ahead
 print("agreed" if confirm("the cart latched a fault: STALL") else "not agreed", flush=True)

@@ -1,44 +1,11 @@
-"""Writes what episodes were worth: metrics.json, and figures of them."""
+"""The simulated cart and the start of each episode, as metrics.json and recordings hold them."""
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from cartpole_rl.commands.run_folder import METRICS, write_json
-from cartpole_rl.evaluation import episode_metrics, summarize
-from cartpole_rl.randomization import PoleSettings
-from cartpole_rl.reporting.animation import write_gif
-from cartpole_rl.reporting.figures import behaviour, learning_curve, save
 from cartpole_rl.tasks.episode import Episode, Origin
-
-
-def report(
-    folder: Path,
-    episodes: Sequence[Episode],
-    plant: str,
-    pole: PoleSettings,
-    x_max: float,
-    link: Mapping[str, int] | None = None,
-    history: Sequence[Mapping[str, float]] = (),
-) -> dict[str, Any]:
-    """Write metrics.json and figures/ into `folder`; returns what `summarize` makes of the episodes.
-
-    The behaviour and the animation show the first episode; `history` adds the learning curve.
-    """
-    figures = [episode_metrics(episode, x_max) for episode in episodes]
-    summary = summarize(figures)
-    head = {"plant": plant, "pole": pole.name, **(link or {})}
-    cart, origins = stored_origins(episodes)
-    told = [{**figure, **origin} for figure, origin in zip(figures, origins, strict=True)]
-    write_json(folder / METRICS, {**head, **summary, **cart, "episodes": told})
-    pictures = folder / "figures"
-    save(behaviour(episodes[0], f"First episode, plant={plant}", x_max), pictures / "behaviour.png")
-    write_gif(episodes[0], pictures / "episode.gif", 2 * pole.nominal.pole_com, x_max, f"plant={plant}")
-    if history:
-        save(learning_curve([("score", list(history))]), pictures / "learning_curve.png")
-    return summary
 
 
 def stored_origins(episodes: Sequence[Episode]) -> tuple[dict[str, Any], list[dict[str, Any]]]:

@@ -15,7 +15,7 @@ from typing import Any
 import yaml
 
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.learning.checkpoints import FOLDER, LAST, RESUME
+from cartpole_rl.learning.checkpoint_files import FOLDER, LAST, RESUME
 
 CONFIG, PROVENANCE, MULTIRUN = "config.yaml", "provenance.json", "multirun.yaml"
 METRICS = "metrics.json"

@@ -9,24 +9,17 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from cartpole_rl.commands.config import TrainConfig
-from cartpole_rl.evaluation import episode_metrics
+from cartpole_rl.evaluation.metrics import episode_metrics
 from cartpole_rl.files import replacing
-from cartpole_rl.learning.checkpoints import (
-    BEST,
-    FOLDER,
-    LAST,
-    AgentCheckpoint,
-    TrainingCheckpoint,
-    save_agent,
-    save_training,
-)
+from cartpole_rl.learning.checkpoint_files import BEST, FOLDER, LAST
+from cartpole_rl.learning.checkpoints import AgentCheckpoint, TrainingCheckpoint, save_agent, save_training
 from cartpole_rl.learning.training import Scalars, Training
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.reporting.animation import gif
 from cartpole_rl.reporting.figures import behaviour
 from cartpole_rl.reporting.tensorboard import TensorBoardLog
 from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.workflows.config import TrainConfig
 
 HISTORY = "history.jsonl"  # a line an evaluation
 COMPARED = ("score", "score_upright", "steps", "time_to_upright_s", "upright_fraction")  # on the HPARAMS page

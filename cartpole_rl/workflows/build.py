@@ -1,57 +1,61 @@
 """Build plants, environments and agents from checked configs."""
 
 import math
-import os
-import shutil
-import sys
-import sysconfig
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-import hydra
 import torch
 
-from cartpole_rl.agents import QAgent
 from cartpole_rl.agents.baseline import EnergyAndRegulator
-from cartpole_rl.commands.application import as_mapping
-from cartpole_rl.commands.config import (
+from cartpole_rl.agents.dqn import QAgent
+from cartpole_rl.emulator.settings import EmulatorSettings
+from cartpole_rl.envs.make import CartPoleEnv, make_env
+from cartpole_rl.errors import CheckpointError, ConfigError
+from cartpole_rl.evaluation.episodes import Policy
+from cartpole_rl.learning.checkpoints import load_agent, restore_weights
+from cartpole_rl.physics.bounds import check_names
+from cartpole_rl.physics.parameters import CartParameters
+from cartpole_rl.physics.residual import UNDER_WAY
+from cartpole_rl.plants.emulated import emulated_plant
+from cartpole_rl.plants.learned import LearnedPlant
+from cartpole_rl.plants.learned_model import LearnedModel, load_model
+from cartpole_rl.plants.serial import SerialPlant
+from cartpole_rl.plants.serial_faults import Confirm, nobody
+from cartpole_rl.plants.serial_settings import SerialPlantSettings
+from cartpole_rl.plants.simulated import SimulatedPlant
+from cartpole_rl.plants.specs import Plant
+from cartpole_rl.randomization.found import Draws, FoundCarts, found_carts
+from cartpole_rl.randomization.poles import Pole, PoleSettings
+from cartpole_rl.randomization.randomizer import Randomizer
+from cartpole_rl.randomization.settings import FoundSettings
+from cartpole_rl.settings import evaluation_seed
+from cartpole_rl.tasks.settings import Start, StartSettings
+from cartpole_rl.workflows.checking import checked
+from cartpole_rl.workflows.checks import BASELINE, check_has_agent, check_model, simulated_carts
+from cartpole_rl.workflows.config import (
     CartPoleSettings,
     EmulatedSettings,
     EvaluateConfig,
     LearnedSettings,
     SimulatedSettings,
     TrainConfig,
-    checked,
 )
-from cartpole_rl.commands.run_folder import PREFIX, check_program, program_of, use_of
-from cartpole_rl.emulator.settings import EmulatorSettings
-from cartpole_rl.envs import CartPoleEnv, make_env
-from cartpole_rl.errors import CheckpointError, ConfigError
-from cartpole_rl.evaluation.episodes import Policy
-from cartpole_rl.learning.checkpoints import FOLDER, LAST, load_agent, restore_weights
-from cartpole_rl.physics.parameters import CartParameters, check_names
-from cartpole_rl.physics.residual import UNDER_WAY
-from cartpole_rl.plants.emulated import emulated_plant
-from cartpole_rl.plants.learned import LearnedPlant
-from cartpole_rl.plants.learned_model import LearnedModel, load_model
-from cartpole_rl.plants.serial import SerialPlant, SerialPlantSettings
-from cartpole_rl.plants.serial_faults import Confirm, nobody
-from cartpole_rl.plants.simulated import SimulatedPlant
-from cartpole_rl.plants.specs import Plant
-from cartpole_rl.randomization import FoundCarts, Pole, PoleSettings
-from cartpole_rl.settings import evaluation_seed
-from cartpole_rl.tasks.starts import Start, StartSettings
 
-BASELINE = Path("lqr")  # run=lqr is no folder: the controller that learned nothing
 LATER: dict[str, dict[str, Any]] = {  # settings that older checkpoints do not know, as they were then
     "cart": {"pole_coulomb": 0.0},
     "learning": {"try_again": 0.0, "carry": False},
 }
-LARGEST_BATCH = 1024  # carts that an evaluation simulates at once
 SIMILAR = 0.1  # share by which a pole's length may differ from a learned model's
 REPLACEABLE = ("cart", "cart_friction", "pole_friction", "pole", "reward")  # by an evaluation; and the task
+
+
+def randomizer(config: CartPoleSettings) -> Draws:
+    """What draws the carts that `config` describes. Raises ConfigError where its numbers make no sense."""
+    if isinstance(config.randomization, FoundSettings):
+        return found_carts(config.randomization, config.nominal, config.pole)
+    return Randomizer(config.nominal, config.pole, config.randomization)
 
 
 def simulated_env(
@@ -69,7 +73,7 @@ def simulated_env(
         config,
         SimulatedPlant(
             carts,
-            config.randomizer(),
+            randomizer(config),
             start,
             config.models(plant),
             config.control_period,
@@ -89,7 +93,7 @@ def learned_plant(
     compiled: bool,
 ) -> LearnedPlant:
     """Carts of a learned model. Raises ConfigError where it is of another cart than `config` describes."""
-    model = model_of(plant)
+    model = load_model_of(plant)
     own, length = model.parameters, 2 * config.pole.nominal.pole_com
     if not math.isclose(model.period, config.control_period, rel_tol=1e-6):
         raise ConfigError(f"control_period={config.control_period}: plant.model has {model.period} s")
@@ -102,13 +106,13 @@ def learned_plant(
     if abs(2 * own["pole_com"] / length - 1) > SIMILAR:
         raise ConfigError(f"pole: plant.model has one of {2 * own['pole_com']:.2f} m, not {length:.2f} m")
     found = torch.tensor([[own[name]] for name in CartParameters.names()])
-    draws = FoundCarts(found, config.randomizer(), plant.elsewhere, UNDER_WAY * model.period)
+    draws = FoundCarts(found, randomizer(config), plant.elsewhere, UNDER_WAY * model.period)
     return LearnedPlant(carts, model, draws, start, seed, compiled=compiled)
 
 
-def model_of(plant: LearnedSettings) -> LearnedModel:
+def load_model_of(plant: LearnedSettings) -> LearnedModel:
     """The model that plant.model= names. Raises CheckpointError, ConfigError."""
-    check_program("plant.model", plant.model, "model")
+    check_model(plant)
     return load_model(plant.model)
 
 
@@ -150,27 +154,23 @@ def trained_agent(run: Path) -> TrainedAgent:
     return TrainedAgent(training, agent.greedy_policy())
 
 
-def check_has_agent(run: Path) -> None:
-    """Raise ConfigError where `run` is a run folder without an agent, with what can be done with it."""
-    check_program("run", run, "train", "finetune")
-    if (program := program_of(run)) and not (run / FOLDER / LAST).exists():
-        raise ConfigError(
-            f"run={run}: this run of {PREFIX}{program} has no agent yet; {use_of(run, program)}"
-        )
+def evaluated_agent(config: EvaluateConfig, baseline: TrainConfig | None = None) -> TrainedAgent:
+    """The agent of config.run, or the baseline controller. Raises CheckpointError, ConfigError.
 
-
-def evaluated_agent(config: EvaluateConfig) -> TrainedAgent:
-    """The agent of config.run, or the baseline. Raises CheckpointError, ConfigError."""
-    return baseline_agent(config) if config.run == BASELINE else trained_agent(config.run)
-
-
-def baseline_agent(config: EvaluateConfig) -> TrainedAgent:
-    """Energy and LQR, for the nominal cart of conf/ with the pole that `config` puts on it.
-
-    Only within a command, where Hydra knows conf/. Raises ConfigError where there may be several poles.
+    `baseline` describes the cart that the controller is made for, and what it observes.
     """
-    composed = hydra.compose("train", ["observation=raw", "observation.past_motors=1"])
-    training = checked(TrainConfig, as_mapping(composed))
+    if config.run != BASELINE:
+        return trained_agent(config.run)
+    if baseline is None:
+        raise ConfigError(f"run={BASELINE} needs the settings of the cart that it is made for")
+    return baseline_agent(config, baseline)
+
+
+def baseline_agent(config: EvaluateConfig, training: TrainConfig) -> TrainedAgent:
+    """Energy and LQR, for the cart of `training` with the pole that `config` puts on it.
+
+    Raises ConfigError where there may be several poles.
+    """
     poles = evaluated_settings(training, config.model_copy(update={"parameters": None})).pole
     if poles.choices is None or len(poles.choices) > 1:
         raise ConfigError(
@@ -196,7 +196,7 @@ def evaluated_settings(training: TrainConfig, config: EvaluateConfig) -> CartPol
     if isinstance(config.plant, EmulatedSettings):
         given["pole"] = emulated_pole(config.emulator)
     if isinstance(config.plant, LearnedSettings):
-        found = model_of(config.plant).parameters
+        found = load_model_of(config.plant).parameters
         given["pole"] = one_pole(Pole(**{name: found[name] for name in Pole.model_fields}))
     settings = checked(CartPoleSettings, {**own, **given, "randomization": config.randomization})
     return with_parameters(settings, config.parameters or {})
@@ -268,21 +268,6 @@ def evaluated_env(
         control_period=settings.control_period,
     )
     return environment(settings, SerialPlant(serial, prompt, confirm=confirm))
-
-
-def simulated_carts(config: EvaluateConfig) -> int:
-    """How many carts an evaluation simulates at once: one an episode, up to LARGEST_BATCH."""
-    return min(config.episodes, LARGEST_BATCH)
-
-
-def check_compiler() -> None:
-    """Raise ConfigError where torch.compile has no C++ compiler or no header of Python to build with."""
-    compiler = os.environ.get("CXX", {"darwin": "clang++", "win32": "cl"}.get(sys.platform, "g++"))
-    header = Path(sysconfig.get_path("include"), "Python.h")
-    if shutil.which(compiler) is None:
-        raise ConfigError(f"compile=true finds no C++ compiler {compiler}: install it, or give compile=false")
-    if not header.exists():
-        raise ConfigError(f"compile=true finds no {header}: install Python's headers, or give compile=false")
 
 
 def use_threads(threads: int | None) -> None:

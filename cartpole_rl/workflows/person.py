@@ -1,6 +1,7 @@
 """The person at the terminal."""
 
 import sys
+from contextlib import suppress
 
 
 def confirm(text: str) -> bool:
@@ -28,3 +29,9 @@ def forget_typed() -> None:
             msvcrt.getwch()  # type: ignore[attr-defined]
         return
     termios.tcflush(sys.stdin, termios.TCIFLUSH)
+
+
+def tell(name: str, message: str) -> None:
+    """One line on stderr, if that still leads anywhere: a closed terminal does not."""
+    with suppress(OSError):
+        print(f"cartpole-{name.replace('_', '-')}: {message}", file=sys.stderr)

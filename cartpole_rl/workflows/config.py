@@ -1,29 +1,30 @@
-"""The shape of each command's config: what Hydra composes is checked against it before any work is done."""
+"""What each command reads: its settings are checked against these classes before any work is done."""
 
-import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, TypeVar
+from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import Discriminator, Field, Tag, ValidationError, field_validator, model_validator
+from pydantic import Discriminator, Field, Tag, field_validator, model_validator
 
-from cartpole_rl.agents import AgentSettings
-from cartpole_rl.commands.complaints import no_such_setting, setting_names
+from cartpole_rl.agents.settings import AgentSettings
 from cartpole_rl.emulator.settings import EmulatorSettings
-from cartpole_rl.envs.hardware import ObservationSettings, RewardSettings, TaskSettings
+from cartpole_rl.envs.settings import ObservationSettings, RewardSettings, TaskSettings
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.learning.finetuning import FinetuningSettings
-from cartpole_rl.learning.settings import LearningSettings, OptimizerSettings, ReplaySettings
-from cartpole_rl.physics.actuator import Actuator
-from cartpole_rl.physics.dynamics import Integrator, Models
-from cartpole_rl.physics.friction import CartFriction, PoleFriction
-from cartpole_rl.randomization import Draws, FoundSettings, PoleSettings, Randomizer, Range
+from cartpole_rl.identification.settings import EnsembleSettings
+from cartpole_rl.learning.settings import (
+    FinetuningSettings,
+    LearningSettings,
+    OptimizerSettings,
+    ReplaySettings,
+)
+from cartpole_rl.physics.bounds import check_values
+from cartpole_rl.physics.models import Actuator, CartFriction, Integrator, Models, PoleFriction
+from cartpole_rl.randomization.poles import PoleSettings
+from cartpole_rl.randomization.ranges import Range
+from cartpole_rl.randomization.settings import FoundSettings
 from cartpole_rl.settings import Count, Finite, Fraction, Positive, Seed, Settings
 from cartpole_rl.tasks.actions import ActionSettings
 
-KINDS = re.compile(
-    r"(?<=^plant\.)(simulated|emulated|serial|learned)\.|(?<=^randomization\.)(ranges|found)\."
-)
 OF_SIMULATION = ("parameters", "randomization", "cart", "cart_friction", "pole_friction")
 
 
@@ -108,12 +109,6 @@ class CartPoleSettings(Settings):
     def nominal(self) -> dict[str, float]:
         """Nominal parameters of the cart, without the pole's."""
         return {**self.cart, **self.cart_friction.parameters, **self.pole_friction.parameters}
-
-    def randomizer(self) -> Draws:
-        """Draws carts of this kind. Raises ConfigError where the numbers make no sense."""
-        if isinstance(self.randomization, FoundSettings):
-            return self.randomization.carts(self.nominal, self.pole)
-        return Randomizer(self.nominal, self.pole, self.randomization)
 
     @property
     def ranges(self) -> dict[str, Range]:
@@ -229,6 +224,10 @@ class EvaluateConfig(Settings):
         return self
 
 
+class RecordConfig(EvaluateConfig):
+    """cartpole-record: what is run is said as for an evaluation."""
+
+
 class FinetuneConfig(Settings):
     """cartpole-finetune."""
 
@@ -245,33 +244,79 @@ class FinetuneConfig(Settings):
     resume: str | None
 
 
+class ReplayConfig(Settings):
+    """cartpole-replay."""
+
+    source: Annotated[Path, Field(alias="from")]
+    cart: dict[str, Finite]
+    cart_friction: CartFrictionSettings
+    pole_friction: PoleFrictionSettings
+    pole: PoleSettings | None = None
+    plant: SimulatedSettings
+    actuator: Actuator
+    parameters: dict[str, Finite] | None
+    restart: Annotated[float, Field(ge=0.1, le=60)]
+    label: str
+
+
+class IdentifyConfig(Settings):
+    """cartpole-identify."""
+
+    source: Annotated[Path | None, Field(alias="from")]
+    plant: Annotated[EmulatedSettings | RealSettings, Field(discriminator="kind")]
+    emulator: EmulatorSettings
+    cart: dict[str, Finite]
+    pole: PoleSettings
+    pole_friction: PoleFrictionSettings
+    control_period: Annotated[float, Field(ge=0.005, le=0.1)]
+    windows: Annotated[int, Field(ge=20, le=5000)]
+    substeps: Annotated[int, Field(ge=1, le=200)]
+    carts: Count
+    seed: Seed
+    label: str
+    threads: Count | None
+
+    @property
+    def nominal(self) -> dict[str, float]:
+        """What is thought of the cart before. Raises ConfigError."""
+        if self.pole.choices is None or len(self.pole.choices) > 1:
+            raise ConfigError(
+                f"pole: a cart carries one pole, not {self.pole.name}; choose it, as pole=medium"
+            )
+        values = {**self.cart, **self.pole_friction.parameters, **self.pole.nominal.model_dump()}
+        check_values(values)
+        return values
+
+
+class ModelConfig(Settings):
+    """cartpole-model."""
+
+    source: Annotated[tuple[Path, ...], Field(alias="from", min_length=1)]
+    cart: dict[str, Finite]
+    pole_friction: PoleFrictionSettings
+    pole: PoleSettings | None = None
+    actuator: Actuator
+    windows: Annotated[int, Field(ge=10, le=10_000)]
+    ensemble: EnsembleSettings
+    seed: Seed
+    label: str
+    threads: Count | None
+
+    @field_validator("source", mode="before")
+    @classmethod
+    def _one_or_several(cls, source: Any) -> Any:
+        return [source] if isinstance(source, str) else source
+
+
+class PreflightConfig(Settings):
+    """cartpole-preflight."""
+
+    plant: Annotated[EmulatedSettings | RealSettings, Field(discriminator="kind")]
+    emulator: EmulatorSettings
+    home_timeout: Positive  # s
+
+
 class EmulateConfig(Settings):
     """cartpole-emulate."""
 
     emulator: EmulatorSettings
-
-
-Config = TypeVar("Config", bound=Settings)
-
-
-def checked(schema: type[Config], values: Mapping[str, Any]) -> Config:
-    """`values` as `schema`. Raises ConfigError that names each key that is wrong, and what would be right."""
-    try:
-        return schema(**values)
-    except ValidationError as error:
-        complaints = (_complaint(detail, values) for detail in error.errors())
-        raise ConfigError("; ".join(complaints)) from None
-
-
-def _complaint(detail: Mapping[str, Any], values: Mapping[str, Any]) -> str:
-    key = KINDS.sub("", ".".join(map(str, detail["loc"])))
-    if detail["type"] == "extra_forbidden":
-        return no_such_setting(key, (name for name in setting_names(values) if not name.startswith(key)))
-    if detail["type"] == "missing":
-        return f"{key} is missing; give {key}=..."
-    reason = detail["msg"].removeprefix("Value error, ")
-    if not key:
-        return reason
-    reason = reason[0].lower() + reason[1:]
-    value = "null" if detail["input"] is None else detail["input"]
-    return f"{key}={value}: {reason}" if isinstance(value, int | float | str) else f"{key}: {reason}"

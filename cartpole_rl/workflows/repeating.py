@@ -1,26 +1,21 @@
 """repeat=: one episode of an earlier evaluation again, the same simulated cart from the same start."""
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import yaml
-from hydra.core.hydra_config import HydraConfig
 
-from cartpole_rl.commands.build import simulated_carts
-from cartpole_rl.commands.config import EvaluateConfig, checked
-from cartpole_rl.commands.report import read_origin
-from cartpole_rl.commands.run_folder import CONFIG, METRICS, check_program
-from cartpole_rl.envs import CartPoleEnv
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.evaluation.episodes import Policy, run_batch
-from cartpole_rl.plants.simulated import OF_CHANCE, SimulatedPlant
-from cartpole_rl.randomization import Pole
-from cartpole_rl.tasks.episode import Episode, Origin
-
-FREE = ("run", "repeat.run", "repeat.episode", "label")  # settings that a repetition takes
+from cartpole_rl.randomization.poles import Pole
+from cartpole_rl.tasks.episode import Origin
+from cartpole_rl.workflows.checking import checked
+from cartpole_rl.workflows.checks import simulated_carts
+from cartpole_rl.workflows.config import EvaluateConfig
+from cartpole_rl.workflows.origins import read_origin
+from cartpole_rl.workflows.run_folder import CONFIG, METRICS, check_program
 
 
 @dataclass(frozen=True)
@@ -32,17 +27,6 @@ class Repetition:
     row: int  # of the batch: sums of another batch, or in another row, are rounded in another order
     score: float  # then
 
-    @property
-    def left_to_chance(self) -> list[str]:
-        """The parameters of this cart that keep it from being driven exactly alike."""
-        return [name for name in OF_CHANCE if self.origin.parameters[name] != 0]
-
-    def drive(self, env: CartPoleEnv, policy: Policy) -> Iterator[Episode]:
-        """The episode."""
-        assert isinstance(env.plant, SimulatedPlant)
-        env.plant.start_from(self.origin.state)
-        yield run_batch(env, policy)[self.row]
-
 
 def repetition(config: EvaluateConfig) -> Repetition | None:
     """Return the episode that `config` repeats; None where it repeats none. Raises ConfigError."""
@@ -51,9 +35,6 @@ def repetition(config: EvaluateConfig) -> Repetition | None:
         return None
     if run is None:
         raise ConfigError("repeat.run is missing; give repeat.run=..., the run folder of an evaluation")
-    given = HydraConfig.get().overrides.task
-    if others := [word for word in given if word.lstrip("+").split("=")[0] not in FREE]:
-        raise ConfigError(f"repeat takes that evaluation's own settings; leave out {', '.join(others)}")
     recorded, metrics = read_evaluation(run)
     count = len(metrics["episodes"])
     if number is None:

@@ -1,0 +1,33 @@
+"""Where a run folder keeps its checkpoints, without reading them."""
+
+from pathlib import Path
+
+from cartpole_rl.errors import CheckpointError
+
+FOLDER, LAST, BEST, RESUME = "checkpoints", "last.pt", "best.pt", "resume.pt"
+
+
+def find_agent(run: Path) -> Path:
+    """The checkpoint file that `run` means: itself, or the last one of a run folder."""
+    if not run.exists():
+        raise CheckpointError(
+            f"run={run}: there is no such file or folder; give a run folder or a checkpoint"
+        )
+    if run.is_file():
+        return run
+    path = run / FOLDER / LAST
+    if not path.exists():
+        raise CheckpointError(f"run={run}: it holds no {FOLDER}/{LAST}; give the folder of a training")
+    return path
+
+
+def find_training(run: Path) -> Path:
+    """The file that the training in the folder `run` can resume from. Raises CheckpointError."""
+    if not run.is_dir():
+        raise CheckpointError(f"resume={run}: there is no such folder; give the run folder of a training")
+    path = run / FOLDER / RESUME
+    if not path.exists():
+        raise CheckpointError(
+            f"resume={run}: it holds no {FOLDER}/{RESUME}; give the folder of a training that came so far"
+        )
+    return path

@@ -1,0 +1,30 @@
+"""Checks that a cart, its poles and their ranges make sense, before anything is drawn."""
+
+from collections.abc import Mapping
+
+from cartpole_rl.errors import ConfigError
+from cartpole_rl.physics.bounds import check_names, check_values
+from cartpole_rl.randomization.poles import Pole, PoleSettings
+from cartpole_rl.randomization.ranges import Range
+
+
+def check_carts(cart: Mapping[str, float], poles: PoleSettings, ranges: Mapping[str, Range]) -> None:
+    """Raise ConfigError where no such carts can be drawn.
+
+    A name is unknown, a nominal value is impossible, a range reaches an impossible value, or `cart` has a
+    number of the pole's.
+    """
+    for name in Pole.model_fields:
+        if name in cart:
+            raise ConfigError(f"{name} belongs to the pole, not to the cart: choose another pole")
+    nominal = {**cart, **poles.nominal.model_dump()}
+    check_values(nominal)
+    check_names(ranges)
+    for name, line in ranges.items():
+        for pole in possible_poles(poles):
+            line.check(name, {**nominal, **pole.model_dump()}[name])
+
+
+def possible_poles(poles: PoleSettings) -> list[Pole]:
+    """The choices; a rod of random length is as possible as the one of middle length."""
+    return [poles.nominal] if poles.choices is None else list(poles.choices.values())

@@ -1,0 +1,1 @@
+"""The work of each command as functions of checked settings and a folder: the Python API, free of Hydra."""

@@ -1,0 +1,151 @@
+"""What can be found wrong with settings before anything that takes long to import is needed.
+
+Commands call these before they import the work. The work relies on none of it: it checks again what it reads.
+"""
+
+import os
+import shutil
+import sys
+import sysconfig
+from collections.abc import Mapping
+from pathlib import Path
+
+from cartpole_rl.errors import ConfigError
+from cartpole_rl.learning.checkpoint_files import FOLDER, LAST, find_agent, find_training
+from cartpole_rl.physics.bounds import check_names, check_value, check_values
+from cartpole_rl.plants.model_file import find_model
+from cartpole_rl.randomization.checks import check_carts
+from cartpole_rl.randomization.poles import PoleSettings
+from cartpole_rl.workflows.config import (
+    EvaluateConfig,
+    FinetuneConfig,
+    IdentifyConfig,
+    LearnedSettings,
+    ModelConfig,
+    ReplayConfig,
+    TrainConfig,
+)
+from cartpole_rl.workflows.recordings import experiments, recordings
+from cartpole_rl.workflows.run_folder import PREFIX, check_program, has_ended, program_of, use_of
+
+BASELINE = Path("lqr")  # run=lqr is no folder: the controller that learned nothing
+LARGEST_BATCH = 1024  # carts that an evaluation simulates at once
+LONGER = {  # command: how to go further than a run that has ended
+    "train": "cartpole-train with more learning.frames makes a longer training",
+    "finetune": "cartpole-finetune run={0} lets it learn on",
+}
+
+
+def check_training(config: TrainConfig) -> None:
+    """Raise CartPoleError where a new training cannot start."""
+    if config.compile:
+        check_compiler()
+    check_carts(config.nominal, config.pole, config.ranges)
+    if isinstance(config.plant, LearnedSettings):
+        check_model(config.plant)
+
+
+def check_evaluation(config: EvaluateConfig) -> None:
+    """Raise CartPoleError where no agent or no cart of these settings can be found."""
+    if config.run != BASELINE:
+        check_agent(config.run)
+    if isinstance(config.plant, LearnedSettings):
+        check_model(config.plant)
+    check_parameters(config.parameters or {})
+
+
+def check_finetuning(config: FinetuneConfig) -> Path:
+    """Return the run that is fine-tuned. Raises CartPoleError where it cannot be."""
+    if config.run is None:
+        raise ConfigError("run is missing; give run=..., the run folder of a training")
+    if config.compile:
+        check_compiler()
+    check_agent(config.run)
+    return config.run
+
+
+def check_replay(config: ReplayConfig) -> None:
+    """Raise CartPoleError where there is no recording, or the cart or its pole make no sense."""
+    recordings(config.source)
+    if config.pole is not None:
+        check_one_pole("a replay", config.pole)
+    friction = {**config.cart_friction.parameters, **config.pole_friction.parameters}
+    check_parameters({**config.cart, **friction, **(config.parameters or {})})
+
+
+def check_modelling(config: ModelConfig) -> None:
+    """Raise CartPoleError where there is no recording, or more than one pole is chosen."""
+    for source in config.source:
+        recordings(source)
+    if config.pole is not None:
+        check_one_pole("a model", config.pole)
+
+
+def check_identification(config: IdentifyConfig) -> None:
+    """Raise CartPoleError where the cart before any measurement, or the recordings, make no sense."""
+    check_values(config.nominal)
+    if config.source is not None:
+        experiments(config.source)
+
+
+def check_resumable(program: str, resume: str, folder: Path) -> None:
+    """Raise CartPoleError where cartpole-<program> cannot go on with the run `resume` in `folder`."""
+    run = Path(resume)
+    check_program("resume", run, program)
+    if run.is_dir() and not folder.samefile(run):
+        raise ConfigError("resume goes on in that run's own folder; leave out hydra.run.dir")
+    if has_ended(run):
+        raise ConfigError(
+            f"resume={run}: this run of {PREFIX}{program} has ended; cartpole-evaluate run={run} drives its "
+            f"agent, {LONGER[program].format(run)}"
+        )
+    find_training(run)
+
+
+def check_agent(run: Path) -> None:
+    """Raise ConfigError or CheckpointError where `run` is no run folder or file with an agent."""
+    check_has_agent(run)
+    find_agent(run)
+
+
+def check_has_agent(run: Path) -> None:
+    """Raise ConfigError where `run` is a run folder without an agent, with what can be done with it."""
+    check_program("run", run, "train", "finetune")
+    if (program := program_of(run)) and not (run / FOLDER / LAST).exists():
+        raise ConfigError(
+            f"run={run}: this run of {PREFIX}{program} has no agent yet; {use_of(run, program)}"
+        )
+
+
+def check_model(plant: LearnedSettings) -> None:
+    """Raise CheckpointError or ConfigError where plant.model= names no learned model."""
+    check_program("plant.model", plant.model, "model")
+    find_model(plant.model)
+
+
+def check_one_pole(what: str, pole: PoleSettings) -> None:
+    """Raise ConfigError where `what`, which has one pole, is given several."""
+    if pole.choices is None or len(pole.choices) > 1:
+        raise ConfigError(f"pole: {what} has one pole, not {pole.name}; choose one, as pole=medium")
+
+
+def check_parameters(given: Mapping[str, float]) -> None:
+    """Raise ConfigError for an unknown name or an impossible value."""
+    check_names(given)
+    for name, value in given.items():
+        check_value(name, value)
+
+
+def simulated_carts(config: EvaluateConfig) -> int:
+    """How many carts an evaluation simulates at once: one an episode, up to LARGEST_BATCH."""
+    return min(config.episodes, LARGEST_BATCH)
+
+
+def check_compiler() -> None:
+    """Raise ConfigError where torch.compile has no C++ compiler or no header of Python to build with."""
+    compiler = os.environ.get("CXX", {"darwin": "clang++", "win32": "cl"}.get(sys.platform, "g++"))
+    header = Path(sysconfig.get_path("include"), "Python.h")
+    if shutil.which(compiler) is None:
+        raise ConfigError(f"compile=true finds no C++ compiler {compiler}: install it, or give compile=false")
+    if not header.exists():
+        raise ConfigError(f"compile=true finds no {header}: install Python's headers, or give compile=false")

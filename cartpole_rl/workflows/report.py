@@ -1,0 +1,40 @@
+"""Writes what episodes were worth: metrics.json, and figures of them."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from cartpole_rl.evaluation.metrics import episode_metrics, summarize
+from cartpole_rl.randomization.poles import PoleSettings
+from cartpole_rl.reporting.animation import write_gif
+from cartpole_rl.reporting.figures import behaviour, learning_curve, save
+from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.workflows.origins import stored_origins
+from cartpole_rl.workflows.run_folder import METRICS, write_json
+
+
+def report(
+    folder: Path,
+    episodes: Sequence[Episode],
+    plant: str,
+    pole: PoleSettings,
+    x_max: float,
+    link: Mapping[str, int] | None = None,
+    history: Sequence[Mapping[str, float]] = (),
+) -> dict[str, Any]:
+    """Write metrics.json and figures/ into `folder`; returns what `summarize` makes of the episodes.
+
+    The behaviour and the animation show the first episode; `history` adds the learning curve.
+    """
+    figures = [episode_metrics(episode, x_max) for episode in episodes]
+    summary = summarize(figures)
+    head = {"plant": plant, "pole": pole.name, **(link or {})}
+    cart, origins = stored_origins(episodes)
+    told = [{**figure, **origin} for figure, origin in zip(figures, origins, strict=True)]
+    write_json(folder / METRICS, {**head, **summary, **cart, "episodes": told})
+    pictures = folder / "figures"
+    save(behaviour(episodes[0], f"First episode, plant={plant}", x_max), pictures / "behaviour.png")
+    write_gif(episodes[0], pictures / "episode.gif", 2 * pole.nominal.pole_com, x_max, f"plant={plant}")
+    if history:
+        save(learning_curve([("score", list(history))]), pictures / "learning_curve.png")
+    return summary

@@ -1,0 +1,25 @@
+"""The training or fine-tuning that resume= goes on with: one that was stopped before its end."""
+
+from pathlib import Path
+
+from cartpole_rl.learning.checkpoints import (
+    FINETUNING_FORMAT,
+    TRAINING_FORMAT,
+    TrainingCheckpoint,
+    load_training,
+)
+from cartpole_rl.workflows.checks import check_resumable
+
+FORMATS = {"train": TRAINING_FORMAT, "finetune": FINETUNING_FORMAT}
+
+
+def resumed(program: str, resume: str | None, folder: Path) -> TrainingCheckpoint | None:
+    """Return what cartpole-<program> goes on with in `folder`; None for a new run.
+
+    Raises ConfigError where the run has ended or is one of another command; CheckpointError where there is
+    nothing to go on from.
+    """
+    if resume is None:
+        return None
+    check_resumable(program, resume, folder)
+    return load_training(Path(resume), FORMATS[program])

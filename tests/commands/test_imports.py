@@ -1,0 +1,174 @@
+"""Help, completion and complaints come before any work, and so before what takes seconds to import."""
+
+import importlib
+import json
+import os
+import pkgutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+import cartpole_rl
+from cartpole_rl.settings import Settings
+
+SHOWS = (("--help", 0, ""), ("--cfg job", 0, ""), ("seeed=1", 2, "seeed: there is no such setting"))
+COMPLAINS = {  # command: words, exit code, part of the line on stderr
+    "emulate": [("emulator.latency=2", 2, "less than or equal to 1")],
+    "evaluate": [
+        ("run=nowhere", 1, "run=nowhere: there is no such file or folder"),
+        ("run=lqr repeat.run=nowhere seed=1", 2, "leave out seed=1"),
+        ("run=lqr parameters={latency:1}", 2, "latency is 1"),
+        ("run=lqr parameters={latencyy:1}", 2, "did you mean 'latency'?"),
+        ("run=lqr plant=learned plant.model=nowhere", 1, "plant.model=nowhere: there is no such file"),
+    ],
+    "find_port": [("timeout=0", 2, "greater than 0")],
+    "finetune": [
+        ("run=nowhere", 1, "run=nowhere: there is no such file or folder"),
+        ("resume=nowhere", 1, "resume=nowhere: there is no such folder"),
+        ("finetuning.epsilon=0.5", 2, "less than or equal to 0.2"),
+    ],
+    "identify": [
+        ("from=nowhere", 1, "from=nowhere: there is no such folder"),
+        ("pole=range", 2, "choose it, as pole=medium"),
+    ],
+    "model": [
+        ("from=nowhere", 1, "from=nowhere: there is no such file or folder"),
+        ("from=nowhere windows=1", 2, "greater than or equal to 10"),
+    ],
+    "preflight": [("plant.port=nowhere home_timeout=0", 2, "greater than 0")],
+    "record": [("run=nowhere", 1, "run=nowhere: there is no such file or folder")],
+    "replay": [("from=nowhere", 1, "from=nowhere: there is no such file or folder")],
+    "train": [
+        ("resume=nowhere", 1, "resume=nowhere: there is no such folder"),
+        ("seed=abc", 2, "valid integer"),
+        ("agent.gamma=1.5", 2, "less than 1"),
+        ("agent.hidden=[7]", 2, "even numbers of units"),
+        ("cart.cart_mass=-1", 2, "cart_mass is -1"),
+        ("randomization.cart_mass.relative=[-1.5,0]", 2, "it must be above 0"),
+        ("pole=tiny", 2, "both, large, medium, range"),
+    ],
+}
+WORK = {  # what only work needs
+    "gymnasium",
+    "matplotlib",
+    "mujoco",
+    "scipy",
+    "tensorboard",
+    "tensordict",
+    "torch",
+    "torchrl",
+}
+RUN_IN_TURN = """
+import contextlib, io, json, sys
+from hydra.core.global_hydra import GlobalHydra
+from cartpole_rl.commands.{command} import main
+
+runs = []
+for words in {words}:
+    GlobalHydra.instance().clear()
+    sys.argv[1:] = words.split()
+    code, said = 0, io.StringIO()
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(said):
+        try:
+            main()
+        except SystemExit as ended:
+            code = ended.code
+    runs.append((code, said.getvalue(), sorted({{name.partition(".")[0] for name in sys.modules}})))
+print(json.dumps(runs))
+"""
+IMPORT = """
+import json, sys
+{statement}
+print(json.dumps(sorted({{name.partition(".")[0] for name in sys.modules}})))
+"""
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a command came to, and the top-level modules of its process by then."""
+
+    code: int
+    said: str
+    modules: set[str]
+
+
+def process(script: str, folder: Path, **environment: str) -> str:
+    """The last line that a script prints in a process of its own."""
+    done = subprocess.run(
+        [sys.executable, "-c", script],
+        cwd=folder,
+        env={**os.environ, **environment},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.splitlines()[-1]
+
+
+def in_turn(command: str, *words: str, folder: Path, **environment: str) -> list[Run]:
+    """What `cartpole-<command>` comes to with each of `words`, in one process."""
+    script = RUN_IN_TURN.format(command=command, words=repr(words))
+    runs = json.loads(process(script, folder, **environment))
+    return [Run(code, said, set(modules)) for code, said, modules in runs]
+
+
+def modules_after(statement: str, folder: Path) -> set[str]:
+    """Top-level modules of a process after `statement`."""
+    return set(json.loads(process(IMPORT.format(statement=statement), folder)))
+
+
+def test_every_command_is_here() -> None:
+    folder = Path(cartpole_rl.__file__).parent / "commands"
+    assert {path.stem for path in folder.glob("*.py") if "__main__" in path.read_text()} == {*COMPLAINS}
+
+
+@pytest.mark.parametrize("command", COMPLAINS)
+def test_it_helps_and_complains_without_what_work_needs(command: str, tmp_path: Path) -> None:
+    cases = [*SHOWS, *COMPLAINS[command]]
+    runs = in_turn(command, *(words for words, _, _ in cases), folder=tmp_path)
+    for (words, code, said), run in zip(cases, runs, strict=True):
+        assert run.code == code, words
+        assert said in run.said, words
+        assert run.modules & {*WORK, "numpy"} == set(), words
+
+
+def test_a_missing_port_is_told_without_pytorch(tmp_path: Path) -> None:
+    (run,) = in_turn("preflight", "plant.port=nowhere", folder=tmp_path)
+    assert run.code == 1
+    assert run.modules & WORK == set()
+
+
+def test_completion_needs_no_work(tmp_path: Path) -> None:
+    line = {"COMP_LINE": "cartpole-train opt", "COMP_POINT": "18", "COMP_CWORD": "1"}
+    (run,) = in_turn("train", "-sc query=bash", folder=tmp_path, **line)
+    assert run.code == 0
+    assert run.modules & {*WORK, "numpy"} == set()
+
+
+def test_what_is_imported_for_the_work_is_quiet_too(tmp_path: Path) -> None:
+    quiet = "from cartpole_rl.commands.application import quieten; quieten(); import logging, torchrl"
+    level = "assert logging.getLogger('torchrl').getEffectiveLevel() == logging.WARNING"
+    assert "torchrl" in modules_after(f"{quiet}; {level}", tmp_path)
+
+
+def settings_classes() -> Iterator[type[Settings]]:
+    """Every settings class of the package."""
+    for module in pkgutil.walk_packages(cartpole_rl.__path__, "cartpole_rl."):
+        if not module.name.endswith("__main__"):
+            importlib.import_module(module.name)
+    kinds = [Settings]
+    while kinds:
+        kind = kinds.pop()
+        kinds.extend(kind.__subclasses__())
+        yield kind
+
+
+def test_a_settings_class_needs_no_work(tmp_path: Path) -> None:
+    """All modules that define one are imported together."""
+    names = {kind.__module__ for kind in settings_classes() if kind.__module__.startswith("cartpole_rl.")}
+    assert len(names) > 10
+    assert modules_after(f"import {', '.join(sorted(names))}", tmp_path) & WORK == set()
