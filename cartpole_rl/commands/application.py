@@ -12,7 +12,6 @@ import warnings
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from types import FrameType
 from typing import NoReturn, TypeVar
 
 import hydra
@@ -28,7 +27,7 @@ from cartpole_rl.commands.complaints import dashed_setting, in_one_line
 from cartpole_rl.commands.composition import as_mapping
 from cartpole_rl.errors import CartPoleError, ConfigError
 from cartpole_rl.settings import Settings
-from cartpole_rl.signals import ending_signals
+from cartpole_rl.signals import RaiseOnce, ending_signals
 from cartpole_rl.workflows.checking import checked
 from cartpole_rl.workflows.person import tell
 
@@ -72,8 +71,10 @@ def application(name: str, schema: type[Config]) -> Callable[[Body[Config]], Cal
 
         def main() -> None:
             given[:] = sys.argv[1:]
-            for number in ending_signals():
-                signal.signal(number, _terminate)
+            handler = RaiseOnce(_ended)
+            handler.handle(*ending_signals())
+            if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
+                handler.handle(signal.SIGINT)
             os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra's errors come here, not to the screen
             try:
                 if dashed := dashed_setting(sys.argv[1:]):
@@ -124,5 +125,6 @@ def remove_if_empty(folder: Path) -> None:
             folder.rmdir()
 
 
-def _terminate(number: int, frame: FrameType | None) -> NoReturn:
-    raise Terminated(number)
+def _ended(number: int) -> BaseException:
+    """What a signal raises."""
+    return KeyboardInterrupt() if number == signal.SIGINT else Terminated(number)

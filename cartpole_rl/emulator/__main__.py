@@ -10,9 +10,10 @@ import sys
 
 from pydantic import ValidationError
 
-from cartpole_rl.emulator.process import end_with_parent, run
+from cartpole_rl.emulator.process import run
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import CartPoleError, ConfigError
+from cartpole_rl.signals import end_with_parent
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -4,8 +4,6 @@ import json
 import os
 import signal
 import sys
-import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
@@ -15,8 +13,6 @@ from cartpole_rl.emulator.device import CartDevice
 from cartpole_rl.emulator.link import Channel, PtyLink
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.signals import ending_signals
-
-PARENT_POLL = 0.5  # s
 
 
 def run(settings: EmulatorSettings) -> None:
@@ -47,14 +43,3 @@ def until_stopped() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def end_with_parent(parent: int) -> None:
-    """From now on, stop as on SIGTERM once process `parent` is no longer the parent."""
-
-    def watch() -> None:
-        while os.getppid() == parent:
-            time.sleep(PARENT_POLL)
-        os.kill(os.getpid(), signal.SIGTERM)
-
-    threading.Thread(target=watch, name="parent watch", daemon=True).start()

@@ -9,13 +9,13 @@ import gc
 import multiprocessing
 import os
 import signal
-from collections.abc import Callable
-from contextlib import closing
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from multiprocessing.connection import Connection
-from types import FrameType, TracebackType
-from typing import Any, NoReturn
+from types import TracebackType
+from typing import Any
 
 import numpy as np
 import torch
@@ -30,7 +30,7 @@ from cartpole_rl.plants.link_statistics import LinkStatistics
 from cartpole_rl.plants.serial import SerialPlant
 from cartpole_rl.plants.serial_faults import Confirm, nobody
 from cartpole_rl.scheduling import compute_first
-from cartpole_rl.signals import ending_signals
+from cartpole_rl.signals import RaiseOnce, end_with_parent, ending_signals
 from cartpole_rl.tasks.episode import Episode
 
 GRACE = 5.0  # s from SIGTERM to SIGKILL
@@ -101,8 +101,9 @@ class Driver:
         return self._process.pid
 
     def start(self, drive: Drive) -> None:
-        """Begin an episode, and return at once."""
-        self._ours.send(drive)
+        """Begin an episode, and return at once. Raises LinkError if the process died."""
+        with _alive():
+            self._ours.send(drive)
 
     def result(self) -> Driven:
         """Wait for the episode that was begun. Raises what ended it before it had begun, LinkError if the
@@ -130,22 +131,29 @@ class Driver:
         self.close()
 
     def _receive(self) -> Any:
-        try:
-            while isinstance(answer := self._ours.recv(), Question):
-                self._ours.send(self._confirm(answer.text))
-        except (EOFError, ConnectionResetError):
-            raise LinkError("the process that drives the cart has died; start again with resume=") from None
+        with _alive():
+            answer = self._ours.recv()
+        while isinstance(answer, Question):
+            agreed = self._confirm(answer.text)
+            with _alive():
+                self._ours.send(agreed)
+                answer = self._ours.recv()
         if isinstance(answer, BaseException):
             raise answer
         return answer
 
 
+@contextmanager
+def _alive() -> Iterator[None]:
+    """Raise LinkError where the other end of the pipe is gone."""
+    try:
+        yield
+    except (EOFError, ConnectionError):
+        raise LinkError("the process that drives the cart has died; start again with resume=") from None
+
+
 class _Ended(BaseException):
     """SIGTERM or SIGHUP came, or the parent is gone: unwinds, so that the motor is stopped."""
-
-
-def _end(number: int, frame: FrameType | None) -> NoReturn:
-    raise _Ended
 
 
 def _serve(
@@ -156,9 +164,9 @@ def _serve(
     real_time: bool,
     parent: int,
 ) -> None:
-    for number in ending_signals():
-        signal.signal(number, _end)
+    RaiseOnce(_Ended).handle(*ending_signals())
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent gets it too, and ends this one
+    end_with_parent(parent)
     torch.set_num_threads(1)
     try:
         policy = DrivingPolicy(make_policy(), compiled)
@@ -171,7 +179,7 @@ def _serve(
                 pipe.send(_drive(env, policy, pipe.recv(), parent))
     except CartPoleError as error:
         pipe.send(error)
-    except (_Ended, EOFError, BrokenPipeError, ConnectionResetError):
+    except (_Ended, EOFError, ConnectionError):
         pass
 
 

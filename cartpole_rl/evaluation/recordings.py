@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from cartpole_rl.errors import RecordingError
+from cartpole_rl.files import replacing
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
 
@@ -32,9 +33,7 @@ COLUMNS = (*STATE, *COUNTS, "motor", *STEP)
 
 def write_recording(path: Path, episode: Episode, facts: Mapping[str, Any] | None = None) -> None:
     """Write one episode, whole or not at all; `facts` are added to the heading."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_name(f"{path.name}.partial")
-    with beside.open("w", newline="") as file:
+    with replacing(path) as beside, beside.open("w", newline="") as file:
         for key, value in {"format": FORMAT, "ended_by": episode.ended_by, **(facts or {})}.items():
             file.write(f"# {key}: {value}\n")
         lines = csv.writer(file)
@@ -47,7 +46,6 @@ def write_recording(path: Path, episode: Episode, facts: Mapping[str, Any] | Non
                 lines.writerow([*state, *counts, int(episode.motor[row]), *step])
             else:
                 lines.writerow([*state, *counts, "", *[""] * len(STEP)])
-    beside.replace(path)
 
 
 def read_recording(path: Path) -> Episode:

@@ -207,16 +207,19 @@ def conduct(
     The cart stands, with the motor at 0, whenever a recording is handed out: nobody watches it while a file
     is written. The next experiment goes on from there; after an ending by the plant it begins with a reset.
     """
-    task, present = Task(period, np.random.default_rng(seed), BREAKAWAY), plant.reset()
-    for experiment in experiments:
+    task, present, ended = Task(period, np.random.default_rng(seed), BREAKAWAY), plant.reset(), False
+    for number, experiment in enumerate(experiments):
+        if number and not ended:
+            present = driven(plant, present, 0)  # a new frame: the last one is as old as the writing took
+            ended = bool(present["done"])
+        if ended:
+            present = plant.reset()
         recorded, present, breakaway = run(plant, present, and_stop(experiment.moves(task), task))
         task = task._replace(breakaway=breakaway or task.breakaway)
+        ended = recorded.ended_by != Ending.TIME
+        if number + 1 == len(experiments):
+            plant.halt()
         yield experiment, recorded
-        if recorded.ended_by == Ending.TIME:
-            present = driven(plant, present, 0)  # a new frame: the last one is as old as the writing took
-        if recorded.ended_by != Ending.TIME or present["done"]:
-            present = plant.reset()
-    plant.halt()
 
 
 def and_stop(moves: Moves, task: Task) -> Moves:

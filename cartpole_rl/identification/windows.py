@@ -51,7 +51,7 @@ def cut_windows(episodes: Sequence[Episode], period: float, periods: int = 25, m
             )
         regular = np.abs(gaps / period - 1) < IRREGULAR
         padded = np.concatenate((np.zeros(HISTORY), episode.motor))
-        for first in range(0, episode.steps - periods + 1, periods):
+        for first in range(0, episode.measured_steps - periods + 1, periods):
             if regular[max(0, first - HISTORY) : first + periods].all():
                 counts.append(episode.counts[first : first + periods + 1])
                 motors.append(padded[first : first + HISTORY + periods])

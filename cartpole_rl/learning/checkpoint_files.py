@@ -1,7 +1,5 @@
 """Where a run folder keeps its checkpoints, without reading them."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 from cartpole_rl.errors import CheckpointError
@@ -33,12 +31,3 @@ def find_training(run: Path) -> Path:
             f"resume={run}: it holds no {FOLDER}/{RESUME}; give the folder of a training that came so far"
         )
     return path
-
-
-@contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """A file beside `path` to write to; it takes the place of `path` at the end, whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_name(f"{path.name}.partial")
-    yield beside
-    beside.replace(path)

@@ -1,7 +1,6 @@
 """Checkpoints: an agent with all that is needed to use it, and the state that training resumes from.
 
-Files are written beside their place and renamed into it, so that a kill at any moment leaves the old one
-whole.
+A kill or a power cut at any moment leaves the old file whole (`cartpole_rl.files`).
 """
 
 from collections.abc import Mapping
@@ -13,7 +12,8 @@ import torch
 from torch import nn
 
 from cartpole_rl.errors import CheckpointError
-from cartpole_rl.learning.checkpoint_files import FOLDER, RESUME, find_agent, find_training, replacing
+from cartpole_rl.files import replacing
+from cartpole_rl.learning.checkpoint_files import FOLDER, RESUME, find_agent, find_training
 
 AGENT_FORMAT = "cartpole_rl agent 1"
 TRAINING_FORMAT = "cartpole_rl training 2"

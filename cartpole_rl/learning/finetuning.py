@@ -26,19 +26,20 @@ def recorded_chunk(
     over: Callable[[RecordedPlant], CartPoleEnv],
     motors: Sequence[int],
     pole_length: float | None,
-) -> TensorDictBase:
+) -> TensorDictBase | None:
     """The one-step transitions [1, T] of an episode, as the environment `over` a recording sees them.
 
-    `pole_length` m is that of the cart which was driven, None if it is not known.
+    `pole_length` m is that of the cart which was driven, None if it is not known. The last step before a lost
+    link is left out: nothing was measured at its end. None is left of an episode that has no other step.
     """
     env = over(RecordedPlant(episode, pole_length))
     index = {motor: action for action, motor in enumerate(motors)}
     present, taken = env.reset(), []
-    for motor in episode.motor.tolist():
+    for motor in episode.motor[: episode.measured_steps].tolist():
         present["action"] = torch.tensor([index[motor]])
         transition, present = env.step_and_maybe_reset(present)
         taken.append(transition.select(*COLLECTED))
-    return torch.stack(taken, 1)
+    return torch.stack(taken, 1) if taken else None
 
 
 class Finetuning(Training):
@@ -50,8 +51,10 @@ class Finetuning(Training):
         self.recorded: TensorDictBase | None = None
         self._chooser = torch.Generator().manual_seed(0)
 
-    def add(self, chunk: TensorDictBase) -> None:
-        """Learn from one more recorded episode."""
+    def add(self, chunk: TensorDictBase | None) -> None:
+        """Learn from one more recorded episode, if there is anything in it."""
+        if chunk is None:
+            return
         transitions = n_step_transitions(chunk, self.settings.n_step, self.agent.settings.gamma)
         known = self.recorded
         self.recorded = transitions if known is None else torch.cat((known, transitions))

@@ -217,7 +217,7 @@ class Training:
         self.agent.load_state_dict(snapshot["agent"])
         self.optimizer.load_state_dict(snapshot["optimizer"])
         restore_replay(self.replay, snapshot["replay"])
-        self.returns.restore(snapshot.get("returns"))  # older checkpoints have none: nothing was held back
+        self.returns.restore(snapshot["returns"])
         self.collector.restore(snapshot["collector"])
         self.env.plant.restore(snapshot["plant"])
         restore_random_state(snapshot["random"])

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 
 from cartpole_rl.errors import CheckpointError
+from cartpole_rl.files import replacing
 from cartpole_rl.physics.bounds import check_values
 from cartpole_rl.physics.models import Actuator, CartFriction, Integrator, Models, PoleFriction
 from cartpole_rl.physics.residual import PLACES, Residual
@@ -29,8 +30,6 @@ class LearnedModel:
 
 def save_model(path: Path, model: LearnedModel) -> None:
     """Write what `load_model` reads, whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_name(f"{path.name}.partial")
     laws = {
         name: value if isinstance(value, bool) else str(value)
         for name, value in model.models._asdict().items()
@@ -42,8 +41,8 @@ def save_model(path: Path, model: LearnedModel) -> None:
         "substeps": model.substeps,
         "residual": {name: part.detach() for name, part in model.residual._asdict().items()},
     }
-    torch.save({"format": FORMAT, **content}, beside)
-    beside.replace(path)
+    with replacing(path) as beside:
+        torch.save({"format": FORMAT, **content}, beside)
 
 
 def load_model(source: Path) -> LearnedModel:

@@ -168,7 +168,7 @@ class SerialPlant(Plant):
         elif abs(state.cart_counts) >= limit or state.fault:
             self.ended_by = "track"
         elif not self.cart.flags & Flags.ARMED:
-            self.ended_by = "link"
+            self.ended_by, self._hanging = "link", None
             self.last_error = LinkError("the cart is not armed any more: it has restarted; check its power")
         if self.ended_by:
             self.halt()
@@ -176,7 +176,7 @@ class SerialPlant(Plant):
     def _break_off(self, error: PlantError) -> None:
         """End the episode for want of a state: with the counts that came last, the motor taken as 0."""
         self.ended_by, self.last_error = "fault" if isinstance(error, FaultError) else "link", error
-        self._driving = False
+        self._driving, self._hanging = False, None
         if isinstance(error, LinkError):
             self.cart.close()
         else:

@@ -65,6 +65,7 @@ Answer = TypeVar("Answer", bound=Message)
 HALF_MILLISECOND = 500  # us
 OVERTAKEN_TICKS = 16  # 0.3 s: nothing keeps a frame back for longer, and no cart boots and is driven so soon
 BACKLOG_BYTES = 1000  # with more waiting, the system's buffer (4096) may have thrown newer bytes away
+WATCHDOG_PERIODS = 3  # without a command, after which the cart sets its motor to 0
 RESTARTED = "the cart has restarted; check its power"
 UNACKNOWLEDGED_PERIODS = 1.5  # of a frame: by then the state after it has come, if the frame has
 
@@ -109,6 +110,7 @@ class SerialCart:
         self._newest: State | None = None  # arrived, and not yet given to anyone
         self._newest_at = 0.0
         self._last: State | None = None  # the newest that came, given out or not
+        self._stopped_clock: LinkError | None = None  # to be raised with the next state
         self._missing: set[int] = set()  # ticks that were counted as lost, and may still come late
         self._answers: deque[Message] = deque(maxlen=64)
         self._refused: Nack | None = None  # of a SET_MOTOR
@@ -155,6 +157,7 @@ class SerialCart:
             raise
         finally:
             self.statistics = driving
+            self._missing.clear()
         self._open_link.statistics = driving
         return self._information
 
@@ -203,7 +206,7 @@ class SerialCart:
     def clear_fault(self) -> None:
         """Clear the latched faults. Raises FaultError, naming them, if the cause of one is still there."""
         self._request(ClearFault(), Ack)
-        state = self.get_state()
+        state = self._state_since_question()
         if state.fault:
             raise fault_error(state.fault)
 
@@ -226,8 +229,8 @@ class SerialCart:
             if error.reason != Reason.BUSY or not self._is_homing():
                 raise  # otherwise only the ACK was lost
         deadline, restarts = time.perf_counter() + timeout, self.restarts
+        state = self._state_since_question()
         while True:
-            state = self._current_state()
             if state.fault:
                 raise fault_error(state.fault)
             if self.restarts > restarts:
@@ -240,12 +243,17 @@ class SerialCart:
                 raise PlantError(
                     f"homing was not done after {timeout:g} s: clear the track, let the pole hang"
                 )
+            state = self._current_state()
 
     def set_motor(self, value: int) -> int:
-        """Send a motor value; returns what was sent, which is `value` within the cart's limits."""
+        """Send a motor value; returns what was sent.
+
+        That is `value` within the cart's limits, or 0 where it answers a state from so long ago that the
+        cart's watchdog has stopped the motor. Raises LinkError where that was longer ago than `timeout`.
+        """
         link = self._link
         limit = max(0, self.information.motor_limit)  # whatever INFO says, 0 stays 0
-        sent = max(-limit, min(limit, int(value)))
+        sent = self._in_time(max(-limit, min(limit, int(value))))
         self._refused_sequence = -1
         link.send(SetMotor(sent))
         if self._unanswered:
@@ -257,6 +265,21 @@ class SerialCart:
                 self.statistics.latency.add(delay)
                 self._overdue = self._answering if delay > self.information.period_us * 1e-6 else None
         return sent
+
+    def _in_time(self, motor: int) -> int:
+        """The motor value, or 0 where it is too late for it; see `set_motor`.
+
+        If no newer state waits, no time has passed for the cart, as on a lockstep emulator.
+        """
+        if not motor or not self._unanswered or not self._link.waiting():
+            return motor
+        late = time.perf_counter() - self._newest_at
+        if late > self.settings.timeout:  # somebody may have moved the cart meanwhile
+            raise LinkError(
+                f"this computer did not answer the cart on {self.port} for {late:.1f} s; end what keeps it "
+                "busy, and do not suspend a command that drives"
+            )
+        return 0 if late > WATCHDOG_PERIODS * self.information.period_us * 1e-6 else motor
 
     @contextmanager
     def unmeasured(self) -> Iterator[None]:
@@ -381,6 +404,9 @@ class SerialCart:
     def _current_state(self) -> State:
         """`get_state` without the question after a backlog."""
         state = self._await_current(time.perf_counter() + self.settings.timeout)
+        stopped_clock, self._stopped_clock = self._stopped_clock, None
+        if stopped_clock is not None:
+            raise stopped_clock
         refused, self._refused = self._refused, None
         if refused is not None and not state.fault:
             raise refusal(refused)
@@ -388,6 +414,18 @@ class SerialCart:
         self._time_loop(state)
         self._catching_up, self._unanswered, self._answering = False, True, state
         return state
+
+    def _state_since_question(self) -> State:
+        """The first state that was measured after the cart took the newest question. Raises LinkError."""
+        deadline = time.perf_counter() + self.settings.timeout
+        while True:
+            state = self._current_state()
+            if (state.last_sequence - self._asked_sequence) % 256 < 128:
+                return state
+            if time.perf_counter() > deadline:
+                raise LinkError(
+                    f"the states of the cart on {self.port} acknowledge no frame; correct its firmware"
+                )
 
     def _await_current(self, deadline: float) -> State:
         """The newest state that acknowledges the last frame; when that is overdue, the newest there is."""
@@ -458,7 +496,7 @@ class SerialCart:
             if went_back(ticks):
                 self.restarts += 1
             else:
-                self._check_clock(last, state)
+                self._check_clock(last, state, ticks)
                 self._count_missing(state.tick, ticks - 1)
         if self._newest is not None:
             self._count_late()
@@ -468,11 +506,15 @@ class SerialCart:
         self._newest_at = self._link.received_at
         self.flags = flags
 
-    def _check_clock(self, last: State, state: State) -> None:
-        """Raise LinkError if the cart's clock did not advance between two states: no velocity follows."""
+    def _check_clock(self, last: State, state: State, ticks: int) -> None:
+        """Note it if the cart's clock did not advance between two states: no velocity follows.
+
+        After 36 minutes without a state the clock may have wrapped, and tells nothing.
+        """
         passed = microseconds_between(last.time_us, state.time_us)
-        if passed == 0 or went_back(passed):
-            raise LinkError(
+        long_ago = went_back(ticks * min(self.information.period_us, LONGEST_PERIOD_US))
+        if passed == 0 or (went_back(passed) and not long_ago):
+            self._stopped_clock = LinkError(
                 f"the clock of the cart on {self.port} does not advance: STATE {last.tick} is of "
                 f"{last.time_us} us, STATE {state.tick} of {state.time_us} us; correct its firmware"
             )

@@ -38,6 +38,11 @@ class Episode:
     origin: Origin | None = None  # of an episode on a simulated cart
 
     @property
+    def measured_steps(self) -> int:
+        """Control periods whose outcome was measured: all, but for the last one before a lost link."""
+        return self.steps - (self.ended_by == "link")
+
+    @property
     def steps(self) -> int:
         """Control periods in the episode."""
         return len(self.motor)

@@ -10,7 +10,8 @@ import numpy as np
 from tqdm import tqdm
 
 from cartpole_rl.evaluation.metrics import episode_metrics
-from cartpole_rl.learning.checkpoint_files import BEST, FOLDER, LAST, replacing
+from cartpole_rl.files import replacing
+from cartpole_rl.learning.checkpoint_files import BEST, FOLDER, LAST
 from cartpole_rl.learning.checkpoints import AgentCheckpoint, TrainingCheckpoint, save_agent, save_training
 from cartpole_rl.learning.training import Scalars, Training
 from cartpole_rl.plants.simulated import SimulatedPlant

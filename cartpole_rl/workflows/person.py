@@ -10,6 +10,7 @@ def confirm(text: str) -> bool:
         return False
     print(f"{text}.", file=sys.stderr)
     print("Check the cart. It homes as soon as you confirm: keep the track clear.", file=sys.stderr)
+    forget_typed()
     try:
         input("Press Enter to go on, Ctrl-C to stop. ")
     except EOFError:
@@ -21,3 +22,16 @@ def tell(name: str, message: str) -> None:
     """One line on stderr, if that still leads anywhere: a closed terminal does not."""
     with suppress(OSError):
         print(f"cartpole-{name.replace('_', '-')}: {message}", file=sys.stderr)
+
+
+def forget_typed() -> None:
+    """Throw away what was typed before: it answers no question that is asked now."""
+    try:
+        import termios
+    except ImportError:  # Windows
+        import msvcrt
+
+        while msvcrt.kbhit():  # type: ignore[attr-defined]
+            msvcrt.getwch()  # type: ignore[attr-defined]
+        return
+    termios.tcflush(sys.stdin, termios.TCIFLUSH)

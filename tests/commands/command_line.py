@@ -27,6 +27,7 @@ TINY = (
     "task.time_limit=60",
     "compile=false",
 )
+HANDLED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # by a command; a test wants its own back
 ONCE = "learning.evaluations=1"  # most of a tiny training's time goes into pictures of its evaluations
 
 
@@ -49,7 +50,7 @@ class Outcome:
 def in_process(command: str, *words: str, folder: Path) -> Outcome:
     """`cartpole-<command> words...`, with `folder` as the working directory."""
     GlobalHydra.instance().clear()
-    handler = signal.getsignal(signal.SIGTERM)
+    handlers = {number: signal.getsignal(number) for number in HANDLED}
     out, err, code = io.StringIO(), io.StringIO(), 0
     main = importlib.import_module(f"cartpole_rl.commands.{command}").main
     with (
@@ -63,7 +64,8 @@ def in_process(command: str, *words: str, folder: Path) -> Outcome:
         except SystemExit as exit_:
             code = int(exit_.code or 0)
         finally:
-            signal.signal(signal.SIGTERM, handler)
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
     return Outcome(code, out.getvalue(), err.getvalue())
 
 

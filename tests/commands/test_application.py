@@ -7,11 +7,12 @@ from pathlib import Path
 from unittest.mock import patch
 
 import pytest
+from command_line import HANDLED
 from hydra.core.global_hydra import GlobalHydra
 
 from cartpole_rl.commands.application import application
 from cartpole_rl.commands.find_port import FindPortConfig
-from cartpole_rl.signals import ending_signals
+from cartpole_rl.signals import UNWINDING, RaiseOnce, ending_signals
 
 
 def run_until_signalled(number: signal.Signals, folder: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
@@ -39,7 +40,7 @@ def run_until_signalled(number: signal.Signals, folder: Path, monkeypatch: pytes
 
 @pytest.fixture(autouse=True)
 def handlers() -> object:
-    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)}
+    before = {number: signal.getsignal(number) for number in HANDLED}
     yield
     for number, handler in before.items():
         signal.signal(number, handler)
@@ -57,6 +58,20 @@ def test_a_signal_unwinds_the_work(
     signal.signal(number, signal.SIG_DFL)
     assert run_until_signalled(number, tmp_path, monkeypatch) == ["unwound", f"exit code {code}"]
     assert capsys.readouterr().err == "cartpole-find-port: terminated\n"
+
+
+def test_a_second_signal_does_not_interrupt_the_unwinding(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A `with` that stops a motor gets to its end; a program that hangs can be ended later."""
+    handler = RaiseOnce(lambda number: InterruptedError(number))
+    handler.handle(*HANDLED)
+    with pytest.raises(InterruptedError, match=str(int(signal.SIGHUP))):
+        os.kill(os.getpid(), signal.SIGHUP)
+    for number in HANDLED:
+        os.kill(os.getpid(), number)
+    clock = time.monotonic()
+    monkeypatch.setattr(time, "monotonic", lambda: clock + 2 * UNWINDING)
+    with pytest.raises(InterruptedError, match=str(int(signal.SIGTERM))):
+        os.kill(os.getpid(), signal.SIGTERM)
 
 
 def test_a_hangup_that_nohup_ignores_stays_ignored() -> None:

@@ -59,6 +59,7 @@ BOTH: Table = {
     "agent.loss": ("l2", SILENT),
     "agent.target_tau": (None, "4.1.2: the network is copied"),
     "agent.average_decay": (None, "not named"),
+    "learning.carry": (False, SILENT),
     "replay.kind": ("uniform", "5: typically equally distributed"),
     "replay.alpha": (0.0, UNREAD),
     "replay.beta": ([1.0, 1.0], UNREAD),

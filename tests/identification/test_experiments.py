@@ -13,11 +13,15 @@ from cartpole_rl.identification.experiments import (
     EXPERIMENTS,
     HELD_OUT,
     REACH,
+    Experiment,
+    Moves,
     Seen,
+    Task,
     conduct,
     excite,
     free_swing,
     guarded,
+    hold,
 )
 from cartpole_rl.identification.identify import Identification, identify, prediction_errors
 from cartpole_rl.identification.quantities import quantities
@@ -86,6 +90,22 @@ def test_the_swing_is_wide_and_free(recordings: dict[str, Episode]) -> None:
     swing = recordings["swing"]
     assert np.abs(swing.theta - np.pi).max() > np.radians(60)
     assert not swing.motor[-round(7.5 / PERIOD) :].any()
+
+
+def test_nothing_is_asked_of_the_cart_after_the_last_experiment(make_plant: Callable) -> None:
+    """Also where it ended by a fault or off the track: everything is recorded then."""
+
+    def push(task: Task) -> Moves:
+        yield from hold(255, 3.0, task)
+        return None
+
+    plant, resets = make_plant(1, cart={"track_half_length": 0.05}), []
+    reset = plant._reset
+    plant._reset = lambda *given, **named: resets.append(1) or reset(*given, **named)
+    experiments = tuple(Experiment(name, "nothing", push) for name in ("first", "last"))
+    endings = [episode.ended_by for _, episode in conduct(plant, PERIOD, experiments=experiments)]
+    assert endings == ["track", "track"]
+    assert len(resets) == 2
 
 
 def test_recordings_follow_each_other_on_one_cart(recordings: dict[str, Episode]) -> None:
@@ -238,7 +258,9 @@ class TestChecks:
 def changed(episode: Episode, **changes: Callable[[np.ndarray], np.ndarray]) -> Episode:
     """The episode with other columns; `cart` and `pole` are its counts."""
     values = {
-        name: getattr(episode, name).copy() for name in episode.__dataclass_fields__ if name != "ended_by"
+        name: getattr(episode, name).copy()
+        for name in episode.__dataclass_fields__
+        if name not in ("ended_by", "origin")
     }
     for name, change in changes.items():
         if name in ("cart", "pole"):

@@ -6,9 +6,10 @@ import pytest
 import torch
 
 from cartpole_rl.errors import CheckpointError
-from cartpole_rl.learning.checkpoint_files import replacing
+from cartpole_rl.files import replacing
 from cartpole_rl.learning.checkpoints import (
     FINETUNING_FORMAT,
+    TRAINING_FORMAT,
     AgentCheckpoint,
     TrainingCheckpoint,
     forget_training,
@@ -69,7 +70,7 @@ def test_weights_that_are_not_finite_are_neither_written_nor_read(value: float, 
     assert "is refused: its weight w is not finite" in complaint(load_agent, tmp_path / LAST)
     torch.save(
         {
-            "format": "cartpole_rl training 1",
+            "format": TRAINING_FORMAT,
             "config": {},
             "state": {"agent": diverged.weights},
             "frames": 20,

@@ -1,6 +1,7 @@
 """What fine-tuning learns from: a cart's own transitions are what the agent saw while it drove."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -89,6 +90,22 @@ def test_a_recording_has_what_the_agent_saw_and_tunes_it(
     after = dict(agent.named_parameters())
     assert any(not torch.equal(after[name], weight) for name, weight in before.items())
     assert all(weight.isfinite().all() for weight in after.values())
+
+
+def test_what_nobody_measured_is_not_learned_from(make_plant: Callable, make_environment: Callable) -> None:
+    """The last counts are repeated where the link is lost: as if the cart had stopped at once."""
+    episode, _ = drive(make_plant, make_environment, {})
+    lost = replace(episode, ended_by="link")
+    whole, chunk = (
+        recorded_chunk(each, lambda plant: make_environment(plant, MOTORS, time_limit=40), MOTORS, None)
+        for each in (episode, lost)
+    )
+    assert chunk.shape[1] == lost.measured_steps == whole.shape[1] - 1
+    torch.testing.assert_close(chunk["next", "observation"], whole["next", "observation"][:, :-1])
+    assert not chunk["next", "done"].any()
+    only = replace(lost, **{name: getattr(lost, name)[:1] for name in ("motor", "score", "reward")})
+    env = make_environment
+    assert recorded_chunk(only, lambda plant: env(plant, MOTORS), MOTORS, None) is None
 
 
 def test_a_length_that_is_observed_but_not_known_is_an_error(

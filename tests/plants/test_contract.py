@@ -10,11 +10,12 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
+import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from serial_peer import CartPeer
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 
 from cartpole_rl.errors import PlantError
 from cartpole_rl.evaluation.episodes import run_batch
@@ -54,7 +55,8 @@ said = st.fixed_dictionaries(
         "last_sequence": sane | sane | st.integers(0, 255),
     }
 )
-values = st.lists(st.floats(width=32), min_size=len(MOTORS), max_size=len(MOTORS))
+value = st.one_of(*4 * [st.floats(-1, 1, width=32)], st.floats(width=32))
+values = st.lists(value, min_size=len(MOTORS), max_size=len(MOTORS))
 
 
 @dataclass
@@ -65,9 +67,14 @@ class Script:
     values: list[list[float]]
 
 
-scripts = st.builds(
+SOUND = {"ticks": 1} | dict.fromkeys(
+    ("time_us", "cart_counts", "pole_counts", "fault", "flags", "motor_applied", "last_sequence")
+)
+scripts = st.builds(  # sound states first, so that the rest is said in every period of an episode
     Script,
-    st.lists(said, min_size=1, max_size=PERIODS),
+    st.tuples(st.integers(0, PERIODS), st.lists(said, min_size=1, max_size=PERIODS)).map(
+        lambda parts: parts[0] * [SOUND] + parts[1]
+    ),
     st.lists(values, min_size=PERIODS, max_size=PERIODS),
 )
 
@@ -140,6 +147,18 @@ def test_a_serial_cart_that_says_anything(script: Script, make_environment: Call
             assert not any(motor_of(frame) for frame in peer.received[ended_at:])
             finite = [all(map(math.isfinite, script.values[row])) for row in range(episode.steps)]
             assert all(motor == 0 or known for motor, known in zip(episode.motor, finite, strict=True))
+
+
+@pytest.mark.parametrize("motor", [300, -400, 40_000, -(2**40)])
+def test_a_motor_value_beyond_the_limit_is_cut_to_it(motor: int) -> None:
+    """Whatever a loop gives to the plant; SET_MOTOR could not even carry the largest."""
+    with CartPeer() as peer:
+        plant = SerialPlant(SerialPlantSettings(port=peer.port, **QUICK))
+        plant.reset()
+        plant.step(TensorDict({"motor": torch.tensor([[motor]])}, [1]))
+        sent = peer.messages(SetMotor)[-1].motor
+        plant.close()
+    assert sent == math.copysign(255, motor)
 
 
 def drive_on(env: Any) -> None:

@@ -294,6 +294,61 @@ class TestStates:
             with pytest.raises(LinkError, match=rf"does not advance: STATE {before.tick} is of"):
                 cart.get_state()
 
+    def test_a_clock_that_may_have_wrapped_unseen_is_believed(self) -> None:
+        """A person may take an hour to answer a question; nobody reads states meanwhile."""
+        for minutes in (1, 30, 40, 60, 71, 75, 140):
+            with CartPeer(paced=True) as peer, SerialCart(settings(peer.port)) as cart:
+                peer.tick()
+                before = cart.get_state()
+                ticks = minutes * 60 * 50
+                time_us = (before.time_us + ticks * 20_000) % 2**32
+                peer.tick(tick=before.tick + ticks, time_us=time_us, cart_counts=7)
+                assert cart.get_state().cart_counts == 7
+
+    def test_a_command_that_comes_too_late_is_0(self) -> None:
+        """The cart's watchdog has stopped the motor long ago; newer states wait to be read."""
+        with CartPeer(paced=True) as peer, SerialCart(settings(peer.port, timeout=2.0)) as cart:
+            peer.tick()
+            cart.get_state()
+            peer.tick()
+            wait_for(lambda: cart._link.waiting() > 0)
+            cart._newest_at -= 0.07
+            assert cart.set_motor(200) == 0
+            cart.get_state()
+            assert cart.set_motor(200) == 200
+            peer.tick(last_sequence=peer.state.last_sequence)
+            cart.get_state()
+            peer.tick()
+            wait_for(lambda: cart._link.waiting() > 0)
+            cart._newest_at -= 3.0
+            with pytest.raises(LinkError, match=r"did not answer the cart on .* for 3\.\d s"):
+                cart.set_motor(200)
+            assert cart.set_motor(0) == 0
+        assert [message.motor for message in peer.messages(SetMotor)] == [0, 0, 200, 0, 0]
+
+    def test_time_that_passes_for_the_host_alone_makes_no_command_late(self) -> None:
+        with CartPeer() as peer, SerialCart(settings(peer.port)) as cart:
+            cart.get_state()
+            cart._newest_at -= 100.0
+            assert cart.set_motor(200) == 200
+
+    def test_a_state_overtaken_while_opening_is_not_counted_back(self) -> None:
+        with CartPeer() as peer:
+            answer = CartPeer.answer
+            late: list[bytes] = []
+
+            def lose_one(frame: Frame) -> Iterable[bytes]:
+                if not late:
+                    late.append(peer.next_state())
+                yield from answer(peer, frame)
+
+            peer.answer = lose_one
+            with SerialCart(settings(peer.port)) as cart:
+                cart.statistics.lost_frames = 5
+                peer.send(late[0])
+                cart.poll_state()
+                assert cart.statistics.lost_frames == 5
+
     def test_statistics_of_all_connections_are_kept(self) -> None:
         """A reconnection adds to them, but neither a boot banner nor what was said before it does."""
         with CartPeer(boot=b"ets Jul 29 2019\r\n\x00", paced=True) as peer:

@@ -1,0 +1,52 @@
+"""The person at the terminal: asked over a real pseudo-terminal."""
+
+import os
+import pty
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from cartpole_rl.workflows.person import confirm
+
+ASK = """
+import sys
+from cartpole_rl.workflows.person import confirm
+print("ready", flush=True)
+open(sys.argv[1]).read()  # waits until the test has typed ahead
+print("agreed" if confirm("the cart latched a fault: STALL") else "not agreed", flush=True)
+"""
+
+
+def read_until(master: int, words: bytes, deadline: float = 60) -> bytes:
+    """What the terminal shows, up to and with `words`."""
+    seen, end = b"", time.monotonic() + deadline
+    while words not in seen:
+        assert time.monotonic() < end, seen
+        seen += os.read(master, 1000)
+    return seen
+
+
+def test_an_enter_from_before_the_question_does_not_answer_it(tmp_path: Path) -> None:
+    gate = tmp_path / "gate"
+    os.mkfifo(gate)
+    master, slave = pty.openpty()
+    asking = subprocess.Popen([sys.executable, "-c", ASK, str(gate)], stdin=slave, stdout=slave, stderr=slave)
+    try:
+        read_until(master, b"ready")
+        os.write(master, b"\n\n")
+        gate.write_text("go on")
+        shown = read_until(master, b"Ctrl-C to stop. ")
+        assert b"the cart latched a fault: STALL." in shown
+        assert asking.poll() is None
+        os.write(master, b"\n")
+        assert b"not agreed" not in read_until(master, b"agreed")
+    finally:
+        asking.kill()
+        asking.wait()
+        os.close(slave)
+        os.close(master)
+
+
+def test_nobody_is_asked_without_a_terminal() -> None:
+    assert not confirm("the cart latched a fault")
