@@ -12,10 +12,10 @@ from cartpole_rl.wire import Message
 
 
 class Journal:
-    """Appends to the file `path` as things happen."""
+    """Writes to the new file `path` as things happen. Raises FileExistsError: no file is overwritten."""
 
     def __init__(self, path: Path) -> None:
-        self._file = path.open("a", buffering=1)
+        self._file = path.open("x", buffering=1)
         self._motor = 0
 
     def took(self, us: int, message: Message) -> None:

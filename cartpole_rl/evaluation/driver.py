@@ -10,7 +10,7 @@ import multiprocessing
 import os
 import signal
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from multiprocessing.connection import Connection
@@ -164,23 +164,39 @@ def _serve(
     real_time: bool,
     parent: int,
 ) -> None:
-    RaiseOnce(_Ended).handle(*ending_signals())
+    endings = ending_signals()
+    RaiseOnce(_Ended).handle(*endings)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent gets it too, and ends this one
     end_with_parent(parent)
     torch.set_num_threads(1)
-    try:
-        policy = DrivingPolicy(make_policy(), compiled)
-        with closing(make_env(partial(_ask, pipe))) as env:
-            if compiled:
-                env.hardware.compile_arithmetic()
-            rehearse(env, policy)
-            pipe.send(real_time and compute_first())
-            while True:
-                pipe.send(_drive(env, policy, pipe.recv(), parent))
-    except CartPoleError as error:
-        pipe.send(error)
-    except (_Ended, EOFError, ConnectionError):
-        pass
+    with suppress(_Ended, EOFError, ConnectionError):
+        try:
+            _drive_on_demand(
+                pipe, make_env, DrivingPolicy(make_policy(), compiled), compiled, real_time, parent
+            )
+        except CartPoleError as error:
+            pipe.send(error)
+        finally:
+            for number in endings:  # the motor is off; nothing is left to unwind
+                signal.signal(number, signal.SIG_IGN)
+
+
+def _drive_on_demand(
+    pipe: Connection,
+    make_env: MakeEnv,
+    policy: DrivingPolicy,
+    compiled: bool,
+    real_time: bool,
+    parent: int,
+) -> None:
+    """Drive an episode for each `Drive` that comes, until the pipe ends."""
+    with closing(make_env(partial(_ask, pipe))) as env:
+        if compiled:
+            env.hardware.compile_arithmetic()
+        rehearse(env, policy)
+        pipe.send(real_time and compute_first())
+        while True:
+            pipe.send(_drive(env, policy, pipe.recv(), parent))
 
 
 def _ask(pipe: Connection, text: str) -> bool:

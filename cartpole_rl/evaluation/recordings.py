@@ -26,6 +26,7 @@ STATE = {  # column: field of Episode
     "theta_dot_rad_per_s": "theta_dot",
 }
 STEP = {"score": "score", "score_upright": "score_upright", "reward": "reward"}
+LARGEST_MOTOR = 255
 COUNTS = ("cart_counts", "pole_counts")
 LENGTH = "pole_length_m"  # in the heading: twice pivot to centre of mass, empty if not known
 COLUMNS = (*STATE, *COUNTS, "motor", *STEP)
@@ -81,8 +82,20 @@ def read_recording(path: Path) -> Episode:
         motor = np.array([int(row["motor"]) for row in rows[:-1]])
     except (ValueError, TypeError) as error:
         raise RecordingError(f"{path} is damaged: {error}") from None
-    if not all(np.isfinite(values).all() for values in (*columns.values(), *steps.values())):
-        raise RecordingError(f"{path} is damaged: a number in it is not finite")
-    if not (np.diff(columns["time"]) > 0).all():
-        raise RecordingError(f"{path} is damaged: its time does not increase from row to row")
+    _check_numbers(path, {**columns, **steps}, motor)
     return Episode(**columns, **steps, counts=counts, motor=motor, ended_by=ended_by)
+
+
+def _check_numbers(path: Path, columns: Mapping[str, np.ndarray], motor: np.ndarray) -> None:
+    """Raise RecordingError for a number that is not finite, a time that stands still, an impossible motor value."""
+
+    def damaged(row: int, what: str) -> RecordingError:
+        return RecordingError(f"{path} is damaged: {what} in row {row + 1}; record it again, or leave it out")
+
+    for name, values in columns.items():
+        if not np.isfinite(values).all():
+            raise damaged(int(np.flatnonzero(~np.isfinite(values))[0]), f"{name} is not finite")
+    if not (steps := np.diff(columns["time"]) > 0).all():
+        raise damaged(int(np.flatnonzero(~steps)[0]) + 1, "the time does not increase")
+    if (beyond := np.abs(motor) > LARGEST_MOTOR).any():
+        raise damaged(int(np.flatnonzero(beyond)[0]), f"a motor value is beyond {LARGEST_MOTOR}")

@@ -93,7 +93,11 @@ def identify(
     contenders = [now for now, then in zip(tried, screened, strict=True) if now is not then]
     best = min(contenders, key=lambda each: each.error)
     chosen, fit = models._replace(cart_friction=best.law), widened(best, contenders)
-    return Identification(fit, chosen, tried, predicted(held_out, fit, chosen, period, substeps), doubts(fit))
+    cut = [each.ended_by for each in (*episodes, *held_out) if each.ended_by in ("link", "fault")]
+    doubted = [f"{len(cut)} of the recordings ended early, by {' and '.join(sorted({*cut}))}"] if cut else []
+    return Identification(
+        fit, chosen, tried, predicted(held_out, fit, chosen, period, substeps), doubted + doubts(fit)
+    )
 
 
 def lead(period: float, substeps: int) -> float:

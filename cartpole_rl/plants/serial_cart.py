@@ -168,7 +168,11 @@ class SerialCart:
         try:
             self.stop()
         except PlantError as error:
-            LOGGER.warning("the cart did not confirm that it is disarmed (%s); its watchdog stops it", error)
+            LOGGER.warning(
+                "the cart did not confirm that it is disarmed (%s); its watchdog stops it, but if it was homing "
+                "switch it off",
+                error,
+            )
         finally:
             self._let_go(self._open_link)
 

@@ -24,10 +24,10 @@ REASONS: dict[int, str] = {
     Reason.UNKNOWN_TYPE: "it does not know this message: update its firmware",
     Reason.BAD_LENGTH: "the payload has the wrong length: update its firmware, or this program",
     Reason.OUT_OF_RANGE: "the value is out of range",
-    Reason.NOT_HOMED: "it is not homed: call home() first",
-    Reason.NOT_ARMED: "its motor is not armed: call start() first",
-    Reason.FAULT_LATCHED: "a fault is latched: remove its cause, then call clear_fault()",
-    Reason.BUSY: "it is busy, armed or homing: call stop() first, or wait until it is homed",
+    Reason.NOT_HOMED: "it is not homed",
+    Reason.NOT_ARMED: "its motor is not armed; has it restarted?",
+    Reason.FAULT_LATCHED: "a fault is latched: remove its cause, and start again",
+    Reason.BUSY: "it is armed or homing; wait until it is homed, or stop it first",
     Reason.BAD_VERSION: "it speaks another protocol version: update its firmware, or this program",
 }
 
@@ -37,7 +37,7 @@ FAULTS: dict[Fault, str] = {
     Fault.CART_ENCODER: "the cart's encoder does not answer (check its cable)",
     Fault.POLE_ENCODER: "the pole's encoder does not answer (check its cable)",
     Fault.HOMING: "homing failed: a stop was not found, the span was off by over 3 %, or the pole did not "
-    "come to rest (clear the track, let the pole hang, home again)",
+    "come to rest (clear the track, let the pole hang, check the cart encoder's cable)",
 }
 
 
@@ -62,4 +62,4 @@ def fault_words(bits: int) -> str:
 
 def fault_error(bits: int) -> FaultError:
     """The error that names every fault in `bits`, each with its remedy."""
-    return FaultError(f"the cart latched a fault: {fault_words(bits)}; then clear_fault()")
+    return FaultError(f"the cart latched a fault: {fault_words(bits)}")

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 
 from cartpole_rl.errors import PlantError
 from cartpole_rl.physics.encoders import POLE_COUNTS_PER_TURN
-from cartpole_rl.plants.serial_cart import SerialCart
+from cartpole_rl.plants.serial_cart import RESTARTED, SerialCart
 from cartpole_rl.plants.serial_errors import NotReadyError
 from cartpole_rl.plants.serial_faults import FaultClearing
 from cartpole_rl.plants.serial_information import NANOMETRES_PER_COUNT, check_limits, check_scales
@@ -151,10 +151,13 @@ def preflight(
     }
     try:
         for name, check in checks.items():
+            restarts = cart.restarts
             try:
                 finding = Finding(name, True, check())
             except PlantError as error:
                 finding = Finding(name, False, str(error))
+            if cart.restarts > restarts:  # whatever the check made of it
+                finding = Finding(name, False, RESTARTED)
             yield finding
             if not finding.ready:
                 return
@@ -263,13 +266,13 @@ def pole_direction(moves: Moves) -> str:
         swung = round(after.pole_counts - before.pole_counts - drift * period)
         if abs(swung) >= enough or metres(abs(after.cart_counts - before.cart_counts)) > FARTHEST_PUSH:
             break
-    moves.centre()
     if abs(swung) < enough:
         raise NotReadyError(
             f"the pole's count does not follow a push of the cart; it changed by {swung:+d}, and swung by "
             f"{swing} before",
             "check the cable of the pole's encoder, and that the pole is screwed to its shaft",
         )
+    moves.centre()
     if swung < 0:
         raise NotReadyError(
             f"a push to the right moves the hanging pole's count down, by {-swung}",

@@ -84,9 +84,9 @@ class RealSettings(Settings):
     """plant=serial."""
 
     kind: Literal["serial"]
-    port: str
+    port: Annotated[str, Field(min_length=1)]
     baud: Count
-    pole_length: Positive | None
+    pole_length: Annotated[float, Field(gt=0, le=3)] | None
     rehome: Literal["once", "always"] = "once"
     clear_faults: Annotated[int, Field(ge=0)] = 0
 

@@ -1,6 +1,6 @@
 """Run whole episodes of a trained agent, in simulation or on a cart, and report what they are worth."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from cartpole_rl.learning.randomness import seed_everything
 from cartpole_rl.plants.serial import SerialPlant
 from cartpole_rl.plants.simulated import OF_CHANCE, SimulatedPlant
 from cartpole_rl.reporting.table import interval_text, table
+from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.build import evaluated_agent, evaluated_env, evaluated_settings, use_threads
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
@@ -57,11 +58,20 @@ def evaluate(config: EvaluateConfig, folder: Path, baseline: TrainConfig | None 
             link = link_figures(env)
             summary = report(folder, episodes, plant, settings.pole, x_max, link)
             print(score_table(summary, f"plant={plant}, {count_text(len(episodes))}"))
+            for line in cut_off(episodes):
+                print(line)
             if again:
                 print(compared(again, episodes[0]))
             if link.get("latency_override"):
                 print(f"latency as measured, for cartpole-train: '{link['latency_override']}'")
             print(f"{folder}/{METRICS} and figures/ are written")
+
+
+def cut_off(episodes: Sequence[Episode]) -> Iterator[str]:
+    """A warning for each reason that ended episodes from outside the task: their scores are in the means."""
+    for ending in (Ending.LINK, Ending.FAULT, Ending.NON_FINITE):
+        if count := sum(episode.ended_by == ending for episode in episodes):
+            yield f"warning: {count} of {count_text(len(episodes))} ended early by {ending}, see docs/safety.md"
 
 
 def driven(env: CartPoleEnv, policy: Policy, episodes: int, again: Repetition | None) -> Iterator[Episode]:

@@ -11,8 +11,9 @@ def confirm(text: str) -> bool:
     print(f"{text}.", file=sys.stderr)
     print("Check the cart. It homes as soon as you confirm: keep the track clear.", file=sys.stderr)
     forget_typed()
+    print("Press Enter to go on, Ctrl-C to stop. ", end="", file=sys.stderr, flush=True)
     try:
-        input("Press Enter to go on, Ctrl-C to stop. ")
+        input()
     except EOFError:
         return False
     return True

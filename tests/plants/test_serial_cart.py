@@ -509,7 +509,7 @@ class TestAnswers:
     def test_a_refused_motor_value_is_raised_where_the_state_is_read(self) -> None:
         with Refusing(SetMotor, Reason.NOT_ARMED) as peer, SerialCart(settings(peer.port)) as cart:
             cart.set_motor(10)
-            with pytest.raises(RefusedError, match=re.escape("not armed: call start() first")):
+            with pytest.raises(RefusedError, match=re.escape("not armed; has it restarted?")):
                 cart.get_state()
             assert cart.get_state()
 

@@ -89,13 +89,12 @@ class TellingCart:
     """The emulated cart, and what it has told since `listen`."""
 
     def __init__(self, journal: Path) -> None:
-        journal.touch()
-        self._told = journal.open("rb")
         self.process = subprocess.Popen(
             [sys.executable, "-c", EMULATOR, str(journal)], stdout=subprocess.PIPE
         )
         assert self.process.stdout is not None
         self.port = json.loads(self.process.stdout.readline())["port"]
+        self._told = journal.open("rb")
         self.listen()
 
     def listen(self) -> None:
