@@ -15,7 +15,7 @@ from cartpole_rl.settings import NonNegative, Positive, Settings
 Share = Annotated[
     float, Field(allow_inf_nan=False, ge=0, le=0.9)
 ]  # of all frames; over 0.9 hardly anything gets through
-MotorValue = Annotated[float, Field(allow_inf_nan=False, ge=0, le=255)]
+MotorValue = Annotated[float, Field(ge=0, le=255)]
 Coefficient = Annotated[float, Field(allow_inf_nan=False)]
 
 
@@ -29,16 +29,12 @@ class EmulatorSettings(Settings):
     pole_mass: Positive = 0.129  # kg
     pole_com: Positive = 0.1765  # m, pivot to centre of mass
     pole_inertia: Positive = 1.22e-3  # kg m^2, about the centre of mass
-    track_half_length: Annotated[float, Field(allow_inf_nan=False, ge=0.1, le=10)] = (
-        0.409  # m, middle to a stop
-    )
+    track_half_length: Annotated[float, Field(ge=0.1, le=10)] = 0.409  # m, middle to a stop
 
     cart_viscous: NonNegative = 0.65  # N s/m
     cart_coulomb_left: NonNegative = 0.58  # N, while the cart moves left
     cart_coulomb_right: NonNegative = 0.53  # N, while the cart moves right
-    cart_stiction_ratio: Annotated[float, Field(allow_inf_nan=False, ge=1, le=10)] = (
-        1.2  # breakaway force / Coulomb friction
-    )
+    cart_stiction_ratio: Annotated[float, Field(ge=1, le=10)] = 1.2  # breakaway force / Coulomb friction
     cogging: NonNegative = 0.0  # N, amplitude of a force ripple along the track
     cogging_pitch: Positive = 0.04  # m, of that ripple: a turn of the pinion
     pole_viscous: NonNegative = 3.0e-4  # N m s
@@ -47,27 +43,15 @@ class EmulatorSettings(Settings):
 
     force_curve: tuple[Coefficient, Coefficient, Coefficient] = (0.0, 0.0198, -0.99)
     # [a, b, c]: F = sign(u) max(0, a u^2 + b |u| + c), N
-    force_asymmetry: Annotated[float, Field(allow_inf_nan=False, ge=-0.9, le=0.9)] = (
-        0.03  # rightward force is (1 + it) times that
-    )
+    force_asymmetry: Annotated[float, Field(ge=-0.9, le=0.9)] = 0.03  # rightward force is (1 + it) times that
     deadband_left: MotorValue = 55.0  # motor values down to minus this give no force
     deadband_right: MotorValue = 60.0  # motor values up to this give no force
-    motor_time_constant: Annotated[float, Field(allow_inf_nan=False, ge=0, le=1)] = (
-        0.005  # s, first-order lag of the force
-    )
-    latency: Annotated[float, Field(allow_inf_nan=False, ge=0, le=1)] = (
-        0.003  # s, from a frame's arrival to its effect
-    )
-    latency_jitter: Annotated[float, Field(allow_inf_nan=False, ge=0, le=1)] = (
-        0.001  # s, each latency is up to this more or less
-    )
+    motor_time_constant: Annotated[float, Field(ge=0, le=1)] = 0.005  # s, first-order lag of the force
+    latency: Annotated[float, Field(ge=0, le=1)] = 0.003  # s, from a frame's arrival to its effect
+    latency_jitter: Annotated[float, Field(ge=0, le=1)] = 0.001  # s, each latency is up to this more or less
 
-    track_tilt: Annotated[float, Field(allow_inf_nan=False, ge=-0.2, le=0.2)] = (
-        0.002  # rad, positive: the right end is lower
-    )
-    angle_offset: Annotated[float, Field(allow_inf_nan=False, ge=-0.5, le=0.5)] = (
-        0.004  # rad, measured angle - true, once homed
-    )
+    track_tilt: Annotated[float, Field(ge=-0.2, le=0.2)] = 0.002  # rad, positive: the right end is lower
+    angle_offset: Annotated[float, Field(ge=-0.5, le=0.5)] = 0.004  # rad, measured angle - true, once homed
 
     frame_loss: Share = 0.0  # share of frames that vanish, in both directions
     frame_corruption: Share = 0.0  # share of frames that arrive with a wrong byte, in both directions
@@ -82,9 +66,7 @@ class EmulatorSettings(Settings):
     boot: Literal["hanging", "anywhere"] = "hanging"  # near the middle and hanging, or anywhere and swinging
     start: Literal["hanging", "upright"] = "hanging"  # what a person's hand does to the pole before START
     journal: Path | None = None  # file that gets a line for each command taken and motor value in force
-    physics_step: Annotated[float, Field(allow_inf_nan=False, ge=1e-5, le=1e-3)] = (
-        5e-4  # s, or just under to fit a period
-    )
+    physics_step: Annotated[float, Field(ge=1e-5, le=1e-3)] = 5e-4  # s, or just under to fit a period
 
     @model_validator(mode="after")
     def _stuck_at_needs_an_encoder(self) -> Self:

@@ -87,7 +87,7 @@ def read_recording(path: Path) -> Episode:
 
 
 def _check_numbers(path: Path, columns: Mapping[str, np.ndarray], motor: np.ndarray) -> None:
-    """Raise RecordingError for a number that is not finite, a time that stands still, an impossible motor value."""
+    """Raise RecordingError for the first number that no cart can have sent."""
 
     def damaged(row: int, what: str) -> RecordingError:
         return RecordingError(f"{path} is damaged: {what} in row {row + 1}; record it again, or leave it out")

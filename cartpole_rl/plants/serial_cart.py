@@ -169,8 +169,8 @@ class SerialCart:
             self.stop()
         except PlantError as error:
             LOGGER.warning(
-                "the cart did not confirm that it is disarmed (%s); its watchdog stops it, but if it was homing "
-                "switch it off",
+                "the cart did not confirm that it is disarmed (%s); its watchdog stops it, unless it was "
+                "homing: then switch it off",
                 error,
             )
         finally:
@@ -515,8 +515,10 @@ class SerialCart:
 
         After 36 minutes without a state the clock may have wrapped, and tells nothing.
         """
+        if self._information is None:  # before the first INFO nobody knows how long a period is
+            return
         passed = microseconds_between(last.time_us, state.time_us)
-        long_ago = went_back(ticks * min(self.information.period_us, LONGEST_PERIOD_US))
+        long_ago = went_back(ticks * min(self._information.period_us, LONGEST_PERIOD_US))
         if passed == 0 or (went_back(passed) and not long_ago):
             self._stopped_clock = LinkError(
                 f"the clock of the cart on {self.port} does not advance: STATE {last.tick} is of "

@@ -71,7 +71,7 @@ def cut_off(episodes: Sequence[Episode]) -> Iterator[str]:
     """A warning for each reason that ended episodes from outside the task: their scores are in the means."""
     for ending in (Ending.LINK, Ending.FAULT, Ending.NON_FINITE):
         if count := sum(episode.ended_by == ending for episode in episodes):
-            yield f"warning: {count} of {count_text(len(episodes))} ended early by {ending}, see docs/safety.md"
+            yield f"warning: {count} of {count_text(len(episodes))} ended early by {ending} (docs/safety.md)"
 
 
 def driven(env: CartPoleEnv, policy: Policy, episodes: int, again: Repetition | None) -> Iterator[Episode]:

@@ -85,7 +85,9 @@ def wait_for(condition: Callable[[], bool]) -> None:
         time.sleep(0.01)
 
 
-def test_a_person_is_asked_and_a_hangup_stops_the_motor(peer: Faulty) -> None:
+def test_a_person_is_asked_and_a_hangup_stops_the_motor(
+    peer: Faulty, capfd: pytest.CaptureFixture[str]
+) -> None:
     """First the person says no, then yes; the terminal is closed while the cart is driven."""
     drive, asked = Drive(as_weights(network()), 0.0, 0), []
 
@@ -97,6 +99,8 @@ def test_a_person_is_asked_and_a_hangup_stops_the_motor(peer: Faulty) -> None:
         driving.start(drive)
         with pytest.raises(FaultError, match=r"the motor was driven but the cart did not move.*confirm"):
             driving.result()
+
+    assert "Traceback" not in capfd.readouterr().err
 
     def agree(text: str) -> bool:
         asked.append(text)

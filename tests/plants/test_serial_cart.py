@@ -294,6 +294,21 @@ class TestStates:
             with pytest.raises(LinkError, match=rf"does not advance: STATE {before.tick} is of"):
                 cart.get_state()
 
+    def test_states_lost_before_the_first_info_are_no_matter(self) -> None:
+        """A cart that is switched on sends states before anybody asks what it is."""
+        with CartPeer(paced=True) as peer:
+            answer = CartPeer.answer
+
+            def state_first(frame: Frame) -> Iterable[bytes]:
+                yield peer.next_state()
+                peer.next_state()  # is lost
+                yield peer.next_state()
+                yield from answer(peer, frame)
+
+            peer.answer = state_first
+            with SerialCart(settings(peer.port)) as cart:
+                assert cart.information.motor_limit == 255
+
     def test_a_clock_that_may_have_wrapped_unseen_is_believed(self) -> None:
         """A person may take an hour to answer a question; nobody reads states meanwhile."""
         for minutes in (1, 30, 40, 60, 71, 75, 140):
