@@ -28,6 +28,16 @@ def episode(
     return recorded
 
 
+def with_cell(text: str, row: int, column: str, value: str) -> str:
+    """The text of a recording with another value in a row, counted from 1."""
+    lines = text.splitlines()
+    first = next(number for number, line in enumerate(lines) if not line.startswith("#"))
+    cells = lines[first + row].split(",")
+    cells[lines[first].split(",").index(column)] = value
+    lines[first + row] = ",".join(cells)
+    return "\n".join(lines) + "\n"
+
+
 def test_a_recording_comes_back_as_it_was(tmp_path: Path, episode: Episode) -> None:
     write_recording(tmp_path / "deep" / "one.csv", episode)
     again = read_recording(tmp_path / "deep" / "one.csv")
@@ -58,6 +68,9 @@ def test_any_reader_of_csv_sees_columns_with_units(tmp_path: Path, episode: Epis
         (lambda text: "\n".join(text.splitlines()[:3]), "lacks"),
         (lambda text: "\n".join(text.splitlines()[:4]), "no control period"),
         (lambda text: text.replace("ended_by: time", "ended_by: luck"), "damaged"),
+        (lambda text: with_cell(text, 2, "theta_rad", "nan"), "theta is not finite in row 2"),
+        (lambda text: with_cell(text, 2, "time_s", "0.0"), "time does not increase in row 2"),
+        (lambda text: with_cell(text, 1, "motor", "999"), "beyond 255 in row 1; record it again"),
         (lambda text: text[: len(text) // 2], "damaged"),
     ],
 )

@@ -151,6 +151,14 @@ class Sluggish(SerialCart):
         return super().set_motor(waiting.pop(0))
 
 
+def test_a_restart_is_a_finding_whatever_the_check_made_of_it() -> None:
+    """The counts begin anew, which looks like wires the wrong way round."""
+    with EmulatedCart(fast(reset_at=28)) as emulated, SerialCart(patient(emulated.port)) as cart:
+        finding = list(preflight(cart))[-1]
+    assert not finding.ready
+    assert finding.words == "the cart has restarted; check its power"
+
+
 def test_a_fault_is_a_finding_with_its_remedy() -> None:
     stuck = fast(stuck_encoder="cart", stuck_at=0.0)
     with EmulatedCart(stuck) as emulated:
