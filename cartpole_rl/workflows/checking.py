@@ -34,6 +34,9 @@ def _complaint(detail: Mapping[str, Any], values: Mapping[str, Any]) -> str:
         return no_such_setting(key, (name for name in setting_names(values) if not name.startswith(key)))
     if detail["type"] == "missing":
         return f"{key} is missing; give {key}=..."
+    if detail["type"] == "union_tag_invalid":  # a choice of the group that this command does not take
+        taken = detail["ctx"]["expected_tags"].replace("'", "")
+        return f"{key}={detail['ctx']['tag']}: this command takes {taken}"
     reason = detail["msg"].removeprefix("Value error, ")
     if not key:
         return reason

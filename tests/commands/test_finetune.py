@@ -140,4 +140,4 @@ def test_a_run_is_needed(tmp_path: Path) -> None:
 def test_it_is_done_on_a_cart(trained: Path, tmp_path: Path) -> None:
     done = in_process("finetune", f"run={trained}", "plant=simulated", "hydra.run.dir=run", folder=tmp_path)
     assert done.code == 2
-    assert "plant" in done.complaint
+    assert "plant=simulated: this command takes emulated, serial" in done.complaint
