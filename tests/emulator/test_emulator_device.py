@@ -334,7 +334,8 @@ def test_every_setting_is_tried_here_or_on_the_wire():
         "stuck_at",
     }  # ..._faults.py
     cogging = {"cogging", "cogging_pitch"}  # test_cogging.py
-    assert set(OTHER) | on_the_wire | faults | cogging == set(EmulatorSettings.model_fields)
+    journal = {"journal"}  # tests/plants/test_stops.py, tests/bench/test_soak.py
+    assert set(OTHER) | on_the_wire | faults | cogging | journal == set(EmulatorSettings.model_fields)
 
 
 def test_latency_and_jitter_delay_the_force_by_as_much_as_they_say():

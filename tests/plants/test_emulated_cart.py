@@ -120,14 +120,14 @@ class TestLoop:
 
     def test_an_unarmed_cart_refuses_a_motor_value(self, cart: SerialCart) -> None:
         cart.set_motor(100)
-        with pytest.raises(RefusedError, match=r"refused SET_MOTOR: .*call start\(\) first") as caught:
+        with pytest.raises(RefusedError, match="refused SET_MOTOR: its motor is not armed") as caught:
             cart.get_state()
         assert caught.value.reason == Reason.NOT_ARMED
         assert cart.poll_state().motor_applied == 0
 
     def test_an_armed_cart_does_not_take_another_period(self, cart: SerialCart) -> None:
         cart.start()
-        with pytest.raises(RefusedError, match=r"refused SET_PERIOD: .*call stop\(\) first"):
+        with pytest.raises(RefusedError, match=r"refused SET_PERIOD: .*stop it first"):
             cart.set_period(10_000)
         with pytest.raises(RefusedError, match="out of range"):
             cart.stop() or cart.set_period(1)
@@ -141,7 +141,7 @@ class TestLoop:
 
 def test_a_cart_that_is_not_homed_does_not_start() -> None:
     with EmulatedCart(fast()) as emulated, SerialCart(settings(emulated)) as cart:
-        with pytest.raises(RefusedError, match=r"call home\(\) first"):
+        with pytest.raises(RefusedError, match="START: it is not homed"):
             cart.start()
         assert not cart.flags & Flags.HOMED
 
