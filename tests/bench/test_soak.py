@@ -24,7 +24,7 @@ def soak() -> ModuleType:
 
 def test_each_episode_ends_with_a_reason_and_the_motor_at_0() -> None:
     done = subprocess.run(
-        [sys.executable, SCRIPT, "--episodes", "5", "--seed", "5"],
+        [sys.executable, SCRIPT, "--episodes", "1", "--seed", "5"],
         capture_output=True,
         text=True,
         check=False,

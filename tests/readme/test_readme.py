@@ -1,4 +1,8 @@
-"""Every command of the README does what it says: run as a process, with budgets that take seconds."""
+"""Every command of the README does what it says, with budgets that take seconds.
+
+A training, the emulator and the demo run as processes of their own; the rest runs in this one, since PyTorch
+takes seconds to import.
+"""
 
 import json
 import re
@@ -10,6 +14,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "commands"))
+from command_line import in_process
 
 ROOT = Path(__file__).parents[2]
 BIN = Path(sys.executable).parent
@@ -45,8 +52,17 @@ COMMANDS = re.findall(
 
 
 def run(command: str, *more: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    """The installed command, in a process of its own."""
     name, *words = command.split()
     return subprocess.run([BIN / name, *words, *more], cwd=cwd, capture_output=True, text=True, timeout=200)
+
+
+def run_here(command: str, *more: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    """The same command, in this process."""
+    name, *words = command.split()
+    verb = name.removeprefix("cartpole-").replace("-", "_")
+    done = in_process(verb, *words, *more, folder=cwd)
+    return subprocess.CompletedProcess(command, done.code, done.out, done.err)
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +95,7 @@ def test_train(command: str, tmp_path: Path) -> None:
     budget = [word for word in BUDGET if word.split("=")[0] not in command]
     if "learning.frames=" in command:
         command = re.sub(r"learning.frames=\d+", "learning.frames=1024", command)
-    result = run(command, *budget, cwd=tmp_path)
+    result = run_here(command, *budget, cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     runs = list(tmp_path.glob("runs/train/**/metrics.json"))
     assert len(runs) == (6 if " -m " in command else 1)
@@ -119,7 +135,7 @@ def test_evaluate(command: str, trained: Path, serial_port: Callable[[], str]) -
         command = command.replace("PORT", serial_port())
     folder = f"runs/evaluate/{abs(hash(command))}"
     more = [] if "episodes" in command else ["episodes=1"]
-    result = run(command, f"hydra.run.dir={folder}", *more, cwd=trained)
+    result = run_here(command, f"hydra.run.dir={folder}", *more, cwd=trained)
     assert result.returncode == 0, result.stderr
     metrics = json.loads((trained / folder / "metrics.json").read_text())
     assert metrics["plant"] in ("simulated", "emulated", "serial")
@@ -147,23 +163,23 @@ def test_identify_train_on_it_and_model_it(trained: Path, serial_port: Callable[
     (identify,) = listed("cartpole-identify")
     identify = identify.replace("/dev/ttyUSB0", serial_port())
     short = ["windows=20", "substeps=2", "carts=100"]
-    identified = run(identify, *short, "hydra.run.dir=runs/identify/first", cwd=trained)
+    identified = run_here(identify, *short, "hydra.run.dir=runs/identify/first", cwd=trained)
     assert identified.returncode == 0, identified.stderr
     (train,) = [command for command in listed("cartpole-train") if "identify" in command]
-    result = run(train.replace("<run>", "first"), *BUDGET, cwd=trained)
+    result = run_here(train.replace("<run>", "first"), *BUDGET, cwd=trained)
     assert result.returncode == 0, result.stderr
     (model,) = listed("cartpole-model")
     short = ["ensemble.updates=2", "ensemble.members=1", "windows=20", "hydra.run.dir=runs/model/first"]
-    modelled = run(model.replace("<run>", "first"), *short, cwd=trained)
+    modelled = run_here(model.replace("<run>", "first"), *short, cwd=trained)
     assert modelled.returncode == 0, modelled.stderr
     assert (trained / "runs/model/first/model.pt").exists()
 
 
 def test_record_and_replay(trained: Path) -> None:
     (record,), (replay,) = listed("cartpole-record"), listed("cartpole-replay")
-    recorded = run(record.replace("<run>", "first"), "hydra.run.dir=runs/record/first", cwd=trained)
+    recorded = run_here(record.replace("<run>", "first"), "hydra.run.dir=runs/record/first", cwd=trained)
     assert recorded.returncode == 0, recorded.stderr
-    replayed = run(replay.replace("<run>", "first"), "hydra.run.dir=runs/replay/first", cwd=trained)
+    replayed = run_here(replay.replace("<run>", "first"), "hydra.run.dir=runs/replay/first", cwd=trained)
     assert replayed.returncode == 0, replayed.stderr
     assert (trained / "runs/replay/first/replay.json").exists()
 
@@ -175,20 +191,20 @@ def test_finetune(command: str, trained: Path, serial_port: Callable[[], str]) -
         command = command.replace("/dev/ttyUSB0", serial_port())
     short = ["episodes=1", "evaluation_episodes=1", "finetuning.iterations=1", "compile=false"]
     folder = f"runs/finetune/{abs(hash(command))}"
-    result = run(command, *short, f"hydra.run.dir={folder}", cwd=trained)
+    result = run_here(command, *short, f"hydra.run.dir={folder}", cwd=trained)
     assert result.returncode == 0, result.stderr
     assert (trained / folder / "checkpoints/last.pt").exists()
 
 
 def test_find_port_tells_what_there_is(tmp_path: Path) -> None:
     (command,) = listed("cartpole-find-port")
-    result = run(command, cwd=tmp_path)
+    result = run_here(command, cwd=tmp_path)
     assert "USB serial port" in result.stdout + result.stderr
 
 
 def test_preflight(tmp_path: Path, serial_port: Callable[[], str]) -> None:
     (command,) = listed("cartpole-preflight")
-    result = run(command.replace("/dev/ttyUSB0", serial_port()), cwd=tmp_path)
+    result = run_here(command.replace("/dev/ttyUSB0", serial_port()), cwd=tmp_path)
     assert result.returncode == 0, result.stdout + result.stderr
 
 
