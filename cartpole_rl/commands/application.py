@@ -65,7 +65,7 @@ def application(name: str, schema: type[Config]) -> Callable[[Body[Config]], Cal
                 if HydraConfig.get().mode is RunMode.MULTIRUN:
                     tell(name, in_one_line(error, name))
                     raise  # Hydra keeps it until all jobs are through
-                leave(name, error)
+                exit_with_message(name, error)
             finally:
                 remove_if_empty(folder)
 
@@ -83,7 +83,7 @@ def application(name: str, schema: type[Config]) -> Callable[[Body[Config]], Cal
                     sys.argv[1:] = words
                     hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=name)(task)()
             except EXPECTED as error:
-                leave(name, error)
+                exit_with_message(name, error)
             except KeyboardInterrupt:
                 tell(name, "interrupted")
                 sys.exit(INTERRUPTED)
@@ -96,7 +96,7 @@ def application(name: str, schema: type[Config]) -> Callable[[Body[Config]], Cal
     return decorate
 
 
-def leave(name: str, error: Exception) -> NoReturn:
+def exit_with_message(name: str, error: Exception) -> NoReturn:
     """Tell an error and exit. Raises one that names nothing a user could look at."""
     code = CartPoleError.exit_code
     if isinstance(error, CartPoleError):

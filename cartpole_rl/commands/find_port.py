@@ -10,8 +10,8 @@ from pathlib import Path
 
 from cartpole_rl.commands.application import application
 from cartpole_rl.errors import PortError
-from cartpole_rl.plants.serial_port import found_ports
-from cartpole_rl.plants.serial_ports import UsbPort, cart_like, changes, described
+from cartpole_rl.plants.serial.port import found_ports
+from cartpole_rl.plants.serial.ports import UsbPort, cart_like, changes, described
 from cartpole_rl.settings import Positive, Settings
 
 LOOK_EVERY = 0.2  # s

@@ -43,7 +43,7 @@ class HardwareTransform(Transform):
         self.register_buffer("motors", torch.tensor(list(motors), dtype=torch.int64))
         self.register_buffer("_by_action", torch.tensor([0, *motors], dtype=torch.int64))  # from NO_ACTION on
         self._perceive: Callable[[Before, Frame], Perceived] = partial(
-            perceive, sight=observation, task=task, learned=reward
+            perceive, settings=observation, task=task, rewards=reward
         )
         if compiled:
             self.compile_arithmetic()
@@ -96,7 +96,7 @@ class HardwareTransform(Transform):
 
     # frames up
 
-    def begin(self, first: TensorDictBase, rows: Tensor | None = None) -> TensorDictBase:
+    def reset_rows(self, first: TensorDictBase, rows: Tensor | None = None) -> TensorDictBase:
         """Add to the first frames of the carts `rows` [R] what they mean; None is all carts."""
         counts, label = first.get("counts").T, self._label(rows)
         return added(first, perceive_first(counts, label, self.observation_settings))
@@ -118,7 +118,7 @@ class HardwareTransform(Transform):
         return added(following, self._perceive(before, frame))
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        return self.begin(tensordict_reset)
+        return self.reset_rows(tensordict_reset)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         return self.perceive(tensordict, tensordict, next_tensordict)

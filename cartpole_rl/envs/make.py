@@ -37,9 +37,9 @@ class CartPoleEnv(TransformedEnv):
         Returns `tensordict` with the step's outcome under "next", and what the next step starts from.
         """
         stepped = self.step(tensordict)
-        return stepped, self.go_on(stepped)
+        return stepped, self.advance(stepped)
 
-    def go_on(self, stepped: TensorDictBase, again: Tensor | None = None) -> TensorDictBase:
+    def advance(self, stepped: TensorDictBase, again: Tensor | None = None) -> TensorDictBase:
         """What the step after `stepped` starts from: a new episode's first frame where the last one ended.
 
         A cart whose episode ended and that is in `again`, [N] bool, stays the cart that it is; the others
@@ -52,7 +52,7 @@ class CartPoleEnv(TransformedEnv):
         ended = following.get("done").squeeze(-1).nonzero().squeeze(-1)
         if len(ended):
             frames = self.plant.restart(ended, None if again is None else again[ended])
-            first = self.hardware.begin(frames, ended)
+            first = self.hardware.reset_rows(frames, ended)
             present |= {key: replaced(present[key], ended, value) for key, value in first.items()}
         return tensordict_of(present)
 

@@ -71,17 +71,17 @@ class Perceived(NamedTuple):
     done: Tensor  # [1, N] bool
 
 
-def perceive_first(counts: Tensor, label: Tensor, sight: ObservationSettings) -> First:
+def perceive_first(counts: Tensor, label: Tensor, settings: ObservationSettings) -> First:
     """Nothing precedes the first frame that a velocity could be taken from, and nothing is remembered."""
     x, theta = measured_position(counts)
     unknown = torch.zeros_like(x)
     state = Measured(x, unknown, theta, unknown)
-    past = x.new_zeros(sight.past_size, len(x))
+    past = x.new_zeros(settings.past_size, len(x))
     nothing = unknown.unsqueeze(0)
     return First(
         torch.stack(state),
         past,
-        observation(state, past, label, sight),
+        observation(state, past, label, settings),
         score=nothing,
         score_upright=nothing.clone(),
         step_count=torch.zeros_like(counts[:1]),
@@ -89,25 +89,30 @@ def perceive_first(counts: Tensor, label: Tensor, sight: ObservationSettings) ->
 
 
 def perceive(
-    before: Before, frame: Frame, *, sight: ObservationSettings, task: TaskSettings, learned: RewardSettings
+    before: Before,
+    frame: Frame,
+    *,
+    settings: ObservationSettings,
+    task: TaskSettings,
+    rewards: RewardSettings,
 ) -> Perceived:
     """What the frame that followed means."""
     x, theta = measured_position(frame.counts)
     x_dot, theta_dot = measured_velocity(frame.counts, before.counts, frame.dt[0])
     state = Measured(x, x_dot, theta, theta_dot)
-    past = remember(before, sight)
+    past = remember(before, settings)
     step_count = before.step_count + 1
     off_track = frame.terminated
     terminated = off_track | fallen(state, task.angle_limit)
     ended = terminated | frame.truncated | (step_count >= task.time_limit)
     judged = {  # each once: what the agent learns from is often a score
-        kind: REWARDS[kind](state, task.x_max).unsqueeze(0) for kind in {learned.kind, SCORE, SCORE_UPRIGHT}
+        kind: REWARDS[kind](state, task.x_max).unsqueeze(0) for kind in {rewards.kind, SCORE, SCORE_UPRIGHT}
     }
     return Perceived(
         torch.stack(state),
         past,
-        observation(state, past, before.label, sight),
-        learned.scale * judged[learned.kind] - track_cost(x, off_track, task, learned),
+        observation(state, past, before.label, settings),
+        rewards.scale * judged[rewards.kind] - track_cost(x, off_track, task, rewards),
         judged[SCORE],
         judged[SCORE_UPRIGHT],
         step_count,
@@ -117,9 +122,9 @@ def perceive(
     )
 
 
-def remember(before: Before, sight: ObservationSettings) -> Tensor:
+def remember(before: Before, settings: ObservationSettings) -> Tensor:
     """`past` one period on, [past_size, N]: motor values, velocities, positions, each newest first."""
-    sizes = sight.past_motors, 2 * sight.past_velocities
+    sizes = settings.past_motors, 2 * settings.past_velocities
     motors, velocities, positions = before.past.split([*sizes, len(before.past) - sum(sizes)])
     newest = before.state[1:2] / SPEED_SCALE, before.state[3:4] / ANGULAR_SPEED_SCALE
     place = torch.stack(observe(Measured(*before.state), ObservationKind.POSITIONS))
@@ -132,12 +137,12 @@ def remember(before: Before, sight: ObservationSettings) -> Tensor:
     )
 
 
-def observation(state: Measured, past: Tensor, label: Tensor, sight: ObservationSettings) -> Tensor:
+def observation(state: Measured, past: Tensor, label: Tensor, settings: ObservationSettings) -> Tensor:
     """What the agent sees, [size, N]."""
-    return torch.cat((torch.stack(observe(state, sight.kind)), past, label))
+    return torch.cat((torch.stack(observe(state, settings.kind)), past, label))
 
 
-def track_cost(x: Tensor, off_track: Tensor, task: TaskSettings, learned: RewardSettings) -> Tensor:
+def track_cost(x: Tensor, off_track: Tensor, task: TaskSettings, rewards: RewardSettings) -> Tensor:
     """What nearing and leaving the track's end take off the reward, [1, N]."""
     nearness = (x / task.x_max).square().unsqueeze(0)
-    return learned.track_penalty * off_track + learned.track_price * nearness
+    return rewards.track_penalty * off_track + rewards.position_cost * nearness

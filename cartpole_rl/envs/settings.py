@@ -56,7 +56,7 @@ class RewardSettings(Settings):
     kind: Reward
     scale: Positive
     track_penalty: NonNegative  # for leaving the track
-    track_price: NonNegative  # of each step, times (x / x_max)^2: of nearing the track's end
+    position_cost: NonNegative  # of each step, times (x / x_max)^2: of nearing the track's end
 
 
 class TaskSettings(Settings):

@@ -26,9 +26,9 @@ from cartpole_rl.envs.make import CartPoleEnv
 from cartpole_rl.errors import CartPoleError, LinkError
 from cartpole_rl.evaluation.driving_policy import DrivingPolicy, Weights
 from cartpole_rl.evaluation.episodes import rehearse, run_batch
-from cartpole_rl.plants.link_statistics import LinkStatistics
-from cartpole_rl.plants.serial import SerialPlant
-from cartpole_rl.plants.serial_faults import Confirm, nobody
+from cartpole_rl.plants.serial.faults import Confirm, nobody
+from cartpole_rl.plants.serial.plant import SerialPlant
+from cartpole_rl.plants.serial.statistics import LinkStatistics
 from cartpole_rl.scheduling import compute_first
 from cartpole_rl.signals import RaiseOnce, end_with_parent, ending_signals
 from cartpole_rl.tasks.episode import Episode

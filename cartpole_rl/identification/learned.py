@@ -276,9 +276,9 @@ class Ensemble:
         of_windows = (left * self.worth).sum()
         places = self.residual.places
         steps = places.diff(dim=1)
-        of_places = self.settings.price_of_places * ((places**2).sum() + 10 * (steps**2).sum())
+        of_places = self.settings.table_penalty * ((places**2).sum() + 10 * (steps**2).sum())
         outputs = self.residual.network(self.random_inputs())
-        return of_windows + of_places + self.settings.price * (outputs**2).mean((1, 2)).sum()
+        return of_windows + of_places + self.settings.output_penalty * (outputs**2).mean((1, 2)).sum()
 
     def random_inputs(self) -> Tensor:
         """Motions from anywhere, [1, INPUTS, BACKGROUND]; see `network_inputs`."""

@@ -18,5 +18,5 @@ class EnsembleSettings(Settings):
     validation: Annotated[
         float, Field(gt=0, lt=1)
     ]  # of the windows, drawn for each member, by which it is stopped
-    price: NonNegative  # of outputs of 1 at random motions
-    price_of_places: NonNegative  # of a force of 1 at each place, and ten times that of a step between two
+    output_penalty: NonNegative  # of outputs of 1 at random motions
+    table_penalty: NonNegative  # of a force of 1 at each place, and ten times that of a step between two

@@ -31,7 +31,7 @@ class AgentCheckpoint:
 
     config: dict[str, Any]  # the resolved config of the training
     weights: dict[str, Any]
-    frames: int
+    transitions: int
     score: float | None  # mean score of the evaluation before the checkpoint
 
 
@@ -41,7 +41,7 @@ class TrainingCheckpoint:
 
     config: dict[str, Any]
     state: dict[str, Any]  # of a training: what `Training.snapshot` gave
-    frames: int
+    transitions: int
 
 
 def save_agent(path: Path, agent: AgentCheckpoint) -> None:

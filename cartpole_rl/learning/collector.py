@@ -26,22 +26,27 @@ class Collector:
     """Steps `env` with `policy`, resetting the carts whose episode ended; remembers where it stands.
 
     A cart whose episode was a failure is not replaced by a new one but tries again, with probability
-    `try_again`: so carts that are hard to drive are met up to 1 / (1 - try_again) times as often (after Jiang
+    `retry_probability` p: carts that are hard to drive are met up to 1 / (1 - p) times as often (after Jiang
     et al., "Prioritized level replay", 2021, and Rajeswaran et al., "EPOpt", 2017).
     """
 
     def __init__(
-        self, env: CartPoleEnv, policy: TensorDictModuleBase, actions: int, seed: int, try_again: float = 0.0
+        self,
+        env: CartPoleEnv,
+        policy: TensorDictModuleBase,
+        actions: int,
+        seed: int,
+        retry_probability: float = 0.0,
     ) -> None:
         self.env, self.policy, self.actions = env, policy, actions
-        self.epsilon, self.try_again = 1.0, try_again
+        self.epsilon, self.retry_probability = 1.0, retry_probability
         self._usual = 0.0  # score of a period
         self._generator = torch.Generator(device=env.device)
         self._generator.manual_seed(seed)
         self._finished: list[tuple[float, int]] = []  # score and length of those that ended since last asked
-        self.begin()
+        self.reset()
 
-    def begin(self) -> None:
+    def reset(self) -> None:
         """Start a new episode on every cart."""
         self._present = self.env.reset()
         self._score = torch.zeros(self.env.batch_size, device=self.env.device)  # of the episodes under way
@@ -54,7 +59,7 @@ class Collector:
             self._act(self._present)
             stepped = self.env.step(self._present)
             taken.append(stepped.select(*COLLECTED))
-            self._present = self.env.go_on(stepped, self._tally(stepped["next"]))
+            self._present = self.env.advance(stepped, self._tally(stepped["next"]))
         return torch.stack(taken, 1)
 
     def finished(self) -> dict[str, float]:
@@ -76,7 +81,7 @@ class Collector:
         self._finished += zip(self._score[done].tolist(), lengths.tolist(), strict=True)
         chance = torch.rand(self.env.batch_size, generator=self._generator, device=self.env.device)
         whole = self._usual * self.env.hardware.task.time_limit
-        again = (self._score < FAILED * whole) & (chance < self.try_again)
+        again = (self._score < FAILED * whole) & (chance < self.retry_probability)
         self._score.masked_fill_(done, 0)
         return again
 

@@ -63,7 +63,7 @@ class Finetuning(Training):
         """Go on with simulated carts drawn from `carts`; what older ones taught is forgotten."""
         assert isinstance(self.env.plant, SimulatedPlant)
         self.env.plant.replace_randomizer(carts)
-        self.collector.begin()
+        self.collector.reset()
         self.returns.reset()
         self.replay.empty()
         self.fill()

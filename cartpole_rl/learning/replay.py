@@ -8,12 +8,12 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import LazyTensorStorage, PrioritizedSampler, RandomSampler, TensorDictReplayBuffer
 
-from cartpole_rl.learning.settings import ReplaySettings
+from cartpole_rl.learning.settings import BufferSettings
 
 TREES = ("_sum_tree", "_min_tree")  # of priorities, by their names in TorchRL's state of a PrioritizedSampler
 
 
-def make_replay(settings: ReplaySettings, batch_size: int) -> TensorDictReplayBuffer:
+def make_replay(settings: BufferSettings, batch_size: int) -> TensorDictReplayBuffer:
     """An empty buffer whose `sample` gives `batch_size` transitions.
 
     A prioritized one draws from NumPy's global generator, a uniform one from torch's.

@@ -7,7 +7,7 @@ from pydantic import Field, model_validator
 from cartpole_rl.settings import Count, Fraction, NonNegative, Positive, Settings
 
 
-class ReplaySettings(Settings):
+class BufferSettings(Settings):
     """Replay buffer; `alpha` and `beta` are those of Schaul et al., "Prioritized experience replay", 2016."""
 
     kind: Literal["prioritized", "uniform"]
@@ -30,27 +30,27 @@ class OptimizerSettings(Settings):
 class LearningSettings(Settings):
     """The training loop: an iteration collects `chunk` periods on each cart, then makes `updates` updates."""
 
-    frames: Count  # transitions in all
+    transitions: Count  # transitions in all
     carts: Count  # simulated in parallel
     chunk: Count  # periods
-    try_again: Fraction  # of the carts that the agent failed with: they are not replaced by new ones
+    retry_probability: Fraction  # of the carts that the agent failed with: they are not replaced by new ones
     updates: Count  # gradient steps an iteration
     batch_size: Count
     n_step: Annotated[int, Field(ge=1, le=20)]  # the longest return
     carry: bool  # the last n_step - 1 periods of a chunk wait for the next one, for whole returns
-    warmup_frames: Annotated[int, Field(ge=0)]  # random actions before the first update
+    warmup_transitions: Annotated[int, Field(ge=0)]  # random actions before the first update
     epsilon: tuple[Fraction, Fraction]  # exploration, from first to last
-    epsilon_frames: Count  # over which epsilon falls, linearly
+    epsilon_transitions: Count  # over which epsilon falls, linearly
     evaluations: Count  # during training, evenly spaced, the last at the end
     evaluation_episodes: Count
     checkpoint_interval: Count  # evaluations between two checkpoints that training can resume from
 
     @model_validator(mode="after")
     def _long_enough(self) -> "LearningSettings":
-        if self.frames < self.carts * self.chunk * self.evaluations:
+        if self.transitions < self.carts * self.chunk * self.evaluations:
             raise ValueError(
-                f"frames {self.frames} is less than one iteration an evaluation; it must be at least "
-                f"carts * chunk * evaluations = {self.carts * self.chunk * self.evaluations}"
+                f"transitions {self.transitions} is less than one iteration per evaluation; it must be at "
+                f"least carts * chunk * evaluations = {self.carts * self.chunk * self.evaluations}"
             )
         if self.chunk < self.n_step:
             raise ValueError(f"chunk {self.chunk} must be at least n_step {self.n_step}")
@@ -59,11 +59,11 @@ class LearningSettings(Settings):
     @property
     def iterations(self) -> int:
         """Rounds of collecting and learning."""
-        return self.frames // (self.carts * self.chunk)
+        return self.transitions // (self.carts * self.chunk)
 
     @property
-    def collected_frames(self) -> int:
-        """Transitions that whole iterations collect: `frames`, or a little less."""
+    def collected_transitions(self) -> int:
+        """Transitions that whole iterations collect: `transitions`, or a little less."""
         return self.iterations * self.carts * self.chunk
 
 
@@ -73,7 +73,7 @@ class FinetuningSettings(Settings):
     iterations: Count  # of learning while one episode is driven
     refit: Count  # episodes between two fits of the simulator
     cart_share: Fraction  # of each batch from the cart itself, the rest is simulated
-    elsewhere: Fraction  # of the simulated carts drawn as in training, and not from the fit
+    prior_share: Fraction  # of the simulated carts drawn as in training, and not from the fit
     widen: Positive  # the fit's uncertainty is multiplied by it
     epsilon: Annotated[float, Field(ge=0, le=0.2)]  # share of random actions on the cart
     learning_rate: Positive  # at the start; it falls along half a cosine

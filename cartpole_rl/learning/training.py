@@ -1,7 +1,7 @@
 """The training loop: collect, learn, evaluate, in that order, from the first frame to the last.
 
 Everything that the next iteration depends on is in `snapshot`, so that a run that was killed goes on as if it
-had not been. Schedules are functions of the frames seen.
+had not been. Schedules are functions of the transitions seen.
 """
 
 import math
@@ -22,7 +22,7 @@ from cartpole_rl.learning.collector import Collector
 from cartpole_rl.learning.randomness import random_state, restore_random_state
 from cartpole_rl.learning.replay import NStepReturns, make_replay, replay_snapshot, restore_replay
 from cartpole_rl.learning.schedules import half_cosine, linear
-from cartpole_rl.learning.settings import LearningSettings, OptimizerSettings, ReplaySettings
+from cartpole_rl.learning.settings import BufferSettings, LearningSettings, OptimizerSettings
 from cartpole_rl.tasks.episode import Episode
 
 Scalars = dict[str, float]
@@ -32,13 +32,13 @@ OPTIMIZERS = {"adam": torch.optim.Adam, "adamw": torch.optim.AdamW}
 class Monitor(Protocol):
     """Who is told how training goes."""
 
-    def learned(self, frames: int, scalars: Scalars) -> None:
+    def on_update(self, transitions: int, scalars: Scalars) -> None:
         """After an iteration; not after each one."""
 
-    def evaluated(self, training: "Training", episodes: Sequence[Episode], is_best: bool) -> None:
+    def on_evaluation(self, training: "Training", episodes: Sequence[Episode], is_best: bool) -> None:
         """After an evaluation."""
 
-    def checkpoint(self, training: "Training") -> None:
+    def on_checkpoint(self, training: "Training") -> None:
         """When the state of the training should be written."""
 
 
@@ -48,7 +48,7 @@ class Training:
     def __init__(
         self,
         settings: LearningSettings,
-        replay: ReplaySettings,
+        replay: BufferSettings,
         optimizer: OptimizerSettings,
         agent: QAgent,
         env: CartPoleEnv,
@@ -59,7 +59,9 @@ class Training:
     ) -> None:
         self.settings, self.agent, self.env = settings, agent, env
         self.evaluate, self.monitor = evaluate, monitor
-        self.collector = Collector(env, agent.actor, len(env.hardware.motors), seed, settings.try_again)
+        self.collector = Collector(
+            env, agent.actor, len(env.hardware.motors), seed, settings.retry_probability
+        )
         self.replay_settings, self.optimizer_settings = replay, optimizer
         self.returns = NStepReturns(settings.n_step, agent.settings.gamma, settings.carry)
         self.replay = make_replay(replay, settings.updates * settings.batch_size)
@@ -73,7 +75,7 @@ class Training:
         self.last_score: float | None = None
 
     @property
-    def frames(self) -> int:
+    def transitions(self) -> int:
         """Transitions collected so far."""
         return self.iteration * self.settings.carts * self.settings.chunk
 
@@ -95,18 +97,18 @@ class Training:
         while self.iteration < settings.iterations:
             chunk, scalars = self.iterate()
             if self.iteration % max(1, settings.iterations // 200) == 0:
-                self.monitor.learned(self.frames, scalars | self.describe(chunk))
+                self.monitor.on_update(self.transitions, scalars | self.describe(chunk))
             if self.iteration in evaluate_at:
                 self.judge()
             if self.iteration in checkpoint_at:
-                self.monitor.checkpoint(self)
+                self.monitor.on_checkpoint(self)
 
     def iterate(self) -> tuple[TensorDictBase, Scalars]:
         """Collect a chunk and learn; what was collected, and what is worth a curve of the learning."""
         with self.timed():
             chunk = self.collect()
             self.iteration += 1
-            return chunk, self.learn() if self.frames > self.settings.warmup_frames else {}
+            return chunk, self.learn() if self.transitions > self.settings.warmup_transitions else {}
 
     def collect(self) -> TensorDictBase:
         """A chunk from all carts, whose transitions are in replay from now on, or wait for the next chunk."""
@@ -148,7 +150,7 @@ class Training:
         loss, norm, errors = self.gradient(batch)
         if not math.isfinite(loss.item() + norm.item()):
             raise LearningError(
-                f"learning diverged after {self.frames} transitions: the loss is {loss.item():g}, its "
+                f"learning diverged after {self.transitions} transitions: the loss is {loss.item():g}, its "
                 f"gradient's norm {norm.item():g}; the checkpoints from before are kept; try a smaller "
                 f"optimizer.learning_rate than {self.optimizer_settings.learning_rate:g}"
             )
@@ -159,9 +161,11 @@ class Training:
     def epsilon(self) -> float:
         """Share of random actions now."""
         settings = self.settings
-        if self.frames < settings.warmup_frames:
+        if self.transitions < settings.warmup_transitions:
             return 1.0
-        return linear(*settings.epsilon, (self.frames - settings.warmup_frames) / settings.epsilon_frames)
+        return linear(
+            *settings.epsilon, (self.transitions - settings.warmup_transitions) / settings.epsilon_transitions
+        )
 
     @torch.no_grad()
     def describe(self, chunk: TensorDictBase) -> Scalars:
@@ -172,7 +176,7 @@ class Training:
             "learning/q_max": value.max().item(),
             "learning/epsilon": self.collector.epsilon,
             "learning/updates": float(self.updates),
-            "speed/frames_per_second": self.frames / self.seconds,
+            "speed/transitions_per_second": self.transitions / self.seconds,
         }
         return scalars | {f"exploration/{key}": value for key, value in self.collector.finished().items()}
 
@@ -183,7 +187,7 @@ class Training:
         self.last_score = float(np.mean([episode.score.sum() for episode in episodes]))
         is_best = self.last_score > self.best_score
         self.best_score = max(self.best_score, self.last_score)
-        self.monitor.evaluated(self, episodes, is_best)
+        self.monitor.on_evaluation(self, episodes, is_best)
 
     @contextmanager
     def timed(self) -> Iterator[None]:

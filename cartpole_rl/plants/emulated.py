@@ -8,8 +8,8 @@ from typing import Literal
 
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.plants.emulated_cart import EmulatedCart
-from cartpole_rl.plants.serial import SerialPlant
-from cartpole_rl.plants.serial_settings import SerialPlantSettings
+from cartpole_rl.plants.serial.plant import SerialPlant
+from cartpole_rl.plants.serial.settings import SerialPlantSettings
 
 
 def emulated_plant(

@@ -1,4 +1,4 @@
-"""The emulated cart as a process of its own. It needs no torch, as `serial_cart` does not."""
+"""The emulated cart as a process of its own. It needs no torch, as `plants.serial` does not."""
 
 import json
 import os

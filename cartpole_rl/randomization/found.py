@@ -37,7 +37,7 @@ LATENCY = CartParameters.names().index("latency")
 
 
 class FoundCarts:
-    """Draws with replacement from `found` [P, M], and for `elsewhere` of all draws from `others` instead.
+    """Draws with replacement from `found` [P, M], and for `prior_share` of all draws from `others` instead.
 
     It stands where a Randomizer stands; `others` keep an agent from trusting what was found too much. Of the
     parameters that are not `told` every draw is the others'; None tells all. Raises ConfigError for a number
@@ -48,14 +48,14 @@ class FoundCarts:
         self,
         found: Tensor,
         others: Draws,
-        elsewhere: float,
+        prior_share: float,
         longest_delay: float,
         told: Collection[str] | None = None,
     ) -> None:
         if not found.isfinite().all():
             row = int((~found.isfinite()).any(1).nonzero()[0])
             raise ConfigError(f"carts to draw from: {CartParameters.names()[row]} is not finite")
-        self.found, self.others, self.elsewhere = found.to(others.nominal), others, elsewhere
+        self.found, self.others, self.prior_share = found.to(others.nominal), others, prior_share
         telling = [told is None or name in told for name in CartParameters.names()]
         self._told = torch.tensor(telling, device=self.found.device).unsqueeze(1)
         self._longest_delay = longest_delay  # s, of this table and of all that may take its place
@@ -63,7 +63,7 @@ class FoundCarts:
 
     def draw(self, count: int, generator: torch.Generator) -> Tensor:
         """Parameters of `count` carts, [P, count]."""
-        table, keeps = self._draw_found(count, generator, self.elsewhere)
+        table, keeps = self._draw_found(count, generator, self.prior_share)
         return torch.where(keeps, table, self.others.draw(count, generator))
 
     def ends(self, name: str, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
@@ -72,18 +72,22 @@ class FoundCarts:
         Two tables [P, count], equal where a cart has what was found of `name`. Where a share of the carts
         comes from elsewhere, at least half do here, so that a small share is not overlooked.
         """
-        table, keeps = self._draw_found(count, generator, max(self.elsewhere, 0.5) if self.elsewhere else 0.0)
+        table, keeps = self._draw_found(
+            count, generator, max(self.prior_share, 0.5) if self.prior_share else 0.0
+        )
         low, high = self.others.ends(name, count, generator)
         return torch.where(keeps, table, low), torch.where(keeps, table, high)
 
-    def _draw_found(self, count: int, generator: torch.Generator, elsewhere: float) -> tuple[Tensor, Tensor]:
+    def _draw_found(
+        self, count: int, generator: torch.Generator, prior_share: float
+    ) -> tuple[Tensor, Tensor]:
         """Carts of `found` [P, count], and which of their numbers are kept, [P, count] bool.
 
-        All numbers of a share `elsewhere` of the carts are given up.
+        All numbers of a share `prior_share` of the carts are given up.
         """
         device = self.nominal.device
         which = torch.randint(self.found.shape[1], (count,), generator=generator, device=device)
-        strangers = torch.rand(count, generator=generator, device=device) < elsewhere
+        strangers = torch.rand(count, generator=generator, device=device) < prior_share
         return self.found[:, which], self._told & ~strangers
 
     def longest_delay(self) -> float:
@@ -111,4 +115,4 @@ def found_carts(settings: FoundSettings, cart: Mapping[str, float], poles: PoleS
         values = np.median(values) + settings.widen * (values - np.median(values))
         rows.append(np.clip(values, BOUNDS[name].low, BOUNDS[name].high))
     found = torch.from_numpy(np.stack(np.broadcast_arrays(*rows))).float()
-    return FoundCarts(found, others, settings.elsewhere, float(found[LATENCY].max()), told)
+    return FoundCarts(found, others, settings.prior_share, float(found[LATENCY].max()), told)

@@ -11,5 +11,5 @@ class FoundSettings(Settings):
 
     posterior: Path  # posterior.npz of cartpole-identify
     widen: Positive  # its uncertainty is multiplied by it
-    elsewhere: Fraction  # of the carts are nominal ones within `ranges`
+    prior_share: Fraction  # of the carts are nominal ones within `ranges`
     ranges: dict[str, Range]  # of what the identification does not tell

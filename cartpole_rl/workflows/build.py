@@ -21,9 +21,9 @@ from cartpole_rl.physics.residual import UNDER_WAY
 from cartpole_rl.plants.emulated import emulated_plant
 from cartpole_rl.plants.learned import LearnedPlant
 from cartpole_rl.plants.learned_model import LearnedModel, load_model
-from cartpole_rl.plants.serial import SerialPlant
-from cartpole_rl.plants.serial_faults import Confirm, nobody
-from cartpole_rl.plants.serial_settings import SerialPlantSettings
+from cartpole_rl.plants.serial.faults import Confirm, nobody
+from cartpole_rl.plants.serial.plant import SerialPlant
+from cartpole_rl.plants.serial.settings import SerialPlantSettings
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.plants.specs import Plant
 from cartpole_rl.randomization.found import Draws, FoundCarts, found_carts
@@ -45,7 +45,7 @@ from cartpole_rl.workflows.config import (
 
 LATER: dict[str, dict[str, Any]] = {  # settings that older checkpoints do not know, as they were then
     "cart": {"pole_coulomb": 0.0},
-    "learning": {"try_again": 0.0, "carry": False},
+    "learning": {"retry_probability": 0.0, "carry": False},
 }
 SIMILAR = 0.1  # share by which a pole's length may differ from a learned model's
 REPLACEABLE = ("cart", "cart_friction", "pole_friction", "pole", "reward")  # by an evaluation; and the task
@@ -106,7 +106,7 @@ def learned_plant(
     if abs(2 * own["pole_com"] / length - 1) > SIMILAR:
         raise ConfigError(f"pole: plant.model has one of {2 * own['pole_com']:.2f} m, not {length:.2f} m")
     found = torch.tensor([[own[name]] for name in CartParameters.names()])
-    draws = FoundCarts(found, randomizer(config), plant.elsewhere, UNDER_WAY * model.period)
+    draws = FoundCarts(found, randomizer(config), plant.prior_share, UNDER_WAY * model.period)
     return LearnedPlant(carts, model, draws, start, seed, compiled=compiled)
 
 
@@ -123,8 +123,8 @@ def environment(config: CartPoleSettings, plant: Plant) -> CartPoleEnv:
 
 def new_agent(config: TrainConfig) -> QAgent:
     """An untrained agent."""
-    sight = config.observation
-    return QAgent(config.agent, sight.mirror_signs, len(config.actions.motors), sight.frames)
+    observation = config.observation
+    return QAgent(config.agent, observation.mirror_signs, len(config.actions.motors), observation.frames)
 
 
 def recorded_config(config: Mapping[str, Any], source: str) -> TrainConfig:
@@ -245,7 +245,7 @@ def evaluated_env(
     start = settings.task.evaluation_start
     carts, seed = simulated_carts(config), evaluation_seed(config.seed)
     if isinstance(config.plant, LearnedSettings):
-        found = config.plant.model_copy(update={"elsewhere": 0.0})
+        found = config.plant.model_copy(update={"prior_share": 0.0})
         return simulated_env(settings, found, carts, start, seed)
     if isinstance(config.plant, SimulatedSettings):
         return simulated_env(settings, config.plant, carts, start, seed)

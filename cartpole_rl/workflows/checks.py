@@ -31,7 +31,7 @@ from cartpole_rl.workflows.run_folder import PREFIX, check_program, has_ended, p
 BASELINE = Path("lqr")  # run=lqr is no folder: the controller that learned nothing
 LARGEST_BATCH = 1024  # carts that an evaluation simulates at once
 LONGER = {  # command: how to go further than a run that has ended
-    "train": "cartpole-train with more learning.frames makes a longer training",
+    "train": "cartpole-train with more learning.transitions makes a longer training",
     "finetune": "cartpole-finetune run={0} lets it learn on",
 }
 

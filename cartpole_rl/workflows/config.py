@@ -12,10 +12,10 @@ from cartpole_rl.envs.settings import ObservationSettings, RewardSettings, TaskS
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.identification.settings import EnsembleSettings
 from cartpole_rl.learning.settings import (
+    BufferSettings,
     FinetuningSettings,
     LearningSettings,
     OptimizerSettings,
-    ReplaySettings,
 )
 from cartpole_rl.physics.bounds import check_values
 from cartpole_rl.physics.models import Actuator, CartFriction, Integrator, Models, PoleFriction
@@ -67,7 +67,7 @@ class LearnedSettings(Settings):
 
     kind: Literal["learned"]
     model: Path
-    elsewhere: Fraction
+    prior_share: Fraction
     integrator: ClassVar = Integrator.SEMI_IMPLICIT
     substeps: ClassVar = 4
     pole_presses: ClassVar = False
@@ -132,7 +132,7 @@ class TrainConfig(CartPoleSettings):
 
     plant: Annotated[SimulatedSettings | LearnedSettings, Field(discriminator="kind")]
     agent: AgentSettings
-    replay: ReplaySettings
+    buffer: BufferSettings
     optimizer: OptimizerSettings
     learning: LearningSettings
     seed: Seed
@@ -172,9 +172,9 @@ class TrainConfig(CartPoleSettings):
 
     @model_validator(mode="after")
     def _memory_holds_a_batch(self) -> "TrainConfig":
-        if self.replay.size < self.learning.batch_size:
+        if self.buffer.size < self.learning.batch_size:
             raise ValueError(
-                f"replay.size {self.replay.size} must be at least learning.batch_size "
+                f"buffer.size {self.buffer.size} must be at least learning.batch_size "
                 f"{self.learning.batch_size}"
             )
         return self

@@ -10,7 +10,7 @@ from tqdm import tqdm
 from cartpole_rl.envs.make import CartPoleEnv
 from cartpole_rl.evaluation.episodes import Policy, run_batch, run_episodes
 from cartpole_rl.learning.randomness import seed_everything
-from cartpole_rl.plants.serial import SerialPlant
+from cartpole_rl.plants.serial.plant import SerialPlant
 from cartpole_rl.plants.simulated import OF_CHANCE, SimulatedPlant
 from cartpole_rl.reporting.table import interval_text, table
 from cartpole_rl.tasks.endings import Ending

@@ -40,8 +40,8 @@ from cartpole_rl.learning.finetuning import Finetuning, recorded_chunk
 from cartpole_rl.learning.randomness import seed_everything
 from cartpole_rl.learning.training import Scalars, Training
 from cartpole_rl.physics.models import CartFriction, Models
-from cartpole_rl.plants.link_statistics import LinkStatistics
 from cartpole_rl.plants.recorded import RecordedPlant
+from cartpole_rl.plants.serial.statistics import LinkStatistics
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.randomization.found import FoundCarts
 from cartpole_rl.reporting.tensorboard import TensorBoardLog
@@ -136,13 +136,13 @@ def driven_length(config: FinetuneConfig) -> float | None:
 class Unheard:
     """A monitor of a training that is watched by its episodes."""
 
-    def learned(self, frames: int, scalars: Scalars) -> None:
+    def on_update(self, transitions: int, scalars: Scalars) -> None:
         """Nobody looks."""
 
-    def evaluated(self, training: Training, episodes: Sequence[Episode], is_best: bool) -> None:
+    def on_evaluation(self, training: Training, episodes: Sequence[Episode], is_best: bool) -> None:
         """There are no evaluations in simulation."""
 
-    def checkpoint(self, training: Training) -> None:
+    def on_checkpoint(self, training: Training) -> None:
         """The session writes its own."""
 
 
@@ -247,13 +247,13 @@ class Session:
             finetuning,
             learning.model_copy(
                 update={
-                    "frames": iterations * learning.carts * learning.chunk,
-                    "warmup_frames": 0,
+                    "transitions": iterations * learning.carts * learning.chunk,
+                    "warmup_transitions": 0,
                     "epsilon": (0.1, 0.02),
-                    "epsilon_frames": iterations * learning.carts * learning.chunk // 2,
+                    "epsilon_transitions": iterations * learning.carts * learning.chunk // 2,
                 }
             ),
-            training.replay.model_copy(update={"kind": "uniform"}),
+            training.buffer.model_copy(update={"kind": "uniform"}),
             training.optimizer.model_copy(update={"learning_rate": finetuning.learning_rate}),
             self.agent,
             environment(training, plant),
@@ -296,8 +296,8 @@ class Session:
         """Carts of the fit, and some as in training."""
         random = np.random.default_rng(self.config.seed)
         table = torch.from_numpy(fit.draw(DRAWN, random, self.config.finetuning.widen)).float()
-        elsewhere = self.config.finetuning.elsewhere
-        return FoundCarts(table, randomizer(self.training), elsewhere, LONGEST_LATENCY)
+        prior_share = self.config.finetuning.prior_share
+        return FoundCarts(table, randomizer(self.training), prior_share, LONGEST_LATENCY)
 
     def drive_all(self, stage: str, count: int) -> None:
         """Drive what is missing of a stage, without exploration."""
@@ -390,7 +390,7 @@ class Session:
         """Write the better policy as the run's last checkpoint."""
         weights = self.agent.state_dict() if tuned else self.start.weights
         score = summary["score"]["mean"]
-        checkpoint = AgentCheckpoint(self.start.config, weights, self.start.frames, score)
+        checkpoint = AgentCheckpoint(self.start.config, weights, self.start.transitions, score)
         save_agent(self.folder / FOLDER / LAST, checkpoint)
 
     @staticmethod

@@ -26,8 +26,8 @@ from cartpole_rl.physics.friction import dry_friction, viscous_coefficient
 from cartpole_rl.physics.models import Actuator, CartFriction, Models
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.emulated import emulated_plant
-from cartpole_rl.plants.serial import SerialPlant
-from cartpole_rl.plants.serial_settings import SerialPlantSettings
+from cartpole_rl.plants.serial.plant import SerialPlant
+from cartpole_rl.plants.serial.settings import SerialPlantSettings
 from cartpole_rl.randomization.poles import Pole
 from cartpole_rl.reporting.figures import save
 from cartpole_rl.reporting.figures.identified import (
@@ -161,7 +161,7 @@ def write_found(config: IdentifyConfig, found: Identification, carts: np.ndarray
         point=found.fit.point,
         covariance=found.fit.covariance,
     )
-    drawn = {"posterior": "${here}/" + POSTERIOR, "widen": 2.0, "elsewhere": 0.0, "ranges": OPEN}
+    drawn = {"posterior": "${here}/" + POSTERIOR, "widen": 2.0, "prior_share": 0.0, "ranges": OPEN}
     (folder / RANDOMIZATION).write_text(
         "# Carts as identified, correlations included; their uncertainty doubled.\n"
         + yaml.safe_dump(drawn, sort_keys=False)

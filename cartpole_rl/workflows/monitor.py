@@ -30,7 +30,7 @@ PICTURES = 4  # behaviour figures and animations in TensorBoard, over the whole 
 class TrainingMonitor:
     """Listens to one training in the run folder `folder`; a context manager around `Training.run`.
 
-    A resumed training hands in the frames it has seen; what was written after them is written anew.
+    A resumed training hands in the transitions it has seen; what was written after them is written anew.
     """
 
     def __init__(self, folder: Path, config: TrainConfig, resumed_at: int | None = None) -> None:
@@ -39,13 +39,13 @@ class TrainingMonitor:
         self._seen = resumed_at or 0
         self._log = TensorBoardLog(folder, purge_step=None if resumed_at is None else resumed_at + 1)
         self._bar = tqdm(
-            total=config.learning.collected_frames,
+            total=config.learning.collected_transitions,
             initial=self._seen,
-            unit=" frames",
+            unit=" transitions",
             unit_scale=True,
             mininterval=1.0,
         )
-        self.history = [record for record in read_history(folder) if record["frames"] <= self._seen]
+        self.history = [record for record in read_history(folder) if record["transitions"] <= self._seen]
         write_history(folder, self.history)
 
     def __enter__(self) -> "TrainingMonitor":
@@ -57,29 +57,31 @@ class TrainingMonitor:
         self._bar.close()
         self._log.close()
 
-    def learned(self, frames: int, scalars: Scalars) -> None:
+    def on_update(self, transitions: int, scalars: Scalars) -> None:
         """Curves and the progress bar."""
-        self._log.scalars(scalars, frames)
-        self._advance(frames)
+        self._log.scalars(scalars, transitions)
+        self._advance(transitions)
 
-    def evaluated(self, training: Training, episodes: Sequence[Episode], is_best: bool) -> None:
+    def on_evaluation(self, training: Training, episodes: Sequence[Episode], is_best: bool) -> None:
         """Scores, pictures now and then, and the last and the best checkpoint."""
-        frames, record = training.frames, self._record(training, episodes)
+        transitions, record = training.transitions, self._record(training, episodes)
         self.history.append(record)
         write_history(self.folder, self.history)
-        self._log.scalars({f"evaluation/{key}": record[key] for key in record if key != "frames"}, frames)
+        self._log.scalars(
+            {f"evaluation/{key}": record[key] for key in record if key != "transitions"}, transitions
+        )
         if len(self.history) % max(1, self.config.learning.evaluations // PICTURES) == 0:
-            self._show(episodes[0], frames)
-        agent = AgentCheckpoint(self._settings, training.agent.state_dict(), frames, record["score"])
+            self._show(episodes[0], transitions)
+        agent = AgentCheckpoint(self._settings, training.agent.state_dict(), transitions, record["score"])
         for name in (LAST, BEST) if is_best else (LAST,):
             save_agent(self.folder / FOLDER / name, agent)
         self._bar.set_postfix_str(f"score {record['score']:.0f}")
-        self._advance(frames)
+        self._advance(transitions)
 
-    def checkpoint(self, training: Training) -> None:
+    def on_checkpoint(self, training: Training) -> None:
         """The state to resume from."""
         self._log.flush()
-        state = TrainingCheckpoint(self._settings, training.snapshot(), training.frames)
+        state = TrainingCheckpoint(self._settings, training.snapshot(), training.transitions)
         save_training(self.folder, state)
 
     def randomization(self, plant: SimulatedPlant) -> None:
@@ -93,9 +95,9 @@ class TrainingMonitor:
         shown = {key: value["mean"] for key in COMPARED if (value := summary[key]) is not None}
         self._log.hparams(self._settings, shown)
 
-    def _advance(self, frames: int) -> None:
-        self._bar.update(frames - self._seen)
-        self._seen = frames
+    def _advance(self, transitions: int) -> None:
+        self._bar.update(transitions - self._seen)
+        self._seen = transitions
 
     def _record(self, training: Training, episodes: Sequence[Episode]) -> dict[str, float]:
         """The evaluation's line in the history."""
@@ -103,18 +105,20 @@ class TrainingMonitor:
         scores = [figure["score"] for figure in figures]
         means = {key: float(np.mean([figure[key] for figure in figures])) for key in AVERAGED}
         return {
-            "frames": training.frames,
+            "transitions": training.transitions,
             "seconds": training.seconds,
             **means,
             "score_min": min(scores),
             "score_max": max(scores),
         }
 
-    def _show(self, episode: Episode, frames: int) -> None:
+    def _show(self, episode: Episode, transitions: int) -> None:
         half = self.config.task.x_max
         length = 2 * self.config.pole.nominal.pole_com
-        self._log.figure("behaviour", behaviour(episode, f"After {frames / 1e6:.1f} M frames", half), frames)
-        self._log.animation("cart", gif(episode, length, half), frames)
+        self._log.figure(
+            "behaviour", behaviour(episode, f"After {transitions / 1e6:.1f} M transitions", half), transitions
+        )
+        self._log.animation("cart", gif(episode, length, half), transitions)
 
 
 def read_history(folder: Path) -> list[dict[str, float]]:

@@ -5,9 +5,9 @@ from contextlib import contextmanager
 
 from cartpole_rl.errors import PlantError
 from cartpole_rl.plants.emulated_cart import EmulatedCart
-from cartpole_rl.plants.serial_cart import SerialCart, SerialSettings
-from cartpole_rl.plants.serial_faults import FaultClearing
-from cartpole_rl.plants.serial_preflight import Finding, preflight
+from cartpole_rl.plants.serial.cart import SerialCart, SerialSettings
+from cartpole_rl.plants.serial.faults import FaultClearing
+from cartpole_rl.plants.serial.preflight import Finding, preflight
 from cartpole_rl.workflows.config import EmulatedSettings, PreflightConfig, RealSettings
 from cartpole_rl.workflows.person import confirm
 

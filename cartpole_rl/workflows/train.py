@@ -41,10 +41,10 @@ def train(config: TrainConfig, folder: Path) -> None:
     policy = DrivingPolicy(agent.greedy_policy(), config.compile)
     evaluate = partial(judge, nominal_env(config), policy, config.seed)
     write_config(folder, "train", config.model_dump(mode="json"), resumed=checkpoint is not None)
-    with TrainingMonitor(folder, config, checkpoint.frames if checkpoint else None) as monitor:
+    with TrainingMonitor(folder, config, checkpoint.transitions if checkpoint else None) as monitor:
         training = Training(
             config.learning,
-            config.replay,
+            config.buffer,
             config.optimizer,
             agent,
             env,
@@ -85,7 +85,7 @@ def nominal_env(config: TrainConfig) -> CartPoleEnv:
     nominal = config.model_copy(update={"pole": poles, "randomization": {}})
     plant = config.plant
     if isinstance(plant, LearnedSettings):
-        plant = plant.model_copy(update={"elsewhere": 0.0})
+        plant = plant.model_copy(update={"prior_share": 0.0})
     return simulated_env(nominal, plant, carts, config.task.evaluation_start, 0, config.compile)
 
 

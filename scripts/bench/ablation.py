@@ -17,7 +17,7 @@ from learning import REFERENCES, result, train_all
 from cartpole_rl.reporting.table import table
 from cartpole_rl.workflows.build import use_threads
 
-FRAMES = 2_500_000
+TRANSITIONS = 2_500_000
 ARMS = {
     "as it is": [],
     "without mirror": ["agent.mirrored=false"],
@@ -29,8 +29,8 @@ ARMS = {
     "returns of five whole steps": ["learning.carry=true"],
     "no resting starts": ["task.start.resting_share=0"],
     "constant learning rate": ["optimizer.learning_rate_end=1"],
-    "prioritized replay": ["replay=prioritized"],
-    "no second tries": ["learning.try_again=0"],
+    "prioritized replay": ["buffer=prioritized"],
+    "no second tries": ["learning.retry_probability=0"],
     "rewards twice as large": ["reward.scale=0.1", "reward.track_penalty=10"],
     "without randomization": ["randomization=none"],
 }
@@ -48,7 +48,7 @@ def main() -> None:
     references = {plant: found["score"] for plant, found in json.loads(REFERENCES.read_text()).items()}
     everything, rows = {}, []
     for arm in given.arms:
-        words = [f"learning.frames={FRAMES}", *ARMS[arm]]
+        words = [f"learning.transitions={TRANSITIONS}", *ARMS[arm]]
         parent = Path("runs/bench/ablation", arm.replace(" ", "_"))
         folders = train_all("medium", given.seeds, given.jobs, words, parent)
         results = [result("medium", folder, references) for folder in folders]
@@ -56,7 +56,7 @@ def main() -> None:
         fractions = [each["plants"]["medium"]["fraction"] for each in results]
         drawn = [each["plants"]["medium"]["drawn"] for each in results]
         failed = [each["plants"]["medium"]["failed"] for each in results]
-        reached = [each["frames_to_reached"] or float("inf") for each in results]
+        reached = [each["transitions_to_reached"] or float("inf") for each in results]
         rows.append(
             {
                 "arm": arm,
@@ -65,7 +65,7 @@ def main() -> None:
                 "max": f"{max(fractions):.3f}",
                 "drawn carts": f"{np.median(drawn):.0f}",
                 "failed": f"{100 * np.mean(failed):.1f} %",
-                "million frames to 0.9": f"{np.median(reached) / 1e6:.2f}",
+                "million transitions to 0.9": f"{np.median(reached) / 1e6:.2f}",
                 "kept over 0.85": f"{np.mean([each['kept'] or 0.0 for each in results]):.2f}",
             }
         )

@@ -3,7 +3,7 @@
 
     scripts/bench/learning.py medium large --seeds 10 --jobs 2 --json learning.json
 
-A row is an experiment of conf/experiment; words like learning.frames=100000 are given on to cartpole-train.
+A row is an experiment of conf/experiment; overrides are passed to cartpole-train.
 Runs go to runs/bench/<row>/<seed> and are not trained again when they are there. A fraction is the mean score
 over 20 starts on a nominal cart, divided by the best that scripts/bench/reference.py has found there
 (references.json). "Drawn" carts are a thousand of randomization=wide, each driven once; one that scores less
@@ -110,7 +110,7 @@ def result(row: str, folder: Path, references: dict[str, float]) -> dict[str, An
     return {
         "seconds": history[-1]["seconds"],
         "seconds_to_reached": None if first is None else history[first]["seconds"],
-        "frames_to_reached": None if first is None else history[first]["frames"],
+        "transitions_to_reached": None if first is None else history[first]["transitions"],
         "kept": float(np.mean([fraction > KEPT for fraction in later])) if later else None,
         "plants": {
             plant: {**figures, "fraction": figures["score"] / references[plant]}

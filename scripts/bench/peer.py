@@ -57,7 +57,7 @@ SETTINGS: dict[str, Any] = {
     "exploration_fraction": 0.1,
     "policy_kwargs": {"net_arch": [128, 128]},
 }
-CARTS, UPDATES, FRAMES = 128, 16, 20_000_000
+CARTS, UPDATES, TRANSITIONS = 128, 16, 20_000_000
 
 
 class ManyCarts(VecEnv):
@@ -118,7 +118,7 @@ class ManyCarts(VecEnv):
 
 
 class Judge(BaseCallback):
-    """Evaluates every so many frames, stops the clock meanwhile, and ends at `REACHED` or after `limit` s."""
+    """Evaluates at intervals with the clock stopped, and ends at `REACHED` or after `limit` s."""
 
     def __init__(self, every: int, limit: float) -> None:
         super().__init__()
@@ -137,8 +137,12 @@ class Judge(BaseCallback):
         score = float(np.mean([episode.score.sum() for episode in episodes]))
         seconds = now - self.started - self.judging
         self.judging += time.perf_counter() - now
-        self.course.append({"frames": self.num_timesteps, "seconds": seconds, "score": score})
-        print(f"{self.num_timesteps} frames, {seconds:.0f} s, score {score:.0f}", file=sys.stderr, flush=True)
+        self.course.append({"transitions": self.num_timesteps, "seconds": seconds, "score": score})
+        print(
+            f"{self.num_timesteps} transitions, {seconds:.0f} s, score {score:.0f}",
+            file=sys.stderr,
+            flush=True,
+        )
         return score < REACHED * REFERENCE and seconds < self.limit
 
     def policy(self, present: TensorDict) -> TensorDict:
@@ -153,7 +157,7 @@ def theirs(seed: int, limit: float) -> list[dict[str, float]]:
     """Course of a training by Stable-Baselines3."""
     model = DQN("MlpPolicy", ManyCarts(CARTS, seed), seed=seed, gradient_steps=UPDATES, **SETTINGS)
     judge = Judge(200_000, limit)
-    model.learn(FRAMES, callback=judge)
+    model.learn(TRANSITIONS, callback=judge)
     return judge.course
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 BENCH = Path(__file__).parents[2] / "scripts" / "bench"
-TINY = ["learning.frames=2048", "learning.carts=16", "learning.evaluations=2", "compile=false"]
+TINY = ["learning.transitions=2048", "learning.carts=16", "learning.evaluations=2", "compile=false"]
 
 
 def bench(folder: Path, script: str, *arguments: str) -> str:

@@ -14,16 +14,16 @@ from hydra.core.global_hydra import GlobalHydra
 
 BIN = Path(sys.executable).parent
 TINY = (
-    "learning.frames=2048",
+    "learning.transitions=2048",
     "learning.carts=32",
     "learning.chunk=8",
     "learning.updates=2",
     "learning.batch_size=32",
-    "learning.warmup_frames=256",
+    "learning.warmup_transitions=256",
     "learning.evaluations=2",
     "learning.evaluation_episodes=2",
     "learning.checkpoint_interval=1",
-    "replay.size=1500",
+    "buffer.size=1500",
     "task.time_limit=60",
     "compile=false",
 )
@@ -92,5 +92,5 @@ def outcome(process: "subprocess.Popen[str]", timeout: float = 120) -> Outcome:
 def tells_only_how_it_goes(done: Outcome, trainings: int = 1) -> bool:
     """Whether trainings left no warning and no log of a library: progress bars, a line each at the end."""
     lines = done.err.replace("\r", "\n").splitlines()
-    bars = all("frames/s" in line for line in lines if line.strip())
+    bars = all("transitions/s" in line for line in lines if line.strip())
     return bars and len(done.out.splitlines()) == trainings

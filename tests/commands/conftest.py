@@ -31,7 +31,7 @@ def stopped(tmp_path_factory: pytest.TempPathFactory) -> Path:
         os.kill(os.getpid(), signal.SIGINT)
 
     threading.Thread(target=interrupt, daemon=True).start()
-    longer = ("actions=two", "learning.frames=2000000", "learning.evaluations=2000", "hydra.run.dir=run")
+    longer = ("actions=two", "learning.transitions=2000000", "learning.evaluations=2000", "hydra.run.dir=run")
     done = in_process("train", *TINY, *longer, folder=folder)
     assert done.code == 130, done.err
     return folder / "run"

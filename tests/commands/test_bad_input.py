@@ -38,7 +38,7 @@ WRONG_TRAINING = [
     ("randomization.cart_mass.relative=[-1.5,0]", "cart_mass", "above 0"),
     ("randomization.cart_mass.relative=[0.2,-0.2]", "randomization.cart_mass", "wrong order"),
     ("randomization=none +randomization.track_tilt={relative:[-1,1]}", "track_tilt", "give absolute bounds"),
-    ("learning.frames=100", "learning", "must be at least"),
+    ("learning.transitions=100", "learning", "must be at least"),
     ("agent.target_period=10", "agent", "either target_tau or target_period"),
     ("actions.motors=[100,100]", "actions", "two or more different values"),
     ("plant=emulated", "plant", "cartpole-evaluate takes plant=emulated"),
@@ -166,7 +166,7 @@ def test_resuming_takes_no_other_setting(words: str, remedy: str, trained: Path)
     done = in_process("train", f"resume={trained}", words, folder=trained.parent)
     assert remedy in done.complaint
     assert done.code == 2
-    assert not (trained.parent / "elsewhere").exists()
+    assert not (trained.parent / "prior_share").exists()
 
 
 def test_resuming_what_is_no_training(files: Path) -> None:
@@ -204,7 +204,7 @@ def test_a_training_that_has_ended_is_not_resumed(trained: Path) -> None:
     done = in_process("train", "resume=run", folder=trained.parent)
     assert done.complaint == (
         "cartpole-train: resume=run: this run of cartpole-train has ended; cartpole-evaluate run=run drives "
-        "its agent, cartpole-train with more learning.frames makes a longer training"
+        "its agent, cartpole-train with more learning.transitions makes a longer training"
     )
     assert done.code == 2
     assert {path: path.read_bytes() for path in trained.rglob("*") if path.is_file()} == before
@@ -256,7 +256,7 @@ def test_an_interrupt_is_told_in_one_line(tmp_path: Path) -> None:
         os.kill(os.getpid(), signal.SIGINT)
 
     threading.Thread(target=interrupt, daemon=True).start()
-    longer = ("learning.frames=2000000", "learning.evaluations=2000", "hydra.run.dir=run")
+    longer = ("learning.transitions=2000000", "learning.evaluations=2000", "hydra.run.dir=run")
     done = in_process("train", *TINY, *longer, folder=tmp_path)
     assert done.code == 130
     assert done.err.splitlines()[-1] == "cartpole-train: interrupted"

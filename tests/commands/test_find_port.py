@@ -8,8 +8,8 @@ from command_line import in_process
 
 from cartpole_rl.commands.find_port import listing, watched
 from cartpole_rl.errors import PortError
-from cartpole_rl.plants.serial_port import found_ports
-from cartpole_rl.plants.serial_ports import UsbPort
+from cartpole_rl.plants.serial.port import found_ports
+from cartpole_rl.plants.serial.ports import UsbPort
 
 CH340 = UsbPort("/dev/ttyUSB0", 0x1A86, 0x7523)
 FTDI = UsbPort("/dev/ttyUSB1", 0x0403, 0x6001)

@@ -99,7 +99,7 @@ def test_one_that_has_ended_is_not_resumed(tuned: tuple[Path, Outcome], tmp_path
     done = in_process("finetune", f"resume={run}", "hydra.run.dir=elsewhere", folder=tmp_path)
     assert done.code == 2
     assert "leave out hydra.run.dir" in done.complaint
-    assert not (tmp_path / "elsewhere").exists()
+    assert not (tmp_path / "prior_share").exists()
 
 
 def test_a_tuned_agent_is_evaluated_like_any_other(tuned: tuple[Path, Outcome], tmp_path: Path) -> None:

@@ -24,8 +24,8 @@ from cartpole_rl.tasks.settings import ObservationKind, StartSettings
 MOTORS = tuple(choice("actions/nine_levels")["motors"])
 SHORT = [
     "compile=false",
-    "learning.frames=327680",
-    "learning.epsilon_frames=100000",
+    "learning.transitions=327680",
+    "learning.epsilon_transitions=100000",
     "learning.evaluations=2",
 ]
 SWING_UP = [  # on the nominal cart, with a smaller network: 5400 updates are enough there
@@ -35,9 +35,9 @@ SWING_UP = [  # on the nominal cart, with a smaller network: 5400 updates are en
     "agent.target_tau=0.02",
     "optimizer.learning_rate_end=0.3",
     "learning.batch_size=256",
-    "learning.try_again=0",
-    "learning.frames=700000",
-    "learning.epsilon_frames=100000",
+    "learning.retry_probability=0",
+    "learning.transitions=700000",
+    "learning.epsilon_transitions=100000",
     "learning.evaluations=1",
 ]
 BALANCED = 0.5  # of the periods within 5 degrees; three seeds had 0.78 to 0.79, the best pump 0.07

@@ -67,17 +67,17 @@ def test_a_training_leaves_what_runs_readme_says(trained: Path) -> None:
     assert (metrics["plant"], metrics["pole"], len(metrics["episodes"])) == ("simulated", "medium", 2)
     assert timeless(metrics)
     config = yaml.safe_load((trained / "config.yaml").read_text())
-    assert config["learning"]["frames"] == 2048
+    assert config["learning"]["transitions"] == 2048
     assert config["task"]["x_max"] == config["cart"]["track_half_length"]
     provenance = read(trained / "provenance.json")
     assert (provenance["program"], provenance["seed"]) == ("cartpole-train", 0)
-    assert "learning.frames=2048" in provenance["command"]
+    assert "learning.transitions=2048" in provenance["command"]
     assert provenance["packages"]["torch"] == torch.__version__.split("+")[0]
 
 
 def test_the_last_evaluation_is_that_of_the_metrics(trained: Path) -> None:
     last, metrics = history(trained)[-1], read(trained / "metrics.json")
-    assert last["frames"] == 2048
+    assert last["transitions"] == 2048
     for key in ("score", "score_upright", "steps", "upright_fraction"):
         assert last[key] == pytest.approx(metrics[key]["mean"])
     assert last["score"] == pytest.approx(curves(trained)["evaluation/score"][-1][1])
@@ -210,7 +210,7 @@ def when_saved(process: "subprocess.Popen[str]", checkpoint: Path) -> None:
 
 def test_a_training_that_was_stopped_goes_on_as_if_it_had_not_been(tmp_path: Path) -> None:
     """Killed, resumed, terminated, resumed: the same to the bit as one that ran through."""
-    words = (*TINY, "learning.frames=4096", "learning.evaluations=8", "replay=prioritized", "pole=both")
+    words = (*TINY, "learning.transitions=4096", "learning.evaluations=8", "buffer=prioritized", "pole=both")
     checkpoint = tmp_path / "stopped/checkpoints/resume.pt"
 
     killed = console_script("train", *words, "hydra.run.dir=stopped", folder=tmp_path)
@@ -246,7 +246,7 @@ def test_a_training_that_was_stopped_keeps_no_more_than_it_has_seen(stopped: Pat
     """Its replay buffer has room for 1500 transitions, the default one for a million."""
     state = torch.load(stopped / "checkpoints/resume.pt", weights_only=True)
     kept = state["state"]["replay"]["transitions"]
-    assert {len(column) for column in kept.values()} == {min(state["frames"], 1500)}
+    assert {len(column) for column in kept.values()} == {min(state["transitions"], 1500)}
     assert not (stopped / "metrics.json").exists()
 
 

@@ -241,7 +241,7 @@ class TestEndings:
 def test_rewards_and_scores_are_of_the_measured_state(
     make_plant: MakePlant, make_environment: MakeEnvironment, kind: Reward
 ) -> None:
-    reward: dict[str, Any] = {"kind": kind, "scale": 0.3, "track_penalty": 0.0, "track_price": 0.0}
+    reward: dict[str, Any] = {"kind": kind, "scale": 0.3, "track_penalty": 0.0, "position_cost": 0.0}
     env = make_environment(make_plant(32, start=ANYWHERE), MOTORS, reward=reward)
     following = course(env, actions(10, 32))["next"].flatten()
     for key, law, scale in (
@@ -256,7 +256,7 @@ def test_rewards_and_scores_are_of_the_measured_state(
 def test_nearing_the_tracks_end_has_its_price(
     make_plant: MakePlant, make_environment: MakeEnvironment
 ) -> None:
-    reward: dict[str, Any] = {"kind": "constant", "scale": 1.0, "track_penalty": 0.0, "track_price": 0.4}
+    reward: dict[str, Any] = {"kind": "constant", "scale": 1.0, "track_penalty": 0.0, "position_cost": 0.4}
     env = make_environment(make_plant(32, start=ANYWHERE), MOTORS, reward=reward)
     following = course(env, actions(10, 32))["next"].flatten()
     expected = 1 - 0.4 * (following["state"][:, 0] / 0.38) ** 2

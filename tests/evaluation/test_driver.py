@@ -22,10 +22,10 @@ from cartpole_rl.envs.settings import ObservationSettings, RewardSettings, TaskS
 from cartpole_rl.errors import FaultError, LinkError
 from cartpole_rl.evaluation.driver import Drive, Driver
 from cartpole_rl.evaluation.driving_policy import as_weights
-from cartpole_rl.plants.serial import SerialPlant
-from cartpole_rl.plants.serial_errors import NotReadyError
-from cartpole_rl.plants.serial_faults import Confirm
-from cartpole_rl.plants.serial_settings import SerialPlantSettings
+from cartpole_rl.plants.serial.errors import NotReadyError
+from cartpole_rl.plants.serial.faults import Confirm
+from cartpole_rl.plants.serial.plant import SerialPlant
+from cartpole_rl.plants.serial.settings import SerialPlantSettings
 from cartpole_rl.tasks.actions import ActionSettings
 from cartpole_rl.wire import ClearFault, Fault, Message, SetMotor, Stop
 
@@ -51,8 +51,8 @@ def scripted_env(port: str, time_limit: int, confirm: Confirm) -> CartPoleEnv:
 def network() -> nn.Module:
     """An untrained one, the same each time."""
     torch.manual_seed(0)
-    sight = ObservationSettings(**choice("observation/history"))
-    return QAgent(AgentSettings(**choice("agent/dqn")), sight.mirror_signs, 2).greedy_policy()
+    observation = ObservationSettings(**choice("observation/history"))
+    return QAgent(AgentSettings(**choice("agent/dqn")), observation.mirror_signs, 2).greedy_policy()
 
 
 class Faulty(CartPeer):

@@ -38,8 +38,8 @@ SETTINGS = EnsembleSettings(
     learning_rate=0.05,
     refresh=10,
     validation=0.2,
-    price=3.0,
-    price_of_places=0.1,
+    output_penalty=3.0,
+    table_penalty=0.1,
 )
 
 MakeEnvironment = Callable[..., CartPoleEnv]

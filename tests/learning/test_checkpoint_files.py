@@ -19,8 +19,8 @@ from cartpole_rl.learning.checkpoints import (
     save_training,
 )
 
-AGENT = AgentCheckpoint(config={"seed": 1}, weights={"w": torch.arange(3.0)}, frames=10, score=2.5)
-TRAINING = TrainingCheckpoint(config={"seed": 1}, state={"counters": [1, 2]}, frames=10)
+AGENT = AgentCheckpoint(config={"seed": 1}, weights={"w": torch.arange(3.0)}, transitions=10, score=2.5)
+TRAINING = TrainingCheckpoint(config={"seed": 1}, state={"counters": [1, 2]}, transitions=10)
 LAST = Path("checkpoints/last.pt")
 
 
@@ -37,7 +37,7 @@ def test_an_agent_comes_back_from_its_folder_and_from_its_file(tmp_path: Path) -
     save_agent(tmp_path / LAST, AGENT)
     for run in (tmp_path, tmp_path / LAST):
         found = load_agent(run)
-        assert (found.config, found.frames, found.score) == ({"seed": 1}, 10, 2.5)
+        assert (found.config, found.transitions, found.score) == ({"seed": 1}, 10, 2.5)
         assert torch.equal(found.weights["w"], torch.arange(3.0))
 
 
@@ -60,12 +60,12 @@ def test_a_training_is_no_fine_tuning(tmp_path: Path) -> None:
 def test_weights_that_are_not_finite_are_neither_written_nor_read(value: float, tmp_path: Path) -> None:
     save_agent(tmp_path / LAST, AGENT)
     whole = (tmp_path / LAST).read_bytes()
-    diverged = AgentCheckpoint({}, {"w": torch.tensor([1.0, value])}, frames=20, score=None)
+    diverged = AgentCheckpoint({}, {"w": torch.tensor([1.0, value])}, transitions=20, score=None)
     with pytest.raises(CheckpointError, match=r"last\.pt is not written: its weight w is not finite"):
         save_agent(tmp_path / LAST, diverged)
     assert (tmp_path / LAST).read_bytes() == whole
     with pytest.raises(CheckpointError, match=r"resume\.pt is not written: its weight w is not finite"):
-        save_training(tmp_path, TrainingCheckpoint({}, {"agent": diverged.weights}, frames=20))
+        save_training(tmp_path, TrainingCheckpoint({}, {"agent": diverged.weights}, transitions=20))
     torch.save({"format": "cartpole_rl agent 1", **vars(diverged)}, tmp_path / LAST)
     assert "is refused: its weight w is not finite" in complaint(load_agent, tmp_path / LAST)
     torch.save(
@@ -73,7 +73,7 @@ def test_weights_that_are_not_finite_are_neither_written_nor_read(value: float, 
             "format": TRAINING_FORMAT,
             "config": {},
             "state": {"agent": diverged.weights},
-            "frames": 20,
+            "transitions": 20,
         },
         tmp_path / "checkpoints/resume.pt",
     )
@@ -136,7 +136,7 @@ def test_a_file_left_half_written_does_no_harm(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         killed_while_writing()
     assert len(list((tmp_path / "checkpoints").iterdir())) == 2  # the half lies beside the whole
-    assert load_agent(tmp_path).frames == 10
-    save_agent(tmp_path / LAST, AgentCheckpoint({}, {}, frames=20, score=None))
-    assert load_agent(tmp_path).frames == 20
+    assert load_agent(tmp_path).transitions == 10
+    save_agent(tmp_path / LAST, AgentCheckpoint({}, {}, transitions=20, score=None))
+    assert load_agent(tmp_path).transitions == 20
     assert [path.name for path in (tmp_path / "checkpoints").iterdir()] == ["last.pt"]

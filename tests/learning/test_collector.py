@@ -104,7 +104,7 @@ def test_a_cart_that_failed_tries_again(
     )
     acting.epsilon = 0.0
     acting.collect(1000)  # what is usual is known from here on
-    acting.begin()
+    acting.reset()
     score, failed, stood = torch.zeros(CARTS), [], []
     for _ in range(500):
         before = plant.parameters.pole_viscous.clone()

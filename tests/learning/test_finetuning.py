@@ -15,22 +15,22 @@ from cartpole_rl.errors import ConfigError
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.learning.finetuning import Finetuning, recorded_chunk
 from cartpole_rl.learning.settings import (
+    BufferSettings,
     FinetuningSettings,
     LearningSettings,
     OptimizerSettings,
-    ReplaySettings,
 )
 
 MOTORS = (-250, -200, 0, 200, 250)
 LENGTH = 2 * 0.1778  # m, the medium pole
 KINDS = ("history", "history_length", "positions", "raw")
 LEARNING = choice("learning/fast") | {
-    "frames": 2560,
+    "transitions": 2560,
     "carts": 16,
     "chunk": 8,
     "updates": 2,
     "batch_size": 64,
-    "warmup_frames": 0,
+    "warmup_transitions": 0,
 }
 
 
@@ -70,12 +70,14 @@ def test_a_recording_has_what_the_agent_saw_and_tunes_it(
     assert all(value.isfinite().all() for value in chunk.values(True, True) if value.is_floating_point())
 
     env = make_environment(make_plant(16), MOTORS, time_limit=40, **observation)
-    sight = env.hardware.observation_settings
-    agent = QAgent(AgentSettings(**choice("agent/dqn")), sight.mirror_signs, len(MOTORS), sight.frames)
+    observation = env.hardware.observation_settings
+    agent = QAgent(
+        AgentSettings(**choice("agent/dqn")), observation.mirror_signs, len(MOTORS), observation.frames
+    )
     learner = Finetuning(
         FinetuningSettings(**choice("finetuning/gentle") | {"iterations": 3, "cart_share": 0.5}),
         LearningSettings(**LEARNING),
-        ReplaySettings(**choice("replay/uniform") | {"size": 5000}),
+        BufferSettings(**choice("buffer/uniform") | {"size": 5000}),
         OptimizerSettings(**choice("optimizer/adam")),
         agent,
         env,

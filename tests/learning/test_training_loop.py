@@ -16,26 +16,26 @@ from cartpole_rl.errors import LearningError
 from cartpole_rl.learning.finetuning import Finetuning
 from cartpole_rl.learning.randomness import seed_everything
 from cartpole_rl.learning.settings import (
+    BufferSettings,
     FinetuningSettings,
     LearningSettings,
     OptimizerSettings,
-    ReplaySettings,
 )
 from cartpole_rl.learning.training import Scalars, Training
 from cartpole_rl.tasks.episode import Episode
 
 LEARNING = {
-    "frames": 1024,
+    "transitions": 1024,
     "carts": 16,
     "chunk": 4,
-    "try_again": 0.5,
+    "retry_probability": 0.5,
     "updates": 2,
     "batch_size": 32,
     "n_step": 3,
     "carry": False,
-    "warmup_frames": 128,
+    "warmup_transitions": 128,
     "epsilon": (0.5, 0.1),
-    "epsilon_frames": 400,
+    "epsilon_transitions": 400,
     "evaluations": 4,
     "evaluation_episodes": 2,
     "checkpoint_interval": 2,
@@ -78,16 +78,16 @@ class Listener:
         self.judged: list[tuple[int, bool]] = []
         self.snapshots: list[tuple[int, bytes]] = []
 
-    def learned(self, frames: int, scalars: Scalars) -> None:
-        self.scalars.append((frames, scalars))
+    def on_update(self, transitions: int, scalars: Scalars) -> None:
+        self.scalars.append((transitions, scalars))
 
-    def evaluated(self, training: Training, episodes: Sequence[Episode], is_best: bool) -> None:
-        self.judged.append((training.frames, is_best))
+    def on_evaluation(self, training: Training, episodes: Sequence[Episode], is_best: bool) -> None:
+        self.judged.append((training.transitions, is_best))
 
-    def checkpoint(self, training: Training) -> None:
+    def on_checkpoint(self, training: Training) -> None:
         file = io.BytesIO()
         torch.save(training.snapshot(), file)
-        self.snapshots.append((training.frames, file.getvalue()))
+        self.snapshots.append((training.transitions, file.getvalue()))
 
 
 @pytest.fixture
@@ -111,7 +111,7 @@ def make_training(make_plant: Callable, make_environment: Callable) -> Callable[
         )
         return kind(
             LearningSettings(**{**LEARNING, **(learning or {})}),
-            ReplaySettings(**{**REPLAY, **(replay or {})}),
+            BufferSettings(**{**REPLAY, **(replay or {})}),
             OptimizerSettings(**{**OPTIMIZER, **(optimizer or {})}),
             q_agent,
             env,
@@ -126,7 +126,7 @@ def make_training(make_plant: Callable, make_environment: Callable) -> Callable[
 def test_it_counts_frames_and_updates(make_training: Callable[..., Training]) -> None:
     training = make_training()
     training.run()
-    assert training.frames == 1024
+    assert training.transitions == 1024
     assert len(training.replay) == 500
     iterations, warmed_up = 1024 // 64, 128 // 64
     assert training.updates == 2 * (iterations - warmed_up)
@@ -138,8 +138,8 @@ def test_it_evaluates_evenly_and_checkpoints_every_second_time(
 ) -> None:
     training = make_training()
     training.run()
-    assert [frames for frames, _ in training.monitor.judged] == [256, 512, 768, 1024]
-    assert [frames for frames, _ in training.monitor.snapshots] == [512, 1024]
+    assert [transitions for transitions, _ in training.monitor.judged] == [256, 512, 768, 1024]
+    assert [transitions for transitions, _ in training.monitor.snapshots] == [512, 1024]
 
 
 def test_the_best_is_the_first_of_the_highest_scores(make_training: Callable[..., Training]) -> None:
@@ -153,9 +153,9 @@ def test_the_best_is_the_first_of_the_highest_scores(make_training: Callable[...
 def test_exploration_falls_from_all_to_the_last_share(make_training: Callable[..., Training]) -> None:
     training = make_training()
     training.run()
-    told = {frames: scalars["learning/epsilon"] for frames, scalars in training.monitor.scalars}
+    told = {transitions: scalars["learning/epsilon"] for transitions, scalars in training.monitor.scalars}
     assert told[64] == told[128] == 1.0  # acted before an update could be made
-    assert told[192] == pytest.approx(0.5)  # 128 frames were seen
+    assert told[192] == pytest.approx(0.5)  # 128 transitions were seen
     assert told[192 + 64] == pytest.approx(0.5 - 0.4 * 64 / 400)
     assert told[1024] == pytest.approx(0.1)
 
@@ -194,10 +194,10 @@ def test_learning_stops_at_the_first_loss_that_is_not_finite(
 def test_a_time_limit_does_not_end_the_world(make_training: Callable[..., Training]) -> None:
     """With 1 a step and gamma = 0.5 every state is worth 2, since episodes of 6 steps are only cut short."""
     training = make_training(
-        learning={"frames": 6400, "updates": 8, "n_step": 2},
+        learning={"transitions": 6400, "updates": 8, "n_step": 2},
         agent={"gamma": 0.5},
         optimizer={"learning_rate": 1e-2},
-        reward={"kind": "constant", "scale": 1.0, "track_penalty": 0.0, "track_price": 0.0},
+        reward={"kind": "constant", "scale": 1.0, "track_penalty": 0.0, "position_cost": 0.0},
         time_limit=6,
     )
     training.run()
@@ -229,8 +229,8 @@ def test_a_resumed_training_ends_with_the_same_weights(
 
     whole = build(seed=0)
     whole.run()
-    frames, state = whole.monitor.snapshots[0]
-    assert frames == 512
+    transitions, state = whole.monitor.snapshots[0]
+    assert transitions == 512
 
     resumed = build(seed=1)  # every generator stands elsewhere
     resumed.restore(torch.load(io.BytesIO(state), weights_only=True))
@@ -246,7 +246,7 @@ def test_no_return_reaches_from_one_fit_of_the_cart_to_the_next(
     make_training: Callable[..., Training],
 ) -> None:
     settings = FinetuningSettings(
-        iterations=1, refit=1, cart_share=0, elsewhere=0, widen=1, epsilon=0, learning_rate=1e-3
+        iterations=1, refit=1, cart_share=0, prior_share=0, widen=1, epsilon=0, learning_rate=1e-3
     )
     training = make_training(learning={"carry": True}, kind=partial(Finetuning, settings))
     filled = []
@@ -261,7 +261,7 @@ def test_no_return_reaches_from_one_fit_of_the_cart_to_the_next(
 @pytest.mark.parametrize(
     "wrong",
     [
-        {"frames": 100},
+        {"transitions": 100},
         {"n_step": 5},
         {"carts": 0},
         {"epsilon": (1.5, 0.1)},

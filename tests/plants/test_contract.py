@@ -20,8 +20,8 @@ from tensordict import TensorDict, TensorDictBase
 from cartpole_rl.errors import PlantError
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.physics.dynamics import State as TrueState
-from cartpole_rl.plants.serial import SerialPlant
-from cartpole_rl.plants.serial_settings import SerialPlantSettings
+from cartpole_rl.plants.serial.plant import SerialPlant
+from cartpole_rl.plants.serial.settings import SerialPlantSettings
 from cartpole_rl.wire import Flags, Frame, SetMotor, Start, State
 
 MOTORS = (-255, -100, 0, 255)

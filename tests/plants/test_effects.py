@@ -144,8 +144,8 @@ def test_of_carts_that_were_found_only_what_is_drawn(ip02: dict[str, float], med
     others = Randomizer(ip02, medium, ranges)
     found = others.nominal.unsqueeze(1).repeat(1, 5)
 
-    def unread(elsewhere: float, told: list[str] | None) -> list[str]:
-        carts = FoundCarts(found, others, elsewhere, longest_delay=0.02, told=told)
+    def unread(prior_share: float, told: list[str] | None) -> list[str]:
+        carts = FoundCarts(found, others, prior_share, longest_delay=0.02, told=told)
         return without_effect(carts, ranges, (-200, 0, 200), Models(), 0.02)
 
     assert unread(0.0, None) == ["cart_mass", "latency"]

@@ -14,8 +14,8 @@ import pytest
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import EmulatorError, LinkError
 from cartpole_rl.plants.emulated_cart import EmulatedCart
-from cartpole_rl.plants.serial_cart import SerialCart, SerialSettings
-from cartpole_rl.plants.serial_errors import RefusedError
+from cartpole_rl.plants.serial.cart import SerialCart, SerialSettings
+from cartpole_rl.plants.serial.errors import RefusedError
 from cartpole_rl.wire import Flags, Reason
 
 fast = partial(EmulatorSettings, physics_step=1e-3)

@@ -17,7 +17,7 @@ from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import LinkError
 from cartpole_rl.plants.emulated import emulated_plant
 from cartpole_rl.plants.emulated_cart import EmulatedCart
-from cartpole_rl.plants.serial import SerialPlant
+from cartpole_rl.plants.serial.plant import SerialPlant
 
 TURN = 4096
 

@@ -13,9 +13,9 @@ import pytest
 from serial_peer import CartPeer, Peer, open_descriptors
 
 from cartpole_rl.errors import FaultError, LinkError, PlantError, PortError
-from cartpole_rl.plants.serial_cart import SerialCart, SerialSettings
-from cartpole_rl.plants.serial_errors import RefusedError
-from cartpole_rl.plants.serial_port import why_not_open
+from cartpole_rl.plants.serial.cart import SerialCart, SerialSettings
+from cartpole_rl.plants.serial.errors import RefusedError
+from cartpole_rl.plants.serial.port import why_not_open
 from cartpole_rl.wire import Fault, Flags, Frame, Hello, Nack, Reason, SetMotor, Start, Stop
 
 
@@ -572,7 +572,7 @@ class TestAnswers:
 
 PROGRAM = """
 import sys, time
-from cartpole_rl.plants.serial_cart import SerialCart, SerialSettings
+from cartpole_rl.plants.serial.cart import SerialCart, SerialSettings
 with SerialCart(SerialSettings(port=sys.argv[1])) as cart:
     cart.start()
     cart.set_motor(200)

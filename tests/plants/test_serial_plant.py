@@ -9,9 +9,9 @@ from serial_peer import HANGING, CartPeer
 from tensordict import TensorDict
 
 from cartpole_rl.errors import FaultError, LinkError, PlantError, PortError
-from cartpole_rl.plants.serial import SerialPlant
-from cartpole_rl.plants.serial_errors import NotReadyError
-from cartpole_rl.plants.serial_settings import SerialPlantSettings
+from cartpole_rl.plants.serial.errors import NotReadyError
+from cartpole_rl.plants.serial.plant import SerialPlant
+from cartpole_rl.plants.serial.settings import SerialPlantSettings
 from cartpole_rl.wire import ClearFault, Fault, Flags, Frame, Home, SetMotor, Start, Stop
 
 

@@ -4,9 +4,9 @@ import pytest
 from serial.tools.list_ports_common import ListPortInfo
 
 from cartpole_rl.errors import PortError
-from cartpole_rl.plants.serial_cart import SerialCart, SerialSettings
-from cartpole_rl.plants.serial_port import found_ports, only_cart, resolved_port
-from cartpole_rl.plants.serial_ports import UsbPort, cart_like, changes, described, usb_ports
+from cartpole_rl.plants.serial.cart import SerialCart, SerialSettings
+from cartpole_rl.plants.serial.port import found_ports, only_cart, resolved_port
+from cartpole_rl.plants.serial.ports import UsbPort, cart_like, changes, described, usb_ports
 
 
 def listed(device: str, vid: int | None, product: str | None = None) -> ListPortInfo:

@@ -11,9 +11,9 @@ from serial_peer import INFO, Between, CartPeer
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import FaultError
 from cartpole_rl.plants.emulated_cart import EmulatedCart
-from cartpole_rl.plants.serial_cart import SerialCart, SerialSettings
-from cartpole_rl.plants.serial_errors import NotReadyError
-from cartpole_rl.plants.serial_preflight import (
+from cartpole_rl.plants.serial.cart import SerialCart, SerialSettings
+from cartpole_rl.plants.serial.errors import NotReadyError
+from cartpole_rl.plants.serial.preflight import (
     Finding,
     Moves,
     cart_direction,

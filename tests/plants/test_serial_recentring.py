@@ -13,11 +13,11 @@ from tensordict import TensorDict
 
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.plants.emulated import emulated_plant
-from cartpole_rl.plants.serial import SerialPlant
-from cartpole_rl.plants.serial_cart import SerialCart
-from cartpole_rl.plants.serial_errors import NotReadyError
-from cartpole_rl.plants.serial_recentring import recentre
-from cartpole_rl.plants.serial_settings import SerialPlantSettings
+from cartpole_rl.plants.serial.cart import SerialCart
+from cartpole_rl.plants.serial.errors import NotReadyError
+from cartpole_rl.plants.serial.plant import SerialPlant
+from cartpole_rl.plants.serial.recentring import recentre
+from cartpole_rl.plants.serial.settings import SerialPlantSettings
 from cartpole_rl.wire import Fault, Flags
 
 TURN = 4096

@@ -10,7 +10,7 @@ from hydra.core.global_hydra import GlobalHydra
 from cartpole_rl.choices import conf_folder
 from cartpole_rl.commands.composition import as_mapping
 from cartpole_rl.errors import PlantError
-from cartpole_rl.plants.link_statistics import LATENCY_SAMPLES, LatencyRing, LinkStatistics
+from cartpole_rl.plants.serial.statistics import LATENCY_SAMPLES, LatencyRing, LinkStatistics
 from cartpole_rl.randomization.ranges import Range
 from cartpole_rl.workflows.build import randomizer
 from cartpole_rl.workflows.checking import checked

@@ -21,9 +21,9 @@ from tensordict import TensorDictBase
 
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.identification.experiments import Experiment, Moves, Task, conduct, hold
-from cartpole_rl.plants.serial import SerialPlant
-from cartpole_rl.plants.serial_cart import SerialCart, SerialSettings
-from cartpole_rl.plants.serial_settings import SerialPlantSettings
+from cartpole_rl.plants.serial.cart import SerialCart, SerialSettings
+from cartpole_rl.plants.serial.plant import SerialPlant
+from cartpole_rl.plants.serial.settings import SerialPlantSettings
 from cartpole_rl.wire import Flags
 
 PERIOD_MS = 20
@@ -61,7 +61,7 @@ process.run(EmulatorSettings(clock="real", cart_mass=20.0, physics_step=1e-3, jo
 
 HOST = """
 import itertools, signal, sys
-from cartpole_rl.plants.serial_cart import SerialCart, SerialSettings
+from cartpole_rl.plants.serial.cart import SerialCart, SerialSettings
 
 from cartpole_rl.signals import ending_signals
 

@@ -11,15 +11,15 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 BUDGET = [
-    "learning.frames=512",
+    "learning.transitions=512",
     "learning.carts=16",
     "learning.chunk=8",
     "learning.updates=1",
     "learning.batch_size=16",
-    "learning.warmup_frames=64",
+    "learning.warmup_transitions=64",
     "learning.evaluations=1",
     "learning.evaluation_episodes=1",
-    "replay.size=1000",
+    "buffer.size=1000",
     "task.time_limit=60",
     "compile=false",
 ]

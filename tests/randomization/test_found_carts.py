@@ -16,12 +16,12 @@ from cartpole_rl.randomization.ranges import Range
 MASS, VISCOUS = (CartParameters.names().index(name) for name in ("cart_mass", "cart_viscous"))
 
 
-def found_carts(ip02: dict[str, float], medium: PoleSettings, elsewhere: float) -> FoundCarts:
+def found_carts(ip02: dict[str, float], medium: PoleSettings, prior_share: float) -> FoundCarts:
     others = Randomizer(ip02, medium, {"cart_mass": Range(absolute=(5.0, 6.0))})
     table = others.nominal.unsqueeze(1).repeat(1, 100)
     table[MASS] = torch.linspace(0.5, 1.0, 100)
     table[VISCOUS] = 2 * table[MASS]
-    return FoundCarts(table, others, elsewhere, longest_delay=0.03)
+    return FoundCarts(table, others, prior_share, longest_delay=0.03)
 
 
 def test_rows_stay_together(ip02: dict[str, float], medium: PoleSettings) -> None:

@@ -22,15 +22,15 @@ ROOT = Path(__file__).parents[2]
 BIN = Path(sys.executable).parent
 BUDGET = [
     "compile=false",
-    "learning.frames=1024",
+    "learning.transitions=1024",
     "learning.carts=16",
     "learning.chunk=8",
     "learning.updates=1",
     "learning.batch_size=16",
-    "learning.warmup_frames=64",
+    "learning.warmup_transitions=64",
     "learning.evaluations=1",
     "learning.evaluation_episodes=2",
-    "replay.size=2000",
+    "buffer.size=2000",
 ]
 VERBS = (
     "train",
@@ -93,8 +93,8 @@ def test_every_command_is_one_that_a_test_here_runs() -> None:
 @pytest.mark.parametrize("command", [c for c in listed("cartpole-train") if "<run>" not in c])
 def test_train(command: str, tmp_path: Path) -> None:
     budget = [word for word in BUDGET if word.split("=")[0] not in command]
-    if "learning.frames=" in command:
-        command = re.sub(r"learning.frames=\d+", "learning.frames=1024", command)
+    if "learning.transitions=" in command:
+        command = re.sub(r"learning.transitions=\d+", "learning.transitions=1024", command)
     result = run_here(command, *budget, cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     runs = list(tmp_path.glob("runs/train/**/metrics.json"))
@@ -105,7 +105,7 @@ def test_resume(trained: Path) -> None:
     """A training is interrupted, goes on, and is interrupted again."""
     (command,) = [command for command in listed("cartpole-train") if "resume" in command]
     folder = trained / "runs/train/stopped"
-    longer = ["learning.frames=10000000", "learning.evaluations=5000", f"hydra.run.dir={folder}"]
+    longer = ["learning.transitions=10000000", "learning.evaluations=5000", f"hydra.run.dir={folder}"]
     interrupt_when_saved(["cartpole-train", *BUDGET, *longer], folder, trained)
     seen = len((folder / "history.jsonl").read_text().splitlines())
     interrupt_when_saved(command.replace("<run>", "stopped").split(), folder, trained)

@@ -50,7 +50,7 @@ def records(scores: list[float], frames_apart: int = 100_000) -> list[dict]:
     """Evaluations a second apart whose episodes lie 100 around the mean."""
     return [
         {
-            "frames": (i + 1) * frames_apart,
+            "transitions": (i + 1) * frames_apart,
             "seconds": float(i + 1),
             "score": score,
             "score_min": score - 100,
@@ -152,7 +152,7 @@ class TestLearningCurve:
         band = axes.collections[0].get_paths()[0].vertices
         assert band[:, 1].min() == 0
         assert band[:, 1].max() == 4200
-        assert axes.get_xlabel() == "frames (millions)"
+        assert axes.get_xlabel() == "transitions (millions)"
         assert axes.get_ylabel() == "score of an episode"
 
     def test_runs_of_one_label_get_their_median(self) -> None:

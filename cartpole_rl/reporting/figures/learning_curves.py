@@ -1,4 +1,4 @@
-"""Learning curves: the score of the evaluation episodes over the frames seen (as figure 6.9 of the thesis).
+"""Learning curves: the score of the evaluation episodes over the transitions collected (figure 6.9).
 
 The thesis draws one agent; here every seed is drawn, so that luck shows.
 """
@@ -32,10 +32,10 @@ def learning_curve(
     guides: Mapping[str, float] | None = None,
     title: str = "Learning curve",
 ) -> Figure:
-    """Score per evaluation over millions of frames, one colour for each label.
+    """Score per evaluation over millions of transitions, one colour for each label.
 
-    A history is a label and its records, one an evaluation, in the order of learning: `frames`, `seconds` of
-    training, and over the episodes of that evaluation `score` (mean), `score_min`, `score_max`.
+    A history is a label and its records, one per evaluation, in the order of learning: `transitions`,
+    `seconds` of training, and over the episodes of that evaluation `score` (mean), `score_min`, `score_max`.
     **Runs that share a label are seeds of one set-up**: each is a thin line, their median a thick one. A run
     alone is a thick line. The band spans the worst to the best episode of all runs of that label.
     `threshold` is a score to reach, `guides` names other scores, as THESIS_GUIDES does.
@@ -54,7 +54,7 @@ def learning_curve(
     axes.set_xlim(left=0)
     axes.set_ylim(bottom=min(0.0, axes.dataLim.y0))
     axes.legend(loc="lower right", fontsize=style.NOTE_SIZE, frameon=True, framealpha=0.9, edgecolor="none")
-    style.label(axes, x="frames (millions)", y="score of an episode")
+    style.label(axes, x="transitions (millions)", y="score of an episode")
     lines = "thin lines: runs,  thick line: their median" if len(histories) > len(groups) else "line: mean"
     style.title(axes, title, f"{lines},  band: worst to best episode")
     return figure
@@ -73,36 +73,40 @@ def _column(run: Run, key: str) -> Array:
     return np.array([record[key] for record in run], dtype=np.float64)
 
 
-def _on_common_frames(runs: Sequence[Run], key: str) -> tuple[Array, Array]:
+def _on_common_transitions(runs: Sequence[Run], key: str) -> tuple[Array, Array]:
     """Frames [F] that all runs have passed, and `key` of each run there [runs, F], interpolated."""
-    frames = [_column(run, "frames") for run in runs]
-    first, last = max(each[0] for each in frames), min(each[-1] for each in frames)
-    shared = np.unique(np.concatenate(frames))
+    transitions = [_column(run, "transitions") for run in runs]
+    first, last = max(each[0] for each in transitions), min(each[-1] for each in transitions)
+    shared = np.unique(np.concatenate(transitions))
     shared = shared[(first <= shared) & (shared <= last)]
     if not shared.size:  # runs that have no frame in common
-        shared = np.unique(np.concatenate(frames))
-    values = [np.interp(shared, own, _column(run, key)) for own, run in zip(frames, runs, strict=True)]
+        shared = np.unique(np.concatenate(transitions))
+    values = [np.interp(shared, own, _column(run, key)) for own, run in zip(transitions, runs, strict=True)]
     return shared, np.stack(values)
 
 
 def _draw_group(axes: Axes, name: str, runs: Sequence[Run], colour: str) -> None:
     """The band, the thin line of each seed and the thick line of a label."""
-    frames, lowest = _on_common_frames(runs, "score_min")
-    _, highest = _on_common_frames(runs, "score_max")
-    axes.fill_between(frames / MILLION, lowest.min(0), highest.max(0), color=colour, alpha=0.13, linewidth=0)
+    transitions, lowest = _on_common_transitions(runs, "score_min")
+    _, highest = _on_common_transitions(runs, "score_max")
+    axes.fill_between(
+        transitions / MILLION, lowest.min(0), highest.max(0), color=colour, alpha=0.13, linewidth=0
+    )
     if len(runs) > 1:
         for run in runs:
             axes.plot(
-                _column(run, "frames") / MILLION,
+                _column(run, "transitions") / MILLION,
                 _column(run, "score"),
                 color=colour,
                 alpha=0.55,
                 linewidth=0.9,
             )
         name = f"{name}: median of {len(runs)} runs"
-    frames, scores = _on_common_frames(runs, "score")
-    marker = "o" if len(frames) == 1 else ""
-    axes.plot(frames / MILLION, np.median(scores, 0), marker=marker, color=colour, linewidth=2.2, label=name)
+    transitions, scores = _on_common_transitions(runs, "score")
+    marker = "o" if len(transitions) == 1 else ""
+    axes.plot(
+        transitions / MILLION, np.median(scores, 0), marker=marker, color=colour, linewidth=2.2, label=name
+    )
 
 
 def _draw_guides(

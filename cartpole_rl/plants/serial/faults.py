@@ -4,8 +4,8 @@ import logging
 from collections.abc import Callable
 
 from cartpole_rl.errors import FaultError
-from cartpole_rl.plants.serial_cart import SerialCart
-from cartpole_rl.plants.serial_errors import fault_words
+from cartpole_rl.plants.serial.cart import SerialCart
+from cartpole_rl.plants.serial.errors import fault_words
 
 LOGGER = logging.getLogger(__name__)
 

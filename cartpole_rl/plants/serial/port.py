@@ -12,7 +12,7 @@ import serial
 from serial.tools import list_ports
 
 from cartpole_rl.errors import PortError
-from cartpole_rl.plants.serial_ports import UsbPort, cart_like, described, usb_ports
+from cartpole_rl.plants.serial.ports import UsbPort, cart_like, described, usb_ports
 
 READ_SLICE = 0.01  # s that one read blocks at most; callers look at their own clocks in between
 AUTO = "auto"

@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from cartpole_rl.plants.serial_cart import SerialSettings
+from cartpole_rl.plants.serial.cart import SerialSettings
 from cartpole_rl.settings import Positive
 
 

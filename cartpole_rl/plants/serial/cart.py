@@ -30,11 +30,11 @@ from typing import Annotated, Self, TypeVar
 from pydantic import Field
 
 from cartpole_rl.errors import LinkError, PlantError
-from cartpole_rl.plants.link_statistics import LinkStatistics
-from cartpole_rl.plants.serial_errors import RefusedError, fault_error, refusal
-from cartpole_rl.plants.serial_information import LONGEST_PERIOD_US, check_limits, check_scales
-from cartpole_rl.plants.serial_link import SerialLink
-from cartpole_rl.plants.serial_port import open_port, resolved_port
+from cartpole_rl.plants.serial.errors import RefusedError, fault_error, refusal
+from cartpole_rl.plants.serial.information import LONGEST_PERIOD_US, check_limits, check_scales
+from cartpole_rl.plants.serial.link import SerialLink
+from cartpole_rl.plants.serial.port import open_port, resolved_port
+from cartpole_rl.plants.serial.statistics import LinkStatistics
 from cartpole_rl.settings import Count, Positive, Settings
 from cartpole_rl.wire import (
     Ack,

@@ -5,7 +5,7 @@ motor values. A cart that uses other ones would be driven with every number off.
 """
 
 from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_COUNTS_PER_TURN
-from cartpole_rl.plants.serial_errors import NotReadyError
+from cartpole_rl.plants.serial.errors import NotReadyError
 from cartpole_rl.wire import Info
 
 MOTOR_LIMIT = 255

@@ -16,11 +16,11 @@ from dataclasses import dataclass, field
 
 from cartpole_rl.errors import PlantError
 from cartpole_rl.physics.encoders import POLE_COUNTS_PER_TURN
-from cartpole_rl.plants.serial_cart import RESTARTED, SerialCart
-from cartpole_rl.plants.serial_errors import NotReadyError
-from cartpole_rl.plants.serial_faults import FaultClearing
-from cartpole_rl.plants.serial_information import NANOMETRES_PER_COUNT, check_limits, check_scales
-from cartpole_rl.plants.serial_moves import GENTLE_MOTOR, ArmedCart, metres
+from cartpole_rl.plants.serial.cart import RESTARTED, SerialCart
+from cartpole_rl.plants.serial.errors import NotReadyError
+from cartpole_rl.plants.serial.faults import FaultClearing
+from cartpole_rl.plants.serial.information import NANOMETRES_PER_COUNT, check_limits, check_scales
+from cartpole_rl.plants.serial.moves import GENTLE_MOTOR, ArmedCart, metres
 from cartpole_rl.wire import Flags, Info, State, seconds_between, ticks_between
 
 QUESTIONS = 25  # asked over the link

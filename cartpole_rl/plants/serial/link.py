@@ -9,7 +9,7 @@ from contextlib import suppress
 import serial
 
 from cartpole_rl.errors import FrameError, LinkError
-from cartpole_rl.plants.link_statistics import LinkStatistics
+from cartpole_rl.plants.serial.statistics import LinkStatistics
 from cartpole_rl.wire import Frame, FrameSplitter, Message, decode_frame, encode_frame
 
 

@@ -18,12 +18,12 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from cartpole_rl.errors import ConfigError, FaultError, LinkError, PlantError, PortError
-from cartpole_rl.plants.serial_cart import RESTARTED, SerialCart
-from cartpole_rl.plants.serial_errors import RefusedError, fault_error
-from cartpole_rl.plants.serial_faults import Confirm, FaultClearing, nobody
-from cartpole_rl.plants.serial_information import check_scales
-from cartpole_rl.plants.serial_recentring import recentre
-from cartpole_rl.plants.serial_settings import SerialPlantSettings
+from cartpole_rl.plants.serial.cart import RESTARTED, SerialCart
+from cartpole_rl.plants.serial.errors import RefusedError, fault_error
+from cartpole_rl.plants.serial.faults import Confirm, FaultClearing, nobody
+from cartpole_rl.plants.serial.information import check_scales
+from cartpole_rl.plants.serial.recentring import recentre
+from cartpole_rl.plants.serial.settings import SerialPlantSettings
 from cartpole_rl.plants.specs import Plant, one_cart
 from cartpole_rl.wire import (
     Fault,

@@ -4,8 +4,8 @@ import math
 from dataclasses import dataclass
 
 from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT
-from cartpole_rl.plants.serial_cart import SerialCart
-from cartpole_rl.plants.serial_errors import NotReadyError, fault_error
+from cartpole_rl.plants.serial.cart import SerialCart
+from cartpole_rl.plants.serial.errors import NotReadyError, fault_error
 from cartpole_rl.wire import State
 
 GENTLE_MOTOR = 199  # motor value; from 200 on the cart watches for stalls

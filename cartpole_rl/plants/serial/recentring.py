@@ -5,7 +5,7 @@ hangs still; what the move left of a swing is braked once more. Motor values sta
 watched for, and all of the cart's own rules hold, as it is armed. The cart is known only roughly here (its
 nominal motor curve, mass and friction), so that this works for any cart near enough to the nominal one.
 
-Signs as in `serial_preflight`: a hanging pole's count grows when the cart speeds up to the right.
+Signs as in `preflight`: a hanging pole's count grows when the cart speeds up to the right.
 """
 
 import math
@@ -13,9 +13,9 @@ from contextlib import suppress
 
 from cartpole_rl.errors import PlantError
 from cartpole_rl.physics.encoders import POLE_RADIANS_PER_COUNT
-from cartpole_rl.plants.serial_cart import SerialCart
-from cartpole_rl.plants.serial_errors import NotReadyError
-from cartpole_rl.plants.serial_moves import (
+from cartpole_rl.plants.serial.cart import SerialCart
+from cartpole_rl.plants.serial.errors import NotReadyError
+from cartpole_rl.plants.serial.moves import (
     GENTLE_MOTOR,
     SWING_SECONDS,
     ArmedCart,
