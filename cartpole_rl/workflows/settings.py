@@ -40,28 +40,82 @@ Config = TypeVar("Config", bound=Settings)
 
 
 def load_settings(schema: type[Config], overrides: Mapping[str, Any] | None = None) -> Config:
-    """Return the settings that conf/ has for the command of `schema`, with `overrides` as on its command line.
+    """Return the settings of conf/ for the command of `schema`, with `overrides` as on its command line.
 
-        load_settings(TrainConfig, {"pole": "large", "experiment": "balance", "learning.carts": 512, "seed": 1})
+        load_settings(TrainConfig, {"experiment": "balance", "pole": "large", "learning.carts": 512})
 
-    A group (pole, task, ...) takes the name of a file in conf/, the path of another one, or a mapping; a dotted
-    name takes a value. Raises ConfigError for an unknown name and for a value that is out of range.
+    A group (pole, task, ...) takes the name of its file in conf/, the path of another file, None, or a mapping
+    in its place; any other name, dotted or not, takes a value. Raises ConfigError for a file that does not
+    exist, an unknown name and a value out of range.
     """
-    command, overrides = COMMANDS[schema], dict(overrides or {})
-    chosen = default_choices(command)
-    chosen = {group: name for group, name in chosen.items() if "/" not in group}
-    for group in list(chosen):
-        if group in overrides:
-            chosen[group] = overrides.pop(group)
-    experiment = _experiment(chosen.pop("experiment", None))
-    for line in experiment.pop("defaults", []):
-        for override, name in line.items():
-            group = override.removeprefix("override /")
-            if chosen[group] == default_choices(command)[group]:
-                chosen[group] = name
-    values = {group: _choice(group, name) for group, name in chosen.items() if name is not None}
-    own = {key: value for key, value in choice(command).items() if key not in OF_COMMAND_LINE}
-    values = merged(merged(values, own), experiment)
-    for key, value in overrides.items():
-        values = merged(values, _nested(key, value))
+    command = COMMANDS[schema]
+    defaults = {group: name for group, name in default_choices(command).items() if "/" not in group}
+    given = {name: value for name, value in (overrides or {}).items() if name in defaults}
+    experiment = _load("experiment", given.pop("experiment", None))
+    lines: list[dict[str, str]] = experiment.pop("defaults", [])
+    of_experiment = {group.removeprefix("override /"): name for line in lines for group, name in line.items()}
+    chosen = {**defaults, **of_experiment, **given}
+    values = {group: _load(group, name) for group, name in chosen.items() if name is not None}
+    own = {name: value for name, value in choice(command).items() if name not in OF_COMMAND_LINE}
+    values = _merged(_merged(values, own), experiment)
+    for name, value in (overrides or {}).items():
+        if name not in defaults:
+            values = _merged(values, _nested(name, value))
     return checked(schema, _resolved(values))
+
+
+def _load(group: str, chosen: str | Path | Mapping[str, Any] | None) -> dict[str, Any]:
+    """Return a choice of a group as plain data, with the choices of the same group that it builds upon."""
+    if chosen is None or isinstance(chosen, Mapping):
+        return dict(chosen or {})
+    if str(chosen).endswith(".yaml"):
+        return _load_file(group, Path(chosen))
+    if group == "emulator" and chosen == "medium":  # its numbers are the defaults of the class
+        return EmulatorSettings().model_dump(mode="json")
+    values = choice(f"{group}/{chosen}") or {}
+    if group == "experiment":
+        return values
+    base: dict[str, Any] = {}
+    for name in values.pop("defaults", []):
+        base = _merged(base, _load(group, name))
+    return _merged(base, values)
+
+
+def _load_file(group: str, path: Path) -> dict[str, Any]:
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"{group}={path} cannot be read: {error}") from None
+    values: dict[str, Any] = yaml.safe_load(text.replace(HERE, str(path.resolve().parent)))
+    return values
+
+
+def _merged(base: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return `base` with `values` in place of its own, nested mappings merged."""
+    merged = dict(base)
+    for name, value in values.items():
+        nested = isinstance(value, Mapping) and isinstance(merged.get(name), Mapping)
+        merged[name] = _merged(merged[name], value) if nested else value
+    return merged
+
+
+def _nested(name: str, value: Any) -> dict[str, Any]:
+    """Return {"a": {"b": value}} for the name "a.b"."""
+    first, _, rest = name.partition(".")
+    return {first: _nested(rest, value) if rest else value}
+
+
+def _resolved(values: dict[str, Any]) -> dict[str, Any]:
+    """Return `values` with the track of the cart for TRACK, and without those that are missing ("???")."""
+    half_length = values.get("cart", {}).get("track_half_length")
+    return _without_missing(
+        _merged(values, {"task": {"x_max": half_length}})
+        if values.get("task", {}).get("x_max") == TRACK
+        else values
+    )
+
+
+def _without_missing(values: Any) -> Any:
+    if not isinstance(values, Mapping):
+        return values
+    return {name: _without_missing(value) for name, value in values.items() if value != "???"}
