@@ -6,7 +6,7 @@ from typing import Any, TypeVar
 
 import yaml
 
-from cartpole_rl.choices import choice, conf_folder, default_choices
+from cartpole_rl.choices import choice, default_choices
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.settings import Settings
@@ -32,7 +32,7 @@ COMMANDS: dict[type[Settings], str] = {
     FinetuneConfig: "finetune",
     PreflightConfig: "preflight",
 }
-HERE = "${here}"  # the folder of a file that is given as a choice
+HERE = "${here}"  # the folder of a file of one's own
 TRACK = "${oc.select:cart.track_half_length}"  # the only interpolation of conf/'s groups
 OF_COMMAND_LINE = ("defaults", "hydra")
 
@@ -44,17 +44,17 @@ def load_settings(schema: type[Config], overrides: Mapping[str, Any] | None = No
 
         load_settings(TrainConfig, {"experiment": "balance", "pole": "large", "learning.carts": 512})
 
-    A group (pole, task, ...) takes the name of its file in conf/, the path of another file, None, or a mapping
-    in its place; any other name, dotted or not, takes a value. Raises ConfigError for a file that does not
-    exist, an unknown name and a value out of range.
+    A group (pole, task, ...) takes the name of its file in conf/, the path of another file, None, or a
+    mapping in its place; any other name, dotted or not, takes a value. Raises ConfigError for a missing file,
+    an unknown name or a value out of range.
     """
     command = COMMANDS[schema]
     defaults = {group: name for group, name in default_choices(command).items() if "/" not in group}
     given = {name: value for name, value in (overrides or {}).items() if name in defaults}
     experiment = _load("experiment", given.pop("experiment", None))
     lines: list[dict[str, str]] = experiment.pop("defaults", [])
-    of_experiment = {group.removeprefix("override /"): name for line in lines for group, name in line.items()}
-    chosen = {**defaults, **of_experiment, **given}
+    replaced = {group.removeprefix("override /"): name for line in lines for group, name in line.items()}
+    chosen = {**defaults, **replaced, **given}
     values = {group: _load(group, name) for group, name in chosen.items() if name is not None}
     own = {name: value for name, value in choice(command).items() if name not in OF_COMMAND_LINE}
     values = _merged(_merged(values, own), experiment)

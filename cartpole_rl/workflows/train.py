@@ -24,7 +24,13 @@ from cartpole_rl.workflows.run_folder import write_config
 
 
 def train(config: TrainConfig, folder: Path) -> None:
-    """Build, train, report; or go on with the training in `folder`. Raises CartPoleError."""
+    """Train an agent on randomized simulated carts, or resume the training in `folder`.
+
+    Writes config.yaml, provenance.json, TensorBoard events, history.jsonl (evaluations), checkpoints/last.pt
+    and best.pt, metrics.json and figures/; until the end also checkpoints/resume.pt. Raises ConfigError for
+    settings that do not fit together or a folder that already holds a run, CheckpointError for a resumed run
+    without a checkpoint, LearningError where learning diverges.
+    """
     checkpoint = resumed("train", config.resume, folder)
     if checkpoint:
         config = recorded_config(checkpoint.config, f"resume={folder}")

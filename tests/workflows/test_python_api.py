@@ -75,12 +75,12 @@ def notebook(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def record_shaken_carts(folder: Path, make_plant: Callable, make_environment: Callable) -> None:
-    """Write three recordings of 10 s: the cart stands still, then each motor value is held for 0.2 s."""
+    """Write six recordings of up to 10 s: the cart stands still, then each motor value is held for 0.2 s."""
     random = torch.Generator().manual_seed(0)
-    actions = torch.randint(len(MOTORS), (50, 3), generator=random).repeat_interleave(10, 0)
+    actions = torch.randint(len(MOTORS), (50, 6), generator=random).repeat_interleave(10, 0)
     actions[:STILL] = MOTORS.index(0)
     in_turn = iter(actions)
-    env = make_environment(make_plant(3, cart={"track_half_length": 2.0}), MOTORS)
+    env = make_environment(make_plant(6, cart={"track_half_length": 2.0}), MOTORS)
     episodes = run_batch(env, lambda present: present.set("action", next(in_turn)))
     for number, episode in enumerate(episodes):
         write_recording(folder / f"{number}.csv", episode, {"pole_length_m": "0.3556"})

@@ -1,16 +1,16 @@
-"""Words in a figure, outside and inside its panels."""
+"""Annotations inside and outside the panels of a figure."""
 
 from matplotlib.axes import Axes
 
 from cartpole_rl.reporting import style
 
-LATE = 0.85  # of a time axis; words about a later moment stand to its left
+LATE = 0.85  # share of a time axis; the text of a later time stands to its left
 
 
-def beside(axes: Axes, height: float, word: str, colour: str) -> None:
-    """A word outside the right edge of a panel, at `height` in data units."""
+def beside(axes: Axes, height: float, text: str, colour: str) -> None:
+    """Write `text` outside the right edge of a panel, at `height` in data units."""
     axes.annotate(
-        word,
+        text,
         xy=(1, height),
         xycoords=("axes fraction", "data"),
         xytext=(6, 0),
@@ -22,14 +22,14 @@ def beside(axes: Axes, height: float, word: str, colour: str) -> None:
     )
 
 
-def at_moment(axes: Axes, moment: float, words: str, colour: str) -> None:
-    """A dashed vertical line at `moment` in data units, and words next to it where they fit."""
-    axes.axvline(moment, color=colour, linewidth=1.2, linestyle=(0, (4, 3)))
+def at_time(axes: Axes, time: float, text: str, colour: str) -> None:
+    """Draw a dashed vertical line at `time` in data units, with `text` on the side where it fits."""
+    axes.axvline(time, color=colour, linewidth=1.2, linestyle=(0, (4, 3)))
     start, end = axes.get_xlim()
-    leftwards = moment > start + LATE * (end - start)
+    leftwards = time > start + LATE * (end - start)
     axes.annotate(
-        words,
-        xy=(moment, 0.25),
+        text,
+        xy=(time, 0.25),
         xycoords=("data", "axes fraction"),
         xytext=(-6 if leftwards else 6, 0),
         textcoords="offset points",
@@ -40,7 +40,7 @@ def at_moment(axes: Axes, moment: float, words: str, colour: str) -> None:
     )
 
 
-def guide(axes: Axes, height: float, word: str, colour: str = style.MUTED) -> None:
-    """A dotted horizontal line at `height` in data units, named outside the right edge."""
+def guide(axes: Axes, height: float, text: str, colour: str = style.MUTED) -> None:
+    """Draw a dotted horizontal line at `height` in data units, with `text` outside the right edge."""
     axes.axhline(height, color=colour, linewidth=1.0, linestyle=(0, (3, 3)), zorder=1)
-    beside(axes, height, word, colour)
+    beside(axes, height, text, colour)
