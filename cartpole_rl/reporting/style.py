@@ -35,7 +35,7 @@ WIDTH = 8.0  # inch, of every figure
 DPI = 150  # of saved pictures
 TITLE_SIZE = 13.0  # points
 LABEL_SIZE = 11.0
-NOTE_SIZE = 9.5
+SMALL_SIZE = 9.5
 
 
 def series_colour(index: int) -> str:
@@ -54,7 +54,7 @@ def dress(axes: Axes, grid: str = "both") -> None:
         axes.spines[side].set_visible(False)
     for side in ("left", "bottom"):
         axes.spines[side].set_color(MUTED)
-    axes.tick_params(colors=MUTED, labelcolor=INK, labelsize=NOTE_SIZE)
+    axes.tick_params(colors=MUTED, labelcolor=INK, labelsize=SMALL_SIZE)
     axes.set_axisbelow(True)
     axes.grid(False)
     if grid != "none":
@@ -69,18 +69,18 @@ def label(axes: Axes, x: str | None = None, y: str | None = None) -> None:
         axes.set_ylabel(y, fontsize=LABEL_SIZE, color=INK)
 
 
-def title(axes: Axes, text: str, note: str = "") -> None:
-    """Write a title over `axes`, and `note` below it, smaller and grey."""
-    room = 1.9 * NOTE_SIZE if note else 0.8 * NOTE_SIZE
+def title(axes: Axes, text: str, subtitle: str = "") -> None:
+    """Write a title over `axes`, and `subtitle` below it, smaller and grey."""
+    room = 1.9 * SMALL_SIZE if subtitle else 0.8 * SMALL_SIZE
     axes.set_title(text, loc="left", fontsize=TITLE_SIZE, color=INK, fontweight="bold", pad=room)
-    if note:
+    if subtitle:
         axes.annotate(
-            note,
+            subtitle,
             in_layout=False,  # the pad above makes room for it
             xy=(0, 1),
             xycoords="axes fraction",
-            xytext=(0, 0.6 * NOTE_SIZE),
+            xytext=(0, 0.6 * SMALL_SIZE),
             textcoords="offset points",
-            fontsize=NOTE_SIZE,
+            fontsize=SMALL_SIZE,
             color=MUTED,
         )

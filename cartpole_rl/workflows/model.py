@@ -66,8 +66,8 @@ def learn_model(config: ModelConfig, folder: Path) -> None:
     save_model(folder / MODEL, model)
     data = {"pole": pole_name, "control_period_s": period, "recordings": [str(path) for path in paths]}
     write_json(folder / REPORT, {**data, **results(model, ensemble, windows, errors)})
-    note = f"{count_text(len(episodes))}, pole={pole_name}, {windows.number} held-out windows"
-    save(make_figure(predictions, model, ensemble, note), folder / FIGURE)
+    subtitle = f"{count_text(len(episodes))}, pole={pole_name}, {windows.number} held-out windows"
+    save(make_figure(predictions, model, ensemble, subtitle), folder / FIGURE)
     print(model_table(errors, f"errors on {windows.number} held-out windows, over the time predicted"))
     print(
         f"\n{spread_table(errors[LEARNED], CERTAIN, 'RMS errors and ensemble spreads on the same windows')}"
@@ -149,7 +149,7 @@ def results(
 
 
 def make_figure(
-    predictions: Mapping[str, Prediction], model: LearnedModel, ensemble: Ensemble, note: str
+    predictions: Mapping[str, Prediction], model: LearnedModel, ensemble: Ensemble, subtitle: str
 ) -> Figure:
     """Return the figure of the prediction errors and of the residual."""
     physics, learned = predictions[PHYSICS], predictions[LEARNED]
@@ -162,5 +162,5 @@ def make_figure(
         *forces_along_track(model.residual.places.numpy(), visited),
         np.array(ensemble.updates, dtype=np.float64),
         np.array(ensemble.history),
-        note=note,
+        subtitle=subtitle,
     )

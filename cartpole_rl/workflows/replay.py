@@ -48,8 +48,8 @@ def replay_recordings(config: ReplayConfig, folder: Path) -> None:
     results = {"pole": name, "control_period_s": period, "parameters": parameters, "errors": errors}
     write_json(folder / REPLAY, {"recordings": [str(path) for path in paths], **results})
     count = count_text(len(episodes))
-    note = f"above: {paths[0].name},  below: {count},  pole={name}"
-    save(replay_figure(replays, period, REPORTED_TIMES, "Measured and simulated", note), folder / FIGURE)
+    subtitle = f"above: {paths[0].name},  below: {count},  pole={name}"
+    save(replay_figure(replays, period, REPORTED_TIMES, "Measured and simulated", subtitle), folder / FIGURE)
     print(replay_table(errors, f"errors of {count}, pole={name}, over the time since a reset"))
     print(f"{folder}/{REPLAY} and {FIGURE} are written")
 

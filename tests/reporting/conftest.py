@@ -1,4 +1,4 @@
-"""Episodes of a simple cart that swings its pole up by energy and balances it by a linear law."""
+"""Episodes of a simple cart that swings its pole up by energy and balances it by linear feedback."""
 
 import dataclasses
 import math

@@ -24,8 +24,8 @@ def samples(prior: dict[str, float], **changes: tuple[float, ...]) -> np.ndarray
 
 def test_friction_over_velocity(prior: dict[str, float]) -> None:
     identified = {**prior, "cart_coulomb": 0.4, "cart_viscous": 2.0}
-    drawn = samples(prior, cart_viscous=(1.0, 3.0))
-    curve = friction_curve(identified, drawn, prior, CartFriction.STEP)
+    carts = samples(prior, cart_viscous=(1.0, 3.0))
+    curve = friction_curve(identified, carts, prior, CartFriction.STEP)
     fast = int(np.abs(curve.at - 0.5).argmin())
     assert curve.identified[fast] == pytest.approx(0.4 + 2.0 * 0.5)
     assert curve.identified[-1] == pytest.approx(-curve.identified[0])

@@ -71,8 +71,8 @@ def test_an_evaluation_of_a_task_leaves_the_track_to_the_agent() -> None:
 
 
 def test_a_file_or_a_mapping_takes_the_place_of_a_choice(tmp_path: Path) -> None:
-    drawn = {"posterior": "${here}/posterior.npz", "widen": 2.0, "prior_share": 0.0, "ranges": {}}
-    (tmp_path / "own.yaml").write_text(yaml.safe_dump(drawn))
+    randomization = {"posterior": "${here}/posterior.npz", "widen": 2.0, "prior_share": 0.0, "ranges": {}}
+    (tmp_path / "own.yaml").write_text(yaml.safe_dump(randomization))
     config = load_settings(TrainConfig, {"randomization": tmp_path / "own.yaml"})
     assert config.randomization.posterior == tmp_path / "posterior.npz"
     assert load_settings(TrainConfig, {"randomization": {}}) == load_settings(

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from cartpole_rl.reporting import style
-from cartpole_rl.reporting.figures.notes import at_time, beside
+from cartpole_rl.reporting.figures.annotations import at_time, beside
 from cartpole_rl.reporting.words import ending_text
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.tasks.rewards import UPRIGHT_ANGLE

@@ -14,7 +14,7 @@ from scipy import stats
 
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.reporting import style
-from cartpole_rl.reporting.figures.notes import guide
+from cartpole_rl.reporting.figures.annotations import guide
 from cartpole_rl.reporting.table import interval_text
 
 CONFIDENCE = 0.95

@@ -63,7 +63,7 @@ def _finite(name: str, draws: ArrayLike) -> NDArray[np.float64]:
 def _draw_parameter(axes: Axes, name: str, values: NDArray[np.float64], nominal: float | None) -> None:
     """Draw the histogram of one parameter and its nominal value, or the value of one that is fixed."""
     style.dress(axes, grid="none")
-    axes.set_title(name, fontsize=style.NOTE_SIZE, color=style.INK, loc="left")
+    axes.set_title(name, fontsize=style.SMALL_SIZE, color=style.INK, loc="left")
     axes.spines["left"].set_visible(False)
     axes.set_yticks([])
     axes.xaxis.set_major_locator(MaxNLocator(nbins=4, steps=(1, 2, 5, 10)))
@@ -77,7 +77,7 @@ def _draw_parameter(axes: Axes, name: str, values: NDArray[np.float64], nominal:
             transform=axes.transAxes,
             ha="center",
             va="center",
-            fontsize=style.NOTE_SIZE,
+            fontsize=style.SMALL_SIZE,
             color=style.MUTED,
         )
         return

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from cartpole_rl.reporting import style
 from cartpole_rl.reporting.curves import Curve
+from cartpole_rl.reporting.figures.annotations import beside
 from cartpole_rl.reporting.figures.behaviours import wrapped_line
-from cartpole_rl.reporting.figures.notes import beside
 from cartpole_rl.reporting.identification import Estimate
 from cartpole_rl.reporting.replays import ReplayedEpisode
 from cartpole_rl.reporting.table import number_text
@@ -35,7 +35,7 @@ def friction_and_force_figure(friction: Curve, force: Curve) -> Figure:
     left, right = figure.subplots(1, 2)
     _draw_curve(left, friction, "Friction", "cart velocity (m/s)", "friction (N)")
     _draw_curve(right, force, "Force", "motor value", "force on the cart (N)")
-    left.legend(fontsize=style.NOTE_SIZE, frameon=False, loc="upper left")
+    left.legend(fontsize=style.SMALL_SIZE, frameon=False, loc="upper left")
     return figure
 
 
@@ -57,7 +57,7 @@ def interval_figure(estimates: Sequence[Estimate]) -> Figure:
     for height, estimate in enumerate(reversed(estimates)):
         _draw_interval(axes, height, estimate)
     names = [estimate.name for estimate in reversed(estimates)]
-    axes.set_yticks(range(len(names)), names, fontsize=style.NOTE_SIZE)
+    axes.set_yticks(range(len(names)), names, fontsize=style.SMALL_SIZE)
     axes.set_xlim(-FARTHEST - 1, FARTHEST + 1)
     style.label(axes, x="difference from the identified value\n(half widths of the 95 % interval)")
     style.title(axes, "Identified values", "blue: value and 95 % interval,  grey: prior")
@@ -97,7 +97,7 @@ def experiments_figure(replays: Mapping[str, ReplayedEpisode]) -> Figure:
     for axes in panels[-1]:
         style.label(axes, x="time (s)")
     panels[0][1].legend(
-        loc="lower right", ncols=2, fontsize=style.NOTE_SIZE, frameon=False, bbox_to_anchor=(1, 1)
+        loc="lower right", ncols=2, fontsize=style.SMALL_SIZE, frameon=False, bbox_to_anchor=(1, 1)
     )
     return figure
 
@@ -148,7 +148,7 @@ def spectrum_figure(covariance: Array, names: Sequence[str]) -> Figure:
     left.set_yticks(rows, [f"{row + 1}" for row in rows])
     style.title(left, "Remaining uncertainty", "dashed line: as uncertain as the prior")
     _draw_weights(right, vectors.T)
-    right.set_xticks(range(len(names)), names, rotation=60, ha="right", fontsize=style.NOTE_SIZE)
+    right.set_xticks(range(len(names)), names, rotation=60, ha="right", fontsize=style.SMALL_SIZE)
     style.title(right, "Combinations", "weight of each parameter")
     return figure
 

@@ -24,7 +24,7 @@ def learned_model_figure(
     updates: Array,
     losses: Array,
     title: str = "Learned model",
-    note: str = "",
+    subtitle: str = "",
 ) -> Figure:
     """Draw prediction errors above the learned force and the loss.
 
@@ -38,10 +38,10 @@ def learned_model_figure(
     for axes, channel, factor in ((cart, 0, 1e3), (angle, 1, 180 / np.pi)):
         curves = [factor * root_mean_square(each[:, channel]) for each in (physics, learned, spread)]
         _draw_errors(axes, time, [np.maximum(curve, SMALLEST) for curve in curves])
-    style.title(cart, title, note)
+    style.title(cart, title, subtitle)
     style.label(cart, x="prediction time (s)", y="RMS error, cart (mm)")
     style.label(angle, x="prediction time (s)", y="RMS error, angle (deg)")
-    cart.legend(loc="lower right", fontsize=style.NOTE_SIZE, frameon=False)
+    cart.legend(loc="lower right", fontsize=style.SMALL_SIZE, frameon=False)
     _draw_members(track, 100 * places, forces.T)
     style.label(track, x="position on the track (cm)", y="learned force (N)")
     visited = places[np.isfinite(forces).all(0)]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.reporting import style
-from cartpole_rl.reporting.figures.notes import guide
+from cartpole_rl.reporting.figures.annotations import guide
 
 THESIS_GUIDES = {"good": 2000.0, "very good": 2500.0}
 """The thesis's grades of a swing-up by score (6.2)."""
@@ -53,7 +53,7 @@ def learning_curve(
     axes.xaxis.set_major_locator(MaxNLocator(nbins=8, steps=(1, 2, 5, 10)))
     axes.set_xlim(left=0)
     axes.set_ylim(bottom=min(0.0, axes.dataLim.y0))
-    axes.legend(loc="lower right", fontsize=style.NOTE_SIZE, frameon=True, framealpha=0.9, edgecolor="none")
+    axes.legend(loc="lower right", fontsize=style.SMALL_SIZE, frameon=True, framealpha=0.9, edgecolor="none")
     style.label(axes, x="transitions (millions)", y="score of an episode")
     lines = "thin lines: runs,  thick line: their median" if len(histories) > len(groups) else "line: mean"
     style.title(axes, title, f"{lines},  band: worst to best episode")

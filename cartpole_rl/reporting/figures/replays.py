@@ -8,8 +8,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from cartpole_rl.reporting import style
+from cartpole_rl.reporting.figures.annotations import beside
 from cartpole_rl.reporting.figures.behaviours import wrapped_line
-from cartpole_rl.reporting.figures.notes import beside
 from cartpole_rl.reporting.replays import ReplayedEpisode, root_mean_square, stack_errors
 from cartpole_rl.reporting.table import number_text
 
@@ -24,7 +24,7 @@ def replay_figure(
     period: float,
     times: Sequence[float],
     title: str = "Replay",
-    note: str = "",
+    subtitle: str = "",
 ) -> Figure:
     """Draw the first episode, measured and simulated, above the errors of all episodes.
 
@@ -37,7 +37,7 @@ def replay_figure(
     _draw_angle(angle, replays[0])
     _draw_position(position, replays[0])
     style.label(position, x="time (s)")
-    style.title(angle, title, note)
+    style.title(angle, title, subtitle)
     above.align_ylabels()
     left, right = below.subplots(1, 2, sharex=True)
     x_errors, theta_errors = stack_errors(replays)
@@ -79,7 +79,7 @@ def _draw_position(axes: Axes, replay: ReplayedEpisode) -> None:
     reach = 1.2 * max(2.0, 100 * float(np.abs(episode.x).max()))
     axes.set_ylim(-reach, 1.5 * reach)
     axes.legend(
-        loc="upper right", ncols=2, fontsize=style.NOTE_SIZE, frameon=True, framealpha=0.9, edgecolor="none"
+        loc="upper right", ncols=2, fontsize=style.SMALL_SIZE, frameon=True, framealpha=0.9, edgecolor="none"
     )
 
 
@@ -111,7 +111,7 @@ def _mark_times(axes: Axes, lag: Array, errors: Array, times: Sequence[float], u
             xytext=(-4 if last else 4, 7),
             textcoords="offset points",
             ha="right" if last else "left",
-            fontsize=style.NOTE_SIZE,
+            fontsize=style.SMALL_SIZE,
             fontweight="bold",
             color=style.INK,
             bbox={"facecolor": style.PAPER, "alpha": 0.75, "edgecolor": "none", "pad": 1},

@@ -7,13 +7,13 @@ from matplotlib.figure import Figure
 
 
 def line_of(axes: Axes, colour: str) -> np.ndarray:
-    """The points [P, 2] of the longest line of a colour."""
+    """Return the points [P, 2] of the longest line of a colour."""
     lines = [line for line in axes.lines if colors.same_color(line.get_color(), colour)]
     return max((line.get_xydata() for line in lines), key=len)
 
 
 def words(figure: Figure) -> str:
-    """Every text of a drawn figure."""
+    """Return every text of a figure."""
     figure.draw_without_rendering()
     return " | ".join(
         text.get_text() for text in figure.findobj(match=lambda each: hasattr(each, "get_text"))

@@ -16,7 +16,7 @@ def beside(axes: Axes, height: float, text: str, colour: str) -> None:
         xytext=(6, 0),
         textcoords="offset points",
         va="center",
-        fontsize=style.NOTE_SIZE,
+        fontsize=style.SMALL_SIZE,
         color=colour,
         annotation_clip=False,
     )
@@ -35,7 +35,7 @@ def at_time(axes: Axes, time: float, text: str, colour: str) -> None:
         textcoords="offset points",
         ha="right" if leftwards else "left",
         va="center",
-        fontsize=style.NOTE_SIZE,
+        fontsize=style.SMALL_SIZE,
         color=colour,
     )
 
