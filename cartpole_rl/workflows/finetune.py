@@ -19,7 +19,6 @@ from cartpole_rl.learning.checkpoint_files import LAST
 from cartpole_rl.learning.checkpoints import AgentCheckpoint, forget_training, load_agent
 from cartpole_rl.learning.randomness import seed_everything
 from cartpole_rl.reporting.tensorboard import TensorBoardLog
-from cartpole_rl.scheduling import compute_last
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.build import (
     evaluated_env,
@@ -32,10 +31,10 @@ from cartpole_rl.workflows.checking import checked
 from cartpole_rl.workflows.checks import check_finetuning
 from cartpole_rl.workflows.config import CartPoleSettings, EvaluateConfig, FinetuneConfig, TrainConfig
 from cartpole_rl.workflows.evaluate import count_text, score_table
-from cartpole_rl.workflows.finetuning_cart import DrivenCart
+from cartpole_rl.workflows.finetuning_cart import DrivenCart, yield_to
 from cartpole_rl.workflows.finetuning_files import FinetuningFiles, Stage, resumed_config
 from cartpole_rl.workflows.finetuning_learner import CartLearner
-from cartpole_rl.workflows.person import confirm, print_message
+from cartpole_rl.workflows.person import confirm
 from cartpole_rl.workflows.report import report
 from cartpole_rl.workflows.resuming import resumed
 from cartpole_rl.workflows.run_folder import METRICS, write_config, write_json
@@ -89,15 +88,6 @@ def evaluation_config(config: FinetuneConfig) -> EvaluateConfig:
 def greedy_network(training: TrainConfig) -> nn.Module:
     """Return the network that drives, for weights of `as_weights`."""
     return new_agent(training).greedy_policy()
-
-
-def yield_to(driver: Driver) -> None:
-    """Lower this process's priority, but not that of the driver or of an emulated cart: they have started."""
-    compute_last()
-    if not driver.goes_first:
-        print_message(
-            "finetune", "other processes may delay the cart: no real-time priority (see `ulimit -r`)"
-        )
 
 
 class Session:

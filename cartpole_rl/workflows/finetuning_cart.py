@@ -9,9 +9,11 @@ from cartpole_rl.evaluation.driver import Drive, Driver
 from cartpole_rl.evaluation.driving_policy import Weights
 from cartpole_rl.plants.serial.statistics import LinkStatistics
 from cartpole_rl.reporting.tensorboard import TensorBoardLog
+from cartpole_rl.scheduling import compute_last
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.workflows.config import FinetuneConfig
 from cartpole_rl.workflows.finetuning_files import FinetuningFiles, Stage
+from cartpole_rl.workflows.person import print_message
 
 
 class DrivenCart:
@@ -67,3 +69,12 @@ class DrivenCart:
         if self.link is None:
             return {}
         return {**vars(self.link.summary()), "latency_override": self.link.latency_override()}
+
+
+def yield_to(driver: Driver) -> None:
+    """Lower this process's priority, but not that of the driver or of an emulated cart: they have started."""
+    compute_last()
+    if not driver.goes_first:
+        print_message(
+            "finetune", "other processes may delay the cart: no real-time priority (see `ulimit -r`)"
+        )
