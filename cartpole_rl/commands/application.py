@@ -29,7 +29,7 @@ from cartpole_rl.errors import CartPoleError, ConfigError
 from cartpole_rl.settings import Settings
 from cartpole_rl.signals import RaiseOnce, ending_signals
 from cartpole_rl.workflows.checking import checked
-from cartpole_rl.workflows.person import tell
+from cartpole_rl.workflows.person import print_message
 
 INTERRUPTED, SIGNALLED = 130, 128  # what a shell reports: for SIGINT, and plus its number for another signal
 Config = TypeVar("Config", bound=Settings)
@@ -63,7 +63,7 @@ def application(name: str, schema: type[Config]) -> Callable[[Body[Config]], Cal
                 body(checked(schema, as_mapping(composed)), folder)
             except EXPECTED as error:
                 if HydraConfig.get().mode is RunMode.MULTIRUN:
-                    tell(name, in_one_line(error, name))
+                    print_message(name, in_one_line(error, name))
                     raise  # Hydra keeps it until all jobs are through
                 exit_with_message(name, error)
             finally:
@@ -85,10 +85,10 @@ def application(name: str, schema: type[Config]) -> Callable[[Body[Config]], Cal
             except EXPECTED as error:
                 exit_with_message(name, error)
             except KeyboardInterrupt:
-                tell(name, "interrupted")
+                print_message(name, "interrupted")
                 sys.exit(INTERRUPTED)
             except Terminated as ended:
-                tell(name, "terminated")
+                print_message(name, "terminated")
                 sys.exit(SIGNALLED + ended.number)
 
         return main
@@ -105,7 +105,7 @@ def exit_with_message(name: str, error: Exception) -> NoReturn:
         code = ConfigError.exit_code
     elif isinstance(error, OSError) and not error.filename:
         raise error
-    tell(name, in_one_line(error, name))
+    print_message(name, in_one_line(error, name))
     sys.exit(code)
 
 

@@ -68,12 +68,18 @@ class LearningSettings(Settings):
 
 
 class FinetuningSettings(Settings):
-    """How a trained agent learns on a cart."""
+    """Fine-tuning of a trained agent on one cart."""
 
     iterations: Count  # of learning while one episode is driven
     refit: Count  # episodes between two fits of the simulator
-    cart_share: Fraction  # of each batch from the cart itself, the rest is simulated
-    prior_share: Fraction  # of the simulated carts drawn as in training, and not from the fit
-    widen: Positive  # the fit's uncertainty is multiplied by it
+    cart_share: Fraction  # of each batch that the cart recorded; the rest is simulated
+    prior_share: Fraction  # of the simulated carts that are drawn as in training, not from the fit
+    widen: Positive  # factor on the fit's standard deviations
     epsilon: Annotated[float, Field(ge=0, le=0.2)]  # share of random actions on the cart
+    simulated_epsilon: tuple[Fraction, Fraction]  # share of random actions in simulation, first to last
+    simulated_epsilon_share: Annotated[
+        float, Field(gt=0, le=1)
+    ]  # of the simulated transitions, over which it falls
+    warmup_transitions: Annotated[int, Field(ge=0)]  # random actions in simulation before the first update
+    buffer_kind: Literal["prioritized", "uniform"]  # of the simulated transitions
     learning_rate: Positive  # at the start; it falls along half a cosine

@@ -1,1 +1,1 @@
-"""What users see of a run: figures, animations, TensorBoard, tables."""
+"""Figures, animations, pages, tables and TensorBoard events of a run."""

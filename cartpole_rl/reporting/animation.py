@@ -1,6 +1,6 @@
 """One episode as an animated GIF in real time, small enough for a page, a pull request or TensorBoard.
 
-All frames share one fixed palette of at most 32 colours, so that a frame holds only what changed.
+All frames share a fixed palette of at most 32 colours, so that a frame stores only the pixels that changed.
 """
 
 import io
@@ -14,7 +14,7 @@ from cartpole_rl.reporting.drawing import FINER, CartDrawing, palette
 from cartpole_rl.tasks.episode import Episode
 
 EVERY = 2  # control periods between frames: 25 frames a second at 50 Hz
-LAST_FRAME = 1000  # ms that the end stays before the animation begins again
+LAST_FRAME = 1000  # ms, of the last frame before the animation repeats
 SHORTEST = 20  # ms; browsers slow down a frame that claims less
 
 
@@ -26,7 +26,7 @@ def write_gif(
     title: str = "",
     every: int = EVERY,
 ) -> Path:
-    """Write the animation of `gif` to `path`; folders are made."""
+    """Write the animation of `gif` to `path`, and create its folder."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(gif(episode, pole_length, track_half_length, title, every))
@@ -36,9 +36,9 @@ def write_gif(
 def gif(
     episode: Episode, pole_length: float, track_half_length: float, title: str = "", every: int = EVERY
 ) -> bytes:
-    """The episode as the bytes of an endless GIF that runs in real time and rests on its last frame.
+    """Return the episode as the bytes of an endless GIF in real time that pauses on its last frame.
 
-    `pole_length` from pivot to tip and `track_half_length`, both in m; a frame every `every` control periods.
+    `pole_length` (pivot to tip) and `track_half_length` in m; one frame for each `every` control periods.
     """
     first, *others = frames(episode, pole_length, track_half_length, title, every)
     buffer = io.BytesIO()
@@ -58,22 +58,22 @@ def gif(
 def frames(
     episode: Episode, pole_length: float, track_half_length: float, title: str = "", every: int = EVERY
 ) -> Iterator[Image.Image]:
-    """Pictures of 480 by 320 pixels in the fixed palette; arguments as for `gif`."""
+    """Yield pictures of 480 by 320 pixels in the fixed palette; arguments as for `gif`."""
     drawing = CartDrawing.of(episode, pole_length, track_half_length)
-    still = drawing.still(title)
+    background = drawing.background(title)
     for row in rows(episode, every):
-        canvas = still.copy()
+        canvas = background.copy()
         drawing.draw(ImageDraw.Draw(canvas), row)
         yield canvas.reduce(FINER).quantize(palette=palette(), dither=Image.Dither.NONE)
 
 
 def rows(episode: Episode, every: int = EVERY) -> list[int]:
-    """Rows of the state that become frames: each `every`-th, and the last."""
+    """Return the rows of the state that become frames: each `every`-th, and the last."""
     chosen = list(range(0, episode.steps + 1, every))
     return chosen if chosen[-1] == episode.steps else [*chosen, episode.steps]
 
 
 def durations(episode: Episode, every: int = EVERY) -> list[int]:
-    """How long each frame is shown, in ms: real time in the GIF's unit of 10 ms, rounded without drift."""
+    """Return the duration of each frame (ms): real time in the GIF's unit of 10 ms, rounded without drift."""
     hundredths = np.rint(100 * episode.time[rows(episode, every)]).astype(int)
     return [max(10 * int(wait), SHORTEST) for wait in np.diff(hundredths)] + [LAST_FRAME]

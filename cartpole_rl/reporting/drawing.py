@@ -1,8 +1,8 @@
 """A cart, its pole and its track as a Pillow picture, to scale.
 
 Positions are those that the cart measured, x and theta positive to the right. Everything is drawn FINER times
-larger and scaled down, which smooths the edges; coordinates in this file are those fine pixels, sizes that a
-reader sees are given in pixels and multiplied. Colours mean what they mean in the figures.
+larger and scaled down, which smooths the edges. Coordinates in this file are these fine pixels; constants are
+in pixels of the result. Colours mean the same as in the figures.
 """
 
 import math
@@ -28,15 +28,15 @@ FINER = 2
 MARGIN = 20  # pixels, left and right
 PIVOT_HEIGHT = 172  # pixels from the top
 REACH = 118  # pixels that the pole may take above and below the pivot
-CART_WIDTH, CART_HEIGHT, WHEEL = 40, 20, 5  # pixels; a sign for the cart, the only thing not to scale
-FULL_MOTOR, LONGEST_ARROW = 255, 70  # motor value, and the pixels that it is drawn with
-BAR = (294, 301)  # pixels from the top: the bar that fills as time goes by
+CART_WIDTH, CART_HEIGHT, WHEEL = 40, 20, 5  # pixels; only the cart is not to scale
+FULL_MOTOR, LONGEST_ARROW = 255, 70  # motor value, and the pixels of its arrow
+BAR = (294, 301)  # pixels from the top: the time bar
 LEGEND = 311  # pixels from the top
-TITLE_WIDTH = 270  # pixels; what is longer is cut
-TRAIL = 0.4  # s that the way of the pole's tip stays visible
-FAINTEST = 0.15  # part of its colour at the far end
+TITLE_WIDTH = 270  # pixels; a longer title is cut
+TRAIL = 0.4  # s for which the path of the pole's tip stays visible
+FAINTEST = 0.15  # share of its colour at the far end
 
-TINTS = {  # parts of each colour over white that smooth edges need; with white at most 32 colours
+TINTS = {  # shares of each colour over white, for smooth edges; with white at most 32 colours
     style.INK: (1.0, 0.8, 0.6, 0.42, 0.27, 0.13),
     style.POLE: (1.0, 0.75, 0.5, 0.3, 0.15),
     style.UPRIGHT: (1.0, 0.75, 0.5, 0.3, 0.15),
@@ -62,7 +62,7 @@ class CartDrawing:
 
     @classmethod
     def of(cls, episode: Episode, pole_length: float, track_half_length: float) -> "CartDrawing":
-        """At the largest scale at which the track fits sideways, and the pole up and down; lengths in m."""
+        """Scale the drawing so that track and pole (lengths in m) just fit."""
         width = SIZE[0] - 2 * MARGIN
         scale = FINER * min(REACH / pole_length, (width - 1.3 * CART_WIDTH) / (2 * track_half_length))
         return cls(
@@ -74,8 +74,8 @@ class CartDrawing:
             score=np.concatenate(([0.0], np.cumsum(episode.score))),
         )
 
-    def still(self, title: str) -> Image.Image:
-        """What never changes: the title, the track with its stops and its middle, the empty time bar."""
+    def background(self, title: str) -> Image.Image:
+        """Draw what never changes: title, track, stops and middle, the empty time bar, and the legend."""
         canvas = Image.new("RGB", (FINER * SIZE[0], FINER * SIZE[1]), style.PAPER)
         draw = ImageDraw.Draw(canvas)
         self._draw_title(draw, title)
@@ -85,7 +85,7 @@ class CartDrawing:
         return canvas
 
     def draw(self, draw: Draw, row: int) -> None:
-        """What moves, as it was at `row` of the state."""
+        """Draw what moves, at `row` of the state."""
         self._draw_trail(draw, row)
         self._draw_arrow(draw, row)
         self._draw_cart(draw, row)
@@ -93,21 +93,21 @@ class CartDrawing:
         self._draw_numbers(draw, row)
 
     def _cart(self, row: int) -> tuple[float, float]:
-        """Where the pivot is."""
+        """Return the position of the pivot."""
         return FINER * SIZE[0] / 2 + self.episode.x[row] * self.scale, FINER * float(PIVOT_HEIGHT)
 
     def _tip(self, row: int) -> tuple[float, float]:
-        """Where the pole's tip is."""
+        """Return the position of the pole's tip."""
         x, y = self._cart(row)
         theta = self.episode.theta[row]
         return x + self.pole * math.sin(theta), y - self.pole * math.cos(theta)
 
     def _colour(self, row: int) -> str:
-        """Green while the pole is upright."""
+        """Return the pole's colour: green while it is upright."""
         return style.UPRIGHT if self.upright[row] else style.POLE
 
     def _draw_title(self, draw: Draw, title: str) -> None:
-        """The title, cut where the numbers begin."""
+        """Draw the title, cut to TITLE_WIDTH."""
         font, whole = _font(15, bold=True), title
         while font.getlength(title) > FINER * TITLE_WIDTH:
             whole = whole[:-1].rstrip()
@@ -115,7 +115,7 @@ class CartDrawing:
         draw.text((FINER * MARGIN, FINER * 24), title, fill=style.INK, font=font, anchor="lm")
 
     def _draw_track(self, draw: Draw) -> None:
-        """The rail, its stops, which a cart in the last position touches, and its middle."""
+        """Draw the rail, its middle, and the stops that the cart touches at the track's ends."""
         middle, height, grey = FINER * SIZE[0] / 2, FINER * PIVOT_HEIGHT, tint(style.INK, 0.42)
         end = self.track + FINER * CART_WIDTH / 2
         rail = height + FINER * (CART_HEIGHT / 2 + WHEEL)
@@ -127,7 +127,7 @@ class CartDrawing:
         draw.line((middle, rail + FINER * 5, middle, rail + FINER * 11), fill=grey, width=FINER * 2)
 
     def _draw_trail(self, draw: Draw, row: int) -> None:
-        """Where the tip was a moment ago, fading."""
+        """Draw the fading path of the tip."""
         since = self.episode.time[row] - self.episode.time[: row + 1]
         for earlier in np.flatnonzero(since < TRAIL)[:-1]:
             part = FAINTEST + (0.5 - FAINTEST) * (1 - since[earlier] / TRAIL)
@@ -135,7 +135,7 @@ class CartDrawing:
             draw.line(points, fill=tint(self._colour(earlier), part), width=FINER * 3)
 
     def _draw_arrow(self, draw: Draw, row: int) -> None:
-        """The motor value, from the side of the cart that it pushes towards."""
+        """Draw the motor value as an arrow on the side towards which it pushes."""
         motor = int(self.episode.motor[row]) if row < self.episode.steps else 0
         if motor == 0:
             return
@@ -150,7 +150,7 @@ class CartDrawing:
         )
 
     def _draw_cart(self, draw: Draw, row: int) -> None:
-        """Wheels, cart and pole."""
+        """Draw wheels, cart and pole."""
         x, y = self._cart(row)
         half_width, half_height = FINER * CART_WIDTH / 2, FINER * CART_HEIGHT / 2
         for side in (-0.55, 0.55):
@@ -163,7 +163,7 @@ class CartDrawing:
         _disc(draw, x, y, FINER * 2.5, style.PAPER)
 
     def _draw_progress(self, draw: Draw, row: int) -> None:
-        """Fill the bar up to now: green where the pole was upright."""
+        """Fill the bar up to now, green where the pole was upright."""
         time = self.episode.time
         span = time[-1] - time[0] or 1.0
         edges = [0, *(np.flatnonzero(np.diff(self.upright[: row + 1])) + 1), row]
@@ -172,7 +172,7 @@ class CartDrawing:
             draw.rectangle(_bar((time[start] - time[0]) / span, (time[stop] - time[0]) / span), fill=colour)
 
     def _draw_numbers(self, draw: Draw, row: int) -> None:
-        """Clock and score so far, and whether the pole is up."""
+        """Write the time, the score so far and, on the last frame, an ending other than the time limit."""
         right, font = FINER * (SIZE[0] - MARGIN), _font(15)
         clock = f"{self.episode.time[row] - self.episode.time[0]:.2f} s"
         draw.text((right, FINER * 24), clock, fill=style.INK, font=font, anchor="rm")
@@ -189,14 +189,14 @@ class CartDrawing:
 
 
 def tint(colour: str, part: float) -> Colour:
-    """`part` of a colour over white; 0 is white."""
+    """Return the share `part` of a colour over white; 0 is white."""
     red, green, blue = (round(255 + part * (level - 255)) for level in ImageColor.getrgb(colour)[:3])
     return red, green, blue
 
 
 @cache
 def palette() -> Image.Image:
-    """The fixed colours, as Pillow wants them: a picture whose palette is read."""
+    """Return a picture whose palette has the fixed colours, as Pillow's `quantize` takes it."""
     colours = [tint(style.INK, 0.0)] + [
         tint(colour, part) for colour, parts in TINTS.items() for part in parts
     ]
@@ -207,19 +207,19 @@ def palette() -> Image.Image:
 
 @cache
 def _font(size: int, bold: bool = False) -> ImageFont.FreeTypeFont:
-    """The figures' own typeface, which matplotlib brings along, at `size` pixels."""
+    """Return the typeface of the figures, which comes with matplotlib, at `size` pixels."""
     name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
     return ImageFont.truetype(str(Path(matplotlib.get_data_path(), "fonts", "ttf", name)), FINER * size)
 
 
 def _bar(start: float, stop: float) -> tuple[float, float, float, float]:
-    """The time bar between two parts of the episode, 0 to 1, as a box."""
+    """Return the box of the time bar between two shares of the episode, 0 to 1."""
     left, width = FINER * MARGIN, FINER * (SIZE[0] - 2 * MARGIN)
     return left + start * width, FINER * BAR[0], left + stop * width, FINER * BAR[1]
 
 
 def _draw_legend(draw: Draw) -> None:
-    """Under the bar, what its green means, and what the arrow is."""
+    """Explain the bar's green and the arrow, below the bar."""
     font, height, grey = _font(10), FINER * LEGEND, tint(style.INK, 0.6)
     left, right = FINER * MARGIN, FINER * (SIZE[0] - MARGIN)
     draw.text((left, height), "time, green while the pole is upright", fill=grey, font=font, anchor="lm")
@@ -231,5 +231,5 @@ def _draw_legend(draw: Draw) -> None:
 
 
 def _disc(draw: Draw, x: float, y: float, radius: float, colour: str) -> None:
-    """A filled circle."""
+    """Draw a filled circle."""
     draw.ellipse((x - radius, y - radius, x + radius, y + radius), fill=colour)

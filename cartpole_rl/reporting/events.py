@@ -1,10 +1,10 @@
-"""Cutting TensorBoard's event files back to the step at which a resumed run begins again.
+"""Truncation of TensorBoard's event files at the step from which a run is resumed.
 
-TensorBoard has a mark for this, torch's `purge_step`, but of its three readers only one keeps to it: the one
-that `tensorboard` starts with replaces points only where new ones come, and the one behind its option
-`--load_fast=false` shows both (seen with TensorBoard 2.21). So what is to go is taken out of the files.
+TensorBoard has a marker for this, torch's `purge_step`, but only one of its three readers obeys it: the
+default reader replaces points only where new ones exist, and that of `--load_fast=false` shows both
+(TensorBoard 2.21). Therefore the later points are removed from the files.
 
-An event file is a row of records: length u64 and its CRC u32, little-endian, the event, and its CRC u32.
+An event file is a sequence of records: length u64 and its CRC u32, little-endian, the event, and its CRC u32.
 """
 
 import struct
@@ -16,28 +16,27 @@ from tensorboard.compat.proto.event_pb2 import Event
 
 HEADER = struct.Struct("<QI")
 FOOTER_BYTES = 4
-HPARAMS = "_hparams_/"  # what TensorBoard's hparams plugin puts before its tags
-FINAL = "Final/"  # before the names of final metrics; capitals sort first, and HPARAMS shows the first few
+HPARAMS = "_hparams_/"  # prefix of the tags of TensorBoard's hparams plugin
+FINAL = "Final/"  # prefix of final metrics; capitals sort first, and HPARAMS shows the first few
 
 
 def cut_back(folder: Path, first_step: int) -> None:
-    """Remove from the event files in `folder` all points at `first_step` and later, and the run's end.
+    """Remove points at `first_step` and later, and the final results, from the event files in `folder`.
 
-    The end is the line on the HPARAMS page and the final metrics, which the resumed run writes anew. Other
-    records stay as they are, save a last one that a killed run left unfinished. A file is replaced as a
-    whole, so that being killed here loses nothing.
+    The final results are the line on the HPARAMS page and the final metrics; a resumed run writes them again.
+    Other records stay, except a last one that a killed run left incomplete. Files are replaced atomically.
     """
     for path in sorted(folder.glob("events.out.tfevents.*")):
         copy = path.with_name(f"{path.name.replace('tfevents', 'rest')}.part")
         with path.open("rb") as source, copy.open("wb") as target:
             for record, event in _records(source):
-                if _stays(event, first_step):
+                if _is_kept(event, first_step):
                     target.write(record)
         copy.replace(path)
 
 
 def _records(source: BinaryIO) -> Iterator[tuple[bytes, Event]]:
-    """Each whole record with the event in it."""
+    """Yield each complete record with its event."""
     while len(header := source.read(HEADER.size)) == HEADER.size:
         length, _ = HEADER.unpack(header)
         body = source.read(length)
@@ -47,8 +46,8 @@ def _records(source: BinaryIO) -> Iterator[tuple[bytes, Event]]:
         yield header + body + footer, Event.FromString(body)
 
 
-def _stays(event: Event, first_step: int) -> bool:
-    """Whether an event is older than `first_step` and no part of the run's end."""
+def _is_kept(event: Event, first_step: int) -> bool:
+    """Return True for an event before `first_step` that is no final result."""
     tags = [value.tag for value in event.summary.value]
-    ends = any(tag.startswith((HPARAMS, FINAL)) for tag in tags)
-    return event.step < first_step and not ends
+    is_final = any(tag.startswith((HPARAMS, FINAL)) for tag in tags)
+    return event.step < first_step and not is_final

@@ -1,4 +1,4 @@
-"""A page that a person reads in a browser: headings, tables, sentences, pictures; beside its figures."""
+"""A simple HTML page: headings, tables, lists, paragraphs and figures."""
 
 import html
 from collections.abc import Mapping, Sequence
@@ -7,7 +7,7 @@ from typing import Any
 
 from cartpole_rl.reporting import style
 
-LOOK = f"""
+STYLE = f"""
 body {{ font: 16px/1.5 system-ui, sans-serif; color: {style.INK}; max-width: 60rem; margin: 2rem auto;
        padding: 0 1rem; }}
 h1 {{ font-size: 1.7rem; }} h2 {{ font-size: 1.15rem; margin-top: 2.2rem; }}
@@ -21,22 +21,23 @@ Section = Sequence[Mapping[str, str]] | Sequence[str] | str | Path
 
 
 def page(title: str, sections: Sequence[tuple[str, Any]]) -> str:
-    """HTML: each section a heading and rows (a table), sentences (a list), a text, or the path of a picture.
+    """Return HTML: each section is a heading and its content.
 
-    Texts are escaped, but for those that are <code> as a whole.
+    Mappings become a table headed by their keys, texts a list, one text a paragraph, and a path a figure.
+    Texts are escaped; only a list's text that starts with <code> and ends with </code> keeps these tags.
     """
     parts = [f"<h1>{html.escape(title)}</h1>"]
     for heading, content in sections:
         if heading:
             parts.append(f"<h2>{html.escape(heading)}</h2>")
-        parts.append(_shown(content, heading))
+        parts.append(_section(content, heading))
     return (
         f'<!doctype html>\n<html lang="en"><meta charset="utf-8"><title>{html.escape(title)}</title>'
-        f"<style>{LOOK}</style>\n" + "\n".join(parts) + "\n</html>\n"
+        f"<style>{STYLE}</style>\n" + "\n".join(parts) + "\n</html>\n"
     )
 
 
-def _shown(content: Section, heading: str) -> str:
+def _section(content: Section, heading: str) -> str:
     if isinstance(content, Path):
         return f'<img src="{html.escape(content.as_posix())}" alt="{html.escape(heading)}">'
     if isinstance(content, str):

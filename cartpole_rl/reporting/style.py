@@ -1,8 +1,8 @@
-"""One place for what pictures look like: colours, sizes and the look of a matplotlib axes.
+"""Colours, sizes and the style of all figures.
 
 The colours are those of Okabe and Ito (2008), "Color Universal Design", which stay distinct for colour-blind
-readers, with a brown in place of their yellow; figures and the animation give one meaning one colour. Figures
-are built through matplotlib's object API, so nothing here touches pyplot or global settings.
+readers, with a brown in place of their yellow. A colour means the same in figures and animations. Figures are
+built with matplotlib's object API, so that nothing here touches pyplot or global settings.
 """
 
 from matplotlib.axes import Axes
@@ -29,32 +29,32 @@ UPRIGHT = GREEN  # |theta| below the upright angle
 LIMIT = VERMILLION  # the ends of the track
 
 SERIES = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY, BROWN, BLACK)
-"""Colours of unrelated series, in the order in which they are given out."""
+"""Colours of unrelated series, in order of use."""
 
 WIDTH = 8.0  # inch, of every figure
 DPI = 150  # of saved pictures
 TITLE_SIZE = 13.0  # points
 LABEL_SIZE = 11.0
-NOTE_SIZE = 9.5
+SMALL_SIZE = 9.5
 
 
 def series_colour(index: int) -> str:
-    """Colour of the series `index`; after eight they begin again."""
+    """Return the colour of the series `index`; the ninth has that of the first."""
     return SERIES[index % len(SERIES)]
 
 
 def new_figure(height: float, width: float = WIDTH) -> Figure:
-    """An empty white figure of `width` by `height` inches that keeps labels from being cut off."""
+    """Return an empty white figure of `width` by `height` inches whose layout has room for all labels."""
     return Figure(figsize=(width, height), layout="constrained", facecolor=PAPER)
 
 
 def dress(axes: Axes, grid: str = "both") -> None:
-    """Give `axes` the common look: two spines, a faint grid ("both", "x", "y" or "none") behind the data."""
+    """Style `axes`: two spines, and a faint grid ("both", "x", "y" or "none") behind the data."""
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
     for side in ("left", "bottom"):
         axes.spines[side].set_color(MUTED)
-    axes.tick_params(colors=MUTED, labelcolor=INK, labelsize=NOTE_SIZE)
+    axes.tick_params(colors=MUTED, labelcolor=INK, labelsize=SMALL_SIZE)
     axes.set_axisbelow(True)
     axes.grid(False)
     if grid != "none":
@@ -62,25 +62,25 @@ def dress(axes: Axes, grid: str = "both") -> None:
 
 
 def label(axes: Axes, x: str | None = None, y: str | None = None) -> None:
-    """Name the axes, each with its unit."""
+    """Label the axes; a label states its unit."""
     if x is not None:
         axes.set_xlabel(x, fontsize=LABEL_SIZE, color=INK)
     if y is not None:
         axes.set_ylabel(y, fontsize=LABEL_SIZE, color=INK)
 
 
-def title(axes: Axes, text: str, note: str = "") -> None:
-    """A title over `axes`; `note` stands below it, smaller and grey."""
-    room = 1.9 * NOTE_SIZE if note else 0.8 * NOTE_SIZE
+def title(axes: Axes, text: str, subtitle: str = "") -> None:
+    """Write a title over `axes`, and `subtitle` below it, smaller and grey."""
+    room = 1.9 * SMALL_SIZE if subtitle else 0.8 * SMALL_SIZE
     axes.set_title(text, loc="left", fontsize=TITLE_SIZE, color=INK, fontweight="bold", pad=room)
-    if note:
+    if subtitle:
         axes.annotate(
-            note,
+            subtitle,
             in_layout=False,  # the pad above makes room for it
             xy=(0, 1),
             xycoords="axes fraction",
-            xytext=(0, 0.6 * NOTE_SIZE),
+            xytext=(0, 0.6 * SMALL_SIZE),
             textcoords="offset points",
-            fontsize=NOTE_SIZE,
+            fontsize=SMALL_SIZE,
             color=MUTED,
         )

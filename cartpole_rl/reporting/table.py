@@ -1,4 +1,4 @@
-"""Small text tables for terminals, with numbers rounded to what a reader can use."""
+"""Small text tables for terminals, with numbers rounded to significant digits."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -8,55 +8,56 @@ Cell = str | int | float | bool | None
 MISSING = "–"
 GAP = "  "
 RULE = "─"
-FIGURES = 3  # significant digits of the largest number of a column
+DIGITS = 3  # significant, of the largest number of a column
 MOST_DECIMALS = 6
-LEANING = 0.25  # difference of the two half widths, as part of the wider, from which both ends are shown
+ASYMMETRY = 0.25  # difference of the half widths, relative to the wider, above which both ends are shown
 
 
 def table(rows: Sequence[Mapping[str, Cell]], columns: Mapping[str, str] | Sequence[str]) -> str:
-    """Rows as aligned text under a ruled heading, without a final newline.
+    """Return rows as aligned text under a ruled heading, without a final newline.
 
-    `columns` gives the keys to show, in order, or maps each to its heading. The numbers of a column share
-    their decimals and stand to the right, as do texts that begin like a number ("4210 ± 85"); other texts
-    stand to the left. A key that a row lacks, None and NaN show as a dash.
+    `columns` lists the keys to show, or maps each of them to its heading. The numbers of a column have the
+    same decimals and are aligned to the right, as are texts that start with a number ("4210 ± 85"); other
+    texts are aligned to the left. A missing key, None and NaN become a dash.
     """
     headings = dict(columns) if isinstance(columns, Mapping) else {key: key for key in columns}
-    shown = [_column(heading, [row.get(key) for row in rows]) for key, heading in headings.items()]
-    return "\n".join(GAP.join(cells).rstrip() for cells in zip(*shown, strict=True))
+    cells = [_column(heading, [row.get(key) for row in rows]) for key, heading in headings.items()]
+    return "\n".join(GAP.join(line).rstrip() for line in zip(*cells, strict=True))
 
 
 def interval_text(mean: float, low: float | None, high: float | None) -> str:
-    """A mean with the half width of its interval, to two digits of that, or three of the mean: "4210 ± 85".
+    """Return a mean with the half width of its interval: "4210 ± 85".
 
-    An interval that leans to one side shows its ends instead, "4350 (4110 to 4420)"; one that is not finite,
-    and None, as that of a single episode, leave the mean alone.
+    The half width has two significant digits, or fewer if the mean would have more than three. An asymmetric
+    interval is written by its ends, "4350 (4110 to 4420)". Without an interval (None or not finite) the mean
+    stands alone.
     """
     if low is None or high is None or not math.isfinite(high - low):
         return number_text(mean)
     below, above = mean - low, high - mean
-    finest = _decimals(mean or max(below, above), FIGURES)
-    decimals = min(_decimals(max(below, above), figures=2) if above > 0 or below > 0 else finest, finest)
-    if abs(below - above) <= LEANING * max(below, above):
+    finest = _decimals(mean or max(below, above), DIGITS)
+    decimals = min(_decimals(max(below, above), digits=2) if above > 0 or below > 0 else finest, finest)
+    if abs(below - above) <= ASYMMETRY * max(below, above):
         return f"{mean:.{decimals}f} ± {(below + above) / 2:.{decimals}f}"
     return f"{mean:.{decimals}f} ({low:.{decimals}f} to {high:.{decimals}f})"
 
 
 def number_text(value: float) -> str:
-    """A number with three significant digits, or all digits before the point: "4210", "12.3", "0.00456"."""
-    return f"{value:.{_decimals(value, FIGURES)}f}" if math.isfinite(value) else MISSING
+    """Return a number with at least three significant digits: "4210", "12.3", "0.00456"; a dash for NaN."""
+    return f"{value:.{_decimals(value, DIGITS)}f}" if math.isfinite(value) else MISSING
 
 
-def _decimals(largest: float, figures: int) -> int:
-    """Digits after the point that show `figures` significant digits of a number of this size."""
+def _decimals(largest: float, digits: int) -> int:
+    """Return the decimals that give a number of this size `digits` significant digits."""
     if largest == 0 or not math.isfinite(largest):
         return 0
-    return min(max(figures - 1 - math.floor(math.log10(abs(largest))), 0), MOST_DECIMALS)
+    return min(max(digits - 1 - math.floor(math.log10(abs(largest))), 0), MOST_DECIMALS)
 
 
 def _column(heading: str, cells: Sequence[Cell]) -> list[str]:
-    """Heading, rule and cells as texts of one width."""
+    """Return heading, rule and cells as texts of the same width."""
     sizes = [abs(cell) for cell in cells if isinstance(cell, float) and math.isfinite(cell)]
-    decimals = _decimals(max(sizes, default=0.0), FIGURES)
+    decimals = _decimals(max(sizes, default=0.0), DIGITS)
     texts = [_text(cell, decimals) for cell in cells]
     width = max(len(text) for text in (heading, *texts))
     rightwards = all(_is_numeric(text) for text in texts)
@@ -65,7 +66,7 @@ def _column(heading: str, cells: Sequence[Cell]) -> list[str]:
 
 
 def _text(cell: Cell, decimals: int) -> str:
-    """One cell as text; floats with the decimals of their column."""
+    """Return one cell as text; floats with the decimals of their column."""
     if cell is None or (isinstance(cell, float) and math.isnan(cell)):
         return MISSING
     if isinstance(cell, bool):
@@ -74,5 +75,5 @@ def _text(cell: Cell, decimals: int) -> str:
 
 
 def _is_numeric(text: str) -> bool:
-    """Whether a text is a number, begins with one, or stands for a missing one."""
+    """Return True for a text that is a number, starts with one, or is MISSING."""
     return text == MISSING or text.lstrip("+-")[:1].isdigit()

@@ -1,13 +1,11 @@
-"""What a run writes for TensorBoard: scalars, histograms, figures, animations, its line on the HPARAMS page.
+"""TensorBoard events of a run: scalars, histograms, figures, animations, its line on the HPARAMS page.
 
-Pictures are stored as the PNG or GIF that they are: torch's `add_figure` goes through pyplot, and its
-`add_video` writes nothing with moviepy 2. Everything goes into one file: TensorBoard may ignore what is added
-to an older file of the same folder once it has seen a newer one, so torch's `add_hparams`, which opens a
-second file, is not used.
+Pictures are stored as PNG or GIF: torch's `add_figure` uses pyplot, and its `add_video` writes nothing with
+moviepy 2. All events go into one file: TensorBoard may ignore additions to an older file of the same folder
+once it has read a newer one, and torch's `add_hparams` opens a second file.
 
-On the HPARAMS page TensorBoard takes the settings to show from the first "experiment" that it meets, and so
-hides those that only other runs have. Without any, it collects them from all runs and shows first those that
-differ; so none is written, and the metrics to choose from are then all curves.
+No hparams "experiment" is written: with one, TensorBoard's HPARAMS page shows only its settings; without, it
+collects the settings of all runs, those that differ first, and offers all curves as metrics.
 """
 
 import io
@@ -28,15 +26,15 @@ from cartpole_rl.reporting.events import FINAL, cut_back
 from cartpole_rl.reporting.figures import png
 
 BINS = 40
-FLUSH_SECONDS = 10  # how old at most the page of somebody who watches is
+FLUSH_SECONDS = 10  # largest age of what a running TensorBoard shows
 FIGURE_DPI = 110  # sharp on a page, and a third of the bytes of a saved figure
 
 
 class TensorBoardLog:
     """Writes one run folder's TensorBoard events; a context manager that flushes and closes on the way out.
 
-    `purge_step` is for a run that goes on: the first step that it writes again. Points at that step and
-    later, from before it was killed, disappear; earlier ones stay. A new run leaves it out.
+    A resumed run gives `purge_step`, the first step that it writes again: points at that step and later are
+    removed.
     """
 
     def __init__(self, folder: Path | str, purge_step: int | None = None) -> None:
@@ -53,40 +51,40 @@ class TensorBoardLog:
         self.close()
 
     def close(self) -> None:
-        """Flush and close the file; the log is of no use afterwards."""
+        """Flush and close the file. Nothing can be logged afterwards."""
         self._writer.close()
 
     def flush(self) -> None:
-        """Bring everything to disk, so that a TensorBoard that is looking on shows it."""
+        """Write everything to disk, so that a running TensorBoard shows it."""
         self._writer.flush()
 
     def scalars(self, values: Mapping[str, float | None], step: int) -> None:
-        """One point of each curve at `step`; None is left out."""
+        """Log one point of each curve at `step`; None is skipped."""
         for name, value in values.items():
             if value is not None:
                 self._writer.add_summary(summary.scalar(name, float(value)), step)
 
     def histogram(self, name: str, values: ArrayLike, step: int) -> None:
-        """The distribution of `values`, of any shape; what is not finite is left out."""
+        """Log the distribution of the finite `values`, of any shape."""
         flat = np.asarray(values, dtype=np.float64).ravel()
         flat = flat[np.isfinite(flat)]
         if flat.size:
             self._writer.add_summary(summary.histogram(name, flat, bins=BINS), step)
 
     def figure(self, name: str, figure: Figure, step: int) -> None:
-        """A figure as a picture."""
+        """Log a figure as a picture."""
         self._picture(name, png(figure, FIGURE_DPI), step)
 
     def animation(self, name: str, gif: bytes, step: int) -> None:
-        """The bytes of a GIF; the IMAGES page plays it."""
+        """Log the bytes of a GIF; the IMAGES page plays it."""
         self._picture(name, gif, step)
 
     def hparams(self, config: Mapping[str, Any], metrics: Mapping[str, float | None], step: int = 0) -> None:
-        """The run's line on the HPARAMS page; once a run, at its end.
+        """Log the run's line on the HPARAMS page, once at the end of a run.
 
-        `config` may be nested: `{"agent": {"gamma": 0.99}}` becomes `agent.gamma`, a list its text. `metrics`
-        is what came out in the end, stored as points of curves named `Final/...` at `step`; None and what is
-        not finite are left out.
+        `config` may be nested: `{"agent": {"gamma": 0.99}}` becomes `agent.gamma`, a list its text. The final
+        `metrics` become points of curves named `Final/...` at `step`; those that are None or not finite are
+        skipped.
         """
         final = {
             FINAL + name: float(value)
@@ -99,7 +97,7 @@ class TensorBoardLog:
         self.scalars(final, step)
 
     def _picture(self, name: str, encoded: bytes, step: int) -> None:
-        """The bytes of a PNG or GIF file as they are."""
+        """Log the bytes of a PNG or GIF file, unchanged."""
         with Image.open(io.BytesIO(encoded)) as picture:
             width, height = picture.size
         image = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=encoded)
@@ -107,10 +105,10 @@ class TensorBoardLog:
 
 
 def flatten(config: Mapping[str, Any], prefix: str = "") -> dict[str, float | str]:
-    """Nested settings as dotted names with plain values: numbers stay, everything else becomes its text.
+    """Return nested settings as dotted names with plain values: finite numbers stay, all else becomes text.
 
-    True and False become "true" and "false" and None becomes "none", since torch stores a truth value as a
-    number and drops None. Numbers that are not finite become text too: TensorBoard's page cannot read them.
+    True, False and None become "true", "false" and "none": torch stores booleans as numbers and drops None.
+    TensorBoard cannot read numbers that are not finite.
     """
     flat: dict[str, float | str] = {}
     for key, value in config.items():
@@ -123,7 +121,7 @@ def flatten(config: Mapping[str, Any], prefix: str = "") -> dict[str, float | st
 
 
 def _plain(value: Any) -> float | str:
-    """One setting as TensorBoard shows it best."""
+    """Return one setting as a number or as text."""
     if value is None or isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, int | float) and math.isfinite(value):

@@ -1,4 +1,4 @@
-"""Words that several pictures use."""
+"""Texts that several figures share."""
 
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
@@ -13,5 +13,5 @@ ENDINGS = {
 
 
 def ending_text(episode: Episode) -> str:
-    """Why and when an episode ended: "left the track after 6.6 s"."""
+    """Return why and when an episode ended: "left the track after 6.6 s"."""
     return f"{ENDINGS[Ending(episode.ended_by)]} after {episode.time[-1] - episode.time[0]:.1f} s"

@@ -34,9 +34,12 @@ SHOWN = {
 
 
 def evaluate(config: EvaluateConfig, folder: Path, baseline: TrainConfig | None = None) -> None:
-    """Load, build, run, report. Raises CartPoleError.
+    """Run episodes of the agent of `config.run`, in simulation or on a cart.
 
-    `baseline` describes the cart that run=lqr is made for; no agent needs it.
+    `baseline` describes the cart that the controller of run=lqr is made for; no agent needs it. Writes into
+    `folder` config.yaml, provenance.json, metrics.json and figures/, also after an interruption, and prints
+    the scores. Raises ConfigError and CheckpointError for settings, PlantError and LinkError for a cart that
+    fails.
     """
     if again := repetition(config):
         config = again.config

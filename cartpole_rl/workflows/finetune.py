@@ -1,399 +1,194 @@
-"""A trained agent learns on, on the cart that it drives.
+"""Fine-tune a trained agent on the cart that it drives.
 
 Three stages: episodes without exploration (before), episodes to learn from (tune), episodes without
-exploration (after). The cart is driven by a process of its own; this one learns meanwhile. Each finished
-episode is on disk before the next begins, so that an interruption costs at most the one under way.
+exploration (after). A separate process drives the cart while this one learns. Each finished episode is on
+disk before the next one starts: an interruption costs at most the one under way.
 """
 
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import torch
 from torch import nn
-from tqdm import tqdm
 
 from cartpole_rl.agents.dqn import QAgent
-from cartpole_rl.envs.make import CartPoleEnv
-from cartpole_rl.errors import LearningError
-from cartpole_rl.evaluation.driver import Drive, Driver
+from cartpole_rl.evaluation.driver import Driver
 from cartpole_rl.evaluation.driving_policy import as_weights
-from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.evaluation.metrics import episode_metrics, summarize
-from cartpole_rl.evaluation.recordings import LENGTH, read_recording, write_recording
-from cartpole_rl.identification.fit import Fit, fit_cart
-from cartpole_rl.identification.unknowns import LONGEST_LATENCY
-from cartpole_rl.identification.windows import cut_windows
-from cartpole_rl.learning.checkpoint_files import FOLDER, LAST
-from cartpole_rl.learning.checkpoints import (
-    FINETUNING_FORMAT,
-    AgentCheckpoint,
-    TrainingCheckpoint,
-    forget_training,
-    load_agent,
-    save_agent,
-    save_training,
-)
-from cartpole_rl.learning.finetuning import Finetuning, recorded_chunk
+from cartpole_rl.learning.checkpoint_files import LAST
+from cartpole_rl.learning.checkpoints import AgentCheckpoint, forget_training, load_agent
 from cartpole_rl.learning.randomness import seed_everything
-from cartpole_rl.learning.training import Scalars, Training
-from cartpole_rl.physics.models import CartFriction, Models
-from cartpole_rl.plants.recorded import RecordedPlant
-from cartpole_rl.plants.serial.statistics import LinkStatistics
-from cartpole_rl.plants.simulated import SimulatedPlant
-from cartpole_rl.randomization.found import FoundCarts
 from cartpole_rl.reporting.tensorboard import TensorBoardLog
-from cartpole_rl.scheduling import compute_last
-from cartpole_rl.settings import evaluation_seed
-from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.build import (
-    environment,
     evaluated_env,
     evaluated_settings,
     new_agent,
-    randomizer,
-    simulated_env,
     trained_agent,
     use_threads,
 )
 from cartpole_rl.workflows.checking import checked
 from cartpole_rl.workflows.checks import check_finetuning
-from cartpole_rl.workflows.config import (
-    CartPoleSettings,
-    EvaluateConfig,
-    FinetuneConfig,
-    RealSettings,
-    TrainConfig,
-)
-from cartpole_rl.workflows.evaluate import score_table
-from cartpole_rl.workflows.person import confirm, tell
+from cartpole_rl.workflows.config import CartPoleSettings, EvaluateConfig, FinetuneConfig, TrainConfig
+from cartpole_rl.workflows.evaluate import count_text, score_table
+from cartpole_rl.workflows.finetuning_cart import DrivenCart, yield_to
+from cartpole_rl.workflows.finetuning_files import FinetuningFiles, Stage, resumed_config
+from cartpole_rl.workflows.finetuning_learner import CartLearner
+from cartpole_rl.workflows.person import confirm
 from cartpole_rl.workflows.report import report
 from cartpole_rl.workflows.resuming import resumed
 from cartpole_rl.workflows.run_folder import METRICS, write_config, write_json
 
-BEFORE, TUNE, AFTER = "before", "tune", "after"
-RECORDINGS = "recordings"
-DRAWN = 4096  # carts of each fit
+COMPARISON = "comparison.json"
 SIMULATED_SCORE = "cart/score_in_simulation"  # TensorBoard's curve beside those of the cart
-SIMULATED_CARTS = 10
 
 
 def finetune(config: FinetuneConfig, folder: Path) -> None:
-    """Drive and learn, compare, report; or go on with the fine-tuning in `folder`. Raises CartPoleError."""
+    """Fine-tune the agent of `config.run` on the cart of `config.plant`, or resume the run in `folder`.
+
+    Writes config.yaml, provenance.json, recordings/, TensorBoard events, comparison.json (before and after),
+    metrics.json, figures/ and checkpoints/last.pt with the better of both policies; until the end also
+    checkpoints/resume.pt. Prints both scores. Raises ConfigError and CheckpointError before the cart moves,
+    PlantError and LinkError for a cart that fails, LearningError where learning diverges.
+    """
     checkpoint = resumed("finetune", config.resume, folder)
     if checkpoint:
-        config = checked(FinetuneConfig, {**checkpoint.config, "resume": config.resume})
+        config = resumed_config(checkpoint, config.resume)
     run = check_finetuning(config)
     use_threads(config.threads)
     seed_everything(config.seed)
     training = trained_agent(run).training
-    evaluation = as_evaluation(config)
+    evaluation = evaluation_config(config)
     settings = evaluated_settings(training, evaluation)
+    files = FinetuningFiles(folder, config)
+    write_config(folder, "finetune", config.model_dump(mode="json"), resumed=checkpoint is not None)
     if not checkpoint:
-        write_config(folder, "finetune", config.model_dump(mode="json"))
-        save_training(folder, TrainingCheckpoint(config.model_dump(mode="json"), {}, 0), FINETUNING_FORMAT)
-    else:
-        write_config(folder, "finetune", config.model_dump(mode="json"), resumed=True)
-    make_env = partial(evaluated_env, settings, evaluation, print)  # takes who confirms, too
+        files.save({}, 0)
+    make_env = partial(evaluated_env, settings, evaluation, print)  # called with `confirm`
     real_time = config.plant.kind == "serial" or config.emulator.clock == "real"
     with (
         TensorBoardLog(folder) as log,
         Driver(make_env, partial(greedy_network, training), config.compile, real_time, confirm) as driver,
     ):
         if real_time:
-            compute_last()  # but not the process that drives, nor an emulated cart: those have begun
-            if not driver.goes_first:
-                tell(
-                    "finetune", "other processes may delay the cart: no real-time priority (see `ulimit -r`)"
-                )
-        session = Session(config, training, settings, folder, driver, log)
+            yield_to(driver)
+        session = Session(files, DrivenCart(driver, files, log), load_agent(run), training, settings)
         if checkpoint and checkpoint.state:
             session.restore(checkpoint.state)
         session.run()
 
 
-def as_evaluation(config: FinetuneConfig) -> EvaluateConfig:
-    """How the cart is driven."""
+def evaluation_config(config: FinetuneConfig) -> EvaluateConfig:
+    """Return the settings that the cart is driven with."""
     shared = config.model_dump(include={"run", "plant", "emulator", "seed", "label", "threads"})
     episodes = config.evaluation_episodes
     return checked(EvaluateConfig, {**shared, "episodes": episodes, "randomization": {}, "parameters": None})
 
 
 def greedy_network(training: TrainConfig) -> nn.Module:
-    """The network that drives, for weights of `as_weights`."""
+    """Return the network that drives, for weights of `as_weights`."""
     return new_agent(training).greedy_policy()
 
 
-def driven_length(config: FinetuneConfig) -> float | None:
-    """m, the length of the pole on the cart that is driven; None where nobody has said it."""
-    plant = config.plant
-    return plant.pole_length if isinstance(plant, RealSettings) else 2 * config.emulator.pole_com
-
-
-class Unheard:
-    """A monitor of a training that is watched by its episodes."""
-
-    def on_update(self, transitions: int, scalars: Scalars) -> None:
-        """Nobody looks."""
-
-    def on_evaluation(self, training: Training, episodes: Sequence[Episode], is_best: bool) -> None:
-        """There are no evaluations in simulation."""
-
-    def on_checkpoint(self, training: Training) -> None:
-        """The session writes its own."""
-
-
 class Session:
-    """One fine-tuning: what is on disk, what is learned, and what is driven next."""
+    """The stages of one fine-tuning of the agent `start`, on `cart`; `files` keep what is done."""
 
     def __init__(
         self,
-        config: FinetuneConfig,
+        files: FinetuningFiles,
+        cart: DrivenCart,
+        start: AgentCheckpoint,
         training: TrainConfig,
         settings: CartPoleSettings,
-        folder: Path,
-        driver: Driver,
-        log: TensorBoardLog,
     ) -> None:
-        assert config.run is not None
-        self.config, self.training, self.settings = config, training, settings
-        self.folder, self.driver, self.log = folder, driver, log
-        self.start = load_agent(config.run)
+        self.files, self.cart, self.start, self.settings = files, cart, start, settings
+        self.config = files.config
         self.agent: QAgent = new_agent(training)
-        self.agent.load_state_dict(self.start.weights)
+        self.agent.load_state_dict(start.weights)
         self.first_weights = as_weights(self.agent.greedy_policy())
-        self.learner: Finetuning | None = None
-        self.learned = 0  # episodes whose learning is done
-        self.optimizer_state: dict[str, Any] | None = None  # of a run that is resumed
-        self.models = [training.models(training.plant)]
-        if self.models[0].cart_friction is CartFriction.SIGMOID:
-            self.models.append(self.models[0]._replace(cart_friction=CartFriction.STEP))
-        self.link: LinkStatistics | None = None  # of the newest episode's process
+        self.learner = CartLearner(self.config, training, settings, self.agent)
+        self.num_learned = 0  # episodes of the stage TUNE
+        self.optimizer_state: dict[str, Any] | None = None  # of a resumed run
 
     def run(self) -> None:
-        """All stages, from where the disk says that they stand."""
-        config = self.config
-        self.drive_all(BEFORE, config.evaluation_episodes)
+        """Run all stages, as far as they are not on disk."""
+        count = self.config.evaluation_episodes
+        self.cart.drive_missing(Stage.BEFORE, count, self.first_weights)
         self.tune()
-        before = summarize([self.figures(episode) for episode in self.episodes(BEFORE)])
-        self.drive_all(AFTER, config.evaluation_episodes)
-        after_episodes = self.episodes(AFTER)
-        after = summarize([self.figures(episode) for episode in after_episodes])
-        better = after["score"]["mean"] >= before["score"]["mean"]
-        self.keep(better, after if better else before)
-        shown = after_episodes if better else self.episodes(BEFORE)
-        link = {} if self.link is None else self.link_figures(self.link)
-        plant, x_max = config.plant.kind, self.settings.task.x_max
-        report(self.folder, shown, plant, self.settings.pole, x_max, link)
-        kept = AFTER if better else BEFORE
-        write_json(self.folder / "comparison.json", {BEFORE: before, AFTER: after, "kept": kept})
-        forget_training(self.folder)
-        print(score_table(before, f"before, {config.evaluation_episodes} episodes"))
-        print(score_table(after, f"after {config.episodes} episodes of learning"))
-        if link.get("latency_override"):
-            print(f"latency as measured, for cartpole-train: '{link['latency_override']}'")
-        print(
-            f"kept: the policy {kept} fine-tuning; "
-            f"{self.folder}/{METRICS}, checkpoints/{LAST}, recordings/ are written"
-        )
+        self.cart.drive_missing(Stage.AFTER, count, as_weights(self.agent.greedy_policy()))
+        self.compare()
+        forget_training(self.files.folder)
 
     def tune(self) -> None:
-        """Drive and learn at once, episode by episode."""
-        count = self.config.episodes
-        if self.learned >= count:
+        """Drive and learn at the same time, episode by episode."""
+        count, files = self.config.episodes, self.files
+        if self.num_learned >= count:
             return
-        self.begin_learning()
-        assert self.learner is not None
-        if not self.learned:
-            self.log.scalars({SIMULATED_SCORE: self.simulated_score()}, self.step(TUNE, 0))
-        while self.learned < count:
-            number = self.learned
-            driving = number >= len(self.episodes(TUNE))
-            if driving:
-                weights = as_weights(self.agent.greedy_policy())
-                self.driver.start(Drive(weights, self.config.finetuning.epsilon, self.config.seed + number))
-            scalars = {**self.learner.round(), SIMULATED_SCORE: self.simulated_score()}
-            if driving:
-                self.finish(TUNE, number)
-            episode = self.episodes(TUNE)[number]
-            self.learner.add(self.chunk(episode))
-            self.learned += 1
-            if self.learned % self.config.finetuning.refit == 0 and self.learned < count:
-                self.refit()
-            self.log.scalars(scalars, self.step(TUNE, self.learned))
+        recorded = files.episodes(Stage.BEFORE) + files.episodes(Stage.TUNE)[: self.num_learned]
+        self.learner.start(recorded, self.num_learned, self.optimizer_state)
+        if not self.num_learned:
+            self.log({SIMULATED_SCORE: self.learner.simulated_score()})
+        while self.num_learned < count:
+            scalars = self.learn_from_next()
+            if self.num_learned % self.config.finetuning.refit == 0 and self.num_learned < count:
+                self.learner.refit(files.episodes(Stage.BEFORE) + files.episodes(Stage.TUNE))
+            self.log(scalars)
             self.save()
 
-    def begin_learning(self) -> None:
-        """Build the learner on the first fit; after a resumption, on all that was recorded."""
-        recorded = self.episodes(BEFORE) + self.episodes(TUNE)[: self.learned]
-        fit, models = self.best_fit(recorded)
-        training, finetuning = self.training, self.config.finetuning
-        learning = training.learning
-        iterations = self.config.episodes * finetuning.iterations
-        plant = SimulatedPlant(
-            learning.carts,
-            self.carts(fit),
-            training.task.start,
-            models,
-            training.control_period,
-            training.plant.substeps,
-            self.config.seed,
-            compiled=self.config.compile,
+    def learn_from_next(self) -> dict[str, float]:
+        """Learn while the next episode is driven, unless it is on disk, and add it. Return curves to log."""
+        number = self.num_learned
+        driving = number >= self.files.count(Stage.TUNE)
+        if driving:
+            weights = as_weights(self.agent.greedy_policy())
+            self.cart.start(weights, self.config.finetuning.epsilon, self.config.seed + number)
+        scalars = {**self.learner.round(), SIMULATED_SCORE: self.learner.simulated_score()}
+        if driving:
+            self.cart.finish(Stage.TUNE, number)
+        self.learner.add(self.files.episode(Stage.TUNE, number))
+        self.num_learned += 1
+        return scalars
+
+    def log(self, scalars: dict[str, float]) -> None:
+        """Log curves at the step of the last episode that was learned from."""
+        self.cart.log.scalars(scalars, self.cart.step(Stage.TUNE, self.num_learned))
+
+    def compare(self) -> None:
+        """Keep the better policy, and write and print the results."""
+        episodes = {stage: self.files.episodes(stage) for stage in (Stage.BEFORE, Stage.AFTER)}
+        summaries = {stage: self.summarize(each) for stage, each in episodes.items()}
+        scores = {stage: each["score"]["mean"] for stage, each in summaries.items()}
+        kept = Stage.AFTER if scores[Stage.AFTER] >= scores[Stage.BEFORE] else Stage.BEFORE
+        weights = self.agent.state_dict() if kept is Stage.AFTER else self.start.weights
+        self.files.save_agent(
+            AgentCheckpoint(self.start.config, weights, self.start.transitions, scores[kept])
         )
-        learner = Finetuning(
-            finetuning,
-            learning.model_copy(
-                update={
-                    "transitions": iterations * learning.carts * learning.chunk,
-                    "warmup_transitions": 0,
-                    "epsilon": (0.1, 0.02),
-                    "epsilon_transitions": iterations * learning.carts * learning.chunk // 2,
-                }
-            ),
-            training.buffer.model_copy(update={"kind": "uniform"}),
-            training.optimizer.model_copy(update={"learning_rate": finetuning.learning_rate}),
-            self.agent,
-            environment(training, plant),
-            lambda: [],
-            Unheard(),
-            self.config.seed,
-            self.config.compile,
-        )
-        learner.iteration = self.learned * finetuning.iterations
-        for episode in recorded:
-            learner.add(self.chunk(episode))
-        if self.optimizer_state is not None:
-            learner.optimizer.load_state_dict(self.optimizer_state)
-        learner.fill()
-        self.models, self.learner = [models], learner
+        folder, link = self.files.folder, self.cart.link_summary()
+        x_max = self.settings.task.x_max
+        report(folder, episodes[kept], self.config.plant.kind, self.settings.pole, x_max, link)
+        write_json(folder / COMPARISON, {**summaries, "kept": kept})
+        print(score_table(summaries[Stage.BEFORE], f"before, {count_text(len(episodes[Stage.BEFORE]))}"))
+        print(score_table(summaries[Stage.AFTER], f"after, {count_text(len(episodes[Stage.AFTER]))}"))
+        if link.get("latency_override"):
+            print(f"latency as measured, for cartpole-train: '{link['latency_override']}'")
+        print(f"kept: the policy {kept} fine-tuning")
+        print(f"{folder}/{METRICS}, {COMPARISON}, checkpoints/{LAST} and recordings/ are written")
 
-    def refit(self) -> None:
-        """Fit anew to all recordings, and go on with carts of that fit."""
-        assert self.learner is not None
-        fit, _ = self.best_fit(self.episodes(BEFORE) + self.episodes(TUNE))
-        self.learner.simulate(self.carts(fit))
-
-    def best_fit(self, episodes: list[Episode]) -> tuple[Fit, Models]:
-        """The fit, and the laws of those tried under which it is best."""
-        windows = cut_windows(episodes, self.settings.control_period)
-        nominal = {**self.training.nominal, **self.training.pole.nominal.model_dump()}
-        fits = [
-            (fit_cart(windows, nominal, models, self.settings.control_period), models)
-            for models in self.models
-        ]
-        fit, models = min(fits, key=lambda each: each[0].cost)
-        tell(
-            "finetune",
-            f"the simulator follows {windows.number} recorded half seconds within "
-            f"{fit.rms[0] * 0.022749:.2f} mm and {fit.rms[1] * 0.0879:.2f} deg",
-        )
-        return fit, models
-
-    def carts(self, fit: Fit) -> FoundCarts:
-        """Carts of the fit, and some as in training."""
-        random = np.random.default_rng(self.config.seed)
-        table = torch.from_numpy(fit.draw(DRAWN, random, self.config.finetuning.widen)).float()
-        prior_share = self.config.finetuning.prior_share
-        return FoundCarts(table, randomizer(self.training), prior_share, LONGEST_LATENCY)
-
-    def drive_all(self, stage: str, count: int) -> None:
-        """Drive what is missing of a stage, without exploration."""
-        weights = self.first_weights if stage == BEFORE else as_weights(self.agent.greedy_policy())
-        for number in range(len(self.episodes(stage)), count):
-            self.driver.start(Drive(weights, 0.0, self.config.seed))
-            self.finish(stage, number)
-
-    def finish(self, stage: str, number: int) -> None:
-        """Wait for an episode, and write it down."""
-        driven = self.driver.result()
-        self.link = driven.link
-        if driven.episode.ended_by == Ending.NON_FINITE:
-            raise LearningError(
-                f"{stage} {number + 1}: an observation or an action value was not finite, so the cart was "
-                "stopped; nothing is learned from this episode"
-            )
-        length = driven_length(self.config)
-        facts = {"stage": stage, "number": number, LENGTH: "" if length is None else f"{length:.4f}"}
-        write_recording(self.path(stage, number), driven.episode, facts)
-        figures = self.figures(driven.episode)
-        step = self.step(stage, number + 1)
-        self.log.scalars({f"cart/score_{stage}": figures["score"]}, step)
-        self.log.scalars(
-            {f"link/{key}": float(value) for key, value in vars(self.link.summary()).items()}, step
-        )
-        self.log.flush()
-        tqdm.write(f"{stage} {number + 1}: score {figures['score']:.0f}, ended by {driven.episode.ended_by}")
-
-    def step(self, stage: str, number: int) -> int:
-        """TensorBoard's step of a stage's `number`th episode, from 1: all stages in one row."""
-        config = self.config
-        ahead = {
-            BEFORE: 0,
-            TUNE: config.evaluation_episodes,
-            AFTER: config.evaluation_episodes + config.episodes,
-        }
-        return ahead[stage] + number
-
-    def simulated_score(self) -> float:
-        """Mean score of the agent as it is now, on the same carts of its training's simulation each time."""
-        training = self.training
-        start = training.task.evaluation_start
-        env = simulated_env(
-            training, training.plant, SIMULATED_CARTS, start, evaluation_seed(self.config.seed)
-        )
-        return float(np.mean([each.score.sum() for each in run_batch(env, self.agent.greedy_policy())]))
-
-    def path(self, stage: str, number: int) -> Path:
-        """Where an episode is kept."""
-        return self.folder / RECORDINGS / f"{stage}_{number:03d}.csv"
-
-    def episodes(self, stage: str) -> list[Episode]:
-        """What is on disk of a stage, in order."""
-        found: list[Episode] = []
-        while (path := self.path(stage, len(found))).exists():
-            found.append(read_recording(path))
-        return found
-
-    def figures(self, episode: Episode) -> dict[str, Any]:
-        """What an episode is worth."""
-        return episode_metrics(episode, self.settings.task.x_max)
-
-    def chunk(self, episode: Episode) -> Any:
-        """An episode's transitions, as the agent sees them."""
-
-        def over(plant: RecordedPlant) -> CartPoleEnv:
-            return environment(self.settings, plant)
-
-        return recorded_chunk(episode, over, self.settings.actions.motors, driven_length(self.config))
+    def summarize(self, episodes: list[Episode]) -> dict[str, Any]:
+        """Return the summary of the metrics of `episodes`."""
+        return summarize([episode_metrics(episode, self.settings.task.x_max) for episode in episodes])
 
     def save(self) -> None:
-        """The state to resume from."""
-        assert self.learner is not None
+        """Write the checkpoint to resume from."""
         state = {
-            "learned": self.learned,
+            "learned": self.num_learned,
             "agent": self.agent.state_dict(),
-            "optimizer": self.learner.optimizer.state_dict(),
+            "optimizer": self.learner.started.optimizer.state_dict(),
         }
-        checkpoint = TrainingCheckpoint(self.config.model_dump(mode="json"), state, self.learned)
-        save_training(self.folder, checkpoint, FINETUNING_FORMAT)
+        self.files.save(state, self.num_learned)
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from `save`."""
-        self.learned = state["learned"]
+        """Continue from what `save` wrote."""
+        self.num_learned = state["learned"]
         self.agent.load_state_dict(state["agent"])
         self.optimizer_state = state["optimizer"]
-
-    def keep(self, tuned: bool, summary: dict[str, Any]) -> None:
-        """Write the better policy as the run's last checkpoint."""
-        weights = self.agent.state_dict() if tuned else self.start.weights
-        score = summary["score"]["mean"]
-        checkpoint = AgentCheckpoint(self.start.config, weights, self.start.transitions, score)
-        save_agent(self.folder / FOLDER / LAST, checkpoint)
-
-    @staticmethod
-    def link_figures(link: LinkStatistics) -> dict[str, Any]:
-        """Frames lost, spoilt and late on the wire, and the time from a state to its command."""
-        return {**vars(link.summary()), "latency_override": link.latency_override()}

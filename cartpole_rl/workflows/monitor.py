@@ -1,4 +1,4 @@
-"""What is seen of a training, then and later: progress bar, TensorBoard, history, checkpoints."""
+"""Progress bar, TensorBoard events, history and checkpoints of a training."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -21,31 +21,31 @@ from cartpole_rl.reporting.tensorboard import TensorBoardLog
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.config import TrainConfig
 
-HISTORY = "history.jsonl"  # a line an evaluation
+HISTORY = "history.jsonl"  # a line for each evaluation
 COMPARED = ("score", "score_upright", "steps", "time_to_upright_s", "upright_fraction")  # on the HPARAMS page
 AVERAGED = ("score", "score_upright", "steps", "upright_fraction")  # over the episodes of an evaluation
 PICTURES = 4  # behaviour figures and animations in TensorBoard, over the whole training
 
 
 class TrainingMonitor:
-    """Listens to one training in the run folder `folder`; a context manager around `Training.run`.
+    """Monitor of one training in the run folder `folder`; a context manager around `Training.run`.
 
-    A resumed training hands in the transitions it has seen; what was written after them is written anew.
+    `resumed_at` is the number of transitions from which a training is resumed: later records are removed.
     """
 
     def __init__(self, folder: Path, config: TrainConfig, resumed_at: int | None = None) -> None:
         self.folder, self.config = folder, config
         self._settings = config.model_dump(mode="json")
-        self._seen = resumed_at or 0
+        self._logged = resumed_at or 0
         self._log = TensorBoardLog(folder, purge_step=None if resumed_at is None else resumed_at + 1)
         self._bar = tqdm(
             total=config.learning.collected_transitions,
-            initial=self._seen,
+            initial=self._logged,
             unit=" transitions",
             unit_scale=True,
             mininterval=1.0,
         )
-        self.history = [record for record in read_history(folder) if record["transitions"] <= self._seen]
+        self.history = [record for record in read_history(folder) if record["transitions"] <= self._logged]
         write_history(folder, self.history)
 
     def __enter__(self) -> "TrainingMonitor":
@@ -58,12 +58,12 @@ class TrainingMonitor:
         self._log.close()
 
     def on_update(self, transitions: int, scalars: Scalars) -> None:
-        """Curves and the progress bar."""
+        """Log curves and advance the progress bar."""
         self._log.scalars(scalars, transitions)
         self._advance(transitions)
 
     def on_evaluation(self, training: Training, episodes: Sequence[Episode], is_best: bool) -> None:
-        """Scores, pictures now and then, and the last and the best checkpoint."""
+        """Log scores and sometimes pictures, and write the last and the best checkpoint."""
         transitions, record = training.transitions, self._record(training, episodes)
         self.history.append(record)
         write_history(self.folder, self.history)
@@ -71,7 +71,7 @@ class TrainingMonitor:
             {f"evaluation/{key}": record[key] for key in record if key != "transitions"}, transitions
         )
         if len(self.history) % max(1, self.config.learning.evaluations // PICTURES) == 0:
-            self._show(episodes[0], transitions)
+            self._log_pictures(episodes[0], transitions)
         agent = AgentCheckpoint(self._settings, training.agent.state_dict(), transitions, record["score"])
         for name in (LAST, BEST) if is_best else (LAST,):
             save_agent(self.folder / FOLDER / name, agent)
@@ -79,31 +79,31 @@ class TrainingMonitor:
         self._advance(transitions)
 
     def on_checkpoint(self, training: Training) -> None:
-        """The state to resume from."""
+        """Write the state to resume from."""
         self._log.flush()
         state = TrainingCheckpoint(self._settings, training.snapshot(), training.transitions)
         save_training(self.folder, state)
 
     def randomization(self, plant: SimulatedPlant) -> None:
-        """Histograms of the parameters in force on all carts."""
+        """Log histograms of the current parameters of all carts."""
         for name in (*self.config.ranges, "pole_length"):
             values = getattr(plant.parameters, name).cpu().numpy()
-            self._log.histogram(f"randomization/{name}", values, self._seen)
+            self._log.histogram(f"randomization/{name}", values, self._logged)
 
     def finished(self, summary: Mapping[str, Any]) -> None:
-        """The run's line on TensorBoard's HPARAMS page, with means of the last evaluation."""
-        shown = {key: value["mean"] for key in COMPARED if (value := summary[key]) is not None}
-        self._log.hparams(self._settings, shown)
+        """Write the run's line on TensorBoard's HPARAMS page, with means of the last evaluation."""
+        metrics = {key: value["mean"] for key in COMPARED if (value := summary[key]) is not None}
+        self._log.hparams(self._settings, metrics)
 
     def _advance(self, transitions: int) -> None:
-        self._bar.update(transitions - self._seen)
-        self._seen = transitions
+        self._bar.update(transitions - self._logged)
+        self._logged = transitions
 
     def _record(self, training: Training, episodes: Sequence[Episode]) -> dict[str, float]:
-        """The evaluation's line in the history."""
-        figures = [episode_metrics(episode, self.config.task.x_max) for episode in episodes]
-        scores = [figure["score"] for figure in figures]
-        means = {key: float(np.mean([figure[key] for figure in figures])) for key in AVERAGED}
+        """Return the evaluation's line in the history."""
+        metrics = [episode_metrics(episode, self.config.task.x_max) for episode in episodes]
+        scores = [each["score"] for each in metrics]
+        means = {key: float(np.mean([each[key] for each in metrics])) for key in AVERAGED}
         return {
             "transitions": training.transitions,
             "seconds": training.seconds,
@@ -112,7 +112,7 @@ class TrainingMonitor:
             "score_max": max(scores),
         }
 
-    def _show(self, episode: Episode, transitions: int) -> None:
+    def _log_pictures(self, episode: Episode, transitions: int) -> None:
         half = self.config.task.x_max
         length = 2 * self.config.pole.nominal.pole_com
         self._log.figure(
@@ -122,12 +122,12 @@ class TrainingMonitor:
 
 
 def read_history(folder: Path) -> list[dict[str, float]]:
-    """The evaluations of a training so far, oldest first."""
+    """Return the evaluations of a training so far, oldest first."""
     path = folder / HISTORY
     return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
 
 
 def write_history(folder: Path, history: Sequence[dict[str, float]]) -> None:
-    """What `read_history` reads."""
+    """Write the evaluations for `read_history`, all or none."""
     with replacing(folder / HISTORY) as beside:
         beside.write_text("".join(json.dumps(record) + "\n" for record in history))

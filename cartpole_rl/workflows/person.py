@@ -5,13 +5,13 @@ from contextlib import suppress
 
 
 def confirm(text: str) -> bool:
-    """Show `text` and wait for Enter; False, at once, where nobody sits at a terminal."""
+    """Show `text` and wait for Enter. Return False at once if standard input is no terminal."""
     if sys.stdin is None or not sys.stdin.isatty():
         return False
     print(f"{text}.", file=sys.stderr)
     print("Check the cart. It homes as soon as you confirm: keep the track clear.", file=sys.stderr)
-    forget_typed()
-    print("Press Enter to go on, Ctrl-C to stop. ", end="", file=sys.stderr, flush=True)
+    discard_typed()
+    print("Press Enter to continue, Ctrl-C to stop. ", end="", file=sys.stderr, flush=True)
     try:
         input()
     except EOFError:
@@ -19,8 +19,8 @@ def confirm(text: str) -> bool:
     return True
 
 
-def forget_typed() -> None:
-    """Throw away what was typed before: it answers no question that is asked now."""
+def discard_typed() -> None:
+    """Discard what was typed before the question."""
     try:
         import termios
     except ImportError:  # Windows
@@ -32,7 +32,7 @@ def forget_typed() -> None:
     termios.tcflush(sys.stdin, termios.TCIFLUSH)
 
 
-def tell(name: str, message: str) -> None:
-    """One line on stderr, if that still leads anywhere: a closed terminal does not."""
+def print_message(name: str, message: str) -> None:
+    """Print one line on stderr; do nothing if the terminal is closed."""
     with suppress(OSError):
         print(f"cartpole-{name.replace('_', '-')}: {message}", file=sys.stderr)

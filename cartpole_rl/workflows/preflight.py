@@ -1,7 +1,7 @@
 """Check a cart by small moves before an agent drives it."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 
 from cartpole_rl.errors import PlantError
 from cartpole_rl.plants.emulated_cart import EmulatedCart
@@ -13,10 +13,13 @@ from cartpole_rl.workflows.person import confirm
 
 
 def check_cart(config: PreflightConfig) -> None:
-    """Print a line for each check. Raises PlantError after the first that is not OK."""
-    with the_cart(config) as cart:
+    """Check the cart of `config.plant` by small moves, and print a line for each check.
+
+    Writes no files. Raises PlantError after the first check that fails, LinkError where no cart answers.
+    """
+    with connected_cart(config) as cart:
         finding: Finding | None = None
-        for finding in preflight(cart, config.home_timeout, faults(config.plant)):
+        for finding in preflight(cart, config.home_timeout, fault_clearing(config.plant)):
             print(finding, flush=True)
     if finding is None or not finding.ready:
         raise PlantError(
@@ -25,27 +28,21 @@ def check_cart(config: PreflightConfig) -> None:
     print("The cart is ready.")
 
 
-def faults(plant: EmulatedSettings | RealSettings) -> FaultClearing:
-    """The rule by which latched faults are cleared."""
+def fault_clearing(plant: EmulatedSettings | RealSettings) -> FaultClearing:
+    """Return the rule for clearing latched faults."""
     return FaultClearing(plant.clear_faults if isinstance(plant, RealSettings) else None, confirm)
 
 
 @contextmanager
-def the_cart(config: PreflightConfig) -> Iterator[SerialCart]:
-    """The cart to check, not open yet; disarmed and closed at the end, and an emulated one ended."""
+def connected_cart(config: PreflightConfig) -> Iterator[SerialCart]:
+    """Yield the cart, not open yet; disarm and close it at the end, and stop an emulated one."""
     if isinstance(config.plant, RealSettings):
-        cart = SerialCart(SerialSettings(port=config.plant.port, baud=config.plant.baud))
-        try:
+        with closing(SerialCart(SerialSettings(port=config.plant.port, baud=config.plant.baud))) as cart:
             yield cart
-        finally:
-            cart.close()
         return
     with EmulatedCart(config.emulator.model_copy(update={"start": "hanging"})) as emulated:
         patient = SerialSettings(
             port=emulated.port, timeout=5, connect_timeout=10, answer_timeout=2, nudge_after=2
         )
-        cart = SerialCart(patient)
-        try:
+        with closing(SerialCart(patient)) as cart:
             yield cart
-        finally:
-            cart.close()

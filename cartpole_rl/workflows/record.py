@@ -25,9 +25,11 @@ from cartpole_rl.workflows.run_folder import write_config
 
 
 def record(config: RecordConfig, folder: Path, baseline: TrainConfig | None = None) -> None:
-    """Load, build, run, write each. Raises CartPoleError.
+    """Run episodes of the agent of `config.run` as `evaluate` does, and write each one as a recording.
 
-    `baseline` describes the cart that run=lqr is made for; no agent needs it.
+    `baseline` describes the cart that the controller of run=lqr is made for; no agent needs it. Writes into
+    `folder` config.yaml, provenance.json and recordings/episode_<number>.csv. Raises ConfigError and
+    CheckpointError for settings, PlantError and LinkError for a cart that fails.
     """
     evaluation: EvaluateConfig = config
     if again := repetition(config):

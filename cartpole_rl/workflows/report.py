@@ -1,4 +1,4 @@
-"""Writes what episodes were worth: metrics.json, and figures of them."""
+"""Writes the results of episodes: metrics.json and figures."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -22,19 +22,19 @@ def report(
     link: Mapping[str, int] | None = None,
     history: Sequence[Mapping[str, float]] = (),
 ) -> dict[str, Any]:
-    """Write metrics.json and figures/ into `folder`; returns what `summarize` makes of the episodes.
+    """Write metrics.json and figures/ into `folder`, and return the summary of the episodes (`summarize`).
 
-    The behaviour and the animation show the first episode; `history` adds the learning curve.
+    The behaviour figure and the animation show the first episode; `history` adds the learning curve.
     """
-    figures = [episode_metrics(episode, x_max) for episode in episodes]
-    summary = summarize(figures)
-    head = {"plant": plant, "pole": pole.name, **(link or {})}
+    metrics = [episode_metrics(episode, x_max) for episode in episodes]
+    summary = summarize(metrics)
+    header = {"plant": plant, "pole": pole.name, **(link or {})}
     cart, origins = stored_origins(episodes)
-    told = [{**figure, **origin} for figure, origin in zip(figures, origins, strict=True)]
-    write_json(folder / METRICS, {**head, **summary, **cart, "episodes": told})
-    pictures = folder / "figures"
-    save(behaviour(episodes[0], f"First episode, plant={plant}", x_max), pictures / "behaviour.png")
-    write_gif(episodes[0], pictures / "episode.gif", 2 * pole.nominal.pole_com, x_max, f"plant={plant}")
+    listed = [{**each, **origin} for each, origin in zip(metrics, origins, strict=True)]
+    write_json(folder / METRICS, {**header, **summary, **cart, "episodes": listed})
+    figures = folder / "figures"
+    save(behaviour(episodes[0], f"First episode, plant={plant}", x_max), figures / "behaviour.png")
+    write_gif(episodes[0], figures / "episode.gif", 2 * pole.nominal.pole_com, x_max, f"plant={plant}")
     if history:
-        save(learning_curve([("score", list(history))]), pictures / "learning_curve.png")
+        save(learning_curve([("score", list(history))]), figures / "learning_curve.png")
     return summary

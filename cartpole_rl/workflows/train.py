@@ -17,14 +17,20 @@ from cartpole_rl.workflows.build import new_agent, recorded_config, simulated_en
 from cartpole_rl.workflows.checks import check_compiler
 from cartpole_rl.workflows.config import LearnedSettings, TrainConfig
 from cartpole_rl.workflows.monitor import TrainingMonitor
-from cartpole_rl.workflows.person import tell
+from cartpole_rl.workflows.person import print_message
 from cartpole_rl.workflows.report import report
 from cartpole_rl.workflows.resuming import resumed
 from cartpole_rl.workflows.run_folder import write_config
 
 
 def train(config: TrainConfig, folder: Path) -> None:
-    """Build, train, report; or go on with the training in `folder`. Raises CartPoleError."""
+    """Train an agent on randomized simulated carts, or resume the training in `folder`.
+
+    Writes config.yaml, provenance.json, TensorBoard events, history.jsonl (evaluations), checkpoints/last.pt
+    and best.pt, metrics.json and figures/; until the end also checkpoints/resume.pt. Raises ConfigError for
+    settings that do not fit together or a folder that already holds a run, CheckpointError for a resumed run
+    without a checkpoint, LearningError where learning diverges.
+    """
     checkpoint = resumed("train", config.resume, folder)
     if checkpoint:
         config = recorded_config(checkpoint.config, f"resume={folder}")
@@ -74,7 +80,7 @@ def note_unused_randomization(config: TrainConfig, draws: Draws) -> None:
             f"cart_friction={config.cart_friction.model}, pole_friction={config.pole_friction.model} and "
             f"actuator {config.actions.actuator} with motor values {list(config.actions.motors)}"
         )
-        tell("train", f"note: randomization of {', '.join(unused)} has no effect with {chosen}")
+        print_message("train", f"note: randomization of {', '.join(unused)} has no effect with {chosen}")
 
 
 def nominal_env(config: TrainConfig) -> CartPoleEnv:

@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import threading
 import time
 from collections import defaultdict
 from pathlib import Path
@@ -96,10 +97,10 @@ def test_one_that_has_ended_is_not_resumed(tuned: tuple[Path, Outcome], tmp_path
     done = in_process("finetune", f"resume={run}", folder=tmp_path)
     assert done.code == 2
     assert f"this run of cartpole-finetune has ended; cartpole-evaluate run={run}" in done.complaint
-    done = in_process("finetune", f"resume={run}", "hydra.run.dir=elsewhere", folder=tmp_path)
+    done = in_process("finetune", f"resume={run}", "hydra.run.dir=other", folder=tmp_path)
     assert done.code == 2
     assert "leave out hydra.run.dir" in done.complaint
-    assert not (tmp_path / "prior_share").exists()
+    assert not (tmp_path / "other").exists()
 
 
 def test_a_tuned_agent_is_evaluated_like_any_other(tuned: tuple[Path, Outcome], tmp_path: Path) -> None:
@@ -110,25 +111,50 @@ def test_a_tuned_agent_is_evaluated_like_any_other(tuned: tuple[Path, Outcome], 
     assert done.code == 0, done.err
 
 
-@pytest.mark.parametrize("stop", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
-def test_an_interrupted_run_goes_on(trained: Path, tmp_path: Path, stop: signal.Signals) -> None:
-    words = (f"run={trained}", *SHORT, f"hydra.run.dir={tmp_path}/run")
+def interrupt(folder: Path, recording: str, stop: signal.Signals) -> None:
+    """Send `stop` to this process once an episode is on disk."""
+
+    def send() -> None:
+        while not (folder / "run/recordings" / recording).exists():
+            time.sleep(0.01)
+        os.kill(os.getpid(), stop)
+
+    threading.Thread(target=send, daemon=True).start()
+
+
+def contents(run: Path) -> dict[str, bytes]:
+    """The recordings of a run."""
+    return {name: (run / "recordings" / name).read_bytes() for name in recordings(run)}
+
+
+def test_a_run_continues_after_each_kind_of_interruption(trained: Path, tmp_path: Path) -> None:
+    """One run: killed, then interrupted, then terminated, each time after one more episode to learn from."""
+    words = (f"run={trained}", *SHORT, "episodes=4", f"hydra.run.dir={tmp_path}/run")
     process = console_script("finetune", *words, folder=tmp_path)
-    first = tmp_path / "run" / "recordings" / "tune_000.csv"
     deadline = time.monotonic() + 100
-    while not first.exists() and time.monotonic() < deadline:
+    while not (tmp_path / "run/recordings/tune_000.csv").exists() and time.monotonic() < deadline:
         time.sleep(0.02)
-    os.kill(process.pid, stop)
-    interrupted = outcome(process)
-    assert interrupted.code == {signal.SIGKILL: -9, signal.SIGINT: 130, signal.SIGTERM: 143}[stop]
-    kept = {
-        name: (tmp_path / "run" / "recordings" / name).read_bytes() for name in recordings(tmp_path / "run")
-    }
-    done = in_process("finetune", f"resume={tmp_path}/run", folder=tmp_path)
-    assert done.code == 0, done.err
-    assert recordings(tmp_path / "run") == ["after_000.csv", "before_000.csv", "tune_000.csv", "tune_001.csv"]
-    for name, content in kept.items():
-        assert (tmp_path / "run" / "recordings" / name).read_bytes() == content
+    os.kill(process.pid, signal.SIGKILL)
+    assert outcome(process).code == -signal.SIGKILL
+    kept = contents(tmp_path / "run")
+    for recording, stop, code in (
+        ("tune_001.csv", signal.SIGINT, 130),
+        ("tune_002.csv", signal.SIGTERM, 143),
+        (None, None, 0),
+    ):
+        if recording is not None:
+            assert recording not in kept
+            interrupt(tmp_path, recording, stop)
+        done = in_process("finetune", f"resume={tmp_path}/run", folder=tmp_path)
+        assert done.code == code, done.err
+        now = contents(tmp_path / "run")
+        assert {name: now[name] for name in kept} == kept
+        kept = now
+    assert recordings(tmp_path / "run") == [
+        "after_000.csv",
+        "before_000.csv",
+        *(f"tune_00{number}.csv" for number in range(4)),
+    ]
 
 
 def test_a_run_is_needed(tmp_path: Path) -> None:

@@ -27,12 +27,12 @@ def identified(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def told(identified: Path) -> dict[str, Any]:
+def results(identified: Path) -> dict[str, Any]:
     return json.loads((identified / "run/identification.json").read_text())
 
 
-def test_the_cart_is_found(told: dict[str, Any]) -> None:
-    found = {name: each["value"] for name, each in told["quantities"].items()}
+def test_the_cart_is_found(results: dict[str, Any]) -> None:
+    found = {name: each["value"] for name, each in results["quantities"].items()}
     mass, moment = 0.735 + 0.129, 0.129 * 0.1765
     assert found["viscous"] == pytest.approx(1.1 / mass, rel=0.1)
     assert found["coulomb"] == pytest.approx(0.555 / mass, rel=0.1)
@@ -44,10 +44,10 @@ def test_the_cart_is_found(told: dict[str, Any]) -> None:
     assert found["angle_offset"] == pytest.approx(np.degrees(-0.01), abs=0.1)
 
 
-def test_held_out_motion_is_predicted(told: dict[str, Any]) -> None:
-    assert told["held_out_1_s"]["x_m"] < 5e-3
-    assert told["held_out_1_s"]["theta_rad"] < np.radians(2)
-    assert set(told["tried"]) == {"linear", "sigmoid", "step", "stribeck"}
+def test_held_out_motion_is_predicted(results: dict[str, Any]) -> None:
+    assert results["held_out_1_s"]["x_m"] < 5e-3
+    assert results["held_out_1_s"]["theta_rad"] < np.radians(2)
+    assert set(results["tried"]) == {"linear", "sigmoid", "step", "stribeck"}
 
 
 def test_what_is_written_can_be_read(identified: Path) -> None:
@@ -62,24 +62,24 @@ def test_what_is_written_can_be_read(identified: Path) -> None:
         assert stored["covariance"].shape == (size, size)
     assert np.median(viscous) == pytest.approx(cart["cart_viscous"], rel=0.2)
     page = (run / "page.html").read_text()
-    for part in ("What was measured", "What was found", "What to doubt", "What to do next", "spectrum.png"):
+    for part in ("Recordings", "Identified values", "Warnings", "Next step", "spectrum.png"):
         assert part in page
     assert len(list((run / "figures").glob("*.png"))) == 5
 
 
-def test_offline_is_as_online(identified: Path, told: dict[str, Any], tmp_path: Path) -> None:
+def test_offline_is_as_online(identified: Path, results: dict[str, Any], tmp_path: Path) -> None:
     done = in_process(
         "identify", f"from={identified / 'run'}", *QUICK, "hydra.run.dir=again", folder=tmp_path
     )
     assert done.code == 0, done.err
-    assert json.loads((tmp_path / "again/identification.json").read_text()) == told
+    assert json.loads((tmp_path / "again/identification.json").read_text()) == results
 
 
 def test_an_agent_trains_on_what_was_found(identified: Path, tmp_path: Path) -> None:
     run = shutil.copytree(identified / "run", tmp_path / "moved")  # a run can be taken elsewhere
     files = [f"{group}={run}/{group}.yaml" for group in ("cart", "pole", "randomization")]
-    laws = ["cart_friction=step", "pole_friction=bearing"]
-    done = in_process("train", *files, *laws, *TINY, ONCE, "hydra.run.dir=trained", folder=tmp_path)
+    friction = ["cart_friction=step", "pole_friction=bearing"]
+    done = in_process("train", *files, *friction, *TINY, ONCE, "hydra.run.dir=trained", folder=tmp_path)
     assert done.code == 0, done.err
     config = yaml.safe_load((tmp_path / "trained/config.yaml").read_text())
     assert config["cart"] == yaml.safe_load((run / "cart.yaml").read_text())

@@ -30,7 +30,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def learned(recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Outcome]:
-    """The run folder of a small ensemble, and what was said."""
+    """The run folder of a small ensemble, and what was printed."""
     folder = tmp_path_factory.mktemp("model")
     both = ",".join(str(recorded / f"recordings/episode_00{number}.csv") for number in range(2))
     done = in_process("model", f"from=[{both}]", *SMALL, "hydra.run.dir=run", folder=folder)
@@ -42,17 +42,17 @@ def report(folder: Path) -> dict[str, Any]:
     return json.loads((folder / "model.json").read_text())
 
 
-def test_it_tells_what_it_is_worth(learned: tuple[Path, Outcome], recorded: Path) -> None:
+def test_its_errors_are_written_and_printed(learned: tuple[Path, Outcome], recorded: Path) -> None:
     folder, done = learned
-    told = report(folder)
-    assert (told["pole"], told["control_period_s"], len(told["recordings"])) == ("medium", 0.02, 2)
+    results = report(folder)
+    assert (results["pole"], results["control_period_s"], len(results["recordings"])) == ("medium", 0.02, 2)
     for model in ("physics alone", "physics + network"):
-        assert [line["after_s"] for line in told["errors"][model]] == [0.1, 0.5, 1.0]
+        assert [line["after_s"] for line in results["errors"][model]] == [0.1, 0.5, 1.0]
         assert model in done.out
-        assert 0 < told["errors"][model][0]["rms_x_mm"] < 5
-    assert told["errors"]["physics alone"][0]["windows"] == told["held_out_windows"] > 0
-    assert "error against spread" in done.out
-    assert len(told["left_out_loss"]) == 3
+        assert 0 < results["errors"][model][0]["rms_x_mm"] < 5
+    assert results["errors"]["physics alone"][0]["windows"] == results["held_out_windows"] > 0
+    assert "RMS errors and ensemble spreads" in done.out
+    assert len(results["left_out_loss"]) == 3
     assert (folder / "figures/model.png").stat().st_size > 10_000
     config = yaml.safe_load((folder / "config.yaml").read_text())
     assert config["from"][1] == str(recorded / "recordings/episode_001.csv")
@@ -115,7 +115,7 @@ def test_a_missing_or_damaged_model_is_one_line(tmp_path: Path) -> None:
         ("from=. ensemble.validation=0", "ensemble.validation=0: input should be greater than 0", 2),
     ],
 )
-def test_what_nothing_is_learned_from(words: str, complaint: str, code: int, tmp_path: Path) -> None:
+def test_what_cannot_be_learned_from(words: str, complaint: str, code: int, tmp_path: Path) -> None:
     done = in_process("model", *words.split(), folder=tmp_path)
     assert done.complaint == f"cartpole-model: {complaint}"
     assert done.code == code
@@ -127,5 +127,5 @@ def test_too_short_a_recording_says_so(recorded: Path, tmp_path: Path) -> None:
     heading = sum(line.startswith("#") for line in lines)
     (tmp_path / "short.csv").write_text("\n".join([*lines[: heading + 80], lines[-1]]) + "\n")
     done = in_process("model", "from=short.csv", *SMALL, folder=tmp_path)
-    assert "what is held out has no 1.32 s without a lost frame: record longer" in done.err
+    assert "the held-out recordings have no 1.32 s without a lost frame: record longer" in done.err
     assert done.code == 1

@@ -1,5 +1,6 @@
-"""Episodes of a simple cart that swings its pole up by energy and balances it by a linear law."""
+"""Episodes of a simple cart that swings its pole up by energy and balances it by linear feedback."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -42,8 +43,8 @@ def drive(theta: float, seconds: float, loss_of_control: float = math.inf) -> Ep
     state = np.array([0.0, 0.0, theta, 0.0])
     rows, motors, ended_by = [state.copy()], [], "time"
     for step in range(round(seconds / PERIOD)):
-        wanted = choose_force(*state) if step * PERIOD < loss_of_control else FULL_FORCE
-        motors.append(int(LEVELS[np.abs(LEVELS - wanted / FULL_FORCE * 255).argmin()]))
+        target = choose_force(*state) if step * PERIOD < loss_of_control else FULL_FORCE
+        motors.append(int(LEVELS[np.abs(LEVELS - target / FULL_FORCE * 255).argmin()]))
         for _ in range(SUBSTEPS):
             force = motors[-1] / 255 * FULL_FORCE - 1.0 * state[1]
             x_dd, theta_dd = accelerations(state[2], state[3], force)
@@ -96,3 +97,31 @@ def balance() -> Episode:
 def runaway() -> Episode:
     """From hanging, with a motor that sticks after 6.2 seconds, until the cart leaves the track."""
     return drive(math.pi - 0.35, 10.0, loss_of_control=6.2)
+
+
+@dataclasses.dataclass(frozen=True)
+class Replay:
+    """An episode beside its simulation, as `cartpole_rl.reporting.replays.ReplayedEpisode` asks for."""
+
+    episode: Episode
+    time: np.ndarray
+    x: np.ndarray
+    theta: np.ndarray
+    x_error: np.ndarray
+    theta_error: np.ndarray
+
+
+@pytest.fixture(scope="session")
+def replay(swing_up: Episode) -> Replay:
+    """Nine stretches of 1 s, 20 mm and 3 degrees off; the last one ends after 0.6 s."""
+    rows = np.arange(0, 450, 50)[:, None] + np.arange(51)
+    known = np.ones(rows.shape)
+    known[-1, 30:] = math.nan
+    return Replay(
+        swing_up,
+        swing_up.time[rows],
+        swing_up.x[rows] + 0.02 * known,
+        swing_up.theta[rows] + math.radians(3) * known,
+        0.02 * known,
+        math.radians(3) * known,
+    )

@@ -67,10 +67,10 @@ def test_every_frame_differs_from_the_one_before(animation: bytes) -> None:
 
 
 def test_the_file_holds_what_frames_draws(swing_up: Episode, animation: bytes) -> None:
-    drawn = list(frames(swing_up, POLE, TRACK, "Swing-up"))
+    expected = list(frames(swing_up, POLE, TRACK, "Swing-up"))
     for index, (picture, _) in enumerate(shown(animation)):
         if index % 50 == 0:
-            assert ImageChops.difference(picture, drawn[index].convert("RGB")).getbbox() is None
+            assert ImageChops.difference(picture, expected[index].convert("RGB")).getbbox() is None
 
 
 @pytest.mark.parametrize("row", [0, 40, 90, 300])
@@ -78,7 +78,9 @@ def test_cart_and_pole_are_to_scale(swing_up: Episode, row: int) -> None:
     still = part(swing_up, row, 1, motor=np.zeros(1, dtype=np.int64))
     picture = next(iter(frames(still, POLE, TRACK)))
     stops = places(picture, style.LIMIT)
-    scale = (np.ptp(stops[:, 0]) - 2 * 5 - CART_WIDTH) / (2 * TRACK)  # pixels a metre, from the drawn stops
+    scale = (np.ptp(stops[:, 0]) - 2 * 5 - CART_WIDTH) / (
+        2 * TRACK
+    )  # pixels a metre, from the expected stops
     cart = places(picture, style.CART)
     cart = cart[np.abs(cart[:, 1] - PIVOT_HEIGHT) < 9]
     middle = (cart[:, 0].min() + cart[:, 0].max()) / 2

@@ -61,10 +61,10 @@ def test_figures_and_animations_come_back_as_they_are(tmp_path: Path, runaway: E
         log.figure("behaviour", behaviour(runaway), 1)
         log.animation("episode", animation, 1)
     log_read = read(tmp_path)
-    drawn, played = log_read.Images("behaviour")[0], log_read.Images("episode")[0]
-    with Image.open(io.BytesIO(drawn.encoded_image_string)) as picture:
+    stored, played = log_read.Images("behaviour")[0], log_read.Images("episode")[0]
+    with Image.open(io.BytesIO(stored.encoded_image_string)) as picture:
         assert picture.format == "PNG"
-        assert picture.size == (drawn.width, drawn.height)
+        assert picture.size == (stored.width, stored.height)
     assert played.encoded_image_string == animation
     assert (played.width, played.height) == (480, 320)
 

@@ -35,7 +35,7 @@ def test_an_enter_from_before_the_question_does_not_answer_it(tmp_path: Path) ->
     try:
         read_until(master, b"ready")
         os.write(master, b"\n\n")
-        gate.write_text("go on")
+        gate.write_text("ready")
         shown = read_until(master, b"Ctrl-C to stop. ")
         assert b"the cart latched a fault: STALL." in shown
         assert asking.poll() is None

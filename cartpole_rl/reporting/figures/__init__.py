@@ -1,7 +1,6 @@
-"""Figures of a run: each function takes arrays and gives a matplotlib Figure; `save` writes one.
+"""Figures of a run: each function takes arrays and returns a matplotlib Figure; `save` writes one.
 
-No function touches pyplot or a global setting, so they may be called from any thread and beside anything else
-that draws.
+No function touches pyplot or a global setting, so that they may be called from any thread.
 """
 
 from cartpole_rl.reporting.figures.behaviours import behaviour

@@ -1,6 +1,6 @@
-"""What the cart did in one episode: angle, position and action over time (thesis, figures 6.2 and 6.10).
+"""Angle, position and motor value of one episode over time (thesis, figures 6.2 and 6.10).
 
-The thesis scales the three to one axis; here each has its own panel and unit, on one time axis.
+The thesis scales the three to one axis; here each has a panel with its unit, on a common time axis.
 """
 
 import math
@@ -11,13 +11,13 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from cartpole_rl.reporting import style
-from cartpole_rl.reporting.figures.notes import at_moment, beside
+from cartpole_rl.reporting.figures.annotations import at_time, beside
 from cartpole_rl.reporting.words import ending_text
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.tasks.rewards import UPRIGHT_ANGLE
 from cartpole_rl.tasks.upright import is_upright, upright_since
 
-SMALL_SWING = 40.0  # deg; a pole that never leaned further is shown enlarged
+SMALL_SWING = 40.0  # deg; the angle axis of an episode within it is enlarged
 MOTOR_LIMIT = 255
 MOTOR_TICKS = (-250, -125, 0, 125, 250)
 
@@ -25,10 +25,10 @@ Array = NDArray[np.float64]
 
 
 def behaviour(episode: Episode, title: str = "One episode", track_half_length: float | None = None) -> Figure:
-    """Angle (deg, wrapped), position (cm) and motor value of one episode over time (s).
+    """Draw angle (deg, wrapped), position (cm) and motor value of one episode over time (s).
 
-    `track_half_length` in m draws the ends of the track. Under the title stand the score, equation (6.2),
-    how much of the time the pole was upright, and how the episode ended.
+    `track_half_length` in m draws the ends of the track. The line under the title states the score, equation
+    (6.2), the share of time for which the pole was upright, and how the episode ended.
     """
     figure = style.new_figure(height=6.2)
     angle, position, motor = figure.subplots(3, 1, sharex=True, height_ratios=(2.2, 1.3, 1.0))
@@ -42,11 +42,11 @@ def behaviour(episode: Episode, title: str = "One episode", track_half_length: f
 
 
 def wrapped_line(time: Array, theta: Array) -> tuple[Array, Array]:
-    """The angle as a line that can be drawn: times (s) and degrees in [-180, 180], broken where it wraps.
+    """Return the angle as a line: times (s) and degrees in [-180, 180], interrupted where the angle wraps.
 
     `time` [T] in s and `theta` [T] in rad, wrapped or not, become arrays of at least T points. Where the pole
-    passes the bottom the line runs to the edge, breaks (a NaN) and comes in from the other edge, instead of
-    crossing the whole panel.
+    passes the bottom, the line ends at one edge (NaN) and continues from the other, instead of crossing the
+    panel.
     """
     degrees = np.degrees(np.unwrap(theta))
     turns = np.ceil((degrees - 180.0) / 360.0)  # 0 within (-180, 180]
@@ -65,7 +65,7 @@ def wrapped_line(time: Array, theta: Array) -> tuple[Array, Array]:
 
 
 def _draw_angle(axes: Axes, episode: Episode) -> None:
-    """The top panel: the wrapped angle, the upright band, and when the pole was up for the first time."""
+    """Draw the wrapped angle, the upright band, and the time from which the pole stays up."""
     style.dress(axes)
     style.label(axes, y="pole angle (deg)")
     band = math.degrees(UPRIGHT_ANGLE)
@@ -84,11 +84,11 @@ def _draw_angle(axes: Axes, episode: Episode) -> None:
     axes.set_xlim(episode.time[0], episode.time[-1])
     moment = upright_since(episode.time, episode.theta)
     if moment is not None and moment > episode.time[0]:
-        at_moment(axes, moment, f"up from {moment:.1f} s", style.UPRIGHT)
+        at_time(axes, moment, f"up from {moment:.1f} s", style.UPRIGHT)
 
 
 def _draw_position(axes: Axes, episode: Episode, track_half_length: float | None) -> None:
-    """The middle panel: where the cart is, between the ends of its track."""
+    """Draw the cart's position between the ends of its track."""
     style.dress(axes)
     style.label(axes, y="cart (cm)")
     position = 100 * episode.x
@@ -104,7 +104,7 @@ def _draw_position(axes: Axes, episode: Episode, track_half_length: float | None
 
 
 def _draw_motor(axes: Axes, episode: Episode) -> None:
-    """The bottom panel: the motor value asked for in each period."""
+    """Draw the commanded motor value of each period."""
     style.dress(axes)
     style.label(axes, y="motor value")
     axes.stairs(episode.motor, episode.time, fill=True, color=style.MOTOR, alpha=0.35)
@@ -116,6 +116,6 @@ def _draw_motor(axes: Axes, episode: Episode) -> None:
 
 
 def _summary(episode: Episode) -> str:
-    """The episode in one line."""
+    """Return the episode in one line."""
     share = 100 * is_upright(episode.theta[1:]).mean()
     return f"score {episode.score.sum():.0f},  upright {share:.0f} % of the time,  {ending_text(episode)}"

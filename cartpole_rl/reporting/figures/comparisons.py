@@ -1,6 +1,6 @@
-"""The same agent on several carts: every episode, the mean with its 95 % interval, the ratio to the first.
+"""Scores of an agent on several carts: episodes, their mean with its 95 % interval, ratio to the first.
 
-Figures 6.8 and 6.14 of the thesis show that ratio, of real to simulated score.
+Figures 6.8 and 6.14 of the thesis show the ratio of the real to the simulated score.
 """
 
 import math
@@ -14,12 +14,12 @@ from scipy import stats
 
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.reporting import style
-from cartpole_rl.reporting.figures.notes import guide
+from cartpole_rl.reporting.figures.annotations import guide
 from cartpole_rl.reporting.table import interval_text
 
 CONFIDENCE = 0.95
-DOTS = -0.15  # where the dots of a column stand, in columns left of its middle
-MEAN = 0.12  # and its mean with the interval
+DOTS = -0.15  # offset of a column's dots, in columns
+MEAN = 0.12  # offset of its mean and interval
 SPREAD = 0.11  # half width of the cloud of dots
 BOX = 0.07  # half width of a mean's line and of the box that is its interval
 
@@ -33,7 +33,7 @@ def comparison(
     intervals: Mapping[str, Interval] | None = None,
     guides: Mapping[str, float] | None = None,
 ) -> Figure:
-    """Score per episode as dots, the mean with a 95 % interval, and under each name the ratio to the first.
+    """Draw each episode's score as a dot, the mean with a 95 % interval, and its ratio to the first mean.
 
     `results` maps a name, such as "simulated", to the scores of its episodes [episodes]. `intervals` maps a
     name to (low, high) of its mean; where it is missing, Student's t interval is drawn, and none for a single
@@ -45,8 +45,8 @@ def comparison(
     figure = style.new_figure(height=4.6, width=max(5.0, 1.6 + 1.9 * len(scores)))
     axes = figure.subplots()
     style.dress(axes, grid="y")
-    for word, score in (guides or {}).items():
-        guide(axes, score, word)
+    for name, score in (guides or {}).items():
+        guide(axes, score, name)
     for column, (name, each) in enumerate(scores.items()):
         interval = (intervals or {}).get(name) or student_interval(each)
         _draw_result(axes, column, each, interval)
@@ -59,7 +59,7 @@ def comparison(
 
 
 def student_interval(scores: Array) -> Interval:
-    """The 95 % interval of the mean by Student's t, [episodes] -> (low, high); NaN for a single episode."""
+    """Return the 95 % interval of the mean of scores [episodes] by Student's t; NaN for a single episode."""
     if scores.size < 2:
         return math.nan, math.nan
     error = float(scores.std(ddof=1)) / math.sqrt(scores.size)
@@ -68,7 +68,7 @@ def student_interval(scores: Array) -> Interval:
 
 
 def _draw_result(axes: Axes, column: int, scores: Array, interval: Interval) -> None:
-    """One column: its dots side by side, and next to them the mean with its interval and its numbers."""
+    """Draw one column: the dots, and next to them the mean with its interval."""
     colour = style.series_colour(column)
     axes.plot(
         column + DOTS + _sideways(scores.size),
@@ -96,14 +96,14 @@ def _draw_result(axes: Axes, column: int, scores: Array, interval: Interval) -> 
 
 
 def _sideways(episodes: int) -> Array:
-    """Offsets [episodes] in columns for the sorted scores: neighbours stand apart, always in the same way."""
+    """Return offsets [episodes] in columns that keep neighbours of the sorted scores apart."""
     golden = (math.sqrt(5) - 1) / 2  # multiples of it modulo 1 fill an interval evenly
     places: Array = SPREAD * (2 * ((np.arange(episodes, dtype=np.float64) * golden + 0.5) % 1) - 1)
     return places
 
 
 def _name_columns(axes: Axes, scores: Mapping[str, Array]) -> None:
-    """Under each column its name, its number of episodes, and its ratio to the first column."""
+    """Label each column with its name, its number of episodes, and its ratio to the first column."""
     first = float(next(iter(scores.values())).mean())
     names = []
     for column, (name, each) in enumerate(scores.items()):

@@ -1,4 +1,4 @@
-"""A figure as a file or as the bytes of one."""
+"""Figures as files or as bytes."""
 
 import io
 from pathlib import Path
@@ -9,7 +9,7 @@ from cartpole_rl.reporting import style
 
 
 def save(figure: Figure, path: Path | str) -> Path:
-    """Write `figure` to `path`, whose ending chooses the format (.png, .pdf, .svg); folders are made."""
+    """Write `figure` to `path` in the format of its suffix (.png, .pdf, .svg), and create its folder."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=style.DPI)
@@ -17,7 +17,7 @@ def save(figure: Figure, path: Path | str) -> Path:
 
 
 def png(figure: Figure, dpi: float = style.DPI) -> bytes:
-    """`figure` as the bytes of a PNG file."""
+    """Return `figure` as the bytes of a PNG file."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=dpi)
     return buffer.getvalue()

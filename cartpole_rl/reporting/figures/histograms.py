@@ -1,4 +1,4 @@
-"""What a randomization draws: one small histogram for each parameter."""
+"""Histograms of the parameters that a randomization draws."""
 
 import math
 from collections.abc import Mapping
@@ -19,9 +19,9 @@ BINS = 24
 def randomization_histograms(
     draws: Mapping[str, ArrayLike],
     nominal: Mapping[str, float] | None = None,
-    title: str = "What the randomization draws",
+    title: str = "Randomized parameters",
 ) -> Figure:
-    """Small multiples, one parameter each, all with counts from zero.
+    """Draw a small histogram of each parameter.
 
     `draws` maps a parameter, named with its unit, to its draws [carts]; `nominal` maps parameters to the
     value they vary around, drawn as a line. A parameter that never varies is said to be fixed.
@@ -52,7 +52,7 @@ def randomization_histograms(
 
 
 def _finite(name: str, draws: ArrayLike) -> NDArray[np.float64]:
-    """The finite ones of a parameter's draws, flat; ConfigError if there are none."""
+    """Return the finite draws of a parameter, flat. Raises ConfigError if there are none."""
     values = np.asarray(draws, dtype=np.float64).ravel()
     values = values[np.isfinite(values)]
     if not values.size:
@@ -61,9 +61,9 @@ def _finite(name: str, draws: ArrayLike) -> NDArray[np.float64]:
 
 
 def _draw_parameter(axes: Axes, name: str, values: NDArray[np.float64], nominal: float | None) -> None:
-    """One panel: the histogram, its range in words, and the nominal value."""
+    """Draw the histogram of one parameter and its nominal value, or the value of one that is fixed."""
     style.dress(axes, grid="none")
-    axes.set_title(name, fontsize=style.NOTE_SIZE, color=style.INK, loc="left")
+    axes.set_title(name, fontsize=style.SMALL_SIZE, color=style.INK, loc="left")
     axes.spines["left"].set_visible(False)
     axes.set_yticks([])
     axes.xaxis.set_major_locator(MaxNLocator(nbins=4, steps=(1, 2, 5, 10)))
@@ -77,7 +77,7 @@ def _draw_parameter(axes: Axes, name: str, values: NDArray[np.float64], nominal:
             transform=axes.transAxes,
             ha="center",
             va="center",
-            fontsize=style.NOTE_SIZE,
+            fontsize=style.SMALL_SIZE,
             color=style.MUTED,
         )
         return

@@ -1,10 +1,9 @@
-"""Figures of an identification: laws with their uncertainty, intervals, experiments, what the data tell.
+"""Figures of an identification: friction and force, intervals, experiments, remaining uncertainty.
 
-The first redoes figures 5.2, 5.3 and 5.5 of the thesis: friction over speed, force over motor value.
+The first shows figures 5.2, 5.3 and 5.5 of the thesis for the identified cart.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple, Protocol
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,192 +11,152 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from cartpole_rl.reporting import style
+from cartpole_rl.reporting.curves import Curve
+from cartpole_rl.reporting.figures.annotations import beside
 from cartpole_rl.reporting.figures.behaviours import wrapped_line
-from cartpole_rl.reporting.table import interval_text, number_text
+from cartpole_rl.reporting.identification import Estimate
+from cartpole_rl.reporting.replays import ReplayedEpisode
+from cartpole_rl.reporting.table import number_text
 from cartpole_rl.tasks.episode import Episode
 
-FOUND, BEFORE, SIMULATED = style.BLUE, style.MUTED, style.VERMILLION
+IDENTIFIED, PRIOR, SIMULATED = style.BLUE, style.MUTED, style.VERMILLION
 TAIL = 2.5  # percent beyond each end of an interval
 LONGEST = 14.0  # s of an experiment that are drawn
-TOLD = 0.05  # of a component, from which its name is written
+FARTHEST = 12.0  # half widths of the interval; a prior value farther away becomes an arrow
+WRITTEN = 0.3  # smallest weight in a combination that is written as a number
+DARK = 0.6  # weight from which white digits are legible
 
 Array = NDArray[np.floating]
 
 
-class Law(NamedTuple):
-    """A curve with what it may be: `over` [S], `best` [S], `drawn` [S, N], `before` [S]."""
-
-    over: Array
-    best: Array
-    drawn: Array
-    before: Array
-
-
-class Known(NamedTuple):
-    """One quantity: value, ends of its interval, and what was thought of it before."""
-
-    words: str
-    unit: str
-    value: float
-    low: float
-    high: float
-    before: float
-
-
-class Course(Protocol):
-    """An episode beside its replay; see `identification.replay.Replayed`."""
-
-    @property
-    def episode(self) -> Episode: ...  # noqa: D102
-    @property
-    def time(self) -> NDArray[np.float64]: ...  # noqa: D102
-    @property
-    def x(self) -> NDArray[np.float64]: ...  # noqa: D102
-    @property
-    def theta(self) -> NDArray[np.float64]: ...  # noqa: D102
-
-
-def laws_figure(friction: Law, force: Law) -> Figure:
-    """Friction of the cart (N) over its speed (m/s), and force (N) over motor value, with 95 % bands."""
+def friction_and_force_figure(friction: Curve, force: Curve) -> Figure:
+    """Draw friction (N) over velocity (m/s), and force (N) over motor value, with 95 % bands."""
     figure = style.new_figure(height=4.4)
     left, right = figure.subplots(1, 2)
-    for axes, law, x, y, heading in (
-        (left, friction, "speed of the cart (m/s)", "friction (N)", "Friction"),
-        (right, force, "motor value", "force on the cart (N)", "Force"),
-    ):
-        style.dress(axes)
-        low, high = np.percentile(law.drawn, [TAIL, 100 - TAIL], axis=1)
-        axes.fill_between(law.over, low, high, color=FOUND, alpha=0.25, linewidth=0)
-        axes.plot(law.over, law.before, color=BEFORE, linestyle=(0, (4, 3)), label="thought before")
-        axes.plot(law.over, law.best, color=FOUND, linewidth=2, label="found, with 95 %")
-        style.label(axes, x=x, y=y)
-        style.title(axes, heading)
-    left.legend(fontsize=style.NOTE_SIZE, frameon=False, loc="upper left")
+    _draw_curve(left, friction, "Friction", "cart velocity (m/s)", "friction (N)")
+    _draw_curve(right, force, "Force", "motor value", "force on the cart (N)")
+    left.legend(fontsize=style.SMALL_SIZE, frameon=False, loc="upper left")
     return figure
 
 
-def interval_figure(rows: Sequence[Known]) -> Figure:
-    """Each quantity's 95 % interval, about its value in units of half that interval, and what was thought."""
-    figure = style.new_figure(height=1.2 + 0.36 * len(rows))
+def _draw_curve(axes: Axes, curve: Curve, title: str, x: str, y: str) -> None:
+    style.dress(axes)
+    low, high = np.percentile(curve.samples, [TAIL, 100 - TAIL], axis=1)
+    axes.fill_between(curve.at, low, high, color=IDENTIFIED, alpha=0.25, linewidth=0)
+    axes.plot(curve.at, curve.prior, color=PRIOR, linestyle=(0, (4, 3)), label="prior")
+    axes.plot(curve.at, curve.identified, color=IDENTIFIED, linewidth=2, label="identified, 95 % band")
+    style.label(axes, x=x, y=y)
+    style.title(axes, title)
+
+
+def interval_figure(estimates: Sequence[Estimate]) -> Figure:
+    """Draw the 95 % interval of each quantity and its prior value, in units of the interval's half width."""
+    figure = style.new_figure(height=1.2 + 0.36 * len(estimates))
     axes = figure.subplots()
     style.dress(axes, grid="x")
-    farthest = 12.0
-    for height, row in enumerate(reversed(rows)):
-        half = max((row.high - row.low) / 2, 1e-12)
-        axes.plot(
-            [(row.low - row.value) / half, (row.high - row.value) / half],
-            [height, height],
-            color=FOUND,
-            linewidth=5,
-            alpha=0.4,
-            solid_capstyle="butt",
-        )
-        axes.plot(0, height, "o", color=FOUND)
-        away = (row.before - row.value) / half
-        marker = "D" if abs(away) <= farthest else (">" if away > 0 else "<")
-        axes.plot(np.clip(away, -farthest, farthest), height, marker, color=BEFORE, markersize=6)
-        text = (
-            f"{interval_text(row.value, row.low, row.high)} {row.unit}   (before {number_text(row.before)})"
-        )
-        axes.annotate(
-            text,
-            xy=(1, height),
-            xycoords=("axes fraction", "data"),
-            xytext=(8, 0),
-            textcoords="offset points",
-            va="center",
-            fontsize=style.NOTE_SIZE,
-            color=style.INK,
-            annotation_clip=False,
-        )
-    axes.set_yticks(range(len(rows)), [row.words for row in reversed(rows)], fontsize=style.NOTE_SIZE)
-    axes.set_xlim(-farthest - 1, farthest + 1)
-    axes.set_xlabel("in half widths of the 95 % interval", fontsize=style.LABEL_SIZE, color=style.INK)
-    note = "blue: found, with its interval,  grey: thought before"
-    style.title(axes, "What was found", note)
+    for height, estimate in enumerate(reversed(estimates)):
+        _draw_interval(axes, height, estimate)
+    names = [estimate.name for estimate in reversed(estimates)]
+    axes.set_yticks(range(len(names)), names, fontsize=style.SMALL_SIZE)
+    axes.set_xlim(-FARTHEST - 1, FARTHEST + 1)
+    style.label(axes, x="difference from the identified value\n(half widths of the 95 % interval)")
+    style.title(axes, "Identified values", "blue: value and 95 % interval,  grey: prior")
     return figure
 
 
-def experiments_figure(courses: Mapping[str, Course]) -> Figure:
-    """Position (cm) and angle (deg from hanging) of each experiment over time (s), measured and simulated."""
-    figure = style.new_figure(height=1.0 + 2.1 * len(courses), width=10.0)
-    panels = figure.subplots(len(courses), 2, squeeze=False)
-    for (left, right), (name, course) in zip(panels, courses.items(), strict=True):
-        start = _liveliest(course.episode)
-        _draw_course(left, course, start, angle=False)
-        _draw_course(right, course, start, angle=True)
+def _draw_interval(axes: Axes, height: int, estimate: Estimate) -> None:
+    value, half = estimate.value, max((estimate.high - estimate.low) / 2, 1e-12)
+    axes.plot(
+        [(estimate.low - value) / half, (estimate.high - value) / half],
+        [height, height],
+        color=IDENTIFIED,
+        linewidth=5,
+        alpha=0.4,
+        solid_capstyle="butt",
+    )
+    axes.plot(0, height, "o", color=IDENTIFIED)
+    away = (estimate.prior - value) / half
+    marker = "D" if abs(away) <= FARTHEST else (">" if away > 0 else "<")
+    axes.plot(np.clip(away, -FARTHEST, FARTHEST), height, marker, color=PRIOR, markersize=6)
+    beside(axes, height, f"{estimate.text}   (prior {number_text(estimate.prior)})", style.INK)
+
+
+def experiments_figure(replays: Mapping[str, ReplayedEpisode]) -> Figure:
+    """Draw each experiment, measured and simulated: position (cm) and angle from hanging (deg) over time."""
+    figure = style.new_figure(height=1.0 + 2.1 * len(replays), width=10.0)
+    panels = figure.subplots(len(replays), 2, squeeze=False)
+    for (left, right), (name, replay) in zip(panels, replays.items(), strict=True):
+        _draw_positions(left, replay)
+        _draw_angles(right, replay)
+        start = _liveliest(replay.episode)
+        for axes in (left, right):
+            axes.set_xlim(start, min(start + LONGEST, float(replay.episode.time[-1])))
         style.title(left, name)
         style.label(left, y="cart (cm)")
         style.label(right, y="from hanging (deg)")
     for axes in panels[-1]:
         style.label(axes, x="time (s)")
     panels[0][1].legend(
-        loc="upper right", ncols=2, fontsize=style.NOTE_SIZE, frameon=False, bbox_to_anchor=(1, 1.22)
+        loc="lower right", ncols=2, fontsize=style.SMALL_SIZE, frameon=False, bbox_to_anchor=(1, 1)
     )
     return figure
 
 
 def _liveliest(episode: Episode) -> float:
-    """Where the LONGEST s begin in which the cart moves most, s."""
+    """Return the start (s) of the LONGEST seconds in which the cart moves most."""
     way = np.concatenate((np.zeros(1), np.cumsum(np.abs(np.diff(episode.x)))))
     starts = episode.time[episode.time <= max(0.0, episode.time[-1] - LONGEST)]
     covered = np.interp(starts + LONGEST, episode.time, way) - np.interp(starts, episode.time, way)
     return float(starts[int(np.argmax(covered))])
 
 
-def _draw_course(axes: Axes, course: Course, start: float, angle: bool) -> None:
+def _draw_positions(axes: Axes, replay: ReplayedEpisode) -> None:
     style.dress(axes)
-    episode, colour = course.episode, style.POLE if angle else style.CART
-    if angle:
-        axes.plot(
-            *wrapped_line(episode.time, episode.theta - np.pi),
-            color=colour,
-            linewidth=3,
-            alpha=0.45,
-            label="measured",
-        )
-        axes.set_yticks((-180, -90, 0, 90, 180))
-        axes.set_ylim(-190, 190)
-    else:
-        axes.plot(episode.time, 100 * episode.x, color=colour, linewidth=3, alpha=0.55, label="measured")
-    values = course.theta if angle else course.x
-    for index, (moments, row) in enumerate(zip(course.time, values, strict=True)):
-        known = np.isfinite(row)
-        line = (
-            wrapped_line(moments[known], row[known] - np.pi) if angle else (moments[known], 100 * row[known])
-        )
+    episode = replay.episode
+    axes.plot(episode.time, 100 * episode.x, color=style.CART, linewidth=3, alpha=0.55, label="measured")
+    for times, positions in zip(replay.time, replay.x, strict=True):
+        known = np.isfinite(positions)
+        axes.plot(times[known], 100 * positions[known], color=SIMULATED, linewidth=1.1)
+
+
+def _draw_angles(axes: Axes, replay: ReplayedEpisode) -> None:
+    style.dress(axes)
+    measured = wrapped_line(replay.episode.time, replay.episode.theta - np.pi)
+    axes.plot(*measured, color=style.POLE, linewidth=3, alpha=0.45, label="measured")
+    for index, (times, angles) in enumerate(zip(replay.time, replay.theta, strict=True)):
+        known = np.isfinite(angles)
+        line = wrapped_line(times[known], angles[known] - np.pi)
         axes.plot(*line, color=SIMULATED, linewidth=1.1, label="simulated" if index == 0 else None)
-    axes.set_xlim(start, min(start + LONGEST, float(episode.time[-1])))
+    axes.set_yticks((-180, -90, 0, 90, 180))
+    axes.set_ylim(-190, 190)
 
 
 def spectrum_figure(covariance: Array, names: Sequence[str]) -> Figure:
-    """Combinations of numbers, the best known below: what is left of the uncertainty before, and their parts.
+    """Draw the remaining uncertainty of combinations of parameters, the best known at the bottom.
 
-    `covariance` [U, U] is in units of the variance before; its eigenvectors are the combinations.
+    `covariance` [U, U] is in units of the prior variance; the combinations are its eigenvectors.
     """
     values, vectors = np.linalg.eigh(covariance)
     figure = style.new_figure(height=1.6 + 0.34 * len(names), width=11.0)
     left, right = figure.subplots(1, 2, width_ratios=(1.0, 1.7), sharey=True)
     rows = np.arange(len(values))
     style.dress(left, grid="x")
-    left.barh(rows, np.sqrt(values), color=FOUND, alpha=0.7)
-    left.axvline(1.0, color=BEFORE, linestyle=(0, (3, 3)))
+    left.barh(rows, np.sqrt(values), color=IDENTIFIED, alpha=0.7)
+    left.axvline(1.0, color=PRIOR, linestyle=(0, (3, 3)))
     left.set_xscale("log")
-    style.label(left, x="standard deviation left, of that before", y="combination")
+    style.label(left, x="standard deviation / prior", y="combination")
     left.set_yticks(rows, [f"{row + 1}" for row in rows])
-    style.title(left, "What the recordings tell", "at the dashed line: nothing")
-    right.imshow(np.abs(vectors.T), aspect="auto", cmap="Blues", vmin=0, vmax=1, origin="lower")
-    for row, column in zip(*np.nonzero(np.abs(vectors.T) > 0.3), strict=True):
-        dark = abs(vectors[column, row]) > 0.6
-        right.text(
-            column,
-            row,
-            f"{vectors[column, row]:+.1f}",
-            ha="center",
-            va="center",
-            fontsize=7,
-            color=style.PAPER if dark else style.INK,
-        )
-    right.set_xticks(range(len(names)), names, rotation=60, ha="right", fontsize=style.NOTE_SIZE)
-    style.title(right, "Of which numbers", "weight of each in the combination")
+    style.title(left, "Remaining uncertainty", "dashed line: as uncertain as the prior")
+    _draw_weights(right, vectors.T)
+    right.set_xticks(range(len(names)), names, rotation=60, ha="right", fontsize=style.SMALL_SIZE)
+    style.title(right, "Combinations", "weight of each parameter")
     return figure
+
+
+def _draw_weights(axes: Axes, weights: Array) -> None:
+    """Draw the weights [combinations, parameters] as a picture, large ones as numbers too."""
+    axes.imshow(np.abs(weights), aspect="auto", cmap="Blues", vmin=0, vmax=1, origin="lower")
+    for row, column in zip(*np.nonzero(np.abs(weights) > WRITTEN), strict=True):
+        weight = weights[row, column]
+        colour = style.PAPER if abs(weight) > DARK else style.INK
+        axes.text(column, row, f"{weight:+.1f}", ha="center", va="center", fontsize=7, color=colour)

@@ -1,20 +1,21 @@
-"""What a learned model is worth on held-out motion, and what it learned about places along the track."""
+"""Prediction errors of a learned model on held-out motion, and the force that it learned along the track."""
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from cartpole_rl.physics.residual import SPACING, UNITS
 from cartpole_rl.reporting import style
 
 PHYSICS, LEARNED = style.VERMILLION, style.BLUE
-SMALLEST = (0.01, 0.01)  # mm, deg: less is less than an encoder's count
+SMALLEST = 0.01  # mm and deg, of the logarithmic axes: less than one encoder count
 
 Array = NDArray[np.float64]
 
 
 def learned_model_figure(
-    ahead: Array,
+    time: Array,
     physics: Array,
     learned: Array,
     spread: Array,
@@ -23,57 +24,67 @@ def learned_model_figure(
     updates: Array,
     losses: Array,
     title: str = "Learned model",
-    note: str = "",
+    subtitle: str = "",
 ) -> Figure:
-    """Above, RMS errors of cart (mm) and angle (deg) over `ahead` [H] s of predicting, with the spread.
+    """Draw prediction errors above the learned force and the loss.
 
-    Errors `physics` and `learned`, and the members' `spread`, are [H, 2, W] in m and rad. Below, the `forces`
-    [M, K] N that the members place along the track at `places` [K] m, NaN where the cart never was; and their
-    `losses` [R, M] on what each left out, after so many `updates` [R]. Thin lines are members, thick ones
-    their mean.
+    Above: RMS errors of cart (mm) and angle (deg) over the prediction `time` [H] s, and the spread of the
+    ensemble; `physics`, `learned` and `spread` are [H, 2, W] in m and rad. Below: the `forces` [M, K] N of
+    the members at `places` [K] m of the track, NaN for places that were never visited, and the validation
+    `losses` [R, M] after `updates` [R]. Thin lines are members, thick lines their mean.
     """
     figure = style.new_figure(height=6.6)
     (cart, angle), (track, learning) = figure.subplots(2, 2)
     for axes, channel, factor in ((cart, 0, 1e3), (angle, 1, 180 / np.pi)):
         curves = [factor * root_mean_square(each[:, channel]) for each in (physics, learned, spread)]
-        _draw_errors(axes, ahead, [np.maximum(curve, SMALLEST[channel]) for curve in curves])
-    style.title(cart, title, note)
-    style.label(cart, x="predicted ahead (s)", y="RMS error, cart (mm)")
-    style.label(angle, x="predicted ahead (s)", y="RMS error, angle (deg)")
-    cart.legend(loc="lower right", fontsize=style.NOTE_SIZE, frameon=False)
+        _draw_errors(axes, time, [np.maximum(curve, SMALLEST) for curve in curves])
+    style.title(cart, title, subtitle)
+    style.label(cart, x="prediction time (s)", y="RMS error, cart (mm)")
+    style.label(angle, x="prediction time (s)", y="RMS error, angle (deg)")
+    cart.legend(loc="lower right", fontsize=style.SMALL_SIZE, frameon=False)
     _draw_members(track, 100 * places, forces.T)
-    style.label(track, x="place on the track (cm)", y="force by place (N)")
-    known = places[np.isfinite(forces).all(0)]
-    if len(known):
-        track.set_xlim(100 * known.min(), 100 * known.max())
+    style.label(track, x="position on the track (cm)", y="learned force (N)")
+    visited = places[np.isfinite(forces).all(0)]
+    if len(visited):
+        track.set_xlim(100 * visited.min(), 100 * visited.max())
     _draw_members(learning, updates, losses)
     learning.set_xlim(0, updates[-1])
     learning.set_ylim(bottom=0)
-    style.label(learning, x="updates", y="loss on windows left out")
+    style.label(learning, x="updates", y="validation loss")
     return figure
 
 
+def forces_along_track(outputs: Array, visited: Array) -> tuple[Array, Array]:
+    """Return places [K] in m and the force [M, K] in N there, NaN at places that are not in `visited` (m).
+
+    `outputs` [M, K] is the table over places of a `physics.residual.Residual`.
+    """
+    places = SPACING * (np.arange(outputs.shape[1]) - outputs.shape[1] // 2)
+    counts, _ = np.histogram(visited, np.append(places, places[-1] + SPACING) - SPACING / 2)
+    return places, np.where(counts > 0, UNITS[0] * outputs.astype(np.float64), np.nan)
+
+
 def root_mean_square(values: Array) -> Array:
-    """RMS of the last axis."""
+    """Return the RMS over the last axis."""
     return np.sqrt((values**2).mean(-1))
 
 
-def _draw_errors(axes: Axes, ahead: Array, curves: list[Array]) -> None:
+def _draw_errors(axes: Axes, time: Array, curves: list[Array]) -> None:
     style.dress(axes)
     lines = (
         ("physics alone", PHYSICS, "-", 2.2),
         ("physics + network", LEARNED, "-", 2.2),
-        ("spread of the members", LEARNED, (0, (2, 2)), 1.4),
+        ("spread of the ensemble", LEARNED, (0, (2, 2)), 1.4),
     )
     for curve, (name, colour, dashes, width) in zip(curves, lines, strict=True):
-        axes.plot(ahead[1:], curve[1:], color=colour, linestyle=dashes, linewidth=width, label=name)
+        axes.plot(time[1:], curve[1:], color=colour, linestyle=dashes, linewidth=width, label=name)
     axes.set_yscale("log")
     axes.yaxis.set_major_formatter("{x:g}")
-    axes.set_xlim(0, float(ahead[-1]))
+    axes.set_xlim(0, float(time[-1]))
 
 
 def _draw_members(axes: Axes, at: Array, values: Array) -> None:
-    """Each member's curve, [K, M], and their mean."""
+    """Draw the curve of each member, [K, M], and their mean."""
     style.dress(axes)
     axes.plot(at, values, color=LEARNED, linewidth=0.8, alpha=0.5)
     axes.plot(at, values.mean(1), color=style.INK, linewidth=1.8)

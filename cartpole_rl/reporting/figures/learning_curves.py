@@ -1,6 +1,6 @@
-"""Learning curves: the score of the evaluation episodes over the transitions collected (figure 6.9).
+"""Learning curves: the score of the evaluation episodes over the collected transitions (figure 6.9).
 
-The thesis draws one agent; here every seed is drawn, so that luck shows.
+The thesis shows one agent; here every seed is drawn.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.reporting import style
-from cartpole_rl.reporting.figures.notes import guide
+from cartpole_rl.reporting.figures.annotations import guide
 
 THESIS_GUIDES = {"good": 2000.0, "very good": 2500.0}
-"""How the thesis judges a swing-up by score (6.2)."""
+"""The thesis's grades of a swing-up by score (6.2)."""
 
 MILLION = 1e6
 
@@ -32,13 +32,13 @@ def learning_curve(
     guides: Mapping[str, float] | None = None,
     title: str = "Learning curve",
 ) -> Figure:
-    """Score per evaluation over millions of transitions, one colour for each label.
+    """Draw the score of each evaluation over millions of transitions, one colour for each label.
 
-    A history is a label and its records, one per evaluation, in the order of learning: `transitions`,
-    `seconds` of training, and over the episodes of that evaluation `score` (mean), `score_min`, `score_max`.
-    **Runs that share a label are seeds of one set-up**: each is a thin line, their median a thick one. A run
-    alone is a thick line. The band spans the worst to the best episode of all runs of that label.
-    `threshold` is a score to reach, `guides` names other scores, as THESIS_GUIDES does.
+    A history is a label and its records in order, one per evaluation: `transitions`, `seconds` of training,
+    and over the episodes of that evaluation `score` (mean), `score_min`, `score_max`.
+    **Runs that share a label are seeds of one set-up**: each is a thin line, their median a thick one. A
+    single run is a thick line. The band spans the worst to the best episode of all runs of that label.
+    `threshold` is a target score; `guides` are other named scores, such as THESIS_GUIDES.
     Raises ConfigError for no history and for one without a record.
     """
     if not histories or not all(records for _, records in histories):
@@ -53,7 +53,7 @@ def learning_curve(
     axes.xaxis.set_major_locator(MaxNLocator(nbins=8, steps=(1, 2, 5, 10)))
     axes.set_xlim(left=0)
     axes.set_ylim(bottom=min(0.0, axes.dataLim.y0))
-    axes.legend(loc="lower right", fontsize=style.NOTE_SIZE, frameon=True, framealpha=0.9, edgecolor="none")
+    axes.legend(loc="lower right", fontsize=style.SMALL_SIZE, frameon=True, framealpha=0.9, edgecolor="none")
     style.label(axes, x="transitions (millions)", y="score of an episode")
     lines = "thin lines: runs,  thick line: their median" if len(histories) > len(groups) else "line: mean"
     style.title(axes, title, f"{lines},  band: worst to best episode")
@@ -61,7 +61,7 @@ def learning_curve(
 
 
 def _groups(histories: Sequence[tuple[str, Run]]) -> dict[str, list[Run]]:
-    """The runs of each label, labels in the order in which they first come."""
+    """Return the runs of each label, in the order of the labels' first runs."""
     groups: dict[str, list[Run]] = {}
     for label, records in histories:
         groups.setdefault(label, []).append(records)
@@ -69,24 +69,24 @@ def _groups(histories: Sequence[tuple[str, Run]]) -> dict[str, list[Run]]:
 
 
 def _column(run: Run, key: str) -> Array:
-    """One key of a run's records as an array [evaluations]."""
+    """Return one key of a run's records as an array [evaluations]."""
     return np.array([record[key] for record in run], dtype=np.float64)
 
 
 def _on_common_transitions(runs: Sequence[Run], key: str) -> tuple[Array, Array]:
-    """Frames [F] that all runs have passed, and `key` of each run there [runs, F], interpolated."""
+    """Return transitions [F] that all runs reached, and `key` of each run there, interpolated [runs, F]."""
     transitions = [_column(run, "transitions") for run in runs]
     first, last = max(each[0] for each in transitions), min(each[-1] for each in transitions)
     shared = np.unique(np.concatenate(transitions))
     shared = shared[(first <= shared) & (shared <= last)]
-    if not shared.size:  # runs that have no frame in common
+    if not shared.size:  # runs whose ranges do not overlap
         shared = np.unique(np.concatenate(transitions))
     values = [np.interp(shared, own, _column(run, key)) for own, run in zip(transitions, runs, strict=True)]
     return shared, np.stack(values)
 
 
 def _draw_group(axes: Axes, name: str, runs: Sequence[Run], colour: str) -> None:
-    """The band, the thin line of each seed and the thick line of a label."""
+    """Draw the band, the thin line of each seed and the thick line of a label."""
     transitions, lowest = _on_common_transitions(runs, "score_min")
     _, highest = _on_common_transitions(runs, "score_max")
     axes.fill_between(
@@ -112,20 +112,20 @@ def _draw_group(axes: Axes, name: str, runs: Sequence[Run], colour: str) -> None
 def _draw_guides(
     axes: Axes, guides: Mapping[str, float], threshold: float | None, runs: Sequence[Run]
 ) -> None:
-    """Horizontal lines for named scores, and for the target, with what became of it."""
-    for word, score in guides.items():
-        guide(axes, score, word)
+    """Draw horizontal lines at named scores, and at the target, with when it was reached."""
+    for name, score in guides.items():
+        guide(axes, score, name)
     if threshold is not None:
         guide(axes, threshold, f"target {threshold:g}\n{_outcome(runs, threshold)}", style.LIMIT)
 
 
 def _reached(run: Run, threshold: float) -> Record | None:
-    """The first record whose mean score is at least `threshold`."""
+    """Return the first record whose mean score is at least `threshold`."""
     return next((record for record in run if record["score"] >= threshold), None)
 
 
 def _outcome(runs: Sequence[Run], threshold: float) -> str:
-    """How many runs reached the threshold, and after how long (the median of those that did)."""
+    """Return how many runs reached the threshold, and their median time."""
     hits = [record["seconds"] for run in runs if (record := _reached(run, threshold))]
     if not hits:
         return "not reached"
@@ -138,5 +138,5 @@ def _outcome(runs: Sequence[Run], threshold: float) -> str:
 
 
 def _duration(seconds: float) -> str:
-    """Seconds below three minutes, minutes above."""
+    """Return a time in seconds below three minutes, in minutes above."""
     return f"{seconds:.0f} s" if seconds < 180 else f"{seconds / 60:.1f} min"

@@ -1,4 +1,4 @@
-"""A recorded episode beside the simulated cart that its motor values drive, and how far the two part."""
+"""A recorded episode beside the simulated cart that its motor values drive, and the prediction errors."""
 
 from collections.abc import Sequence
 
@@ -8,59 +8,58 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from cartpole_rl.reporting import style
+from cartpole_rl.reporting.figures.annotations import beside
 from cartpole_rl.reporting.figures.behaviours import wrapped_line
-from cartpole_rl.reporting.figures.notes import beside
+from cartpole_rl.reporting.replays import ReplayedEpisode, root_mean_square, stack_errors
 from cartpole_rl.reporting.table import number_text
-from cartpole_rl.tasks.episode import Episode
 
 SIMULATED = style.VERMILLION
-SMALLEST = {"x": 0.01, "theta": 0.01}  # mm, deg: less is less than an encoder's count
+SMALLEST = 0.01  # mm and deg, of the logarithmic axes: less than one encoder count
 
 Array = NDArray[np.float64]
 
 
 def replay_figure(
-    episode: Episode,
-    time: Array,
-    x: Array,
-    theta: Array,
-    lag: Array,
-    x_errors: Array,
-    theta_errors: Array,
-    marked: Sequence[float],
+    replays: Sequence[ReplayedEpisode],
+    period: float,
+    times: Sequence[float],
     title: str = "Replay",
-    note: str = "",
+    subtitle: str = "",
 ) -> Figure:
-    """Above, x (cm) and theta (deg) over time (s), measured and simulated; below, the error over `lag`.
+    """Draw the first episode, measured and simulated, above the errors of all episodes.
 
-    The simulated `x` (m) and `theta` (rad, not wrapped) at `time` are [S, T], a row each stretch; NaN is left
-    out. `x_errors` (m) and `theta_errors` (rad) are [E, L] of E stretches, of other episodes too, at `lag`
-    [L] s after their beginnings; their RMS is told at the lags `marked`.
+    Above: angle (deg) and position (cm) over time (s). Below: absolute errors over the time since the reset,
+    with the RMS over all stretches as a number at `times` (s).
     """
     figure = style.new_figure(height=8.2)
     above, below = figure.subfigures(2, 1, hspace=0.05, height_ratios=(1.75, 1.0), squeeze=False)[:, 0]
     angle, position = above.subplots(2, 1, sharex=True, height_ratios=(1.5, 1.0))
-    _draw_angle(angle, episode, time, theta)
-    _draw_position(position, episode, time, x)
+    _draw_angle(angle, replays[0])
+    _draw_position(position, replays[0])
     style.label(position, x="time (s)")
-    style.title(angle, title, note)
+    style.title(angle, title, subtitle)
     above.align_ylabels()
     left, right = below.subplots(1, 2, sharex=True)
-    _draw_errors(left, lag, 1e3 * x_errors, marked, "mm", SMALLEST["x"], style.CART)
-    _draw_errors(right, lag, np.degrees(theta_errors), marked, "deg", SMALLEST["theta"], style.POLE)
-    style.label(left, x="since the restart (s)", y="error of the cart (mm)")
-    style.label(right, x="since the restart (s)", y="error of the angle (deg)")
+    x_errors, theta_errors = stack_errors(replays)
+    lag = period * np.arange(x_errors.shape[1], dtype=np.float64)
+    _draw_errors(left, lag, 1e3 * x_errors, style.CART)
+    _mark_times(left, lag, 1e3 * x_errors, times, "mm")
+    _draw_errors(right, lag, np.degrees(theta_errors), style.POLE)
+    _mark_times(right, lag, np.degrees(theta_errors), times, "deg")
+    style.label(left, x="time since the reset (s)", y="cart error (mm)")
+    style.label(right, x="time since the reset (s)", y="angle error (deg)")
     return figure
 
 
-def _draw_angle(axes: Axes, episode: Episode, time: Array, theta: Array) -> None:
+def _draw_angle(axes: Axes, replay: ReplayedEpisode) -> None:
     style.dress(axes)
     style.label(axes, y="pole angle (deg)")
+    episode = replay.episode
     axes.plot(*wrapped_line(episode.time, episode.theta), color=style.POLE, linewidth=3.2, alpha=0.45)
-    for moments, angles in zip(time, theta, strict=True):
+    for times, angles in zip(replay.time, replay.theta, strict=True):
         known = np.isfinite(angles)
-        axes.plot(*wrapped_line(moments[known], angles[known]), color=SIMULATED, linewidth=1.2)
-        axes.plot(moments[0], wrapped_line(moments[:1], angles[:1])[1], "o", color=SIMULATED, markersize=3.5)
+        axes.plot(*wrapped_line(times[known], angles[known]), color=SIMULATED, linewidth=1.2)
+        axes.plot(times[0], wrapped_line(times[:1], angles[:1])[1], "o", color=SIMULATED, markersize=3.5)
     axes.set_ylim(-190, 190)
     axes.set_yticks((-180, -90, 0, 90, 180))
     axes.set_xlim(episode.time[0], episode.time[-1])
@@ -68,56 +67,52 @@ def _draw_angle(axes: Axes, episode: Episode, time: Array, theta: Array) -> None
     beside(axes, 180, "hanging", style.MUTED)
 
 
-def _draw_position(axes: Axes, episode: Episode, time: Array, x: Array) -> None:
+def _draw_position(axes: Axes, replay: ReplayedEpisode) -> None:
     style.dress(axes)
     style.label(axes, y="cart (cm)")
+    episode = replay.episode
     axes.plot(episode.time, 100 * episode.x, color=style.CART, linewidth=3.2, alpha=0.55, label="measured")
-    for stretch, (moments, positions) in enumerate(zip(time, x, strict=True)):
-        name = "simulated, restarted at each dot" if stretch == 0 else None
-        axes.plot(moments, 100 * positions, color=SIMULATED, linewidth=1.2, label=name)
-        axes.plot(moments[0], 100 * positions[0], "o", color=SIMULATED, markersize=3.5)
+    for stretch, (times, positions) in enumerate(zip(replay.time, replay.x, strict=True)):
+        name = "simulated, reset at each dot" if stretch == 0 else None
+        axes.plot(times, 100 * positions, color=SIMULATED, linewidth=1.2, label=name)
+        axes.plot(times[0], 100 * positions[0], "o", color=SIMULATED, markersize=3.5)
     reach = 1.2 * max(2.0, 100 * float(np.abs(episode.x).max()))
     axes.set_ylim(-reach, 1.5 * reach)
     axes.legend(
-        loc="upper right", ncols=2, fontsize=style.NOTE_SIZE, frameon=True, framealpha=0.9, edgecolor="none"
+        loc="upper right", ncols=2, fontsize=style.SMALL_SIZE, frameon=True, framealpha=0.9, edgecolor="none"
     )
 
 
-def _draw_errors(
-    axes: Axes, lag: Array, errors: Array, marked: Sequence[float], unit: str, smallest: float, colour: str
-) -> None:
-    """The size of each stretch's error, their RMS, and the numbers at the marked lags; a logarithmic axis."""
+def _draw_errors(axes: Axes, lag: Array, errors: Array, colour: str) -> None:
+    """Draw the absolute error of each stretch and their RMS on a logarithmic axis."""
     style.dress(axes)
-    sizes = np.maximum(np.abs(errors), smallest)
+    sizes = np.maximum(np.abs(errors), SMALLEST)
     axes.plot(lag[1:], sizes[:, 1:].T, color=colour, linewidth=0.7, alpha=min(0.5, 6 / len(errors) + 0.05))
-    rms = np.maximum(root_mean_square(errors), smallest)
+    rms = np.maximum(root_mean_square(errors), SMALLEST)
     axes.plot(lag[1:], rms[1:], color=style.INK, linewidth=2.2)
     axes.set_yscale("log")
     axes.yaxis.set_major_formatter("{x:g}")
     axes.set_xlim(0, float(lag[-1]))
-    for moment in marked:
-        index = int(np.abs(lag - moment).argmin())
-        if abs(lag[index] - moment) > 1e-6 or not np.isfinite(rms[index]):
+    style.title(axes, "", f"thick line: RMS of {len(errors)} stretches")
+
+
+def _mark_times(axes: Axes, lag: Array, errors: Array, times: Sequence[float], unit: str) -> None:
+    """Write the RMS error as a number at each of `times` that the stretches reach."""
+    rms = np.maximum(root_mean_square(errors), SMALLEST)
+    for time in times:
+        index = int(np.abs(lag - time).argmin())
+        if abs(lag[index] - time) > 1e-6 or not np.isfinite(rms[index]):
             continue
         axes.plot(lag[index], rms[index], "o", color=style.INK, markersize=5, clip_on=False, zorder=3)
-        last = moment > 0.8 * lag[-1]
+        last = time > 0.8 * lag[-1]
         axes.annotate(
             f"{number_text(rms[index])} {unit}",
             xy=(lag[index], rms[index]),
             xytext=(-4 if last else 4, 7),
             textcoords="offset points",
             ha="right" if last else "left",
-            fontsize=style.NOTE_SIZE,
+            fontsize=style.SMALL_SIZE,
             fontweight="bold",
             color=style.INK,
             bbox={"facecolor": style.PAPER, "alpha": 0.75, "edgecolor": "none", "pad": 1},
         )
-    style.title(axes, "", f"thick: RMS of {len(errors)} stretches")
-
-
-def root_mean_square(errors: Array) -> Array:
-    """RMS [L] over the rows of `errors` [E, L] that are known there; NaN where none is."""
-    known = np.isfinite(errors)
-    count = known.sum(0)
-    total = np.where(known, errors, 0.0) ** 2
-    return np.sqrt(np.where(count > 0, total.sum(0) / np.maximum(count, 1), np.nan))

@@ -1,0 +1,80 @@
+"""The cart of a fine-tuning, driven by its own process; each finished episode is written and logged."""
+
+from typing import Any
+
+from tqdm import tqdm
+
+from cartpole_rl.errors import LearningError
+from cartpole_rl.evaluation.driver import Drive, Driver
+from cartpole_rl.evaluation.driving_policy import Weights
+from cartpole_rl.plants.serial.statistics import LinkStatistics
+from cartpole_rl.reporting.tensorboard import TensorBoardLog
+from cartpole_rl.scheduling import compute_last
+from cartpole_rl.tasks.endings import Ending
+from cartpole_rl.workflows.config import FinetuneConfig
+from cartpole_rl.workflows.finetuning_files import FinetuningFiles, Stage
+from cartpole_rl.workflows.person import print_message
+
+
+class DrivenCart:
+    """Drives episodes with `driver`, writes them to `files` and logs them to `log`."""
+
+    def __init__(self, driver: Driver, files: FinetuningFiles, log: TensorBoardLog) -> None:
+        self.driver, self.files, self.log = driver, files, log
+        self.link: LinkStatistics | None = None  # since the driver started; None before its first episode
+
+    @property
+    def config(self) -> FinetuneConfig:
+        """The settings of the fine-tuning."""
+        return self.files.config
+
+    def drive_missing(self, stage: Stage, count: int, weights: Weights) -> None:
+        """Drive the episodes of a stage that are not on disk, without exploration."""
+        for number in range(self.files.count(stage), count):
+            self.start(weights, 0.0, self.config.seed)
+            self.finish(stage, number)
+
+    def start(self, weights: Weights, epsilon: float, seed: int) -> None:
+        """Start an episode and return at once. Raises LinkError."""
+        self.driver.start(Drive(weights, epsilon, seed))
+
+    def finish(self, stage: Stage, number: int) -> None:
+        """Wait for the started episode, write and log it.
+
+        Raises LinkError, and LearningError where the network's numbers were not finite: the cart was stopped.
+        """
+        driven = self.driver.result()
+        self.link = driven.link
+        episode = driven.episode
+        if episode.ended_by == Ending.NON_FINITE:
+            raise LearningError(
+                f"{stage} {number + 1}: an observation or an action value was not finite, so the cart was "
+                "stopped; nothing is learned from this episode"
+            )
+        self.files.write_episode(stage, number, episode)
+        score, step = float(episode.score.sum()), self.step(stage, number + 1)
+        self.log.scalars({f"cart/score_{stage}": score}, step)
+        summary = vars(driven.link.summary())
+        self.log.scalars({f"link/{key}": float(value) for key, value in summary.items()}, step)
+        self.log.flush()
+        tqdm.write(f"{stage} {number + 1}: score {score:.0f}, ended by {episode.ended_by}")
+
+    def step(self, stage: Stage, number: int) -> int:
+        """Return TensorBoard's step of a stage's episode `number`, from 1: the stages follow each other."""
+        evaluations, episodes = self.config.evaluation_episodes, self.config.episodes
+        return {Stage.BEFORE: 0, Stage.TUNE: evaluations, Stage.AFTER: evaluations + episodes}[stage] + number
+
+    def link_summary(self) -> dict[str, Any]:
+        """Return counts of lost, damaged and late frames, and the latency; empty before the first episode."""
+        if self.link is None:
+            return {}
+        return {**vars(self.link.summary()), "latency_override": self.link.latency_override()}
+
+
+def yield_to(driver: Driver) -> None:
+    """Lower this process's priority, but not that of the driver or of an emulated cart: they have started."""
+    compute_last()
+    if not driver.goes_first:
+        print_message(
+            "finetune", "other processes may delay the cart: no real-time priority (see `ulimit -r`)"
+        )

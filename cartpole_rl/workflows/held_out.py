@@ -1,0 +1,53 @@
+"""Splits recordings into those that a model learns from and held-out ones that judge it."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from cartpole_rl.errors import RecordingError
+from cartpole_rl.identification.held_out import LEAD
+from cartpole_rl.identification.windows import HISTORY, Windows, cut_windows
+from cartpole_rl.tasks.episode import Episode
+
+HELD_OUT = 5  # one recording in so many is held out
+
+
+def split(episodes: Sequence[Episode]) -> tuple[list[Episode], list[Episode]]:
+    """Return episodes to learn from and held-out ones: every fifth, or the last fifth of each of a few."""
+    if len(episodes) >= HELD_OUT:
+        chosen = range(HELD_OUT // 2, len(episodes), HELD_OUT)
+        return (
+            [episode for number, episode in enumerate(episodes) if number not in chosen],
+            [episodes[number] for number in chosen],
+        )
+    ends = [episode.steps - episode.steps // HELD_OUT for episode in episodes]
+    return (
+        [part(episode, 0, end) for episode, end in zip(episodes, ends, strict=True)],
+        [part(episode, end, episode.steps) for episode, end in zip(episodes, ends, strict=True)],
+    )
+
+
+def part(episode: Episode, first: int, last: int) -> Episode:
+    """Return the periods from `first` up to, and without, `last` as an episode."""
+    rows = {"time", "x", "x_dot", "theta", "theta_dot", "counts"}
+    cut = {name: getattr(episode, name)[first : last + 1] for name in rows}
+    steps = {
+        name: getattr(episode, name)[first:last] for name in ("motor", "score", "score_upright", "reward")
+    }
+    return replace(episode, **cut, **steps)
+
+
+def held_out_windows(episodes: Sequence[Episode], period: float, horizon: float) -> Windows:
+    """Return windows of a lead and `horizon` s, overlapping by half.
+
+    The motor values before each window are those of its episode. Raises RecordingError if there is no window.
+    """
+    ahead = LEAD + round(horizon / period)
+    later = [part(episode, min((HISTORY + ahead) // 2, episode.steps), episode.steps) for episode in episodes]
+    try:
+        cut = cut_windows([*episodes, *later], period, HISTORY + ahead, most=1000)
+    except RecordingError:
+        raise RecordingError(
+            f"the held-out recordings have no {(HISTORY + ahead) * period:.2f} s without a lost frame: "
+            "record longer episodes"
+        ) from None
+    return cut._replace(positions=cut.positions[HISTORY:], motors=cut.motors[HISTORY:])

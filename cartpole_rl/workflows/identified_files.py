@@ -1,0 +1,118 @@
+"""Files of an identification: the cart, its pole and carts to train on, as choices for conf/'s groups."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from cartpole_rl.identification.identify import Identification, prediction_errors
+from cartpole_rl.identification.quantities import intervals
+from cartpole_rl.identification.unknowns import WEIGHED
+from cartpole_rl.physics.parameters import CartParameters
+from cartpole_rl.randomization.poles import Pole
+
+CART, POLE, RANDOMIZATION, POSTERIOR = "cart.yaml", "pole.yaml", "randomization.yaml", "posterior.npz"
+UNIDENTIFIABLE = {  # randomized about the identified cart, since no experiment shows them
+    "track_half_length": {"distribution": "uniform", "relative": [-0.1, 0.0]},
+    "latency_jitter": {"distribution": "uniform", "absolute": [0.0, 0.002]},
+}
+WIDEN = 2.0  # factor on the standard deviations, for carts to train on
+UNITS = {
+    "cart_mass": "kg",
+    "track_half_length": "m",
+    "track_tilt": "rad",
+    "cart_viscous": "N s/m",
+    "cart_coulomb": "N",
+    "stribeck_velocity": "m/s",
+    "sigmoid_slope": "s/m",
+    "pole_viscous": "N m s/rad",
+    "pole_drag": "N m s^2/rad^2",
+    "pole_coulomb": "N m",
+    "force_quadratic": "N",
+    "force_linear": "N",
+    "force_offset": "N",
+    "motor_time_constant": "s",
+    "latency": "s",
+    "latency_jitter": "s",
+    "angle_offset": "rad",
+    "position_noise": "m",
+    "angle_noise": "rad",
+}
+
+
+def write_choices(found: Identification, carts: np.ndarray, folder: Path) -> None:
+    """Write cart.yaml, pole.yaml, randomization.yaml and posterior.npz into `folder`.
+
+    `carts` [P, N] are drawn from the fit.
+    """
+    write_cart(found, carts, folder / CART)
+    parameters = found.fit.parameters
+    pole = Pole(**{name: parameters[name] for name in Pole.model_fields})
+    choices = {"choices": {"identified": pole.model_dump()}}
+    (folder / POLE).write_text(yaml.safe_dump(choices, sort_keys=False))
+    np.savez(
+        folder / POSTERIOR,
+        names=np.array(CartParameters.names()),
+        carts=carts,
+        told=np.array(identified_names(found)),
+        unknowns=np.array([unknown.name for unknown in found.fit.unknowns]),
+        point=found.fit.point,
+        covariance=found.fit.covariance,
+    )
+    randomization = {
+        "posterior": "${here}/" + POSTERIOR,
+        "widen": WIDEN,
+        "prior_share": 0.0,
+        "ranges": UNIDENTIFIABLE,
+    }
+    (folder / RANDOMIZATION).write_text(
+        f"# Carts drawn from the posterior, correlations included; standard deviations times {WIDEN:g}.\n"
+        + yaml.safe_dump(randomization, sort_keys=False)
+    )
+
+
+def write_cart(found: Identification, carts: np.ndarray, path: Path) -> None:
+    """Write the identified cart without its pole; each parameter with its unit and standard error."""
+    parameters, models = found.fit.parameters, found.models
+    deviations, identified = standard_deviations(carts), identified_names(found)
+    lines = [
+        "# Identified by cartpole-identify; each number with its unit and standard error. Found with",
+        f"# cart_friction={models.cart_friction} and pole_friction={models.pole_friction}; masses and forces "
+        f"are relative to the pole's mass, {parameters['pole_mass']:g} kg.",
+    ]
+    for name in CartParameters.names():
+        if name not in Pole.model_fields:
+            error = f"+- {deviations[name]:.2g}" if name in identified else "prior value"
+            lines.append(f"{name}: {parameters[name]:.6g}  # {UNITS.get(name, '1')}, {error}")
+    path.write_text("\n".join(lines) + "\n")
+
+
+def standard_deviations(carts: np.ndarray) -> dict[str, float]:
+    """Return the standard deviation of each parameter among `carts` [P, N]."""
+    return dict(zip(CartParameters.names(), carts.std(1).tolist(), strict=True))
+
+
+def identified_names(found: Identification) -> list[str]:
+    """Return the names of the parameters that were identified, the pole's included."""
+    names = [unknown.name for unknown in found.fit.unknowns if unknown.name not in WEIGHED]
+    return [*names, *Pole.model_fields]
+
+
+def summary(found: Identification, carts: np.ndarray) -> dict[str, Any]:
+    """Return the content of identification.json."""
+    deviations = standard_deviations(carts)
+    x_error, theta_error = prediction_errors(found.held_out)
+    return {
+        "cart_friction": found.models.cart_friction,
+        "parameters": found.fit.parameters,
+        "standard_errors": {name: deviations[name] for name in identified_names(found) if name in deviations},
+        "quantities": {
+            each.name: {"value": each.value, "low": each.low, "high": each.high, "unit": each.unit}
+            for each in intervals(found.fit, carts)
+        },
+        "tried": {each.law: {"x_m": each.x_error, "theta_rad": each.theta_error} for each in found.tried},
+        "held_out_1_s": {"x_m": x_error, "theta_rad": theta_error},
+        "residual_counts": found.fit.rms.tolist(),
+        "doubts": found.doubts,
+    }

@@ -1,0 +1,111 @@
+"""The behaviour figure shows an episode in the units that its axes name."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from figure_contents import line_of, words
+from hypothesis import given
+from hypothesis import strategies as st
+from matplotlib.patches import StepPatch
+
+from cartpole_rl.reporting import style
+from cartpole_rl.reporting.figures import (
+    behaviour,
+    png,
+)
+from cartpole_rl.reporting.figures.behaviours import wrapped_line
+from cartpole_rl.tasks.episode import Episode
+
+TRACK = 0.407  # m
+
+
+def test_panels_show_the_episode_in_their_units(swing_up: Episode) -> None:
+    angle, position, motor = behaviour(swing_up, "A title", TRACK).axes
+    time, centimetres = line_of(position, style.CART).T
+    np.testing.assert_allclose(time, swing_up.time)
+    np.testing.assert_allclose(centimetres, 100 * swing_up.x)
+    steps = next(patch for patch in motor.patches if isinstance(patch, StepPatch)).get_data()
+    np.testing.assert_array_equal(steps.values, swing_up.motor)
+    np.testing.assert_array_equal(steps.edges, swing_up.time)
+    degrees = line_of(angle, style.POLE)[:, 1]
+    for value in np.degrees(swing_up.theta[::50]):
+        assert np.nanmin(np.abs((degrees - value + 180) % 360 - 180)) < 1e-6
+    assert [axes.get_ylabel() for axes in (angle, position, motor)] == [
+        "pole angle (deg)",
+        "cart (cm)",
+        "motor value",
+    ]
+    assert motor.get_xlabel() == "time (s)"
+
+
+def test_the_band_is_five_degrees_each_way(swing_up: Episode) -> None:
+    band = behaviour(swing_up).axes[0].patches[0]
+    assert (band.get_y(), band.get_height()) == pytest.approx((-5, 10))
+
+
+def test_track_ends_are_drawn_where_they_are(swing_up: Episode) -> None:
+    position = behaviour(swing_up, track_half_length=TRACK).axes[1]
+    limits = [line for line in position.lines if line.get_color() == style.LIMIT]
+    assert sorted(line.get_ydata()[0] for line in limits) == pytest.approx([-40.7, 40.7])
+    low, high = position.get_ylim()
+    assert low < -40.7
+    assert high > 40.7
+
+
+def test_says_score_ending_and_time_upright(swing_up: Episode, runaway: Episode) -> None:
+    text = words(behaviour(swing_up, "A title"))
+    assert "A title" in text
+    assert f"score {swing_up.score.sum():.0f}" in text
+    assert "time was up after 10.0 s" in text
+    share = np.mean(np.abs((swing_up.theta[1:] + math.pi) % (2 * math.pi) - math.pi) < math.radians(5))
+    assert f"upright {100 * share:.0f} % of the time" in text
+    assert "left the track" in words(behaviour(runaway))
+
+
+def test_the_mark_stands_where_the_pole_stays_up(swing_up: Episode) -> None:
+    angle = behaviour(swing_up).axes[0]
+    moment = next(line for line in angle.lines if line.get_color() == style.UPRIGHT).get_xdata()[0]
+    lean = np.abs((swing_up.theta + math.pi) % (2 * math.pi) - math.pi)
+    after = (swing_up.time >= moment) & (swing_up.time < moment + 1)
+    assert np.all(lean[after] < math.radians(5))
+    assert lean[np.searchsorted(swing_up.time, moment) - 1] >= math.radians(5)
+
+
+def test_a_small_swing_is_enlarged(balance: Episode) -> None:
+    low, high = behaviour(balance).axes[0].get_ylim()
+    assert high - low < 30
+
+
+def test_an_episode_of_one_period_can_be_drawn(swing_up: Episode) -> None:
+    short = {field.name: getattr(swing_up, field.name) for field in dataclasses.fields(swing_up)}
+    short = {
+        name: each[: 2 if len(each) == 501 else 1]
+        for name, each in short.items()
+        if name not in ("ended_by", "origin")
+    }
+    assert png(behaviour(Episode(**short, ended_by="link")))
+
+
+@given(
+    st.lists(st.floats(-2.9, 2.9), min_size=2, max_size=60),
+    st.floats(-10, 10),
+    st.booleans(),
+)
+def test_a_wrapped_line_never_jumps(steps: list[float], start: float, wrapped: bool) -> None:
+    theta = start + np.cumsum(steps)
+    given_theta = (theta + math.pi) % (2 * math.pi) - math.pi if wrapped else theta
+    time = np.arange(len(theta)) * 0.02
+    times, degrees = wrapped_line(time, given_theta)
+    assert np.nanmax(np.abs(degrees)) <= 180 + 1e-9
+    drawn = np.abs(np.diff(degrees))
+    longest = np.degrees(np.abs(np.diff(theta)).max())
+    assert np.all(drawn[np.isfinite(drawn)] <= longest + 1e-6)
+    assert np.all(np.diff(times) >= -1e-12)
+
+
+def test_a_line_leaves_and_comes_in_at_the_edges() -> None:
+    times, degrees = wrapped_line(np.array([0.0, 1.0]), np.radians([170.0, 200.0]))
+    np.testing.assert_allclose(times, [0, 1 / 3, 1 / 3, 1 / 3, 1])
+    np.testing.assert_allclose(degrees, [170, 180, np.nan, -180, -160])

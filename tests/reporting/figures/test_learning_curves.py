@@ -1,0 +1,77 @@
+"""Learning curves show every run and the median of those with one label."""
+
+import numpy as np
+import pytest
+from figure_contents import line_of, words
+
+from cartpole_rl.errors import ConfigError
+from cartpole_rl.reporting import style
+from cartpole_rl.reporting.figures import (
+    THESIS_GUIDES,
+    learning_curve,
+)
+
+
+def records(scores: list[float], transitions_apart: int = 100_000) -> list[dict]:
+    """Evaluations a second apart whose episodes lie 100 around the mean."""
+    return [
+        {
+            "transitions": (i + 1) * transitions_apart,
+            "seconds": float(i + 1),
+            "score": score,
+            "score_min": score - 100,
+            "score_max": score + 100,
+        }
+        for i, score in enumerate(scores)
+    ]
+
+
+def test_one_run_is_a_line_over_millions_of_transitions_in_its_band() -> None:
+    axes = learning_curve([("medium", records([100, 900, 4100]))]).axes[0]
+    np.testing.assert_allclose(line_of(axes, style.series_colour(0)), [[0.1, 100], [0.2, 900], [0.3, 4100]])
+    band = axes.collections[0].get_paths()[0].vertices
+    assert band[:, 1].min() == 0
+    assert band[:, 1].max() == 4200
+    assert axes.get_xlabel() == "transitions (millions)"
+    assert axes.get_ylabel() == "score of an episode"
+
+
+def test_runs_of_one_label_get_their_median() -> None:
+    runs = [("medium", records([score, 2 * score])) for score in (100.0, 300.0, 2000.0)]
+    axes = learning_curve(runs).axes[0]
+    assert len(axes.lines) == 4
+    thick = max(axes.lines, key=lambda line: line.get_linewidth())
+    np.testing.assert_allclose(thick.get_ydata(), [300, 600])
+    assert "median of 3 runs" in axes.get_legend().get_texts()[0].get_text()
+
+
+def test_each_label_has_its_colour() -> None:
+    runs = [("Adam", records([1, 2])), ("AdamW", records([3, 4])), ("Adam", records([5, 6]))]
+    axes = learning_curve(runs).axes[0]
+    assert {line.get_color() for line in axes.lines} == {style.series_colour(0), style.series_colour(1)}
+    assert len(axes.get_legend().get_texts()) == 2
+
+
+def test_runs_with_other_evaluation_points_meet_in_between() -> None:
+    runs = [("a", records([0, 300], 300_000)), ("a", records([0, 100, 200, 300, 400, 500, 600]))]
+    axes = learning_curve(runs).axes[0]
+    thick = max(axes.lines, key=lambda line: line.get_linewidth())
+    transitions, scores = thick.get_xydata().T
+    assert transitions[0] == pytest.approx(0.3)
+    assert transitions[-1] == pytest.approx(0.6)
+    assert scores[0] == pytest.approx((0 + 200) / 2)
+    assert scores[-1] == pytest.approx((300 + 500) / 2)
+
+
+def test_says_when_the_target_was_reached() -> None:
+    runs = [("a", records([0, 4000, 5000])), ("a", records([0, 0, 4500])), ("a", records([0, 0, 0]))]
+    text = words(learning_curve(runs, threshold=4000, guides=THESIS_GUIDES))
+    assert "target 4000\n2 of 3 runs,\nmedian 2 s" in text
+    assert "very good" in text
+    assert "not reached" in words(learning_curve(runs, threshold=6000))
+
+
+@pytest.mark.parametrize("histories", [[], [("a", [])]])
+def test_nothing_to_draw_is_an_error(histories: list) -> None:
+    with pytest.raises(ConfigError, match="at least one"):
+        learning_curve(histories)

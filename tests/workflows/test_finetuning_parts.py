@@ -1,0 +1,70 @@
+"""What a fine-tuning keeps on disk, and the settings that it learns with."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cartpole_rl.choices import choice
+from cartpole_rl.errors import CheckpointError
+from cartpole_rl.learning.checkpoints import FINETUNING_FORMAT, TrainingCheckpoint, load_training
+from cartpole_rl.learning.settings import FinetuningSettings, LearningSettings
+from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.workflows.config import FinetuneConfig
+from cartpole_rl.workflows.finetuning_files import FinetuningFiles, Stage, resumed_config
+from cartpole_rl.workflows.finetuning_learner import simulated_learning
+from cartpole_rl.workflows.settings import load_settings
+
+EPISODE = Episode(
+    time=0.02 * np.arange(3),
+    x=np.zeros(3),
+    x_dot=np.zeros(3),
+    theta=np.full(3, np.pi),
+    theta_dot=np.zeros(3),
+    counts=np.zeros((3, 2), dtype=np.int64),
+    motor=np.array([100, -100]),
+    score=np.ones(2),
+    score_upright=np.ones(2),
+    reward=np.ones(2),
+    ended_by="time",
+)
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> FinetuningFiles:
+    return FinetuningFiles(tmp_path, load_settings(FinetuneConfig, {"run": "somewhere", "episodes": 3}))
+
+
+def test_recorded_episodes_are_counted_by_stage(files: FinetuningFiles) -> None:
+    for stage, count in ((Stage.BEFORE, 1), (Stage.TUNE, 2)):
+        for number in range(count):
+            files.write_episode(stage, number, EPISODE)
+    assert [files.count(stage) for stage in Stage] == [1, 2, 0]
+    assert files.path(Stage.TUNE, 1) == files.folder / "recordings/tune_001.csv"
+    (first, second) = files.episodes(Stage.TUNE)
+    assert first.motor.tolist() == second.motor.tolist() == [100, -100]
+    assert "# pole_length_m: 0.3530" in files.path(Stage.BEFORE, 0).read_text()
+
+
+def test_a_checkpoint_brings_its_settings_back(files: FinetuningFiles) -> None:
+    files.save({}, 2)
+    checkpoint = load_training(files.folder, FINETUNING_FORMAT)
+    assert checkpoint.transitions == 2
+    assert resumed_config(checkpoint, None) == files.config
+
+
+def test_settings_of_another_version_are_named() -> None:
+    old = TrainingCheckpoint({"run": "somewhere", "prior": 0.1}, {}, 0)
+    with pytest.raises(CheckpointError, match=r"resume=run is of another version .*prior: there is no such"):
+        resumed_config(old, "run")
+
+
+def test_learning_in_simulation_follows_the_settings() -> None:
+    learning = LearningSettings(**choice("learning/fast"))
+    gentle = FinetuningSettings(**choice("finetuning/gentle"))
+    simulated = simulated_learning(learning, gentle, episodes=20)
+    assert simulated.iterations == 20 * gentle.iterations
+    assert simulated.epsilon == gentle.simulated_epsilon == (0.1, 0.02)
+    assert simulated.epsilon_transitions == simulated.transitions // 2
+    assert simulated.warmup_transitions == 0
+    assert simulated.batch_size == learning.batch_size
