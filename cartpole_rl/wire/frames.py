@@ -75,21 +75,21 @@ class FrameSplitter:
     """Cuts a byte stream at each 0x00. Memory is bounded: an overlong run is dropped up to the next 0x00."""
 
     def __init__(self) -> None:
-        self._pending = bytearray()
+        self.pending = bytearray()  # of a frame whose 0x00 has not arrived
         self._dropping = False
-        self.overlong = 0
+        self.overlong = 0  # runs dropped so far
 
     def feed(self, data: bytes) -> Iterator[bytes]:
         """Yield each whole stuffed frame, without its 0x00; empty ones are skipped."""
         for byte in data:
             if byte == 0:
-                if self._pending and not self._dropping:
-                    yield bytes(self._pending)
-                self._pending.clear()
+                if self.pending and not self._dropping:
+                    yield bytes(self.pending)
+                self.pending.clear()
                 self._dropping = False
             elif not self._dropping:
-                self._pending.append(byte)
-                if len(self._pending) > LONGEST_FRAME:
-                    self._pending.clear()
+                self.pending.append(byte)
+                if len(self.pending) > LONGEST_FRAME:
+                    self.pending.clear()
                     self._dropping = True
                     self.overlong += 1

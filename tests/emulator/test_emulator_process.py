@@ -208,7 +208,8 @@ def test_it_starts_without_torch_and_without_the_simulator():
 import sys
 import cartpole_rl.emulator.__main__
 from cartpole_rl.emulator.device import CartDevice
-CartDevice(cartpole_rl.emulator.EmulatorSettings())
+from cartpole_rl.emulator.settings import EmulatorSettings
+CartDevice(EmulatorSettings())
 print(sorted(name for name in sys.modules if name.split(".")[0] in ("torch", "tensordict", "torchrl", "scipy")
       or name.startswith(("cartpole_rl.physics", "cartpole_rl.tasks", "cartpole_rl.randomization"))))
 """

@@ -51,7 +51,7 @@ def test_the_hosts_decoder_takes_any_bytes(stream):
         except FrameError:
             continue
         assert encode_frame(frame.message, frame.sequence, frame.flags)
-    assert len(splitter._pending) <= LONGEST_FRAME
+    assert len(splitter.pending) <= LONGEST_FRAME
 
 
 @given(streams())
@@ -71,7 +71,7 @@ def test_a_disarmed_cart_stays_still_and_disarmed_under_any_bytes(stream):
     assert not firmware.homing
     assert {value for _, value in firmware.drive(0, 20_000)} == {0}
     assert decode_frame(firmware.tick(20_000, 0, 0)[-1][:-1]).message.motor_applied == 0
-    assert len(splitter._pending) <= LONGEST_FRAME
+    assert len(splitter.pending) <= LONGEST_FRAME
 
 
 def test_no_start_with_one_wrong_byte_arms():

@@ -112,7 +112,7 @@ def test_splitter_skips_empty_runs_and_stays_bounded():
     assert list(splitter.feed(b"\x00\x00\x00")) == []
     for _ in range(100):
         assert list(splitter.feed(b"\x55" * 1000)) == []
-    assert len(splitter._pending) <= LONGEST_FRAME
+    assert len(splitter.pending) <= LONGEST_FRAME
     assert splitter.overlong == 1
     assert list(splitter.feed(b"\x00" + encode_frame(Hello(), 0))) == [encode_frame(Hello(), 0)[:-1]]
 
