@@ -224,7 +224,7 @@ class Firmware:
         self._stalls = StallWatch()
 
     def _beyond(self, inside: int, cart: int) -> int:
-        """Return 1 or -1 if the cart is less than `inside` counts from the right or left stop, else 0."""
+        """Return 1 or -1 if the cart is within `inside` counts of the right or left stop, else 0."""
         from_middle = cart - self._zeros.middle
         if abs(from_middle) < self._zeros.half_span - inside:
             return 0

@@ -51,7 +51,7 @@ class SwingBrake:
     HARDEST = 2.5  # m/s^2
 
     def motor(self, x: float, x_dot: float, swing: float, swing_dot: float) -> int:
-        """Return the motor value; x in m from the middle, swing in rad from hanging, positive to the right."""
+        """Return the motor value; x in m from the middle, swing in rad from hanging, signed as the angle."""
         acceleration = -self.FOLLOW * swing_dot * math.cos(swing) - self.RETURN * x - self.DAMPING * x_dot
         acceleration = max(-self.HARDEST, min(self.HARDEST, acceleration))
         moving = x_dot if abs(x_dot) > 0.002 else acceleration

@@ -50,7 +50,7 @@ def row_of(line: str) -> Row:
     return Row(names, values, truths, [off for off in off_by.split(", ") if off])
 
 
-TABLE = PAGE.split("| what stands behind it |\n")[1].split("\n\n")[0].splitlines()[1:]
+TABLE = PAGE.split("| reason |\n")[1].split("\n\n")[0].splitlines()[1:]
 ROWS = [row_of(line) for line in TABLE]
 by_name = pytest.mark.parametrize("row", ROWS, ids=[row.names[0] for row in ROWS])
 
