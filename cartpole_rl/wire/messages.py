@@ -122,7 +122,7 @@ class SetMotor(Message):
 
 @dataclass(frozen=True)
 class Home(Message):
-    """Starts homing: touch both stops, check the span, centre, wait until the pole is still, set the zeros."""
+    """Starts homing: touch both stops, check the span, centre, wait until the pole is still, set zeros."""
 
     TYPE = MessageType.HOME
 

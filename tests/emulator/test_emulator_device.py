@@ -6,6 +6,8 @@ import pytest
 
 pytest.importorskip("mujoco", reason='pip install "cartpole_rl[emulator]"')
 
+from test_emulator_physics import OTHER as PHYSICAL
+
 from cartpole_rl.emulator.device import CartDevice
 from cartpole_rl.emulator.homing import CART_METRES, POLE_RADIANS
 from cartpole_rl.emulator.settings import EmulatorSettings
@@ -280,25 +282,9 @@ def trace(**settings: object) -> bytes:
     return b"".join(sent)
 
 
-OTHER = {
+OTHER = PHYSICAL | {
     "seed": 1,
-    "cart_mass": 0.8,
-    "pole_mass": 0.15,
-    "pole_com": 0.2,
-    "pole_inertia": 2e-3,
-    "track_half_length": 0.3,
-    "cart_viscous": 1.0,
-    "cart_coulomb_left": 0.8,
-    "cart_coulomb_right": 0.8,
-    "cart_stiction_ratio": 1.8,
-    "pole_viscous": 1e-3,
-    "pole_coulomb": 1e-3,
     "pole_drag": 2e-4,
-    "force_curve": (0.0, 0.021, -0.99),
-    "force_asymmetry": -0.03,
-    "deadband_left": 90.0,
-    "deadband_right": 90.0,
-    "motor_time_constant": 0.02,
     "latency": 0.01,
     "latency_jitter": 0.003,
     "track_tilt": -0.004,
