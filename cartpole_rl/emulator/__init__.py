@@ -1,10 +1,5 @@
-"""The emulated cart: a program of its own that speaks the wire protocol, with its own MuJoCo physics.
+"""The emulated cart: a separate program that speaks the wire protocol, with its own MuJoCo physics.
 
-It stands in for a cart on a serial port and shares no equation with the simulator.
-``python -m cartpole_rl.emulator '{"clock": "real"}'`` starts one; ``docs/emulator.md`` says what
-it is made of.
+It replaces a cart on a serial port and shares no equation with the simulator. Start one with
+``python -m cartpole_rl.emulator '{"clock": "real"}'``. ``docs/emulator.md`` describes it.
 """
-
-from cartpole_rl.emulator.settings import EmulatorSettings
-
-__all__ = ["EmulatorSettings"]

@@ -1,7 +1,7 @@
 """``python -m cartpole_rl.emulator '{"clock": "real"}'``: start an emulated cart and print its port.
 
-One JSON line, ``{"port": "/dev/pts/3", "pid": 4711}``, goes to stdout when a host may open the port. Exit
-status: 0 after SIGINT or SIGTERM, 2 for settings that are wrong, 1 where the cart cannot be emulated here.
+One JSON line, ``{"port": "/dev/pts/3", "pid": 4711}``, goes to stdout when the port can be opened. Exit
+status: 0 after SIGINT or SIGTERM, 2 for invalid settings, 1 if the cart cannot be emulated on this machine.
 """
 
 import argparse
@@ -17,11 +17,19 @@ from cartpole_rl.signals import end_with_parent
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run an emulated cart until it is interrupted; returns the exit status."""
+    """Run an emulated cart until it is interrupted; return the exit status."""
     parent = os.getppid()
-    parser = argparse.ArgumentParser(prog="python -m cartpole_rl.emulator", description="Emulate a cart.")
-    parser.add_argument("settings", nargs="?", default="{}", help="EmulatorSettings as JSON")
-    parser.add_argument("--exit-with-parent", action="store_true", help="stop when the starter is gone")
+    parser = argparse.ArgumentParser(
+        prog="python -m cartpole_rl.emulator",
+        description="Emulate a cart on a pseudo-terminal. Prints its port as one JSON line.",
+    )
+    parser.add_argument(
+        "settings",
+        nargs="?",
+        default="{}",
+        help='settings as JSON, such as \'{"clock": "real"}\' (docs/emulator.md)',
+    )
+    parser.add_argument("--exit-with-parent", action="store_true", help="stop when the parent process ends")
     options = parser.parse_args(arguments)
     try:
         settings = read_settings(options.settings)
@@ -32,13 +40,13 @@ def main(arguments: list[str] | None = None) -> int:
         print(error, file=sys.stderr)
         return error.exit_code
     except OSError as error:
-        print(f"journal={error.filename}: {error.strerror}", file=sys.stderr)
+        print(f"journal={error.filename}: {error.strerror}; give the path of a new file", file=sys.stderr)
         return 1
     return 0
 
 
 def read_settings(text: str) -> EmulatorSettings:
-    """Settings from JSON. Raises ConfigError, one line, that names every wrong key."""
+    """Return the settings in a JSON text. Raises ConfigError with one line that names every wrong key."""
     try:
         return EmulatorSettings.model_validate_json(text)
     except ValidationError as error:

@@ -1,4 +1,4 @@
-"""The emulated cart seen from outside: firmware, physics, encoders and a person's hand, period by period."""
+"""The emulated cart as a whole: firmware, physics, encoders and a person's hand, period by period."""
 
 import math
 import random
@@ -10,26 +10,26 @@ from cartpole_rl.emulator.journal import Journal
 from cartpole_rl.emulator.physics import CartPhysics
 from cartpole_rl.emulator.settings import EmulatorSettings
 
-FARTHEST_BOOT = 0.3  # share of the half length: the cart wakes up this near to the middle
-ANYWHERE = 0.99  # share of the half length, where it may wake up anywhere ...
-FASTEST_BOOT = 8.0  # rad/s, ... and how fast the pole may turn then
-HAND_ERROR = 0.03  # rad: how near to upright a hand holds the pole
+BOOT_HANGING = 0.3  # largest distance from the middle with boot=hanging, share of the half length
+BOOT_ANYWHERE = 0.99  # the same with boot=anywhere
+FASTEST_BOOT = 8.0  # rad/s, of the pole with boot=anywhere
+HAND_ERROR = 0.03  # rad, largest error of a hand that holds the pole upright
 
 
 class CartDevice:
-    """A cart just switched on, somewhere on its track, as `boot` says. Time passes only when told to.
+    """A cart that was just switched on, at a place that `boot` decides. Time passes only in `pass_period`.
 
-    Times are whole microseconds since the start; the firmware counts its own since it booted.
+    Times are whole microseconds since the start; the firmware counts from its own boot.
     """
 
     def __init__(self, settings: EmulatorSettings) -> None:
-        """Raises EmulatorError where MuJoCo is not installed, OSError where the journal cannot be written."""
+        """Raises EmulatorError if MuJoCo is not installed, OSError if the journal cannot be created."""
         self._settings = settings
         self.physics = CartPhysics(settings)
         self._journal = Journal(settings.journal) if settings.journal else None
         self._latencies = random.Random(f"latency {settings.seed}")
         self._people = random.Random(f"people {settings.seed}")
-        self._held: float | None = None  # rad, where the hand holds the pole
+        self._held: float | None = None  # rad, the angle at which the hand holds the pole
         self.now_us = 0
         self._place_cart()
         self._reset_us = microseconds(settings.reset_at)
@@ -39,7 +39,7 @@ class CartDevice:
         self._boot_firmware()
 
     def receive(self, stuffed: bytes, now_us: int) -> list[bytes]:
-        """Give the cart a frame that arrived at a time, which is not before `now_us`; returns its answer."""
+        """Give the cart a frame that arrived at `now_us`; return the answer."""
         answer = self.firmware.receive(stuffed, now_us - self._booted_us)
         if self._journal and self.firmware.carried_out:
             self._journal.took(now_us, self.firmware.carried_out)
@@ -52,13 +52,13 @@ class CartDevice:
 
     @property
     def period_end_us(self) -> int:
-        """When the period ends that begins now."""
+        """The end of the period that begins now."""
         return self.now_us + self.firmware.period_us
 
     def pass_period(self, end_us: int) -> list[bytes]:
-        """Let the time until `end_us` pass as one period; returns the frames sent at its end, STATE last.
+        """Pass the time until `end_us` as one period; return the frames sent at its end, STATE last.
 
-        A reset that is due comes first, and its banner, which ends in 0x00 too, before the frames.
+        A reset that is due happens first; its banner, which ends in 0x00, precedes the frames.
         """
         banner = []
         if self._reset_us is not None and self.now_us >= self._reset_us:
@@ -82,26 +82,26 @@ class CartDevice:
     def _place_cart(self) -> None:
         settings, draw = self._settings, self._people.uniform
         if settings.boot == "hanging":
-            self.physics.place(settings.track_half_length * draw(-FARTHEST_BOOT, FARTHEST_BOOT), math.pi)
+            self.physics.place(settings.track_half_length * draw(-BOOT_HANGING, BOOT_HANGING), math.pi)
             return
-        x = settings.track_half_length * draw(-ANYWHERE, ANYWHERE)
+        x = settings.track_half_length * draw(-BOOT_ANYWHERE, BOOT_ANYWHERE)
         self.physics.place(x, draw(-math.pi, math.pi), draw(-FASTEST_BOOT, FASTEST_BOOT))
 
     def _boot_firmware(self) -> None:
-        """Start the firmware, which takes the counts of this moment as 0."""
+        """Start the firmware, whose encoders count from 0 at this moment."""
         self._booted_us = self.now_us
         self._boot = (0, 0)
         self._boot = self._counts()
         self.firmware = Firmware(self._latency_us, round(self._settings.angle_offset / POLE_RADIANS))
 
     def _counts(self) -> tuple[int, int]:
-        """Raw counts of cart and pole since boot, as the encoders tell them."""
+        """Return the raw counts of cart and pole since boot."""
         cart, pole = self._disc_counts()
-        cart, pole = self._stick("cart", cart), self._stick("pole", pole)
+        cart, pole = self._maybe_stuck("cart", cart), self._maybe_stuck("pole", pole)
         return cart - self._boot[0], pole - self._boot[1]
 
-    def _stick(self, encoder: Literal["cart", "pole"], count: int) -> int:
-        """The count, or the one at which a stuck encoder froze."""
+    def _maybe_stuck(self, encoder: Literal["cart", "pole"], count: int) -> int:
+        """Return the count, or the frozen count of a stuck encoder."""
         if encoder != self._settings.stuck_encoder or self._stuck_us is None or self.now_us < self._stuck_us:
             return count
         if self._stuck_count is None:
@@ -109,10 +109,10 @@ class CartDevice:
         return self._stuck_count
 
     def _disc_counts(self) -> tuple[int, int]:
-        """Counts of cart and pole; a count changes where a line of the disc passes.
+        """Return the counts of the encoder discs.
 
-        The pole's disc sits so that its lines carry the part of `angle_offset` below a count; the firmware's
-        zero, a whole number, carries the rest.
+        The position of the pole's disc includes the fraction of `angle_offset` that is below a count; the
+        firmware's zero, a whole number, includes the rest.
         """
         cart = math.floor(self.physics.x / CART_METRES)
         pole = math.floor((self.physics.angle + self._settings.angle_offset) / POLE_RADIANS + 0.5)
@@ -123,25 +123,25 @@ class CartDevice:
         return round(max(0.0, self._settings.latency + self._latencies.uniform(-jitter, jitter)) * 1e6)
 
     def _move_hand(self) -> None:
-        """Where `start` is upright: hold the pole up while the cart is homed and disarmed, else let go."""
+        """With start=upright: hold the pole up while the cart is homed and disarmed, else let go."""
         if self._settings.start != "upright":
             return
         firmware = self.firmware
-        wanted = firmware.homed and not firmware.armed
-        if wanted and self._held is None:
+        holds = firmware.homed and not firmware.armed
+        if holds and self._held is None:
             self._held = nearest_upright(self.physics.angle) + self._people.uniform(-HAND_ERROR, HAND_ERROR)
             self.physics.place_pole(self._held)
-        elif not wanted and self._held is not None:
+        elif not holds and self._held is not None:
             if firmware.homing:
                 self.physics.place_pole(nearest_upright(self.physics.angle) + math.pi)
             self._held = None
 
 
 def nearest_upright(angle: float) -> float:
-    """The upright angle to which a hand lifts the pole; one that hangs near pi goes to 0, not to two pi."""
+    """Return the upright angle to which a hand lifts the pole; a pole near pi goes to 0, not to two pi."""
     return 2 * math.pi * round((angle - 0.5) / (2 * math.pi))
 
 
 def microseconds(seconds: float | None) -> int | None:
-    """Whole microseconds; None stays None, which is never."""
+    """Return whole microseconds; None, which means never, stays None."""
     return None if seconds is None else round(seconds * 1e6)

@@ -1,4 +1,4 @@
-"""Frames that vanish, arrive with a wrong byte, twice or too late, by chance and by seed."""
+"""Random frame loss, corruption, duplication and reordering, repeatable by seed."""
 
 import random
 
@@ -6,17 +6,17 @@ from cartpole_rl.emulator.settings import EmulatorSettings
 
 
 class Disturbance:
-    """One direction of a bad cable. The ends of frames get through, so that frames never merge or split."""
+    """One direction of a bad cable. The final 0x00 always arrives, so frames never merge or split."""
 
     def __init__(self, settings: EmulatorSettings, direction: str) -> None:
-        """The settings' shares of frames; their seed and the direction's name decide which frames."""
+        """Take the shares of frames from the settings; the seed and `direction` decide which frames."""
         self._settings = settings
         self._damage_dice = random.Random(f"{direction} {settings.seed}")
         self._order_dice = random.Random(f"{direction} order {settings.seed}")
-        self._held: list[bytes] = []  # what arrives after the next frame; one frame, or its two copies
+        self._held: list[bytes] = []  # one frame, or its two copies, that arrives after the next frame
 
     def carry(self, stuffed: bytes) -> list[bytes]:
-        """What arrives now that a frame was sent, in order, each without its ending 0x00."""
+        """Send a frame; return the frames that arrive now, in order, each without its final 0x00."""
         settings, dice = self._settings, self._damage_dice
         lost, damaged = dice.random() < settings.frame_loss, dice.random() < settings.frame_corruption
         twice = self._order_dice.random() < settings.frame_duplication

@@ -1,9 +1,9 @@
-"""The firmware of the emulated cart: protocol version 1 as a state machine, free of I/O and of real clocks.
+"""The firmware of the emulated cart: protocol version 1 as a state machine without I/O or real clocks.
 
-Frames come in with the time at which they arrived, frames go out, and the caller lets time pass. A period is
-`drive` (which motor value is in force when), then `tick` (read the encoders, keep the rules, report).
-The cart is idle, homing or armed; a latched fault disarms it. ``docs/protocol.md`` has the rules.
-All times are whole microseconds since boot.
+The caller passes frames with their time of arrival and advances the time. A period is `drive` (the motor
+values in force), then `tick` (read the encoders, apply the rules, report). The cart is idle, homing or
+armed; a latched fault disarms it. ``docs/protocol.md`` has the rules. All times are whole microseconds
+since boot.
 """
 
 from collections.abc import Callable, Generator
@@ -42,7 +42,7 @@ from cartpole_rl.wire.frames import VERSION, Envelope, open_envelope
 
 FIRMWARE = (1, 0, 0)
 BANNER = b"ets Jul 29 2019 12:21:46\r\n\r\nrst:0x1 (POWERON_RESET),boot:0x13\r\ncart 1.0.0\r\n\x00"
-# as an ESP32 prints, and one 0x00, so that it is no part of the first frame
+# the text of an ESP32, and one 0x00 that separates it from the first frame
 PERIOD_US = 20_000
 SHORTEST_US, LONGEST_US = 5_000, 100_000
 MOTOR_LIMIT = 255
@@ -58,15 +58,15 @@ HOST_MESSAGES: dict[int, type[Message]] = {
 
 
 class Firmware:
-    """One cart's firmware, just booted: idle, not homed, motor 0."""
+    """The firmware of one cart, just booted: idle, not homed, motor 0."""
 
     def __init__(self, delay_us: Callable[[], int], zero_error: int = 0) -> None:
-        """`delay_us` draws a command's latency; homing sets the pole's zero `zero_error` counts too low."""
+        """`delay_us` returns a command's latency; homing sets the pole's zero `zero_error` counts too low."""
         self.period_us = PERIOD_US
         self.armed = False
         self.homed = False
         self.fault = Fault.NONE
-        self.carried_out: Message | None = None  # by the newest frame, None where it was refused or damaged
+        self.carried_out: Message | None = None  # the newest message; None if it was refused or damaged
         self._delay_us = delay_us
         self._zero_error = zero_error
         self._line = MotorLine()
@@ -74,25 +74,25 @@ class Firmware:
         self._zeros = Zeros(-NOMINAL_HALF_SPAN, NOMINAL_HALF_SPAN, hanging=None)
         self._pole_zero = 0  # raw count that is reported as 0
         self._command_us: int | None = None  # when the newest SET_MOTOR arrived
-        self._watchdog_us = 0  # when the watchdog was last fed
+        self._watchdog_us = 0  # time of START or of the newest SET_MOTOR
         self._last_sequence = 0  # of the host
         self._sequence = 0  # of the next frame sent
         self._ticks = 0
         self._ticked_us = 0
-        self._watch_anew()
+        self._reset_watches()
 
     @property
     def homing(self) -> bool:
-        """Whether it moves by itself to find its zeros."""
+        """Whether the cart is homing."""
         return self._homing is not None
 
     def receive(self, stuffed: bytes, now_us: int) -> list[bytes]:
-        """Take one frame, without its ending 0x00; returns the answer, which is at most one frame."""
+        """Handle one frame without its final 0x00; return the answer, at most one frame."""
         self.carried_out = None
         try:
             envelope = open_envelope(stuffed)
         except FrameError:
-            return []  # nothing in a damaged frame can be trusted, not even whom to answer
+            return []  # nothing in a damaged frame can be trusted
         answer = self._obey(envelope, now_us)
         if isinstance(answer, Reason):
             return [self._frame(Nack(envelope.sequence, envelope.kind, answer))]
@@ -100,20 +100,20 @@ class Firmware:
         return [self._frame(answer)] if answer else []
 
     def drive(self, start_us: int, end_us: int) -> list[tuple[int, int]]:
-        """The motor values in force in a period, as (since, value); the last one holds to its end."""
+        """Return the motor values in force during a period as (since, value)."""
         return self._line.over(start_us, end_us)
 
     def tick(self, now_us: int, cart: int, pole: int) -> list[bytes]:
-        """End a period at two raw counts: keep the rules, and return the frames to send, STATE last."""
+        """End a period with two raw counts: apply the rules and return the frames to send, STATE last."""
         reading = Reading(cart, pole, (now_us - self._ticked_us) / 1e6)
         self._ticks, self._ticked_us = self._ticks + 1, now_us
         faults_before = self.fault
-        # looked at once a period: what is not over at the next look would be over too late
+        # checked once a period: the limit has to pass by the next check at the latest
         expired = self.armed and now_us - self._watchdog_us > (WATCHDOG_PERIODS - 1) * self.period_us
         if expired:
             self._line.hold(0)
         if self.armed or self.homing:
-            self._look_for_faults(reading)
+            self._check_faults(reading)
         if self._homing:
             self._step_homing(self._homing, reading)
         self._line.blocked = self._beyond(SOFT_LIMIT, cart) if self.armed else 0
@@ -124,7 +124,7 @@ class Firmware:
         return frames
 
     def _obey(self, envelope: Envelope, now_us: int) -> Message | Reason | None:
-        """Carry a frame out and return the answer; None where the next STATE is answer enough."""
+        """Carry out a frame and return the answer; None for SET_MOTOR, which the next STATE acknowledges."""
         if envelope.version != VERSION:
             return Reason.BAD_VERSION
         if envelope.kind not in HOST_MESSAGES:
@@ -145,7 +145,7 @@ class Firmware:
         return Ack(envelope.sequence, envelope.kind)
 
     def _objection(self, message: Message) -> Reason | None:
-        """Why a message is refused now, if it is."""
+        """Return the reason for which a message is refused now, or None."""
         match message:
             case SetMotor(motor) if abs(motor) > MOTOR_LIMIT:
                 return Reason.OUT_OF_RANGE
@@ -170,21 +170,21 @@ class Firmware:
                 self._line.command(now_us + self._delay_us(), motor)
             case Start() if not self.armed:
                 self.armed, self._watchdog_us = True, now_us
-                self._watch_anew()
+                self._reset_watches()
             case Stop():
                 self.armed, self._homing = False, None
                 self._line.stop(now_us)
             case Home():
                 self.homed, self._homing = False, home(self._zeros.hanging)
                 next(self._homing)
-                self._watch_anew()
+                self._reset_watches()
             case ClearFault():
                 self.fault = Fault.NONE
             case SetPeriod(period_us):
                 self.period_us = period_us
 
     def _step_homing(self, homing: Generator[int, Reading, Zeros], reading: Reading) -> None:
-        """Let homing choose the motor value, or end with its zeros or a fault."""
+        """Let homing choose the motor value, or end it with its zeros or a fault."""
         try:
             self._line.hold(homing.send(reading))
         except StopIteration as end:
@@ -195,8 +195,8 @@ class Firmware:
         except HomingError:
             self._latch(Fault.HOMING)
 
-    def _look_for_faults(self, reading: Reading) -> None:
-        """Latch what is wrong. A cart under homing may touch the stops, and finds a stall by itself."""
+    def _check_faults(self, reading: Reading) -> None:
+        """Latch new faults. Homing may touch the stops and detects a stall itself."""
         motor = self._line.value
         jumped = self._cart_jumps.jumped(reading.cart, reading.seconds)
         if self._cart_freezes.frozen(reading.cart, motor, reading.seconds) or jumped:
@@ -210,21 +210,21 @@ class Firmware:
             self._latch(Fault.STALL)
 
     def _latch(self, fault: Fault) -> None:
-        """Disarm, motor 0, and remember why. What an encoder counted before it failed is worth nothing."""
+        """Disarm, set motor 0 and latch the fault. An encoder fault makes the zeros invalid."""
         self.fault |= fault
         self.armed, self._homing = False, None
         self._line.hold(0)
         if fault in Fault.CART_ENCODER | Fault.POLE_ENCODER:
             self.homed = False
 
-    def _watch_anew(self) -> None:
-        """Forget what the guards saw while the motor was off: a hand may have moved everything since."""
+    def _reset_watches(self) -> None:
+        """Start with new guards: a hand may have moved cart and pole while the motor was off."""
         self._cart_jumps, self._pole_jumps = JumpWatch(FASTEST_CART), JumpWatch(FASTEST_POLE)
         self._cart_freezes, self._pole_freezes = FrozenCartWatch(), FrozenPoleWatch()
         self._stalls = StallWatch()
 
     def _beyond(self, inside: int, cart: int) -> int:
-        """1 or -1 where the cart is within `inside` counts of the right or left stop, or past it, else 0."""
+        """Return 1 or -1 if the cart is within `inside` counts of the right or left stop, else 0."""
         from_middle = cart - self._zeros.middle
         if abs(from_middle) < self._zeros.half_span - inside:
             return 0

@@ -1,23 +1,23 @@
-"""What the firmware watches while the motor may move: a stalled cart and encoders that cannot be right."""
+"""Fault detection while the motor may move: a stalled cart and implausible encoders."""
 
-STALL_MOTOR = 200  # motor values from here on move any healthy cart
+STALL_MOTOR = 200  # smallest motor value that moves any healthy cart
 STALL_SECONDS = 0.5
 STALL_COUNTS = 44  # 1 mm
-PUSH_SECONDS = 0.1  # of such a push one way, after which a count must have changed
-SPEED_CHANGE = 0.2 / 22749e-9  # counts/s; 0.2 m/s of the cart turn any pole by several counts
+PUSH_SECONDS = 0.1  # of such a push one way, after which the count must have changed
+SPEED_CHANGE = 0.2 / 22749e-9  # counts/s; 0.2 m/s turn any pole by several counts
 FASTEST_CART = 5.0 / 22749e-9  # counts/s; 5 m/s is over twice what the motor can reach on this track
 FASTEST_POLE = 16 * 4096.0  # counts/s; 16 turns a second is five times a fast swing
 
 
 class StallWatch:
-    """A hard push one way for half a second that moves the cart by less than a millimetre."""
+    """Detects a hard push one way for half a second that moves the cart by less than a millimetre."""
 
     def __init__(self) -> None:
-        self._since = 0.0  # s of pushing from the anchor
-        self._anchor: tuple[int, bool] | None = None  # count and direction where this push began
+        self._since = 0.0  # s of pushing since the anchor was set
+        self._anchor: tuple[int, bool] | None = None  # count and direction at the beginning of this push
 
     def stalled(self, cart: int, motor: int, seconds: float) -> bool:
-        """Whether the cart stalls, after `seconds` under `motor` ended at a count."""
+        """Return whether the cart stalls, after `seconds` under `motor` that ended at count `cart`."""
         if abs(motor) < STALL_MOTOR:
             self._anchor = None
         elif self._anchor is None or self._anchor[1] != (motor > 0) or self._moved(cart):
@@ -31,33 +31,33 @@ class StallWatch:
 
 
 class JumpWatch:
-    """A count that changes faster than the cart or pole can move: a miscounting encoder."""
+    """Detects a count that changes faster than the cart or pole can move."""
 
     def __init__(self, fastest: float) -> None:
         self._fastest = fastest  # counts/s
         self._last: int | None = None
 
     def jumped(self, count: int, seconds: float) -> bool:
-        """Whether this count cannot follow the last one, `seconds` ago."""
+        """Return whether this count is impossible `seconds` after the last one."""
         last, self._last = self._last, count
         return last is not None and abs(count - last) > self._fastest * seconds
 
 
 class FrozenCartWatch:
-    """A cart count that does not change at all under a hard push one way and then the other.
+    """Detects a cart count that does not change under a hard push one way and then the other.
 
-    Pushed one way only, it may be the cart that stands, against a stop or something on the track; that is
-    the stall watch's. What jams a cart one way lets it go the other way, by a count of 23 um at least.
+    Under a push one way only, the cart itself may be held by a stop or an obstacle, which is a stall. An
+    obstacle on one side lets the cart move the other way, by at least one count of 23 um.
     """
 
     def __init__(self) -> None:
         self._count: int | None = None
-        self._direction = 0  # of the push that lasts: 1, -1, or 0 for none
-        self._seconds = 0.0  # that it has lasted
+        self._direction = 0  # of the present push: 1, -1, or 0 for none
+        self._seconds = 0.0  # since it began
         self._pushed: set[int] = set()  # directions of long pushes since the count changed
 
     def frozen(self, cart: int, motor: int, seconds: float) -> bool:
-        """Whether the encoder is dead, after `seconds` under `motor` ended at a count."""
+        """Return whether the encoder is frozen, after `seconds` under `motor` that ended at count `cart`."""
         direction = 0 if abs(motor) < STALL_MOTOR else 1 if motor > 0 else -1
         self._seconds = self._seconds + seconds if direction == self._direction else 0.0
         self._direction = direction
@@ -69,20 +69,20 @@ class FrozenCartWatch:
 
 
 class FrozenPoleWatch:
-    """A pole count that does not change at all while the cart speeds up by 0.2 m/s and slows down again.
+    """Detects a pole count that does not change while the cart speeds up by 0.2 m/s and slows down again.
 
-    Gravity can hold a pole still in a cart that accelerates, but only at one angle for one acceleration,
-    never at the same angle for another one the other way.
+    Gravity can hold a pole still in an accelerating cart only at one angle for each acceleration, so never
+    at the same angle during an opposite acceleration.
     """
 
     def __init__(self) -> None:
         self._pole: int | None = None
         self._cart: int | None = None
-        self._lowest = self._highest = 0.0  # counts/s of the cart since the pole's count changed
-        self._rise = self._fall = 0.0  # largest changes of that speed, each way
+        self._lowest = self._highest = 0.0  # cart speed in counts/s since the pole's count changed
+        self._rise = self._fall = 0.0  # largest increase and decrease of that speed
 
     def frozen(self, pole: int, cart: int, seconds: float) -> bool:
-        """Whether the pole's encoder is dead, `seconds` after the last counts."""
+        """Return whether the pole's encoder is frozen, `seconds` after the last counts."""
         last, self._cart = self._cart, cart
         if last is None:
             return False

@@ -1,9 +1,9 @@
-"""How the cart finds its zeros: touch both stops, check the span, centre, wait until the pole hangs still.
+"""Homing: touch both stops, check the span, centre the cart, wait until the pole hangs still.
 
-Works on raw encoder counts, one reading a tick, and needs to know the cart only roughly. A procedure here is
-a generator: it is sent a `Reading`, yields the motor value until the next one, and returns what it found.
-The pole's zero is the middle of its last small swing. Waiting for a dead stop would not be better: friction
-in the bearing holds a pole that has stopped up to a count off the vertical.
+Homing works on raw encoder counts, one reading a tick, and needs only rough numbers of the cart. A
+procedure is a generator: it receives a `Reading`, yields the motor value until the next one, and returns
+its result. The pole's zero is the middle of its last small swing. Waiting for a complete stop would not be
+more accurate: friction in the bearing holds a stopped pole up to a count off the vertical.
 """
 
 import math
@@ -18,24 +18,24 @@ CART_METRES = 22749e-9  # a count
 POLE_COUNTS = 4096  # a turn
 POLE_RADIANS = 2 * math.pi / POLE_COUNTS  # a count
 QUARTER_TURN = POLE_COUNTS // 4
-SPAN = 0.814  # m, stop to stop, as the drawing says
+SPAN = 0.814  # m, nominal distance between the stops
 SPAN_TOLERANCE = 0.03  # of the span
 
 SEARCH_SPEED = 0.08  # m/s, towards a stop
-TRAVEL_SPEED = 0.2  # m/s, where the way is known to be free
-TOUCH_ZONE = 0.06  # m before a stop whose place is known
-AGAINST_STOP = 0.4  # s that the cart stands still however hard it pushes
-STANDS = 3e-4  # m
+TRAVEL_SPEED = 0.2  # m/s, far from a stop whose position is known
+TOUCH_ZONE = 0.06  # m, distance from such a stop at which the slow search begins
+AGAINST_STOP = 0.4  # s under full push without motion that mean a stop
+STANDS = 3e-4  # m, largest motion in that time
 LONGEST_SEARCH = 30.0  # s for one stop
 CENTRED = 0.001  # m
 LONGEST_CENTRING = 20.0  # s
 
 WHOLE_SWING = 2.0  # s: one period of a rod of 1.5 m
 STILL = 8  # counts peak to peak, 0.7 degree
-BRAKED = 30  # counts peak to peak: below this the brake would do more harm than good
+BRAKED = 30  # counts peak to peak; the brake cannot improve a smaller swing
 LONGEST_BRAKING = 20.0  # s
-PATIENCE = 20.0  # s, after which a pole with next to no friction ...
-NEARLY_STILL = 40  # ... may swing by so many counts, peak to peak
+PATIENCE = 20.0  # s, after which NEARLY_STILL is sufficient, for a pole with hardly any friction
+NEARLY_STILL = 40  # counts peak to peak
 LONGEST_WAIT = 60.0  # s
 
 
@@ -50,7 +50,7 @@ class Reading:
 
 @dataclass(frozen=True)
 class Zeros:
-    """What homing found, in raw counts."""
+    """The result of homing, in raw counts."""
 
     left_stop: int
     right_stop: int
@@ -83,7 +83,7 @@ class Window:
         self._full = False
 
     def add(self, count: int, seconds: float) -> None:
-        """Take one count; `seconds` lie between two of them."""
+        """Add a count, `seconds` after the last one."""
         self._counts.append(count)
         length = math.ceil(self._seconds / seconds) + 1
         self._full = len(self._counts) >= length
@@ -102,7 +102,7 @@ class Window:
 
 
 def home(hanging: int | None) -> Generator[int, Reading, Zeros]:
-    """The whole homing; `hanging` is the pole count at which the pole hung last, None after a boot.
+    """Perform the whole homing. `hanging` is the pole count at which the pole hung before, None after a boot.
 
     Raises HomingError.
     """
@@ -122,7 +122,7 @@ def home(hanging: int | None) -> Generator[int, Reading, Zeros]:
 
 
 def touch_stop(direction: int, expected: int | None, reading: Reading) -> Procedure:
-    """Move until a stop holds the cart. `expected` is the stop's raw count where it is known."""
+    """Move until a stop holds the cart. `expected` is the raw count of the stop, or None if it is unknown."""
     servo, window, elapsed, before = SpeedServo(), Window(AGAINST_STOP), 0.0, reading.cart
     while elapsed < LONGEST_SEARCH:
         far = expected is not None and abs(expected - reading.cart) * CART_METRES > TOUCH_ZONE
@@ -138,7 +138,7 @@ def touch_stop(direction: int, expected: int | None, reading: Reading) -> Proced
 
 
 def centre(middle: int, reading: Reading) -> Procedure:
-    """Move to the middle, gently, and let go."""
+    """Move gently to the middle and switch the motor off."""
     servo, elapsed, before = SpeedServo(), 0.0, reading.cart
     while elapsed < LONGEST_CENTRING:
         away = (middle - reading.cart) * CART_METRES
@@ -153,9 +153,9 @@ def centre(middle: int, reading: Reading) -> Procedure:
 
 
 def brake_swing(middle: int, hanging: int | None, reading: Reading) -> Procedure:
-    """Take the swing out of the pole, or most of it, by moving the cart about the middle.
+    """Brake the pole's swing by moving the cart about the middle.
 
-    Where the pole hangs, if that is not known, is where it is fastest.
+    If the hanging count is unknown, it is the count at which the pole is fastest.
     """
     if hanging is None:
         hanging, reading = yield from find_hanging(reading)
@@ -164,7 +164,7 @@ def brake_swing(middle: int, hanging: int | None, reading: Reading) -> Procedure
         window.add(reading.pole, reading.seconds)
         if window.spread <= BRAKED:
             return reading
-        if window.spread < QUARTER_TURN:  # a swing as small as this has the hanging pole in its middle
+        if window.spread < QUARTER_TURN:  # the middle of such a small swing is the hanging pole
             hanging = window.centre
         motor = brake.motor(
             (reading.cart - middle) * CART_METRES,
@@ -179,7 +179,7 @@ def brake_swing(middle: int, hanging: int | None, reading: Reading) -> Procedure
 
 
 def find_hanging(reading: Reading) -> Generator[int, Reading, tuple[int, Reading]]:
-    """Watch the pole for a whole swing with the motor off; returns the count at which it was fastest."""
+    """Watch the pole for a whole swing with the motor off; return the count at which it was fastest."""
     hanging, fastest, elapsed = reading.pole, 0.0, 0.0
     while elapsed < WHOLE_SWING:
         before = reading
@@ -192,7 +192,7 @@ def find_hanging(reading: Reading) -> Generator[int, Reading, tuple[int, Reading
 
 
 def wait_until_still(reading: Reading) -> Generator[int, Reading, int]:
-    """Wait with the motor off until the pole's swing is small; returns the count in its middle."""
+    """Wait with the motor off until the pole's swing is small; return the count in its middle."""
     window, elapsed = Window(WHOLE_SWING), 0.0
     while elapsed < LONGEST_WAIT:
         window.add(reading.pole, reading.seconds)

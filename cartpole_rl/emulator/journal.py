@@ -1,6 +1,6 @@
-"""What the emulated cart did, written down by itself: the truth about commands taken and the motor.
+"""The emulated cart's own record of the commands that it carried out and of the motor values in force.
 
-A JSON line for each event, with `us` in microseconds since the emulator's start:
+One JSON line for each event, with `us` in microseconds since the emulator's start:
 {"us": 40210, "took": "SET_MOTOR", "motor": -200} and {"us": 43310, "in_force": -200}.
 """
 
@@ -12,18 +12,18 @@ from cartpole_rl.wire import Message
 
 
 class Journal:
-    """Writes to the new file `path` as things happen. Raises FileExistsError: no file is overwritten."""
+    """Writes events to a new file at once. Raises FileExistsError: it overwrites no file."""
 
     def __init__(self, path: Path) -> None:
         self._file = path.open("x", buffering=1)
         self._motor = 0
 
     def took(self, us: int, message: Message) -> None:
-        """Note a command that the cart carried out."""
+        """Record a command that the cart carried out."""
         self._write(us, took=message.TYPE.name, **vars(message))
 
     def in_force(self, us: int, motor: int) -> None:
-        """Note the motor value in force if it is another one than before."""
+        """Record the motor value in force if it has changed."""
         if motor != self._motor:
             self._motor = motor
             self._write(us, in_force=motor)

@@ -1,4 +1,4 @@
-"""The emulated cart's end of the cable: a pseudo-terminal, and the frames that go through it."""
+"""The emulated cart's end of the cable: a pseudo-terminal and its frames."""
 
 import os
 import select
@@ -13,14 +13,14 @@ from cartpole_rl.errors import EmulatorError
 from cartpole_rl.wire.frames import END, FrameSplitter
 
 READ_BYTES = 4096
-LONGEST_WAIT = 0.5  # s; a signal that arrives just before a wait begins is noticed only after it
+LONGEST_WAIT = 0.5  # s; a signal that arrives just before a wait is handled after it
 
 
 class PtyLink:
-    """A pseudo-terminal in raw mode; a host opens `port` as it would open a serial port, again and again.
+    """A pseudo-terminal in raw mode; a host can open `port` like a serial port, any number of times.
 
-    It is in packet mode (tty_ioctl(4)): each read begins with a byte that is 0 before data, and else tells
-    what the host did. One who opens a serial port throws away what came before, which is how it is noticed.
+    It is in packet mode (tty_ioctl(4)): each read begins with a byte that is 0 before data and otherwise
+    reports an action of the host. A host that opens a serial port flushes its input, and that is reported.
     """
 
     def __init__(self) -> None:
@@ -57,7 +57,7 @@ class PtyLink:
         os.close(self._slave)
 
     def read(self, timeout: float = LONGEST_WAIT) -> bytes:
-        """What the host wrote, after waiting for it for at most `timeout` seconds; b"" for nothing."""
+        """Wait at most `timeout` seconds; return what the host wrote, or b""."""
         while select.select([self._master], [], [], min(timeout, LONGEST_WAIT))[0]:
             packet = os.read(self._master, READ_BYTES)
             if packet[0] == 0:
@@ -67,19 +67,19 @@ class PtyLink:
         return b""
 
     def write(self, data: bytes) -> None:
-        """Write all of it, and wait for as long as the host does not read."""
+        """Write all data; wait while the host does not read."""
         self._unsent += data
         while not self._flush():
             select.select([], [self._master], [], LONGEST_WAIT)
 
     def offer(self, data: bytes) -> None:
-        """Write it, or drop it where the host has not read what came before; never wait or cut a frame."""
+        """Write a frame, or drop it if the host has not read earlier frames; never wait or cut a frame."""
         if self._flush():
             self._unsent = data
             self._flush()
 
     def _flush(self) -> bool:
-        """Push out what is left of earlier frames; returns whether nothing is left."""
+        """Write the rest of earlier frames; return whether nothing is left."""
         while self._unsent:
             try:
                 self._unsent = self._unsent[os.write(self._master, self._unsent) :]
@@ -89,7 +89,7 @@ class PtyLink:
 
 
 class Channel:
-    """Frames over a pseudo-terminal, with the settings' disturbances in both directions."""
+    """Frames over a pseudo-terminal, disturbed in both directions as the settings say."""
 
     def __init__(self, link: PtyLink, settings: EmulatorSettings) -> None:
         self._link = link
@@ -100,10 +100,10 @@ class Channel:
         self._greeted = False
 
     def receive(self, timeout: float = LONGEST_WAIT) -> list[bytes | None]:
-        """Frames from the host, without their 0x00, after waiting at most `timeout` s; None is a lost one.
+        """Wait at most `timeout` s; return the host's frames without their 0x00, None for each lost one.
 
-        One that is held back for its successor counts as lost until that comes. The first host to open the
-        port is sent the boot banner.
+        A reordered frame counts as lost until its successor arrives. The first host that opens the port
+        receives the boot banner.
         """
         data = self._link.read(timeout)
         if self._link.opened and not self._greeted:
@@ -115,7 +115,7 @@ class Channel:
         return frames
 
     def send(self, frame: bytes) -> bool:
-        """Send one frame that ends with its 0x00; returns whether it left at once and undamaged."""
+        """Send one frame with its final 0x00; return whether it was sent at once and undamaged."""
         arriving = self._outward.carry(frame[:-1])
         for stuffed in arriving:
             self._send(stuffed + END)

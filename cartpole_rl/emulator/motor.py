@@ -13,7 +13,7 @@ class Motor:
         self.force = 0.0  # N, positive to the right
 
     def static_force(self, motor: int) -> float:
-        """Force in N that a motor value gives once the lag has passed."""
+        """Return the steady force of a motor value, N."""
         settings = self._settings
         size = abs(motor)
         if size <= (settings.deadband_right if motor > 0 else settings.deadband_left):
@@ -23,7 +23,7 @@ class Motor:
         return force * (1 + settings.force_asymmetry) if motor > 0 else -force
 
     def step(self, motor: int, seconds: float) -> float:
-        """Force in N after `seconds` under a motor value."""
+        """Apply a motor value for `seconds`; return the force at the end, N."""
         target = self.static_force(motor)
         lag = self._settings.motor_time_constant
         self.force = target + (self.force - target) * (math.exp(-seconds / lag) if lag else 0.0)

@@ -1,4 +1,4 @@
-"""Motor values on their way to the motor: each comes into force a latency after it arrived.
+"""Delayed motor values: each comes into force one latency after its arrival.
 
 Times are whole microseconds since boot.
 """
@@ -7,10 +7,10 @@ from collections import deque
 
 
 class MotorLine:
-    """The value in force, and the ones that are still due. Order is kept: no command overtakes another."""
+    """The motor value in force and the pending ones. No command overtakes another."""
 
     def __init__(self) -> None:
-        self.blocked = 0  # the direction that a soft limit forbids: 1 right, -1 left, 0 none
+        self.blocked = 0  # direction that the soft limit forbids: 1 right, -1 left, 0 none
         self._requested = 0
         self._pending: deque[tuple[int, int]] = deque()  # (due, value)
 
@@ -21,27 +21,27 @@ class MotorLine:
 
     @property
     def limited(self) -> bool:
-        """Whether the newest command in force points where it may not, and is held at 0."""
+        """Whether the command in force points in the forbidden direction and is held at 0."""
         return self._requested * self.blocked > 0
 
     def command(self, due_us: int, value: int) -> None:
-        """Bring a value into force at a time, or when the one before it is in force if that is later."""
+        """Bring a value into force at `due_us`, or together with an earlier command that is due later."""
         newest = self._pending[-1][0] if self._pending else 0
         self._pending.append((max(due_us, newest), value))
 
     def stop(self, now_us: int) -> None:
-        """Bring 0 into force now, and forget what is due later."""
+        """Bring 0 into force at `now_us` and discard values that are due later."""
         while self._pending and self._pending[-1][0] > now_us:
             self._pending.pop()
         self.command(now_us, 0)
 
     def hold(self, value: int) -> None:
-        """Put a value into force at once, and forget all that is due."""
+        """Put a value into force at once and discard all pending ones."""
         self._pending.clear()
         self._requested = value
 
     def over(self, start_us: int, end_us: int) -> list[tuple[int, int]]:
-        """What is in force from start to end, as (since, value); afterwards the last one is in force."""
+        """Return the values in force from start to end as (since, value); the last one remains in force."""
         values = [(start_us, self.value)]
         while self._pending and self._pending[0][0] < end_us:
             due, self._requested = self._pending.popleft()

@@ -1,10 +1,9 @@
 """The emulated cart's physics: a MuJoCo model of a cart on a rail with a pole, stepped at 1 kHz or finer.
 
-Coordinates: x in m from the middle of the rail, angle in rad from upright; both positive to the right.
-A tilt of the rail is a turn of gravity, so MuJoCo's own joint angle, which counts from the rail's normal,
-is the angle less the tilt.
-Dry friction is MuJoCo's friction loss, held almost rigidly (its default is soft: a cart at rest would creep);
-the stops are stiff limits of the joint.
+Coordinates: x in m from the middle of the rail, angle in rad from upright; both positive to the right. A
+tilt of the rail is a rotation of gravity, so MuJoCo's joint angle, which is measured from the normal of the
+rail, is the angle minus the tilt. Dry friction is MuJoCo's friction loss, made almost rigid (with the soft
+default a cart at rest would creep); the stops are stiff joint limits.
 """
 
 import math
@@ -15,7 +14,7 @@ from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import EmulatorError
 
 GRAVITY = 9.81  # m/s^2
-AT_REST = 1e-4  # m/s: slower than this the breakaway friction holds
+AT_REST = 1e-4  # m/s; below this speed the breakaway friction applies
 MODEL = """
 <mujoco>
   <compiler angle="radian" autolimits="true"/>
@@ -43,7 +42,7 @@ MODEL = """
 
 
 def load_mujoco() -> ModuleType:
-    """The mujoco package. Raises EmulatorError where it is not installed."""
+    """Return the mujoco package. Raises EmulatorError if it is not installed."""
     try:
         import mujoco
     except ImportError:
@@ -58,7 +57,7 @@ class CartPhysics:
 
     def __init__(self, settings: EmulatorSettings) -> None:
         mujoco = load_mujoco()
-        thin = settings.pole_inertia * 1e-3  # about the pole's own axis, which nothing turns about
+        thin = settings.pole_inertia * 1e-3  # about the pole's own axis, about which nothing rotates
         model = MODEL.format(thin_inertia=thin, **settings.model_dump())
         self._model = mujoco.MjModel.from_xml_string(model)
         tilt = settings.track_tilt
@@ -81,7 +80,7 @@ class CartPhysics:
 
     @property
     def angle(self) -> float:
-        """Pole angle, rad from where gravity would balance it upright; not wrapped."""
+        """Pole angle, rad from the vertical, not wrapped."""
         return float(self._data.qpos[1]) + self._settings.track_tilt
 
     @property
@@ -90,18 +89,18 @@ class CartPhysics:
         return float(self._data.qvel[1])
 
     def place(self, x: float, angle: float, angle_dot: float = 0.0) -> None:
-        """Put the cart at x, at rest, and the pole at an angle, turning at `angle_dot` rad/s."""
+        """Place the cart at x m, at rest, and the pole at an angle and angular velocity, rad and rad/s."""
         self._data.qpos[0] = x
         self._data.qvel[0] = 0.0
         self.place_pole(angle, angle_dot)
 
     def place_pole(self, angle: float, angle_dot: float = 0.0) -> None:
-        """Put the pole at an angle, at rest unless told otherwise, and leave the cart alone."""
+        """Place the pole at an angle and angular velocity, rad and rad/s; do not move the cart."""
         self._data.qpos[1] = angle - self._settings.track_tilt
         self._data.qvel[1] = angle_dot
 
     def advance(self, motor: int, seconds: float) -> None:
-        """Let `seconds` pass under one motor value, in equal steps of `physics_step` or just under."""
+        """Simulate `seconds` under one motor value, in equal steps of at most `physics_step`."""
         steps = math.ceil(seconds / self._settings.physics_step - 1e-9)
         if steps == 0:
             return
@@ -116,14 +115,14 @@ class CartPhysics:
             self._mj_step(self._model, self._data)
 
     def _cogging(self, x: float) -> float:
-        """Force in N with which gears and magnets pull the cart toward their nearest resting place."""
+        """Return the cogging force, which pulls the cart to the nearest stable position, N."""
         settings = self._settings
         return -settings.cogging * math.sin(math.tau * x / settings.cogging_pitch)
 
     def _cart_friction(self, x_dot: float) -> float:
-        """Dry friction in N that the rail can hold against the cart now."""
+        """Return the largest dry friction that the rail can exert now, N."""
         settings = self._settings
         at_rest = abs(x_dot) < AT_REST
-        pull = self._data.qacc_smooth[0] if at_rest else x_dot  # at rest: where all else would move the cart
+        pull = self._data.qacc_smooth[0] if at_rest else x_dot  # at rest: the direction of all other forces
         coulomb = settings.cart_coulomb_right if pull > 0 else settings.cart_coulomb_left
         return coulomb * settings.cart_stiction_ratio if at_rest else coulomb

@@ -1,4 +1,4 @@
-"""The emulated cart as a program: from settings to a port that a host can open."""
+"""The emulated cart as a process with a port that a host can open."""
 
 import json
 import os
@@ -18,19 +18,19 @@ from cartpole_rl.signals import ending_signals
 def run(settings: EmulatorSettings) -> None:
     """Print one JSON line with `port` and `pid`, and emulate until SIGINT, SIGTERM, SIGHUP or `unplug_at`.
 
-    Main thread only. Raises EmulatorError where MuJoCo or pseudo-terminals are missing.
+    Main thread only. Raises EmulatorError if MuJoCo or pseudo-terminals are missing.
     """
     cart = CartDevice(settings)
     with until_stopped(), PtyLink() as link:
         print(json.dumps({"port": link.port, "pid": os.getpid()}), flush=True)
         clock = run_lockstep if settings.clock == "lockstep" else run_real
         clock(cart, Channel(link, settings))
-        print(f"the cable was pulled after {settings.unplug_at:g} s, as unplug_at says", file=sys.stderr)
+        print(f"the cable was pulled after {settings.unplug_at:g} s (unplug_at)", file=sys.stderr)
 
 
 @contextmanager
 def until_stopped() -> Iterator[None]:
-    """Let SIGINT, SIGTERM and SIGHUP end the block quietly, wherever it waits."""
+    """End the block without an error on SIGINT, SIGTERM or SIGHUP."""
 
     def interrupt(signum: int, frame: FrameType | None) -> None:
         raise KeyboardInterrupt

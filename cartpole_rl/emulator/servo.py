@@ -1,6 +1,6 @@
 """The firmware's slow motions: a speed servo and a brake for the swinging pole.
 
-Both know the cart only roughly (the nominal motor curve, mass and friction), as firmware does.
+Both use only rough numbers of the cart (nominal motor curve, mass and friction), as firmware does.
 SI units; positive to the right.
 """
 
@@ -8,30 +8,30 @@ import math
 
 MASS = 0.85  # kg, cart and pole
 FRICTION = 0.5  # N
-PUSH = 3.0  # N, the most that these motions push with
-GENTLE = 0.2  # m/s^2: changes of speed that leave the pole nearly still
+PUSH = 3.0  # N, largest force of these motions
+GENTLE = 0.2  # m/s^2, an acceleration that leaves the pole nearly still
 
 
 def rough_motor(force: float) -> int:
-    """Motor value for about a force in N: 50 to overcome the curve's offset, then 50 a newton."""
+    """Return the motor value for a force in N, roughly: an offset of 50, then 50 a newton."""
     if abs(force) < 0.02:
         return 0
     return int(math.copysign(50 + 50 * min(abs(force), PUSH), force))
 
 
 class SpeedServo:
-    """Holds a speed of the cart and changes it gently: PI on the measured speed, rough friction added."""
+    """PI control of the cart's speed with rough friction compensation; the target changes gently."""
 
     PROPORTIONAL = 12.0  # N s/m
     INTEGRAL = 80.0  # N/m
-    TUNED_FOR = 0.02  # s, the period that these gains suit; a longer one cannot bear them
+    TUNED_FOR = 0.02  # s, the period for these gains; a longer one needs smaller gains
 
     def __init__(self) -> None:
         self._reference = 0.0  # m/s, follows the target at GENTLE
         self._integral = 0.0  # N
 
     def motor(self, target: float, speed: float, seconds: float) -> int:
-        """Motor value for the next `seconds`; target and measured speed in m/s."""
+        """Return the motor value for the next `seconds`; target and measured speed in m/s."""
         change = GENTLE * seconds
         self._reference += max(-change, min(change, target - self._reference))
         error = self._reference - speed
@@ -43,7 +43,7 @@ class SpeedServo:
 
 
 class SwingBrake:
-    """Takes the swing out of a hanging pole: the cart follows the pole, and is drawn back to the middle."""
+    """Brakes the swing of a hanging pole: the cart follows the pole and is pulled back to the middle."""
 
     FOLLOW = 0.9  # m/s^2 of the cart for 1 rad/s of the pole
     RETURN = 3.0  # 1/s^2
@@ -51,8 +51,8 @@ class SwingBrake:
     HARDEST = 2.5  # m/s^2
 
     def motor(self, x: float, x_dot: float, swing: float, swing_dot: float) -> int:
-        """Motor value; x in m from the middle, swing in rad from hanging, positive as the pole's angle is."""
-        wanted = -self.FOLLOW * swing_dot * math.cos(swing) - self.RETURN * x - self.DAMPING * x_dot
-        wanted = max(-self.HARDEST, min(self.HARDEST, wanted))
-        moving = x_dot if abs(x_dot) > 0.002 else wanted
-        return rough_motor(MASS * wanted + math.copysign(FRICTION, moving))
+        """Return the motor value; x in m from the middle, swing in rad from hanging, signed as the angle."""
+        acceleration = -self.FOLLOW * swing_dot * math.cos(swing) - self.RETURN * x - self.DAMPING * x_dot
+        acceleration = max(-self.HARDEST, min(self.HARDEST, acceleration))
+        moving = x_dot if abs(x_dot) > 0.002 else acceleration
+        return rough_motor(MASS * acceleration + math.copysign(FRICTION, moving))

@@ -1,8 +1,8 @@
-"""The truth of the emulated cart: every number that its world is made of, in SI units.
+"""The settings of the emulated cart, in SI units: its true parameters, its imperfections and its faults.
 
-The defaults are a cart that is not the nominal one: they differ from the simulator's nominal cart by as much
-as a cart that was weighed and measured by hand would. ``docs/emulator.md`` has them side by side.
-Signs: x, motor and angles are positive to the right, angle 0 is upright.
+The default cart is not the nominal one: it differs from the simulator's nominal cart by as much as a real
+cart differs from one that was weighed and measured by hand. ``docs/emulator.md`` compares the two. Signs:
+x, motor and angles are positive to the right; angle 0 is upright.
 """
 
 from pathlib import Path
@@ -14,16 +14,18 @@ from cartpole_rl.settings import NonNegative, Positive, Settings
 
 Share = Annotated[
     float, Field(allow_inf_nan=False, ge=0, le=0.9)
-]  # of all frames; over 0.9 hardly anything gets through
+]  # of frames; above 0.9 hardly any frame would arrive
 MotorValue = Annotated[float, Field(ge=0, le=255)]
 Coefficient = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class EmulatorSettings(Settings):
-    """What ``emulator.*`` sets; raises pydantic's ValidationError for a wrong name or value."""
+    """The settings ``emulator.*``. Raises pydantic's ValidationError for a wrong name or value."""
 
-    clock: Literal["lockstep", "real"] = "lockstep"  # one period a command, or by the wall clock
-    seed: Annotated[int, Field(ge=0)] = 0  # of latencies, disturbed frames, boot place and the hand's angle
+    clock: Literal["lockstep", "real"] = "lockstep"  # one period for each frame, or 50 Hz by the wall clock
+    seed: Annotated[int, Field(ge=0)] = (
+        0  # of latencies, disturbed frames, boot position and the hand's angle
+    )
 
     cart_mass: Positive = 0.735  # kg, rotor included
     pole_mass: Positive = 0.129  # kg
@@ -39,37 +41,45 @@ class EmulatorSettings(Settings):
     cogging_pitch: Positive = 0.04  # m, of that ripple: a turn of the pinion
     pole_viscous: NonNegative = 3.0e-4  # N m s
     pole_coulomb: NonNegative = 2.0e-4  # N m
-    pole_drag: NonNegative = 2.5e-5  # N m s^2, against the square of the speed
+    pole_drag: NonNegative = 2.5e-5  # N m s^2, times the square of the angular speed
 
     force_curve: tuple[Coefficient, Coefficient, Coefficient] = (0.0, 0.0198, -0.99)
     # [a, b, c]: F = sign(u) max(0, a u^2 + b |u| + c), N
-    force_asymmetry: Annotated[float, Field(ge=-0.9, le=0.9)] = 0.03  # rightward force is (1 + it) times that
-    deadband_left: MotorValue = 55.0  # motor values down to minus this give no force
-    deadband_right: MotorValue = 60.0  # motor values up to this give no force
+    force_asymmetry: Annotated[float, Field(ge=-0.9, le=0.9)] = (
+        0.03  # the force to the right is multiplied by 1 + this
+    )
+    deadband_left: MotorValue = 55.0  # motor values from minus this to 0 give no force
+    deadband_right: MotorValue = 60.0  # motor values from 0 to this give no force
     motor_time_constant: Annotated[float, Field(ge=0, le=1)] = 0.005  # s, first-order lag of the force
-    latency: Annotated[float, Field(ge=0, le=1)] = 0.003  # s, from a frame's arrival to its effect
-    latency_jitter: Annotated[float, Field(ge=0, le=1)] = 0.001  # s, each latency is up to this more or less
+    latency: Annotated[float, Field(ge=0, le=1)] = 0.003  # s, from a command's arrival to its effect
+    latency_jitter: Annotated[float, Field(ge=0, le=1)] = 0.001  # s, each latency differs by up to this
 
-    track_tilt: Annotated[float, Field(ge=-0.2, le=0.2)] = 0.002  # rad, positive: the right end is lower
-    angle_offset: Annotated[float, Field(ge=-0.5, le=0.5)] = 0.004  # rad, measured angle - true, once homed
+    track_tilt: Annotated[float, Field(ge=-0.2, le=0.2)] = 0.002  # rad; positive if the right end is lower
+    angle_offset: Annotated[float, Field(ge=-0.5, le=0.5)] = (
+        0.004  # rad, measured angle minus true angle after homing
+    )
 
-    frame_loss: Share = 0.0  # share of frames that vanish, in both directions
-    frame_corruption: Share = 0.0  # share of frames that arrive with a wrong byte, in both directions
-    frame_duplication: Share = 0.0  # share of frames that arrive twice, in both directions
-    frame_reordering: Share = 0.0  # share of frames that arrive after the one sent next, in both directions
+    frame_loss: Share = 0.0  # share of frames lost, in each direction
+    frame_corruption: Share = 0.0  # share of frames with a wrong byte, in each direction
+    frame_duplication: Share = 0.0  # share of frames that arrive twice, in each direction
+    frame_reordering: Share = 0.0  # share of frames that arrive after the next one, in each direction
 
-    unplug_at: Positive | None = None  # s since the start: the cable is pulled and the process ends
-    reset_at: Positive | None = None  # s since the start: the firmware boots again
-    stuck_encoder: Literal["none", "cart", "pole"] = "none"  # whose count freezes
-    stuck_at: NonNegative = 0.0  # s since the start: from here on
+    unplug_at: Positive | None = None  # s since the start; the cable is pulled and the process ends
+    reset_at: Positive | None = None  # s since the start; the firmware restarts
+    stuck_encoder: Literal["none", "cart", "pole"] = "none"  # the encoder whose count freezes
+    stuck_at: NonNegative = 0.0  # s since the start; the count freezes then
 
-    boot: Literal["hanging", "anywhere"] = "hanging"  # near the middle and hanging, or anywhere and swinging
-    start: Literal["hanging", "upright"] = "hanging"  # what a person's hand does to the pole before START
-    journal: Path | None = None  # file that gets a line for each command taken and motor value in force
-    physics_step: Annotated[float, Field(ge=1e-5, le=1e-3)] = 5e-4  # s, or just under to fit a period
+    boot: Literal["hanging", "anywhere"] = (
+        "hanging"  # near the middle with a hanging pole, or anywhere with a turning pole
+    )
+    start: Literal["hanging", "upright"] = "hanging"  # upright: a hand holds the pole up before START
+    journal: Path | None = None  # new file for commands carried out and motor values in force
+    physics_step: Annotated[float, Field(ge=1e-5, le=1e-3)] = 5e-4  # s, the longest step of the physics
 
     @model_validator(mode="after")
     def _stuck_at_needs_an_encoder(self) -> Self:
         if self.stuck_at > 0 and self.stuck_encoder == "none":
-            raise ValueError("stuck_at has no effect without an encoder: give stuck_encoder=cart or pole")
+            raise ValueError(
+                "stuck_at has no effect without stuck_encoder: set stuck_encoder=cart or stuck_encoder=pole"
+            )
         return self

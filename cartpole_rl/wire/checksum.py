@@ -6,5 +6,5 @@ CRC_START = 0xFFFF
 
 
 def crc16(data: bytes) -> int:
-    """Checksum of `data`, 0 to 65535. Source: the CRC catalogue's CRC-16/IBM-3740, alias CCITT-FALSE."""
+    """Return the checksum of `data`. Source: CRC-16/IBM-3740 in the CRC catalogue, alias CCITT-FALSE."""
     return binascii.crc_hqx(data, CRC_START)

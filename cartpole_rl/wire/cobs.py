@@ -5,11 +5,11 @@ Source: Cheshire and Baker, "Consistent Overhead Byte Stuffing", IEEE/ACM ToN 7(
 
 from cartpole_rl.errors import FrameError
 
-LONGEST_BLOCK = 0xFF  # a code byte of 0xFF: 254 data bytes follow and no zero stands after them
+LONGEST_BLOCK = 0xFF  # code byte of a block of 254 data bytes that is not followed by a zero
 
 
 def encode(data: bytes) -> bytes:
-    """`data` with every zero replaced; one byte longer for data of up to 254 bytes."""
+    """Return `data` without zeros; it is one byte longer for data of up to 254 bytes."""
     stuffed = bytearray()
     parts = data.split(b"\x00")
     for part in parts:
@@ -25,9 +25,9 @@ def encode(data: bytes) -> bytes:
 
 
 def decode(stuffed: bytes) -> bytes:
-    """The data that `encode` was given. Raises FrameError where a block is cut short or holds a zero."""
+    """Return the data that was encoded. Raises FrameError if a block is cut short or contains a zero."""
     if not stuffed or 0 in stuffed:
-        raise FrameError("stuffed bytes are empty or hold a zero")
+        raise FrameError("stuffed bytes are empty or contain a zero")
     data = bytearray()
     at = 0
     while at < len(stuffed):

@@ -12,12 +12,12 @@ VERSION = 1
 END = b"\x00"
 HEADER_BYTES = 4
 CRC_BYTES = 2
-LONGEST_FRAME = 64  # stuffed bytes without the end; the longest messages, INFO and STATE, take 30
+LONGEST_FRAME = 64  # stuffed bytes without the final 0x00; INFO and STATE, the longest messages, take 30
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One message with the header it travelled in."""
+    """A message with its sequence and flags."""
 
     message: Message
     sequence: int
@@ -26,7 +26,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class Envelope:
-    """A frame whose checksum is right, before its version, type and payload are judged."""
+    """A frame with a right checksum whose version, type and payload are not checked yet."""
 
     version: int
     kind: int
@@ -36,16 +36,16 @@ class Envelope:
 
 
 def encode_frame(message: Message, sequence: int, flags: int = 0) -> bytes:
-    """Bytes for the wire, the ending 0x00 included. `sequence` is taken modulo 256."""
+    """Return the bytes for the wire, including the final 0x00. `sequence` is taken modulo 256."""
     body = bytes((VERSION, message.TYPE, sequence & 0xFF, flags)) + message.pack()
     return cobs.encode(body + crc16(body).to_bytes(CRC_BYTES, "little")) + END
 
 
 def open_envelope(stuffed: bytes) -> Envelope:
-    """The undamaged header and payload in `stuffed`, which comes without its ending 0x00.
+    """Return the header and payload in `stuffed`, which does not include the final 0x00.
 
-    A device that refuses a frame with a reason starts here. Raises FrameError for bad stuffing, a frame
-    cut short or a bad checksum.
+    A cart needs them to refuse a frame with a reason. Raises FrameError for wrong stuffing, a frame that is
+    cut short or a wrong checksum.
     """
     data = cobs.decode(stuffed)
     if len(data) < HEADER_BYTES + CRC_BYTES:
@@ -58,10 +58,10 @@ def open_envelope(stuffed: bytes) -> Envelope:
 
 
 def decode_frame(stuffed: bytes) -> Frame:
-    """The frame in `stuffed`, which comes without its ending 0x00.
+    """Return the frame in `stuffed`, which does not include the final 0x00.
 
-    Raises FrameError for bad stuffing, a frame cut short, a bad checksum, a foreign version,
-    an unknown type or a wrong payload length.
+    Raises FrameError for wrong stuffing, a frame that is cut short, a wrong checksum, another version, an
+    unknown type or a wrong payload length.
     """
     envelope = open_envelope(stuffed)
     if envelope.version != VERSION:
@@ -72,24 +72,24 @@ def decode_frame(stuffed: bytes) -> Frame:
 
 
 class FrameSplitter:
-    """Cuts a byte stream at each 0x00. Memory is bounded: an overlong run is dropped up to the next 0x00."""
+    """Splits a byte stream at each 0x00. Memory is bounded: overlong runs are dropped up to the next 0x00."""
 
     def __init__(self) -> None:
-        self._pending = bytearray()
+        self.pending = bytearray()  # of a frame whose 0x00 has not arrived
         self._dropping = False
-        self.overlong = 0
+        self.overlong = 0  # runs dropped so far
 
     def feed(self, data: bytes) -> Iterator[bytes]:
-        """Yield each whole stuffed frame, without its 0x00; empty ones are skipped."""
+        """Yield each complete stuffed frame without its 0x00; skip empty ones."""
         for byte in data:
             if byte == 0:
-                if self._pending and not self._dropping:
-                    yield bytes(self._pending)
-                self._pending.clear()
+                if self.pending and not self._dropping:
+                    yield bytes(self.pending)
+                self.pending.clear()
                 self._dropping = False
             elif not self._dropping:
-                self._pending.append(byte)
-                if len(self._pending) > LONGEST_FRAME:
-                    self._pending.clear()
+                self.pending.append(byte)
+                if len(self.pending) > LONGEST_FRAME:
+                    self.pending.clear()
                     self._dropping = True
                     self.overlong += 1

@@ -1,4 +1,4 @@
-"""The messages of protocol version 1. Numbers are little-endian; `LAYOUT` is the payload in struct's letters.
+"""The messages of protocol version 1. Numbers are little-endian; `LAYOUT` is a payload in `struct` notation.
 
 Host to cart: HELLO, START, STOP, SET_MOTOR, HOME, CLEAR_FAULT, SET_PERIOD.
 Cart to host: INFO, STATE (each period), ACK, NACK, FAULT.
@@ -13,7 +13,7 @@ from cartpole_rl.errors import FrameError
 
 
 class MessageType(IntEnum):
-    """The frame's type byte. The top bit tells the direction: 0 host to cart, 1 cart to host."""
+    """The type byte of a frame. The top bit is the direction: 0 host to cart, 1 cart to host."""
 
     HELLO = 0x01
     START = 0x02
@@ -30,29 +30,29 @@ class MessageType(IntEnum):
 
 
 class Flags(IntFlag):
-    """The frame's flags byte in frames of the cart; the host sends 0."""
+    """The flags byte of frames from the cart; the host sends 0."""
 
     ARMED = 0x01
     HOMED = 0x02
     HOMING = 0x04
     FAULTED = 0x08
-    SOFT_LIMIT = 0x10  # this period's command was outward beyond the soft limit and was held at 0
-    WATCHDOG = 0x20  # no valid command for more than two periods: motor 0
+    SOFT_LIMIT = 0x10  # the command in force points outward beyond the soft limit and is held at 0
+    WATCHDOG = 0x20  # no SET_MOTOR was accepted for more than two periods; motor 0
 
 
 class Fault(IntFlag):
-    """Latched faults: motor 0 until CLEAR_FAULT."""
+    """Latched faults; the motor is 0 until CLEAR_FAULT."""
 
     NONE = 0
     HARD_LIMIT = 0x0001
     STALL = 0x0002
     CART_ENCODER = 0x0004
     POLE_ENCODER = 0x0008
-    HOMING = 0x0010  # a stop was not found, the span was off by over 3 %, or the pole did not come to rest
+    HOMING = 0x0010  # a stop was not found, the span was wrong by over 3 %, or the pole did not come to rest
 
 
 class Reason(IntEnum):
-    """Why the cart refuses a message."""
+    """The reasons for which the cart refuses a message."""
 
     UNKNOWN_TYPE = 1
     BAD_LENGTH = 2
@@ -65,13 +65,13 @@ class Reason(IntEnum):
 
 
 class Message:
-    """Base of the messages: packs and unpacks its fields in the order in which they stand."""
+    """Base class of the messages; packs and unpacks the fields in their order."""
 
     TYPE: ClassVar[MessageType]
     LAYOUT: ClassVar[str] = ""
 
     def pack(self) -> bytes:
-        """Payload bytes. Raises FrameError where a field does not fit its width."""
+        """Return the payload. Raises FrameError if a field does not fit its width."""
         try:
             return struct.pack("<" + self.LAYOUT, *vars(self).values())
         except struct.error as error:
@@ -79,7 +79,7 @@ class Message:
 
     @classmethod
     def unpack(cls, payload: bytes) -> Self:
-        """The message in `payload`. Raises FrameError for a wrong length or a value that has no meaning."""
+        """Return the message in `payload`. Raises FrameError for a wrong length or an undefined value."""
         if len(payload) != struct.calcsize("<" + cls.LAYOUT):
             raise FrameError(
                 f"{cls.TYPE.name} has {len(payload)} payload bytes, not {struct.calcsize('<' + cls.LAYOUT)}"
@@ -99,21 +99,21 @@ class Hello(Message):
 
 @dataclass(frozen=True)
 class Start(Message):
-    """Arms the motor. Refused unless homed and free of faults."""
+    """Arms the motor. Refused unless the cart is homed and has no fault."""
 
     TYPE = MessageType.START
 
 
 @dataclass(frozen=True)
 class Stop(Message):
-    """Disarms: motor 0. Never refused; ends a homing."""
+    """Sets motor 0, disarms and ends homing. Never refused."""
 
     TYPE = MessageType.STOP
 
 
 @dataclass(frozen=True)
 class SetMotor(Message):
-    """Motor value, -255 to 255, positive to the right."""
+    """Sets the motor value, -255 to 255, positive to the right."""
 
     TYPE = MessageType.SET_MOTOR
     LAYOUT = "h"
@@ -122,21 +122,21 @@ class SetMotor(Message):
 
 @dataclass(frozen=True)
 class Home(Message):
-    """Touches both stops, checks the span, centres, waits for the pole to hang still, sets both zeros."""
+    """Starts homing: touch both stops, check the span, centre, wait until the pole is still, set zeros."""
 
     TYPE = MessageType.HOME
 
 
 @dataclass(frozen=True)
 class ClearFault(Message):
-    """Clears the latched faults. One whose cause still holds comes again once the cart is armed or homes."""
+    """Clears the latched faults. One whose cause persists is latched again on arming or homing."""
 
     TYPE = MessageType.CLEAR_FAULT
 
 
 @dataclass(frozen=True)
 class SetPeriod(Message):
-    """Control period in microseconds; the cart accepts 5000 to 100000, only while disarmed."""
+    """Sets the control period in microseconds, 5000 to 100000. Refused while armed or homing."""
 
     TYPE = MessageType.SET_PERIOD
     LAYOUT = "I"
@@ -145,7 +145,7 @@ class SetPeriod(Message):
 
 @dataclass(frozen=True)
 class Info(Message):
-    """What the cart is. Answers HELLO and SET_PERIOD."""
+    """The properties of the cart. Answers HELLO and SET_PERIOD."""
 
     TYPE = MessageType.INFO
     LAYOUT = "BBBHIhiiI"
@@ -155,14 +155,14 @@ class Info(Message):
     pole_counts_per_turn: int
     cart_nanometres_per_count: int
     motor_limit: int
-    soft_limit_counts: int  # from the middle: outward motion ends here
-    hard_limit_counts: int  # from the middle: HARD_LIMIT is latched here
+    soft_limit_counts: int  # from the middle; outward commands are held at 0 beyond this
+    hard_limit_counts: int  # from the middle; HARD_LIMIT is latched from here on
     period_us: int
 
 
 @dataclass(frozen=True)
 class State(Message):
-    """What the cart measures, once a period. Counts are 0 in the middle of the track and at upright."""
+    """The cart's measurements, once a period. Counts are 0 in the middle of the track and at upright."""
 
     TYPE = MessageType.STATE
     LAYOUT = "IIiihBHH"
@@ -173,12 +173,12 @@ class State(Message):
     motor_applied: int
     last_sequence: int  # of the newest host frame that was accepted
     fault: int
-    command_age_ms: int  # since the newest valid SET_MOTOR, 65535 for none or longer
+    command_age_ms: int  # since the newest accepted SET_MOTOR; 65535 for longer or never
 
 
 @dataclass(frozen=True)
 class Ack(Message):
-    """The host frame of this sequence and type was carried out."""
+    """Reports that the host frame of this sequence and type was carried out."""
 
     TYPE = MessageType.ACK
     LAYOUT = "BB"
@@ -188,7 +188,7 @@ class Ack(Message):
 
 @dataclass(frozen=True)
 class Nack(Message):
-    """The host frame of this sequence and type was refused."""
+    """Reports that the host frame of this sequence and type was refused."""
 
     TYPE = MessageType.NACK
     LAYOUT = "BBB"
@@ -199,7 +199,7 @@ class Nack(Message):
 
 @dataclass(frozen=True)
 class FaultReport(Message):
-    """Sent once when a fault is latched; STATE repeats the bits each period."""
+    """Reports a newly latched fault, once; STATE repeats the bits in each period."""
 
     TYPE = MessageType.FAULT
     LAYOUT = "HI"

@@ -1,77 +1,80 @@
 #!/usr/bin/env python
-"""What each of the means of docs/learning.md is worth: the medium pole, trained without one at a time.
+"""How much does each means of docs/learning.md contribute? Trains the medium pole without one at a time.
 
     scripts/bench/ablation.py --seeds 5 --jobs 2 --json ablation.json
 
-Trainings are half as long as `cartpole-train experiment=medium`, so that a difference shows; all schedules
-shrink with them. Runs go to runs/bench/ablation/<arm>/<seed> and are not trained again when they are there.
+Trainings are half as long as `cartpole-train experiment=medium`, so that differences show; all schedules
+shrink with them. The runs are in runs/bench/ablation/<arm>/<seed>; one that exists is not trained again.
+The figures are those of scripts/bench/learning.py.
 """
 
-import argparse
-import json
-from pathlib import Path
+from typing import Any
 
 import numpy as np
-from learning import REFERENCES, result, train_all
+from common import (
+    RUNS,
+    min_median_max,
+    option_parser,
+    print_table,
+    reference_scores,
+    train_seeds,
+    write_json,
+)
+from learning import seed_result
 
-from cartpole_rl.reporting.table import table
 from cartpole_rl.workflows.build import use_threads
 
 TRANSITIONS = 2_500_000
-ARMS = {
-    "as it is": [],
+ARMS = {  # name: overrides of cartpole-train
+    "default": [],
     "without mirror": ["agent.mirrored=false"],
     "without layer normalization": ["agent.layer_norm=false"],
     "without action gap": ["agent.action_gap=0"],
     "without averaged policy": ["agent.average_decay=null"],
     "single instead of double": ["agent.double=false"],
     "one-step returns": ["learning.n_step=1"],
-    "returns of five whole steps": ["learning.carry=true"],
+    "full five-step returns": ["learning.carry=true"],
     "no resting starts": ["task.start.resting_share=0"],
     "constant learning rate": ["optimizer.learning_rate_end=1"],
     "prioritized replay": ["buffer=prioritized"],
-    "no second tries": ["learning.retry_probability=0"],
+    "no retries": ["learning.retry_probability=0"],
     "rewards twice as large": ["reward.scale=0.1", "reward.track_penalty=10"],
     "without randomization": ["randomization=none"],
 }
 
 
+def row(arm: str, results: list[dict[str, Any]]) -> dict[str, str]:
+    """Return the table row of one arm."""
+    judged = [each["plants"]["medium"] for each in results]
+    reached = [each["transitions_to_reached"] or float("inf") for each in results]
+    return {
+        "arm": arm,
+        **min_median_max([each["fraction"] for each in judged], decimals=3),
+        "drawn carts": f"{np.median([each['drawn'] for each in judged]):.0f}",
+        "failed": f"{100 * np.mean([each['failed'] for each in judged]):.1f} %",
+        "million transitions to 0.9": f"{np.median(reached) / 1e6:.2f}",
+        "kept over 0.85": f"{np.mean([each['kept'] or 0.0 for each in results]):.2f}",
+    }
+
+
 def main() -> None:
-    """Train, judge, print a table, write what was seen."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--arms", nargs="+", choices=list(ARMS), default=list(ARMS))
-    parser.add_argument("--seeds", type=int, default=5)
-    parser.add_argument("--jobs", type=int, default=1, help="trainings at once; 1 where time is measured")
-    parser.add_argument("--json", type=Path, help="file for all figures")
-    given = parser.parse_args()
+    """Train, judge, print a table and write the figures."""
+    parser = option_parser(__doc__)
+    parser.add_argument("--arms", nargs="+", choices=list(ARMS), default=list(ARMS), metavar="ARM")
+    parser.add_argument("--seeds", type=int, default=5, help="trainings of each arm (5)")
+    parser.add_argument("--jobs", type=int, default=1, help="trainings at the same time (1)")
+    options = parser.parse_args()
     use_threads(1)
-    references = {plant: found["score"] for plant, found in json.loads(REFERENCES.read_text()).items()}
+    references = reference_scores()
     everything, rows = {}, []
-    for arm in given.arms:
+    for arm in options.arms:
         words = [f"learning.transitions={TRANSITIONS}", *ARMS[arm]]
-        parent = Path("runs/bench/ablation", arm.replace(" ", "_"))
-        folders = train_all("medium", given.seeds, given.jobs, words, parent)
-        results = [result("medium", folder, references) for folder in folders]
-        everything[arm] = results
-        fractions = [each["plants"]["medium"]["fraction"] for each in results]
-        drawn = [each["plants"]["medium"]["drawn"] for each in results]
-        failed = [each["plants"]["medium"]["failed"] for each in results]
-        reached = [each["transitions_to_reached"] or float("inf") for each in results]
-        rows.append(
-            {
-                "arm": arm,
-                "min": f"{min(fractions):.3f}",
-                "median": f"{np.median(fractions):.3f}",
-                "max": f"{max(fractions):.3f}",
-                "drawn carts": f"{np.median(drawn):.0f}",
-                "failed": f"{100 * np.mean(failed):.1f} %",
-                "million transitions to 0.9": f"{np.median(reached) / 1e6:.2f}",
-                "kept over 0.85": f"{np.mean([each['kept'] or 0.0 for each in results]):.2f}",
-            }
-        )
-        print(table(rows, {key: key for key in rows[0]}), flush=True)
-    if given.json:
-        given.json.write_text(json.dumps(everything, indent=1))
+        parent = RUNS / "ablation" / arm.replace(" ", "_")
+        folders = train_seeds("medium", options.seeds, options.jobs, words, parent)
+        everything[arm] = [seed_result("medium", folder, references) for folder in folders]
+        rows.append(row(arm, everything[arm]))
+        print_table(rows)
+    write_json(options.json, everything)
 
 
 if __name__ == "__main__":

@@ -1,35 +1,32 @@
 #!/usr/bin/env python
-"""Speed of the simulated environment beside its peers', in one process and in turns.
+"""How fast is the simulated environment, beside Gymnasium's CartPole and TorchRL's PendulumEnv?
 
-    scripts/bench/environment.py [--json environment.json] [--threads 1 2] [--seconds 30] [--quick]
+    scripts/bench/environment.py --threads 1 2 --seconds 30 --json environment.json
 
-*Dynamics*: friction, force curve, latency, lag, score (6.2) and reset, compiled, on 8192 carts, one control
-period a call or several fused in one; beside Gymnasium's CartPole vector entry point, which has a constant
-force, no friction and reward 1. Random actions are drawn beforehand, and so are our start states, one for
-each cart and call. Substeps are integration steps a period: 1 is Gymnasium's (and the thesis's own 0.02 s), 4
-is what training takes.
+*Dynamics*: friction, force curve, latency, motor lag, score (6.2) and reset, compiled, on 8192 carts, with
+one control period or several in one call. The peer is Gymnasium's CartPole vector entry point, which has a
+constant force, no friction and reward 1. Actions and start states are drawn in advance. Substeps are
+integration steps in a period: Gymnasium takes 1, training takes 4.
 
-*Environment*: all that training steps through, on 4096 carts: encoders, delays, the hardware transform,
-randomization as in conf/randomization/wide, reset of single carts; beside TorchRL's PendulumEnv, which has
-none of that and never ends. Both by `step_and_maybe_reset` with actions drawn beforehand, and both by
-`rollout` of 32 steps, which draws the actions and stacks what happened.
+*Environment*: everything that training steps through, on 4096 carts: encoders, delays, the hardware
+transform, randomization=wide, reset of single carts. The peer is TorchRL's PendulumEnv, which has none of
+that and never ends. Both are measured with `step_and_maybe_reset`, with actions drawn in advance, and with
+`rollout` over 32 steps, which draws the actions and stacks the results.
 
-Speed is that of the fastest of many rounds of 10 ms, in which the rows take turns: other work on the machine
-slows single rounds, not the fastest. A round begins with a call that is not counted, since the row before
-has left nothing of this one in the caches. Before, every row runs until its episodes end at any time.
+A speed is that of the fastest of many rounds of 10 ms, in which the rows take turns: other work on the
+machine slows single rounds, not the fastest. The first call of a round, which fills the caches, is not
+counted. Before the measurement every row runs until the ends of its episodes are spread over time.
 """
 
-import argparse
-import json
 import time
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
 import torch
+from common import option_parser, write_json
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase, PendulumEnv
@@ -54,13 +51,13 @@ Step = Callable[[], object]
 
 
 class Row(NamedTuple):
-    """One thing whose speed is measured."""
+    """One line of the table: a step function and the row with which it is compared."""
 
     name: str
     carts: int
     periods: int  # in one call
     step: Step
-    peer: str  # the row that it is compared with
+    peer: str  # name of that row
     compile_seconds: float
 
 
@@ -68,28 +65,28 @@ class Row(NamedTuple):
 
 
 class Inputs(NamedTuple):
-    """What a call is given."""
+    """The inputs of one call, drawn in advance."""
 
     table: Tensor  # [P, N] parameters
-    motors: Tensor  # [K, N] a period's motor value each
-    starts: Tensor  # [4, N] where an episode begins that follows one which ended
+    motors: Tensor  # [K, N] motor value in each period
+    starts: Tensor  # [4, N] start states of the episodes that begin in this call
 
 
 class Carts(NamedTuple):
-    """What goes on from one call to the next, [N] each."""
+    """The state kept from one call to the next, [N] each."""
 
     x: Tensor
     x_dot: Tensor
     theta: Tensor
     theta_dot: Tensor
     force: Tensor
-    motor: Tensor  # of the period before
-    steps: Tensor  # of the episode
-    score: Tensor  # of the last call's periods
+    motor: Tensor  # in the previous period
+    steps: Tensor  # since the start of the episode
+    score: Tensor  # sum over the periods of the last call
 
 
 def run_dynamics(carts: Carts, inputs: Inputs, *, substeps: int) -> Carts:
-    """K control periods of N carts, each with its score and the reset of what ended."""
+    """Run K control periods of N carts; score each and reset the carts whose episodes ended."""
     parameters = CartParameters.from_table(inputs.table)
     state, force, motor, steps, total = State(*carts[:4]), carts.force, carts.motor, carts.steps, 0.0
     start = State(*inputs.starts.unbind(0))
@@ -105,8 +102,8 @@ def run_dynamics(carts: Carts, inputs: Inputs, *, substeps: int) -> Carts:
     return Carts(*state, force, motor, steps, total)
 
 
-def dynamics(carts: int, periods: int, substeps: int) -> Row:
-    """The row of our dynamics."""
+def dynamics(carts: int, periods: int, substeps: int, compiled: bool) -> Row:
+    """Return the row of our dynamics."""
     plant = simulated_environment("swingup", carts, "wide").plant
     generator = torch.Generator().manual_seed(0)
     table = plant.randomizer.draw(carts, generator)
@@ -118,13 +115,14 @@ def dynamics(carts: int, periods: int, substeps: int) -> Row:
         )
         for _ in range(4)
     ]
-    run = Compiled(partial(run_dynamics, substeps=substeps))
-    now = Carts(*draws[0].starts, *torch.zeros(4, carts))
+    plain = partial(run_dynamics, substeps=substeps)
+    run = Compiled(plain) if compiled else plain
+    state = Carts(*draws[0].starts, *torch.zeros(4, carts))
     calls = 0
 
     def step() -> None:
-        nonlocal now, calls
-        now = run(now, draws[calls % len(draws)])
+        nonlocal state, calls
+        state = run(state, draws[calls % len(draws)])
         calls += 1
 
     fused = f"{periods} periods a call" if periods > 1 else "1 period a call"
@@ -133,7 +131,7 @@ def dynamics(carts: int, periods: int, substeps: int) -> Row:
 
 
 def cartpole(carts: int) -> Row:
-    """The row of Gymnasium's cart-pole."""
+    """Return the row of Gymnasium's CartPole."""
     env = gymnasium.make_vec("CartPole-v1", num_envs=carts, vectorization_mode="vector_entry_point")
     env.reset(seed=0)
     actions = np.random.default_rng(0).integers(2, size=(16, carts))
@@ -145,7 +143,7 @@ def cartpole(carts: int) -> Row:
 
 
 def stepper(env: EnvBase, present: TensorDictBase, actions: Tensor) -> Step:
-    """Steps with resets from `present` on, through `actions` [K, N, ...] again and again."""
+    """Return a function that steps from `present`, with resets, cycling through `actions` [K, N, ...]."""
     calls = 0
 
     @torch.no_grad()
@@ -159,12 +157,12 @@ def stepper(env: EnvBase, present: TensorDictBase, actions: Tensor) -> Step:
     return step
 
 
-def environments(carts: int) -> list[Row]:
-    """The rows of our environment."""
-    compiled, plain = (simulated_environment("swingup", carts, "wide", each) for each in (True, False))
+def environments(carts: int, compiled: bool) -> list[Row]:
+    """Return the rows of our environment."""
+    fast, plain = (simulated_environment("swingup", carts, "wide", each) for each in (compiled, False))
     actions = torch.randint(len(plain.hardware.motors), (16, carts))
-    step, plain_step = (stepper(env, env.reset(), actions) for env in (compiled, plain))
-    rollout = partial(compiled.rollout, ROLLOUT, break_when_any_done=False)
+    step, plain_step = (stepper(env, env.reset(), actions) for env in (fast, plain))
+    rollout = partial(fast.rollout, ROLLOUT, break_when_any_done=False)
     return [
         Row("environment, step", carts, 1, step, PENDULUM_STEP, seconds(step)),
         Row("environment, rollout", carts, ROLLOUT, rollout, PENDULUM_ROLLOUT, 0.0),
@@ -173,7 +171,7 @@ def environments(carts: int) -> list[Row]:
 
 
 def pendulums(carts: int) -> list[Row]:
-    """The rows of TorchRL's pendulum."""
+    """Return the rows of TorchRL's pendulum."""
     env = PendulumEnv()
     first = env.reset(env.gen_params(batch_size=[carts]), set_state=False)
     step = stepper(env, first.clone(), 4 * torch.rand(16, carts, 1) - 2)
@@ -191,14 +189,14 @@ def pendulums(carts: int) -> list[Row]:
 
 
 def seconds(step: Step) -> float:
-    """How long one call takes."""
+    """Return the seconds of one call."""
     started = time.perf_counter()
     step()
     return time.perf_counter() - started
 
 
 def seconds_a_call(step: Step, length: float) -> float:
-    """Mean of the calls that fit into a round of `length` s, after one that fills the caches."""
+    """Return the mean seconds of the calls in a round of `length` s, without the first call."""
     step()
     calls, started, passed = 0, time.perf_counter(), 0.0
     while calls == 0 or passed < length:
@@ -208,7 +206,7 @@ def seconds_a_call(step: Step, length: float) -> float:
 
 
 def fastest(rows: list[Row], budget: float) -> dict[str, float]:
-    """Periods of one cart a second, by the row's name, from rounds over `budget` s."""
+    """Return cart periods per second by row name, from rounds over `budget` s."""
     best = dict.fromkeys((row.name for row in rows), np.inf)
     ends = time.perf_counter() + budget
     while time.perf_counter() < ends or np.inf in best.values():
@@ -218,11 +216,11 @@ def fastest(rows: list[Row], budget: float) -> dict[str, float]:
 
 
 def measure(threads: int, budget: float, quick: bool) -> list[dict[str, Any]]:
-    """All rows with `threads` threads of torch; Gymnasium's NumPy takes one."""
+    """Measure all rows with `threads` torch threads; Gymnasium's NumPy uses one."""
     torch.set_num_threads(threads)
     wide, whole = (64, 32) if quick else (8192, 4096)
-    rows = [cartpole(wide), *(dynamics(wide, *fused) for fused in ((1, 1), (1, 4), (8, 1)))]
-    rows += [*pendulums(whole), *environments(whole)]
+    rows = [cartpole(wide), *(dynamics(wide, *each, not quick) for each in ((1, 1), (1, 4), (8, 1)))]
+    rows += [*pendulums(whole), *environments(whole, not quick)]
     for row in rows:
         for _ in range(1 if quick else MIXING // row.periods):
             row.step()
@@ -242,7 +240,7 @@ def measure(threads: int, budget: float, quick: bool) -> list[dict[str, Any]]:
 
 
 def show(results: list[dict[str, Any]]) -> str:
-    """The table of the results."""
+    """Return the table of the results."""
     lines = [{**result, "millions": result["steps_per_second"] / 1e6} for result in results]
     columns = {
         "name": "",
@@ -250,26 +248,26 @@ def show(results: list[dict[str, Any]]) -> str:
         "threads": "threads",
         "millions": "million steps/s",
         "ratio": "ratio",
-        "peer": "to",
+        "peer": "compared with",
         "compile_seconds": "first call, s",
     }
     return table(lines, columns)
 
 
 def main() -> None:
-    """Measure, print, write."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the results there")
+    """Measure, print a table and write the figures."""
+    parser = option_parser(__doc__)
+    parser.add_argument("--threads", type=int, nargs="+", default=[1, 2], help="torch threads (1 2)")
     parser.add_argument(
-        "--threads", type=int, nargs="+", default=[1, 2], help="threads of torch (default: 1 2)"
+        "--seconds", type=float, default=30.0, help="of measurement for each number of threads (30)"
     )
-    parser.add_argument("--seconds", type=float, default=30.0, help="of rounds for each number of threads")
-    parser.add_argument("--quick", action="store_true", help="few carts and rounds: only that it runs")
+    parser.add_argument(
+        "--quick", action="store_true", help="only check that it runs: few carts, one round, nothing compiled"
+    )
     options = parser.parse_args()
     results = [row for threads in options.threads for row in measure(threads, options.seconds, options.quick)]
     print(show(results))
-    if options.json:
-        options.json.write_text(json.dumps(results, indent=2) + "\n")
+    write_json(options.json, results)
 
 
 if __name__ == "__main__":

@@ -1,31 +1,26 @@
 #!/usr/bin/env python
-"""Identification judged by truths: the tables of docs/identification.md.
+"""How accurate is identification? The tables of docs/identification.md.
 
     scripts/bench/identification.py --truths 20 --json identification.json
 
-The numbers of each emulated cart are drawn at random about the nominal cart's; `cartpole-identify` drives it,
-and what it found is held against what was drawn. Runs go to runs/bench/identify/<number> and are not made
-again when they are there.
+Draws emulated carts about the nominal one, runs `cartpole-identify` on each, and compares what it found
+with the truth. The runs are in runs/bench/identify/<number>; one that exists is not made again.
 """
 
-import argparse
-import json
 import math
-import subprocess
-import sys
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
+from common import RUNS, failure, option_parser, print_table, read_json, write_json
+from truths import identification_truths, overrides
 
 from cartpole_rl.choices import choice
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.identification.quantities import quantities
 from cartpole_rl.physics.parameters import CartParameters
-from cartpole_rl.reporting.table import table
 
-SEED = 2026
-WANTED = {  # quantity: largest median error, and whether it is a share (of the truth) or an amount
+TARGETS = {  # quantity: target of the median error, and whether errors are relative to the truth
     "pole_frequency": (0.01, True),
     "force_gain": (0.03, True),
     "viscous": (0.10, True),
@@ -34,52 +29,11 @@ WANTED = {  # quantity: largest median error, and whether it is a share (of the 
     "latency": (3.0, False),  # ms
     "deadband": (0.15, True),
 }
-WITHIN = 0.85  # of the truths lie in their intervals
-
-
-def draw_truth(random: np.random.Generator) -> dict[str, object]:
-    """`emulator.*` of one cart."""
-
-    def factor(low: float, high: float) -> float:
-        return float(np.exp(random.uniform(math.log(low), math.log(high))))
-
-    def between(low: float, high: float) -> float:
-        return float(random.uniform(low, high))
-
-    usual = EmulatorSettings()
-    friction, side, damping, gain = factor(0.3, 3), between(-0.15, 0.15), factor(0.1, 3), between(0.75, 1.25)
-    pole = between(0.8, 1.2)
-    return {
-        "cart_mass": 0.703 * between(0.8, 1.2),
-        "pole_mass": 0.127 * pole,
-        "pole_com": 0.1778,
-        "pole_inertia": 1.199e-3 * pole,
-        "cart_viscous": 0.5 * factor(0.3, 3),
-        "cart_coulomb_left": 0.5 * friction * (1 - side),
-        "cart_coulomb_right": 0.5 * friction * (1 + side),
-        "cart_stiction_ratio": between(1.0, 1.8),
-        "pole_viscous": damping * usual.pole_viscous,
-        "pole_coulomb": damping * usual.pole_coulomb,
-        "pole_drag": damping * usual.pole_drag,
-        "force_curve": [0.0, 0.02 * gain, -1.0 * gain],
-        "force_asymmetry": between(-0.1, 0.1),
-        "deadband_left": between(0, 60),
-        "deadband_right": between(0, 60),
-        "motor_time_constant": between(0, 0.03),
-        "latency": between(0, 0.03),
-        "latency_jitter": 0.001,
-        "track_tilt": math.radians(between(-0.5, 0.5)),
-        "angle_offset": math.radians(between(-1, 1)),
-    }
-
-
-def overrides(truth: dict[str, object]) -> list[str]:
-    """The words that make an emulated cart so."""
-    return [f"emulator.{name}={value}" for name, value in truth.items()]
+COVERAGE = 0.85  # target: share of the true values that lie in their intervals
 
 
 def true_quantities(truth: dict[str, object]) -> dict[str, float]:
-    """What should be found."""
+    """Return the true values of the quantities that identification reports."""
     settings = EmulatorSettings(**truth).model_dump()
     left, right = settings["cart_coulomb_left"], settings["cart_coulomb_right"]
     a, b, c = settings["force_curve"]
@@ -92,68 +46,75 @@ def true_quantities(truth: dict[str, object]) -> dict[str, float]:
     return {each.name: each.value for each in quantities(cart)}
 
 
-def identified(number: int, truth: dict[str, object]) -> dict[str, object] | None:
-    """What `cartpole-identify` found; None where it said that it cannot."""
-    folder = Path("runs/bench/identify", f"{number:02d}")
+def identify(number: int, truth: dict[str, object]) -> dict[str, Any] | None:
+    """Return the identification.json of one cart; None if `cartpole-identify` refused."""
+    folder = RUNS / "identify" / f"{number:02d}"
     if not (folder / "identification.json").exists():
-        command = [Path(sys.executable).with_name("cartpole-identify"), "plant=emulated", *overrides(truth)]
-        done = subprocess.run(
-            [*command, f"emulator.seed={number}", f"hydra.run.dir={folder}"],
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        if done.returncode:
-            print(f"{number}: {done.stderr.strip().splitlines()[-1]}", flush=True)
+        words = ["plant=emulated", *overrides(truth), f"emulator.seed={number}", f"hydra.run.dir={folder}"]
+        if error := failure("identify", *words):
+            print(f"cart {number}: {error}", flush=True)
             return None
         (folder / "truth.yaml").write_text(yaml.safe_dump(truth))
-    return json.loads((folder / "identification.json").read_text())
+    return read_json(folder / "identification.json")
+
+
+def compare(found: dict[str, Any], true: dict[str, float]) -> dict[str, tuple[float, bool]]:
+    """Return each quantity's error, and whether its true value lies in its interval."""
+    compared = {}
+    for name, (_, relative) in TARGETS.items():
+        reported = found["quantities"][name]
+        error = abs(reported["value"] - true[name]) / (abs(true[name]) if relative else 1)
+        compared[name] = (error, reported["low"] <= true[name] <= reported["high"])
+    return compared
+
+
+def quantity_row(name: str, compared: list[dict[str, tuple[float, bool]]]) -> dict[str, str]:
+    """Return the table row of one quantity."""
+    target, relative = TARGETS[name]
+    scale, unit = (100, "%") if relative else (1, "ms")
+    errors, inside = zip(*(each[name] for each in compared), strict=True)
+    return {
+        "quantity": name,
+        "median error": f"{np.median(errors) * scale:.2f} {unit}",
+        "worst": f"{np.max(errors) * scale:.2f}",
+        "target": f"{target * scale:g}",
+        "in its interval": f"{100 * np.mean(inside):.0f} %",
+    }
+
+
+def print_summary(results: list[dict[str, Any]], refused: int) -> None:
+    """Print the table, the coverage of the intervals and the held-out errors."""
+    compared = [compare(result["found"], result["true"]) for result in results]
+    print_table([quantity_row(name, compared) for name in TARGETS])
+    covered = np.mean([inside for each in compared for _, inside in each.values()])
+    print(
+        f"true values in their intervals: {100 * covered:.0f} % (target {100 * COVERAGE:.0f} %); "
+        f"carts refused: {refused}"
+    )
+    held_out = [result["found"]["held_out_1_s"] for result in results]
+    errors = [(1e3 * each["x_m"], math.degrees(each["theta_rad"])) for each in held_out]
+    for label, (x, theta) in {"median": np.median(errors, axis=0), "worst": np.max(errors, axis=0)}.items():
+        print(f"held-out prediction over 1 s, {label} cart: {x:.2f} mm, {theta:.2f} degrees")
 
 
 def main() -> None:
-    """Identify every cart, print a table, write what was seen."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--truths", type=int, default=20)
-    parser.add_argument("--json", type=Path, help="file for all figures")
-    given = parser.parse_args()
-    random = np.random.default_rng(SEED)
-    errors: dict[str, list[float]] = {name: [] for name in WANTED}
-    inside: dict[str, list[bool]] = {name: [] for name in WANTED}
-    held_out, refused, everything = [], 0, []
-    for number in range(given.truths):
-        truth = draw_truth(random)
-        found = identified(number, truth)
+    """Identify every cart, print a summary and write the figures."""
+    parser = option_parser(__doc__)
+    parser.add_argument("--truths", type=int, default=20, help="number of carts (20)")
+    options = parser.parse_args()
+    results, refused = [], 0
+    for number, truth in enumerate(identification_truths(options.truths)):
+        found = identify(number, truth)
         if found is None:
             refused += 1
             continue
         true = true_quantities(truth)
-        for name, (_, share) in WANTED.items():
-            told = found["quantities"][name]
-            errors[name].append(abs(told["value"] - true[name]) / (abs(true[name]) if share else 1))
-            inside[name].append(told["low"] <= true[name] <= told["high"])
-        held_out.append(
-            (1e3 * found["held_out_1_s"]["x_m"], math.degrees(found["held_out_1_s"]["theta_rad"]))
-        )
-        everything.append({"truth": truth, "true": true, "found": found})
-        print(number, {name: round(values[-1], 4) for name, values in errors.items()}, flush=True)
-    rows = [
-        {
-            "quantity": name,
-            "median error": f"{np.median(errors[name]) * (100 if share else 1):.2f} {'%' if share else 'ms'}",
-            "worst": f"{np.max(errors[name]) * (100 if share else 1):.2f}",
-            "wanted": f"{wanted * (100 if share else 1):g}",
-            "in its interval": f"{100 * np.mean(inside[name]):.0f} %",
-        }
-        for name, (wanted, share) in WANTED.items()
-    ]
-    print(table(rows, {key: key for key in rows[0]}))
-    share_inside = np.mean([value for values in inside.values() for value in values])
-    x, theta = np.median(held_out, axis=0)
-    print(f"in their intervals: {100 * share_inside:.0f} % (wanted {100 * WITHIN:.0f} %); refused: {refused}")
-    worst = np.max(held_out, axis=0).round(2)
-    print(f"held out, 1 s: {x:.2f} mm and {theta:.2f} deg in the median, {worst} in the worst")
-    if given.json:
-        given.json.write_text(json.dumps(everything, indent=1))
+        results.append({"truth": truth, "true": true, "found": found})
+        errors = {name: round(error, 4) for name, (error, _) in compare(found, true).items()}
+        print(f"cart {number}: errors {errors}", flush=True)
+    if results:
+        print_summary(results, refused)
+    write_json(options.json, results)
 
 
 if __name__ == "__main__":

@@ -1,19 +1,18 @@
 #!/usr/bin/env python
-"""Stable-Baselines3's DQN beside ours: seconds until each holds 0.9 of the reference on the medium pole.
+"""How much faster than Stable-Baselines3's DQN does cartpole-train learn the medium pole?
 
     pip install "stable-baselines3>=2.7"
     scripts/bench/peer.py --seeds 3 --times 10 --json peer.json
 
-Both learn on the same simulated carts with the same observation, reward and randomization, theirs through the
-Gymnasium registration (the vector entry point), and are judged on the nominal cart from the same 20 starts.
-Its settings are the best of those that were tried by hand: see SETTINGS. Ours is `cartpole-train
-experiment=medium`. One training at a time, `--threads` for each.
+Measures the seconds until the score reaches 0.9 of the reference. Both train on the same simulated carts
+with the same observation, reward and randomization, Stable-Baselines3 through the Gymnasium registration
+(the vector entry point), and both are judged on the nominal cart from the same 20 starts. The settings of
+Stable-Baselines3 (SETTINGS in this file) are the best of those tried by hand; ours are `cartpole-train
+experiment=medium`. One training runs at a time.
 """
 
-import argparse
 import json
 import math
-import subprocess
 import sys
 import tempfile
 import time
@@ -22,11 +21,11 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from common import option_parser, print_table, reference_scores, run_once, write_json
 from tensordict import TensorDict
 
 from cartpole_rl.envs.gymnasium import simulated_environment
 from cartpole_rl.evaluation.episodes import run_batch
-from cartpole_rl.reporting.table import table
 from cartpole_rl.settings import evaluation_seed
 from cartpole_rl.workflows.build import use_threads
 
@@ -35,11 +34,9 @@ try:
     from stable_baselines3.common.callbacks import BaseCallback
     from stable_baselines3.common.vec_env import VecEnv
 except ModuleNotFoundError as error:
-    sys.exit(
-        f'peer.py: {error}; the peer is no part of an installation: pip install "stable-baselines3>=2.7"'
-    )
+    sys.exit(f'peer.py: {error}; install it: pip install "stable-baselines3>=2.7"')
 
-REFERENCE = json.loads(Path(__file__).with_name("references.json").read_text())["medium"]["score"]
+REFERENCE = reference_scores()["medium"]
 REACHED = 0.9
 STARTS = 20
 SETTINGS: dict[str, Any] = {
@@ -61,7 +58,7 @@ CARTS, UPDATES, TRANSITIONS = 128, 16, 20_000_000
 
 
 class ManyCarts(VecEnv):
-    """Gymnasium's vector entry point as Stable-Baselines3 wants it."""
+    """Gymnasium's vector entry point behind the interface of Stable-Baselines3."""
 
     def __init__(self, carts: int, seed: int) -> None:
         self.carts = gymnasium.make_vec(
@@ -76,55 +73,55 @@ class ManyCarts(VecEnv):
         super().__init__(carts, self.carts.single_observation_space, self.carts.single_action_space)
 
     def reset(self) -> np.ndarray:
-        """First observations [N, K]."""
+        """Return the first observations [N, K]."""
         observation, _ = self.carts.reset(seed=self.first_seed)
         self.first_seed = None
         return observation
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Keep the actions."""
+        """Store the actions [N] for step_wait."""
         self.actions = actions
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        """Observations [N, K], rewards [N], ends [N], what the end looked like."""
-        observation, reward, terminated, truncated, seen = self.carts.step(self.actions)
+        """Return observations [N, K], rewards [N], done [N] and the final observations of done rows."""
+        observation, reward, terminated, truncated, extra = self.carts.step(self.actions)
         done = terminated | truncated
         info: list[dict[str, Any]] = [{} for _ in done]
         for row in np.flatnonzero(done):
             info[row] = {
-                "terminal_observation": seen["final_obs"][row],
+                "terminal_observation": extra["final_obs"][row],
                 "TimeLimit.truncated": bool(truncated[row]),
             }
         return observation, reward, done, info
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Do nothing: no resource is open."""
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """The same for each cart."""
+        """Return the same value for each cart."""
         return [getattr(self.carts, attr_name, None)] * self.num_envs
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Carts have no attributes of their own."""
+        """Raise NotImplementedError: single carts have no attributes."""
         raise NotImplementedError
 
     def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
-        """Carts have no methods of their own."""
+        """Raise NotImplementedError: single carts have no methods."""
         raise NotImplementedError
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-        """No."""
+        """Return False for each cart."""
         return [False] * self.num_envs
 
 
 class Judge(BaseCallback):
-    """Evaluates at intervals with the clock stopped, and ends at `REACHED` or after `limit` s."""
+    """Evaluates at intervals with the clock stopped; ends the training at `REACHED` or after `limit` s."""
 
     def __init__(self, every: int, limit: float) -> None:
         super().__init__()
         self.every, self.limit = every, limit
         self.env = simulated_environment("swingup", STARTS)
-        self.course: list[dict[str, float]] = []
+        self.history: list[dict[str, float]] = []
         self.judging, self.started, self.next = 0.0, time.perf_counter(), every
 
     def _on_step(self) -> bool:
@@ -137,7 +134,7 @@ class Judge(BaseCallback):
         score = float(np.mean([episode.score.sum() for episode in episodes]))
         seconds = now - self.started - self.judging
         self.judging += time.perf_counter() - now
-        self.course.append({"transitions": self.num_timesteps, "seconds": seconds, "score": score})
+        self.history.append({"transitions": self.num_timesteps, "seconds": seconds, "score": score})
         print(
             f"{self.num_timesteps} transitions, {seconds:.0f} s, score {score:.0f}",
             file=sys.stderr,
@@ -146,7 +143,7 @@ class Judge(BaseCallback):
         return score < REACHED * REFERENCE and seconds < self.limit
 
     def policy(self, present: TensorDict) -> TensorDict:
-        """Greedy actions."""
+        """Add greedy actions."""
         import torch
 
         action, _ = self.model.predict(present["observation"].numpy(), deterministic=True)
@@ -154,60 +151,59 @@ class Judge(BaseCallback):
 
 
 def theirs(seed: int, limit: float) -> list[dict[str, float]]:
-    """Course of a training by Stable-Baselines3."""
+    """Return the evaluations of a training by Stable-Baselines3."""
     model = DQN("MlpPolicy", ManyCarts(CARTS, seed), seed=seed, gradient_steps=UPDATES, **SETTINGS)
     judge = Judge(200_000, limit)
     model.learn(TRANSITIONS, callback=judge)
-    return judge.course
+    return judge.history
 
 
 def ours(seed: int, threads: int) -> list[dict[str, float]]:
-    """Course of a training by cartpole-train."""
+    """Return the evaluations of a training by cartpole-train."""
     with tempfile.TemporaryDirectory() as folder:
-        command = [Path(sys.executable).with_name("cartpole-train"), "experiment=medium", f"seed={seed}"]
-        subprocess.run(
-            [*command, f"threads={threads}", f"hydra.run.dir={folder}"], check=True, capture_output=True
-        )
-        return [json.loads(line) for line in (Path(folder) / "history.jsonl").read_text().splitlines()]
+        run = run_once(Path(folder), "train", "experiment=medium", f"seed={seed}", f"threads={threads}")
+        return [json.loads(line) for line in (run / "history.jsonl").read_text().splitlines()]
 
 
-def seconds_to_reached(course: list[dict[str, float]]) -> float:
-    """When 0.9 first holds; infinite if it never does."""
-    return next((each["seconds"] for each in course if each["score"] >= REACHED * REFERENCE), math.inf)
+def seconds_to_reached(history: list[dict[str, float]]) -> float:
+    """Return when the score first reaches 0.9 of the reference; infinity if it never does."""
+    return next((each["seconds"] for each in history if each["score"] >= REACHED * REFERENCE), math.inf)
+
+
+def row(seed: int, own: float, peers: list[dict[str, float]], times: float, limit: float) -> dict[str, str]:
+    """Return the table row of one seed; `own` is our seconds, `peers` the evaluations of the peer."""
+    peer = seconds_to_reached(peers)
+    best = max(each["score"] for each in peers) / REFERENCE
+    unreached = f"over {times:.1f}" if math.isfinite(own) else "neither"
+    return {
+        "seed": str(seed),
+        "ours, s": f"{own:.0f}" if math.isfinite(own) else "never",
+        "Stable-Baselines3, s": f"{peer:.0f}" if math.isfinite(peer) else f"not in {limit:.0f}",
+        "its best fraction": f"{best:.3f}",
+        "ratio": f"{peer / own:.1f}" if math.isfinite(peer) else unreached,
+    }
 
 
 def main() -> None:
-    """Train both, seed by seed, print a table, write what was seen."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seeds", type=int, default=3, help="seeds 0 to this less one")
-    parser.add_argument("--times", type=float, default=10, help="theirs is given up after so many times ours")
-    parser.add_argument("--threads", type=int, default=1, help="of torch, for each training")
-    parser.add_argument("--json", type=Path, help="file for the courses")
-    given = parser.parse_args()
-    use_threads(given.threads)
+    """Train both, seed by seed, print a table and write the figures."""
+    parser = option_parser(__doc__)
+    parser.add_argument("--seeds", type=int, default=3, help="trainings of each (3)")
+    parser.add_argument(
+        "--times", type=float, default=10, help="stop the peer after this many times our seconds (10)"
+    )
+    parser.add_argument("--threads", type=int, default=1, help="torch threads of each training (1)")
+    options = parser.parse_args()
+    use_threads(options.threads)
     everything, rows = {}, []
-    for seed in range(given.seeds):
-        course = ours(seed, given.threads)
-        own = seconds_to_reached(course)
-        limit = given.times * min(own, course[-1]["seconds"])  # of all of ours where it never got there
+    for seed in range(options.seeds):
+        history = ours(seed, options.threads)
+        own = seconds_to_reached(history)
+        limit = options.times * min(own, history[-1]["seconds"])  # our whole training if it never got there
         peers = theirs(seed, limit)
-        everything[seed] = {"ours": course, "stable-baselines3": peers}
-        peer = seconds_to_reached(peers)
-        best = max(each["score"] for each in peers) / REFERENCE
-        beyond = f"over {given.times:.1f}" if math.isfinite(own) else "neither"
-        ratio = f"{peer / own:.1f}" if math.isfinite(peer) else beyond
-        rows.append(
-            {
-                "seed": str(seed),
-                "ours, s": f"{own:.0f}" if math.isfinite(own) else "never",
-                "Stable-Baselines3, s": f"{peer:.0f}" if math.isfinite(peer) else f"not in {limit:.0f}",
-                "its best fraction": f"{best:.3f}",
-                "ratio": ratio,
-            }
-        )
-        print(table(rows, {key: key for key in rows[0]}), flush=True)
-    if given.json:
-        given.json.write_text(json.dumps(everything, indent=1))
+        everything[seed] = {"ours": history, "stable-baselines3": peers}
+        rows.append(row(seed, own, peers, options.times, limit))
+        print_table(rows)
+    write_json(options.json, everything)
 
 
 if __name__ == "__main__":

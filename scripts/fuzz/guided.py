@@ -1,20 +1,20 @@
 #!/usr/bin/env python
-"""Coverage-guided fuzzing of both sides of the wire.
+"""Coverage-guided fuzzing of both sides of the wire, with libFuzzer.
 
-    pip install atheris       # libFuzzer for Python; no dependency of this project
+    pip install atheris       # libFuzzer for Python; not a dependency of this project
     scripts/fuzz/guided.py cart corpus/cart -max_total_time=300
     scripts/fuzz/guided.py host corpus/host -max_total_time=300
     coverage run --branch scripts/fuzz/guided.py --replay cart corpus/cart     # needs no atheris
 
-An input is a list of steps for one side: raw bytes, sound frames of any type with any payload, and between
-them periods that pass with any encoder counts (cart), or calls of any method (host). Sound frames get the
-fuzzer past the checksum, to the state machines. What libFuzzer prints says what was reached (`cov`, `ft`)
-and the memory (`rss`); options that begin with `-` are its own. An input that breaks a rule is left as
-`crash-...`.
+An input is a list of steps for one side: raw bytes, valid frames of any type with any payload, and between
+them periods with any encoder counts (cart) or calls of any method (host). Valid frames take the fuzzer past
+the checksum to the state machines. libFuzzer prints what was reached (`cov`, `ft`) and the memory (`rss`);
+options that begin with `-` are its own. An input that breaks a rule is saved as `crash-...`.
 
-The rules. Cart: no exception; the motor is 0 unless it is armed or homing; 0 in the third period without a
-command; what is no sound frame changes nothing and is not answered. Host: no exception but those of
-`errors.py`; no motor value other than 0 goes out but one that was asked for; what it keeps stays small.
+Rules for the cart: no exception; the motor is 0 unless the cart is armed or homing; the motor is 0 in the
+third period without a command; bytes that are not a valid frame change nothing and get no answer. Rules for
+the host: no exception outside `errors.py`; no motor value other than 0 is sent unless it was requested; its
+buffers stay small.
 """
 
 import contextlib
@@ -34,7 +34,8 @@ if "--replay" not in sys.argv:
 
 with fuzzer.instrument_imports(include=LIBRARIES) if fuzzer else contextlib.nullcontext():
     from cartpole_rl.emulator.firmware import HOST_MESSAGES, WATCHDOG_PERIODS, Firmware
-    from cartpole_rl.plants import serial_cart, serial_link
+    from cartpole_rl.plants.serial import cart as serial_cart
+    from cartpole_rl.plants.serial import link as serial_link
     from cartpole_rl.wire import Flags, FrameSplitter, SetMotor, Start, State, cobs, decode_frame
     from cartpole_rl.wire.checksum import crc16
     from cartpole_rl.wire.frames import END, LONGEST_FRAME, open_envelope
@@ -53,28 +54,28 @@ class Steps:
 
     @property
     def left(self) -> bool:
-        """Whether there is more."""
+        """Whether bytes are left."""
         return self._at < len(self._data)
 
     def take(self, count: int) -> bytes:
-        """The next bytes, zeros past the end."""
+        """Return the next bytes, zeros past the end."""
         taken = self._data[self._at : self._at + count]
         self._at += count
         return taken.ljust(count, b"\0")
 
     def number(self, count: int = 1) -> int:
-        """The next number, signed where it has more than a byte."""
+        """Return the next number, signed if it has more than one byte."""
         return int.from_bytes(self.take(count), "little", signed=count > 1)
 
 
-def sound(version: int, kind: int, sequence: int, flags: int, payload: bytes) -> bytes:
-    """A frame with a right checksum, without its ending 0x00."""
+def valid_frame(version: int, kind: int, sequence: int, flags: int, payload: bytes) -> bytes:
+    """Return a frame with a right checksum, without its final 0x00."""
     body = bytes((version, kind, sequence, flags)) + payload
     return cobs.encode(body + crc16(body).to_bytes(2, "little"))
 
 
 def cart(data: bytes) -> None:
-    """One input to a firmware."""
+    """Feed one input to a firmware."""
     steps, firmware, splitter = Steps(data), Firmware(lambda: 3_000), FrameSplitter()
     firmware.homed = bool(steps.number() & 1)
     now_us = carts = poles = silent = 0
@@ -89,12 +90,14 @@ def cart(data: bytes) -> None:
                     if not opens(stuffed):
                         assert not answers
                         assert before == (firmware.armed, firmware.homing, firmware.fault)
-                assert len(splitter._pending) <= LONGEST_FRAME
+                assert len(splitter.pending) <= LONGEST_FRAME
             case 1:
                 kinds = tuple(HOST_MESSAGES)
                 kind, size = kinds[steps.number() % len(kinds)], (0, 0, 2, 2, 4, 4, 1, 3)[steps.number() % 8]
                 fed = firmware.armed
-                for answer in firmware.receive(sound(1, kind, steps.number(), 0, steps.take(size)), now_us):
+                for answer in firmware.receive(
+                    valid_frame(1, kind, steps.number(), 0, steps.take(size)), now_us
+                ):
                     decode_frame(answer[:-1])
                 if fed and kind in (SetMotor.TYPE, Start.TYPE):
                     silent = 0
@@ -103,7 +106,7 @@ def cart(data: bytes) -> None:
             case 2:
                 version, kind, size = steps.number(), steps.number(), steps.number() % 12
                 firmware.receive(
-                    sound(version, kind, steps.number(), steps.number(), steps.take(size)), now_us
+                    valid_frame(version, kind, steps.number(), steps.number(), steps.take(size)), now_us
                 )
             case _:
                 periods, step_cart, step_pole = 1 + steps.number() % 32, steps.number(2), steps.number(2)
@@ -117,20 +120,20 @@ def cart(data: bytes) -> None:
                     now_us, silent = end_us, silent + 1
                     assert armed or driven == {0}, "the motor ran while it was neither armed nor homing"
                     if firmware.armed and not firmware.homing and silent > WATCHDOG_PERIODS:
-                        assert driven == {0}, "the watchdog slept"
+                        assert driven == {0}, "the watchdog did not stop the motor"
                     if not firmware.armed and not firmware.homing:
                         assert isinstance(state, State)
                         assert state.motor_applied == 0
 
 
 def in_force(values: list[tuple[int, int]], end_us: int) -> set[int]:
-    """The motor values that hold for longer than nothing."""
+    """Return the motor values that are in force for a nonzero time."""
     ends = [since for since, _ in values[1:]] + [end_us]
     return {value for (since, value), end in zip(values, ends, strict=True) if end > since}
 
 
 def opens(stuffed: bytes) -> bool:
-    """Whether the checksum lets a run of bytes through."""
+    """Return whether the checksum of a run of bytes is right."""
     try:
         open_envelope(stuffed)
     except FrameError:
@@ -139,39 +142,39 @@ def opens(stuffed: bytes) -> bool:
 
 
 class Wire:
-    """A port in memory whose cart answers each write with the input's next bytes and frames."""
+    """A port in memory; its cart answers each write with the next bytes and frames of the input."""
 
     port = "memory"
 
     def __init__(self, steps: Steps) -> None:
         self._steps, self._inward = steps, b""
         self._splitter = FrameSplitter()
-        self.asked = 0  # the motor value that may go out
+        self.requested = 0  # the motor value that may be sent
         self._tick = 0
 
     @property
     def in_waiting(self) -> int:
-        """Bytes that can be read."""
+        """Number of bytes that can be read."""
         return len(self._inward)
 
     def read(self, count: int) -> bytes:
-        """Bytes that have come; none where none have."""
+        """Return up to `count` bytes that have arrived."""
         data, self._inward = self._inward[:count], self._inward[count:]
         return data
 
     def write(self, data: bytes) -> None:
-        """Look at what the host sends, and answer it."""
+        """Check what the host sends, and answer it."""
         sequence = 0
         for stuffed in self._splitter.feed(data):
             frame = decode_frame(stuffed)
             sequence = frame.sequence
             if isinstance(frame.message, SetMotor):
-                assert frame.message.motor in (0, self.asked), "a motor value that nobody asked for"
+                assert frame.message.motor in (0, self.requested), "the motor value was not requested"
         for _ in range(self._steps.number() % 4):
             self._inward += self._answer(sequence)
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Do nothing: no resource is open."""
 
     def _answer(self, sequence: int) -> bytes:
         steps = self._steps
@@ -180,24 +183,27 @@ class Wire:
                 return steps.take(steps.number() % 40)
             case 1:
                 kind, size = CART_TYPES[steps.number() % 5], steps.number() % 32
-                return sound(1, kind, steps.number(), steps.number(), steps.take(size)) + END
+                return valid_frame(1, kind, steps.number(), steps.number(), steps.take(size)) + END
             case 2:
                 info = bytes((1, 0, 0)) + (4096).to_bytes(2, "little") + (22749).to_bytes(4, "little")
-                return sound(1, 0x81, 0, 0, info + steps.take(14)) + END
+                return valid_frame(1, 0x81, 0, 0, info + steps.take(14)) + END
             case 3:
-                return sound(1, 0x83, 0, 0, bytes((sequence, steps.number() % 8))) + END
+                return valid_frame(1, 0x83, 0, 0, bytes((sequence, steps.number() % 8))) + END
             case 4:
-                return sound(1, 0x84, 0, 0, bytes((sequence, steps.number() % 8, steps.number() % 12))) + END
+                return (
+                    valid_frame(1, 0x84, 0, 0, bytes((sequence, steps.number() % 8, steps.number() % 12)))
+                    + END
+                )
             case _:
                 self._tick = (self._tick + steps.number() % 40 - 4) % 2**32
                 counts = steps.take(8) + (0).to_bytes(2, "little") + bytes((sequence,))
                 times = self._tick.to_bytes(4, "little") + (self._tick * 20_000 % 2**32).to_bytes(4, "little")
                 state = times + counts + bytes((steps.number() & 1, 0)) + steps.take(2)
-                return sound(1, 0x82, 0, steps.number() & int(~Flags(0)), state) + END
+                return valid_frame(1, 0x82, 0, steps.number() & int(~Flags(0)), state) + END
 
 
 def host(data: bytes) -> None:
-    """One input to a SerialCart, whose times are so short that nothing is waited for."""
+    """Feed one input to a SerialCart whose timeouts are close to 0."""
     serial_cart.UNACKNOWLEDGED_PERIODS = 1e-3
     steps = Steps(data)
     wire = Wire(steps)
@@ -215,21 +221,22 @@ def host(data: bytes) -> None:
             call(driven, wire, steps)
         assert len(driven._answers) <= 64
         assert len(driven._missing) <= serial_cart.OVERTAKEN_TICKS
-        seen = driven.statistics
-        assert min(seen.lost_frames, seen.late_ticks, seen.overtaken_frames, seen.repeated_frames) >= 0
+        counts = driven.statistics
+        lost, late = counts.lost_frames, counts.late_ticks
+        assert min(lost, late, counts.overtaken_frames, counts.repeated_frames) >= 0
     driven.close()
 
 
 def call(driven: "serial_cart.SerialCart", wire: Wire, steps: Steps) -> None:
-    """Call one method."""
+    """Call one method of the host."""
     match steps.number() % 8:
         case 0:
             driven.start()
         case 1 | 2:
-            wire.asked = steps.number(2)
+            wire.requested = steps.number(2)
             limit = max(0, driven.information.motor_limit)
-            wire.asked = max(-limit, min(limit, wire.asked))
-            driven.set_motor(wire.asked)
+            wire.requested = max(-limit, min(limit, wire.requested))
+            driven.set_motor(wire.requested)
         case 3 | 4:
             driven.get_state()
         case 5:

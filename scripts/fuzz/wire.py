@@ -1,18 +1,19 @@
 #!/usr/bin/env python
-"""Noise and damaged frames, in bulk, into both sides of the wire.
+"""Do noise and damaged frames leave both sides of the wire unharmed?
 
-    scripts/fuzz/wire.py [--noise 10000000] [--frames 1000000] [--seed 0]
+    scripts/fuzz/wire.py --noise 10000000 --frames 1000000 --seed 0
 
-Random bytes, then sound frames with a few bytes changed, put in, taken out or doubled, half of them on the
-wire and half before they are stuffed, so that the checksum alone can tell, go through the frame splitter
-into the host's decoder and, separately, into a homed and disarmed firmware. Prints counts, the longest run
-that a splitter kept, and the peak of the process's memory. Exit status 1 if the cart moved, armed or homed,
-if it answered a frame that the checksum refuses, or if a splitter kept more than it may; any exception but
-FrameError ends the run with its traceback.
+Feeds random bytes, then damaged frames, through the frame splitter into the host's decoder and, separately,
+into a homed and disarmed firmware. A damaged frame is a valid one with a few bytes changed, inserted,
+deleted or doubled; half of the frames are damaged on the wire, half before they are stuffed, so that only
+the checksum can detect it. Prints counts, the largest number of bytes that a splitter kept, and the peak
+memory. Exit status 1 if the cart moved, armed or homed, if it answered a frame whose checksum is wrong, or
+if a splitter kept too many bytes. An exception other than FrameError ends the run with its traceback.
 
-A checksum of 16 bits lets up to one well-stuffed frame in 65536 through (*passed*). Such a frame is sound
-to any reader; one that would start or home the cart is counted (*kept back*) and not given to it. Nor is a
-run that is undamaged after all, as when a zero was put before it (*whole*).
+A checksum of 16 bits passes about one of 65536 well-stuffed random frames (*passed*). Such a frame is valid
+to any reader; one that would start or home the cart is counted (*withheld*) but not given to it. A run of
+bytes that is undamaged after all, for example when a zero was inserted before it, is not given to it either
+(*whole*).
 """
 
 import argparse
@@ -46,7 +47,7 @@ from cartpole_rl.wire import (
 )
 from cartpole_rl.wire.frames import END, LONGEST_FRAME, Envelope, open_envelope
 
-CHUNK = 4096  # bytes; as much as one read of a port gives
+CHUNK = 4096  # bytes, as one read of a port returns
 TICK_EVERY = 64  # runs of bytes between two periods of the firmware
 FROM_HOST: list[Message] = [Hello(), Start(), Stop(), SetMotor(-200), Home(), ClearFault(), SetPeriod(20_000)]
 FROM_CART: list[Message] = [
@@ -59,13 +60,13 @@ FROM_CART: list[Message] = [
 
 
 def noise(count: int, dice: random.Random) -> Iterator[bytes]:
-    """`count` random bytes, in chunks."""
+    """Yield `count` random bytes in chunks."""
     for start in range(0, count, CHUNK):
         yield dice.randbytes(min(CHUNK, count - start))
 
 
 def damaged(count: int, whole: list[bytes], dice: random.Random) -> Iterator[bytes]:
-    """`count` frames after one to four changes each, with their ending 0x00."""
+    """Yield `count` frames with one to four changes each, including the final 0x00."""
     for number in range(count):
         stuffed = number % 2 == 0
         frame = bytearray(dice.choice(whole))
@@ -83,17 +84,17 @@ def damaged(count: int, whole: list[bytes], dice: random.Random) -> Iterator[byt
 
 
 class Side:
-    """One reader of the wire: its splitter, its counts, what was wrong."""
+    """One side of the wire: its splitter, its counts and its complaints."""
 
     def __init__(self, whole: list[bytes]) -> None:
         self._whole = set(whole)
         self._splitter = FrameSplitter()
-        self.counts = Counter({"passed": 0, "kept back": 0})
+        self.counts = Counter({"passed": 0, "withheld": 0})
         self.longest = 0
-        self.wrong: list[str] = []
+        self.complaints: list[str] = []
 
     def feed(self, stream: Iterator[bytes]) -> None:
-        """Take all chunks of a stream."""
+        """Read all chunks of a stream."""
         for chunk in stream:
             self.counts["bytes"] += len(chunk)
             for stuffed in self._splitter.feed(chunk):
@@ -102,13 +103,13 @@ class Side:
                     self.counts["whole"] += 1
                 else:
                     self.take(stuffed)
-            self.longest = max(self.longest, len(self._splitter._pending))
+            self.longest = max(self.longest, len(self._splitter.pending))
         self.counts["overlong"] = self._splitter.overlong
         if self.longest > LONGEST_FRAME:
-            self.wrong.append(f"a splitter kept {self.longest} bytes")
+            self.complaints.append(f"a splitter kept {self.longest} bytes")
 
     def take(self, stuffed: bytes) -> None:
-        """Take one run of bytes."""
+        """Handle one run of bytes."""
         raise NotImplementedError
 
 
@@ -116,7 +117,7 @@ class HostSide(Side):
     """The host's decoder."""
 
     def take(self, stuffed: bytes) -> None:
-        """Decode it, or have it refused."""
+        """Decode it or refuse it."""
         try:
             open_envelope(stuffed)
             self.counts["passed"] += 1
@@ -126,7 +127,7 @@ class HostSide(Side):
 
 
 class CartSide(Side):
-    """The firmware of a cart that is homed and disarmed, and ticks now and then."""
+    """The firmware of a homed and disarmed cart, which also runs some periods."""
 
     def __init__(self, whole: list[bytes]) -> None:
         super().__init__(whole)
@@ -135,21 +136,21 @@ class CartSide(Side):
         self._now_us = 0
 
     def take(self, stuffed: bytes) -> None:
-        """Give it to the firmware, and look whether the cart keeps still."""
+        """Give it to the firmware and check that the cart does not move."""
         envelope = opened(stuffed)
         if envelope is not None:
             self.counts["passed"] += 1
             if envelope.kind in (Start.TYPE, Home.TYPE):
-                self.counts["kept back"] += 1
+                self.counts["withheld"] += 1
                 return
         answers = self._firmware.receive(stuffed, self._now_us)
         self.counts["answers"] += len(answers)
         if envelope is None:
             self.counts["refused"] += 1
             if answers:
-                self.wrong.append(f"{stuffed.hex(' ')} was answered")
+                self.complaints.append(f"{stuffed.hex(' ')} was answered")
         if self._firmware.armed or self._firmware.homing:
-            self.wrong.append(f"{stuffed.hex(' ')} set the cart in motion")
+            self.complaints.append(f"{stuffed.hex(' ')} set the cart in motion")
             self._firmware.armed = False
         if self.counts["runs"] % TICK_EVERY == 0:
             self._tick()
@@ -161,11 +162,11 @@ class CartSide(Side):
         self._now_us = end_us
         self.counts["periods"] += 1
         if motors != {0} or not isinstance(state, State) or state.motor_applied:
-            self.wrong.append(f"the motor ran in period {self.counts['periods']}")
+            self.complaints.append(f"the motor ran in period {self.counts['periods']}")
 
 
 def opened(stuffed: bytes) -> Envelope | None:
-    """What the checksum lets through of a run of bytes."""
+    """Return the envelope of a run of bytes whose checksum is right, else None."""
     try:
         return open_envelope(stuffed)
     except FrameError:
@@ -173,38 +174,42 @@ def opened(stuffed: bytes) -> Envelope | None:
 
 
 def peak_megabytes() -> float:
-    """The process's largest resident memory so far; ru_maxrss counts KiB on Linux, bytes on macOS."""
+    """Return the peak resident memory; ru_maxrss is in KiB on Linux, in bytes on macOS."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / (2**20 if sys.platform == "darwin" else 2**10)
 
 
 def frames_of(messages: list[Message]) -> list[bytes]:
-    """One sound frame for each message and a few sequences."""
+    """Return valid frames of each message with a few sequence numbers."""
     return [encode_frame(message, sequence)[:-1] for message in messages for sequence in (0, 1, 3, 200)]
 
 
 def main() -> int:
-    """Run both kinds of bytes into both sides; returns the exit status."""
-    parser = argparse.ArgumentParser(description="Noise and damaged frames into both sides of the wire.")
-    parser.add_argument("--noise", type=int, default=10_000_000, help="random bytes to each side")
-    parser.add_argument("--frames", type=int, default=1_000_000, help="damaged frames to each side")
-    parser.add_argument("--seed", type=int, default=0)
+    """Feed noise and damaged frames to both sides; return the exit status."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--noise", type=int, default=10_000_000, help="random bytes for each side (10^7)")
+    parser.add_argument("--frames", type=int, default=1_000_000, help="damaged frames for each side (10^6)")
+    parser.add_argument("--seed", type=int, default=0, help="of the bytes and damages (0)")
     options = parser.parse_args()
     from_cart, from_host = frames_of(FROM_CART), frames_of(FROM_HOST)
-    wrong: list[str] = []
-    print(f"{peak_megabytes():.1f} MiB before")
+    complaints: list[str] = []
+    print(f"memory before: {peak_megabytes():.1f} MiB")
     for name, kind, whole in (("host", HostSide, from_cart), ("cart", CartSide, from_host)):
-        for what in ("noise", "frames"):
-            dice, begun, side = random.Random(f"{what} {options.seed}"), time.perf_counter(), kind(whole)
-            side.feed(noise(options.noise, dice) if what == "noise" else damaged(options.frames, whole, dice))
+        for source in ("noise", "frames"):
+            dice, started, side = random.Random(f"{source} {options.seed}"), time.perf_counter(), kind(whole)
+            side.feed(
+                noise(options.noise, dice) if source == "noise" else damaged(options.frames, whole, dice)
+            )
             counts = ", ".join(f"{count} {item}" for item, count in side.counts.items())
             print(
-                f"{what} to the {name}: {counts}; splitter at most {side.longest} bytes; "
-                f"peak {peak_megabytes():.1f} MiB; {time.perf_counter() - begun:.0f} s"
+                f"{source} to the {name}: {counts}; splitter at most {side.longest} bytes kept; "
+                f"peak {peak_megabytes():.1f} MiB; {time.perf_counter() - started:.0f} s"
             )
-            wrong += side.wrong
-    print("\n".join(wrong) or "nothing wrong")
-    return 1 if wrong else 0
+            complaints += side.complaints
+    print("\n".join(complaints) or "no complaints")
+    return 1 if complaints else 0
 
 
 if __name__ == "__main__":

@@ -12,11 +12,11 @@ import serial
 from cartpole_rl.errors import FrameError
 from cartpole_rl.wire import Flags, Frame, FrameSplitter, Home, Message, State, decode_frame, encode_frame
 
-SILENCE = 20.0  # s until a test gives up
+SILENCE = 20.0  # s, timeout of a test
 
 
 class EmulatorHost:
-    """The port of a running emulator, and all that came over it."""
+    """The port of a running emulator and all bytes received from it."""
 
     def __init__(self, process: "subprocess.Popen[str]") -> None:
         assert process.stdout is not None
@@ -29,7 +29,7 @@ class EmulatorHost:
         self.open()
 
     def open(self) -> None:
-        """Open the port, as a host does that starts anew."""
+        """Open the port as a new host does."""
         self.serial = serial.Serial(self.ready["port"], 921600, timeout=SILENCE, exclusive=True)
         self._splitter = FrameSplitter()
         self._frames: deque[Frame] = deque()
@@ -39,7 +39,7 @@ class EmulatorHost:
         self._sequence += 1
 
     def frame(self) -> Frame:
-        """The next undamaged frame."""
+        """Return the next undamaged frame."""
         while not self._frames:
             data = self.serial.read(max(1, self.serial.in_waiting))
             assert data, "the emulator is silent"
@@ -52,26 +52,26 @@ class EmulatorHost:
         return self._frames.popleft()
 
     def until_state(self) -> list[Frame]:
-        """Frames up to the next STATE, that one included."""
+        """Return the frames up to and including the next STATE."""
         frames = [self.frame()]
         while not isinstance(frames[-1].message, State):
             frames.append(self.frame())
         return frames
 
     def state(self) -> State:
-        """The next STATE."""
+        """Return the next STATE."""
         frame = self.until_state()[-1]
         message, self.flags = frame.message, Flags(frame.flags)
         assert isinstance(message, State)
         return message
 
     def ask(self, message: Message) -> list[Frame]:
-        """Send a message; frames up to the next STATE."""
+        """Send a message; return the frames up to and including the next STATE."""
         self.send(message)
         return self.until_state()
 
     def home(self) -> Frame:
-        """The STATE that ends a homing."""
+        """Home the cart; return the STATE that ends homing."""
         frame = self.ask(Home())[-1]
         while frame.flags & Flags.HOMING:
             frame = self.until_state()[-1]
@@ -80,7 +80,7 @@ class EmulatorHost:
 
 @contextlib.contextmanager
 def emulator(*options: str, **settings: object) -> Iterator[EmulatorHost]:
-    """A running emulator; terminated at the end, and its exit status has to be 0."""
+    """Run an emulator; terminate it at the end and check that its exit status is 0."""
     command = [sys.executable, "-m", "cartpole_rl.emulator", json.dumps(settings), *options]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:

@@ -1,4 +1,4 @@
-"""The default truth is what docs/emulator.md says of it, and each number that is off can be seen to be."""
+"""The default truth is that of docs/emulator.md, and each difference from the nominal cart has an effect."""
 
 import math
 import re
@@ -22,7 +22,7 @@ PAGE = (Path(__file__).parents[2] / "docs" / "emulator.md").read_text(encoding="
 LEVELS = choice("actions/nine_levels")["motors"]
 CART = {**choice("cart/ip02"), **choice("pole/medium")["choices"]["medium"]}
 CURVE = (CART["force_quadratic"], CART["force_linear"], CART["force_offset"])
-OTHERWISE = {  # what conf/ has under another name, or has not
+OTHERWISE = {  # numbers that conf/ has under another name or does not have
     "track_half_length": CART["track_half_length"] + SOFT_LIMIT * CART_METRES,
     "cart_coulomb_left": CART["cart_coulomb"] * (1 - CART["cart_coulomb_asymmetry"]),
     "cart_coulomb_right": CART["cart_coulomb"] * (1 + CART["cart_coulomb_asymmetry"]),
@@ -50,7 +50,7 @@ def row_of(line: str) -> Row:
     return Row(names, values, truths, [off for off in off_by.split(", ") if off])
 
 
-TABLE = PAGE.split("| what stands behind it |\n")[1].split("\n\n")[0].splitlines()[1:]
+TABLE = PAGE.split("| reason |\n")[1].split("\n\n")[0].splitlines()[1:]
 ROWS = [row_of(line) for line in TABLE]
 by_name = pytest.mark.parametrize("row", ROWS, ids=[row.names[0] for row in ROWS])
 
@@ -75,7 +75,7 @@ def test_the_truth_is_that_of_the_settings(row: Row) -> None:
 
 
 @by_name
-def test_it_is_off_by_what_the_table_says(row: Row) -> None:
+def test_the_difference_is_that_of_the_table(row: Row) -> None:
     if row.names == ["force_curve"]:
         shares = [
             force(EmulatorSettings().force_curve, size) / force(CURVE, size) - 1 for size in LEVELS if size
@@ -86,24 +86,24 @@ def test_it_is_off_by_what_the_table_says(row: Row) -> None:
         off = row.truth
     else:
         off = [truth / usual - 1 for truth, usual in zip(row.truth, row.nominal, strict=True) if usual]
-    assert row.off_by == [shown(share, told) for share, told in zip(off, row.off_by, strict=True)]
+    assert row.off_by == [shown(share, printed) for share, printed in zip(off, row.off_by, strict=True)]
 
 
 def force(curve: tuple[float, float, float], motor: int) -> float:
-    """N of a force curve, for a motor value of either sign."""
+    """Return the force of a curve, N, for a motor value of either sign."""
     a, b, c = curve
     return math.copysign(max(0.0, a * motor**2 + b * abs(motor) + c), motor)
 
 
 def shown(share: float, like: str) -> str:
-    """A share in per cent, with as many digits as `like` has."""
+    """Return a share in per cent, with as many digits as `like`."""
     digits = len(like.partition(".")[2].removesuffix(" %"))
     rounded = round(100 * share, digits)
     return f"{rounded:+.{digits}f} %" if rounded else "0 %"
 
 
 def changed() -> list[str]:
-    """Settings of which the truth is not the nominal number."""
+    """Return the settings whose truth is not the nominal number."""
     settings = EmulatorSettings()
     return [
         name for row in ROWS for name in row.names if nominal(name) not in (None, getattr(settings, name))
@@ -112,16 +112,16 @@ def changed() -> list[str]:
 
 @cache
 def driven(name: str | None) -> list[tuple[int, int]]:
-    """Counts of a whole homing and of a drive after it, `name` being nominal and all else the truth."""
+    """Return the counts of a homing and a drive with the nominal value of `name`, all else being default."""
     settings = EmulatorSettings(physics_step=1e-3, **({} if name is None else {name: nominal(name)}))
-    cart, seen = CartDevice(settings), []
+    cart, counts = CartDevice(settings), []
 
     def period(message: Message | None) -> Flags:
         if message is not None:
             cart.receive(encode_frame(message, 0)[:-1], cart.now_us)
         frame = decode_frame(cart.pass_period(cart.period_end_us)[-1][:-1])
         assert isinstance(frame.message, State)
-        seen.append((frame.message.cart_counts, frame.message.pole_counts))
+        counts.append((frame.message.cart_counts, frame.message.pole_counts))
         return Flags(frame.flags)
 
     flags = period(Home())
@@ -132,11 +132,11 @@ def driven(name: str | None) -> list[tuple[int, int]]:
     for motor in (200, 58, 57, -200, -200, -56, -55, 200, 100, 0, -100, -150, 150):
         for _ in range(4):
             assert period(SetMotor(motor)) & Flags.ARMED
-    return seen
+    return counts
 
 
 def test_the_same_cart_moves_alike() -> None:
-    """What the next test would miss: a difference that comes from elsewhere."""
+    """Without this the next test would prove nothing."""
     assert driven.__wrapped__(None) == driven(None)
 
 
@@ -147,7 +147,7 @@ def test_each_number_that_is_off_changes_the_motion(name: str) -> None:
 
 @pytest.mark.parametrize("side", [-1, 1])
 def test_the_dead_bands_show_in_the_force(side: int) -> None:
-    """Up to them there is none although the curve alone gives some, and then as much as the page says."""
+    """Inside the dead-band the force is 0 although the curve gives one; outside it is that of the page."""
     settings = EmulatorSettings()
     edge = int(settings.deadband_right if side > 0 else settings.deadband_left)
     motor, curve = (

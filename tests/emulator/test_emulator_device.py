@@ -1,10 +1,12 @@
-"""Firmware and physics together, without a process: homing, encoders, the hand, effects of the settings."""
+"""Firmware and physics together, without a process: homing, encoders, the hand, effects of settings."""
 
 import math
 
 import pytest
 
 pytest.importorskip("mujoco", reason='pip install "cartpole_rl[emulator]"')
+
+from test_emulator_physics import OTHER as PHYSICAL
 
 from cartpole_rl.emulator.device import CartDevice
 from cartpole_rl.emulator.homing import CART_METRES, POLE_RADIANS
@@ -31,7 +33,7 @@ NOMINAL_LIMITS = (16704, 17539)  # counts, as docs/protocol.md has them
 
 
 class Driven:
-    """An emulated cart that is driven in lockstep, without a wire."""
+    """An emulated cart driven in lockstep, without a wire."""
 
     def __init__(self, **settings: object) -> None:
         self.settings = EmulatorSettings(**COARSE | settings)
@@ -64,7 +66,7 @@ class Driven:
         return message
 
     def limits(self) -> tuple[int, int]:
-        """Soft and hard limit, counts from the middle, as INFO tells them."""
+        """Soft and hard limit, counts from the middle, as INFO reports them."""
         return self.info().soft_limit_counts, self.info().hard_limit_counts
 
     def home(self) -> State:
@@ -78,7 +80,7 @@ class Driven:
 
 
 def check_homed(driven: Driven, state: State) -> None:
-    """The zeros are right to within two counts, the cart is in the middle, the pole nearly still."""
+    """Check that the zeros are right within two counts and that cart and pole rest in place."""
     assert driven.flags == Flags.HOMED
     assert state.fault == 0
     x, angle = driven.measured(state)
@@ -87,7 +89,7 @@ def check_homed(driven: Driven, state: State) -> None:
     true = math.remainder(driven.angle, 2 * math.pi)
     offset = driven.settings.angle_offset
     assert math.remainder(angle - true - offset, 2 * math.pi) == pytest.approx(0, abs=2 * POLE_RADIANS)
-    assert angle == pytest.approx(math.pi, abs=0.05)  # whatever turns it made before
+    assert angle == pytest.approx(math.pi, abs=0.05)  # regardless of earlier turns
 
 
 @pytest.mark.parametrize(
@@ -109,15 +111,15 @@ def test_homing_finds_the_zeros_of_any_healthy_cart(settings):
 
 
 @pytest.mark.parametrize("turns", [-1, 0, 2])
-def test_homing_finds_them_again_after_the_pole_was_thrown_about(turns):
+def test_homing_finds_the_zeros_again_after_the_pole_has_turned(turns):
     driven = Driven()
     driven.home()
     driven.cart.physics.place_pole(2 * math.pi * turns + 0.3)
     while driven.angle < 2 * math.pi * turns + 3:
         driven.tick()
-    begun = driven.cart.now_us
+    started = driven.cart.now_us
     check_homed(driven, driven.home())
-    assert driven.cart.now_us - begun < 60e6
+    assert driven.cart.now_us - started < 60e6
 
 
 @pytest.mark.parametrize("period_us", [5_000, 100_000])
@@ -149,7 +151,7 @@ def test_limits_count_from_the_stops_that_were_found():
     assert driven.info().hard_limit_counts * CART_METRES == pytest.approx(0.4 - 0.008, abs=1e-4)
 
 
-def test_before_the_first_homing_the_limits_are_those_of_the_drawing():
+def test_before_the_first_homing_the_limits_are_nominal():
     driven = Driven(track_half_length=0.4)
     assert driven.limits() == NOMINAL_LIMITS
     driven.ask(Home())
@@ -178,7 +180,7 @@ def test_limits_and_zeros_last_until_another_homing_succeeds_or_the_cart_restart
 
 
 def test_neither_watchdog_nor_limits_hold_while_homing():
-    """The cart moves on, without a SET_MOTOR, beyond both limits of a homing before, to the stops."""
+    """Without SET_MOTOR the cart moves beyond both limits of an earlier homing, to the stops."""
     driven = Driven()
     driven.home()
     soft, hard = driven.limits()
@@ -193,7 +195,7 @@ def test_neither_watchdog_nor_limits_hold_while_homing():
     assert outward > 10
 
 
-def test_counts_follow_the_truth_all_along():
+def test_counts_follow_the_true_state():
     driven = Driven(seed=2)
     driven.home()
     driven.ask(Start())
@@ -251,7 +253,7 @@ def test_a_hand_holds_the_pole_up_until_the_cart_is_armed():
     assert abs(state.pole_counts * POLE_RADIANS) > 0.1 or held[0].pole_counts == 0
 
 
-def test_a_hand_takes_the_pole_again_elsewhere_and_lets_it_hang_to_home():
+def test_a_hand_takes_the_pole_again_at_another_angle_and_releases_it_for_homing():
     driven = Driven(start="upright")
     driven.home()
     first = driven.ask(Hello())
@@ -269,7 +271,7 @@ def test_a_hand_takes_the_pole_again_elsewhere_and_lets_it_hang_to_home():
 
 
 def trace(**settings: object) -> bytes:
-    """All that a cart sends under one series of commands, from boot; homed by decree."""
+    """Return all bytes that a cart sends for one series of commands after boot; `homed` is set by hand."""
     cart = CartDevice(EmulatorSettings(**COARSE | settings))
     cart.firmware.homed = True
     sent = cart.receive(encode_frame(Start(), 0)[:-1], 0)
@@ -280,25 +282,9 @@ def trace(**settings: object) -> bytes:
     return b"".join(sent)
 
 
-OTHER = {
+OTHER = PHYSICAL | {
     "seed": 1,
-    "cart_mass": 0.8,
-    "pole_mass": 0.15,
-    "pole_com": 0.2,
-    "pole_inertia": 2e-3,
-    "track_half_length": 0.3,
-    "cart_viscous": 1.0,
-    "cart_coulomb_left": 0.8,
-    "cart_coulomb_right": 0.8,
-    "cart_stiction_ratio": 1.8,
-    "pole_viscous": 1e-3,
-    "pole_coulomb": 1e-3,
     "pole_drag": 2e-4,
-    "force_curve": (0.0, 0.021, -0.99),
-    "force_asymmetry": -0.03,
-    "deadband_left": 90.0,
-    "deadband_right": 90.0,
-    "motor_time_constant": 0.02,
     "latency": 0.01,
     "latency_jitter": 0.003,
     "track_tilt": -0.004,
@@ -326,19 +312,14 @@ def test_another_value_sends_other_bytes(base, name):
 
 def test_every_setting_is_tried_here_or_on_the_wire():
     on_the_wire = {"clock", "frame_loss", "frame_corruption"}  # test_emulator_process.py
-    faults = {
-        "frame_duplication",
-        "frame_reordering",
-        "unplug_at",
-        "stuck_encoder",
-        "stuck_at",
-    }  # ..._faults.py
-    cogging = {"cogging", "cogging_pitch"}  # test_cogging.py
+    order = {"frame_duplication", "frame_reordering"}  # test_emulator_disturbance.py
+    faults = {"unplug_at", "stuck_encoder", "stuck_at"}  # test_emulator_faults.py
+    cogging = {"cogging", "cogging_pitch"}  # test_emulator_physics.py
     journal = {"journal"}  # tests/plants/test_stops.py, tests/bench/test_soak.py
-    assert set(OTHER) | on_the_wire | faults | cogging | journal == set(EmulatorSettings.model_fields)
+    assert set(OTHER) | on_the_wire | order | faults | cogging | journal == set(EmulatorSettings.model_fields)
 
 
-def test_latency_and_jitter_delay_the_force_by_as_much_as_they_say():
+def test_latency_delays_the_force_by_its_value():
     def moved(latency: float) -> float:
         settings = EmulatorSettings(latency=latency, latency_jitter=0.0, motor_time_constant=0.0)
         cart = CartDevice(settings)

@@ -1,18 +1,12 @@
-"""The emulator's end of the cable: whole frames or none, and damage by chance and by seed."""
+"""The emulator's end of the cable passes on whole frames or none."""
 
 import os
 import tty
 
-import pytest
 import serial
 
-from cartpole_rl.emulator.disturbance import Disturbance
 from cartpole_rl.emulator.link import PtyLink
-from cartpole_rl.emulator.settings import EmulatorSettings
-from cartpole_rl.errors import FrameError
 from cartpole_rl.wire import FrameSplitter, SetMotor, decode_frame, encode_frame
-
-FRAME = encode_frame(SetMotor(-200), 4)[:-1]
 
 
 def test_a_host_that_does_not_read_loses_whole_frames_and_never_half_of_one():
@@ -46,39 +40,6 @@ def test_what_a_host_writes_arrives_and_nothing_is_nothing():
         assert link.read(5) == bytes(range(256))
         os.close(host)
         assert link.read(0) == b""  # a closed port is a silent one
-
-
-def test_a_sound_cable_changes_nothing():
-    cable = Disturbance(EmulatorSettings(), "inward")
-    assert all(cable.carry(FRAME) == [FRAME] for _ in range(100))
-
-
-def test_shares_of_lost_and_damaged_frames_are_as_asked():
-    cable = Disturbance(EmulatorSettings(frame_loss=0.2, frame_corruption=0.3), "inward")
-    came = [cable.carry(FRAME) for _ in range(4000)]
-    arrived = [frame for frames in came for frame in frames]
-    damaged = [frame for frame in arrived if frame != FRAME]
-    assert 1 - len(arrived) / len(came) == pytest.approx(0.2, abs=0.03)
-    assert len(damaged) / len(arrived) == pytest.approx(0.3, abs=0.03)
-    for frame in damaged:
-        assert 0 not in frame
-        with pytest.raises(FrameError):
-            decode_frame(frame)
-
-
-def test_the_seed_decides():
-    def pattern(seed: int, direction: str = "inward") -> list[list[bytes]]:
-        cable = Disturbance(
-            EmulatorSettings(
-                seed=seed, frame_loss=0.3, frame_corruption=0.3, frame_duplication=0.3, frame_reordering=0.3
-            ),
-            direction,
-        )
-        return [cable.carry(FRAME) for _ in range(50)]
-
-    assert pattern(1) == pattern(1)
-    assert pattern(1) != pattern(2)
-    assert pattern(1) != pattern(1, "outward")
 
 
 def test_a_host_that_opens_the_port_is_noticed():

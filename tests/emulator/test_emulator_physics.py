@@ -8,7 +8,6 @@ pytest.importorskip("mujoco", reason='pip install "cartpole_rl[emulator]"')
 
 import itertools
 
-from cartpole_rl.emulator.motor import Motor
 from cartpole_rl.emulator.physics import GRAVITY, CartPhysics
 from cartpole_rl.emulator.settings import EmulatorSettings
 
@@ -172,25 +171,6 @@ def test_a_finer_step_changes_little():
     assert ends[0] == pytest.approx(ends[1], abs=0.01)
 
 
-def test_force_curve_dead_band_and_asymmetry():
-    settings = EmulatorSettings(
-        force_curve=(1e-5, 0.02, -1.0), force_asymmetry=0.1, deadband_left=80, deadband_right=60
-    )
-    motor = Motor(settings)
-    assert motor.static_force(100) == pytest.approx(1.1 * 1.1)
-    assert motor.static_force(-100) == pytest.approx(-1.1)
-    assert motor.static_force(60) == motor.static_force(-80) == motor.static_force(0) == 0.0
-    assert motor.static_force(61) > 0 > motor.static_force(-81)
-    assert Motor(EmulatorSettings(deadband_right=0)).static_force(30) == 0.0  # the curve is never negative
-
-
-def test_force_lags_by_its_time_constant():
-    motor = Motor(EmulatorSettings(**PLAIN_MOTOR | {"motor_time_constant": 0.01}))
-    assert motor.step(100, 0.01) == pytest.approx(2.0 * (1 - math.exp(-1)))
-    assert motor.step(0, 0.01) == pytest.approx(2.0 * (1 - math.exp(-1)) * math.exp(-1))
-    assert Motor(EmulatorSettings(**PLAIN_MOTOR)).step(100, 0.001) == pytest.approx(2.0)
-
-
 OTHER = {
     "cart_mass": 0.8,
     "pole_mass": 0.15,
@@ -229,3 +209,70 @@ def test_each_setting_has_an_effect(name):
 
 def test_the_same_settings_end_in_the_same_state():
     assert end_state() == end_state()
+
+
+# cogging: a force ripple along the track
+
+BARE = FREE | NO_POLE | {"cart_mass": 0.8}
+
+
+def rippled_cart(amplitude: float, pitch: float = 0.04, **changes: float) -> CartPhysics:
+    return CartPhysics(EmulatorSettings(**BARE | changes, cogging=amplitude, cogging_pitch=pitch))
+
+
+def test_there_is_no_cogging_by_default() -> None:
+    plain = CartPhysics(EmulatorSettings(**BARE))
+    plain.place(0.01, math.pi)
+    plain.advance(0, 0.5)
+    assert plain.x == 0.01
+
+
+@pytest.mark.parametrize("pitch", [0.04, 0.01])
+def test_a_cart_swings_about_a_cogging_position(pitch: float) -> None:
+    """The period of a small oscillation is 2 pi sqrt(m p / (2 pi A))."""
+    swinging, amplitude = rippled_cart(0.3, pitch), 0.3
+    swinging.place(0.01 * pitch + 5 * pitch, math.pi)
+    half = math.pi * math.sqrt(BARE["cart_mass"] * pitch / (math.tau * amplitude))
+    swinging.advance(0, half)
+    assert swinging.x - 5 * pitch == pytest.approx(-0.01 * pitch, rel=0.03)
+
+
+def test_cogging_returns_the_energy_that_it_takes() -> None:
+    """A cart is slowest on top of a tooth, by the work of half a ripple, and equally fast in each valley."""
+    coasting, amplitude, pitch = rippled_cart(0.4), 0.4, 0.04
+    coasting.place(-0.3, math.pi)
+    coasting.advance(200, 0.12)
+    coasting.advance(0, 0.1)  # twenty times the motor's lag
+    start, speeds = coasting.x, []
+    while coasting.x < start + 2 * pitch:
+        coasting.advance(0, 5e-4)
+        speeds.append((coasting.x - start, coasting.x_dot))
+    fastest, again = (
+        max(speed for x, speed in speeds if first <= x < first + pitch) for first in (0.0, pitch)
+    )
+    slowest = min(speed for _, speed in speeds)
+    assert slowest == pytest.approx(
+        math.sqrt(fastest**2 - 2 * (amplitude * pitch / math.pi) / BARE["cart_mass"]), rel=0.002
+    )
+    assert again == pytest.approx(fastest, rel=0.002)
+
+
+def test_cogging_adds_to_the_force_that_friction_holds() -> None:
+    """A cart at rest does not move up to a motor force of Coulomb friction plus amplitude."""
+    coulomb, amplitude = 0.5, 0.4
+    motor = {
+        "force_curve": (0.0, 0.01, 0.0),
+        "force_asymmetry": 0.0,
+        "deadband_left": 0.0,
+        "deadband_right": 0.0,
+        "cart_coulomb_left": coulomb,
+        "cart_coulomb_right": coulomb,
+        "cart_stiction_ratio": 1.0,
+    }
+    for value, comes_free in {85: False, 130: True}.items():
+        pushed = rippled_cart(amplitude, **motor)
+        pushed.place(0.0, math.pi)
+        for step in range(value + 1):  # slowly, without momentum
+            pushed.advance(step, 0.02)
+        pushed.advance(value, 1.0)
+        assert (pushed.x > 0.04) == comes_free

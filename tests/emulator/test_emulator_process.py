@@ -131,9 +131,9 @@ def test_no_state_of_a_homing_is_lost_on_a_host_that_reads_slowly():
 
 def test_real_clock_ticks_at_50_hz():
     with emulator(clock="real") as host:
-        first, begun = host.state(), time.monotonic()
+        first, started = host.state(), time.monotonic()
         states = states_of(host, 60)
-        seconds = time.monotonic() - begun
+        seconds = time.monotonic() - started
     assert [state.tick - first.tick for state in states] == list(range(1, 61))
     assert {after.time_us - before.time_us for before, after in itertools.pairwise(states)} == {20_000}
     assert 0.6 < seconds < 2.4
@@ -178,20 +178,20 @@ def refusal(*command: str) -> tuple[int, str]:
         ("cart_mass=1", "Invalid JSON"),
     ],
 )
-def test_wrong_settings_are_told_in_one_line(settings, complaint):
-    status, told = refusal("-m", "cartpole_rl.emulator", settings)
+def test_wrong_settings_are_reported_in_one_line(settings, complaint):
+    status, message = refusal("-m", "cartpole_rl.emulator", settings)
     assert status == 2
-    assert complaint in told
+    assert complaint in message
 
 
-def test_without_mujoco_the_remedy_is_told_in_one_line():
+def test_without_mujoco_the_remedy_is_printed_in_one_line():
     hide = "import sys, runpy; sys.modules['mujoco'] = None; sys.argv = ['emulator']; "
-    status, told = refusal("-c", hide + "runpy.run_module('cartpole_rl.emulator', run_name='__main__')")
+    status, message = refusal("-c", hide + "runpy.run_module('cartpole_rl.emulator', run_name='__main__')")
     assert status == 1
-    assert 'pip install "cartpole_rl[emulator]"' in told
+    assert 'pip install "cartpole_rl[emulator]"' in message
 
 
-def test_it_ends_with_its_parent_if_told_so():
+def test_it_ends_with_its_parent_on_request():
     command = [sys.executable, "-m", "cartpole_rl.emulator", "{}", "--exit-with-parent"]
     parent = f"""
 import subprocess, sys
@@ -208,7 +208,8 @@ def test_it_starts_without_torch_and_without_the_simulator():
 import sys
 import cartpole_rl.emulator.__main__
 from cartpole_rl.emulator.device import CartDevice
-CartDevice(cartpole_rl.emulator.EmulatorSettings())
+from cartpole_rl.emulator.settings import EmulatorSettings
+CartDevice(EmulatorSettings())
 print(sorted(name for name in sys.modules if name.split(".")[0] in ("torch", "tensordict", "torchrl", "scipy")
       or name.startswith(("cartpole_rl.physics", "cartpole_rl.tasks", "cartpole_rl.randomization"))))
 """

@@ -1,4 +1,4 @@
-"""The emulator's settings: complete, documented, strict, and nowhere nominal by accident."""
+"""The emulator's settings are complete, documented and strict."""
 
 from pathlib import Path
 
@@ -22,7 +22,7 @@ FAULTS = ["unplug_at", "reset_at", "stuck_encoder", "stuck_at"]
 OURS = ["boot", "clock", "journal", "physics_step", "seed", "start", *FAULTS]
 
 
-def test_the_names_are_the_ones_that_users_know():
+def test_the_names_are_the_public_ones():
     assert sorted(EmulatorSettings.model_fields) == sorted(NAMES + OURS)
 
 
@@ -67,7 +67,7 @@ def test_the_page_names(name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_page_tells_the_default(name):
+def test_the_page_states_the_default(name):
     value = getattr(EmulatorSettings(), name)
     named = {
         "deadband_right": "_right",

@@ -1,4 +1,4 @@
-"""The firmware's rules one by one, on made-up encoder counts and without physics."""
+"""The firmware's rules one by one, with artificial encoder counts and without physics."""
 
 import pytest
 
@@ -33,7 +33,7 @@ HANGING = 0
 
 
 class Bench:
-    """A firmware whose encoders are turned by hand."""
+    """A firmware whose encoder counts a test sets."""
 
     def __init__(self, latency_us: int = 0, homed: bool = True) -> None:
         self.firmware = Firmware(lambda: latency_us)
@@ -42,7 +42,7 @@ class Bench:
         self.sequence = 0
 
     def send(self, message: Message) -> Message | None:
-        """The answer to a message, if it has one."""
+        """Send a message; return the answer or None."""
         frame = encode_frame(message, self.sequence)[:-1]
         self.sequence = (self.sequence + 1) & 0xFF
         answers = [decode_frame(answer[:-1]).message for answer in self.firmware.receive(frame, self.now_us)]
@@ -50,19 +50,19 @@ class Bench:
         return answers[0] if answers else None
 
     def refusal(self, message: Message) -> Reason | None:
-        """Why a message is refused, if it is."""
+        """Send a message; return the reason of its refusal or None."""
         answer = self.send(message)
         return Reason(answer.reason) if isinstance(answer, Nack) else None
 
     def frames(self, cart: int = 0, pole: int = HANGING) -> list[Frame]:
-        """What the cart sends at the end of a period."""
+        """Pass a period; return the frames at its end."""
         end = self.now_us + self.firmware.period_us
         self.motors = self.firmware.drive(self.now_us, end)
         self.now_us = end
         return [decode_frame(frame[:-1]) for frame in self.firmware.tick(end, cart, pole)]
 
     def tick(self, cart: int = 0, pole: int = HANGING) -> tuple[State, Flags]:
-        """The STATE of a period, and its flags."""
+        """Pass a period; return its STATE and flags."""
         last = self.frames(cart, pole)[-1]
         assert isinstance(last.message, State)
         return last.message, Flags(last.flags)
@@ -70,7 +70,7 @@ class Bench:
 
 @pytest.fixture
 def bench() -> Bench:
-    """A cart that is homed and armed."""
+    """Return a homed and armed cart."""
     bench = Bench()
     assert bench.send(Start()) == Ack(0, MessageType.START)
     return bench
@@ -82,7 +82,7 @@ def test_a_cart_boots_idle_with_the_motor_at_zero():
     assert flags == Flags(0)
 
 
-def test_hello_tells_what_the_cart_is():
+def test_hello_is_answered_with_info():
     assert Bench().send(Hello()) == Info(1, 0, 0, 4096, 22749, 255, SOFT, HARD, 20_000)
 
 
@@ -110,7 +110,7 @@ def test_motor_is_refused_unless_armed_and_in_range(bench):
     assert bench.send(SetMotor(-255)) is None
 
 
-def test_state_tells_the_newest_accepted_frame_and_its_age(bench):
+def test_state_reports_the_newest_accepted_frame_and_its_age(bench):
     bench.send(SetMotor(10))
     state, _ = bench.tick()
     assert (state.last_sequence, state.command_age_ms) == (1, 20)
@@ -149,7 +149,7 @@ def test_a_latency_of_more_than_a_period_keeps_the_order():
     assert motors[-1] == (60_000, -100)
 
 
-def test_stop_forgets_commands_that_are_still_due():
+def test_stop_discards_pending_commands():
     bench = Bench(latency_us=30_000)
     bench.send(Start())
     bench.send(SetMotor(100))
@@ -160,10 +160,10 @@ def test_stop_forgets_commands_that_are_still_due():
 
 def test_watchdog_stops_the_motor_after_three_periods_and_a_command_revives_it(bench):
     bench.send(SetMotor(100))
-    told = [bench.tick() for _ in range(5)]
-    assert [state.motor_applied for state, _ in told] == [100, 100, 0, 0, 0]
-    assert [bool(flags & Flags.WATCHDOG) for _, flags in told] == [False, False, True, True, True]
-    assert told[-1][1] & Flags.ARMED
+    states = [bench.tick() for _ in range(5)]
+    assert [state.motor_applied for state, _ in states] == [100, 100, 0, 0, 0]
+    assert [bool(flags & Flags.WATCHDOG) for _, flags in states] == [False, False, True, True, True]
+    assert states[-1][1] & Flags.ARMED
     bench.send(SetMotor(-100))
     state, flags = bench.tick()
     assert state.motor_applied == -100
@@ -205,7 +205,7 @@ def test_hard_limit_latches_until_it_is_cleared(bench, side):
     assert state.message.fault == Fault.HARD_LIMIT
     assert state.message.motor_applied == 0
     assert Flags(state.flags) == Flags.HOMED | Flags.FAULTED
-    assert len(bench.frames(0)) == 1  # told once, though still latched in the middle
+    assert len(bench.frames(0)) == 1  # reported once, though still latched
     assert bench.refusal(Start()) == Reason.FAULT_LATCHED
     assert bench.refusal(SetMotor(1)) == Reason.FAULT_LATCHED
     assert bench.refusal(Home()) == Reason.FAULT_LATCHED
@@ -221,7 +221,7 @@ def test_a_disarmed_cart_may_be_anywhere():
 
 
 def push(bench: Bench, motors: list[int], counts: list[int]) -> State:
-    """The last STATE under motor values that move the cart to given counts."""
+    """Drive with motor values that move the cart to given counts; return the last STATE."""
     for motor, cart in zip(motors, counts, strict=True):
         bench.send(SetMotor(motor))
         state, _ = bench.tick(cart)
@@ -242,14 +242,14 @@ def test_stall_is_a_hard_push_that_moves_nothing(bench):
         (([255] * 20 + [0] * 2) * 4, [0] * 88),  # short pushes
     ],
 )
-def test_stall_is_not_cried_over_less(bench, motors, counts):
+def test_less_than_that_is_no_stall(bench, motors, counts):
     assert push(bench, motors, counts).fault == 0
 
 
 @pytest.mark.parametrize(
     ("counts", "fault"), [((5_000, 0), Fault.CART_ENCODER), ((0, 2_000), Fault.POLE_ENCODER)]
 )
-def test_a_count_that_jumps_is_a_fault_and_costs_the_homing(bench, counts, fault):
+def test_a_count_that_jumps_is_a_fault_and_loses_the_zeros(bench, counts, fault):
     bench.tick(0, 0)
     state, flags = bench.tick(*counts)
     assert state.fault == fault
@@ -312,7 +312,7 @@ def answer_to(body: bytes) -> list[Message]:
     return [decode_frame(frame[:-1]).message for frame in Firmware(lambda: 0).receive(stuffed, 0)]
 
 
-def test_strange_frames_are_refused_with_a_reason():
+def test_invalid_messages_are_refused_with_a_reason():
     assert answer_to(b"\x02\x01\x07\x00") == [Nack(7, 0x01, Reason.BAD_VERSION)]
     assert answer_to(b"\x01\x7f\x07\x00") == [Nack(7, 0x7F, Reason.UNKNOWN_TYPE)]
     assert answer_to(b"\x01\x82\x07\x00") == [Nack(7, 0x82, Reason.UNKNOWN_TYPE)]
@@ -320,7 +320,7 @@ def test_strange_frames_are_refused_with_a_reason():
     assert answer_to(b"\x01\x02\x07\x00\x01") == [Nack(7, 0x02, Reason.BAD_LENGTH)]
 
 
-def test_damaged_frames_are_passed_over(bench):
+def test_damaged_frames_are_ignored(bench):
     frame = bytearray(encode_frame(SetMotor(100), 9)[:-1])
     frame[-1] ^= 0x10
     for garbage in (bytes(frame), b"\x01", b"\xff" * 60, b"ets Jul 29 2019"):

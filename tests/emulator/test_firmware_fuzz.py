@@ -1,6 +1,6 @@
-"""Any bytes at all on either side of the wire: no error, no motion, no arming, no growing memory.
+"""Arbitrary bytes on either side of the wire cause no error, no motion, no arming and no growing memory.
 
-The long run of the same kind is scripts/fuzz/wire.py.
+scripts/fuzz/wire.py is the long version.
 """
 
 import contextlib
@@ -21,7 +21,7 @@ BITS = {"B": 8, "h": 16, "H": 16, "i": 32, "I": 32}
 
 @st.composite
 def mutated(draw: st.DrawFn) -> bytes:
-    """A frame after a few changes, insertions and deletions of bytes, with its ending 0x00."""
+    """Draw a frame with a few bytes changed, inserted and deleted, including its final 0x00."""
     frame = bytearray(draw(st.sampled_from(FRAMES)))
     for _ in range(draw(st.integers(1, 4))):
         at = draw(st.integers(0, len(frame)))
@@ -34,7 +34,7 @@ def streams() -> st.SearchStrategy[bytes]:
 
 
 def envelope(stuffed: bytes) -> Envelope | None:
-    """What the cart sees in a run of bytes, if its checksum is right."""
+    """Return the envelope of a run of bytes if its checksum is right."""
     with contextlib.suppress(FrameError):
         return open_envelope(stuffed)
     return None
@@ -51,7 +51,7 @@ def test_the_hosts_decoder_takes_any_bytes(stream):
         except FrameError:
             continue
         assert encode_frame(frame.message, frame.sequence, frame.flags)
-    assert len(splitter._pending) <= LONGEST_FRAME
+    assert len(splitter.pending) <= LONGEST_FRAME
 
 
 @given(streams())
@@ -61,17 +61,17 @@ def test_a_disarmed_cart_stays_still_and_disarmed_under_any_bytes(stream):
     firmware, splitter = Firmware(lambda: 0), FrameSplitter()
     firmware.homed = True
     for stuffed in splitter.feed(stream):
-        seen = envelope(stuffed)
-        if seen is not None and seen.kind in (Start.TYPE, Home.TYPE):
-            continue  # a sound frame, which may move a cart
+        opened = envelope(stuffed)
+        if opened is not None and opened.kind in (Start.TYPE, Home.TYPE):
+            continue  # a valid frame, which may move a cart
         answers = firmware.receive(stuffed, 0)
-        assert seen is not None or answers == []
+        assert opened is not None or answers == []
         assert len(answers) <= 1
     assert not firmware.armed
     assert not firmware.homing
     assert {value for _, value in firmware.drive(0, 20_000)} == {0}
     assert decode_frame(firmware.tick(20_000, 0, 0)[-1][:-1]).message.motor_applied == 0
-    assert len(splitter._pending) <= LONGEST_FRAME
+    assert len(splitter.pending) <= LONGEST_FRAME
 
 
 def test_no_start_with_one_wrong_byte_arms():
@@ -99,7 +99,7 @@ def any_number(letter: str) -> st.SearchStrategy[int]:
 @given(st.lists(any_host_message() | st.integers(-40_000, 40_000), max_size=40), st.booleans())
 @settings(max_examples=150, deadline=None)
 def test_the_motor_is_0_whenever_the_cart_is_neither_armed_nor_homing(events, homed):
-    """Sound frames in any order, between periods that end at any count (an int)."""
+    """Valid frames in any order, between periods that end at any count (an int)."""
     firmware, now_us = Firmware(lambda: 3_000), 0
     firmware.homed = homed
     for event in events:

@@ -1,4 +1,4 @@
-"""tests/wire/vectors.json on the firmware: a cart that has just booted gives these answers, byte for byte."""
+"""A cart that has just booted answers tests/wire/vectors.json byte for byte."""
 
 import json
 from pathlib import Path

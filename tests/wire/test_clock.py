@@ -1,4 +1,4 @@
-"""The cart's ticks and clock wrap at 2^32; differences go across it."""
+"""The cart's ticks and clock wrap at 2^32; differences are right across the wrap."""
 
 import pytest
 
@@ -8,13 +8,13 @@ from cartpole_rl.wire import microseconds_between, seconds_between, ticks_betwee
 @pytest.mark.parametrize(
     ("before", "after", "difference"), [(5, 7, 2), (2**32 - 1, 1, 2), (7, 7, 0), (7, 5, 2**32 - 2)]
 )
-def test_differences_go_across_the_wrap(before: int, after: int, difference: int) -> None:
+def test_differences_are_right_across_the_wrap(before: int, after: int, difference: int) -> None:
     assert ticks_between(before, after) == difference
     assert microseconds_between(before, after) == difference
     assert seconds_between(before, after) == pytest.approx(difference * 1e-6)
 
 
-def test_a_number_that_is_older_went_back() -> None:
+def test_an_older_number_went_back() -> None:
     assert went_back(ticks_between(7, 5))
     assert went_back(ticks_between(3, 2**32 - 3))
     assert not went_back(ticks_between(5, 7))

@@ -1,4 +1,4 @@
-"""Byte stuffing: published vectors, round trips, and refusal of what no encoder makes."""
+"""Byte stuffing: published vectors, round trips, and refusal of invalid input."""
 
 import pytest
 from hypothesis import given
@@ -44,7 +44,7 @@ def test_round_trip_has_no_zero_and_bounded_overhead(data):
 
 
 @pytest.mark.parametrize("stuffed", [b"", b"\x05\x11", b"\x02", b"\x02\x00", b"\xff\x01"])
-def test_what_no_encoder_makes_is_refused(stuffed):
+def test_bytes_that_no_encoder_makes_are_refused(stuffed):
     with pytest.raises(FrameError):
         cobs.decode(stuffed)
 

@@ -1,4 +1,4 @@
-"""Frames and messages: round trips, damage that is noticed, and a splitter that stays in step and bounded."""
+"""Frames and messages: round trips, detection of damage, a splitter that stays synchronized and bounded."""
 
 from dataclasses import fields
 
@@ -29,7 +29,7 @@ def frame_of(body: bytes) -> bytes:
 
 
 @given(messages(), st.integers(0, 255), st.integers(0, 255))
-def test_every_message_comes_back_as_it_went(message, sequence, flags):
+def test_every_message_survives_a_round_trip(message, sequence, flags):
     frame = encode_frame(message, sequence, flags)
     assert frame.count(0) == 1
     assert frame[-1] == 0
@@ -53,7 +53,7 @@ def test_a_value_too_wide_for_its_field_is_refused():
 
 
 @given(messages(), st.data())
-def test_every_wrong_byte_is_noticed(message, data):
+def test_every_wrong_byte_is_detected(message, data):
     body = bytearray(cobs.decode(encode_frame(message, 3)[:-1]))
     body[data.draw(st.integers(0, len(body) - 1))] ^= data.draw(st.integers(1, 255))
     with pytest.raises(FrameError):
@@ -63,7 +63,7 @@ def test_every_wrong_byte_is_noticed(message, data):
 @pytest.mark.parametrize(
     "message", [Hello(), SetMotor(-200), State(1169, 23380000, 43, 2051, -200, 4, 0, 20)]
 )
-def test_every_cut_is_noticed(message):
+def test_every_cut_is_detected(message):
     stuffed = encode_frame(message, 3)[:-1]
     for length in range(len(stuffed)):
         with pytest.raises(FrameError):
@@ -79,7 +79,7 @@ def test_every_cut_is_noticed(message):
         (b"\x01\x01", "cut short"),
     ],
 )
-def test_sound_frames_with_a_wrong_content_are_refused_by_name(body, complaint):
+def test_valid_frames_with_invalid_content_are_refused_by_name(body, complaint):
     with pytest.raises(FrameError, match=complaint):
         decode_frame(frame_of(body))
 
@@ -90,7 +90,7 @@ def test_an_envelope_opens_where_only_the_content_is_wrong():
 
 
 @given(st.lists(messages(), min_size=1, max_size=8), st.data())
-def test_splitter_does_not_care_how_bytes_arrive(sent, data):
+def test_splitter_is_independent_of_how_bytes_arrive(sent, data):
     stream = b"".join(encode_frame(message, number) for number, message in enumerate(sent))
     splitter, came, at = FrameSplitter(), [], 0
     while at < len(stream):
@@ -101,7 +101,7 @@ def test_splitter_does_not_care_how_bytes_arrive(sent, data):
 
 
 @given(st.binary(max_size=300))
-def test_splitter_is_in_step_after_one_zero_behind_any_garbage(garbage):
+def test_splitter_is_synchronized_after_one_zero_after_any_garbage(garbage):
     splitter = FrameSplitter()
     list(splitter.feed(garbage + b"\x00"))
     assert list(splitter.feed(encode_frame(SetMotor(5), 1) * 2)) == [encode_frame(SetMotor(5), 1)[:-1]] * 2
@@ -112,11 +112,11 @@ def test_splitter_skips_empty_runs_and_stays_bounded():
     assert list(splitter.feed(b"\x00\x00\x00")) == []
     for _ in range(100):
         assert list(splitter.feed(b"\x55" * 1000)) == []
-    assert len(splitter._pending) <= LONGEST_FRAME
+    assert len(splitter.pending) <= LONGEST_FRAME
     assert splitter.overlong == 1
     assert list(splitter.feed(b"\x00" + encode_frame(Hello(), 0))) == [encode_frame(Hello(), 0)[:-1]]
 
 
-def test_state_has_the_bytes_that_the_protocol_says():
+def test_state_has_the_bytes_of_the_protocol():
     state = State(1, 2, -3, 4, -5, 6, 7, 8)
     assert state.pack().hex() == "0100000002000000fdffffff04000000fbff0607000800"

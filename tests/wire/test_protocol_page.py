@@ -1,4 +1,4 @@
-"""What docs/protocol.md states in numbers is what the code does."""
+"""The numbers in docs/protocol.md are those of the code."""
 
 import re
 from pathlib import Path
@@ -51,7 +51,7 @@ def test_every_type_has_one_example():
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
-def test_example_is_what_the_encoder_makes(name):
+def test_example_has_the_bytes_of_the_encoder(name):
     assert ROWS[name] == encode_frame(*EXAMPLES[name]).hex(" ")
 
 
@@ -76,9 +76,9 @@ def test_reason_is_listed(reason):
 
 
 @pytest.mark.parametrize("name", ["STATE", "SET_MOTOR"])
-def test_the_length_of_a_frame_is_told(name):
-    told = int(re.search(rf"\b{name} is (\d+) bytes", PAGE).group(1))
-    assert told == len(encode_frame(*EXAMPLES[name]))
+def test_the_length_of_a_frame_is_stated(name):
+    stated = int(re.search(rf"\b{name} is (\d+) bytes", PAGE).group(1))
+    assert stated == len(encode_frame(*EXAMPLES[name]))
 
 
 def test_the_longest_messages_fit_a_frame():
@@ -91,14 +91,14 @@ def test_the_longest_messages_fit_a_frame():
 
 @pytest.mark.parametrize("rule", ["Watchdog", "Soft limit", "Faults"])
 def test_each_rule_says_when_it_holds(rule):
-    """A homing touches the stops by itself: with a rule that held then too it could not."""
+    """Homing has to touch the stops, so a page without these words would be wrong."""
     text = re.search(rf"^\d\. \*\*{rule}\*\*(.*?)(?=^\d\. |^$)", PAGE, re.MULTILINE | re.DOTALL).group(1)
     assert "while armed" in text
     assert "homing" in text
 
 
-def test_the_limits_before_the_first_homing_are_told():
-    """Those that tests/emulator/test_emulator_device.py finds."""
-    text = PAGE.split("**The limits in INFO**")[1].split("\n\n")[0]
-    assert "Before the\nfirst homing" in text
+def test_the_limits_before_the_first_homing_are_stated():
+    """The same numbers as in tests/emulator/test_emulator_device.py."""
+    text = " ".join(PAGE.split("**The limits in INFO**")[1].split("\n\n")[0].split())
+    assert "Before the first homing" in text
     assert "16704 and 17539" in text

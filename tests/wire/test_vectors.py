@@ -1,6 +1,6 @@
-"""tests/wire/vectors.json, for firmware writers: the host's encoder and decoder agree with every frame in it.
+"""The host's encoder and decoder agree with every frame of tests/wire/vectors.json.
 
-The checksum and the stuffing are worked out a second time here, bit by bit as docs/protocol.md tells them.
+The checksum and the stuffing are computed a second time here, bit by bit, as docs/protocol.md describes them.
 """
 
 import json
@@ -22,7 +22,7 @@ def named(vectors: list[dict]) -> list:
 
 
 def by_hand(stuffed: bytes) -> tuple[bytes, int, int]:
-    """Body, checksum as sent, and checksum by the long way."""
+    """Return the body, the checksum as sent, and the checksum computed bit by bit."""
     data, rest = b"", stuffed
     while rest:
         code = rest[0]
@@ -50,8 +50,8 @@ def test_a_good_frame_is_encoded_and_decoded(vector):
 
 @pytest.mark.parametrize("vector", named(GOOD))
 def test_a_good_frame_is_good_by_hand(vector):
-    body, sent, worked_out = by_hand(bytes.fromhex(vector["hex"])[:-1])
-    assert sent == worked_out
+    body, sent, computed = by_hand(bytes.fromhex(vector["hex"])[:-1])
+    assert sent == computed
     assert body[:4] == bytes((1, MessageType[vector["type"]], vector["sequence"], vector["flags"]))
 
 

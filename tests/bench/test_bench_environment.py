@@ -1,23 +1,18 @@
 """The benchmark of the environment runs, and its JSON has every row; how fast they are is not tested."""
 
 import json
-import shutil
-import subprocess
-import sys
 from pathlib import Path
 
+import environment
 import pytest
+import torch
+from bench_scripts import Run
 
-SCRIPT = Path(__file__).parents[2] / "scripts/bench/environment.py"
 
-
-@pytest.mark.skipif(shutil.which("g++") is None, reason="needs a C++ compiler: install g++")
-def test_all_rows_are_there(tmp_path: Path) -> None:
-    file = tmp_path / "environment.json"
-    command = [sys.executable, SCRIPT, "--quick", "--threads", "1", "--json", file]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    rows = {row["name"]: row for row in json.loads(file.read_text())}
+def test_all_rows_are_there(tmp_path: Path, run: Run) -> None:
+    threads = torch.get_num_threads()
+    shown = run(environment, tmp_path, "--quick", "--threads", str(threads), "--json", "environment.json")
+    rows = {row["name"]: row for row in json.loads((tmp_path / "environment.json").read_text())}
     for peer, ours in (
         ("Gymnasium CartPole", "dynamics, 1 period a call, 1 substep"),
         ("Gymnasium CartPole", "dynamics, 1 period a call, 4 substeps"),
@@ -30,4 +25,4 @@ def test_all_rows_are_there(tmp_path: Path) -> None:
         assert row["peer"] == peer
         assert row["ratio"] == pytest.approx(row["steps_per_second"] / rows[peer]["steps_per_second"])
         assert row["carts"] == rows[peer]["carts"]
-        assert ours in done.stdout
+        assert ours in shown

@@ -1,0 +1,89 @@
+"""Landing and holding: beam search that keeps the best state of each small cell of the state space."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from best_score.cart import LOST, KnownCart, Nodes, wrapped
+from cartpole_rl.physics.dynamics import State
+
+LANDINGS = (3, 10)  # steps before the pole stands at which a landing begins
+SETTLING = 30  # steps after that moment at which a landing ends
+HOLDING_STATES, LOOKAHEAD, KEPT_STEPS = 300, 40, 20  # holding looks 40 steps ahead and keeps 20 of them
+CELL = (0.002, 0.01, 0.006, 0.03)  # m, m/s, rad, rad/s
+HASHED = 1 << 22  # number of hash values of cells
+
+
+def landed(cart: KnownCart, position: float, swing: list[int], arrival: int, states: int) -> list[list[int]]:
+    """Return sequences until SETTLING steps after `arrival`, one for each beginning of the landing."""
+    sequences = []
+    for early in LANDINGS:
+        first = swing[: max(arrival - early, 0)]
+        steps = min(arrival + SETTLING, cart.steps) - len(first)
+        root = cart.run(cart.hanging(position), first)
+        sequences.append(first + beam(cart, root, steps, states))
+    return sequences
+
+
+def held(cart: KnownCart, position: float, actions: list[int]) -> list[int]:
+    """Return the sequence continued to the end of the episode.
+
+    Each search starts from the state that the cart reaches alone: among many states it differs by rounding.
+    """
+    actions, nodes = list(actions), cart.run(cart.hanging(position), actions)
+    while len(actions) < cart.steps:
+        left = cart.steps - len(actions)
+        ahead = beam(cart, nodes, min(LOOKAHEAD, left), HOLDING_STATES)
+        kept = ahead if len(ahead) in (0, left) else ahead[:KEPT_STEPS]
+        if not kept:
+            break
+        actions, nodes = actions + kept, cart.run(nodes, kept)
+    return actions
+
+
+def beam(cart: KnownCart, root: Nodes, steps: int, states: int) -> list[int]:
+    """Return the best `steps` actions found from `root`, one node; fewer if every cart leaves the track."""
+    nodes, history = root, []
+    for _ in range(steps):
+        count, actions = len(nodes.points), len(cart.motors)
+        parents = torch.arange(count).repeat_interleave(actions)
+        chosen = torch.arange(actions).repeat(count)
+        after, _, on_track = cart.step(nodes.at(parents), chosen)
+        rank = torch.where(on_track, after.points - risk(cart, after.state), -LOST)
+        rows = best_of_cells(cells(after.state), rank, states)
+        if len(rows) == 0:
+            break
+        nodes = after.at(rows)
+        history.append((parents[rows], chosen[rows]))
+    return traced(history, int((nodes.points - risk(cart, nodes.state)).argmax()))
+
+
+def risk(cart: KnownCart, state: State) -> Tensor:
+    """Return the points [N] that states near upright are going to lose, roughly."""
+    falls = wrapped(state.theta) + state.theta_dot / cart.growth
+    return 100 * falls.abs() + 30 * ((state.x + 0.3 * state.x_dot) / cart.reach) ** 2
+
+
+def cells(state: State) -> Tensor:
+    """Return a hash [N] of each state's cell."""
+    number = torch.zeros_like(state.x, dtype=torch.int64)
+    for value, width in zip(state._replace(theta=wrapped(state.theta)), CELL, strict=True):
+        number = number * 1009 + (value / width).floor().long()
+    return torch.remainder(number, HASHED)
+
+
+def best_of_cells(cell: Tensor, rank: Tensor, count: int) -> Tensor:
+    """Return the rows of the best state of each cell, at most `count`, none of them off the track."""
+    best = torch.full((HASHED,), -LOST).scatter_reduce_(0, cell, rank, "amax")
+    rows = ((rank == best[cell]) & (rank > -LOST / 2)).nonzero().squeeze(1)
+    return rows[rank[rows].topk(min(count, len(rows))).indices]
+
+
+def traced(history: Sequence[tuple[Tensor, Tensor]], row: int) -> list[int]:
+    """Return the actions that led to `row` of the last step, from each step's (parent row, action) [N]."""
+    actions = []
+    for parents, chosen in reversed(history):
+        actions.append(int(chosen[row]))
+        row = int(parents[row])
+    return actions[::-1]

@@ -1,0 +1,100 @@
+"""Shared by the bench scripts: options, commands, run folders, parallel work, JSON files and tables."""
+
+import argparse
+import json
+import subprocess
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from cartpole_rl.reporting.table import Cell, table
+
+RUNS = Path("runs/bench")  # the parent of every run folder that a bench script makes
+REFERENCES = Path(__file__).with_name("references.json")  # written by reference.py
+LOST_SCORE = 500  # an episode with a lower score counts as lost
+Job = TypeVar("Job")
+Result = TypeVar("Result")
+
+
+def option_parser(page: str | None) -> argparse.ArgumentParser:
+    """Return a parser with `--json` whose `--help` shows the script's whole docstring."""
+    parser = argparse.ArgumentParser(description=page, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", type=Path, metavar="FILE", help="also write all figures to FILE")
+    return parser
+
+
+def positive_int(text: str) -> int:
+    """Convert an option to an integer of at least 1."""
+    if (value := int(text)) < 1:
+        raise argparse.ArgumentTypeError(f"{text} is less than 1")
+    return value
+
+
+def failure(command: str, *words: str) -> str | None:
+    """Run cartpole-`command`; return None on success, else the last line of its error output."""
+    program = Path(sys.executable).with_name(f"cartpole-{command}")
+    done = subprocess.run([program, *words], capture_output=True, text=True, check=False)
+    if done.returncode == 0:
+        return None
+    return (done.stderr.strip().splitlines() or [f"exit status {done.returncode}"])[-1]
+
+
+def run_once(folder: Path, command: str, *words: str, result: str = "metrics.json") -> Path:
+    """Run cartpole-`command` in `folder` unless its `result` file exists; exit if the command fails."""
+    if not (folder / result).exists():
+        error = failure(command, *words, f"hydra.run.dir={folder}")
+        if error:
+            sys.exit(f"cartpole-{command} in {folder}: {error}")
+    return folder
+
+
+def train_seeds(experiment: str, seeds: int, jobs: int, overrides: Sequence[str], parent: Path) -> list[Path]:
+    """Train `seeds` seeds of an experiment in `parent`/<seed>, `jobs` at a time; return the folders."""
+
+    def train(seed: int) -> Path:
+        words = (f"experiment={experiment}", f"seed={seed}", *overrides)
+        return run_once(parent / str(seed), "train", *words)
+
+    return in_parallel(train, range(seeds), jobs)
+
+
+def in_parallel(work: Callable[[Job], Result], items: Iterable[Job], jobs: int) -> list[Result]:
+    """Return `work(item)` for each item, in order, `jobs` at a time in threads."""
+    with ThreadPoolExecutor(jobs) as pool:
+        return list(pool.map(work, items))
+
+
+def mean_score(file: Path) -> float:
+    """Return the mean score (6.2) in a metrics.json."""
+    return float(read_json(file)["score"]["mean"])
+
+
+def reference_scores() -> dict[str, float]:
+    """Return the best score known for each plant, from references.json."""
+    return {plant: found["score"] for plant, found in read_json(REFERENCES).items()}
+
+
+def min_median_max(values: Sequence[float], decimals: int) -> dict[str, str]:
+    """Return three table cells that summarize one figure over the seeds."""
+    summaries = {"min": np.min, "median": np.median, "max": np.max}
+    return {name: f"{summary(values):.{decimals}f}" for name, summary in summaries.items()}
+
+
+def print_table(rows: Sequence[Mapping[str, Cell]]) -> None:
+    """Print rows with the keys of the first one as headings."""
+    print(table(rows, list(rows[0])), flush=True)
+
+
+def read_json(file: Path) -> Any:
+    """Return the content of a JSON file."""
+    return json.loads(file.read_text())
+
+
+def write_json(file: Path | None, content: Any) -> None:
+    """Write `content` to a JSON file; do nothing without a file."""
+    if file:
+        file.write_text(json.dumps(content, indent=1) + "\n")
