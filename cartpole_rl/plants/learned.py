@@ -12,7 +12,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from cartpole_rl.compilation import Compiled
-from cartpole_rl.physics.residual import UNDER_WAY, Residual, chosen_members, run_corrected_period
+from cartpole_rl.physics.residual import UNDER_WAY, Residual, chosen_members
 from cartpole_rl.plants.learned_model import LearnedModel
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.plants.simulation import Carts, Given, Period, run_carts
@@ -32,11 +32,10 @@ class Learned(NamedTuple):
     last: Tensor
 
 
-def run_learned_carts(carts: Carts, given: Given, learned: Learned, **laws: Any) -> Period:
-    """`run_carts` with what the members of `learned` add."""
+def run_learned_carts(carts: Carts, given: Given, learned: Learned, **settings: Any) -> Period:
+    """Run `run_carts` with the addition of the members of `learned`."""
     member, *weights = learned
-    addition = chosen_members(Residual(*weights), member)
-    return run_carts(carts, given, run=partial(run_corrected_period, addition=addition), **laws)
+    return run_carts(carts, given, addition=chosen_members(Residual(*weights), member), **settings)
 
 
 class LearnedPlant(SimulatedPlant):

@@ -4,16 +4,16 @@ What chance has a part in comes in drawn, so that this can be compiled. Tensors 
 transpose of what stands in the tensordict: compiled code then runs along the carts.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from cartpole_rl.physics.dynamics import Drive, State, run_period
+from cartpole_rl.physics.dynamics import AddsTo, Drive, State, run_period
+from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import CartParameters
-from cartpole_rl.tasks.features import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 
 LARGEST_COUNT = 2**30  # STATE's counts are 32-bit numbers
 
@@ -50,15 +50,15 @@ def run_carts(
     models: Models,
     period: float,
     substeps: int,
-    run: Callable[..., tuple[State, Drive]] = run_period,
+    addition: AddsTo | None = None,
 ) -> Period:
-    """Run every cart for `period` s in `substeps` steps under a new motor value, as `run` does."""
+    """Run every cart for `period` s in `substeps` steps under a new motor value."""
     cart = CartParameters.from_table(carts.table)
     before = State(*carts.motion.unbind(0))
     force, *motors = carts.drive.unbind(0)
     drive = Drive(force, [given.motor[0].to(force.dtype), *motors[:-1]])
     latency = (cart.latency + given.chance[0] * cart.latency_jitter).clamp(min=0)
-    state, drive = run(before, drive, latency, cart, models, period, substeps)
+    state, drive = run_period(before, drive, latency, cart, models, period, substeps, addition)
     return Period(
         torch.stack(state),
         torch.stack((drive.force, *drive.motors)),
