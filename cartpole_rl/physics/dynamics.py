@@ -41,7 +41,7 @@ class Addition(NamedTuple):
     angular_acceleration: Tensor  # rad/s^2 of the pole
 
 
-AddsTo = Callable[[State, Drive], Addition]  # the addition of a period, from where it starts
+MakeAddition = Callable[[State, Drive], Addition]  # the addition of a period, from where it starts
 
 
 class Mechanism(NamedTuple):
@@ -165,7 +165,7 @@ def run_period(
     models: Models,
     period: float,
     substeps: int,
-    addition: AddsTo | None = None,
+    addition: MakeAddition | None = None,
 ) -> tuple[State, Drive]:
     """Integrate one control period of `period` s in `substeps` equal steps.
 

@@ -12,7 +12,7 @@ from typing import NamedTuple, Self
 import torch
 from torch import Tensor
 
-from cartpole_rl.physics.dynamics import Addition, AddsTo, Drive, State
+from cartpole_rl.physics.dynamics import Addition, Drive, MakeAddition, State
 
 UNDER_WAY = 4  # motor values that the network reads, newest first
 INPUTS = 6 + UNDER_WAY
@@ -76,7 +76,7 @@ class Residual(NamedTuple):
         return UNITS[0] * (low + share * (high - low))
 
 
-def chosen_members(residual: Residual, member: Tensor) -> AddsTo:
+def chosen_members(residual: Residual, member: Tensor) -> MakeAddition:
     """Return the addition for carts of `member` [N] int64 each: all networks run, each cart takes its own."""
 
     def network(inputs: Tensor) -> Tensor:
@@ -86,7 +86,7 @@ def chosen_members(residual: Residual, member: Tensor) -> AddsTo:
     return adding(residual, network, member)
 
 
-def members_in_turn(residual: Residual, each: int) -> AddsTo:
+def members_in_turn(residual: Residual, each: int) -> MakeAddition:
     """Return the addition for M times `each` carts, the first member's first."""
 
     def network(inputs: Tensor) -> Tensor:
@@ -96,7 +96,7 @@ def members_in_turn(residual: Residual, each: int) -> AddsTo:
     return adding(residual, network, torch.arange(residual.members).repeat_interleave(each))
 
 
-def adding(residual: Residual, network: Callable[[Tensor], Tensor], member: Tensor) -> AddsTo:
+def adding(residual: Residual, network: Callable[[Tensor], Tensor], member: Tensor) -> MakeAddition:
     """Return the addition of `network`, inputs [INPUTS, N] to outputs [2, N], and of the members' tables."""
 
     def addition(state: State, drive: Drive) -> Addition:

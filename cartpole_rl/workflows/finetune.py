@@ -5,6 +5,7 @@ exploration (after). The cart is driven by a process of its own; this one learns
 episode is on disk before the next begins, so that an interruption costs at most the one under way.
 """
 
+import math
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -39,11 +40,12 @@ from cartpole_rl.learning.checkpoints import (
 from cartpole_rl.learning.finetuning import Finetuning, recorded_chunk
 from cartpole_rl.learning.randomness import seed_everything
 from cartpole_rl.learning.training import Scalars, Training
+from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 from cartpole_rl.physics.models import CartFriction, Models
 from cartpole_rl.plants.recorded import RecordedPlant
 from cartpole_rl.plants.serial.statistics import LinkStatistics
 from cartpole_rl.plants.simulated import SimulatedPlant
-from cartpole_rl.randomization.found import FoundCarts
+from cartpole_rl.randomization.identified import IdentifiedCarts
 from cartpole_rl.reporting.tensorboard import TensorBoardLog
 from cartpole_rl.scheduling import compute_last
 from cartpole_rl.settings import evaluation_seed
@@ -288,16 +290,17 @@ class Session:
         tell(
             "finetune",
             f"the simulator follows {windows.number} recorded half seconds within "
-            f"{fit.rms[0] * 0.022749:.2f} mm and {fit.rms[1] * 0.0879:.2f} deg",
+            f"{fit.rms[0] * 1e3 * CART_METRES_PER_COUNT:.2f} mm and "
+            f"{fit.rms[1] * math.degrees(POLE_RADIANS_PER_COUNT):.2f} deg",
         )
         return fit, models
 
-    def carts(self, fit: Fit) -> FoundCarts:
+    def carts(self, fit: Fit) -> IdentifiedCarts:
         """Carts of the fit, and some as in training."""
         random = np.random.default_rng(self.config.seed)
         table = torch.from_numpy(fit.draw(DRAWN, random, self.config.finetuning.widen)).float()
         prior_share = self.config.finetuning.prior_share
-        return FoundCarts(table, randomizer(self.training), prior_share, LONGEST_LATENCY)
+        return IdentifiedCarts(table, randomizer(self.training), prior_share, LONGEST_LATENCY)
 
     def drive_all(self, stage: str, count: int) -> None:
         """Drive what is missing of a stage, without exploration."""

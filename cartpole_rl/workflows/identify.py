@@ -177,10 +177,13 @@ def write_found(config: IdentifyConfig, found: Identification, carts: np.ndarray
                 each.name: {"value": each.value, "low": each.low, "high": each.high, "unit": each.unit}
                 for each in intervals(found.fit, carts)
             },
-            "tried": {each.law: {"x_m": each.x_error, "theta_rad": each.theta_error} for each in found.tried},
+            "tried": {
+                each.cart_friction: {"x_m": each.x_error, "theta_rad": each.theta_error}
+                for each in found.candidates
+            },
             "held_out_1_s": {"x_m": x_error, "theta_rad": theta_error},
             "residual_counts": found.fit.rms.tolist(),
-            "doubts": found.doubts,
+            "doubts": found.warnings,
         },
     )
 
@@ -324,11 +327,11 @@ def as_page(
     ]
     laws = [
         {
-            "cart_friction": str(each.law),
+            "cart_friction": str(each.cart_friction),
             "x, mm": f"{1e3 * each.x_error:.2f}",
             "theta, deg": f"{math.degrees(each.theta_error):.2f}",
         }
-        for each in found.tried
+        for each in found.candidates
     ]
     x_error, theta_error = prediction_errors(found.held_out)
     sections: list[tuple[str, Any]] = [
@@ -340,7 +343,7 @@ def as_page(
             "RMS of a prediction over one second of motion that nothing was fitted to, away from upright: "
             f"{1e3 * x_error:.2f} mm and {math.degrees(theta_error):.2f} degrees.",
         ),
-        ("What to doubt", found.doubts or ["Nothing stood out."]),
+        ("What to doubt", found.warnings or ["Nothing stood out."]),
         ("What to do next", [f"<code>{next_command(found, folder)}</code>"]),
         *[(words, Path("figures") / f"{name}.png") for name, words in FIGURES.items()],
     ]
@@ -370,7 +373,7 @@ def print_verdict(found: Identification, folder: Path) -> None:
         f"one second of held-out motion is predicted within {1e3 * x_error:.2f} mm and "
         f"{math.degrees(theta_error):.2f} deg RMS, with cart_friction={found.models.cart_friction}"
     )
-    for doubt in found.doubts:
+    for doubt in found.warnings:
         print(f"doubt: {doubt}")
     print(f"{folder}/{PAGE}, {CART}, {POLE}, {RANDOMIZATION} and figures/ are written; next:")
     print(next_command(found, folder))

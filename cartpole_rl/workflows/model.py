@@ -14,11 +14,13 @@ from tqdm import tqdm
 
 from cartpole_rl.errors import RecordingError
 from cartpole_rl.evaluation.recordings import read_recording
+from cartpole_rl.identification.ensemble import Ensemble
 from cartpole_rl.identification.fit import Fit, fit_cart
 from cartpole_rl.identification.held_out import CERTAIN, LEAD, Prediction, errors_at, predict_held_out
-from cartpole_rl.identification.learned import Dynamics, Ensemble
 from cartpole_rl.identification.replay import recorded_period
+from cartpole_rl.identification.rollout import Dynamics
 from cartpole_rl.identification.windows import HISTORY, Windows, cut_windows
+from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT
 from cartpole_rl.physics.models import CartFriction, Models
 from cartpole_rl.physics.residual import SPACING, UNITS, Residual
 from cartpole_rl.plants.learned_model import LearnedModel, save_model
@@ -28,7 +30,6 @@ from cartpole_rl.reporting.figures import save
 from cartpole_rl.reporting.figures.learned_models import learned_model_figure
 from cartpole_rl.reporting.table import number_text, table
 from cartpole_rl.tasks.episode import Episode
-from cartpole_rl.tasks.features import CART_METRES_PER_COUNT
 from cartpole_rl.workflows.build import use_threads
 from cartpole_rl.workflows.checks import check_one_pole
 from cartpole_rl.workflows.config import LearnedSettings, ModelConfig

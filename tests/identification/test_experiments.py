@@ -1,4 +1,4 @@
-"""Experiments on a simulated cart: they keep clear of the ends, and what is found from them is the cart."""
+"""Experiments on a simulated cart keep clear of the ends, and identify the cart."""
 
 from collections.abc import Callable
 from functools import partial
@@ -15,7 +15,7 @@ from cartpole_rl.identification.experiments import (
     REACH,
     Experiment,
     Moves,
-    Seen,
+    Observed,
     Task,
     conduct,
     excite,
@@ -25,6 +25,7 @@ from cartpole_rl.identification.experiments import (
 )
 from cartpole_rl.identification.identify import Identification, identify, prediction_errors
 from cartpole_rl.identification.quantities import quantities
+from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_COUNTS_PER_TURN
 from cartpole_rl.physics.models import CartFriction, Models, PoleFriction
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.simulated import SimulatedPlant
@@ -128,7 +129,7 @@ def test_recordings_follow_each_other_on_one_cart(recordings: dict[str, Episode]
     ],
 )
 def test_the_guard_brakes(x: float, x_dot: float, motor: int, given: int) -> None:
-    assert guarded(motor, Seen(x, x_dot, np.pi, 0.0)) == given
+    assert guarded(motor, Observed(x, x_dot, np.pi, 0.0)) == given
 
 
 def test_the_cart_is_found(found: Identification, nominal: dict[str, float]) -> None:
@@ -149,7 +150,7 @@ def test_the_cart_is_found(found: Identification, nominal: dict[str, float]) -> 
 
 
 def test_the_law_that_holds_predicts_best(found: Identification) -> None:
-    errors = {each.law: each.error for each in found.tried}
+    errors = {each.cart_friction: each.error for each in found.candidates}
     assert found.models.cart_friction in (CartFriction.STEP, CartFriction.STRIBECK)
     assert errors[CartFriction.LINEAR] > 3 * errors[CartFriction.STEP]
     x_error, theta_error = prediction_errors(found.held_out)
@@ -223,7 +224,9 @@ class TestChecks:
 
     def test_a_swapped_pole_encoder(self, recordings: dict[str, Episode]) -> None:
         swapped = [
-            changed(each, theta=lambda theta: 2 * np.pi - theta, pole=lambda counts: 4096 - counts)
+            changed(
+                each, theta=lambda theta: 2 * np.pi - theta, pole=lambda counts: POLE_COUNTS_PER_TURN - counts
+            )
             for each in recordings.values()
         ]
         with pytest.raises(RecordingError, match="swap the pole encoder's channels"):
@@ -248,7 +251,7 @@ class TestChecks:
         most = 8000
         saturated = changed(
             recordings["excite"],
-            x=lambda x: x.clip(-most * 2.2749e-5, most * 2.2749e-5),
+            x=lambda x: x.clip(-most * CART_METRES_PER_COUNT, most * CART_METRES_PER_COUNT),
             cart=lambda counts: counts.clip(-most, most),
         )
         with pytest.raises(RecordingError, match=r"stops dead at -?8000 counts"):

@@ -10,7 +10,7 @@ from cartpole_rl.envs.make import CartPoleEnv
 from cartpole_rl.errors import RecordingError
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.identification.fit import fit_cart
-from cartpole_rl.identification.prediction import predict
+from cartpole_rl.identification.rollout import rollout
 from cartpole_rl.identification.unknowns import limits, parameters_at, unknowns_of
 from cartpole_rl.identification.windows import HISTORY, cut_windows
 from cartpole_rl.physics.models import CartFriction, Models
@@ -68,7 +68,7 @@ def test_the_true_cart_predicts_every_count(episodes: list[Episode], nominal: di
     values = {**nominal, **TRUTH}
     table = torch.tensor([[values[name]] for name in CartParameters.names()], dtype=torch.float64)
     motion = torch.tensor([[0.0], [0.0], [np.pi], [0.0]], dtype=torch.float64)
-    counts = predict(table, motion, torch.from_numpy(motors).unsqueeze(1), STEP, PERIOD, 4)[..., 0]
+    counts = rollout(table, motion, torch.from_numpy(motors).unsqueeze(1), STEP, PERIOD, 4)[..., 0]
     assert np.abs(counts.numpy() - first.counts[:51]).max() < 0.6
 
 

@@ -9,7 +9,7 @@ from cartpole_rl.choices import choice, conf_folder
 from cartpole_rl.physics.models import Actuator, CartFriction, Models, PoleFriction, unused_parameters
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.effects import without_effect
-from cartpole_rl.randomization.found import FoundCarts
+from cartpole_rl.randomization.identified import IdentifiedCarts
 from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.randomization.randomizer import Randomizer
 from cartpole_rl.randomization.ranges import Range
@@ -145,7 +145,7 @@ def test_of_carts_that_were_found_only_what_is_drawn(ip02: dict[str, float], med
     found = others.nominal.unsqueeze(1).repeat(1, 5)
 
     def unread(prior_share: float, told: list[str] | None) -> list[str]:
-        carts = FoundCarts(found, others, prior_share, longest_delay=0.02, told=told)
+        carts = IdentifiedCarts(found, others, prior_share, longest_delay=0.02, told=told)
         return without_effect(carts, ranges, (-200, 0, 200), Models(), 0.02)
 
     assert unread(0.0, None) == ["cart_mass", "latency"]
