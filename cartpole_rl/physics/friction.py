@@ -72,7 +72,7 @@ class CartFriction(PhysicsModel):
 
     @property
     def has_dry_friction(self) -> bool:
-        """Whether there is more than the viscous term."""
+        """The model has more than the viscous term."""
         return self.formula is not zero
 
 

@@ -41,7 +41,7 @@ class Range(Settings):
 
     @property
     def scales_nominal(self) -> bool:
-        """Whether the drawn value is a multiple of the nominal one."""
+        """The drawn value is a multiple of the nominal one."""
         return self.absolute is None
 
     def limits(self) -> Bounds:

@@ -1,7 +1,7 @@
 """A residual learned from recordings: it finds what the physics lacks, and leaves right physics alone."""
 
 from collections.abc import Callable, Mapping
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 import pytest
@@ -86,6 +86,7 @@ def record(
 ) -> Callable[[bool], tuple[Windows, Windows]]:
     """Windows to learn from and windows held out, of a cart whose track ripples, or not."""
 
+    @cache
     def build(ripples: bool) -> tuple[Windows, Windows]:
         randomizer = Randomizer({**ip02, **TRACK}, medium, {})
         if ripples:

@@ -34,7 +34,7 @@ from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.tasks.settings import Start, StartSettings
 
 PERIOD = 0.02
-LAWS = Models(CartFriction.STEP, PoleFriction.BEARING)
+MODELS = Models(CartFriction.STEP, PoleFriction.BEARING)
 TRUTH = {
     "cart_viscous": 0.8,
     "cart_coulomb": 0.4,
@@ -61,7 +61,7 @@ HANGING = StartSettings(
 
 @pytest.fixture(scope="module")
 def recordings(make_plant: Callable[..., SimulatedPlant]) -> dict[str, Episode]:
-    plant = make_plant(1, cart=TRUTH, models=LAWS, start=HANGING)
+    plant = make_plant(1, cart=TRUTH, models=MODELS, start=HANGING)
     shorter = tuple(each._replace(moves=SHORTER.get(each.name, each.moves)) for each in EXPERIMENTS)
     return {each.name: episode for each, episode in conduct(plant, PERIOD, experiments=shorter)}
 
@@ -74,7 +74,7 @@ def nominal(ip02: dict[str, float], medium: PoleSettings) -> dict[str, float]:
 @pytest.fixture(scope="module")
 def found(recordings: dict[str, Episode], nominal: dict[str, float]) -> Identification:
     fitted = [episode for name, episode in recordings.items() if name != HELD_OUT]
-    return identify(fitted, [recordings[HELD_OUT]], nominal, LAWS, PERIOD, substeps=4, most=120)
+    return identify(fitted, [recordings[HELD_OUT]], nominal, MODELS, PERIOD, substeps=4, most=120)
 
 
 def test_every_experiment_is_made_to_its_end(recordings: dict[str, Episode]) -> None:
@@ -134,7 +134,7 @@ def test_the_guard_brakes(x: float, x_dot: float, motor: int, given: int) -> Non
 
 def test_the_cart_is_found(found: Identification, nominal: dict[str, float]) -> None:
     true = {each.name: each.value for each in quantities({**nominal, **TRUTH})}
-    told = {each.name: each.value for each in quantities(found.fit.parameters)}
+    values = {each.name: each.value for each in quantities(found.fit.parameters)}
     for name, share in {
         "pole_frequency": 0.002,
         "force_gain": 0.01,
@@ -143,10 +143,10 @@ def test_the_cart_is_found(found: Identification, nominal: dict[str, float]) -> 
         "coulomb": 0.05,
         "pole_damping": 0.1,
     }.items():
-        assert told[name] == pytest.approx(true[name], rel=share), name
+        assert values[name] == pytest.approx(true[name], rel=share), name
     early = 2.5  # ms: the simulated cart's step is 5 ms, and (3.8) moves it half of one early
-    assert told["latency"] == pytest.approx(true["latency"] - early, abs=1.0)
-    assert told["lag"] == pytest.approx(true["lag"], abs=1.0)
+    assert values["latency"] == pytest.approx(true["latency"] - early, abs=1.0)
+    assert values["lag"] == pytest.approx(true["lag"], abs=1.0)
 
 
 def test_the_law_that_holds_predicts_best(found: Identification) -> None:

@@ -62,7 +62,7 @@ def nominal(ip02: dict[str, float], medium: PoleSettings) -> dict[str, float]:
 
 
 def test_the_true_cart_predicts_every_count(episodes: list[Episode], nominal: dict[str, float]) -> None:
-    """From true beginnings at rest, to the rounding of the encoders."""
+    """From the true initial state at rest, to the rounding of the encoders."""
     first = episodes[0]
     motors = np.concatenate((np.zeros(HISTORY), first.motor[:50]))
     values = {**nominal, **TRUTH}
