@@ -96,7 +96,7 @@ def record(
             plant = SimulatedPlant(8, randomizer, START, STEP, seed=1)
         recorded = shaken(make_environment(plant, MOTORS, time_limit=300), seed=0)
         held_out = cut_windows(recorded[6:], PERIOD, periods=LEAD + 50)
-        return cut_windows(recorded[:6], PERIOD, most=60), held_out
+        return cut_windows(recorded[:6], PERIOD, most=40), held_out
 
     return build
 

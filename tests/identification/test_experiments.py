@@ -74,7 +74,7 @@ def nominal(ip02: dict[str, float], medium: PoleSettings) -> dict[str, float]:
 @pytest.fixture(scope="module")
 def found(recordings: dict[str, Episode], nominal: dict[str, float]) -> Identification:
     fitted = [episode for name, episode in recordings.items() if name != HELD_OUT]
-    return identify(fitted, [recordings[HELD_OUT]], nominal, MODELS, PERIOD, substeps=4, most=120)
+    return identify(fitted, [recordings[HELD_OUT]], nominal, MODELS, PERIOD, substeps=4, most=60)
 
 
 def test_every_experiment_is_made_to_its_end(recordings: dict[str, Episode]) -> None:
