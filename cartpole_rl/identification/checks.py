@@ -1,6 +1,6 @@
-"""What is wrong with a recording, before a cart is fitted to it: said in one line, with what to do.
+"""Checks of recordings before a cart is fitted to them. A message says what is wrong and what to do.
 
-A fit finds some cart for any numbers. These checks refuse those that no cart could have made.
+A fit finds a cart for any numbers. These checks refuse numbers that no cart could have made.
 """
 
 from collections.abc import Sequence
@@ -10,46 +10,47 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cartpole_rl.errors import RecordingError
+from cartpole_rl.identification.correlation import correlation
+from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 from cartpole_rl.tasks.episode import Episode
-from cartpole_rl.tasks.features import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 from cartpole_rl.tasks.upright import wrap
 
 Array = NDArray[np.floating]
 SHORTEST = 20.0  # s
-LEAST_WAY, LEAST_SWING = 0.05, 0.35  # m, rad
+LEAST_TRAVEL, LEAST_SWING = 0.05, 0.35  # m, rad
 STILL, STILL_ANGLE, STILL_SPREAD = 0.3, 0.2, 0.02  # s, rad from hanging, rad
 FROZEN = 1.0  # s
 STRONG, MOVES = 150, 0.03  # motor value; m of cart that move a hanging pole
 SUDDEN = 0.25  # m/s: from here to standing exactly still within a period
 TOLERANCE = 2.0  # counts by which positions in SI units may differ from counts
-SURE = 0.2  # correlation that tells a sign
+SIGNIFICANT = 0.2  # correlation from which its sign is certain
 
 
 def check_recordings(episodes: Sequence[Episode], period: float) -> None:
-    """Raise RecordingError for the first thing that is wrong with them."""
+    """Raise RecordingError for the first problem."""
     seconds = period * sum(episode.steps for episode in episodes)
     if seconds < SHORTEST:
         raise RecordingError(f"{seconds:.1f} s of recordings are too short; record {SHORTEST:g} s or more")
     for number, episode in enumerate(episodes):
         _check_units(episode, number)
-    way = max(float(np.ptp(episode.x)) for episode in episodes)
+    travel = max(float(np.ptp(episode.x)) for episode in episodes)
     swing = max(float(np.ptp(episode.theta)) for episode in episodes)
-    if way < LEAST_WAY or not any(episode.motor.any() for episode in episodes):
+    if travel < LEAST_TRAVEL or not any(episode.motor.any() for episode in episodes):
         raise RecordingError(
-            f"the cart moves {1e3 * way:.0f} mm in all: too little to tell its friction and its motor; "
+            f"the cart moves {1e3 * travel:.0f} mm in all: too little to identify its friction and motor; "
             "drive it over 100 mm or more"
         )
     for number, episode in enumerate(episodes):
         _check_encoders(episode, number, period)
     if swing < LEAST_SWING:
         raise RecordingError(
-            f"the pole swings over {np.degrees(swing):.0f} deg in all: too little to tell what it is; "
+            f"the pole swings over {np.degrees(swing):.0f} deg in all: too little to identify it; "
             "let it swing freely, over 20 deg or more"
         )
     if not any(_hangs_still(episode, period) for episode in episodes):
         raise RecordingError(
-            "the pole hangs still nowhere in the recordings, so that its zero cannot be checked; "
-            "begin one with half a second of the pole at rest"
+            "the pole hangs still nowhere in the recordings, so its zero cannot be checked; "
+            "start one with half a second of the pole at rest"
         )
     _check_signs(episodes, period)
 
@@ -71,7 +72,7 @@ def _check_units(episode: Episode, number: int) -> None:
 
 
 def _check_encoders(episode: Episode, number: int, period: float) -> None:
-    """A count that stands while the other one, or the motor, says that it should not."""
+    """Refuse a count that stands while the other one, or the motor, shows that it should move."""
     long = round(FROZEN / period)
     cart, pole = episode.counts[:, 0], episode.counts[:, 1]
     for name, own, other, enough in (
@@ -100,7 +101,7 @@ def _check_encoders(episode: Episode, number: int, period: float) -> None:
 
 
 def _standstills(counts: NDArray[np.int64]) -> list[tuple[int, int]]:
-    """First and last row of each stretch in which a count does not change."""
+    """Return the first and last row of each stretch in which a count does not change."""
     edges = np.flatnonzero(np.diff(counts)) + 1
     borders = [0, *edges.tolist(), len(counts)]
     return [(first, last - 1) for first, last in pairwise(borders) if last - first > 1]
@@ -116,8 +117,8 @@ def _hangs_still(episode: Episode, period: float) -> bool:
 
 
 def _check_signs(episodes: Sequence[Episode], period: float) -> None:
-    """The motor pushes the cart its own way; a hanging pole stays behind."""
-    pushes, answers, jerks, lags = [], [], [], []
+    """Refuse signs by which the motor pushes the cart backwards, or a hanging pole leads its cart."""
+    pushes, responses, jerks, lags = [], [], [], []
     for episode in episodes:
         if episode.steps < 10:
             continue
@@ -125,18 +126,18 @@ def _check_signs(episodes: Sequence[Episode], period: float) -> None:
         motor = np.convolve(episode.motor, np.ones(3) / 3, "valid")[::3]
         rows = min(len(x_ddot), len(motor) - 1)
         pushes.append(motor[1 : rows + 1] if len(motor) > rows else motor[:rows])
-        answers.append(x_ddot[:rows])
+        responses.append(x_ddot[:rows])
         angle = wrap(episode.theta[::3][1:-1] - np.pi)
         hanging = np.abs(angle[:rows]) < 0.8
-        free = theta_ddot[:rows] + (3 * period) ** 2 * 40 * np.sin(angle[:rows])  # less what gravity does
+        free = theta_ddot[:rows] + (3 * period) ** 2 * 40 * np.sin(angle[:rows])  # without gravity
         jerks.append(x_ddot[:rows][hanging])
         lags.append(free[hanging])
-    if _correlation(pushes, answers) < -SURE:
+    if _correlation(pushes, responses) < -SIGNIFICANT:
         raise RecordingError(
             "positive motor values push the cart towards smaller counts: swap the motor's wires, or the "
             "cart encoder's channels"
         )
-    if _correlation(jerks, lags) < -SURE:
+    if _correlation(jerks, lags) < -SIGNIFICANT:
         raise RecordingError(
             "the pole runs ahead of its cart instead of staying behind: swap the pole encoder's channels"
         )
@@ -144,4 +145,4 @@ def _check_signs(episodes: Sequence[Episode], period: float) -> None:
 
 def _correlation(first: Sequence[Array], second: Sequence[Array]) -> float:
     a, b = np.concatenate(first), np.concatenate(second)
-    return float(np.corrcoef(a, b)[0, 1]) if len(a) > 10 and a.std() > 0 and b.std() > 0 else 0.0
+    return correlation(a, b) if len(a) > 10 else 0.0

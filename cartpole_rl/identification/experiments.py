@@ -1,8 +1,8 @@
-"""What is asked of a cart to learn what it is: motor values that make each of its numbers show.
+"""Experiments on a cart: motor values under which its parameters show.
 
-An experiment is a generator: it yields the motor value of the next period and is sent what was seen at its
-end. Nothing but motor values and encoder positions goes in or out, so that any plant will do. The cart keeps
-clear of the track's ends by a guard, which brakes whatever an experiment asks for.
+An experiment is a generator: it yields the motor value of the next period and is sent the observation at its
+end. Only motor values and encoder positions go in and out, so that any plant can be used. A guard keeps the
+cart clear of the track's ends: it brakes, whatever an experiment requests.
 """
 
 import math
@@ -14,26 +14,26 @@ import numpy as np
 import torch
 from tensordict import TensorDictBase
 
+from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 from cartpole_rl.plants.specs import Plant
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
-from cartpole_rl.tasks.features import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 
 REACH = 0.27  # m from the middle; the shortest track ends at 0.3
-SIDE = 0.2  # m, where the cart is put to have way before it
-FORESIGHT = 0.12  # s, in which the guard stops a cart
+SIDE = 0.2  # m, start of a run to the other side
+FORESIGHT = 0.12  # s in which the guard stops a cart
 BRAKE = 220  # motor value of the guard
 BREAKAWAY = 90  # motor value that moves most carts, before it is known
 STRONGEST = 255
 BROKEN_AWAY = 0.002  # m
-CLOSE, SLOW = 0.02, 0.05  # m, m/s: there, and at rest
-LONGEST_WAY = 4.0  # s
+CLOSE, SLOW = 0.02, 0.05  # m, m/s: at the target, and at rest
+LONGEST_MOVE = 4.0  # s
 STANDING, LONGEST_STOP = 0.005, 3.0  # m/s, s: at the end of an experiment
 RIGHT, LEFT = 1, -1
 
 
-class Seen(NamedTuple):
-    """What the encoders tell after a period."""
+class Observed(NamedTuple):
+    """The observation at the end of a period."""
 
     x: float  # m
     x_dot: float  # m/s, a difference
@@ -41,45 +41,45 @@ class Seen(NamedTuple):
     theta_dot: float  # rad/s, a difference
 
 
-Moves = Generator[int, Seen, int | None]
+Moves = Generator[int, Observed, int | None]
 
 
 class Task(NamedTuple):
-    """What an experiment has to go by."""
+    """The conditions of an experiment."""
 
     period: float  # s, of control
     random: np.random.Generator
     breakaway: int  # motor value that moves the cart from rest
 
     def periods(self, seconds: float) -> int:
-        """Control periods in a time."""
+        """Return the number of control periods in a time."""
         return round(seconds / self.period)
 
     def moving(self, more: int) -> int:
-        """A motor value that moves the cart, by `more` than it needs."""
+        """Return a motor value that moves the cart, by `more` than needed."""
         return min(STRONGEST, self.breakaway + more)
 
 
 class Experiment(NamedTuple):
-    """Something to be asked of a cart; its moves return a motor value that moves the cart, if they tell."""
+    """A named sequence of moves, which return a motor value that moves the cart if they show one."""
 
     name: str
-    shows: str  # in words
+    shows: str  # the parameters, in words
     moves: Callable[[Task], Moves]
 
 
 def ramps(task: Task) -> Moves:
-    """Raise the motor value to each side until the cart breaks away; returns a value that always moves it."""
+    """Raise the motor value to each side until the cart breaks away; return a value that always moves it."""
     needed = 0
     yield from hold(0, 0.6, task)  # the pole at rest: where its zero is
     for side in 3 * (RIGHT, LEFT):
         yield from go_to(-side * 0.08, task)
         yield from hold(0, 0.4, task)
-        start = seen = yield 0
+        start = now = yield 0
         size = 20
-        while abs(seen.x - start.x) < BROKEN_AWAY and size < STRONGEST:
+        while abs(now.x - start.x) < BROKEN_AWAY and size < STRONGEST:
             size += 1
-            seen = yield side * size
+            now = yield side * size
         needed = max(needed, size)
     yield from hold(0, 0.2, task)
     return needed
@@ -87,12 +87,12 @@ def ramps(task: Task) -> Moves:
 
 def free_swing(task: Task, swing: float = 1.6, seconds: float = 24.0) -> Moves:
     """Swing the pole up to `swing` rad by the cart's own moves, then let it swing, `seconds` s."""
-    seen = yield 0
+    now = yield 0
     for _ in range(task.periods(15)):
-        if abs(math.remainder(seen.theta - math.pi, math.tau)) > swing and abs(seen.theta_dot) < 2:
+        if abs(math.remainder(now.theta - math.pi, math.tau)) > swing and abs(now.theta_dot) < 2:
             break
-        side = -np.sign(seen.theta_dot * np.cos(seen.theta)) or RIGHT
-        seen = yield round(side * task.moving(50) - 120 * seen.x)
+        side = -np.sign(now.theta_dot * np.cos(now.theta)) or RIGHT
+        now = yield round(side * task.moving(50) - 120 * now.x)
     yield from hold(0, seconds, task)
     return None
 
@@ -108,7 +108,7 @@ def coast(task: Task) -> Moves:
 
 
 def levels(task: Task) -> Moves:
-    """Hold small motor values on a cart that moves: the force near the dead-band shows there, not at rest."""
+    """Hold small motor values on a moving cart: the force near the dead-band does not show at rest."""
     for size in (40, 50, 55, 60, 65, 70, 80, 95):
         for side in (RIGHT, LEFT):
             yield from go_to(-side * SIDE, task)
@@ -118,7 +118,7 @@ def levels(task: Task) -> Moves:
 
 
 def square(task: Task) -> Moves:
-    """Turn the force round at a steady pace: the delay shows."""
+    """Reverse the force at regular times: the delay shows."""
     for more in (50, 100):
         yield from go_to(0.0, task)
         for half in (0.1, 0.14, 0.2):
@@ -129,7 +129,7 @@ def square(task: Task) -> Moves:
 
 
 def excite(task: Task, seconds: float = 60.0) -> Moves:
-    """Motor values and durations at random, so that cart and pole go through all they can do."""
+    """Apply random motor values for random times, so that cart and pole cover their range of motion."""
     left = task.periods(seconds)
     while left > 0:
         size, periods = int(task.random.integers(50, 256)), int(task.random.integers(2, 18))
@@ -152,60 +152,60 @@ EXPERIMENTS = (
 HELD_OUT = "held_out"
 
 
-# the moves that experiments are made of
+# the moves of which experiments consist
 
 
 def hold(motor: int, seconds: float, task: Task) -> Moves:
-    """One motor value for `seconds` s."""
+    """Hold one motor value for `seconds` s."""
     for _ in range(task.periods(seconds)):
         yield motor
     return None
 
 
 def push(motor: int, speed: float, task: Task) -> Moves:
-    """One motor value until the cart has that speed, m/s, or has come 0.1 m, or half a second has passed."""
-    start = seen = yield motor
+    """Hold one motor value until the cart reaches a speed, m/s, or has moved 0.1 m, at most half a second."""
+    start = now = yield motor
     for _ in range(task.periods(0.5)):
-        if abs(seen.x - start.x) > 0.1 or abs(seen.x_dot) > speed:
+        if abs(now.x - start.x) > 0.1 or abs(now.x_dot) > speed:
             break
-        seen = yield motor
+        now = yield motor
     return None
 
 
 def until_stopped(motor: int, side: int, task: Task) -> Moves:
-    """One motor value until the cart stops or has used its way to `side`, then a short rest."""
-    seen = yield motor
-    for _ in range(task.periods(LONGEST_WAY)):
-        if abs(seen.x_dot) < SLOW / 5 or side * seen.x > SIDE + 0.03:
+    """Hold one motor value until the cart stops or gets near the end at `side`, then rest briefly."""
+    now = yield motor
+    for _ in range(task.periods(LONGEST_MOVE)):
+        if abs(now.x_dot) < SLOW / 5 or side * now.x > SIDE + 0.03:
             break
-        seen = yield motor
+        now = yield motor
     yield from hold(0, 0.2, task)
     return None
 
 
 def go_to(target: float, task: Task) -> Moves:
-    """Bring the cart to `target` m, about."""
-    seen = yield 0
-    for _ in range(task.periods(LONGEST_WAY)):
-        away = target - seen.x
-        if abs(away) < CLOSE and abs(seen.x_dot) < SLOW:
+    """Bring the cart near `target` m."""
+    now = yield 0
+    for _ in range(task.periods(LONGEST_MOVE)):
+        away = target - now.x
+        if abs(away) < CLOSE and abs(now.x_dot) < SLOW:
             break
-        wish = np.clip(6 * away, -0.5, 0.5) - seen.x_dot  # m/s
-        seen = yield round(np.sign(wish) * 0.8 * task.breakaway + 250 * wish)
+        wish = np.clip(6 * away, -0.5, 0.5) - now.x_dot  # m/s
+        now = yield round(np.sign(wish) * 0.8 * task.breakaway + 250 * wish)
     yield 0
     return None
 
 
-# and what makes a recording of them
+# making recordings of experiments
 
 
 def conduct(
     plant: Plant, period: float, seed: int = 0, experiments: tuple[Experiment, ...] = EXPERIMENTS
 ) -> Iterator[tuple[Experiment, Episode]]:
-    """Each experiment with its recording, on a plant of one cart.
+    """Yield each experiment with its recording, on a plant of one cart.
 
-    The cart stands, with the motor at 0, whenever a recording is handed out: nobody watches it while a file
-    is written. The next experiment goes on from there; after an ending by the plant it begins with a reset.
+    The cart stands, with the motor at 0, whenever a recording is yielded: nothing controls it while a file is
+    written. The next experiment continues from there; after an ending by the plant it starts with a reset.
     """
     task, present, ended = Task(period, np.random.default_rng(seed), BREAKAWAY), plant.reset(), False
     for number, experiment in enumerate(experiments):
@@ -223,30 +223,30 @@ def conduct(
 
 
 def and_stop(moves: Moves, task: Task) -> Moves:
-    """The moves, then motor 0 until the cart stands; returns what the moves return."""
-    told = yield from moves
+    """Make the moves, then hold motor 0 until the cart stands; return the result of the moves."""
+    breakaway = yield from moves
     for _ in range(task.periods(LONGEST_STOP)):
-        seen = yield 0
-        if abs(seen.x_dot) < STANDING:
+        now = yield 0
+        if abs(now.x_dot) < STANDING:
             break
-    return told
+    return breakaway
 
 
 def driven(plant: Plant, present: TensorDictBase, motor: int) -> TensorDictBase:
-    """The frame at the end of a period under a motor value."""
+    """Return the frame at the end of a period under a motor value."""
     return plant.step(present.set("motor", torch.tensor([[motor]])))["next"]
 
 
 def run(plant: Plant, present: TensorDictBase, moves: Moves) -> tuple[Episode, TensorDictBase, int | None]:
-    """Make the moves from the frame `present` on: the recording, the last frame, what the moves return.
+    """Make the moves from the frame `present` on; return the recording, the last frame, and their result.
 
-    The motor is at 0 at the end, whatever the moves or the guard asked for last.
+    The motor is at 0 at the end, whatever the moves or the guard requested last.
     """
     counts, gaps, motors, ended = [counts_of(present)], [float(present["dt"])], [], str(Ending.TIME)
-    wanted, told = next(moves), None
+    requested, breakaway = next(moves), None
     while True:
-        seen = as_seen(counts, gaps)
-        motor = guarded(wanted, seen)
+        now = observed(counts, gaps)
+        motor = guarded(requested, now)
         following = driven(plant, present, motor)
         motors.append(motor)
         counts.append(counts_of(following))
@@ -256,24 +256,24 @@ def run(plant: Plant, present: TensorDictBase, moves: Moves) -> tuple[Episode, T
             ended = str(getattr(plant, "ended_by", "") or Ending.TRACK)
             break
         try:
-            wanted = moves.send(as_seen(counts, gaps))
+            requested = moves.send(observed(counts, gaps))
         except StopIteration as end:
-            told = end.value
+            breakaway = end.value
             present = driven(plant, present, 0) if motor else present
             break
-    return recording(np.array(counts), np.array(gaps[1:]), np.array(motors), ended), present, told
+    return recording(np.array(counts), np.array(gaps[1:]), np.array(motors), ended), present, breakaway
 
 
 def counts_of(frame: TensorDictBase) -> tuple[int, int]:
-    """Encoder counts of cart and pole."""
+    """Return the encoder counts of cart and pole."""
     cart, pole = frame["counts"][0].tolist()
     return cart, pole
 
 
-def as_seen(counts: list[tuple[int, int]], gaps: list[float]) -> Seen:
-    """The newest positions, and speeds from the two newest."""
+def observed(counts: list[tuple[int, int]], gaps: list[float]) -> Observed:
+    """Return the newest positions, and speeds from the two newest."""
     (x_before, theta_before), (x, theta) = counts[-2:] if len(counts) > 1 else (counts[0], counts[0])
-    return Seen(
+    return Observed(
         x * CART_METRES_PER_COUNT,
         (x - x_before) * CART_METRES_PER_COUNT / gaps[-1],
         theta * POLE_RADIANS_PER_COUNT,
@@ -281,16 +281,16 @@ def as_seen(counts: list[tuple[int, int]], gaps: list[float]) -> Seen:
     )
 
 
-def guarded(motor: float, seen: Seen) -> int:
-    """The motor value, unless the cart would get beyond REACH: then what brings it back."""
-    ahead = seen.x + FORESIGHT * seen.x_dot * (1 + abs(seen.x_dot))
+def guarded(motor: float, now: Observed) -> int:
+    """Return the motor value, or one that brakes where the cart would get beyond REACH."""
+    ahead = now.x + FORESIGHT * now.x_dot * (1 + abs(now.x_dot))
     if abs(ahead) > REACH and ahead * (motor + BRAKE * np.sign(ahead)) > 0:
         return int(-np.sign(ahead) * BRAKE)
     return int(np.clip(motor, -255, 255))
 
 
 def recording(counts: np.ndarray, gaps: np.ndarray, motors: np.ndarray, ended_by: str) -> Episode:
-    """An episode without a task: nothing is scored."""
+    """Return an episode without a task, with scores of 0."""
     positions = counts * np.array([CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT])
     speeds = np.vstack((np.zeros((1, 2)), np.diff(positions, axis=0) / gaps[:, None]))
     nothing = np.zeros(len(motors))

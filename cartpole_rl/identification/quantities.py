@@ -1,4 +1,4 @@
-"""What an identification found, in quantities that motion tells: ratios to the moving mass, times, angles."""
+"""An identified cart in quantities that motion shows: ratios to the moving mass, times, angles."""
 
 import math
 from collections.abc import Mapping
@@ -12,11 +12,11 @@ from cartpole_rl.physics.parameters import GRAVITY, CartParameters
 
 Array = NDArray[np.floating]
 CONFIDENCE = 0.95
-TYPICAL = 5.0  # rad/s, at which the pole's damping is told: that of a wide swing
+TYPICAL = 5.0  # rad/s, the speed of a wide swing, for which the pole's damping is given
 
 
 class Quantity(NamedTuple):
-    """One thing that was found."""
+    """One quantity, with its interval."""
 
     name: str
     words: str
@@ -32,7 +32,7 @@ class Quantity(NamedTuple):
 
 
 def quantities(cart: Mapping[str, float]) -> list[Quantity]:
-    """Those of one cart, from its parameters. The force is that about motor value 200."""
+    """Return the quantities of one cart, from its parameters. The force is that about motor value 200."""
     mass = cart["cart_mass"] + cart["pole_mass"]
     moment = cart["pole_mass"] * cart["pole_com"]
     inertia = cart["pole_inertia"] + moment * cart["pole_com"]
@@ -75,20 +75,20 @@ def quantities(cart: Mapping[str, float]) -> list[Quantity]:
 
 
 def no_force_up_to(cart: Mapping[str, float]) -> float:
-    """Motor value up to which there is no force: the dead-bands' mean, or where the force curve begins."""
+    """Return the motor value up to which there is no force: the dead-bands' mean, or the curve's zero."""
     a, b, c = (cart[f"force_{name}"] for name in ("quadratic", "linear", "offset"))
-    begins = -c / b if abs(a) < 1e-12 else (-b + math.sqrt(max(0.0, b * b - 4 * a * c))) / (2 * a)
-    return (max(begins, cart["deadband_left"]) + max(begins, cart["deadband_right"])) / 2
+    zero = -c / b if abs(a) < 1e-12 else (-b + math.sqrt(max(0.0, b * b - 4 * a * c))) / (2 * a)
+    return (max(zero, cart["deadband_left"]) + max(zero, cart["deadband_right"])) / 2
 
 
 def intervals(fit: Fit, carts: Array) -> list[Quantity]:
-    """The quantities that were looked for with 95 % intervals, from carts [P, N] drawn from the fit."""
+    """Return the quantities that were identified, with 95 % intervals of carts [P, N] drawn from the fit."""
     names = CartParameters.names()
     drawn = [quantities(dict(zip(names, cart.tolist(), strict=True))) for cart in carts.T]
     tail = 100 * (1 - CONFIDENCE) / 2
-    told = []
+    identified = []
     for index, each in enumerate(quantities(fit.parameters)):
         low, high = np.percentile([quantity[index].value for quantity in drawn], [tail, 100 - tail])
-        if high > low:  # what the laws do not read has no interval
-            told.append(each._replace(low=float(low), high=float(high)))
-    return told
+        if high > low:  # a quantity that the models do not read has no interval
+            identified.append(each._replace(low=float(low), high=float(high)))
+    return identified

@@ -1,4 +1,4 @@
-"""What can be set about learning a residual."""
+"""Settings of learning a residual."""
 
 from typing import Annotated
 
@@ -8,15 +8,13 @@ from cartpole_rl.settings import Count, NonNegative, Positive, Settings
 
 
 class EnsembleSettings(Settings):
-    """How an ensemble is learned."""
+    """Settings of an ensemble and its learning."""
 
     members: Count
     hidden: Count  # units of each of two layers
     updates: Count
-    learning_rate: Positive  # at first; it falls along half a cosine
-    refresh: Count  # updates between two searches for the windows' beginnings
-    validation: Annotated[
-        float, Field(gt=0, lt=1)
-    ]  # of the windows, drawn for each member, by which it is stopped
+    learning_rate: Positive  # the first one; it falls along half a cosine
+    refresh: Count  # updates between two searches for the windows' initial states
+    validation: Annotated[float, Field(gt=0, lt=1)]  # share of the windows left out, drawn for each member
     output_penalty: NonNegative  # of outputs of 1 at random motions
     table_penalty: NonNegative  # of a force of 1 at each place, and ten times that of a step between two

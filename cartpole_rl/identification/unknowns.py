@@ -1,7 +1,7 @@
-"""What is not known about a cart, and what is thought of it before any measurement.
+"""The unknown numbers of a cart and their prior.
 
-A cart is a point u of as many numbers as there are unknowns; each is 0 with standard deviation 1 before
-measurement. A logarithmic unknown multiplies its nominal value by exp(spread u), another adds spread u.
+A cart is a point u with one number for each unknown, of prior mean 0 and standard deviation 1. A logarithmic
+unknown multiplies its nominal value by exp(spread u); any other adds spread u.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,17 +17,17 @@ from cartpole_rl.physics.models import Models, unused_parameters
 from cartpole_rl.physics.parameters import CartParameters
 
 Array = NDArray[np.floating]
-LONGEST_LATENCY = 0.06  # s, that is looked for
-POLE_LENGTH = "pole_length"  # not a parameter of its own: see `parameters_at`
+LONGEST_LATENCY = 0.06  # s, in the search
+POLE_LENGTH = "pole_length"  # not a field of CartParameters: see `parameters_at`
 
 
 class Unknown(NamedTuple):
-    """One number to be found."""
+    """One number of the search."""
 
     name: str  # of CartParameters, or POLE_LENGTH
-    spread: float  # standard deviation before measurement: of the logarithm, or in the parameter's unit
+    spread: float  # prior standard deviation: of the logarithm, or in the parameter's unit
     logarithmic: bool = False
-    middle: float | None = None  # before measurement; None is the nominal value
+    middle: float | None = None  # prior mean; None is the nominal value
 
 
 UNKNOWNS: tuple[Unknown, ...] = (
@@ -53,22 +53,22 @@ UNKNOWNS: tuple[Unknown, ...] = (
 )
 
 
-WEIGHED = (POLE_LENGTH, "pole_mass")  # known where the pole is: then all forces and masses have a scale
+WEIGHED = (POLE_LENGTH, "pole_mass")  # measured with a known pole; they give forces and masses their scale
 
 
 def unknowns_of(models: Models, known: Sequence[str] = ()) -> list[Unknown]:
-    """Those that the chosen laws read and nobody has measured."""
+    """Return the unknowns that the chosen models read and that are not `known`."""
     without = {*unused_parameters(models), *known}
     return [unknown for unknown in UNKNOWNS if unknown.name not in without]
 
 
 def bound_of(name: str) -> Bound:
-    """What a parameter can be, as far as it is looked for."""
+    """Return the range of a parameter in the search."""
     return Bound(0, LONGEST_LATENCY) if name == "latency" else BOUNDS[name]
 
 
 def limits(unknowns: Sequence[Unknown], nominal: Mapping[str, float]) -> tuple[Array, Array]:
-    """Lowest and highest point, [U] each, at which every parameter is what it can be."""
+    """Return the lowest and highest point, [U] each, whose parameters are within their bounds."""
     low, high = np.full(len(unknowns), -np.inf), np.full(len(unknowns), np.inf)
     for index, unknown in enumerate(unknowns):
         if not unknown.logarithmic:
@@ -80,10 +80,10 @@ def limits(unknowns: Sequence[Unknown], nominal: Mapping[str, float]) -> tuple[A
 
 
 def parameters_at(points: Array, unknowns: Sequence[Unknown], nominal: Mapping[str, float]) -> Tensor:
-    """Carts [P, N] float64 at `points` [U, N], a row a parameter in the order of `CartParameters.names()`.
+    """Return carts [P, N] float64 at `points` [U, N], a row a parameter in the order of `CartParameters`.
 
     A pole of another length is the nominal one scaled: its mass goes with the length, its centre of mass too,
-    its inertia with the third power. Values stay within what a parameter can be.
+    its inertia with the third power. Values stay within their bounds.
     """
     values = {
         name: np.full(points.shape[1], float(nominal[name]), dtype=np.float64)

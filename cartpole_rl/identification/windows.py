@@ -1,7 +1,7 @@
-"""Cuts episodes into short windows, each with its own unknown beginning.
+"""Cuts episodes into short windows, each with its own unknown initial state.
 
-A prediction over a whole swing-up forgets where it began: an error doubles every tenth of a second near
-upright. Half a second is long enough for parameters to show and short enough for them to be found.
+A prediction over a whole swing-up forgets its initial state: an error doubles every tenth of a second near
+upright. Half a second is long enough for parameters to show and short enough for a search to converge.
 """
 
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ class Windows(NamedTuple):
 
     positions: NDArray[np.float64]  # [T + 1, 2, W] encoder counts of cart and pole, as measured
     motors: NDArray[np.float64]  # [HISTORY + T, W] motor values chosen, oldest first
-    episode: NDArray[np.int64]  # [W] number of the episode that each was cut from
+    episode: NDArray[np.int64]  # [W] number of the episode of each
 
     @property
     def periods(self) -> int:
@@ -36,7 +36,7 @@ class Windows(NamedTuple):
 
 
 def cut_windows(episodes: Sequence[Episode], period: float, periods: int = 25, most: int = 240) -> Windows:
-    """Windows of `periods` periods of `period` s, one after another, evenly thinned to at most `most`.
+    """Cut windows of `periods` periods of `period` s, one after another, evenly thinned to at most `most`.
 
     A window over a lost or late frame is left out. Raises RecordingError where nothing is left, or where the
     recordings are of another rate.

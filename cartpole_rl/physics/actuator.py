@@ -1,39 +1,93 @@
 """From motor value to force on the cart: a measured force curve, or plain newtons; a lag; a delay.
 
 The force curve is the thesis's quadratic fit (figure 5.5), F = sign(u) max(0, a u^2 + b |u| + c), with an
-asymmetry, and a dead-band per direction. Plain newtons are the thesis's eyeballed levels: 1, 2, 3, 4 N at
+asymmetry, and a dead-band per direction. Plain newtons are the thesis's estimated levels: 1, 2, 3, 4 N at
 100, 150, 200, 250.
 """
 
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import TYPE_CHECKING
 
-import torch
-from torch import Tensor
+from cartpole_rl.physics.formula import PhysicsModel
 
-from cartpole_rl.physics.models import Actuator
-from cartpole_rl.physics.parameters import CartParameters
+if TYPE_CHECKING:
+    from torch import Tensor
 
-SHORTEST_TIME_CONSTANT = 1e-12  # s; stands in for no lag at all
+    from cartpole_rl.physics.parameters import CartParameters
+
+SHORTEST_TIME_CONSTANT = 1e-12  # s; stands in for no lag
+LAG = "motor_time_constant"
+CURVE = (
+    "force_quadratic",
+    "force_linear",
+    "force_offset",
+    "force_asymmetry",
+    "deadband_left",
+    "deadband_right",
+    LAG,
+)
 
 
-def static_force(motor: Tensor, cart: CartParameters, model: Actuator) -> Tensor:
-    """Force that a held motor value settles at, N. `motor`: [N], -255 to 255."""
+def newtons(motor: "Tensor", cart: "CartParameters") -> "Tensor":
+    """Return the thesis's levels and the line through them, whatever the cart."""
+    return motor.sign() * (0.02 * motor.abs() - 1).clamp(min=0)
+
+
+def force_curve(motor: "Tensor", cart: "CartParameters") -> "Tensor":
+    """Return the force of the cart's own curve."""
     size = motor.abs()
-    if model is Actuator.NEWTONS:
-        return torch.sign(motor) * (0.02 * size - 1).clamp(min=0)
     curve = ((cart.force_quadratic * size + cart.force_linear) * size + cart.force_offset).clamp(min=0)
     rightward = (motor > cart.deadband_right) * (1 + cart.force_asymmetry)
     leftward = -motor > cart.deadband_left
     return curve * (rightward - leftward.to(curve.dtype))
 
 
-def mean_commands(held: Sequence[Tensor], latency: Tensor, period: float, substeps: int) -> list[Tensor]:
-    """Mean over each step of a period of what the commands in force hold, [N] each.
+class Actuator(PhysicsModel):
+    """How a motor value becomes a force; the formula gives the force of a held motor value, N."""
 
-    `held` is what each command settles at, [N] each, newest first, each next one a period older, the oldest
-    in force for ever. A command takes effect `latency` s, [N], after its period began and is replaced a
-    period later by the next.
+    NEWTONS = "newtons", (), newtons  # exact: without lag, dead-band or asymmetry
+    FORCE_CURVE = "force_curve", CURVE, force_curve
+
+
+def static_force(motor: "Tensor", cart: "CartParameters", model: Actuator) -> "Tensor":
+    """Return the force that a held motor value settles at, N. `motor`: [N], -255 to 255."""
+    return model.formula(motor, cart)
+
+
+def step_forces(
+    force: "Tensor",
+    motors: "Sequence[Tensor] | Tensor",
+    latency: "Tensor",
+    cart: "CartParameters",
+    model: Actuator,
+    period: float,
+    substeps: int,
+) -> "tuple[list[Tensor], Tensor]":
+    """Return the mean force in each step of a control period, and the force at its end, N, [N] each.
+
+    `force` N is the force at its start; `motors` are the motor values of this period and the ones before it,
+    newest first; `latency` s, [N], holds for all of them.
+    """
+    held = [static_force(motor, cart, model) for motor in motors]
+    targets = mean_commands(held, latency, period, substeps)
+    if LAG not in model.reads:
+        return targets, targets[-1]
+    means = []
+    for target in targets:
+        mean, force = lagged_force(force, target, cart.motor_time_constant, period / substeps)
+        means.append(mean)
+    return means, force
+
+
+def mean_commands(
+    held: "Sequence[Tensor]", latency: "Tensor", period: float, substeps: int
+) -> "list[Tensor]":
+    """Return for each step of a period the mean of the forces in effect, [N] each.
+
+    `held` is the force that each command settles at, [N] each, newest first, each next one a period older,
+    the oldest in effect for ever. A command takes effect `latency` s, [N], after its period began and is
+    replaced a period later by the next.
     """
     onset = latency * (substeps / period)  # in steps
     means = []
@@ -46,9 +100,11 @@ def mean_commands(held: Sequence[Tensor], latency: Tensor, period: float, subste
     return means
 
 
-def lagged_force(force: Tensor, target: Tensor, time_constant: Tensor, step: float) -> tuple[Tensor, Tensor]:
-    """Exact first-order lag over one step: (mean force over the step, force at its end), N, [N] each."""
+def lagged_force(
+    force: "Tensor", target: "Tensor", time_constant: "Tensor", step: float
+) -> "tuple[Tensor, Tensor]":
+    """Return (mean force over the step, force at its end), N, [N] each: the exact first-order lag."""
     ratio = time_constant.clamp(min=SHORTEST_TIME_CONSTANT) / step
-    decay = torch.exp(-1 / ratio)
+    decay = (-1 / ratio).exp()
     gap = force - target
     return target + gap * ratio * (1 - decay), target + gap * decay

@@ -1,4 +1,4 @@
-"""What each parameter of a cart and its pole can physically be, by name."""
+"""Physical bounds of each parameter of a cart and its pole, by name."""
 
 import difflib
 import math
@@ -9,14 +9,14 @@ from cartpole_rl.errors import ConfigError
 
 
 class Bound(NamedTuple):
-    """What a parameter can physically be."""
+    """The physical range of a parameter."""
 
     low: float
     high: float
     low_allowed: bool = True
 
     def holds(self, value: float) -> bool:
-        """Whether `value` is within."""
+        """Return whether `value` is within."""
         return (value >= self.low if self.low_allowed else value > self.low) and value <= self.high
 
     def __str__(self) -> str:
@@ -28,8 +28,8 @@ class Bound(NamedTuple):
 POSITIVE = Bound(0, math.inf, low_allowed=False)
 NON_NEGATIVE = Bound(0, math.inf)
 ANY = Bound(-math.inf, math.inf)
-LESS_THAN_ALL = Bound(-0.99, 0.99)
-DELAY = Bound(0, 0.1)  # s; more than five periods is no cart that one can balance
+ASYMMETRY = Bound(-0.99, 0.99)
+DELAY = Bound(0, 0.1)  # s; with a delay of more than five periods a pole cannot be balanced
 SMALL_ANGLE = Bound(-0.2, 0.2)  # rad
 
 BOUNDS: dict[str, Bound] = {
@@ -41,7 +41,7 @@ BOUNDS: dict[str, Bound] = {
     "track_tilt": SMALL_ANGLE,
     "cart_viscous": NON_NEGATIVE,
     "cart_coulomb": NON_NEGATIVE,
-    "cart_coulomb_asymmetry": LESS_THAN_ALL,
+    "cart_coulomb_asymmetry": ASYMMETRY,
     "cart_stiction_ratio": Bound(1, math.inf),
     "stribeck_velocity": POSITIVE,
     "sigmoid_slope": POSITIVE,
@@ -51,7 +51,7 @@ BOUNDS: dict[str, Bound] = {
     "force_quadratic": ANY,
     "force_linear": ANY,
     "force_offset": ANY,
-    "force_asymmetry": LESS_THAN_ALL,
+    "force_asymmetry": ASYMMETRY,
     "deadband_left": Bound(0, 255),
     "deadband_right": Bound(0, 255),
     "motor_time_constant": DELAY,
@@ -64,7 +64,7 @@ BOUNDS: dict[str, Bound] = {
 
 
 def check_names(names: Iterable[str]) -> None:
-    """Raise ConfigError for a name that is no parameter, with the nearest one that is."""
+    """Raise ConfigError for a name that is not a parameter, with the nearest one that is."""
     for name in names:
         if name not in BOUNDS:
             nearest = difflib.get_close_matches(name, BOUNDS, n=1, cutoff=0)[0]

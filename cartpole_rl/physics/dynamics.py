@@ -5,21 +5,15 @@ to the right. Every tensor is [N]; the four numbers of the state stay separate, 
 compiled code be fast. Functions are pure: parameters and random draws are passed in.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from cartpole_rl.physics.actuator import lagged_force, mean_commands, static_force
-from cartpole_rl.physics.friction import (
-    DRY,
-    STICKING,
-    dry_friction,
-    pole_torque,
-    viscous_coefficient,
-)
-from cartpole_rl.physics.models import Actuator, CartFriction, Integrator, Models
+from cartpole_rl.physics.actuator import step_forces
+from cartpole_rl.physics.friction import CartFriction, dry_friction, pole_torque, viscous_coefficient
+from cartpole_rl.physics.models import Integrator, Models
 from cartpole_rl.physics.parameters import GRAVITY, CartParameters
 
 
@@ -33,14 +27,25 @@ class State(NamedTuple):
 
 
 class Drive(NamedTuple):
-    """What the actuator carries from one period to the next."""
+    """The actuator's state, carried from one period to the next."""
 
     force: Tensor  # [N] N, behind the lag
     motors: Sequence[Tensor]  # [N] motor values of this and the D - 1 periods before, newest first; or [D, N]
 
 
+class Addition(NamedTuple):
+    """Forces and an acceleration on top of the physics during one period, [N] each."""
+
+    force: Tensor  # N on the cart, in front of friction
+    force_at: Callable[[Tensor], Tensor]  # position x, m, to a further force on the cart, N
+    angular_acceleration: Tensor  # rad/s^2 of the pole
+
+
+MakeAddition = Callable[[State, Drive], Addition]  # the addition of a period, from where it starts
+
+
 class Mechanism(NamedTuple):
-    """What (3.5) and (3.6) take from the parameters, worked out once a period, [N] each."""
+    """The constants of (3.5) and (3.6), evaluated once a period, [N] each."""
 
     total_mass: Tensor  # kg
     first_moment: Tensor  # m_p l, kg m
@@ -52,7 +57,7 @@ class Mechanism(NamedTuple):
 
 
 def mechanism(cart: CartParameters) -> Mechanism:
-    """Evaluate the constants of a cart."""
+    """Return the constants of a cart."""
     total_mass = cart.total_mass
     weight = total_mass * GRAVITY
     sin_tilt, cos_tilt = torch.sin(cart.track_tilt), torch.cos(cart.track_tilt)
@@ -77,7 +82,7 @@ class Coupling(NamedTuple):
 
 
 def coupling(state: State, cart: CartParameters, body: Mechanism) -> Coupling:
-    """Evaluate the shared terms. On a track tilted by t the pole stands theta - t from the track's normal."""
+    """Return the shared terms. On a track tilted by t the pole stands theta - t from the track's normal."""
     from_normal = state.theta - cart.track_tilt
     sin, cos = torch.sin(from_normal), torch.cos(from_normal)
     sin_theta = sin * body.cos_tilt + cos * body.sin_tilt  # costs less than a third function of an angle
@@ -92,7 +97,7 @@ def coupling(state: State, cart: CartParameters, body: Mechanism) -> Coupling:
 def accelerations(
     state: State, force: Tensor, torque: Tensor, body: Mechanism, terms: Coupling
 ) -> tuple[Tensor, Tensor]:
-    """(x_ddot m/s^2, theta_ddot rad/s^2), [N] each, under `force` on the cart and `torque` on the pole.
+    """Return (x_ddot m/s^2, theta_ddot rad/s^2), [N] each, under `force` on cart and `torque` on pole.
 
     Equations (3.5) and (3.6) for a pole of any inertia: with k = J / (m_p l^2) they are the thesis's.
     """
@@ -105,7 +110,7 @@ def accelerations(
 
 
 def normal_force_ratio(state: State, theta_ddot: Tensor, body: Mechanism, terms: Coupling) -> Tensor:
-    """Normal force of the track over that with the pole at rest, [N], never negative.
+    """Return the track's normal force over that with the pole at rest, [N], never negative.
 
     Florian, "Correct equations for the dynamics of the cart-pole system", 2007, equation (22).
     """
@@ -116,13 +121,13 @@ def normal_force_ratio(state: State, theta_ddot: Tensor, body: Mechanism, terms:
 def speed_lost(
     x_dot: Tensor, x_dot_free: Tensor, yielding: Tensor, cart: CartParameters, model: CartFriction
 ) -> Tensor:
-    """Speed that dry friction takes from the cart in one step, m/s, [N].
+    """Return the speed that dry friction takes from the cart in one step, m/s, [N].
 
-    `x_dot_free` is where the step would lead without it; `yielding`, m/s per N, is the speed that a force
-    takes in the step. Models with a force at rest stop the cart at most and never turn it round: the sign of
-    (5.6) is not defined at rest, and taken one step late it feeds energy in.
+    `x_dot_free` m/s is the velocity after the step without dry friction; `yielding`, m/s per N, is the speed
+    that a force takes in the step. Models with a force at rest stop the cart at most and never reverse it:
+    the sign of (5.6) is not defined at rest, and taken one step late it feeds energy in.
     """
-    if model not in STICKING:
+    if not model.sticks:
         return yielding * dry_friction(x_dot, cart, model)
     toward = torch.copysign(x_dot.abs().clamp(min=torch.finfo(x_dot.dtype).tiny), x_dot_free)
     limit = yielding * dry_friction(toward, cart, model).abs()
@@ -132,14 +137,14 @@ def speed_lost(
 def advance(
     state: State, force: Tensor, cart: CartParameters, body: Mechanism, models: Models, step: float
 ) -> State:
-    """The state after `step` s under a constant `force` (N, [N]); `body` is `mechanism(cart)`."""
+    """Return the state after `step` s under a constant `force` (N, [N]); `body` is `mechanism(cart)`."""
     terms = coupling(state, cart, body)
     torque = pole_torque(state.theta_dot, cart, models.pole_friction)
     driven = force - viscous_coefficient(cart, models.cart_friction) * state.x_dot
     x_ddot, theta_ddot = accelerations(state, driven, torque, body, terms)
     x_dot = state.x_dot + step * x_ddot
     theta_dot = state.theta_dot + step * theta_ddot
-    if models.cart_friction in DRY:
+    if models.cart_friction.has_dry_friction:
         yielding = step * body.pivot_inertia / terms.determinant
         if models.pole_presses:
             yielding = yielding * normal_force_ratio(state, theta_ddot, body, terms)
@@ -160,28 +165,35 @@ def run_period(
     models: Models,
     period: float,
     substeps: int,
+    addition: MakeAddition | None = None,
 ) -> tuple[State, Drive]:
-    """One control period of `period` s in `substeps` equal steps.
+    """Integrate one control period of `period` s in `substeps` equal steps.
 
     `drive.motors` holds this period's motor value first; `latency` [N] s is this period's own draw, for all
     commands under way. Where the command in force changes inside a step, the step takes the mean of both
-    forces by their share of time.
+    forces by their share of time. `addition` acts in every step.
     """
     step = period / substeps
     body = mechanism(cart)
-    held = [static_force(motor, cart, models.actuator) for motor in drive.motors]
-    force = drive.force
-    for target in mean_commands(held, latency, period, substeps):
-        if models.actuator is Actuator.NEWTONS:
-            mean = force = target
+    added = None if addition is None else addition(state, drive)
+    forces, last = step_forces(*drive, latency, cart, models.actuator, period, substeps)
+    for mean in forces:
+        if added is None:
+            state = advance(state, mean, cart, body, models, step)
         else:
-            mean, force = lagged_force(force, target, cart.motor_time_constant, step)
-        state = advance(state, mean, cart, body, models, step)
-    return state, Drive(force, drive.motors)
+            acting = mean + added.force + added.force_at(state.x)
+            state = turned(advance(state, acting, cart, body, models, step), added.angular_acceleration, step)
+    return state, Drive(last, drive.motors)
+
+
+def turned(state: State, acceleration: Tensor, step: float) -> State:
+    """Return the state after a further angular acceleration, rad/s^2, [N], for `step` s."""
+    faster = step * acceleration
+    return state._replace(theta=state.theta + step * faster, theta_dot=state.theta_dot + faster)
 
 
 def energy(state: State, cart: CartParameters) -> Tensor:
-    """Kinetic and potential energy, J, [N]; 0 for a cart at rest in the middle with the pole level."""
+    """Return kinetic and potential energy, J, [N]; 0 for a cart at rest in the middle with the pole level."""
     angle = state.theta - cart.track_tilt
     kinetic = (
         0.5 * cart.total_mass * state.x_dot**2

@@ -1,4 +1,4 @@
-"""The encoders of the cart: what one count is. Source: Quanser IP02 user manual."""
+"""The encoders of the cart: the size of one count. Source: Quanser IP02 user manual."""
 
 import math
 

@@ -14,12 +14,12 @@ GRAVITY = 9.81  # m/s^2
 
 
 class CartParameters(TensorClass["frozen", "tensor_only"]):  # type: ignore[name-defined]
-    """N carts: masses, friction, actuator, and what stands between the state and the host.
+    """N carts: masses, friction, actuator, delays and sensors.
 
     Nominal numbers and their sources are in ``conf/cart/ip02.yaml`` and ``conf/pole/``.
     """
 
-    cart_mass: Tensor  # kg, the motor's rotor counted in: only the sum moves
+    cart_mass: Tensor  # kg, including the motor's rotor
     pole_mass: Tensor  # kg
     pole_com: Tensor  # m, pivot to centre of mass; the l of equation (3.5)
     pole_inertia: Tensor  # kg m^2, about the centre of mass
@@ -39,7 +39,7 @@ class CartParameters(TensorClass["frozen", "tensor_only"]):  # type: ignore[name
 
     force_quadratic: Tensor  # N per motor value squared
     force_linear: Tensor  # N per motor value
-    force_offset: Tensor  # N, negative: the force that small motor values lack
+    force_offset: Tensor  # N, negative: the force curve is zero for small motor values
     force_asymmetry: Tensor  # 1, a force to the right is (1 + it) times as large
     deadband_left: Tensor  # motor values up to this give no force to the left
     deadband_right: Tensor  # motor values up to this give no force to the right
@@ -47,7 +47,7 @@ class CartParameters(TensorClass["frozen", "tensor_only"]):  # type: ignore[name
     latency: Tensor  # s, from a state's measurement until the motor value chosen on it is in force
     latency_jitter: Tensor  # s, the latency of each period is drawn from latency +- this, never below 0
 
-    angle_offset: Tensor  # rad, measured minus true angle: the zero was set off the vertical
+    angle_offset: Tensor  # rad, measured minus true angle: the error of the encoder's zero
     position_noise: Tensor  # m, standard deviation before quantization
     angle_noise: Tensor  # rad, standard deviation before quantization
 
@@ -73,10 +73,10 @@ class CartParameters(TensorClass["frozen", "tensor_only"]):  # type: ignore[name
 
     @classmethod
     def names(cls) -> tuple[str, ...]:
-        """The fields, in order."""
+        """Return the fields, in order."""
         return tuple(field.name for field in dataclasses.fields(cls))
 
     @classmethod
     def from_table(cls, table: Tensor) -> Self:
-        """N carts from `table` [P, N], a row a field in the order of `names`; the fields share its memory."""
+        """Return N carts from `table` [P, N], a row a field in the order of `names`, sharing memory."""
         return cls(**dict(zip(cls.names(), table.unbind(0), strict=True)), batch_size=[table.shape[1]])

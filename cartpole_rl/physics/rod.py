@@ -1,9 +1,9 @@
-"""A uniform rod, as the thesis has its poles of any length."""
+"""A uniform rod: the thesis's model of poles of any length."""
 
 from typing import Any
 
-# The thesis's (6.4). Quanser's poles have half of it, 0.127 kg on 0.3365 m and 0.230 kg on 0.6413 m: 0.7 kg/m
-# is their mass over the distance from pivot to centre of mass.
+# From the thesis (6.4). Quanser's poles have half of it, 0.127 kg on 0.3365 m and 0.230 kg on 0.6413 m:
+# 0.7 kg/m is their mass over the distance from pivot to centre of mass.
 POLE_DENSITY = 0.7  # kg/m
 
 

@@ -1,7 +1,7 @@
-"""N carts that move as a recorded one did: identified physics, and one member of an ensemble an episode.
+"""N carts that move like a recorded one: identified physics, and one member of an ensemble for each episode.
 
-The members differ where the recordings do not tell, so that an agent meets what is not known as well. Numbers
-of the cart are drawn as by any simulated plant; what was learned is added to all of them.
+The members differ where the recordings give no information, so that an agent is trained on this uncertainty
+as well. Carts are drawn as in any simulated plant; the learned residual is added to all of them.
 """
 
 from functools import partial
@@ -12,16 +12,16 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from cartpole_rl.compilation import Compiled
-from cartpole_rl.physics.residual import UNDER_WAY, Residual, chosen_members, run_corrected_period
+from cartpole_rl.physics.residual import UNDER_WAY, Residual, chosen_members
 from cartpole_rl.plants.learned_model import LearnedModel
 from cartpole_rl.plants.simulated import SimulatedPlant
-from cartpole_rl.plants.simulation import Carts, Given, Period, run_carts
-from cartpole_rl.randomization.found import Draws
+from cartpole_rl.plants.simulation import Carts, Inputs, Period, run_carts
+from cartpole_rl.randomization.draws import Draws
 from cartpole_rl.tasks.settings import StartSettings
 
 
-class Learned(NamedTuple):
-    """What a period takes beside what every simulated cart takes: `Residual`, in one tuple with the draws."""
+class Weights(NamedTuple):
+    """The residual of a period: the member of each cart and the fields of `Residual`, in one tuple."""
 
     member: Tensor  # [N] int64, of each cart's episode
     places: Tensor
@@ -32,18 +32,17 @@ class Learned(NamedTuple):
     last: Tensor
 
 
-def run_learned_carts(carts: Carts, given: Given, learned: Learned, **laws: Any) -> Period:
-    """`run_carts` with what the members of `learned` add."""
-    member, *weights = learned
-    addition = chosen_members(Residual(*weights), member)
-    return run_carts(carts, given, run=partial(run_corrected_period, addition=addition), **laws)
+def run_learned_carts(carts: Carts, inputs: Inputs, weights: Weights, **settings: Any) -> Period:
+    """Run `run_carts` with the addition of the members of `weights`."""
+    member, *residual = weights
+    return run_carts(carts, inputs, addition=chosen_members(Residual(*residual), member), **settings)
 
 
 class LearnedPlant(SimulatedPlant):
     """N carts of a learned model.
 
-    `carts`, `start`, `seed`, `device` and `compiled` as of a simulated plant; `randomizer` draws the numbers
-    of the carts, and has to allow UNDER_WAY motor values under way.
+    `carts`, `start`, `seed`, `device` and `compiled` are those of a simulated plant; `randomizer` draws the
+    parameters of the carts.
     """
 
     def __init__(
@@ -71,23 +70,23 @@ class LearnedPlant(SimulatedPlant):
         if len(self._carts.drive) < 1 + UNDER_WAY:
             missing = self._carts.drive.new_zeros(1 + UNDER_WAY - len(self._carts.drive), carts)
             self._carts = self._carts._replace(drive=torch.cat((self._carts.drive, missing)))
-        self._weights = Residual(*(part.to(self.device) for part in model.residual))
+        self._residual = Residual(*(part.to(self.device) for part in model.residual))
         run = partial(run_learned_carts, models=model.models, period=model.period, substeps=model.substeps)
         self._run_learned = Compiled(run) if compiled else run
         self._run = self._run_members
 
     @property
     def member(self) -> Tensor:
-        """Which member moves each cart, [N]; changes in place when a row resets."""
+        """The member that moves each cart, [N]; it changes in place when a row resets."""
         return self._member
 
-    def _run_members(self, carts: Carts, given: Given) -> Period:
-        return self._run_learned(carts, given, Learned(self._member, *self._weights))
+    def _run_members(self, carts: Carts, inputs: Inputs) -> Period:
+        return self._run_learned(carts, inputs, Weights(self._member, *self._residual))
 
     def restart(self, rows: Tensor, again: Tensor | None = None) -> TensorDict:
-        """Begin a new episode on the carts `rows` [R], each with a member drawn for it, but for `again`."""
+        """Start an episode on the carts `rows` [R], each with a new member, except for `again`."""
         drawn = torch.randint(
-            self._weights.members, (len(rows),), generator=self._generator, device=self.device
+            self._residual.members, (len(rows),), generator=self._generator, device=self.device
         )
         if again is not None:
             drawn = torch.where(again, self._member[rows], drawn)
@@ -95,10 +94,10 @@ class LearnedPlant(SimulatedPlant):
         return super().restart(rows, again)
 
     def snapshot(self) -> dict[str, Any]:
-        """All that the next step depends on; `restore` takes it back."""
+        """Return everything on which the next step depends, for `restore`."""
         return {**super().snapshot(), "member": self._member.clone()}
 
     def restore(self, snapshot: Any) -> None:
-        """Go on from `snapshot` as if nothing had happened."""
+        """Return to `snapshot`."""
         super().restore(snapshot)
         self._member.copy_(snapshot["member"])

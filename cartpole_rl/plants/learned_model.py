@@ -1,4 +1,4 @@
-"""A learned model of one cart as a file: identified numbers, the laws that they belong to, residuals."""
+"""A learned model of one cart as a file: identified parameters, their physics models, residuals."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -19,24 +19,24 @@ FORMAT = "cartpole_rl learned model 1"
 
 @dataclass(frozen=True)
 class LearnedModel:
-    """What a plant needs to move as a recorded cart did."""
+    """An identified cart and its residual."""
 
     parameters: Mapping[str, float]  # of the identified cart, by name
     models: Models
-    period: float  # s; a residual is of one control period
+    period: float  # s; a residual holds for one control period
     substeps: int
     residual: Residual  # float32
 
 
 def save_model(path: Path, model: LearnedModel) -> None:
-    """Write what `load_model` reads, whole or not at all."""
-    laws = {
+    """Write a model for `load_model`. An interrupted write leaves no file."""
+    models = {
         name: value if isinstance(value, bool) else str(value)
         for name, value in model.models._asdict().items()
     }
     content = {
         "parameters": dict(model.parameters),
-        "models": laws,
+        "models": models,
         "period": model.period,
         "substeps": model.substeps,
         "residual": {name: part.detach() for name, part in model.residual._asdict().items()},
@@ -46,30 +46,30 @@ def save_model(path: Path, model: LearnedModel) -> None:
 
 
 def load_model(source: Path) -> LearnedModel:
-    """The model in a file or a run folder. Raises CheckpointError where there is none, or a damaged one."""
+    """Return the model in a file or a run folder. Raises CheckpointError if it is missing or damaged."""
     path = find_model(source)
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # torch raises whatever the damaged bytes lead it to
+    except Exception as error:  # damaged bytes make torch raise anything
         raise CheckpointError(
-            f"plant.model={source} is no learned model, or it is damaged ({type(error).__name__}); {REMEDY}"
+            f"plant.model={source} is not a learned model, or is damaged ({type(error).__name__}); {REMEDY}"
         ) from None
     found = content.get("format") if isinstance(content, dict) else None
     if found != FORMAT:
         raise CheckpointError(
-            f"plant.model={source} is no learned model: its format is {found!r}, not {FORMAT!r}; {REMEDY}"
+            f"plant.model={source} is not a learned model: its format is {found!r}, not {FORMAT!r}; {REMEDY}"
         )
     try:
         return _as_model(content)
     except Exception as error:  # of another version, or edited by hand
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise CheckpointError(
-            f"plant.model={source} is of another version of this package: {reason}; learn it anew"
+            f"plant.model={source} is of another version of this package: {reason}; run cartpole-model again"
         ) from None
 
 
 def _as_model(content: Mapping[str, Any]) -> LearnedModel:
-    laws = content["models"]
+    models = content["models"]
     check_values(content["parameters"])
     residual = Residual(**content["residual"])
     if bad := [name for name, part in residual._asdict().items() if not part.isfinite().all()]:
@@ -79,11 +79,11 @@ def _as_model(content: Mapping[str, Any]) -> LearnedModel:
     return LearnedModel(
         content["parameters"],
         Models(
-            CartFriction(laws["cart_friction"]),
-            PoleFriction(laws["pole_friction"]),
-            Actuator(laws["actuator"]),
-            Integrator(laws["integrator"]),
-            bool(laws["pole_presses"]),
+            CartFriction(models["cart_friction"]),
+            PoleFriction(models["pole_friction"]),
+            Actuator(models["actuator"]),
+            Integrator(models["integrator"]),
+            bool(models["pole_presses"]),
         ),
         float(content["period"]),
         int(content["substeps"]),

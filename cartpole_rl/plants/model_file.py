@@ -1,15 +1,15 @@
-"""Where a run folder keeps a learned model, without reading it."""
+"""The path of a learned model in a run folder."""
 
 from pathlib import Path
 
 from cartpole_rl.errors import CheckpointError
 
 MODEL = "model.pt"  # in a run folder
-REMEDY = "give what cartpole-model wrote"
+REMEDY = "give a run of cartpole-model"
 
 
 def find_model(source: Path) -> Path:
-    """The model that `source` means: itself, or that of a run folder. Raises CheckpointError."""
+    """Return the path of the model: `source`, or the one in a run folder. Raises CheckpointError."""
     path = source / MODEL if source.is_dir() else source
     if not path.exists():
         missing = f"it holds no {MODEL}" if source.exists() else "there is no such file or folder"

@@ -1,6 +1,6 @@
 """N simulated carts as one plant: parameters and starts drawn anew for each episode, physics, encoders.
 
-The true state lives here and stays here; what leaves is what a cart's serial port would say.
+The true state stays inside; the frames hold what a cart reports over its serial port.
 """
 
 import math
@@ -16,19 +16,19 @@ from cartpole_rl.compilation import Compiled
 from cartpole_rl.physics.dynamics import State
 from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import CartParameters
-from cartpole_rl.plants.simulation import Carts, Given, Period, encoder_counts, run_carts
+from cartpole_rl.plants.simulation import Carts, Inputs, Period, encoder_counts, run_carts
 from cartpole_rl.plants.specs import Plant
-from cartpole_rl.randomization.found import Draws
+from cartpole_rl.randomization.draws import Draws
 from cartpole_rl.tasks.episode import Origin
 from cartpole_rl.tasks.settings import StartSettings
 from cartpole_rl.tasks.starts import draw_start
 
-OF_CHANCE = ("latency_jitter", "position_noise", "angle_noise")  # drawn anew in each period
-DRAWN_AT_ONCE = 1024  # episodes; a few at a time would take about as long
+NOISE_PARAMETERS = ("latency_jitter", "position_noise", "angle_noise")  # drawn anew in each period
+DRAWN_AT_ONCE = 1024  # episodes; drawing a few takes about as long
 
 
 class Episodes(NamedTuple):
-    """Beginnings of episodes, drawn and not yet begun."""
+    """Starts of coming episodes, drawn in advance."""
 
     table: Tensor  # [P, M]
     motion: Tensor  # [4, M]
@@ -40,7 +40,7 @@ class SimulatedPlant(Plant):
 
     `period` s is one control period, integrated in `substeps` steps. Parameters and the start are new in each
     episode, for the rows that reset; `parameters` reads the values in force. A `compiled` plant and the
-    hardware transform over it are several times as fast, need a C++ compiler and cost some seconds once.
+    hardware transform over it are several times faster, need a C++ compiler and take seconds to compile.
     """
 
     def __init__(
@@ -60,12 +60,12 @@ class SimulatedPlant(Plant):
         self.randomizer, self.start, self.models = randomizer, start, models
         self.period, self.substeps = period, substeps
         run = partial(run_carts, models=models, period=period, substeps=substeps)
-        self._run: Callable[[Carts, Given], Period] = Compiled(run) if compiled else run
+        self._run: Callable[[Carts, Inputs], Period] = Compiled(run) if compiled else run
         self._generator = torch.Generator(device=self.device)
-        self._chancy = any(randomizer.can_differ_from_zero(name) for name in OF_CHANCE)
-        self._no_chance = torch.zeros(3, carts, device=self.device)
+        self._noisy = any(randomizer.can_differ_from_zero(name) for name in NOISE_PARAMETERS)
+        self._no_noise = torch.zeros(3, carts, device=self.device)
         delay = randomizer.longest_delay()
-        commands = 1 + max(1, math.ceil(delay / period - 1e-9))  # motor values that can be under way
+        commands = 1 + max(1, math.ceil(delay / period - 1e-9))  # motor values under way at most
         self._carts = Carts(
             randomizer.nominal.unsqueeze(1).repeat(1, carts),
             torch.zeros(4, carts, device=self.device),
@@ -76,7 +76,7 @@ class SimulatedPlant(Plant):
 
     @property
     def parameters(self) -> CartParameters:
-        """The parameters in force, [N]; they change in place when a row resets: clone what is to be kept."""
+        """The parameters in force, [N]; they change in place when a row resets: clone them to keep them."""
         return self._cart
 
     @property
@@ -94,7 +94,7 @@ class SimulatedPlant(Plant):
         self._carts = self._carts._replace(motion=torch.stack(state).to(self._carts.motion))
 
     def origins(self) -> list[Origin]:
-        """The cart and the true state of each row as they are now; after a reset, as its episode began."""
+        """Return the present cart and true state of each row; after a reset, those at the episode's start."""
         names, states = CartParameters.names(), self._carts.motion.T.tolist()
         return [
             Origin(dict(zip(names, cart, strict=True)), dict(zip(State._fields, state, strict=True)))
@@ -102,26 +102,28 @@ class SimulatedPlant(Plant):
         ]
 
     def start_from(self, state: Mapping[str, float]) -> None:
-        """Let the next episode of every cart begin in this true state; `Origin` has the units."""
+        """Start the next episode of every cart in this true state; `Origin` has the units."""
         table = self.randomizer.draw(self.carts, self._generator)
         column = torch.tensor([[state[name]] for name in State._fields], device=self.device)
         motion = column.repeat(1, self.carts)
-        counts = encoder_counts(State(*motion), CartParameters.from_table(table), self._chance(self.carts))
+        counts = encoder_counts(
+            State(*motion), CartParameters.from_table(table), self._draw_noise(self.carts)
+        )
         self._coming = Episodes(table, motion, counts)
 
     def replace_randomizer(self, randomizer: Draws) -> None:
-        """Draw the next episodes from another one, whose delays are no longer than those of the first."""
+        """Draw the next episodes from `randomizer`, whose delays are no longer than those of the first."""
         self.randomizer = randomizer
         self._coming = self._draw_episodes(0)
 
     def snapshot(self) -> dict[str, Any]:
-        """All that the next step depends on; `restore` takes it back."""
+        """Return everything on which the next step depends, for `restore`."""
         coming = {f"next_{name}": value.clone() for name, value in self._coming._asdict().items()}
         now = {name: value.clone() for name, value in self._carts._asdict().items()}
         return {**now, **coming, "generator": self._generator.get_state()}
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
-        """Go on from `snapshot` as if nothing had happened."""
+        """Return to `snapshot`."""
         self._carts.table.copy_(snapshot["table"])
         self._carts = Carts(self._carts.table, snapshot["motion"].clone(), snapshot["drive"].clone())
         self._coming = Episodes(*(snapshot[f"next_{name}"].clone() for name in Episodes._fields))
@@ -132,12 +134,12 @@ class SimulatedPlant(Plant):
         self._coming = self._draw_episodes(0)
 
     def restart(self, rows: Tensor, again: Tensor | None = None) -> TensorDict:
-        """Begin a new episode on the carts `rows` [R], new ones but for `again`; their first frame, [R]."""
+        """Start an episode on the carts `rows` [R], new but for `again`; return their first frame, [R]."""
         table, motion, counts = self._next_episodes(len(rows))
         if again is not None and again.any():
             table = torch.where(again, self._carts.table[:, rows], table)
             cart = CartParameters.from_table(table)
-            counts = encoder_counts(State(*motion), cart, self._chance(len(rows)))
+            counts = encoder_counts(State(*motion), cart, self._draw_noise(len(rows)))
         self._carts.table.index_copy_(1, rows, table)
         self._carts = Carts(
             self._carts.table,
@@ -157,11 +159,11 @@ class SimulatedPlant(Plant):
     def _draw_episodes(self, count: int) -> Episodes:
         table = self.randomizer.draw(count, self._generator)
         motion = draw_start(count, self.start, self._generator).T
-        counts = encoder_counts(State(*motion), CartParameters.from_table(table), self._chance(count))
+        counts = encoder_counts(State(*motion), CartParameters.from_table(table), self._draw_noise(count))
         return Episodes(table, motion, counts)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDict:
-        """The first frame of the carts that reset; TorchRL keeps the others', which are zeros here."""
+        """Return the first frame of the carts that reset; TorchRL keeps the others', which are zeros here."""
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if mask is None:
             return self.restart(torch.arange(self.carts, device=self.device))
@@ -172,21 +174,21 @@ class SimulatedPlant(Plant):
         return frame
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        given = Given(tensordict.get("motor").T, self._chance(self.carts))
-        after = self._run(self._carts, given)
+        inputs = Inputs(tensordict.get("motor").T, self._draw_noise(self.carts))
+        after = self._run(self._carts, inputs)
         self._carts = Carts(self._carts.table, after.motion, after.drive)
         return self._report(self.step_frame, after.counts, after.motor_applied, after.off_track)
 
-    def _chance(self, count: int) -> Tensor:
-        """The draws for one period of `count` carts, [3, count]; 0 where nothing is left to chance."""
-        if not self._chancy:
-            return self._no_chance if count == self.carts else self._no_chance.new_zeros(3, count)
+    def _draw_noise(self, count: int) -> Tensor:
+        """Return the noise of one period of `count` carts, [3, count]; 0 where no parameter is noisy."""
+        if not self._noisy:
+            return self._no_noise if count == self.carts else self._no_noise.new_zeros(3, count)
         draws = {"generator": self._generator, "device": self.device}
         return torch.cat((2 * torch.rand(1, count, **draws) - 1, torch.randn(2, count, **draws)))
 
     def _report(
         self, frame: Callable[..., TensorDict], counts: Tensor, motor_applied: Tensor, off_track: Tensor
     ) -> TensorDict:
-        """The frame of what is transposed here."""
+        """Return the frame of tensors that are transposed here."""
         dt = torch.full(off_track.shape, self.period, device=self.device)
         return frame(counts.T, dt.T, motor_applied.T, off_track.T, torch.zeros_like(off_track).T)

@@ -1,40 +1,40 @@
 """One control period of N simulated carts as pure functions: a motor value in, encoder counts out.
 
-What chance has a part in comes in drawn, so that this can be compiled. Tensors are [N] or [k, N], the
+Random numbers are drawn beforehand, so that this can be compiled. Tensors are [N] or [k, N], the
 transpose of what stands in the tensordict: compiled code then runs along the carts.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from cartpole_rl.physics.dynamics import Drive, State, run_period
+from cartpole_rl.physics.dynamics import Drive, MakeAddition, State, run_period
+from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import CartParameters
-from cartpole_rl.tasks.features import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 
 LARGEST_COUNT = 2**30  # STATE's counts are 32-bit numbers
 
 
 class Carts(NamedTuple):
-    """All that the next period depends on, in few tensors: each one more costs time in every call."""
+    """The state before a period, in few tensors: each one costs time in every call."""
 
     table: Tensor  # [P, N], a row a parameter, for `CartParameters.from_table`
     motion: Tensor  # [4, N], the true `State`
     drive: Tensor  # [1 + D, N], the `Drive`: force, then motor values, newest first
 
 
-class Given(NamedTuple):
-    """What comes in with a period."""
+class Inputs(NamedTuple):
+    """The inputs of a period."""
 
     motor: Tensor  # [1, N] int64
-    chance: Tensor  # [3, N]: of the latency, uniform in -1 to 1; of position and angle, standard normal
+    noise: Tensor  # [3, N]: of the latency, uniform in -1 to 1; of position and angle, standard normal
 
 
 class Period(NamedTuple):
-    """What a period leads to."""
+    """The results of a period."""
 
     motion: Tensor  # [4, N]
     drive: Tensor  # [1 + D, N]
@@ -45,39 +45,39 @@ class Period(NamedTuple):
 
 def run_carts(
     carts: Carts,
-    given: Given,
+    inputs: Inputs,
     *,
     models: Models,
     period: float,
     substeps: int,
-    run: Callable[..., tuple[State, Drive]] = run_period,
+    addition: MakeAddition | None = None,
 ) -> Period:
-    """Run every cart for `period` s in `substeps` steps under a new motor value, as `run` does."""
+    """Run every cart for `period` s in `substeps` steps under a new motor value."""
     cart = CartParameters.from_table(carts.table)
     before = State(*carts.motion.unbind(0))
     force, *motors = carts.drive.unbind(0)
-    drive = Drive(force, [given.motor[0].to(force.dtype), *motors[:-1]])
-    latency = (cart.latency + given.chance[0] * cart.latency_jitter).clamp(min=0)
-    state, drive = run(before, drive, latency, cart, models, period, substeps)
+    drive = Drive(force, [inputs.motor[0].to(force.dtype), *motors[:-1]])
+    latency = (cart.latency + inputs.noise[0] * cart.latency_jitter).clamp(min=0)
+    state, drive = run_period(before, drive, latency, cart, models, period, substeps, addition)
     return Period(
         torch.stack(state),
         torch.stack((drive.force, *drive.motors)),
-        encoder_counts(state, cart, given.chance),
+        encoder_counts(state, cart, inputs.noise),
         motor_in_force(drive.motors, cart.latency, period),
         ~(state.x.abs() <= cart.track_half_length).unsqueeze(0),  # also where it is not a number
     )
 
 
-def encoder_counts(state: State, cart: CartParameters, chance: Tensor) -> Tensor:
-    """Counts [2, N] int64 of the true state, with the zero's error and the noise of `chance` [3, N]."""
-    x = state.x + chance[1] * cart.position_noise
-    theta = state.theta + cart.angle_offset + chance[2] * cart.angle_noise
+def encoder_counts(state: State, cart: CartParameters, noise: Tensor) -> Tensor:
+    """Return counts [2, N] int64 of the true state, with the error of the zero and `noise` [3, N]."""
+    x = state.x + noise[1] * cart.position_noise
+    theta = state.theta + cart.angle_offset + noise[2] * cart.angle_noise
     counts = torch.stack((x / CART_METRES_PER_COUNT, theta / POLE_RADIANS_PER_COUNT)).round()
     return counts.nan_to_num(0.0).clamp(-LARGEST_COUNT, LARGEST_COUNT).long()
 
 
 def motor_in_force(motors: Sequence[Tensor], latency: Tensor, period: float) -> Tensor:
-    """The motor value [1, N] int64 in force at a period's end, of `motors` [N] each, newest first."""
+    """Return the motor value [1, N] int64 in force at a period's end, of `motors` [N] each, newest first."""
     applied = motors[0]
     for age in range(1, len(motors)):
         applied = torch.where(latency > age * period, motors[age], applied)

@@ -9,9 +9,9 @@ from cartpole_rl.randomization.ranges import Range
 
 
 def check_carts(cart: Mapping[str, float], poles: PoleSettings, ranges: Mapping[str, Range]) -> None:
-    """Raise ConfigError where no such carts can be drawn.
+    """Raise ConfigError where no such carts can be drawn:
 
-    A name is unknown, a nominal value is impossible, a range reaches an impossible value, or `cart` has a
+    a name is unknown, a nominal value is impossible, a range reaches an impossible value, or `cart` has a
     number of the pole's.
     """
     for name in Pole.model_fields:
@@ -26,5 +26,5 @@ def check_carts(cart: Mapping[str, float], poles: PoleSettings, ranges: Mapping[
 
 
 def possible_poles(poles: PoleSettings) -> list[Pole]:
-    """The choices; a rod of random length is as possible as the one of middle length."""
+    """Return the choices; the rod of middle length stands for rods of random length."""
     return [poles.nominal] if poles.choices is None else list(poles.choices.values())

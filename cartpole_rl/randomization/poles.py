@@ -1,11 +1,11 @@
-"""Which pole a cart carries: one, one of several, or a rod of random length. A pole is chosen whole."""
+"""The pole of a cart: one, one of several, or a rod of random length. A pole is chosen whole."""
 
 from pydantic import model_validator
 
 from cartpole_rl.physics.rod import uniform_rod
 from cartpole_rl.settings import NonNegative, Positive, Settings
 
-JUDGED_LENGTHS = 5  # rods that an agent of a range of lengths is judged on
+JUDGED_LENGTHS = 5  # rods on which an agent of a range of lengths is evaluated
 
 
 class Pole(Settings):
@@ -17,7 +17,7 @@ class Pole(Settings):
 
     @classmethod
     def rod(cls, length: float) -> "Pole":
-        """A uniform rod of `length` m and the thesis's 0.7 kg/m."""
+        """Return a uniform rod of `length` m and the thesis's 0.7 kg/m."""
         return cls(**uniform_rod(length))
 
 

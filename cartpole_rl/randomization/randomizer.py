@@ -1,4 +1,4 @@
-"""Draws the parameters of carts: a pole, then each randomized parameter about that cart's nominal value.
+"""Draws the parameters of carts: first a pole, then each randomized parameter about its nominal value.
 
 A draw is a table [P, N] with a row a parameter in the order of `CartParameters.names()`, so that the rows of
 finished episodes are replaced by one assignment.
@@ -47,11 +47,11 @@ class Randomizer:
         self._choices = self.nominal.new_tensor(choices).T  # [3, poles]
 
     def draw(self, count: int, generator: torch.Generator) -> Tensor:
-        """Parameters of `count` carts, [P, count]."""
+        """Return parameters of `count` carts, [P, count]."""
         return self._table(*self._draw_parts(count, generator))
 
     def ends(self, name: str, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """A draw with `name` at the low end of its range, and the same draw with it at the high end.
+        """Return a draw with `name` at the low end of its range, and the same with it at the high end.
 
         Two tables [P, count] that are equal in every other parameter. `name` must have a range.
         """
@@ -62,7 +62,7 @@ class Randomizer:
         return self._table(poles, low), self._table(poles, high)
 
     def longest_delay(self) -> float:
-        """The longest latency that a draw can have, jitter included, s."""
+        """Return the longest latency that a draw can have, jitter included, s."""
         longest = 0.0
         for name in ("latency", "latency_jitter"):
             line, nominal = self.ranges.get(name), self._nominal_of(name)
@@ -73,11 +73,11 @@ class Randomizer:
         return longest
 
     def can_differ_from_zero(self, name: str) -> bool:
-        """Whether a draw of `name` can be anything but 0; what stays 0 need not be simulated."""
+        """Return whether a draw of `name` can be anything but 0."""
         return name in self.ranges or self._nominal_of(name) != 0
 
     def _draw_parts(self, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Nominal carts with drawn poles, [P, count], and a number from 0 to 1 a range, [R, count]."""
+        """Return nominal carts with drawn poles, [P, count], and a number from 0 to 1 a range, [R, count]."""
         table = self.nominal.unsqueeze(1).repeat(1, count)
         if self.poles.lengths is not None or self._choices.shape[1] > 1:
             table[self._pole_rows] = self._draw_poles(count, generator)
@@ -87,14 +87,14 @@ class Randomizer:
         return table, unit
 
     def _table(self, poles: Tensor, unit: Tensor) -> Tensor:
-        """Parameters [P, N] of the carts that `_draw_parts` drew."""
+        """Return parameters [P, N] of the carts that `_draw_parts` drew."""
         value = self._low + unit * self._width
         value = torch.where(self._logarithmic, value.exp(), value)
         value = torch.where(self._scales, poles.index_select(0, self._rows) * value, value)
         return poles.index_copy(0, self._rows, value)
 
     def _draw_poles(self, count: int, generator: torch.Generator) -> Tensor:
-        """Mass, centre of mass and inertia, [3, count]."""
+        """Return mass, centre of mass and inertia, [3, count]."""
         device = self.nominal.device
         if self.poles.lengths is None:
             number = self._choices.shape[1]

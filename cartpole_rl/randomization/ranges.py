@@ -16,7 +16,7 @@ Bounds = tuple[Finite, Finite]
 
 
 class Distribution(StrEnum):
-    """How a value is spread between its bounds."""
+    """Distribution of a value between its bounds."""
 
     UNIFORM = "uniform"
     LOG_UNIFORM = "log_uniform"
@@ -41,11 +41,11 @@ class Range(Settings):
 
     @property
     def scales_nominal(self) -> bool:
-        """Whether the drawn value is a multiple of the nominal one."""
+        """The drawn value is a multiple of the nominal one."""
         return self.absolute is None
 
     def limits(self) -> Bounds:
-        """[low, high] of the value (absolute) or of the multiple of the nominal value (relative, factor)."""
+        """Return [low, high] of the value (absolute) or of its ratio to the nominal one."""
         if self.absolute is not None:
             return self.absolute
         if self.factor is not None:
@@ -70,7 +70,7 @@ class Range(Settings):
             raise ConfigError(f"randomization of {name}: log_uniform needs bounds above 0")
 
     def warped(self) -> Bounds:
-        """The limits on the axis on which the draw is uniform."""
+        """Return the limits on the axis on which the draw is uniform."""
         low, high = self.limits()
         if self.distribution is Distribution.LOG_UNIFORM:
             return math.log(low), math.log(high)

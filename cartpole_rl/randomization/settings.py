@@ -1,4 +1,4 @@
-"""What can be set about drawn carts beside ranges: the carts of an identification."""
+"""Settings of carts that are drawn from an identification."""
 
 from pathlib import Path
 
@@ -6,10 +6,10 @@ from cartpole_rl.randomization.ranges import Range
 from cartpole_rl.settings import Fraction, Positive, Settings
 
 
-class FoundSettings(Settings):
-    """Carts as an identification found them, in place of ranges about the nominal cart."""
+class IdentifiedSettings(Settings):
+    """Identified carts, in place of ranges about the nominal cart."""
 
     posterior: Path  # posterior.npz of cartpole-identify
-    widen: Positive  # its uncertainty is multiplied by it
-    prior_share: Fraction  # of the carts are nominal ones within `ranges`
-    ranges: dict[str, Range]  # of what the identification does not tell
+    widen: Positive  # factor of its uncertainty
+    prior_share: Fraction  # of the carts, which are nominal ones within `ranges`
+    ranges: dict[str, Range]  # of parameters that are not identified, and of the prior share

@@ -26,10 +26,11 @@ from cartpole_rl.plants.serial.plant import SerialPlant
 from cartpole_rl.plants.serial.settings import SerialPlantSettings
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.plants.specs import Plant
-from cartpole_rl.randomization.found import Draws, FoundCarts, found_carts
+from cartpole_rl.randomization.draws import Draws
+from cartpole_rl.randomization.identified import IdentifiedCarts, identified_carts
 from cartpole_rl.randomization.poles import Pole, PoleSettings
 from cartpole_rl.randomization.randomizer import Randomizer
-from cartpole_rl.randomization.settings import FoundSettings
+from cartpole_rl.randomization.settings import IdentifiedSettings
 from cartpole_rl.settings import evaluation_seed
 from cartpole_rl.tasks.settings import Start, StartSettings
 from cartpole_rl.workflows.checking import checked
@@ -53,8 +54,8 @@ REPLACEABLE = ("cart", "cart_friction", "pole_friction", "pole", "reward")  # by
 
 def randomizer(config: CartPoleSettings) -> Draws:
     """What draws the carts that `config` describes. Raises ConfigError where its numbers make no sense."""
-    if isinstance(config.randomization, FoundSettings):
-        return found_carts(config.randomization, config.nominal, config.pole)
+    if isinstance(config.randomization, IdentifiedSettings):
+        return identified_carts(config.randomization, config.nominal, config.pole)
     return Randomizer(config.nominal, config.pole, config.randomization)
 
 
@@ -106,7 +107,7 @@ def learned_plant(
     if abs(2 * own["pole_com"] / length - 1) > SIMILAR:
         raise ConfigError(f"pole: plant.model has one of {2 * own['pole_com']:.2f} m, not {length:.2f} m")
     found = torch.tensor([[own[name]] for name in CartParameters.names()])
-    draws = FoundCarts(found, randomizer(config), plant.prior_share, UNDER_WAY * model.period)
+    draws = IdentifiedCarts(found, randomizer(config), plant.prior_share, UNDER_WAY * model.period)
     return LearnedPlant(carts, model, draws, start, seed, compiled=compiled)
 
 

@@ -21,7 +21,7 @@ from cartpole_rl.physics.bounds import check_values
 from cartpole_rl.physics.models import Actuator, CartFriction, Integrator, Models, PoleFriction
 from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.randomization.ranges import Range
-from cartpole_rl.randomization.settings import FoundSettings
+from cartpole_rl.randomization.settings import IdentifiedSettings
 from cartpole_rl.settings import Count, Finite, Fraction, Positive, Seed, Settings
 from cartpole_rl.tasks.actions import ActionSettings
 
@@ -30,11 +30,11 @@ OF_SIMULATION = ("parameters", "randomization", "cart", "cart_friction", "pole_f
 
 def _kind_of_randomization(given: Any) -> str:
     """A posterior of an identification, or else ranges by the parameters' names."""
-    return "found" if isinstance(given, FoundSettings) or "posterior" in given else "ranges"
+    return "found" if isinstance(given, IdentifiedSettings) or "posterior" in given else "ranges"
 
 
 Randomization = Annotated[
-    Annotated[dict[str, Range], Tag("ranges")] | Annotated[FoundSettings, Tag("found")],
+    Annotated[dict[str, Range], Tag("ranges")] | Annotated[IdentifiedSettings, Tag("found")],
     Discriminator(_kind_of_randomization),
 ]
 
@@ -114,7 +114,7 @@ class CartPoleSettings(Settings):
     def ranges(self) -> dict[str, Range]:
         """What is randomized by ranges; of carts that were found, what they leave open."""
         given = self.randomization
-        return given.ranges if isinstance(given, FoundSettings) else given
+        return given.ranges if isinstance(given, IdentifiedSettings) else given
 
     def models(self, plant: SimulatedSettings | LearnedSettings) -> Models:
         """The laws that the simulated cart obeys."""

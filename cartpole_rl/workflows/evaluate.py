@@ -11,7 +11,7 @@ from cartpole_rl.envs.make import CartPoleEnv
 from cartpole_rl.evaluation.episodes import Policy, run_batch, run_episodes
 from cartpole_rl.learning.randomness import seed_everything
 from cartpole_rl.plants.serial.plant import SerialPlant
-from cartpole_rl.plants.simulated import OF_CHANCE, SimulatedPlant
+from cartpole_rl.plants.simulated import NOISE_PARAMETERS, SimulatedPlant
 from cartpole_rl.reporting.table import interval_text, table
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
@@ -110,7 +110,7 @@ def compared(again: Repetition, episode: Episode) -> str:
 
 def left_to_chance(again: Repetition) -> list[str]:
     """The parameters of the cart that keep its episode from being driven exactly alike."""
-    return [name for name in OF_CHANCE if again.origin.parameters[name] != 0]
+    return [name for name in NOISE_PARAMETERS if again.origin.parameters[name] != 0]
 
 
 def link_figures(env: CartPoleEnv) -> dict[str, Any]:

@@ -16,13 +16,13 @@ from cartpole_rl.identification.windows import cut_windows
 from cartpole_rl.learning.finetuning import Finetuning, recorded_chunk
 from cartpole_rl.learning.settings import FinetuningSettings, LearningSettings
 from cartpole_rl.learning.training import Scalars, Training
+from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 from cartpole_rl.physics.models import CartFriction, Models
 from cartpole_rl.plants.recorded import RecordedPlant
 from cartpole_rl.plants.simulated import SimulatedPlant
-from cartpole_rl.randomization.found import FoundCarts
+from cartpole_rl.randomization.identified import IdentifiedCarts
 from cartpole_rl.settings import evaluation_seed
 from cartpole_rl.tasks.episode import Episode
-from cartpole_rl.tasks.features import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 from cartpole_rl.workflows.build import environment, randomizer, simulated_env
 from cartpole_rl.workflows.config import CartPoleSettings, FinetuneConfig, TrainConfig
 from cartpole_rl.workflows.finetuning_files import pole_length
@@ -141,11 +141,11 @@ class CartLearner:
         )
         return fit, models
 
-    def draws(self, fit: Fit) -> FoundCarts:
+    def draws(self, fit: Fit) -> IdentifiedCarts:
         """Return what draws simulated carts: from `fit`, and a share as in training."""
         finetuning, random = self.config.finetuning, np.random.default_rng(self.config.seed)
         table = torch.from_numpy(fit.draw(SAMPLES, random, finetuning.widen)).float()
-        return FoundCarts(table, randomizer(self.training), finetuning.prior_share, LONGEST_LATENCY)
+        return IdentifiedCarts(table, randomizer(self.training), finetuning.prior_share, LONGEST_LATENCY)
 
     def transitions(self, episode: Episode) -> Any:
         """Return an episode's transitions as the agent observes them; None where it has none."""

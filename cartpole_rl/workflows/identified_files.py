@@ -111,8 +111,11 @@ def summary(found: Identification, carts: np.ndarray) -> dict[str, Any]:
             each.name: {"value": each.value, "low": each.low, "high": each.high, "unit": each.unit}
             for each in intervals(found.fit, carts)
         },
-        "tried": {each.law: {"x_m": each.x_error, "theta_rad": each.theta_error} for each in found.tried},
+        "tried": {
+            each.cart_friction: {"x_m": each.x_error, "theta_rad": each.theta_error}
+            for each in found.candidates
+        },
         "held_out_1_s": {"x_m": x_error, "theta_rad": theta_error},
         "residual_counts": found.fit.rms.tolist(),
-        "doubts": found.doubts,
+        "doubts": found.warnings,
     }

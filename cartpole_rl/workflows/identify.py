@@ -169,9 +169,9 @@ def html_page(
     return identification_page(
         recordings,
         estimates(config, found, carts),
-        {each.law: PredictionError(each.x_error, each.theta_error) for each in found.tried},
+        {each.cart_friction: PredictionError(each.x_error, each.theta_error) for each in found.candidates},
         PredictionError(*prediction_errors(found.held_out)),
-        found.doubts,
+        found.warnings,
         next_command(found, folder),
     )
 
@@ -191,7 +191,7 @@ def print_verdict(found: Identification, folder: Path) -> None:
         f"RMS prediction error over one second of held-out motion: {error.text}, with "
         f"cart_friction={found.models.cart_friction}"
     )
-    for warning in found.doubts:
+    for warning in found.warnings:
         print(f"warning: {warning}")
     print(f"{folder}/{PAGE}, {CART}, {POLE}, {RANDOMIZATION} and figures/ are written; next:")
     print(next_command(found, folder))

@@ -12,11 +12,13 @@ from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from cartpole_rl.evaluation.recordings import read_recording
+from cartpole_rl.identification.ensemble import Ensemble
 from cartpole_rl.identification.fit import Fit, fit_cart
 from cartpole_rl.identification.held_out import CERTAIN, Prediction, errors_at, predict_held_out
-from cartpole_rl.identification.learned import Dynamics, Ensemble
 from cartpole_rl.identification.replay import recorded_period
+from cartpole_rl.identification.rollout import Dynamics
 from cartpole_rl.identification.windows import Windows, cut_windows
+from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT
 from cartpole_rl.physics.models import CartFriction, Models
 from cartpole_rl.plants.learned_model import LearnedModel, save_model
 from cartpole_rl.plants.model_file import MODEL
@@ -25,7 +27,6 @@ from cartpole_rl.reporting.error_tables import model_table, spread_table
 from cartpole_rl.reporting.figures import save
 from cartpole_rl.reporting.figures.learned_models import forces_along_track, learned_model_figure
 from cartpole_rl.tasks.episode import Episode
-from cartpole_rl.tasks.features import CART_METRES_PER_COUNT
 from cartpole_rl.workflows.build import use_threads
 from cartpole_rl.workflows.checks import check_one_pole
 from cartpole_rl.workflows.config import LearnedSettings, ModelConfig

@@ -10,7 +10,7 @@ from cartpole_rl.learning.checkpoints import forget_training, restore_weights
 from cartpole_rl.learning.randomness import seed_everything
 from cartpole_rl.learning.training import Training
 from cartpole_rl.plants.effects import without_effect
-from cartpole_rl.randomization.found import Draws
+from cartpole_rl.randomization.draws import Draws
 from cartpole_rl.settings import evaluation_seed
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.build import new_agent, recorded_config, simulated_env, use_threads

@@ -93,10 +93,10 @@ def test_a_missing_or_damaged_model_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "damaged.pt").write_bytes(b"not a model")
     torch.save({"format": "cartpole_rl agent 1"}, tmp_path / "agent.pt")
     for source, complaint in {
-        "nowhere": "nowhere: there is no such file or folder; give what cartpole-model wrote",
-        ".": ".: it holds no model.pt; give what cartpole-model wrote",
-        "damaged.pt": "damaged.pt is no learned model, or it is damaged",
-        "agent.pt": "agent.pt is no learned model: its format is 'cartpole_rl agent 1'",
+        "nowhere": "nowhere: there is no such file or folder; give a run of cartpole-model",
+        ".": ".: it holds no model.pt; give a run of cartpole-model",
+        "damaged.pt": "damaged.pt is not a learned model, or is damaged",
+        "agent.pt": "agent.pt is not a learned model: its format is 'cartpole_rl agent 1'",
     }.items():
         done = in_process("train", "plant=learned", f"plant.model={source}", *TINY, folder=tmp_path)
         assert done.complaint.startswith(f"cartpole-train: plant.model={complaint}")

@@ -1,4 +1,4 @@
-"""Experiments on a simulated cart: they keep clear of the ends, and what is found from them is the cart."""
+"""Experiments on a simulated cart keep clear of the ends, and identify the cart."""
 
 from collections.abc import Callable
 from functools import partial
@@ -15,7 +15,7 @@ from cartpole_rl.identification.experiments import (
     REACH,
     Experiment,
     Moves,
-    Seen,
+    Observed,
     Task,
     conduct,
     excite,
@@ -25,6 +25,7 @@ from cartpole_rl.identification.experiments import (
 )
 from cartpole_rl.identification.identify import Identification, identify, prediction_errors
 from cartpole_rl.identification.quantities import quantities
+from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_COUNTS_PER_TURN
 from cartpole_rl.physics.models import CartFriction, Models, PoleFriction
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.simulated import SimulatedPlant
@@ -33,7 +34,7 @@ from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.tasks.settings import Start, StartSettings
 
 PERIOD = 0.02
-LAWS = Models(CartFriction.STEP, PoleFriction.BEARING)
+MODELS = Models(CartFriction.STEP, PoleFriction.BEARING)
 TRUTH = {
     "cart_viscous": 0.8,
     "cart_coulomb": 0.4,
@@ -60,7 +61,7 @@ HANGING = StartSettings(
 
 @pytest.fixture(scope="module")
 def recordings(make_plant: Callable[..., SimulatedPlant]) -> dict[str, Episode]:
-    plant = make_plant(1, cart=TRUTH, models=LAWS, start=HANGING)
+    plant = make_plant(1, cart=TRUTH, models=MODELS, start=HANGING)
     shorter = tuple(each._replace(moves=SHORTER.get(each.name, each.moves)) for each in EXPERIMENTS)
     return {each.name: episode for each, episode in conduct(plant, PERIOD, experiments=shorter)}
 
@@ -73,7 +74,7 @@ def nominal(ip02: dict[str, float], medium: PoleSettings) -> dict[str, float]:
 @pytest.fixture(scope="module")
 def found(recordings: dict[str, Episode], nominal: dict[str, float]) -> Identification:
     fitted = [episode for name, episode in recordings.items() if name != HELD_OUT]
-    return identify(fitted, [recordings[HELD_OUT]], nominal, LAWS, PERIOD, substeps=4, most=120)
+    return identify(fitted, [recordings[HELD_OUT]], nominal, MODELS, PERIOD, substeps=4, most=60)
 
 
 def test_every_experiment_is_made_to_its_end(recordings: dict[str, Episode]) -> None:
@@ -128,12 +129,12 @@ def test_recordings_follow_each_other_on_one_cart(recordings: dict[str, Episode]
     ],
 )
 def test_the_guard_brakes(x: float, x_dot: float, motor: int, given: int) -> None:
-    assert guarded(motor, Seen(x, x_dot, np.pi, 0.0)) == given
+    assert guarded(motor, Observed(x, x_dot, np.pi, 0.0)) == given
 
 
 def test_the_cart_is_found(found: Identification, nominal: dict[str, float]) -> None:
     true = {each.name: each.value for each in quantities({**nominal, **TRUTH})}
-    told = {each.name: each.value for each in quantities(found.fit.parameters)}
+    values = {each.name: each.value for each in quantities(found.fit.parameters)}
     for name, share in {
         "pole_frequency": 0.002,
         "force_gain": 0.01,
@@ -142,14 +143,14 @@ def test_the_cart_is_found(found: Identification, nominal: dict[str, float]) -> 
         "coulomb": 0.05,
         "pole_damping": 0.1,
     }.items():
-        assert told[name] == pytest.approx(true[name], rel=share), name
+        assert values[name] == pytest.approx(true[name], rel=share), name
     early = 2.5  # ms: the simulated cart's step is 5 ms, and (3.8) moves it half of one early
-    assert told["latency"] == pytest.approx(true["latency"] - early, abs=1.0)
-    assert told["lag"] == pytest.approx(true["lag"], abs=1.0)
+    assert values["latency"] == pytest.approx(true["latency"] - early, abs=1.0)
+    assert values["lag"] == pytest.approx(true["lag"], abs=1.0)
 
 
 def test_the_law_that_holds_predicts_best(found: Identification) -> None:
-    errors = {each.law: each.error for each in found.tried}
+    errors = {each.cart_friction: each.error for each in found.candidates}
     assert found.models.cart_friction in (CartFriction.STEP, CartFriction.STRIBECK)
     assert errors[CartFriction.LINEAR] > 3 * errors[CartFriction.STEP]
     x_error, theta_error = prediction_errors(found.held_out)
@@ -223,7 +224,9 @@ class TestChecks:
 
     def test_a_swapped_pole_encoder(self, recordings: dict[str, Episode]) -> None:
         swapped = [
-            changed(each, theta=lambda theta: 2 * np.pi - theta, pole=lambda counts: 4096 - counts)
+            changed(
+                each, theta=lambda theta: 2 * np.pi - theta, pole=lambda counts: POLE_COUNTS_PER_TURN - counts
+            )
             for each in recordings.values()
         ]
         with pytest.raises(RecordingError, match="swap the pole encoder's channels"):
@@ -248,7 +251,7 @@ class TestChecks:
         most = 8000
         saturated = changed(
             recordings["excite"],
-            x=lambda x: x.clip(-most * 2.2749e-5, most * 2.2749e-5),
+            x=lambda x: x.clip(-most * CART_METRES_PER_COUNT, most * CART_METRES_PER_COUNT),
             cart=lambda counts: counts.clip(-most, most),
         )
         with pytest.raises(RecordingError, match=r"stops dead at -?8000 counts"):

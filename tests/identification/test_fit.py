@@ -10,7 +10,7 @@ from cartpole_rl.envs.make import CartPoleEnv
 from cartpole_rl.errors import RecordingError
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.identification.fit import fit_cart
-from cartpole_rl.identification.prediction import predict
+from cartpole_rl.identification.rollout import rollout
 from cartpole_rl.identification.unknowns import limits, parameters_at, unknowns_of
 from cartpole_rl.identification.windows import HISTORY, cut_windows
 from cartpole_rl.physics.models import CartFriction, Models
@@ -62,13 +62,13 @@ def nominal(ip02: dict[str, float], medium: PoleSettings) -> dict[str, float]:
 
 
 def test_the_true_cart_predicts_every_count(episodes: list[Episode], nominal: dict[str, float]) -> None:
-    """From true beginnings at rest, to the rounding of the encoders."""
+    """From the true initial state at rest, to the rounding of the encoders."""
     first = episodes[0]
     motors = np.concatenate((np.zeros(HISTORY), first.motor[:50]))
     values = {**nominal, **TRUTH}
     table = torch.tensor([[values[name]] for name in CartParameters.names()], dtype=torch.float64)
     motion = torch.tensor([[0.0], [0.0], [np.pi], [0.0]], dtype=torch.float64)
-    counts = predict(table, motion, torch.from_numpy(motors).unsqueeze(1), STEP, PERIOD, 4)[..., 0]
+    counts = rollout(table, motion, torch.from_numpy(motors).unsqueeze(1), STEP, PERIOD, 4)[..., 0]
     assert np.abs(counts.numpy() - first.counts[:51]).max() < 0.6
 
 

@@ -99,8 +99,8 @@ def test_a_coasting_cart_never_gains_energy(make_cart: MakeCart, step: float, se
     cart, start = make_cart(64), random_states(64)
     frictionless = energies(coast(start, cart, FRICTIONLESS, step, seconds), cart)
     error = frictionless.max(0).values - frictionless.min(0).values
-    for law, pole in product(CartFriction, POLES):
-        models = FRICTIONLESS._replace(cart_friction=law, **pole)
+    for friction, pole in product(CartFriction, POLES):
+        models = FRICTIONLESS._replace(cart_friction=friction, **pole)
         if models == FRICTIONLESS:
             continue
         course = energies(coast(start, cart, models, step, seconds), cart)
@@ -119,8 +119,8 @@ def test_sticking_friction_takes_kinetic_energy_out_of_every_single_step(
     slow = start._replace(x_dot=0.02 * start.x_dot)  # where the cart stops or turns within the step
     for state in (start, slow):
         (_, free), (_, rubbed) = (
-            coast(state, cart, FRICTIONLESS._replace(cart_friction=law), step, step)
-            for law in (CartFriction.NONE, model)
+            coast(state, cart, FRICTIONLESS._replace(cart_friction=friction), step, step)
+            for friction in (CartFriction.NONE, model)
         )
         before, after = (
             energy(state._replace(x_dot=end.x_dot, theta_dot=end.theta_dot), cart) for end in (free, rubbed)

@@ -1,4 +1,4 @@
-"""What is added to the physics adds nothing while it is zero, and what it says otherwise."""
+"""The learned residual adds nothing while it is zero; otherwise it adds its tables and networks."""
 
 from collections.abc import Callable
 
@@ -16,12 +16,11 @@ from cartpole_rl.physics.residual import (
     Residual,
     chosen_members,
     members_in_turn,
-    run_corrected_period,
 )
 
 MakeCart = Callable[..., CartParameters]
 STEP = Models(cart_friction=CartFriction.STEP)
-LAWS = (STEP, 0.02, 4)
+SETTINGS = (STEP, 0.02, 4)
 
 
 def residual(members: int = 2, changed: bool = True) -> Residual:
@@ -46,11 +45,11 @@ def stacked(state: State, drive: Drive) -> torch.Tensor:
     return torch.stack((*state, drive.force))
 
 
-def test_zero_adds_nothing(make_cart: MakeCart) -> None:
+def test_a_residual_of_zeros_changes_nothing(make_cart: MakeCart) -> None:
     cart, (state, drive) = make_cart(8, latency=0.013, motor_time_constant=0.005), motion(8)
     addition = members_in_turn(residual(changed=False), 4)
-    plain = run_period(state, drive, cart.latency, cart, *LAWS)
-    corrected = run_corrected_period(state, drive, cart.latency, cart, *LAWS, addition)
+    plain = run_period(state, drive, cart.latency, cart, *SETTINGS)
+    corrected = run_period(state, drive, cart.latency, cart, *SETTINGS, addition)
     assert torch.equal(stacked(*plain), stacked(*corrected))
 
 
@@ -58,17 +57,15 @@ def test_members_in_turn_are_the_members_chosen(make_cart: MakeCart) -> None:
     cart, (state, drive) = make_cart(8), motion(8)
     learned, member = residual(), torch.arange(2).repeat_interleave(4)
     in_turn, chosen = (
-        run_corrected_period(state, drive, cart.latency, cart, *LAWS, addition)
+        run_period(state, drive, cart.latency, cart, *SETTINGS, addition)
         for addition in (members_in_turn(learned, 4), chosen_members(learned, member))
     )
     assert torch.allclose(stacked(*in_turn), stacked(*chosen), rtol=1e-12)
-    exchanged = run_corrected_period(
-        state, drive, cart.latency, cart, *LAWS, chosen_members(learned, 1 - member)
-    )
+    exchanged = run_period(state, drive, cart.latency, cart, *SETTINGS, chosen_members(learned, 1 - member))
     assert not torch.allclose(stacked(*in_turn), stacked(*exchanged), rtol=1e-3)
 
 
-def test_places_are_joined_by_straight_lines() -> None:
+def test_tables_are_interpolated_linearly() -> None:
     learned = residual()
     middle, member = PLACES // 2, torch.tensor([1, 1, 1, 1])
     x = SPACING * torch.tensor([3.0, 3.5, 4.0, 1e3], dtype=torch.float64)
@@ -80,7 +77,7 @@ def test_places_are_joined_by_straight_lines() -> None:
 
 
 def test_a_force_that_friction_holds_does_not_move_a_cart(make_cart: MakeCart) -> None:
-    """Which a change of velocity, added after the physics, would."""
+    """A change of velocity, added after the physics, would move it."""
     zero = torch.zeros(1, dtype=torch.float64)
     hanging = State(zero, zero, zero + torch.pi, zero)
     places = torch.full((1, PLACES), 0.4 / UNITS[0], dtype=torch.float64)
@@ -89,9 +86,7 @@ def test_a_force_that_friction_holds_does_not_move_a_cart(make_cart: MakeCart) -
     for coulomb in (0.5, 0.3):
         cart = make_cart(cart_coulomb=coulomb)
         drive = Drive(zero, [zero] * UNDER_WAY)
-        after, _ = run_corrected_period(
-            hanging, drive, cart.latency, cart, *LAWS, members_in_turn(learned, 1)
-        )
+        after, _ = run_period(hanging, drive, cart.latency, cart, *SETTINGS, members_in_turn(learned, 1))
         moved[coulomb] = after.x_dot.item()
     assert moved[0.5] == 0
     pull = make_cart()

@@ -9,7 +9,7 @@ from cartpole_rl.choices import choice, conf_folder
 from cartpole_rl.physics.models import Actuator, CartFriction, Models, PoleFriction, unused_parameters
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.effects import without_effect
-from cartpole_rl.randomization.found import FoundCarts
+from cartpole_rl.randomization.identified import IdentifiedCarts
 from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.randomization.randomizer import Randomizer
 from cartpole_rl.randomization.ranges import Range
@@ -68,12 +68,12 @@ def test_every_shipped_range_has_an_effect(
         assert found == (left_out if actions == "nine_newtons" else set())
 
 
-@pytest.mark.parametrize("law", [CartFriction.STEP, CartFriction.SIGMOID, CartFriction.STRIBECK])
+@pytest.mark.parametrize("model", [CartFriction.STEP, CartFriction.SIGMOID, CartFriction.STRIBECK])
 @pytest.mark.parametrize("randomization", [name for name in RANDOMIZATIONS if name.startswith("friction")])
 def test_the_thesis_perturbs_friction_that_is_read(
-    ip02: dict[str, float], medium: PoleSettings, randomization: str, law: CartFriction
+    ip02: dict[str, float], medium: PoleSettings, randomization: str, model: CartFriction
 ) -> None:
-    assert idle(ip02, ranges_of(randomization), medium, models=Models(law)) == set()
+    assert idle(ip02, ranges_of(randomization), medium, models=Models(model)) == set()
 
 
 @pytest.mark.parametrize("actions", [name for name in ACTIONS if name != "nine_newtons"])
@@ -144,8 +144,8 @@ def test_of_carts_that_were_found_only_what_is_drawn(ip02: dict[str, float], med
     others = Randomizer(ip02, medium, ranges)
     found = others.nominal.unsqueeze(1).repeat(1, 5)
 
-    def unread(prior_share: float, told: list[str] | None) -> list[str]:
-        carts = FoundCarts(found, others, prior_share, longest_delay=0.02, told=told)
+    def unread(prior_share: float, identified: list[str] | None) -> list[str]:
+        carts = IdentifiedCarts(found, others, prior_share, longest_delay=0.02, identified=identified)
         return without_effect(carts, ranges, (-200, 0, 200), Models(), 0.02)
 
     assert unread(0.0, None) == ["cart_mass", "latency"]
@@ -153,7 +153,7 @@ def test_of_carts_that_were_found_only_what_is_drawn(ip02: dict[str, float], med
     assert unread(0.001, None) == []
 
 
-def test_asking_draws_nothing_from_elsewhere(ip02: dict[str, float], medium: PoleSettings) -> None:
+def test_the_search_leaves_the_random_state_alone(ip02: dict[str, float], medium: PoleSettings) -> None:
     before = torch.get_rng_state()
     first, second = (idle(ip02, ranges_of("wide"), medium, "nine_newtons") for _ in range(2))
     assert first == second

@@ -149,12 +149,12 @@ class TestFile:
                 load_model(source)
             return str(error.value).replace(str(tmp_path), "")
 
-        assert complaint(tmp_path) == "plant.model=: it holds no model.pt; give what cartpole-model wrote"
+        assert complaint(tmp_path) == "plant.model=: it holds no model.pt; give a run of cartpole-model"
         assert complaint(tmp_path / "a.pt").startswith("plant.model=/a.pt: there is no such file or folder")
         whole = tmp_path / "whole.pt"
         save_model(whole, learned_model(parameters, 0.5))
         (tmp_path / "cut.pt").write_bytes(whole.read_bytes()[:2000])
-        assert "cut.pt is no learned model, or it is damaged" in complaint(tmp_path / "cut.pt")
+        assert "cut.pt is not a learned model, or is damaged" in complaint(tmp_path / "cut.pt")
         torch.save({"format": "cartpole_rl agent 1"}, tmp_path / "agent.pt")
         assert "its format is 'cartpole_rl agent 1'" in complaint(tmp_path / "agent.pt")
         content = torch.load(whole)
@@ -162,4 +162,4 @@ class TestFile:
         del content["parameters"]["cart_mass"]
         torch.save(content, tmp_path / "older.pt")
         assert "of another version" in complaint(tmp_path / "older.pt")
-        assert "'cart_mass' is missing; learn it anew" in complaint(tmp_path / "older.pt")
+        assert "'cart_mass' is missing; run cartpole-model again" in complaint(tmp_path / "older.pt")

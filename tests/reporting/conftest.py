@@ -6,8 +6,8 @@ import math
 import numpy as np
 import pytest
 
+from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 from cartpole_rl.tasks.episode import Episode
-from cartpole_rl.tasks.features import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 
 PERIOD = 0.02  # s
 SUBSTEPS = 20

@@ -7,9 +7,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_COUNTS_PER_TURN
 from cartpole_rl.tasks.features import (
-    CART_METRES_PER_COUNT,
-    POLE_COUNTS_PER_TURN,
     Measured,
     measured_position,
     measured_velocity,

@@ -9,10 +9,9 @@ from torch import Tensor
 
 from cartpole_rl.physics.actuator import static_force
 from cartpole_rl.physics.dynamics import Drive, State, run_period
+from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 from cartpole_rl.physics.parameters import GRAVITY, CartParameters
 from cartpole_rl.tasks.features import (
-    CART_METRES_PER_COUNT,
-    POLE_RADIANS_PER_COUNT,
     Measured,
     measured_position,
     measured_velocity,

@@ -1,4 +1,4 @@
-"""What `unused_parameters` names has no effect, and everything else has one somewhere."""
+"""The parameters of `unused_parameters` have no effect; others have."""
 
 import pytest
 import torch

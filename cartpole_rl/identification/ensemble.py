@@ -1,0 +1,133 @@
+"""Learns the errors of the identified physics: an ensemble of residuals, by matching trajectories.
+
+Windows of recorded motion are predicted by physics and residual together, and gradients flow through the
+whole window: the same encoder counts of positions as in the fit, no measured velocity, no one-step target.
+The initial state of each window is a nuisance. It is matched anew at intervals, for the current residual; in
+between, any effect that a changed initial state could explain is projected out of the errors (variable
+projection, as in the fit). With initial states merely held, learning is several times as slow.
+
+Members differ by their first weights and by the weights of the windows, which are drawn for each (the
+Bayesian bootstrap; Rubin, 1981). A share of the windows is left out for each member: it keeps the parameters
+with which it predicts those best, zeros included.
+Outputs that no window determines are drawn to zero: tables by a penalty on each entry, networks by a penalty
+on their outputs at random motions.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from cartpole_rl.identification.matching import (
+    COARSE,
+    FINEST,
+    ROUNDS,
+    InitialStates,
+    first_guess,
+    huber,
+    match_initial_states,
+    scaled_residuals,
+)
+from cartpole_rl.identification.rollout import Dynamics
+from cartpole_rl.identification.settings import EnsembleSettings
+from cartpole_rl.identification.windows import Windows
+from cartpole_rl.physics.residual import INPUTS, UNDER_WAY, Residual
+
+REFRESHING = 2  # steps towards the initial states each time after the first
+BACKGROUND = 256  # random motions an update
+
+
+class Ensemble:
+    """The learning of one ensemble on one set of windows."""
+
+    def __init__(
+        self, windows: Windows, dynamics: Dynamics, scale: np.ndarray, settings: EnsembleSettings, seed: int
+    ) -> None:
+        self.dynamics, self.settings = dynamics, settings
+        self.scale = torch.from_numpy(scale).clamp(FINEST, COARSE)
+        self.positions = torch.from_numpy(windows.positions)
+        self.motors = torch.from_numpy(windows.motors)
+        self.generator = torch.Generator().manual_seed(seed)
+        members = settings.members
+        draws = torch.rand(members, windows.number, generator=self.generator, dtype=torch.float64)
+        self.left_out = draws.argsort(1).argsort(1) < settings.validation * windows.number  # [M, W]
+        weight = -torch.rand(draws.shape, generator=self.generator, dtype=torch.float64).log()
+        self.weight = weight * ~self.left_out  # [M, W], of each window for each member
+        self.residual = Residual.untrained(members, settings.hidden, self.generator).as_type(torch.float64)
+        guess = first_guess(self.positions, dynamics.period)
+        self.initial = InitialStates(guess.unsqueeze(1).repeat(1, members, 1), torch.empty(0))
+        self.best = self.residual
+        self.lowest = torch.full((members,), torch.inf, dtype=torch.float64)
+        self.history: list[list[float]] = []  # loss of each member on the windows left out, at each refresh
+        self.updates: list[int] = []  # at each refresh
+
+    def learn(self, on_refresh: Callable[[int, list[float]], None] = lambda *_: None) -> Residual:
+        """Make all updates; return each member as it best predicted the windows left out.
+
+        `on_refresh` is called with the number of updates and each member's loss on those windows.
+        """
+        weights = [weight.clone().requires_grad_() for weight in self.residual]
+        optimizer = torch.optim.Adam(weights, self.settings.learning_rate)
+        falling = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, self.settings.updates)
+        self.residual = Residual(*weights)
+        self.refresh(ROUNDS, 0)
+        for update in range(1, self.settings.updates + 1):
+            optimizer.zero_grad()
+            self.cost().backward()
+            torch.nn.utils.clip_grad_norm_(weights, 1e3)
+            optimizer.step()
+            falling.step()
+            if update % self.settings.refresh == 0 or update == self.settings.updates:
+                self.refresh(REFRESHING, update)
+                on_refresh(update, self.history[-1])
+        return self.best
+
+    def refresh(self, rounds: int, update: int) -> None:
+        """Match the initial states anew, and keep the members that are better than ever before."""
+        self.initial = match_initial_states(
+            self.dynamics,
+            self.positions,
+            self.motors,
+            self.residual,
+            self.initial.motion,
+            rounds,
+            self.scale,
+        )
+        with torch.no_grad():
+            error = huber(self.residuals()).mean(-1)
+        loss = (error * self.left_out).sum(1) / self.left_out.sum(1)
+        self.history.append(loss.tolist())
+        self.updates.append(update)
+        better = loss < self.lowest
+        kept = [
+            torch.where(better.reshape(-1, *[1] * (new.dim() - 1)), new.detach(), old)
+            for new, old in zip(self.residual, self.best, strict=True)
+        ]
+        self.best, self.lowest = Residual(*kept), torch.minimum(loss, self.lowest)
+
+    def residuals(self) -> Tensor:
+        """Return scaled residuals from the present initial states, [M, W, R]."""
+        counts = self.dynamics.counts(self.initial.motion, self.motors, self.residual)
+        error = scaled_residuals(counts, self.positions.unsqueeze(2), self.scale)
+        return error.permute(2, 3, 0, 1).flatten(2)
+
+    def cost(self) -> Tensor:
+        """Return the loss of an update: errors in windows, and penalties."""
+        residuals = self.residuals().unsqueeze(-1)
+        errors = (residuals.mT @ self.initial.form @ residuals).flatten(1)  # [M, W]
+        places = self.residual.places
+        steps = places.diff(dim=1)
+        table_penalty = self.settings.table_penalty * ((places**2).sum() + 10 * (steps**2).sum())
+        outputs = self.residual.network(self.random_inputs())
+        output_penalty = self.settings.output_penalty * (outputs**2).mean((1, 2)).sum()
+        return (errors * self.weight).sum() + table_penalty + output_penalty
+
+    def random_inputs(self) -> Tensor:
+        """Return inputs of random motions, [1, INPUTS, BACKGROUND]; see `network_inputs`."""
+        size = torch.tensor([1.0, 2.0, 1.0, 1.0, 2.0, 1.2, *[1.25] * UNDER_WAY], dtype=torch.float64)
+        draws = torch.rand(INPUTS, BACKGROUND, generator=self.generator, dtype=torch.float64)
+        inputs = size.unsqueeze(1) * (2 * draws - 1)
+        angle = torch.pi * inputs[2]
+        inputs[2], inputs[3] = torch.sin(angle), torch.cos(angle)
+        return inputs.unsqueeze(0)

@@ -1,0 +1,266 @@
+"""Matches simulated trajectories to recorded windows: Levenberg-Marquardt on encoder counts of positions.
+
+The unknowns are the initial state of each window and, optionally, a point that all windows share. Initial
+states are eliminated from the normal equations (variable projection; Golub and Pereyra, 1973), so that no
+velocity is measured. Derivatives are differences of carts that are simulated side by side.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from cartpole_rl.identification.rollout import Dynamics
+from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
+from cartpole_rl.physics.residual import Residual
+
+COARSE = torch.tensor([20.0, 3.0], dtype=torch.float64)  # counts that count as one: 0.5 mm, 0.26 degrees
+FINEST = torch.tensor([1.0, 0.4], dtype=torch.float64)  # counts: the effect of quantization alone, about
+ROBUST = 3.0  # scaled residuals beyond this count linearly (Huber)
+RUNAWAY = 1e6  # scaled residual of a prediction that diverged
+POINT_STEP = 1e-5  # for derivatives; larger steps suggest that the data show the scale of all forces
+STATE_STEP = torch.tensor([1e-7, 1e-6, 1e-6, 1e-5], dtype=torch.float64)  # m, m/s, rad, rad/s
+STATE_SPREAD = torch.tensor([5e-4, 0.5, 5e-3, 3.0], dtype=torch.float64)  # of an initial state's first guess
+FARTHEST = 3.0  # of STATE_SPREAD: the largest distance of an initial state from its first guess
+GUESSED_FROM = 3  # positions; when the motor reverses, later ones bend away from any parabola
+CORRELATED = 10.0  # residuals of one window resemble each other: this many carry the information of one
+FIRST_DAMPING, LEAST_DAMPING = 1e-3, 1e-6
+ATTEMPTS = 6  # to lower the cost from one linearization, with ever more damping
+CONVERGED = 1e-4  # relative fall of the cost
+ROUNDS = 10  # steps towards initial states of which there is no more than a guess
+
+
+def huber(residuals: Tensor) -> Tensor:
+    """Return squares up to ROBUST, and straight lines beyond."""
+    size = residuals.abs()
+    return torch.where(size < ROBUST, size**2, 2 * ROBUST * size - ROBUST**2)
+
+
+def scaled_residuals(counts: Tensor, measured: Tensor, scale: Tensor) -> Tensor:
+    """Return (counts [F, 2, ...] - measured [F, 2, ...]) / scale [2] within RUNAWAY, with the same shape."""
+    error = (counts - measured) / scale.reshape(2, *[1] * (counts.dim() - 2))
+    return error.nan_to_num(RUNAWAY, RUNAWAY, -RUNAWAY).clamp(-RUNAWAY, RUNAWAY)
+
+
+def first_guess(positions: Tensor, period: float) -> Tensor:
+    """Return states [4, W]: parabolas through the first positions [T + 1, 2, W], in counts."""
+    known = positions[:GUESSED_FROM].numpy()
+    time = np.arange(len(known)) * period
+    (_, x_dot, x), (_, theta_dot, theta) = (np.polyfit(time, known[:, k], 2) for k in range(2))
+    metres, radians = CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
+    return torch.from_numpy(np.stack((x * metres, x_dot * metres, theta * radians, theta_dot * radians)))
+
+
+class NormalEquations(NamedTuple):
+    """Blocks of the normal equations; windows are coupled only through the point, of U numbers."""
+
+    point_points: Tensor  # [W, U, U], of each window
+    point_state: Tensor  # [W, U, 4]
+    state_state: Tensor  # [W, 4, 4], prior included
+    point_slopes: Tensor  # [W, U], of each window
+    prior_slope: Tensor  # [U]
+    state_slope: Tensor  # [W, 4], prior included
+
+    def reduced(self, damping: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the equations of the point alone: [U, U], each window's share [W, U]; inverses [W, 4, 4]."""
+        diagonal = self.state_state.diagonal(dim1=-2, dim2=-1)
+        inverse = torch.linalg.inv(self.state_state + torch.diag_embed(damping.unsqueeze(-1) * diagonal))
+        carried = self.point_state @ inverse
+        matrix = self.point_points.sum(0) + torch.eye(len(self.prior_slope), dtype=inverse.dtype)
+        matrix = matrix + damping[0] * torch.diag(matrix.diagonal())
+        matrix = matrix - (carried @ self.point_state.mT).sum(0)
+        slopes = self.point_slopes - torch.einsum("wis,ws->wi", carried, self.state_slope)
+        return matrix, slopes, inverse
+
+    def solve(self, damping: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the steps of the point [U] and of the initial states [4, W].
+
+        `damping` is [1], or [W] for windows without a point.
+        """
+        matrix, slopes, inverse = self.reduced(damping)
+        step = -torch.linalg.solve(matrix, slopes.sum(0) + self.prior_slope)
+        rest = self.state_slope + torch.einsum("wis,i->ws", self.point_state, step)
+        return step, -torch.einsum("wst,wt->sw", inverse, rest)
+
+    def covariance(self, episode: Tensor) -> Tensor:
+        """Return that of the point, [U, U]: prior, and disagreement of windows and episodes (`episode` [W]).
+
+        Errors within a window resemble each other, so that a window counts as one observation (White, 1980).
+        Shortcomings of the physics show as episodes that would each have another cart: the point moves when
+        one is left out, which is the jackknife's variance (Tukey, 1958), to first order.
+        """
+        matrix, slopes, _ = self.reduced(torch.zeros(1, dtype=torch.float64))
+        inverse, count = torch.linalg.inv(matrix), len(slopes)
+        centred = slopes - slopes.mean(0)
+        spread = centred.mT @ centred * count / max(1, count - 1)
+        sampled = inverse @ (spread + torch.eye(len(matrix), dtype=matrix.dtype)) @ inverse
+        groups = episode.unique()
+        if len(groups) < 2:
+            return sampled
+        carried = self.point_state @ torch.linalg.inv(self.state_state)
+        per_window = self.point_points - carried @ self.point_state.mT
+        moves = torch.stack(
+            [
+                torch.linalg.solve(matrix - per_window[own].sum(0), slopes[own].sum(0))
+                for own in (episode == group for group in groups)
+            ]
+        )
+        moves = moves - moves.mean(0)
+        return sampled + (len(groups) - 1) / len(groups) * moves.mT @ moves
+
+
+class Linearization(NamedTuple):
+    """Residuals of each window and their derivatives."""
+
+    residuals: Tensor  # [W, R]
+    by_point: Tensor  # [W, R, U]
+    by_state: Tensor  # [W, R, 4]
+
+    @property
+    def weights(self) -> Tensor:
+        """Weights of squared residuals that touch Huber's cost, [W, R]."""
+        return ROBUST / self.residuals.abs().clamp(min=ROBUST) / CORRELATED
+
+    def normal_equations(self, point: Tensor, offset: Tensor) -> NormalEquations:
+        """Return the quadratic that touches the cost, for initial states `offset` [4, W] off their guess."""
+        weights, doubt = self.weights.unsqueeze(-1), STATE_SPREAD**-2 / CORRELATED
+        weighted_point, weighted_state = self.by_point * weights, self.by_state * weights
+        residuals = self.residuals.unsqueeze(-1)
+        return NormalEquations(
+            point_points=weighted_point.mT @ self.by_point,
+            point_state=weighted_point.mT @ self.by_state,
+            state_state=weighted_state.mT @ self.by_state + torch.diag(doubt),
+            point_slopes=(weighted_point.mT @ residuals).squeeze(-1),
+            prior_slope=point,
+            state_slope=(weighted_state.mT @ residuals).squeeze(-1) + offset.T * doubt,
+        )
+
+
+class Match(NamedTuple):
+    """A solution."""
+
+    point: Tensor  # [U]
+    motion: Tensor  # [4, W], the initial states
+    cost: float
+    iterations: int
+
+
+class Matching:
+    """The least-squares problem of W windows.
+
+    `simulate` takes K points [U, K] and K initial states of each window [4, W, K] to counts [F, 2, W, K];
+    `measured` [F, 2, W] are counts, `scale` [2] the counts that count as one, and `guess` [4, W] the initial
+    states before the search. A point is prior to measurement 0 with standard deviation 1, and stays within
+    `limits`, [U] each.
+    """
+
+    def __init__(
+        self,
+        simulate: Callable[[Tensor, Tensor], Tensor],
+        measured: Tensor,
+        scale: Tensor,
+        guess: Tensor,
+        limits: tuple[Tensor, Tensor] | None = None,
+    ) -> None:
+        self.simulate, self.measured, self.scale, self.guess = simulate, measured, scale, guess
+        self.limits = limits or (guess.new_empty(0), guess.new_empty(0))
+        farthest = FARTHEST * STATE_SPREAD.unsqueeze(1)
+        self.bounds = guess - farthest, guess + farthest
+
+    @torch.no_grad()
+    def residuals(self, points: Tensor, motion: Tensor) -> Tensor:
+        """Return scaled residuals [W, R, K] at `points` [U, K] with initial states `motion` [4, W, K]."""
+        scaled = scaled_residuals(self.simulate(points, motion), self.measured.unsqueeze(-1), self.scale)
+        return scaled.permute(2, 0, 1, 3).flatten(1, 2)
+
+    def cost(self, point: Tensor, motion: Tensor) -> Tensor:
+        """Return Huber's cost and that of the prior: [W], or [1] for all windows where they share a point."""
+        residuals = self.residuals(point.unsqueeze(1), motion.unsqueeze(2)).squeeze(2)
+        offset = (motion - self.guess) / STATE_SPREAD.unsqueeze(1)
+        each = (huber(residuals).sum(1) + (offset**2).sum(0)) / CORRELATED
+        return each.sum(0, keepdim=True) + point @ point if len(point) else each
+
+    def linearize(self, point: Tensor, motion: Tensor) -> Linearization:
+        """Return the residuals and their differences: one simulation of U + 5 carts a window."""
+        size = len(point)
+        moves = torch.block_diag(POINT_STEP * torch.eye(size, dtype=point.dtype), torch.diag(STATE_STEP))
+        moves = torch.cat((moves.new_zeros(size + 4, 1), moves), 1)  # [U + 4, U + 5]
+        points = point.unsqueeze(1) + moves[:size]
+        motions = motion.unsqueeze(2) + moves[size:].unsqueeze(1)
+        residuals = self.residuals(points, motions)
+        slopes = (residuals[..., 1:] - residuals[..., :1]) / moves[:, 1:].diagonal()
+        return Linearization(residuals[..., 0], slopes[..., :size], slopes[..., size:])
+
+    def normal_equations(self, point: Tensor, motion: Tensor) -> NormalEquations:
+        """Return the quadratic that touches the cost at a point and initial states."""
+        return self.linearize(point, motion).normal_equations(point, motion - self.guess)
+
+    def minimize(self, point: Tensor, motion: Tensor, iterations: int) -> Match:
+        """Search by Levenberg-Marquardt from a point and initial states.
+
+        Windows that share no point have a damping each: where a cart sticks or not, steps overshoot.
+        """
+        shared, made = len(point) > 0, 0
+        cost = self.cost(point, motion)
+        damping = torch.full_like(cost, FIRST_DAMPING)
+        for _ in range(iterations):
+            made += 1
+            normal, before = self.normal_equations(point, motion), cost
+            for _ in range(ATTEMPTS if shared else 1):
+                step, moves = normal.solve(damping)
+                trial_point = (point + step).clamp(*self.limits)
+                trial = (motion + moves).clamp(*self.bounds)
+                trial_cost = self.cost(trial_point, trial)
+                better = trial_cost < cost
+                point = trial_point if better.all() else point
+                motion, cost = torch.where(better, trial, motion), torch.where(better, trial_cost, cost)
+                damping = torch.where(better, (damping / 5).clamp(min=LEAST_DAMPING), damping * 8)
+                if better.any():
+                    break
+            if shared and before - cost < CONVERGED * before:
+                break
+        return Match(point, motion, float(cost.sum()), made)
+
+
+class InitialStates(NamedTuple):
+    """The states in which windows start, and the cost of residuals once these states may follow them."""
+
+    motion: Tensor  # [4, M, W]
+    form: Tensor  # [M, W, R, R]: residuals r cost r' form r where the initial states are the best for them
+
+
+def match_initial_states(
+    dynamics: Dynamics,
+    positions: Tensor,
+    motors: Tensor,
+    residual: Residual | None = None,
+    start: Tensor | None = None,
+    rounds: int = ROUNDS,
+    scale: Tensor = FINEST,
+) -> InitialStates:
+    """Return the initial states that lead nearest to `positions` [T + 1, 2, W], in counts.
+
+    `motors` [HISTORY + T, W] are motor values; each member of `residual` has initial states of its own. The
+    search is from `start` [4, M, W], or from the first guess. Components that the positions do not show, such
+    as the speed of a cart that sticks at once, stay near that guess.
+    """
+    members, windows = 1 if residual is None else residual.members, positions.shape[2]
+    guess = first_guess(positions, dynamics.period).repeat(1, members)
+
+    def simulate(points: Tensor, motion: Tensor) -> Tensor:
+        variants = motion.shape[2]
+        counts = dynamics.counts(
+            motion.reshape(4, members, -1), motors.repeat_interleave(variants, 1), residual
+        )
+        return counts.reshape(len(positions), 2, -1, variants)
+
+    problem = Matching(simulate, positions.repeat(1, 1, members), scale, guess)
+    nothing = guess.new_empty(0)
+    motion = problem.minimize(nothing, guess if start is None else start.flatten(1), rounds).motion
+    linear = problem.linearize(nothing, motion)
+    normal = linear.normal_equations(nothing, motion - guess)
+    weighted = linear.by_state * linear.weights.unsqueeze(-1)
+    form = torch.diag_embed(linear.weights) - weighted @ torch.linalg.solve(normal.state_state, weighted.mT)
+    return InitialStates(motion.reshape(4, members, windows), form.unflatten(0, (members, windows)))

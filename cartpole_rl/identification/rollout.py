@@ -1,0 +1,89 @@
+"""Simulates recorded windows with the project's own physics, many carts at once, and reads their encoders."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Self
+
+import torch
+from torch import Tensor
+
+from cartpole_rl.identification.windows import HISTORY
+from cartpole_rl.physics.actuator import step_forces
+from cartpole_rl.physics.dynamics import Drive, MakeAddition, State, run_period
+from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
+from cartpole_rl.physics.models import Models
+from cartpole_rl.physics.parameters import CartParameters
+from cartpole_rl.physics.residual import UNDER_WAY, Residual, members_in_turn
+
+
+def rollout(
+    table: Tensor,
+    motion: Tensor,
+    motors: Tensor,
+    models: Models,
+    period: float,
+    substeps: int,
+    lead: float = 0.0,
+    addition: MakeAddition | None = None,
+) -> Tensor:
+    """Return counts [T + 1, 2, N], not rounded, of carts `table` [P, N] from initial states `motion` [4, N].
+
+    `motors` [HISTORY + T, N] holds the values chosen before the window as well: the actuator runs through
+    them first, since its force lags behind. `lead`, s, is added to each latency: (3.8) moves a cart half a
+    step early, so that with half a step of it a latency means the same however long the step.
+    """
+    cart = CartParameters.from_table(table)
+    state, force, latency = State(*motion.unbind(0)), torch.zeros_like(motion[0]), cart.latency + lead
+    counts = [as_counts(state, cart)]
+    for now in range(UNDER_WAY - 1, len(motors)):
+        drive = Drive(force, [motors[now - age] for age in range(UNDER_WAY)])
+        if now < HISTORY:
+            _, force = step_forces(*drive, latency, cart, models.actuator, period, substeps)
+            continue
+        state, (force, _) = run_period(state, drive, latency, cart, models, period, substeps, addition)
+        counts.append(as_counts(state, cart))
+    return torch.stack(counts)
+
+
+def as_counts(state: State, cart: CartParameters) -> Tensor:
+    """Return the counts of ideal encoders, [2, N]."""
+    return torch.stack(
+        (state.x / CART_METRES_PER_COUNT, (state.theta + cart.angle_offset) / POLE_RADIANS_PER_COUNT)
+    )
+
+
+@dataclass(frozen=True)
+class Dynamics:
+    """One cart of which copies are simulated."""
+
+    cart: Tensor  # [P, 1] float64
+    models: Models
+    period: float  # s
+    substeps: int
+    lead: float = 0.0  # s; see `rollout`
+
+    @classmethod
+    def of(
+        cls, parameters: Mapping[str, float], models: Models, period: float, substeps: int, lead: float = 0.0
+    ) -> Self:
+        """Return the dynamics of `parameters` by name."""
+        table = [[float(parameters[name])] for name in CartParameters.names()]
+        return cls(torch.tensor(table, dtype=torch.float64), models, period, substeps, lead)
+
+    def counts(self, motion: Tensor, motors: Tensor, residual: Residual | None = None) -> Tensor:
+        """Return counts [T + 1, 2, M, W] from initial states [4, M, W] and motor values [HISTORY + T, W].
+
+        M is the number of members of `residual`, W that of windows.
+        """
+        members, windows = motion.shape[1:]
+        simulated = rollout(
+            self.cart.expand(-1, members * windows),
+            motion.reshape(4, -1),
+            motors.repeat(1, members),
+            self.models,
+            self.period,
+            self.substeps,
+            self.lead,
+            None if residual is None else members_in_turn(residual, windows),
+        )
+        return simulated.reshape(-1, 2, members, windows)

@@ -1,0 +1,99 @@
+"""Draws carts from a table of carts: the posterior of an identification, correlations included."""
+
+from collections.abc import Collection, Mapping
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from cartpole_rl.errors import ConfigError
+from cartpole_rl.physics.bounds import BOUNDS
+from cartpole_rl.physics.parameters import CartParameters
+from cartpole_rl.randomization.draws import Draws
+from cartpole_rl.randomization.poles import PoleSettings
+from cartpole_rl.randomization.randomizer import Randomizer
+from cartpole_rl.randomization.settings import IdentifiedSettings
+
+LATENCY = CartParameters.names().index("latency")
+
+
+class IdentifiedCarts(Draws):
+    """Draws with replacement from `table` [P, M], and a `prior_share` of all draws from `prior` instead.
+
+    The prior keeps an agent from relying too much on an identification. Parameters not `identified` are
+    always the prior's; with None all are identified. Raises ConfigError for a number that is not finite.
+    """
+
+    def __init__(
+        self,
+        table: Tensor,
+        prior: Draws,
+        prior_share: float,
+        longest_delay: float,
+        identified: Collection[str] | None = None,
+    ) -> None:
+        if not table.isfinite().all():
+            row = int((~table.isfinite()).any(1).nonzero()[0])
+            raise ConfigError(f"carts to draw from: {CartParameters.names()[row]} is not finite")
+        self.table, self.prior, self.prior_share = table.to(prior.nominal), prior, prior_share
+        flags = [identified is None or name in identified for name in CartParameters.names()]
+        self._identified = torch.tensor(flags, device=self.table.device).unsqueeze(1)
+        self._longest_delay = longest_delay  # s, of this table and of any that may replace it
+        self.nominal = self.table.median(1).values
+
+    def draw(self, count: int, generator: torch.Generator) -> Tensor:
+        """Return parameters of `count` carts, [P, count]."""
+        table, keeps = self._draw_table(count, generator, self.prior_share)
+        return torch.where(keeps, table, self.prior.draw(count, generator))
+
+    def ends(self, name: str, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Return a draw with `name` at the low end of its range, and the same with it at the high end.
+
+        Two tables [P, count], equal where a cart has the identified `name`. If the prior has a share, it
+        has at least half of the carts here, so that a small share is not overlooked.
+        """
+        share = max(self.prior_share, 0.5) if self.prior_share else 0.0
+        table, keeps = self._draw_table(count, generator, share)
+        low, high = self.prior.ends(name, count, generator)
+        return torch.where(keeps, table, low), torch.where(keeps, table, high)
+
+    def _draw_table(
+        self, count: int, generator: torch.Generator, prior_share: float
+    ) -> tuple[Tensor, Tensor]:
+        """Return carts of the table [P, count], and which of their numbers are kept, [P, count] bool.
+
+        No number is kept of a `prior_share` of the carts.
+        """
+        device = self.nominal.device
+        which = torch.randint(self.table.shape[1], (count,), generator=generator, device=device)
+        from_prior = torch.rand(count, generator=generator, device=device) < prior_share
+        return self.table[:, which], self._identified & ~from_prior
+
+    def longest_delay(self) -> float:
+        """Return the longest latency that a draw can have, jitter included, s."""
+        return max(self.prior.longest_delay(), self._longest_delay)
+
+    def can_differ_from_zero(self, name: str) -> bool:
+        """Return whether a draw of `name` can be anything but 0."""
+        row = self.table[CartParameters.names().index(name)]
+        return self.prior.can_differ_from_zero(name) or bool((row != 0).any())
+
+
+def identified_carts(
+    settings: IdentifiedSettings, cart: Mapping[str, float], poles: PoleSettings
+) -> IdentifiedCarts:
+    """Return the draws that `settings` describe. Raises ConfigError where the file is missing or damaged."""
+    prior = Randomizer(cart, poles, settings.ranges)
+    try:
+        with np.load(settings.posterior) as stored:
+            posterior = dict(zip(stored["names"].tolist(), stored["carts"], strict=True))
+            identified = [str(name) for name in stored["told"]]
+    except (OSError, ValueError, KeyError) as error:
+        raise ConfigError(f"randomization.posterior={settings.posterior} cannot be read: {error}") from None
+    rows = []
+    for name, nominal in zip(CartParameters.names(), prior.nominal.tolist(), strict=True):
+        values = np.asarray(posterior.get(name, [nominal]), dtype=np.float64)
+        values = np.median(values) + settings.widen * (values - np.median(values))
+        rows.append(np.clip(values, BOUNDS[name].low, BOUNDS[name].high))
+    table = torch.from_numpy(np.stack(np.broadcast_arrays(*rows))).float()
+    return IdentifiedCarts(table, prior, settings.prior_share, float(table[LATENCY].max()), identified)
