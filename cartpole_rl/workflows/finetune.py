@@ -65,7 +65,7 @@ from cartpole_rl.workflows.config import (
     CartPoleSettings,
     EvaluateConfig,
     FinetuneConfig,
-    RealSettings,
+    SerialSettings,
     TrainConfig,
 )
 from cartpole_rl.workflows.evaluate import score_table
@@ -130,7 +130,7 @@ def greedy_network(training: TrainConfig) -> nn.Module:
 def driven_length(config: FinetuneConfig) -> float | None:
     """m, the length of the pole on the cart that is driven; None where nobody has said it."""
     plant = config.plant
-    return plant.pole_length if isinstance(plant, RealSettings) else 2 * config.emulator.pole_com
+    return plant.pole_length if isinstance(plant, SerialSettings) else 2 * config.emulator.pole_com
 
 
 class Unheard:

@@ -27,7 +27,6 @@ from cartpole_rl.physics.models import Actuator, CartFriction, Models
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.emulated import emulated_plant
 from cartpole_rl.plants.serial.plant import SerialPlant
-from cartpole_rl.plants.serial.settings import SerialPlantSettings
 from cartpole_rl.randomization.poles import Pole
 from cartpole_rl.reporting.figures import save
 from cartpole_rl.reporting.figures.identified import (
@@ -119,14 +118,7 @@ def the_plant(config: IdentifyConfig) -> SerialPlant:
     if isinstance(config.plant, EmulatedSettings):
         truth = config.emulator.model_copy(update={"start": "hanging"})
         return emulated_plant(truth, config.control_period, tqdm.write, config.plant.rehome)
-    settings = SerialPlantSettings(
-        port=config.plant.port,
-        baud=config.plant.baud,
-        control_period=config.control_period,
-        rehome=config.plant.rehome,
-        clear_faults=config.plant.clear_faults,
-    )
-    return SerialPlant(settings, tqdm.write, confirm=confirm)
+    return SerialPlant(config.plant, control_period=config.control_period, prompt=tqdm.write, confirm=confirm)
 
 
 def read(source: Path) -> dict[str, Episode]:

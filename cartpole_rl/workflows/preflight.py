@@ -1,14 +1,15 @@
 """Check a cart by small moves before an agent drives it."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 
 from cartpole_rl.errors import PlantError
 from cartpole_rl.plants.emulated_cart import EmulatedCart
-from cartpole_rl.plants.serial.cart import SerialCart, SerialSettings
-from cartpole_rl.plants.serial.faults import FaultClearing
+from cartpole_rl.plants.serial.cart import SerialCart
+from cartpole_rl.plants.serial.faults import FaultClearing, always
 from cartpole_rl.plants.serial.preflight import Finding, preflight
-from cartpole_rl.workflows.config import EmulatedSettings, PreflightConfig, RealSettings
+from cartpole_rl.plants.serial.settings import SerialSettings
+from cartpole_rl.workflows.config import EmulatedSettings, PreflightConfig
 from cartpole_rl.workflows.person import confirm
 
 
@@ -16,7 +17,7 @@ def check_cart(config: PreflightConfig) -> None:
     """Print a line for each check. Raises PlantError after the first that is not OK."""
     with the_cart(config) as cart:
         finding: Finding | None = None
-        for finding in preflight(cart, config.home_timeout, faults(config.plant)):
+        for finding in preflight(cart, faults(config.plant)):
             print(finding, flush=True)
     if finding is None or not finding.ready:
         raise PlantError(
@@ -25,27 +26,20 @@ def check_cart(config: PreflightConfig) -> None:
     print("The cart is ready.")
 
 
-def faults(plant: EmulatedSettings | RealSettings) -> FaultClearing:
+def faults(plant: EmulatedSettings | SerialSettings) -> FaultClearing:
     """The rule by which latched faults are cleared."""
-    return FaultClearing(plant.clear_faults if isinstance(plant, RealSettings) else None, confirm)
+    if isinstance(plant, SerialSettings):
+        return FaultClearing(plant.clear_faults, confirm)
+    return FaultClearing(0, always)
 
 
 @contextmanager
 def the_cart(config: PreflightConfig) -> Iterator[SerialCart]:
     """The cart to check, not open yet; disarmed and closed at the end, and an emulated one ended."""
-    if isinstance(config.plant, RealSettings):
-        cart = SerialCart(SerialSettings(port=config.plant.port, baud=config.plant.baud))
-        try:
+    if isinstance(config.plant, SerialSettings):
+        with closing(SerialCart(config.plant)) as cart:
             yield cart
-        finally:
-            cart.close()
         return
-    with EmulatedCart(config.emulator.model_copy(update={"start": "hanging"})) as emulated:
-        patient = SerialSettings(
-            port=emulated.port, timeout=5, connect_timeout=10, answer_timeout=2, nudge_after=2
-        )
-        cart = SerialCart(patient)
-        try:
-            yield cart
-        finally:
-            cart.close()
+    truth = config.emulator.model_copy(update={"start": "hanging"})
+    with EmulatedCart(truth) as emulated, closing(SerialCart(emulated.settings)) as cart:
+        yield cart
