@@ -11,13 +11,13 @@ from tensordict import TensorDict
 from cartpole_rl.errors import FaultError, LinkError, PlantError, PortError
 from cartpole_rl.plants.serial.errors import NotReadyError
 from cartpole_rl.plants.serial.plant import SerialPlant
-from cartpole_rl.plants.serial.settings import SerialPlantSettings
+from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.wire import ClearFault, Fault, Flags, Frame, Home, SetMotor, Start, Stop
 
 
-def settings(port: str, **changes) -> SerialPlantSettings:
+def settings(port: str, **changes) -> SerialSettings:
     quick = {"timeout": 0.4, "connect_timeout": 0.8, "answer_timeout": 0.2, "retries": 1, "nudge_after": 0.1}
-    return SerialPlantSettings(port=port, **(quick | changes))
+    return SerialSettings(port=port, **(quick | changes))
 
 
 @pytest.fixture
@@ -107,7 +107,7 @@ def test_a_person_who_agrees_lets_a_fault_be_cleared(peer: CartPeer) -> None:
         asked.append(text)
         return True
 
-    peer._carry_out = lambda message: clear(peer, message)
+    peer.carry_out = lambda message: clear(peer, message)
     plant = SerialPlant(settings(peer.port), confirm=agree)
     plant.reset()
     for _ in range(2):
@@ -121,7 +121,7 @@ def test_a_person_who_agrees_lets_a_fault_be_cleared(peer: CartPeer) -> None:
 
 
 def test_unattended_work_gives_up_after_the_stated_number_of_faults(peer: CartPeer) -> None:
-    peer._carry_out = lambda message: clear(peer, message)
+    peer.carry_out = lambda message: clear(peer, message)
     plant = SerialPlant(settings(peer.port, clear_faults=2))
     plant.reset()
     for _ in range(2):
@@ -146,7 +146,7 @@ def test_a_fault_ends_the_episode_and_is_cleared_in_the_next_reset(peer: CartPee
     assert_stopped(peer)
     with pytest.raises(FaultError, match="motor"):
         plant.reset()
-    peer._carry_out = lambda message: clear(peer, message)
+    peer.carry_out = lambda message: clear(peer, message)
     assert not plant.reset()["done"]
     assert plant.ended_by == ""
     plant.close()
@@ -233,7 +233,7 @@ def test_upright_asks_a_person_and_waits_for_the_pole(peer: CartPeer) -> None:
         said.append(text)
         peer.state = replace(peer.state, pole_counts=4096 + 30)  # a turn further is upright too
 
-    plant = SerialPlant(settings(peer.port, start="upright"), prompt=hold)
+    plant = SerialPlant(settings(peer.port), start="upright", prompt=hold)
     assert plant.reset()["counts"][0, 1] == 30
     assert "upright" in said[0]
     plant.close()
@@ -247,7 +247,7 @@ def test_a_pole_that_is_not_there_is_waited_for_in_vain(
     peer: CartPeer, start: str, counts: int, words: str
 ) -> None:
     peer.state = replace(peer.state, pole_counts=counts)
-    plant = SerialPlant(settings(peer.port, start=start, start_timeout=0.05), prompt=lambda text: None)
+    plant = SerialPlant(settings(peer.port, start_timeout=0.05), start, prompt=lambda text: None)
     with pytest.raises(PlantError, match=words):
         plant.reset()
     assert not peer.messages(Start)
@@ -272,7 +272,7 @@ def test_a_swinging_pole_does_not_start(peer: CartPeer) -> None:
 
 
 def test_another_control_period_is_set_on_the_cart(peer: CartPeer) -> None:
-    plant = SerialPlant(settings(peer.port, control_period=0.01))
+    plant = SerialPlant(settings(peer.port), control_period=0.01)
     plant.reset()
     assert peer.info.period_us == 10_000
     assert step(plant, 0)["dt"].item() == pytest.approx(0.01)
@@ -285,7 +285,7 @@ def test_another_control_period_is_set_on_the_cart(peer: CartPeer) -> None:
 def test_a_reset_mask_of_false_leaves_the_cart_alone(peer: CartPeer, plant: SerialPlant) -> None:
     plant.reset()
     began = len(peer.received)
-    plant._reset(TensorDict({"_reset": torch.zeros(1, 1, dtype=torch.bool)}, [1]))
+    plant.restart(torch.tensor([], dtype=torch.int64))
     assert len(peer.received) == began
 
 
@@ -324,7 +324,7 @@ def test_what_is_owned_is_closed_when_the_port_cannot_be_opened() -> None:
 def clear(peer: CartPeer, message: object) -> None:
     if isinstance(message, ClearFault):
         peer.state = replace(peer.state, fault=0)
-    CartPeer._carry_out(peer, message)
+    CartPeer.carry_out(peer, message)
 
 
 def assert_stopped(peer: CartPeer) -> None:

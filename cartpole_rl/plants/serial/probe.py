@@ -7,6 +7,7 @@ from cartpole_rl.plants.serial.moves import GENTLE_MOTOR, ArmedCart, metres
 from cartpole_rl.wire import Flags, State
 
 FARTHEST = 0.08  # m from the middle: no check needs more
+NEAR = 0.004  # m from the middle: no check needs to start closer
 RAMP_STEP = 1  # motor values a period
 SMALL_SWING, SHORT_PATIENCE = 40, 5.0  # counts peak to peak, s; pushes the cart like three motor values
 MOVED = 4  # counts, 0.09 mm: more than a pole that swings can press into the gears' play
@@ -55,7 +56,7 @@ class Probe(ArmedCart):
         other_side = {-side: motor for side, motor in self.deadband.items()}
         known = NOMINAL_DEADBAND | other_side | self.deadband
         self.rest()
-        centre(self, known)
+        centre(self, known, NEAR)
         self.rest()
 
     def check(self, state: State) -> State:
