@@ -205,7 +205,13 @@ def host(data: bytes) -> None:
     wire = Wire(steps)
     serial_cart.open_port = lambda *given: wire
     settings = SerialSettings(
-        port="memory", timeout=2e-4, connect_timeout=2e-4, answer_timeout=1e-4, retries=1, nudge_after=5e-5
+        port="memory",
+        timeout=2e-4,
+        connect_timeout=2e-4,
+        answer_timeout=1e-4,
+        retries=1,
+        nudge_after=5e-5,
+        home_timeout=2e-4,
     )
     driven = serial_cart.SerialCart(settings)
     for _ in range(MOST_STEPS):
@@ -234,7 +240,7 @@ def call(driven: "serial_cart.SerialCart", wire: Wire, steps: Steps) -> None:
         case 3 | 4:
             driven.get_state()
         case 5:
-            driven.home(2e-4)
+            driven.home()
         case 6:
             driven.clear_fault()
         case _:

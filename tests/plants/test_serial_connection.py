@@ -92,10 +92,13 @@ def test_a_homing_that_fails_names_the_fault() -> None:
 
 
 def test_a_homing_that_does_not_end() -> None:
-    with CartPeer() as peer, SerialCart(quick_settings(peer.port, nudge_after=0.01)) as cart:
+    with (
+        CartPeer() as peer,
+        SerialCart(quick_settings(peer.port, nudge_after=0.01, home_timeout=0.1)) as cart,
+    ):
         peer.carry_out = lambda message: setattr(peer, "flags", Flags.HOMING)
         with pytest.raises(PlantError, match=r"not done after 0\.1 s"):
-            cart.home(timeout=0.1)
+            cart.home()
         assert isinstance(peer.received[-1].message, Stop)
 
 

@@ -68,9 +68,8 @@ def test_another_control_period_is_set_on_the_cart(peer: CartPeer) -> None:
     plant = SerialPlant(quick_settings(peer.port), control_period=0.01)
     plant.reset()
     assert peer.info.period_us == 10_000
-    assert plant.step(TensorDict({"motor": torch.zeros(1, 1, dtype=torch.int64)}, [1]))[
-        "next", "dt"
-    ].item() == pytest.approx(0.01)
+    motor = torch.zeros(1, 1, dtype=torch.int64)
+    assert plant.step(TensorDict({"motor": motor}, [1]))["next", "dt"].item() == pytest.approx(0.01)
     peer.info = replace(peer.info, period_us=20_000)  # as after a restart
     plant.reset()
     assert peer.info.period_us == 10_000

@@ -172,20 +172,20 @@ class SerialCart:
             self._connection.request(SetPeriod(period_us), Info, lambda info: info.period_us == period_us)
         )
 
-    def home(self, timeout: float | None = None) -> State:
+    def home(self) -> State:
         """Home, and wait until it is done: zeros set, the cart in the middle, the pole hanging still.
 
         Returns the state after it; `information` then has the limits that follow from the measured span.
-        `timeout` in s is `settings.home_timeout` unless given. Raises FaultError if homing fails, PlantError
-        if it takes longer than `timeout`, LinkError if the cart restarts meanwhile.
+        Raises FaultError if homing fails, PlantError if it takes longer than `settings.home_timeout`,
+        LinkError if the cart restarts meanwhile.
         """
-        timeout = self.settings.home_timeout if timeout is None else timeout
         try:
             self._connection.request(Home(), Ack)
         except RefusedError as error:
             if error.reason != Reason.BUSY or not self._is_homing():
                 raise  # otherwise only the ACK was lost
-        deadline, restarts = time.perf_counter() + timeout, self.restarts
+        timeout, restarts = self.settings.home_timeout, self.restarts
+        deadline = time.perf_counter() + timeout
         state = self._connection.state_since_question()
         while True:
             if state.fault:

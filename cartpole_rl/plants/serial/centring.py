@@ -5,8 +5,10 @@ swings. A PI controller turns the lag behind that speed into a force; friction i
 the inverse of the motor curve turns the force into a motor value. All of it stays below the motor values for
 which the cart watches for stalls.
 
-The model is that of the nominal cart. How much motor value its friction needs may be known better: the
-preflight measures the dead-band of each side, the re-centring between episodes uses the nominal one.
+The model is that of the nominal cart. The motor value that its friction needs may be known better: the
+preflight measures the dead-band of each side, the re-centring between episodes uses the nominal one. The
+moves in `identification.experiments` do not use this controller: they are fast on purpose, as part of what is
+recorded, and work on any plant.
 """
 
 import math
