@@ -62,10 +62,10 @@ class Faulty(CartPeer):
         super().__init__()
         self.state = replace(self.state, fault=int(Fault.STALL))
 
-    def _carry_out(self, message: Message) -> None:
+    def carry_out(self, message: Message) -> None:
         if isinstance(message, ClearFault):
             self.state = replace(self.state, fault=0)
-        super()._carry_out(message)
+        super().carry_out(message)
 
 
 @pytest.fixture
