@@ -16,6 +16,7 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 
 from cartpole_rl.choices import default_choices
 from cartpole_rl.emulator.settings import EmulatorSettings
+from cartpole_rl.plants.serial.settings import SerialSettings
 
 LONGEST_NAME = 150  # characters; file systems take 255
 
@@ -90,3 +91,5 @@ OmegaConf.register_new_resolver("job_name", job_name)
 OmegaConf.register_new_resolver("choices_of", choices_of)
 # conf/emulator/ builds on this one: the settings class is where its numbers stand
 ConfigStore.instance().store(group="emulator", name="medium", node=EmulatorSettings().model_dump(mode="json"))
+# so does conf/plant/serial.yaml
+ConfigStore.instance().store(name="serial_defaults", node=SerialSettings(port=MISSING).model_dump())

@@ -1,4 +1,4 @@
-"""The emulated cart as a process of its own. It needs no torch, as `plants.serial` does not."""
+"""The emulated cart in a separate process. Imports no torch."""
 
 import json
 import os
@@ -12,24 +12,26 @@ from typing import Self
 
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import EmulatorError
+from cartpole_rl.plants.serial.settings import SerialSettings
 
 READY_TIMEOUT = 60.0  # s for the first line; the process loads MuJoCo before it
 GRACE = 3.0  # s from SIGTERM to SIGKILL
-STDERR_BYTES = 2000  # of its last words in an error
+STDERR_BYTES = 2000  # of the end of its stderr, for an error
 
 
 class EmulatedCart:
     """A running emulator: `port` to open with pyserial, `pid`. A context manager that ends the process.
 
-    The process ends by itself when this one dies. Ctrl-C in a terminal reaches this process alone, so that
-    the cart is still there to be stopped. Raises EmulatorError if it does not get ready, and on the way out
-    of a `with` that has no error of its own if it had died before.
+    The process ends by itself when this one dies. Ctrl-C in a terminal reaches this process alone, so the
+    cart can still be stopped. Raises EmulatorError if it does not get ready, and at the end of a `with`
+    without another error if it had died before.
     """
 
-    def __init__(self, settings: EmulatorSettings) -> None:
+    def __init__(self, truth: EmulatorSettings) -> None:
+        self.truth = truth
         self._stderr = tempfile.TemporaryFile()  # noqa: SIM115 - open as long as the process
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "cartpole_rl.emulator", settings.model_dump_json(), "--exit-with-parent"],
+            [sys.executable, "-m", "cartpole_rl.emulator", truth.model_dump_json(), "--exit-with-parent"],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=self._stderr,
@@ -47,10 +49,29 @@ class EmulatedCart:
         return self._process.pid
 
     @property
+    def settings(self) -> SerialSettings:
+        """Settings for a host that drives this cart.
+
+        Without disturbed frames the host repeats a question late: a busy computer then adds no period to a
+        lockstep run, which is repeatable. With disturbed frames it repeats early, so that a lost answer costs
+        little time.
+        """
+        truth = self.truth
+        disturbed = bool(truth.frame_loss or truth.frame_corruption or truth.frame_reordering)
+        return SerialSettings(
+            port=self.port,
+            timeout=5.0,
+            connect_timeout=10.0,
+            answer_timeout=0.1 if disturbed else 2.0,
+            retries=20 if disturbed else 2,
+            nudge_after=2.0,
+        )
+
+    @property
     def died(self) -> str:
-        """How the process ended by itself, in one line with its last words; empty while it runs."""
+        """How the process ended by itself, in one line with the end of its stderr; empty while it runs."""
         code = self._process.poll()
-        return "" if code is None else f"the emulated cart ended with exit code {code}: {self._last_words()}"
+        return "" if code is None else f"the emulated cart ended with exit code {code}: {self._stderr_end()}"
 
     def close(self) -> None:
         """End the process: SIGTERM, and SIGKILL after a grace."""
@@ -81,7 +102,7 @@ class EmulatedCart:
             raise EmulatorError(died)
 
     def _read_port(self) -> str:
-        """The port in the JSON line that the process prints when it is ready."""
+        """Return the port in the JSON line that the process prints when it is ready."""
         assert self._process.stdout is not None  # a pipe was asked for
         output = self._process.stdout.fileno()
         deadline = time.monotonic() + READY_TIMEOUT
@@ -101,7 +122,7 @@ class EmulatedCart:
                 f"the emulated cart's first line is not JSON with `port`: {line!r}"
             ) from error
 
-    def _last_words(self) -> str:
+    def _stderr_end(self) -> str:
         if self._stderr.closed:
             return "stderr is closed"
         length = self._stderr.seek(0, os.SEEK_END)

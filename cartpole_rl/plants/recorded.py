@@ -1,4 +1,4 @@
-"""A recorded episode as a plant: it plays back what a cart said, whatever it is told.
+"""A recorded episode as a plant: it plays back the recorded frames, whatever motor values it gets.
 
 Under the hardware transform it gives the observations, rewards and endings that the same code gave, or would
 have given, while the cart was driven.
@@ -16,8 +16,8 @@ from cartpole_rl.tasks.episode import Episode
 class RecordedPlant(Plant):
     """One cart, [1]; each step returns the next recorded frame, the last of which ends the episode.
 
-    `pole_length` m is twice the distance from pivot to centre of mass of the recorded pole, None if nobody
-    knows it.
+    `pole_length` in m is twice the distance from pivot to centre of mass of the recorded pole; None if it is
+    unknown.
     """
 
     def __init__(self, episode: Episode, pole_length: float | None) -> None:
@@ -28,13 +28,13 @@ class RecordedPlant(Plant):
 
     @property
     def pole_length(self) -> Tensor:
-        """m, [1]. Raises ConfigError where it is not known."""
+        """m, [1]. Raises ConfigError if it is unknown."""
         if self._pole_length is None:
             raise ConfigError("this agent observes the pole's length, which the recording does not have")
         return torch.tensor([self._pole_length])
 
     def _set_seed(self, seed: int | None) -> None:
-        """Nothing is left to chance."""
+        """Do nothing: there is no randomness."""
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDict:
         self._row = 0
@@ -49,6 +49,4 @@ class RecordedPlant(Plant):
         last = row == episode.steps
         since = episode.time[row] - episode.time[max(0, row - 1)]
         motor = int(episode.motor[row - 1]) if row else 0
-        ended_by = episode.ended_by if last else ""
-        terminated, truncated = ended_by in ("track", "fault"), ended_by == "link"
-        return one_cart(episode.counts[row].tolist(), since, motor, terminated, truncated)
+        return one_cart(episode.counts[row].tolist(), since, motor, episode.ended_by if last else "")

@@ -1,4 +1,4 @@
-"""The contract that every plant keeps: what goes in, what comes out, in which shape and type."""
+"""The contract of every plant: its inputs and outputs, with shapes and types."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -9,13 +9,15 @@ from tensordict import TensorDict
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Origin
 
 MOTOR_LIMIT = 255
+TERMINATING, TRUNCATING = (Ending.TRACK, Ending.FAULT), (Ending.LINK,)  # the endings that plants report
 
 
 class Plant(EnvBase):
-    """A batch of N carts that speak encoder counts and motor values; simulated, or one cart on a wire.
+    """A batch of N carts that take motor values and return encoder counts; simulated, or one cart on a wire.
 
     In, each period: `motor` [N, 1] int64, -255 to 255, positive to the right.
     Out: `counts` [N, 2] int64 (cart from the middle of the track, pole from upright, both positive to the
@@ -25,7 +27,7 @@ class Plant(EnvBase):
     A plant has no reward of its own and gives zeros.
     """
 
-    compiled = False  # whether what stands above may compile its arithmetic as well
+    compiled = False  # whether the hardware transform above it may compile its arithmetic as well
 
     def __init__(self, carts: int, device: torch.device | str = "cpu") -> None:
         super().__init__(device=torch.device(device), batch_size=torch.Size([carts]))
@@ -49,20 +51,20 @@ class Plant(EnvBase):
 
     @property
     def pole_length(self) -> torch.Tensor:
-        """m, [N]: twice the distance from pivot to centre of mass; what a length-aware agent observes."""
+        """m, [N]: twice the distance from pivot to centre of mass; observed by a length-aware agent."""
         raise NotImplementedError
 
     def halt(self) -> None:
-        """Motor to 0 until the next reset. A simulated cart stands still anyway when nobody steps it."""
+        """Set the motor to 0 until the next reset. Nothing moves a simulated cart that is not stepped."""
 
     def origins(self) -> Sequence[Origin | None]:
-        """The cart and the true state of each row, [N], right after a reset; None where nobody knows them."""
+        """Return the cart and the true state of each row, [N], right after a reset; None if unknown."""
         return [None] * self.carts
 
     def restart(self, rows: torch.Tensor, again: torch.Tensor | None = None) -> TensorDict:
-        """Begin a new episode on the carts `rows`, [R] int64; their first frame, [R].
+        """Start a new episode on the carts `rows`, [R] int64; return their first frame, [R].
 
-        Where carts are drawn, those in `again`, [R] bool, stay as they are.
+        Carts in `again`, [R] bool, keep their parameters if parameters are drawn.
         """
         mask = torch.zeros(self.carts, 1, dtype=torch.bool, device=self.device)
         mask[rows] = True
@@ -81,7 +83,7 @@ class Plant(EnvBase):
         terminated: torch.Tensor,
         truncated: torch.Tensor,
     ) -> TensorDict:
-        """What `_reset` returns, of all carts or some; `done` is `terminated | truncated`."""
+        """Return the result of `_reset`, of all carts or some; `done` is `terminated | truncated`."""
         return tensordict_of(
             {
                 "counts": counts,
@@ -94,33 +96,35 @@ class Plant(EnvBase):
         )
 
     def step_frame(self, *frame: torch.Tensor) -> TensorDict:
-        """What `_step` returns: `frame` of the same arguments, and the reward 0, which TorchRL asks for."""
+        """Return the result of `_step`: `frame` of the same arguments, and the reward 0 for TorchRL."""
         result = self.frame(*frame)
         return result.set("reward", torch.zeros_like(result.get("dt")))
 
 
 def tensordict_of(entries: dict[str, Any]) -> TensorDict:
-    """A tensordict of entries [N, ...] on one device that are known to fit together.
+    """Return a tensordict of entries [N, ...] on one device that are known to fit together.
 
-    What TensorDict's constructor checks takes longer than the physics of a thousand carts.
+    The only use of a private part of TensorDict: the checks of its public constructor take longer than the
+    physics of a thousand carts. `TensorDict(entries, batch_size, device=...)` has the same result.
     """
     first = next(iter(entries.values()))
     return TensorDict._new_unsafe(entries, batch_size=first.shape[:1], device=first.device)
 
 
 def one_cart(
-    counts: Sequence[int], dt: float, motor_applied: int, terminated: bool, truncated: bool
+    counts: Sequence[int], dt: float, motor_applied: int, ended_by: str, halted: bool = False
 ) -> tuple[torch.Tensor, ...]:
-    """The arguments of `Plant.frame` for a single cart.
+    """Return the arguments of `Plant.frame` for a single cart.
 
-    A cart waits for them, and torch.tensor takes five times as long as NumPy.
+    `ended_by` is why the plant ended the episode, or anything else while it has not; a plant that was
+    `halted` by its user is truncated. The cart waits meanwhile: NumPy is five times as fast as torch.tensor.
     """
     rows = (
         np.array([counts], np.int64),
         np.array([[dt]], np.float32),
         np.array([[motor_applied]], np.int64),
-        np.array([[terminated]]),
-        np.array([[truncated]]),
+        np.array([[ended_by in TERMINATING]]),
+        np.array([[halted or ended_by in TRUNCATING]]),
     )
     return tuple(map(torch.from_numpy, rows))
 

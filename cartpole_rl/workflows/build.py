@@ -23,7 +23,6 @@ from cartpole_rl.plants.learned import LearnedPlant
 from cartpole_rl.plants.learned_model import LearnedModel, load_model
 from cartpole_rl.plants.serial.faults import Confirm, nobody
 from cartpole_rl.plants.serial.plant import SerialPlant
-from cartpole_rl.plants.serial.settings import SerialPlantSettings
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.plants.specs import Plant
 from cartpole_rl.randomization.draws import Draws
@@ -259,16 +258,8 @@ def evaluated_env(
         )
         plant = emulated_plant(truth, settings.control_period, prompt, config.plant.rehome)
         return environment(settings, plant)
-    serial = SerialPlantSettings(
-        port=config.plant.port,
-        baud=config.plant.baud,
-        pole_length=config.plant.pole_length,
-        rehome=config.plant.rehome,
-        clear_faults=config.plant.clear_faults,
-        start=angle,
-        control_period=settings.control_period,
-    )
-    return environment(settings, SerialPlant(serial, prompt, confirm=confirm))
+    serial = SerialPlant(config.plant, angle, settings.control_period, prompt, confirm=confirm)
+    return environment(settings, serial)
 
 
 def use_threads(threads: int | None) -> None:

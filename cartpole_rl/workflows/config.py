@@ -19,10 +19,11 @@ from cartpole_rl.learning.settings import (
 )
 from cartpole_rl.physics.bounds import check_values
 from cartpole_rl.physics.models import Actuator, CartFriction, Integrator, Models, PoleFriction
+from cartpole_rl.plants.serial.settings import Rehome, SerialSettings
 from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.randomization.ranges import Range
 from cartpole_rl.randomization.settings import IdentifiedSettings
-from cartpole_rl.settings import Count, Finite, Fraction, Positive, Seed, Settings
+from cartpole_rl.settings import Count, Finite, Fraction, Seed, Settings
 from cartpole_rl.tasks.actions import ActionSettings
 
 OF_SIMULATION = ("parameters", "randomization", "cart", "cart_friction", "pole_friction")
@@ -77,18 +78,7 @@ class EmulatedSettings(Settings):
     """plant=emulated."""
 
     kind: Literal["emulated"]
-    rehome: Literal["once", "always"] = "once"
-
-
-class RealSettings(Settings):
-    """plant=serial."""
-
-    kind: Literal["serial"]
-    port: Annotated[str, Field(min_length=1)]
-    baud: Count
-    pole_length: Annotated[float, Field(gt=0, le=3)] | None
-    rehome: Literal["once", "always"] = "once"
-    clear_faults: Annotated[int, Field(ge=0)] = 0
+    rehome: Rehome = "once"
 
 
 class CartPoleSettings(Settings):
@@ -193,7 +183,7 @@ class EvaluateConfig(Settings):
     run: Path
     episodes: Annotated[int, Field(ge=1, le=100_000)]
     plant: Annotated[
-        SimulatedSettings | LearnedSettings | EmulatedSettings | RealSettings, Field(discriminator="kind")
+        SimulatedSettings | LearnedSettings | EmulatedSettings | SerialSettings, Field(discriminator="kind")
     ]
     emulator: EmulatorSettings
     randomization: Randomization
@@ -232,7 +222,7 @@ class FinetuneConfig(Settings):
     """cartpole-finetune."""
 
     run: Path | None
-    plant: Annotated[EmulatedSettings | RealSettings, Field(discriminator="kind")]
+    plant: Annotated[EmulatedSettings | SerialSettings, Field(discriminator="kind")]
     emulator: EmulatorSettings
     episodes: Annotated[int, Field(ge=1, le=1000)]
     evaluation_episodes: Annotated[int, Field(ge=1, le=1000)]
@@ -263,7 +253,7 @@ class IdentifyConfig(Settings):
     """cartpole-identify."""
 
     source: Annotated[Path | None, Field(alias="from")]
-    plant: Annotated[EmulatedSettings | RealSettings, Field(discriminator="kind")]
+    plant: Annotated[EmulatedSettings | SerialSettings, Field(discriminator="kind")]
     emulator: EmulatorSettings
     cart: dict[str, Finite]
     pole: PoleSettings
@@ -311,9 +301,8 @@ class ModelConfig(Settings):
 class PreflightConfig(Settings):
     """cartpole-preflight."""
 
-    plant: Annotated[EmulatedSettings | RealSettings, Field(discriminator="kind")]
+    plant: Annotated[EmulatedSettings | SerialSettings, Field(discriminator="kind")]
     emulator: EmulatorSettings
-    home_timeout: Positive  # s
 
 
 class EmulateConfig(Settings):

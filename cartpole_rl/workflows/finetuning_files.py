@@ -17,9 +17,10 @@ from cartpole_rl.learning.checkpoints import (
     save_agent,
     save_training,
 )
+from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.checking import checked
-from cartpole_rl.workflows.config import FinetuneConfig, RealSettings
+from cartpole_rl.workflows.config import FinetuneConfig
 from cartpole_rl.workflows.recordings import RECORDINGS
 
 
@@ -75,7 +76,7 @@ class FinetuningFiles:
 def pole_length(config: FinetuneConfig) -> float | None:
     """Return the length (m) of the pole on the cart; None where the settings do not state it."""
     plant = config.plant
-    return plant.pole_length if isinstance(plant, RealSettings) else 2 * config.emulator.pole_com
+    return plant.pole_length if isinstance(plant, SerialSettings) else 2 * config.emulator.pole_com
 
 
 def resumed_config(checkpoint: TrainingCheckpoint, resume: str | None) -> FinetuneConfig:

@@ -19,7 +19,6 @@ from cartpole_rl.identification.quantities import intervals, quantities
 from cartpole_rl.physics.models import Actuator, CartFriction, Models
 from cartpole_rl.plants.emulated import emulated_plant
 from cartpole_rl.plants.serial.plant import SerialPlant
-from cartpole_rl.plants.serial.settings import SerialPlantSettings
 from cartpole_rl.reporting.curves import force_curve, friction_curve
 from cartpole_rl.reporting.figures import save
 from cartpole_rl.reporting.figures.identified import (
@@ -103,14 +102,7 @@ def make_plant(config: IdentifyConfig) -> SerialPlant:
     if isinstance(config.plant, EmulatedSettings):
         truth = config.emulator.model_copy(update={"start": "hanging"})
         return emulated_plant(truth, config.control_period, tqdm.write, config.plant.rehome)
-    settings = SerialPlantSettings(
-        port=config.plant.port,
-        baud=config.plant.baud,
-        control_period=config.control_period,
-        rehome=config.plant.rehome,
-        clear_faults=config.plant.clear_faults,
-    )
-    return SerialPlant(settings, tqdm.write, confirm=confirm)
+    return SerialPlant(config.plant, control_period=config.control_period, prompt=tqdm.write, confirm=confirm)
 
 
 def read_recordings(source: Path) -> Episodes:

@@ -5,10 +5,11 @@ from contextlib import closing, contextmanager
 
 from cartpole_rl.errors import PlantError
 from cartpole_rl.plants.emulated_cart import EmulatedCart
-from cartpole_rl.plants.serial.cart import SerialCart, SerialSettings
-from cartpole_rl.plants.serial.faults import FaultClearing
+from cartpole_rl.plants.serial.cart import SerialCart
+from cartpole_rl.plants.serial.faults import FaultClearing, always
 from cartpole_rl.plants.serial.preflight import Finding, preflight
-from cartpole_rl.workflows.config import EmulatedSettings, PreflightConfig, RealSettings
+from cartpole_rl.plants.serial.settings import SerialSettings
+from cartpole_rl.workflows.config import EmulatedSettings, PreflightConfig
 from cartpole_rl.workflows.person import confirm
 
 
@@ -19,7 +20,7 @@ def check_cart(config: PreflightConfig) -> None:
     """
     with connected_cart(config) as cart:
         finding: Finding | None = None
-        for finding in preflight(cart, config.home_timeout, fault_clearing(config.plant)):
+        for finding in preflight(cart, fault_clearing(config.plant)):
             print(finding, flush=True)
     if finding is None or not finding.ready:
         raise PlantError(
@@ -28,21 +29,20 @@ def check_cart(config: PreflightConfig) -> None:
     print("The cart is ready.")
 
 
-def fault_clearing(plant: EmulatedSettings | RealSettings) -> FaultClearing:
+def fault_clearing(plant: EmulatedSettings | SerialSettings) -> FaultClearing:
     """Return the rule for clearing latched faults."""
-    return FaultClearing(plant.clear_faults if isinstance(plant, RealSettings) else None, confirm)
+    if isinstance(plant, SerialSettings):
+        return FaultClearing(plant.clear_faults, confirm)
+    return FaultClearing(0, always)
 
 
 @contextmanager
 def connected_cart(config: PreflightConfig) -> Iterator[SerialCart]:
     """Yield the cart, not open yet; disarm and close it at the end, and stop an emulated one."""
-    if isinstance(config.plant, RealSettings):
-        with closing(SerialCart(SerialSettings(port=config.plant.port, baud=config.plant.baud))) as cart:
+    if isinstance(config.plant, SerialSettings):
+        with closing(SerialCart(config.plant)) as cart:
             yield cart
         return
-    with EmulatedCart(config.emulator.model_copy(update={"start": "hanging"})) as emulated:
-        patient = SerialSettings(
-            port=emulated.port, timeout=5, connect_timeout=10, answer_timeout=2, nudge_after=2
-        )
-        with closing(SerialCart(patient)) as cart:
-            yield cart
+    truth = config.emulator.model_copy(update={"start": "hanging"})
+    with EmulatedCart(truth) as emulated, closing(SerialCart(emulated.settings)) as cart:
+        yield cart

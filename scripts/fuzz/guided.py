@@ -35,7 +35,8 @@ if "--replay" not in sys.argv:
 with fuzzer.instrument_imports(include=LIBRARIES) if fuzzer else contextlib.nullcontext():
     from cartpole_rl.emulator.firmware import HOST_MESSAGES, WATCHDOG_PERIODS, Firmware
     from cartpole_rl.plants.serial import cart as serial_cart
-    from cartpole_rl.plants.serial import link as serial_link
+    from cartpole_rl.plants.serial import connection, tracking
+    from cartpole_rl.plants.serial.settings import SerialSettings
     from cartpole_rl.wire import Flags, FrameSplitter, SetMotor, Start, State, cobs, decode_frame
     from cartpole_rl.wire.checksum import crc16
     from cartpole_rl.wire.frames import END, LONGEST_FRAME, open_envelope
@@ -204,26 +205,30 @@ class Wire:
 
 def host(data: bytes) -> None:
     """Feed one input to a SerialCart whose timeouts are close to 0."""
-    serial_cart.UNACKNOWLEDGED_PERIODS = 1e-3
+    connection.UNACKNOWLEDGED_PERIODS = 1e-3
     steps = Steps(data)
     wire = Wire(steps)
-    settings = serial_cart.SerialSettings(
-        port="memory", timeout=2e-4, connect_timeout=2e-4, answer_timeout=1e-4, retries=1, nudge_after=5e-5
+    serial_cart.open_port = lambda *given: wire
+    settings = SerialSettings(
+        port="memory",
+        timeout=2e-4,
+        connect_timeout=2e-4,
+        answer_timeout=1e-4,
+        retries=1,
+        nudge_after=5e-5,
+        home_timeout=2e-4,
     )
     driven = serial_cart.SerialCart(settings)
-    driven._open_link = serial_link.SerialLink(wire, driven.statistics)
-    with contextlib.suppress(CartPoleError):
-        driven._information = driven._shake_hands()
     for _ in range(MOST_STEPS):
-        if not steps.left or not driven.is_open:
+        if not steps.left:
             break
         with contextlib.suppress(CartPoleError):
+            driven.open()  # again, where the cart did not answer
             call(driven, wire, steps)
-        assert len(driven._answers) <= 64
-        assert len(driven._missing) <= serial_cart.OVERTAKEN_TICKS
-        counts = driven.statistics
-        lost, late = counts.lost_frames, counts.late_ticks
-        assert min(lost, late, counts.overtaken_frames, counts.repeated_frames) >= 0
+            assert len(driven._connection._answers) <= connection.KEPT_ANSWERS
+        assert len(driven._tracker._missing) <= tracking.OVERTAKEN_TICKS
+        seen = driven.statistics
+        assert min(seen.lost_frames, seen.late_ticks, seen.overtaken_frames, seen.repeated_frames) >= 0
     driven.close()
 
 
@@ -240,7 +245,7 @@ def call(driven: "serial_cart.SerialCart", wire: Wire, steps: Steps) -> None:
         case 3 | 4:
             driven.get_state()
         case 5:
-            driven.home(2e-4)
+            driven.home()
         case 6:
             driven.clear_fault()
         case _:

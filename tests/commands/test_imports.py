@@ -39,7 +39,7 @@ COMPLAINS = {  # command: words, exit code, part of the line on stderr
         ("from=nowhere", 1, "from=nowhere: there is no such file or folder"),
         ("from=nowhere windows=1", 2, "greater than or equal to 10"),
     ],
-    "preflight": [("plant.port=nowhere home_timeout=0", 2, "greater than 0")],
+    "preflight": [("plant.port=nowhere plant.home_timeout=0", 2, "greater than 0")],
     "record": [("run=nowhere", 1, "run=nowhere: there is no such file or folder")],
     "replay": [("from=nowhere", 1, "from=nowhere: there is no such file or folder")],
     "train": [

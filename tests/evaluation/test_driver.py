@@ -25,7 +25,7 @@ from cartpole_rl.evaluation.driving_policy import as_weights
 from cartpole_rl.plants.serial.errors import NotReadyError
 from cartpole_rl.plants.serial.faults import Confirm
 from cartpole_rl.plants.serial.plant import SerialPlant
-from cartpole_rl.plants.serial.settings import SerialPlantSettings
+from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.tasks.actions import ActionSettings
 from cartpole_rl.wire import ClearFault, Fault, Message, SetMotor, Stop
 
@@ -37,7 +37,7 @@ LONG = 100_000  # periods
 
 def scripted_env(port: str, time_limit: int, confirm: Confirm) -> CartPoleEnv:
     """Made in the driving process."""
-    plant = SerialPlant(SerialPlantSettings(port=port), confirm=confirm)
+    plant = SerialPlant(SerialSettings(port=port), confirm=confirm)
     task = choice("task/swingup") | {"x_max": 0.38, "time_limit": time_limit}
     return make_env(
         plant,
@@ -62,10 +62,10 @@ class Faulty(CartPeer):
         super().__init__()
         self.state = replace(self.state, fault=int(Fault.STALL))
 
-    def _carry_out(self, message: Message) -> None:
+    def carry_out(self, message: Message) -> None:
         if isinstance(message, ClearFault):
             self.state = replace(self.state, fault=0)
-        super()._carry_out(message)
+        super().carry_out(message)
 
 
 @pytest.fixture

@@ -1,13 +1,17 @@
-"""The other end of a pseudo-terminal: answers byte for byte like a cart, so far as a test wants it to."""
+"""Stand-ins at the other end of a pseudo-terminal, which answer byte for byte like a cart."""
 
+import fcntl
 import os
 import select
+import struct
+import termios
 import threading
 import tty
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 
+from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.wire import (
     Ack,
     Flags,
@@ -17,6 +21,7 @@ from cartpole_rl.wire import (
     Home,
     Info,
     Message,
+    Nack,
     SetMotor,
     SetPeriod,
     Start,
@@ -54,6 +59,10 @@ class Peer:
 
     def send(self, data: bytes) -> None:
         os.write(self.master, data)
+
+    def unread(self) -> int:
+        """Bytes that wait for the host to read them."""
+        return struct.unpack("i", fcntl.ioctl(self._slave, termios.FIONREAD, bytes(4)))[0]
 
     def messages(self, kind: type[Message]) -> list[Message]:
         return [frame.message for frame in self.received if isinstance(frame.message, kind)]
@@ -110,7 +119,7 @@ class CartPeer(Peer):
         elif isinstance(message, SetMotor):
             self.state = replace(self.state, motor_applied=message.motor)
         else:
-            self._carry_out(message)
+            self.carry_out(message)
             yield self.encode(Ack(frame.sequence, message.TYPE))
         if not self.paced:
             yield self.next_state()
@@ -125,7 +134,7 @@ class CartPeer(Peer):
         """A period passes: the state goes out."""
         self.send(self.next_state(**changes))
 
-    def _carry_out(self, message: Message) -> None:
+    def carry_out(self, message: Message) -> None:
         if isinstance(message, Home):
             self.flags |= Flags.HOMED
         elif isinstance(message, Start):
@@ -135,8 +144,37 @@ class CartPeer(Peer):
             self.state = replace(self.state, motor_applied=0)
 
 
+class Refusing(CartPeer):
+    """Refuses messages of one type with one reason."""
+
+    def __init__(self, kind: type, reason: int) -> None:
+        super().__init__()
+        self.kind, self.reason = kind, reason
+
+    def answer(self, frame: Frame) -> Iterable[bytes]:
+        if isinstance(frame.message, self.kind):
+            yield self.encode(Nack(frame.sequence, frame.message.TYPE, self.reason))
+            yield self.next_state()
+        else:
+            yield from super().answer(frame)
+
+
+class Forgetful(CartPeer):
+    """Does not hear the first `deaf_to` messages of one type."""
+
+    def __init__(self, kind: type, deaf_to: int) -> None:
+        super().__init__()
+        self.kind, self.deaf_to = kind, deaf_to
+
+    def answer(self, frame: Frame) -> Iterable[bytes]:
+        if isinstance(frame.message, self.kind) and self.deaf_to:
+            self.deaf_to -= 1
+            return
+        yield from super().answer(frame)
+
+
 class Between:
-    """A cable to a cart's port with an end of its own, `port`: frames pass, some with a sign turned.
+    """A cable between a cart's port and the new `port`: frames pass, some with a sign changed.
 
     `motor`, `cart` and `pole` are 1, or -1 for a motor or an encoder that is connected the wrong way round.
     """
@@ -190,6 +228,20 @@ class Between:
                 pole_counts=message.pole_counts if pole > 0 else 2 * HANGING - message.pole_counts,
             )
         return message
+
+
+def quick_settings(port: str, **changes: float) -> SerialSettings:
+    quick = {"timeout": 0.4, "connect_timeout": 2.0, "answer_timeout": 0.2, "retries": 1, "nudge_after": 0.1}
+    return SerialSettings(port=port, **(quick | changes))
+
+
+def wait_for(condition: Callable[[], bool], seconds: float = 5.0) -> None:
+    event = threading.Event()
+    for _ in range(int(seconds / 0.005)):
+        if condition():
+            return
+        event.wait(0.005)
+    raise AssertionError("waited in vain")
 
 
 def open_descriptors() -> int:

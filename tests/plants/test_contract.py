@@ -21,7 +21,7 @@ from cartpole_rl.errors import PlantError
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.physics.dynamics import State as TrueState
 from cartpole_rl.plants.serial.plant import SerialPlant
-from cartpole_rl.plants.serial.settings import SerialPlantSettings
+from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.wire import Flags, Frame, SetMotor, Start, State
 
 MOTORS = (-255, -100, 0, 255)
@@ -128,7 +128,7 @@ class Policy:
 @given(script=scripts)
 def test_a_serial_cart_that_says_anything(script: Script, make_environment: Callable) -> None:
     with ScriptedCart(script) as peer:
-        plant = SerialPlant(SerialPlantSettings(port=peer.port, **QUICK))
+        plant = SerialPlant(SerialSettings(port=peer.port, **QUICK))
         env = make_environment(plant, MOTORS, time_limit=PERIODS)
         policy, episode = Policy(script), None
         try:
@@ -153,7 +153,7 @@ def test_a_serial_cart_that_says_anything(script: Script, make_environment: Call
 def test_a_motor_value_beyond_the_limit_is_cut_to_it(motor: int) -> None:
     """Whatever a loop gives to the plant; SET_MOTOR could not even carry the largest."""
     with CartPeer() as peer:
-        plant = SerialPlant(SerialPlantSettings(port=peer.port, **QUICK))
+        plant = SerialPlant(SerialSettings(port=peer.port, **QUICK))
         plant.reset()
         plant.step(TensorDict({"motor": torch.tensor([[motor]])}, [1]))
         sent = peer.messages(SetMotor)[-1].motor

@@ -14,8 +14,9 @@ import pytest
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import EmulatorError, LinkError
 from cartpole_rl.plants.emulated_cart import EmulatedCart
-from cartpole_rl.plants.serial.cart import SerialCart, SerialSettings
+from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.errors import RefusedError
+from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.wire import Flags, Reason
 
 fast = partial(EmulatorSettings, physics_step=1e-3)

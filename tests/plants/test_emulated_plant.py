@@ -91,11 +91,11 @@ def test_an_upright_start() -> None:
 
 
 def test_a_killed_emulator_truncates_and_the_next_reset_says_so() -> None:
-    settings = fast()
-    with contextlib.closing(emulated_plant(settings)) as plant:
+    emulated = EmulatedCart(fast())
+    with contextlib.closing(SerialPlant(emulated.settings, owned=emulated)) as plant:
         plant.reset()
         before = push(plant, 100)
-        os.kill(plant._owned.pid, signal.SIGKILL)
+        os.kill(emulated.pid, signal.SIGKILL)
         time.sleep(0.2)
         frame = push(plant, 100)
         assert frame["truncated"]
@@ -124,9 +124,8 @@ def test_pole_length_is_that_of_the_emulated_pole(plant: SerialPlant) -> None:
 
 
 def test_closing_ends_the_process() -> None:
-    plant = emulated_plant(fast())
-    emulated = plant._owned
-    assert isinstance(emulated, EmulatedCart)
+    emulated = EmulatedCart(fast())
+    plant = SerialPlant(emulated.settings, owned=emulated)
     plant.close()
     with pytest.raises(ProcessLookupError):
         os.kill(emulated.pid, 0)

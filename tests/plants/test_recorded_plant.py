@@ -43,4 +43,5 @@ def test_it_keeps_the_contract(
 ) -> None:
     env = make_environment(make_plant(1), MOTORS, time_limit=20)
     (episode,) = run_batch(env, lambda present: present.set("action", torch.tensor([0])))
+    check_env_specs(RecordedPlant(episode, None))
     check_env_specs(make_environment(RecordedPlant(episode, None), MOTORS))

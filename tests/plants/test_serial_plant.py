@@ -1,23 +1,18 @@
-"""The plant on a scripted cart: endings, clocks and starts. On the emulated cart: test_emulated_plant.py."""
+"""The plant on a scripted cart: endings, clocks and faults. On the emulated cart: test_emulated_plant.py."""
 
 from collections.abc import Iterator
 from dataclasses import replace
 
 import pytest
 import torch
-from serial_peer import HANGING, CartPeer
+from serial_peer import HANGING, CartPeer, quick_settings
 from tensordict import TensorDict
+from torchrl.envs.utils import check_env_specs
 
-from cartpole_rl.errors import FaultError, LinkError, PlantError, PortError
+from cartpole_rl.errors import FaultError, LinkError, PortError
 from cartpole_rl.plants.serial.errors import NotReadyError
 from cartpole_rl.plants.serial.plant import SerialPlant
-from cartpole_rl.plants.serial.settings import SerialPlantSettings
-from cartpole_rl.wire import ClearFault, Fault, Flags, Frame, Home, SetMotor, Start, Stop
-
-
-def settings(port: str, **changes) -> SerialPlantSettings:
-    quick = {"timeout": 0.4, "connect_timeout": 0.8, "answer_timeout": 0.2, "retries": 1, "nudge_after": 0.1}
-    return SerialPlantSettings(port=port, **(quick | changes))
+from cartpole_rl.wire import ClearFault, Fault, Flags, Home, SetMotor, Start, Stop
 
 
 @pytest.fixture
@@ -28,13 +23,17 @@ def peer() -> Iterator[CartPeer]:
 
 @pytest.fixture
 def plant(peer: CartPeer) -> Iterator[SerialPlant]:
-    plant = SerialPlant(settings(peer.port))
+    plant = SerialPlant(quick_settings(peer.port))
     yield plant
     plant.close()
 
 
 def step(plant: SerialPlant, motor: int) -> TensorDict:
     return plant.step(TensorDict({"motor": torch.tensor([[motor]])}, [1]))["next"]
+
+
+def test_specs(plant: SerialPlant) -> None:
+    check_env_specs(plant)
 
 
 def test_a_reset_homes_and_arms(peer: CartPeer, plant: SerialPlant) -> None:
@@ -107,8 +106,8 @@ def test_a_person_who_agrees_lets_a_fault_be_cleared(peer: CartPeer) -> None:
         asked.append(text)
         return True
 
-    peer._carry_out = lambda message: clear(peer, message)
-    plant = SerialPlant(settings(peer.port), confirm=agree)
+    peer.carry_out = lambda message: clear(peer, message)
+    plant = SerialPlant(quick_settings(peer.port), confirm=agree)
     plant.reset()
     for _ in range(2):
         peer.state = replace(peer.state, fault=int(Fault.STALL))
@@ -121,8 +120,8 @@ def test_a_person_who_agrees_lets_a_fault_be_cleared(peer: CartPeer) -> None:
 
 
 def test_unattended_work_gives_up_after_the_stated_number_of_faults(peer: CartPeer) -> None:
-    peer._carry_out = lambda message: clear(peer, message)
-    plant = SerialPlant(settings(peer.port, clear_faults=2))
+    peer.carry_out = lambda message: clear(peer, message)
+    plant = SerialPlant(quick_settings(peer.port, clear_faults=2))
     plant.reset()
     for _ in range(2):
         peer.state = replace(peer.state, fault=int(Fault.POLE_ENCODER))
@@ -136,7 +135,7 @@ def test_unattended_work_gives_up_after_the_stated_number_of_faults(peer: CartPe
 
 
 def test_a_fault_ends_the_episode_and_is_cleared_in_the_next_reset(peer: CartPeer) -> None:
-    plant = SerialPlant(settings(peer.port, clear_faults=2))
+    plant = SerialPlant(quick_settings(peer.port, clear_faults=2))
     plant.reset()
     peer.state = replace(peer.state, fault=int(Fault.STALL))
     frame = step(plant, 0)
@@ -146,7 +145,7 @@ def test_a_fault_ends_the_episode_and_is_cleared_in_the_next_reset(peer: CartPee
     assert_stopped(peer)
     with pytest.raises(FaultError, match="motor"):
         plant.reset()
-    peer._carry_out = lambda message: clear(peer, message)
+    peer.carry_out = lambda message: clear(peer, message)
     assert not plant.reset()["done"]
     assert plant.ended_by == ""
     plant.close()
@@ -192,7 +191,7 @@ WRONG_INFO = [
 def test_a_cart_of_another_kind_is_never_armed(peer: CartPeer, changes: dict, words: str) -> None:
     peer.info = replace(peer.info, **changes)
     with pytest.raises(NotReadyError, match=words):
-        SerialPlant(settings(peer.port)).reset()
+        SerialPlant(quick_settings(peer.port)).reset()
     assert not peer.messages(Start)
     assert not any(message.motor for message in peer.messages(SetMotor))
 
@@ -226,66 +225,10 @@ def test_a_silent_cart_truncates_with_the_last_counts_and_can_come_back(
     assert plant.reset()["counts"].tolist() == [[42, HANGING]]
 
 
-def test_upright_asks_a_person_and_waits_for_the_pole(peer: CartPeer) -> None:
-    said: list[str] = []
-
-    def hold(text: str) -> None:
-        said.append(text)
-        peer.state = replace(peer.state, pole_counts=4096 + 30)  # a turn further is upright too
-
-    plant = SerialPlant(settings(peer.port, start="upright"), prompt=hold)
-    assert plant.reset()["counts"][0, 1] == 30
-    assert "upright" in said[0]
-    plant.close()
-
-
-@pytest.mark.parametrize(
-    ("start", "counts", "words"),
-    [("upright", 45, r"\+4\.0 deg off: hold it up"), ("hanging", 1900, r"-13\.0 deg off: let it hang")],
-)
-def test_a_pole_that_is_not_there_is_waited_for_in_vain(
-    peer: CartPeer, start: str, counts: int, words: str
-) -> None:
-    peer.state = replace(peer.state, pole_counts=counts)
-    plant = SerialPlant(settings(peer.port, start=start, start_timeout=0.05), prompt=lambda text: None)
-    with pytest.raises(PlantError, match=words):
-        plant.reset()
-    assert not peer.messages(Start)
-    plant.close()
-
-
-def test_a_swinging_pole_does_not_start(peer: CartPeer) -> None:
-    class Swinging:
-        def __init__(self) -> None:
-            self.talk, self.side = peer.answer, 1
-
-        def __call__(self, frame: Frame) -> Iterator[bytes]:
-            self.side = -self.side
-            peer.state = replace(peer.state, pole_counts=HANGING + 30 * self.side)
-            yield from self.talk(frame)
-
-    peer.answer = Swinging()
-    plant = SerialPlant(settings(peer.port, start_timeout=0.1))
-    with pytest.raises(PlantError, match="let it hang until it is still"):
-        plant.reset()
-    plant.close()
-
-
-def test_another_control_period_is_set_on_the_cart(peer: CartPeer) -> None:
-    plant = SerialPlant(settings(peer.port, control_period=0.01))
-    plant.reset()
-    assert peer.info.period_us == 10_000
-    assert step(plant, 0)["dt"].item() == pytest.approx(0.01)
-    peer.info = replace(peer.info, period_us=20_000)  # as after a restart
-    plant.reset()
-    assert peer.info.period_us == 10_000
-    plant.close()
-
-
 def test_a_reset_mask_of_false_leaves_the_cart_alone(peer: CartPeer, plant: SerialPlant) -> None:
     plant.reset()
     began = len(peer.received)
-    plant._reset(TensorDict({"_reset": torch.zeros(1, 1, dtype=torch.bool)}, [1]))
+    plant.restart(torch.tensor([], dtype=torch.int64))
     assert len(peer.received) == began
 
 
@@ -298,7 +241,7 @@ def test_close_stops_the_motor_and_closes_what_is_owned(peer: CartPeer) -> None:
             self.closed = True
 
     owned = Owned()
-    plant = SerialPlant(settings(peer.port), owned=owned)
+    plant = SerialPlant(quick_settings(peer.port), owned=owned)
     plant.reset()
     step(plant, 200)
     plant.close()
@@ -317,14 +260,14 @@ def test_what_is_owned_is_closed_when_the_port_cannot_be_opened() -> None:
 
     owned = Owned()
     with pytest.raises(PortError):
-        SerialPlant(settings("/dev/nosuch0"), owned=owned)
+        SerialPlant(quick_settings("/dev/nosuch0"), owned=owned)
     assert owned.closed
 
 
 def clear(peer: CartPeer, message: object) -> None:
     if isinstance(message, ClearFault):
         peer.state = replace(peer.state, fault=0)
-    CartPeer._carry_out(peer, message)
+    CartPeer.carry_out(peer, message)
 
 
 def assert_stopped(peer: CartPeer) -> None:

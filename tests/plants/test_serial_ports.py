@@ -4,9 +4,10 @@ import pytest
 from serial.tools.list_ports_common import ListPortInfo
 
 from cartpole_rl.errors import PortError
-from cartpole_rl.plants.serial.cart import SerialCart, SerialSettings
+from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.port import found_ports, only_cart, resolved_port
 from cartpole_rl.plants.serial.ports import UsbPort, cart_like, changes, described, usb_ports
+from cartpole_rl.plants.serial.settings import SerialSettings
 
 
 def listed(device: str, vid: int | None, product: str | None = None) -> ListPortInfo:

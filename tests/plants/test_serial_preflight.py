@@ -11,19 +11,19 @@ from serial_peer import INFO, Between, CartPeer
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import FaultError
 from cartpole_rl.plants.emulated_cart import EmulatedCart
-from cartpole_rl.plants.serial.cart import SerialCart, SerialSettings
-from cartpole_rl.plants.serial.errors import NotReadyError
-from cartpole_rl.plants.serial.preflight import (
-    Finding,
-    Moves,
+from cartpole_rl.plants.serial.cart import SerialCart
+from cartpole_rl.plants.serial.checks import (
     cart_direction,
     deadband,
     latency,
     limits,
     pole_direction,
-    preflight,
     soft_limit,
 )
+from cartpole_rl.plants.serial.errors import NotReadyError
+from cartpole_rl.plants.serial.preflight import Finding, preflight
+from cartpole_rl.plants.serial.probe import Probe
+from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.wire import Flags, Home
 
 TRUTH: dict[str, Any] = {
@@ -56,18 +56,18 @@ def emulated() -> Iterator[EmulatedCart]:
 
 
 @pytest.fixture
-def moves(emulated: EmulatedCart) -> Iterator[Moves]:
+def probe(emulated: EmulatedCart) -> Iterator[Probe]:
     with SerialCart(patient(emulated.port)) as cart:
-        yield Moves(cart)
+        yield Probe(cart)
     settle(emulated)
 
 
 def settle(emulated: EmulatedCart) -> None:
     """Bring the cart back to the middle, for the next test."""
     with SerialCart(patient(emulated.port)) as cart:
-        moves = Moves(cart, deadband={+1: 100, -1: 80})
-        moves.arm()
-        moves.centre()
+        probe = Probe(cart)
+        probe.arm()
+        probe.centre()
 
 
 def test_a_good_cart_passes_and_is_left_disarmed() -> None:
@@ -80,17 +80,17 @@ def test_a_good_cart_passes_and_is_left_disarmed() -> None:
         cart.close()
 
 
-def test_what_is_measured_is_the_truth(moves: Moves) -> None:
-    assert "motor value +10" in cart_direction(moves)
-    assert "swings the hanging pole to the left" in pole_direction(moves)
-    deadband(moves)
-    assert 100 < moves.deadband[+1] < 106  # a ramp goes on by one a period until the motion is seen
-    assert 80 < moves.deadband[-1] < 88
-    words = latency(moves)
+def test_what_is_measured_is_the_truth(probe: Probe) -> None:
+    assert "motor value +10" in cart_direction(probe)
+    assert "swings the hanging pole to the left" in pole_direction(probe)
+    deadband(probe)
+    assert 100 < probe.deadband[+1] < 106  # a ramp goes on by one a period until the motion is seen
+    assert 80 < probe.deadband[-1] < 88
+    words = latency(probe)
     assert 11 <= float(words.split(" ms")[0].split()[-1]) <= 15
     assert "command age of 20 ms" in words
-    assert "not reached" in soft_limit(moves)
-    assert moves.farthest * 22749e-9 < 0.05
+    assert "not reached" in soft_limit(probe)
+    assert probe.farthest * 22749e-9 < 0.05
 
 
 @pytest.mark.parametrize("signs", [{"motor": -1}, {"cart": -1}])
@@ -99,7 +99,7 @@ def test_a_motor_or_a_cart_encoder_the_wrong_way_round(emulated: EmulatedCart, s
         with pytest.raises(
             NotReadyError, match=r"moves the cart's count down, .*swap its encoder's wires A and B"
         ):
-            cart_direction(Moves(cart))
+            cart_direction(Probe(cart))
         assert abs(cart.poll_state().cart_counts) < 2000
     settle(emulated)
 
@@ -107,19 +107,19 @@ def test_a_motor_or_a_cart_encoder_the_wrong_way_round(emulated: EmulatedCart, s
 @pytest.mark.parametrize("signs", [{"pole": -1}, {"motor": -1, "cart": -1}])
 def test_a_pole_encoder_the_wrong_way_round(emulated: EmulatedCart, signs: dict[str, int]) -> None:
     with Between(emulated.port, **signs) as cable, SerialCart(patient(cable.port)) as cart:
-        moves = Moves(cart)
-        cart_direction(moves)
+        probe = Probe(cart)
+        cart_direction(probe)
         with pytest.raises(
             NotReadyError, match=r"pole's count down, by \d+: swap the wires A and B of the pole"
         ):
-            pole_direction(moves)
+            pole_direction(probe)
 
 
-def test_a_motor_without_power(moves: Moves, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = moves.cart.set_motor
-    monkeypatch.setattr(moves.cart, "set_motor", lambda value: asked(0))
+def test_a_motor_without_power(probe: Probe, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = probe.cart.set_motor
+    monkeypatch.setattr(probe.cart, "set_motor", lambda value: asked(0))
     with pytest.raises(NotReadyError, match=r"up to \+199 do not move .*switch the motor's supply on"):
-        cart_direction(moves)
+        cart_direction(probe)
 
 
 def test_a_cart_that_hardly_moves(emulated: EmulatedCart) -> None:
@@ -128,18 +128,18 @@ def test_a_cart_that_hardly_moves(emulated: EmulatedCart) -> None:
         SerialCart(patient(stiff.port)) as cart,
     ):
         cart.home()
-        moves = Moves(cart)
-        cart_direction(moves)
+        probe = Probe(cart)
+        cart_direction(probe)
         with pytest.raises(NotReadyError, match=r"-17\d left: clean the track"):
-            deadband(moves)
+            deadband(probe)
 
 
-def test_a_slow_motor(moves: Moves) -> None:
-    cart_direction(moves)
-    deadband(moves)
-    moves.cart.__class__ = Sluggish
+def test_a_slow_motor(probe: Probe) -> None:
+    cart_direction(probe)
+    deadband(probe)
+    probe.cart.__class__ = Sluggish
     with pytest.raises(NotReadyError, match=r"begins to move \d+ ms after .*look for a ramp"):
-        latency(moves)
+        latency(probe)
 
 
 class Sluggish(SerialCart):
@@ -236,7 +236,7 @@ def test_a_cart_too_far_out_is_stopped() -> None:
     with CartPeer() as peer, SerialCart(patient(peer.port)) as cart:
         peer.state = replace(peer.state, cart_counts=4000)
         with pytest.raises(NotReadyError, match=r"went \+91 mm, more than any move"):
-            Moves(cart).arm()
+            Probe(cart).arm()
         assert not peer.flags & Flags.ARMED
 
 
@@ -244,4 +244,4 @@ def test_a_fault_ends_a_move() -> None:
     with CartPeer() as peer, SerialCart(patient(peer.port)) as cart:
         peer.state = replace(peer.state, fault=2)
         with pytest.raises(FaultError, match="did not move"):
-            Moves(cart).arm()
+            Probe(cart).arm()

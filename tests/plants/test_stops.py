@@ -21,9 +21,9 @@ from tensordict import TensorDictBase
 
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.identification.experiments import Experiment, Moves, Task, conduct, hold
-from cartpole_rl.plants.serial.cart import SerialCart, SerialSettings
+from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.plant import SerialPlant
-from cartpole_rl.plants.serial.settings import SerialPlantSettings
+from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.wire import Flags
 
 PERIOD_MS = 20
@@ -61,7 +61,8 @@ process.run(EmulatorSettings(clock="real", cart_mass=20.0, physics_step=1e-3, jo
 
 HOST = """
 import itertools, signal, sys
-from cartpole_rl.plants.serial.cart import SerialCart, SerialSettings
+from cartpole_rl.plants.serial.cart import SerialCart
+from cartpole_rl.plants.serial.settings import SerialSettings
 
 from cartpole_rl.signals import ending_signals
 
@@ -206,7 +207,7 @@ def always_right(seen: TensorDictBase) -> TensorDictBase:
 
 
 def serial_plant(cart: TellingCart) -> SerialPlant:
-    return SerialPlant(SerialPlantSettings(port=cart.port))
+    return SerialPlant(SerialSettings(port=cart.port))
 
 
 def test_an_exception_in_the_policy(cart: TellingCart, make_environment: Callable) -> None:

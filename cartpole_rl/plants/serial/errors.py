@@ -1,11 +1,11 @@
-"""What the cart's refusals and faults mean, in words, each with its remedy."""
+"""Errors for the cart's refusals and faults: their meaning in words, each with its remedy."""
 
 from cartpole_rl.errors import FaultError, PlantError
 from cartpole_rl.wire import Fault, MessageType, Nack, Reason
 
 
 class RefusedError(PlantError):
-    """The cart answered NACK. `reason` is the protocol's, or its bare number where it is unknown here."""
+    """The cart answered NACK. `reason` is the protocol's, or a bare number if it is unknown here."""
 
     def __init__(self, text: str, reason: Reason | int) -> None:
         super().__init__(text)
@@ -42,7 +42,7 @@ FAULTS: dict[Fault, str] = {
 
 
 def refusal(nack: Nack) -> PlantError:
-    """The error for a NACK: FaultError if a fault is latched, otherwise RefusedError."""
+    """Return the error for a NACK: FaultError if a fault is latched, otherwise RefusedError."""
     known = nack.type in MessageType.__members__.values()
     what = MessageType(nack.type).name if known else f"message {nack.type:#04x}"
     text = f"the cart refused {what}: {REASONS.get(nack.reason, f'reason {nack.reason}, unknown here')}"
@@ -52,7 +52,7 @@ def refusal(nack: Nack) -> PlantError:
 
 
 def fault_words(bits: int) -> str:
-    """Every fault in `bits` in words, each with its remedy."""
+    """Return every fault in `bits` in words, each with its remedy."""
     named = [words for fault, words in FAULTS.items() if bits & fault]
     unknown = bits & ~sum(FAULTS)
     if unknown:
@@ -61,5 +61,5 @@ def fault_words(bits: int) -> str:
 
 
 def fault_error(bits: int) -> FaultError:
-    """The error that names every fault in `bits`, each with its remedy."""
+    """Return the error that names every fault in `bits`, each with its remedy."""
     return FaultError(f"the cart latched a fault: {fault_words(bits)}")

@@ -1,4 +1,4 @@
-"""Clearing latched faults: a cart that stopped itself moves again only when somebody has agreed to it."""
+"""Clearing latched faults: a cart that stopped itself moves again only after somebody has agreed."""
 
 import logging
 from collections.abc import Callable
@@ -9,21 +9,23 @@ from cartpole_rl.plants.serial.errors import fault_words
 
 LOGGER = logging.getLogger(__name__)
 
-Confirm = Callable[[str], bool]  # shows a person the text; True once the person says that the cart may move
+Confirm = Callable[[str], bool]  # shows a person the text; True if the person says that the cart may move
 
 
 def nobody(text: str) -> bool:
-    """Confirm nothing: there is no person to ask."""
+    """Never confirm: there is no person to ask."""
     return False
 
 
+def always(text: str) -> bool:
+    """Always confirm: for a cart that cannot be damaged."""
+    return True
+
+
 class FaultClearing:
-    """Clears latched faults after a person has confirmed, or the first `unattended` ones without asking.
+    """Clears latched faults after a person has confirmed, or the first `unattended` ones without asking."""
 
-    `unattended` None is no limit, for carts that cannot be damaged.
-    """
-
-    def __init__(self, unattended: int | None, confirm: Confirm = nobody) -> None:
+    def __init__(self, unattended: int, confirm: Confirm = nobody) -> None:
         self.unattended = unattended
         self.cleared = 0  # faults cleared without asking
         self._confirm = confirm
@@ -31,13 +33,12 @@ class FaultClearing:
     def clear(self, cart: SerialCart, fault: int) -> None:
         """Clear the latched `fault` bits of the cart.
 
-        Raises FaultError if nobody agrees, or if the cause of a fault is still there.
+        Raises FaultError if nobody confirms, or if the cause of a fault is still there.
         """
         words = f"the cart latched a fault: {fault_words(fault)}"
-        if self.unattended is None or self.cleared < self.unattended:
+        if self.cleared < self.unattended:
             self.cleared += 1
-            level = logging.INFO if self.unattended is None else logging.WARNING
-            LOGGER.log(level, "%s; cleared without asking, %s of %s", words, self.cleared, self.unattended)
+            LOGGER.warning("%s; cleared without asking, %s of %s", words, self.cleared, self.unattended)
         elif not self._confirm(words):
             raise FaultError(f"{words}; {self._remedy()}")
         cart.clear_fault()

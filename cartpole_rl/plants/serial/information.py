@@ -1,7 +1,7 @@
-"""Checks that a cart is the kind of cart that everything above the wire takes it for, by its INFO.
+"""Checks by a cart's INFO that it is the kind of cart that this package drives.
 
-Positions, angles and forces are computed from constants: encoder counts a turn, metres a count, the range of
-motor values. A cart that uses other ones would be driven with every number off. It is therefore refused.
+Positions, angles and forces are computed from constants: encoder counts per turn, metres per count, the range
+of motor values. With a cart that has other constants every number would be wrong, so it is refused.
 """
 
 from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_COUNTS_PER_TURN
@@ -22,9 +22,11 @@ def check_scales(information: Info) -> None:
         "pole counts per turn": (information.pole_counts_per_turn, POLE_COUNTS_PER_TURN),
         "motor limit": (information.motor_limit, MOTOR_LIMIT),
     }
-    for name, (told, expected) in constants.items():
-        if told != expected:
-            raise NotReadyError(f"INFO says {name} {told}, not {expected}", "correct the firmware's settings")
+    for name, (reported, expected) in constants.items():
+        if reported != expected:
+            raise NotReadyError(
+                f"INFO says {name} {reported}, not {expected}", "correct the firmware's settings"
+            )
     if not SHORTEST_PERIOD_US <= information.period_us <= LONGEST_PERIOD_US:
         raise NotReadyError(
             f"INFO says period {information.period_us} us, not {SHORTEST_PERIOD_US} to {LONGEST_PERIOD_US}",

@@ -1,6 +1,6 @@
-"""Frames over an open serial port: bytes out at once, bytes in as they come, bad frames passed over.
+"""Frames over an open serial port: bytes go out at once, come in as they arrive, and bad frames are dropped.
 
-A receiver that starts in the middle of a frame, or meets noise, is right again at the next 0x00.
+A receiver that starts in the middle of a frame, or receives noise, is synchronized again at the next 0x00.
 """
 
 import time
@@ -25,8 +25,13 @@ class SerialLink:
         self.bytes_received = 0
         self.why_bad = ""  # what was wrong with the newest bad frame
 
+    @property
+    def port(self) -> str:
+        """Path or URL of the port."""
+        return str(self._port.port)
+
     def send(self, *messages: Message) -> int:
-        """Write the messages at once and return the sequence of the last. Raises LinkError."""
+        """Write the messages in one go and return the sequence of the last. Raises LinkError."""
         data = b""
         for message in messages:
             self.sequence = (self.sequence + 1) & 0xFF
@@ -35,7 +40,7 @@ class SerialLink:
         return self.sequence
 
     def write(self, data: bytes) -> None:
-        """Write bytes as they are, within the port's write timeout. Raises LinkError."""
+        """Write raw bytes within the port's write timeout. Raises LinkError."""
         try:
             self._port.write(data)
         except OSError as error:
@@ -43,14 +48,14 @@ class SerialLink:
         self.sent_at = time.perf_counter()
 
     def waiting(self) -> int:
-        """Bytes that have come and are not read yet. Raises LinkError."""
+        """Return the number of bytes that have arrived and are not read yet. Raises LinkError."""
         try:
             return self._port.in_waiting
         except OSError as error:
             raise self._broken("asked for bytes", error) from error
 
     def receive(self) -> list[Frame]:
-        """The frames that are here, in order; waits one read slice for a first byte. Raises LinkError."""
+        """Return the frames that have arrived; wait one read slice for a first byte. Raises LinkError."""
         try:
             data = self._port.read(self._port.in_waiting or 1)
         except OSError as error:
@@ -82,5 +87,5 @@ class SerialLink:
 
     def _broken(self, what: str, error: OSError) -> LinkError:
         return LinkError(
-            f"{self._port.port} cannot be {what} any more: {error}; is the cart unplugged or without power?"
+            f"{self.port} cannot be {what} any more: {error}; is the cart unplugged or without power?"
         )

@@ -1,7 +1,6 @@
-"""An armed cart on a wire that is moved a little at a time: what the preflight and the re-centring share."""
+"""An armed cart that is moved a little at a time: shared by the preflight and the re-centring."""
 
 import math
-from dataclasses import dataclass
 
 from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT
 from cartpole_rl.plants.serial.cart import SerialCart
@@ -15,24 +14,24 @@ LONGEST_REST = 10.0  # s
 SWING_SECONDS = 1.5  # a whole swing of the large pole takes 1.3 s
 
 
-@dataclass
 class ArmedCart:
     """An armed cart. Every move raises FaultError when it latches a fault. Times by the cart's clock."""
 
-    cart: SerialCart
+    def __init__(self, cart: SerialCart) -> None:
+        self.cart = cart
 
     def arm(self) -> State:
         """Arm the motor, at rest."""
         self.cart.start()
-        return self.seen(self.cart.get_state())
+        return self.check(self.cart.get_state())
 
     def drive(self, motor: int) -> State:
-        """One period under a motor value; the state at its end."""
+        """Apply a motor value for one period; return the state at its end."""
         self.cart.set_motor(motor)
-        return self.seen(self.cart.get_state())
+        return self.check(self.cart.get_state())
 
     def rest(self) -> State:
-        """Motor 0 until the cart stands. Raises NotReadyError if it never does."""
+        """Apply motor 0 until the cart stands. Raises NotReadyError if it never does."""
         states = [self.drive(0)]
         for _ in range(self.periods(LONGEST_REST)):
             states.append(self.drive(0))
@@ -45,9 +44,9 @@ class ArmedCart:
         )
 
     def calm(self, swing: int, patience: float) -> tuple[list[State], int]:
-        """Motor 0 until the pole swings by `swing` counts or less, peak to peak; no longer than `patience` s.
+        """Apply motor 0 until the pole swings by `swing` counts peak to peak or less, within `patience` s.
 
-        The states, and the swing that is left. A pole with little friction takes minutes to be still.
+        Returns the states and the swing that is left. A pole with little friction swings for minutes.
         """
         states = [self.rest()]
         for _ in range(self.periods(max(patience, SWING_SECONDS))):
@@ -63,21 +62,21 @@ class ArmedCart:
         return self.cart.information.period_us * 1e-6
 
     def periods(self, seconds: float) -> int:
-        """Control periods in a time."""
+        """Return the number of control periods in a time, rounded up."""
         return math.ceil(seconds / self.period)
 
-    def seen(self, state: State) -> State:
-        """Raise what is wrong with a state, or return it."""
+    def check(self, state: State) -> State:
+        """Return the state. Raises FaultError if it has a latched fault."""
         if state.fault:
             raise fault_error(state.fault)
         return state
 
 
 def metres(counts: int) -> float:
-    """Cart counts in m."""
+    """Return cart counts in m."""
     return counts * CART_METRES_PER_COUNT
 
 
 def spread(counts: list[int]) -> int:
-    """Largest less smallest count."""
+    """Return the largest minus the smallest count."""
     return max(counts) - min(counts)

@@ -1,7 +1,7 @@
-"""Finds and opens the serial port of a cart, and says in words why one cannot be found or opened.
+"""Find and open the serial port of a cart; say in words why it cannot be found or opened.
 
 An ESP32 board restarts when DTR or RTS rise, so both are set low before the port is opened. The operating
-system may still pulse them for a moment; `SerialCart` therefore says hello until the cart has booted.
+system may still pulse them for a moment; `SerialCart` therefore sends HELLO until the cart has booted.
 Source: Espressif, "Boot Mode Selection", esptool documentation; pyserial 3.5.
 """
 
@@ -21,7 +21,7 @@ AUTO = "auto"
 def open_port(port: str, baud: int, write_timeout: float) -> serial.SerialBase:
     """Open `port`, a device path or one of pyserial's URLs, for this process alone.
 
-    Raises PortError: it does not exist, is busy, may not be opened, or is not a serial port.
+    Raises PortError if it does not exist, is busy, may not be opened, or is not a serial port.
     """
     try:
         line = serial.serial_for_url(
@@ -41,12 +41,12 @@ def open_port(port: str, baud: int, write_timeout: float) -> serial.SerialBase:
 
 
 def resolved_port(port: str) -> str:
-    """`port`, or for "auto" the only one of this computer that may be a cart. Raises PortError."""
+    """Return `port`, or for "auto" the only port of this computer that may be a cart. Raises PortError."""
     return only_cart(found_ports()) if port == AUTO else port
 
 
 def only_cart(ports: Iterable[UsbPort]) -> str:
-    """Path of the only port that may be a cart. Raises PortError, which names those there are."""
+    """Return the path of the only port that may be a cart. Raises PortError, which names the ports found."""
     ports = list(ports)
     carts = cart_like(ports)
     if len(carts) == 1:
@@ -54,19 +54,19 @@ def only_cart(ports: Iterable[UsbPort]) -> str:
     if carts:
         raise PortError(
             f"port=auto: {len(carts)} of the ports may be the cart: {named(carts)}; choose one, as "
-            f"plant.port={carts[0].device}; `cartpole-find-port watch=true` tells which it is"
+            f"plant.port={carts[0].device}; `cartpole-find-port watch=true` shows which one it is"
         )
     others = f"; there are {named(ports)}" if ports else ""
     raise PortError(f"port=auto: no port looks like a cart{others}; plug the cart in, or give plant.port=...")
 
 
 def found_ports() -> list[UsbPort]:
-    """The USB serial ports of this computer."""
+    """Return the USB serial ports of this computer."""
     return usb_ports(list_ports.comports())
 
 
 def why_not_open(port: str, error: OSError | ValueError) -> str:
-    """One line: the port, what is wrong with it, and the remedy."""
+    """Return one line: the port, what is wrong with it, and the remedy."""
     number = getattr(error, "errno", None)
     if number in (errno.ENOENT, errno.ENODEV, errno.ENXIO):
         return (
@@ -84,5 +84,5 @@ def why_not_open(port: str, error: OSError | ValueError) -> str:
 
 
 def named(ports: Iterable[UsbPort]) -> str:
-    """The ports in one line: "/dev/ttyUSB0 (CH340), /dev/ttyUSB1 (FTDI)"."""
+    """Return the ports in one line: "/dev/ttyUSB0 (CH340), /dev/ttyUSB1 (FTDI)"."""
     return ", ".join(f"{port.device} ({described(port)})" for port in ports)

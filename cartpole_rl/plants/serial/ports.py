@@ -1,6 +1,6 @@
-"""Which serial ports there are, and which of them may be a cart: pure functions of pyserial's list of ports.
+"""USB serial ports, and those of them that may be a cart: pure functions of pyserial's list of ports.
 
-A board is known by the vendor id of the chip between its USB plug and its serial line.
+A board is recognized by the vendor id of the chip between its USB plug and its serial line.
 Source of the ids: the USB ID Repository, linux-usb.org/usb.ids.
 """
 
@@ -19,7 +19,7 @@ BOARDS = {  # vendor ids of chips on ESP32 and Arduino boards
 
 @dataclass(frozen=True, order=True)
 class UsbPort:
-    """A serial port on USB. Texts are empty where the device tells none."""
+    """A serial port on USB. Texts are empty where the device has none."""
 
     device: str  # path or name to open
     vendor: int  # USB vendor id
@@ -29,7 +29,7 @@ class UsbPort:
 
 
 def usb_ports(ports: Iterable[ListPortInfo]) -> list[UsbPort]:
-    """Those of pyserial's ports that are on USB, sorted; a computer's own lines have no vendor id."""
+    """Return pyserial's ports that are on USB, sorted; a computer's own ports have no vendor id."""
     return sorted(
         UsbPort(port.device, port.vid, port.pid or 0, port.product or "", port.serial_number or "")
         for port in ports
@@ -38,12 +38,12 @@ def usb_ports(ports: Iterable[ListPortInfo]) -> list[UsbPort]:
 
 
 def cart_like(ports: Iterable[UsbPort]) -> list[UsbPort]:
-    """The ports whose chip is one that carts have."""
+    """Return the ports whose chip is used on carts."""
     return [port for port in ports if port.vendor in BOARDS]
 
 
 def described(port: UsbPort) -> str:
-    """What a person may know the port by: its chip, its own name, its ids and serial number."""
+    """Describe a port to a person: its chip, its own name, its ids and serial number."""
     chip = BOARDS.get(port.vendor, "no chip that carts have")
     own = f" {port.name!r}" if port.name else ""
     number = f", serial number {port.serial_number}" if port.serial_number else ""
@@ -51,5 +51,5 @@ def described(port: UsbPort) -> str:
 
 
 def changes(before: Sequence[UsbPort], after: Sequence[UsbPort]) -> tuple[list[UsbPort], list[UsbPort]]:
-    """The ports that vanished and those that appeared, between two lists."""
+    """Return the ports that vanished and those that appeared, between two lists."""
     return sorted(set(before) - set(after)), sorted(set(after) - set(before))

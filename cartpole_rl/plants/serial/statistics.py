@@ -1,7 +1,8 @@
-"""What a serial link has been through: frames counted, and the time from a state to its command.
+"""Statistics of a serial link: counts of frames, and the time from a state to its command.
 
-The host's own share of that time is told to the microsecond, by its clock. The whole, from the measurement to
-the command's arrival at the cart, is told by the cart: its STATEs carry the age of the newest command.
+The host's own share of that time is measured with the host's clock, to the microsecond. The whole, from the
+measurement to the arrival of the command at the cart, is measured by the cart: its STATEs have the age of the
+newest command.
 """
 
 from dataclasses import dataclass, field
@@ -15,19 +16,19 @@ LATENCY_SAMPLES = 65536  # the newest 22 minutes at 50 Hz; 512 KiB
 
 
 class LatencyRing:
-    """The newest `LATENCY_SAMPLES` times in seconds. Memory is taken once and does not grow."""
+    """The newest `LATENCY_SAMPLES` times in seconds. Its memory does not grow."""
 
     def __init__(self) -> None:
         self._seconds = np.zeros(LATENCY_SAMPLES)
         self._added = 0
 
     def add(self, seconds: float) -> None:
-        """Store one time; the oldest is overwritten when the ring is full."""
+        """Store one time; when the ring is full, it replaces the oldest."""
         self._seconds[self._added % LATENCY_SAMPLES] = seconds
         self._added += 1
 
     def samples(self) -> NDArray[np.float64]:
-        """The stored times in s, in no particular order, shape [0 to LATENCY_SAMPLES]."""
+        """Return the stored times in s, in no particular order, shape [0 to LATENCY_SAMPLES]."""
         return self._seconds[: min(self._added, LATENCY_SAMPLES)].copy()
 
     def clear(self) -> None:
@@ -54,10 +55,10 @@ class LinkSummary:
 
 @dataclass
 class LinkStatistics:
-    """Running counts of one cart over all its connections, without those of opening a port."""
+    """Running counts of one cart over all its connections, without those made while opening a port."""
 
     frames_received: int = 0  # whole frames of the cart, of every type
-    bad_frames: int = 0  # bytes between two 0x00 that are no frame: checksum, stuffing, type, length
+    bad_frames: int = 0  # bytes between two 0x00 that are not a frame: checksum, stuffing, type, length
     lost_frames: int = 0  # states that never arrived whole, by the gaps in STATE's tick
     overtaken_frames: int = 0  # states that arrived after a newer one, and were dropped
     repeated_frames: int = 0  # states that arrived once more, and were dropped
@@ -66,7 +67,7 @@ class LinkStatistics:
     loop_times: LatencyRing = field(default_factory=LatencyRing)  # see `loop`
 
     def summary(self) -> LinkSummary:
-        """The counts and the latency's median, 99th and 99.9th percentile and maximum."""
+        """Return the counts, and the median, 99th and 99.9th percentile and maximum of the latency."""
         times = self.latency.samples() * 1e3
         percentiles = np.percentile(times, (50, 99, 99.9, 100)) if len(times) else np.full(4, np.nan)
         median, p99, p999, longest = percentiles.tolist()
@@ -85,12 +86,12 @@ class LinkStatistics:
         )
 
     def loop(self, share: float = 0.98) -> tuple[float, float]:
-        """[low, high] in s between which the middle `share` of the loop times lie.
+        """Return [low, high] in s, between which the middle `share` of the loop times lie.
 
-        From a state's measurement to the arrival of the command chosen on it, by the cart's clock: the wire
-        both ways, and the host between. What the cart takes from there to a force is not in it; the
-        `latency` of `cartpole-preflight` is that part. Raises PlantError without a sample, ValueError for a
-        share outside 0 to 1.
+        A loop time is the time from a state's measurement to the arrival of its command, by the cart's
+        clock: the wire both ways and the host between. The time from there to a force at the cart is not
+        included; `cartpole-preflight` measures it as `latency`. Raises PlantError without a sample,
+        ValueError for a share outside 0 to 1.
         """
         if not 0 <= share <= 1:
             raise ValueError(f"a share is between 0 and 1, not {share:g}")
@@ -101,10 +102,9 @@ class LinkStatistics:
         return low, high
 
     def latency_override(self) -> str | None:
-        """What hands the measured loop times to `cartpole-train`, as a word of its command line.
+        """Return the measured loop times as a setting on the command line of `cartpole-train`.
 
-        None where there is nothing to hand on: without a sample, or where every command came at once, as to
-        a lockstep emulator.
+        None without a sample, or if every command came at once, as with a lockstep emulator.
         """
         if not len(self.loop_times.samples()):
             return None
@@ -114,7 +114,7 @@ class LinkStatistics:
         return f"++randomization.latency={{distribution: uniform, absolute: [{low}, {high}]}}"
 
     def clear(self) -> None:
-        """Begin to count anew."""
+        """Reset all counts."""
         self.frames_received = self.bad_frames = self.lost_frames = self.late_ticks = 0
         self.overtaken_frames = self.repeated_frames = 0
         self.latency.clear()

@@ -1,0 +1,222 @@
+"""The checks of the preflight: small moves that show how a cart is wired and limited, and how quick it is.
+
+Each check moves the cart a few centimetres at most, brings it back to the middle, and returns its result in
+words. It raises NotReadyError, which says what is wrong and what to do about it.
+
+Signs: a positive motor value moves the cart to the right, and the cart's count goes up. The hanging pole of a
+cart that accelerates to the right stays behind: its tip swings left, its angle grows beyond pi, its count
+goes up.
+"""
+
+import math
+import statistics
+import time
+
+from cartpole_rl.physics.encoders import POLE_COUNTS_PER_TURN
+from cartpole_rl.plants.serial.cart import SerialCart
+from cartpole_rl.plants.serial.centring import LEFT, RIGHT
+from cartpole_rl.plants.serial.errors import NotReadyError
+from cartpole_rl.plants.serial.faults import FaultClearing
+from cartpole_rl.plants.serial.information import NANOMETRES_PER_COUNT, check_limits, check_scales
+from cartpole_rl.plants.serial.moves import GENTLE_MOTOR, metres
+from cartpole_rl.plants.serial.probe import MOVED, Probe
+from cartpole_rl.wire import Info, seconds_between, ticks_between
+
+QUESTIONS = 25  # asked over the link
+LOST_SHARE = 0.05  # of the frames; a good cable loses none
+PERIOD_TOLERANCE = 0.02  # of the period in INFO
+ROUND_TRIP_SHARE = 0.5  # of a period: a command that comes later acts in the next one
+
+SURELY_MOVED = 44  # counts, 1 mm
+POLE_MOVED = 14  # counts; more, where the pole still swings
+PUSH = 60  # motor values above the dead-band: about 1.5 m/s^2
+LONGEST_PUSH, FARTHEST_PUSH = 0.3, 0.035  # s, m
+DRIFT = 4  # periods over which a remaining swing is measured
+NO_SWING, LONG_PATIENCE = 6, 15.0  # counts peak to peak, s
+LARGEST_DEADBAND = 150  # motor value; of nine_levels the two weakest, 100 and 150, would not move such a cart
+STEPS = 4  # for the latency, two to each side
+LONGEST_LATENCY_PERIODS = 2.0  # agents are trained on up to about one period
+
+
+def link(cart: SerialCart) -> str:
+    """Check the period by the cart's own clock, the round trip, and that few frames get lost."""
+    cart.open()
+    first, trips = cart.poll_state(), []
+    for _ in range(QUESTIONS):
+        asked = time.perf_counter()
+        information = cart.info()
+        trips.append(time.perf_counter() - asked)
+        last = cart.poll_state()
+    trip, period = statistics.median(trips), information.period_us * 1e-6
+    measured = seconds_between(first.time_us, last.time_us) / max(1, ticks_between(first.tick, last.tick))
+    counted = cart.statistics
+    bad = counted.bad_frames + counted.lost_frames
+    if bad > LOST_SHARE * (counted.frames_received + counted.lost_frames):
+        raise NotReadyError(
+            f"{counted.lost_frames} frames were lost and {counted.bad_frames} spoilt of "
+            f"{counted.frames_received}",
+            "use a short shielded cable, away from the motor's, or baud=115200",
+        )
+    if abs(measured / period - 1) > PERIOD_TOLERANCE:
+        raise NotReadyError(
+            f"a period takes {measured * 1e3:.2f} ms by the cart's clock, not {period * 1e3:g} ms as it says",
+            "its firmware does too much in a period, or miscounts its time",
+        )
+    if trip > ROUND_TRIP_SHARE * period:
+        raise NotReadyError(
+            f"a question is answered after {trip * 1e3:.1f} ms, more than half a period",
+            "with an FTDI chip, set its latency_timer in /sys/bus/usb-serial/devices/ to 1; "
+            "end what keeps this computer busy",
+        )
+    version = (information.firmware_major, information.firmware_minor, information.firmware_patch)
+    return (
+        f"firmware {'.'.join(map(str, version))}, period {measured * 1e3:.2f} ms, "
+        f"round trip {trip * 1e3:.1f} ms, {bad} of {counted.frames_received} frames bad or lost"
+    )
+
+
+def limits(information: Info) -> str:
+    """Check that INFO describes the kind of cart that everything above the wire takes it for."""
+    check_scales(information)
+    check_limits(information)
+    soft, hard = metres(information.soft_limit_counts), metres(information.hard_limit_counts)
+    return (
+        f"soft {soft * 1e3:.0f} mm, hard {hard * 1e3:.0f} mm from the middle; {NANOMETRES_PER_COUNT} nm and "
+        f"1/{POLE_COUNTS_PER_TURN} turn a count"
+    )
+
+
+def homing(cart: SerialCart, faults: FaultClearing) -> str:
+    """Home; check that the cart is in the middle, the pole hangs, and the limits fit the track."""
+    if fault := cart.poll_state().fault:
+        faults.clear(cart, fault)
+    started_us = cart.get_state().time_us
+    state = cart.home()
+    limits(cart.information)
+    pole = (state.pole_counts - POLE_COUNTS_PER_TURN // 2) * 360 / POLE_COUNTS_PER_TURN
+    if abs(metres(state.cart_counts)) > 0.01 or abs(pole) > 2:
+        raise NotReadyError(
+            f"after homing the cart is {metres(state.cart_counts) * 1e3:+.0f} mm from the middle, "
+            f"the pole {pole:+.1f} deg from hanging",
+            "keep hands off during homing, check that no gear slips",
+        )
+    seconds = seconds_between(started_us, state.time_us)
+    off = metres(state.cart_counts) * 1e3
+    return f"{seconds:.0f} s; the cart {off:+.1f} mm from the middle, the pole {pole:+.1f} deg from hanging"
+
+
+def cart_direction(probe: Probe) -> str:
+    """Check that a positive motor value moves the count up. Arms the cart."""
+    probe.arm()
+    value, before, after = probe.ramp(RIGHT)
+    for _ in range(probe.periods(LONGEST_PUSH)):
+        if abs(after.cart_counts - before.cart_counts) >= SURELY_MOVED:
+            break
+        after = probe.drive(value + 10)
+    moved = after.cart_counts - before.cart_counts
+    if moved < 0:
+        raise NotReadyError(
+            f"motor value {value:+d} moves the cart's count down, by {-moved}",
+            "if the cart went right, swap its encoder's wires A and B; if it went left, swap the motor's two",
+        )
+    probe.deadband[RIGHT] = value
+    probe.centre()
+    return f"motor value {value:+d} moves the count up"
+
+
+def pole_direction(probe: Probe) -> str:
+    """Check that a push to the right leaves the hanging pole's tip behind, on the left: its count goes up.
+
+    A remaining swing is assumed to continue evenly during the push, and is subtracted.
+    """
+    states, swing = probe.calm(NO_SWING, LONG_PATIENCE)
+    before, drift = states[-1], (states[-1].pole_counts - states[-1 - DRIFT].pole_counts) / DRIFT
+    enough = max(POLE_MOVED, NO_SWING + swing // 2)
+    value = min(GENTLE_MOTOR, probe.deadband[RIGHT] + PUSH)
+    for period in range(1, probe.periods(LONGEST_PUSH) + 1):
+        after = probe.drive(value)
+        swung = round(after.pole_counts - before.pole_counts - drift * period)
+        if abs(swung) >= enough or metres(abs(after.cart_counts - before.cart_counts)) > FARTHEST_PUSH:
+            break
+    if abs(swung) < enough:
+        raise NotReadyError(
+            f"the pole's count does not follow a push of the cart; it changed by {swung:+d}, and swung by "
+            f"{swing} before",
+            "check the cable of the pole's encoder, and that the pole is screwed to its shaft",
+        )
+    probe.centre()
+    if swung < 0:
+        raise NotReadyError(
+            f"a push to the right moves the hanging pole's count down, by {-swung}",
+            "swap the wires A and B of the pole's encoder, or turn its sign in the firmware",
+        )
+    return f"a push to the right swings the hanging pole to the left, {swung:+d} counts"
+
+
+def deadband(probe: Probe) -> str:
+    """Measure the smallest motor value that moves the cart, to each side."""
+    for side in (RIGHT, LEFT):
+        probe.deadband[side], _, _ = probe.ramp(side)
+        probe.centre()
+    right, left = probe.deadband[RIGHT], probe.deadband[LEFT]
+    if max(right, left) > LARGEST_DEADBAND:
+        raise NotReadyError(
+            f"it takes a motor value of {right:+d} to move the cart right, {-left:+d} left",
+            "clean the track and the rack, loosen what rubs, check the motor's supply voltage",
+        )
+    return f"{right:+d} moves the cart right, {-left:+d} left"
+
+
+def latency(probe: Probe) -> str:
+    """Measure the time from a motor value's arrival at the cart to the start of the motion."""
+    measured = [step_latency(probe, side) for side in (RIGHT, LEFT) * (STEPS // 2)]
+    middle = statistics.median(seconds for seconds, _ in measured)
+    age = statistics.median(age for _, age in measured)
+    if middle > LONGEST_LATENCY_PERIODS * probe.period:
+        raise NotReadyError(
+            f"the cart begins to move {middle * 1e3:.0f} ms after it took a motor value, which is "
+            f"{middle / probe.period:.1f} periods",
+            "look for a ramp or a filter in the motor driver, and for play in the gears",
+        )
+    return (
+        f"the cart begins to move {middle * 1e3:.0f} ms after it took a motor value; the first state that "
+        f"knew of the value had a command age of {age * 1e3:.0f} ms"
+    )
+
+
+def step_latency(probe: Probe, side: int) -> tuple[float, float]:
+    """Return the latency of one motor step from rest, and the command age in the first state after it, in s.
+
+    With constant acceleration the distance grows with the square of the time since the start of the motion;
+    two states during the motion give that start more precisely than a period.
+    """
+    before = probe.settle()
+    value = side * min(GENTLE_MOTOR, probe.deadband[side] + PUSH)
+    states = [probe.drive(value)]
+    age = states[0].command_age_ms * 1e-3
+    taken_us = states[0].time_us - states[0].command_age_ms * 1000
+    for _ in range(probe.periods(LONGEST_PUSH)):
+        states.append(probe.drive(value))
+        distances = [side * (state.cart_counts - before.cart_counts) for state in states[-2:]]
+        if MOVED <= distances[0] < distances[1]:
+            break
+    probe.centre()
+    if not MOVED <= distances[0] < distances[1]:
+        raise NotReadyError(
+            f"motor value {value:+d} does not move the cart evenly within {LONGEST_PUSH:g} s",
+            "free the cart; look for a ramp or a filter in the motor driver",
+        )
+    first, second = (seconds_between(taken_us, state.time_us) for state in states[-2:])
+    ratio = math.sqrt(distances[0] / distances[1])
+    return max(0.0, (first - ratio * second) / (1 - ratio)), age
+
+
+def soft_limit(probe: Probe) -> str:
+    """Check that none of the moves came near the end of the track."""
+    limit = probe.cart.information.soft_limit_counts
+    if probe.limited or probe.farthest >= limit:
+        raise NotReadyError(
+            f"the soft limit was reached {metres(probe.farthest) * 1e3:.0f} mm from the middle",
+            "check the firmware's limits and the zero that homing set",
+        )
+    return f"not reached; the cart stayed within {metres(probe.farthest) * 1e3:.0f} mm of the middle"

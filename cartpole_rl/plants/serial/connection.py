@@ -1,0 +1,233 @@
+"""One open connection to a cart: questions, their answers, and the newest state.
+
+A question is repeated until the cart answers it with ACK, NACK or INFO. A motor value is not: the cart
+acknowledges it in its next STATE, which has the sequence of the last frame taken.
+
+`current_state` returns the newest state, and only one that was measured after the cart took the last frame,
+so that a loop never mistakes an older state for the effect of its command. A frame that was lost is never
+acknowledged; one and a half periods after it was sent the newest state is returned anyway.
+
+If nothing arrives for `nudge_after` seconds, the host sends HELLO. That is harmless to a cart with its own
+clock. A lockstep emulator, which advances by one period per frame, continues after a lost frame.
+"""
+
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import TypeVar
+
+from cartpole_rl.errors import LinkError
+from cartpole_rl.plants.serial.errors import refusal
+from cartpole_rl.plants.serial.information import LONGEST_PERIOD_US
+from cartpole_rl.plants.serial.link import SerialLink
+from cartpole_rl.plants.serial.settings import SerialSettings
+from cartpole_rl.plants.serial.tracking import StateTracker
+from cartpole_rl.wire import (
+    Ack,
+    Flags,
+    Hello,
+    Info,
+    Message,
+    MessageType,
+    Nack,
+    SetMotor,
+    State,
+)
+from cartpole_rl.wire.frames import END
+
+Answer = TypeVar("Answer", bound=Message)
+
+BACKLOG_BYTES = 1000  # with more waiting, the system's buffer (4096) may have dropped newer bytes
+UNACKNOWLEDGED_PERIODS = 1.5  # after a frame: by then the next state has come, if the frame has arrived
+KEPT_ANSWERS = 64
+
+
+class Connection:
+    """Questions, answers and states over `link`. Every method raises LinkError if the cart is gone."""
+
+    def __init__(self, link: SerialLink, settings: SerialSettings, tracker: StateTracker) -> None:
+        self.link = link
+        self._settings = settings
+        self._tracker = tracker
+        self._answers: deque[Message] = deque(maxlen=KEPT_ANSWERS)
+        self._asked_sequence = 0  # of the newest question; older refusals of motor values are void
+        self._refused: Nack | None = None  # of a motor value
+        self._refused_sequence = -1  # of the newest frame that was refused; no state will acknowledge it
+        self._state_since_refusal = True
+
+    def shake_hands(self) -> Info:
+        """Send HELLO until the cart answers. Whatever a booting board prints before is ignored."""
+        deadline = time.perf_counter() + self._settings.connect_timeout
+        pause = min(self._settings.answer_timeout, self._settings.connect_timeout)
+        while time.perf_counter() < deadline:
+            self._answers.clear()
+            self.link.write(END)  # ends whatever the cart has taken for the start of a frame
+            self.link.send(Hello())
+            until = min(deadline, time.perf_counter() + pause)
+            answer = self._await_answer(until, (), Info, lambda info: True)
+            if answer is not None:
+                return answer
+        raise LinkError(f"no cart answers on {self.link.port}: {self._what_came()}")
+
+    def request(
+        self,
+        message: Message,
+        kind: type[Answer],
+        fits: Callable[[Answer], bool] = lambda answer: True,
+        before: tuple[Message, ...] = (),
+    ) -> Answer:
+        """Send `before` and `message` until the cart answers `message`; return the answer.
+
+        Raises RefusedError or FaultError for a NACK, LinkError without an answer.
+        """
+        self._tracker.send_question()
+        self._refused_sequence = -1
+        self._answers.clear()
+        asked: list[int] = []
+        for _ in range(1 + self._settings.retries):
+            asked.append(self.link.send(*before, message))
+            self.notice_backlog()
+            self._asked_sequence = asked[-1]
+            deadline = time.perf_counter() + self._settings.answer_timeout
+            answer = self._await_answer(deadline, asked, kind, fits)
+            if answer is not None:
+                self._refused = None  # of an earlier motor value, which has no meaning any more
+                return answer
+        raise LinkError(
+            f"the cart on {self.link.port} did not answer {message.TYPE.name}, asked {len(asked)} times: "
+            "check its cable and power"
+        )
+
+    def send_motor(self, value: int) -> None:
+        """Send a motor value once."""
+        self._refused_sequence = -1
+        self.link.send(SetMotor(value))
+        self._tracker.send_command(self.link.sequence, self.link.sent_at)
+
+    def current_state(self) -> State:
+        """Wait for the newest state that was measured after the cart took the last frame.
+
+        Raises RefusedError or FaultError if the cart refused the last motor value, LinkError if no state
+        arrives within `timeout` or the cart's clock stands still.
+        """
+        state = self._await_current(time.perf_counter() + self._settings.timeout)
+        self._raise_stopped_clock()
+        refused, self._refused = self._refused, None
+        if refused is not None and not state.fault:
+            raise refusal(refused)
+        self._tracker.hand_out(state)
+        return state
+
+    def state_since_question(self) -> State:
+        """Wait for a state that was measured after the cart took the newest question."""
+        deadline = time.perf_counter() + self._settings.timeout
+        while True:
+            state = self.current_state()
+            if (state.last_sequence - self._asked_sequence) % 256 < 128:
+                return state
+            if time.perf_counter() > deadline:
+                raise LinkError(
+                    f"the states of the cart on {self.link.port} acknowledge no frame; correct its firmware"
+                )
+
+    def notice_backlog(self) -> bool:
+        """Return True if so many bytes wait that newer states may have been dropped: they are not lost."""
+        backlog = self.link.waiting() > BACKLOG_BYTES
+        if backlog:
+            self._tracker.catch_up()
+        return backlog
+
+    def _await_answer(
+        self, deadline: float, asked: Sequence[int], kind: type[Answer], fits: Callable[[Answer], bool]
+    ) -> Answer | None:
+        while True:
+            for answer in self._answers:
+                if isinstance(answer, Ack | Nack) and answer.sequence not in asked:
+                    continue
+                if isinstance(answer, Nack):
+                    raise refusal(answer)
+                if isinstance(answer, kind) and fits(answer):
+                    return answer
+            if time.perf_counter() >= deadline:
+                return None
+            self._answers.clear()
+            self._read()
+
+    def _await_current(self, deadline: float) -> State:
+        """The newest state that acknowledges the last frame; when that is overdue, the newest there is."""
+        older: State | None = None
+        while True:
+            while self.link.waiting():
+                self._read()
+            state = self._tracker.take_newest()
+            if state is None:
+                self._read()
+                state = self._tracker.take_newest()
+            if state is not None and older is not None:
+                self._tracker.count_passed_over()
+            older = state or older
+            if older is None:
+                self._endure_silence(deadline)
+            elif self._is_current(older):
+                return older
+
+    def _is_current(self, state: State) -> bool:
+        """Whether the state was measured after the cart took the last frame, or that frame must be lost."""
+        link = self.link
+        if link.sequence == state.last_sequence:
+            return True
+        if link.sequence == self._refused_sequence and self._state_since_refusal:
+            return True
+        waited = time.perf_counter() - link.sent_at
+        period_us = min(self._tracker.period_us or LONGEST_PERIOD_US, LONGEST_PERIOD_US)
+        return waited > UNACKNOWLEDGED_PERIODS * period_us * 1e-6
+
+    def _endure_silence(self, deadline: float) -> None:
+        """Raise LinkError after the deadline; send HELLO after each `nudge_after` seconds without a byte."""
+        now = time.perf_counter()
+        if now > deadline:
+            raise LinkError(
+                f"no state came from {self.link.port} for {self._settings.timeout:g} s: "
+                "check the cart's cable and power"
+            )
+        if now - max(self.link.received_at, self.link.sent_at) > self._settings.nudge_after:
+            self.link.send(Hello())
+
+    def _read(self) -> None:
+        """Take in what has arrived; wait a little for a first byte."""
+        for frame in self.link.receive():
+            message = frame.message
+            if isinstance(message, State):
+                if self._tracker.receive(message, Flags(frame.flags), self.link.received_at):
+                    self._state_since_refusal = True
+            elif isinstance(message, Nack):
+                self._take_refusal(message)
+            else:
+                self._answers.append(message)
+
+    def _take_refusal(self, nack: Nack) -> None:
+        self._refused_sequence = nack.sequence
+        self._state_since_refusal = False
+        if nack.type != MessageType.SET_MOTOR:
+            self._answers.append(nack)
+        elif (nack.sequence - self._asked_sequence) % 256 < 128:
+            self._refused = nack  # `current_state` raises it
+
+    def _raise_stopped_clock(self) -> None:
+        stopped, self._tracker.stopped_clock = self._tracker.stopped_clock, None
+        if stopped is not None:
+            last, state = stopped
+            raise LinkError(
+                f"the clock of the cart on {self.link.port} does not advance: STATE {last.tick} is of "
+                f"{last.time_us} us, STATE {state.tick} of {state.time_us} us; correct its firmware"
+            )
+
+    def _what_came(self) -> str:
+        link = self.link
+        if link.bytes_received == 0:
+            return "nothing came; is it powered, and is this the right port?"
+        if not link.why_bad:
+            return f"{link.bytes_received} bytes came but no frame; is {self._settings.baud} its baud rate?"
+        return (
+            f"{link.bytes_received} bytes came, the last bad frame: {link.why_bad}; right port, right baud?"
+        )

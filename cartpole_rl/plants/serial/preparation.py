@@ -1,0 +1,155 @@
+"""Preparing an episode: clear faults, find the middle of the track, set the period, wait for the pole.
+
+The first preparation homes the cart; later ones bring it back to the middle, which is quicker. After a fault,
+a restart or a lost link the zeros may be wrong, and the cart is homed again.
+"""
+
+import logging
+import math
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+from cartpole_rl.errors import LinkError, PlantError
+from cartpole_rl.plants.serial.cart import RESTARTED, SerialCart
+from cartpole_rl.plants.serial.faults import FaultClearing
+from cartpole_rl.plants.serial.recentring import recentre
+from cartpole_rl.wire import Flags, State, microseconds_between
+
+LOGGER = logging.getLogger(__name__)
+
+STILL_SECONDS = 0.3  # by the cart's clock, for which the pole has to stay
+
+StartPosition = Literal["hanging", "upright"]
+
+
+@dataclass(frozen=True)
+class PolePosition:
+    """A position of the pole in which an episode starts. Angles in rad, 0 upright."""
+
+    angle: float
+    tolerance: float
+    sway: float  # largest minus smallest angle of a pole that counts as still
+    remedy: str  # if the pole does not get there
+
+
+POSITIONS: dict[StartPosition, PolePosition] = {
+    "upright": PolePosition(
+        0.0,
+        math.radians(3),
+        math.radians(1.5),  # a hand is never quite still
+        "hold it up by hand until the cart begins to move",
+    ),
+    "hanging": PolePosition(
+        math.pi,
+        math.radians(5),
+        math.radians(1),  # homing accepts eight counts of 4096 a turn
+        "let it hang until it is still; it may not be touched during homing",
+    ),
+}
+
+
+class Preparation:
+    """Prepares episodes on a connected cart. `prompt` shows a person what to do."""
+
+    def __init__(
+        self,
+        cart: SerialCart,
+        start: StartPosition,
+        control_period: float,
+        faults: FaultClearing,
+        prompt: Callable[[str], None],
+    ) -> None:
+        self.start: StartPosition = start
+        self.control_period = control_period  # s
+        self._cart = cart
+        self._faults = faults
+        self._prompt = prompt
+        self._hanging: int | None = None  # pole count at rest after homing; None if the cart has to be homed
+
+    def require_homing(self) -> None:
+        """Home in the next preparation, as the zeros may be wrong."""
+        self._hanging = None
+
+    def prepare(self) -> None:
+        """Bring the cart to the middle and wait for the pole; the cart is disarmed.
+
+        Raises FaultError for a fault that does not clear or that nobody agrees to clear, or for a homing that
+        fails; PlantError if the pole does not reach its position in time; LinkError.
+        """
+        restarts = self._cart.restarts
+        try:
+            self._prepare_once()
+        except PlantError:
+            if self._cart.restarts == restarts:
+                raise
+            self.require_homing()
+            self._prepare_once()  # a cart that restarts twice is given up
+
+    def _prepare_once(self) -> None:
+        self._clear_faults()
+        if not self._recentred():
+            self.require_homing()
+            self._hanging = self._cart.home().pole_counts
+        period_us = round(self.control_period * 1e6)
+        if self._cart.info().period_us != period_us:  # the cart may have restarted since it was last asked
+            self._cart.set_period(period_us)
+        self._cart.get_state()  # read before the next question, so that a lockstep run is repeatable
+        if self.start == "upright":
+            self._prompt("Hold the pole upright and still; let go when the cart begins to move.")
+        self._await_pole(POSITIONS[self.start])
+
+    def _clear_faults(self) -> None:
+        """Clear latched faults if there are any and somebody agrees. Raises FaultError."""
+        if fault := self._cart.poll_state().fault:
+            self.require_homing()
+            self._faults.clear(self._cart, fault)
+
+    def _recentred(self) -> bool:
+        """Bring the cart to the middle without homing; False if it has to be homed. Raises LinkError."""
+        homed = bool(self._cart.flags & Flags.HOMED)
+        if self._cart.settings.rehome == "always" or self._hanging is None or not homed:
+            return False
+        try:
+            recentre(self._cart, self._hanging)
+        except LinkError:
+            raise
+        except PlantError as error:
+            LOGGER.warning("homing, as the cart could not be brought back to the middle: %s", error)
+            self._clear_faults()
+            return False
+        return True
+
+    def _await_pole(self, position: PolePosition) -> None:
+        """Wait until the pole stays still in the position. Raises PlantError after `start_timeout`."""
+        timeout = self._cart.settings.start_timeout
+        window: deque[tuple[int, float]] = deque()  # (us, rad) of the last STILL_SECONDS
+        deadline = time.perf_counter() + timeout
+        while True:
+            state = self._cart.poll_state()
+            if not self._cart.flags & Flags.HOMED:
+                raise LinkError(RESTARTED)
+            pole = self._pole_angle(state)
+            off = math.remainder(pole - position.angle, 2 * math.pi)
+            window.append((state.time_us, pole))
+            if abs(off) > position.tolerance or _spread(window) > position.sway:
+                window.clear()
+            elif microseconds_between(window[0][0], state.time_us) >= STILL_SECONDS * 1e6:
+                return
+            if time.perf_counter() > deadline:
+                raise PlantError(
+                    f"waited {timeout:g} s for the pole to be still within "
+                    f"{math.degrees(position.tolerance):.0f} deg of {self.start}; "
+                    f"it is {math.degrees(off):+.1f} deg off: {position.remedy}"
+                )
+
+    def _pole_angle(self, state: State) -> float:
+        return 2 * math.pi * state.pole_counts / self._cart.information.pole_counts_per_turn
+
+
+def _spread(window: deque[tuple[int, float]]) -> float:
+    """Return the largest minus the smallest angle in rad."""
+    angles = [angle for _, angle in window]
+    return max(angles) - min(angles)

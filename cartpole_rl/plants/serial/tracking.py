@@ -1,0 +1,169 @@
+"""Tracking of the cart's states: which one is the newest, what was lost on the way, what came too late.
+
+Only a state with a newer tick becomes the newest. A tick at or a little below the newest one belongs to a
+state that was repeated, or overtaken by a newer one: it is dropped. A tick far below it means that the cart
+has restarted.
+
+Late ticks are counted while the host answers states with motor values: each state that was passed over, and
+each state whose command was sent more than a period after the state had arrived. The second is counted only
+if the cart's tick advanced meanwhile: a lockstep emulator waits for the host, so nothing is late there.
+
+There is no I/O and no clock here: the caller passes the times, in s of `time.perf_counter`.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from cartpole_rl.plants.serial.information import LONGEST_PERIOD_US
+from cartpole_rl.plants.serial.statistics import LinkStatistics
+from cartpole_rl.wire import Flags, State, microseconds_between, ticks_between, went_back
+
+HALF_MILLISECOND = 500  # us
+OVERTAKEN_TICKS = 16  # 0.3 s: no frame is delayed for longer, and no cart boots and is driven so soon
+
+
+class StateTracker:
+    """The states of one cart, and `statistics` of them over all its connections."""
+
+    def __init__(self) -> None:
+        self.statistics = LinkStatistics()
+        self.flags = Flags(0)  # of the newest state
+        self.restarts = 0  # of the cart, while the port was open
+        self.period_us: int | None = None  # by INFO; None before the first INFO of a connection
+        self.newest_at = 0.0  # when the newest state arrived
+        self.awaits_command = False  # a state was handed out, and its command is not sent yet
+        self.measuring = True  # latencies and late ticks are counted
+        self.stopped_clock: tuple[State, State] | None = None  # two states between which no time passed
+        self._newest: State | None = None  # arrived, and not handed out yet
+        self._last: State | None = None  # the newest that arrived, handed out or not
+        self._missing: set[int] = set()  # ticks that were counted as lost, and may still arrive
+        self._catching_up = False  # the operating system dropped states while the host was busy
+        self._driving = False  # states are answered with motor values
+        self._handed_out: State | None = None
+        self._overdue: State | None = None  # its command was sent more than a period after it arrived
+        self._commanded: tuple[int, State] | None = None  # sequence of a motor value, and the state before it
+
+    @contextmanager
+    def uncounted(self) -> Iterator[LinkStatistics]:
+        """Count into statistics that are thrown away: a boot banner is no fault of the link."""
+        kept, self.statistics = self.statistics, LinkStatistics()
+        try:
+            yield self.statistics
+        finally:
+            self.statistics = kept
+            self._missing.clear()
+
+    def disconnect(self) -> None:
+        """Forget the states of this connection; the cart may restart before the next one."""
+        self._newest = self._last = self.stopped_clock = self.period_us = None
+        self._missing.clear()
+
+    def receive(self, state: State, flags: Flags, arrived_at: float) -> bool:
+        """Take in a state that has arrived; return True if it is the newest now."""
+        last = self._last
+        if last is not None:
+            if ticks_between(state.tick, last.tick) < OVERTAKEN_TICKS:
+                self._count_dropped(state.tick)
+                return False
+            ticks = ticks_between(last.tick, state.tick)
+            if went_back(ticks):
+                self.restarts += 1
+            else:
+                self._check_clock(last, state, ticks)
+                self._count_missing(state.tick, ticks - 1)
+        if self._newest is not None:
+            self.count_passed_over()
+        self._last = self._newest = state
+        self.newest_at = arrived_at
+        self.flags = flags
+        return True
+
+    def take_newest(self) -> State | None:
+        """Return the newest state if it was not returned before."""
+        state, self._newest = self._newest, None
+        return state
+
+    def hand_out(self, state: State) -> None:
+        """Note that `state` is handed to the caller, who may answer it with a motor value."""
+        self._count_overdue(state)
+        self._time_loop(state)
+        self._catching_up, self.awaits_command, self._handed_out = False, True, state
+
+    def send_command(self, sequence: int, sent_at: float) -> None:
+        """Note that a motor value was sent."""
+        if not self.awaits_command:
+            return
+        self.awaits_command = False
+        if not self.measuring:
+            return
+        assert self.period_us is not None  # a state was handed out, so INFO is known
+        self._driving = True
+        self._commanded = None if self._handed_out is None else (sequence, self._handed_out)
+        delay = sent_at - self.newest_at
+        self.statistics.latency.add(delay)
+        self._overdue = self._handed_out if delay > self.period_us * 1e-6 else None
+
+    def send_question(self) -> None:
+        """Note that something else than a motor value is sent: waiting for its answer is no delay."""
+        self._driving = self.awaits_command = False
+        self._overdue = self._commanded = None
+
+    def catch_up(self) -> None:
+        """Note that states were dropped while the host was busy: until the next `hand_out` none are lost."""
+        self._catching_up = True
+
+    def count_passed_over(self) -> None:
+        """Count a state that was not answered, if motor values are being sent."""
+        if self._driving:
+            self.statistics.late_ticks += 1
+
+    def _check_clock(self, last: State, state: State, ticks: int) -> None:
+        """Note it if the cart's clock did not advance between two states: no velocity can be computed.
+
+        After 36 minutes without a state the clock may have wrapped; it is not checked then.
+        """
+        if self.period_us is None:
+            return
+        passed = microseconds_between(last.time_us, state.time_us)
+        long_ago = went_back(ticks * min(self.period_us, LONGEST_PERIOD_US))
+        if passed == 0 or (went_back(passed) and not long_ago):
+            self.stopped_clock = last, state
+
+    def _count_missing(self, tick: int, states: int) -> None:
+        """Count states before `tick` that did not arrive: lost on the way, or dropped by a busy host."""
+        if not self._catching_up:
+            self.statistics.lost_frames += states
+            newest = min(states, OVERTAKEN_TICKS)
+            missing = self._missing | {ticks_between(age, tick) for age in range(1, newest + 1)}
+            self._missing = {each for each in missing if ticks_between(each, tick) < OVERTAKEN_TICKS}
+        elif self._driving:
+            self.statistics.late_ticks += states
+
+    def _count_dropped(self, tick: int) -> None:
+        """Count a state that was overtaken, and so was not lost, or that arrived twice."""
+        statistics = self.statistics
+        if tick in self._missing:
+            self._missing.remove(tick)
+            statistics.lost_frames = max(0, statistics.lost_frames - 1)  # its loss may not have been counted
+            statistics.overtaken_frames += 1
+        else:
+            statistics.repeated_frames += 1
+
+    def _count_overdue(self, state: State) -> None:
+        """Count a state whose command took over a period, if more than one tick lies between by the cart."""
+        overdue, self._overdue = self._overdue, None
+        if overdue is not None and ticks_between(overdue.tick, state.tick) != 1:
+            self.statistics.late_ticks += 1
+
+    def _time_loop(self, state: State) -> None:
+        """Note the time from the measurement of a state to the arrival of its command at the cart.
+
+        STATE has the age of the command in whole milliseconds, rounded down: half a millisecond is added.
+        """
+        commanded, self._commanded = self._commanded, None
+        if commanded is None or state.last_sequence != commanded[0]:
+            return
+        passed_us = microseconds_between(commanded[1].time_us, state.time_us)
+        if not went_back(passed_us):  # otherwise the cart has restarted
+            until_arrival_us = passed_us - 1000 * state.command_age_ms - HALF_MILLISECOND
+            self.statistics.loop_times.add(max(0, until_arrival_us) * 1e-6)
