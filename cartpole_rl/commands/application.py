@@ -11,6 +11,7 @@ import sys
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import NoReturn, TypeVar
 
@@ -18,13 +19,13 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.types import RunMode
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from cartpole_rl.choices import conf_folder
 from cartpole_rl.commands.choice_files import with_choice_files
 from cartpole_rl.commands.complaints import dashed_setting, in_one_line
-from cartpole_rl.commands.composition import as_mapping
+from cartpole_rl.commands.composition import as_mapping, choices_of
 from cartpole_rl.errors import CartPoleError, ConfigError
 from cartpole_rl.settings import Settings
 from cartpole_rl.signals import RaiseOnce, ending_signals
@@ -75,6 +76,7 @@ def application(name: str, schema: type[Config]) -> Callable[[Body[Config]], Cal
             handler.handle(*ending_signals())
             if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
                 handler.handle(signal.SIGINT)
+            OmegaConf.register_new_resolver("choices_of", partial(choices_of, name, schema), replace=True)
             os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra's errors come here, not to the screen
             try:
                 if dashed := dashed_setting(sys.argv[1:]):

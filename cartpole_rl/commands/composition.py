@@ -7,7 +7,7 @@ from contextlib import suppress
 from datetime import datetime
 from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
@@ -16,6 +16,8 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 
 from cartpole_rl.choices import default_choices
 from cartpole_rl.emulator.settings import EmulatorSettings
+from cartpole_rl.settings import Settings
+from cartpole_rl.workflows.config import EvaluateConfig
 
 LONGEST_NAME = 150  # characters; file systems take 255
 
@@ -63,14 +65,27 @@ def job_name(number: int, overrides: Sequence[str]) -> str:
     return "_".join((str(number), *plain))[:LONGEST_NAME]
 
 
-def choices_of(command: str) -> str:
+def choices_of(command: str, schema: type[Settings]) -> str:
     """Return the groups that cartpole-<command> reads, for its --help: a line each, with all choices.
 
-    Choices in folders of a user's own are among them.
+    Choices in folders of a user's own are listed too; plants that `schema` does not take are not.
     """
     loader = GlobalHydra.instance().config_loader()
-    groups = sorted(group for group in default_choices(command) if "/" not in group)
-    return "".join(f"{group}: {', '.join(sorted(loader.get_group_options(group)))}\n" for group in groups)
+    refused = {"plant": plant_kinds(EvaluateConfig) - plant_kinds(schema)}
+    lines = [
+        f"  {group}: {', '.join(sorted({*loader.get_group_options(group)} - refused.get(group, set())))}\n"
+        for group in sorted(default_choices(command))
+    ]
+    return "".join(("Choices (group=choice)\n", *lines, "\n")) if lines else ""
+
+
+def plant_kinds(schema: type[Settings]) -> set[str]:
+    """Return the choices of plant= that a command with the settings `schema` takes."""
+    if "plant" not in schema.model_fields:
+        return set()
+    annotation = schema.model_fields["plant"].annotation
+    classes = get_args(annotation) or (annotation,)
+    return {kind for plant in classes for kind in get_args(plant.model_fields["kind"].annotation)}
 
 
 def as_mapping(composed: DictConfig) -> dict[str, Any]:
@@ -87,6 +102,5 @@ def _without_missing(tree: Any) -> Any:
 OmegaConf.register_new_resolver("run_folder", run_folder, use_cache=True)
 OmegaConf.register_new_resolver("sweep_folder", sweep_folder, use_cache=True)
 OmegaConf.register_new_resolver("job_name", job_name)
-OmegaConf.register_new_resolver("choices_of", choices_of)
 # conf/emulator/ builds on this one: the settings class is where its numbers stand
 ConfigStore.instance().store(group="emulator", name="medium", node=EmulatorSettings().model_dump(mode="json"))
