@@ -22,6 +22,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from cartpole_rl.checking import checked
 from cartpole_rl.choices import conf_folder
 from cartpole_rl.commands.choice_files import with_choice_files
 from cartpole_rl.commands.complaints import dashed_setting, in_one_line
@@ -29,7 +30,6 @@ from cartpole_rl.commands.composition import as_mapping, choices_of
 from cartpole_rl.errors import CartPoleError, ConfigError
 from cartpole_rl.settings import Settings
 from cartpole_rl.signals import RaiseOnce, ending_signals
-from cartpole_rl.workflows.checking import checked
 from cartpole_rl.workflows.person import tell
 
 INTERRUPTED, SIGNALLED = 130, 128  # what a shell reports: for SIGINT, and plus its number for another signal

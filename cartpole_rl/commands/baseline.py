@@ -2,8 +2,8 @@
 
 import hydra
 
+from cartpole_rl.checking import checked
 from cartpole_rl.commands.composition import as_mapping
-from cartpole_rl.workflows.checking import checked
 from cartpole_rl.workflows.config import TrainConfig
 
 

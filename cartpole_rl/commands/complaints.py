@@ -8,8 +8,8 @@ import hydra
 from hydra.errors import HydraException, OverrideParseException
 from omegaconf import OmegaConf
 
+from cartpole_rl.checking import no_such_setting, setting_names
 from cartpole_rl.choices import conf_folder
-from cartpole_rl.workflows.checking import no_such_setting, setting_names
 
 HYDRA_OPTIONS = ("--config-", "--package", "--info", "--cfg", "--experimental-rerun")
 

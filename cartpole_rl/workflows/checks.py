@@ -14,13 +14,12 @@ from cartpole_rl.errors import ConfigError
 from cartpole_rl.learning.checkpoint_files import FOLDER, LAST, find_agent, find_training
 from cartpole_rl.physics.bounds import check_names, check_value, check_values
 from cartpole_rl.plants.model_file import find_model
-from cartpole_rl.randomization.checks import check_carts
-from cartpole_rl.randomization.poles import PoleSettings
+from cartpole_rl.plants.settings import LearnedSettings
+from cartpole_rl.randomization.checks import check_carts, check_one_pole
 from cartpole_rl.workflows.config import (
     EvaluateConfig,
     FinetuneConfig,
     IdentifyConfig,
-    LearnedSettings,
     ModelConfig,
     ReplayConfig,
     TrainConfig,
@@ -121,12 +120,6 @@ def check_model(plant: LearnedSettings) -> None:
     """Raise CheckpointError or ConfigError where plant.model= names no learned model."""
     check_program("plant.model", plant.model, "model")
     find_model(plant.model)
-
-
-def check_one_pole(what: str, pole: PoleSettings) -> None:
-    """Raise ConfigError where `what`, which has one pole, is given several."""
-    if pole.choices is None or len(pole.choices) > 1:
-        raise ConfigError(f"pole: {what} has one pole, not {pole.name}; choose one, as pole=medium")
 
 
 def check_parameters(given: Mapping[str, float]) -> None:

@@ -16,6 +16,9 @@ from torch import nn
 from tqdm import tqdm
 
 from cartpole_rl.agents.dqn import QAgent
+from cartpole_rl.checking import checked
+from cartpole_rl.envs.build import environment, randomizer, simulated_env
+from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
 from cartpole_rl.envs.make import CartPoleEnv
 from cartpole_rl.errors import LearningError
 from cartpole_rl.evaluation.driver import Drive, Driver
@@ -49,20 +52,10 @@ from cartpole_rl.scheduling import compute_last
 from cartpole_rl.settings import evaluation_seed
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
-from cartpole_rl.workflows.build import (
-    environment,
-    evaluated_env,
-    evaluated_settings,
-    new_agent,
-    randomizer,
-    simulated_env,
-    trained_agent,
-    use_threads,
-)
-from cartpole_rl.workflows.checking import checked
+from cartpole_rl.workflows.agents import new_agent, trained_agent
+from cartpole_rl.workflows.build import evaluated_env, evaluated_settings, use_threads
 from cartpole_rl.workflows.checks import check_finetuning
 from cartpole_rl.workflows.config import (
-    CartPoleSettings,
     EvaluateConfig,
     FinetuneConfig,
     RealSettings,

@@ -8,10 +8,10 @@ from typing import Any
 
 import yaml
 
+from cartpole_rl.checking import checked
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.randomization.poles import Pole
 from cartpole_rl.tasks.episode import Origin
-from cartpole_rl.workflows.checking import checked
 from cartpole_rl.workflows.checks import simulated_carts
 from cartpole_rl.workflows.config import EvaluateConfig
 from cartpole_rl.workflows.origins import read_origin

@@ -16,11 +16,11 @@ from cartpole_rl.evaluation.recordings import LENGTH, read_recording
 from cartpole_rl.identification.replay import Array, Replayed, recorded_period, replay
 from cartpole_rl.physics.bounds import check_names, check_values
 from cartpole_rl.physics.models import Models
+from cartpole_rl.randomization.checks import check_one_pole
 from cartpole_rl.randomization.poles import Pole
 from cartpole_rl.reporting.figures import save
 from cartpole_rl.reporting.figures.replays import replay_figure, root_mean_square
 from cartpole_rl.reporting.table import number_text, table
-from cartpole_rl.workflows.checks import check_one_pole
 from cartpole_rl.workflows.config import ReplayConfig
 from cartpole_rl.workflows.evaluate import count_text
 from cartpole_rl.workflows.recordings import recordings

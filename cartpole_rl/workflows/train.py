@@ -3,6 +3,7 @@
 from functools import partial
 from pathlib import Path
 
+from cartpole_rl.envs.build import simulated_env
 from cartpole_rl.envs.make import CartPoleEnv
 from cartpole_rl.evaluation.driving_policy import DrivingPolicy
 from cartpole_rl.evaluation.episodes import Policy, run_batch
@@ -10,12 +11,14 @@ from cartpole_rl.learning.checkpoints import forget_training, restore_weights
 from cartpole_rl.learning.randomness import seed_everything
 from cartpole_rl.learning.training import Training
 from cartpole_rl.plants.effects import without_effect
+from cartpole_rl.plants.settings import LearnedSettings
 from cartpole_rl.randomization.found import Draws
 from cartpole_rl.settings import evaluation_seed
 from cartpole_rl.tasks.episode import Episode
-from cartpole_rl.workflows.build import new_agent, recorded_config, simulated_env, use_threads
+from cartpole_rl.workflows.agents import new_agent, recorded_config
+from cartpole_rl.workflows.build import use_threads
 from cartpole_rl.workflows.checks import check_compiler
-from cartpole_rl.workflows.config import LearnedSettings, TrainConfig
+from cartpole_rl.workflows.config import TrainConfig
 from cartpole_rl.workflows.monitor import TrainingMonitor
 from cartpole_rl.workflows.person import tell
 from cartpole_rl.workflows.report import report

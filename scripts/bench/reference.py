@@ -41,8 +41,10 @@ from omegaconf import open_dict
 from omegaconf.errors import OmegaConfBaseException
 from torch import Tensor
 
+from cartpole_rl.checking import checked
 from cartpole_rl.choices import conf_folder
 from cartpole_rl.commands.composition import as_mapping
+from cartpole_rl.envs.build import randomizer, simulated_env
 from cartpole_rl.errors import CartPoleError, ConfigError
 from cartpole_rl.physics.actuator import static_force
 from cartpole_rl.physics.dynamics import Drive, State, run_period
@@ -59,8 +61,6 @@ from cartpole_rl.tasks.features import (
 from cartpole_rl.tasks.rewards import BONUS, UPRIGHT_ANGLE, UPRIGHT_SPEED, score
 from cartpole_rl.tasks.settings import Start, StartSettings
 from cartpole_rl.tasks.upright import upright_since
-from cartpole_rl.workflows.build import randomizer, simulated_env
-from cartpole_rl.workflows.checking import checked
 from cartpole_rl.workflows.config import TrainConfig
 
 STARTS = (-0.1, -0.05, 0.0, 0.05, 0.1)  # m: an evaluation draws the cart within 0.1 m of the middle

@@ -30,18 +30,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cartpole_rl.checking import checked
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import PlantError
 from cartpole_rl.evaluation.episodes import run_episodes
 from cartpole_rl.reporting.table import Cell, table
-from cartpole_rl.workflows.build import (
-    TrainedAgent,
-    evaluated_env,
-    evaluated_settings,
-    trained_agent,
-    use_threads,
-)
-from cartpole_rl.workflows.checking import checked
+from cartpole_rl.workflows.agents import TrainedAgent, trained_agent
+from cartpole_rl.workflows.build import evaluated_env, evaluated_settings, use_threads
 from cartpole_rl.workflows.config import EvaluateConfig
 
 COMPARED, REPORTED = 0, 1000  # seeds: of the carts that settings were compared on, and of those to report

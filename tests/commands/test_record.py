@@ -68,7 +68,7 @@ def test_the_baseline_knows_the_nominal_cart_and_not_the_simulated_one(tmp_path:
 def test_the_baseline_has_one_pole(pole: str, tmp_path: Path) -> None:
     done = in_process("record", "run=lqr", f"pole={pole}", folder=tmp_path)
     assert done.code == 2
-    assert "run=lqr is" in done.complaint
+    assert "run=lqr takes one pole" in done.complaint
     assert "choose one, as pole=medium" in done.complaint
     assert not list(tmp_path.glob("runs/record/*"))
 

@@ -259,7 +259,7 @@ def test_what_a_broken_link_leaves_is_reported(
         yield next(run_episodes(env, policy, episodes))
         raise LinkError("the cart was unplugged")
 
-    monkeypatch.setattr("cartpole_rl.workflows.evaluate.run_episodes", pulled)
+    monkeypatch.setattr("cartpole_rl.workflows.episodes.run_episodes", pulled)
     done = in_process("evaluate", f"run={trained}", "hydra.run.dir=it", folder=tmp_path)
     assert done.code == 1
     assert done.err.splitlines()[-1] == "cartpole-evaluate: the cart was unplugged"
