@@ -1,4 +1,4 @@
-"""The settings of run=lqr: energy and LQR, a controller that learned nothing."""
+"""The settings of run=lqr: energy and LQR, a controller without learning."""
 
 import hydra
 
@@ -8,6 +8,6 @@ from cartpole_rl.workflows.config import TrainConfig
 
 
 def baseline_training() -> TrainConfig:
-    """A training on the nominal cart of conf/. Only within a command, where Hydra knows conf/."""
+    """Return a training on the nominal cart. To be called within a command, where Hydra has found conf/."""
     composed = hydra.compose("train", ["observation=raw", "observation.past_motors=1"])
     return checked(TrainConfig, as_mapping(composed))

@@ -27,7 +27,7 @@ from cartpole_rl.workflows.run_folder import write_config
 
 
 def train(config: TrainConfig, folder: Path) -> None:
-    """Build, train, report; or go on with the training in `folder`. Raises CartPoleError."""
+    """Build, train, report; or resume the training in `folder`. Raises CartPoleError."""
     checkpoint = resumed("train", config.resume, folder)
     if checkpoint:
         config = recorded_config(checkpoint.config, f"resume={folder}")
@@ -40,7 +40,9 @@ def train(config: TrainConfig, folder: Path) -> None:
     note_unused_randomization(config, env.plant.randomizer)
     agent = new_agent(config)
     if checkpoint:
-        restore_weights(agent, checkpoint.state["agent"], f"resume={folder}")  # or complain before any work
+        restore_weights(
+            agent, checkpoint.state["agent"], f"resume={folder}"
+        )  # an error comes before any work
     policy = DrivingPolicy(agent.greedy_policy(), config.compile)
     evaluate = partial(judge, nominal_env(config), policy, config.seed)
     write_config(folder, "train", config.model_dump(mode="json"), resumed=checkpoint is not None)
@@ -70,7 +72,7 @@ def train(config: TrainConfig, folder: Path) -> None:
 
 
 def note_unused_randomization(config: TrainConfig, draws: Draws) -> None:
-    """Name the ranges that change nothing with the chosen actions and friction models, if there are any."""
+    """Print the ranges that change nothing with the chosen actions and friction models."""
     models = config.models(config.plant)
     if unused := without_effect(draws, config.ranges, config.actions.motors, models, config.control_period):
         chosen = (
@@ -81,7 +83,7 @@ def note_unused_randomization(config: TrainConfig, draws: Draws) -> None:
 
 
 def nominal_env(config: TrainConfig) -> CartPoleEnv:
-    """Where the agent is judged: the nominal cart with each pole in turn, starting as the task says."""
+    """Return the environment of evaluations: the nominal cart with each pole in turn."""
     poles = config.pole.each
     assert poles.choices is not None
     carts = len(poles.choices) * max(1, config.learning.evaluation_episodes // len(poles.choices))
@@ -93,6 +95,6 @@ def nominal_env(config: TrainConfig) -> CartPoleEnv:
 
 
 def judge(env: CartPoleEnv, policy: Policy, seed: int) -> list[Episode]:
-    """Episodes of the greedy policy in a training with `seed`, from the same starts each time."""
+    """Return episodes of the greedy policy in a training with `seed`, from the same starts each time."""
     env.set_seed(evaluation_seed(seed))
     return run_batch(env, policy)
