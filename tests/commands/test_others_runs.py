@@ -47,17 +47,18 @@ def runs(trained: Path, stopped: Path, tmp_path_factory: pytest.TempPathFactory)
     folder = tmp_path_factory.mktemp("runs")
     shutil.copytree(trained, folder / "train")
     shutil.copytree(stopped, folder / "unfinished")
+    emulated = ("plant=emulated", "emulator.physics_step=1e-3")
     identify = ("windows=20", "substeps=2", "carts=100")
     model = ("windows=20", "ensemble.members=1", "ensemble.hidden=4", "ensemble.updates=2")
     finetune = ("episodes=1", "evaluation_episodes=1", "finetuning.iterations=1", "compile=false")
     made = (
         ("evaluate", "run=train", "episodes=1", "hydra.run.dir=evaluate"),
         ("record", "run=lqr", "episodes=3", "hydra.run.dir=record"),
-        ("record", "-m", "run=lqr", "episodes=1", "seed=0,1", "hydra.sweep.dir=multirun"),
+        ("record", "-m", "run=train", "episodes=1", "seed=0,1", "hydra.sweep.dir=multirun"),
         ("replay", "from=record", "hydra.run.dir=replay"),
-        ("identify", "plant=emulated", *identify, "hydra.run.dir=identify"),
+        ("identify", *emulated, *identify, "hydra.run.dir=identify"),
         ("model", "from=record", *model, "hydra.run.dir=model"),
-        ("finetune", "run=train", "plant=emulated", *finetune, "hydra.run.dir=finetune"),
+        ("finetune", "run=train", *emulated, *finetune, "hydra.run.dir=finetune"),
     )
     for command, *words in made:
         done = in_process(command, *words, folder=folder)
