@@ -24,6 +24,11 @@ def choice(name: str) -> dict[str, Any]:
 
 
 def default_choices(command: str) -> dict[str, str]:
-    """What a command takes from each group of conf/ unless it is told otherwise: {"cart": "ip02", ...}."""
-    lines = choice(command)["defaults"]
-    return {group: chosen for line in lines if isinstance(line, dict) for group, chosen in line.items()}
+    """Return the default choice of each group that a command reads: {"cart": "ip02", ...}."""
+    chosen: dict[str, str] = {}
+    for line in choice(command)["defaults"]:
+        if isinstance(line, dict):
+            chosen |= line
+        elif line != "_self_":  # another command's config, which this one extends
+            chosen |= default_choices(line)
+    return {group: name for group, name in chosen.items() if "/" not in group}

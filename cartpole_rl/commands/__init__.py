@@ -1,1 +1,1 @@
-"""The commands: compose, build, run, save. The only place that knows Hydra."""
+"""The commands: compose, check, call one workflow. Only this package imports Hydra."""

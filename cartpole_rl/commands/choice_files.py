@@ -1,8 +1,7 @@
-"""A group's choice may be a file of one's own: cartpole-train cart=runs/identify/<run>/cart.yaml.
+"""Files as choices of a group: cartpole-train cart=runs/identify/<run>/cart.yaml.
 
-Hydra looks for choices in folders that have one folder a group. Such a file is copied into one, under its own
-name, and Hydra is told to look there as well. `${here}` in it stands for the folder that the file is in, so
-that a run folder can be moved.
+Hydra finds choices in folders with a subfolder for each group. The file is copied into such a folder, which
+is added to Hydra's search path. `${here}` in it stands for the file's folder, so run folders can be moved.
 """
 
 import re
@@ -17,16 +16,16 @@ from cartpole_rl.workflows.run_folder import PREFIX, USES, check_program, progra
 
 HERE = "${here}"
 WORD = re.compile(r"^([a-z_]+)=(.+)$")
-KEPT = ("config.yaml", "cart.yaml", "pole.yaml", "randomization.yaml")  # files of run folders
+RUN_FILES = ("config.yaml", "cart.yaml", "pole.yaml", "randomization.yaml")  # of a run folder
 
 
 @contextmanager
 def with_choice_files(words: Sequence[str]) -> Iterator[list[str]]:
-    """Overrides in which files have become choices. Raises ConfigError for a file that is missing."""
+    """Yield the overrides with files replaced by choices. Raises ConfigError for a missing file."""
     with TemporaryDirectory(prefix="cartpole_rl-") as folder:
-        given = [_with_choices(word, Path(folder)) for word in words]
+        replaced = [_with_choices(word, Path(folder)) for word in words]
         found = any(Path(folder).iterdir())
-        yield [*given, f"hydra.searchpath=[file://{folder}]"] if found else list(words)
+        yield [*replaced, f"hydra.searchpath=[file://{folder}]"] if found else list(words)
 
 
 def _with_choices(word: str, folder: Path) -> str:
@@ -45,18 +44,18 @@ def _with_choices(word: str, folder: Path) -> str:
 
 
 def _check_run_folder(group: str, value: str) -> None:
-    """Raise ConfigError where `value` is a folder, or a file of a run folder that is not for `group`."""
+    """Raise ConfigError where `value` is a folder, or a run folder's file of another group."""
     path = Path(value)
     is_folder = "/" in value and path.is_dir()
     folder = path if is_folder else path.parent
     own, program = folder / f"{group}.yaml", program_of(folder)
-    other_file = program is not None and path.name in KEPT and path.name != own.name and path.is_file()
+    other_file = program is not None and path.name in RUN_FILES and path.name != own.name and path.is_file()
     if not (is_folder or other_file):
         return
     check_program(group, folder, *USES)
     what = f"is a folder, a run of {PREFIX}{program}" if program else "is a folder"
     if other_file:
-        what = f"is no {group}, but another file of a run of {PREFIX}{program}"
+        what = f"is not a {group} but another file of a run of {PREFIX}{program}"
     if own.is_file():
         raise ConfigError(f"{group}={path} {what}; give {group}={own}")
     use = use_of(folder, program) if program else f"give a file: {group}=mine.yaml"
@@ -64,7 +63,7 @@ def _check_run_folder(group: str, value: str) -> None:
 
 
 def _copied(value: str, group: Path) -> str:
-    """Copy the file `value` to a folder of choices; its name there."""
+    """Copy the file `value` to a folder of choices, and return its name there."""
     file = Path(value)
     if not file.is_file():
         raise ConfigError(f"{group.name}={value}: there is no such file")

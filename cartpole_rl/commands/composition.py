@@ -1,4 +1,4 @@
-"""What Hydra has to know before it composes: names of folders, choices for --help, the emulated cart."""
+"""Extends Hydra: names of run folders, the choices in --help, the defaults of the emulated cart."""
 
 import re
 import sys
@@ -7,7 +7,7 @@ from contextlib import suppress
 from datetime import datetime
 from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
@@ -17,14 +17,16 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 from cartpole_rl.choices import default_choices
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.plants.serial.settings import SerialSettings
+from cartpole_rl.settings import Settings
+from cartpole_rl.workflows.config import EvaluateConfig
 
 LONGEST_NAME = 150  # characters; file systems take 255
 
 
 def run_folder(command: str, label: str, resume: str | None = None) -> str:
-    """Folder of a run: that of the training which is resumed, or a new one by date and time.
+    """Return the folder of a run: that of the resumed run, or a new one named by date and time.
 
-    A new one is made here, so that runs which start in the same second do not share it.
+    A new one is made here, so runs that start in the same second do not share it.
     """
     if resume is not None and Path(resume).is_dir():
         return str(resume)
@@ -32,16 +34,16 @@ def run_folder(command: str, label: str, resume: str | None = None) -> str:
 
 
 def sweep_folder(command: str) -> str:
-    """Folder of a multirun: a new one by date and time, made here for the same reason as that of a run.
+    """Return the folder of a multirun: a new one named by date and time, made here as that of a run.
 
-    Hydra composes the config of each job anew, and gives it the answers of its cached resolvers, also where
-    a launcher brings the job to another process: all jobs of a multirun share the folder.
+    Hydra composes the config of each job anew with the cached values of its resolvers, in other processes
+    too, so all jobs of a multirun share the folder.
     """
     return new_folder(command, "multirun")
 
 
 def new_folder(command: str, label: str) -> str:
-    """Make a folder that no other run has, named by date, time and `label`."""
+    """Make a new folder named by date, time and `label`, and return its path."""
     name = datetime.now().strftime("%Y-%m-%d_%H-%M-%S") + (f"_{label}" if label else "")
     for number in count(1):
         folder = Path("runs", command, name if number == 1 else f"{name}_{number}")
@@ -52,30 +54,43 @@ def new_folder(command: str, label: str) -> str:
 
 
 def job_name(number: int, overrides: Sequence[str]) -> str:
-    """Folder of one job of a multirun, by what differs between its jobs: "0_randomization-friction_3_seed-0".
+    """Return the folder of one job of a multirun, by its swept settings: "0_randomization-friction_3_seed-0".
 
-    Signs that a shell or Hydra would take for something else become "-".
+    Characters that a shell or Hydra would interpret become "-".
     """
     words = [word for word in sys.argv[1:] if "=" in word and not word.startswith("-")]
     parsed = OverridesParser.create().parse_overrides(words)
-    constant = {given.get_key_element() for given in parsed if not given.is_sweep_override()}
+    constant = {each.get_key_element() for each in parsed if not each.is_sweep_override()}
     swept = (word for word in overrides if "=" in word and word.split("=")[0] not in constant)
     plain = (re.sub(r"[^\w.+-]+", "-", word).strip("-") for word in swept)
     return "_".join((str(number), *plain))[:LONGEST_NAME]
 
 
-def choices_of(command: str) -> str:
+def choices_of(command: str, schema: type[Settings]) -> str:
     """Return the groups that cartpole-<command> reads, for its --help: a line each, with all choices.
 
-    Choices in folders of a user's own are among them.
+    Choices in folders of a user's own are listed too; plants that `schema` does not take are not.
     """
     loader = GlobalHydra.instance().config_loader()
-    groups = sorted(group for group in default_choices(command) if "/" not in group)
-    return "".join(f"{group}: {', '.join(sorted(loader.get_group_options(group)))}\n" for group in groups)
+    refused = {"plant": plant_kinds(EvaluateConfig) - plant_kinds(schema)}
+    lines = [
+        f"  {group}: {', '.join(sorted({*loader.get_group_options(group)} - refused.get(group, set())))}\n"
+        for group in sorted(default_choices(command))
+    ]
+    return "".join(("Choices (group=choice)\n", *lines, "\n")) if lines else ""
+
+
+def plant_kinds(schema: type[Settings]) -> set[str]:
+    """Return the choices of plant= that a command with the settings `schema` takes."""
+    if "plant" not in schema.model_fields:
+        return set()
+    annotation = schema.model_fields["plant"].annotation
+    classes = get_args(annotation) or (annotation,)
+    return {kind for plant in classes for kind in get_args(plant.model_fields["kind"].annotation)}
 
 
 def as_mapping(composed: DictConfig) -> dict[str, Any]:
-    """The composed config, resolved, as plain mappings; what is still missing (`???`) is left out."""
+    """Return the composed config, resolved, as plain mappings without the missing values (`???`)."""
     return _without_missing(OmegaConf.to_container(composed, resolve=True))
 
 
@@ -88,8 +103,7 @@ def _without_missing(tree: Any) -> Any:
 OmegaConf.register_new_resolver("run_folder", run_folder, use_cache=True)
 OmegaConf.register_new_resolver("sweep_folder", sweep_folder, use_cache=True)
 OmegaConf.register_new_resolver("job_name", job_name)
-OmegaConf.register_new_resolver("choices_of", choices_of)
-# conf/emulator/ builds on this one: the settings class is where its numbers stand
+# conf/emulator/ extends this choice; its numbers are the defaults of the settings class
 ConfigStore.instance().store(group="emulator", name="medium", node=EmulatorSettings().model_dump(mode="json"))
 # so does conf/plant/serial.yaml
 ConfigStore.instance().store(name="serial_defaults", node=SerialSettings(port=MISSING).model_dump())

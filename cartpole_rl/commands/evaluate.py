@@ -1,6 +1,6 @@
 """cartpole-evaluate: run whole episodes of a trained agent, in simulation or on a cart.
 
-run=lqr is no agent but energy and LQR, a controller that learned nothing, to compare with.
+run=lqr is energy and LQR, a controller without learning, as a baseline.
 
 cartpole-evaluate run=runs/train/2026-11-21_12-00-00 episodes=20
 cartpole-evaluate run=runs/train/2026-11-21_12-00-00 plant=emulated emulator.latency=0.02
@@ -8,7 +8,7 @@ cartpole-evaluate run=runs/train/2026-11-21_12-00-00 plant=serial plant.port=/de
 cartpole-evaluate run=lqr plant=emulated
 cartpole-evaluate run=runs/train/<run> repeat.run=runs/evaluate/<run> repeat.episode=17
 
-The last one drives an episode of an earlier evaluation again, the same simulated cart from the same start.
+The last one repeats an episode of an earlier evaluation: the same simulated cart from the same start.
 """
 
 from pathlib import Path

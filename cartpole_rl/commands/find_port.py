@@ -1,4 +1,4 @@
-"""cartpole-find-port: which serial ports there are, and which of them is the cart.
+"""cartpole-find-port: list the serial ports and name the one of the cart.
 
 cartpole-find-port                  lists the USB serial ports, each with the chip that tells boards apart
 cartpole-find-port watch=true       names the port that vanishes when the cart is unplugged, or appears
@@ -32,12 +32,12 @@ class FindPortConfig(Settings):
 
 @application("find_port", FindPortConfig)
 def main(config: FindPortConfig, folder: Path) -> None:
-    """List the ports, or watch them change. Raises PortError where there is none to tell of."""
+    """List the ports, or watch them change. Raises PortError where there is none."""
     print(listing(found_ports()) if not config.watch else watched(found_ports, config.timeout))
 
 
 def listing(ports: list[UsbPort]) -> str:
-    """One line a port, and the one to give to a command. Raises PortError where there is none."""
+    """Return a line for each port, and the port of the cart. Raises PortError where there is none."""
     if not ports:
         raise PortError(f"no USB serial port was found: {REMEDY}")
     lines = [f"{port.device}  {described(port)}" for port in ports]
@@ -45,14 +45,14 @@ def listing(ports: list[UsbPort]) -> str:
     if len(carts) == 1:
         lines.append(f"The cart is probably on it: plant.port={carts[0].device}, or plant.port=auto")
     elif carts:
-        lines.append("`cartpole-find-port watch=true` tells which of them is the cart")
+        lines.append("`cartpole-find-port watch=true` finds out which of them is the cart")
     else:
         lines.append("None of them has a chip that carts have (CP210x, CH340, FTDI, Espressif)")
     return "\n".join(lines)
 
 
 def watched(ports: PortList, timeout: float) -> str:
-    """Wait until a port vanishes or appears, and name it. Raises PortError after `timeout` s."""
+    """Return a line that names the next port to vanish or appear. Raises PortError after `timeout` s."""
     before = ports()
     print(f"{len(before)} found. Unplug the cart now, or plug it in if it is not yet ...", flush=True)
     end = time.monotonic() + timeout
@@ -63,7 +63,7 @@ def watched(ports: PortList, timeout: float) -> str:
             lines = [f"{port.device} {what}: plant.port={port.device}  {described(port)}" for port in changed]
             return "\n".join([*lines, *(["Plug it in again before you use it."] if vanished else [])])
         time.sleep(LOOK_EVERY)
-    raise PortError(f"no port came or went within {timeout:g} s: {REMEDY}")
+    raise PortError(f"no port appeared or vanished within {timeout:g} s: {REMEDY}")
 
 
 if __name__ == "__main__":

@@ -1,13 +1,12 @@
-"""cartpole-finetune: a trained agent learns on, on the cart that it drives.
+"""cartpole-finetune: train an agent further on the cart that it drives.
 
 cartpole-finetune run=runs/train/2026-11-21_12-00-00 plant=serial plant.port=/dev/ttyUSB0 episodes=20
 cartpole-finetune run=runs/train/2026-11-21_12-00-00 plant=emulated emulator.cart_viscous=2
 cartpole-finetune resume=runs/finetune/2026-11-21_12-30-00
 
 Three stages: episodes without exploration (before), episodes to learn from (tune), episodes without
-exploration (after). The cart is driven by a process of its own; this one learns meanwhile. Each finished
-episode is on disk before the next begins, so that Ctrl-C, a power cut or a pulled cable cost at most the one
-under way.
+exploration (after). One process drives the cart while this one learns. Each episode is written to disk before
+the next one starts, so Ctrl-C, a power cut or a pulled cable loses at most the current episode.
 """
 
 from pathlib import Path

@@ -1,11 +1,11 @@
-"""cartpole-identify: find out what a cart is, by experiments on it or from recordings.
+"""cartpole-identify: measure the parameters of a cart, by experiments or from recordings.
 
 cartpole-identify plant=serial plant.port=/dev/ttyUSB0 pole=medium
 cartpole-identify plant=emulated emulator.cart_viscous=2
 cartpole-identify from=runs/identify/2026-11-21_12-00-00
 
-Keep the track clear; the cart moves by itself, four minutes long, and the pole swings all round. Each
-experiment is on disk before the next begins, and what is found is found from the files.
+Keep the track clear: the cart moves by itself for four minutes, and the pole swings all round. Each
+experiment is written to disk before the next one starts, and the parameters are fitted to the files.
 """
 
 from pathlib import Path

@@ -1,9 +1,9 @@
-"""cartpole-model: learn from recordings what the identified physics lacks, and say whether that helps.
+"""cartpole-model: fit networks to what the identified physics leaves unexplained, and test them.
 
 cartpole-model from=runs/record/2026-11-21_12-00-00
 cartpole-model from=[runs/record/2026-11-21_12-00-00,runs/record/2026-11-21_12-30-00] seed=1
 
-Every fifth recording is held out: nothing is fitted to it. What is written is for plant=learned.
+Every fifth recording is held out for the test. The resulting model is for plant=learned.
 """
 
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""cartpole-preflight: small moves that tell whether a cart may be trusted with an agent.
+"""cartpole-preflight: check a cart by small moves before an agent drives it.
 
 cartpole-preflight plant.port=/dev/ttyUSB0
 cartpole-preflight plant.port=auto
@@ -13,7 +13,7 @@ from cartpole_rl.workflows.config import PreflightConfig
 
 @application("preflight", PreflightConfig)
 def main(config: PreflightConfig, folder: Path) -> None:
-    """A line for each check; exit code 1 after the first that is not OK."""
+    """Print a line for each check; the exit code is 1 after the first that fails."""
     from cartpole_rl.workflows.preflight import check_cart
 
     check_cart(config)

@@ -1,11 +1,11 @@
-"""cartpole-record: run whole episodes as cartpole-evaluate does, and keep each as a file of its own.
+"""cartpole-record: run whole episodes as cartpole-evaluate does, and write a recording of each.
 
 cartpole-record run=runs/train/2026-11-21_12-00-00 plant=serial plant.port=/dev/ttyUSB0 episodes=5
 cartpole-record run=runs/train/2026-11-21_12-00-00 plant=emulated
 cartpole-record run=lqr pole=large
 
-An episode's file is there, whole, as soon as the episode ends; simulated carts run side by side, and end
-together. Ctrl-C or a pulled cable cost at most the one under way.
+A recording is written as soon as its episode ends, so Ctrl-C or a pulled cable loses at most the current
+episode. Simulated carts run side by side, and end together.
 """
 
 from pathlib import Path

@@ -1,9 +1,9 @@
-"""cartpole-replay: drive the simulated cart with recorded motor values, and see how far it strays.
+"""cartpole-replay: drive the simulated cart with recorded motor values, and compare.
 
 cartpole-replay from=runs/record/2026-11-21_12-00-00
 cartpole-replay from=recordings/episode_000.csv pole=large 'parameters={cart_coulomb:0.8,latency:0.01}'
 
-The simulated cart is put where the recorded one was every second: over a whole episode any two carts part.
+The simulated cart restarts from the recorded state every second, since any two carts diverge in an episode.
 """
 
 from pathlib import Path

@@ -26,15 +26,10 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
 
-from cartpole_rl.choices import choice, default_choices
-from cartpole_rl.envs.make import CartPoleEnv, make_env
-from cartpole_rl.envs.settings import ObservationSettings, RewardSettings, TaskSettings
-from cartpole_rl.physics.models import Actuator, CartFriction, Integrator, Models, PoleFriction
-from cartpole_rl.plants.simulated import SimulatedPlant
-from cartpole_rl.randomization.poles import PoleSettings
-from cartpole_rl.randomization.randomizer import Randomizer
-from cartpole_rl.randomization.ranges import Range
-from cartpole_rl.tasks.actions import ActionSettings
+from cartpole_rl.choices import choice
+from cartpole_rl.envs.build import shipped_settings, simulated_env
+from cartpole_rl.envs.make import CartPoleEnv
+from cartpole_rl.plants.settings import SimulatedSettings
 
 OF_TASK = {
     "swingup": {"task": "swingup", "actions": "nine_levels", "reward": "score"},
@@ -49,34 +44,13 @@ Randomization = str | Mapping[str, Mapping[str, Any]]
 def simulated_environment(
     task: str, carts: int, randomization: Randomization = "none", compiled: bool = False
 ) -> CartPoleEnv:
-    """The environment of `task`, "swingup" or "balance", with what conf/train.yaml chooses for all else.
+    """Return the environment of `task`, "swingup" or "balance", with conf/train.yaml's other choices.
 
-    `randomization` is the name of a file in conf/randomization/, or the lines of one. Raises ConfigError.
+    `randomization` is the name of a file in conf/randomization/, or its lines. Raises ConfigError.
     """
-    chosen = {**default_choices("train"), "pole": "medium", **OF_TASK[task]}
-    chosen.pop("randomization")
-    part = {group: choice(f"{group}/{name}") for group, name in chosen.items() if name and "/" not in group}
-    lines = choice(f"randomization/{randomization}") if isinstance(randomization, str) else randomization
-    cart = {**part["cart"], **part["cart_friction"]["parameters"], **part["pole_friction"]["parameters"]}
-    actions = ActionSettings(**part["actions"])
-    asked = TaskSettings(**{**part["task"], "x_max": cart["track_half_length"]})
-    plant = SimulatedPlant(
-        carts,
-        Randomizer(cart, PoleSettings(**part["pole"]), {name: Range(**line) for name, line in lines.items()}),
-        asked.start,
-        Models(
-            CartFriction(part["cart_friction"]["model"]),
-            PoleFriction(part["pole_friction"]["model"]),
-            Actuator(actions.actuator),
-            Integrator(part["plant"]["integrator"]),
-            part["plant"]["pole_presses"],
-        ),
-        choice("train")["control_period"],
-        part["plant"]["substeps"],
-        compiled=compiled,
-    )
-    observation, reward = ObservationSettings(**part["observation"]), RewardSettings(**part["reward"])
-    return make_env(plant, actions, asked, observation, reward)
+    settings = shipped_settings(randomization, pole="medium", **OF_TASK[task])
+    plant = SimulatedSettings(**choice("plant/simulated"))
+    return simulated_env(settings, plant, carts, settings.task.start, seed=0, compiled=compiled)
 
 
 def observation_space(env: CartPoleEnv) -> spaces.Box:

@@ -28,3 +28,10 @@ def check_carts(cart: Mapping[str, float], poles: PoleSettings, ranges: Mapping[
 def possible_poles(poles: PoleSettings) -> list[Pole]:
     """Return the choices; the rod of middle length stands for rods of random length."""
     return [poles.nominal] if poles.choices is None else list(poles.choices.values())
+
+
+def check_one_pole(owner: str, poles: PoleSettings) -> Pole:
+    """Return the pole. Raises ConfigError where `poles` are several, naming `owner`, which takes one."""
+    if not poles.is_single:
+        raise ConfigError(f"pole: {owner} takes one pole, not {poles.name}; choose one, as pole=medium")
+    return poles.nominal

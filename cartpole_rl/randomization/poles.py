@@ -50,6 +50,11 @@ class PoleSettings(Settings):
         return Pole.rod(sum(self.lengths) / 2)
 
     @property
+    def is_single(self) -> bool:
+        """True where every cart carries the same pole."""
+        return self.choices is not None and len(self.choices) == 1
+
+    @property
     def each(self) -> "PoleSettings":
         """The poles that stand for all, in turn: every choice, or rods from the shortest to the longest."""
         if self.choices is not None:

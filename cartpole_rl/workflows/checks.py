@@ -1,6 +1,6 @@
-"""What can be found wrong with settings before anything that takes long to import is needed.
+"""Checks of settings that need no slow imports. Commands call them before they import a workflow.
 
-Commands call these before they import the work. The work relies on none of it: it checks again what it reads.
+A workflow does not rely on them: it checks what it reads.
 """
 
 import os
@@ -14,13 +14,12 @@ from cartpole_rl.errors import ConfigError
 from cartpole_rl.learning.checkpoint_files import FOLDER, LAST, find_agent, find_training
 from cartpole_rl.physics.bounds import check_names, check_value, check_values
 from cartpole_rl.plants.model_file import find_model
-from cartpole_rl.randomization.checks import check_carts
-from cartpole_rl.randomization.poles import PoleSettings
+from cartpole_rl.plants.settings import LearnedSettings
+from cartpole_rl.randomization.checks import check_carts, check_one_pole
 from cartpole_rl.workflows.config import (
     EvaluateConfig,
     FinetuneConfig,
     IdentifyConfig,
-    LearnedSettings,
     ModelConfig,
     ReplayConfig,
     TrainConfig,
@@ -28,11 +27,11 @@ from cartpole_rl.workflows.config import (
 from cartpole_rl.workflows.recordings import experiments, recordings
 from cartpole_rl.workflows.run_folder import PREFIX, check_program, has_ended, program_of, use_of
 
-BASELINE = Path("lqr")  # run=lqr is no folder: the controller that learned nothing
+BASELINE = Path("lqr")  # run=lqr is energy and LQR, not a folder
 LARGEST_BATCH = 1024  # carts that an evaluation simulates at once
-LONGER = {  # command: how to go further than a run that has ended
+LONGER = {  # command: how to train further than a run that has ended
     "train": "cartpole-train with more learning.transitions makes a longer training",
-    "finetune": "cartpole-finetune run={0} lets it learn on",
+    "finetune": "cartpole-finetune run={0} trains it further",
 }
 
 
@@ -46,7 +45,7 @@ def check_training(config: TrainConfig) -> None:
 
 
 def check_evaluation(config: EvaluateConfig) -> None:
-    """Raise CartPoleError where no agent or no cart of these settings can be found."""
+    """Raise CartPoleError where there is no such agent, or no such cart."""
     if config.run != BASELINE:
         check_agent(config.run)
     if isinstance(config.plant, LearnedSettings):
@@ -55,7 +54,7 @@ def check_evaluation(config: EvaluateConfig) -> None:
 
 
 def check_finetuning(config: FinetuneConfig) -> Path:
-    """Return the run that is fine-tuned. Raises CartPoleError where it cannot be."""
+    """Return the run to fine-tune. Raises CartPoleError where it has no agent."""
     if config.run is None:
         raise ConfigError("run is missing; give run=..., the run folder of a training")
     if config.compile:
@@ -65,7 +64,7 @@ def check_finetuning(config: FinetuneConfig) -> Path:
 
 
 def check_replay(config: ReplayConfig) -> None:
-    """Raise CartPoleError where there is no recording, or the cart or its pole make no sense."""
+    """Raise CartPoleError where there is no recording, or the cart or its pole is impossible."""
     recordings(config.source)
     if config.pole is not None:
         check_one_pole("a replay", config.pole)
@@ -82,18 +81,18 @@ def check_modelling(config: ModelConfig) -> None:
 
 
 def check_identification(config: IdentifyConfig) -> None:
-    """Raise CartPoleError where the cart before any measurement, or the recordings, make no sense."""
+    """Raise CartPoleError where the prior cart is impossible, or there is no recording."""
     check_values(config.nominal)
     if config.source is not None:
         experiments(config.source)
 
 
 def check_resumable(program: str, resume: str, folder: Path) -> None:
-    """Raise CartPoleError where cartpole-<program> cannot go on with the run `resume` in `folder`."""
+    """Raise CartPoleError where cartpole-<program> cannot resume the run `resume` in `folder`."""
     run = Path(resume)
     check_program("resume", run, program)
     if run.is_dir() and not folder.samefile(run):
-        raise ConfigError("resume goes on in that run's own folder; leave out hydra.run.dir")
+        raise ConfigError("resume continues in that run's own folder; leave out hydra.run.dir")
     if has_ended(run):
         raise ConfigError(
             f"resume={run}: this run of {PREFIX}{program} has ended; cartpole-evaluate run={run} drives its "
@@ -103,13 +102,13 @@ def check_resumable(program: str, resume: str, folder: Path) -> None:
 
 
 def check_agent(run: Path) -> None:
-    """Raise ConfigError or CheckpointError where `run` is no run folder or file with an agent."""
+    """Raise ConfigError or CheckpointError where `run` is not a run folder or file with an agent."""
     check_has_agent(run)
     find_agent(run)
 
 
 def check_has_agent(run: Path) -> None:
-    """Raise ConfigError where `run` is a run folder without an agent, with what can be done with it."""
+    """Raise ConfigError where `run` is a run folder without an agent."""
     check_program("run", run, "train", "finetune")
     if (program := program_of(run)) and not (run / FOLDER / LAST).exists():
         raise ConfigError(
@@ -123,12 +122,6 @@ def check_model(plant: LearnedSettings) -> None:
     find_model(plant.model)
 
 
-def check_one_pole(what: str, pole: PoleSettings) -> None:
-    """Raise ConfigError where `what`, which has one pole, is given several."""
-    if pole.choices is None or len(pole.choices) > 1:
-        raise ConfigError(f"pole: {what} has one pole, not {pole.name}; choose one, as pole=medium")
-
-
 def check_parameters(given: Mapping[str, float]) -> None:
     """Raise ConfigError for an unknown name or an impossible value."""
     check_names(given)
@@ -137,7 +130,7 @@ def check_parameters(given: Mapping[str, float]) -> None:
 
 
 def simulated_carts(config: EvaluateConfig) -> int:
-    """How many carts an evaluation simulates at once: one an episode, up to LARGEST_BATCH."""
+    """Return how many carts an evaluation simulates at once: one for each episode, up to LARGEST_BATCH."""
     return min(config.episodes, LARGEST_BATCH)
 
 

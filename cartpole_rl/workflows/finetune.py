@@ -12,6 +12,8 @@ from typing import Any
 from torch import nn
 
 from cartpole_rl.agents.dqn import QAgent
+from cartpole_rl.checking import checked
+from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
 from cartpole_rl.evaluation.driver import Driver
 from cartpole_rl.evaluation.driving_policy import as_weights
 from cartpole_rl.evaluation.metrics import episode_metrics, summarize
@@ -20,16 +22,10 @@ from cartpole_rl.learning.checkpoints import AgentCheckpoint, forget_training, l
 from cartpole_rl.learning.randomness import seed_everything
 from cartpole_rl.reporting.tensorboard import TensorBoardLog
 from cartpole_rl.tasks.episode import Episode
-from cartpole_rl.workflows.build import (
-    evaluated_env,
-    evaluated_settings,
-    new_agent,
-    trained_agent,
-    use_threads,
-)
-from cartpole_rl.workflows.checking import checked
+from cartpole_rl.workflows.agents import new_agent, trained_agent
+from cartpole_rl.workflows.build import evaluated_env, evaluated_settings, use_threads
 from cartpole_rl.workflows.checks import check_finetuning
-from cartpole_rl.workflows.config import CartPoleSettings, EvaluateConfig, FinetuneConfig, TrainConfig
+from cartpole_rl.workflows.config import EvaluateConfig, FinetuneConfig, TrainConfig
 from cartpole_rl.workflows.evaluate import count_text, score_table
 from cartpole_rl.workflows.finetuning_cart import DrivenCart, yield_to
 from cartpole_rl.workflows.finetuning_files import FinetuningFiles, Stage, resumed_config

@@ -7,6 +7,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
+from cartpole_rl.checking import checked
 from cartpole_rl.errors import CheckpointError, ConfigError
 from cartpole_rl.evaluation.recordings import LENGTH, read_recording, write_recording
 from cartpole_rl.learning.checkpoint_files import FOLDER, LAST
@@ -19,7 +20,6 @@ from cartpole_rl.learning.checkpoints import (
 )
 from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.tasks.episode import Episode
-from cartpole_rl.workflows.checking import checked
 from cartpole_rl.workflows.config import FinetuneConfig
 from cartpole_rl.workflows.recordings import RECORDINGS
 

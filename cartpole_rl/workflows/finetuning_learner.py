@@ -8,6 +8,8 @@ import numpy as np
 import torch
 
 from cartpole_rl.agents.dqn import QAgent
+from cartpole_rl.envs.build import environment, randomizer, simulated_env
+from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
 from cartpole_rl.envs.make import CartPoleEnv
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.identification.fit import Fit, fit_cart
@@ -23,8 +25,7 @@ from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.randomization.identified import IdentifiedCarts
 from cartpole_rl.settings import evaluation_seed
 from cartpole_rl.tasks.episode import Episode
-from cartpole_rl.workflows.build import environment, randomizer, simulated_env
-from cartpole_rl.workflows.config import CartPoleSettings, FinetuneConfig, TrainConfig
+from cartpole_rl.workflows.config import FinetuneConfig, TrainConfig
 from cartpole_rl.workflows.finetuning_files import pole_length
 from cartpole_rl.workflows.person import print_message
 

@@ -22,14 +22,15 @@ from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT
 from cartpole_rl.physics.models import CartFriction, Models
 from cartpole_rl.plants.learned_model import LearnedModel, save_model
 from cartpole_rl.plants.model_file import MODEL
+from cartpole_rl.plants.settings import LearnedSettings
+from cartpole_rl.randomization.checks import check_one_pole
 from cartpole_rl.randomization.poles import Pole
 from cartpole_rl.reporting.error_tables import model_table, spread_table
 from cartpole_rl.reporting.figures import save
 from cartpole_rl.reporting.figures.learned_models import forces_along_track, learned_model_figure
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.build import use_threads
-from cartpole_rl.workflows.checks import check_one_pole
-from cartpole_rl.workflows.config import LearnedSettings, ModelConfig
+from cartpole_rl.workflows.config import ModelConfig
 from cartpole_rl.workflows.evaluate import count_text
 from cartpole_rl.workflows.held_out import held_out_windows, split
 from cartpole_rl.workflows.recordings import recordings

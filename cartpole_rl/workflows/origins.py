@@ -1,4 +1,4 @@
-"""The simulated cart and the start of each episode, as metrics.json and recordings hold them."""
+"""The simulated cart and the initial state of each episode, in metrics.json and recordings."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -9,9 +9,9 @@ from cartpole_rl.tasks.episode import Episode, Origin
 
 
 def stored_origins(episodes: Sequence[Episode]) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """What metrics.json holds of the simulated carts: what all have in common, and what each has of its own.
+    """Return the parameters that all simulated carts share, and the rest for each, for metrics.json.
 
-    Nothing where a cart was not simulated. `read_origin` puts both together again.
+    Both are empty where a cart was not simulated. `read_origin` is the inverse.
     """
     stored = [stored_origin(episode.origin) for episode in episodes if episode.origin is not None]
     if len(stored) < len(episodes):
@@ -23,7 +23,7 @@ def stored_origins(episodes: Sequence[Episode]) -> tuple[dict[str, Any], list[di
 
 
 def stored_origin(origin: Origin) -> dict[str, dict[str, float]]:
-    """A cart and its start as they are written down, each number as short as it can be."""
+    """Return a cart and its initial state with numbers as short as possible."""
     return {
         "cart": {name: as_stored(value) for name, value in origin.parameters.items()},
         "start": {name: as_stored(value) for name, value in origin.state.items()},
@@ -31,12 +31,12 @@ def stored_origin(origin: Origin) -> dict[str, dict[str, float]]:
 
 
 def read_origin(metrics: Mapping[str, Any], number: int) -> Origin:
-    """The cart and the start of an episode in metrics.json. Raises LookupError where they are not there."""
+    """Return the cart and the initial state of an episode in metrics.json. Raises LookupError."""
     episode = metrics["episodes"][number]
     return Origin({**metrics["cart"], **episode["cart"]}, episode["start"])
 
 
 def as_stored(value: float) -> float:
-    """The shortest number that is `value` as a float32 again: 0.7 instead of 0.699999988079071."""
+    """Return the shortest number that is `value` as float32: 0.7 instead of 0.699999988079071."""
     short = float(str(np.float32(value)))
     return short if np.float32(short) == np.float32(value) else value

@@ -1,4 +1,4 @@
-"""Where runs keep recordings, without reading them."""
+"""Finds recordings in run folders, without reading them."""
 
 from pathlib import Path
 
@@ -10,9 +10,9 @@ RECORDING = ("record", "identify", "finetune")  # commands whose runs hold recor
 
 
 def recordings(source: Path) -> list[Path]:
-    """The recordings that `source` means: itself, those in it, or those of a run.
+    """Return `source` itself if it is a file, else the recordings in that folder or run folder.
 
-    Raises RecordingError, and ConfigError where it is a run of a command that records nothing.
+    Raises RecordingError where there is none, and ConfigError for a run of a command that records nothing.
     """
     if source.is_file():
         return [source]
@@ -26,11 +26,5 @@ def recordings(source: Path) -> list[Path]:
 
 
 def experiments(source: Path) -> dict[str, Path]:
-    """Recordings by the names of their experiments, or of their files. Raises RecordingError, ConfigError."""
-    check_program("from", source, *RECORDING)
-    inner = source / RECORDINGS
-    paths = sorted((inner if inner.is_dir() else source).glob("*.csv"))
-    if not paths:
-        missing = "it holds no recording" if source.exists() else "there is no such folder"
-        raise RecordingError(f"from={source}: {missing}; give a run of cartpole-identify or cartpole-record")
-    return {path.stem.partition("_")[2] or path.stem: path for path in paths}
+    """Return `recordings` by the names of their experiments, or of their files. Raises the same errors."""
+    return {path.stem.partition("_")[2] or path.stem: path for path in recordings(source)}

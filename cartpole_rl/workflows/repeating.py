@@ -1,4 +1,4 @@
-"""repeat=: one episode of an earlier evaluation again, the same simulated cart from the same start."""
+"""repeat=: one episode of an earlier evaluation, with the same simulated cart from the same start."""
 
 import json
 from collections.abc import Mapping
@@ -8,10 +8,10 @@ from typing import Any
 
 import yaml
 
+from cartpole_rl.checking import checked
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.randomization.poles import Pole
 from cartpole_rl.tasks.episode import Origin
-from cartpole_rl.workflows.checking import checked
 from cartpole_rl.workflows.checks import simulated_carts
 from cartpole_rl.workflows.config import EvaluateConfig
 from cartpole_rl.workflows.origins import read_origin
@@ -20,12 +20,12 @@ from cartpole_rl.workflows.run_folder import CONFIG, METRICS, check_program
 
 @dataclass(frozen=True)
 class Repetition:
-    """An episode to drive again."""
+    """An episode to repeat."""
 
-    config: EvaluateConfig  # of that evaluation, on this cart alone
+    config: EvaluateConfig  # of that evaluation, with this cart only
     origin: Origin
-    row: int  # of the batch: sums of another batch, or in another row, are rounded in another order
-    score: float  # then
+    row: int  # in the batch; another batch or row would be rounded differently
+    score: float  # in that evaluation
 
 
 def repetition(config: EvaluateConfig) -> Repetition | None:
@@ -45,16 +45,16 @@ def repetition(config: EvaluateConfig) -> Repetition | None:
         origin = read_origin(metrics, number)
     except LookupError:
         raise ConfigError(
-            f"repeat.run={run}: its {METRICS} does not tell the cart of each episode; evaluate again"
+            f"repeat.run={run}: its {METRICS} has no cart for each episode; evaluate again"
         ) from None
     batch_number = (recorded.get("repeat") or {}).get("episode")
-    evaluation = as_then(config, recorded, origin)
+    evaluation = same_evaluation(config, recorded, origin)
     row = (number if batch_number is None else batch_number) % simulated_carts(evaluation)
     return Repetition(evaluation, origin, row, metrics["episodes"][number]["score"])
 
 
 def read_evaluation(run: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The config and the metrics of an evaluation in simulation. Raises ConfigError."""
+    """Return the config and the metrics of an evaluation in simulation. Raises ConfigError."""
     check_program("repeat.run", run, "evaluate")
     try:
         recorded = yaml.safe_load((run / CONFIG).read_text())
@@ -62,19 +62,19 @@ def read_evaluation(run: Path) -> tuple[dict[str, Any], dict[str, Any]]:
         plant, _ = metrics["plant"], recorded["evaluated"]
     except (OSError, ValueError, LookupError, TypeError, yaml.YAMLError):
         raise ConfigError(
-            f"repeat.run={run}: it is no finished run of cartpole-evaluate; give the run folder of one"
+            f"repeat.run={run}: it is not a finished run of cartpole-evaluate; give the run folder of one"
         ) from None
     if plant != "simulated":
         raise ConfigError(
-            f"repeat.run={run}: it drove plant={plant}, whose episodes cannot be driven again; give a run "
+            f"repeat.run={run}: it drove plant={plant}, whose episodes cannot be repeated; give a run "
             "with plant=simulated"
         )
     return recorded, metrics
 
 
-def as_then(config: EvaluateConfig, recorded: Mapping[str, Any], origin: Origin) -> EvaluateConfig:
-    """The recorded evaluation with the agent of `config`, on that cart alone. Raises ConfigError."""
-    then = {name: recorded[name] for name in EvaluateConfig.model_fields if name in recorded}
+def same_evaluation(config: EvaluateConfig, recorded: Mapping[str, Any], origin: Origin) -> EvaluateConfig:
+    """Return the recorded evaluation with the agent of `config`, on that cart only. Raises ConfigError."""
+    former = {name: recorded[name] for name in EvaluateConfig.model_fields if name in recorded}
     own = {name: getattr(config, name) for name in ("run", "label", "repeat")}
     pole = {name: origin.parameters[name] for name in Pole.model_fields}
     of_cart = {name: value for name, value in origin.parameters.items() if name not in pole}
@@ -83,4 +83,4 @@ def as_then(config: EvaluateConfig, recorded: Mapping[str, Any], origin: Origin)
         "pole": {"choices": {f"{2 * pole['pole_com']:.2f} m": pole}},
         "randomization": {},
     }
-    return checked(EvaluateConfig, {**then, **own, **one_cart})
+    return checked(EvaluateConfig, {**former, **own, **one_cart})

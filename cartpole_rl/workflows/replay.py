@@ -13,12 +13,12 @@ from cartpole_rl.evaluation.recordings import LENGTH, read_recording
 from cartpole_rl.identification.replay import recorded_period, replay
 from cartpole_rl.physics.bounds import check_names, check_values
 from cartpole_rl.physics.models import Models
+from cartpole_rl.randomization.checks import check_one_pole
 from cartpole_rl.randomization.poles import Pole
 from cartpole_rl.reporting.error_tables import replay_table
 from cartpole_rl.reporting.figures import save
 from cartpole_rl.reporting.figures.replays import replay_figure
 from cartpole_rl.reporting.replays import errors_at
-from cartpole_rl.workflows.checks import check_one_pole
 from cartpole_rl.workflows.config import ReplayConfig
 from cartpole_rl.workflows.evaluate import count_text
 from cartpole_rl.workflows.recordings import recordings

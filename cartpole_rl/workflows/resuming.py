@@ -1,4 +1,4 @@
-"""The training or fine-tuning that resume= goes on with: one that was stopped before its end."""
+"""resume=: a training or fine-tuning that was stopped before its end."""
 
 from pathlib import Path
 
@@ -14,10 +14,10 @@ FORMATS = {"train": TRAINING_FORMAT, "finetune": FINETUNING_FORMAT}
 
 
 def resumed(program: str, resume: str | None, folder: Path) -> TrainingCheckpoint | None:
-    """Return what cartpole-<program> goes on with in `folder`; None for a new run.
+    """Return the state from which cartpole-<program> continues in `folder`; None for a new run.
 
-    Raises ConfigError where the run has ended or is one of another command; CheckpointError where there is
-    nothing to go on from.
+    Raises ConfigError where the run has ended or is of another command, CheckpointError where it holds no
+    state.
     """
     if resume is None:
         return None

@@ -1,6 +1,6 @@
-"""What every run folder holds beside its results: the resolved config, and what it was run with.
+"""Run folders: the config and the provenance in each, and the command that wrote it.
 
-A run folder says which command made it, so that a command can refuse the folder of another one.
+A command refuses the run folder of a command whose results it cannot use.
 """
 
 import json
@@ -15,17 +15,18 @@ from typing import Any
 import yaml
 
 from cartpole_rl.errors import ConfigError
+from cartpole_rl.files import replacing
 from cartpole_rl.learning.checkpoint_files import FOLDER, LAST, RESUME
 
 CONFIG, PROVENANCE, MULTIRUN = "config.yaml", "provenance.json", "multirun.yaml"
 METRICS = "metrics.json"
 PREFIX = "cartpole-"
-USES = {  # command: what can be done with one of its runs
+USES = {  # command: how its runs can be used
     "train": "cartpole-evaluate, cartpole-record and cartpole-finetune take it as run={0}",
     "finetune": "cartpole-evaluate, cartpole-record and cartpole-finetune take it as run={0}",
     "evaluate": "cartpole-evaluate drives one of its episodes again: repeat.run={0}",
     "record": "cartpole-replay, cartpole-identify and cartpole-model take it as from={0}",
-    "replay": "its replay.json and figures are its results; cartpole-replay from=... makes others",
+    "replay": "its results are replay.json and figures/; cartpole-replay from=... makes others",
     "identify": "cartpole-train takes its files: cart={0}/cart.yaml pole={0}/pole.yaml "
     "randomization={0}/randomization.yaml",
     "model": "cartpole-train, cartpole-evaluate and cartpole-record take it as plant=learned plant.model={0}",
@@ -34,11 +35,10 @@ PACKAGES = ("cartpole_rl", "torch", "torchrl", "tensordict", "numpy", "hydra-cor
 
 
 def write_config(folder: Path, program: str, config: Mapping[str, Any], resumed: bool = False) -> None:
-    """Write config.yaml (resolved) and provenance.json of a run of cartpole-<program>.
+    """Write config.yaml and provenance.json of a run of cartpole-<program>.
 
-    A resumed run adds to the latter what resumed it.
-
-    Raises ConfigError where the folder holds another run: none is ever overwritten.
+    A resumed run adds its provenance to that of the first start. Raises ConfigError where a new run would
+    overwrite another one.
     """
     if resumed:
         first = json.loads((folder / PROVENANCE).read_text())
@@ -48,27 +48,24 @@ def write_config(folder: Path, program: str, config: Mapping[str, Any], resumed:
     if (folder / CONFIG).exists():
         raise ConfigError(f"hydra.run.dir={folder}: it holds a run already; give another folder")
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / CONFIG).write_text(yaml.safe_dump(dict(config), sort_keys=False))
+    with replacing(folder / CONFIG) as beside:
+        beside.write_text(yaml.safe_dump(dict(config), sort_keys=False))
     head = {"program": f"{PREFIX}{program}", "seed": config["seed"]}
     write_json(folder / PROVENANCE, {**head, **provenance()})
 
 
 def program_of(folder: Path) -> str | None:
-    """Return the command that made the run in `folder`, as a key of USES; None where none did.
-
-    Runs from before provenance.json named it have it in their command line.
-    """
+    """Return the command that wrote the run in `folder`, as a key of USES; None for any other folder."""
     try:
-        told = json.loads((folder / PROVENANCE).read_text())
-        named = told.get("program") or Path(told["command"][0]).stem
-    except (OSError, ValueError, AttributeError, LookupError, TypeError):
+        program = json.loads((folder / PROVENANCE).read_text())["program"]
+    except (OSError, ValueError, LookupError, TypeError):
         return None
-    name = str(named).removeprefix(PREFIX)
+    name = str(program).removeprefix(PREFIX)
     return name if name in USES else None
 
 
-def check_program(setting: str, folder: Path, *wanted: str) -> None:
-    """Raise ConfigError, with what can be done, where `folder` is a run of another command than `wanted`."""
+def check_program(setting: str, folder: Path, *taken: str) -> None:
+    """Raise ConfigError where `folder` is a run of a command that is not among `taken`."""
     if (folder / MULTIRUN).is_file():
         jobs = sorted(path for path in folder.iterdir() if path.is_dir())
         example = f": {setting}={jobs[0]}" if jobs else ""
@@ -76,31 +73,31 @@ def check_program(setting: str, folder: Path, *wanted: str) -> None:
             f"{setting}={folder} is a folder of a multirun; give that of one of its jobs{example}"
         )
     program = program_of(folder)
-    if program is None or program in wanted:
+    if program is None or program in taken:
         return
-    right = " or ".join(f"{PREFIX}{name}" for name in wanted)
+    right = " or ".join(f"{PREFIX}{name}" for name in taken)
     raise ConfigError(
         f"{setting}={folder} is a run of {PREFIX}{program}, not of {right}; {use_of(folder, program)}"
     )
 
 
 def use_of(folder: Path, program: str) -> str:
-    """Say what can be done with a run of cartpole-<program>."""
+    """Return how a run of cartpole-<program> can be used."""
     if program in ("train", "finetune") and not (folder / METRICS).exists():
         if (folder / FOLDER / RESUME).exists():
-            return f"{PREFIX}{program} resume={folder} goes on with it"
+            return f"{PREFIX}{program} resume={folder} continues it"
         return f"it was stopped before its first checkpoint; start {PREFIX}{program} again"
     return USES[program].format(folder)
 
 
 def has_ended(run: Path) -> bool:
-    """Whether a training or fine-tuning came to its end: its results are there and nothing to resume from."""
+    """True where a training or fine-tuning has results and no state to resume from."""
     results = (run / METRICS).exists() and (run / FOLDER / LAST).exists()
     return results and not (run / FOLDER / RESUME).exists()
 
 
 def provenance() -> dict[str, Any]:
-    """Command, versions and commit that a result depends on."""
+    """Return the command line, the versions and the commit that a result depends on."""
     return {
         "command": sys.argv,
         "python": platform.python_version(),
@@ -110,9 +107,9 @@ def provenance() -> dict[str, Any]:
 
 
 def git_commit() -> str | None:
-    """Commit of the checkout the package runs from, "-dirty" if changed; None outside a checkout."""
+    """Return the commit of the checkout that runs, "-dirty" if it was changed; None for a wheel."""
     checkout = Path(__file__).resolve().parents[2]
-    if not (checkout / ".git").exists():  # an installed package may lie in somebody else's repository
+    if not (checkout / ".git").exists():  # git would find a repository around the installed package
         return None
     command = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
     try:
@@ -123,8 +120,9 @@ def git_commit() -> str | None:
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Indented JSON, NaN refused."""
-    path.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
+    """Write indented JSON. Raises ValueError for NaN."""
+    with replacing(path) as beside:
+        beside.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
 
 
 def _version(name: str) -> str | None:

@@ -6,11 +6,11 @@ from typing import Any, TypeVar
 
 import yaml
 
+from cartpole_rl.checking import checked
 from cartpole_rl.choices import choice, default_choices
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.settings import Settings
-from cartpole_rl.workflows.checking import checked
 from cartpole_rl.workflows.config import (
     EvaluateConfig,
     FinetuneConfig,

@@ -3,6 +3,7 @@
 from functools import partial
 from pathlib import Path
 
+from cartpole_rl.envs.build import simulated_env
 from cartpole_rl.envs.make import CartPoleEnv
 from cartpole_rl.evaluation.driving_policy import DrivingPolicy
 from cartpole_rl.evaluation.episodes import Policy, run_batch
@@ -10,12 +11,14 @@ from cartpole_rl.learning.checkpoints import forget_training, restore_weights
 from cartpole_rl.learning.randomness import seed_everything
 from cartpole_rl.learning.training import Training
 from cartpole_rl.plants.effects import without_effect
+from cartpole_rl.plants.settings import LearnedSettings
 from cartpole_rl.randomization.draws import Draws
 from cartpole_rl.settings import evaluation_seed
 from cartpole_rl.tasks.episode import Episode
-from cartpole_rl.workflows.build import new_agent, recorded_config, simulated_env, use_threads
+from cartpole_rl.workflows.agents import new_agent, recorded_config
+from cartpole_rl.workflows.build import use_threads
 from cartpole_rl.workflows.checks import check_compiler
-from cartpole_rl.workflows.config import LearnedSettings, TrainConfig
+from cartpole_rl.workflows.config import TrainConfig
 from cartpole_rl.workflows.monitor import TrainingMonitor
 from cartpole_rl.workflows.person import print_message
 from cartpole_rl.workflows.report import report
@@ -43,7 +46,9 @@ def train(config: TrainConfig, folder: Path) -> None:
     note_unused_randomization(config, env.plant.randomizer)
     agent = new_agent(config)
     if checkpoint:
-        restore_weights(agent, checkpoint.state["agent"], f"resume={folder}")  # or complain before any work
+        restore_weights(
+            agent, checkpoint.state["agent"], f"resume={folder}"
+        )  # an error comes before any work
     policy = DrivingPolicy(agent.greedy_policy(), config.compile)
     evaluate = partial(judge, nominal_env(config), policy, config.seed)
     write_config(folder, "train", config.model_dump(mode="json"), resumed=checkpoint is not None)
@@ -73,7 +78,7 @@ def train(config: TrainConfig, folder: Path) -> None:
 
 
 def note_unused_randomization(config: TrainConfig, draws: Draws) -> None:
-    """Name the ranges that change nothing with the chosen actions and friction models, if there are any."""
+    """Print the ranges that change nothing with the chosen actions and friction models."""
     models = config.models(config.plant)
     if unused := without_effect(draws, config.ranges, config.actions.motors, models, config.control_period):
         chosen = (
@@ -84,7 +89,7 @@ def note_unused_randomization(config: TrainConfig, draws: Draws) -> None:
 
 
 def nominal_env(config: TrainConfig) -> CartPoleEnv:
-    """Where the agent is judged: the nominal cart with each pole in turn, starting as the task says."""
+    """Return the environment of evaluations: the nominal cart with each pole in turn."""
     poles = config.pole.each
     assert poles.choices is not None
     carts = len(poles.choices) * max(1, config.learning.evaluation_episodes // len(poles.choices))
@@ -96,6 +101,6 @@ def nominal_env(config: TrainConfig) -> CartPoleEnv:
 
 
 def judge(env: CartPoleEnv, policy: Policy, seed: int) -> list[Episode]:
-    """Episodes of the greedy policy in a training with `seed`, from the same starts each time."""
+    """Return episodes of the greedy policy in a training with `seed`, from the same starts each time."""
     env.set_seed(evaluation_seed(seed))
     return run_batch(env, policy)

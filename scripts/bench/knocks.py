@@ -15,8 +15,10 @@ import torch
 from common import option_parser, print_table, write_json
 from torch import Tensor
 
+from cartpole_rl.envs.build import simulated_env
 from cartpole_rl.settings import evaluation_seed
-from cartpole_rl.workflows.build import TrainedAgent, simulated_env, trained_agent, use_threads
+from cartpole_rl.workflows.agents import TrainedAgent, trained_agent
+from cartpole_rl.workflows.build import use_threads
 
 KNOCK, PATIENCE, HOLD = 250, 150, 50  # periods of 0.02 s: 5 s, 3 s, 1 s
 SPEEDS = (6.0, 10.0)  # rad/s

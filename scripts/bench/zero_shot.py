@@ -32,18 +32,13 @@ from common import LOST_SCORE, option_parser, positive_int, print_table, read_js
 from numpy.typing import NDArray
 from truths import COMPARED, REPORTED, Truth, draw_truths
 
+from cartpole_rl.checking import checked
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import PlantError
 from cartpole_rl.evaluation.episodes import run_episodes
 from cartpole_rl.reporting.table import Cell
-from cartpole_rl.workflows.build import (
-    TrainedAgent,
-    evaluated_env,
-    evaluated_settings,
-    trained_agent,
-    use_threads,
-)
-from cartpole_rl.workflows.checking import checked
+from cartpole_rl.workflows.agents import TrainedAgent, trained_agent
+from cartpole_rl.workflows.build import evaluated_env, evaluated_settings, use_threads
 from cartpole_rl.workflows.config import EvaluateConfig
 
 NOMINAL_STARTS = 20

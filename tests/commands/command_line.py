@@ -3,9 +3,12 @@
 import contextlib
 import importlib
 import io
+import os
 import signal
 import subprocess
 import sys
+import threading
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from unittest.mock import patch
@@ -33,7 +36,7 @@ ONCE = "learning.evaluations=1"  # most of a tiny training's time goes into pict
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a user sees of a command."""
+    """The exit code and the output of a command."""
 
     code: int
     out: str
@@ -69,6 +72,17 @@ def in_process(command: str, *words: str, folder: Path) -> Outcome:
     return Outcome(code, out.getvalue(), err.getvalue())
 
 
+def interrupt_after(file: Path) -> None:
+    """Send SIGINT to this process as soon as `file` exists."""
+
+    def interrupt() -> None:
+        while not file.exists():
+            time.sleep(0.01)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    threading.Thread(target=interrupt, daemon=True).start()
+
+
 def console_script(command: str, *words: str, folder: Path) -> "subprocess.Popen[str]":
     """The installed `cartpole-<command>`, just started."""
     return subprocess.Popen(
@@ -81,7 +95,7 @@ def console_script(command: str, *words: str, folder: Path) -> "subprocess.Popen
 
 
 def outcome(process: "subprocess.Popen[str]", timeout: float = 120) -> Outcome:
-    """What a started command comes to."""
+    """Wait for a started command, and return its outcome."""
     try:
         out, err = process.communicate(timeout=timeout)
     finally:
@@ -89,8 +103,8 @@ def outcome(process: "subprocess.Popen[str]", timeout: float = 120) -> Outcome:
     return Outcome(process.returncode, out, err)
 
 
-def tells_only_how_it_goes(done: Outcome, trainings: int = 1) -> bool:
-    """Whether trainings left no warning and no log of a library: progress bars, a line each at the end."""
+def prints_only_progress(done: Outcome, trainings: int = 1) -> bool:
+    """True where trainings printed progress bars and a line each, and no warning or log of a library."""
     lines = done.err.replace("\r", "\n").splitlines()
     bars = all("transitions/s" in line for line in lines if line.strip())
     return bars and len(done.out.splitlines()) == trainings

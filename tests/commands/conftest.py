@@ -1,13 +1,9 @@
 """Runs that several tests use: a training that came to its end, and one that was stopped before."""
 
-import os
-import signal
-import threading
-import time
 from pathlib import Path
 
 import pytest
-from command_line import TINY, in_process, tells_only_how_it_goes
+from command_line import TINY, Outcome, in_process, interrupt_after, prints_only_progress
 
 
 @pytest.fixture(scope="session")
@@ -16,22 +12,22 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("trained")
     done = in_process("train", *TINY, "actions=two", "hydra.run.dir=run", folder=folder)
     assert done.code == 0, done.err
-    assert tells_only_how_it_goes(done), done
+    assert prints_only_progress(done), done
     return folder / "run"
 
 
 @pytest.fixture(scope="session")
-def stopped(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The run folder of a tiny training that was interrupted once it had something to resume from."""
+def interrupted(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Outcome]:
+    """The folder and the outcome of a tiny training that was interrupted after its first checkpoint."""
     folder = tmp_path_factory.mktemp("stopped")
-
-    def interrupt() -> None:
-        while not (folder / "run/checkpoints/resume.pt").exists():
-            time.sleep(0.01)
-        os.kill(os.getpid(), signal.SIGINT)
-
-    threading.Thread(target=interrupt, daemon=True).start()
+    interrupt_after(folder / "run/checkpoints/resume.pt")
     longer = ("actions=two", "learning.transitions=2000000", "learning.evaluations=2000", "hydra.run.dir=run")
-    done = in_process("train", *TINY, *longer, folder=folder)
+    return folder / "run", in_process("train", *TINY, *longer, folder=folder)
+
+
+@pytest.fixture(scope="session")
+def stopped(interrupted: tuple[Path, Outcome]) -> Path:
+    """The run folder of the interrupted training."""
+    folder, done = interrupted
     assert done.code == 130, done.err
-    return folder / "run"
+    return folder

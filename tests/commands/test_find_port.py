@@ -32,7 +32,7 @@ def test_a_watch_in_which_nothing_happens_ends(tmp_path: Path) -> None:
     done = in_process("find_port", "watch=true", "timeout=0.3", folder=tmp_path)
     assert done.code == 1
     assert "Unplug the cart now" in done.out
-    assert "no port came or went within 0.3 s" in done.complaint
+    assert "no port appeared or vanished within 0.3 s" in done.complaint
 
 
 def test_a_wrong_setting_is_told(tmp_path: Path) -> None:
@@ -47,7 +47,7 @@ def test_help_has_examples(tmp_path: Path) -> None:
     ("ports", "last"),
     [
         ([CH340, MODEM], "The cart is probably on it: plant.port=/dev/ttyUSB0, or plant.port=auto"),
-        ([CH340, FTDI], "`cartpole-find-port watch=true` tells which of them is the cart"),
+        ([CH340, FTDI], "`cartpole-find-port watch=true` finds out which of them is the cart"),
         ([MODEM], "None of them has a chip that carts have (CP210x, CH340, FTDI, Espressif)"),
     ],
 )

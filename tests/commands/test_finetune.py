@@ -14,7 +14,7 @@ from command_line import ONCE, TINY, Outcome, console_script, in_process, outcom
 from tensorboard.backend.event_processing.event_file_loader import EventFileLoader
 
 from cartpole_rl.evaluation.recordings import read_recording
-from cartpole_rl.workflows.build import trained_agent
+from cartpole_rl.workflows.agents import trained_agent
 
 SHORT = (
     "plant=emulated",

@@ -38,7 +38,7 @@ def test_help_shows_examples_and_choices(command: str, tmp_path: Path) -> None:
     assert done.code == 0
     assert done.err == ""
     assert f"Examples\n  cartpole-{command}" in done.out
-    assert f"\n{SHOWN[command]}\n" in done.out
+    assert f"\n  {SHOWN[command]}\n" in done.out
     assert not list(tmp_path.iterdir())
 
 
@@ -48,17 +48,24 @@ def test_help_shows_the_groups_that_the_command_reads_and_no_other(command: str,
     done = in_process(command, "--help", folder=tmp_path)
     assert done.code == 0
     groups = {path.name for path in conf_folder().iterdir() if path.is_dir()}
-    shown = {line.partition(":")[0] for line in done.out.splitlines() if re.match(r"\w+: \w", line)}
+    shown = {line.partition(":")[0].strip() for line in done.out.splitlines() if re.match(r"  \w+: \w", line)}
     assert shown & groups == groups & SCHEMAS[command].model_fields.keys() | WITHOUT_A_SETTING.get(
         command, set()
     )
+
+
+@pytest.mark.parametrize(
+    ("command", "plants"), [("train", "learned, simulated"), ("finetune", "emulated, serial")]
+)
+def test_help_shows_the_plants_that_the_command_takes(command: str, plants: str, tmp_path: Path) -> None:
+    assert f"\n  plant: {plants}\n" in in_process(command, "--help", folder=tmp_path).out
 
 
 def test_help_shows_choices_of_ones_own(tmp_path: Path) -> None:
     (tmp_path / "mine/pole").mkdir(parents=True)
     (tmp_path / "mine/pole/broomstick.yaml").write_text("choices: {}\n")
     done = in_process("train", "--config-dir=mine", "--help", folder=tmp_path)
-    assert "\npole: both, broomstick, large, medium, range\n" in done.out
+    assert "\n  pole: both, broomstick, large, medium, range\n" in done.out
 
 
 @pytest.mark.parametrize("command", COMMANDS)

@@ -115,7 +115,7 @@ class TestBadInput:
     def test_several_poles(self, tmp_path: Path) -> None:
         done = in_process("identify", "pole=both", folder=tmp_path)
         assert done.code == 2
-        assert "a cart carries one pole" in done.complaint
+        assert "an identification takes one pole" in done.complaint
 
     def test_another_rate(self, identified: Path, tmp_path: Path) -> None:
         done = in_process("identify", f"from={identified / 'run'}", "control_period=0.01", folder=tmp_path)

@@ -32,8 +32,8 @@ COMPLAINS = {  # command: words, exit code, part of the line on stderr
         ("finetuning.epsilon=0.5", 2, "less than or equal to 0.2"),
     ],
     "identify": [
-        ("from=nowhere", 1, "from=nowhere: there is no such folder"),
-        ("pole=range", 2, "choose it, as pole=medium"),
+        ("from=nowhere", 1, "from=nowhere: there is no such file or folder"),
+        ("pole=range", 2, "choose one, as pole=medium"),
     ],
     "model": [
         ("from=nowhere", 1, "from=nowhere: there is no such file or folder"),

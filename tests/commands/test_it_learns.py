@@ -1,15 +1,13 @@
-"""Learning itself: short trainings that end far above what no learning gets. Fails when learning breaks."""
+"""Short trainings that end far above the score without learning."""
 
 import json
-import os
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from command_line import in_process
 from tensordict import TensorDictBase
 
 from cartpole_rl.agents.baseline import EnergyAndRegulator
@@ -45,10 +43,8 @@ BALANCED = 0.5  # of the periods within 5 degrees; three seeds had 0.78 to 0.79,
 
 def train(folder: Path, *overrides: str) -> dict:
     """metrics.json of a training with `overrides`."""
-    command = [Path(sys.executable).with_name("cartpole-train"), *overrides, f"hydra.run.dir={folder}"]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, env=environment)
-    assert done.returncode == 0, done.stderr
+    done = in_process("train", *overrides, f"hydra.run.dir={folder}", folder=folder)
+    assert done.code == 0, done.err
     return json.loads((folder / "metrics.json").read_text())
 
 

@@ -76,7 +76,7 @@ def test_a_model_that_does_not_fit_is_refused(learned: tuple[Path, Outcome], tmp
     model = f"plant.model={learned[0]}"
     for word, complaint in {
         "pole=large": "pole: plant.model has one of 0.36 m, not 0.66 m",
-        "pole=both": "pole: plant.model has one pole, not medium or large; choose it, as pole=medium",
+        "pole=both": "pole: plant.model takes one pole, not medium or large; choose one, as pole=medium",
         "control_period=0.01": "control_period=0.01: plant.model has 0.02 s",
         "actions=nine_newtons": "actions: plant.model has actuator force_curve",
     }.items():

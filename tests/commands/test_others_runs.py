@@ -18,7 +18,7 @@ WHAT_TO_DO = {  # with a folder, by what made it
     "replay": "cartpole-replay from=... makes others",
     "identify": "cartpole-train takes its files: cart={0}/cart.yaml",
     "model": "plant=learned plant.model={0}",
-    "unfinished": "cartpole-train resume={0} goes on with it",
+    "unfinished": "cartpole-train resume={0} continues it",
     "multirun": "give that of one of its jobs",
 }
 ENDED = "has ended; cartpole-evaluate run={0} drives its agent"
@@ -47,17 +47,18 @@ def runs(trained: Path, stopped: Path, tmp_path_factory: pytest.TempPathFactory)
     folder = tmp_path_factory.mktemp("runs")
     shutil.copytree(trained, folder / "train")
     shutil.copytree(stopped, folder / "unfinished")
+    emulated = ("plant=emulated", "emulator.physics_step=1e-3")
     identify = ("windows=20", "substeps=2", "carts=100")
     model = ("windows=20", "ensemble.members=1", "ensemble.hidden=4", "ensemble.updates=2")
     finetune = ("episodes=1", "evaluation_episodes=1", "finetuning.iterations=1", "compile=false")
     made = (
         ("evaluate", "run=train", "episodes=1", "hydra.run.dir=evaluate"),
         ("record", "run=lqr", "episodes=3", "hydra.run.dir=record"),
-        ("record", "-m", "run=lqr", "episodes=1", "seed=0,1", "hydra.sweep.dir=multirun"),
+        ("record", "-m", "run=train", "episodes=1", "seed=0,1", "hydra.sweep.dir=multirun"),
         ("replay", "from=record", "hydra.run.dir=replay"),
-        ("identify", "plant=emulated", *identify, "hydra.run.dir=identify"),
+        ("identify", *emulated, *identify, "hydra.run.dir=identify"),
         ("model", "from=record", *model, "hydra.run.dir=model"),
-        ("finetune", "run=train", "plant=emulated", *finetune, "hydra.run.dir=finetune"),
+        ("finetune", "run=train", *emulated, *finetune, "hydra.run.dir=finetune"),
     )
     for command, *words in made:
         done = in_process(command, *words, folder=folder)
@@ -73,14 +74,9 @@ def contents(folder: Path) -> dict[str, tuple[int, int]]:
 
 def test_every_run_says_what_made_it(runs: Path) -> None:
     for command in USES:
-        told = json.loads((runs / command / "provenance.json").read_text())
-        assert told["program"] == f"cartpole-{command}"
+        provenance = json.loads((runs / command / "provenance.json").read_text())
+        assert provenance["program"] == f"cartpole-{command}"
         assert program_of(runs / command) == command
-        del told["program"]  # as it was before
-        older = runs / f"older_{command}"
-        older.mkdir()
-        (older / "provenance.json").write_text(json.dumps(told))
-        assert program_of(older) == command
     assert program_of(runs) is None
 
 

@@ -1,16 +1,12 @@
-"""What cartpole-record leaves, on every kind of cart, and when it is interrupted; what run=lqr is."""
+"""cartpole-record on every kind of cart and when it is interrupted, and run=lqr."""
 
 import json
 import math
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import pytest
 import yaml
-from command_line import in_process
+from command_line import in_process, interrupt_after
 
 from cartpole_rl.evaluation.recordings import read_recording
 
@@ -68,7 +64,7 @@ def test_the_baseline_knows_the_nominal_cart_and_not_the_simulated_one(tmp_path:
 def test_the_baseline_has_one_pole(pole: str, tmp_path: Path) -> None:
     done = in_process("record", "run=lqr", f"pole={pole}", folder=tmp_path)
     assert done.code == 2
-    assert "run=lqr is" in done.complaint
+    assert "run=lqr takes one pole" in done.complaint
     assert "choose one, as pole=medium" in done.complaint
     assert not list(tmp_path.glob("runs/record/*"))
 
@@ -77,27 +73,12 @@ def test_nothing_is_recorded_of_no_run(tmp_path: Path) -> None:
     assert "run is missing; give run=..." in in_process("record", folder=tmp_path).complaint
 
 
-def test_an_interrupt_keeps_what_has_ended(tmp_path: Path) -> None:
+def test_an_interrupt_keeps_the_finished_episodes(tmp_path: Path) -> None:
+    interrupt_after(tmp_path / "run/recordings/episode_000.csv")
     words = ("run=lqr", "plant=emulated", "episodes=1000", "hydra.run.dir=run")
-    recorder = subprocess.Popen(
-        [sys.executable, "-m", "cartpole_rl.commands.record", *words],
-        cwd=tmp_path,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    try:
-        end = time.monotonic() + 120
-        while not (tmp_path / "run/recordings/episode_000.csv").exists():
-            assert time.monotonic() < end
-            assert recorder.poll() is None
-            time.sleep(0.05)
-        recorder.send_signal(signal.SIGINT)
-        out, err = recorder.communicate(timeout=60)
-    finally:
-        recorder.kill()
-    assert recorder.returncode == 130
-    assert err.endswith("cartpole-record: interrupted\n")
+    done = in_process("record", *words, folder=tmp_path)
+    assert done.code == 130
+    assert done.err.endswith("cartpole-record: interrupted\n")
     paths = sorted((tmp_path / "run/recordings").glob("*.csv"))
-    assert f"holds {len(paths)} episode" in out
+    assert f"holds {len(paths)} episode" in done.out
     assert all(read_recording(path).ended_by == "time" for path in paths)

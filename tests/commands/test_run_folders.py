@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import torch
 import yaml
-from command_line import TINY, console_script, in_process, outcome, tells_only_how_it_goes
+from command_line import TINY, console_script, in_process, outcome, prints_only_progress
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from cartpole_rl.commands.composition import job_name, run_folder
@@ -146,7 +146,7 @@ def sweep(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     swept = ["actions=two", "randomization=wide,friction_6", "seed=0,1"]  # as `trained`
     done = in_process("train", "-m", *TINY, *swept, folder=folder)
     assert done.code == 0, done.err
-    assert tells_only_how_it_goes(done, trainings=4)
+    assert prints_only_progress(done, trainings=4)
     (made,) = folder.glob("runs/train/*_multirun")
     return sorted(path for path in made.iterdir() if path.is_dir())
 
@@ -259,7 +259,7 @@ def test_what_a_broken_link_leaves_is_reported(
         yield next(run_episodes(env, policy, episodes))
         raise LinkError("the cart was unplugged")
 
-    monkeypatch.setattr("cartpole_rl.workflows.evaluate.run_episodes", pulled)
+    monkeypatch.setattr("cartpole_rl.workflows.episodes.run_episodes", pulled)
     done = in_process("evaluate", f"run={trained}", "hydra.run.dir=it", folder=tmp_path)
     assert done.code == 1
     assert done.err.splitlines()[-1] == "cartpole-evaluate: the cart was unplugged"

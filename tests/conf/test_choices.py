@@ -8,13 +8,13 @@ import hydra
 import pytest
 import yaml
 from hydra.core.global_hydra import GlobalHydra
-from omegaconf import OmegaConf
 
-from cartpole_rl.choices import conf_folder
+from cartpole_rl.checking import checked
+from cartpole_rl.choices import conf_folder, default_choices
 from cartpole_rl.commands.composition import as_mapping
+from cartpole_rl.envs.build import randomizer
 from cartpole_rl.tasks.settings import Reward
-from cartpole_rl.workflows.build import evaluated_settings, randomizer
-from cartpole_rl.workflows.checking import checked
+from cartpole_rl.workflows.build import evaluated_settings
 from cartpole_rl.workflows.config import EmulateConfig, EvaluateConfig, FinetuneConfig, TrainConfig
 
 CONF = conf_folder()
@@ -92,24 +92,46 @@ def test_the_emulated_carts_differ_in_the_pole_alone() -> None:
     assert {key for key in medium if medium[key] != large[key]} == {"pole_mass", "pole_com", "pole_inertia"}
 
 
-@pytest.mark.parametrize("name", ["train", "evaluate", "emulate"])
-def test_each_command_has_a_help_page_with_examples(name: str) -> None:
-    page = yaml.safe_load((CONF / f"hydra/help/{name}.yaml").read_text())
-    assert page["app_name"] == f"cartpole-{name}"
-    assert f"cartpole-{name} " in page["template"].split("Examples")[1]
+@pytest.mark.parametrize("name", sorted(path.stem for path in CONF.glob("*.yaml")))
+def test_each_command_has_a_help_page_with_three_examples(name: str) -> None:
+    program = f"cartpole-{name.replace('_', '-')}"
+    page = hydra.compose(name, return_hydra_config=True).hydra.help
+    assert page.app_name == program
+    assert page.header.startswith(f"{program} ")
+    examples = page.header.split("Examples\n")[1].splitlines()
+    assert len(examples) == 3
+    assert all(example.startswith(f"  {program}") for example in examples)
 
 
-@pytest.mark.parametrize("experiment", sorted(path.stem for path in (CONF / "experiment").glob("*.yaml")))
-def test_an_experiment_holds_only_choices_and_differences(experiment: str) -> None:
-    """A line that says what the default says anyway is an error, but for the choices that define it."""
-    content = yaml.safe_load((CONF / f"experiment/{experiment}.yaml").read_text())
-    plain = OmegaConf.create({key: value for key, value in content.items() if key != "defaults"})
-    default = hydra.compose("train")
-    for key in plain:
-        assert plain[key] != default[key], key
+EXPERIMENTS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
+
+
+def leaves(tree: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Each number, text or list in nested mappings by its dotted name."""
+    if not isinstance(tree, dict):
+        yield prefix.removesuffix("."), tree
+        return
+    for key, value in tree.items():
+        yield from leaves(value, f"{prefix}{key}.")
+
+
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
+def test_training_takes_an_experiment(experiment: str) -> None:
+    assert checked(TrainConfig, composed("train", f"experiment={experiment}"))
+
+
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
+def test_an_experiment_holds_only_differences(experiment: str) -> None:
+    """From the defaults of cartpole-train. Those of the thesis name every group, each with its source."""
+    content = yaml.safe_load((CONF / f"experiment/{experiment}.yaml").read_text()) or {}
+    groups = dict(next(iter(line.items())) for line in content.pop("defaults", []))
+    chosen = {name.removeprefix("override /"): choice for name, choice in groups.items()}
+    if not experiment.startswith("thesis"):
+        assert not chosen.items() & default_choices("train").items()
+    before = dict(leaves(composed("train", *(f"{group}={name}" for group, name in chosen.items()))))
+    assert not [name for name, value in leaves(content) if before[name] == value]
 
 
 def test_every_file_says_what_it_is() -> None:
     for path in CONF.rglob("*.yaml"):
-        if "help" not in path.parts:
-            assert path.read_text().lstrip().startswith("#"), path
+        assert path.read_text().lstrip().startswith("#"), path

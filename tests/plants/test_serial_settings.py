@@ -10,6 +10,7 @@ import serial
 from hydra.core.global_hydra import GlobalHydra
 from serial_peer import CartPeer
 
+from cartpole_rl.checking import checked
 from cartpole_rl.choices import conf_folder
 from cartpole_rl.commands.composition import as_mapping
 from cartpole_rl.envs.make import CartPoleEnv
@@ -17,7 +18,6 @@ from cartpole_rl.errors import ConfigError, LinkError, PlantError
 from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.wire import Flags
 from cartpole_rl.workflows.build import evaluated_env, evaluated_settings
-from cartpole_rl.workflows.checking import checked
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
 
 TIMEOUTS = {

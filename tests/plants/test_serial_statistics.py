@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from hydra.core.global_hydra import GlobalHydra
 
+from cartpole_rl.checking import checked
 from cartpole_rl.choices import conf_folder
 from cartpole_rl.commands.composition import as_mapping
+from cartpole_rl.envs.build import randomizer
 from cartpole_rl.errors import PlantError
 from cartpole_rl.plants.serial.statistics import LATENCY_SAMPLES, LatencyRing, LinkStatistics
 from cartpole_rl.randomization.ranges import Range
-from cartpole_rl.workflows.build import randomizer
-from cartpole_rl.workflows.checking import checked
 from cartpole_rl.workflows.config import TrainConfig
 
 

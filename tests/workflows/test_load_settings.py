@@ -9,11 +9,11 @@ import pytest
 import yaml
 from hydra.core.global_hydra import GlobalHydra
 
+from cartpole_rl.checking import checked
 from cartpole_rl.choices import conf_folder
 from cartpole_rl.commands.composition import as_mapping
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.settings import Settings
-from cartpole_rl.workflows.checking import checked
 from cartpole_rl.workflows.config import EvaluateConfig, PreflightConfig, TrainConfig
 from cartpole_rl.workflows.settings import COMMANDS, load_settings
 

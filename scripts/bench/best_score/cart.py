@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from cartpole_rl.envs.build import randomizer
 from cartpole_rl.physics.actuator import static_force
 from cartpole_rl.physics.dynamics import Drive, State, run_period
 from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
@@ -17,7 +18,6 @@ from cartpole_rl.tasks.features import (
     measured_velocity,
 )
 from cartpole_rl.tasks.rewards import BONUS, score
-from cartpole_rl.workflows.build import randomizer
 from cartpole_rl.workflows.config import TrainConfig
 
 MOST = 1 + 2 * BONUS  # points of a step, standing still in the middle

@@ -1,4 +1,4 @@
-"""Checks settings that come as plain data, and says of each that is wrong what would be right."""
+"""Checks settings given as plain data. The message names each wrong key and the remedy."""
 
 import difflib
 import re
@@ -13,14 +13,14 @@ from cartpole_rl.settings import Settings
 KINDS = re.compile(
     r"(?<=^plant\.)(simulated|emulated|serial|learned)\.|(?<=^randomization\.)(ranges|found)\."
 )
-NEAR = 0.8  # likeness of two names, 0 to 1, from which one may stand for the other
-SAME_PLACE = 0.15  # likeness that a name gains in the same group
+NEAR = 0.8  # similarity of two names, 0 to 1, from which one is suggested for the other
+SAME_GROUP = 0.15  # added to the similarity within one group
 
 Config = TypeVar("Config", bound=Settings)
 
 
 def checked(schema: type[Config], values: Mapping[str, Any]) -> Config:
-    """`values` as `schema`. Raises ConfigError that names each key that is wrong, and what would be right."""
+    """Return `values` as a `schema`. Raises ConfigError that names each wrong key and the remedy."""
     try:
         return schema(**values)
     except ValidationError as error:
@@ -34,7 +34,7 @@ def _complaint(detail: Mapping[str, Any], values: Mapping[str, Any]) -> str:
         return no_such_setting(key, (name for name in setting_names(values) if not name.startswith(key)))
     if detail["type"] == "missing":
         return f"{key} is missing; give {key}=..."
-    if detail["type"] == "union_tag_invalid":  # a choice of the group that this command does not take
+    if detail["type"] == "union_tag_invalid":  # a plant that this command does not take
         taken = detail["ctx"]["expected_tags"].replace("'", "")
         return f"{key}={detail['ctx']['tag']}: this command takes {taken}"
     reason = detail["msg"].removeprefix("Value error, ")
@@ -46,22 +46,22 @@ def _complaint(detail: Mapping[str, Any], values: Mapping[str, Any]) -> str:
 
 
 def no_such_setting(key: str, known: Iterable[str]) -> str:
-    """That there is no setting `key`, and the one that was meant, if one is near."""
+    """Return the message for an unknown setting, with the most similar one if there is any."""
     above, _, wrong = key.rpartition(".")
 
-    def likeness(setting: str) -> float:
+    def similarity(setting: str) -> float:
         place, _, name = setting.rpartition(".")
-        return difflib.SequenceMatcher(None, wrong, name).ratio() + SAME_PLACE * (place == above)
+        return difflib.SequenceMatcher(None, wrong, name).ratio() + SAME_GROUP * (place == above)
 
-    nearest = max(sorted(known), key=likeness, default="")
-    near = bool(nearest) and likeness(nearest) > NEAR
+    nearest = max(sorted(known), key=similarity, default="")
+    near = bool(nearest) and similarity(nearest) > NEAR
     return f"{key}: there is no such setting; " + (
         f"did you mean {nearest}?" if near else "--cfg job shows the settings"
     )
 
 
 def setting_names(tree: Any, prefix: str = "") -> set[str]:
-    """Dotted names of all groups and settings in nested mappings."""
+    """Return the dotted names of all groups and settings in nested mappings."""
     if not isinstance(tree, dict):
         return set()
     own = {f"{prefix}{key}" for key in tree}

@@ -1,0 +1,110 @@
+"""Builds simulated environments from settings, for commands, Gymnasium, notebooks and tests alike."""
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+
+from cartpole_rl.checking import checked
+from cartpole_rl.choices import choice, default_choices
+from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
+from cartpole_rl.envs.make import CartPoleEnv, make_env
+from cartpole_rl.errors import ConfigError
+from cartpole_rl.physics.parameters import CartParameters
+from cartpole_rl.physics.residual import UNDER_WAY
+from cartpole_rl.plants.learned import LearnedPlant
+from cartpole_rl.plants.learned_model import LearnedModel, load_model
+from cartpole_rl.plants.settings import LearnedSettings, SimulatedSettings
+from cartpole_rl.plants.simulated import SimulatedPlant
+from cartpole_rl.plants.specs import Plant
+from cartpole_rl.randomization.checks import check_one_pole
+from cartpole_rl.randomization.draws import Draws
+from cartpole_rl.randomization.identified import IdentifiedCarts, identified_carts
+from cartpole_rl.randomization.randomizer import Randomizer
+from cartpole_rl.randomization.settings import IdentifiedSettings
+from cartpole_rl.tasks.settings import StartSettings
+
+SIMILAR = 0.1  # largest relative difference between the length of a pole and that of a learned model's
+Lines = Mapping[str, Mapping[str, Any]]  # of a file in conf/randomization/
+
+
+def shipped_settings(randomization: str | Lines = "none", **chosen: str) -> CartPoleSettings:
+    """Return the settings of conf/train.yaml, with `chosen` in place of its choices: task="balance".
+
+    `randomization` is the name of a file in conf/randomization/, or its lines. Raises ConfigError.
+    """
+    named = {**default_choices("train"), **chosen}
+    groups = (group for group in CartPoleSettings.model_fields if group in named)
+    part = {group: choice(f"{group}/{named[group]}") for group in groups if group != "randomization"}
+    part["randomization"] = (
+        choice(f"randomization/{randomization}") if isinstance(randomization, str) else dict(randomization)
+    )
+    part["task"]["x_max"] = part["cart"]["track_half_length"]
+    return checked(CartPoleSettings, {**part, "control_period": choice("train")["control_period"]})
+
+
+def environment(config: CartPoleSettings, plant: Plant) -> CartPoleEnv:
+    """Return the environment of `config` over `plant`."""
+    return make_env(plant, config.actions, config.task, config.observation, config.reward)
+
+
+def simulated_env(
+    config: CartPoleSettings,
+    plant: SimulatedSettings | LearnedSettings,
+    carts: int,
+    start: StartSettings,
+    seed: int,
+    compiled: bool = False,
+) -> CartPoleEnv:
+    """Return an environment over `carts` simulated carts. Raises CheckpointError, ConfigError."""
+    if isinstance(plant, LearnedSettings):
+        return environment(config, learned_plant(config, plant, carts, start, seed, compiled))
+    return environment(
+        config,
+        SimulatedPlant(
+            carts,
+            randomizer(config),
+            start,
+            config.models(plant),
+            config.control_period,
+            plant.substeps,
+            seed,
+            compiled=compiled,
+        ),
+    )
+
+
+def randomizer(config: CartPoleSettings) -> Draws:
+    """Return the source of the carts that `config` describes. Raises ConfigError for impossible carts."""
+    if isinstance(config.randomization, IdentifiedSettings):
+        return identified_carts(config.randomization, config.nominal, config.pole)
+    return Randomizer(config.nominal, config.pole, config.randomization)
+
+
+def learned_plant(
+    config: CartPoleSettings,
+    plant: LearnedSettings,
+    carts: int,
+    start: StartSettings,
+    seed: int,
+    compiled: bool,
+) -> LearnedPlant:
+    """Return carts of a learned model. Raises CheckpointError; ConfigError for a model of another cart."""
+    model = load_model(plant.model)
+    check_same_cart(model, config)
+    found = torch.tensor([[model.parameters[name]] for name in CartParameters.names()])
+    draws = IdentifiedCarts(found, randomizer(config), plant.prior_share, UNDER_WAY * model.period)
+    return LearnedPlant(carts, model, draws, start, seed, compiled=compiled)
+
+
+def check_same_cart(model: LearnedModel, config: CartPoleSettings) -> None:
+    """Raise ConfigError where a learned model has another period, actuator or pole than `config`."""
+    if not math.isclose(model.period, config.control_period, rel_tol=1e-6):
+        raise ConfigError(f"control_period={config.control_period}: plant.model has {model.period} s")
+    if model.models.actuator != config.actions.actuator:
+        raise ConfigError(f"actions: plant.model has actuator {model.models.actuator}")
+    check_one_pole("plant.model", config.pole)
+    own, length = 2 * model.parameters["pole_com"], 2 * config.pole.nominal.pole_com
+    if abs(own / length - 1) > SIMILAR:
+        raise ConfigError(f"pole: plant.model has one of {own:.2f} m, not {length:.2f} m")

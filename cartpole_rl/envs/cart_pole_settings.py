@@ -1,0 +1,76 @@
+"""Settings of a whole environment: the cart, its randomization, the task, and what the agent observes."""
+
+from typing import Annotated, Any
+
+from pydantic import Discriminator, Field, Tag
+
+from cartpole_rl.envs.settings import ObservationSettings, RewardSettings, TaskSettings
+from cartpole_rl.physics.models import Actuator, CartFriction, Models, PoleFriction
+from cartpole_rl.plants.settings import LearnedSettings, SimulatedSettings
+from cartpole_rl.randomization.poles import PoleSettings
+from cartpole_rl.randomization.ranges import Range
+from cartpole_rl.randomization.settings import IdentifiedSettings
+from cartpole_rl.settings import Finite, Settings
+from cartpole_rl.tasks.actions import ActionSettings
+
+
+def _randomization_kind(given: Any) -> str:
+    """Return "found" for the posterior of an identification, "ranges" for ranges by parameter name."""
+    return "identified" if isinstance(given, IdentifiedSettings) or "posterior" in given else "ranges"
+
+
+Randomization = Annotated[
+    Annotated[dict[str, Range], Tag("ranges")] | Annotated[IdentifiedSettings, Tag("identified")],
+    Discriminator(_randomization_kind),
+]
+ControlPeriod = Annotated[float, Field(ge=0.005, le=0.1)]  # s
+
+
+class CartFrictionSettings(Settings):
+    """The friction model of the cart, and parameters that replace the cart's own."""
+
+    model: CartFriction
+    parameters: dict[str, Finite]
+
+
+class PoleFrictionSettings(Settings):
+    """The friction model of the pole, and parameters that replace the cart's own."""
+
+    model: PoleFriction
+    parameters: dict[str, Finite]
+
+
+class CartPoleSettings(Settings):
+    """An environment, but for the plant below it. Training and evaluation share these settings."""
+
+    cart: dict[str, Finite]
+    cart_friction: CartFrictionSettings
+    pole_friction: PoleFrictionSettings
+    pole: PoleSettings
+    actions: ActionSettings
+    task: TaskSettings
+    reward: RewardSettings
+    observation: ObservationSettings
+    randomization: Randomization
+    control_period: ControlPeriod
+
+    @property
+    def nominal(self) -> dict[str, float]:
+        """The nominal parameters of the cart, without the pole's."""
+        return {**self.cart, **self.cart_friction.parameters, **self.pole_friction.parameters}
+
+    @property
+    def ranges(self) -> dict[str, Range]:
+        """The ranges of the randomization; of an identified cart, those that it leaves open."""
+        given = self.randomization
+        return given.ranges if isinstance(given, IdentifiedSettings) else given
+
+    def models(self, plant: SimulatedSettings | LearnedSettings) -> Models:
+        """Return the physics models of the simulated cart."""
+        return Models(
+            self.cart_friction.model,
+            self.pole_friction.model,
+            Actuator(self.actions.actuator),
+            plant.integrator,
+            plant.pole_presses,
+        )

@@ -1,0 +1,29 @@
+"""Settings of the simulated plants: plant=simulated and plant=learned."""
+
+from pathlib import Path
+from typing import Annotated, ClassVar, Literal
+
+from pydantic import Field
+
+from cartpole_rl.physics.models import Integrator
+from cartpole_rl.settings import Fraction, Settings
+
+
+class SimulatedSettings(Settings):
+    """plant=simulated."""
+
+    kind: Literal["simulated"]
+    integrator: Integrator
+    substeps: Annotated[int, Field(ge=1, le=200)]
+    pole_presses: bool  # the pole's vertical force changes the cart's friction
+
+
+class LearnedSettings(Settings):
+    """plant=learned. The residual of a model is fitted with these physics, so they cannot be chosen."""
+
+    kind: Literal["learned"]
+    model: Path
+    prior_share: Fraction
+    integrator: ClassVar = Integrator.SEMI_IMPLICIT
+    substeps: ClassVar = 4
+    pole_presses: ClassVar = False

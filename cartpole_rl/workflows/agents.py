@@ -1,0 +1,79 @@
+"""Agents: new ones, those in checkpoints, and the controller of run=lqr."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from cartpole_rl.agents.baseline import EnergyAndRegulator
+from cartpole_rl.agents.dqn import QAgent
+from cartpole_rl.checking import checked
+from cartpole_rl.errors import CheckpointError, ConfigError
+from cartpole_rl.evaluation.episodes import Policy
+from cartpole_rl.learning.checkpoints import load_agent, restore_weights
+from cartpole_rl.randomization.checks import check_one_pole
+from cartpole_rl.workflows.build import evaluated_settings
+from cartpole_rl.workflows.checks import BASELINE, check_has_agent
+from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
+
+
+def new_agent(config: TrainConfig) -> QAgent:
+    """Return an untrained agent."""
+    observation = config.observation
+    return QAgent(config.agent, observation.mirror_signs, len(config.actions.motors), observation.frames)
+
+
+def recorded_config(config: Mapping[str, Any], source: str) -> TrainConfig:
+    """Return the config in a checkpoint. Raises CheckpointError where another version wrote it."""
+    try:
+        return checked(TrainConfig, config)
+    except ConfigError as error:
+        raise CheckpointError(f"{source} is of another version of this package: {error}") from None
+
+
+@dataclass(frozen=True)
+class TrainedAgent:
+    """A policy, and the settings that it was trained with."""
+
+    training: TrainConfig
+    policy: Policy
+
+
+def trained_agent(run: Path) -> TrainedAgent:
+    """Return the agent of a run folder or a checkpoint file. Raises CheckpointError, ConfigError."""
+    check_has_agent(run)
+    checkpoint = load_agent(run)
+    training = recorded_config(checkpoint.config, f"run={run}")
+    agent = new_agent(training)
+    restore_weights(agent, checkpoint.weights, f"run={run}")
+    return TrainedAgent(training, agent.greedy_policy())
+
+
+def evaluated_agent(config: EvaluateConfig, baseline: TrainConfig | None = None) -> TrainedAgent:
+    """Return the agent of config.run, or the baseline controller. Raises CheckpointError, ConfigError.
+
+    `baseline` describes the cart that the controller is made for, and its observation.
+    """
+    if config.run != BASELINE:
+        return trained_agent(config.run)
+    if baseline is None:
+        raise ConfigError(f"run={BASELINE} needs the settings of the cart that it is made for")
+    return baseline_agent(config, baseline)
+
+
+def baseline_agent(config: EvaluateConfig, training: TrainConfig) -> TrainedAgent:
+    """Return energy and LQR for the cart of `training` with the pole of `config`.
+
+    Raises ConfigError for several poles.
+    """
+    poles = evaluated_settings(training, config.model_copy(update={"parameters": None})).pole
+    pole = check_one_pole(f"run={BASELINE}", poles)
+    policy = EnergyAndRegulator(
+        {**training.nominal, **pole.model_dump()},
+        training.models(training.plant),
+        training.actions.motors,
+        training.observation.kind,
+        training.observation.past_motors,
+        training.control_period,
+    )
+    return TrainedAgent(training, policy)

@@ -1,0 +1,72 @@
+"""Whole episodes of an agent on any cart, as evaluations and recordings drive them."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from tqdm import tqdm
+
+from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
+from cartpole_rl.envs.make import CartPoleEnv
+from cartpole_rl.evaluation.episodes import Policy, run_batch, run_episodes
+from cartpole_rl.learning.randomness import seed_everything
+from cartpole_rl.plants.simulated import SimulatedPlant
+from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.workflows.agents import evaluated_agent
+from cartpole_rl.workflows.build import evaluated_env, evaluated_settings, use_threads
+from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
+from cartpole_rl.workflows.person import confirm
+from cartpole_rl.workflows.repeating import Repetition, repetition
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """A policy in its environment, ready to be driven. The environment has to be closed."""
+
+    config: EvaluateConfig
+    settings: CartPoleSettings
+    env: CartPoleEnv
+    policy: Policy
+    repetition: Repetition | None
+
+    def episodes(self) -> Iterator[Episode]:
+        """Drive the repeated episode, or new ones, and yield each as it ends."""
+        if self.repetition:
+            return repeated(self.env, self.policy, self.repetition)
+        return with_progress(self.env, self.policy, self.config.episodes)
+
+
+def prepared(config: EvaluateConfig, baseline: TrainConfig | None = None) -> Evaluation:
+    """Load the agent of `config` and build its environment. Raises CartPoleError.
+
+    `baseline` describes the cart that run=lqr is made for; an agent does not need it.
+    """
+    again = repetition(config)
+    if again:
+        config = again.config
+    use_threads(config.threads)
+    seed_everything(config.seed)
+    agent = evaluated_agent(config, baseline)
+    settings = evaluated_settings(agent.training, config)
+    env = evaluated_env(settings, config, prompt=tqdm.write, confirm=confirm)
+    return Evaluation(config, settings, env, agent.policy, again)
+
+
+def repeated(env: CartPoleEnv, policy: Policy, again: Repetition) -> Iterator[Episode]:
+    """Drive the same simulated cart from the same start."""
+    assert isinstance(env.plant, SimulatedPlant)
+    env.plant.start_from(again.origin.state)
+    yield run_batch(env, policy)[again.row]
+
+
+def with_progress(env: CartPoleEnv, policy: Policy, episodes: int) -> Iterator[Episode]:
+    """Drive episodes behind a progress bar that shows the score of each."""
+    with tqdm(total=episodes, unit=" episodes") as progress:
+        for episode in run_episodes(env, policy, episodes):
+            progress.set_postfix_str(f"score {episode.score.sum():.0f}", refresh=False)
+            progress.update()
+            yield episode
+
+
+def count_text(episodes: int) -> str:
+    """Return "1 episode" or "20 episodes"."""
+    return f"{episodes} episode{'s' if episodes > 1 else ''}"
