@@ -5,6 +5,7 @@ from collections.abc import Callable
 import pytest
 import torch
 from tensordict.nn import TensorDictModule
+from torchrl.collectors import Collector as TorchRLCollector
 
 from cartpole_rl.envs.make import CartPoleEnv
 from cartpole_rl.learning.collector import COLLECTED, Collector
@@ -44,6 +45,35 @@ def test_each_transition_begins_where_the_last_one_ended(env: CartPoleEnv) -> No
     assert ended.any()
     assert follows[~ended].all()
     assert not follows[ended].any()  # a new episode begins at a state of its own
+
+
+def test_transitions_equal_those_of_torchrls_collector_and_rollout(
+    make_plant: Callable, make_environment: Callable
+) -> None:
+    """The same seed and policy give the same transitions, to the bit, over resets of single carts."""
+    torch.manual_seed(0)
+    layer = torch.nn.Linear(10, 3)
+    policy = TensorDictModule(
+        lambda seen: (10 * layer(seen)).argmax(-1), in_keys=["observation"], out_keys=["action"]
+    )
+    start = StartSettings(
+        angle=Start.ANY, position_spread=0.3, angle_spread=0, speed_spread=0.5, angular_speed_spread=1.0
+    )
+
+    def build() -> CartPoleEnv:
+        return make_environment(make_plant(CARTS, start=start, seed=3), time_limit=LIMIT)
+
+    ours = Collector(build(), policy, actions=3, seed=0)
+    ours.epsilon = 0.0
+    chunk, periods = ours.collect(3 * LIMIT), 3 * LIMIT
+    stock = TorchRLCollector(build(), policy, frames_per_batch=CARTS * periods, total_frames=CARTS * periods)
+    with torch.no_grad():
+        rollout = build().rollout(periods, policy, break_when_any_done=False)
+    for other in (next(iter(stock)), rollout):
+        for key in COLLECTED:
+            assert torch.equal(chunk[key], other[key]), key
+    assert len(chunk["action"].unique()) == 3
+    assert 0 < chunk["next", "terminated"].sum() < chunk["next", "done"].sum()
 
 
 def test_epsilon_is_the_share_of_random_actions(env: CartPoleEnv) -> None:
