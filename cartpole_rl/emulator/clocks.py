@@ -5,7 +5,7 @@ from collections import deque
 
 from cartpole_rl.emulator.device import CartDevice
 from cartpole_rl.emulator.link import Channel
-from cartpole_rl.scheduling import compute_first
+from cartpole_rl.scheduling import take_precedence
 
 
 def run_lockstep(cart: CartDevice, channel: Channel) -> None:
@@ -32,7 +32,7 @@ def run_real(cart: CartDevice, channel: Channel) -> None:
 
     Commands are stamped as they arrive; the physics of a period is worked out at its end, when all are known.
     """
-    compute_first()  # a cart is late for nobody
+    take_precedence()  # a cart is late for nobody
     boot = time.monotonic()
     while not cart.unplugged:
         end_us = cart.period_end_us

@@ -45,7 +45,7 @@ from cartpole_rl.plants.serial.statistics import LinkStatistics
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.randomization.found import FoundCarts
 from cartpole_rl.reporting.tensorboard import TensorBoardLog
-from cartpole_rl.scheduling import compute_last
+from cartpole_rl.scheduling import give_precedence
 from cartpole_rl.settings import evaluation_seed
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
@@ -104,8 +104,8 @@ def finetune(config: FinetuneConfig, folder: Path) -> None:
         Driver(make_env, partial(greedy_network, training), config.compile, real_time, confirm) as driver,
     ):
         if real_time:
-            compute_last()  # but not the process that drives, nor an emulated cart: those have begun
-            if not driver.goes_first:
+            give_precedence()  # but not the process that drives, nor an emulated cart: those have begun
+            if not driver.has_priority:
                 tell(
                     "finetune", "other processes may delay the cart: no real-time priority (see `ulimit -r`)"
                 )

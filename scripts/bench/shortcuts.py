@@ -38,8 +38,8 @@ from cartpole_rl.envs.gymnasium import simulated_environment
 from cartpole_rl.envs.hardware import HardwareTransform
 from cartpole_rl.envs.make import CartPoleEnv
 from cartpole_rl.evaluation.driving_policy import DrivingPolicy
+from cartpole_rl.learning.buffer import n_step_transitions
 from cartpole_rl.learning.collector import Collector
-from cartpole_rl.learning.replay import n_step_transitions
 from cartpole_rl.reporting.table import table
 
 CHUNK, EPSILON, BATCH = 8, 0.1, 512

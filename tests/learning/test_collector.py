@@ -1,4 +1,4 @@
-"""Transitions hang together, epsilon is the share of random actions, and a snapshot goes on to the bit."""
+"""The collector: consistent transitions, the share of random actions, retries, and resuming to the bit."""
 
 from collections.abc import Callable
 
@@ -85,7 +85,7 @@ def test_epsilon_is_the_share_of_random_actions(env: CartPoleEnv) -> None:
     assert shares == pytest.approx([0.0, 0.5 * 2 / 3, 2 / 3], abs=0.03)  # a third of the random ones is 1 too
 
 
-def test_finished_episodes_are_told_once(env: CartPoleEnv) -> None:
+def test_finished_episodes_are_reported_once(env: CartPoleEnv) -> None:
     acting = collector(env)
     acting.epsilon = 0.0
     acting.collect(LIMIT - 1)
@@ -105,7 +105,7 @@ def test_equal_seeds_act_alike_and_others_do_not(make_plant: Callable, make_envi
     assert not torch.equal(chunks[0]["action"], chunks[2]["action"])
 
 
-def test_a_snapshot_goes_on_to_the_bit(make_plant: Callable, make_environment: Callable) -> None:
+def test_a_restored_collector_continues_to_the_bit(make_plant: Callable, make_environment: Callable) -> None:
     def build(seed: int) -> Collector:
         return collector(make_environment(make_plant(CARTS, seed=seed), time_limit=LIMIT), seed=seed)
 
@@ -120,9 +120,7 @@ def test_a_snapshot_goes_on_to_the_bit(make_plant: Callable, make_environment: C
 
 
 @pytest.mark.parametrize("share", [0.0, 0.75])
-def test_a_cart_that_failed_tries_again(
-    make_plant: Callable, make_environment: Callable, share: float
-) -> None:
+def test_a_failed_cart_is_retried(make_plant: Callable, make_environment: Callable, share: float) -> None:
     """Poles that start a little off upright: some have enough friction to stand for a second, some fall."""
     viscous = Range(distribution="log_uniform", absolute=(1e-4, 10.0))
     near = StartSettings(
