@@ -59,7 +59,7 @@ Randomization = str | Mapping[str, Mapping[str, Any]]
 def simulated_environment(
     task: str, carts: int, randomization: Randomization = "none", compiled: bool = False
 ) -> CartPoleEnv:
-    """The environment of `task`, "swingup" or "balance", with what conf/train.yaml chooses for all else.
+    """Return the environment of `task`, "swingup" or "balance", with the other choices of conf/train.yaml.
 
     `randomization` is the name of a file in conf/randomization/, or the lines of one. Raises ConfigError.
     """
