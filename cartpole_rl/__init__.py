@@ -1,7 +1,7 @@
 """Train a cart-pole agent in simulation, drive a serial cart with it, and fine-tune it there.
 
-The floors of the house, and what may import what, are drawn in ``docs/house.md``. Importing the package
-registers its environments with Gymnasium.
+``docs/house.md`` describes the layers and their imports. Importing the package registers its environments
+with Gymnasium.
 """
 
 from cartpole_rl.registration import register_with_gymnasium

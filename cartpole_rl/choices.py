@@ -1,4 +1,4 @@
-"""The choices of conf/ as plain data, for what is built without a command."""
+"""The choices in conf/ as plain data, for code that runs without a command."""
 
 from pathlib import Path
 from typing import Any
@@ -9,17 +9,17 @@ from cartpole_rl.errors import ConfigError
 
 
 def conf_folder() -> Path:
-    """The shipped conf/: inside the package when it was installed as a wheel, beside it in a checkout."""
+    """Return the conf/ folder: inside the package in a wheel, beside it in a checkout."""
     package = Path(__file__).resolve().parent
     return package / "conf" if (package / "conf").is_dir() else package.parent / "conf"
 
 
 def choice(name: str) -> dict[str, Any]:
-    """A file of conf/ as it stands there, by its name: "train", "task/swingup". Raises ConfigError."""
+    """Return the content of a file in conf/, named like "train" or "task/swingup". Raises ConfigError."""
     file = conf_folder() / f"{name}.yaml"
     if not file.is_file():
         others = sorted(other.stem for other in file.parent.glob("*.yaml"))
-        raise ConfigError(f"no choice {name!r} in conf/; there is {', '.join(others)}")
+        raise ConfigError(f"no choice {name!r} in conf/; choose from {', '.join(others)}")
     return yaml.safe_load(file.read_text(encoding="utf-8"))
 
 

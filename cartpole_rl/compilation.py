@@ -1,8 +1,12 @@
-"""Compiles a pure function of tensors for the shapes that it is first called with.
+"""Compilation of a pure function of tensors for the shapes of its first call.
 
-The function is traced to a flat graph, which TorchInductor gets as it is. `torch.compile` would also guard
-every Python object that the function reads, in every call, and that takes longer than the arithmetic of a
-thousand carts; where nothing but the tensors changes between two calls, there is nothing to guard.
+The function is traced to a flat graph that goes straight to TorchInductor. `torch.compile` would also check
+every Python object that the function reads, in every call, which takes longer than the arithmetic of a
+thousand carts. Where only the tensors change between calls, there is nothing to check.
+
+`standalone_compile` is a private function of PyTorch: no public one compiles a traced graph without
+those checks. Should it go, `torch.compile` with `torch.compiler.skip_all_guards_unsafe` as
+`guard_filter_fn` takes its place, here alone.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -20,11 +24,11 @@ Result = TypeVar("Result", bound=tuple)
 
 
 class Compiled(Generic[Result]):
-    """`function` of tuples of tensors, named or plain, which returns another, compiled in its first call.
+    """A compiled `function` that takes tuples of tensors, named or plain, and returns another.
 
-    Shapes, types and devices have to stay as they are in that call, and so has all that `function` reads
-    beside its arguments. It needs a C++ compiler; what was compiled is kept on disk by TorchInductor, where
-    the next process finds it. No gradient flows through it; the function may well compute one.
+    It is compiled in its first call, whose shapes, types and devices all later calls must have; whatever else
+    `function` reads must not change. It needs a C++ compiler. TorchInductor caches the code on disk, also for
+    other processes. No gradient flows through it, though the function may compute one.
     """
 
     def __init__(self, function: Callable[..., Result]) -> None:
@@ -35,7 +39,7 @@ class Compiled(Generic[Result]):
 
     @torch.no_grad()
     def __call__(self, *arguments: tuple[Tensor, ...]) -> Result:
-        """The function's value."""
+        """Return the function's result."""
         tensors = [tensor.contiguous() for tensor in chain.from_iterable(arguments)]
         if self._call is None:
             self._call = self._compile(arguments, tensors)
@@ -60,10 +64,10 @@ class Compiled(Generic[Result]):
 
 
 def rebuild(example: tuple[Tensor, ...]) -> Callable[[Iterable[Tensor]], Any]:
-    """What makes a tuple like `example` of as many tensors."""
+    """Return a constructor of tuples of the type of `example` from an iterable of tensors."""
     return getattr(type(example), "_make", tuple)
 
 
 def as_byte(flags: Tensor) -> Tensor:
-    """1 or 0 for each flag: compiled code stores bytes eight at a time, but booleans one by one."""
+    """Return 1 or 0 for each flag: compiled code stores bytes eight at a time, but booleans one by one."""
     return torch.where(flags, 1.0, 0.0).to(torch.uint8)

@@ -1,19 +1,19 @@
-"""The error tree. An error that a user can cause says in one line what is wrong and what would be right."""
+"""The error tree. Messages say in one line what is wrong and what to do."""
 
 from typing import Any
 
 
 class CartPoleError(Exception):
-    """Anything this package raises on purpose. Commands print it as one line and exit with `exit_code`."""
+    """The base of all errors of this package. Commands print it in one line and exit with `exit_code`."""
 
     exit_code = 1
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Survive the way from one process to another, whatever arguments the class is made with."""
-        return _remade, (type(self), self.args), vars(self)
+        """Support pickling, whatever arguments the constructor takes."""
+        return _rebuild, (type(self), self.args), vars(self)
 
 
-def _remade(kind: type[CartPoleError], arguments: tuple[Any, ...]) -> CartPoleError:
+def _rebuild(kind: type[CartPoleError], arguments: tuple[Any, ...]) -> CartPoleError:
     error = kind.__new__(kind, *arguments)
     error.args = arguments
     return error
@@ -26,15 +26,15 @@ class ConfigError(CartPoleError):
 
 
 class LearningError(CartPoleError):
-    """A training cannot go on."""
+    """A training cannot continue."""
 
 
 class CheckpointError(CartPoleError):
-    """A checkpoint is missing, damaged, or not one of ours."""
+    """A checkpoint is missing, damaged, or not of this package."""
 
 
 class RecordingError(CartPoleError):
-    """A recording is missing, damaged, or says too little."""
+    """A recording is missing, damaged, or incomplete."""
 
 
 class PlantError(CartPoleError):
@@ -54,7 +54,7 @@ class FaultError(PlantError):
 
 
 class EmulatorError(PlantError):
-    """The emulated cart did not start, or ended too early."""
+    """The emulated cart did not start, or stopped too early."""
 
 
 class FrameError(CartPoleError):

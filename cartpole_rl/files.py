@@ -1,4 +1,4 @@
-"""Files that are there whole or not at all, even after a kill or a power cut at any moment."""
+"""Atomic writing of files: complete or absent, even after a kill or a power cut."""
 
 import os
 from collections.abc import Iterator
@@ -8,21 +8,21 @@ from pathlib import Path
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A file beside `path` to write to; at the end it takes the place of `path`, which is whole throughout.
+    """Yield a temporary path beside `path`; at the end, it replaces `path` atomically.
 
-    The content is on the disk before the name points to it, and the name is before this returns.
+    Content and new name are flushed to the disk, in this order, before this returns.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     beside = path.with_name(f"{path.name}.partial")
     yield beside
     _flush(beside)
     beside.replace(path)
-    if os.name == "posix":  # elsewhere a folder cannot be opened
+    if os.name == "posix":  # Windows cannot open a folder
         _flush(path.parent)
 
 
 def _flush(path: Path) -> None:
-    """Wait until the disk has what was written."""
+    """Wait until the content of `path` is on the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

@@ -1,9 +1,9 @@
-"""Tells Gymnasium which environments there are, without importing them, and without importing Gymnasium.
+"""Registration of the environments with Gymnasium, without importing either.
 
-``import cartpole_rl`` calls `register_with_gymnasium`, as Gymnasium expects of a package: after it, or in one
-go by ``gymnasium.make("cartpole_rl:cartpole_rl/SwingUp-v0")``, the environments are found by their names.
-Gymnasium takes long to import and most of this package never uses it, so that it is not imported for this.
-Where it is there already, the environments are registered at once; otherwise as soon as it is imported.
+``import cartpole_rl`` calls `register_with_gymnasium`, as Gymnasium expects of a package. After that, or with
+``gymnasium.make("cartpole_rl:cartpole_rl/SwingUp-v0")`` alone, Gymnasium finds the environments by name.
+Gymnasium is slow to import and most of this package does not need it. If it is imported already, the
+environments are registered at once, otherwise right after its import.
 """
 
 import sys
@@ -16,7 +16,7 @@ ENVIRONMENTS = {"cartpole_rl/SwingUp-v0": "swingup", "cartpole_rl/Balance-v0": "
 
 
 def register() -> None:
-    """Register what is not registered yet."""
+    """Register the environments that are not registered yet."""
     import gymnasium
 
     for name, task in ENVIRONMENTS.items():
@@ -30,20 +30,20 @@ def register() -> None:
 
 
 def register_with_gymnasium() -> None:
-    """Register now if Gymnasium is imported, or else right after it will be."""
+    """Register now if Gymnasium is imported, otherwise right after its import."""
     if "gymnasium" in sys.modules:
         register()
     else:
-        sys.meta_path.insert(0, _WhenGymnasiumIsImported())
+        sys.meta_path.insert(0, _GymnasiumImportHook())
 
 
-class _WhenGymnasiumIsImported(MetaPathFinder):
-    """Lets whatever loads Gymnasium register the environments after it."""
+class _GymnasiumImportHook(MetaPathFinder):
+    """A finder that makes the loader of Gymnasium register the environments."""
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        """Return Gymnasium's spec as other finders have it; None for every other module."""
+        """Return the spec of Gymnasium from the other finders; None for every other module."""
         if fullname != "gymnasium":
             return None
         others = (finder for finder in sys.meta_path if finder is not self)

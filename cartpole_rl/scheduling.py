@@ -1,18 +1,14 @@
-"""Which process the operating system lets compute first, where several want to.
-
-Driving a cart goes ahead of learning. Both calls are for a whole process, and last until it ends.
-"""
+"""Scheduling priority of a whole process, until it ends: driving a cart takes precedence over learning."""
 
 import os
 
-PRIORITY = 20  # of 1 to 99 among real-time processes; interrupts of Linux's real-time kernels have 50
+PRIORITY = 20  # real-time priority, 1 to 99; interrupt threads of Linux's real-time kernels have 50
 
 
-def compute_first() -> bool:
-    """Compute at once whenever there is something to do, ahead of every usual process (`SCHED_FIFO`).
+def take_precedence() -> bool:
+    """Give this process real-time priority (`SCHED_FIFO`); return False if the system does not allow it.
 
-    Returns whether the operating system allows it: Linux does for root, with CAP_SYS_NICE, or where
-    `ulimit -r` is at least `PRIORITY`.
+    Linux allows it to root, with CAP_SYS_NICE, or if `ulimit -r` is at least `PRIORITY`.
     """
     if not hasattr(os, "SCHED_FIFO"):
         return False
@@ -23,8 +19,8 @@ def compute_first() -> bool:
     return True
 
 
-def compute_last() -> None:
-    """Compute only where no other process wants to (`SCHED_IDLE`, elsewhere the highest niceness)."""
+def give_precedence() -> None:
+    """Give this process the lowest priority: `SCHED_IDLE`, or niceness 19 on other systems."""
     if hasattr(os, "SCHED_IDLE"):
         os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
     elif hasattr(os, "nice"):

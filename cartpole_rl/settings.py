@@ -1,6 +1,6 @@
-"""The base of every settings class: frozen, strict about unknown keys, checked when it is made.
+"""The base class of all settings: frozen, strict about unknown keys, checked on construction.
 
-A settings class lives beside the thing it sets; only `cartpole_rl.commands` fills one from Hydra.
+A settings class lives beside the code that it configures; only `cartpole_rl.commands` fills one from Hydra.
 Bounds are written on the field (``Annotated[float, Field(gt=0)]``), units in its comment.
 """
 
@@ -19,10 +19,10 @@ Seed = Annotated[int, Field(ge=0, lt=NUM_SEEDS)]
 
 
 def evaluation_seed(seed: int) -> int:
-    """Return the seed of the carts and starts that an evaluation with `seed` draws: NUM_SEEDS and more.
+    """Return the generator seed of an evaluation's carts and starts: NUM_SEEDS + `seed`.
 
-    It is no training's seed, so that no evaluation meets the carts that a training began with. It stays
-    below 2**32, since torch's generator on the CPU reads the lowest 32 bits alone.
+    No training has such a seed, so no evaluation draws the carts that a training drew. It is below 2**32,
+    because torch's CPU generator reads only the lowest 32 bits.
     """
     return NUM_SEEDS + seed
 

@@ -1,6 +1,6 @@
-"""Signals that ask a process to end. A program that drives a cart turns them into exceptions.
+"""Signals that end a process, turned into exceptions where a cart is driven.
 
-An exception unwinds every `with`, so that the motor is at 0 and the cart disarmed before the process ends.
+An exception unwinds every `with`: the motor is at 0 and the cart disarmed before the process ends.
 """
 
 import os
@@ -10,14 +10,14 @@ import time
 from collections.abc import Callable
 from types import FrameType
 
-UNWINDING = 5.0  # s after a signal in which others are ignored, so that they do not interrupt the unwinding
+UNWINDING = 5.0  # s after a signal during which others are ignored: they would interrupt the unwinding
 PARENT_POLL = 0.5  # s
 
 
 def ending_signals() -> list[signal.Signals]:
-    """SIGTERM, and SIGHUP: a closed terminal, a dropped ssh connection.
+    """Return SIGTERM and SIGHUP (a closed terminal, a dropped ssh connection).
 
-    A SIGHUP that the parent process ignores stays ignored, since that is what nohup is for.
+    A SIGHUP that the parent process ignores stays ignored, as nohup needs it.
     """
     ending = [signal.SIGTERM]
     if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
@@ -26,10 +26,10 @@ def ending_signals() -> list[signal.Signals]:
 
 
 class RaiseOnce:
-    """A signal handler that raises `error(number)`, and ignores what comes while that unwinds.
+    """A signal handler that raises `error(number)`, and ignores further signals for UNWINDING s.
 
-    A second signal would otherwise break out of a `with` before it has stopped its motor. Signals that come
-    more than UNWINDING s after the first one raise again, so that a program which hangs can still be ended.
+    A second signal could otherwise leave a `with` before the motor is stopped. Later signals raise again, so
+    a program that hangs can still be ended.
     """
 
     def __init__(self, error: Callable[[int], BaseException]) -> None:
@@ -42,7 +42,7 @@ class RaiseOnce:
             signal.signal(number, self)
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
-        """Raise, unless the last one is still unwinding."""
+        """Raise, unless the last error may still be unwinding."""
         now = time.monotonic()
         if now - self._raised_at >= UNWINDING:
             self._raised_at = now
@@ -50,7 +50,7 @@ class RaiseOnce:
 
 
 def end_with_parent(parent: int) -> None:
-    """From now on, behave as on SIGTERM once process `parent` is no longer the parent."""
+    """Start a thread that sends SIGTERM to this process once `parent` is no longer its parent."""
 
     def watch() -> None:
         while os.getppid() == parent:

@@ -1,1 +1,1 @@
-"""Agents: Q-networks, their loss, and the policy that leaves training."""
+"""Agents: Q-networks, their loss, the greedy policy, and a baseline."""

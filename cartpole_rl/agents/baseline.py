@@ -1,10 +1,10 @@
-"""A controller that learned nothing, to judge agents by: energy swings the pole up, LQR balances it.
+"""A classical controller to compare agents with: energy control swings the pole up, LQR balances it.
 
 Swing-up: Astrom and Furuta, "Swinging up a pendulum by energy control", Automatica 36, 2000: the pivot is
 accelerated so that the pole's energy rises to that of standing upright. Balance: a discrete linear-quadratic
-regulator of the linearized nominal cart (Anderson and Moore, "Optimal control", 1990). Both act on the state
-in which the chosen force will find the cart: the measured velocities are half a period old, and the motor
-obeys after the cart's latency.
+regulator of the linearized nominal cart (Anderson and Moore, "Optimal control", 1990). Both act on the
+predicted state at the time the force takes effect: the measured velocities are half a period old, and the
+motor responds after the cart's latency.
 """
 
 import math
@@ -30,21 +30,20 @@ Array = NDArray[np.float64]
 STATE_COST = (10.0, 1.0, 100.0, 1.0)  # of 1 m, 1 m/s, 1 rad, 1 rad/s, squared
 FORCE_COST = 0.05  # of 1 N, squared
 SUBSTEPS = 4  # of the linearized period
-CATCH_ANGLE = math.radians(35)  # from upright; nearer, the regulator takes over if its force is enough
-CATCH_FORCE = 1.0  # of the largest force: what the regulator may ask for when it acts
-PUMP = 3.8  # m/s^2, of the pivot while energy is far from what is aimed at
-NEAR = 0.1  # of the weight times the length: missing energy below which the pivot accelerates less
-SURPLUS = 1.06  # of the pole's weight and length: the energy that is aimed at, friction takes the rest
-CENTRE = (8.0, 1.5)  # m/s^2 per m and per m/s: back to the middle while swinging up
-MARGIN = 0.04  # m, from the track's end: from where braking stops the cart
+CATCH_ANGLE = math.radians(35)  # from upright; within it, the regulator takes over if its force suffices
+CATCH_FORCE = 1.0  # of the largest force: the limit below which the regulator acts
+PUMP_ACCELERATION = 3.8  # m/s^2, of the pivot while the energy is far from its target
+PUMP_BAND = 0.1  # of the pole's weight and length: energy error below which the pivot accelerates less
+TARGET_ENERGY = 1.06  # of the pole's weight and length; the surplus makes up for friction
+CENTRING = (8.0, 1.5)  # m/s^2 per m and per m/s, towards the middle during the swing-up
+MARGIN = 0.04  # m, from the track's end: braking stops the cart before it
 
 
 class EnergyAndRegulator:
-    """A policy: `observation` [N, K] to `action` [N], the index of the motor value of the nearest force.
+    """A policy from `observation` [N, K] to `action` [N]: the motor value whose force is nearest.
 
-    `nominal` are the parameters of the cart and pole that it is made for. It reads measured positions and
-    velocities (`kind` raw or cos_sin) and the motor value before (`past_motors` of at least 1). Raises
-    ConfigError where the observation holds something else.
+    `nominal` holds the parameters of cart and pole. The policy needs measured positions and velocities
+    (`kind` raw or cos_sin) and the last motor value (`past_motors` of at least 1); otherwise ConfigError.
     """
 
     def __init__(
@@ -59,7 +58,7 @@ class EnergyAndRegulator:
         if kind is ObservationKind.POSITIONS or past_motors < 1:
             raise ConfigError(
                 f"observation.kind={kind}, past_motors={past_motors}: the baseline reads velocities and the "
-                "last motor value; give kind raw or cos_sin, and past_motors of at least 1"
+                "last motor value; set kind to raw or cos_sin, and past_motors to at least 1"
             )
         row = [float(nominal[name]) for name in CartParameters.names()]
         self.models, self.kind, self.period = models, kind, period
@@ -70,14 +69,14 @@ class EnergyAndRegulator:
         self.forces = static_force(self.motors, self.cart, models.actuator)
         self.strongest = float(self.forces.abs().max())
 
-    def __call__(self, present: TensorDictBase) -> TensorDictBase:
-        """Add `action` [N] and `action_value` [N, A] to `present`."""
-        state, motor = decoded(present["observation"], self.kind)
-        value = self.value(self.force(self.expected(state, motor)))
-        return present.set("action_value", value).set("action", value.argmax(-1))
+    def __call__(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Add `action` [N] and `action_value` [N, A] to `tensordict`."""
+        state, motor = decode(tensordict["observation"], self.kind)
+        value = self.value(self.force(self.predict(state, motor)))
+        return tensordict.set("action_value", value).set("action", value.argmax(-1))
 
-    def expected(self, measured: State, motor: Tensor) -> State:
-        """The state [N] when the next motor value takes effect, while the last one, `motor` [N], is held."""
+    def predict(self, measured: State, motor: Tensor) -> State:
+        """Return the state [N] at which the next motor value takes effect; `motor` [N] acts until then."""
         force = static_force(motor, self.cart, self.models.actuator)
         now = self._after(measured, force, self.period / 2)._replace(x=measured.x, theta=measured.theta)
         return self._after(now, force, float(self.cart.latency))
@@ -86,31 +85,31 @@ class EnergyAndRegulator:
         return advance(state, force, self.cart, self.body, self.models, step)
 
     def force(self, state: State) -> Tensor:
-        """The force that is wanted in `state`, N, [N]."""
+        """Return the control force in `state`, N, [N]."""
         balance = self.balance(state)
         caught = (state.theta.abs() < CATCH_ANGLE) & (balance.abs() < CATCH_FORCE * self.strongest)
         return self.on_track(state, torch.where(caught, balance, self.swing_up(state)))
 
     def balance(self, state: State) -> Tensor:
-        """The regulator's force, and what dry friction will take of it, N, [N]."""
+        """Return the regulator's force plus compensation of dry friction, N, [N]."""
         force = -sum(float(gain) * value for gain, value in zip(self.gain, state, strict=True))
         return force + dry_friction(
             state.x_dot + self.period * force / self.cart.total_mass, self.cart, self.models.cart_friction
         )
 
     def swing_up(self, state: State) -> Tensor:
-        """The force that gives the pivot the acceleration that energy asks for, N, [N]."""
+        """Return the force of the energy controller, N, [N]."""
         lift = self.body.first_moment * GRAVITY  # J per cos(theta)
         kinetic = 0.5 * self.body.pivot_inertia * state.theta_dot**2
-        missing = SURPLUS - torch.cos(state.theta) - kinetic / lift  # of the energy upright, in lifts
+        missing = TARGET_ENERGY - torch.cos(state.theta) - kinetic / lift  # of the energy upright, in lifts
         phase = state.theta_dot * torch.cos(state.theta)
         side = torch.where(phase == 0, torch.ones_like(phase), phase.sign())
-        pumped = -PUMP * (missing / NEAR).clamp(-1, 1) * side
-        wanted = pumped - CENTRE[0] * state.x - CENTRE[1] * state.x_dot
-        return self.force_for(state, wanted)
+        pumped = -PUMP_ACCELERATION * (missing / PUMP_BAND).clamp(-1, 1) * side
+        target = pumped - CENTRING[0] * state.x - CENTRING[1] * state.x_dot
+        return self.force_for(state, target)
 
     def force_for(self, state: State, x_ddot: Tensor) -> Tensor:
-        """The force under which the cart accelerates by `x_ddot` m/s^2, N, [N]: (3.5) and (3.6) inverted."""
+        """Return the force that accelerates the cart by `x_ddot` m/s^2, N, [N], by (3.5), (3.6)."""
         terms = coupling(state, self.cart, self.body)
         moment = self.body.first_moment * terms.cos
         torque = terms.gravity_torque + pole_torque(state.theta_dot, self.cart, self.models.pole_friction)
@@ -121,22 +120,24 @@ class EnergyAndRegulator:
         return self.body.total_mass * x_ddot + reaction + viscous + dry
 
     def on_track(self, state: State, force: Tensor) -> Tensor:
-        """`force` [N], or full braking where the cart could otherwise not be stopped on the track."""
+        """Return `force` [N], or full braking where the cart would otherwise leave the track."""
         braking = (self.strongest / self.cart.total_mass).clamp(min=1e-6)
-        stop = state.x + state.x_dot * state.x_dot.abs() / (2 * braking)  # m, where braking would end
+        stop = state.x + state.x_dot * state.x_dot.abs() / (
+            2 * braking
+        )  # m, where the cart would stop under braking
         end = self.cart.track_half_length - MARGIN
         return torch.where(stop.abs() > end, -stop.sign() * self.strongest, force)
 
     def value(self, force: Tensor) -> Tensor:
-        """How near each motor value comes to a force, [N, A]: largest for the nearest one.
+        """Return minus the distance of each motor value's force from `force`, [N, A].
 
-        Of several that are equally near, the smallest motor value is the largest.
+        A tie goes to the smallest motor value.
         """
         return -(force.unsqueeze(-1) - self.forces).abs() - 1e-6 * self.motors.abs()
 
 
-def decoded(observation: Tensor, kind: ObservationKind) -> tuple[State, Tensor]:
-    """Measured state [N] and last motor value [N] of observations [N, K]: `tasks.features` backwards."""
+def decode(observation: Tensor, kind: ObservationKind) -> tuple[State, Tensor]:
+    """Return measured state [N] and last motor value [N] of observations [N, K]: inverts `tasks.features`."""
     size = observation_size(kind)
     numbers, motor = observation[:, :size].unbind(-1), observation[:, size] * MOTOR_SCALE
     if kind is ObservationKind.RAW:
@@ -147,26 +148,28 @@ def decoded(observation: Tensor, kind: ObservationKind) -> tuple[State, Tensor]:
 
 
 def regulator(table: Tensor, models: Models, period: float) -> Array:
-    """N per m, m/s, rad and rad/s, [4]: the force is minus their sum. `table` [P, 1] float64 is the cart."""
+    """Return the gain [4], N per m, m/s, rad and rad/s, for the cart `table` [P, 1] float64."""
     transition, effect = linearized(table, models, period)
     state_cost, force_cost = np.diag(STATE_COST), np.array([[FORCE_COST]])
-    worth = solve_discrete_are(transition, effect, state_cost, force_cost)
-    gain = np.linalg.solve(force_cost + effect.T @ worth @ effect, effect.T @ worth @ transition)
+    cost_to_go = solve_discrete_are(transition, effect, state_cost, force_cost)
+    gain = np.linalg.solve(force_cost + effect.T @ cost_to_go @ effect, effect.T @ cost_to_go @ transition)
     return gain[0]
 
 
 def linearized(table: Tensor, models: Models, period: float) -> tuple[Array, Array]:
-    """(A [4, 4], B [4, 1]) of one period about upright under a held force, dry friction left out."""
+    """Return (A [4, 4], B [4, 1]) of one period about upright, at constant force, without dry friction."""
     cart = CartParameters.from_table(table)
     smooth = CartFriction.NONE if models.cart_friction is CartFriction.NONE else CartFriction.LINEAR
-    body, laws = mechanism(cart), models._replace(cart_friction=smooth)
+    body, smooth_models = mechanism(cart), models._replace(cart_friction=smooth)
 
     def after_a_period(numbers: Tensor) -> Tensor:
         *motion, force = numbers.unsqueeze(-1)
         state = State(*motion)
         for _ in range(SUBSTEPS):
-            state = advance(state, force, cart, body, laws, period / SUBSTEPS)
+            state = advance(state, force, cart, body, smooth_models, period / SUBSTEPS)
         return torch.cat(state)
 
-    slopes = torch.autograd.functional.jacobian(after_a_period, torch.zeros(5, dtype=table.dtype)).numpy()
-    return slopes[:, :4], slopes[:, 4:]
+    jacobian_matrix = torch.autograd.functional.jacobian(
+        after_a_period, torch.zeros(5, dtype=table.dtype)
+    ).numpy()
+    return jacobian_matrix[:, :4], jacobian_matrix[:, 4:]

@@ -18,11 +18,11 @@ from cartpole_rl.agents.settings import AgentSettings
 class QAgent(nn.Module):
     """Online and target Q-network of `actions` outputs.
 
-    `mirror_signs` [K] has +1 or -1 for each number of an observation: what it is multiplied by when left and
-    right are swapped. `frames` [T, F] says where a recurrent network finds its frames in an observation.
+    `mirror_signs` [K] holds the factor, +1 or -1, of each number of an observation when left and right are
+    swapped. `frames` [T, F] holds the indices of the frames that a recurrent network reads.
     """
 
-    updates: Tensor  # gradient steps followed so far, []
+    updates: Tensor  # gradient steps so far, []
 
     def __init__(
         self,
@@ -47,19 +47,21 @@ class QAgent(nn.Module):
             action_space="categorical",
         )
         self.loss.make_value_estimator(gamma=settings.gamma)
-        TargetNetUpdater(self.loss)  # copies the weights, and tells the loss that `follow` moves its target
+        TargetNetUpdater(
+            self.loss
+        )  # copies the weights and marks the target as updated; `update_target` moves it
         decay = settings.average_decay
         self.average = None if decay is None else copy.deepcopy(self.actor).requires_grad_(False)
         self.register_buffer("updates", torch.zeros((), dtype=torch.int64))
         online, target = self.loss.value_network_params, self.loss.target_value_network_params
-        learned = [name for name, weight in online.items(True, True) if weight.requires_grad]
+        trainable = [name for name, weight in online.items(True, True) if weight.requires_grad]
         networks = online, target, TensorDict.from_module(self.greedy_policy())
-        weights = [TensorDict({name: network[name] for name in learned}).lock_() for network in networks]
+        weights = [TensorDict({name: network[name] for name in trainable}).lock_() for network in networks]
         self._online, self._target, self._average = weights
 
     @torch.no_grad()
-    def follow(self) -> None:
-        """Move the target network and the average towards the online one; once after each gradient step."""
+    def update_target(self) -> None:
+        """Move the target network and the average towards the online network, after a gradient step."""
         self.updates += 1
         tau, period = self.settings.target_tau, self.settings.target_period
         if tau is not None:
@@ -70,18 +72,18 @@ class QAgent(nn.Module):
             self._average.lerp_(self._online, self._newest_share())
 
     def _newest_share(self) -> float:
-        """Weight of the newest weights in the average, which spans at most a tenth of the updates so far.
+        """Return the share of the newest weights in the average, which spans a tenth of the updates or less.
 
-        So the untrained weights are forgotten at once, not after 1 / (1 - decay) updates.
+        The untrained weights are thus soon forgotten, not only after 1 / (1 - decay) updates.
         """
         assert self.settings.average_decay is not None
         return max(1 - self.settings.average_decay, 10 / (9 + int(self.updates)))
 
     def greedy_policy(self) -> nn.Module:
-        """The policy that is evaluated and exported; it follows the weights as they learn.
+        """Return the policy that is evaluated and saved; it shares memory with the weights in training.
 
         With `average_decay` it acts with an exponential average of the online weights over about
-        1 / (1 - decay) updates: single updates make the policy lose a start here and there, their mean does
-        not (Izmailov et al., "Averaging weights leads to wider optima", 2018). Without, it is the online one.
+        1 / (1 - decay) updates, which fails less often than the policy after a single update (Izmailov et
+        al., "Averaging weights leads to wider optima", 2018). Otherwise it is the online network.
         """
         return self.actor if self.average is None else self.average

@@ -1,8 +1,8 @@
-"""Q-networks: multilayer perceptrons, free or bound to the mirror symmetry of cart and pole.
+"""Q-networks: multilayer perceptrons, with or without the mirror symmetry of cart and pole.
 
-Either may stand behind a recurrent reader of the last frames.
+Either may have a recurrent input layer that reads the last frames.
 
-Layer normalization after each hidden layer keeps a learned swing-up from being unlearned
+Layer normalization after each hidden layer keeps a trained agent from forgetting the swing-up
 (Gallici et al., "Simplifying deep temporal difference learning", 2024).
 """
 
@@ -15,7 +15,7 @@ from torch.nn import functional
 
 
 class QNetwork(nn.Module):
-    """Observation [..., K] float32 to one value an action [..., A], read by `reader` where there is one."""
+    """A network from observations [..., K] float32 to action values [..., A], with an optional `reader`."""
 
     def __init__(
         self,
@@ -38,21 +38,21 @@ class QNetwork(nn.Module):
         self.layers = nn.Sequential(*layers, nn.Linear(width, actions))
 
     def forward(self, observation: Tensor) -> Tensor:
-        """Values of the actions."""
+        """Return the action values."""
         return self.layers(self.reader(observation))
 
 
 class MirrorQNetwork(nn.Module):
-    """A QNetwork that values an action as it values the mirrored action in the mirrored observation.
+    """A QNetwork whose value of an action equals that of the mirrored action in the mirrored observation.
 
     Swapping left and right multiplies the numbers of an observation by `signs` [K], +1 or -1, and reverses
-    the order of the actions. What is learned on one side then holds on the other, with half the weights
-    (van der Pol et al., "MDP homomorphic networks", 2020). Carts may differ from left to right as long as
-    an agent meets both kinds equally often.
+    the order of the actions. Experience on one side then counts on the other, with half the weights (van der
+    Pol et al., "MDP homomorphic networks", 2020). Single carts may differ from left to right if the
+    distribution of carts is symmetric.
 
-    Each layer has half its units for the scene and half, with the same weights, for its mirror image. Their
-    sum (even: the image is the same) and difference (odd: it is the negative) never mix in a linear layer, so
-    that two of half the width do the work. A `reader` reads the scene, and then its image.
+    Half of a layer's units are for the scene and half, with the same weights, for its mirror image. Their sum
+    (even) and difference (odd) never mix in a linear layer, so each layer is two of half the width. A
+    `reader` reads the scene, and then its image.
     """
 
     signs: Tensor
@@ -78,7 +78,7 @@ class MirrorQNetwork(nn.Module):
         self.odd_values = nn.Linear(width, actions, bias=False)
 
     def forward(self, observation: Tensor) -> Tensor:
-        """Values of the actions."""
+        """Return the action values."""
         even, odd = halves(self.reader(observation), self.reader(observation * self.signs))
         for layer in self.layers:
             even, odd = layer(even, odd)
@@ -89,10 +89,10 @@ class MirrorQNetwork(nn.Module):
 class FrameReader(nn.Module):
     """A gated recurrent unit that reads the last frames of an observation [..., K], oldest first.
 
-    `frames` [T, F] says where in an observation the numbers of each frame stand. The state begins at zero
-    with the oldest frame, so that a policy needs to carry nothing from step to step and replay holds all that
-    a gradient needs (Hausknecht and Stone, "Deep recurrent Q-learning", 2015: random updates, T steps long).
-    What comes out, [..., width], is the last state and the numbers that stand in no frame.
+    `frames` [T, F] holds the indices of the numbers of each frame. The state is zero before the oldest frame,
+    so a policy carries nothing from step to step and the buffer holds all that a gradient needs (Hausknecht
+    and Stone, "Deep recurrent Q-learning", 2015: random updates, T steps long). The output [..., width] is
+    the last state and the numbers that are in no frame.
     """
 
     frames: Tensor
@@ -108,7 +108,7 @@ class FrameReader(nn.Module):
         self.width = units + len(rest)
 
     def forward(self, observation: Tensor) -> Tensor:
-        """The state after the newest frame, and the rest."""
+        """Return the state after the newest frame, and the rest."""
         batch = observation.flatten(0, -2) if observation.ndim > 1 else observation.unsqueeze(0)
         state = batch.new_zeros(len(batch), self.cell.hidden_size)
         for frame in batch[:, self.frames].unbind(1):
@@ -126,7 +126,7 @@ class MirrorLayer(nn.Module):
         self.norm = nn.LayerNorm(units) if layer_norm else nn.Identity()
 
     def forward(self, even: Tensor, odd: Tensor) -> tuple[Tensor, Tensor]:
-        """Even and odd parts [..., units] from those of the layer before, [..., width]."""
+        """Return even and odd parts [..., units] of those of the previous layer, [..., width]."""
         same, opposite = self.even(even), self.odd(odd)
         scene = functional.relu(self.norm(same + opposite))
         image = functional.relu(self.norm(same - opposite))
@@ -134,5 +134,5 @@ class MirrorLayer(nn.Module):
 
 
 def halves(scene: Tensor, image: Tensor) -> tuple[Tensor, Tensor]:
-    """Even and odd part: sum and difference of a scene and its mirror image, of the same length together."""
+    """Return sum and difference of a scene and its mirror image, scaled to keep the norm."""
     return (scene + image) * math.sqrt(0.5), (scene - image) * math.sqrt(0.5)

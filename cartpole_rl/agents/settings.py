@@ -1,4 +1,4 @@
-"""What can be set about an agent."""
+"""Settings of an agent."""
 
 from typing import Annotated, Literal
 
@@ -11,15 +11,15 @@ class AgentSettings(Settings):
     """The agent and its loss."""
 
     hidden: tuple[Count, ...]
-    recurrent: Count | None  # units of a recurrent layer below the hidden ones, which reads the last frames
+    recurrent: Count | None  # units of a recurrent input layer that reads the last frames
     layer_norm: bool
-    mirrored: bool  # the network knows that left and right are one problem, reflected
+    mirrored: bool  # the network has the mirror symmetry of left and right
     gamma: Annotated[float, Field(ge=0, lt=1)]
     double: bool  # van Hasselt et al., 2016
     action_gap: Annotated[float, Field(ge=0, lt=1)]  # alpha of advantage learning, 0 for plain Q-learning
     loss: Literal["l2", "smooth_l1"]
     target_tau: Annotated[float, Field(gt=0, le=1)] | None  # Polyak averaging each update
-    target_period: Count | None  # or a copy every so many updates
+    target_period: Count | None  # or a copy after this many updates
     average_decay: (
         Annotated[float, Field(gt=0, lt=1)] | None
     )  # of the weights that the greedy policy acts with

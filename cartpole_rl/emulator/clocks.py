@@ -5,7 +5,7 @@ from collections import deque
 
 from cartpole_rl.emulator.device import CartDevice
 from cartpole_rl.emulator.link import Channel
-from cartpole_rl.scheduling import compute_first
+from cartpole_rl.scheduling import take_precedence
 
 
 def run_lockstep(cart: CartDevice, channel: Channel) -> None:
@@ -32,7 +32,7 @@ def run_real(cart: CartDevice, channel: Channel) -> None:
 
     Commands get a time stamp on arrival; the physics of a period is computed at its end.
     """
-    compute_first()  # a real cart would not be late either
+    take_precedence()  # a real cart would not be late either
     boot = time.monotonic()
     while not cart.unplugged:
         end_us = cart.period_end_us

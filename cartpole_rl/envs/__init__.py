@@ -1,1 +1,1 @@
-"""TorchRL environments over either plant: the hardware transform, and what puts the two together."""
+"""TorchRL environments over any plant: the hardware transform, and `make_env`."""

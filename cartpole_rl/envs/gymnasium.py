@@ -1,17 +1,27 @@
-"""The simulated environment by Gymnasium's rules: one cart, or many at once.
+"""The simulated environments for Gymnasium: one cart, or many at once.
 
     gymnasium.make("cartpole_rl/SwingUp-v0")
     gymnasium.make_vec("cartpole_rl/Balance-v0", num_envs=1024, vectorization_mode="vector_entry_point")
 
-Both are shells over the same `CartPoleEnv` as everything else, with conf/'s nominal cart and medium pole.
+Both wrap the same `CartPoleEnv` as everything else, with the nominal cart and the medium pole of conf/.
 
 | task    | actions                                     | reward                             | ends          |
 |---------|---------------------------------------------|------------------------------------|---------------|
 | swingup | nine motor values, conf/actions/nine_levels | (6.2), as conf/reward/score has it | track         |
 | balance | left, none, right, conf/actions/three       | (6.1), as conf/reward/position     | track, 12 deg |
 
-An episode is cut off after 10 s. Observations are those of `envs.settings.ObservationSettings` as in
-conf/train.yaml; `info` has the step's scores (6.1) `score_upright` and (6.2) `score`.
+An episode is truncated after 10 s. An action is an index of the motor values, from full left to full right.
+`info` has the step's scores (6.1) `score_upright` and (6.2) `score`. The observation is a Box of float32
+without bounds, as in conf/train.yaml:
+
+| index | observation                       | unit    |
+|-------|-----------------------------------|---------|
+| 0     | x, positive right                 | 0.38 m  |
+| 1     | x_dot                             | 1 m/s   |
+| 2, 3  | cos and sin of theta, 0 upright   | 1       |
+| 4     | theta_dot                         | 8 rad/s |
+| 5-7   | last motor values, newest first   | 255     |
+| 8, 9  | x_dot and theta_dot, a step ago   | as 1, 4 |
 """
 
 from collections.abc import Mapping
@@ -44,7 +54,7 @@ Randomization = str | Mapping[str, Mapping[str, Any]]
 def simulated_environment(
     task: str, carts: int, randomization: Randomization = "none", compiled: bool = False
 ) -> CartPoleEnv:
-    """Return the environment of `task`, "swingup" or "balance", with conf/train.yaml's other choices.
+    """Return the environment of `task`, "swingup" or "balance", with the other choices of conf/train.yaml.
 
     `randomization` is the name of a file in conf/randomization/, or its lines. Raises ConfigError.
     """
@@ -54,12 +64,12 @@ def simulated_environment(
 
 
 def observation_space(env: CartPoleEnv) -> spaces.Box:
-    """Of one cart."""
+    """Return the observation space of one cart."""
     return spaces.Box(-np.inf, np.inf, (env.hardware.observation_settings.size,), np.float32)
 
 
 def action_space(env: CartPoleEnv) -> spaces.Discrete:
-    """Of one cart: an index of its motor values."""
+    """Return the action space of one cart: an index of its motor values."""
     return spaces.Discrete(len(env.hardware.motors))
 
 
@@ -72,16 +82,17 @@ class CartPoleGymnasium(gymnasium.Env[Array, np.int64]):
         self.env = simulated_environment(task, 1, randomization)
         self.observation_space, self.action_space = observation_space(self.env), action_space(self.env)
         self.render_mode = render_mode
+        self._seeded = False
         self._present: TensorDictBase
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Array, dict[str, Any]]:
-        """Begin an episode."""
-        fresh = self._np_random is None
+        """Start an episode."""
         super().reset(seed=seed)
-        if fresh or seed is not None:
+        if seed is not None or not self._seeded:
             seed_plant(self.env, self.np_random)
+            self._seeded = True
         self._present = self.env.reset()
         return first_row(self._present, "observation"), {}
 
@@ -100,7 +111,7 @@ class CartPoleGymnasium(gymnasium.Env[Array, np.int64]):
 
 
 class CartPoleVector(VectorEnv[Array, Array, Array]):
-    """Many simulated carts at once; a cart whose episode ends begins the next in the same step.
+    """Many simulated carts at once; a cart whose episode ends starts the next in the same step.
 
     `info` then holds the last observation under `final_obs`, as in Gymnasium's own vector environments.
     """
@@ -121,16 +132,17 @@ class CartPoleVector(VectorEnv[Array, Array, Array]):
         self.single_action_space = action_space(self.env)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
+        self._seeded = False
         self._present: TensorDictBase
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Array, dict[str, Any]]:
-        """Begin an episode on each cart; one seed serves all."""
-        fresh = self._np_random is None
+        """Start an episode on each cart; one seed serves all."""
         super().reset(seed=seed)
-        if fresh or seed is not None:
+        if seed is not None or not self._seeded:
             seed_plant(self.env, self.np_random)
+            self._seeded = True
         self._present = self.env.reset()
         return self._present["observation"].numpy().copy(), {}
 
@@ -149,7 +161,7 @@ class CartPoleVector(VectorEnv[Array, Array, Array]):
 
 
 def vector_info(last: Mapping[str, Array]) -> dict[str, Any]:
-    """Scores of all carts, and the end of those whose episode ended; a mask "_key" goes with each key."""
+    """Return the scores of all carts and the final observations of those that ended, each with its mask."""
     ended = last["done"][:, 0]
     everyone = np.ones_like(ended)
     scores = {key: last[key][:, 0] for key in SCORES}
@@ -164,10 +176,10 @@ def vector_info(last: Mapping[str, Array]) -> dict[str, Any]:
 
 
 def first_row(tensordict: TensorDictBase, key: str) -> Array:
-    """The one cart's own, as an array."""
+    """Return the first row of `key` as an array."""
     return tensordict.get(key)[0].numpy().copy()
 
 
 def seed_plant(env: CartPoleEnv, source: np.random.Generator) -> None:
-    """Seed the carts' draws, and nothing else, from Gymnasium's generator."""
+    """Seed the plant's generator, and no other, from Gymnasium's."""
     env.set_seed(int(source.integers(2**31)))

@@ -1,13 +1,40 @@
-"""The hardware transform: a cart that speaks counts and motor values becomes an environment to learn in.
+"""The hardware transform: encoder counts become observations, actions become motor values.
 
-One transform, the same over a simulated and over a serial plant, keeps the stack short (each TorchRL
-transform costs more time than the arithmetic in it) and holds no state of its own: what it needs of the past
-stands in the tensordict, so a step depends on nothing else.
+It is the same over a simulated and a serial plant. It is a single transform, since each TorchRL transform
+costs more time than the arithmetic in it. It is stateless: a step depends on the tensordict alone.
 
-Keys, each [N, ...]: in `action` int64 index (or NO_ACTION, which sets the motor to 0 and ends the episode);
-out `observation` float32, `state` (measured x m, x_dot m/s, theta rad, theta_dot rad/s), `reward` [N, 1],
-`score` (6.2) and `score_upright` (6.1) of this step [N, 1], `step_count` int64 [N, 1], `past` (what the
-observation remembers), and the plant's own keys.
+Action, key `action` [N] int64:
+
+| value     | meaning                                                    |
+|-----------|------------------------------------------------------------|
+| 0 to A-1  | index of the motor value (-255 to 255, positive rightward) |
+| NO_ACTION | motor 0; the episode is truncated                          |
+
+State, key `state` [N, 4] float32, as measured, without bounds in the specs:
+
+| index | quantity  | unit  | usual range                                                       |
+|-------|-----------|-------|-------------------------------------------------------------------|
+| 0     | x         | m     | within the track, 0 in the middle, positive right                 |
+| 1     | x_dot     | m/s   | -1 to 1 in a swing-up; mean of the last period                    |
+| 2     | theta     | rad   | -pi to pi, 0 upright, positive right                              |
+| 3     | theta_dot | rad/s | -10 to 10 in a swing-up; mean of the last period                  |
+
+Observation, key `observation` [N, K] float32, in this order (`envs.settings.ObservationSettings`):
+
+| numbers             | quantity                                                                        |
+|---------------------|---------------------------------------------------------------------------------|
+| 4, 5 or 3           | raw: the state; cos_sin: x, x_dot, cos, sin, theta_dot; positions: x, cos, sin  |
+| past_motors         | the last motor values / 255, newest first                                       |
+| 2 * past_velocities | the last x_dot, theta_dot                                                       |
+| 3 * past_positions  | the last x, cos, sin                                                            |
+| 1 if pole_length    | the length of the pole, twice pivot to centre of mass                           |
+
+All but `raw` are divided by the scales in `tasks.features`. Other keys, [N, 1] each: `reward`; the scores of
+this step, `score` (6.2) and `score_upright` (6.1); `step_count`; and those of the plant. `past` holds the
+numbers that an observation needs from earlier steps.
+
+`terminated`: the cart left the track, the pole fell (balance), or the cart reported a fault. `truncated`: the
+time limit, a lost link, or NO_ACTION. `done` is either; an episode that ends in both ways is terminated.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,7 +47,7 @@ from torchrl.data import Categorical, Composite, Unbounded
 from torchrl.envs import Transform
 
 from cartpole_rl.compilation import Compiled
-from cartpole_rl.envs.perception import Before, First, Frame, Perceived, perceive, perceive_first
+from cartpole_rl.envs.perception import FirstPercept, Frame, Percept, Previous, perceive, perceive_first
 from cartpole_rl.envs.settings import ObservationSettings, RewardSettings, TaskSettings
 from cartpole_rl.plants.specs import Plant, tensordict_of
 from cartpole_rl.tasks.actions import NO_ACTION
@@ -28,7 +55,7 @@ from cartpole_rl.tasks.features import LENGTH_SCALE
 
 
 class HardwareTransform(Transform):
-    """Counts and motor values of a `Plant` to observations, rewards and scores, and back from actions."""
+    """The transform over a `Plant`: counts to observations, rewards and scores; actions to motor values."""
 
     def __init__(
         self,
@@ -42,14 +69,14 @@ class HardwareTransform(Transform):
         self.task, self.observation_settings, self.reward = task, observation, reward
         self.register_buffer("motors", torch.tensor(list(motors), dtype=torch.int64))
         self.register_buffer("_by_action", torch.tensor([0, *motors], dtype=torch.int64))  # from NO_ACTION on
-        self._perceive: Callable[[Before, Frame], Perceived] = partial(
+        self._perceive: Callable[[Previous, Frame], Percept] = partial(
             perceive, settings=observation, task=task, rewards=reward
         )
         if compiled:
             self.compile_arithmetic()
 
     def compile_arithmetic(self) -> None:
-        """Compile what makes observations and rewards of frames, in the next step."""
+        """Compile the computation of observations and rewards, in the next step."""
         self._perceive = Compiled(self._perceive)
 
     @property
@@ -59,17 +86,17 @@ class HardwareTransform(Transform):
         assert parent is not None
         return parent
 
-    # what changes in the specs
+    # specs
 
     def transform_action_spec(self, action_spec: Composite) -> Composite:
-        """`motor` is replaced by `action`, an index."""
+        """Replace `motor` by `action`, an index."""
         motor = action_spec["motor"]
         del action_spec["motor"]
         action_spec["action"] = Categorical(len(self.motors), shape=motor.shape[:1], device=motor.device)
         return action_spec
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Adds the keys that this transform writes."""
+        """Add the keys that this transform writes."""
         carts, device = observation_spec.shape[0], observation_spec.device
         settings = self.observation_settings
         floats = {"state": 4, "observation": settings.size, "past": settings.past_size}
@@ -78,44 +105,44 @@ class HardwareTransform(Transform):
         observation_spec["step_count"] = Unbounded((carts, 1), dtype=torch.int64, device=device)
         return observation_spec
 
-    # actions down
+    # from actions to motor values
 
     def motor_values(self, action: Tensor) -> Tensor:
-        """The motor values of actions, int64 of the same shape; 0 for NO_ACTION.
+        """Return the motor values of actions, int64 of the same shape; 0 for NO_ACTION.
 
         Raises IndexError for an action that does not exist.
         """
         return self._by_action.index_select(0, action.reshape(-1) - NO_ACTION).reshape(action.shape)
 
     def command(self, tensordict: TensorDictBase) -> TensorDict:
-        """The `motor` values [N, 1] of the actions."""
+        """Return the `motor` values [N, 1] of the actions."""
         return tensordict_of({"motor": self.motor_values(tensordict.get("action")).unsqueeze(-1)})
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         return tensordict.update(self.command(tensordict)) if "action" in tensordict else tensordict
 
-    # frames up
+    # from frames to observations
 
     def reset_rows(self, first: TensorDictBase, rows: Tensor | None = None) -> TensorDictBase:
-        """Add to the first frames of the carts `rows` [R] what they mean; None is all carts."""
-        counts, label = first.get("counts").T, self._label(rows)
-        return added(first, perceive_first(counts, label, self.observation_settings))
+        """Add state and observation to the first frames of the carts `rows` [R]; None means all carts."""
+        counts, length = first.get("counts").T, self._scaled_length(rows)
+        return added(first, perceive_first(counts, length, self.observation_settings))
 
     def perceive(
-        self, present: TensorDictBase, command: TensorDictBase, following: TensorDictBase
+        self, current: TensorDictBase, command: TensorDictBase, next_frame: TensorDictBase
     ) -> TensorDictBase:
-        """Add to the frames that followed a `command` given in `present` what they mean."""
-        before = Before(
-            present.get("counts").T,
-            present.get("state").T,
-            present.get("past").T,
-            present.get("step_count").T,
+        """Add state, observation and reward to the frames after a `command` that was chosen on `current`."""
+        previous = Previous(
+            current.get("counts").T,
+            current.get("state").T,
+            current.get("past").T,
+            current.get("step_count").T,
             command.get("motor").T,
-            self._label(),
+            self._scaled_length(),
         )
-        frame = Frame(*(following.get(key).T for key in Frame._fields))
-        frame = frame._replace(truncated=frame.truncated | (present.get("action") == NO_ACTION))
-        return added(following, self._perceive(before, frame))
+        frame = Frame(*(next_frame.get(key).T for key in Frame._fields))
+        frame = frame._replace(truncated=frame.truncated | (current.get("action") == NO_ACTION))
+        return added(next_frame, self._perceive(previous, frame))
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         return self.reset_rows(tensordict_reset)
@@ -123,8 +150,8 @@ class HardwareTransform(Transform):
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         return self.perceive(tensordict, tensordict, next_tensordict)
 
-    def _label(self, rows: Tensor | None = None) -> Tensor:
-        """What is read off the carts `rows`: their poles' scaled lengths, [1, R]; [0, R] if nobody looks."""
+    def _scaled_length(self, rows: Tensor | None = None) -> Tensor:
+        """Return the scaled pole lengths of the carts `rows`, [1, R]; [0, R] if they are not observed."""
         if not self.observation_settings.pole_length:
             return self.motors.new_empty(
                 0, self.plant.carts if rows is None else len(rows), dtype=torch.float32
@@ -133,6 +160,6 @@ class HardwareTransform(Transform):
         return (lengths / LENGTH_SCALE).unsqueeze(0)
 
 
-def added(frame: TensorDictBase, meaning: First | Perceived) -> TensorDict:
-    """The frame [N] with what it means."""
-    return tensordict_of(dict(frame.items()) | {key: rows.T for key, rows in meaning._asdict().items()})
+def added(frame: TensorDictBase, percept: FirstPercept | Percept) -> TensorDict:
+    """Return the frame [N] with the entries of `percept`."""
+    return tensordict_of(dict(frame.items()) | {key: rows.T for key, rows in percept._asdict().items()})

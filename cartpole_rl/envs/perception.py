@@ -1,8 +1,7 @@
-"""What a host makes of the frames that a cart sends: pure functions, the same for every cart.
+"""From frames to measured state, memory, observation, reward, scores and endings, as pure functions.
 
-Measured state, memory, observation, reward, scores and endings of N carts. Nothing here knows whether a cart
-is simulated. Every tensor is [k, N], a row a number, which is the transpose of what stands in the tensordict:
-compiled code then runs along the carts.
+They are the same for simulated and real carts. Every tensor is [k, N], the transpose of the tensordict's, so
+that compiled code runs along the carts.
 """
 
 from typing import NamedTuple
@@ -25,19 +24,19 @@ from cartpole_rl.tasks.rewards import REWARDS, SCORE, SCORE_UPRIGHT
 from cartpole_rl.tasks.settings import ObservationKind
 
 
-class Before(NamedTuple):
-    """What the host knew when it chose the motor value that led to a frame."""
+class Previous(NamedTuple):
+    """The step before a frame, and the motor value chosen in it."""
 
     counts: Tensor  # [2, N] int64
     state: Tensor  # [4, N]: x m, x_dot m/s, theta rad, theta_dot rad/s
     past: Tensor  # [past_size, N]
     step_count: Tensor  # [1, N] int64
     motor: Tensor  # [1, N] int64, the value chosen
-    label: Tensor  # [1, N] scaled length of the pole if the agent observes it, or else [0, N]
+    length: Tensor  # [1, N] scaled length of the pole if it is observed, otherwise [0, N]
 
 
 class Frame(NamedTuple):
-    """What the plant says after the period: see `plants.specs.Plant`."""
+    """The plant's output after the period: see `plants.specs.Plant`."""
 
     counts: Tensor  # [2, N] int64
     dt: Tensor  # [1, N] s
@@ -45,19 +44,19 @@ class Frame(NamedTuple):
     truncated: Tensor  # [1, N] bool
 
 
-class First(NamedTuple):
-    """What a host makes of the first frame of an episode."""
+class FirstPercept(NamedTuple):
+    """Quantities computed from the first frame of an episode."""
 
     state: Tensor  # [4, N]
     past: Tensor  # [past_size, N]
     observation: Tensor  # [size, N]
-    score: Tensor  # [1, N], as the next
-    score_upright: Tensor
+    score: Tensor  # [1, N], 0
+    score_upright: Tensor  # [1, N], 0
     step_count: Tensor  # [1, N] int64
 
 
-class Perceived(NamedTuple):
-    """What a host makes of a later frame."""
+class Percept(NamedTuple):
+    """Quantities computed from a later frame."""
 
     state: Tensor  # [4, N]
     past: Tensor  # [past_size, N]
@@ -71,17 +70,17 @@ class Perceived(NamedTuple):
     done: Tensor  # [1, N] bool
 
 
-def perceive_first(counts: Tensor, label: Tensor, settings: ObservationSettings) -> First:
-    """Nothing precedes the first frame that a velocity could be taken from, and nothing is remembered."""
+def perceive_first(counts: Tensor, length: Tensor, settings: ObservationSettings) -> FirstPercept:
+    """Return the percept of a first frame: velocities and memory are 0."""
     x, theta = measured_position(counts)
     unknown = torch.zeros_like(x)
     state = Measured(x, unknown, theta, unknown)
     past = x.new_zeros(settings.past_size, len(x))
     nothing = unknown.unsqueeze(0)
-    return First(
+    return FirstPercept(
         torch.stack(state),
         past,
-        observation(state, past, label, settings),
+        observation(state, past, length, settings),
         score=nothing,
         score_upright=nothing.clone(),
         step_count=torch.zeros_like(counts[:1]),
@@ -89,32 +88,32 @@ def perceive_first(counts: Tensor, label: Tensor, settings: ObservationSettings)
 
 
 def perceive(
-    before: Before,
+    previous: Previous,
     frame: Frame,
     *,
     settings: ObservationSettings,
     task: TaskSettings,
     rewards: RewardSettings,
-) -> Perceived:
-    """What the frame that followed means."""
+) -> Percept:
+    """Return the percept of the frame after `previous`."""
     x, theta = measured_position(frame.counts)
-    x_dot, theta_dot = measured_velocity(frame.counts, before.counts, frame.dt[0])
+    x_dot, theta_dot = measured_velocity(frame.counts, previous.counts, frame.dt[0])
     state = Measured(x, x_dot, theta, theta_dot)
-    past = remember(before, settings)
-    step_count = before.step_count + 1
+    past = remember(previous, settings)
+    step_count = previous.step_count + 1
     off_track = frame.terminated
     terminated = off_track | fallen(state, task.angle_limit)
     ended = terminated | frame.truncated | (step_count >= task.time_limit)
-    judged = {  # each once: what the agent learns from is often a score
+    values = {  # each once: the reward is often a score
         kind: REWARDS[kind](state, task.x_max).unsqueeze(0) for kind in {rewards.kind, SCORE, SCORE_UPRIGHT}
     }
-    return Perceived(
+    return Percept(
         torch.stack(state),
         past,
-        observation(state, past, before.label, settings),
-        rewards.scale * judged[rewards.kind] - track_cost(x, off_track, task, rewards),
-        judged[SCORE],
-        judged[SCORE_UPRIGHT],
+        observation(state, past, previous.length, settings),
+        rewards.scale * values[rewards.kind] - track_cost(x, off_track, task, rewards),
+        values[SCORE],
+        values[SCORE_UPRIGHT],
         step_count,
         terminated,
         ended & ~terminated,
@@ -122,27 +121,27 @@ def perceive(
     )
 
 
-def remember(before: Before, settings: ObservationSettings) -> Tensor:
-    """`past` one period on, [past_size, N]: motor values, velocities, positions, each newest first."""
+def remember(previous: Previous, settings: ObservationSettings) -> Tensor:
+    """Return the `past` of the next step: motor values, velocities, positions, each newest first."""
     sizes = settings.past_motors, 2 * settings.past_velocities
-    motors, velocities, positions = before.past.split([*sizes, len(before.past) - sum(sizes)])
-    newest = before.state[1:2] / SPEED_SCALE, before.state[3:4] / ANGULAR_SPEED_SCALE
-    place = torch.stack(observe(Measured(*before.state), ObservationKind.POSITIONS))
+    motors, velocities, positions = previous.past.split([*sizes, len(previous.past) - sum(sizes)])
+    newest = previous.state[1:2] / SPEED_SCALE, previous.state[3:4] / ANGULAR_SPEED_SCALE
+    place = torch.stack(observe(Measured(*previous.state), ObservationKind.POSITIONS))
     return torch.cat(
         (
-            torch.cat((before.motor / MOTOR_SCALE, motors))[: len(motors)],
+            torch.cat((previous.motor / MOTOR_SCALE, motors))[: len(motors)],
             torch.cat((*newest, velocities))[: len(velocities)],
             torch.cat((place, positions))[: len(positions)],
         )
     )
 
 
-def observation(state: Measured, past: Tensor, label: Tensor, settings: ObservationSettings) -> Tensor:
-    """What the agent sees, [size, N]."""
-    return torch.cat((torch.stack(observe(state, settings.kind)), past, label))
+def observation(state: Measured, past: Tensor, length: Tensor, settings: ObservationSettings) -> Tensor:
+    """Return the observation, [size, N]."""
+    return torch.cat((torch.stack(observe(state, settings.kind)), past, length))
 
 
 def track_cost(x: Tensor, off_track: Tensor, task: TaskSettings, rewards: RewardSettings) -> Tensor:
-    """What nearing and leaving the track's end take off the reward, [1, N]."""
+    """Return the cost of leaving the track and of being near its end, [1, N]."""
     nearness = (x / task.x_max).square().unsqueeze(0)
     return rewards.track_penalty * off_track + rewards.position_cost * nearness

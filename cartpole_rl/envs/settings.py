@@ -1,4 +1,4 @@
-"""What can be set about an environment: what the agent sees and learns from, what is asked of the cart."""
+"""Settings of an environment: observation, reward, task."""
 
 from pydantic import Field
 
@@ -9,27 +9,27 @@ POSITIONS = MIRROR_SIGNS[ObservationKind.POSITIONS]
 
 
 class ObservationSettings(Settings):
-    """What the agent sees beside the present measured state."""
+    """The observation: the measured state and what the agent remembers."""
 
     kind: ObservationKind
-    past_motors: int = Field(ge=0, le=16)  # the last so many motor values
-    past_velocities: int = Field(ge=0, le=16)  # the velocities so many periods back
-    past_positions: int = Field(ge=0, le=16)  # the positions so many periods back, as kind `positions`
-    pole_length: bool  # the length of the pole, known from a label on it
+    past_motors: int = Field(ge=0, le=16)  # number of last motor values
+    past_velocities: int = Field(ge=0, le=16)  # number of last velocities
+    past_positions: int = Field(ge=0, le=16)  # number of last positions, each as kind `positions`
+    pole_length: bool  # the length of the pole, as labelled on it
 
     @property
     def past_size(self) -> int:
-        """Numbers of the past: motor values, velocities, positions, each newest first."""
+        """Size of the past: motor values, velocities, positions, each newest first."""
         return self.past_motors + 2 * self.past_velocities + len(POSITIONS) * self.past_positions
 
     @property
     def size(self) -> int:
-        """Numbers in an observation."""
+        """Size of an observation."""
         return observation_size(self.kind) + self.past_size + int(self.pole_length)
 
     @property
     def mirror_signs(self) -> list[int]:
-        """What each number of an observation is multiplied by when left and right are swapped, [size]."""
+        """The factor of each number of an observation when left and right are swapped, [size]."""
         return [
             *MIRROR_SIGNS[self.kind],
             *[-1] * (self.past_motors + 2 * self.past_velocities),
@@ -39,9 +39,9 @@ class ObservationSettings(Settings):
 
     @property
     def frames(self) -> list[list[int]]:
-        """Where in an observation each frame stands, oldest first: its positions, and the motor value before.
+        """The indices of each frame in an observation, oldest first: its positions and the last motor value.
 
-        Empty unless positions are what is seen, and each has its motor value.
+        Empty unless the kind is `positions` and each position has its motor value.
         """
         if self.kind is not ObservationKind.POSITIONS or self.past_motors <= self.past_positions:
             return []
@@ -51,19 +51,19 @@ class ObservationSettings(Settings):
 
 
 class RewardSettings(Settings):
-    """What the agent learns from: `kind` times `scale`, less what the track costs; scores know no price."""
+    """The reward: `kind` times `scale`, minus the costs of the track, which the scores do not have."""
 
     kind: Reward
     scale: Positive
     track_penalty: NonNegative  # for leaving the track
-    position_cost: NonNegative  # of each step, times (x / x_max)^2: of nearing the track's end
+    position_cost: NonNegative  # of each step, times (x / x_max)^2
 
 
 class TaskSettings(Settings):
-    """What is asked of the cart."""
+    """The task."""
 
     name: str
-    start: StartSettings  # where training starts
+    start: StartSettings  # of training episodes
     evaluation_start: StartSettings
     time_limit: Count  # control periods
     angle_limit: Finite | None  # rad; None: the pole may hang

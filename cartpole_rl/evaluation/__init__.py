@@ -1,1 +1,1 @@
-"""Evaluation: whole episodes of a policy on any plant, and what they are worth."""
+"""Evaluation: whole episodes of a policy on any plant, their metrics and recordings."""

@@ -1,8 +1,7 @@
-"""Drives a cart in a process of its own, so that nothing that learns, draws or writes can delay a tick.
+"""Driving a cart in a separate process, so that learning, plotting or writing cannot delay a tick.
 
-The process does one thing at a time: it waits for a policy's weights, runs one episode, and sends it back. It
-ends when the process that started it does, in the middle of an episode too, and every way out of it sets the
-motor to 0 and disarms.
+The process waits for the weights of a policy, runs one episode, and sends it back. It ends with its parent,
+even during an episode, and every exit sets the motor to 0 and disarms the cart.
 """
 
 import gc
@@ -25,21 +24,21 @@ from torch import nn
 from cartpole_rl.envs.make import CartPoleEnv
 from cartpole_rl.errors import CartPoleError, LinkError
 from cartpole_rl.evaluation.driving_policy import DrivingPolicy, Weights
-from cartpole_rl.evaluation.episodes import rehearse, run_batch
+from cartpole_rl.evaluation.episodes import run_batch, warm_up
 from cartpole_rl.plants.serial.faults import Confirm, nobody
 from cartpole_rl.plants.serial.plant import SerialPlant
 from cartpole_rl.plants.serial.statistics import LinkStatistics
-from cartpole_rl.scheduling import compute_first
+from cartpole_rl.scheduling import take_precedence
 from cartpole_rl.signals import RaiseOnce, end_with_parent, ending_signals
 from cartpole_rl.tasks.episode import Episode
 
 GRACE = 5.0  # s from SIGTERM to SIGKILL
-MakeEnv = Callable[[Confirm], CartPoleEnv]  # over a cart whose faults are cleared if a person agrees
+MakeEnv = Callable[[Confirm], CartPoleEnv]  # over a cart whose faults are cleared if a person confirms
 
 
 @dataclass(frozen=True)
 class Drive:
-    """One episode to be driven."""
+    """A request to drive one episode."""
 
     weights: Weights  # of the greedy policy
     epsilon: float  # share of random actions
@@ -48,7 +47,7 @@ class Drive:
 
 @dataclass(frozen=True)
 class Driven:
-    """One episode that was driven, and what the link went through since the process began."""
+    """The result of a Drive: the episode, and the statistics of the link since the process started."""
 
     episode: Episode
     link: LinkStatistics
@@ -56,18 +55,18 @@ class Driven:
 
 @dataclass(frozen=True)
 class Question:
-    """A fault that a person should confirm before it is cleared: True or False is the answer."""
+    """A fault to be confirmed by a person before it is cleared; the answer is True or False."""
 
     text: str
 
 
 class Driver:
-    """A process that drives the cart of `make_env` with the network of `make_policy`; a context manager.
+    """A context manager of a process that drives the cart of `make_env` with the network of `make_policy`.
 
-    Both are called in that process, and their arithmetic is compiled there if `compiled`, before the first
-    episode. `confirm` is called in this process, which has the terminal, while it waits for a result.
-    Where the cart keeps its own clock, `real_time`, the process goes ahead of others if it may; `goes_first`
-    is whether it does. Raises what making the environment raises there.
+    The process calls both, and compiles them before the first episode if `compiled`. `confirm` is called in
+    this process, which has the terminal, while it waits for a result. For a cart with its own clock,
+    `real_time`, the process asks for real-time priority; `has_priority` says if it got it. Raises the errors
+    of `make_env`.
     """
 
     def __init__(
@@ -89,32 +88,30 @@ class Driver:
         self._process.start()
         theirs.close()
         try:
-            self.goes_first: bool = self._receive()
+            self.has_priority: bool = self._receive()
         except BaseException:
             self.close()
             raise
 
     @property
     def pid(self) -> int:
-        """Process id."""
+        """The process id."""
         assert self._process.pid is not None
         return self._process.pid
 
     def start(self, drive: Drive) -> None:
-        """Begin an episode, and return at once. Raises LinkError if the process died."""
+        """Start an episode, and return at once. Raises LinkError if the process died."""
         with _alive():
             self._ours.send(drive)
 
     def result(self) -> Driven:
-        """Wait for the episode that was begun. Raises what ended it before it had begun, LinkError if the
-        process died.
-        """
+        """Wait for the started episode. Raises the errors of its reset, or LinkError if the process died."""
         driven = self._receive()
         assert isinstance(driven, Driven)
         return driven
 
     def close(self) -> None:
-        """Motor to 0, disarm, end the process."""
+        """Set the motor to 0, disarm, end the process."""
         self._process.terminate()
         self._process.join(GRACE)
         if self._process.is_alive():
@@ -145,7 +142,7 @@ class Driver:
 
 @contextmanager
 def _alive() -> Iterator[None]:
-    """Raise LinkError where the other end of the pipe is gone."""
+    """Raise LinkError if the other end of the pipe is closed."""
     try:
         yield
     except (EOFError, ConnectionError):
@@ -153,7 +150,7 @@ def _alive() -> Iterator[None]:
 
 
 class _Ended(BaseException):
-    """SIGTERM or SIGHUP came, or the parent is gone: unwinds, so that the motor is stopped."""
+    """SIGTERM, SIGHUP or the end of the parent: unwinds, so that the motor is stopped."""
 
 
 def _serve(
@@ -166,7 +163,7 @@ def _serve(
 ) -> None:
     endings = ending_signals()
     RaiseOnce(_Ended).handle(*endings)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent gets it too, and ends this one
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent gets it too, and ends this process
     end_with_parent(parent)
     torch.set_num_threads(1)
     with suppress(_Ended, EOFError, ConnectionError):
@@ -177,7 +174,7 @@ def _serve(
         except CartPoleError as error:
             pipe.send(error)
         finally:
-            for number in endings:  # the motor is off; nothing is left to unwind
+            for number in endings:  # the motor is off already
                 signal.signal(number, signal.SIG_IGN)
 
 
@@ -189,18 +186,18 @@ def _drive_on_demand(
     real_time: bool,
     parent: int,
 ) -> None:
-    """Drive an episode for each `Drive` that comes, until the pipe ends."""
+    """Drive an episode for each `Drive` in the pipe, until it is closed."""
     with closing(make_env(partial(_ask, pipe))) as env:
         if compiled:
             env.hardware.compile_arithmetic()
-        rehearse(env, policy)
-        pipe.send(real_time and compute_first())
+        warm_up(env, policy)
+        pipe.send(real_time and take_precedence())
         while True:
             pipe.send(_drive(env, policy, pipe.recv(), parent))
 
 
 def _ask(pipe: Connection, text: str) -> bool:
-    """Let the process that started this one ask the person at its terminal."""
+    """Let the parent process ask the person at its terminal."""
     pipe.send(Question(text))
     return bool(pipe.recv())
 
@@ -210,16 +207,16 @@ def _drive(env: CartPoleEnv, policy: DrivingPolicy, drive: Drive, parent: int) -
     random = np.random.default_rng(drive.seed)
     actions = len(env.hardware.motors)
 
-    def act(present: TensorDictBase) -> TensorDictBase:
+    def act(current: TensorDictBase) -> TensorDictBase:
         if os.getppid() != parent:
             raise _Ended
-        chosen = policy(present)
+        chosen = policy(current)
         if random.random() < drive.epsilon:
             chosen["action"] = torch.tensor([int(random.integers(actions))])
         return chosen
 
     gc.collect()
-    gc.disable()  # a collection in the middle of an episode takes longer than a tick allows
+    gc.disable()  # garbage collection takes longer than a tick allows
     try:
         (episode,) = run_batch(env, act)
     finally:

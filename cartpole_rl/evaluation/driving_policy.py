@@ -1,4 +1,4 @@
-"""The policy that drives: a network as a function of its weights, which may come from elsewhere."""
+"""The greedy policy as a pure function of weights and observation, for driving a cart."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -16,35 +16,37 @@ Weights = dict[str, NDArray[Any]]
 
 
 def as_weights(policy: nn.Module) -> Weights:
-    """The weights of a policy, copied."""
+    """Return a copy of the weights of a policy."""
     return {name: value.detach().cpu().numpy().copy() for name, value in policy.state_dict().items()}
 
 
 class DrivingPolicy:
-    """The policy `network`, from `observation` to `action`; where `compiled`, as one call.
+    """The policy `network`, from `observation` to `action`, optionally `compiled`.
 
-    It follows the network's weights as they change, until others are loaded. TorchRL's modules take most of
-    a small network's time to look up what is where.
+    It shares the network's weights until others are loaded. Its actions are those of the TorchRL module
+    (tests/evaluation/test_driving_policy.py), whose look-ups take most of the time of a small network:
+    compiled, the action for one cart takes a sixth of the time (scripts/bench/shortcuts.py).
     """
 
     def __init__(self, network: nn.Module, compiled: bool) -> None:
         self.network = network
         state = network.state_dict()  # shares memory with the network
         self.names, self._weights = list(state), tuple(state.values())
-        self._choose = Compiled(self._pure) if compiled else self._pure
+        self._choose = Compiled(self._compute) if compiled else self._compute
 
     def load(self, weights: Weights) -> None:
-        """Act with these from now on."""
+        """Act with `weights` from now on."""
         self._weights = tuple(torch.from_numpy(weights[name]) for name in self.names)
 
-    def __call__(self, present: TensorDictBase) -> TensorDictBase:
-        """The `action` [N] for the `observation` of `present` [N], and the `action_value` [N, A]."""
-        action, value = self._choose(self._weights, (present.get("observation"),))
+    def __call__(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Return `action` [N] and `action_value` [N, A] for the `observation` in `tensordict` [N]."""
+        action, value = self._choose(self._weights, (tensordict.get("observation"),))
         return tensordict_of({"action": action, "action_value": value})
 
-    def _pure(self, weights: Sequence[Tensor], seen: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-        """Actions and action values as a function of its arguments alone."""
-        present = TensorDict({"observation": seen[0]}, batch_size=seen[0].shape[:1])
+    def _compute(self, weights: Sequence[Tensor], observations: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+        """Return actions and action values as a function of the arguments alone."""
+        (observation,) = observations
+        tensordict = TensorDict({"observation": observation}, batch_size=observation.shape[:1])
         state = dict(zip(self.names, weights, strict=True))
-        chosen = functional_call(self.network, state, (present,))
+        chosen = functional_call(self.network, state, (tensordict,))
         return chosen["action"], chosen["action_value"]

@@ -1,7 +1,7 @@
-"""Run whole episodes of a policy on any plant.
+"""Whole episodes of a policy on any plant.
 
-A batched plant runs as many episodes at once as it has carts, each from one reset to its own end, so that
-short episodes do not come round more often than long ones.
+N carts run N episodes at once, each from the common reset to its first end, so short episodes are not
+over-represented.
 """
 
 import math
@@ -18,14 +18,14 @@ from cartpole_rl.tasks.actions import NO_ACTION
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
 
-# reads `observation` [N, K], writes `action` [N] and `action_value` [N, A], which it chose by
+# reads `observation` [N, K]; writes `action` [N] and, if it has them, the `action_value` [N, A]
 Policy = Callable[[TensorDictBase], TensorDictBase]
 _FROM_NEXT = ("score", "score_upright", "reward", "done")
 
 
 def run_episodes(env: CartPoleEnv, policy: Policy, episodes: int) -> Iterator[Episode]:
-    """Yield `episodes` episodes. Raises what the plant raises when it cannot be reset."""
-    rehearse(env, policy)
+    """Yield `episodes` episodes. Raises the errors of the plant's reset."""
+    warm_up(env, policy)
     for _ in range(math.ceil(episodes / env.plant.carts)):
         batch = run_batch(env, policy)
         yield from batch[:episodes]
@@ -33,21 +33,21 @@ def run_episodes(env: CartPoleEnv, policy: Policy, episodes: int) -> Iterator[Ep
 
 
 @torch.no_grad()
-def rehearse(env: CartPoleEnv, policy: Policy) -> None:
-    """Think a step through on zeros, so that what is compiled or loaded at first use delays no tick."""
+def warm_up(env: CartPoleEnv, policy: Policy) -> None:
+    """Compute a step on zeros: compilation and lazy loading must not delay the first ticks."""
     blank = env.fake_tensordict()
     choose(policy, blank)
     env.hardware.perceive(blank, env.hardware.command(blank), blank["next"])
 
 
-def choose(policy: Policy, present: TensorDictBase) -> Tensor:
-    """The policy's actions [N]; NO_ACTION where the observation or an action value is not finite.
+def choose(policy: Policy, current: TensorDictBase) -> Tensor:
+    """Return the policy's actions [N]; NO_ACTION where the observation or an action value is not finite.
 
-    The largest of values that are not numbers is the first one, which is full motor to the left.
+    The argmax of NaN values is the first action, full motor to the left.
     """
-    seen = present.select("observation")
-    finite = seen.get("observation").isfinite().all(-1)
-    chosen = policy(seen)
+    observed = current.select("observation")
+    finite = observed.get("observation").isfinite().all(-1)
+    chosen = policy(observed)
     values = chosen.get("action_value", None)
     if values is not None:
         finite &= values.isfinite().all(-1)
@@ -56,25 +56,25 @@ def choose(policy: Policy, present: TensorDictBase) -> Tensor:
 
 @torch.no_grad()
 def run_batch(env: CartPoleEnv, policy: Policy) -> list[Episode]:
-    """One episode on each cart, all from one reset."""
-    present = env.reset()
+    """Return one episode of each cart, all from one reset."""
+    current = env.reset()
     origins = env.plant.origins()
-    frames, actions = [present], []
+    frames, actions = [current], []
     endings: list[str | None] = [None] * env.plant.carts
-    while None in endings:  # a cart waits for what happens here; all that can wait is done below
-        action = choose(policy, present)
-        following = env.step(present.set("action", action)).get("next")
+    while None in endings:  # the cart waits for this loop; the rest is done afterwards
+        action = choose(policy, current)
+        outcome = env.step(current.set("action", action)).get("next")
         actions.append(action)
-        frames.append(following)
-        if following.get("done").any():
-            _note_endings(env, action, following, endings)
-        present = following.exclude("reward")
-    env.plant.halt()  # a real cart keeps its last motor value
-    begin, steps = frames[0], frames[1:]
+        frames.append(outcome)
+        if outcome.get("done").any():
+            _note_endings(env, action, outcome, endings)
+        current = outcome.exclude("reward")
+    env.plant.halt()  # a real cart would keep its last motor value
+    first, steps = frames[0], frames[1:]
     columns = {key: torch.cat([step[key] for step in steps], 1) for key in _FROM_NEXT}
     columns |= {key: torch.stack([frame[key] for frame in frames], 1) for key in ("state", "counts")}
     columns["motor"] = env.hardware.motor_values(torch.stack(actions, 1))
-    dt = torch.cat([torch.zeros_like(begin["dt"]), *(step["dt"] for step in steps)], 1)
+    dt = torch.cat([torch.zeros_like(first["dt"]), *(step["dt"] for step in steps)], 1)
     columns["time"] = dt.cumsum(1)
     arrays = {key: values.cpu().numpy() for key, values in columns.items()}
     return [
@@ -85,12 +85,12 @@ def run_batch(env: CartPoleEnv, policy: Policy) -> list[Episode]:
 
 
 def _note_endings(
-    env: CartPoleEnv, action: Tensor, following: TensorDictBase, endings: list[str | None]
+    env: CartPoleEnv, action: Tensor, outcome: TensorDictBase, endings: list[str | None]
 ) -> None:
-    """Fill in the reason for each cart whose first episode ends now."""
-    for row in following["done"].squeeze(-1).nonzero().squeeze(-1).tolist():
+    """Fill in the reason for each cart whose first episode ends in this step."""
+    for row in outcome["done"].squeeze(-1).nonzero().squeeze(-1).tolist():
         if endings[row] is None:
-            endings[row] = _ending(env, int(action[row]), following[row])
+            endings[row] = _ending(env, int(action[row]), outcome[row])
 
 
 def _ending(env: CartPoleEnv, action: int, last: TensorDictBase) -> str:
@@ -107,7 +107,7 @@ def _ending(env: CartPoleEnv, action: int, last: TensorDictBase) -> str:
 
 
 def _episode(columns: dict[str, np.ndarray], ended_by: str) -> Episode:
-    """One row's episode, cut where it ended."""
+    """Return the episode of one row, cut at its end."""
     steps = 1 + int(np.argmax(columns["done"]))
     x, x_dot, theta, theta_dot = columns["state"][: steps + 1].astype(np.float64).T
     step = {key: values[:steps] for key, values in columns.items()}

@@ -1,4 +1,4 @@
-"""What an episode is worth, and what several are worth together."""
+"""Metrics of an episode, and their means over several."""
 
 import math
 import warnings
@@ -17,12 +17,12 @@ RESAMPLES = 5000
 
 
 def episode_metrics(episode: Episode, track_half_length: float) -> dict[str, Any]:
-    """Figures of one episode, as they stand in metrics.json; None where a figure has no meaning.
+    """Return the metrics of one episode for metrics.json; None where a metric is undefined.
 
     `score` and `score_upright` are the sums of (6.2) and (6.1); `time_to_upright_s` the first time from which
     the pole stays within 5 degrees for 1 s; `upright_fraction` the share of periods within 5 degrees, over
     which the RMS of angle and position are taken; `rms_motor_change` that of the step from one motor value to
-    the next; `min_track_margin_m` how near the cart came to `track_half_length`, negative beyond it.
+    the next; `min_track_margin_m` the smallest distance from `track_half_length`, negative beyond it.
     """
     upright = is_upright(episode.theta[1:])
     change = np.diff(episode.motor)
@@ -46,27 +46,27 @@ def _rms(values: np.ndarray) -> float | None:
 
 
 def interval(values: Sequence[float]) -> tuple[float, float] | tuple[None, None]:
-    """95 % interval of the mean by BCa bootstrap (Efron, 1987); none for one value, which shows no spread."""
+    """Return the 95 % interval of the mean by BCa bootstrap (Efron, 1987); (None, None) for one value."""
     data = np.asarray(values, dtype=float)
     if len(data) < 2:
         return None, None
     if np.ptp(data) == 0:
         return float(data[0]), float(data[0])
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # said of samples that are equal but for rounding
+        warnings.simplefilter("ignore")  # about samples that differ only by rounding
         result = stats.bootstrap(
             (data,), np.mean, confidence_level=CONFIDENCE, rng=np.random.default_rng(0), n_resamples=RESAMPLES
         )
     low, high = (float(edge) for edge in result.confidence_interval)
     if math.isfinite(low) and math.isfinite(high):
         return low, high
-    # BCa is not defined for those; Student's t is
+    # BCa is undefined for those; use Student's t
     half = float(stats.sem(data) * stats.t.ppf((1 + CONFIDENCE) / 2, len(data) - 1))
     return float(data.mean()) - half, float(data.mean()) + half
 
 
 def summarize(episodes: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Mean of each figure with its interval, over the episodes that have it; endings are counted."""
+    """Return mean and interval of each metric over the episodes that have it, and counts of the endings."""
     summary: dict[str, Any] = {}
     for key in episodes[0]:
         values = [episode[key] for episode in episodes]

@@ -1,8 +1,7 @@
-"""Episodes as files that other programs open: CSV with a unit in each column's name.
+"""Recordings: episodes as CSV files, with units in the column names.
 
-Lines that begin with # hold what is true of the whole episode, as `# key: value`. A row is a control period:
-the state as it was measured, then the motor value chosen on it; the last row, where the episode ended, has no
-motor value and what follows from it.
+Lines `# key: value` describe the whole episode. A row is a control period: the measured state, then the motor
+value chosen on it, its scores and reward. The last row, the end of the episode, has only the state.
 """
 
 import csv
@@ -33,7 +32,7 @@ COLUMNS = (*STATE, *COUNTS, "motor", *STEP)
 
 
 def write_recording(path: Path, episode: Episode, facts: Mapping[str, Any] | None = None) -> None:
-    """Write one episode, whole or not at all; `facts` are added to the heading."""
+    """Write one episode atomically; `facts` are added to the heading."""
     with replacing(path) as beside, beside.open("w", newline="") as file:
         for key, value in {"format": FORMAT, "ended_by": episode.ended_by, **(facts or {})}.items():
             file.write(f"# {key}: {value}\n")
@@ -50,7 +49,7 @@ def write_recording(path: Path, episode: Episode, facts: Mapping[str, Any] | Non
 
 
 def read_recording(path: Path) -> Episode:
-    """The episode in a file. Raises RecordingError where it is no recording, or a damaged one."""
+    """Read the episode in a file. Raises RecordingError if it is no recording, or damaged."""
     facts, text = {}, []
     try:
         for line in path.read_text().splitlines():
@@ -87,7 +86,7 @@ def read_recording(path: Path) -> Episode:
 
 
 def _check_numbers(path: Path, columns: Mapping[str, np.ndarray], motor: np.ndarray) -> None:
-    """Raise RecordingError for the first number that no cart can have sent."""
+    """Raise RecordingError for the first impossible number."""
 
     def damaged(row: int, what: str) -> RecordingError:
         return RecordingError(f"{path} is damaged: {what} in row {row + 1}; record it again, or leave it out")

@@ -1,1 +1,1 @@
-"""Learning: replay, collection, updates, the training loop, and checkpoints."""
+"""Learning: replay buffer, collection, updates, the training loop, and checkpoints."""

@@ -1,4 +1,4 @@
-"""Where a run folder keeps its checkpoints, without reading them."""
+"""The paths of the checkpoints in a run folder."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ FOLDER, LAST, BEST, RESUME = "checkpoints", "last.pt", "best.pt", "resume.pt"
 
 
 def find_agent(run: Path) -> Path:
-    """The checkpoint file that `run` means: itself, or the last one of a run folder."""
+    """Return the checkpoint `run` itself, or the last one of a run folder. Raises CheckpointError."""
     if not run.exists():
         raise CheckpointError(
             f"run={run}: there is no such file or folder; give a run folder or a checkpoint"
@@ -22,12 +22,13 @@ def find_agent(run: Path) -> Path:
 
 
 def find_training(run: Path) -> Path:
-    """The file that the training in the folder `run` can resume from. Raises CheckpointError."""
+    """Return the file to resume the training in the folder `run` from. Raises CheckpointError."""
     if not run.is_dir():
         raise CheckpointError(f"resume={run}: there is no such folder; give the run folder of a training")
     path = run / FOLDER / RESUME
     if not path.exists():
         raise CheckpointError(
-            f"resume={run}: it holds no {FOLDER}/{RESUME}; give the folder of a training that came so far"
+            f"resume={run}: it holds no {FOLDER}/{RESUME}; give the folder of a training that was interrupted"
+            " after its first checkpoint"
         )
     return path

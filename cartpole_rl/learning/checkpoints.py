@@ -1,6 +1,6 @@
-"""Checkpoints: an agent with all that is needed to use it, and the state that training resumes from.
+"""Checkpoints: an agent with its config, and the state that a training resumes from.
 
-A kill or a power cut at any moment leaves the old file whole (`cartpole_rl.files`).
+Files are replaced atomically (`cartpole_rl.files`).
 """
 
 from collections.abc import Mapping
@@ -27,7 +27,7 @@ CONTENT = {  # format: what a file of it holds
 
 @dataclass(frozen=True)
 class AgentCheckpoint:
-    """An agent's weights and the run that made them."""
+    """The weights of an agent and the config of its training."""
 
     config: dict[str, Any]  # the resolved config of the training
     weights: dict[str, Any]
@@ -37,17 +37,17 @@ class AgentCheckpoint:
 
 @dataclass(frozen=True)
 class TrainingCheckpoint:
-    """All that a training or a fine-tuning goes on from."""
+    """The state that a training or a fine-tuning resumes from."""
 
     config: dict[str, Any]
-    state: dict[str, Any]  # of a training: what `Training.snapshot` gave
+    state: dict[str, Any]  # of a training: from `Training.snapshot`
     transitions: int
 
 
 def save_agent(path: Path, agent: AgentCheckpoint) -> None:
-    """Write what `load_agent` reads.
+    """Write a checkpoint for `load_agent`.
 
-    Raises CheckpointError if a weight is not finite; the file then stays as it was.
+    Raises CheckpointError if a weight is not finite, without changing the file.
     """
     check_finite(agent.weights, f"{path} is not written")
     _save(path, AGENT_FORMAT, vars(agent))
@@ -62,7 +62,7 @@ def load_agent(run: Path) -> AgentCheckpoint:
 
 
 def restore_weights(agent: nn.Module, weights: Mapping[str, Any], source: str) -> None:
-    """Load the weights of a checkpoint. Raises CheckpointError where they are those of another network."""
+    """Load the weights of a checkpoint into `agent`. Raises CheckpointError if they do not fit."""
     try:
         agent.load_state_dict(weights)
     except RuntimeError:  # a line for each weight
@@ -72,7 +72,7 @@ def restore_weights(agent: nn.Module, weights: Mapping[str, Any], source: str) -
 
 
 def check_finite(weights: Mapping[str, Any], consequence: str) -> None:
-    """Raise CheckpointError that names a weight which is not finite, if there is one."""
+    """Raise CheckpointError if a weight is not finite."""
     for name, weight in weights.items():
         if isinstance(weight, torch.Tensor) and not weight.isfinite().all():
             raise CheckpointError(
@@ -82,19 +82,19 @@ def check_finite(weights: Mapping[str, Any], consequence: str) -> None:
 
 
 def save_training(run: Path, training: TrainingCheckpoint, file_format: str = TRAINING_FORMAT) -> None:
-    """Write what `load_training` reads. Raises CheckpointError if a weight is not finite."""
+    """Write the state for `load_training`. Raises CheckpointError if a weight is not finite."""
     path = run / FOLDER / RESUME
     check_finite(training.state.get("agent", {}), f"{path} is not written")
     _save(path, file_format, vars(training))
 
 
 def forget_training(run: Path) -> None:
-    """Remove what `save_training` wrote: the training has ended, and its replay buffer is large."""
+    """Remove the file of `save_training`: the training has ended, and the buffer in it is large."""
     (run / FOLDER / RESUME).unlink(missing_ok=True)
 
 
 def load_training(run: Path, file_format: str = TRAINING_FORMAT) -> TrainingCheckpoint:
-    """The state that the training in the folder `run` can go on from. Raises CheckpointError."""
+    """Read the state to resume the training in the folder `run` from. Raises CheckpointError."""
     path = find_training(run)
     training = TrainingCheckpoint(**_load(path, file_format))
     check_finite(training.state.get("agent", {}), f"{path} is refused")
@@ -109,7 +109,7 @@ def _save(path: Path, file_format: str, content: Mapping[str, Any]) -> None:
 def _load(path: Path, expected: str) -> dict[str, Any]:
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # torch raises whatever the damaged bytes lead it to
+    except Exception as error:  # torch.load raises errors of many kinds for damaged files
         raise CheckpointError(
             f"{path} is no checkpoint of this package, or it is damaged ({type(error).__name__}); "
             f"give one that cartpole-train wrote"

@@ -1,7 +1,7 @@
-"""Fine-tuning: a trained agent learns on, from one cart's recordings and from simulations of that cart.
+"""Fine-tuning of a trained agent with recordings of one cart and simulations of it.
 
-Each round fits the simulator to all that was recorded, draws carts from what the fit leaves open, and learns
-from both. The rest of the agent's life in simulation goes on as it was: same loop, same loss.
+The simulator is fitted to all recordings; carts are drawn from the uncertainty of the fit. Training then
+continues on both, with the same loop and the same loss.
 """
 
 from collections.abc import Callable, Sequence
@@ -11,8 +11,8 @@ import torch
 from tensordict import TensorDictBase
 
 from cartpole_rl.envs.make import CartPoleEnv
+from cartpole_rl.learning.buffer import n_step_transitions
 from cartpole_rl.learning.collector import COLLECTED
-from cartpole_rl.learning.replay import n_step_transitions
 from cartpole_rl.learning.settings import FinetuningSettings
 from cartpole_rl.learning.training import Scalars, Training
 from cartpole_rl.plants.recorded import RecordedPlant
@@ -23,27 +23,27 @@ from cartpole_rl.tasks.episode import Episode
 
 def recorded_chunk(
     episode: Episode,
-    over: Callable[[RecordedPlant], CartPoleEnv],
+    make_env: Callable[[RecordedPlant], CartPoleEnv],
     motors: Sequence[int],
     pole_length: float | None,
 ) -> TensorDictBase | None:
-    """The one-step transitions [1, T] of an episode, as the environment `over` a recording sees them.
+    """Return the one-step transitions [1, T] of an episode in the environment that `make_env` builds.
 
-    `pole_length` m is that of the cart which was driven, None if it is not known. The last step before a lost
-    link is left out: nothing was measured at its end. None is left of an episode that has no other step.
+    `pole_length` m is that of the cart, None if it is not known. The last step before a lost link is left
+    out, since its outcome was not measured. Return None if no other step is left.
     """
-    env = over(RecordedPlant(episode, pole_length))
+    env = make_env(RecordedPlant(episode, pole_length))
     index = {motor: action for action, motor in enumerate(motors)}
-    present, taken = env.reset(), []
+    current, taken = env.reset(), []
     for motor in episode.motor[: episode.measured_steps].tolist():
-        present["action"] = torch.tensor([index[motor]])
-        transition, present = env.step_and_maybe_reset(present)
+        current["action"] = torch.tensor([index[motor]])
+        transition, current = env.step_and_maybe_reset(current)
         taken.append(transition.select(*COLLECTED))
     return torch.stack(taken, 1) if taken else None
 
 
 class Finetuning(Training):
-    """A training that goes on from an agent's weights, on carts of a fit and on a cart's recordings."""
+    """A training of a trained agent, on simulated carts of a fit and on recordings of a cart."""
 
     def __init__(self, finetuning: FinetuningSettings, *arguments: Any, **named: Any) -> None:
         super().__init__(*arguments, **named)
@@ -52,38 +52,38 @@ class Finetuning(Training):
         self._chooser = torch.Generator().manual_seed(0)
 
     def add(self, chunk: TensorDictBase | None) -> None:
-        """Learn from one more recorded episode, if there is anything in it."""
+        """Add a recorded episode; None adds nothing."""
         if chunk is None:
             return
         transitions = n_step_transitions(chunk, self.settings.n_step, self.agent.settings.gamma)
-        known = self.recorded
-        self.recorded = transitions if known is None else torch.cat((known, transitions))
+        earlier = self.recorded
+        self.recorded = transitions if earlier is None else torch.cat((earlier, transitions))
 
     def simulate(self, carts: Draws) -> None:
-        """Go on with simulated carts drawn from `carts`; what older ones taught is forgotten."""
+        """Continue on simulated carts drawn from `carts`; the transitions of older ones are discarded."""
         assert isinstance(self.env.plant, SimulatedPlant)
         self.env.plant.replace_randomizer(carts)
         self.collector.reset()
         self.returns.reset()
-        self.replay.empty()
+        self.buffer.empty()
         self.fill()
 
     def fill(self) -> None:
-        """Drive the simulated carts for a whole episode, so that the first updates see all of one."""
+        """Collect a whole episode of each simulated cart, so that the buffer holds all parts of it."""
         for _ in range(self.env.hardware.task.time_limit // self.settings.chunk):
             self.collect()
 
     def round(self) -> Scalars:
-        """Learn while one episode is driven."""
+        """Run the iterations that belong to one episode of the cart."""
         scalars: Scalars = {}
         for _ in range(self.finetuning.iterations):
-            chunk, learned = self.iterate()
-            scalars = learned | self.describe(chunk)
+            chunk, scalars = self.iterate()
+            scalars |= self.describe(chunk)
         return scalars
 
     def sample(self) -> TensorDictBase:
-        """Simulated transitions, with recorded ones in `cart_share` of the places, scattered."""
-        simulated = self.replay.sample()
+        """Return simulated transitions, a random `cart_share` of them replaced by recorded ones."""
+        simulated = self.buffer.sample()
         if self.recorded is None or self.finetuning.cart_share == 0:
             return simulated
         count = len(simulated)

@@ -1,6 +1,6 @@
-"""The global random generators: torch's (weights, uniform replay) and NumPy's (prioritized replay).
+"""The global random generators: torch's (weights, uniform buffer) and NumPy's (prioritized buffer).
 
-What else draws, carts and exploration, has a generator of its own.
+Carts and exploration have separate generators.
 """
 
 from collections.abc import Mapping
@@ -11,15 +11,15 @@ import torch
 
 
 def seed_everything(seed: int) -> None:
-    """Seed both."""
+    """Seed both generators."""
     torch.manual_seed(seed)
     np.random.seed(seed % 2**32)  # noqa: NPY002 - TorchRL's sampler draws from NumPy's global generator
 
 
 def random_state() -> dict[str, Any]:
-    """The state of both, in tensors and plain values."""
+    """Return the state of both generators as tensors and plain values."""
     state = np.random.get_state(legacy=False)  # noqa: NPY002
-    numbers = torch.from_numpy(state["state"]["key"].astype(np.int64))  # torch has few operations for uint32
+    numbers = torch.from_numpy(state["state"]["key"].astype(np.int64))  # torch has few uint32 operations
     return {
         "torch": torch.get_rng_state(),
         "numpy": {**state, "state": {**state["state"], "key": numbers}},
@@ -27,7 +27,7 @@ def random_state() -> dict[str, Any]:
 
 
 def restore_random_state(snapshot: Mapping[str, Any]) -> None:
-    """Go on from what `random_state` gave."""
+    """Restore the state that `random_state` returned."""
     torch.set_rng_state(snapshot["torch"])
     state = snapshot["numpy"]
     numbers = state["state"]["key"].numpy().astype(np.uint32)

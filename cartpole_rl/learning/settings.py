@@ -1,4 +1,4 @@
-"""What can be set about learning."""
+"""Settings of learning."""
 
 from typing import Annotated, Literal
 
@@ -33,7 +33,7 @@ class LearningSettings(Settings):
     transitions: Count  # transitions in all
     carts: Count  # simulated in parallel
     chunk: Count  # periods
-    retry_probability: Fraction  # of the carts that the agent failed with: they are not replaced by new ones
+    retry_probability: Fraction  # that a cart is kept for another episode after a failed one
     updates: Count  # gradient steps an iteration
     batch_size: Count
     n_step: Annotated[int, Field(ge=1, le=20)]  # the longest return
@@ -43,7 +43,7 @@ class LearningSettings(Settings):
     epsilon_transitions: Count  # over which epsilon falls, linearly
     evaluations: Count  # during training, evenly spaced, the last at the end
     evaluation_episodes: Count
-    checkpoint_interval: Count  # evaluations between two checkpoints that training can resume from
+    checkpoint_interval: Count  # evaluations from one resumable checkpoint to the next
 
     @model_validator(mode="after")
     def _long_enough(self) -> "LearningSettings":
@@ -63,7 +63,7 @@ class LearningSettings(Settings):
 
     @property
     def collected_transitions(self) -> int:
-        """Transitions that whole iterations collect: `transitions`, or a little less."""
+        """Transitions in whole iterations: `transitions` or slightly fewer."""
         return self.iterations * self.carts * self.chunk
 
 

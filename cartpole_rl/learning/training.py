@@ -1,7 +1,7 @@
-"""The training loop: collect, learn, evaluate, in that order, from the first frame to the last.
+"""The training loop: collect, learn, evaluate, in that order.
 
-Everything that the next iteration depends on is in `snapshot`, so that a run that was killed goes on as if it
-had not been. Schedules are functions of the transitions seen.
+`snapshot` holds everything that the next iteration depends on, so a resumed run equals one that was never
+interrupted, to the bit. Schedules are functions of the progress.
 """
 
 import math
@@ -18,9 +18,9 @@ from cartpole_rl.agents.dqn import QAgent
 from cartpole_rl.agents.loss import Columns, LossGradient, columns_of
 from cartpole_rl.envs.make import CartPoleEnv
 from cartpole_rl.errors import LearningError
+from cartpole_rl.learning.buffer import NStepReturns, buffer_snapshot, make_buffer, restore_buffer
 from cartpole_rl.learning.collector import Collector
 from cartpole_rl.learning.randomness import random_state, restore_random_state
-from cartpole_rl.learning.replay import NStepReturns, make_replay, replay_snapshot, restore_replay
 from cartpole_rl.learning.schedules import half_cosine, linear
 from cartpole_rl.learning.settings import BufferSettings, LearningSettings, OptimizerSettings
 from cartpole_rl.tasks.episode import Episode
@@ -30,25 +30,25 @@ OPTIMIZERS = {"adam": torch.optim.Adam, "adamw": torch.optim.AdamW}
 
 
 class Monitor(Protocol):
-    """Who is told how training goes."""
+    """Callbacks of a training."""
 
     def on_update(self, transitions: int, scalars: Scalars) -> None:
-        """After an iteration; not after each one."""
+        """Report an iteration; called about 200 times in a training."""
 
     def on_evaluation(self, training: "Training", episodes: Sequence[Episode], is_best: bool) -> None:
-        """After an evaluation."""
+        """Report an evaluation."""
 
     def on_checkpoint(self, training: "Training") -> None:
-        """When the state of the training should be written."""
+        """Save the state of the training."""
 
 
 class Training:
-    """A DQN training of `agent` on `env`; `evaluate` runs the greedy policy on a plant of its own."""
+    """A DQN training of `agent` on `env`; `evaluate` runs the greedy policy on another plant."""
 
     def __init__(
         self,
         settings: LearningSettings,
-        replay: BufferSettings,
+        buffer: BufferSettings,
         optimizer: OptimizerSettings,
         agent: QAgent,
         env: CartPoleEnv,
@@ -62,9 +62,9 @@ class Training:
         self.collector = Collector(
             env, agent.actor, len(env.hardware.motors), seed, settings.retry_probability
         )
-        self.replay_settings, self.optimizer_settings = replay, optimizer
+        self.buffer_settings, self.optimizer_settings = buffer, optimizer
         self.returns = NStepReturns(settings.n_step, agent.settings.gamma, settings.carry)
-        self.replay = make_replay(replay, settings.updates * settings.batch_size)
+        self.buffer = make_buffer(buffer, settings.updates * settings.batch_size)
         self.gradient = LossGradient(agent.loss, optimizer.max_grad_norm, compiled)
         self.weights = self.gradient.weights
         self.optimizer = OPTIMIZERS[optimizer.kind](
@@ -86,56 +86,56 @@ class Training:
 
     @property
     def progress(self) -> float:
-        """Share of the training that is done, 0 to 1."""
+        """Completed share of the training, 0 to 1."""
         return self.iteration / self.settings.iterations
 
     def run(self) -> None:
-        """Train from where this stands to the end."""
+        """Train from the current iteration to the end."""
         settings = self.settings
         evaluate_at = evenly_spaced(settings.evaluations, settings.iterations)
-        checkpoint_at = evaluate_at[:: -settings.checkpoint_interval]  # counted back, so that the end is one
+        checkpoint_at = evaluate_at[:: -settings.checkpoint_interval]  # counted from the end, which is one
         while self.iteration < settings.iterations:
             chunk, scalars = self.iterate()
             if self.iteration % max(1, settings.iterations // 200) == 0:
                 self.monitor.on_update(self.transitions, scalars | self.describe(chunk))
             if self.iteration in evaluate_at:
-                self.judge()
+                self.run_evaluation()
             if self.iteration in checkpoint_at:
                 self.monitor.on_checkpoint(self)
 
     def iterate(self) -> tuple[TensorDictBase, Scalars]:
-        """Collect a chunk and learn; what was collected, and what is worth a curve of the learning."""
+        """Collect a chunk and learn; return the chunk and the scalars of `learn`."""
         with self.timed():
             chunk = self.collect()
             self.iteration += 1
             return chunk, self.learn() if self.transitions > self.settings.warmup_transitions else {}
 
     def collect(self) -> TensorDictBase:
-        """A chunk from all carts, whose transitions are in replay from now on, or wait for the next chunk."""
+        """Collect a chunk [N, T] and add its n-step transitions to the buffer."""
         self.collector.epsilon = self.epsilon()
         chunk = self.collector.collect(self.settings.chunk)
-        self.replay.extend(self.returns(chunk))
+        self.buffer.extend(self.returns(chunk))
         return chunk
 
     def sample(self) -> TensorDictBase:
-        """What one iteration learns from, `updates` batches long."""
-        return self.replay.sample()
+        """Return the transitions of one iteration's updates, `updates` batches long."""
+        return self.buffer.sample()
 
     def learn(self) -> Scalars:
-        """One iteration's gradient steps; the mean loss and gradient norm, and the learning rate."""
-        optimizer, beta = self.optimizer_settings, self.replay_settings.beta
+        """Make one iteration's updates; return mean loss, mean gradient norm and learning rate."""
+        optimizer, beta = self.optimizer_settings, self.buffer_settings.beta
         rate = half_cosine(
             optimizer.learning_rate, optimizer.learning_rate * optimizer.learning_rate_end, self.progress
         )
         for group in self.optimizer.param_groups:
             group["lr"] = rate
-        if self.replay_settings.kind == "prioritized":
-            self.replay.sampler.beta = linear(*beta, self.progress)
+        if self.buffer_settings.kind == "prioritized":
+            self.buffer.sampler.beta = linear(*beta, self.progress)
         sample = self.sample()
         batches = zip(*(column.split(self.settings.batch_size) for column in columns_of(sample)), strict=True)
         losses, norms, errors = zip(*map(self.update, batches), strict=True)
-        if self.replay_settings.kind == "prioritized":
-            self.replay.update_tensordict_priority(sample.set("td_error", torch.cat(errors)))
+        if self.buffer_settings.kind == "prioritized":
+            self.buffer.update_tensordict_priority(sample.set("td_error", torch.cat(errors)))
         return {
             "learning/loss": torch.stack(losses).mean().item(),
             "learning/gradient_norm": torch.stack(norms).mean().item(),
@@ -143,23 +143,32 @@ class Training:
         }
 
     def update(self, batch: Columns) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """One gradient step; the loss, the norm of its gradient, the error of each transition.
+        """Make a gradient step; return the loss, its gradient's norm and the error of each transition.
 
-        Raises LearningError, with the weights as they were, if the loss or its gradient is not finite.
+        Raises LearningError, before the step, if the loss or its gradient is not finite.
         """
         loss, norm, errors = self.gradient(batch)
         if not math.isfinite(loss.item() + norm.item()):
             raise LearningError(
                 f"learning diverged after {self.transitions} transitions: the loss is {loss.item():g}, its "
-                f"gradient's norm {norm.item():g}; the checkpoints from before are kept; try a smaller "
+                f"gradient's norm {norm.item():g}; earlier checkpoints are kept; try a smaller "
                 f"optimizer.learning_rate than {self.optimizer_settings.learning_rate:g}"
             )
         self.optimizer.step()
-        self.agent.follow()
+        self.agent.update_target()
         return loss, norm, errors
 
+    def run_evaluation(self) -> None:
+        """Evaluate the greedy policy and report the episodes to the monitor."""
+        with self.timed():
+            episodes = self.evaluate()
+        self.last_score = float(np.mean([episode.score.sum() for episode in episodes]))
+        is_best = self.last_score > self.best_score
+        self.best_score = max(self.best_score, self.last_score)
+        self.monitor.on_evaluation(self, episodes, is_best)
+
     def epsilon(self) -> float:
-        """Share of random actions now."""
+        """Return the share of random actions in the next chunk."""
         settings = self.settings
         if self.transitions < settings.warmup_transitions:
             return 1.0
@@ -169,7 +178,7 @@ class Training:
 
     @torch.no_grad()
     def describe(self, chunk: TensorDictBase) -> Scalars:
-        """What is worth a curve beside the losses."""
+        """Return the scalars to plot beside those of `learn`."""
         value = self.agent.actor(chunk[:, 0].select("observation"))["chosen_action_value"]
         scalars = {
             "learning/q_mean": value.mean().item(),
@@ -180,18 +189,9 @@ class Training:
         }
         return scalars | {f"exploration/{key}": value for key, value in self.collector.finished().items()}
 
-    def judge(self) -> None:
-        """Evaluate, and tell the monitor."""
-        with self.timed():
-            episodes = self.evaluate()
-        self.last_score = float(np.mean([episode.score.sum() for episode in episodes]))
-        is_best = self.last_score > self.best_score
-        self.best_score = max(self.best_score, self.last_score)
-        self.monitor.on_evaluation(self, episodes, is_best)
-
     @contextmanager
     def timed(self) -> Iterator[None]:
-        """Add the time that passes within it to `seconds`: collecting, learning and evaluating count."""
+        """Add the time within the context to `seconds`: that of collecting, learning and evaluating."""
         started = time.perf_counter()
         try:
             yield
@@ -199,14 +199,14 @@ class Training:
             self.seconds += time.perf_counter() - started
 
     def snapshot(self) -> dict[str, Any]:
-        """All that the next iteration depends on, to be saved at once: it shares memory with the training."""
+        """Return the state of the training, to be saved at once: it shares memory with the training."""
         return {
             "iteration": self.iteration,
             "seconds": self.seconds,
             "scores": [self.best_score, self.last_score],
             "agent": self.agent.state_dict(),
             "optimizer": self.optimizer.state_dict(),
-            "replay": replay_snapshot(self.replay),
+            "replay": buffer_snapshot(self.buffer),
             "returns": self.returns.snapshot(),
             "collector": self.collector.snapshot(),
             "plant": self.env.plant.snapshot(),
@@ -214,13 +214,13 @@ class Training:
         }
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
-        """Go on from `snapshot` as if nothing had happened."""
+        """Restore the state in `snapshot`."""
         self.iteration = snapshot["iteration"]
         self.seconds = snapshot["seconds"]
         self.best_score, self.last_score = snapshot["scores"]
         self.agent.load_state_dict(snapshot["agent"])
         self.optimizer.load_state_dict(snapshot["optimizer"])
-        restore_replay(self.replay, snapshot["replay"])
+        restore_buffer(self.buffer, snapshot["replay"])
         self.returns.restore(snapshot["returns"])
         self.collector.restore(snapshot["collector"])
         self.env.plant.restore(snapshot["plant"])
@@ -228,5 +228,5 @@ class Training:
 
 
 def evenly_spaced(count: int, end: int) -> list[int]:
-    """`count` rising integers up to and with `end`."""
+    """Return `count` evenly spaced integers, of which the last is `end`."""
     return [round(end * (index + 1) / count) for index in range(count)]

@@ -1,1 +1,1 @@
-"""What is asked of a cart: features, rewards, scores, starts and endings, as pure tensor functions."""
+"""The tasks: features, rewards, scores, starts and endings, as pure tensor functions."""

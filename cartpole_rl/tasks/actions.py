@@ -1,4 +1,4 @@
-"""Action sets: which motor values an agent chooses among, and what they mean to the simulated motor."""
+"""Action sets: the motor values that an agent chooses from, and the simulated actuator."""
 
 from typing import Annotated, Literal
 
@@ -6,13 +6,13 @@ from pydantic import Field, model_validator
 
 from cartpole_rl.settings import Settings
 
-NO_ACTION = -1  # what a policy without a finite choice gives: the motor goes to 0 and the episode ends
+NO_ACTION = -1  # where an observation or action value is not finite: motor 0, and the episode ends
 
 Motor = Annotated[int, Field(ge=-255, le=255)]
 
 
 class ActionSettings(Settings):
-    """Motor values by action index, and the simulated actuator that they are meant for."""
+    """Motor values by action index, and the simulated actuator that interprets them."""
 
     motors: tuple[Motor, ...]
     actuator: Literal["newtons", "force_curve"]

@@ -1,4 +1,4 @@
-"""Why an episode ends. Track's end, faults and a lost link are the plant's; angle and time are the task's."""
+"""Reasons of ending. The plant reports track, fault and link; angle and time belong to the task."""
 
 from enum import StrEnum
 
@@ -9,7 +9,7 @@ from cartpole_rl.tasks.features import Measured
 
 
 class Ending(StrEnum):
-    """Reasons, as they stand in metrics.json."""
+    """The reasons of ending in metrics.json and recordings."""
 
     TIME = "time"  # truncated: the time limit
     ANGLE = "angle"  # terminated: the balance task's pole fell
@@ -20,7 +20,7 @@ class Ending(StrEnum):
 
 
 def fallen(state: Measured, angle_limit: float | None) -> Tensor:
-    """Whether the measured |theta| is over `angle_limit` rad, [N] bool; None is no limit."""
+    """Return [N] bool: the measured |theta| exceeds `angle_limit` rad. None means no limit."""
     if angle_limit is None:
         return torch.zeros_like(state.theta, dtype=torch.bool)
     return state.theta.abs() > angle_limit

@@ -1,4 +1,4 @@
-"""One finished episode as arrays: what evaluation scores, figures draw and recordings store."""
+"""One finished episode as arrays, for scores, figures and recordings."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Origin:
-    """A simulated cart and the true state that an episode began in: enough to drive the episode again."""
+    """A simulated cart and the true initial state of an episode: enough to repeat it."""
 
     parameters: Mapping[str, float]  # of cart and pole, by name
     state: Mapping[str, float]  # x m, x_dot m/s, theta rad, theta_dot rad/s
@@ -19,7 +19,7 @@ class Origin:
 
 @dataclass(frozen=True)
 class Episode:
-    """One episode of T control periods, as the cart measured it.
+    """One episode of T control periods, as measured by the cart.
 
     Row t of the state is measured before `motor[t]` is chosen; the last row is where the episode ended.
     """
@@ -30,19 +30,19 @@ class Episode:
     theta: Array  # [T+1] rad, 0 upright, positive to the right, not wrapped
     theta_dot: Array  # [T+1] rad/s
     counts: NDArray[np.int64]  # [T+1, 2] encoder counts of cart and pole, as the cart sent them
-    motor: NDArray[np.int64]  # [T] motor value that the agent asked for, -255 to 255
+    motor: NDArray[np.int64]  # [T] motor value chosen by the agent, -255 to 255
     score: Array  # [T] equation (6.2) of each step, at state t+1
     score_upright: Array  # [T] equation (6.1) of each step, at state t+1
     reward: Array  # [T]
     ended_by: str  # an `endings.Ending`
-    origin: Origin | None = None  # of an episode on a simulated cart
+    origin: Origin | None = None  # None on a real cart
 
     @property
     def measured_steps(self) -> int:
-        """Control periods whose outcome was measured: all, but for the last one before a lost link."""
+        """Number of control periods whose outcome was measured: all but the last one before a lost link."""
         return self.steps - (self.ended_by == "link")
 
     @property
     def steps(self) -> int:
-        """Control periods in the episode."""
+        """Number of control periods."""
         return len(self.motor)

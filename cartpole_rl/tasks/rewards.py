@@ -1,6 +1,6 @@
 """Rewards (5.1) to (5.5) and the scores (6.1) and (6.2): functions of the measured state, [N] -> [N].
 
-Every agent is judged by both scores, whatever reward it learned from.
+Both scores are reported for every agent, whatever its reward.
 """
 
 import math
@@ -14,7 +14,7 @@ from cartpole_rl.tasks.settings import Reward
 
 UPRIGHT_ANGLE = math.radians(5)  # rad
 UPRIGHT_SPEED = math.radians(6)  # rad/s
-BONUS = 5.0  # (6.2), given once for the angle and once more for angle and speed
+BONUS = 5.0  # (6.2), once for the angle and once more for angle and speed
 UPRIGHT_BONUS = 10.0  # (5.5)
 BALANCE_ANGLE = math.radians(12)  # rad, theta_thr of (5.5): where the classical task ends
 

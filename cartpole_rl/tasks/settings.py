@@ -1,4 +1,4 @@
-"""What can be chosen of a task: where episodes start, what the agent observes, what it is rewarded for."""
+"""Choices of a task: starts, observations, rewards."""
 
 from enum import StrEnum
 
@@ -6,7 +6,7 @@ from cartpole_rl.settings import Fraction, NonNegative, Settings
 
 
 class Start(StrEnum):
-    """Which angle of the pole an episode starts from."""
+    """The initial angle of the pole."""
 
     UPRIGHT = "upright"
     HANGING = "hanging"
@@ -14,25 +14,25 @@ class Start(StrEnum):
 
 
 class StartSettings(Settings):
-    """How an episode starts: everything is drawn uniformly within plus or minus its spread."""
+    """The initial state of an episode, drawn uniformly within plus or minus each spread."""
 
     angle: Start
     position_spread: NonNegative  # m, of the cart about the middle
     angle_spread: NonNegative  # rad, about upright or hanging
     speed_spread: NonNegative  # m/s
     angular_speed_spread: NonNegative  # rad/s
-    resting_share: Fraction = 0.0  # of the episodes: the pole hangs and everything is at rest
+    resting_share: Fraction = 0.0  # of the episodes start with a hanging pole at rest
 
 
 class ObservationKind(StrEnum):
-    """How the measured state is shown to the agent."""
+    """The form in which the agent observes the measured state."""
 
     RAW = "raw"  # x, x_dot, theta wrapped, theta_dot: the thesis's four numbers
     COS_SIN = "cos_sin"  # x, x_dot, cos theta, sin theta, theta_dot, each scaled to about one
-    POSITIONS = "positions"  # x, cos theta, sin theta: as cos_sin, velocities hidden
+    POSITIONS = "positions"  # x, cos theta, sin theta: as cos_sin, without velocities
 
 
-# What each number of an observation is multiplied by when left and right are swapped.
+# The factor of each number of an observation when left and right are swapped.
 MIRROR_SIGNS = {
     ObservationKind.RAW: (-1, -1, -1, -1),
     ObservationKind.COS_SIN: (-1, -1, 1, -1, -1),
@@ -41,12 +41,12 @@ MIRROR_SIGNS = {
 
 
 def observation_size(kind: ObservationKind) -> int:
-    """Numbers that `observe` gives."""
+    """Return how many numbers `features.observe` returns."""
     return len(MIRROR_SIGNS[kind])
 
 
 class Reward(StrEnum):
-    """What the agent learns from."""
+    """The formulas to choose the reward from."""
 
     CONSTANT = "constant"
     COSINE = "cosine"

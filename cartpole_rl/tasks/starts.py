@@ -1,4 +1,4 @@
-"""Where an episode starts: draws of the true state."""
+"""Random initial states."""
 
 import math
 from functools import cache
@@ -10,7 +10,7 @@ from cartpole_rl.tasks.settings import Start, StartSettings
 
 
 def draw_start(count: int, start: StartSettings, generator: torch.Generator) -> Tensor:
-    """True states [count, 4]: x m, x_dot m/s, theta rad, theta_dot rad/s."""
+    """Draw true states [count, 4]: x m, x_dot m/s, theta rad, theta_dot rad/s."""
     device = generator.device
     unit = 2 * torch.rand((count, 4), generator=generator, device=device) - 1
     state = torch.addcmul(*bounds(start, device, resting=False), unit)
@@ -22,7 +22,7 @@ def draw_start(count: int, start: StartSettings, generator: torch.Generator) -> 
 
 @cache
 def bounds(start: StartSettings, device: torch.device, resting: bool) -> tuple[Tensor, Tensor]:
-    """Middle and spread of the states [4] that an episode starts from; `resting`: of those at rest."""
+    """Return centre and spread [4] of the initial states; with `resting`, of those at rest."""
     angle, angle_spread = {
         Start.UPRIGHT: (0.0, start.angle_spread),
         Start.HANGING: (math.pi, start.angle_spread),

@@ -1,4 +1,4 @@
-"""When a pole counts as upright: the first band of score (6.2), and how long it has to be held."""
+"""The definition of upright: the angle of score (6.2), and how long it has to be held."""
 
 import math
 
@@ -7,21 +7,21 @@ from numpy.typing import NDArray
 
 from cartpole_rl.tasks.rewards import UPRIGHT_ANGLE
 
-HOLD = 1.0  # s that the pole stays in the band before a picture says that it got there
+HOLD = 1.0  # s that the pole has to stay upright
 
 
 def wrap(theta: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Angles in rad, of any shape, wrapped to (-pi, pi]."""
+    """Return angles in rad, of any shape, wrapped to (-pi, pi]."""
     return -((-theta + math.pi) % (2 * math.pi) - math.pi)
 
 
 def is_upright(theta: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Whether each angle (rad, wrapped or not) is within 5 degrees of upright."""
+    """Return True for each angle (rad, wrapped or not) within 5 degrees of upright."""
     return np.abs(wrap(theta)) < UPRIGHT_ANGLE
 
 
 def upright_since(time: NDArray[np.float64], theta: NDArray[np.float64]) -> float | None:
-    """First time (s) from which the pole stays upright for one second; None if it never does.
+    """Return the first time (s) from which the pole stays upright for one second; None if it never does.
 
     `time` [T] in s, ascending; `theta` [T] in rad.
     """

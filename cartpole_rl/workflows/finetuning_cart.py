@@ -9,7 +9,7 @@ from cartpole_rl.evaluation.driver import Drive, Driver
 from cartpole_rl.evaluation.driving_policy import Weights
 from cartpole_rl.plants.serial.statistics import LinkStatistics
 from cartpole_rl.reporting.tensorboard import TensorBoardLog
-from cartpole_rl.scheduling import compute_last
+from cartpole_rl.scheduling import give_precedence
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.workflows.config import FinetuneConfig
 from cartpole_rl.workflows.finetuning_files import FinetuningFiles, Stage
@@ -73,8 +73,8 @@ class DrivenCart:
 
 def yield_to(driver: Driver) -> None:
     """Lower this process's priority, but not that of the driver or of an emulated cart: they have started."""
-    compute_last()
-    if not driver.goes_first:
+    give_precedence()
+    if not driver.has_priority:
         print_message(
             "finetune", "other processes may delay the cart: no real-time priority (see `ulimit -r`)"
         )

@@ -8,7 +8,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from cartpole_rl.agents.baseline import EnergyAndRegulator, decoded, linearized, regulator
+from cartpole_rl.agents.baseline import EnergyAndRegulator, decode, linearized, regulator
 from cartpole_rl.choices import choice
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.envs.make import CartPoleEnv
@@ -63,7 +63,7 @@ def test_an_observation_is_read_backwards(kind: ObservationKind) -> None:
     state = Measured(*torch.tensor([[0.1, -0.2], [-0.5, 0.7], [3.0, -1.2], [4.0, -9.0]]))
     motors = torch.tensor([[200.0, 0.0], [-150.0, 50.0]])
     seen = torch.cat((torch.stack(observe(state, kind), 1), motors / 255), 1)
-    found, motor = decoded(seen, kind)
+    found, motor = decode(seen, kind)
     torch.testing.assert_close(torch.stack(found), torch.stack(state))
     torch.testing.assert_close(motor, motors[:, 0])
 
@@ -81,7 +81,7 @@ def test_what_it_expects_comes_true(ip02: dict[str, float], make_plant: MakePlan
         "theta_dot": (after.theta - before.theta) / PERIOD,
     }
     policy = baseline({**ip02, "latency": 0.0}, "medium")
-    expected = policy.expected(after._replace(**velocities), torch.tensor([250.0]))
+    expected = policy.predict(after._replace(**velocities), torch.tensor([250.0]))
     for name, measured in velocities.items():
         truth, led_on = getattr(after, name), getattr(expected, name)
         assert abs(led_on - truth) < 0.5 * abs(measured - truth)
@@ -89,8 +89,8 @@ def test_what_it_expects_comes_true(ip02: dict[str, float], make_plant: MakePlan
 
 def test_the_nearest_force_is_chosen(ip02: dict[str, float]) -> None:
     policy = baseline(ip02, "medium")  # 1, 2, 3, 4 N at 100, 150, 200, 250
-    wanted = torch.tensor([0.4, 0.6, -2.6, 99.0, -99.0])
-    assert policy.motors[policy.value(wanted).argmax(-1)].tolist() == [0, 100, -200, 250, -250]
+    target = torch.tensor([0.4, 0.6, -2.6, 99.0, -99.0])
+    assert policy.motors[policy.value(target).argmax(-1)].tolist() == [0, 100, -200, 250, -250]
 
 
 def test_it_brakes_before_the_end_of_the_track(ip02: dict[str, float]) -> None:
@@ -105,7 +105,7 @@ def test_it_brakes_before_the_end_of_the_track(ip02: dict[str, float]) -> None:
 @pytest.mark.parametrize(
     "changes", [{"kind": ObservationKind.POSITIONS}, {"past_motors": 0}], ids=["positions", "no motors"]
 )
-def test_what_it_cannot_read_is_told(ip02: dict[str, float], changes: dict[str, Any]) -> None:
+def test_missing_observations_are_an_error(ip02: dict[str, float], changes: dict[str, Any]) -> None:
     with pytest.raises(ConfigError, match="the baseline reads velocities and the last motor value"):
         baseline(ip02, "medium", **changes)
 

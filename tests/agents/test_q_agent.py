@@ -108,13 +108,13 @@ def test_a_mirrored_network_fits_what_is_odd_and_what_is_even() -> None:
     network = MirrorQNetwork([-1, 1], 3, (64, 64), True)
     optimizer = torch.optim.Adam(network.parameters(), lr=3e-3)
     x, y = torch.rand(2, 2000) * 2 - 1
-    wanted = torch.stack((y - x**3, y * x**2, y + x**3), -1)
+    reference = torch.stack((y - x**3, y * x**2, y + x**3), -1)
     for _ in range(600):
-        error = (network(torch.stack((x, y), -1)) - wanted).square().mean()
+        error = (network(torch.stack((x, y), -1)) - reference).square().mean()
         optimizer.zero_grad()
         error.backward()
         optimizer.step()
-    assert error.item() < 1e-3 * wanted.var().item()
+    assert error.item() < 1e-3 * reference.var().item()
 
 
 @pytest.mark.parametrize("layer_norm", [True, False])
@@ -157,12 +157,12 @@ def test_a_recurrent_network_learns_a_velocity_from_positions(mirrored: bool) ->
     for _ in range(300):
         scene = torch.randn(128, 7)
         velocity = scene[:, 0] - scene[:, 2]
-        wanted = torch.stack((velocity, -velocity), -1)
-        error = (network(scene) - wanted).square().mean()
+        reference = torch.stack((velocity, -velocity), -1)
+        error = (network(scene) - reference).square().mean()
         optimizer.zero_grad()
         error.backward()
         optimizer.step()
-    assert error.item() < 0.1 * wanted.var().item()
+    assert error.item() < 0.1 * reference.var().item()
 
 
 def test_the_actor_takes_the_action_of_the_highest_value() -> None:
@@ -220,7 +220,7 @@ def test_the_action_gap_widens_and_keeps_the_best_action() -> None:
             optimizer.zero_grad()
             agent.loss(batch)["loss"].backward()
             optimizer.step()
-            agent.follow()
+            agent.update_target()
         learned[gap] = values_of(agent, batch["observation"][:1], target=False)[0]
     assert torch.allclose(learned[0.0], torch.tensor([1.0, 0.9]), atol=0.01)
     assert torch.allclose(learned[0.5], torch.tensor([1.0, 0.8]), atol=0.01)
@@ -263,20 +263,20 @@ def test_the_gradient_is_that_of_the_loss(
         batch = transitions(64)
         if weighted:
             batch["priority_weight"] = torch.rand(64)
-        wanted = batch.clone()
-        loss = agent.loss(wanted)["loss"]
+        reference = batch.clone()
+        loss = agent.loss(reference)["loss"]
         expected = torch.autograd.grad(loss, gradient.weights)
         length = nn.utils.get_total_norm(expected).item()
         value, norm, errors = gradient(columns_of(batch))
         assert value.item() == pytest.approx(loss.item(), rel=1e-5)
         assert norm.item() == pytest.approx(length, rel=1e-4)
-        assert torch.allclose(errors, wanted["td_error"], rtol=1e-4, atol=1e-5)
+        assert torch.allclose(errors, reference["td_error"], rtol=1e-4, atol=1e-5)
         share = min(1.0, max_norm / length)
         for weight, part in zip(gradient.weights, expected, strict=True):
             assert weight.grad is not None
             assert torch.allclose(weight.grad, share * part, rtol=1e-4, atol=1e-5)
         disturb(agent)
-        agent.follow()
+        agent.update_target()
 
 
 def test_every_weight_of_the_online_network_is_learned() -> None:
@@ -307,7 +307,7 @@ def test_a_hard_update_copies_at_each_period_and_never_between(period: int) -> N
     for update in range(1, 4 * period + 1):
         disturb(agent)
         before = target_weights(agent)
-        agent.follow()
+        agent.update_target()
         expected = online_weights(agent) if update % period == 0 else before
         assert torch.equal(target_weights(agent), expected), update
 
@@ -316,7 +316,7 @@ def test_a_soft_update_moves_by_tau() -> None:
     agent = make_agent(target_tau=0.25)
     disturb(agent)
     before = target_weights(agent)
-    agent.follow()
+    agent.update_target()
     assert torch.allclose(target_weights(agent), 0.75 * before + 0.25 * online_weights(agent), atol=1e-6)
 
 
@@ -332,12 +332,12 @@ def test_the_greedy_policy_acts_with_the_average_of_the_weights_as_they_move() -
     agent = make_agent(average_decay=0.75)
     policy = agent.greedy_policy()
     disturb(agent)
-    agent.follow()
+    agent.update_target()
     expected = actor_weights(agent)  # the first update is the average itself
     for averages in range(1, 40):
         assert torch.allclose(policy_weights(policy), expected, atol=1e-5)
         disturb(agent)
-        agent.follow()
+        agent.update_target()
         share = max(0.25, 10 / (10 + averages))  # of the newest: the untrained weights are soon forgotten
         expected = (1 - share) * expected + share * actor_weights(agent)
 
@@ -346,7 +346,7 @@ def test_the_greedy_policy_follows_weights_that_are_loaded_later() -> None:
     trained, agent = make_agent(), make_agent()
     for _ in range(2):
         disturb(trained)
-        trained.follow()
+        trained.update_target()
     policy = agent.greedy_policy()
     agent.load_state_dict(trained.state_dict())
     assert torch.equal(policy_weights(policy), policy_weights(trained.greedy_policy()))
@@ -357,7 +357,7 @@ def test_without_an_average_the_greedy_policy_is_the_online_network() -> None:
     agent = make_agent(target_tau=None, target_period=5, average_decay=None)
     policy = agent.greedy_policy()
     disturb(agent)
-    agent.follow()
+    agent.update_target()
     observation = torch.randn(200, 3)
     taken = policy(TensorDict({"observation": observation}, [200]))["action"]
     assert torch.equal(taken, values_of(agent, observation, target=False).argmax(1))

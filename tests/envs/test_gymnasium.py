@@ -138,5 +138,5 @@ def test_randomization_is_by_name_or_by_lines() -> None:
         env = simulated_environment("swingup", 8, given)
         env.reset()
         assert len(env.plant.parameters.cart_mass.unique()) == 8
-    with pytest.raises(ConfigError, match=r"no choice 'randomization/wild' in conf/; there is .*wide"):
+    with pytest.raises(ConfigError, match=r"no choice 'randomization/wild' in conf/; choose from .*wide"):
         simulated_environment("swingup", 8, "wild")

@@ -27,11 +27,11 @@ def test_it_acts_as_the_network_whose_weights_it_was_given(compiled: bool, chang
     policy = DrivingPolicy(network(0, **changes), compiled)
     observations = torch.randn(200, 1, 4, generator=torch.Generator().manual_seed(5))
     for seed in (0, 1):  # the second has other weights than the one that was compiled
-        wanted = network(seed, **changes)
-        policy.load(as_weights(wanted))
+        expected = network(seed, **changes)
+        policy.load(as_weights(expected))
         for observation in observations:
             present = TensorDict({"observation": observation}, batch_size=[1])
-            assert torch.equal(policy(present.clone())["action"], wanted(present.clone())["action"])
+            assert torch.equal(policy(present.clone())["action"], expected(present.clone())["action"])
 
 
 def test_weights_are_copies() -> None:

@@ -124,7 +124,7 @@ def test_an_action_value_that_is_not_finite_stops_the_motor_and_ends_the_episode
     def policy(seen: TensorDictBase) -> TensorDictBase:
         values = torch.zeros(3, 3)
         values[:, RIGHT] = 1
-        if next(periods) == 5:  # the first call is a rehearsal
+        if next(periods) == 5:  # the first call is the warm-up
             values[1, 0] = unsound
         return seen.set("action_value", values).set("action", values.argmax(-1))
 
@@ -137,15 +137,15 @@ def test_an_action_value_that_is_not_finite_stops_the_motor_and_ends_the_episode
 def test_an_observation_that_is_not_finite_stops_the_motor_and_ends_the_episode(
     make_plant: Callable, make_environment: Callable
 ) -> None:
-    env = make_environment(make_plant(1), motors=(-200, 0, 200))
-    perceive, periods = env.hardware._perceive, iter(range(100))
+    """The plant reports a NaN as the duration of the fourth step, so the velocity is NaN."""
+    env, calls = make_environment(make_plant(1), motors=(-200, 0, 200)), iter(range(100))
 
-    def spoil(*arguments: object) -> object:
-        seen = perceive(*arguments)
-        return seen._replace(observation=seen.observation * (math.nan if next(periods) == 4 else 1))
+    def policy(seen: TensorDictBase) -> TensorDictBase:
+        if next(calls) == 4:  # the first call is the warm-up
+            env.plant.period = math.nan  # the period that the plant reports, not the one that it integrates
+        return always(RIGHT)(seen)
 
-    env.hardware._perceive = spoil
-    (episode,) = run_episodes(env, always(RIGHT), 1)
+    (episode,) = run_episodes(env, policy, 1)
     assert episode.ended_by == "non_finite"
     assert episode.motor.tolist() == [200] * 4 + [0]
 

@@ -1,10 +1,11 @@
-"""Transitions hang together, epsilon is the share of random actions, and a snapshot goes on to the bit."""
+"""The collector: consistent transitions, the share of random actions, retries, and resuming to the bit."""
 
 from collections.abc import Callable
 
 import pytest
 import torch
 from tensordict.nn import TensorDictModule
+from torchrl.collectors import Collector as TorchRLCollector
 
 from cartpole_rl.envs.make import CartPoleEnv
 from cartpole_rl.learning.collector import COLLECTED, Collector
@@ -46,6 +47,35 @@ def test_each_transition_begins_where_the_last_one_ended(env: CartPoleEnv) -> No
     assert not follows[ended].any()  # a new episode begins at a state of its own
 
 
+def test_transitions_equal_those_of_torchrls_collector_and_rollout(
+    make_plant: Callable, make_environment: Callable
+) -> None:
+    """The same seed and policy give the same transitions, to the bit, over resets of single carts."""
+    torch.manual_seed(0)
+    layer = torch.nn.Linear(10, 3)
+    policy = TensorDictModule(
+        lambda seen: (10 * layer(seen)).argmax(-1), in_keys=["observation"], out_keys=["action"]
+    )
+    start = StartSettings(
+        angle=Start.ANY, position_spread=0.3, angle_spread=0, speed_spread=0.5, angular_speed_spread=1.0
+    )
+
+    def build() -> CartPoleEnv:
+        return make_environment(make_plant(CARTS, start=start, seed=3), time_limit=LIMIT)
+
+    ours = Collector(build(), policy, actions=3, seed=0)
+    ours.epsilon = 0.0
+    chunk, periods = ours.collect(3 * LIMIT), 3 * LIMIT
+    stock = TorchRLCollector(build(), policy, frames_per_batch=CARTS * periods, total_frames=CARTS * periods)
+    with torch.no_grad():
+        rollout = build().rollout(periods, policy, break_when_any_done=False)
+    for other in (next(iter(stock)), rollout):
+        for key in COLLECTED:
+            assert torch.equal(chunk[key], other[key]), key
+    assert len(chunk["action"].unique()) == 3
+    assert 0 < chunk["next", "terminated"].sum() < chunk["next", "done"].sum()
+
+
 def test_epsilon_is_the_share_of_random_actions(env: CartPoleEnv) -> None:
     acting = collector(env, action=1)
     shares = []
@@ -55,7 +85,7 @@ def test_epsilon_is_the_share_of_random_actions(env: CartPoleEnv) -> None:
     assert shares == pytest.approx([0.0, 0.5 * 2 / 3, 2 / 3], abs=0.03)  # a third of the random ones is 1 too
 
 
-def test_finished_episodes_are_told_once(env: CartPoleEnv) -> None:
+def test_finished_episodes_are_reported_once(env: CartPoleEnv) -> None:
     acting = collector(env)
     acting.epsilon = 0.0
     acting.collect(LIMIT - 1)
@@ -75,7 +105,7 @@ def test_equal_seeds_act_alike_and_others_do_not(make_plant: Callable, make_envi
     assert not torch.equal(chunks[0]["action"], chunks[2]["action"])
 
 
-def test_a_snapshot_goes_on_to_the_bit(make_plant: Callable, make_environment: Callable) -> None:
+def test_a_restored_collector_continues_to_the_bit(make_plant: Callable, make_environment: Callable) -> None:
     def build(seed: int) -> Collector:
         return collector(make_environment(make_plant(CARTS, seed=seed), time_limit=LIMIT), seed=seed)
 
@@ -90,9 +120,7 @@ def test_a_snapshot_goes_on_to_the_bit(make_plant: Callable, make_environment: C
 
 
 @pytest.mark.parametrize("share", [0.0, 0.75])
-def test_a_cart_that_failed_tries_again(
-    make_plant: Callable, make_environment: Callable, share: float
-) -> None:
+def test_a_failed_cart_is_retried(make_plant: Callable, make_environment: Callable, share: float) -> None:
     """Poles that start a little off upright: some have enough friction to stand for a second, some fall."""
     viscous = Range(distribution="log_uniform", absolute=(1e-4, 10.0))
     near = StartSettings(

@@ -64,25 +64,25 @@ AGENT = {
 
 
 def episode(score: float) -> Episode:
-    """One that is worth `score`."""
+    """Return an episode of one step with this score."""
     rest, step = np.zeros(2), np.zeros(1)
     counts = np.zeros((2, 2), int)
     return Episode(rest, rest, rest, rest, rest, counts, step.astype(int), step + score, step, step, "time")
 
 
 class Listener:
-    """A monitor that keeps what it is told."""
+    """A monitor that keeps all reports."""
 
     def __init__(self) -> None:
         self.scalars: list[tuple[int, Scalars]] = []
-        self.judged: list[tuple[int, bool]] = []
+        self.evaluations: list[tuple[int, bool]] = []
         self.snapshots: list[tuple[int, bytes]] = []
 
     def on_update(self, transitions: int, scalars: Scalars) -> None:
         self.scalars.append((transitions, scalars))
 
     def on_evaluation(self, training: Training, episodes: Sequence[Episode], is_best: bool) -> None:
-        self.judged.append((training.transitions, is_best))
+        self.evaluations.append((training.transitions, is_best))
 
     def on_checkpoint(self, training: Training) -> None:
         file = io.BytesIO()
@@ -123,11 +123,11 @@ def make_training(make_plant: Callable, make_environment: Callable) -> Callable[
     return build
 
 
-def test_it_counts_frames_and_updates(make_training: Callable[..., Training]) -> None:
+def test_it_counts_transitions_and_updates(make_training: Callable[..., Training]) -> None:
     training = make_training()
     training.run()
     assert training.transitions == 1024
-    assert len(training.replay) == 500
+    assert len(training.buffer) == 500
     iterations, warmed_up = 1024 // 64, 128 // 64
     assert training.updates == 2 * (iterations - warmed_up)
     assert training.progress == 1
@@ -138,7 +138,7 @@ def test_it_evaluates_evenly_and_checkpoints_every_second_time(
 ) -> None:
     training = make_training()
     training.run()
-    assert [transitions for transitions, _ in training.monitor.judged] == [256, 512, 768, 1024]
+    assert [transitions for transitions, _ in training.monitor.evaluations] == [256, 512, 768, 1024]
     assert [transitions for transitions, _ in training.monitor.snapshots] == [512, 1024]
 
 
@@ -146,25 +146,25 @@ def test_the_best_is_the_first_of_the_highest_scores(make_training: Callable[...
     scores = iter([1.0, 3.0, 2.0, 3.0])
     training = make_training(evaluate=lambda: [episode(next(scores))])
     training.run()
-    assert [best for _, best in training.monitor.judged] == [True, True, False, False]
+    assert [best for _, best in training.monitor.evaluations] == [True, True, False, False]
     assert (training.best_score, training.last_score) == (3.0, 3.0)
 
 
 def test_exploration_falls_from_all_to_the_last_share(make_training: Callable[..., Training]) -> None:
     training = make_training()
     training.run()
-    told = {transitions: scalars["learning/epsilon"] for transitions, scalars in training.monitor.scalars}
-    assert told[64] == told[128] == 1.0  # acted before an update could be made
-    assert told[192] == pytest.approx(0.5)  # 128 transitions were seen
-    assert told[192 + 64] == pytest.approx(0.5 - 0.4 * 64 / 400)
-    assert told[1024] == pytest.approx(0.1)
+    reported = {transitions: scalars["learning/epsilon"] for transitions, scalars in training.monitor.scalars}
+    assert reported[64] == reported[128] == 1.0  # acted before an update could be made
+    assert reported[192] == pytest.approx(0.5)  # 128 transitions were seen
+    assert reported[192 + 64] == pytest.approx(0.5 - 0.4 * 64 / 400)
+    assert reported[1024] == pytest.approx(0.1)
 
 
 def test_learning_rate_and_beta_reach_their_ends(make_training: Callable[..., Training]) -> None:
     training = make_training()
     training.run()
     assert training.optimizer.param_groups[0]["lr"] == pytest.approx(5e-5)
-    assert training.replay.sampler.beta == pytest.approx(1.0)
+    assert training.buffer.sampler.beta == pytest.approx(1.0)
 
 
 def test_gradients_are_clipped(make_training: Callable[..., Training]) -> None:
@@ -183,7 +183,7 @@ def test_learning_stops_at_the_first_loss_that_is_not_finite(
     for _ in range(4):
         training.iterate()
     before = [weight.clone() for weight in training.weights]
-    sample = training.replay.sample()
+    sample = training.buffer.sample()
     sample["next", "reward"][0] = value
     training.sample = lambda: sample
     with pytest.raises(LearningError, match=r"diverged after 320 transitions.*a smaller optimizer"):
@@ -201,7 +201,7 @@ def test_a_time_limit_does_not_end_the_world(make_training: Callable[..., Traini
         time_limit=6,
     )
     training.run()
-    seen = training.replay.sample()["observation"]
+    seen = training.buffer.sample()["observation"]
     values = training.agent.actor(TensorDict({"observation": seen}, [len(seen)]))["action_value"]
     assert values.mean().item() == pytest.approx(2.0, abs=0.02)
     assert values.std().item() < 0.05
@@ -232,7 +232,7 @@ def test_a_resumed_training_ends_with_the_same_weights(
     transitions, state = whole.monitor.snapshots[0]
     assert transitions == 512
 
-    resumed = build(seed=1)  # every generator stands elsewhere
+    resumed = build(seed=1)  # every generator has another state
     resumed.restore(torch.load(io.BytesIO(state), weights_only=True))
     resumed.run()
     assert resumed.updates == whole.updates
@@ -252,7 +252,7 @@ def test_no_return_reaches_from_one_fit_of_the_cart_to_the_next(
     filled = []
     for _ in range(2):
         training.simulate(training.env.plant.randomizer)
-        filled.append(len(training.replay))
+        filled.append(len(training.buffer))
     assert (
         filled == [16 * (7 * 4 - 2)] * 2
     )  # seven chunks of four periods, two of which wait for their returns

@@ -10,23 +10,24 @@ pytestmark = pytest.mark.skipif(not hasattr(os, "SCHED_FIFO"), reason="Linux onl
 
 
 def in_a_process(lines: str) -> str:
-    program = f"import os, resource\nfrom cartpole_rl.scheduling import compute_first, compute_last\n{lines}"
+    imports = "import os, resource\nfrom cartpole_rl.scheduling import give_precedence, take_precedence"
+    program = f"{imports}\n{lines}"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     return done.stdout.strip()
 
 
-def test_it_says_whether_it_goes_first() -> None:
+def test_it_says_whether_it_has_priority() -> None:
     policy = os.SCHED_FIFO  # where it is allowed; the usual one stays where not
-    said = in_a_process("print(compute_first(), os.sched_getscheduler(0))")
+    said = in_a_process("print(take_precedence(), os.sched_getscheduler(0))")
     assert said in (f"True {policy}", f"False {os.SCHED_OTHER}")
 
 
 @pytest.mark.skipif(os.name != "posix" or os.geteuid() != 0, reason="only root can give up being root")
 def test_without_permission_all_stays_as_it_was() -> None:
     give_up = "resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0)); os.setuid(65534)"
-    said = in_a_process(f"{give_up}; print(compute_first(), os.sched_getscheduler(0))")
+    said = in_a_process(f"{give_up}; print(take_precedence(), os.sched_getscheduler(0))")
     assert said == f"False {os.SCHED_OTHER}"
 
 
 def test_it_goes_last() -> None:
-    assert in_a_process("compute_last(); print(os.sched_getscheduler(0))") == str(os.SCHED_IDLE)
+    assert in_a_process("give_precedence(); print(os.sched_getscheduler(0))") == str(os.SCHED_IDLE)

@@ -7,12 +7,12 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from cartpole_rl.learning.replay import (
+from cartpole_rl.learning.buffer import (
     NStepReturns,
-    make_replay,
+    buffer_snapshot,
+    make_buffer,
     n_step_transitions,
-    replay_snapshot,
-    restore_replay,
+    restore_buffer,
 )
 from cartpole_rl.learning.settings import BufferSettings
 
@@ -30,7 +30,7 @@ def test_the_compiled_part_of_torchrl_fits_this_torch() -> None:
 
 def test_prioritized_replay_samples_by_priority() -> None:
     np.random.seed(0)  # noqa: NPY002 - what TorchRL's sampler draws from
-    replay = make_replay(BufferSettings(**PRIORITIZED), batch_size=4)
+    replay = make_buffer(BufferSettings(**PRIORITIZED), batch_size=4)
     replay.extend(numbered(4))
     priority = torch.tensor([1.0, 4.0, 9.0, 16.0])
     replay.update_priority(torch.arange(4), priority)
@@ -41,7 +41,7 @@ def test_prioritized_replay_samples_by_priority() -> None:
 
 
 def test_importance_weights_undo_the_sampling_at_beta_1() -> None:
-    replay = make_replay(BufferSettings(**PRIORITIZED), batch_size=256)
+    replay = make_buffer(BufferSettings(**PRIORITIZED), batch_size=256)
     replay.extend(numbered(4))
     priority = torch.tensor([1.0, 4.0, 9.0, 16.0])
     replay.update_priority(torch.arange(4), priority)
@@ -51,7 +51,7 @@ def test_importance_weights_undo_the_sampling_at_beta_1() -> None:
 
 def test_the_error_of_the_loss_becomes_the_priority() -> None:
     np.random.seed(0)  # noqa: NPY002
-    replay = make_replay(BufferSettings(**PRIORITIZED), batch_size=64)
+    replay = make_buffer(BufferSettings(**PRIORITIZED), batch_size=64)
     replay.extend(numbered(4))
     batch = replay.sample()
     assert set(batch["number"].tolist()) == {0, 1, 2, 3}
@@ -63,7 +63,7 @@ def test_the_error_of_the_loss_becomes_the_priority() -> None:
 
 def test_uniform_replay_samples_all_alike() -> None:
     torch.manual_seed(0)
-    replay = make_replay(BufferSettings(**UNIFORM), batch_size=4)
+    replay = make_buffer(BufferSettings(**UNIFORM), batch_size=4)
     replay.extend(numbered(4))
     drawn = torch.cat([replay.sample()["number"] for _ in range(2500)])
     assert torch.allclose(torch.bincount(drawn, minlength=4) / len(drawn), torch.full((4,), 0.25), atol=0.02)
@@ -72,7 +72,7 @@ def test_uniform_replay_samples_all_alike() -> None:
 
 @pytest.mark.parametrize("settings", [PRIORITIZED, UNIFORM])
 def test_the_oldest_are_overwritten(settings: dict) -> None:
-    replay = make_replay(BufferSettings(**settings), batch_size=1024)
+    replay = make_buffer(BufferSettings(**settings), batch_size=1024)
     replay.extend(numbered(100))
     assert len(replay) == 64
     assert replay.sample()["number"].min() >= 36
@@ -94,12 +94,12 @@ def test_a_restored_buffer_draws_the_same_batches(settings: dict, filled: int, t
             seen += batch["number"].tolist()
         return seen
 
-    original = make_replay(BufferSettings(**settings), batch_size=8)
+    original = make_buffer(BufferSettings(**settings), batch_size=8)
     original.extend(numbered(filled))
     use(original)
-    torch.save(replay_snapshot(original), tmp_path / "replay.pt")
-    restored = make_replay(BufferSettings(**settings), batch_size=8)
-    restore_replay(restored, torch.load(tmp_path / "replay.pt", weights_only=True))
+    torch.save(buffer_snapshot(original), tmp_path / "replay.pt")
+    restored = make_buffer(BufferSettings(**settings), batch_size=8)
+    restore_buffer(restored, torch.load(tmp_path / "replay.pt", weights_only=True))
     assert use(restored) == use(original)
 
 
@@ -108,9 +108,9 @@ def test_a_snapshot_holds_the_filled_rows_alone(settings: dict, tmp_path) -> Non
     """A small and a large buffer with the same transitions give files of the same size."""
     sizes = []
     for capacity in (1000, 100_000):
-        replay = make_replay(BufferSettings(**{**settings, "size": capacity}), batch_size=8)
+        replay = make_buffer(BufferSettings(**{**settings, "size": capacity}), batch_size=8)
         replay.extend(n_step_transitions(random_chunk(10, 50, seed=0), 3, 0.9))
-        torch.save(replay_snapshot(replay), tmp_path / "replay.pt")
+        torch.save(buffer_snapshot(replay), tmp_path / "replay.pt")
         sizes.append((tmp_path / "replay.pt").stat().st_size)
     assert sizes[1] == pytest.approx(sizes[0], rel=0.01)
     assert sizes[0] < 500 * 100  # bytes: what 500 transitions take, and a little more
@@ -123,12 +123,12 @@ def test_a_restored_buffer_holds_the_same_transitions_in_the_same_places(
 ) -> None:
     """Also one that is wrapped round, and one that had other transitions before."""
     transitions = n_step_transitions(random_chunk(10, 10, seed=1), 3, 0.9)
-    original, restored = (make_replay(BufferSettings(**settings), batch_size=8) for _ in range(2))
+    original, restored = (make_buffer(BufferSettings(**settings), batch_size=8) for _ in range(2))
     restored.extend(transitions[-40:])
     for first in range(0, filled, 30):
         original.extend(transitions[first : min(first + 30, filled)])
-    torch.save(replay_snapshot(original), tmp_path / "replay.pt")
-    restore_replay(restored, torch.load(tmp_path / "replay.pt", weights_only=True))
+    torch.save(buffer_snapshot(original), tmp_path / "replay.pt")
+    restore_buffer(restored, torch.load(tmp_path / "replay.pt", weights_only=True))
     for more in range(2):
         assert len(restored) == len(original) == min(64, filled + 40 * more)
         if len(original):

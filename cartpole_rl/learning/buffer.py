@@ -1,4 +1,4 @@
-"""Replay: n-step transitions in, batches out."""
+"""The replay buffer, and the n-step transitions that it holds."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -10,11 +10,13 @@ from torchrl.data import LazyTensorStorage, PrioritizedSampler, RandomSampler, T
 
 from cartpole_rl.learning.settings import BufferSettings
 
-TREES = ("_sum_tree", "_min_tree")  # of priorities, by their names in TorchRL's state of a PrioritizedSampler
+# Priorities in the state of TorchRL's PrioritizedSampler, by their private names: they are compiled objects,
+# which `torch.load` refuses with weights_only. A sampler whose state holds tensors would replace this.
+TREES = ("_sum_tree", "_min_tree")
 
 
-def make_replay(settings: BufferSettings, batch_size: int) -> TensorDictReplayBuffer:
-    """An empty buffer whose `sample` gives `batch_size` transitions.
+def make_buffer(settings: BufferSettings, batch_size: int) -> TensorDictReplayBuffer:
+    """Return an empty buffer whose `sample` returns `batch_size` transitions.
 
     A prioritized one draws from NumPy's global generator, a uniform one from torch's.
     """
@@ -32,43 +34,41 @@ def make_replay(settings: BufferSettings, batch_size: int) -> TensorDictReplayBu
     )
 
 
-def replay_snapshot(replay: TensorDictReplayBuffer) -> dict[str, Any]:
-    """Return all that the buffer's next batch depends on, as tensors and plain values.
+def buffer_snapshot(buffer: TensorDictReplayBuffer) -> dict[str, Any]:
+    """Return the state of `buffer` as tensors and plain values.
 
-    Of the storage and the trees it holds the filled rows alone: a buffer has memory for all that it will ever
-    hold. A full buffer shares its memory with the snapshot. TorchRL gives its trees as compiled objects,
-    which `torch.load` rightly refuses to read from a file.
+    It holds only the filled rows of the storage and the trees. A full buffer shares its memory with it.
     """
-    filled = len(replay)
-    sampler = replay.sampler.state_dict()
+    filled = len(buffer)
+    sampler = buffer.sampler.state_dict()
     trees = {name: torch.as_tensor(sampler[name][torch.arange(filled)]) for name in TREES if name in sampler}
     return {
-        "transitions": _filled_rows(replay.storage, filled),
-        "writer": replay.writer.state_dict(),
+        "transitions": _filled_rows(buffer.storage, filled),
+        "writer": buffer.writer.state_dict(),
         "sampler": {**sampler, **trees},
     }
 
 
-def restore_replay(replay: TensorDictReplayBuffer, snapshot: Mapping[str, Any]) -> None:
-    """Go on from `snapshot`. A tree's nodes follow from its leaves, so it comes back to the bit."""
-    replay.empty()
+def restore_buffer(buffer: TensorDictReplayBuffer, snapshot: Mapping[str, Any]) -> None:
+    """Restore the state in `snapshot`, to the bit: a tree's nodes follow from its leaves."""
+    buffer.empty()
     transitions = snapshot["transitions"]
     if transitions:
         filled = len(next(iter(transitions.values())))
-        replay.extend(TensorDict(transitions, [filled]).unflatten_keys("."))
+        buffer.extend(TensorDict(transitions, [filled]).unflatten_keys("."))
     sampler = dict(snapshot["sampler"])
-    own = replay.sampler.state_dict()
+    own = buffer.sampler.state_dict()
     for name in TREES:
         if name in sampler:
             tree = own[name]
             tree[torch.arange(len(sampler[name]))] = sampler[name]
             sampler[name] = tree
-    replay.sampler.load_state_dict(sampler)
-    replay.writer.load_state_dict(snapshot["writer"])
+    buffer.sampler.load_state_dict(sampler)
+    buffer.writer.load_state_dict(snapshot["writer"])
 
 
 def _filled_rows(storage: LazyTensorStorage, filled: int) -> dict[str, Tensor]:
-    """The columns of the first `filled` rows, with memory of their own unless these are all rows."""
+    """Return the columns of the first `filled` rows, copied unless these are all rows."""
     if not filled:
         return {}
     rows = storage.get(range(filled)) if filled < storage.max_size else storage.get(slice(None))
@@ -76,11 +76,11 @@ def _filled_rows(storage: LazyTensorStorage, filled: int) -> dict[str, Tensor]:
 
 
 class NStepReturns:
-    """Turns chunks of one-step transitions into transitions of up to n steps, in the order of collection.
+    """The conversion of consecutive chunks of one-step transitions into transitions of up to n steps.
 
-    Without `carry` a return ends where its chunk ends, so the last n - 1 periods of a chunk have shorter
-    returns: in a chunk of T >= n periods they have n - n (n - 1) / (2 T) steps on average. With `carry` these
-    periods are held back and get their whole returns from the next chunk of the same carts.
+    Without `carry` a return ends with its chunk, so the last n - 1 periods have shorter returns; the mean
+    length in a chunk of T >= n periods is n - n (n - 1) / (2 T) steps. With `carry` these periods wait for
+    the next chunk of the same carts, which completes their returns.
     """
 
     def __init__(self, n: int, gamma: float, carry: bool) -> None:
@@ -89,13 +89,13 @@ class NStepReturns:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the periods held back: the next chunk does not continue them."""
+        """Discard the waiting periods: the next chunk does not continue them."""
         self._waiting: TensorDictBase | None = None  # [N, held]
 
     def __call__(self, chunk: TensorDictBase) -> TensorDict:
         """Return the n-step transitions [N * T] of `chunk` [N, T].
 
-        With `carry` the first call gives [N * (T - n + 1)].
+        With `carry` the first call returns [N * (T - n + 1)].
         """
         steps = chunk if self._waiting is None else torch.cat((self._waiting, chunk), 1)
         if self.held:
@@ -103,11 +103,11 @@ class NStepReturns:
         return n_step_transitions(steps, self.n, self.gamma, self.held)
 
     def snapshot(self) -> dict[str, Any] | None:
-        """The periods held back, if any."""
+        """Return the waiting periods, if any."""
         return None if self._waiting is None else self._waiting.to_dict()
 
     def restore(self, snapshot: Mapping[str, Any] | None) -> None:
-        """Go on from `snapshot`."""
+        """Restore the state in `snapshot`."""
         self.reset()
         if snapshot is not None:
             carts = len(snapshot["action"])
@@ -115,12 +115,12 @@ class NStepReturns:
 
 
 def n_step_transitions(chunk: TensorDictBase, n: int, gamma: float, held: int = 0) -> TensorDict:
-    """One-step transitions [N, T] to n-step ones [N * (T - held)] with the keys that are learned from.
+    """Return the n-step transitions [N * (T - held)] of the one-step transitions `chunk` [N, T].
 
-    Return, next observation and end flags are those of the step that is reached: n steps on, or the end of
-    the episode, or of the chunk; `steps_to_next_obs` says how many, and the loss discounts by it. TorchRL's
-    MultiStep does the same but keeps the flags of the first step, and so bootstraps through an ending.
-    The last `held` periods add to the returns of those before them, and give no transition themselves.
+    A return ends n steps later, or with the episode or the chunk. Next observation and end flags are those of
+    its last step; `steps_to_next_obs`, the number of steps, sets the discount in the loss. TorchRL's
+    MultiStep keeps the flags of the first step instead, and so bootstraps beyond the end of an episode. The
+    last `held` periods only contribute to the returns of earlier ones.
     """
     carts, periods = chunk.batch_size
     reward, done = chunk["next", "reward"].squeeze(-1), chunk["next", "done"].squeeze(-1)  # [N, T]
@@ -132,17 +132,17 @@ def n_step_transitions(chunk: TensorDictBase, n: int, gamma: float, held: int = 
         reach[:, :-ahead] += alive
     reached = torch.arange(periods, device=reward.device) + reach
     row = torch.arange(carts, device=reward.device).unsqueeze(1)
-    following = chunk["next"][row, reached]
+    last = chunk["next"][row, reached]
     transitions = TensorDict(
         {
             "observation": chunk["observation"],
             "action": chunk["action"],
             "steps_to_next_obs": (reach + 1).unsqueeze(-1),
             "next": {
-                "observation": following["observation"],
+                "observation": last["observation"],
                 "reward": total.unsqueeze(-1),
-                "terminated": following["terminated"],
-                "done": following["done"],
+                "terminated": last["terminated"],
+                "done": last["done"],
             },
         },
         batch_size=[carts, periods],
