@@ -97,7 +97,7 @@ def test_each_episode_has_a_member(make_learned: MakeLearned) -> None:
     assert torch.equal(plant.member[[1, 3, 4, 5]], others)
     own = plant.member[2].clone()
     for _ in range(10):
-        plant.restart(torch.tensor([0, 2]), retry=torch.tensor([False, True]))
+        plant.restart(torch.tensor([0, 2]), again=torch.tensor([False, True]))
         assert plant.member[2] == own
 
 
