@@ -1,11 +1,19 @@
-"""The choices in conf/ as plain data, for code that runs without a command."""
+"""The choices in conf/ as plain data, composed as Hydra composes them, for code without a command."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from cartpole_rl.errors import ConfigError
+
+HERE = "${here}"  # the folder of a user's own file
+TRACK = "${oc.select:cart.track_half_length}"  # the only interpolation in the groups of conf/
+NOT_SETTINGS = ("defaults", "hydra")
+IN_CODE = ("emulator/medium", "plant//serial_defaults@_here_")  # choices that are a class's defaults
+
+Choice = str | Path | Mapping[str, Any] | None
 
 
 def conf_folder() -> Path:
@@ -32,3 +40,91 @@ def default_choices(command: str) -> dict[str, str]:
         elif line != "_self_":  # another command's config, which this one extends
             chosen |= default_choices(line)
     return {group: name for group, name in chosen.items() if "/" not in group}
+
+
+def compose(command: str, overrides: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Return the settings of a command, as Hydra composes them, with `overrides` as on its command line.
+
+    A group (pole, task, ...) takes the name of its file in conf/, the path of another file, None, or a
+    mapping in its place; any other name, dotted or not, takes a value. Values that conf/ leaves open ("???")
+    are left out. Raises ConfigError for a missing file.
+    """
+    defaults = default_choices(command)
+    given = {name: value for name, value in (overrides or {}).items() if name in defaults}
+    experiment = _load("experiment", given.pop("experiment", None))
+    lines: list[dict[str, str]] = experiment.pop("defaults", [])
+    replaced = {group.removeprefix("override /"): name for line in lines for group, name in line.items()}
+    chosen = {**defaults, **replaced, **given}
+    values = {group: _load(group, name) for group, name in chosen.items() if name is not None}
+    values = _merged(_merged(values, _own(command)), experiment)
+    for name, value in (overrides or {}).items():
+        if name not in defaults:
+            values = _merged(values, _nested(name, value))
+    return _resolved(values)
+
+
+def _own(command: str) -> dict[str, Any]:
+    """Return a command's own values, with those of the command that it extends."""
+    written = choice(command)
+    extended = [line for line in written["defaults"] if isinstance(line, str) and line != "_self_"]
+    values: dict[str, Any] = {}
+    for other in extended:
+        values = _merged(values, _own(other))
+    return _merged(values, {name: value for name, value in written.items() if name not in NOT_SETTINGS})
+
+
+def _load(group: str, chosen: Choice) -> dict[str, Any]:
+    """Return a choice of a group as plain data, with the choices of the same group that it extends."""
+    if chosen is None or isinstance(chosen, Mapping):
+        return dict(chosen or {})
+    if str(chosen).endswith(".yaml"):
+        return _load_file(group, Path(chosen))
+    if f"{group}/{chosen}" in IN_CODE:
+        return {}
+    values = choice(f"{group}/{chosen}") or {}
+    if group == "experiment":
+        return values
+    base: dict[str, Any] = {}
+    for name in values.pop("defaults", []):
+        base = _merged(base, _load(group, name))
+    return _merged(base, values)
+
+
+def _load_file(group: str, path: Path) -> dict[str, Any]:
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"{group}={path} cannot be read: {error}") from None
+    values: dict[str, Any] = yaml.safe_load(text.replace(HERE, str(path.resolve().parent)))
+    return values
+
+
+def _merged(base: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return `base` with `values` in place of its own, nested mappings merged."""
+    merged = dict(base)
+    for name, value in values.items():
+        nested = isinstance(value, Mapping) and isinstance(merged.get(name), Mapping)
+        merged[name] = _merged(merged[name], value) if nested else value
+    return merged
+
+
+def _nested(name: str, value: Any) -> dict[str, Any]:
+    """Return {"a": {"b": value}} for the name "a.b"."""
+    first, _, rest = name.partition(".")
+    return {first: _nested(rest, value) if rest else value}
+
+
+def _resolved(values: dict[str, Any]) -> dict[str, Any]:
+    """Return `values` with the track of the cart for TRACK, and without those that are missing ("???")."""
+    half_length = values.get("cart", {}).get("track_half_length")
+    return _without_missing(
+        _merged(values, {"task": {"x_max": half_length}})
+        if values.get("task", {}).get("x_max") == TRACK
+        else values
+    )
+
+
+def _without_missing(values: Any) -> Any:
+    if not isinstance(values, Mapping):
+        return values
+    return {name: _without_missing(value) for name, value in values.items() if value != "???"}

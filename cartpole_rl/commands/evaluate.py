@@ -14,9 +14,8 @@ The last one repeats an episode of an earlier evaluation: the same simulated car
 from pathlib import Path
 
 from cartpole_rl.commands.application import application
-from cartpole_rl.commands.baseline import baseline_training
 from cartpole_rl.commands.overrides import check_repetition
-from cartpole_rl.workflows.checks import BASELINE, check_evaluation
+from cartpole_rl.workflows.checks import check_evaluation
 from cartpole_rl.workflows.config import EvaluateConfig
 
 
@@ -25,10 +24,9 @@ def main(config: EvaluateConfig, folder: Path) -> None:
     """Check, then evaluate."""
     check_repetition(config)
     check_evaluation(config)
-    baseline = baseline_training() if config.run == BASELINE else None
     from cartpole_rl.workflows.evaluate import evaluate
 
-    evaluate(config, folder, baseline)
+    evaluate(config, folder)
 
 
 if __name__ == "__main__":

@@ -11,9 +11,8 @@ episode. Simulated carts run side by side, and end together.
 from pathlib import Path
 
 from cartpole_rl.commands.application import application
-from cartpole_rl.commands.baseline import baseline_training
 from cartpole_rl.commands.overrides import check_repetition
-from cartpole_rl.workflows.checks import BASELINE, check_evaluation
+from cartpole_rl.workflows.checks import check_evaluation
 from cartpole_rl.workflows.config import RecordConfig
 
 
@@ -22,10 +21,9 @@ def main(config: RecordConfig, folder: Path) -> None:
     """Check, then record."""
     check_repetition(config)
     check_evaluation(config)
-    baseline = baseline_training() if config.run == BASELINE else None
     from cartpole_rl.workflows.record import record
 
-    record(config, folder, baseline)
+    record(config, folder)
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 
 from cartpole_rl.checking import checked
-from cartpole_rl.choices import choice, default_choices
+from cartpole_rl.choices import compose
 from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
 from cartpole_rl.envs.make import CartPoleEnv, make_env
 from cartpole_rl.errors import ConfigError
@@ -26,22 +26,12 @@ from cartpole_rl.randomization.settings import IdentifiedSettings
 from cartpole_rl.tasks.settings import StartSettings
 
 SIMILAR = 0.1  # largest relative difference between the length of a pole and that of a learned model's
-Lines = Mapping[str, Mapping[str, Any]]  # of a file in conf/randomization/
 
 
-def shipped_settings(randomization: str | Lines = "none", **chosen: str) -> CartPoleSettings:
-    """Return the settings of conf/train.yaml, with `chosen` in place of its choices: task="balance".
-
-    `randomization` is the name of a file in conf/randomization/, or its lines. Raises ConfigError.
-    """
-    named = {**default_choices("train"), **chosen}
-    groups = (group for group in CartPoleSettings.model_fields if group in named)
-    part = {group: choice(f"{group}/{named[group]}") for group in groups if group != "randomization"}
-    part["randomization"] = (
-        choice(f"randomization/{randomization}") if isinstance(randomization, str) else dict(randomization)
-    )
-    part["task"]["x_max"] = part["cart"]["track_half_length"]
-    return checked(CartPoleSettings, {**part, "control_period": choice("train")["control_period"]})
+def shipped_settings(overrides: Mapping[str, Any] | None = None) -> CartPoleSettings:
+    """Return what conf/train.yaml says of the cart and the task, with `overrides` as in `choices.compose`."""
+    composed = compose("train", overrides)
+    return checked(CartPoleSettings, {name: composed[name] for name in CartPoleSettings.model_fields})
 
 
 def environment(config: CartPoleSettings, plant: Plant) -> CartPoleEnv:

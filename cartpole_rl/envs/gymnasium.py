@@ -58,7 +58,7 @@ def simulated_environment(
 
     `randomization` is the name of a file in conf/randomization/, or its lines. Raises ConfigError.
     """
-    settings = shipped_settings(randomization, pole="medium", **OF_TASK[task])
+    settings = shipped_settings({**OF_TASK[task], "pole": "medium", "randomization": randomization})
     plant = SimulatedSettings(**choice("plant/simulated"))
     return simulated_env(settings, plant, carts, settings.task.start, seed=0, compiled=compiled)
 

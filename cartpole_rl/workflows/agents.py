@@ -15,6 +15,9 @@ from cartpole_rl.randomization.checks import check_one_pole
 from cartpole_rl.workflows.build import evaluated_settings
 from cartpole_rl.workflows.checks import BASELINE, check_has_agent
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
+from cartpole_rl.workflows.settings import load_settings
+
+OF_BASELINE = {"observation": "raw", "observation.past_motors": 1}
 
 
 def new_agent(config: TrainConfig) -> QAgent:
@@ -49,16 +52,11 @@ def trained_agent(run: Path) -> TrainedAgent:
     return TrainedAgent(training, agent.greedy_policy())
 
 
-def evaluated_agent(config: EvaluateConfig, baseline: TrainConfig | None = None) -> TrainedAgent:
-    """Return the agent of config.run, or the baseline controller. Raises CheckpointError, ConfigError.
-
-    `baseline` describes the cart that the controller is made for, and its observation.
-    """
+def evaluated_agent(config: EvaluateConfig) -> TrainedAgent:
+    """Return the agent of config.run, or the baseline controller. Raises CheckpointError, ConfigError."""
     if config.run != BASELINE:
         return trained_agent(config.run)
-    if baseline is None:
-        raise ConfigError(f"run={BASELINE} needs the settings of the cart that it is made for")
-    return baseline_agent(config, baseline)
+    return baseline_agent(config, load_settings(TrainConfig, OF_BASELINE))
 
 
 def baseline_agent(config: EvaluateConfig, training: TrainConfig) -> TrainedAgent:

@@ -13,7 +13,7 @@ from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.agents import evaluated_agent
 from cartpole_rl.workflows.build import evaluated_env, evaluated_settings, use_threads
-from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
+from cartpole_rl.workflows.config import EvaluateConfig
 from cartpole_rl.workflows.person import confirm
 from cartpole_rl.workflows.repeating import Repetition, repetition
 
@@ -35,17 +35,14 @@ class Evaluation:
         return with_progress(self.env, self.policy, self.config.episodes)
 
 
-def prepared(config: EvaluateConfig, baseline: TrainConfig | None = None) -> Evaluation:
-    """Load the agent of `config` and build its environment. Raises CartPoleError.
-
-    `baseline` describes the cart that run=lqr is made for; an agent does not need it.
-    """
+def prepared(config: EvaluateConfig) -> Evaluation:
+    """Load the agent of `config` and build its environment. Raises CartPoleError."""
     again = repetition(config)
     if again:
         config = again.config
     use_threads(config.threads)
     seed_everything(config.seed)
-    agent = evaluated_agent(config, baseline)
+    agent = evaluated_agent(config)
     settings = evaluated_settings(agent.training, config)
     env = evaluated_env(settings, config, prompt=tqdm.write, confirm=confirm)
     return Evaluation(config, settings, env, agent.policy, again)

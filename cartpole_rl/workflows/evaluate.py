@@ -11,7 +11,7 @@ from cartpole_rl.plants.simulated import NOISE_PARAMETERS
 from cartpole_rl.reporting.table import interval_text, table
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
-from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
+from cartpole_rl.workflows.config import EvaluateConfig
 from cartpole_rl.workflows.episodes import Evaluation, count_text, prepared
 from cartpole_rl.workflows.repeating import Repetition
 from cartpole_rl.workflows.report import report
@@ -28,15 +28,14 @@ SHOWN = {
 }
 
 
-def evaluate(config: EvaluateConfig, folder: Path, baseline: TrainConfig | None = None) -> None:
+def evaluate(config: EvaluateConfig, folder: Path) -> None:
     """Run episodes of the agent of `config.run`, in simulation or on a cart.
 
-    `baseline` describes the cart that the controller of run=lqr is made for; no agent needs it. Writes into
-    `folder` config.yaml, provenance.json, metrics.json and figures/, also after an interruption, and prints
-    the scores. Raises ConfigError and CheckpointError for settings, PlantError and LinkError for a cart that
-    fails.
+    Writes into `folder` config.yaml, provenance.json, metrics.json and figures/, also after an interruption,
+    and prints the scores. Raises ConfigError and CheckpointError for settings, PlantError and LinkError for a
+    cart that fails.
     """
-    evaluation = prepared(config, baseline)
+    evaluation = prepared(config)
     episodes: list[Episode] = []
     try:
         with closing(evaluation.env):

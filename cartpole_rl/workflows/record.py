@@ -12,21 +12,20 @@ from typing import Any
 from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
 from cartpole_rl.evaluation.recordings import LENGTH, write_recording
 from cartpole_rl.tasks.episode import Episode
-from cartpole_rl.workflows.config import EvaluateConfig, RecordConfig, TrainConfig
+from cartpole_rl.workflows.config import EvaluateConfig, RecordConfig
 from cartpole_rl.workflows.episodes import count_text, prepared
 from cartpole_rl.workflows.origins import stored_origin
 from cartpole_rl.workflows.recordings import RECORDINGS
 from cartpole_rl.workflows.run_folder import write_config
 
 
-def record(config: RecordConfig, folder: Path, baseline: TrainConfig | None = None) -> None:
+def record(config: RecordConfig, folder: Path) -> None:
     """Run episodes of the agent of `config.run` as `evaluate` does, and write each one as a recording.
 
-    `baseline` describes the cart that the controller of run=lqr is made for; no agent needs it. Writes into
-    `folder` config.yaml, provenance.json and recordings/episode_<number>.csv. Raises ConfigError and
-    CheckpointError for settings, PlantError and LinkError for a cart that fails.
+    Writes into `folder` config.yaml, provenance.json and recordings/episode_<number>.csv. Raises ConfigError
+    and CheckpointError for settings, PlantError and LinkError for a cart that fails.
     """
-    evaluation = prepared(config, baseline)
+    evaluation = prepared(config)
     written = 0
     try:
         with closing(evaluation.env):
