@@ -21,7 +21,7 @@ def recordings(source: Path) -> list[Path]:
     found = sorted((inner if inner.is_dir() else source).glob("*.csv"))
     if not found:
         missing = "it holds no recording" if source.exists() else "there is no such file or folder"
-        raise RecordingError(f"from={source}: {missing}; give what cartpole-record wrote")
+        raise RecordingError(f"from={source}: {missing}; give a run of cartpole-record or cartpole-identify")
     return found
 
 

@@ -104,7 +104,7 @@ class TestBadInput:
     def test_an_empty_folder(self, tmp_path: Path) -> None:
         done = in_process("identify", f"from={tmp_path}", folder=tmp_path)
         assert done.code == 1
-        assert "it holds no recording; give a run of cartpole-identify or cartpole-record" in done.err
+        assert "it holds no recording; give a run of cartpole-record or cartpole-identify" in done.err
 
     def test_a_single_recording(self, identified: Path, tmp_path: Path) -> None:
         shutil.copy(identified / "run/recordings/01_swing.csv", tmp_path)

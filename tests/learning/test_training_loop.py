@@ -12,6 +12,7 @@ from tensordict import TensorDict
 
 from cartpole_rl.agents.dqn import QAgent
 from cartpole_rl.agents.settings import AgentSettings
+from cartpole_rl.choices import choice
 from cartpole_rl.errors import LearningError
 from cartpole_rl.learning.finetuning import Finetuning
 from cartpole_rl.learning.randomness import seed_everything
@@ -245,9 +246,7 @@ def test_a_resumed_training_ends_with_the_same_weights(
 def test_no_return_reaches_from_one_fit_of_the_cart_to_the_next(
     make_training: Callable[..., Training],
 ) -> None:
-    settings = FinetuningSettings(
-        iterations=1, refit=1, cart_share=0, prior_share=0, widen=1, epsilon=0, learning_rate=1e-3
-    )
+    settings = FinetuningSettings(**choice("finetuning/gentle") | {"iterations": 1, "cart_share": 0})
     training = make_training(learning={"carry": True}, kind=partial(Finetuning, settings))
     filled = []
     for _ in range(2):

@@ -29,7 +29,7 @@ class SerialSettings(Settings):
     connect_timeout: Positive = 3.0  # for the first answer; a board that restarts when opened needs about 1 s
     answer_timeout: Positive = 0.5  # for ACK, NACK or INFO; then the question is repeated
     retries: Annotated[int, Field(ge=0)] = 3  # repetitions of a question without an answer
-    write_timeout: Positive = 0.2  # for the operating system to take the bytes of a frame
+    write_timeout: Positive = 1.0  # for the operating system to take the bytes of a frame
     nudge_after: Positive = 0.5  # silence after which the host sends HELLO
     home_timeout: Positive = 120.0  # for homing
     start_timeout: Positive = 60.0  # for the pole to reach the position in which an episode starts
