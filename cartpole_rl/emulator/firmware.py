@@ -20,7 +20,10 @@ from cartpole_rl.emulator.guards import (
 from cartpole_rl.emulator.homing import HomingError, Reading, Zeros, home
 from cartpole_rl.emulator.motor_line import MotorLine
 from cartpole_rl.errors import FrameError
-from cartpole_rl.wire import (
+from cartpole_rl.wire.frames import VERSION, Envelope, encode_frame, open_envelope
+from cartpole_rl.wire.messages import (
+    FROM_CART,
+    MESSAGES,
     Ack,
     ClearFault,
     Fault,
@@ -37,10 +40,7 @@ from cartpole_rl.wire import (
     Start,
     State,
     Stop,
-    encode_frame,
 )
-from cartpole_rl.wire.frames import VERSION, Envelope, open_envelope
-from cartpole_rl.wire.messages import FROM_CART, MESSAGES
 
 FIRMWARE = (1, 0, 0)
 BANNER = b"ets Jul 29 2019 12:21:46\r\n\r\nrst:0x1 (POWERON_RESET),boot:0x13\r\ncart 1.0.0\r\n\x00"
