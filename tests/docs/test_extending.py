@@ -11,6 +11,7 @@ import pytest
 from extended_package import EFFECTS
 from extending_page import PAGE, ROOT, paths
 
+BIN = Path(sys.executable).parent
 PATHS = paths()
 
 
@@ -26,6 +27,16 @@ def test_every_file_of_the_table_is_there() -> None:
     assert [name for name in names if not (ROOT / name).exists()] == []
 
 
+def assert_tidy(folder: Path, files: set[str]) -> None:
+    """Ruff sorts the imports and sets the blank lines of the changed files, and has nothing else to say."""
+    changed = [file for file in files if file.endswith(".py")]
+    for command in (["format"], ["check", "--fix"]) if changed else ():
+        done = subprocess.run(
+            [BIN / "ruff", *command, "--no-cache", *changed], cwd=folder, capture_output=True, text=True
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+
+
 @pytest.mark.parametrize("number", PATHS, ids=lambda number: PATHS[number].title)
 def test_path(number: int, tmp_path: Path) -> None:
     for folder in ("cartpole_rl", "conf", "docs"):
@@ -33,6 +44,7 @@ def test_path(number: int, tmp_path: Path) -> None:
     shutil.copy(ROOT / "pyproject.toml", tmp_path)
     for step in PATHS[number].steps:
         step.apply(tmp_path)
+    assert_tidy(tmp_path, {step.file for step in PATHS[number].steps})
     done = subprocess.run(
         [sys.executable, Path(__file__).with_name("extended_package.py"), str(number), tmp_path],
         env={**os.environ, "PYTHONPATH": str(tmp_path)},
