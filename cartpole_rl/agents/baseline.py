@@ -23,8 +23,13 @@ from cartpole_rl.physics.dynamics import State, advance, coupling, mechanism
 from cartpole_rl.physics.friction import dry_friction, pole_torque, viscous_coefficient
 from cartpole_rl.physics.models import CartFriction, Models
 from cartpole_rl.physics.parameters import GRAVITY, CartParameters
-from cartpole_rl.tasks.features import ANGULAR_SPEED_SCALE, MOTOR_SCALE, POSITION_SCALE, SPEED_SCALE
-from cartpole_rl.tasks.settings import ObservationKind, observation_size
+from cartpole_rl.tasks.features import (
+    ANGULAR_SPEED_SCALE,
+    MOTOR_SCALE,
+    POSITION_SCALE,
+    SPEED_SCALE,
+    ObservationKind,
+)
 
 Array = NDArray[np.float64]
 STATE_COST = (10.0, 1.0, 100.0, 1.0)  # of 1 m, 1 m/s, 1 rad, 1 rad/s, squared
@@ -138,11 +143,10 @@ class EnergyAndRegulator:
 
 def decode(observation: Tensor, kind: ObservationKind) -> tuple[State, Tensor]:
     """Return measured state [N] and last motor value [N] of observations [N, K]: inverts `tasks.features`."""
-    size = observation_size(kind)
-    numbers, motor = observation[:, :size].unbind(-1), observation[:, size] * MOTOR_SCALE
+    numbers, motor = observation[:, : kind.size].unbind(-1), observation[:, kind.size] * MOTOR_SCALE
     if kind is ObservationKind.RAW:
         return State(*numbers), motor
-    x, x_dot, cosine, sine, theta_dot = numbers
+    x, x_dot, cosine, sine, theta_dot = numbers[:5]
     theta = torch.atan2(sine, cosine)
     return State(x * POSITION_SCALE, x_dot * SPEED_SCALE, theta, theta_dot * ANGULAR_SPEED_SCALE), motor
 

@@ -8,6 +8,7 @@ since boot.
 
 from collections.abc import Callable, Generator
 
+from cartpole_rl.emulator.encoders import CART_METRES, POLE_COUNTS, SPAN
 from cartpole_rl.emulator.guards import (
     FASTEST_CART,
     FASTEST_POLE,
@@ -16,10 +17,13 @@ from cartpole_rl.emulator.guards import (
     JumpWatch,
     StallWatch,
 )
-from cartpole_rl.emulator.homing import CART_METRES, POLE_COUNTS, SPAN, HomingError, Reading, Zeros, home
+from cartpole_rl.emulator.homing import HomingError, Reading, Zeros, home
 from cartpole_rl.emulator.motor_line import MotorLine
 from cartpole_rl.errors import FrameError
-from cartpole_rl.wire import (
+from cartpole_rl.wire.frames import VERSION, Envelope, encode_frame, open_envelope
+from cartpole_rl.wire.messages import (
+    FROM_CART,
+    MESSAGES,
     Ack,
     ClearFault,
     Fault,
@@ -36,9 +40,7 @@ from cartpole_rl.wire import (
     Start,
     State,
     Stop,
-    encode_frame,
 )
-from cartpole_rl.wire.frames import VERSION, Envelope, open_envelope
 
 FIRMWARE = (1, 0, 0)
 BANNER = b"ets Jul 29 2019 12:21:46\r\n\r\nrst:0x1 (POWERON_RESET),boot:0x13\r\ncart 1.0.0\r\n\x00"
@@ -52,9 +54,6 @@ WATCHDOG_PERIODS = 3
 NO_AGE = 65535
 U32 = 0xFFFFFFFF
 NOMINAL_HALF_SPAN = round(SPAN / 2 / CART_METRES)
-HOST_MESSAGES: dict[int, type[Message]] = {
-    kind.TYPE: kind for kind in (Hello, Start, Stop, SetMotor, Home, ClearFault, SetPeriod)
-}
 
 
 class Firmware:
@@ -127,10 +126,10 @@ class Firmware:
         """Carry out a frame and return the answer; None for SET_MOTOR, which the next STATE acknowledges."""
         if envelope.version != VERSION:
             return Reason.BAD_VERSION
-        if envelope.kind not in HOST_MESSAGES:
+        if envelope.kind not in MESSAGES or envelope.kind & FROM_CART:
             return Reason.UNKNOWN_TYPE
         try:
-            message = HOST_MESSAGES[envelope.kind].unpack(envelope.payload)
+            message = MESSAGES[envelope.kind].unpack(envelope.payload)
         except FrameError:
             return Reason.BAD_LENGTH
         reason = self._objection(message)

@@ -16,12 +16,12 @@ from cartpole_rl.tasks.features import (
     MOTOR_SCALE,
     SPEED_SCALE,
     Measured,
+    ObservationKind,
     measured_position,
     measured_velocity,
     observe,
 )
-from cartpole_rl.tasks.rewards import REWARDS, SCORE, SCORE_UPRIGHT
-from cartpole_rl.tasks.settings import ObservationKind
+from cartpole_rl.tasks.rewards import SCORE, SCORE_UPRIGHT
 
 
 class Previous(NamedTuple):
@@ -105,7 +105,7 @@ def perceive(
     terminated = off_track | fallen(state, task.angle_limit)
     ended = terminated | frame.truncated | (step_count >= task.time_limit)
     values = {  # each once: the reward is often a score
-        kind: REWARDS[kind](state, task.x_max).unsqueeze(0) for kind in {rewards.kind, SCORE, SCORE_UPRIGHT}
+        kind: kind.formula(state, task.x_max).unsqueeze(0) for kind in {rewards.kind, SCORE, SCORE_UPRIGHT}
     }
     return Percept(
         torch.stack(state),

@@ -3,9 +3,11 @@
 from pydantic import Field
 
 from cartpole_rl.settings import Count, Finite, NonNegative, Positive, Settings
-from cartpole_rl.tasks.settings import MIRROR_SIGNS, ObservationKind, Reward, StartSettings, observation_size
+from cartpole_rl.tasks.features import ObservationKind
+from cartpole_rl.tasks.rewards import Reward
+from cartpole_rl.tasks.settings import StartSettings
 
-POSITIONS = MIRROR_SIGNS[ObservationKind.POSITIONS]
+POSITIONS = ObservationKind.POSITIONS.mirror_signs
 
 
 class ObservationSettings(Settings):
@@ -25,13 +27,13 @@ class ObservationSettings(Settings):
     @property
     def size(self) -> int:
         """Size of an observation."""
-        return observation_size(self.kind) + self.past_size + int(self.pole_length)
+        return self.kind.size + self.past_size + int(self.pole_length)
 
     @property
     def mirror_signs(self) -> list[int]:
         """The factor of each number of an observation when left and right are swapped, [size]."""
         return [
-            *MIRROR_SIGNS[self.kind],
+            *self.kind.mirror_signs,
             *[-1] * (self.past_motors + 2 * self.past_velocities),
             *POSITIONS * self.past_positions,
             *[1] * self.pole_length,

@@ -33,13 +33,14 @@ if "--replay" not in sys.argv:
         sys.exit("guided.py needs atheris: pip install atheris")
 
 with fuzzer.instrument_imports(include=LIBRARIES) if fuzzer else contextlib.nullcontext():
-    from cartpole_rl.emulator.firmware import HOST_MESSAGES, WATCHDOG_PERIODS, Firmware
+    from cartpole_rl.emulator.firmware import WATCHDOG_PERIODS, Firmware
     from cartpole_rl.plants.serial import cart as serial_cart
     from cartpole_rl.plants.serial import connection, tracking
     from cartpole_rl.plants.serial.settings import SerialSettings
     from cartpole_rl.wire import Flags, FrameSplitter, SetMotor, Start, State, cobs, decode_frame
     from cartpole_rl.wire.checksum import crc16
     from cartpole_rl.wire.frames import END, LONGEST_FRAME, open_envelope
+    from cartpole_rl.wire.messages import FROM_CART, MESSAGES
 
 from cartpole_rl.errors import CartPoleError, FrameError  # noqa: E402 - after what is instrumented
 
@@ -93,7 +94,7 @@ def cart(data: bytes) -> None:
                         assert before == (firmware.armed, firmware.homing, firmware.fault)
                 assert len(splitter.pending) <= LONGEST_FRAME
             case 1:
-                kinds = tuple(HOST_MESSAGES)
+                kinds = tuple(kind for kind in MESSAGES if not kind & FROM_CART)
                 kind, size = kinds[steps.number() % len(kinds)], (0, 0, 2, 2, 4, 4, 1, 3)[steps.number() % 8]
                 fed = firmware.armed
                 for answer in firmware.receive(

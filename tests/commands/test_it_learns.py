@@ -17,7 +17,8 @@ from cartpole_rl.evaluation.metrics import episode_metrics
 from cartpole_rl.physics.dynamics import State
 from cartpole_rl.physics.models import Models
 from cartpole_rl.randomization.poles import PoleSettings
-from cartpole_rl.tasks.settings import ObservationKind, StartSettings
+from cartpole_rl.tasks.features import ObservationKind
+from cartpole_rl.tasks.settings import StartSettings
 
 MOTORS = tuple(choice("actions/nine_levels")["motors"])
 SHORT = [

@@ -13,7 +13,7 @@ from cartpole_rl.checking import checked
 from cartpole_rl.choices import conf_folder, default_choices
 from cartpole_rl.commands.composition import as_mapping
 from cartpole_rl.envs.build import randomizer
-from cartpole_rl.tasks.settings import Reward
+from cartpole_rl.tasks.rewards import Reward
 from cartpole_rl.workflows.build import evaluated_settings
 from cartpole_rl.workflows.config import EmulateConfig, EvaluateConfig, FinetuneConfig, TrainConfig
 

@@ -21,10 +21,11 @@ from cartpole_rl.tasks.features import (
     MOTOR_SCALE,
     SPEED_SCALE,
     Measured,
+    ObservationKind,
     observe,
 )
-from cartpole_rl.tasks.rewards import REWARDS
-from cartpole_rl.tasks.settings import ObservationKind, Reward, Start, StartSettings
+from cartpole_rl.tasks.rewards import Reward
+from cartpole_rl.tasks.settings import Start, StartSettings
 
 MakePlant = Callable[..., SimulatedPlant]
 MakeEnvironment = Callable[..., CartPoleEnv]
@@ -249,7 +250,7 @@ def test_rewards_and_scores_are_of_the_measured_state(
         ("score", Reward.SCORE, 1.0),
         ("score_upright", Reward.POSITION, 1.0),
     ):
-        expected = scale * REWARDS[law](Measured(*following["state"].unbind(1)), 0.38)
+        expected = scale * law.formula(Measured(*following["state"].unbind(1)), 0.38)
         torch.testing.assert_close(following[key].squeeze(-1), expected)
 
 

@@ -45,7 +45,7 @@ POSITIONS: dict[StartPosition, PolePosition] = {
     "hanging": PolePosition(
         math.pi,
         math.radians(5),
-        math.radians(1),  # homing accepts eight counts of 4096 a turn
+        math.radians(1),  # homing accepts 0.7 degrees
         "let it hang until it is still; it may not be touched during homing",
     ),
 }

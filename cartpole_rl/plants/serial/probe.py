@@ -1,5 +1,6 @@
 """The moves of the preflight, on a cart that may be wired wrongly."""
 
+from cartpole_rl.physics.encoders import cart_counts, pole_counts
 from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.centring import NOMINAL_DEADBAND, centre
 from cartpole_rl.plants.serial.errors import NotReadyError
@@ -9,8 +10,9 @@ from cartpole_rl.wire import Flags, State
 FARTHEST = 0.08  # m from the middle: no check needs more
 NEAR = 0.004  # m from the middle: no check needs to start closer
 RAMP_STEP = 1  # motor values a period
-SMALL_SWING, SHORT_PATIENCE = 40, 5.0  # counts peak to peak, s; pushes the cart like three motor values
-MOVED = 4  # counts, 0.09 mm: more than a pole that swings can press into the gears' play
+SMALL_SWING = pole_counts(3.5)  # peak to peak; pushes the cart like three motor values
+SHORT_PATIENCE = 5.0  # s
+MOVED = cart_counts(0.09e-3)  # more than a pole that swings can press into the gears' play
 
 
 class Probe(ArmedCart):

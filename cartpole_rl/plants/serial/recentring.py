@@ -12,7 +12,7 @@ import math
 from contextlib import suppress
 
 from cartpole_rl.errors import PlantError
-from cartpole_rl.physics.encoders import POLE_RADIANS_PER_COUNT
+from cartpole_rl.physics.encoders import POLE_RADIANS_PER_COUNT, pole_counts
 from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.centring import FRICTION, MASS, centre, interval, rough_motor, within
 from cartpole_rl.plants.serial.errors import NotReadyError
@@ -24,10 +24,10 @@ LONGEST_ROLLING = 5.0  # s
 
 ROUNDS = 3  # of braking, centring and waiting
 LONGEST_BRAKING, LONGEST_CALM = 12.0, 4.0  # s
-STILL = 11  # pole counts peak to peak, 1 degree: worth waiting for, up to LONGEST_CALM
-NEARLY_STILL = 24  # pole counts peak to peak, 1 degree to each side: good enough
-BRAKED = 30  # pole counts peak to peak; the cart's friction keeps it from braking smaller swings
-SLIPPED = 17  # pole counts, 1.5 degrees: a pole that rests so far from where it did has lost its zero
+STILL = pole_counts(1.0)  # peak to peak: worth waiting for, up to LONGEST_CALM
+NEARLY_STILL = pole_counts(2.1)  # peak to peak: good enough
+BRAKED = pole_counts(2.6)  # peak to peak; the cart's friction keeps it from braking smaller swings
+SLIPPED = pole_counts(1.5)  # a pole that rests so far from where it did has lost its zero
 
 FOLLOW = 0.9  # m/s^2 of the cart for 1 rad/s of the pole
 HARDEST_FOLLOW = 2.0  # m/s^2 in the middle, ...
