@@ -4,14 +4,14 @@ from typing import Annotated, Any
 
 from pydantic import Discriminator, Field, Tag
 
-from cartpole_rl.envs.settings import ObservationSettings, RewardSettings, TaskSettings
+from cartpole_rl.envs.settings import ObservationSettings
 from cartpole_rl.physics.models import Actuator, CartFriction, Models, PoleFriction
 from cartpole_rl.plants.settings import LearnedSettings, SimulatedSettings
 from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.randomization.ranges import Range
 from cartpole_rl.randomization.settings import IdentifiedSettings
 from cartpole_rl.settings import Finite, Settings
-from cartpole_rl.tasks.actions import ActionSettings
+from cartpole_rl.tasks.settings import ActionSettings, RewardSettings, TaskSettings
 
 
 def _randomization_kind(given: Any) -> str:

@@ -8,8 +8,8 @@ import torch
 from cartpole_rl.checking import checked
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.envs.build import environment, simulated_env
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
-from cartpole_rl.envs.make import CartPoleEnv
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.physics.bounds import check_names
 from cartpole_rl.plants.emulated import emulated_plant

@@ -15,7 +15,6 @@ from cartpole_rl.envs.cart_pole_settings import (
     PoleFrictionSettings,
     Randomization,
 )
-from cartpole_rl.envs.settings import RewardSettings
 from cartpole_rl.identification.settings import EnsembleSettings
 from cartpole_rl.learning.settings import (
     BufferSettings,
@@ -30,6 +29,7 @@ from cartpole_rl.plants.settings import LearnedSettings, SimulatedSettings
 from cartpole_rl.randomization.checks import check_one_pole
 from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.settings import Count, Finite, Seed, Settings
+from cartpole_rl.tasks.settings import RewardSettings
 
 OF_SIMULATION = ("parameters", "randomization", "cart", "cart_friction", "pole_friction")
 

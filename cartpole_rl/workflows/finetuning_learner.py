@@ -9,8 +9,8 @@ import torch
 
 from cartpole_rl.agents.dqn import QAgent
 from cartpole_rl.envs.build import environment, randomizer, simulated_env
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
-from cartpole_rl.envs.make import CartPoleEnv
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.identification.fit import Fit, fit_cart
 from cartpole_rl.identification.unknowns import LONGEST_LATENCY

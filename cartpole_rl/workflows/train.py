@@ -4,7 +4,7 @@ from functools import partial
 from pathlib import Path
 
 from cartpole_rl.envs.build import simulated_env
-from cartpole_rl.envs.make import CartPoleEnv
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.evaluation.driving_policy import DrivingPolicy
 from cartpole_rl.evaluation.episodes import Policy, run_batch
 from cartpole_rl.learning.checkpoints import forget_training, restore_weights
