@@ -15,7 +15,7 @@ from cartpole_rl.tasks.settings import ActionSettings, RewardSettings, TaskSetti
 
 
 def _randomization_kind(given: Any) -> str:
-    """Return "found" for the posterior of an identification, "ranges" for ranges by parameter name."""
+    """Return "identified" for the posterior of an identification, "ranges" for ranges by parameter name."""
     return "identified" if isinstance(given, IdentifiedSettings) or "posterior" in given else "ranges"
 
 

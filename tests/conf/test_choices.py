@@ -11,7 +11,7 @@ from hydra.core.global_hydra import GlobalHydra
 
 from cartpole_rl.checking import checked
 from cartpole_rl.choices import conf_folder, default_choices
-from cartpole_rl.commands.composition import as_mapping
+from cartpole_rl.commands.hydra_application.composition import as_mapping
 from cartpole_rl.envs.build import randomizer
 from cartpole_rl.tasks.settings import Reward
 from cartpole_rl.workflows.build import evaluated_settings
