@@ -27,8 +27,6 @@ from cartpole_rl.randomization.randomizer import Randomizer
 from cartpole_rl.randomization.settings import IdentifiedSettings
 from cartpole_rl.tasks.settings import ActionSettings, RewardSettings, StartSettings, TaskSettings
 
-SIMILAR = 0.1  # largest relative difference between the length of a pole and that of a learned model's
-
 
 def shipped_settings(overrides: Mapping[str, Any] | None = None) -> CartPoleSettings:
     """Return what conf/train.yaml says of the cart and the task, with `overrides` as in `choices.compose`."""
@@ -82,8 +80,8 @@ def simulated_env(
 def randomizer(config: CartPoleSettings) -> Draws:
     """Return the source of the carts that `config` describes. Raises ConfigError for impossible carts."""
     if isinstance(config.randomization, IdentifiedSettings):
-        return identified_carts(config.randomization, config.nominal, config.pole)
-    return Randomizer(config.nominal, config.pole, config.randomization)
+        return identified_carts(config.randomization, config.nominal_cart, config.pole)
+    return Randomizer(config.nominal_cart, config.pole, config.randomization)
 
 
 def learned_plant(
@@ -109,6 +107,6 @@ def check_same_cart(model: LearnedModel, config: CartPoleSettings) -> None:
     if model.models.actuator != config.actions.actuator:
         raise ConfigError(f"actions: plant.model has actuator {model.models.actuator}")
     check_one_pole("plant.model", config.pole)
-    own, length = 2 * model.parameters["pole_com"], 2 * config.pole.nominal.pole_com
-    if abs(own / length - 1) > SIMILAR:
-        raise ConfigError(f"pole: plant.model has one of {own:.2f} m, not {length:.2f} m")
+    pole, own = config.pole.nominal, 2 * model.parameters["pole_com"]
+    if not pole.is_about(own):
+        raise ConfigError(f"pole: plant.model has one of {own:.2f} m, not {pole.length:.2f} m")

@@ -128,7 +128,7 @@ class CartLearner:
     def best_fit(self, recorded: Sequence[Episode]) -> tuple[Fit, Models]:
         """Return the fit with the lowest cost among the candidate models, and its models."""
         windows = cut_windows(recorded, self.settings.control_period)
-        nominal = {**self.training.nominal, **self.training.pole.nominal.model_dump()}
+        nominal = self.training.nominal_with(self.training.pole.nominal)
         fits = [
             (fit_cart(windows, nominal, models, self.settings.control_period), models)
             for models in self.candidates

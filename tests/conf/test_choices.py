@@ -63,7 +63,7 @@ def test_an_evaluation_takes_it_in_place_of_the_agents_own(chosen: str, trained:
     group = group_of(chosen)
     if group not in ("cart_friction", "pole_friction"):  # whose numbers are then the cart's
         assert getattr(settings, group) == getattr(wanted, group)
-    assert settings.nominal == wanted.nominal
+    assert settings.nominal_cart == wanted.nominal_cart
 
 
 @pytest.mark.parametrize("chosen", [case for case in CHOICES if group_of(case) == "finetuning"])
