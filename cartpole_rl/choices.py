@@ -117,14 +117,15 @@ def _nested(name: str, value: Any) -> dict[str, Any]:
 def _resolved(values: dict[str, Any]) -> dict[str, Any]:
     """Return `values` with the track of the cart for TRACK, and without those that are missing ("???")."""
     half_length = values.get("cart", {}).get("track_half_length")
-    return _without_missing(
+    return without_missing(
         _merged(values, {"task": {"x_max": half_length}})
         if values.get("task", {}).get("x_max") == TRACK
         else values
     )
 
 
-def _without_missing(values: Any) -> Any:
+def without_missing(values: Any) -> Any:
+    """Return nested mappings without the values that are missing ("???")."""
     if not isinstance(values, Mapping):
         return values
-    return {name: _without_missing(value) for name, value in values.items() if value != "???"}
+    return {name: without_missing(value) for name, value in values.items() if value != "???"}

@@ -18,8 +18,9 @@ import pytest
 import torch
 import yaml
 
-from cartpole_rl.envs.make import CartPoleEnv, make_env
-from cartpole_rl.envs.settings import ObservationSettings, RewardSettings, TaskSettings
+from cartpole_rl.envs.build import make_env
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
+from cartpole_rl.envs.settings import ObservationSettings
 from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.simulated import SimulatedPlant
@@ -27,8 +28,7 @@ from cartpole_rl.plants.specs import Plant
 from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.randomization.randomizer import Randomizer
 from cartpole_rl.randomization.ranges import Range
-from cartpole_rl.tasks.actions import ActionSettings
-from cartpole_rl.tasks.settings import Start, StartSettings
+from cartpole_rl.tasks.settings import ActionSettings, RewardSettings, Start, StartSettings, TaskSettings
 
 CONF = Path(__file__).parents[1] / "conf"
 

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from cartpole_rl.commands.application import application
+from cartpole_rl.commands.hydra_application.application import application
 from cartpole_rl.errors import PortError
 from cartpole_rl.plants.serial.port import found_ports
 from cartpole_rl.plants.serial.ports import UsbPort, cart_like, changes, described

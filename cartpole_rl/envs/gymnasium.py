@@ -38,7 +38,7 @@ from tensordict import TensorDictBase
 
 from cartpole_rl.choices import choice
 from cartpole_rl.envs.build import shipped_settings, simulated_env
-from cartpole_rl.envs.make import CartPoleEnv
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.plants.settings import SimulatedSettings
 
 OF_TASK = {

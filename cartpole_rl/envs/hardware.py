@@ -48,10 +48,10 @@ from torchrl.envs import Transform
 
 from cartpole_rl.compilation import Compiled
 from cartpole_rl.envs.perception import FirstPercept, Frame, Percept, Previous, perceive, perceive_first
-from cartpole_rl.envs.settings import ObservationSettings, RewardSettings, TaskSettings
+from cartpole_rl.envs.settings import ObservationSettings
 from cartpole_rl.plants.specs import Plant, tensordict_of
-from cartpole_rl.tasks.actions import NO_ACTION
 from cartpole_rl.tasks.features import LENGTH_SCALE
+from cartpole_rl.tasks.settings import NO_ACTION, RewardSettings, TaskSettings
 
 
 class HardwareTransform(Transform):

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from cartpole_rl.envs.settings import ObservationSettings, RewardSettings, TaskSettings
+from cartpole_rl.envs.settings import ObservationSettings
 from cartpole_rl.tasks.endings import fallen
 from cartpole_rl.tasks.features import (
     ANGULAR_SPEED_SCALE,
@@ -22,6 +22,7 @@ from cartpole_rl.tasks.features import (
     observe,
 )
 from cartpole_rl.tasks.rewards import SCORE, SCORE_UPRIGHT
+from cartpole_rl.tasks.settings import RewardSettings, TaskSettings
 
 
 class Previous(NamedTuple):

@@ -1,11 +1,9 @@
-"""Settings of an environment: observation, reward, task."""
+"""Settings of the observation."""
 
 from pydantic import Field
 
-from cartpole_rl.settings import Count, Finite, NonNegative, Positive, Settings
+from cartpole_rl.settings import Settings
 from cartpole_rl.tasks.features import ObservationKind
-from cartpole_rl.tasks.rewards import Reward
-from cartpole_rl.tasks.settings import StartSettings
 
 POSITIONS = ObservationKind.POSITIONS.mirror_signs
 
@@ -50,23 +48,3 @@ class ObservationSettings(Settings):
         size, first = len(POSITIONS), self.size - int(self.pole_length) - len(POSITIONS) * self.past_positions
         places = [0, *range(first, first + size * self.past_positions, size)]  # of x, newest first
         return [[*range(place, place + size), size + age] for age, place in enumerate(places)][::-1]
-
-
-class RewardSettings(Settings):
-    """The reward: `kind` times `scale`, minus the costs of the track, which the scores do not have."""
-
-    kind: Reward
-    scale: Positive
-    track_penalty: NonNegative  # for leaving the track
-    position_cost: NonNegative  # of each step, times (x / x_max)^2
-
-
-class TaskSettings(Settings):
-    """The task."""
-
-    name: str
-    start: StartSettings  # of training episodes
-    evaluation_start: StartSettings
-    time_limit: Count  # control periods
-    angle_limit: Finite | None  # rad; None: the pole may hang
-    x_max: Positive  # m, of (5.4), (6.1), (6.2)

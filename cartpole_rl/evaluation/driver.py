@@ -21,7 +21,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import nn
 
-from cartpole_rl.envs.make import CartPoleEnv
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.errors import CartPoleError, LinkError
 from cartpole_rl.evaluation.driving_policy import DrivingPolicy, Weights
 from cartpole_rl.evaluation.episodes import run_batch, warm_up

@@ -13,10 +13,10 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from cartpole_rl.envs.make import CartPoleEnv
-from cartpole_rl.tasks.actions import NO_ACTION
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.tasks.settings import NO_ACTION
 
 # reads `observation` [N, K]; writes `action` [N] and, if it has them, the `action_value` [N, A]
 Policy = Callable[[TensorDictBase], TensorDictBase]

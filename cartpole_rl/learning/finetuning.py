@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 
-from cartpole_rl.envs.make import CartPoleEnv
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.learning.buffer import n_step_transitions
 from cartpole_rl.learning.collector import COLLECTED
 from cartpole_rl.learning.settings import FinetuningSettings

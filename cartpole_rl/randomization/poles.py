@@ -5,6 +5,7 @@ from pydantic import model_validator
 from cartpole_rl.physics.rod import uniform_rod
 from cartpole_rl.settings import NonNegative, Positive, Settings
 
+SIMILAR = 0.1  # largest relative difference between two lengths of the same pole
 JUDGED_LENGTHS = 5  # rods on which an agent of a range of lengths is evaluated
 
 
@@ -19,6 +20,15 @@ class Pole(Settings):
     def rod(cls, length: float) -> "Pole":
         """Return a uniform rod of `length` m and the thesis's 0.7 kg/m."""
         return cls(**uniform_rod(length))
+
+    @property
+    def length(self) -> float:
+        """The length of a uniform rod with the same centre of mass, m."""
+        return 2 * self.pole_com
+
+    def is_about(self, length: float) -> bool:
+        """Return True where a pole of `length` m may be this one, since lengths are measured by hand."""
+        return abs(length / self.length - 1) < SIMILAR
 
 
 class PoleSettings(Settings):

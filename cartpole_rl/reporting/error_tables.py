@@ -6,6 +6,7 @@ from typing import Any
 from cartpole_rl.reporting.table import number_text, table
 
 Errors = Sequence[Mapping[str, Any]]  # one mapping for each time after a reset
+REPORTED_TIMES = (0.1, 0.5, 1.0)  # s after a reset
 ERROR_COLUMNS = {
     "rms_x_mm": "cart RMS (mm)",
     "median_x_mm": "cart median (mm)",

@@ -1,4 +1,4 @@
-"""Texts that several figures share."""
+"""Texts that several figures and tables share."""
 
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
@@ -15,3 +15,8 @@ ENDINGS = {
 def ending_text(episode: Episode) -> str:
     """Return why and when an episode ended: "left the track after 6.6 s"."""
     return f"{ENDINGS[Ending(episode.ended_by)]} after {episode.time[-1] - episode.time[0]:.1f} s"
+
+
+def count_text(episodes: int) -> str:
+    """Return "1 episode" or "20 episodes"."""
+    return f"{episodes} episode{'s' if episodes > 1 else ''}"

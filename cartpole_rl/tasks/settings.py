@@ -1,8 +1,29 @@
-"""The initial states of a task."""
+"""Settings of a task: actions, starts, rewards."""
 
 from enum import StrEnum
+from typing import Annotated, Literal
 
-from cartpole_rl.settings import Fraction, NonNegative, Settings
+from pydantic import Field, model_validator
+
+from cartpole_rl.settings import Count, Finite, Fraction, NonNegative, Positive, Settings
+from cartpole_rl.tasks.rewards import Reward
+
+NO_ACTION = -1  # where an observation or action value is not finite: motor 0, and the episode ends
+
+Motor = Annotated[int, Field(ge=-255, le=255)]
+
+
+class ActionSettings(Settings):
+    """Motor values by action index, and the simulated actuator that interprets them."""
+
+    motors: tuple[Motor, ...]
+    actuator: Literal["newtons", "force_curve"]
+
+    @model_validator(mode="after")
+    def _distinct(self) -> "ActionSettings":
+        if len(set(self.motors)) != len(self.motors) or len(self.motors) < 2:
+            raise ValueError(f"motors {list(self.motors)} must be two or more different values")
+        return self
 
 
 class Start(StrEnum):
@@ -22,3 +43,23 @@ class StartSettings(Settings):
     speed_spread: NonNegative  # m/s
     angular_speed_spread: NonNegative  # rad/s
     resting_share: Fraction = 0.0  # of the episodes start with a hanging pole at rest
+
+
+class RewardSettings(Settings):
+    """The reward: `kind` times `scale`, minus the costs of the track, which the scores do not have."""
+
+    kind: Reward
+    scale: Positive
+    track_penalty: NonNegative  # for leaving the track
+    position_cost: NonNegative  # of each step, times (x / x_max)^2
+
+
+class TaskSettings(Settings):
+    """The task."""
+
+    name: str
+    start: StartSettings  # of training episodes
+    evaluation_start: StartSettings
+    time_limit: Count  # control periods
+    angle_limit: Finite | None  # rad; None: the pole may hang
+    x_max: Positive  # m, of (5.4), (6.1), (6.2)

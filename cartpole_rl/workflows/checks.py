@@ -39,7 +39,7 @@ def check_training(config: TrainConfig) -> None:
     """Raise CartPoleError where a new training cannot start."""
     if config.compile:
         check_compiler()
-    check_carts(config.nominal, config.pole, config.ranges)
+    check_carts(config.nominal_cart, config.pole, config.ranges)
     if isinstance(config.plant, LearnedSettings):
         check_model(config.plant)
 
@@ -68,8 +68,7 @@ def check_replay(config: ReplayConfig) -> None:
     recordings(config.source)
     if config.pole is not None:
         check_one_pole("a replay", config.pole)
-    friction = {**config.cart_friction.parameters, **config.pole_friction.parameters}
-    check_parameters({**config.cart, **friction, **(config.parameters or {})})
+    check_parameters({**config.nominal_cart, **(config.parameters or {})})
 
 
 def check_modelling(config: ModelConfig) -> None:

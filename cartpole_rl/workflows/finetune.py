@@ -20,20 +20,22 @@ from cartpole_rl.evaluation.metrics import episode_metrics, summarize
 from cartpole_rl.learning.checkpoint_files import LAST
 from cartpole_rl.learning.checkpoints import AgentCheckpoint, forget_training, load_agent
 from cartpole_rl.learning.randomness import seed_everything
+from cartpole_rl.reporting.scores import score_table
 from cartpole_rl.reporting.tensorboard import TensorBoardLog
+from cartpole_rl.reporting.words import count_text
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.agents import new_agent, trained_agent
 from cartpole_rl.workflows.build import evaluated_env, evaluated_settings, use_threads
 from cartpole_rl.workflows.checks import check_finetuning
 from cartpole_rl.workflows.config import EvaluateConfig, FinetuneConfig, TrainConfig
-from cartpole_rl.workflows.evaluate import count_text, score_table
 from cartpole_rl.workflows.finetuning_cart import DrivenCart, yield_to
-from cartpole_rl.workflows.finetuning_files import FinetuningFiles, Stage, resumed_config
+from cartpole_rl.workflows.finetuning_files import FinetuningFiles, Stage
 from cartpole_rl.workflows.finetuning_learner import CartLearner
 from cartpole_rl.workflows.person import confirm
 from cartpole_rl.workflows.report import report
 from cartpole_rl.workflows.resuming import resumed
 from cartpole_rl.workflows.run_folder import METRICS, write_config, write_json
+from cartpole_rl.workflows.settings import recorded_settings
 
 COMPARISON = "comparison.json"
 SIMULATED_SCORE = "cart/score_in_simulation"  # TensorBoard's curve beside those of the cart
@@ -49,7 +51,8 @@ def finetune(config: FinetuneConfig, folder: Path) -> None:
     """
     checkpoint = resumed("finetune", config.resume, folder)
     if checkpoint:
-        config = resumed_config(checkpoint, config.resume)
+        values = {**checkpoint.config, "resume": config.resume}
+        config = recorded_settings(FinetuneConfig, values, f"resume={config.resume}")
     run = check_finetuning(config)
     use_threads(config.threads)
     seed_everything(config.seed)

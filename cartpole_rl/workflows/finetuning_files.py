@@ -7,8 +7,6 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
-from cartpole_rl.checking import checked
-from cartpole_rl.errors import CheckpointError, ConfigError
 from cartpole_rl.evaluation.recordings import LENGTH, read_recording, write_recording
 from cartpole_rl.learning.checkpoint_files import FOLDER, LAST
 from cartpole_rl.learning.checkpoints import (
@@ -77,11 +75,3 @@ def pole_length(config: FinetuneConfig) -> float | None:
     """Return the length (m) of the pole on the cart; None where the settings do not state it."""
     plant = config.plant
     return plant.pole_length if isinstance(plant, SerialSettings) else 2 * config.emulator.pole_com
-
-
-def resumed_config(checkpoint: TrainingCheckpoint, resume: str | None) -> FinetuneConfig:
-    """Return the settings in a checkpoint. Raises CheckpointError where this version has other settings."""
-    try:
-        return checked(FinetuneConfig, {**checkpoint.config, "resume": resume})
-    except ConfigError as error:
-        raise CheckpointError(f"resume={resume} is of another version of this package: {error}") from None

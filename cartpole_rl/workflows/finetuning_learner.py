@@ -9,8 +9,8 @@ import torch
 
 from cartpole_rl.agents.dqn import QAgent
 from cartpole_rl.envs.build import environment, randomizer, simulated_env
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
-from cartpole_rl.envs.make import CartPoleEnv
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.identification.fit import Fit, fit_cart
 from cartpole_rl.identification.unknowns import LONGEST_LATENCY
@@ -128,7 +128,7 @@ class CartLearner:
     def best_fit(self, recorded: Sequence[Episode]) -> tuple[Fit, Models]:
         """Return the fit with the lowest cost among the candidate models, and its models."""
         windows = cut_windows(recorded, self.settings.control_period)
-        nominal = {**self.training.nominal, **self.training.pole.nominal.model_dump()}
+        nominal = self.training.nominal_with(self.training.pole.nominal)
         fits = [
             (fit_cart(windows, nominal, models, self.settings.control_period), models)
             for models in self.candidates

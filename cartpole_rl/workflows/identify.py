@@ -17,7 +17,7 @@ from cartpole_rl.identification.experiments import EXPERIMENTS, HELD_OUT, conduc
 from cartpole_rl.identification.identify import Identification, identify, predicted, prediction_errors
 from cartpole_rl.identification.quantities import intervals, quantities
 from cartpole_rl.physics.models import Actuator, CartFriction, Models
-from cartpole_rl.plants.emulated import emulated_plant
+from cartpole_rl.plants.cart_plant import cart_plant
 from cartpole_rl.plants.serial.plant import SerialPlant
 from cartpole_rl.reporting.curves import force_curve, friction_curve
 from cartpole_rl.reporting.figures import save
@@ -36,7 +36,7 @@ from cartpole_rl.reporting.identification import (
 )
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.build import use_threads
-from cartpole_rl.workflows.config import EmulatedSettings, IdentifyConfig
+from cartpole_rl.workflows.config import IdentifyConfig
 from cartpole_rl.workflows.identified_files import (
     CART,
     POLE,
@@ -99,10 +99,8 @@ def record_experiments(config: IdentifyConfig, folder: Path) -> None:
 
 def make_plant(config: IdentifyConfig) -> SerialPlant:
     """Connect to the cart that is identified."""
-    if isinstance(config.plant, EmulatedSettings):
-        truth = config.emulator.model_copy(update={"start": "hanging"})
-        return emulated_plant(truth, config.control_period, tqdm.write, config.plant.rehome)
-    return SerialPlant(config.plant, control_period=config.control_period, prompt=tqdm.write, confirm=confirm)
+    period = config.control_period
+    return cart_plant(config.plant, config.emulator, period, "hanging", tqdm.write, confirm)
 
 
 def read_recordings(source: Path) -> Episodes:

@@ -23,18 +23,17 @@ from cartpole_rl.physics.models import CartFriction, Models
 from cartpole_rl.plants.learned_model import LearnedModel, save_model
 from cartpole_rl.plants.model_file import MODEL
 from cartpole_rl.plants.settings import LearnedSettings
-from cartpole_rl.randomization.checks import check_one_pole
 from cartpole_rl.randomization.poles import Pole
-from cartpole_rl.reporting.error_tables import model_table, spread_table
+from cartpole_rl.reporting.error_tables import REPORTED_TIMES, model_table, spread_table
 from cartpole_rl.reporting.figures import save
 from cartpole_rl.reporting.figures.learned_models import forces_along_track, learned_model_figure
+from cartpole_rl.reporting.words import count_text
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.build import use_threads
 from cartpole_rl.workflows.config import ModelConfig
-from cartpole_rl.workflows.evaluate import count_text
 from cartpole_rl.workflows.held_out import held_out_windows, split
+from cartpole_rl.workflows.poles import chosen_pole
 from cartpole_rl.workflows.recordings import recordings
-from cartpole_rl.workflows.replay import REPORTED_TIMES, recorded_pole
 from cartpole_rl.workflows.run_folder import write_config, write_json
 
 REPORT, FIGURE = "model.json", "figures/model.png"
@@ -53,7 +52,7 @@ def learn_model(config: ModelConfig, folder: Path) -> None:
     use_threads(config.threads)
     paths = [path for source in config.source for path in recordings(source)]
     episodes = [read_recording(path) for path in paths]
-    pole_name, pole = modelled_pole(config, paths)
+    pole_name, pole = chosen_pole("a model", config.pole, paths)
     period = recorded_period(episodes[0])
     training, held_out = split(episodes)
     windows = held_out_windows(held_out, period, max(REPORTED_TIMES))
@@ -75,14 +74,6 @@ def learn_model(config: ModelConfig, folder: Path) -> None:
         f"\n{spread_table(errors[LEARNED], CERTAIN, 'RMS errors and ensemble spreads on the same windows')}"
     )
     print(f"{folder}/{MODEL}, {REPORT} and {FIGURE} are written")
-
-
-def modelled_pole(config: ModelConfig, paths: Sequence[Path]) -> tuple[str, Pole]:
-    """Return name and prior parameters of the pole. Raises ConfigError where several are chosen."""
-    if config.pole is None:
-        return recorded_pole(paths)
-    check_one_pole("a model", config.pole)
-    return config.pole.name, config.pole.nominal
 
 
 def fit_and_learn(
@@ -108,7 +99,7 @@ def best_fit(
 ) -> tuple[Fit, Models]:
     """Return the fit with the lowest cost, and its physics models."""
     windows = cut_windows(episodes, period)
-    nominal = {**config.cart, **config.pole_friction.parameters, **pole.model_dump()}
+    nominal = config.nominal_with(pole)
     fits = []
     for friction in FRICTION_MODELS:
         models = Models(

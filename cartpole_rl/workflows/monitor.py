@@ -114,7 +114,7 @@ class TrainingMonitor:
 
     def _log_pictures(self, episode: Episode, transitions: int) -> None:
         half = self.config.task.x_max
-        length = 2 * self.config.pole.nominal.pole_com
+        length = self.config.pole.nominal.length
         self._log.figure(
             "behaviour", behaviour(episode, f"After {transitions / 1e6:.1f} M transitions", half), transitions
         )

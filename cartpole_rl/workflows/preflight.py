@@ -9,7 +9,8 @@ from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.faults import FaultClearing, always
 from cartpole_rl.plants.serial.preflight import Finding, preflight
 from cartpole_rl.plants.serial.settings import SerialSettings
-from cartpole_rl.workflows.config import EmulatedSettings, PreflightConfig
+from cartpole_rl.plants.settings import EmulatedSettings
+from cartpole_rl.workflows.config import PreflightConfig
 from cartpole_rl.workflows.person import confirm
 
 

@@ -34,7 +34,7 @@ def report(
     write_json(folder / METRICS, {**header, **summary, **cart, "episodes": listed})
     figures = folder / "figures"
     save(behaviour(episodes[0], f"First episode, plant={plant}", x_max), figures / "behaviour.png")
-    write_gif(episodes[0], figures / "episode.gif", 2 * pole.nominal.pole_com, x_max, f"plant={plant}")
+    write_gif(episodes[0], figures / "episode.gif", pole.nominal.length, x_max, f"plant={plant}")
     if history:
         save(learning_curve([("score", list(history))]), figures / "learning_curve.png")
     return summary

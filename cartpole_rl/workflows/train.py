@@ -4,7 +4,7 @@ from functools import partial
 from pathlib import Path
 
 from cartpole_rl.envs.build import simulated_env
-from cartpole_rl.envs.make import CartPoleEnv
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.evaluation.driving_policy import DrivingPolicy
 from cartpole_rl.evaluation.episodes import Policy, run_batch
 from cartpole_rl.learning.checkpoints import forget_training, restore_weights
@@ -15,7 +15,7 @@ from cartpole_rl.plants.settings import LearnedSettings
 from cartpole_rl.randomization.draws import Draws
 from cartpole_rl.settings import evaluation_seed
 from cartpole_rl.tasks.episode import Episode
-from cartpole_rl.workflows.agents import new_agent, recorded_config
+from cartpole_rl.workflows.agents import new_agent
 from cartpole_rl.workflows.build import use_threads
 from cartpole_rl.workflows.checks import check_compiler
 from cartpole_rl.workflows.config import TrainConfig
@@ -24,6 +24,7 @@ from cartpole_rl.workflows.person import print_message
 from cartpole_rl.workflows.report import report
 from cartpole_rl.workflows.resuming import resumed
 from cartpole_rl.workflows.run_folder import write_config
+from cartpole_rl.workflows.settings import recorded_settings
 
 
 def train(config: TrainConfig, folder: Path) -> None:
@@ -36,7 +37,7 @@ def train(config: TrainConfig, folder: Path) -> None:
     """
     checkpoint = resumed("train", config.resume, folder)
     if checkpoint:
-        config = recorded_config(checkpoint.config, f"resume={folder}")
+        config = recorded_settings(TrainConfig, checkpoint.config, f"resume={folder}")
     if config.compile:
         check_compiler()
     use_threads(config.threads)
@@ -94,9 +95,7 @@ def nominal_env(config: TrainConfig) -> CartPoleEnv:
     assert poles.choices is not None
     carts = len(poles.choices) * max(1, config.learning.evaluation_episodes // len(poles.choices))
     nominal = config.model_copy(update={"pole": poles, "randomization": {}})
-    plant = config.plant
-    if isinstance(plant, LearnedSettings):
-        plant = plant.model_copy(update={"prior_share": 0.0})
+    plant = config.plant.without_prior if isinstance(config.plant, LearnedSettings) else config.plant
     return simulated_env(nominal, plant, carts, config.task.evaluation_start, 0, config.compile)
 
 

@@ -34,9 +34,9 @@ from cartpole_rl.agents.dqn import QAgent
 from cartpole_rl.agents.loss import LossGradient, columns_of
 from cartpole_rl.agents.settings import AgentSettings
 from cartpole_rl.choices import choice
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.gymnasium import simulated_environment
 from cartpole_rl.envs.hardware import HardwareTransform
-from cartpole_rl.envs.make import CartPoleEnv
 from cartpole_rl.evaluation.driving_policy import DrivingPolicy
 from cartpole_rl.learning.buffer import n_step_transitions
 from cartpole_rl.learning.collector import Collector

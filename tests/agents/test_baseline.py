@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from cartpole_rl.agents.baseline import EnergyAndRegulator, decode, linearized, regulator
 from cartpole_rl.choices import choice
 from cartpole_rl.emulator.settings import EmulatorSettings
-from cartpole_rl.envs.make import CartPoleEnv
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.physics.dynamics import State

@@ -10,8 +10,8 @@ import pytest
 from command_line import HANDLED
 from hydra.core.global_hydra import GlobalHydra
 
-from cartpole_rl.commands.application import application
 from cartpole_rl.commands.find_port import FindPortConfig
+from cartpole_rl.commands.hydra_application.application import application
 from cartpole_rl.signals import UNWINDING, RaiseOnce, ending_signals
 
 

@@ -12,9 +12,9 @@ from tensordict import TensorDictBase
 
 from cartpole_rl.checking import checked
 from cartpole_rl.choices import conf_folder
-from cartpole_rl.commands.composition import as_mapping
+from cartpole_rl.commands.hydra_application.composition import as_mapping
 from cartpole_rl.envs.build import simulated_env
-from cartpole_rl.envs.make import CartPoleEnv
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.settings import NUM_SEEDS, evaluation_seed
 from cartpole_rl.workflows.build import evaluated_env, evaluated_settings
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig

@@ -150,7 +150,8 @@ def test_completion_needs_no_work(tmp_path: Path) -> None:
 
 
 def test_what_is_imported_for_the_work_is_quiet_too(tmp_path: Path) -> None:
-    quiet = "from cartpole_rl.commands.application import quieten; quieten(); import logging, torchrl"
+    module = "cartpole_rl.commands.hydra_application.application"
+    quiet = f"from {module} import quieten; quieten(); import logging, torchrl"
     level = "assert logging.getLogger('torchrl').getEffectiveLevel() == logging.WARNING"
     assert "torchrl" in modules_after(f"{quiet}; {level}", tmp_path)
 

@@ -13,7 +13,7 @@ from command_line import in_process
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig
 
-import cartpole_rl.commands.composition  # noqa: F401 - registers what conf/ refers to
+import cartpole_rl.commands.hydra_application.composition  # noqa: F401 - registers what conf/ refers to
 from cartpole_rl.choices import conf_folder
 
 COMMANDS = ("evaluate", "finetune", "identify", "model", "record", "replay", "train")
@@ -29,7 +29,7 @@ class StoppedClock(datetime):
 
 @pytest.fixture
 def same_second(monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in ("cartpole_rl.commands.composition", "hydra.core.utils"):
+    for module in ("cartpole_rl.commands.hydra_application.composition", "hydra.core.utils"):
         monkeypatch.setattr(f"{module}.datetime", StoppedClock)
 
 

@@ -14,8 +14,8 @@ import yaml
 from command_line import TINY, console_script, in_process, outcome, prints_only_progress
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from cartpole_rl.commands.composition import job_name, run_folder
-from cartpole_rl.envs.make import CartPoleEnv
+from cartpole_rl.commands.hydra_application.composition import job_name, run_folder
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.errors import LinkError
 from cartpole_rl.evaluation.episodes import Policy, run_episodes
 from cartpole_rl.tasks.episode import Episode

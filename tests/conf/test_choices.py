@@ -11,7 +11,7 @@ from hydra.core.global_hydra import GlobalHydra
 
 from cartpole_rl.checking import checked
 from cartpole_rl.choices import conf_folder, default_choices
-from cartpole_rl.commands.composition import as_mapping
+from cartpole_rl.commands.hydra_application.composition import as_mapping
 from cartpole_rl.envs.build import randomizer
 from cartpole_rl.tasks.rewards import Reward
 from cartpole_rl.workflows.build import evaluated_settings
@@ -63,7 +63,7 @@ def test_an_evaluation_takes_it_in_place_of_the_agents_own(chosen: str, trained:
     group = group_of(chosen)
     if group not in ("cart_friction", "pole_friction"):  # whose numbers are then the cart's
         assert getattr(settings, group) == getattr(wanted, group)
-    assert settings.nominal == wanted.nominal
+    assert settings.nominal_cart == wanted.nominal_cart
 
 
 @pytest.mark.parametrize("chosen", [case for case in CHOICES if group_of(case) == "finetuning"])

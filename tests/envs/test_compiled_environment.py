@@ -9,7 +9,7 @@ import pytest
 import torch
 from tensordict import TensorDictBase
 
-from cartpole_rl.envs.make import CartPoleEnv
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.randomization.ranges import Range
 from cartpole_rl.tasks.settings import Start, StartSettings

@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from cartpole_rl.envs.make import CartPoleEnv
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.physics.models import CartFriction, Models, PoleFriction
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.simulated import SimulatedPlant

@@ -8,8 +8,8 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase, TransformedEnv
 
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.hardware import HardwareTransform
-from cartpole_rl.envs.make import CartPoleEnv
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.randomization.ranges import Range

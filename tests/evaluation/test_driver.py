@@ -17,8 +17,9 @@ from torch import nn
 from cartpole_rl.agents.dqn import QAgent
 from cartpole_rl.agents.settings import AgentSettings
 from cartpole_rl.choices import choice
-from cartpole_rl.envs.make import CartPoleEnv, make_env
-from cartpole_rl.envs.settings import ObservationSettings, RewardSettings, TaskSettings
+from cartpole_rl.envs.build import make_env
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
+from cartpole_rl.envs.settings import ObservationSettings
 from cartpole_rl.errors import FaultError, LinkError
 from cartpole_rl.evaluation.driver import Drive, Driver
 from cartpole_rl.evaluation.driving_policy import as_weights
@@ -26,7 +27,7 @@ from cartpole_rl.plants.serial.errors import NotReadyError
 from cartpole_rl.plants.serial.faults import Confirm
 from cartpole_rl.plants.serial.plant import SerialPlant
 from cartpole_rl.plants.serial.settings import SerialSettings
-from cartpole_rl.tasks.actions import ActionSettings
+from cartpole_rl.tasks.settings import ActionSettings, RewardSettings, TaskSettings
 from cartpole_rl.wire import ClearFault, Fault, Message, SetMotor, Stop
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "plants"))

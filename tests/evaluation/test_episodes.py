@@ -8,7 +8,7 @@ import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
 
-from cartpole_rl.envs.make import CartPoleEnv
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.evaluation.episodes import run_episodes
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.tasks.settings import Start, StartSettings

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from cartpole_rl.envs.make import CartPoleEnv
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.identification.ensemble import Ensemble
 from cartpole_rl.identification.held_out import LEAD, errors_at, predict_held_out

@@ -7,7 +7,7 @@ import torch
 from tensordict.nn import TensorDictModule
 from torchrl.collectors import Collector as TorchRLCollector
 
-from cartpole_rl.envs.make import CartPoleEnv
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.learning.collector import COLLECTED, Collector
 from cartpole_rl.randomization.ranges import Range
 from cartpole_rl.tasks.settings import Start, StartSettings

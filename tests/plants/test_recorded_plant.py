@@ -6,7 +6,7 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.envs.utils import check_env_specs
 
-from cartpole_rl.envs.make import CartPoleEnv
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.plants.recorded import RecordedPlant
 from cartpole_rl.plants.simulated import SimulatedPlant

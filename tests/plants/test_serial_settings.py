@@ -12,8 +12,8 @@ from serial_peer import CartPeer
 
 from cartpole_rl.checking import checked
 from cartpole_rl.choices import conf_folder
-from cartpole_rl.commands.composition import as_mapping
-from cartpole_rl.envs.make import CartPoleEnv
+from cartpole_rl.commands.hydra_application.composition import as_mapping
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.errors import ConfigError, LinkError, PlantError
 from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.wire import Flags

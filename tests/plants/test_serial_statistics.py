@@ -9,7 +9,7 @@ from hydra.core.global_hydra import GlobalHydra
 
 from cartpole_rl.checking import checked
 from cartpole_rl.choices import conf_folder
-from cartpole_rl.commands.composition import as_mapping
+from cartpole_rl.commands.hydra_application.composition import as_mapping
 from cartpole_rl.envs.build import randomizer
 from cartpole_rl.errors import PlantError
 from cartpole_rl.plants.serial.statistics import LATENCY_SAMPLES, LatencyRing, LinkStatistics

@@ -3,7 +3,7 @@
 import pytest
 from pydantic import ValidationError
 
-from cartpole_rl.tasks.actions import ActionSettings
+from cartpole_rl.tasks.settings import ActionSettings
 
 
 def test_motor_values_by_index() -> None:

@@ -11,7 +11,7 @@ from hydra.core.global_hydra import GlobalHydra
 
 from cartpole_rl.checking import checked
 from cartpole_rl.choices import conf_folder
-from cartpole_rl.commands.composition import as_mapping
+from cartpole_rl.commands.hydra_application.composition import as_mapping
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.settings import Settings
 from cartpole_rl.workflows.config import EvaluateConfig, PreflightConfig, TrainConfig

@@ -1,49 +1,38 @@
-"""Makes a command of a function: Hydra composes its config, and each error is one line and an exit code.
-
-Exit codes: 0; 1 where the work failed; 2 where the config is wrong; 130 after Ctrl-C; 143 after SIGTERM; 129
-after SIGHUP, which a closed terminal or a dropped ssh connection sends.
-"""
+"""Makes a command of a function: Hydra composes its config, and each error is one line and an exit code."""
 
 import logging
 import os
-import signal
 import sys
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import NoReturn, TypeVar
+from typing import TypeVar
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
 from cartpole_rl.checking import checked
 from cartpole_rl.choices import conf_folder
-from cartpole_rl.commands.choice_files import with_choice_files
-from cartpole_rl.commands.complaints import dashed_setting, in_one_line
-from cartpole_rl.commands.composition import as_mapping, choices_of
-from cartpole_rl.errors import CartPoleError, ConfigError
+from cartpole_rl.commands.hydra_application.choice_files import with_choice_files
+from cartpole_rl.commands.hydra_application.complaints import dashed_setting, in_one_line
+from cartpole_rl.commands.hydra_application.composition import as_mapping, choices_of
+from cartpole_rl.commands.hydra_application.exits import (
+    EXPECTED,
+    Terminated,
+    catch_signals,
+    exit_after_signal,
+    exit_with_message,
+)
+from cartpole_rl.errors import ConfigError
 from cartpole_rl.settings import Settings
-from cartpole_rl.signals import RaiseOnce, ending_signals
 from cartpole_rl.workflows.person import print_message
 
-INTERRUPTED, SIGNALLED = 130, 128  # what a shell reports: for SIGINT, and plus its number for another signal
 Config = TypeVar("Config", bound=Settings)
 Body = Callable[[Config, Path], None]
-EXPECTED = (CartPoleError, HydraException, OmegaConfBaseException, OSError)  # printed without a traceback
-
-
-class Terminated(BaseException):
-    """SIGTERM or SIGHUP arrived. It unwinds like an exception, so every `with` stops its motor."""
-
-    def __init__(self, number: int) -> None:
-        super().__init__(number)
-        self.number = number
 
 
 def application(name: str, schema: type[Config]) -> Callable[[Body[Config]], Callable[[], None]]:
@@ -83,29 +72,12 @@ def application(name: str, schema: type[Config]) -> Callable[[Body[Config]], Cal
                     hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=name)(task)()
             except EXPECTED as error:
                 exit_with_message(name, error)
-            except KeyboardInterrupt:
-                print_message(name, "interrupted")
-                sys.exit(INTERRUPTED)
-            except Terminated as ended:
-                print_message(name, "terminated")
-                sys.exit(SIGNALLED + ended.number)
+            except (KeyboardInterrupt, Terminated) as signalled:
+                exit_after_signal(name, signalled)
 
         return main
 
     return decorate
-
-
-def exit_with_message(name: str, error: Exception) -> NoReturn:
-    """Print an error and exit. Raises an OSError that names no file: it is a defect of this package."""
-    code = CartPoleError.exit_code
-    if isinstance(error, CartPoleError):
-        code = error.exit_code
-    elif isinstance(error, HydraException | OmegaConfBaseException):  # some of which are OSErrors too
-        code = ConfigError.exit_code
-    elif isinstance(error, OSError) and not error.filename:
-        raise error
-    print_message(name, in_one_line(error, name))
-    sys.exit(code)
 
 
 def quieten() -> None:
@@ -122,16 +94,3 @@ def remove_if_empty(folder: Path) -> None:
     if folder != Path.cwd():
         with suppress(OSError):  # it is not empty
             folder.rmdir()
-
-
-def catch_signals() -> None:
-    """Make SIGTERM, SIGHUP and SIGINT raise, except for those that the parent process ignores."""
-    handler = RaiseOnce(_exception_of)
-    handler.handle(*ending_signals())
-    if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
-        handler.handle(signal.SIGINT)
-
-
-def _exception_of(number: int) -> BaseException:
-    """Return the exception that a signal raises."""
-    return KeyboardInterrupt() if number == signal.SIGINT else Terminated(number)

@@ -1,13 +1,11 @@
-"""The environment: a plant under the hardware transform."""
+"""The environment: a plant under the hardware transform. `envs.build` builds it."""
 
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
 from cartpole_rl.envs.hardware import HardwareTransform
-from cartpole_rl.envs.settings import ObservationSettings, RewardSettings, TaskSettings
 from cartpole_rl.plants.specs import Plant, tensordict_of
-from cartpole_rl.tasks.actions import ActionSettings
 
 
 class CartPoleEnv(TransformedEnv):
@@ -65,15 +63,3 @@ class CartPoleEnv(TransformedEnv):
 def replaced(values: Tensor, rows: Tensor, new: Tensor) -> Tensor:
     """Return `values` [N, k] with `new` [R, k] in the rows [R]; along the last dimension, which is faster."""
     return values.T.index_copy(1, rows, new.T).T
-
-
-def make_env(
-    plant: Plant,
-    actions: ActionSettings,
-    task: TaskSettings,
-    observation: ObservationSettings,
-    reward: RewardSettings,
-) -> CartPoleEnv:
-    """Return the environment over `plant`; its specs do not depend on the plant."""
-    hardware = HardwareTransform(actions.motors, task, observation, reward, compiled=plant.compiled)
-    return CartPoleEnv(plant, hardware)

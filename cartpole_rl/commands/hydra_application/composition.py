@@ -14,7 +14,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import MISSING, DictConfig, OmegaConf
 
-from cartpole_rl.choices import default_choices
+from cartpole_rl.choices import default_choices, without_missing
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.settings import Settings
@@ -91,13 +91,7 @@ def plant_kinds(schema: type[Settings]) -> set[str]:
 
 def as_mapping(composed: DictConfig) -> dict[str, Any]:
     """Return the composed config, resolved, as plain mappings without the missing values (`???`)."""
-    return _without_missing(OmegaConf.to_container(composed, resolve=True))
-
-
-def _without_missing(tree: Any) -> Any:
-    if not isinstance(tree, dict):
-        return tree
-    return {key: _without_missing(value) for key, value in tree.items() if value != MISSING}
+    return without_missing(OmegaConf.to_container(composed, resolve=True))
 
 
 OmegaConf.register_new_resolver("run_folder", run_folder, use_cache=True)
