@@ -16,8 +16,8 @@ from cartpole_rl.files import replacing
 from cartpole_rl.learning.checkpoint_files import FOLDER, RESUME, find_agent, find_training
 
 AGENT_FORMAT = "cartpole_rl agent 1"
-TRAINING_FORMAT = "cartpole_rl training 2"
-FINETUNING_FORMAT = "cartpole_rl fine-tuning 1"
+TRAINING_FORMAT = "cartpole_rl training 3"
+FINETUNING_FORMAT = "cartpole_rl fine-tuning 2"
 CONTENT = {  # format: what a file of it holds
     AGENT_FORMAT: "an agent",
     TRAINING_FORMAT: "the state that a training resumes from",
@@ -40,8 +40,8 @@ class TrainingCheckpoint:
     """The state that a training or a fine-tuning resumes from."""
 
     config: dict[str, Any]
-    state: dict[str, Any]  # of a training: from `Training.snapshot`
-    transitions: int
+    state: dict[str, Any]  # of `Training.snapshot` or `CartLearner.snapshot`
+    step: int  # on the axis of TensorBoard: transitions of a training, episodes of a fine-tuning
 
 
 def save_agent(path: Path, agent: AgentCheckpoint) -> None:

@@ -52,7 +52,7 @@ def train(config: TrainConfig, folder: Path) -> None:
     policy = DrivingPolicy(agent.greedy_policy(), config.compile)
     evaluate = partial(judge, nominal_env(config), policy, config.seed)
     write_config(folder, "train", config.model_dump(mode="json"), resumed=checkpoint is not None)
-    with TrainingMonitor(folder, config, checkpoint.transitions if checkpoint else None) as monitor:
+    with TrainingMonitor(folder, config, checkpoint.step if checkpoint else None) as monitor:
         training = Training(
             config.learning,
             config.buffer,
