@@ -4,8 +4,8 @@ import math
 import random
 from typing import Literal
 
+from cartpole_rl.emulator.encoders import CART_METRES, POLE_RADIANS
 from cartpole_rl.emulator.firmware import BANNER, Firmware
-from cartpole_rl.emulator.homing import CART_METRES, POLE_RADIANS
 from cartpole_rl.emulator.journal import Journal
 from cartpole_rl.emulator.physics import CartPhysics
 from cartpole_rl.emulator.settings import EmulatorSettings

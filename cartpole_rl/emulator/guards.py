@@ -1,12 +1,14 @@
 """Fault detection while the motor may move: a stalled cart and implausible encoders."""
 
+from cartpole_rl.emulator.encoders import CART_METRES, POLE_COUNTS
+
 STALL_MOTOR = 200  # smallest motor value that moves any healthy cart
 STALL_SECONDS = 0.5
-STALL_COUNTS = 44  # 1 mm
+STALL_COUNTS = round(0.001 / CART_METRES)  # 1 mm
 PUSH_SECONDS = 0.1  # of such a push one way, after which the count must have changed
-SPEED_CHANGE = 0.2 / 22749e-9  # counts/s; 0.2 m/s turn any pole by several counts
-FASTEST_CART = 5.0 / 22749e-9  # counts/s; 5 m/s is over twice what the motor can reach on this track
-FASTEST_POLE = 16 * 4096.0  # counts/s; 16 turns a second is five times a fast swing
+SPEED_CHANGE = 0.2 / CART_METRES  # counts/s; 0.2 m/s turn any pole by several counts
+FASTEST_CART = 5.0 / CART_METRES  # counts/s; 5 m/s is over twice what the motor can reach on this track
+FASTEST_POLE = 16.0 * POLE_COUNTS  # counts/s; 16 turns a second is five times a fast swing
 
 
 class StallWatch:

@@ -11,12 +11,10 @@ from collections import deque
 from collections.abc import Generator
 from dataclasses import dataclass
 
+from cartpole_rl.emulator.encoders import CART_METRES, POLE_COUNTS, POLE_RADIANS
 from cartpole_rl.emulator.servo import PUSH, SpeedServo, SwingBrake, rough_motor
 from cartpole_rl.errors import CartPoleError
 
-CART_METRES = 22749e-9  # a count
-POLE_COUNTS = 4096  # a turn
-POLE_RADIANS = 2 * math.pi / POLE_COUNTS  # a count
 QUARTER_TURN = POLE_COUNTS // 4
 SPAN = 0.814  # m, nominal distance between the stops
 SPAN_TOLERANCE = 0.03  # of the span

@@ -12,8 +12,8 @@ pytest.importorskip("mujoco")
 
 from cartpole_rl.choices import choice
 from cartpole_rl.emulator.device import CartDevice
+from cartpole_rl.emulator.encoders import CART_METRES
 from cartpole_rl.emulator.firmware import SOFT_LIMIT
-from cartpole_rl.emulator.homing import CART_METRES
 from cartpole_rl.emulator.motor import Motor
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.wire import Flags, Home, Message, SetMotor, Start, State, decode_frame, encode_frame

@@ -9,7 +9,7 @@ pytest.importorskip("mujoco", reason='pip install "cartpole_rl[emulator]"')
 from test_emulator_physics import OTHER as PHYSICAL
 
 from cartpole_rl.emulator.device import CartDevice
-from cartpole_rl.emulator.homing import CART_METRES, POLE_RADIANS
+from cartpole_rl.emulator.encoders import CART_METRES, POLE_RADIANS
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.wire import (
     ClearFault,

@@ -36,7 +36,8 @@ import math, sys
 from pathlib import Path
 from cartpole_rl.emulator import firmware, process
 from cartpole_rl.emulator.device import CartDevice
-from cartpole_rl.emulator.homing import CART_METRES, SPAN, Zeros
+from cartpole_rl.emulator.encoders import CART_METRES
+from cartpole_rl.emulator.homing import SPAN, Zeros
 from cartpole_rl.emulator.settings import EmulatorSettings
 
 def home_at_once(hanging):
