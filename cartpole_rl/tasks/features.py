@@ -10,13 +10,14 @@ from cartpole_rl.physics.encoders import (
     POLE_COUNTS_PER_TURN,
     POLE_RADIANS_PER_COUNT,
 )
+from cartpole_rl.physics.motor import LARGEST_MOTOR
 from cartpole_rl.tasks.settings import ObservationKind
 
 # Each scale is about the largest value in a vigorous swing-up.
 POSITION_SCALE = 0.38  # m
 SPEED_SCALE = 1.0  # m/s
 ANGULAR_SPEED_SCALE = 8.0  # rad/s
-MOTOR_SCALE = 255.0
+MOTOR_SCALE = float(LARGEST_MOTOR)
 LENGTH_SCALE = 0.5  # m
 
 
