@@ -9,13 +9,14 @@ from cartpole_rl.envs.make import CartPoleEnv
 from cartpole_rl.plants.serial.plant import SerialPlant
 from cartpole_rl.plants.simulated import NOISE_PARAMETERS
 from cartpole_rl.reporting.table import interval_text, table
+from cartpole_rl.run_files import FIGURES, METRICS
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.config import EvaluateConfig
 from cartpole_rl.workflows.episodes import Evaluation, count_text, prepared
 from cartpole_rl.workflows.repeating import Repetition
 from cartpole_rl.workflows.report import report
-from cartpole_rl.workflows.run_folder import METRICS, write_config
+from cartpole_rl.workflows.run_folder import write_config
 
 SHOWN = {
     "score": "score (6.2)",
@@ -62,7 +63,7 @@ def report_evaluation(evaluation: Evaluation, episodes: Sequence[Episode], folde
         print(compared(evaluation.repetition, episodes[0]))
     if link.get("latency_override"):
         print(f"latency as measured, for cartpole-train: '{link['latency_override']}'")
-    print(f"{folder}/{METRICS} and figures/ are written")
+    print(f"{folder}/{METRICS} and {FIGURES}/ are written")
 
 
 def cut_off(episodes: Sequence[Episode]) -> Iterator[str]:

@@ -17,7 +17,6 @@ from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
 from cartpole_rl.evaluation.driver import Driver
 from cartpole_rl.evaluation.driving_policy import as_weights
 from cartpole_rl.evaluation.metrics import episode_metrics, summarize
-from cartpole_rl.learning.checkpoint_files import LAST
 from cartpole_rl.learning.checkpoints import (
     AgentCheckpoint,
     TrainingCheckpoint,
@@ -26,6 +25,7 @@ from cartpole_rl.learning.checkpoints import (
 )
 from cartpole_rl.learning.randomness import seed_everything
 from cartpole_rl.reporting.tensorboard import TensorBoardLog
+from cartpole_rl.run_files import CHECKPOINTS, LAST, METRICS, RECORDINGS
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.agents import new_agent, trained_agent
 from cartpole_rl.workflows.build import evaluated_env, evaluated_settings, use_threads
@@ -38,7 +38,7 @@ from cartpole_rl.workflows.finetuning_learner import CartLearner
 from cartpole_rl.workflows.person import confirm
 from cartpole_rl.workflows.report import report
 from cartpole_rl.workflows.resuming import resumed
-from cartpole_rl.workflows.run_folder import METRICS, write_config, write_json
+from cartpole_rl.workflows.run_folder import write_config, write_json
 
 COMPARISON = "comparison.json"
 SIMULATED_SCORE = "cart/score_in_simulation"  # TensorBoard's curve beside those of the cart
@@ -175,7 +175,7 @@ class Session:
         if link.get("latency_override"):
             print(f"latency as measured, for cartpole-train: '{link['latency_override']}'")
         print(f"kept: the policy {kept} fine-tuning")
-        print(f"{folder}/{METRICS}, {COMPARISON}, checkpoints/{LAST} and recordings/ are written")
+        print(f"{folder}/{METRICS}, {COMPARISON}, {CHECKPOINTS}/{LAST} and {RECORDINGS}/ are written")
 
     def summarize(self, episodes: list[Episode]) -> dict[str, Any]:
         """Return the summary of the metrics of `episodes`."""

@@ -160,7 +160,7 @@ class CartLearner:
         return torch.from_numpy(fit.draw(SAMPLES, random, self.config.finetuning.widen)).float()
 
     def randomizer(self) -> IdentifiedCarts:
-        """Return the randomizer of the simulated carts: those of the newest fit, and a share as in training."""
+        """Return the randomizer of the simulated carts: of the newest fit, and a share of the prior."""
         prior, share = randomizer(self.training), self.config.finetuning.prior_share
         return IdentifiedCarts(self.carts, prior, share, LONGEST_LATENCY)
 

@@ -19,12 +19,13 @@ from cartpole_rl.reporting.error_tables import replay_table
 from cartpole_rl.reporting.figures import save
 from cartpole_rl.reporting.figures.replays import replay_figure
 from cartpole_rl.reporting.replays import errors_at
+from cartpole_rl.run_files import FIGURES
 from cartpole_rl.workflows.config import ReplayConfig
 from cartpole_rl.workflows.evaluate import count_text
 from cartpole_rl.workflows.recordings import recordings
 from cartpole_rl.workflows.run_folder import write_config, write_json
 
-REPLAY, FIGURE = "replay.json", "figures/replay.png"
+REPLAY, FIGURE = "replay.json", f"{FIGURES}/replay.png"
 REPORTED_TIMES = (0.1, 0.5, 1.0)  # s after a reset
 POLES = ("medium", "large")
 SIMILAR = 0.1  # largest relative difference between a recorded pole's length and that of one of POLES

@@ -13,6 +13,7 @@ from cartpole_rl.learning.training import Training
 from cartpole_rl.plants.effects import without_effect
 from cartpole_rl.plants.settings import LearnedSettings
 from cartpole_rl.randomization.draws import Draws
+from cartpole_rl.run_files import CHECKPOINTS, FIGURES, METRICS
 from cartpole_rl.settings import evaluation_seed
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.agents import new_agent, recorded_config
@@ -74,7 +75,7 @@ def train(config: TrainConfig, folder: Path) -> None:
         )
         monitor.finished(metrics)
     forget_training(folder)
-    print(f"trained for {training.seconds:.0f} s; {folder}/metrics.json, figures/, checkpoints/ are written")
+    print(f"trained for {training.seconds:.0f} s; {folder}/{METRICS}, {FIGURES}/, {CHECKPOINTS}/ are written")
 
 
 def note_unused_randomization(config: TrainConfig, draws: Draws) -> None:
