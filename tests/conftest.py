@@ -99,10 +99,11 @@ def make_plant(ip02: dict[str, float], medium: PoleSettings) -> Callable[..., Si
         ranges: dict[str, Range] | None = None,
         start: StartSettings = STILL,
         models: Models = Models(),  # noqa: B008 - immutable
+        kind: type[SimulatedPlant] = SimulatedPlant,
         **settings: Any,
     ) -> SimulatedPlant:
         randomizer = Randomizer({**ip02, **(cart or {})}, poles, ranges or {})
-        return SimulatedPlant(carts, randomizer, start, models, **settings)
+        return kind(carts, randomizer, start, models, **settings)
 
     return build
 

@@ -19,6 +19,7 @@ from cartpole_rl.emulator.guards import (
 )
 from cartpole_rl.emulator.homing import HomingError, Reading, Zeros, home
 from cartpole_rl.emulator.motor_line import MotorLine
+from cartpole_rl.emulator.settings import LARGEST_MOTOR
 from cartpole_rl.errors import FrameError
 from cartpole_rl.wire.frames import VERSION, Envelope, encode_frame, open_envelope
 from cartpole_rl.wire.messages import (
@@ -47,7 +48,6 @@ BANNER = b"ets Jul 29 2019 12:21:46\r\n\r\nrst:0x1 (POWERON_RESET),boot:0x13\r\n
 # the text of an ESP32, and one 0x00 that separates it from the first frame
 PERIOD_US = 20_000
 SHORTEST_US, LONGEST_US = 5_000, 100_000
-MOTOR_LIMIT = 255
 SOFT_LIMIT = round(0.027 / CART_METRES)  # counts inside a stop
 HARD_LIMIT = round(0.008 / CART_METRES)  # counts inside a stop
 WATCHDOG_PERIODS = 3
@@ -146,7 +146,7 @@ class Firmware:
     def _objection(self, message: Message) -> Reason | None:
         """Return the reason for which a message is refused now, or None."""
         match message:
-            case SetMotor(motor) if abs(motor) > MOTOR_LIMIT:
+            case SetMotor(motor) if abs(motor) > LARGEST_MOTOR:
                 return Reason.OUT_OF_RANGE
             case SetPeriod(period_us) if not SHORTEST_US <= period_us <= LONGEST_US:
                 return Reason.OUT_OF_RANGE
@@ -235,7 +235,7 @@ class Firmware:
             *FIRMWARE,
             POLE_COUNTS,
             round(CART_METRES * 1e9),
-            MOTOR_LIMIT,
+            LARGEST_MOTOR,
             half_span - SOFT_LIMIT,
             half_span - HARD_LIMIT,
             self.period_us,

@@ -82,7 +82,7 @@ class CartPoleGymnasium(gymnasium.Env[Array, np.int64]):
         self.env = simulated_environment(task, 1, randomization)
         self.observation_space, self.action_space = observation_space(self.env), action_space(self.env)
         self.render_mode = render_mode
-        self._seeded = False
+        self.seeded = False  # the plant, from `np_random`
         self._present: TensorDictBase
 
     def reset(
@@ -90,10 +90,7 @@ class CartPoleGymnasium(gymnasium.Env[Array, np.int64]):
     ) -> tuple[Array, dict[str, Any]]:
         """Start an episode."""
         super().reset(seed=seed)
-        if seed is not None or not self._seeded:
-            seed_plant(self.env, self.np_random)
-            self._seeded = True
-        self._present = self.env.reset()
+        self._present = start_episodes(self, seed)
         return first_row(self._present, "observation"), {}
 
     def step(self, action: np.int64) -> tuple[Array, float, bool, bool, dict[str, Any]]:
@@ -132,7 +129,7 @@ class CartPoleVector(VectorEnv[Array, Array, Array]):
         self.single_action_space = action_space(self.env)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._seeded = False
+        self.seeded = False  # the plant, from `np_random`
         self._present: TensorDictBase
 
     def reset(
@@ -140,10 +137,7 @@ class CartPoleVector(VectorEnv[Array, Array, Array]):
     ) -> tuple[Array, dict[str, Any]]:
         """Start an episode on each cart; one seed serves all."""
         super().reset(seed=seed)
-        if seed is not None or not self._seeded:
-            seed_plant(self.env, self.np_random)
-            self._seeded = True
-        self._present = self.env.reset()
+        self._present = start_episodes(self, seed)
         return self._present["observation"].numpy().copy(), {}
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
@@ -180,6 +174,12 @@ def first_row(tensordict: TensorDictBase, key: str) -> Array:
     return tensordict.get(key)[0].numpy().copy()
 
 
-def seed_plant(env: CartPoleEnv, source: np.random.Generator) -> None:
-    """Seed the plant's generator, and no other, from Gymnasium's."""
-    env.set_seed(int(source.integers(2**31)))
+def start_episodes(wrapper: CartPoleGymnasium | CartPoleVector, seed: int | None) -> TensorDictBase:
+    """Return the first frames of new episodes.
+
+    The first ones and those after a new `seed` seed the plant's generator, and no other, from Gymnasium's.
+    """
+    if seed is not None or not wrapper.seeded:
+        wrapper.env.set_seed(int(wrapper.np_random.integers(2**31)))
+        wrapper.seeded = True
+    return wrapper.env.reset()

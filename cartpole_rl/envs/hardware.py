@@ -47,7 +47,7 @@ from torchrl.data import Categorical, Composite, Unbounded
 from torchrl.envs import Transform
 
 from cartpole_rl.compilation import Compiled
-from cartpole_rl.envs.perception import FirstPercept, Frame, Percept, Previous, perceive, perceive_first
+from cartpole_rl.envs.perception import FirstPercept, Percept, PlantOutput, Previous, perceive, perceive_first
 from cartpole_rl.envs.settings import ObservationSettings
 from cartpole_rl.plants.specs import Plant, tensordict_of
 from cartpole_rl.tasks.features import LENGTH_SCALE
@@ -69,7 +69,7 @@ class HardwareTransform(Transform):
         self.task, self.observation_settings, self.reward = task, observation, reward
         self.register_buffer("motors", torch.tensor(list(motors), dtype=torch.int64))
         self.register_buffer("_by_action", torch.tensor([0, *motors], dtype=torch.int64))  # from NO_ACTION on
-        self._perceive: Callable[[Previous, Frame], Percept] = partial(
+        self._perceive: Callable[[Previous, PlantOutput], Percept] = partial(
             perceive, settings=observation, task=task, rewards=reward
         )
         if compiled:
@@ -140,7 +140,7 @@ class HardwareTransform(Transform):
             command.get("motor").T,
             self._scaled_length(),
         )
-        frame = Frame(*(next_frame.get(key).T for key in Frame._fields))
+        frame = PlantOutput(*(next_frame.get(key).T for key in PlantOutput._fields))
         frame = frame._replace(truncated=frame.truncated | (current.get("action") == NO_ACTION))
         return added(next_frame, self._perceive(previous, frame))
 

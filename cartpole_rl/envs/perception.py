@@ -36,7 +36,7 @@ class Previous(NamedTuple):
     length: Tensor  # [1, N] scaled length of the pole if it is observed, otherwise [0, N]
 
 
-class Frame(NamedTuple):
+class PlantOutput(NamedTuple):
     """The plant's output after the period: see `plants.specs.Plant`."""
 
     counts: Tensor  # [2, N] int64
@@ -90,7 +90,7 @@ def perceive_first(counts: Tensor, length: Tensor, settings: ObservationSettings
 
 def perceive(
     previous: Previous,
-    frame: Frame,
+    frame: PlantOutput,
     *,
     settings: ObservationSettings,
     task: TaskSettings,

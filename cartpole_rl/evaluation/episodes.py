@@ -94,7 +94,7 @@ def _note_endings(
 
 
 def _ending(env: CartPoleEnv, action: int, last: TensorDictBase) -> str:
-    reported = getattr(env.plant, "ended_by", "")
+    reported = env.plant.ended_by
     if reported:
         return str(Ending(reported))
     if action == NO_ACTION:

@@ -13,6 +13,7 @@ import numpy as np
 
 from cartpole_rl.errors import RecordingError
 from cartpole_rl.files import replacing
+from cartpole_rl.physics.motor import LARGEST_MOTOR
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
 
@@ -25,7 +26,6 @@ STATE = {  # column: field of Episode
     "theta_dot_rad_per_s": "theta_dot",
 }
 STEP = {"score": "score", "score_upright": "score_upright", "reward": "reward"}
-LARGEST_MOTOR = 255
 COUNTS = ("cart_counts", "pole_counts")
 LENGTH = "pole_length_m"  # in the heading: twice pivot to centre of mass, empty if not known
 COLUMNS = (*STATE, *COUNTS, "motor", *STEP)

@@ -15,6 +15,7 @@ import torch
 from tensordict import TensorDictBase
 
 from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
+from cartpole_rl.physics.motor import LARGEST_MOTOR
 from cartpole_rl.plants.specs import Plant
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
@@ -24,7 +25,6 @@ SIDE = 0.2  # m, start of a run to the other side
 FORESIGHT = 0.12  # s in which the guard stops a cart
 BRAKE = 220  # motor value of the guard
 BREAKAWAY = 90  # motor value that moves most carts, before it is known
-STRONGEST = 255
 BROKEN_AWAY = 0.002  # m
 CLOSE, SLOW = 0.02, 0.05  # m, m/s: at the target, and at rest
 LONGEST_MOVE = 4.0  # s
@@ -57,7 +57,7 @@ class Task(NamedTuple):
 
     def moving(self, more: int) -> int:
         """Return a motor value that moves the cart, by `more` than needed."""
-        return min(STRONGEST, self.breakaway + more)
+        return min(LARGEST_MOTOR, self.breakaway + more)
 
 
 class Experiment(NamedTuple):
@@ -77,7 +77,7 @@ def ramps(task: Task) -> Moves:
         yield from hold(0, 0.4, task)
         start = now = yield 0
         size = 20
-        while abs(now.x - start.x) < BROKEN_AWAY and size < STRONGEST:
+        while abs(now.x - start.x) < BROKEN_AWAY and size < LARGEST_MOTOR:
             size += 1
             now = yield side * size
         needed = max(needed, size)
@@ -253,7 +253,7 @@ def run(plant: Plant, present: TensorDictBase, moves: Moves) -> tuple[Episode, T
         gaps.append(float(following["dt"]))
         present = following
         if following["terminated"] or following["truncated"]:
-            ended = str(getattr(plant, "ended_by", "") or Ending.TRACK)
+            ended = str(plant.ended_by or Ending.TRACK)
             break
         try:
             requested = moves.send(observed(counts, gaps))
@@ -286,7 +286,7 @@ def guarded(motor: float, now: Observed) -> int:
     ahead = now.x + FORESIGHT * now.x_dot * (1 + abs(now.x_dot))
     if abs(ahead) > REACH and ahead * (motor + BRAKE * np.sign(ahead)) > 0:
         return int(-np.sign(ahead) * BRAKE)
-    return int(np.clip(motor, -255, 255))
+    return int(np.clip(motor, -LARGEST_MOTOR, LARGEST_MOTOR))
 
 
 def recording(counts: np.ndarray, gaps: np.ndarray, motors: np.ndarray, ended_by: str) -> Episode:

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cartpole_rl.identification.fit import Fit
+from cartpole_rl.intervals import CONFIDENCE
 from cartpole_rl.physics.parameters import GRAVITY, CartParameters
 
 Array = NDArray[np.floating]
-CONFIDENCE = 0.95
 TYPICAL = 5.0  # rad/s, the speed of a wide swing, for which the pole's damping is given
 
 

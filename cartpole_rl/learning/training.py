@@ -58,7 +58,7 @@ class Training:
         compiled: bool = False,
     ) -> None:
         self.settings, self.agent, self.env = settings, agent, env
-        self.evaluate, self.monitor = evaluate, monitor
+        self.evaluate, self.monitor, self.seed = evaluate, monitor, seed
         self.collector = Collector(
             env, agent.actor, len(env.hardware.motors), seed, settings.retry_probability
         )

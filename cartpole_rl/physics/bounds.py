@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 from cartpole_rl.errors import ConfigError
+from cartpole_rl.physics.motor import LARGEST_MOTOR
 
 
 class Bound(NamedTuple):
@@ -52,8 +53,8 @@ BOUNDS: dict[str, Bound] = {
     "force_linear": ANY,
     "force_offset": ANY,
     "force_asymmetry": ASYMMETRY,
-    "deadband_left": Bound(0, 255),
-    "deadband_right": Bound(0, 255),
+    "deadband_left": Bound(0, LARGEST_MOTOR),
+    "deadband_right": Bound(0, LARGEST_MOTOR),
     "motor_time_constant": DELAY,
     "latency": DELAY,
     "latency_jitter": DELAY,

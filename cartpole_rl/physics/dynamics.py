@@ -190,16 +190,3 @@ def turned(state: State, acceleration: Tensor, step: float) -> State:
     """Return the state after a further angular acceleration, rad/s^2, [N], for `step` s."""
     faster = step * acceleration
     return state._replace(theta=state.theta + step * faster, theta_dot=state.theta_dot + faster)
-
-
-def energy(state: State, cart: CartParameters) -> Tensor:
-    """Return kinetic and potential energy, J, [N]; 0 for a cart at rest in the middle with the pole level."""
-    angle = state.theta - cart.track_tilt
-    kinetic = (
-        0.5 * cart.total_mass * state.x_dot**2
-        + cart.first_moment * state.x_dot * state.theta_dot * torch.cos(angle)
-        + 0.5 * cart.pivot_inertia * state.theta_dot**2
-    )
-    height = cart.first_moment * GRAVITY * torch.cos(state.theta)
-    slope = -cart.total_mass * GRAVITY * state.x * torch.sin(cart.track_tilt)
-    return kinetic + height + slope

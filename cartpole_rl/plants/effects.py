@@ -14,7 +14,7 @@ from torch import Tensor
 
 from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import CartParameters
-from cartpole_rl.plants.simulation import Carts, Inputs, Period, run_carts
+from cartpole_rl.plants.simulation import Carts, Inputs, Period, commands_under_way, run_carts
 from cartpole_rl.randomization.draws import Draws
 
 TESTED = 256  # carts for each parameter
@@ -37,7 +37,7 @@ def without_effect(
     ends = [draws.ends(name, TESTED, torch.Generator().manual_seed(0)) for name in names]
     low, high = (torch.cat(tables, 1) for tables in zip(*ends, strict=True))
     track_end = (low[TRACK_HALF_LENGTH] + high[TRACK_HALF_LENGTH]) / 2
-    commands = 1 + max(1, math.ceil(draws.longest_delay() / period - 1e-9))  # that can be under way
+    commands = commands_under_way(draws.longest_delay(), period)
     motion, drive, inputs = _situations(track_end, motors, commands)
     carts = [Carts(table, motion, drive) for table in (low, high)]
     same = torch.ones_like(track_end, dtype=torch.bool)

@@ -4,6 +4,7 @@ Random numbers are drawn beforehand, so that this can be compiled. Tensors are [
 transpose of what stands in the tensordict: compiled code then runs along the carts.
 """
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -41,6 +42,11 @@ class Period(NamedTuple):
     counts: Tensor  # [2, N] int64
     motor_applied: Tensor  # [1, N] int64
     off_track: Tensor  # [1, N] bool
+
+
+def commands_under_way(delay: float, period: float) -> int:
+    """Return how many motor values are under way at most with delays of up to `delay` s."""
+    return 1 + max(1, math.ceil(delay / period - 1e-9))
 
 
 def run_carts(

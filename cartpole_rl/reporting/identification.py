@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 from cartpole_rl.reporting.page import page
 from cartpole_rl.reporting.table import interval_text, number_text, table
+from cartpole_rl.run_files import FIGURES
 
 CAPTIONS = {  # figures/<name>.png: caption
     "friction_and_force": "Friction of the cart and force of the motor, with 95 % bands",
@@ -84,7 +85,7 @@ def identification_page(
         ),
         ("Warnings", [*warnings] or ["None."]),
         ("Next step: train on carts like this one", [f"<code>{next_command}</code>"]),
-        *[(caption, Path("figures") / f"{name}.png") for name, caption in CAPTIONS.items()],
+        *[(caption, Path(FIGURES) / f"{name}.png") for name, caption in CAPTIONS.items()],
     ]
     return page("Identification of a cart", sections)
 

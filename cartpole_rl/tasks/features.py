@@ -13,6 +13,7 @@ from cartpole_rl.physics.encoders import (
     POLE_COUNTS_PER_TURN,
     POLE_RADIANS_PER_COUNT,
 )
+from cartpole_rl.physics.motor import LARGEST_MOTOR
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 POSITION_SCALE = 0.38  # m
 SPEED_SCALE = 1.0  # m/s
 ANGULAR_SPEED_SCALE = 8.0  # rad/s
-MOTOR_SCALE = 255.0
+MOTOR_SCALE = float(LARGEST_MOTOR)
 LENGTH_SCALE = 0.5  # m
 
 

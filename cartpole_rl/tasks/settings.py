@@ -5,18 +5,19 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from cartpole_rl.physics.motor import LARGEST_MOTOR
 from cartpole_rl.settings import Count, Finite, Fraction, NonNegative, Positive, Settings
 from cartpole_rl.tasks.rewards import Reward
 
 NO_ACTION = -1  # where an observation or action value is not finite: motor 0, and the episode ends
 
-Motor = Annotated[int, Field(ge=-255, le=255)]
+MotorValue = Annotated[int, Field(ge=-LARGEST_MOTOR, le=LARGEST_MOTOR)]
 
 
 class ActionSettings(Settings):
     """Motor values by action index, and the simulated actuator that interprets them."""
 
-    motors: tuple[Motor, ...]
+    motors: tuple[MotorValue, ...]
     actuator: Literal["newtons", "force_curve"]
 
     @model_validator(mode="after")

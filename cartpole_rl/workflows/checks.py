@@ -11,11 +11,12 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.learning.checkpoint_files import FOLDER, LAST, find_agent, find_training
+from cartpole_rl.learning.checkpoint_files import find_agent, find_training
 from cartpole_rl.physics.bounds import check_names, check_value, check_values
 from cartpole_rl.plants.model_file import find_model
 from cartpole_rl.plants.settings import LearnedSettings
 from cartpole_rl.randomization.checks import check_carts, check_one_pole
+from cartpole_rl.run_files import CHECKPOINTS, LAST
 from cartpole_rl.workflows.config import (
     EvaluateConfig,
     FinetuneConfig,
@@ -109,7 +110,7 @@ def check_agent(run: Path) -> None:
 def check_has_agent(run: Path) -> None:
     """Raise ConfigError where `run` is a run folder without an agent."""
     check_program("run", run, "train", "finetune")
-    if (program := program_of(run)) and not (run / FOLDER / LAST).exists():
+    if (program := program_of(run)) and not (run / CHECKPOINTS / LAST).exists():
         raise ConfigError(
             f"run={run}: this run of {PREFIX}{program} has no agent yet; {use_of(run, program)}"
         )

@@ -10,13 +10,14 @@ from cartpole_rl.plants.serial.plant import SerialPlant
 from cartpole_rl.plants.simulated import NOISE_PARAMETERS
 from cartpole_rl.reporting.scores import score_table
 from cartpole_rl.reporting.words import count_text
+from cartpole_rl.run_files import FIGURES, METRICS
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.config import EvaluateConfig
 from cartpole_rl.workflows.episodes import Evaluation, prepared
 from cartpole_rl.workflows.repeating import Repetition
 from cartpole_rl.workflows.report import report
-from cartpole_rl.workflows.run_folder import METRICS, write_config
+from cartpole_rl.workflows.run_folder import write_config
 
 
 def evaluate(config: EvaluateConfig, folder: Path) -> None:
@@ -53,7 +54,7 @@ def report_evaluation(evaluation: Evaluation, episodes: Sequence[Episode], folde
         print(compared(evaluation.repetition, episodes[0]))
     if link.get("latency_override"):
         print(f"latency as measured, for cartpole-train: '{link['latency_override']}'")
-    print(f"{folder}/{METRICS} and figures/ are written")
+    print(f"{folder}/{METRICS} and {FIGURES}/ are written")
 
 
 def cut_off(episodes: Sequence[Episode]) -> Iterator[str]:

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from cartpole_rl.evaluation.recordings import LENGTH, read_recording, write_recording
-from cartpole_rl.learning.checkpoint_files import FOLDER, LAST
 from cartpole_rl.learning.checkpoints import (
     FINETUNING_FORMAT,
     AgentCheckpoint,
@@ -17,9 +16,9 @@ from cartpole_rl.learning.checkpoints import (
     save_training,
 )
 from cartpole_rl.plants.serial.settings import SerialSettings
+from cartpole_rl.run_files import CHECKPOINTS, LAST, RECORDINGS
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.config import FinetuneConfig
-from cartpole_rl.workflows.recordings import RECORDINGS
 
 
 class Stage(StrEnum):
@@ -68,7 +67,7 @@ class FinetuningFiles:
 
     def save_agent(self, agent: AgentCheckpoint) -> None:
         """Write the run's last agent, the one that other commands read."""
-        save_agent(self.folder / FOLDER / LAST, agent)
+        save_agent(self.folder / CHECKPOINTS / LAST, agent)
 
 
 def pole_length(config: FinetuneConfig) -> float | None:

@@ -12,6 +12,7 @@ from tqdm import tqdm
 
 from cartpole_rl.errors import RecordingError
 from cartpole_rl.evaluation.recordings import read_recording, write_recording
+from cartpole_rl.files import write_text
 from cartpole_rl.identification.checks import check_recordings
 from cartpole_rl.identification.experiments import EXPERIMENTS, HELD_OUT, conduct
 from cartpole_rl.identification.identify import Identification, identify, predicted, prediction_errors
@@ -34,18 +35,13 @@ from cartpole_rl.reporting.identification import (
     estimates_table,
     identification_page,
 )
+from cartpole_rl.run_files import CART, FIGURES, POLE, RANDOMIZATION, RECORDINGS
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.build import use_threads
 from cartpole_rl.workflows.config import IdentifyConfig
-from cartpole_rl.workflows.identified_files import (
-    CART,
-    POLE,
-    RANDOMIZATION,
-    summary,
-    write_choices,
-)
+from cartpole_rl.workflows.identified_files import summary, write_choices
 from cartpole_rl.workflows.person import confirm, print_message
-from cartpole_rl.workflows.recordings import RECORDINGS, experiments
+from cartpole_rl.workflows.recordings import experiments
 from cartpole_rl.workflows.run_folder import write_config, write_json
 
 PAGE, SUMMARY = "page.html", "identification.json"
@@ -79,8 +75,8 @@ def identify_cart(config: IdentifyConfig, folder: Path) -> None:
     write_choices(found, carts, folder)
     write_json(folder / SUMMARY, summary(found, carts))
     for name, figure in figures(config, found, carts, fitted).items():
-        save(figure, folder / "figures" / f"{name}.png")
-    (folder / PAGE).write_text(html_page(config, found, carts, fitted, folder))
+        save(figure, folder / FIGURES / f"{name}.png")
+    write_text(folder / PAGE, html_page(config, found, carts, fitted, folder))
     print(estimates_table(estimates(config, found, carts)))
     print_verdict(found, folder)
 
@@ -183,5 +179,5 @@ def print_verdict(found: Identification, folder: Path) -> None:
     )
     for warning in found.warnings:
         print(f"warning: {warning}")
-    print(f"{folder}/{PAGE}, {CART}, {POLE}, {RANDOMIZATION} and figures/ are written; next:")
+    print(f"{folder}/{PAGE}, {CART}, {POLE}, {RANDOMIZATION} and {FIGURES}/ are written; next:")
     print(next_command(found, folder))

@@ -28,6 +28,7 @@ from cartpole_rl.reporting.error_tables import REPORTED_TIMES, model_table, spre
 from cartpole_rl.reporting.figures import save
 from cartpole_rl.reporting.figures.learned_models import forces_along_track, learned_model_figure
 from cartpole_rl.reporting.words import count_text
+from cartpole_rl.run_files import FIGURES
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.build import use_threads
 from cartpole_rl.workflows.config import ModelConfig
@@ -36,7 +37,7 @@ from cartpole_rl.workflows.poles import chosen_pole
 from cartpole_rl.workflows.recordings import recordings
 from cartpole_rl.workflows.run_folder import write_config, write_json
 
-REPORT, FIGURE = "model.json", "figures/model.png"
+REPORT, FIGURE = "model.json", f"{FIGURES}/model.png"
 FRICTION_MODELS = (CartFriction.SIGMOID, CartFriction.STEP)  # candidates for the cart
 PHYSICS, LEARNED = "physics alone", "physics + network"
 

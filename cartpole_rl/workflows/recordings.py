@@ -3,9 +3,9 @@
 from pathlib import Path
 
 from cartpole_rl.errors import RecordingError
+from cartpole_rl.run_files import RECORDINGS
 from cartpole_rl.workflows.run_folder import check_program
 
-RECORDINGS = "recordings"
 RECORDING = ("record", "identify", "finetune")  # commands whose runs hold recordings
 
 

@@ -15,12 +15,13 @@ from cartpole_rl.reporting.figures import save
 from cartpole_rl.reporting.figures.replays import replay_figure
 from cartpole_rl.reporting.replays import errors_at
 from cartpole_rl.reporting.words import count_text
+from cartpole_rl.run_files import FIGURES
 from cartpole_rl.workflows.config import ReplayConfig
 from cartpole_rl.workflows.poles import chosen_pole
 from cartpole_rl.workflows.recordings import recordings
 from cartpole_rl.workflows.run_folder import write_config, write_json
 
-REPLAY, FIGURE = "replay.json", "figures/replay.png"
+REPLAY, FIGURE = "replay.json", f"{FIGURES}/replay.png"
 
 
 def replay_recordings(config: ReplayConfig, folder: Path) -> None:

@@ -13,6 +13,7 @@ from cartpole_rl.learning.training import Training
 from cartpole_rl.plants.effects import without_effect
 from cartpole_rl.plants.settings import LearnedSettings
 from cartpole_rl.randomization.draws import Draws
+from cartpole_rl.run_files import CHECKPOINTS, FIGURES, METRICS
 from cartpole_rl.settings import evaluation_seed
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.agents import new_agent
@@ -53,7 +54,7 @@ def train(config: TrainConfig, folder: Path) -> None:
     policy = DrivingPolicy(agent.greedy_policy(), config.compile)
     evaluate = partial(judge, nominal_env(config), policy, config.seed)
     write_config(folder, "train", config.model_dump(mode="json"), resumed=checkpoint is not None)
-    with TrainingMonitor(folder, config, checkpoint.transitions if checkpoint else None) as monitor:
+    with TrainingMonitor(folder, config, checkpoint.step if checkpoint else None) as monitor:
         training = Training(
             config.learning,
             config.buffer,
@@ -75,7 +76,7 @@ def train(config: TrainConfig, folder: Path) -> None:
         )
         monitor.finished(metrics)
     forget_training(folder)
-    print(f"trained for {training.seconds:.0f} s; {folder}/metrics.json, figures/, checkpoints/ are written")
+    print(f"trained for {training.seconds:.0f} s; {folder}/{METRICS}, {FIGURES}/, {CHECKPOINTS}/ are written")
 
 
 def note_unused_randomization(config: TrainConfig, draws: Draws) -> None:

@@ -21,7 +21,7 @@ from cartpole_rl.envs.build import make_env
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.settings import ObservationSettings
 from cartpole_rl.errors import FaultError, LinkError
-from cartpole_rl.evaluation.driver import Drive, Driver
+from cartpole_rl.evaluation.driver import Driver, DriveRequest
 from cartpole_rl.evaluation.driving_policy import as_weights
 from cartpole_rl.plants.serial.errors import NotReadyError
 from cartpole_rl.plants.serial.faults import Confirm
@@ -90,7 +90,7 @@ def test_a_person_is_asked_and_a_hangup_stops_the_motor(
     peer: Faulty, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """First the person says no, then yes; the terminal is closed while the cart is driven."""
-    drive, asked = Drive(as_weights(network()), 0.0, 0), []
+    drive, asked = DriveRequest(as_weights(network()), 0.0, 0), []
 
     def disagree(text: str) -> bool:
         asked.append(text)

@@ -3,9 +3,11 @@
 from collections.abc import Callable
 from functools import partial
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
+from tensordict import TensorDict
 
 from cartpole_rl.errors import RecordingError
 from cartpole_rl.identification.checks import check_recordings
@@ -100,9 +102,14 @@ def test_nothing_is_asked_of_the_cart_after_the_last_experiment(make_plant: Call
         yield from hold(255, 3.0, task)
         return None
 
-    plant, resets = make_plant(1, cart={"track_half_length": 0.05}), []
-    reset = plant._reset
-    plant._reset = lambda *given, **named: resets.append(1) or reset(*given, **named)
+    resets = []
+
+    class CountedPlant(SimulatedPlant):
+        def _reset(self, *given: Any, **named: Any) -> TensorDict:
+            resets.append(1)
+            return super()._reset(*given, **named)
+
+    plant = make_plant(1, cart={"track_half_length": 0.05}, kind=CountedPlant)
     experiments = tuple(Experiment(name, "nothing", push) for name in ("first", "last"))
     endings = [episode.ended_by for _, episode in conduct(plant, PERIOD, experiments=experiments)]
     assert endings == ["track", "track"]

@@ -20,7 +20,7 @@ from cartpole_rl.learning.checkpoints import (
 )
 
 AGENT = AgentCheckpoint(config={"seed": 1}, weights={"w": torch.arange(3.0)}, transitions=10, score=2.5)
-TRAINING = TrainingCheckpoint(config={"seed": 1}, state={"counters": [1, 2]}, transitions=10)
+TRAINING = TrainingCheckpoint(config={"seed": 1}, state={"counters": [1, 2]}, step=10)
 LAST = Path("checkpoints/last.pt")
 
 
@@ -65,7 +65,7 @@ def test_weights_that_are_not_finite_are_neither_written_nor_read(value: float, 
         save_agent(tmp_path / LAST, diverged)
     assert (tmp_path / LAST).read_bytes() == whole
     with pytest.raises(CheckpointError, match=r"resume\.pt is not written: its weight w is not finite"):
-        save_training(tmp_path, TrainingCheckpoint({}, {"agent": diverged.weights}, transitions=20))
+        save_training(tmp_path, TrainingCheckpoint({}, {"agent": diverged.weights}, step=20))
     torch.save({"format": "cartpole_rl agent 1", **vars(diverged)}, tmp_path / LAST)
     assert "is refused: its weight w is not finite" in complaint(load_agent, tmp_path / LAST)
     torch.save(
@@ -73,7 +73,7 @@ def test_weights_that_are_not_finite_are_neither_written_nor_read(value: float, 
             "format": TRAINING_FORMAT,
             "config": {},
             "state": {"agent": diverged.weights},
-            "transitions": 20,
+            "step": 20,
         },
         tmp_path / "checkpoints/resume.pt",
     )

@@ -8,9 +8,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from cartpole_rl.physics.dynamics import State, advance, energy, mechanism
+from cartpole_rl.physics.dynamics import State, advance, mechanism
 from cartpole_rl.physics.models import Actuator, CartFriction, Integrator, Models, PoleFriction
-from cartpole_rl.physics.parameters import CartParameters
+from cartpole_rl.physics.parameters import GRAVITY, CartParameters
 
 MakeCart = Callable[..., CartParameters]
 FRICTIONLESS = Models(CartFriction.NONE, PoleFriction.NONE, Actuator.NEWTONS)
@@ -29,6 +29,19 @@ def coast(state: State, cart: CartParameters, models: Models, step: float, secon
     for _ in range(round(seconds / step)):
         states.append(advance(states[-1], no_force, cart, body, models, step))
     return states
+
+
+def energy(state: State, cart: CartParameters) -> Tensor:
+    """Return kinetic and potential energy, J, [N]; 0 for a cart at rest in the middle with the pole level."""
+    angle = state.theta - cart.track_tilt
+    kinetic = (
+        0.5 * cart.total_mass * state.x_dot**2
+        + cart.first_moment * state.x_dot * state.theta_dot * torch.cos(angle)
+        + 0.5 * cart.pivot_inertia * state.theta_dot**2
+    )
+    height = cart.first_moment * GRAVITY * torch.cos(state.theta)
+    slope = -cart.total_mass * GRAVITY * state.x * torch.sin(cart.track_tilt)
+    return kinetic + height + slope
 
 
 def energies(states: list[State], cart: CartParameters) -> Tensor:

@@ -49,7 +49,7 @@ def test_recorded_episodes_are_counted_by_stage(files: FinetuningFiles) -> None:
 def test_a_checkpoint_brings_its_settings_back(files: FinetuningFiles) -> None:
     files.save({}, 2)
     checkpoint = load_training(files.folder, FINETUNING_FORMAT)
-    assert checkpoint.transitions == 2
+    assert checkpoint.step == 2
     assert recorded_settings(FinetuneConfig, checkpoint.config, "resume=run") == files.config
 
 

@@ -12,10 +12,11 @@ from tempfile import TemporaryDirectory
 
 from cartpole_rl.choices import HERE, conf_folder
 from cartpole_rl.errors import ConfigError
+from cartpole_rl.run_files import CART, CONFIG, POLE, RANDOMIZATION
 from cartpole_rl.workflows.run_folder import PREFIX, USES, check_program, program_of, use_of
 
 WORD = re.compile(r"^([a-z_]+)=(.+)$")
-RUN_FILES = ("config.yaml", "cart.yaml", "pole.yaml", "randomization.yaml")  # of a run folder
+RUN_FILES = (CONFIG, CART, POLE, RANDOMIZATION)
 
 
 @contextmanager

@@ -20,7 +20,7 @@ from cartpole_rl.plants.serial.faults import Confirm, FaultClearing, nobody
 from cartpole_rl.plants.serial.information import check_scales
 from cartpole_rl.plants.serial.preparation import Preparation, StartPosition
 from cartpole_rl.plants.serial.settings import SerialSettings
-from cartpole_rl.plants.specs import Plant, one_cart
+from cartpole_rl.plants.specs import Plant, Report, one_cart
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.wire import Fault, Flags, State, seconds_between, ticks_between, went_back
 
@@ -109,7 +109,7 @@ class SerialPlant(Plant):
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDict:
         if tensordict is not None and "_reset" in tensordict and not tensordict["_reset"].any():
-            return self.frame(*self._report(self._preparation.control_period))
+            return self.frame(self._report(self._preparation.control_period))
         self._reach()
         self._preparation.prepare()
         self.cart.start()
@@ -118,11 +118,11 @@ class SerialPlant(Plant):
         self.ended_by = ""
         self.last_error = None
         self._driving = True
-        return self.frame(*self._report(self._preparation.control_period))
+        return self.frame(self._report(self._preparation.control_period))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         if not self._driving:
-            return self.step_frame(*self._report(self._preparation.control_period))
+            return self.step_frame(self._report(self._preparation.control_period))
         before = self._state
         try:
             self.cart.set_motor(int(tensordict["motor"]))
@@ -132,9 +132,9 @@ class SerialPlant(Plant):
             self._state = state
         except (LinkError, RefusedError, FaultError) as error:
             self._break_off(error)
-            return self.step_frame(*self._report(self._preparation.control_period))
+            return self.step_frame(self._report(self._preparation.control_period))
         self._end_if_due()
-        return self.step_frame(*self._report(seconds_between(before.time_us, self._state.time_us)))
+        return self.step_frame(self._report(seconds_between(before.time_us, self._state.time_us)))
 
     def _end_if_due(self) -> None:
         """Set `ended_by` and stop the motor if the new state ends the episode."""
@@ -162,8 +162,8 @@ class SerialPlant(Plant):
             self.halt()
         self._state = replace(self._state, motor_applied=0, command_age_ms=0)
 
-    def _report(self, dt: float) -> tuple[Tensor, ...]:
-        """Return the arguments of `frame` for the newest state; `dt` in s."""
+    def _report(self, dt: float) -> Report:
+        """Return the report of the newest state; `dt` in s."""
         state = self._state
         counts = (state.cart_counts, state.pole_counts - self._turns)
         halted = not self._driving and not self.ended_by

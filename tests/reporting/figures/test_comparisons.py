@@ -7,11 +7,11 @@ import pytest
 from figure_contents import words
 
 from cartpole_rl.errors import ConfigError
+from cartpole_rl.intervals import student_interval
 from cartpole_rl.reporting.figures import (
     comparison,
     png,
 )
-from cartpole_rl.reporting.figures.comparisons import student_interval
 
 RESULTS = {"simulated": [4000.0, 4100.0, 4200.0], "emulated": [3000.0, 3200.0]}
 
