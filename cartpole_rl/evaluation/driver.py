@@ -29,10 +29,9 @@ from cartpole_rl.plants.serial.faults import Confirm, nobody
 from cartpole_rl.plants.serial.plant import SerialPlant
 from cartpole_rl.plants.serial.statistics import LinkStatistics
 from cartpole_rl.scheduling import take_precedence
-from cartpole_rl.signals import RaiseOnce, end_with_parent, ending_signals
+from cartpole_rl.signals import UNWINDING, RaiseOnce, end_with_parent, ending_signals
 from cartpole_rl.tasks.episode import Episode
 
-GRACE = 5.0  # s from SIGTERM to SIGKILL
 MakeEnv = Callable[[Confirm], CartPoleEnv]  # over a cart whose faults are cleared if a person confirms
 
 
@@ -113,7 +112,7 @@ class Driver:
     def close(self) -> None:
         """Set the motor to 0, disarm, end the process."""
         self._process.terminate()
-        self._process.join(GRACE)
+        self._process.join(UNWINDING)
         if self._process.is_alive():
             self._process.kill()
             self._process.join()
