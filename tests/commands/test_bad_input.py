@@ -65,9 +65,8 @@ def test_training(words: str, named: str, remedy: str, tmp_path: Path) -> None:
 def test_a_choice_file_that_is_no_yaml(tmp_path: Path) -> None:
     (tmp_path / "mine.yaml").write_text("pole_mass: [0.1\n")
     done = in_process("train", "pole=mine.yaml", folder=tmp_path)
-    assert done.complaint == (
-        "cartpole-train: pole=mine.yaml is not valid YAML, line 2: expected ',' or ']', but got '<stream end>'"
-    )
+    problem = "expected ',' or ']', but got '<stream end>'"
+    assert done.complaint == f"cartpole-train: pole=mine.yaml is not valid YAML, line 2: {problem}"
     assert done.code == 2
 
 

@@ -124,16 +124,16 @@ def test_a_small_dead_band_does_not_make_the_way_back_rattle(small: int) -> None
         deadband(probe)
         assert max(probe.deadband.values()) == pytest.approx(small, abs=8)
         for side in (+1, -1):
-            probe.settle()
-            for _ in range(15):
-                probe.drive(side * (probe.deadband[side] + 60))
+            before = state = probe.settle()
+            while abs(state.cart_counts - before.cart_counts) < 440:  # 10 mm; it rolls on
+                state = probe.drive(side * (probe.deadband[side] + 60))
             probe.motors = []
             probe.centre()
             driven = [motor for motor in probe.motors if motor]
             assert len(driven) > 5
             assert sum(one * other < 0 for one, other in pairwise(driven)) <= 2
             assert len(probe.motors) < 150
-        assert probe.farthest * 22749e-9 < 0.06
+        assert probe.farthest * 22749e-9 < 0.07
 
 
 @pytest.mark.parametrize("signs", [{"motor": -1}, {"cart": -1}])
