@@ -158,9 +158,11 @@ class Stalling(CartPeer):
         cart._connection.link.send(Hello())
         assert stalled.wait(10)
         port = os.open(self.port, os.O_WRONLY | os.O_NONBLOCK | os.O_NOCTTY)
-        with suppress(BlockingIOError):
-            while True:
-                os.write(port, bytes(512))
+        for _ in range(20):  # the system moves bytes on for a moment
+            with suppress(BlockingIOError):
+                while True:
+                    os.write(port, bytes(1))
+            time.sleep(0.01)
         os.close(port)
 
 
@@ -185,7 +187,7 @@ def test_a_motor_value_that_the_port_takes_late_breaks_the_link_if_the_cart_tick
         writes.set()
         if not ticks:
             assert cart.set_motor(200) == 200
-            assert cart.get_state().motor_applied == 200
+            wait_for(lambda: peer.state.motor_applied == 200)
             return
         with pytest.raises(LinkError, match="took a motor value too slowly"):
             cart.set_motor(200)

@@ -7,8 +7,8 @@ which the cart watches for stalls.
 
 The model is that of the nominal cart. The motor value that its friction needs may be known better: the
 preflight measures the dead-band of each side, the re-centring between episodes uses the nominal one. A
-dead-band below the nominal one is split into offset and friction in the nominal proportion: an offset larger
-than the dead-band would drive the cart the wrong way. The
+dead-band below the nominal one is taken as friction with a smaller offset: an offset larger than the dead-band
+would drive the cart the wrong way. The
 moves in `identification.experiments` do not use this controller: they are fast on purpose, as part of what is
 recorded, and work on any plant.
 """
@@ -108,8 +108,11 @@ def rough_motor(force: float, deadband: Mapping[int, float] = NOMINAL_DEADBAND) 
 
 
 def motor_offset(deadband: Mapping[int, float], side: int) -> float:
-    """Return the motor value at which the force to a side starts, at most the nominal one."""
-    return min(MOTOR_OFFSET, MOTOR_OFFSET * deadband[side] / NOMINAL_DEADBAND[side])
+    """Return the motor value at which the force to a side starts, at most the nominal one.
+
+    It falls to 0 with the dead-band: a jump of the motor value where the force changes its sign rattles.
+    """
+    return max(0.0, min(MOTOR_OFFSET, MOTOR_OFFSET - 2 * (NOMINAL_DEADBAND[side] - deadband[side])))
 
 
 def interval(before: State, state: State) -> float:
