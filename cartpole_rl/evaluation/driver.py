@@ -32,6 +32,7 @@ from cartpole_rl.scheduling import take_precedence
 from cartpole_rl.signals import UNWINDING, RaiseOnce, end_with_parent, ending_signals
 from cartpole_rl.tasks.episode import Episode
 
+GRACE = UNWINDING + 4.0  # s from SIGTERM to SIGKILL: after the unwinding, PyTorch takes seconds to end
 MakeEnv = Callable[[Confirm], CartPoleEnv]  # over a cart whose faults are cleared if a person confirms
 
 
@@ -112,7 +113,7 @@ class Driver:
     def close(self) -> None:
         """Set the motor to 0, disarm, end the process."""
         self._process.terminate()
-        self._process.join(UNWINDING)
+        self._process.join(GRACE)
         if self._process.is_alive():
             self._process.kill()
             self._process.join()

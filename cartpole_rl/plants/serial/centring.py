@@ -7,8 +7,8 @@ which the cart watches for stalls.
 
 The model is that of the nominal cart. The motor value that its friction needs may be known better: the
 preflight measures the dead-band of each side, the re-centring between episodes uses the nominal one. A
-dead-band below the nominal one is taken as friction with a smaller offset: an offset larger than the dead-band
-would drive the cart the wrong way. The
+dead-band below the nominal one is taken as friction with a smaller offset: an offset larger than the
+dead-band would drive the cart the wrong way. The
 moves in `identification.experiments` do not use this controller: they are fast on purpose, as part of what is
 recorded, and work on any plant.
 """
