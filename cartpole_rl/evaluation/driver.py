@@ -29,10 +29,10 @@ from cartpole_rl.plants.serial.faults import Confirm, nobody
 from cartpole_rl.plants.serial.plant import SerialPlant
 from cartpole_rl.plants.serial.statistics import LinkStatistics
 from cartpole_rl.scheduling import take_precedence
-from cartpole_rl.signals import RaiseOnce, end_with_parent, ending_signals
+from cartpole_rl.signals import UNWINDING, RaiseOnce, end_with_parent, ending_signals
 from cartpole_rl.tasks.episode import Episode
 
-GRACE = 5.0  # s from SIGTERM to SIGKILL
+GRACE = UNWINDING + 4.0  # s from SIGTERM to SIGKILL: after the unwinding, PyTorch takes seconds to end
 MakeEnv = Callable[[Confirm], CartPoleEnv]  # over a cart whose faults are cleared if a person confirms
 
 

@@ -210,15 +210,8 @@ def host(data: bytes) -> None:
     steps = Steps(data)
     wire = Wire(steps)
     serial_cart.open_port = lambda *given: wire
-    settings = SerialSettings(
-        port="memory",
-        timeout=2e-4,
-        connect_timeout=2e-4,
-        answer_timeout=1e-4,
-        retries=1,
-        nudge_after=5e-5,
-        home_timeout=2e-4,
-    )
+    quick = {"timeout": 2e-4, "connect_timeout": 2e-4, "answer_timeout": 1e-4, "home_timeout": 2e-4}
+    settings = SerialSettings(port="memory").model_copy(update={**quick, "retries": 1, "nudge_after": 5e-5})
     driven = serial_cart.SerialCart(settings)
     for _ in range(MOST_STEPS):
         if not steps.left:

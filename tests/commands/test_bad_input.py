@@ -22,6 +22,10 @@ WRONG_TRAINING = [
     ("agent.loss=l1", "agent.loss=l1", "'l2' or 'smooth_l1'"),
     ("control_period=1", "control_period=1", "less than or equal to 0.1"),
     ("pole=tiny", "pole=tiny", "both, large, medium, range"),
+    ("pole=null", "pole=null", "leave pole=null out"),
+    ("task=null", "task=null", "leave task=null out"),
+    ("plant=null", "plant=null", "leave plant=null out"),
+    ("randomization=null", "randomization=null", "leave randomization=null out"),
     ("pole=medum", "pole=medum", "did you mean medium?"),
     ("pole=medium,large", "pole=medium,large", "-m runs each"),
     ("seed", "seed", "key=value"),
@@ -56,6 +60,14 @@ def test_training(words: str, named: str, remedy: str, tmp_path: Path) -> None:
     assert done.code == (1 if words.startswith("resume") else 2)
     assert done.out == ""
     assert not list(tmp_path.glob("runs/train/*"))
+
+
+def test_a_choice_file_that_is_no_yaml(tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_text("pole_mass: [0.1\n")
+    done = in_process("train", "pole=mine.yaml", folder=tmp_path)
+    problem = "expected ',' or ']', but got '<stream end>'"
+    assert done.complaint == f"cartpole-train: pole=mine.yaml is not valid YAML, line 2: {problem}"
+    assert done.code == 2
 
 
 WRONG_EVALUATION = [

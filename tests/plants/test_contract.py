@@ -128,7 +128,7 @@ class Policy:
 @given(script=scripts)
 def test_a_serial_cart_that_says_anything(script: Script, make_environment: Callable) -> None:
     with ScriptedCart(script) as peer:
-        plant = SerialPlant(SerialSettings(port=peer.port, **QUICK))
+        plant = SerialPlant(SerialSettings(port=peer.port).model_copy(update=QUICK))
         env = make_environment(plant, MOTORS, time_limit=PERIODS)
         policy, episode = Policy(script), None
         try:
@@ -153,7 +153,7 @@ def test_a_serial_cart_that_says_anything(script: Script, make_environment: Call
 def test_a_motor_value_beyond_the_limit_is_cut_to_it(motor: int) -> None:
     """Whatever a loop gives to the plant; SET_MOTOR could not even carry the largest."""
     with CartPeer() as peer:
-        plant = SerialPlant(SerialSettings(port=peer.port, **QUICK))
+        plant = SerialPlant(SerialSettings(port=peer.port).model_copy(update=QUICK))
         plant.reset()
         plant.step(TensorDict({"motor": torch.tensor([[motor]])}, [1]))
         sent = peer.messages(SetMotor)[-1].motor

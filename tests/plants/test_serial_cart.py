@@ -4,15 +4,20 @@ import os
 import signal
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
-from serial_peer import CartPeer, Peer, open_descriptors, quick_settings
+from serial_peer import CartPeer, Peer, open_descriptors, quick_settings, wait_for
 
 from cartpole_rl.errors import LinkError, PortError
-from cartpole_rl.plants.serial.cart import SerialCart
+from cartpole_rl.plants.serial.cart import LAST_STOP, LONGEST_STOP, SerialCart
 from cartpole_rl.plants.serial.port import why_not_open
+from cartpole_rl.plants.serial.settings import LONGEST_WRITE, SerialSettings
+from cartpole_rl.signals import UNWINDING
 from cartpole_rl.wire import Flags, Frame, Hello, SetMotor, Stop
 
 
@@ -135,6 +140,78 @@ with SerialCart(SerialSettings(port=sys.argv[1])) as cart:
         cart.set_motor(200)
         time.sleep(0.01)
 """
+
+
+class Stalling(CartPeer):
+    """Reads nothing from the port until `wait`, called in its own thread, returns."""
+
+    def stall(self, cart: SerialCart, wait: Callable[[], None]) -> None:
+        stalled, carry_on = threading.Event(), self.answer
+
+        def answer(frame: Frame) -> Iterable[bytes]:
+            self.answer = carry_on
+            stalled.set()
+            wait()
+            return carry_on(frame)
+
+        self.answer = answer
+        cart._connection.link.send(Hello())
+        assert stalled.wait(10)
+        port = os.open(self.port, os.O_WRONLY | os.O_NONBLOCK | os.O_NOCTTY)
+        for _ in range(20):  # the system moves bytes on for a moment
+            with suppress(BlockingIOError):
+                while True:
+                    os.write(port, bytes(1))
+            time.sleep(0.01)
+        os.close(port)
+
+
+@pytest.mark.parametrize("ticks", [0, 15])
+def test_a_motor_value_that_the_port_takes_late_breaks_the_link_if_the_cart_ticked_on(ticks: int) -> None:
+    """A lockstep emulator does not: it waits for the host, which may have been suspended in a write."""
+    patient = {"write_timeout": 10.0, "timeout": 10.0, "nudge_after": 10.0, "answer_timeout": 10.0}
+    with Stalling() as peer, SerialCart(quick_settings(peer.port, **patient)) as cart:
+        cart.start()
+        cart.get_state()
+        cart.set_motor(100)
+        cart.get_state()
+        writes = threading.Event()
+
+        def wait() -> None:
+            writes.wait(10)
+            time.sleep(0.3)  # 15 periods
+            for _ in range(ticks):
+                peer.tick()
+
+        peer.stall(cart, wait)
+        writes.set()
+        if not ticks:
+            assert cart.set_motor(200) == 200
+            wait_for(lambda: peer.state.motor_applied == 200)
+            return
+        with pytest.raises(LinkError, match="took a motor value too slowly"):
+            cart.set_motor(200)
+        wait_for(lambda: len(peer.messages(Stop)) == 2)
+        assert peer.messages(SetMotor)[-1].motor == 0
+
+
+def test_the_end_waits_a_few_seconds_at_most_whatever_the_settings(caplog: pytest.LogCaptureFixture) -> None:
+    with CartPeer() as peer:
+        cart = SerialCart(SerialSettings(port=peer.port, answer_timeout=60, retries=100))
+        cart.open()
+        peer.answer = lambda frame: ()
+        before = len(peer.messages(Stop))
+        started = time.monotonic()
+        with pytest.raises(LinkError, match="did not answer STOP, asked 2 times"):
+            cart.stop()
+        cart.close()
+        assert time.monotonic() - started < 30
+        assert "then switch it off" in caplog.text
+        assert len(peer.messages(Stop)) - before == 4
+
+
+def test_a_signal_leaves_enough_time_for_the_end() -> None:
+    assert LONGEST_STOP + LAST_STOP + LONGEST_WRITE < UNWINDING
 
 
 def test_ctrl_c_stops_the_motor_of_a_running_program() -> None:

@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
+from itertools import pairwise
 from typing import Any
 
 import pytest
@@ -24,7 +25,7 @@ from cartpole_rl.plants.serial.errors import NotReadyError
 from cartpole_rl.plants.serial.preflight import Finding, preflight
 from cartpole_rl.plants.serial.probe import Probe
 from cartpole_rl.plants.serial.settings import SerialSettings
-from cartpole_rl.wire import Flags, Home
+from cartpole_rl.wire import Flags, Home, State
 
 TRUTH: dict[str, Any] = {
     "deadband_right": 100.0,
@@ -91,6 +92,48 @@ def test_what_is_measured_is_the_truth(probe: Probe) -> None:
     assert "command age of 20 ms" in words
     assert "not reached" in soft_limit(probe)
     assert probe.farthest * 22749e-9 < 0.05
+
+
+class Recording(Probe):
+    """A probe that notes its motor values."""
+
+    def __init__(self, cart: SerialCart) -> None:
+        super().__init__(cart)
+        self.motors: list[int] = []
+
+    def drive(self, motor: int) -> State:
+        self.motors.append(motor)
+        return super().drive(motor)
+
+
+@pytest.mark.parametrize("small", [16, 25, 48])
+def test_a_small_dead_band_does_not_make_the_way_back_rattle(small: int) -> None:
+    breakaway = small * 0.02  # N
+    easy = {
+        "deadband_right": 0.0,
+        "cart_coulomb_left": breakaway / 1.2,
+        "cart_coulomb_right": breakaway / 1.2,
+    }
+    with (
+        EmulatedCart(fast(**TRUTH | easy | {"force_curve": (0.0, 0.02, 0.0)})) as emulated,
+        SerialCart(patient(emulated.port)) as cart,
+    ):
+        cart.home()
+        probe = Recording(cart)
+        probe.arm()
+        deadband(probe)
+        assert max(probe.deadband.values()) == pytest.approx(small, abs=8)
+        for side in (+1, -1):
+            before = state = probe.settle()
+            while abs(state.cart_counts - before.cart_counts) < 440:  # 10 mm; it rolls on
+                state = probe.drive(side * (probe.deadband[side] + 60))
+            probe.motors = []
+            probe.centre()
+            driven = [motor for motor in probe.motors if motor]
+            assert len(driven) > 5
+            assert sum(one * other < 0 for one, other in pairwise(driven)) <= 2
+            assert len(probe.motors) < 150
+        assert probe.farthest * 22749e-9 < 0.07
 
 
 @pytest.mark.parametrize("signs", [{"motor": -1}, {"cart": -1}])

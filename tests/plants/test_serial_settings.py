@@ -21,11 +21,11 @@ from cartpole_rl.workflows.build import evaluated_env, evaluated_settings
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
 
 TIMEOUTS = {
-    "timeout": 0.15,
+    "timeout": 0.35,
     "connect_timeout": 1.5,
     "answer_timeout": 0.25,
     "write_timeout": 0.07,
-    "nudge_after": 0.05,
+    "nudge_after": 0.2,
     "home_timeout": 0.11,
     "start_timeout": 0.12,
 }
@@ -78,7 +78,7 @@ def test_timeouts_reach_the_port_and_the_calls_that_wait(
         with pytest.raises(PlantError, match=r"waited 0\.12 s for the pole"):
             env.reset()
         peer.answer = lambda frame: ()
-        with pytest.raises(LinkError, match=r"no state came from .* for 0\.15 s"):
+        with pytest.raises(LinkError, match=r"no state came from .* for 0\.35 s"):
             env.plant.cart.get_state()
         with pytest.raises(LinkError, match="did not answer HELLO, asked 1 times"):
             env.plant.cart.info()
@@ -90,6 +90,12 @@ def test_timeouts_reach_the_port_and_the_calls_that_wait(
         ("plant.timeout=0", "plant.timeout=0: input should be greater than 0"),
         ("plant.home_timeout=-1", "plant.home_timeout=-1: input should be greater than 0"),
         ("plant.clear_faults=null", "plant.clear_faults=null: input should be a valid integer"),
+        ("plant.timeout=1e300", "plant.timeout=1e[+]?300: input should be less than or equal to 60"),
+        ("plant.home_timeout=601", "plant.home_timeout=601: input should be less than or equal to 600"),
+        ("plant.write_timeout=3", "plant.write_timeout=3: input should be less than or equal to 2"),
+        ("plant.nudge_after=0.1", "plant.nudge_after=0.1: input should be greater than or equal to 0.2"),
+        ("plant.retries=1000000000", "plant.retries=1000000000: input should be less than or equal to 100"),
+        ("plant.baud=10000000000", "plant.baud=10000000000: input should be less than or equal to 12000000"),
         ("plant.pole_length=33", "plant.pole_length=33: input should be less than or equal to 3"),
     ],
 )

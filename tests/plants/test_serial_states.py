@@ -216,7 +216,7 @@ def test_a_clock_that_may_have_wrapped_unseen_is_believed() -> None:
 
 def test_a_command_that_comes_too_late_is_0(host_clock: HostClock) -> None:
     """The cart's watchdog has stopped the motor long ago; newer states wait to be read."""
-    with CartPeer(paced=True) as peer, SerialCart(quick_settings(peer.port, timeout=2.0)) as cart:
+    with CartPeer(paced=True) as peer, SerialCart(quick_settings(peer.port, timeout=10.0)) as cart:
         peer.tick()
         cart.get_state()
         peer.tick()

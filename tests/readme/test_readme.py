@@ -204,7 +204,7 @@ def test_find_port_tells_what_there_is(tmp_path: Path) -> None:
 
 def test_preflight(tmp_path: Path, serial_port: Callable[[], str]) -> None:
     (command,) = listed("cartpole-preflight")
-    result = run_here(command.replace("/dev/ttyUSB0", serial_port()), cwd=tmp_path)
+    result = run_here(command.replace("/dev/ttyUSB0", serial_port()), "plant.write_timeout=2", cwd=tmp_path)
     assert result.returncode == 0, result.stdout + result.stderr
 
 

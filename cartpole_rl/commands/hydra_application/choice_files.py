@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from cartpole_rl.choices import HERE, conf_folder
+from cartpole_rl.choices import conf_folder, file_text
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.run_files import CART, CONFIG, POLE, RANDOMIZATION
 from cartpole_rl.workflows.run_folder import PREFIX, USES, check_program, program_of, use_of
@@ -21,7 +21,7 @@ RUN_FILES = (CONFIG, CART, POLE, RANDOMIZATION)
 
 @contextmanager
 def with_choice_files(words: Sequence[str]) -> Iterator[list[str]]:
-    """Yield the overrides with files replaced by choices. Raises ConfigError for a missing file."""
+    """Yield the overrides with files replaced by choices. Raises ConfigError for a wrong file or null."""
     with TemporaryDirectory(prefix="cartpole_rl-") as folder:
         replaced = [_with_choices(word, Path(folder)) for word in words]
         found = any(Path(folder).iterdir())
@@ -32,6 +32,8 @@ def _with_choices(word: str, folder: Path) -> str:
     match = WORD.match(word)
     if match is None or not (conf_folder() / match[1]).is_dir():
         return word
+    if match[2] == "null":
+        raise ConfigError(f"{word}: a group takes a choice; leave {word} out to take the default")
     for value in match[2].split(","):
         _check_run_folder(match[1], value)
     if not match[2].endswith((".yaml", ".yml")):
@@ -71,8 +73,5 @@ def _copied(value: str, group: Path) -> str:
     name = file.stem
     if (group / f"{name}.yaml").exists():
         name = f"{file.resolve().parent.name}_{name}"
-    here = str(file.resolve().parent)
-    (group / f"{name}.yaml").write_text(
-        file.read_text(encoding="utf-8").replace(HERE, here), encoding="utf-8"
-    )
+    (group / f"{name}.yaml").write_text(file_text(group.name, file), encoding="utf-8")
     return name

@@ -8,6 +8,7 @@ from cartpole_rl.plants.serial.moves import GENTLE_MOTOR, ArmedCart, metres
 from cartpole_rl.wire import Flags, State
 
 FARTHEST = 0.08  # m from the middle: no check needs more
+LEAST_SPEED = 0.03  # m/s of the way back to the middle; slower would take long and show nothing
 NEAR = 0.004  # m from the middle: no check needs to start closer
 RAMP_STEP = 1  # motor values a period
 SMALL_SWING = pole_counts(3.5)  # peak to peak; pushes the cart like three motor values
@@ -58,7 +59,7 @@ class Probe(ArmedCart):
         other_side = {-side: motor for side, motor in self.deadband.items()}
         known = NOMINAL_DEADBAND | other_side | self.deadband
         self.rest()
-        centre(self, known, NEAR)
+        centre(self, known, NEAR, LEAST_SPEED)
         self.rest()
 
     def check(self, state: State) -> State:
