@@ -242,7 +242,7 @@ def match_initial_states(
 ) -> InitialStates:
     """Return the initial states that lead nearest to `positions` [T + 1, 2, W], in counts.
 
-    `motors` [HISTORY + T, W] are motor values; each member of `residual` has initial states of its own. The
+    `motors` [H + T, W] are motor values; each member of `residual` has initial states of its own. The
     search is from `start` [4, M, W], or from the first guess. Components that the positions do not show, such
     as the speed of a cart that sticks at once, stay near that guess.
     """

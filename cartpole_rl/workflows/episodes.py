@@ -62,8 +62,3 @@ def with_progress(env: CartPoleEnv, policy: Policy, episodes: int) -> Iterator[E
             progress.set_postfix_str(f"score {episode.score.sum():.0f}", refresh=False)
             progress.update()
             yield episode
-
-
-def count_text(episodes: int) -> str:
-    """Return "1 episode" or "20 episodes"."""
-    return f"{episodes} episode{'s' if episodes > 1 else ''}"

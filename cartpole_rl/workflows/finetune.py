@@ -20,13 +20,14 @@ from cartpole_rl.evaluation.metrics import episode_metrics, summarize
 from cartpole_rl.learning.checkpoint_files import LAST
 from cartpole_rl.learning.checkpoints import AgentCheckpoint, forget_training, load_agent
 from cartpole_rl.learning.randomness import seed_everything
+from cartpole_rl.reporting.scores import score_table
 from cartpole_rl.reporting.tensorboard import TensorBoardLog
+from cartpole_rl.reporting.words import count_text
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.agents import new_agent, trained_agent
 from cartpole_rl.workflows.build import evaluated_env, evaluated_settings, use_threads
 from cartpole_rl.workflows.checks import check_finetuning
 from cartpole_rl.workflows.config import EvaluateConfig, FinetuneConfig, TrainConfig
-from cartpole_rl.workflows.evaluate import count_text, score_table
 from cartpole_rl.workflows.finetuning_cart import DrivenCart, yield_to
 from cartpole_rl.workflows.finetuning_files import FinetuningFiles, Stage, resumed_config
 from cartpole_rl.workflows.finetuning_learner import CartLearner

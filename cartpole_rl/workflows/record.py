@@ -11,9 +11,10 @@ from typing import Any
 
 from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
 from cartpole_rl.evaluation.recordings import LENGTH, write_recording
+from cartpole_rl.reporting.words import count_text
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.config import EvaluateConfig, RecordConfig
-from cartpole_rl.workflows.episodes import count_text, prepared
+from cartpole_rl.workflows.episodes import prepared
 from cartpole_rl.workflows.origins import stored_origin
 from cartpole_rl.workflows.recordings import RECORDINGS
 from cartpole_rl.workflows.run_folder import write_config

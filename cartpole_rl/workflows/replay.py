@@ -10,22 +10,23 @@ from pathlib import Path
 from cartpole_rl.choices import choice
 from cartpole_rl.errors import ConfigError, RecordingError
 from cartpole_rl.evaluation.recordings import LENGTH, read_recording
-from cartpole_rl.identification.replay import recorded_period, replay
+from cartpole_rl.identification.prediction import errors_at
+from cartpole_rl.identification.replay import all_errors, replay
+from cartpole_rl.identification.rollout import Dynamics
+from cartpole_rl.identification.windows import recorded_period
 from cartpole_rl.physics.bounds import check_names, check_values
 from cartpole_rl.physics.models import Models
 from cartpole_rl.randomization.checks import check_one_pole
 from cartpole_rl.randomization.poles import Pole
-from cartpole_rl.reporting.error_tables import replay_table
+from cartpole_rl.reporting.error_tables import REPORTED_TIMES, replay_table
 from cartpole_rl.reporting.figures import save
 from cartpole_rl.reporting.figures.replays import replay_figure
-from cartpole_rl.reporting.replays import errors_at
+from cartpole_rl.reporting.words import count_text
 from cartpole_rl.workflows.config import ReplayConfig
-from cartpole_rl.workflows.evaluate import count_text
 from cartpole_rl.workflows.recordings import recordings
 from cartpole_rl.workflows.run_folder import write_config, write_json
 
 REPLAY, FIGURE = "replay.json", "figures/replay.png"
-REPORTED_TIMES = (0.1, 0.5, 1.0)  # s after a reset
 POLES = ("medium", "large")
 SIMILAR = 0.1  # largest relative difference between a recorded pole's length and that of one of POLES
 
@@ -41,9 +42,10 @@ def replay_recordings(config: ReplayConfig, folder: Path) -> None:
     episodes = [read_recording(path) for path in paths]
     name, pole = replayed_pole(config, paths)
     parameters = simulated_parameters(config, pole)
-    period, plant = recorded_period(episodes[0]), config.plant
-    replays = replay(episodes, parameters, physics_models(config), period, plant.substeps, config.restart)
-    errors = errors_at(replays, REPORTED_TIMES, period)
+    period = recorded_period(episodes[0])
+    dynamics = Dynamics.of(parameters, physics_models(config), period, config.plant.substeps)
+    replays = replay(episodes, dynamics, config.restart)
+    errors = errors_at(all_errors(replays), REPORTED_TIMES, period)
     write_config(folder, "replay", {**config.model_dump(mode="json", by_alias=True), "seed": None})
     results = {"pole": name, "control_period_s": period, "parameters": parameters, "errors": errors}
     write_json(folder / REPLAY, {"recordings": [str(path) for path in paths], **results})
