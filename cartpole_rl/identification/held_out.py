@@ -39,7 +39,8 @@ def part(episode: Episode, first: int, last: int) -> Episode:
 def held_out_windows(episodes: Sequence[Episode], period: float, horizon: float) -> Windows:
     """Return windows of a lead and `horizon` s, overlapping by half.
 
-    The motor values before each window are those of its episode. Raises RecordingError if there is no window.
+    The motor values before each window are those of its episode. `Windows.episode` counts the episodes, then
+    the same without the first half window. Raises RecordingError if there is no window.
     """
     history, lead = history_periods(period), lead_periods(LEAD, period)
     ahead = lead + round(horizon / period)

@@ -30,9 +30,9 @@ def rollout(
 ) -> Tensor:
     """Return counts [T + 1, 2, N], not rounded, of carts `table` [P, N] from initial states `motion` [4, N].
 
-    `motors` [H + T, N] begin with the H values of `history_periods`: the actuator runs through them first,
-    since its force lags behind. `extra_latency`, s, is added to each latency: (3.8) moves a cart half a step
-    early, so that with half a step of it a latency means the same however long the step.
+    The first `history_periods` of `motors` [H + T, N] are older than the window: the actuator runs through
+    them, since its force lags behind. `extra_latency`, s, is added to each latency: (3.8) moves a cart half a
+    step early, so that with half a step of it a latency means the same however long the step.
     """
     cart = CartParameters.from_table(table)
     state, force = State(*motion.unbind(0)), torch.zeros_like(motion[0])

@@ -28,13 +28,7 @@ from cartpole_rl.reporting.identification import (
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.build import use_threads
 from cartpole_rl.workflows.config import EmulatedSettings, IdentifyConfig
-from cartpole_rl.workflows.identified_files import (
-    CART,
-    POLE,
-    RANDOMIZATION,
-    report,
-    write_choices,
-)
+from cartpole_rl.workflows.identified_files import CART, POLE, RANDOMIZATION, report, write_choices
 from cartpole_rl.workflows.person import confirm, print_message
 from cartpole_rl.workflows.recordings import RECORDINGS, experiments
 from cartpole_rl.workflows.run_folder import write_config, write_json
