@@ -125,16 +125,16 @@ class Linearization(NamedTuple):
 
     def normal_equations(self, point: Tensor, offset: Tensor) -> NormalEquations:
         """Return the quadratic that touches the cost, for initial states `offset` [4, W] off their guess."""
-        weights, doubt = self.weights.unsqueeze(-1), STATE_SPREAD**-2 / CORRELATED
+        weights, prior = self.weights.unsqueeze(-1), STATE_SPREAD**-2 / CORRELATED
         weighted_point, weighted_state = self.by_point * weights, self.by_state * weights
         residuals = self.residuals.unsqueeze(-1)
         return NormalEquations(
             point_points=weighted_point.mT @ self.by_point,
             point_state=weighted_point.mT @ self.by_state,
-            state_state=weighted_state.mT @ self.by_state + torch.diag(doubt),
+            state_state=weighted_state.mT @ self.by_state + torch.diag(prior),
             point_slopes=(weighted_point.mT @ residuals).squeeze(-1),
             prior_slope=point,
-            state_slope=(weighted_state.mT @ residuals).squeeze(-1) + offset.T * doubt,
+            state_slope=(weighted_state.mT @ residuals).squeeze(-1) + offset.T * prior,
         )
 
 
@@ -242,7 +242,7 @@ def match_initial_states(
 ) -> InitialStates:
     """Return the initial states that lead nearest to `positions` [T + 1, 2, W], in counts.
 
-    `motors` [HISTORY + T, W] are motor values; each member of `residual` has initial states of its own. The
+    `motors` [H + T, W] are motor values; each member of `residual` has initial states of its own. The
     search is from `start` [4, M, W], or from the first guess. Components that the positions do not show, such
     as the speed of a cart that sticks at once, stay near that guess.
     """

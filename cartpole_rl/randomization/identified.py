@@ -87,7 +87,7 @@ def identified_carts(
     try:
         with np.load(settings.posterior) as stored:
             posterior = dict(zip(stored["names"].tolist(), stored["carts"], strict=True))
-            identified = [str(name) for name in stored["told"]]
+            identified = [str(name) for name in stored["identified"]]
     except (OSError, ValueError, KeyError) as error:
         raise ConfigError(f"randomization.posterior={settings.posterior} cannot be read: {error}") from None
     rows = []

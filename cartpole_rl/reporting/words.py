@@ -1,4 +1,4 @@
-"""Texts that several figures and tables share."""
+"""Texts that several figures, tables and messages share."""
 
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
@@ -9,14 +9,16 @@ ENDINGS = {
     Ending.ANGLE: "the pole fell",
     Ending.FAULT: "the cart reported a fault",
     Ending.LINK: "the link was lost",
+    Ending.NON_FINITE: "a value was not finite",
 }
-
-
-def ending_text(episode: Episode) -> str:
-    """Return why and when an episode ended: "left the track after 6.6 s"."""
-    return f"{ENDINGS[Ending(episode.ended_by)]} after {episode.time[-1] - episode.time[0]:.1f} s"
+PHYSICS, LEARNED = "physics alone", "physics + network"  # models that are compared
 
 
 def count_text(episodes: int) -> str:
     """Return "1 episode" or "20 episodes"."""
     return f"{episodes} episode{'s' if episodes > 1 else ''}"
+
+
+def ending_text(episode: Episode) -> str:
+    """Return why and when an episode ended: "left the track after 6.6 s"."""
+    return f"{ENDINGS[Ending(episode.ended_by)]} after {episode.time[-1] - episode.time[0]:.1f} s"

@@ -12,7 +12,7 @@ from cartpole_rl.envs.build import environment, randomizer, simulated_env
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
 from cartpole_rl.evaluation.episodes import run_batch
-from cartpole_rl.identification.fit import Fit, fit_cart
+from cartpole_rl.identification.fit import Fit, best_fit
 from cartpole_rl.identification.unknowns import LONGEST_LATENCY
 from cartpole_rl.identification.windows import cut_windows
 from cartpole_rl.learning.finetuning import Finetuning, recorded_chunk
@@ -66,7 +66,7 @@ class CartLearner:
 
     def start(self, recorded: Sequence[Episode]) -> None:
         """Fit the simulator to the `recorded` episodes and prepare learning."""
-        fit, models = self.best_fit(recorded)
+        fit, models = self.fit_simulator(recorded)
         self.carts = self.draw_carts(fit)
         self.prepare(recorded, models)
         self.started.fill()
@@ -107,7 +107,7 @@ class CartLearner:
 
     def refit(self, recorded: Sequence[Episode]) -> None:
         """Fit the simulator to the `recorded` episodes, and continue with carts drawn from that fit."""
-        fit, _ = self.best_fit(recorded)
+        fit, _ = self.fit_simulator(recorded)
         self.carts = self.draw_carts(fit)
         self.started.simulate(self.randomizer())
 
@@ -137,18 +137,15 @@ class CartLearner:
             config.compile,
         )
 
-    def best_fit(self, recorded: Sequence[Episode]) -> tuple[Fit, Models]:
+    def fit_simulator(self, recorded: Sequence[Episode]) -> tuple[Fit, Models]:
         """Return the fit with the lowest cost among the candidate models, and its models."""
-        windows = cut_windows(recorded, self.settings.control_period)
+        period = self.settings.control_period
+        windows = cut_windows(recorded, period)
         nominal = self.training.nominal_with(self.training.pole.nominal)
-        fits = [
-            (fit_cart(windows, nominal, models, self.settings.control_period), models)
-            for models in self.candidates
-        ]
-        fit, models = min(fits, key=lambda each: each[0].cost)
+        fit, models = best_fit(windows, nominal, self.candidates, period)
         print_message(
             "finetune",
-            f"simulator fitted to {windows.number} windows of 0.5 s: RMS error "
+            f"simulator fitted to {windows.number} windows of {windows.periods * period:g} s: RMS error "
             f"{1e3 * CART_METRES_PER_COUNT * fit.rms[0]:.2f} mm and "
             f"{math.degrees(POLE_RADIANS_PER_COUNT) * fit.rms[1]:.2f} deg",
         )

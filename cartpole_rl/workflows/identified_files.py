@@ -7,7 +7,7 @@ import numpy as np
 import yaml
 
 from cartpole_rl.files import replacing, write_text
-from cartpole_rl.identification.identify import Identification, prediction_errors
+from cartpole_rl.identification.identify import Identification
 from cartpole_rl.identification.quantities import intervals
 from cartpole_rl.identification.unknowns import WEIGHED
 from cartpole_rl.physics.parameters import CartParameters
@@ -57,7 +57,7 @@ def write_choices(found: Identification, carts: np.ndarray, folder: Path) -> Non
             file,
             names=np.array(CartParameters.names()),
             carts=carts,
-            told=np.array(identified_names(found)),
+            identified=np.array(identified_names(found)),
             unknowns=np.array([unknown.name for unknown in found.fit.unknowns]),
             point=found.fit.point,
             covariance=found.fit.covariance,
@@ -102,10 +102,9 @@ def identified_names(found: Identification) -> list[str]:
     return [*names, *Pole.model_fields]
 
 
-def summary(found: Identification, carts: np.ndarray) -> dict[str, Any]:
+def report(found: Identification, carts: np.ndarray) -> dict[str, Any]:
     """Return the content of identification.json."""
     deviations = standard_deviations(carts)
-    x_error, theta_error = prediction_errors(found.held_out)
     return {
         "cart_friction": found.models.cart_friction,
         "parameters": found.fit.parameters,
@@ -114,11 +113,11 @@ def summary(found: Identification, carts: np.ndarray) -> dict[str, Any]:
             each.name: {"value": each.value, "low": each.low, "high": each.high, "unit": each.unit}
             for each in intervals(found.fit, carts)
         },
-        "tried": {
-            each.cart_friction: {"x_m": each.x_error, "theta_rad": each.theta_error}
+        "candidates": {
+            each.cart_friction: {"x_m": each.error.x, "theta_rad": each.error.theta}
             for each in found.candidates
         },
-        "held_out_1_s": {"x_m": x_error, "theta_rad": theta_error},
+        "held_out_1_s": {"x_m": found.error.x, "theta_rad": found.error.theta},
         "residual_counts": found.fit.rms.tolist(),
-        "doubts": found.warnings,
+        "warnings": found.warnings,
     }

@@ -7,13 +7,15 @@ diverge.
 from pathlib import Path
 
 from cartpole_rl.evaluation.recordings import read_recording
-from cartpole_rl.identification.replay import recorded_period, replay
+from cartpole_rl.identification.prediction import errors_at
+from cartpole_rl.identification.replay import all_errors, replay
+from cartpole_rl.identification.rollout import Dynamics
+from cartpole_rl.identification.windows import recorded_period
 from cartpole_rl.physics.bounds import check_names, check_values
 from cartpole_rl.randomization.poles import Pole
 from cartpole_rl.reporting.error_tables import REPORTED_TIMES, replay_table
 from cartpole_rl.reporting.figures import save
 from cartpole_rl.reporting.figures.replays import replay_figure
-from cartpole_rl.reporting.replays import errors_at
 from cartpole_rl.reporting.words import count_text
 from cartpole_rl.run_files import FIGURES
 from cartpole_rl.workflows.config import ReplayConfig
@@ -37,8 +39,9 @@ def replay_recordings(config: ReplayConfig, folder: Path) -> None:
     parameters = simulated_parameters(config, pole)
     period, plant = recorded_period(episodes[0]), config.plant
     models = config.models_with(config.actuator, plant)
-    replays = replay(episodes, parameters, models, period, plant.substeps, config.restart)
-    errors = errors_at(replays, REPORTED_TIMES, period)
+    dynamics = Dynamics.of(parameters, models, period, plant.substeps)
+    replays = replay(episodes, dynamics, config.restart)
+    errors = errors_at(all_errors(replays), REPORTED_TIMES, period)
     write_config(folder, "replay", {**config.model_dump(mode="json", by_alias=True), "seed": None})
     results = {"pole": name, "control_period_s": period, "parameters": parameters, "errors": errors}
     write_json(folder / REPLAY, {"recordings": [str(path) for path in paths], **results})

@@ -47,7 +47,7 @@ def test_the_cart_is_found(results: dict[str, Any]) -> None:
 def test_held_out_motion_is_predicted(results: dict[str, Any]) -> None:
     assert results["held_out_1_s"]["x_m"] < 5e-3
     assert results["held_out_1_s"]["theta_rad"] < np.radians(2)
-    assert set(results["tried"]) == {"linear", "sigmoid", "step", "stribeck"}
+    assert set(results["candidates"]) == {"linear", "sigmoid", "step", "stribeck"}
 
 
 def test_what_is_written_can_be_read(identified: Path) -> None:

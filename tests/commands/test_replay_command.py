@@ -32,8 +32,8 @@ def test_the_same_cart_is_followed(recorded: Path, tmp_path: Path) -> None:
     assert soon["rms_theta_deg"] < 0.3
     assert later["rms_x_mm"] < 2
     assert later["median_theta_deg"] < 3
-    assert soon["stretches"] == 20
-    assert last["stretches"] < 20  # the last stretch of an episode is cut by its end
+    assert soon["windows"] == 20
+    assert last["windows"] < 20  # the last stretch of an episode is cut by its end
     assert (results["pole"], results["control_period_s"], len(results["recordings"])) == ("medium", 0.02, 2)
     assert "errors of 2 episodes, pole=medium" in done.out
     assert (tmp_path / "run/figures/replay.png").stat().st_size > 10_000
@@ -51,7 +51,7 @@ def test_another_cart_is_not_followed(recorded: Path, tmp_path: Path) -> None:
 def test_a_longer_stretch_is_one_of_fewer(recorded: Path, tmp_path: Path) -> None:
     _, results = replay(recorded, tmp_path, "restart=0.5", "cart_friction=step", "plant.substeps=8")
     assert [each["after_s"] for each in results["errors"]] == [0.1, 0.5]
-    assert results["errors"][0]["stretches"] == 40
+    assert results["errors"][0]["windows"] == 40
 
 
 def test_the_recorded_pole_is_the_simulated_one(recorded: Path, tmp_path: Path) -> None:

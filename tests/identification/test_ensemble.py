@@ -10,8 +10,8 @@ import torch
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.identification.ensemble import Ensemble
-from cartpole_rl.identification.held_out import LEAD, errors_at, predict_held_out
 from cartpole_rl.identification.matching import match_initial_states
+from cartpole_rl.identification.prediction import errors_at, predict
 from cartpole_rl.identification.rollout import Dynamics
 from cartpole_rl.identification.settings import EnsembleSettings
 from cartpole_rl.identification.windows import Windows, cut_windows
@@ -34,6 +34,7 @@ START = StartSettings(
 TRACK = {"track_half_length": 2.0}
 RIPPLE = 0.6  # N
 PITCH = 0.08  # m
+LEAD = 10  # periods
 SETTINGS = EnsembleSettings(
     members=2,
     hidden=6,
@@ -95,7 +96,7 @@ def record(
         else:
             plant = SimulatedPlant(8, randomizer, START, STEP, seed=1)
         recorded = shaken(make_environment(plant, MOTORS, time_limit=300), seed=0)
-        held_out = cut_windows(recorded[6:], PERIOD, periods=LEAD + 50)
+        held_out = cut_windows(recorded[6:], PERIOD, LEAD * PERIOD + 1.0)._replace(lead=LEAD)
         return cut_windows(recorded[:6], PERIOD, most=40), held_out
 
     return build
@@ -104,7 +105,8 @@ def record(
 def judged(
     windows: Windows, dynamics: Dynamics, residual: Residual | None, moment: float = 0.5
 ) -> dict[str, float]:
-    (errors,) = errors_at(predict_held_out(windows, dynamics, residual), [moment], PERIOD)
+    error, spread = predict(windows, dynamics, residual)[1:]
+    (errors,) = errors_at(error, [moment], PERIOD, spread)
     return errors
 
 
@@ -150,8 +152,8 @@ def test_nothing_after_the_lead_affects_an_initial_state(
     _, windows = record(False)
     changed = windows.positions.copy()
     changed[LEAD + 1 :] += 1000
-    before = predict_held_out(windows, dynamics, None).error
-    after = predict_held_out(windows._replace(positions=changed), dynamics, None).error
+    before = predict(windows, dynamics).error
+    after = predict(windows._replace(positions=changed), dynamics).error
     assert np.array_equal(before[0], after[0])
 
 

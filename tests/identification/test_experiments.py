@@ -25,7 +25,7 @@ from cartpole_rl.identification.experiments import (
     guarded,
     hold,
 )
-from cartpole_rl.identification.identify import Identification, identify, prediction_errors
+from cartpole_rl.identification.identify import Identification, identify
 from cartpole_rl.identification.quantities import quantities
 from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_COUNTS_PER_TURN
 from cartpole_rl.physics.models import CartFriction, Models, PoleFriction
@@ -157,12 +157,11 @@ def test_the_cart_is_found(found: Identification, nominal: dict[str, float]) -> 
 
 
 def test_the_law_that_holds_predicts_best(found: Identification) -> None:
-    errors = {each.cart_friction: each.error for each in found.candidates}
+    errors = {each.cart_friction: each.error.size for each in found.candidates}
     assert found.models.cart_friction in (CartFriction.STEP, CartFriction.STRIBECK)
     assert errors[CartFriction.LINEAR] > 3 * errors[CartFriction.STEP]
-    x_error, theta_error = prediction_errors(found.held_out)
-    assert x_error < 1e-3
-    assert theta_error < np.radians(0.5)
+    assert found.error.x < 1e-3
+    assert found.error.theta < np.radians(0.5)
 
 
 def test_draws_cover_the_cart(found: Identification, nominal: dict[str, float]) -> None:

@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 from figure_contents import line_of, words
 
+from cartpole_rl.identification.quantities import Quantity
+from cartpole_rl.identification.replay import Replayed
 from cartpole_rl.reporting.curves import Curve
 from cartpole_rl.reporting.figures import png
 from cartpole_rl.reporting.figures.identified import (
@@ -16,8 +18,6 @@ from cartpole_rl.reporting.figures.identified import (
     interval_figure,
     spectrum_figure,
 )
-from cartpole_rl.reporting.identification import Estimate
-from cartpole_rl.reporting.replays import ReplayedEpisode
 
 
 def test_curves_are_drawn_with_their_band() -> None:
@@ -34,7 +34,10 @@ def test_curves_are_drawn_with_their_band() -> None:
 
 def test_priors_stand_in_half_widths_and_far_ones_become_arrows() -> None:
     figure = interval_figure(
-        [Estimate("near", "ms", 12.0, 11.0, 13.0, 15.0), Estimate("far", "N", 1.0, 0.9, 1.1, 9.0)]
+        [
+            Quantity("near", "a near prior", "ms", 12.0, 11.0, 13.0, 15.0),
+            Quantity("far", "a far prior", "N", 1.0, 0.9, 1.1, 9.0),
+        ]
     )
     (axes,) = figure.axes
     priors = {
@@ -47,7 +50,7 @@ def test_priors_stand_in_half_widths_and_far_ones_become_arrows() -> None:
     assert "12.0 ± 1.0 ms   (prior 15.0)" in words(figure)
 
 
-def test_experiments_are_drawn_with_their_simulation(replay: ReplayedEpisode) -> None:
+def test_experiments_are_drawn_with_their_simulation(replay: Replayed) -> None:
     figure = experiments_figure({"swing": replay, "coast": replay})
     position, angle = figure.axes[:2]
     simulated = [line for line in position.lines if line.get_color() == SIMULATED]

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from figure_contents import line_of
 
+from cartpole_rl.identification.prediction import Prediction
 from cartpole_rl.physics.residual import PLACES, SPACING, UNITS
 from cartpole_rl.reporting.figures import png
 from cartpole_rl.reporting.figures.learned_models import (
@@ -23,11 +24,12 @@ def test_forces_are_known_where_the_cart_was() -> None:
 
 
 def test_errors_are_in_the_units_of_the_axes() -> None:
-    time = 0.02 * np.arange(51)
-    physics, learned, spread = (np.full((51, 2, 7), each) for each in (0.02, 0.01, 0.005))
+    physics, learned = (
+        Prediction(*(np.full((51, 2, 7), each) for each in (0.1, error, 0.005))) for error in (0.02, 0.01)
+    )
     places, forces = forces_along_track(np.ones((3, PLACES)), np.linspace(-0.1, 0.1, 500))
     updates, losses = np.array([0.0, 20.0]), np.ones((2, 3))
-    figure = learned_model_figure(time, physics, learned, spread, places, forces, updates, losses)
+    figure = learned_model_figure(0.02, physics, learned, places, forces, updates, losses)
     cart, angle, track, learning = figure.axes
     assert line_of(cart, PHYSICS)[:, 1] == pytest.approx(20)
     assert line_of(angle, LEARNED)[:, 1] == pytest.approx(np.degrees(0.01))

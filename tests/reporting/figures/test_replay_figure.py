@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from matplotlib import colors
 
+from cartpole_rl.identification.replay import Replayed
 from cartpole_rl.reporting.figures import png
 from cartpole_rl.reporting.figures.replays import SIMULATED, replay_figure
-from cartpole_rl.reporting.replays import ReplayedEpisode
 
 
-def test_both_carts_and_the_error_are_drawn(replay: ReplayedEpisode) -> None:
+def test_both_carts_and_the_error_are_drawn(replay: Replayed) -> None:
     figure = replay_figure([replay], 0.02, (0.1, 0.5, 1.0, 7.0), "Title")
     assert len(png(figure, dpi=60)) > 10_000
     angle, position, left, right = figure.axes
