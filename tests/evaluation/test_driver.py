@@ -2,16 +2,15 @@
 
 import os
 import signal
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import pytest
 import torch
+from serial_peer import CartPeer
 from torch import nn
 
 from cartpole_rl.agents.dqn import QAgent
@@ -28,9 +27,6 @@ from cartpole_rl.plants.serial.plant import SerialPlant
 from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.tasks.actions import ActionSettings
 from cartpole_rl.wire import ClearFault, Fault, Message, SetMotor, Stop
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "plants"))
-from serial_peer import CartPeer
 
 LONG = 100_000  # periods
 

@@ -14,8 +14,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "commands"))
 from command_line import in_process
 
 ROOT = Path(__file__).parents[2]

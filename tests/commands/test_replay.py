@@ -86,7 +86,8 @@ def test_a_pole_of_another_length_has_to_be_given(recorded: Path, tmp_path: Path
     [
         (
             "from=nowhere",
-            "from=nowhere: there is no such file or folder; give a run of cartpole-record or cartpole-identify",
+            "from=nowhere: there is no such file or folder; "
+            "give a run of cartpole-record or cartpole-identify",
             1,
         ),
         ("from=.", "from=.: it holds no recording; give a run of cartpole-record or cartpole-identify", 1),

@@ -13,8 +13,8 @@ import serial
 
 pytest.importorskip("mujoco", reason='pip install "cartpole_rl[emulator]"')
 
+from driven_cart import Driven, check_homed
 from emulator_host import SILENCE, EmulatorHost, emulator
-from test_emulator_device import Driven, check_homed
 
 from cartpole_rl.emulator.firmware import BANNER
 from cartpole_rl.emulator.settings import EmulatorSettings
