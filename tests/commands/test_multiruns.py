@@ -51,7 +51,14 @@ def folder_in_another_process(multirun: DictConfig, word: str, cwd: str) -> str:
 
 def test_two_multiruns_of_the_same_second(tmp_path: Path, same_second: None) -> None:
     for start in ("hanging", "upright"):
-        words = ("run=lqr", "episodes=1", "seed=0,1", "task=swingup", f"task.evaluation_start.angle={start}")
+        words = (
+            "run=lqr",
+            "episodes=1",
+            "seed=0,1",
+            "task=swingup",
+            "task.time_limit=10",
+            f"task.evaluation_start.angle={start}",
+        )
         done = in_process("record", "-m", *words, folder=tmp_path)
         assert done.code == 0, done.err
     jobs = {

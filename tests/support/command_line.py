@@ -73,14 +73,20 @@ def in_process(command: str, *words: str, folder: Path) -> Outcome:
 
 
 def interrupt_after(file: Path) -> None:
-    """Send SIGINT to this process as soon as `file` exists."""
+    """Send SIGINT to this process as soon as `file` is written, for the first time or again."""
+    before = modified(file)
 
     def interrupt() -> None:
-        while not file.exists():
+        while modified(file) == before:
             time.sleep(0.01)
         os.kill(os.getpid(), signal.SIGINT)
 
     threading.Thread(target=interrupt, daemon=True).start()
+
+
+def modified(file: Path) -> int | None:
+    """Return when a file was written, ns; None if there is none."""
+    return file.stat().st_mtime_ns if file.exists() else None
 
 
 def console_script(command: str, *words: str, folder: Path) -> "subprocess.Popen[str]":

@@ -19,6 +19,7 @@ CARTS = 64
 SAME_STARTS = {
     "task.evaluation_start": choice("task/swingup")["start"],
     "learning.evaluation_episodes": CARTS,
+    "compile": False,
 }
 
 
