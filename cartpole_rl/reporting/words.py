@@ -9,6 +9,7 @@ ENDINGS = {
     Ending.ANGLE: "the pole fell",
     Ending.FAULT: "the cart reported a fault",
     Ending.LINK: "the link was lost",
+    Ending.NON_FINITE: "a value was not finite",
 }
 
 

@@ -30,7 +30,20 @@ TINY = (
     "task.time_limit=60",
     "compile=false",
 )
-HANDLED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # by a command; a test wants its own back
+COARSE = "emulator.physics_step=1e-3"  # s; the default is half of it
+FINETUNING = (
+    "plant=emulated",
+    COARSE,
+    "episodes=2",
+    "evaluation_episodes=1",
+    "finetuning.iterations=2",
+    "finetuning.refit=1",
+    "compile=false",
+)
+TRUTH = ("emulator.cart_viscous=1.1", "emulator.latency=0.012", "emulator.angle_offset=-0.01")
+QUICK = ("windows=80", "substeps=4", "carts=200")
+IDENTIFICATION = (*TRUTH, *QUICK)
+HANDLED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # by a command; a test restores its own
 ONCE = "learning.evaluations=1"  # most of a tiny training's time goes into pictures of its evaluations
 
 
