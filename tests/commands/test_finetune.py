@@ -110,7 +110,13 @@ def contents(run: Path) -> dict[str, bytes]:
 
 def test_a_run_continues_after_each_kind_of_interruption(trained: Path, tmp_path: Path) -> None:
     """One run: killed, then interrupted, then terminated, each time after one more episode to learn from."""
-    words = (f"run={trained}", *FINETUNING, "episodes=4", f"hydra.run.dir={tmp_path}/run")
+    words = (
+        f"run={trained}",
+        *FINETUNING,
+        "finetuning.refit=2",
+        "episodes=4",
+        f"hydra.run.dir={tmp_path}/run",
+    )
     process = console_script("finetune", *words, folder=tmp_path)
     while not (tmp_path / "run/recordings/tune_000.csv").exists():
         assert process.poll() is None, process.communicate()

@@ -113,7 +113,7 @@ def console_script(command: str, *words: str, folder: Path) -> "subprocess.Popen
     )
 
 
-def outcome(process: "subprocess.Popen[str]", timeout: float = 120) -> Outcome:
+def outcome(process: "subprocess.Popen[str]", timeout: float = 1000) -> Outcome:
     """Wait for a started command, and return its outcome."""
     try:
         out, err = process.communicate(timeout=timeout)
