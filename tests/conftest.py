@@ -9,7 +9,7 @@ restores it in children.
 """
 
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -17,6 +17,7 @@ from typing import Any
 import pytest
 import torch
 import yaml
+from hydra_configs import shipped_choices
 
 from cartpole_rl.envs.build import make_env
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
@@ -45,6 +46,13 @@ for name in ("SIGINT", "SIGHUP", "SIGQUIT", "SIGTERM"):  # Windows has the first
 def conf(choice: str) -> dict[str, Any]:
     """A file of conf/, as it stands there."""
     return yaml.safe_load((CONF / f"{choice}.yaml").read_text())
+
+
+@pytest.fixture(scope="module")
+def hydra_reads_conf() -> Iterator[None]:
+    """Let the tests of a module call `hydra.compose`."""
+    with shipped_choices():
+        yield
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -1,15 +1,12 @@
 """cartpole-preflight as a user runs it: on the emulated cart, and on a port whose cart is wired wrongly."""
 
-import sys
 from pathlib import Path
 
 from command_line import in_process
+from serial_peer import Between
 
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.plants.emulated_cart import EmulatedCart
-
-sys.path.append(str(Path(__file__).parents[1] / "plants"))
-from serial_peer import Between
 
 
 def test_the_emulated_cart_is_ready(tmp_path: Path) -> None:

@@ -7,7 +7,6 @@ from typing import Any
 import hydra
 import pytest
 import yaml
-from hydra.core.global_hydra import GlobalHydra
 
 from cartpole_rl.checking import checked
 from cartpole_rl.choices import conf_folder, default_choices
@@ -16,6 +15,8 @@ from cartpole_rl.envs.build import randomizer
 from cartpole_rl.tasks.rewards import Reward
 from cartpole_rl.workflows.build import evaluated_settings
 from cartpole_rl.workflows.config import EmulateConfig, EvaluateConfig, FinetuneConfig, TrainConfig
+
+pytestmark = pytest.mark.usefixtures("hydra_reads_conf")
 
 CONF = conf_folder()
 GROUPS = sorted(path.name for path in CONF.iterdir() if path.is_dir() and path.name != "hydra")
@@ -29,20 +30,13 @@ def group_of(choice: str) -> str:
     return choice.split("=")[0]
 
 
-@pytest.fixture(autouse=True, scope="module")
-def composer() -> Iterator[None]:
-    GlobalHydra.instance().clear()
-    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
-        yield
-
-
 @cache
 def composed(name: str, *overrides: str) -> dict[str, Any]:
     return as_mapping(hydra.compose(name, list(overrides)))
 
 
 @pytest.fixture(scope="module")
-def trained() -> TrainConfig:
+def trained(hydra_reads_conf: None) -> TrainConfig:
     return checked(TrainConfig, composed("train"))
 
 

@@ -8,14 +8,11 @@ from collections.abc import Iterator, Mapping
 from functools import cache
 from typing import Any
 
-import hydra
 import pytest
-from hydra.core.global_hydra import GlobalHydra
 
-from cartpole_rl.checking import checked
 from cartpole_rl.choices import conf_folder
-from cartpole_rl.commands.hydra_application.composition import as_mapping
 from cartpole_rl.workflows.config import TrainConfig
+from cartpole_rl.workflows.settings import load_settings
 
 SILENT = "silent"
 UNREAD = "not read with these settings"
@@ -159,17 +156,10 @@ EXPECTED = {
 }
 
 
-@pytest.fixture(autouse=True, scope="module")
-def composer() -> Iterator[None]:
-    GlobalHydra.instance().clear()
-    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(conf_folder())):
-        yield
-
-
 @cache
 def settings(experiment: str) -> dict[str, Any]:
     """Each setting of an experiment by its whole name."""
-    config = checked(TrainConfig, as_mapping(hydra.compose("train", [f"experiment={experiment}"])))
+    config = load_settings(TrainConfig, {"experiment": experiment})
     return dict(leaves(config.model_dump(mode="json", exclude=OF_THE_RUN)))
 
 

@@ -2,16 +2,15 @@
 
 import os
 import signal
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import pytest
 import torch
+from serial_peer import CartPeer
 from torch import nn
 
 from cartpole_rl.agents.dqn import QAgent
@@ -29,9 +28,6 @@ from cartpole_rl.plants.serial.plant import SerialPlant
 from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.tasks.settings import ActionSettings, RewardSettings, TaskSettings
 from cartpole_rl.wire import ClearFault, Fault, Message, SetMotor, Stop
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "plants"))
-from serial_peer import CartPeer
 
 LONG = 100_000  # periods
 

@@ -1,13 +1,11 @@
 """Settings that Python composes from conf/ are those that the commands compose with Hydra."""
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import hydra
 import pytest
 import yaml
-from hydra.core.global_hydra import GlobalHydra
 
 from cartpole_rl.checking import checked
 from cartpole_rl.choices import conf_folder
@@ -17,6 +15,8 @@ from cartpole_rl.settings import Settings
 from cartpole_rl.workflows.config import EvaluateConfig, PreflightConfig, TrainConfig
 from cartpole_rl.workflows.settings import COMMANDS, load_settings
 
+pytestmark = pytest.mark.usefixtures("hydra_reads_conf")
+
 REQUIRED = {
     "evaluate": {"run": "lqr"},
     "record": {"run": "lqr"},
@@ -24,13 +24,6 @@ REQUIRED = {
     "model": {"from": "."},
 }
 EXPERIMENTS = sorted(path.stem for path in (conf_folder() / "experiment").glob("*.yaml"))
-
-
-@pytest.fixture(autouse=True, scope="module")
-def composer() -> Iterator[None]:
-    GlobalHydra.instance().clear()
-    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(conf_folder())):
-        yield
 
 
 def of_hydra(schema: type[Settings], overrides: dict[str, Any]) -> Settings:

@@ -13,8 +13,8 @@ import serial
 
 pytest.importorskip("mujoco", reason='pip install "cartpole_rl[emulator]"')
 
+from driven_cart import Driven, check_homed
 from emulator_host import SILENCE, EmulatorHost, emulator
-from test_emulator_device import Driven, check_homed
 
 from cartpole_rl.emulator.firmware import BANNER
 from cartpole_rl.emulator.settings import EmulatorSettings
@@ -199,12 +199,12 @@ def test_homing_fails_with_a_frozen_encoder(encoder, fault):
     "settings", [{}, {"pole_mass": 0.233, "pole_com": 0.328, "pole_inertia": 8e-3}, {"start": "upright"}]
 )
 def test_random_driving_through_swing_ups_raises_no_false_alarm(settings):
-    """Drive 4000 periods with random values and durations; put the cart back after it reaches an end."""
+    """Drive 1500 periods with random values and durations; put the cart back after it reaches an end."""
     dice, driven = random.Random(5), Driven(**settings)
     driven.home()
     driven.ask(Start())
     lasts, fastest, faults = 0, 0.0, set()
-    for _ in range(4000):
+    for _ in range(1500):
         if lasts == 0:
             lasts, motor = (
                 dice.randint(1, 25),

@@ -30,7 +30,20 @@ TINY = (
     "task.time_limit=60",
     "compile=false",
 )
-HANDLED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # by a command; a test wants its own back
+COARSE = "emulator.physics_step=1e-3"  # s; the default is half of it
+FINETUNING = (
+    "plant=emulated",
+    COARSE,
+    "episodes=2",
+    "evaluation_episodes=1",
+    "finetuning.iterations=2",
+    "finetuning.refit=1",
+    "compile=false",
+)
+TRUTH = ("emulator.cart_viscous=1.1", "emulator.latency=0.012", "emulator.angle_offset=-0.01")
+QUICK = ("windows=80", "substeps=4", "carts=200")
+IDENTIFICATION = (*TRUTH, *QUICK)
+HANDLED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # by a command; a test restores its own
 ONCE = "learning.evaluations=1"  # most of a tiny training's time goes into pictures of its evaluations
 
 
@@ -73,14 +86,20 @@ def in_process(command: str, *words: str, folder: Path) -> Outcome:
 
 
 def interrupt_after(file: Path) -> None:
-    """Send SIGINT to this process as soon as `file` exists."""
+    """Send SIGINT to this process as soon as `file` is written, for the first time or again."""
+    before = modified(file)
 
     def interrupt() -> None:
-        while not file.exists():
+        while modified(file) == before:
             time.sleep(0.01)
         os.kill(os.getpid(), signal.SIGINT)
 
     threading.Thread(target=interrupt, daemon=True).start()
+
+
+def modified(file: Path) -> int | None:
+    """Return when a file was written, ns; None if there is none."""
+    return file.stat().st_mtime_ns if file.exists() else None
 
 
 def console_script(command: str, *words: str, folder: Path) -> "subprocess.Popen[str]":
@@ -94,7 +113,7 @@ def console_script(command: str, *words: str, folder: Path) -> "subprocess.Popen
     )
 
 
-def outcome(process: "subprocess.Popen[str]", timeout: float = 120) -> Outcome:
+def outcome(process: "subprocess.Popen[str]", timeout: float = 1000) -> Outcome:
     """Wait for a started command, and return its outcome."""
     try:
         out, err = process.communicate(timeout=timeout)

@@ -1,24 +1,20 @@
-"""Settings of plant=serial on a command line reach the port and the calls that wait."""
+"""Settings of plant=serial reach the port and the calls that wait."""
 
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
 
-import hydra
 import pytest
 import serial
-from hydra.core.global_hydra import GlobalHydra
 from serial_peer import CartPeer
 
-from cartpole_rl.checking import checked
-from cartpole_rl.choices import conf_folder
-from cartpole_rl.commands.hydra_application.composition import as_mapping
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.errors import ConfigError, LinkError, PlantError
 from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.wire import Flags
 from cartpole_rl.workflows.build import evaluated_env, evaluated_settings
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
+from cartpole_rl.workflows.settings import load_settings
 
 TIMEOUTS = {
     "timeout": 0.35,
@@ -37,25 +33,18 @@ def peer() -> Iterator[CartPeer]:
         yield peer
 
 
-@pytest.fixture(autouse=True)
-def composer() -> Iterator[None]:
-    GlobalHydra.instance().clear()
-    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(conf_folder())):
-        yield
-
-
-def evaluation(*words: str) -> EvaluateConfig:
-    words = ("run=lqr", "plant=serial", *words)
-    return checked(EvaluateConfig, as_mapping(hydra.compose("evaluate", list(words))))
+def evaluation(**plant: object) -> EvaluateConfig:
+    overrides = {f"plant.{name}": value for name, value in plant.items()}
+    return load_settings(EvaluateConfig, {"run": "lqr", "plant": "serial", **overrides})
 
 
 def environment(config: EvaluateConfig) -> CartPoleEnv:
-    training = checked(TrainConfig, as_mapping(hydra.compose("train")))
+    training = load_settings(TrainConfig)
     return evaluated_env(evaluated_settings(training, config), config, prompt=lambda text: None)
 
 
 def test_defaults_are_those_of_the_class() -> None:
-    assert evaluation("plant.port=COM3").plant == SerialSettings(port="COM3")
+    assert evaluation(port="COM3").plant == SerialSettings(port="COM3")
 
 
 def test_timeouts_reach_the_port_and_the_calls_that_wait(
@@ -65,8 +54,7 @@ def test_timeouts_reach_the_port_and_the_calls_that_wait(
     monkeypatch.setattr(
         serial, "serial_for_url", lambda url, **kwargs: opened.append(kwargs) or real(url, **kwargs)
     )
-    words = (f"plant.{name}={seconds}" for name, seconds in TIMEOUTS.items())
-    config = evaluation(f"plant.port={peer.port}", "plant.baud=115200", "plant.retries=0", *words)
+    config = evaluation(port=peer.port, baud=115200, retries=0, **TIMEOUTS)
     with closing(environment(config)) as env:
         assert (opened[0]["baudrate"], opened[0]["write_timeout"]) == (115200, 0.07)
         peer.flags = Flags.HOMING
@@ -85,20 +73,20 @@ def test_timeouts_reach_the_port_and_the_calls_that_wait(
 
 
 @pytest.mark.parametrize(
-    ("word", "complaint"),
+    ("name", "value", "complaint"),
     [
-        ("plant.timeout=0", "plant.timeout=0: input should be greater than 0"),
-        ("plant.home_timeout=-1", "plant.home_timeout=-1: input should be greater than 0"),
-        ("plant.clear_faults=null", "plant.clear_faults=null: input should be a valid integer"),
-        ("plant.timeout=1e300", "plant.timeout=1e[+]?300: input should be less than or equal to 60"),
-        ("plant.home_timeout=601", "plant.home_timeout=601: input should be less than or equal to 600"),
-        ("plant.write_timeout=3", "plant.write_timeout=3: input should be less than or equal to 2"),
-        ("plant.nudge_after=0.1", "plant.nudge_after=0.1: input should be greater than or equal to 0.2"),
-        ("plant.retries=1000000000", "plant.retries=1000000000: input should be less than or equal to 100"),
-        ("plant.baud=10000000000", "plant.baud=10000000000: input should be less than or equal to 12000000"),
-        ("plant.pole_length=33", "plant.pole_length=33: input should be less than or equal to 3"),
+        ("timeout", 0, "plant.timeout=0: input should be greater than 0"),
+        ("home_timeout", -1, "plant.home_timeout=-1: input should be greater than 0"),
+        ("clear_faults", None, "plant.clear_faults=null: input should be a valid integer"),
+        ("timeout", 1e300, "plant.timeout=1e[+]?300: input should be less than or equal to 60"),
+        ("home_timeout", 601, "plant.home_timeout=601: input should be less than or equal to 600"),
+        ("write_timeout", 3, "plant.write_timeout=3: input should be less than or equal to 2"),
+        ("nudge_after", 0.1, "plant.nudge_after=0.1: input should be greater than or equal to 0.2"),
+        ("retries", 10**9, "plant.retries=1000000000: input should be less than or equal to 100"),
+        ("baud", 10**10, "plant.baud=10000000000: input should be less than or equal to 12000000"),
+        ("pole_length", 33, "plant.pole_length=33: input should be less than or equal to 3"),
     ],
 )
-def test_values_out_of_range_are_refused(word: str, complaint: str) -> None:
+def test_values_out_of_range_are_refused(name: str, value: float | None, complaint: str) -> None:
     with pytest.raises(ConfigError, match=complaint):
-        evaluation("plant.port=COM3", word)
+        evaluation(port="COM3", **{name: value})

@@ -49,14 +49,12 @@ def train(folder: Path, *overrides: str) -> dict:
     return json.loads((folder / "metrics.json").read_text())
 
 
-@pytest.mark.timeout(300)
 def test_the_balance_is_learned(tmp_path: Path) -> None:
     metrics = train(tmp_path, "experiment=balance", *SHORT)
     assert metrics["score_upright"]["mean"] > 450  # of 500; an untrained agent falls within 30 steps
     assert {episode["ended_by"] for episode in metrics["episodes"]} == {"time"}
 
 
-@pytest.mark.timeout(300)
 def test_the_swing_up_is_learned_and_ends_in_balance(tmp_path: Path) -> None:
     metrics = train(tmp_path, "experiment=medium", *SWING_UP)
     assert metrics["upright_fraction"]["mean"] > BALANCED

@@ -1,40 +1,31 @@
 """No evaluation drives the carts, or begins at the starts, with which a training of a nearby seed began."""
 
-from collections.abc import Iterator
 from contextlib import closing
-from pathlib import Path
 
-import hydra
 import pytest
 import torch
-from hydra.core.global_hydra import GlobalHydra
 from tensordict import TensorDictBase
 
-from cartpole_rl.checking import checked
-from cartpole_rl.choices import conf_folder
-from cartpole_rl.commands.hydra_application.composition import as_mapping
+from cartpole_rl.choices import choice
 from cartpole_rl.envs.build import simulated_env
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.settings import NUM_SEEDS, evaluation_seed
 from cartpole_rl.workflows.build import evaluated_env, evaluated_settings
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
+from cartpole_rl.workflows.settings import load_settings
 from cartpole_rl.workflows.train import judge, nominal_env
 
 CARTS = 64
-SAME_STARTS = ("task.evaluation_start=${task.start}", f"learning.evaluation_episodes={CARTS}")
+SAME_STARTS = {
+    "task.evaluation_start": choice("task/swingup")["start"],
+    "learning.evaluation_episodes": CARTS,
+    "compile": False,
+}
 
 
-@pytest.fixture(scope="module", autouse=True)
-def shipped_choices() -> Iterator[None]:
-    GlobalHydra.instance().clear()
-    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(conf_folder())):
-        yield
-
-
-def training(seed: int, *words: str) -> TrainConfig:
-    """A training whose evaluations start as its episodes do, so that equal seeds would show."""
-    composed = hydra.compose("train", [f"learning.carts={CARTS}", f"seed={seed}", *SAME_STARTS, *words])
-    return checked(TrainConfig, as_mapping(composed))
+def training(seed: int, **overrides: object) -> TrainConfig:
+    """A training whose evaluations start as its episodes do: equal seeds would give equal starts."""
+    return load_settings(TrainConfig, {**SAME_STARTS, "learning.carts": CARTS, "seed": seed, **overrides})
 
 
 def begun(env: CartPoleEnv) -> set[tuple[float, ...]]:
@@ -56,8 +47,8 @@ def trained_on(seeds: range) -> set[tuple[float, ...]]:
 
 @pytest.mark.parametrize("seed", [0, 7])
 def test_drawn_carts_are_not_those_of_a_training(seed: int) -> None:
-    composed = as_mapping(hydra.compose("evaluate", ["run=any", "randomization=wide", f"episodes={CARTS}"]))
-    config = checked(EvaluateConfig, {**composed, "run": Path("any"), "seed": seed})
+    overrides = {"run": "any", "randomization": "wide", "episodes": CARTS, "seed": seed}
+    config = load_settings(EvaluateConfig, overrides)
     with closing(evaluated_env(evaluated_settings(training(0), config), config, print)) as env:
         drawn = begun(env)
     assert len(drawn) == CARTS
@@ -65,9 +56,9 @@ def test_drawn_carts_are_not_those_of_a_training(seed: int) -> None:
 
 
 @pytest.mark.parametrize("other", [0, 1, 10_000])
-def test_a_trainings_own_evaluations_begin_elsewhere(other: int) -> None:
+def test_a_trainings_own_evaluations_start_at_other_states(other: int) -> None:
     """Whichever seed another training has; both begin with the starts of their first reset."""
-    env, begun_at = nominal_env(training(0, "randomization=none", "task.time_limit=1")), []
+    env, begun_at = nominal_env(training(0, randomization="none", **{"task.time_limit": 1})), []
 
     def still(present: TensorDictBase) -> TensorDictBase:
         begun_at.append({tuple(row) for row in env.plant.snapshot()["motion"].T.tolist()})
@@ -76,7 +67,7 @@ def test_a_trainings_own_evaluations_begin_elsewhere(other: int) -> None:
     judge(env, still, seed=0)
     (starts,) = begun_at
     assert len(starts) == CARTS
-    config = training(other, "randomization=none")
+    config = training(other, randomization="none")
     learned_from = simulated_env(config, config.plant, CARTS, config.task.start, config.seed)
     assert not starts & {row[-4:] for row in begun(learned_from)}
 

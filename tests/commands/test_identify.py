@@ -8,27 +8,25 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from command_line import ONCE, TINY, in_process
+from command_line import ONCE, QUICK, TINY, Outcome, in_process
 
 from cartpole_rl.physics.parameters import CartParameters
 
-QUICK = ("windows=80", "substeps=4", "carts=200")
-TRUTH = ("emulator.cart_viscous=1.1", "emulator.latency=0.012", "emulator.angle_offset=-0.01")
+
+@pytest.fixture(scope="module")
+def run(identified: tuple[Path, Outcome]) -> Path:
+    """The run folder of an identification."""
+    return identified[0]
 
 
 @pytest.fixture(scope="module")
-def identified(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder in which `run` is an identification of an emulated cart."""
-    folder = tmp_path_factory.mktemp("identified")
-    done = in_process("identify", "plant=emulated", *TRUTH, *QUICK, "hydra.run.dir=run", folder=folder)
-    assert done.code == 0, done.err
-    assert f"cartpole-train cart={folder}/run/cart.yaml pole={folder}/run/pole.yaml" in done.out
-    return folder
+def results(run: Path) -> dict[str, Any]:
+    return json.loads((run / "identification.json").read_text())
 
 
-@pytest.fixture(scope="module")
-def results(identified: Path) -> dict[str, Any]:
-    return json.loads((identified / "run/identification.json").read_text())
+def test_the_command_that_trains_on_it_is_printed(identified: tuple[Path, Outcome]) -> None:
+    run, done = identified
+    assert f"cartpole-train cart={run}/cart.yaml pole={run}/pole.yaml" in done.out
 
 
 def test_the_cart_is_found(results: dict[str, Any]) -> None:
@@ -50,8 +48,7 @@ def test_held_out_motion_is_predicted(results: dict[str, Any]) -> None:
     assert set(results["candidates"]) == {"linear", "sigmoid", "step", "stribeck"}
 
 
-def test_what_is_written_can_be_read(identified: Path) -> None:
-    run = identified / "run"
+def test_what_is_written_can_be_read(run: Path) -> None:
     cart = yaml.safe_load((run / "cart.yaml").read_text())
     assert "# N s/m, +- " in (run / "cart.yaml").read_text()
     with np.load(run / "posterior.npz") as stored:
@@ -67,16 +64,14 @@ def test_what_is_written_can_be_read(identified: Path) -> None:
     assert len(list((run / "figures").glob("*.png"))) == 5
 
 
-def test_offline_is_as_online(identified: Path, results: dict[str, Any], tmp_path: Path) -> None:
-    done = in_process(
-        "identify", f"from={identified / 'run'}", *QUICK, "hydra.run.dir=again", folder=tmp_path
-    )
+def test_offline_is_as_online(run: Path, results: dict[str, Any], tmp_path: Path) -> None:
+    done = in_process("identify", f"from={run}", *QUICK, "hydra.run.dir=again", folder=tmp_path)
     assert done.code == 0, done.err
     assert json.loads((tmp_path / "again/identification.json").read_text()) == results
 
 
-def test_an_agent_trains_on_what_was_found(identified: Path, tmp_path: Path) -> None:
-    run = shutil.copytree(identified / "run", tmp_path / "moved")  # a run can be taken elsewhere
+def test_an_agent_trains_on_what_was_found(run: Path, tmp_path: Path) -> None:
+    run = shutil.copytree(run, tmp_path / "moved")  # a run folder can be moved
     files = [f"{group}={run}/{group}.yaml" for group in ("cart", "pole", "randomization")]
     friction = ["cart_friction=step", "pole_friction=bearing"]
     done = in_process("train", *files, *friction, *TINY, ONCE, "hydra.run.dir=trained", folder=tmp_path)
@@ -95,8 +90,8 @@ class TestBadInput:
         assert done.code == 2
         assert done.complaint == "cartpole-train: cart=nowhere/cart.yaml: there is no such file"
 
-    def test_a_posterior_that_is_missing(self, identified: Path, tmp_path: Path) -> None:
-        shutil.copy(identified / "run/randomization.yaml", tmp_path)
+    def test_a_posterior_that_is_missing(self, run: Path, tmp_path: Path) -> None:
+        shutil.copy(run / "randomization.yaml", tmp_path)
         done = in_process("train", "randomization=./randomization.yaml", *TINY, folder=tmp_path)
         assert done.code == 2
         assert "posterior.npz cannot be read" in done.complaint
@@ -106,8 +101,8 @@ class TestBadInput:
         assert done.code == 1
         assert "it holds no recording; give a run of cartpole-record or cartpole-identify" in done.err
 
-    def test_a_single_recording(self, identified: Path, tmp_path: Path) -> None:
-        shutil.copy(identified / "run/recordings/01_swing.csv", tmp_path)
+    def test_a_single_recording(self, run: Path, tmp_path: Path) -> None:
+        shutil.copy(run / "recordings/01_swing.csv", tmp_path)
         done = in_process("identify", f"from={tmp_path}", folder=tmp_path)
         assert done.code == 1
         assert "give two recordings or more" in done.err
@@ -117,7 +112,7 @@ class TestBadInput:
         assert done.code == 2
         assert "an identification takes one pole" in done.complaint
 
-    def test_another_rate(self, identified: Path, tmp_path: Path) -> None:
-        done = in_process("identify", f"from={identified / 'run'}", "control_period=0.01", folder=tmp_path)
+    def test_another_rate(self, run: Path, tmp_path: Path) -> None:
+        done = in_process("identify", f"from={run}", "control_period=0.01", folder=tmp_path)
         assert done.code == 1
         assert "a frame every 20.0 ms, and not every 10.0 ms" in done.err

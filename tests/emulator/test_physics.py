@@ -8,6 +8,8 @@ pytest.importorskip("mujoco", reason='pip install "cartpole_rl[emulator]"')
 
 import itertools
 
+from driven_cart import OTHER_PHYSICS
+
 from cartpole_rl.emulator.physics import GRAVITY, CartPhysics
 from cartpole_rl.emulator.settings import EmulatorSettings
 
@@ -171,29 +173,6 @@ def test_a_finer_step_changes_little():
     assert ends[0] == pytest.approx(ends[1], abs=0.01)
 
 
-OTHER = {
-    "cart_mass": 0.8,
-    "pole_mass": 0.15,
-    "pole_com": 0.2,
-    "pole_inertia": 2e-3,
-    "track_half_length": 0.3,
-    "cart_viscous": 1.0,
-    "cart_coulomb_left": 0.8,
-    "cart_coulomb_right": 0.8,
-    "cart_stiction_ratio": 1.8,
-    "pole_viscous": 1e-3,
-    "pole_coulomb": 1e-3,
-    "pole_drag": 1e-4,
-    "force_curve": (0.0, 0.021, -0.99),
-    "force_asymmetry": -0.03,
-    "deadband_left": 90.0,
-    "deadband_right": 90.0,
-    "motor_time_constant": 0.02,
-    "track_tilt": -0.002,
-    "physics_step": 1e-3,
-}
-
-
 def end_state(**changes: object) -> tuple[float, float]:
     cart = CartPhysics(EmulatorSettings(**changes))
     for motor in (85, -85, 80, 0, -200, 200, 255, 255, 255, 255):
@@ -201,9 +180,9 @@ def end_state(**changes: object) -> tuple[float, float]:
     return cart.x, cart.angle
 
 
-@pytest.mark.parametrize("name", OTHER)
+@pytest.mark.parametrize("name", OTHER_PHYSICS)
 def test_each_setting_has_an_effect(name):
-    base, other = end_state(), end_state(**{name: OTHER[name]})
+    base, other = end_state(), end_state(**{name: OTHER_PHYSICS[name]})
     assert max(abs(a - b) for a, b in zip(base, other, strict=True)) > 1e-5
 
 

@@ -5,7 +5,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from command_line import in_process
+from command_line import Outcome, in_process
 
 from cartpole_rl.workflows.run_folder import USES, program_of
 
@@ -42,23 +42,26 @@ SETTINGS = {  # words, with the folder at {0} and an agent at {1}: what is taken
 
 
 @pytest.fixture(scope="module")
-def runs(trained: Path, stopped: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a toy run of each command, named by it, and a training that was stopped."""
+def runs(
+    trained: Path,
+    stopped: Path,
+    identified: tuple[Path, Outcome],
+    tuned: tuple[Path, Outcome],
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Path:
+    """A folder with a toy run of each command, named after it, and an interrupted training."""
     folder = tmp_path_factory.mktemp("runs")
     shutil.copytree(trained, folder / "train")
     shutil.copytree(stopped, folder / "unfinished")
-    emulated = ("plant=emulated", "emulator.physics_step=1e-3")
-    identify = ("windows=20", "substeps=2", "carts=100")
+    shutil.copytree(identified[0], folder / "identify")
+    shutil.copytree(tuned[0], folder / "finetune")
     model = ("windows=20", "ensemble.members=1", "ensemble.hidden=4", "ensemble.updates=2")
-    finetune = ("episodes=1", "evaluation_episodes=1", "finetuning.iterations=1", "compile=false")
     made = (
         ("evaluate", "run=train", "episodes=1", "hydra.run.dir=evaluate"),
         ("record", "run=lqr", "episodes=3", "hydra.run.dir=record"),
         ("record", "-m", "run=train", "episodes=1", "seed=0,1", "hydra.sweep.dir=multirun"),
         ("replay", "from=record", "hydra.run.dir=replay"),
-        ("identify", *emulated, *identify, "hydra.run.dir=identify"),
         ("model", "from=record", *model, "hydra.run.dir=model"),
-        ("finetune", "run=train", *emulated, *finetune, "hydra.run.dir=finetune"),
     )
     for command, *words in made:
         done = in_process(command, *words, folder=folder)

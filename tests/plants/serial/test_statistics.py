@@ -5,10 +5,8 @@ import math
 import hydra
 import numpy as np
 import pytest
-from hydra.core.global_hydra import GlobalHydra
 
 from cartpole_rl.checking import checked
-from cartpole_rl.choices import conf_folder
 from cartpole_rl.commands.hydra_application.composition import as_mapping
 from cartpole_rl.envs.build import randomizer
 from cartpole_rl.errors import PlantError
@@ -56,19 +54,16 @@ def test_the_distribution_is_one_that_the_randomization_takes() -> None:
         seen.loop(share=98)
 
 
-def test_the_override_is_a_word_that_cartpole_train_takes() -> None:
+def test_the_override_is_a_word_that_cartpole_train_takes(hydra_reads_conf: None) -> None:
     seen = LinkStatistics()
     for seconds in np.linspace(0.002, 0.012, 1001):
         seen.loop_times.add(seconds)
     word = seen.latency_override()
     assert word == "++randomization.latency={distribution: uniform, absolute: [0.0021, 0.0119]}"
-    GlobalHydra.instance().clear()
-    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(conf_folder())):
-        for group in ("none", "wide"):
-            composed = as_mapping(hydra.compose("train", [f"randomization={group}", word]))
-            config = checked(TrainConfig, composed)
-            assert config.randomization["latency"].limits() == (0.0021, 0.0119)
-            assert randomizer(config).longest_delay() == pytest.approx(0.0119)
+    for group in ("none", "wide"):
+        config = checked(TrainConfig, as_mapping(hydra.compose("train", [f"randomization={group}", word])))
+        assert config.randomization["latency"].limits() == (0.0021, 0.0119)
+        assert randomizer(config).longest_delay() == pytest.approx(0.0119)
 
 
 def test_commands_that_come_at_once_leave_nothing_to_hand_on() -> None:
