@@ -41,7 +41,9 @@ CLOCKS = pytest.mark.parametrize("clock", ["lockstep", "real"])
 
 
 def host_settings(emulated: EmulatedCart) -> SerialSettings:
-    return SerialSettings(port=emulated.port, timeout=5, nudge_after=0.2, answer_timeout=0.2, retries=20)
+    return SerialSettings(
+        port=emulated.port, timeout=60, write_timeout=60, nudge_after=0.2, answer_timeout=0.2, retries=300
+    )
 
 
 def until_unplugged(host: EmulatorHost) -> list[State]:
