@@ -42,7 +42,7 @@ CLOCKS = pytest.mark.parametrize("clock", ["lockstep", "real"])
 
 def host_settings(emulated: EmulatedCart) -> SerialSettings:
     return SerialSettings(
-        port=emulated.port, timeout=5, write_timeout=2, nudge_after=0.2, answer_timeout=0.2, retries=20
+        port=emulated.port, timeout=60, write_timeout=2, nudge_after=0.2, answer_timeout=0.2, retries=100
     )
 
 

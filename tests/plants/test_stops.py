@@ -130,7 +130,7 @@ class TellingCart:
 
     def close(self) -> None:
         self.process.terminate()
-        self.process.wait(10)
+        self.process.wait(100)
         assert self.process.stdout is not None
         self.process.stdout.close()
         self._told.close()
@@ -200,7 +200,7 @@ def test_a_pulled_cable(cart: TellingCart, host: Callable[..., "subprocess.Popen
         after, through = cart.stopped()
         assert 0 < after <= WATCHDOG_MS
         assert through == "watchdog"
-        _, said = process.communicate(timeout=10)
+        _, said = process.communicate(timeout=100)
         assert b"is the cart unplugged" in said
 
 

@@ -12,7 +12,7 @@ import serial
 from cartpole_rl.errors import FrameError
 from cartpole_rl.wire import Flags, Frame, FrameSplitter, Home, Message, State, decode_frame, encode_frame
 
-SILENCE = 20.0  # s, timeout of a test
+SILENCE = 200.0  # s, timeout of a test
 
 
 class EmulatorHost:

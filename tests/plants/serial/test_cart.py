@@ -221,7 +221,7 @@ def test_ctrl_c_stops_the_motor_of_a_running_program() -> None:
         )
         assert program.stdout.readline() == b"driving\n"
         program.send_signal(signal.SIGINT)
-        _, errors = program.communicate(timeout=20)
+        _, errors = program.communicate(timeout=200)
         assert b"KeyboardInterrupt" in errors
         assert [type(frame.message) for frame in peer.received[-2:]] == [SetMotor, Stop]
         assert peer.state.motor_applied == 0
