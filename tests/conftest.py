@@ -1,4 +1,4 @@
-"""What tests share: the nominal cart and pole of conf/, and builders of carts, plants and environments.
+"""Shared fixtures: the nominal cart and pole of conf/, and builders of carts, plants and environments.
 
 Tests may be started where signals are ignored: a script's `&` ignores SIGINT and SIGQUIT, nohup SIGHUP. A
 child inherits that, and no Ctrl-C of a test reaches it. So every ignored signal gets a handler here, before
@@ -44,7 +44,7 @@ for name in ("SIGINT", "SIGHUP", "SIGQUIT", "SIGTERM"):  # Windows has the first
 
 
 def conf(choice: str) -> dict[str, Any]:
-    """A file of conf/, as it stands there."""
+    """Return the content of a file of conf/."""
     return yaml.safe_load((CONF / f"{choice}.yaml").read_text())
 
 
@@ -98,7 +98,7 @@ STILL = StartSettings(
 
 @pytest.fixture(scope="session")
 def make_plant(ip02: dict[str, float], medium: PoleSettings) -> Callable[..., SimulatedPlant]:
-    """Simulated carts that start hanging, at rest, in the middle, unless `start` says otherwise."""
+    """Simulated carts that start hanging, at rest, in the middle, unless `start` is given."""
 
     def build(
         carts: int = 1,

@@ -47,7 +47,7 @@ class CartDevice:
 
     @property
     def unplugged(self) -> bool:
-        """Whether the cable has been pulled."""
+        """True once the cable has been pulled."""
         return self._unplug_us is not None and self.now_us >= self._unplug_us
 
     @property

@@ -82,7 +82,7 @@ class Firmware:
 
     @property
     def homing(self) -> bool:
-        """Whether the cart is homing."""
+        """True while the cart is homing."""
         return self._homing is not None
 
     def receive(self, stuffed: bytes, now_us: int) -> list[bytes]:

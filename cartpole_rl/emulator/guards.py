@@ -16,7 +16,7 @@ class StallWatch:
 
     def __init__(self) -> None:
         self._since = 0.0  # s of pushing since the anchor was set
-        self._anchor: tuple[int, bool] | None = None  # count and direction at the beginning of this push
+        self._anchor: tuple[int, bool] | None = None  # count and direction at the start of this push
 
     def stalled(self, cart: int, motor: int, seconds: float) -> bool:
         """Return whether the cart stalls, after `seconds` under `motor` that ended at count `cart`."""

@@ -1,6 +1,6 @@
 """Homing: touch both stops, check the span, centre the cart, wait until the pole hangs still.
 
-Homing works on raw encoder counts, one reading a tick, and needs only rough numbers of the cart. A
+Homing works on raw encoder counts, one reading per tick, and needs only rough numbers of the cart. A
 procedure is a generator: it receives a `Reading`, yields the motor value until the next one, and returns
 its result. The pole's zero is the middle of its last small swing. Waiting for a complete stop would not be
 more accurate: friction in the bearing holds a stopped pole up to a count off the vertical.

@@ -101,7 +101,7 @@ def learned_plant(
 
 
 def check_same_cart(model: LearnedModel, config: CartPoleSettings) -> None:
-    """Raise ConfigError where a learned model has another period, actuator or pole than `config`."""
+    """Raise ConfigError if a learned model has another period, actuator or pole than `config`."""
     if not math.isclose(model.period, config.control_period, rel_tol=1e-6):
         raise ConfigError(f"control_period={config.control_period}: plant.model has {model.period} s")
     if model.models.actuator != config.actions.actuator:

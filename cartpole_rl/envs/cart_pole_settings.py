@@ -73,7 +73,7 @@ class SimulatedCartSettings(CartSettings):
 
 
 class CartPoleSettings(SimulatedCartSettings):
-    """An environment, but for the plant below it. Training and evaluation share these settings."""
+    """Settings of an environment without its plant, shared by training and evaluation."""
 
     pole: PoleSettings
     actions: ActionSettings

@@ -7,8 +7,8 @@ Both wrap the same `CartPoleEnv` as everything else, with the nominal cart and t
 
 | task    | actions                                     | reward                             | ends          |
 |---------|---------------------------------------------|------------------------------------|---------------|
-| swingup | nine motor values, conf/actions/nine_levels | (6.2), as conf/reward/score has it | track         |
-| balance | left, none, right, conf/actions/three       | (6.1), as conf/reward/position     | track, 12 deg |
+| swingup | nine motor values, conf/actions/nine_levels | (6.2), as in conf/reward/score     | track         |
+| balance | left, none, right, conf/actions/three       | (6.1), as in conf/reward/position  | track, 12 deg |
 
 An episode is truncated after 10 s. An action is an index of the motor values, from full left to full right.
 `info` has the step's scores (6.1) `score_upright` and (6.2) `score`. The observation is a Box of float32

@@ -1,4 +1,4 @@
-"""From frames to measured state, memory, observation, reward, scores and endings, as pure functions.
+"""Pure functions from frames to measured state, memory, observation, reward, scores and endings.
 
 They are the same for simulated and real carts. Every tensor is [k, N], the transpose of the tensordict's, so
 that compiled code runs along the carts.

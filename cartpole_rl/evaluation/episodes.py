@@ -41,7 +41,7 @@ def warm_up(env: CartPoleEnv, policy: Policy) -> None:
 
 
 def choose(policy: Policy, current: TensorDictBase) -> Tensor:
-    """Return the policy's actions [N]; NO_ACTION where the observation or an action value is not finite.
+    """Return the policy's actions [N]; NO_ACTION if the observation or an action value is not finite.
 
     The argmax of NaN values is the first action, full motor to the left.
     """

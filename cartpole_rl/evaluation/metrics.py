@@ -17,7 +17,7 @@ RESAMPLES = 5000
 
 
 def episode_metrics(episode: Episode, track_half_length: float) -> dict[str, Any]:
-    """Return the metrics of one episode for metrics.json; None where a metric is undefined.
+    """Return the metrics of one episode for metrics.json; None if a metric is undefined.
 
     `score` and `score_upright` are the sums of (6.2) and (6.1); `time_to_upright_s` the first time from which
     the pole stays within 5 degrees for 1 s; `upright_fraction` the share of periods within 5 degrees, over

@@ -49,7 +49,7 @@ def write_recording(path: Path, episode: Episode, facts: Mapping[str, Any] | Non
 
 
 def read_recording(path: Path) -> Episode:
-    """Read the episode in a file. Raises RecordingError if it is no recording, or damaged."""
+    """Read the episode in a file. Raises RecordingError if it is damaged or not a recording."""
     facts, text = {}, []
     try:
         for line in path.read_text().splitlines():
@@ -61,7 +61,7 @@ def read_recording(path: Path) -> Episode:
     except (OSError, UnicodeDecodeError) as error:
         raise RecordingError(f"{path} cannot be read: {error}") from None
     if facts.get("format") != FORMAT:
-        raise RecordingError(f"{path} is no recording: its first line is not '# format: {FORMAT}'")
+        raise RecordingError(f"{path} is not a recording: its first line is not '# format: {FORMAT}'")
     rows = list(csv.DictReader(text))
     if missing := [name for name in COLUMNS if not rows or name not in rows[0]]:
         raise RecordingError(f"{path} lacks {', '.join(missing)}")

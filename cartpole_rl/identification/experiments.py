@@ -1,4 +1,4 @@
-"""Experiments on a cart: motor values under which its parameters show.
+"""Experiments on a cart: motor values that make its parameters observable.
 
 An experiment is a sequence of `moves`. Only motor values and encoder positions go in and out, so that any
 plant can be used. A guard keeps the cart clear of the track's ends: it brakes, whatever the experiment.
@@ -39,7 +39,7 @@ RIGHT, LEFT = 1, -1
 
 
 class Experiment(NamedTuple):
-    """A named sequence of moves, which return a motor value that moves the cart if they show one."""
+    """A named sequence of moves; they return the breakaway motor value if they measure it."""
 
     name: str
     shows: str  # the parameters, in words
@@ -49,7 +49,7 @@ class Experiment(NamedTuple):
 def ramps(task: Task) -> Moves:
     """Raise the motor value to each side until the cart breaks away; return a value that always moves it."""
     needed = 0
-    yield from hold(0, 0.6, task)  # the pole at rest: where its zero is
+    yield from hold(0, 0.6, task)  # the pole at rest shows its zero
     for side in 3 * (RIGHT, LEFT):
         yield from go_to(-side * 0.08, task)
         yield from hold(0, 0.4, task)
@@ -76,7 +76,7 @@ def free_swing(task: Task, swing: float = 1.6, seconds: float = 24.0) -> Moves:
 
 
 def coast(task: Task) -> Moves:
-    """Push the cart to each side, weakly and strongly, and let it run out."""
+    """Push the cart to each side, weakly and strongly, and let it coast."""
     for more in (20, 50, 90, 140):
         for side in (RIGHT, LEFT):
             yield from go_to(-side * SIDE, task)
@@ -86,7 +86,7 @@ def coast(task: Task) -> Moves:
 
 
 def levels(task: Task) -> Moves:
-    """Hold small motor values on a moving cart: the force near the dead-band does not show at rest."""
+    """Hold small motor values on a moving cart: the force near the dead-band is not observable at rest."""
     for size in (40, 50, 55, 60, 65, 70, 80, 95):
         for side in (RIGHT, LEFT):
             yield from go_to(-side * SIDE, task)
@@ -96,7 +96,7 @@ def levels(task: Task) -> Moves:
 
 
 def square(task: Task) -> Moves:
-    """Reverse the force at regular times: the delay shows."""
+    """Reverse the force at regular intervals, which makes the delay observable."""
     for more in (50, 100):
         yield from go_to(0.0, task)
         for half in (0.1, 0.14, 0.2):
@@ -125,7 +125,7 @@ EXPERIMENTS = (
     Experiment("levels", "the force of small motor values", levels),
     Experiment("square", "latency and lag", square),
     Experiment("excite", "everything at once", excite),
-    Experiment("held_out", "nothing: kept to judge the fit by", partial(excite, seconds=40.0)),
+    Experiment("held_out", "nothing: held out to judge the fit", partial(excite, seconds=40.0)),
 )
 HELD_OUT = "held_out"
 
@@ -203,7 +203,7 @@ def observed(counts: list[tuple[int, int]], gaps: list[float]) -> Observed:
 
 
 def guarded(motor: float, now: Observed) -> int:
-    """Return the motor value, or one that brakes where the cart would get beyond REACH."""
+    """Return the motor value, or one that brakes if the cart would get beyond REACH."""
     ahead = now.x + FORESIGHT * now.x_dot * (1 + abs(now.x_dot))
     if abs(ahead) > REACH and ahead * (motor + BRAKE * np.sign(ahead)) > 0:
         return int(-np.sign(ahead) * BRAKE)

@@ -1,4 +1,4 @@
-"""Fits the cart whose predictions match recorded windows.
+"""Fit of a cart whose predictions match recorded windows.
 
 Residuals are encoder counts of positions only; see `matching`. One-step regression, the thesis's way, puts
 the same quantized sample into regressor and target, and one count at 50 Hz is 0.077 rad/s.
@@ -82,8 +82,8 @@ def fit_cart(
 ) -> Fit:
     """Return the most probable cart, searched for from several starts.
 
-    The names `known`, of UNKNOWNS, keep their nominal values. Motion shows nothing but ratios of forces and
-    masses: without WEIGHED among them the scale is that of the prior. `extra_latency` is that of `rollout`.
+    The names `known`, of UNKNOWNS, keep their nominal values. Motion shows only ratios of forces and
+    masses: unless WEIGHED are known, the prior sets the scale. `extra_latency` is that of `rollout`.
     With `sharpened`, a second search weighs errors by the size that the first one left.
     """
     unknowns, nominal = unknowns_of(models, known), dict(nominal)

@@ -1,4 +1,4 @@
-"""From recordings to a cart: its friction model, its numbers with their uncertainty, and warnings."""
+"""Identification of a cart from recordings: friction model, parameters with uncertainty, warnings."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -21,7 +21,7 @@ from cartpole_rl.tasks.upright import wrap
 Array = NDArray[np.floating]
 CART_FRICTIONS = (CartFriction.LINEAR, CartFriction.SIGMOID, CartFriction.STEP, CartFriction.STRIBECK)
 HORIZON = 1.0  # s of held-out motion, predicted
-AWAY = 0.6  # rad from upright; nearer to it, an error grows e times in 0.15 s, whatever the cart
+AWAY = 0.6  # rad from upright; nearer to it, an error grows e times in 0.15 s for any cart
 SCREENING_STEPS = 4  # integration steps a period when a friction model is screened
 CONTENDS = 1.5  # a screened model stays a candidate up to this multiple of the best one's error
 FALLOFF = 4  # a model with twice the error of the best one has a weight of 2^-FALLOFF
@@ -44,7 +44,7 @@ class PredictionError(NamedTuple):
         return float(np.hypot(self.x / ALIKE.x, self.theta / ALIKE.theta))
 
 
-ALIKE = PredictionError(5e-3, np.radians(2.0))  # errors of cart and pole that weigh alike
+ALIKE = PredictionError(5e-3, np.radians(2.0))  # errors of cart and pole with equal weight
 
 
 class Candidate(NamedTuple):

@@ -1,4 +1,4 @@
-"""Recorded motor values drive a simulated cart, which is put back onto the recorded one at intervals.
+"""Replay of recorded motor values on a simulated cart, which is reset to the measured state at intervals.
 
 Longer predictions cannot be compared: near upright an error grows e times in 0.15 s. Velocities are not
 measured; the initial state of a stretch is the one whose simulated motion best matches the positions measured

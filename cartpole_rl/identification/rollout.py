@@ -32,7 +32,7 @@ def rollout(
 
     The first `history_periods` of `motors` [H + T, N] are older than the window: the actuator runs through
     them, since its force lags behind. `extra_latency`, s, is added to each latency: (3.8) moves a cart half a
-    step early, so that with half a step of it a latency means the same however long the step.
+    step early, so a lead of half a step makes latencies independent of the step.
     """
     cart = CartParameters.from_table(table)
     state, force = State(*motion.unbind(0)), torch.zeros_like(motion[0])

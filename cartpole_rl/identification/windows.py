@@ -75,7 +75,7 @@ def cut_windows(
 ) -> Windows:
     """Cut windows of `seconds` s, one after another, evenly thinned to at most `most`.
 
-    A window over a lost or late frame is left out. Raises RecordingError where nothing is left, or where the
+    A window over a lost or late frame is left out. Raises RecordingError if nothing is left, or if the
     recordings have another control period than `period` s.
     """
     periods = round(seconds / period)
@@ -133,8 +133,7 @@ def regular_frames(episode: Episode, period: float) -> NDArray[np.bool_]:
     gaps = np.diff(episode.time)
     if len(gaps) and abs(np.median(gaps) / period - 1) > IRREGULAR:
         raise RecordingError(
-            f"a recording has a frame every {np.median(gaps) * 1e3:.1f} ms, and not every "
-            f"{period * 1e3:.1f} ms"
+            f"a recording has a frame every {np.median(gaps) * 1e3:.1f} ms, not every {period * 1e3:.1f} ms"
         )
     return np.abs(gaps / period - 1) < IRREGULAR
 

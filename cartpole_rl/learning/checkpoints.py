@@ -112,7 +112,7 @@ def _load(path: Path, expected: str) -> dict[str, Any]:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch.load raises errors of many kinds for damaged files
         raise CheckpointError(
-            f"{path} is no checkpoint of this package, or it is damaged ({type(error).__name__}); "
+            f"{path} is not a checkpoint of this package, or is damaged ({type(error).__name__}); "
             f"give one that cartpole-train wrote"
         ) from None
     found = content.pop("format", None) if isinstance(content, dict) else None

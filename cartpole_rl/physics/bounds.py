@@ -73,7 +73,7 @@ def check_names(names: Iterable[str]) -> None:
 
 
 def check_value(name: str, value: float) -> None:
-    """Raise ConfigError where `value` is physically impossible for the parameter `name`."""
+    """Raise ConfigError if `value` is physically impossible for the parameter `name`."""
     if not BOUNDS[name].holds(value):
         raise ConfigError(f"{name} is {value:g}; it must be {BOUNDS[name]}")
 

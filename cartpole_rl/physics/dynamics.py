@@ -41,7 +41,7 @@ class Addition(NamedTuple):
     angular_acceleration: Tensor  # rad/s^2 of the pole
 
 
-MakeAddition = Callable[[State, Drive], Addition]  # the addition of a period, from where it starts
+MakeAddition = Callable[[State, Drive], Addition]  # from the state at the start of a period to its addition
 
 
 class Mechanism(NamedTuple):
@@ -85,7 +85,7 @@ def coupling(state: State, cart: CartParameters, body: Mechanism) -> Coupling:
     """Return the shared terms. On a track tilted by t the pole stands theta - t from the track's normal."""
     from_normal = state.theta - cart.track_tilt
     sin, cos = torch.sin(from_normal), torch.cos(from_normal)
-    sin_theta = sin * body.cos_tilt + cos * body.sin_tilt  # costs less than a third function of an angle
+    sin_theta = sin * body.cos_tilt + cos * body.sin_tilt  # cheaper than a third trigonometric function
     return Coupling(
         sin=sin,
         cos=cos,
@@ -170,7 +170,7 @@ def run_period(
     """Integrate one control period of `period` s in `substeps` equal steps.
 
     `drive.motors` holds this period's motor value first; `latency` [N] s is this period's own draw, for all
-    commands under way. Where the command in force changes inside a step, the step takes the mean of both
+    pending commands. If the command in force changes inside a step, the step takes the mean of both
     forces by their share of time. `addition` acts in every step.
     """
     step = period / substeps

@@ -1,9 +1,9 @@
 """Finds randomized parameters without any effect on a simulated cart, by simulation.
 
-A range can be without effect for many reasons: the chosen friction does not read the parameter, a dead-band
+A range can have no effect for several reasons: the chosen friction does not read the parameter, a dead-band
 ends below the smallest motor value, no cart is drawn from it. Each range is tested: carts are drawn twice,
 with the parameter at the low and at the high end of its range and all else equal, and simulated for a few
-periods under the motor values of the agent. If they move alike and report alike, the range has no effect.
+periods under the motor values of the agent. If all motions and reports are equal, the range has no effect.
 """
 
 import math
@@ -77,6 +77,6 @@ def _situations(
 
 
 def _alike(one: Period, other: Period) -> Tensor:
-    """Return which carts moved and reported alike, [N] bool."""
+    """Return which carts had equal motions and reports, [N] bool."""
     parts = ("motion", "counts", "motor_applied", "off_track")
     return torch.stack([(getattr(one, part) == getattr(other, part)).all(0) for part in parts]).all(0)

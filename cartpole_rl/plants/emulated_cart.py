@@ -22,8 +22,8 @@ STDERR_BYTES = 2000  # of the end of its stderr, for an error
 class EmulatedCart:
     """A running emulator: `port` to open with pyserial, `pid`. A context manager that ends the process.
 
-    The process ends by itself when this one dies. Ctrl-C in a terminal reaches this process alone, so the
-    cart can still be stopped. Raises EmulatorError if it does not get ready, and at the end of a `with`
+    The process ends when this one dies. Ctrl-C in a terminal reaches only this process, so the
+    cart can still be stopped. Raises EmulatorError if it does not become ready, and at the end of a `with`
     without another error if it had died before.
     """
 
@@ -71,7 +71,7 @@ class EmulatedCart:
 
     @property
     def died(self) -> str:
-        """How the process ended by itself, in one line with the end of its stderr; empty while it runs."""
+        """The reason why the process ended early, with the end of its stderr; empty while it runs."""
         code = self._process.poll()
         return "" if code is None else f"the emulated cart ended with exit code {code}: {self._stderr_end()}"
 

@@ -34,7 +34,7 @@ class RecordedPlant(Plant):
         return torch.tensor([self._pole_length])
 
     def _set_seed(self, seed: int | None) -> None:
-        """Do nothing: there is no randomness."""
+        """Do nothing: a recording is not random."""
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDict:
         self._row = 0

@@ -1,4 +1,4 @@
-"""N simulated carts as one plant: parameters and starts drawn anew for each episode, physics, encoders.
+"""N simulated carts as one plant: parameters and starts drawn for each episode, physics, encoders.
 
 The true state stays inside; the frames hold what a cart reports over its serial port.
 """
@@ -22,7 +22,7 @@ from cartpole_rl.tasks.episode import Origin
 from cartpole_rl.tasks.settings import StartSettings
 from cartpole_rl.tasks.starts import draw_start
 
-NOISE_PARAMETERS = ("latency_jitter", "position_noise", "angle_noise")  # drawn anew in each period
+NOISE_PARAMETERS = ("latency_jitter", "position_noise", "angle_noise")  # drawn in each period
 DRAWN_AT_ONCE = 1024  # episodes; drawing a few takes about as long
 
 
@@ -132,7 +132,7 @@ class SimulatedPlant(Plant):
         self._coming = self._draw_starts(0)
 
     def restart(self, rows: Tensor, again: Tensor | None = None) -> TensorDict:
-        """Start an episode on the carts `rows` [R], new but for `again`; return their first frame, [R]."""
+        """Start an episode on the carts `rows` [R], new except for `again`; return their first frame, [R]."""
         table, motion, counts = self._next_starts(len(rows))
         if again is not None and again.any():
             table = torch.where(again, self._carts.table[:, rows], table)
@@ -178,7 +178,7 @@ class SimulatedPlant(Plant):
         return self.step_frame(self._report(after.counts, after.motor_applied, after.off_track))
 
     def _draw_noise(self, count: int) -> Tensor:
-        """Return the noise of one period of `count` carts, [3, count]; 0 where no parameter is noisy."""
+        """Return the noise of one period of `count` carts, [3, count]; 0 if no parameter is noisy."""
         if not self._noisy:
             return self._no_noise if count == self.carts else self._no_noise.new_zeros(3, count)
         draws = {"generator": self._generator, "device": self.device}

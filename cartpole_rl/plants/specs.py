@@ -34,7 +34,7 @@ class Plant(EnvBase):
     right, the pole not wrapped), `dt` [N, 1] float32 seconds since the previous frame by the plant's clock,
     `motor_applied` [N, 1] int64, `terminated` [N, 1] bool (left the track, or a device fault),
     `truncated` [N, 1] bool (link lost; time limits belong to the task).
-    A plant has no reward of its own and gives zeros.
+    A plant computes no reward; it returns zeros.
     """
 
     compiled = False  # whether the hardware transform above it may compile its arithmetic as well
@@ -111,7 +111,7 @@ def one_cart(
     """Return the report of a single cart.
 
     `ended_by` is why the plant ended the episode, or anything else while it has not; a plant that was
-    `halted` by its user is truncated. The cart waits meanwhile: NumPy is five times as fast as torch.tensor.
+    `halted` by its user is truncated. NumPy is five times as fast as torch.tensor; the cart is waiting.
     """
     rows = (
         np.array([counts], np.int64),

@@ -53,7 +53,7 @@ class PoleSettings(Settings):
 
     @property
     def nominal(self) -> Pole:
-        """The pole that stands for the whole choice: the first one, or the rod of middle length."""
+        """The pole that represents the whole choice: the first one, or the rod of middle length."""
         if self.choices is not None:
             return next(iter(self.choices.values()))
         assert self.lengths is not None
@@ -61,12 +61,12 @@ class PoleSettings(Settings):
 
     @property
     def is_single(self) -> bool:
-        """True where every cart carries the same pole."""
+        """True if every cart carries the same pole."""
         return self.choices is not None and len(self.choices) == 1
 
     @property
     def each(self) -> "PoleSettings":
-        """The poles that stand for all, in turn: every choice, or rods from the shortest to the longest."""
+        """The poles that represent the choice: every choice, or rods from the shortest to the longest."""
         if self.choices is not None:
             return PoleSettings(choices=self.choices, in_turn=True)
         assert self.lengths is not None

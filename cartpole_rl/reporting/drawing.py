@@ -57,7 +57,7 @@ class CartDrawing:
     episode: Episode
     pole: float  # fine pixels
     track: float  # fine pixels, half length
-    scale: float  # fine pixels a metre
+    scale: float  # fine pixels per metre
     upright: NDArray[np.bool_]  # [T+1]
     score: NDArray[np.float64]  # [T+1] sum of equation (6.2) so far
 

@@ -1,4 +1,4 @@
-"""From encoder counts to observations. All tensors are [N] or [k, N]; angles in rad, positions in m.
+"""Encoder counts to observations. All tensors are [N] or [k, N]; angles in rad, positions in m.
 
 To add a number to the observation, add a `Quantity`, an `ObservationKind` that lists it, and a choice in
 `conf/observation/`. Formulas use methods of tensors alone; settings can import this module without PyTorch.

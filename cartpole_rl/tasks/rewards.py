@@ -41,7 +41,7 @@ def linear_angle(state: Measured, x_max: float) -> "Tensor":
 
 
 def position(state: Measured, x_max: float) -> "Tensor":
-    """(5.4) and (6.1): cos(theta / 2) (x_max - |x|) / x_max, not below 0, at most 1 a step."""
+    """(5.4) and (6.1): cos(theta / 2) (x_max - |x|) / x_max, from 0 to 1 per step."""
     return cosine(state, x_max) * (1 - state.x.abs() / x_max).clamp(min=0)
 
 

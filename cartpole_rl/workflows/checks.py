@@ -37,7 +37,7 @@ LONGER = {  # command: how to train further than a run that has ended
 
 
 def check_training(config: TrainConfig) -> None:
-    """Raise CartPoleError where a new training cannot start."""
+    """Raise CartPoleError if a new training cannot start."""
     if config.compile:
         check_compiler()
     check_carts(config.nominal_cart, config.pole, config.ranges)
@@ -46,7 +46,7 @@ def check_training(config: TrainConfig) -> None:
 
 
 def check_evaluation(config: EvaluateConfig) -> None:
-    """Raise CartPoleError where there is no such agent, or no such cart."""
+    """Raise CartPoleError if the agent or the cart does not exist."""
     if config.run != BASELINE:
         check_agent(config.run)
     if isinstance(config.plant, LearnedSettings):
@@ -55,7 +55,7 @@ def check_evaluation(config: EvaluateConfig) -> None:
 
 
 def check_finetuning(config: FinetuneConfig) -> Path:
-    """Return the run to fine-tune. Raises CartPoleError where it has no agent."""
+    """Return the run to fine-tune. Raises CartPoleError if it has no agent."""
     if config.run is None:
         raise ConfigError("run is missing; give run=..., the run folder of a training")
     if config.compile:
@@ -65,7 +65,7 @@ def check_finetuning(config: FinetuneConfig) -> Path:
 
 
 def check_replay(config: ReplayConfig) -> None:
-    """Raise CartPoleError where there is no recording, or the cart or its pole is impossible."""
+    """Raise CartPoleError if there is no recording, or the cart or its pole is impossible."""
     recordings(config.source)
     if config.pole is not None:
         check_one_pole("a replay", config.pole)
@@ -73,7 +73,7 @@ def check_replay(config: ReplayConfig) -> None:
 
 
 def check_modelling(config: ModelConfig) -> None:
-    """Raise CartPoleError where there is no recording, or more than one pole is chosen."""
+    """Raise CartPoleError if there is no recording, or more than one pole is chosen."""
     for source in config.source:
         recordings(source)
     if config.pole is not None:
@@ -81,14 +81,14 @@ def check_modelling(config: ModelConfig) -> None:
 
 
 def check_identification(config: IdentifyConfig) -> None:
-    """Raise CartPoleError where the prior cart is impossible, or there is no recording."""
+    """Raise CartPoleError if the prior cart is impossible, or there is no recording."""
     check_values(config.nominal)
     if config.source is not None:
         experiments(config.source)
 
 
 def check_resumable(program: str, resume: str, folder: Path) -> None:
-    """Raise CartPoleError where cartpole-<program> cannot resume the run `resume` in `folder`."""
+    """Raise CartPoleError if cartpole-<program> cannot resume the run `resume` in `folder`."""
     run = Path(resume)
     check_program("resume", run, program)
     if run.is_dir() and not folder.samefile(run):
@@ -102,13 +102,13 @@ def check_resumable(program: str, resume: str, folder: Path) -> None:
 
 
 def check_agent(run: Path) -> None:
-    """Raise ConfigError or CheckpointError where `run` is not a run folder or file with an agent."""
+    """Raise ConfigError or CheckpointError if `run` is not a run folder or file with an agent."""
     check_has_agent(run)
     find_agent(run)
 
 
 def check_has_agent(run: Path) -> None:
-    """Raise ConfigError where `run` is a run folder without an agent."""
+    """Raise ConfigError if `run` is a run folder without an agent."""
     check_program("run", run, "train", "finetune")
     if (program := program_of(run)) and not (run / CHECKPOINTS / LAST).exists():
         raise ConfigError(
@@ -117,7 +117,7 @@ def check_has_agent(run: Path) -> None:
 
 
 def check_model(plant: LearnedSettings) -> None:
-    """Raise CheckpointError or ConfigError where plant.model= names no learned model."""
+    """Raise CheckpointError or ConfigError if plant.model= names no learned model."""
     check_program("plant.model", plant.model, "model")
     find_model(plant.model)
 
@@ -135,7 +135,7 @@ def simulated_carts(config: EvaluateConfig) -> int:
 
 
 def check_compiler() -> None:
-    """Raise ConfigError where torch.compile has no C++ compiler or no header of Python to build with."""
+    """Raise ConfigError if torch.compile has no C++ compiler or no header of Python to build with."""
     compiler = os.environ.get("CXX", {"darwin": "clang++", "win32": "cl"}.get(sys.platform, "g++"))
     header = Path(sysconfig.get_path("include"), "Python.h")
     if shutil.which(compiler) is None:

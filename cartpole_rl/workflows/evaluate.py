@@ -70,7 +70,7 @@ def compared(again: Repetition, episode: Episode) -> str:
     then = f"episode {repeat.episode} of {repeat.run} had score {again.score:.1f}"
     if by_chance := left_to_chance(again):
         chance = ", ".join(by_chance)
-        return f"{then}, now {score:.1f}: {chance} is left to chance, so it cannot be repeated exactly"
+        return f"{then}, now {score:.1f}: {chance} is random, so the episode cannot be repeated exactly"
     return f"{then}, now {'exactly the same' if score == again.score else f'{score:.1f}'}"
 
 

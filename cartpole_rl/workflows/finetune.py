@@ -2,7 +2,7 @@
 
 Three stages: episodes without exploration (before), episodes to learn from (tune), episodes without
 exploration (after). A separate process drives the cart while this one learns. Each finished episode is on
-disk before the next one starts: an interruption costs at most the one under way.
+disk before the next one starts: an interruption costs at most the current one.
 """
 
 from functools import partial
@@ -52,7 +52,7 @@ def finetune(config: FinetuneConfig, folder: Path) -> None:
     Writes config.yaml, provenance.json, recordings/, TensorBoard events, comparison.json (before and after),
     metrics.json, figures/ and checkpoints/last.pt with the better of both policies; until the end also
     checkpoints/resume.pt. Prints both scores. Raises ConfigError and CheckpointError before the cart moves,
-    PlantError and LinkError for a cart that fails, LearningError where learning diverges.
+    PlantError and LinkError for a cart that fails, LearningError if learning diverges.
     """
     checkpoint = resumed("finetune", config.resume, folder)
     if checkpoint:

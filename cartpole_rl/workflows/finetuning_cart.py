@@ -41,7 +41,7 @@ class DrivenCart:
     def finish(self, stage: Stage, number: int) -> None:
         """Wait for the started episode, write and log it.
 
-        Raises LinkError, and LearningError where the network's numbers were not finite: the cart was stopped.
+        Raises LinkError, and LearningError if the network's numbers were not finite: the cart was stopped.
         """
         driven = self.driver.result()
         self.link = driven.link

@@ -71,6 +71,6 @@ class FinetuningFiles:
 
 
 def pole_length(config: FinetuneConfig) -> float | None:
-    """Return the length (m) of the pole on the cart; None where the settings do not state it."""
+    """Return the length (m) of the pole on the cart; None if the settings do not state it."""
     plant = config.plant
     return plant.pole_length if isinstance(plant, SerialSettings) else 2 * config.emulator.pole_com

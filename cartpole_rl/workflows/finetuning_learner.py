@@ -162,7 +162,7 @@ class CartLearner:
         return IdentifiedCarts(self.carts, prior, share, LONGEST_LATENCY)
 
     def transitions(self, episode: Episode) -> Any:
-        """Return an episode's transitions as the agent observes them; None where it has none."""
+        """Return an episode's transitions as the agent observes them; None if it has none."""
 
         def make_env(plant: RecordedPlant) -> CartPoleEnv:
             return environment(self.settings, plant)

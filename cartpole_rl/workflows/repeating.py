@@ -30,7 +30,7 @@ class Repetition:
 
 
 def repetition(config: EvaluateConfig) -> Repetition | None:
-    """Return the episode that `config` repeats; None where it repeats none. Raises ConfigError."""
+    """Return the episode that `config` repeats; None if it repeats none. Raises ConfigError."""
     run, number = config.repeat.run, config.repeat.episode
     if run is None and number is None:
         return None

@@ -36,7 +36,7 @@ USES = {  # command: how its runs can be used
     "finetune": "cartpole-evaluate, cartpole-record and cartpole-finetune take it as run={0}",
     "evaluate": "cartpole-evaluate drives one of its episodes again: repeat.run={0}",
     "record": "cartpole-replay, cartpole-identify and cartpole-model take it as from={0}",
-    "replay": f"its results are replay.json and {FIGURES}/; cartpole-replay from=... makes others",
+    "replay": f"its results are replay.json and {FIGURES}/; cartpole-replay from=... makes new ones",
     "identify": f"cartpole-train takes its files: cart={{0}}/{CART} pole={{0}}/{POLE} "
     f"randomization={{0}}/{RANDOMIZATION}",
     "model": "cartpole-train, cartpole-evaluate and cartpole-record take it as plant=learned plant.model={0}",
@@ -47,7 +47,7 @@ PACKAGES = ("cartpole_rl", "torch", "torchrl", "tensordict", "numpy", "hydra-cor
 def write_config(folder: Path, program: str, config: Mapping[str, Any], resumed: bool = False) -> None:
     """Write config.yaml and provenance.json of a run of cartpole-<program>.
 
-    A resumed run adds its provenance to that of the first start. Raises ConfigError where a new run would
+    A resumed run adds its provenance to that of the first start. Raises ConfigError if a new run would
     overwrite another one.
     """
     if resumed:
@@ -74,7 +74,7 @@ def program_of(folder: Path) -> str | None:
 
 
 def check_program(setting: str, folder: Path, *taken: str) -> None:
-    """Raise ConfigError where `folder` is a run of a command that is not among `taken`."""
+    """Raise ConfigError if `folder` is a run of a command that is not among `taken`."""
     if (folder / MULTIRUN).is_file():
         jobs = sorted(path for path in folder.iterdir() if path.is_dir())
         example = f": {setting}={jobs[0]}" if jobs else ""
@@ -100,7 +100,7 @@ def use_of(folder: Path, program: str) -> str:
 
 
 def has_ended(run: Path) -> bool:
-    """True where a training or fine-tuning has results and no state to resume from."""
+    """True if a training or fine-tuning has results and no state to resume from."""
     results = (run / METRICS).exists() and (run / CHECKPOINTS / LAST).exists()
     return results and not (run / CHECKPOINTS / RESUME).exists()
 

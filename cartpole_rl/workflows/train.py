@@ -34,7 +34,7 @@ def train(config: TrainConfig, folder: Path) -> None:
     Writes config.yaml, provenance.json, TensorBoard events, history.jsonl (evaluations), checkpoints/last.pt
     and best.pt, metrics.json and figures/; until the end also checkpoints/resume.pt. Raises ConfigError for
     settings that do not fit together or a folder that already holds a run, CheckpointError for a resumed run
-    without a checkpoint, LearningError where learning diverges.
+    without a checkpoint, LearningError if learning diverges.
     """
     checkpoint = resumed("train", config.resume, folder)
     if checkpoint:

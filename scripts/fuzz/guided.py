@@ -56,7 +56,7 @@ class Steps:
 
     @property
     def left(self) -> bool:
-        """Whether bytes are left."""
+        """True while bytes are left."""
         return self._at < len(self._data)
 
     def take(self, count: int) -> bytes:
@@ -217,7 +217,7 @@ def host(data: bytes) -> None:
         if not steps.left:
             break
         with contextlib.suppress(CartPoleError):
-            driven.open()  # again, where the cart did not answer
+            driven.open()  # again, if the cart did not answer
             call(driven, wire, steps)
         seen = driven.statistics
         assert min(seen.lost_frames, seen.late_ticks, seen.overtaken_frames, seen.repeated_frames) >= 0

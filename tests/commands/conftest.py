@@ -16,7 +16,7 @@ from command_line import (
 
 @pytest.fixture(scope="session")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The run folder of a tiny training; with two actions its agent cannot but move the cart."""
+    """The run folder of a tiny training; with two actions its agent always moves the cart."""
     folder = tmp_path_factory.mktemp("trained")
     done = in_process("train", *TINY, "actions=two", "hydra.run.dir=run", folder=folder)
     assert done.code == 0, done.err

@@ -32,7 +32,7 @@ def test_every_episode_is_on_disk_once(tuned: tuple[Path, Outcome]) -> None:
     assert all(read_recording(path).steps > 1 for path in (run / "recordings").iterdir())
 
 
-def test_the_better_policy_is_kept_and_said(tuned: tuple[Path, Outcome]) -> None:
+def test_the_better_policy_is_kept_and_reported(tuned: tuple[Path, Outcome]) -> None:
     run, done = tuned
     compared = json.loads((run / "comparison.json").read_text())
     better = (

@@ -39,7 +39,7 @@ def composing_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[
 
 
 def folder_of_a_job(multirun: DictConfig, word: str) -> str:
-    """What Hydra's launchers do to start a job, in this process or another."""
+    """Compose a job as Hydra's launchers do, in this process or another."""
     loader = GlobalHydra.instance().config_loader()
     return loader.load_sweep_config(multirun, [word]).hydra.sweep.dir
 

@@ -49,7 +49,7 @@ def test_training_takes_it(chosen: str) -> None:
 
 
 @pytest.mark.parametrize("chosen", [case for case in CHOICES if group_of(case) in REPLACEABLE])
-def test_an_evaluation_takes_it_in_place_of_the_agents_own(chosen: str, trained: TrainConfig) -> None:
+def test_an_evaluation_can_replace_the_agents_choice(chosen: str, trained: TrainConfig) -> None:
     config = checked(EvaluateConfig, composed("evaluate", "run=somewhere", chosen))
     settings = evaluated_settings(trained, config)
     randomizer(settings)
@@ -126,6 +126,6 @@ def test_an_experiment_holds_only_differences(experiment: str) -> None:
     assert not [name for name, value in leaves(content) if before[name] == value]
 
 
-def test_every_file_says_what_it_is() -> None:
+def test_every_file_starts_with_a_description() -> None:
     for path in CONF.rglob("*.yaml"):
         assert path.read_text().lstrip().startswith("#"), path

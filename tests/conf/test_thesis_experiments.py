@@ -1,6 +1,6 @@
-"""experiment=thesis_balance and thesis_swingup are what the thesis says, each number with its source.
+"""experiment=thesis_balance and thesis_swingup match the thesis; each number has its source.
 
-Where the thesis is silent the number is ours; it is listed too, so that none of the settings is overlooked.
+If the thesis gives no value, ours is listed as "silent", so that no setting is overlooked.
 """
 
 import math
@@ -186,7 +186,7 @@ def test_no_setting_is_overlooked(experiment: str) -> None:
 
 
 @pytest.mark.parametrize("experiment", EXPECTED)
-def test_a_source_stands_beside_each_number_of_the_file(experiment: str) -> None:
+def test_each_number_in_the_file_has_a_source(experiment: str) -> None:
     lines = (conf_folder() / f"experiment/{experiment}.yaml").read_text().splitlines()
     for line in lines[lines.index("defaults:") + 1 :]:
         if not line.rstrip().endswith(":"):

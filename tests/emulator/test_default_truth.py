@@ -135,8 +135,8 @@ def driven(name: str | None) -> list[tuple[int, int]]:
     return counts
 
 
-def test_the_same_cart_moves_alike() -> None:
-    """Without this the next test would prove nothing."""
+def test_equal_carts_move_equally() -> None:
+    """The control for the next test."""
     assert driven.__wrapped__(None) == driven(None)
 
 
@@ -146,7 +146,7 @@ def test_each_number_that_is_off_changes_the_motion(name: str) -> None:
 
 
 @pytest.mark.parametrize("side", [-1, 1])
-def test_the_dead_bands_show_in_the_force(side: int) -> None:
+def test_the_dead_bands_affect_the_force(side: int) -> None:
     """Inside the dead-band the force is 0 although the curve gives one; outside it is that of the page."""
     settings = EmulatorSettings()
     edge = int(settings.deadband_right if side > 0 else settings.deadband_left)

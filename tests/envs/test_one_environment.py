@@ -40,7 +40,7 @@ def over_simulated(make_plant: MakePlant, make_environment: MakeEnvironment) -> 
 
 
 class RecordedPlant(Plant):
-    """Carts that say what a recording says, each the same."""
+    """Carts that all report a given recording."""
 
     def __init__(self, frames: TensorDictBase, carts: int, length: float) -> None:
         super().__init__(carts)
@@ -80,7 +80,7 @@ def specs(env: EnvBase) -> tuple:
     return env.input_spec, env.output_spec
 
 
-def test_both_plants_keep_the_same_contract(serial: SerialPlant, make_plant: MakePlant) -> None:
+def test_both_plants_have_the_same_specs(serial: SerialPlant, make_plant: MakePlant) -> None:
     assert specs(serial) == specs(make_plant())
 
 
@@ -98,7 +98,7 @@ def test_specs_hold(over_serial: CartPoleEnv, over_simulated: CartPoleEnv) -> No
 def test_the_same_counts_give_the_same_observations(
     request: pytest.FixtureRequest, make_environment: MakeEnvironment, source: str, carts: int
 ) -> None:
-    """What either cart said, said again by a third plant, is seen alike, alone and in a batch."""
+    """Counts of either cart, replayed by a third plant, give the same observations, alone and in a batch."""
     env: CartPoleEnv = request.getfixturevalue(source)
     actions = torch.randint(3, (STEPS,), generator=torch.Generator().manual_seed(0))
     original = drive(env, actions)

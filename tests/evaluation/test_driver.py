@@ -1,4 +1,4 @@
-"""The process that drives: what a person is asked, what it refuses, and how it ends, on a scripted cart."""
+"""The driving process on a scripted cart: confirmation, refusals and exit."""
 
 import os
 import signal
@@ -85,7 +85,7 @@ def wait_for(condition: Callable[[], bool]) -> None:
 def test_a_person_is_asked_and_a_hangup_stops_the_motor(
     peer: Faulty, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """First the person says no, then yes; the terminal is closed while the cart is driven."""
+    """The person declines, then confirms; the terminal is closed while the cart is driven."""
     drive, asked = DriveRequest(as_weights(network()), 0.0, 0), []
 
     def disagree(text: str) -> bool:
@@ -117,7 +117,7 @@ def test_a_person_is_asked_and_a_hangup_stops_the_motor(
     assert peer.state.motor_applied == 0
 
 
-def test_a_refusal_keeps_its_words(peer: Faulty) -> None:
+def test_a_refusal_keeps_its_message(peer: Faulty) -> None:
     peer.info = replace(peer.info, motor_limit=100)
     with pytest.raises(NotReadyError, match="INFO says motor limit 100, not 255") as refused:
         driver(peer, lambda text: True)

@@ -1,4 +1,4 @@
-"""A residual learned from recordings: it finds what the physics lacks, and leaves right physics alone."""
+"""A residual learned from recordings: it finds what the physics lacks, and is zero if nothing does."""
 
 from collections.abc import Callable, Mapping
 from functools import cache, partial
@@ -50,7 +50,7 @@ MakeEnvironment = Callable[..., CartPoleEnv]
 
 
 def rippled() -> Residual:
-    """One member that adds a force ripple along the track, and no more."""
+    """A residual of one member that adds only a force ripple along the track."""
     places = SPACING * (torch.arange(PLACES) - PLACES // 2)
     zeros = Residual.untrained(1, 6, torch.Generator().manual_seed(0))
     return zeros._replace(places=(RIPPLE / UNITS[0] * torch.sin(2 * torch.pi * places / PITCH)).unsqueeze(0))
@@ -127,7 +127,7 @@ def test_an_effect_that_the_physics_lacks_is_learned(
     assert np.corrcoef(mean, rippled().places[0, near].numpy())[0, 1] > 0.5
 
 
-def test_right_physics_is_left_alone(
+def test_complete_physics_gets_no_residual(
     record: Callable[[bool], tuple[Windows, Windows]], dynamics: Dynamics
 ) -> None:
     windows, held_out = record(False)
@@ -138,7 +138,7 @@ def test_right_physics_is_left_alone(
         assert learned[key] < 1.2 * physics[key]
 
 
-def test_the_true_model_knows_the_rest(
+def test_the_true_model_predicts_held_out_motion(
     record: Callable[[bool], tuple[Windows, Windows]], dynamics: Dynamics
 ) -> None:
     _, held_out = record(True)
@@ -160,7 +160,7 @@ def test_nothing_after_the_lead_affects_an_initial_state(
 def test_initial_states_are_found(
     record: Callable[[bool], tuple[Windows, Windows]], dynamics: Dynamics
 ) -> None:
-    """Those of a cart whose motion they were, from encoder counts alone."""
+    """The estimates from encoder counts are the true initial states."""
     windows, _ = record(False)
     positions, motors = torch.from_numpy(windows.positions), torch.from_numpy(windows.motors)
     unscaled = torch.ones(2, dtype=torch.float64)

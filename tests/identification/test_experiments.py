@@ -95,8 +95,8 @@ def test_the_swing_is_wide_and_free(recordings: dict[str, Episode]) -> None:
     assert not swing.motor[-round(7.5 / PERIOD) :].any()
 
 
-def test_nothing_is_asked_of_the_cart_after_the_last_experiment(make_plant: Callable) -> None:
-    """Also where it ended by a fault or off the track: everything is recorded then."""
+def test_the_cart_is_not_driven_after_the_last_experiment(make_plant: Callable) -> None:
+    """Also after a fault or off the track: all experiments are then recorded."""
 
     def push(task: Task) -> Moves:
         yield from hold(255, 3.0, task)
@@ -117,7 +117,7 @@ def test_nothing_is_asked_of_the_cart_after_the_last_experiment(make_plant: Call
 
 
 def test_recordings_follow_each_other_on_one_cart(recordings: dict[str, Episode]) -> None:
-    """Without a reset between them, each begins where the one before it ended: the cart stands in between."""
+    """Without resets, each recording starts where the previous one ended, with the cart at rest."""
     for before, after in pairwise(recordings.values()):
         assert before.motor[-1] == 0
         assert after.x[0] == pytest.approx(before.x[-1], abs=1e-3)
@@ -156,7 +156,7 @@ def test_the_cart_is_found(found: Identification, nominal: dict[str, float]) -> 
     assert values["lag"] == pytest.approx(true["lag"], abs=1.0)
 
 
-def test_the_law_that_holds_predicts_best(found: Identification) -> None:
+def test_the_true_friction_model_predicts_best(found: Identification) -> None:
     errors = {each.cart_friction: each.error.size for each in found.candidates}
     assert found.models.cart_friction in (CartFriction.STEP, CartFriction.STRIBECK)
     assert errors[CartFriction.LINEAR] > 3 * errors[CartFriction.STEP]
@@ -220,7 +220,7 @@ class TestChecks:
             check_recordings([rest], PERIOD)
 
     def test_a_pole_that_never_hangs_still(self, recordings: dict[str, Episode]) -> None:
-        with pytest.raises(RecordingError, match="hangs still nowhere"):
+        with pytest.raises(RecordingError, match="never hangs still"):
             check_recordings([recordings["excite"]], PERIOD)
 
     def test_swapped_motor_wires(self, recordings: dict[str, Episode]) -> None:

@@ -104,7 +104,7 @@ def test_a_fit_finds_another_pole(
     assert found["pole_com"] == pytest.approx(large.nominal.pole_com, rel=0.05)
 
 
-def test_draws_stay_what_carts_can_be(episodes: list[Episode], nominal: dict[str, float]) -> None:
+def test_draws_are_physically_possible(episodes: list[Episode], nominal: dict[str, float]) -> None:
     fit = fit_cart(cut_windows(episodes, PERIOD, most=10), nominal, STEP, PERIOD, iterations=3)
     drawn = dict(
         zip(CartParameters.names(), fit.draw(500, np.random.default_rng(0), widen=20.0), strict=True)
@@ -114,7 +114,7 @@ def test_draws_stay_what_carts_can_be(episodes: list[Episode], nominal: dict[str
     assert drawn["cart_viscous"].std() > 0
 
 
-def test_limits_are_where_parameters_end(nominal: dict[str, float]) -> None:
+def test_limits_match_the_parameter_bounds(nominal: dict[str, float]) -> None:
     unknowns = unknowns_of(STEP)
     low, _ = limits(unknowns, nominal)
     at_low = np.where(np.isfinite(low), low, 0.0)[:, None]
@@ -132,11 +132,11 @@ class TestWindows:
         broken = Episode(**{**vars(episodes[0]), "time": gap})
         assert cut_windows([broken], PERIOD).number < whole.number
 
-    def test_another_rate_is_named(self, episodes: list[Episode]) -> None:
-        with pytest.raises(RecordingError, match=r"every 20\.0 ms, and not every 10\.0 ms"):
+    def test_another_rate_is_refused(self, episodes: list[Episode]) -> None:
+        with pytest.raises(RecordingError, match=r"every 20\.0 ms, not every 10\.0 ms"):
             cut_windows(episodes, 0.01)
 
-    def test_too_short_is_named(self, episodes: list[Episode]) -> None:
+    def test_too_short_recordings_are_refused(self, episodes: list[Episode]) -> None:
         with pytest.raises(RecordingError, match="record longer"):
             cut_windows(episodes, PERIOD, seconds=12.0)
 

@@ -1,4 +1,4 @@
-"""What fine-tuning learns from: a cart's own transitions are what the agent saw while it drove."""
+"""Recorded transitions for fine-tuning equal what the agent observed while driving."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -119,7 +119,7 @@ def test_the_seed_chooses_the_recorded_transitions(make_plant: Callable, make_en
     assert not torch.equal(batches[0], batches[2])
 
 
-def test_what_nobody_measured_is_not_learned_from(make_plant: Callable, make_environment: Callable) -> None:
+def test_unmeasured_transitions_are_left_out(make_plant: Callable, make_environment: Callable) -> None:
     """The last counts are repeated where the link is lost: as if the cart had stopped at once."""
     episode, _ = drive(make_plant, make_environment, {})
     lost = replace(episode, ended_by="link")

@@ -1,4 +1,4 @@
-"""However a host ends, the motor is at 0 soon after its last command: told by the emulated cart itself.
+"""After every kind of end of a host, the motor is soon at 0, according to the emulated cart's journal.
 
 The cart runs on the wall clock and writes down, by its own clock, which commands it took and which motor
 value was in force from when on. It homes at once, and is too heavy for full motor to take it off the track.
@@ -89,7 +89,7 @@ with SerialCart(SerialSettings(port=sys.argv[1])) as cart:
 
 
 class TellingCart:
-    """The emulated cart, and what it has told since `listen`."""
+    """The emulated cart, and its journal since `listen`."""
 
     def __init__(self, journal: Path) -> None:
         self.process = subprocess.Popen(
@@ -101,7 +101,7 @@ class TellingCart:
         self.listen()
 
     def listen(self) -> None:
-        """Forget what was told so far."""
+        """Ignore journal entries so far."""
         self._from = self._told.seek(0, 2)
 
     def told(self) -> list[dict[str, Any]]:
@@ -112,7 +112,7 @@ class TellingCart:
     def stopped(self) -> tuple[float, str]:
         """Wait until the motor stays at 0 after full motor: ms from the last command until then, and by what.
 
-        A host on a busy machine may fall silent for longer than the watchdog allows, and go on to drive.
+        A host on a busy machine may pause for longer than the watchdog allows, and then drive again.
         """
         end = time.monotonic() + 10
         before: list[dict[str, Any]] = []

@@ -51,7 +51,7 @@ COMMANDS = re.findall(
 
 
 def run(command: str, *more: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    """The installed command, in a process of its own."""
+    """Run the installed command in a separate process."""
     name, *words = command.split()
     return subprocess.run([BIN / name, *words, *more], cwd=cwd, capture_output=True, text=True)
 

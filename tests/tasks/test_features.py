@@ -1,4 +1,4 @@
-"""From encoder counts to the measured state and the observation."""
+"""Conversion of encoder counts to the measured state and the observation."""
 
 import math
 

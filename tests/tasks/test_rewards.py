@@ -58,7 +58,7 @@ def test_value(kind: Reward, state: dict[str, float], expected: float) -> None:
         (Reward.SCORE, 11),
     ],
 )
-def test_most_is_earned_upright_in_the_middle_and_least_is_zero(kind: Reward, most: float) -> None:
+def test_rewards_are_largest_upright_in_the_middle_and_never_negative(kind: Reward, most: float) -> None:
     assert value(kind) == most
     values = kind.formula(random_states(10_000), X_MAX)
     assert values.max() <= most
@@ -72,6 +72,6 @@ def test_scores_of_an_episode_are_at_most_500_and_5500() -> None:
 
 
 @pytest.mark.parametrize("kind", Reward)
-def test_left_and_right_are_worth_the_same(kind: Reward) -> None:
+def test_rewards_are_symmetric(kind: Reward) -> None:
     right, left = (kind.formula(random_states(1000, side), X_MAX) for side in (1, -1))
     torch.testing.assert_close(right, left)

@@ -1,4 +1,4 @@
-"""What a fine-tuning keeps on disk, and the settings that it learns with."""
+"""Files of a fine-tuning, and the settings of its learning."""
 
 from pathlib import Path
 
@@ -46,7 +46,7 @@ def test_recorded_episodes_are_counted_by_stage(files: FinetuningFiles) -> None:
     assert "# pole_length_m: 0.3530" in files.path(Stage.BEFORE, 0).read_text()
 
 
-def test_a_checkpoint_brings_its_settings_back(files: FinetuningFiles) -> None:
+def test_a_checkpoint_restores_its_settings(files: FinetuningFiles) -> None:
     files.save({}, 2)
     checkpoint = load_training(files.folder, FINETUNING_FORMAT)
     assert checkpoint.step == 2

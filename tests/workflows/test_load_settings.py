@@ -27,7 +27,7 @@ EXPERIMENTS = sorted(path.stem for path in (conf_folder() / "experiment").glob("
 
 
 def of_hydra(schema: type[Settings], overrides: dict[str, Any]) -> Settings:
-    """What the command of `schema` reads with these overrides."""
+    """Return the settings that Hydra composes for `schema` with these overrides."""
     words = [f"{name}={value}" for name, value in overrides.items()]
     return checked(schema, as_mapping(hydra.compose(COMMANDS[schema], words)))
 
@@ -58,7 +58,7 @@ def test_choices_and_values_are_those_of_the_command(overrides: dict[str, Any]) 
     assert load_settings(TrainConfig, overrides) == of_hydra(TrainConfig, overrides)
 
 
-def test_an_evaluation_of_a_task_leaves_the_track_to_the_agent() -> None:
+def test_an_evaluation_of_a_task_uses_the_agents_track() -> None:
     overrides = {"run": "lqr", "task": "balance", "plant": "emulated", "emulator": "large"}
     assert load_settings(EvaluateConfig, overrides) == of_hydra(EvaluateConfig, overrides)
 
@@ -106,6 +106,6 @@ def test_what_is_wrong_with_a_file_is_one_line(text: str, message: str, tmp_path
         ({"seed": -1}, "seed=-1"),
     ],
 )
-def test_what_is_wrong_is_named(overrides: dict[str, Any], message: str) -> None:
+def test_errors_name_the_wrong_setting(overrides: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         load_settings(TrainConfig, overrides)

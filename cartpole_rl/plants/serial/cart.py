@@ -119,14 +119,14 @@ class SerialCart:
 
     @property
     def is_open(self) -> bool:
-        """Whether the port is open."""
+        """True while the port is open."""
         return self._open_connection is not None
 
     @property
     def information(self) -> Info:
         """The newest INFO of the cart, without asking again."""
         if self._information is None:
-            raise LinkError(f"the cart on {self.port} was never reached: open() it first")
+            raise LinkError(f"the cart on {self.port} is not connected yet: call open() first")
         return self._information
 
     @property
@@ -213,7 +213,7 @@ class SerialCart:
         LONGEST_SUSPENSION, or if the operating system delayed the value for as long as the watchdog waits.
         """
         connection = self._connection
-        limit = max(0, self.information.motor_limit)  # whatever INFO says, 0 stays 0
+        limit = max(0, self.information.motor_limit)  # 0 stays 0 for any limit in INFO
         sent = self._in_time(max(-limit, min(limit, int(value))))
         connection.send_motor(sent)
         return sent
@@ -279,7 +279,7 @@ class SerialCart:
         return self._open_connection
 
     def _abandon(self) -> None:
-        """`close` without waiting for an answer: whatever is there may be no cart."""
+        """`close` without waiting for an answer: the device may not be a cart."""
         connection = self._connection
         try:
             with suppress(LinkError):

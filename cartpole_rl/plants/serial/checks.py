@@ -1,7 +1,7 @@
-"""The checks of the preflight: small moves that show how a cart is wired and limited, and how quick it is.
+"""The checks of the preflight: small moves that show a cart's wiring, limits and latency.
 
-Each check moves the cart a few centimetres at most, brings it back to the middle, and returns its result in
-words. It raises NotReadyError, which says what is wrong and what to do about it.
+Each check moves the cart a few centimetres at most, brings it back to the middle, and returns its result as
+text. It raises NotReadyError, which says what is wrong and what to do about it.
 
 Signs: a positive motor value moves the cart to the right, and the cart's count goes up. The hanging pole of a
 cart that accelerates to the right stays behind: its tip swings left, its angle grows beyond pi, its count
@@ -53,7 +53,7 @@ def link(cart: SerialCart) -> str:
     bad = counted.bad_frames + counted.lost_frames
     if bad > LOST_SHARE * (counted.frames_received + counted.lost_frames):
         raise NotReadyError(
-            f"{counted.lost_frames} frames were lost and {counted.bad_frames} spoilt of "
+            f"{counted.lost_frames} frames were lost and {counted.bad_frames} damaged of "
             f"{counted.frames_received}",
             "use a short shielded cable, away from the motor's, or baud=115200",
         )
@@ -76,7 +76,7 @@ def link(cart: SerialCart) -> str:
 
 
 def limits(information: Info) -> str:
-    """Check that INFO describes the kind of cart that everything above the wire takes it for."""
+    """Check that the scales and limits in INFO are those that this package assumes."""
     check_scales(information)
     check_limits(information)
     soft, hard = metres(information.soft_limit_counts), metres(information.hard_limit_counts)

@@ -69,7 +69,7 @@ class Connection:
         pause = min(self._settings.answer_timeout, self._settings.connect_timeout)
         while time.perf_counter() < deadline:
             self._answers.clear()
-            self.link.write(END)  # ends whatever the cart has taken for the start of a frame
+            self.link.write(END)  # ends a partial frame that the cart may have read
             self.link.send(Hello())
             until = min(deadline, time.perf_counter() + pause)
             answer = self._await_answer(until, (), Info, lambda info: True)
@@ -209,7 +209,7 @@ class Connection:
                 return older
 
     def _is_current(self, state: State) -> bool:
-        """Whether the state was measured after the cart took the last frame, or that frame must be lost."""
+        """Return True if the state was measured after the last frame arrived, or if that frame is lost."""
         link = self.link
         if link.sequence == state.last_sequence:
             return True

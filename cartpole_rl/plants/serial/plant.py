@@ -30,7 +30,7 @@ class Owned(Protocol):
 
     @property
     def died(self) -> str:
-        """How it ended by itself, in words; empty while it lives."""
+        """The reason why it ended early; empty while it runs."""
 
     def close(self) -> None:
         """End it."""
@@ -92,7 +92,7 @@ class SerialPlant(Plant):
     def halt(self) -> None:
         """Set the motor to 0 and disarm, between episodes; does not raise."""
         self._driving = False
-        with suppress(PlantError):  # the cart's watchdog does it where the link cannot
+        with suppress(PlantError):  # the cart's watchdog does it if the link cannot
             self.cart.stop()
 
     def close(self, *, raise_if_closed: bool = True) -> None:
@@ -188,7 +188,7 @@ class SerialPlant(Plant):
         except (PortError, LinkError) as error:
             lost = f" ({self.last_error})" if self.last_error else ""
             why = self._owned.died if self._owned is not None and self._owned.died else error
-            raise LinkError(f"the link to the cart was lost{lost} and is not there again: {why}") from error
+            raise LinkError(f"the link to the cart was lost{lost} and not restored: {why}") from error
 
     def _connect(self) -> None:
         """Open the port and check the cart's scales. Raises PortError, LinkError, NotReadyError."""

@@ -1,4 +1,4 @@
-"""Find and open the serial port of a cart; say in words why it cannot be found or opened.
+"""Find and open the serial port of a cart; explain why it cannot be found or opened.
 
 An ESP32 board restarts when DTR or RTS rise, so both are set low before the port is opened. The operating
 system may still pulse them for a moment; `SerialCart` therefore sends HELLO until the cart has booted.

@@ -10,7 +10,7 @@ from cartpole_rl.wire import Flags, State
 FARTHEST = 0.08  # m from the middle: no check needs more
 LEAST_SPEED = 0.03  # m/s of the way back to the middle; slower would take long and show nothing
 NEAR = 0.004  # m from the middle: no check needs to start closer
-RAMP_STEP = 1  # motor values a period
+RAMP_STEP = 1  # motor values per period
 SMALL_SWING = pole_counts(3.5)  # peak to peak; pushes the cart like three motor values
 SHORT_PATIENCE = 5.0  # s
 MOVED = cart_counts(0.09e-3)  # more than a pole that swings can press into the gears' play
@@ -51,7 +51,7 @@ class Probe(ArmedCart):
         )
 
     def centre(self) -> None:
-        """Bring the cart back to the middle and let it stand. Needs the sign of the cart's count to be right.
+        """Bring the cart to the middle and to rest. Needs the sign of the cart's count to be right.
 
         A dead-band that is not measured yet is taken from the other side. Raises NotReadyError if the cart
         does not get there.
@@ -63,14 +63,14 @@ class Probe(ArmedCart):
         self.rest()
 
     def check(self, state: State) -> State:
-        """Note where the cart is; return the state, or raise what is wrong with it."""
+        """Record the cart's position and return the state. Raises NotReadyError or FaultError."""
         self.farthest = max(self.farthest, abs(state.cart_counts))
         self.limited = self.limited or bool(self.cart.flags & Flags.SOFT_LIMIT)
         super().check(state)
         if metres(abs(state.cart_counts)) > FARTHEST:
             self.cart.stop()
             raise NotReadyError(
-                f"the cart went {metres(state.cart_counts) * 1e3:+.0f} mm, more than any move that was asked",
+                f"the cart went {metres(state.cart_counts) * 1e3:+.0f} mm, further than any requested move",
                 "put the track level, check the motor driver",
             )
         return state

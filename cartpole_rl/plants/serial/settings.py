@@ -17,7 +17,7 @@ Wait = Annotated[float, Field(gt=0, le=600)]  # s, for the cart or a person to m
 class SerialSettings(Settings):
     """Settings of a real cart, `plant=serial`. Times in s.
 
-    Each timeout is the longest wait; a cart that works is never waited for so long.
+    Each timeout is an upper limit; a working cart answers sooner.
     """
 
     kind: Literal["serial"] = "serial"

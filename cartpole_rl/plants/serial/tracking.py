@@ -45,7 +45,7 @@ class StateTracker:
 
     @contextmanager
     def uncounted(self) -> Iterator[LinkStatistics]:
-        """Count into statistics that are thrown away: a boot banner is no fault of the link."""
+        """Discard what is counted within: a boot banner is not a fault of the link."""
         kept, self.statistics = self.statistics, LinkStatistics()
         try:
             yield self.statistics
@@ -104,7 +104,7 @@ class StateTracker:
         self._overdue = self._handed_out if delay > self.period_us * 1e-6 else None
 
     def send_question(self) -> None:
-        """Note that something else than a motor value is sent: waiting for its answer is no delay."""
+        """Note that a question is sent, not a motor value: waiting for its answer is not a delay."""
         self._driving = self.awaits_command = False
         self._overdue = self._commanded = None
 

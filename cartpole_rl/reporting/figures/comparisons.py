@@ -35,7 +35,7 @@ def comparison(
     """Draw each episode's score as a dot, the mean with a 95 % interval, and its ratio to the first mean.
 
     `results` maps a name, such as "simulated", to the scores of its episodes [episodes]. `intervals` maps a
-    name to (low, high) of its mean; where it is missing, Student's t interval is drawn, and none for a single
+    name to (low, high) of its mean; if it is missing, Student's t interval is drawn, and none for a single
     episode. `guides` names scores to draw as lines. Raises ConfigError for no result or one without episodes.
     """
     scores = {name: np.asarray(values, dtype=np.float64).ravel() for name, values in results.items()}

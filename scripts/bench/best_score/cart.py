@@ -66,7 +66,7 @@ class KnownCart:
 
     @property
     def symmetric(self) -> bool:
-        """Whether left and right are alike, so that a mirrored start has the same best score."""
+        """True if left and right are symmetric, so that a mirrored start has the same best score."""
         motors = self.config.actions.motors
         mirrored = sorted(motors) == sorted(-motor for motor in motors)
         same_dead_band = bool(self.one.deadband_left == self.one.deadband_right)
