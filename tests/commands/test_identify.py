@@ -99,7 +99,7 @@ class TestBadInput:
     def test_an_empty_folder(self, tmp_path: Path) -> None:
         done = in_process("identify", f"from={tmp_path}", folder=tmp_path)
         assert done.code == 1
-        assert "it holds no recording; give a run of cartpole-record or cartpole-identify" in done.err
+        assert "it contains no recording; give a run of cartpole-record or cartpole-identify" in done.err
 
     def test_a_single_recording(self, run: Path, tmp_path: Path) -> None:
         shutil.copy(run / "recordings/01_swing.csv", tmp_path)

@@ -40,7 +40,7 @@ def test_experiments_have_the_names_of_their_files_without_the_number(tmp_path: 
 
 
 @pytest.mark.parametrize(
-    ("name", "missing"), [(".", "it holds no recording"), ("none", "there is no such file or folder")]
+    ("name", "missing"), [(".", "it contains no recording"), ("none", "there is no such file or folder")]
 )
 def test_a_source_without_recordings_is_refused(tmp_path: Path, name: str, missing: str) -> None:
     with pytest.raises(RecordingError, match=f"{missing}; give a run of cartpole-record"):
