@@ -22,14 +22,12 @@ EXAMPLES = {  # of required settings
     "plant.port": "plant.port=/dev/ttyUSB0 (cartpole-find-port lists the ports) or plant.port=auto",
     "plant.model": "plant.model=runs/model/<run>",
 }
-_INTEGER, _NUMBER, _BOOLEAN = "give an integer", "give a number", "give true or false"
-_TEXT, _MAPPING = "give text", "give a mapping, as {{name:value}}"
 REMEDIES = {  # by pydantic's type of error; the others keep pydantic's text
-    **dict.fromkeys(("int_type", "int_parsing", "int_from_float"), _INTEGER),
-    **dict.fromkeys(("float_type", "float_parsing"), _NUMBER),
-    **dict.fromkeys(("bool_type", "bool_parsing"), _BOOLEAN),
-    **dict.fromkeys(("string_type", "path_type"), _TEXT),
-    **dict.fromkeys(("dict_type", "model_type"), _MAPPING),
+    **dict.fromkeys(("int_type", "int_parsing", "int_from_float"), "give an integer"),
+    **dict.fromkeys(("float_type", "float_parsing"), "give a number"),
+    **dict.fromkeys(("bool_type", "bool_parsing"), "give true or false"),
+    **dict.fromkeys(("string_type", "path_type"), "give text"),
+    **dict.fromkeys(("dict_type", "model_type"), "give a mapping, as {{name:value}}"),
     **dict.fromkeys(("literal_error", "enum"), "give {expected}"),
     "tuple_type": "give a list, as [0.5,0.02]",
     "finite_number": "give a finite number",

@@ -112,7 +112,7 @@ def test_numbers_come_back_to_the_bit() -> None:
     ("words", "named", "remedy"),
     [
         ("repeat.run=wide repeat.episode=7", "repeat.episode=7", "has episodes 0 to 6"),
-        ("repeat.run=wide repeat.episode=-1", "repeat.episode=-1", "greater than or equal to 0"),
+        ("repeat.run=wide repeat.episode=-1", "repeat.episode=-1", "give at least 0"),
         ("repeat.run=wide", "repeat.episode is missing", "repeat.episode=0 to 6"),
         ("repeat.episode=1", "repeat.run is missing", "the run folder of an evaluation"),
         ("repeat.run=nowhere repeat.episode=1", "repeat.run=nowhere", "give the run folder of one"),

@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 from cartpole_rl.checking import most_similar, no_such_setting, setting_names, similarity
 from cartpole_rl.choices import conf_folder, default_choices
 
-# of Hydra, to the first hyphen; without --run, which does nothing: a user means run=
+# Hydra's, each up to its first hyphen; without --run, which has no effect: a user means run=
 HYDRA_OPTIONS = (
     "help",
     "hydra",
