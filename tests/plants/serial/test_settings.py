@@ -14,7 +14,7 @@ from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.wire import Flags
 from cartpole_rl.workflows.build import evaluated_env, evaluated_settings
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
-from cartpole_rl.workflows.settings import load_settings
+from cartpole_rl.workflows.loading import load_settings
 
 TIMEOUTS = {
     "timeout": 0.35,
