@@ -14,9 +14,9 @@ def test_all_rows_are_there(tmp_path: Path, run: Run) -> None:
     shown = run(environment, tmp_path, "--quick", "--threads", str(threads), "--json", "environment.json")
     rows = {row["name"]: row for row in json.loads((tmp_path / "environment.json").read_text())}
     for peer, ours in (
-        ("Gymnasium CartPole", "dynamics, 1 period a call, 1 substep"),
-        ("Gymnasium CartPole", "dynamics, 1 period a call, 4 substeps"),
-        ("Gymnasium CartPole", "dynamics, 8 periods a call, 1 substep"),
+        ("Gymnasium CartPole", "dynamics, 1 period per call, 1 substep"),
+        ("Gymnasium CartPole", "dynamics, 1 period per call, 4 substeps"),
+        ("Gymnasium CartPole", "dynamics, 8 periods per call, 1 substep"),
         ("PendulumEnv, step", "environment, step"),
         ("PendulumEnv, step", "environment, step, not compiled"),
         ("PendulumEnv, rollout", "environment, rollout"),

@@ -115,4 +115,4 @@ class TestBadInput:
     def test_another_rate(self, run: Path, tmp_path: Path) -> None:
         done = in_process("identify", f"from={run}", "control_period=0.01", folder=tmp_path)
         assert done.code == 1
-        assert "a frame every 20.0 ms, and not every 10.0 ms" in done.err
+        assert "a frame every 20.0 ms, not every 10.0 ms" in done.err

@@ -15,7 +15,7 @@ WHAT_TO_DO = {  # with a folder, by what made it
     "finetune": "cartpole-evaluate, cartpole-record and cartpole-finetune take it as run={0}",
     "evaluate": "cartpole-evaluate drives one of its episodes again: repeat.run={0}",
     "record": "cartpole-replay, cartpole-identify and cartpole-model take it as from={0}",
-    "replay": "cartpole-replay from=... makes others",
+    "replay": "cartpole-replay from=... makes new ones",
     "identify": "cartpole-train takes its files: cart={0}/cart.yaml",
     "model": "plant=learned plant.model={0}",
     "unfinished": "cartpole-train resume={0} continues it",

@@ -278,7 +278,7 @@ def test_a_finding_is_a_line() -> None:
 def test_a_cart_too_far_out_is_stopped() -> None:
     with CartPeer() as peer, SerialCart(patient(peer.port)) as cart:
         peer.state = replace(peer.state, cart_counts=4000)
-        with pytest.raises(NotReadyError, match=r"went \+91 mm, more than any move"):
+        with pytest.raises(NotReadyError, match=r"went \+91 mm, further than any requested move"):
             Probe(cart).arm()
         assert not peer.flags & Flags.ARMED
 
