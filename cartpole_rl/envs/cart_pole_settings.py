@@ -4,7 +4,7 @@ from typing import Annotated, Any
 
 from pydantic import Discriminator, Field, Tag
 
-from cartpole_rl.envs.settings import ObservationSettings, RewardSettings, TaskSettings
+from cartpole_rl.envs.settings import GuardSettings, ObservationSettings, RewardSettings, TaskSettings
 from cartpole_rl.physics.models import Actuator, CartFriction, Models, PoleFriction
 from cartpole_rl.plants.settings import LearnedSettings, SimulatedSettings
 from cartpole_rl.randomization.poles import PoleSettings
@@ -51,6 +51,7 @@ class CartPoleSettings(Settings):
     task: TaskSettings
     reward: RewardSettings
     observation: ObservationSettings
+    guard: GuardSettings
     randomization: Randomization
     control_period: ControlPeriod
 

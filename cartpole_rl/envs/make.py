@@ -5,7 +5,7 @@ from torch import Tensor
 from torchrl.envs import TransformedEnv
 
 from cartpole_rl.envs.hardware import HardwareTransform
-from cartpole_rl.envs.settings import ObservationSettings, RewardSettings, TaskSettings
+from cartpole_rl.envs.settings import ObservationSettings, RewardSettings, TaskSettings, TrackGuard
 from cartpole_rl.plants.specs import Plant, tensordict_of
 from cartpole_rl.tasks.actions import ActionSettings
 
@@ -73,7 +73,8 @@ def make_env(
     task: TaskSettings,
     observation: ObservationSettings,
     reward: RewardSettings,
+    guard: TrackGuard | None = None,
 ) -> CartPoleEnv:
     """Return the environment over `plant`; its specs do not depend on the plant."""
-    hardware = HardwareTransform(actions.motors, task, observation, reward, compiled=plant.compiled)
+    hardware = HardwareTransform(actions.motors, task, observation, reward, guard, compiled=plant.compiled)
     return CartPoleEnv(plant, hardware)

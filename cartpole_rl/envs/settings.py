@@ -1,5 +1,7 @@
 """Settings of an environment: observation, reward, task."""
 
+from typing import Annotated
+
 from pydantic import Field
 
 from cartpole_rl.settings import Count, Finite, NonNegative, Positive, Settings
@@ -57,6 +59,27 @@ class RewardSettings(Settings):
     scale: Positive
     track_penalty: NonNegative  # for leaving the track
     position_cost: NonNegative  # of each step, times (x / x_max)^2
+
+
+class TrackGuard(Settings):
+    """The numbers of a track guard: see `envs/guard.py`."""
+
+    margin: NonNegative  # m
+    delay: NonNegative  # s
+    deceleration: Positive  # m/s^2
+
+
+class GuardSettings(Settings):
+    """The track guard: its numbers, or the quantile by which they are fitted to the carts."""
+
+    enabled: bool
+    quantile: Annotated[float, Field(gt=0, le=1)]  # of the ways that braking carts run on
+    numbers: TrackGuard | None  # None: fitted when a training starts
+
+    @property
+    def active(self) -> TrackGuard | None:
+        """The guard to drive with, None if it is disabled or not yet fitted."""
+        return self.numbers if self.enabled else None
 
 
 class TaskSettings(Settings):

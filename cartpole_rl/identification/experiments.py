@@ -14,6 +14,8 @@ import numpy as np
 import torch
 from tensordict import TensorDictBase
 
+from cartpole_rl.envs.guard import guard_side
+from cartpole_rl.envs.settings import TrackGuard
 from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 from cartpole_rl.plants.specs import Plant
 from cartpole_rl.tasks.endings import Ending
@@ -21,7 +23,7 @@ from cartpole_rl.tasks.episode import Episode
 
 REACH = 0.27  # m from the middle; the shortest track ends at 0.3
 SIDE = 0.2  # m, start of a run to the other side
-FORESIGHT = 0.12  # s in which the guard stops a cart
+GUARD = TrackGuard(margin=0.0, delay=0.12, deceleration=1 / 0.24)  # of carts that are not known yet
 BRAKE = 220  # motor value of the guard
 BREAKAWAY = 90  # motor value that moves most carts, before it is known
 STRONGEST = 255
@@ -283,9 +285,9 @@ def observed(counts: list[tuple[int, int]], gaps: list[float]) -> Observed:
 
 def guarded(motor: float, now: Observed) -> int:
     """Return the motor value, or one that brakes where the cart would get beyond REACH."""
-    ahead = now.x + FORESIGHT * now.x_dot * (1 + abs(now.x_dot))
-    if abs(ahead) > REACH and ahead * (motor + BRAKE * np.sign(ahead)) > 0:
-        return int(-np.sign(ahead) * BRAKE)
+    side = guard_side(now.x, now.x_dot, REACH, GUARD)
+    if side and motor * side < BRAKE:
+        return int(side) * BRAKE
     return int(np.clip(motor, -255, 255))
 
 

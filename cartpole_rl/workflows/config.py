@@ -15,7 +15,7 @@ from cartpole_rl.envs.cart_pole_settings import (
     PoleFrictionSettings,
     Randomization,
 )
-from cartpole_rl.envs.settings import RewardSettings
+from cartpole_rl.envs.settings import GuardSettings, RewardSettings
 from cartpole_rl.identification.settings import EnsembleSettings
 from cartpole_rl.learning.settings import (
     BufferSettings,
@@ -118,6 +118,7 @@ class EvaluateConfig(Settings):
     pole: PoleSettings | None = None
     task: dict[str, Any] | None = None  # TaskSettings, whose x_max may be missing: it is then the agent's
     reward: RewardSettings | None = None
+    guard: GuardSettings | None = None
     repeat: RepeatSettings = RepeatSettings()
     seed: Seed
     label: str
