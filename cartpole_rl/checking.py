@@ -10,8 +10,9 @@ from pydantic import ValidationError
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.settings import Settings
 
-KINDS = re.compile(
-    r"(?<=^plant\.)(simulated|emulated|serial|learned)\.|(?<=^randomization\.)(ranges|found)\."
+# the tags of unions, which pydantic adds to a key
+TAGS = re.compile(
+    r"(?<=^plant\.)(simulated|emulated|serial|learned)\.|(?<=^randomization\.)(ranges|identified)\."
 )
 NEAR = 0.8  # similarity of two names, 0 to 1, from which one is suggested for the other
 SAME_GROUP = 0.15  # added to the similarity within one group
@@ -29,7 +30,7 @@ def checked(schema: type[Config], values: Mapping[str, Any]) -> Config:
 
 
 def _complaint(detail: Mapping[str, Any], values: Mapping[str, Any]) -> str:
-    key = KINDS.sub("", ".".join(map(str, detail["loc"])))
+    key = TAGS.sub("", ".".join(map(str, detail["loc"])))
     if detail["type"] == "extra_forbidden":
         return no_such_setting(key, (name for name in setting_names(values) if not name.startswith(key)))
     if detail["type"] == "missing":

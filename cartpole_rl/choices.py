@@ -77,26 +77,48 @@ def _load(group: str, chosen: Choice) -> dict[str, Any]:
     """Return a choice of a group as plain data, with the choices of the same group that it extends."""
     if chosen is None or isinstance(chosen, Mapping):
         return dict(chosen or {})
-    if str(chosen).endswith(".yaml"):
-        return _load_file(group, Path(chosen))
     if f"{group}/{chosen}" in IN_CODE:
         return {}
-    values = choice(f"{group}/{chosen}") or {}
+    is_file = str(chosen).endswith((".yaml", ".yml"))
+    values = _load_file(group, Path(chosen)) if is_file else choice(f"{group}/{chosen}") or {}
     if group == "experiment":
         return values
+    extended = values.pop("defaults", [])
+    if not isinstance(extended, list) or not all(isinstance(name, str) for name in extended):
+        raise ConfigError(f"{group}={chosen}: defaults is a list of choices of {group}, as [large]")
     base: dict[str, Any] = {}
-    for name in values.pop("defaults", []):
-        base = _merged(base, _load(group, name))
-    return _merged(base, values)
+    for name in extended if "_self_" in extended else [*extended, "_self_"]:
+        base = _merged(base, values if name == "_self_" else _load(group, name))
+    return base
 
 
 def _load_file(group: str, path: Path) -> dict[str, Any]:
-    try:
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(f"{group}={path} cannot be read: {error}") from None
-    values: dict[str, Any] = yaml.safe_load(text.replace(HERE, str(path.resolve().parent)))
+    values: dict[str, Any] = yaml.safe_load(file_text(group, path)) or {}
     return values
+
+
+def file_text(group: str, path: Path) -> str:
+    """Return the text of a user's own choice, with its folder in place of HERE.
+
+    Raises ConfigError in one line if it cannot be read or is not a YAML mapping.
+    """
+    try:
+        text = path.read_text(encoding="utf-8").replace(HERE, str(path.resolve().parent))
+        values = yaml.safe_load(text)
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{group}={path} cannot be read: {error}") from None
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{group}={path} is not valid YAML{_where_and_why(error)}") from None
+    if not isinstance(values, dict | None):
+        raise ConfigError(f"{group}={path} holds no settings; write each as name: value")
+    return text
+
+
+def _where_and_why(error: yaml.YAMLError) -> str:
+    """Return the line and the problem of an error of the parser: ", line 3: found undefined alias 'a'"."""
+    if isinstance(error, yaml.MarkedYAMLError) and error.problem_mark is not None:
+        return f", line {error.problem_mark.line + 1}: {error.problem}"
+    return f": {' '.join(str(error).split())}"
 
 
 def _merged(base: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
@@ -117,14 +139,15 @@ def _nested(name: str, value: Any) -> dict[str, Any]:
 def _resolved(values: dict[str, Any]) -> dict[str, Any]:
     """Return `values` with the track of the cart for TRACK, and without those that are missing ("???")."""
     half_length = values.get("cart", {}).get("track_half_length")
-    return _without_missing(
+    return without_missing(
         _merged(values, {"task": {"x_max": half_length}})
         if values.get("task", {}).get("x_max") == TRACK
         else values
     )
 
 
-def _without_missing(values: Any) -> Any:
+def without_missing(values: Any) -> Any:
+    """Return nested mappings without the values that are missing ("???")."""
     if not isinstance(values, Mapping):
         return values
-    return {name: _without_missing(value) for name, value in values.items() if value != "???"}
+    return {name: without_missing(value) for name, value in values.items() if value != "???"}

@@ -2,11 +2,11 @@
 
 The function is traced to a flat graph that goes straight to TorchInductor. `torch.compile` would also check
 every Python object that the function reads, in every call, which takes longer than the arithmetic of a
-thousand carts. Where only the tensors change between calls, there is nothing to check.
+thousand carts. If only the tensors change between calls, there is nothing to check.
 
 `standalone_compile` is a private function of PyTorch: no public one compiles a traced graph without
-those checks. Should it go, `torch.compile` with `torch.compiler.skip_all_guards_unsafe` as
-`guard_filter_fn` takes its place, here alone.
+those checks. If it is removed, replace it here with `torch.compile` and the `guard_filter_fn`
+`torch.compiler.skip_all_guards_unsafe`.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -18,7 +18,7 @@ from torch import Tensor
 from torch._inductor import standalone_compile
 from torch.fx.experimental.proxy_tensor import make_fx
 
-OPTIONS = {"cpp.enable_floating_point_contract_flag": "fast"}  # a product and a sum may be rounded as one
+OPTIONS = {"cpp.enable_floating_point_contract_flag": "fast"}  # allow fused multiply-add
 
 Result = TypeVar("Result", bound=tuple)
 

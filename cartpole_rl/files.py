@@ -21,6 +21,12 @@ def replacing(path: Path) -> Iterator[Path]:
         _flush(path.parent)
 
 
+def write_text(path: Path, text: str) -> None:
+    """Write `text` to `path` atomically."""
+    with replacing(path) as beside:
+        beside.write_text(text)
+
+
 def _flush(path: Path) -> None:
     """Wait until the content of `path` is on the disk."""
     descriptor = os.open(path, os.O_RDONLY)

@@ -10,7 +10,9 @@ import time
 from collections.abc import Callable
 from types import FrameType
 
-UNWINDING = 5.0  # s after a signal during which others are ignored: they would interrupt the unwinding
+# s after a signal during which others are ignored: they would interrupt the unwinding. Stopping a cart that
+# does not answer takes up to 5.5 s: LONGEST_STOP, LAST_STOP and LONGEST_WRITE in `plants.serial`.
+UNWINDING = 6.0
 PARENT_POLL = 0.5  # s
 
 

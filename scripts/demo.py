@@ -10,17 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from cartpole_rl.reporting.figures import comparison, save
+from cartpole_rl.reporting.scores import SCORES
 from cartpole_rl.reporting.table import interval_text, table
 
 EPISODES = 10
 BIN = Path(sys.executable).parent
-FIGURES = {  # key in metrics.json: line of the table
-    "score": "score (6.2)",
-    "score_upright": "upright score (6.1)",
-    "time_to_upright_s": "time to upright, s",
-    "upright_fraction": "share of time upright",
-    "min_track_margin_m": "smallest distance to the end of the track, m",
-}
+SHOWN = ("score", "score_upright", "time_to_upright_s", "upright_fraction", "min_track_margin_m")
 
 
 def main() -> None:
@@ -64,8 +59,8 @@ def report(folder: Path, results: dict[str, dict]) -> None:
     """Print the results by plant, save the comparison figure and list all figures."""
     print(f"\nThe last checkpoint on both carts: mean and 95 % interval of {EPISODES} episodes")
     rows = [
-        {"figure": label} | {plant: mean_text(result[key]) for plant, result in results.items()}
-        for key, label in FIGURES.items()
+        {"figure": SCORES[key]} | {plant: mean_text(result[key]) for plant, result in results.items()}
+        for key in SHOWN
     ]
     print(table(rows, {"figure": "", "simulated": "simulated", "emulated": "emulated"}))
     ratio = results["emulated"]["score"]["mean"] / results["simulated"]["score"]["mean"]

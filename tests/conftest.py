@@ -1,4 +1,4 @@
-"""What tests share: the nominal cart and pole of conf/, and builders of carts, plants and environments.
+"""Shared fixtures: the nominal cart and pole of conf/, and builders of carts, plants and environments.
 
 Tests may be started where signals are ignored: a script's `&` ignores SIGINT and SIGQUIT, nohup SIGHUP. A
 child inherits that, and no Ctrl-C of a test reaches it. So every ignored signal gets a handler here, before
@@ -9,7 +9,7 @@ restores it in children.
 """
 
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -17,9 +17,11 @@ from typing import Any
 import pytest
 import torch
 import yaml
+from hydra_configs import shipped_choices
 
-from cartpole_rl.envs.make import CartPoleEnv, make_env
-from cartpole_rl.envs.settings import ObservationSettings, RewardSettings, TaskSettings
+from cartpole_rl.envs.build import make_env
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
+from cartpole_rl.envs.settings import ObservationSettings
 from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.simulated import SimulatedPlant
@@ -27,8 +29,7 @@ from cartpole_rl.plants.specs import Plant
 from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.randomization.randomizer import Randomizer
 from cartpole_rl.randomization.ranges import Range
-from cartpole_rl.tasks.actions import ActionSettings
-from cartpole_rl.tasks.settings import Start, StartSettings
+from cartpole_rl.tasks.settings import ActionSettings, RewardSettings, Start, StartSettings, TaskSettings
 
 CONF = Path(__file__).parents[1] / "conf"
 
@@ -43,8 +44,15 @@ for name in ("SIGINT", "SIGHUP", "SIGQUIT", "SIGTERM"):  # Windows has the first
 
 
 def conf(choice: str) -> dict[str, Any]:
-    """A file of conf/, as it stands there."""
+    """Return the content of a file of conf/."""
     return yaml.safe_load((CONF / f"{choice}.yaml").read_text())
+
+
+@pytest.fixture(scope="module")
+def hydra_reads_conf() -> Iterator[None]:
+    """Let the tests of a module call `hydra.compose`."""
+    with shipped_choices():
+        yield
 
 
 @pytest.fixture(autouse=True, scope="session")
@@ -90,7 +98,7 @@ STILL = StartSettings(
 
 @pytest.fixture(scope="session")
 def make_plant(ip02: dict[str, float], medium: PoleSettings) -> Callable[..., SimulatedPlant]:
-    """Simulated carts that start hanging, at rest, in the middle, unless `start` says otherwise."""
+    """Simulated carts that start hanging, at rest, in the middle, unless `start` is given."""
 
     def build(
         carts: int = 1,
@@ -99,10 +107,11 @@ def make_plant(ip02: dict[str, float], medium: PoleSettings) -> Callable[..., Si
         ranges: dict[str, Range] | None = None,
         start: StartSettings = STILL,
         models: Models = Models(),  # noqa: B008 - immutable
+        kind: type[SimulatedPlant] = SimulatedPlant,
         **settings: Any,
     ) -> SimulatedPlant:
         randomizer = Randomizer({**ip02, **(cart or {})}, poles, ranges or {})
-        return SimulatedPlant(carts, randomizer, start, models, **settings)
+        return kind(carts, randomizer, start, models, **settings)
 
     return build
 

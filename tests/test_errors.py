@@ -1,4 +1,4 @@
-"""Errors keep their words, and what else they know, on the way from one process to another."""
+"""Errors keep their message and attributes when they are pickled."""
 
 import pickle
 from collections.abc import Iterator

@@ -23,15 +23,20 @@ from cartpole_rl.physics.dynamics import State, advance, coupling, mechanism
 from cartpole_rl.physics.friction import dry_friction, pole_torque, viscous_coefficient
 from cartpole_rl.physics.models import CartFriction, Models
 from cartpole_rl.physics.parameters import GRAVITY, CartParameters
-from cartpole_rl.tasks.features import ANGULAR_SPEED_SCALE, MOTOR_SCALE, POSITION_SCALE, SPEED_SCALE
-from cartpole_rl.tasks.settings import ObservationKind, observation_size
+from cartpole_rl.tasks.features import (
+    ANGULAR_SPEED_SCALE,
+    MOTOR_SCALE,
+    POSITION_SCALE,
+    SPEED_SCALE,
+    ObservationKind,
+)
 
 Array = NDArray[np.float64]
-STATE_COST = (10.0, 1.0, 100.0, 1.0)  # of 1 m, 1 m/s, 1 rad, 1 rad/s, squared
-FORCE_COST = 0.05  # of 1 N, squared
-SUBSTEPS = 4  # of the linearized period
+STATE_COST = (10.0, 1.0, 100.0, 1.0)  # LQR weights of x, x_dot, theta, theta_dot squared, SI units
+FORCE_COST = 0.05  # 1/N^2, LQR weight of the force squared
+SUBSTEPS = 4  # integration steps per linearized period
 CATCH_ANGLE = math.radians(35)  # from upright; within it, the regulator takes over if its force suffices
-CATCH_FORCE = 1.0  # of the largest force: the limit below which the regulator acts
+CATCH_FORCE = 1.0  # share of the largest force; the regulator takes over only if it needs less
 PUMP_ACCELERATION = 3.8  # m/s^2, of the pivot while the energy is far from its target
 PUMP_BAND = 0.1  # of the pole's weight and length: energy error below which the pivot accelerates less
 TARGET_ENERGY = 1.06  # of the pole's weight and length; the surplus makes up for friction
@@ -129,7 +134,7 @@ class EnergyAndRegulator:
         return torch.where(stop.abs() > end, -stop.sign() * self.strongest, force)
 
     def value(self, force: Tensor) -> Tensor:
-        """Return minus the distance of each motor value's force from `force`, [N, A].
+        """Return the negative distance between each motor value's force and `force`, [N, A].
 
         A tie goes to the smallest motor value.
         """
@@ -138,11 +143,10 @@ class EnergyAndRegulator:
 
 def decode(observation: Tensor, kind: ObservationKind) -> tuple[State, Tensor]:
     """Return measured state [N] and last motor value [N] of observations [N, K]: inverts `tasks.features`."""
-    size = observation_size(kind)
-    numbers, motor = observation[:, :size].unbind(-1), observation[:, size] * MOTOR_SCALE
+    numbers, motor = observation[:, : kind.size].unbind(-1), observation[:, kind.size] * MOTOR_SCALE
     if kind is ObservationKind.RAW:
         return State(*numbers), motor
-    x, x_dot, cosine, sine, theta_dot = numbers
+    x, x_dot, cosine, sine, theta_dot = numbers[:5]
     theta = torch.atan2(sine, cosine)
     return State(x * POSITION_SCALE, x_dot * SPEED_SCALE, theta, theta_dot * ANGULAR_SPEED_SCALE), motor
 

@@ -16,7 +16,7 @@ from cartpole_rl.agents.settings import AgentSettings
 
 
 class QAgent(nn.Module):
-    """Online and target Q-network of `actions` outputs.
+    """The online and the target Q-network, each with `actions` outputs.
 
     `mirror_signs` [K] holds the factor, +1 or -1, of each number of an observation when left and right are
     swapped. `frames` [T, F] holds the indices of the frames that a recurrent network reads.
@@ -74,7 +74,7 @@ class QAgent(nn.Module):
     def _newest_share(self) -> float:
         """Return the share of the newest weights in the average, which spans a tenth of the updates or less.
 
-        The untrained weights are thus soon forgotten, not only after 1 / (1 - decay) updates.
+        The initial weights therefore fade sooner than after 1 / (1 - decay) updates.
         """
         assert self.settings.average_decay is not None
         return max(1 - self.settings.average_decay, 10 / (9 + int(self.updates)))

@@ -50,9 +50,9 @@ class MirrorQNetwork(nn.Module):
     Pol et al., "MDP homomorphic networks", 2020). Single carts may differ from left to right if the
     distribution of carts is symmetric.
 
-    Half of a layer's units are for the scene and half, with the same weights, for its mirror image. Their sum
+    Half of a layer's units process the input and half, with the same weights, its mirror image. Their sum
     (even) and difference (odd) never mix in a linear layer, so each layer is two of half the width. A
-    `reader` reads the scene, and then its image.
+    `reader` reads the observation, then its mirror image.
     """
 
     signs: Tensor
@@ -134,5 +134,5 @@ class MirrorLayer(nn.Module):
 
 
 def halves(scene: Tensor, image: Tensor) -> tuple[Tensor, Tensor]:
-    """Return sum and difference of a scene and its mirror image, scaled to keep the norm."""
+    """Return sum and difference of features and their mirror image, scaled to keep the norm."""
     return (scene + image) * math.sqrt(0.5), (scene - image) * math.sqrt(0.5)

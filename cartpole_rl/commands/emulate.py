@@ -6,7 +6,7 @@ cartpole-emulate emulator.latency=0.02 emulator.cart_coulomb_left=0.8
 
 from pathlib import Path
 
-from cartpole_rl.commands.application import application
+from cartpole_rl.commands.hydra_application.application import application
 from cartpole_rl.workflows.config import EmulateConfig
 
 

@@ -1,6 +1,6 @@
 """cartpole-find-port: list the serial ports and name the one of the cart.
 
-cartpole-find-port                  lists the USB serial ports, each with the chip that tells boards apart
+cartpole-find-port                  lists the USB serial ports, each with the chip that identifies its board
 cartpole-find-port watch=true       names the port that vanishes when the cart is unplugged, or appears
 """
 
@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from cartpole_rl.commands.application import application
+from cartpole_rl.commands.hydra_application.application import application
 from cartpole_rl.errors import PortError
 from cartpole_rl.plants.serial.port import found_ports
 from cartpole_rl.plants.serial.ports import UsbPort, cart_like, changes, described
@@ -32,12 +32,12 @@ class FindPortConfig(Settings):
 
 @application("find_port", FindPortConfig)
 def main(config: FindPortConfig, folder: Path) -> None:
-    """List the ports, or watch them change. Raises PortError where there is none."""
+    """List the ports, or watch them change. Raises PortError if there is none."""
     print(listing(found_ports()) if not config.watch else watched(found_ports, config.timeout))
 
 
 def listing(ports: list[UsbPort]) -> str:
-    """Return a line for each port, and the port of the cart. Raises PortError where there is none."""
+    """Return a line for each port, and the port of the cart. Raises PortError if there is none."""
     if not ports:
         raise PortError(f"no USB serial port was found: {REMEDY}")
     lines = [f"{port.device}  {described(port)}" for port in ports]
@@ -47,14 +47,14 @@ def listing(ports: list[UsbPort]) -> str:
     elif carts:
         lines.append("`cartpole-find-port watch=true` finds out which of them is the cart")
     else:
-        lines.append("None of them has a chip that carts have (CP210x, CH340, FTDI, Espressif)")
+        lines.append("None of them has a chip used on carts (CP210x, CH340, FTDI, Espressif)")
     return "\n".join(lines)
 
 
 def watched(ports: PortList, timeout: float) -> str:
     """Return a line that names the next port to vanish or appear. Raises PortError after `timeout` s."""
     before = ports()
-    print(f"{len(before)} found. Unplug the cart now, or plug it in if it is not yet ...", flush=True)
+    print(f"{len(before)} found. Unplug the cart now, or plug it in if it is unplugged ...", flush=True)
     end = time.monotonic() + timeout
     while time.monotonic() < end:
         vanished, appeared = changes(before, ports())

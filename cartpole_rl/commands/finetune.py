@@ -11,8 +11,8 @@ the next one starts, so Ctrl-C, a power cut or a pulled cable loses at most the 
 
 from pathlib import Path
 
-from cartpole_rl.commands.application import application
-from cartpole_rl.commands.overrides import check_resumption
+from cartpole_rl.commands.hydra_application.application import application
+from cartpole_rl.commands.hydra_application.overrides import check_resumption
 from cartpole_rl.workflows.checks import check_finetuning
 from cartpole_rl.workflows.config import FinetuneConfig
 

@@ -10,7 +10,7 @@ experiment is written to disk before the next one starts, and the parameters are
 
 from pathlib import Path
 
-from cartpole_rl.commands.application import application
+from cartpole_rl.commands.hydra_application.application import application
 from cartpole_rl.workflows.checks import check_identification
 from cartpole_rl.workflows.config import IdentifyConfig
 

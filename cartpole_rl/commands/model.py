@@ -8,7 +8,7 @@ Every fifth recording is held out for the test. The resulting model is for plant
 
 from pathlib import Path
 
-from cartpole_rl.commands.application import application
+from cartpole_rl.commands.hydra_application.application import application
 from cartpole_rl.workflows.checks import check_modelling
 from cartpole_rl.workflows.config import ModelConfig
 

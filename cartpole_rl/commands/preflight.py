@@ -7,7 +7,7 @@ cartpole-preflight plant=emulated emulator.deadband_right=90
 
 from pathlib import Path
 
-from cartpole_rl.commands.application import application
+from cartpole_rl.commands.hydra_application.application import application
 from cartpole_rl.workflows.config import PreflightConfig
 
 

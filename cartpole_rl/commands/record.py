@@ -10,8 +10,8 @@ episode. Simulated carts run side by side, and end together.
 
 from pathlib import Path
 
-from cartpole_rl.commands.application import application
-from cartpole_rl.commands.overrides import check_repetition
+from cartpole_rl.commands.hydra_application.application import application
+from cartpole_rl.commands.hydra_application.overrides import check_repetition
 from cartpole_rl.workflows.checks import check_evaluation
 from cartpole_rl.workflows.config import RecordConfig
 

@@ -8,7 +8,7 @@ The simulated cart restarts from the recorded state every second, since any two 
 
 from pathlib import Path
 
-from cartpole_rl.commands.application import application
+from cartpole_rl.commands.hydra_application.application import application
 from cartpole_rl.workflows.checks import check_replay
 from cartpole_rl.workflows.config import ReplayConfig
 

@@ -7,8 +7,8 @@ cartpole-train resume=runs/train/2026-11-21_12-00-00
 
 from pathlib import Path
 
-from cartpole_rl.commands.application import application
-from cartpole_rl.commands.overrides import check_resumption
+from cartpole_rl.commands.hydra_application.application import application
+from cartpole_rl.commands.hydra_application.overrides import check_resumption
 from cartpole_rl.workflows.checks import check_training
 from cartpole_rl.workflows.config import TrainConfig
 

@@ -4,8 +4,8 @@ import math
 import random
 from typing import Literal
 
+from cartpole_rl.emulator.encoders import CART_METRES, POLE_RADIANS
 from cartpole_rl.emulator.firmware import BANNER, Firmware
-from cartpole_rl.emulator.homing import CART_METRES, POLE_RADIANS
 from cartpole_rl.emulator.journal import Journal
 from cartpole_rl.emulator.physics import CartPhysics
 from cartpole_rl.emulator.settings import EmulatorSettings
@@ -47,7 +47,7 @@ class CartDevice:
 
     @property
     def unplugged(self) -> bool:
-        """Whether the cable has been pulled."""
+        """True once the cable has been pulled."""
         return self._unplug_us is not None and self.now_us >= self._unplug_us
 
     @property

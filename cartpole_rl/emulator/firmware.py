@@ -8,6 +8,7 @@ since boot.
 
 from collections.abc import Callable, Generator
 
+from cartpole_rl.emulator.encoders import CART_METRES, POLE_COUNTS, SPAN
 from cartpole_rl.emulator.guards import (
     FASTEST_CART,
     FASTEST_POLE,
@@ -16,10 +17,14 @@ from cartpole_rl.emulator.guards import (
     JumpWatch,
     StallWatch,
 )
-from cartpole_rl.emulator.homing import CART_METRES, POLE_COUNTS, SPAN, HomingError, Reading, Zeros, home
+from cartpole_rl.emulator.homing import HomingError, Reading, Zeros, home
 from cartpole_rl.emulator.motor_line import MotorLine
+from cartpole_rl.emulator.settings import LARGEST_MOTOR
 from cartpole_rl.errors import FrameError
-from cartpole_rl.wire import (
+from cartpole_rl.wire.frames import VERSION, Envelope, encode_frame, open_envelope
+from cartpole_rl.wire.messages import (
+    FROM_CART,
+    MESSAGES,
     Ack,
     ClearFault,
     Fault,
@@ -36,25 +41,19 @@ from cartpole_rl.wire import (
     Start,
     State,
     Stop,
-    encode_frame,
 )
-from cartpole_rl.wire.frames import VERSION, Envelope, open_envelope
 
 FIRMWARE = (1, 0, 0)
 BANNER = b"ets Jul 29 2019 12:21:46\r\n\r\nrst:0x1 (POWERON_RESET),boot:0x13\r\ncart 1.0.0\r\n\x00"
 # the text of an ESP32, and one 0x00 that separates it from the first frame
 PERIOD_US = 20_000
 SHORTEST_US, LONGEST_US = 5_000, 100_000
-MOTOR_LIMIT = 255
 SOFT_LIMIT = round(0.027 / CART_METRES)  # counts inside a stop
 HARD_LIMIT = round(0.008 / CART_METRES)  # counts inside a stop
 WATCHDOG_PERIODS = 3
 NO_AGE = 65535
 U32 = 0xFFFFFFFF
 NOMINAL_HALF_SPAN = round(SPAN / 2 / CART_METRES)
-HOST_MESSAGES: dict[int, type[Message]] = {
-    kind.TYPE: kind for kind in (Hello, Start, Stop, SetMotor, Home, ClearFault, SetPeriod)
-}
 
 
 class Firmware:
@@ -83,7 +82,7 @@ class Firmware:
 
     @property
     def homing(self) -> bool:
-        """Whether the cart is homing."""
+        """True while the cart is homing."""
         return self._homing is not None
 
     def receive(self, stuffed: bytes, now_us: int) -> list[bytes]:
@@ -127,10 +126,10 @@ class Firmware:
         """Carry out a frame and return the answer; None for SET_MOTOR, which the next STATE acknowledges."""
         if envelope.version != VERSION:
             return Reason.BAD_VERSION
-        if envelope.kind not in HOST_MESSAGES:
+        if envelope.kind not in MESSAGES or envelope.kind & FROM_CART:
             return Reason.UNKNOWN_TYPE
         try:
-            message = HOST_MESSAGES[envelope.kind].unpack(envelope.payload)
+            message = MESSAGES[envelope.kind].unpack(envelope.payload)
         except FrameError:
             return Reason.BAD_LENGTH
         reason = self._objection(message)
@@ -147,7 +146,7 @@ class Firmware:
     def _objection(self, message: Message) -> Reason | None:
         """Return the reason for which a message is refused now, or None."""
         match message:
-            case SetMotor(motor) if abs(motor) > MOTOR_LIMIT:
+            case SetMotor(motor) if abs(motor) > LARGEST_MOTOR:
                 return Reason.OUT_OF_RANGE
             case SetPeriod(period_us) if not SHORTEST_US <= period_us <= LONGEST_US:
                 return Reason.OUT_OF_RANGE
@@ -236,7 +235,7 @@ class Firmware:
             *FIRMWARE,
             POLE_COUNTS,
             round(CART_METRES * 1e9),
-            MOTOR_LIMIT,
+            LARGEST_MOTOR,
             half_span - SOFT_LIMIT,
             half_span - HARD_LIMIT,
             self.period_us,

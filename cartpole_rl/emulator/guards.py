@@ -1,12 +1,14 @@
 """Fault detection while the motor may move: a stalled cart and implausible encoders."""
 
+from cartpole_rl.emulator.encoders import CART_METRES, POLE_COUNTS
+
 STALL_MOTOR = 200  # smallest motor value that moves any healthy cart
 STALL_SECONDS = 0.5
-STALL_COUNTS = 44  # 1 mm
+STALL_COUNTS = round(0.001 / CART_METRES)
 PUSH_SECONDS = 0.1  # of such a push one way, after which the count must have changed
-SPEED_CHANGE = 0.2 / 22749e-9  # counts/s; 0.2 m/s turn any pole by several counts
-FASTEST_CART = 5.0 / 22749e-9  # counts/s; 5 m/s is over twice what the motor can reach on this track
-FASTEST_POLE = 16 * 4096.0  # counts/s; 16 turns a second is five times a fast swing
+SPEED_CHANGE = 0.2 / CART_METRES  # counts/s; 0.2 m/s turn any pole by several counts
+FASTEST_CART = 5.0 / CART_METRES  # counts/s; 5 m/s is over twice what the motor can reach on this track
+FASTEST_POLE = 16.0 * POLE_COUNTS  # counts/s; 16 turns a second is five times a fast swing
 
 
 class StallWatch:
@@ -14,7 +16,7 @@ class StallWatch:
 
     def __init__(self) -> None:
         self._since = 0.0  # s of pushing since the anchor was set
-        self._anchor: tuple[int, bool] | None = None  # count and direction at the beginning of this push
+        self._anchor: tuple[int, bool] | None = None  # count and direction at the start of this push
 
     def stalled(self, cart: int, motor: int, seconds: float) -> bool:
         """Return whether the cart stalls, after `seconds` under `motor` that ended at count `cart`."""
@@ -47,7 +49,7 @@ class FrozenCartWatch:
     """Detects a cart count that does not change under a hard push one way and then the other.
 
     Under a push one way only, the cart itself may be held by a stop or an obstacle, which is a stall. An
-    obstacle on one side lets the cart move the other way, by at least one count of 23 um.
+    obstacle on one side lets the cart move the other way, by at least one count.
     """
 
     def __init__(self) -> None:

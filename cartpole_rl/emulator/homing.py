@@ -1,6 +1,6 @@
 """Homing: touch both stops, check the span, centre the cart, wait until the pole hangs still.
 
-Homing works on raw encoder counts, one reading a tick, and needs only rough numbers of the cart. A
+Homing works on raw encoder counts, one reading per tick, and needs only rough numbers of the cart. A
 procedure is a generator: it receives a `Reading`, yields the motor value until the next one, and returns
 its result. The pole's zero is the middle of its last small swing. Waiting for a complete stop would not be
 more accurate: friction in the bearing holds a stopped pole up to a count off the vertical.
@@ -11,14 +11,11 @@ from collections import deque
 from collections.abc import Generator
 from dataclasses import dataclass
 
+from cartpole_rl.emulator.encoders import CART_METRES, POLE_COUNTS, POLE_RADIANS, SPAN
 from cartpole_rl.emulator.servo import PUSH, SpeedServo, SwingBrake, rough_motor
 from cartpole_rl.errors import CartPoleError
 
-CART_METRES = 22749e-9  # a count
-POLE_COUNTS = 4096  # a turn
-POLE_RADIANS = 2 * math.pi / POLE_COUNTS  # a count
 QUARTER_TURN = POLE_COUNTS // 4
-SPAN = 0.814  # m, nominal distance between the stops
 SPAN_TOLERANCE = 0.03  # of the span
 
 SEARCH_SPEED = 0.08  # m/s, towards a stop
@@ -31,11 +28,11 @@ CENTRED = 0.001  # m
 LONGEST_CENTRING = 20.0  # s
 
 WHOLE_SWING = 2.0  # s: one period of a rod of 1.5 m
-STILL = 8  # counts peak to peak, 0.7 degree
-BRAKED = 30  # counts peak to peak; the brake cannot improve a smaller swing
+STILL = round(0.7 / 360 * POLE_COUNTS)  # counts peak to peak: 0.7 degrees
+BRAKED = round(2.6 / 360 * POLE_COUNTS)  # counts peak to peak; the brake cannot improve a smaller swing
 LONGEST_BRAKING = 20.0  # s
 PATIENCE = 20.0  # s, after which NEARLY_STILL is sufficient, for a pole with hardly any friction
-NEARLY_STILL = 40  # counts peak to peak
+NEARLY_STILL = round(3.5 / 360 * POLE_COUNTS)  # counts peak to peak
 LONGEST_WAIT = 60.0  # s
 
 

@@ -21,7 +21,7 @@ class MotorLine:
 
     @property
     def limited(self) -> bool:
-        """Whether the command in force points in the forbidden direction and is held at 0."""
+        """True if the command in force points in the forbidden direction and is held at 0."""
         return self._requested * self.blocked > 0
 
     def command(self, due_us: int, value: int) -> None:

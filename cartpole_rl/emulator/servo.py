@@ -9,14 +9,17 @@ import math
 MASS = 0.85  # kg, cart and pole
 FRICTION = 0.5  # N
 PUSH = 3.0  # N, largest force of these motions
+NEGLIGIBLE = 0.02  # N, below which the motor stays off
+MOTOR_OFFSET = 50  # motor value at which the force starts
+MOTOR_PER_NEWTON = 50
 GENTLE = 0.2  # m/s^2, an acceleration that leaves the pole nearly still
 
 
 def rough_motor(force: float) -> int:
-    """Return the motor value for a force in N, roughly: an offset of 50, then 50 a newton."""
-    if abs(force) < 0.02:
+    """Return the motor value for a force in N, roughly: a line with an offset."""
+    if abs(force) < NEGLIGIBLE:
         return 0
-    return int(math.copysign(50 + 50 * min(abs(force), PUSH), force))
+    return int(math.copysign(MOTOR_OFFSET + MOTOR_PER_NEWTON * min(abs(force), PUSH), force))
 
 
 class SpeedServo:
@@ -49,10 +52,11 @@ class SwingBrake:
     RETURN = 3.0  # 1/s^2
     DAMPING = 2.0  # 1/s
     HARDEST = 2.5  # m/s^2
+    STANDS = 0.002  # m/s, a speed up to which the cart counts as standing
 
     def motor(self, x: float, x_dot: float, swing: float, swing_dot: float) -> int:
         """Return the motor value; x in m from the middle, swing in rad from hanging, signed as the angle."""
         acceleration = -self.FOLLOW * swing_dot * math.cos(swing) - self.RETURN * x - self.DAMPING * x_dot
         acceleration = max(-self.HARDEST, min(self.HARDEST, acceleration))
-        moving = x_dot if abs(x_dot) > 0.002 else acceleration
+        moving = x_dot if abs(x_dot) > self.STANDS else acceleration
         return rough_motor(MASS * acceleration + math.copysign(FRICTION, moving))

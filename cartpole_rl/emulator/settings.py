@@ -15,7 +15,8 @@ from cartpole_rl.settings import NonNegative, Positive, Settings
 Share = Annotated[
     float, Field(allow_inf_nan=False, ge=0, le=0.9)
 ]  # of frames; above 0.9 hardly any frame would arrive
-MotorValue = Annotated[float, Field(ge=0, le=255)]
+LARGEST_MOTOR = 255
+MotorValue = Annotated[float, Field(ge=0, le=LARGEST_MOTOR)]
 Coefficient = Annotated[float, Field(allow_inf_nan=False)]
 
 

@@ -1,1 +1,1 @@
-"""TorchRL environments over any plant: the hardware transform, and `make_env`."""
+"""TorchRL environments over any plant: the hardware transform, and `build` that puts them together."""

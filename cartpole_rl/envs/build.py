@@ -1,4 +1,4 @@
-"""Builds simulated environments from settings, for commands, Gymnasium, notebooks and tests alike."""
+"""Builds environments: over a plant, or from settings over simulated carts."""
 
 import math
 from collections.abc import Mapping
@@ -8,9 +8,11 @@ import torch
 
 from cartpole_rl.checking import checked
 from cartpole_rl.choices import compose
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
 from cartpole_rl.envs.guard_fitting import fitted_guard
-from cartpole_rl.envs.make import CartPoleEnv, make_env
+from cartpole_rl.envs.hardware import HardwareTransform
+from cartpole_rl.envs.settings import ObservationSettings, TrackGuard
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.physics.models import Actuator, Models
 from cartpole_rl.physics.parameters import CartParameters
@@ -25,9 +27,7 @@ from cartpole_rl.randomization.draws import Draws
 from cartpole_rl.randomization.identified import IdentifiedCarts, identified_carts
 from cartpole_rl.randomization.randomizer import Randomizer
 from cartpole_rl.randomization.settings import IdentifiedSettings
-from cartpole_rl.tasks.settings import StartSettings
-
-SIMILAR = 0.1  # largest relative difference between the length of a pole and that of a learned model's
+from cartpole_rl.tasks.settings import ActionSettings, RewardSettings, StartSettings, TaskSettings
 
 
 def shipped_settings(overrides: Mapping[str, Any] | None = None) -> CartPoleSettings:
@@ -49,6 +49,19 @@ def with_fitted_guard(config: Config) -> Config:
     motors, period = config.actions.motors, config.control_period
     numbers = fitted_guard(guard.quantile, randomizer(config), motors, models, period)
     return config.model_copy(update={"guard": guard.model_copy(update={"numbers": numbers})})
+
+
+def make_env(
+    plant: Plant,
+    actions: ActionSettings,
+    task: TaskSettings,
+    observation: ObservationSettings,
+    reward: RewardSettings,
+    guard: TrackGuard | None = None,
+) -> CartPoleEnv:
+    """Return the environment over `plant`; its specs do not depend on the plant."""
+    hardware = HardwareTransform(actions.motors, task, observation, reward, guard, compiled=plant.compiled)
+    return CartPoleEnv(plant, hardware)
 
 
 def environment(config: CartPoleSettings, plant: Plant) -> CartPoleEnv:
@@ -87,8 +100,8 @@ def simulated_env(
 def randomizer(config: CartPoleSettings) -> Draws:
     """Return the source of the carts that `config` describes. Raises ConfigError for impossible carts."""
     if isinstance(config.randomization, IdentifiedSettings):
-        return identified_carts(config.randomization, config.nominal, config.pole)
-    return Randomizer(config.nominal, config.pole, config.randomization)
+        return identified_carts(config.randomization, config.nominal_cart, config.pole)
+    return Randomizer(config.nominal_cart, config.pole, config.randomization)
 
 
 def learned_plant(
@@ -108,12 +121,12 @@ def learned_plant(
 
 
 def check_same_cart(model: LearnedModel, config: CartPoleSettings) -> None:
-    """Raise ConfigError where a learned model has another period, actuator or pole than `config`."""
+    """Raise ConfigError if a learned model has another period, actuator or pole than `config`."""
     if not math.isclose(model.period, config.control_period, rel_tol=1e-6):
         raise ConfigError(f"control_period={config.control_period}: plant.model has {model.period} s")
     if model.models.actuator != config.actions.actuator:
         raise ConfigError(f"actions: plant.model has actuator {model.models.actuator}")
     check_one_pole("plant.model", config.pole)
-    own, length = 2 * model.parameters["pole_com"], 2 * config.pole.nominal.pole_com
-    if abs(own / length - 1) > SIMILAR:
-        raise ConfigError(f"pole: plant.model has one of {own:.2f} m, not {length:.2f} m")
+    pole, own = config.pole.nominal, 2 * model.parameters["pole_com"]
+    if not pole.is_about(own):
+        raise ConfigError(f"pole: plant.model has one of {own:.2f} m, not {pole.length:.2f} m")

@@ -4,18 +4,18 @@ from typing import Annotated, Any
 
 from pydantic import Discriminator, Field, Tag
 
-from cartpole_rl.envs.settings import GuardSettings, ObservationSettings, RewardSettings, TaskSettings
+from cartpole_rl.envs.settings import GuardSettings, ObservationSettings
 from cartpole_rl.physics.models import Actuator, CartFriction, Models, PoleFriction
 from cartpole_rl.plants.settings import LearnedSettings, SimulatedSettings
-from cartpole_rl.randomization.poles import PoleSettings
+from cartpole_rl.randomization.poles import Pole, PoleSettings
 from cartpole_rl.randomization.ranges import Range
 from cartpole_rl.randomization.settings import IdentifiedSettings
 from cartpole_rl.settings import Finite, Settings
-from cartpole_rl.tasks.actions import ActionSettings
+from cartpole_rl.tasks.settings import ActionSettings, RewardSettings, TaskSettings
 
 
 def _randomization_kind(given: Any) -> str:
-    """Return "found" for the posterior of an identification, "ranges" for ranges by parameter name."""
+    """Return "identified" for the posterior of an identification, "ranges" for ranges by parameter name."""
     return "identified" if isinstance(given, IdentifiedSettings) or "posterior" in given else "ranges"
 
 
@@ -40,12 +40,41 @@ class PoleFrictionSettings(Settings):
     parameters: dict[str, Finite]
 
 
-class CartPoleSettings(Settings):
-    """An environment, but for the plant below it. Training and evaluation share these settings."""
+class CartSettings(Settings):
+    """The nominal cart, without a friction model: a fit chooses one."""
 
     cart: dict[str, Finite]
-    cart_friction: CartFrictionSettings
     pole_friction: PoleFrictionSettings
+
+    @property
+    def nominal_cart(self) -> dict[str, float]:
+        """The nominal parameters of the cart, without the pole's."""
+        return {**self.cart, **self.pole_friction.parameters}
+
+    def nominal_with(self, pole: Pole) -> dict[str, float]:
+        """Return the nominal parameters of the cart with `pole`."""
+        return {**self.nominal_cart, **pole.model_dump()}
+
+
+class SimulatedCartSettings(CartSettings):
+    """The nominal cart with its friction models."""
+
+    cart_friction: CartFrictionSettings
+
+    @property
+    def nominal_cart(self) -> dict[str, float]:
+        """The nominal parameters of the cart, without the pole's."""
+        return {**self.cart, **self.cart_friction.parameters, **self.pole_friction.parameters}
+
+    def models_with(self, actuator: Actuator, plant: SimulatedSettings | LearnedSettings) -> Models:
+        """Return the physics models of the cart with `actuator`, on `plant`."""
+        friction = self.cart_friction.model, self.pole_friction.model
+        return Models(*friction, actuator, plant.integrator, plant.pole_presses)
+
+
+class CartPoleSettings(SimulatedCartSettings):
+    """Settings of an environment without its plant, shared by training and evaluation."""
+
     pole: PoleSettings
     actions: ActionSettings
     task: TaskSettings
@@ -56,11 +85,6 @@ class CartPoleSettings(Settings):
     control_period: ControlPeriod
 
     @property
-    def nominal(self) -> dict[str, float]:
-        """The nominal parameters of the cart, without the pole's."""
-        return {**self.cart, **self.cart_friction.parameters, **self.pole_friction.parameters}
-
-    @property
     def ranges(self) -> dict[str, Range]:
         """The ranges of the randomization; of an identified cart, those that it leaves open."""
         given = self.randomization
@@ -68,10 +92,4 @@ class CartPoleSettings(Settings):
 
     def models(self, plant: SimulatedSettings | LearnedSettings) -> Models:
         """Return the physics models of the simulated cart."""
-        return Models(
-            self.cart_friction.model,
-            self.pole_friction.model,
-            Actuator(self.actions.actuator),
-            plant.integrator,
-            plant.pole_presses,
-        )
+        return self.models_with(Actuator(self.actions.actuator), plant)

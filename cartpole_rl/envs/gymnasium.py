@@ -7,8 +7,8 @@ Both wrap the same `CartPoleEnv` as everything else, with the nominal cart and t
 
 | task    | actions                                     | reward                             | ends          |
 |---------|---------------------------------------------|------------------------------------|---------------|
-| swingup | nine motor values, conf/actions/nine_levels | (6.2), as conf/reward/score has it | track         |
-| balance | left, none, right, conf/actions/three       | (6.1), as conf/reward/position     | track, 12 deg |
+| swingup | nine motor values, conf/actions/nine_levels | (6.2), as in conf/reward/score     | track         |
+| balance | left, none, right, conf/actions/three       | (6.1), as in conf/reward/position  | track, 12 deg |
 
 An episode is truncated after 10 s. An action is an index of the motor values, from full left to full right.
 `info` has the step's scores (6.1) `score_upright` and (6.2) `score`. The observation is a Box of float32
@@ -38,7 +38,7 @@ from tensordict import TensorDictBase
 
 from cartpole_rl.choices import choice
 from cartpole_rl.envs.build import shipped_settings, simulated_env, with_fitted_guard
-from cartpole_rl.envs.make import CartPoleEnv
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.plants.settings import SimulatedSettings
 
 OF_TASK = {
@@ -83,7 +83,7 @@ class CartPoleGymnasium(gymnasium.Env[Array, np.int64]):
         self.env = simulated_environment(task, 1, randomization)
         self.observation_space, self.action_space = observation_space(self.env), action_space(self.env)
         self.render_mode = render_mode
-        self._seeded = False
+        self.seeded = False  # the plant, from `np_random`
         self._present: TensorDictBase
 
     def reset(
@@ -91,10 +91,7 @@ class CartPoleGymnasium(gymnasium.Env[Array, np.int64]):
     ) -> tuple[Array, dict[str, Any]]:
         """Start an episode."""
         super().reset(seed=seed)
-        if seed is not None or not self._seeded:
-            seed_plant(self.env, self.np_random)
-            self._seeded = True
-        self._present = self.env.reset()
+        self._present = start_episodes(self, seed)
         return first_row(self._present, "observation"), {}
 
     def step(self, action: np.int64) -> tuple[Array, float, bool, bool, dict[str, Any]]:
@@ -133,7 +130,7 @@ class CartPoleVector(VectorEnv[Array, Array, Array]):
         self.single_action_space = action_space(self.env)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._seeded = False
+        self.seeded = False  # the plant, from `np_random`
         self._present: TensorDictBase
 
     def reset(
@@ -141,10 +138,7 @@ class CartPoleVector(VectorEnv[Array, Array, Array]):
     ) -> tuple[Array, dict[str, Any]]:
         """Start an episode on each cart; one seed serves all."""
         super().reset(seed=seed)
-        if seed is not None or not self._seeded:
-            seed_plant(self.env, self.np_random)
-            self._seeded = True
-        self._present = self.env.reset()
+        self._present = start_episodes(self, seed)
         return self._present["observation"].numpy().copy(), {}
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
@@ -181,6 +175,12 @@ def first_row(tensordict: TensorDictBase, key: str) -> Array:
     return tensordict.get(key)[0].numpy().copy()
 
 
-def seed_plant(env: CartPoleEnv, source: np.random.Generator) -> None:
-    """Seed the plant's generator, and no other, from Gymnasium's."""
-    env.set_seed(int(source.integers(2**31)))
+def start_episodes(wrapper: CartPoleGymnasium | CartPoleVector, seed: int | None) -> TensorDictBase:
+    """Return the first frames of new episodes.
+
+    The first ones and those after a new `seed` seed the plant's generator, and no other, from Gymnasium's.
+    """
+    if seed is not None or not wrapper.seeded:
+        wrapper.env.set_seed(int(wrapper.np_random.integers(2**31)))
+        wrapper.seeded = True
+    return wrapper.env.reset()

@@ -47,11 +47,11 @@ from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import Transform
 
 from cartpole_rl.compilation import Compiled
-from cartpole_rl.envs.perception import FirstPercept, Frame, Percept, Previous, perceive, perceive_first
-from cartpole_rl.envs.settings import ObservationSettings, RewardSettings, TaskSettings, TrackGuard
+from cartpole_rl.envs.perception import FirstPercept, Percept, PlantOutput, Previous, perceive, perceive_first
+from cartpole_rl.envs.settings import ObservationSettings, TrackGuard
 from cartpole_rl.plants.specs import Plant, tensordict_of
-from cartpole_rl.tasks.actions import NO_ACTION
 from cartpole_rl.tasks.features import LENGTH_SCALE
+from cartpole_rl.tasks.settings import NO_ACTION, RewardSettings, TaskSettings
 
 
 class HardwareTransform(Transform):
@@ -73,7 +73,7 @@ class HardwareTransform(Transform):
         self.register_buffer("_inward", inward)
         self.guard = guard
         self.register_buffer("_by_action", torch.tensor([0, *motors], dtype=torch.int64))  # from NO_ACTION on
-        self._perceive: Callable[[Previous, Frame], Percept] = partial(
+        self._perceive: Callable[[Previous, PlantOutput], Percept] = partial(
             perceive, settings=observation, task=task, rewards=reward, guard=guard
         )
         if compiled:
@@ -161,7 +161,7 @@ class HardwareTransform(Transform):
             self._scaled_length(),
             self._track_end(),
         )
-        frame = Frame(*(next_frame.get(key).T for key in Frame._fields))
+        frame = PlantOutput(*(next_frame.get(key).T for key in PlantOutput._fields))
         frame = frame._replace(truncated=frame.truncated | (current.get("action") == NO_ACTION))
         return added(next_frame, self._perceive(previous, frame))
 

@@ -1,4 +1,4 @@
-"""From frames to measured state, memory, observation, reward, scores and endings, as pure functions.
+"""Pure functions from frames to measured state, memory, observation, reward, scores and endings.
 
 They are the same for simulated and real carts. Every tensor is [k, N], the transpose of the tensordict's, so
 that compiled code runs along the carts.
@@ -10,19 +10,20 @@ import torch
 from torch import Tensor
 
 from cartpole_rl.envs.guard import guard_side
-from cartpole_rl.envs.settings import ObservationSettings, RewardSettings, TaskSettings, TrackGuard
+from cartpole_rl.envs.settings import ObservationSettings, TrackGuard
 from cartpole_rl.tasks.endings import fallen
 from cartpole_rl.tasks.features import (
     ANGULAR_SPEED_SCALE,
     MOTOR_SCALE,
     SPEED_SCALE,
     Measured,
+    ObservationKind,
     measured_position,
     measured_velocity,
     observe,
 )
-from cartpole_rl.tasks.rewards import REWARDS, SCORE, SCORE_UPRIGHT
-from cartpole_rl.tasks.settings import ObservationKind
+from cartpole_rl.tasks.rewards import SCORE, SCORE_UPRIGHT
+from cartpole_rl.tasks.settings import RewardSettings, TaskSettings
 
 
 class Previous(NamedTuple):
@@ -37,7 +38,7 @@ class Previous(NamedTuple):
     track_end: Tensor  # [1, N] m from the middle
 
 
-class Frame(NamedTuple):
+class PlantOutput(NamedTuple):
     """The plant's output after the period: see `plants.specs.Plant`."""
 
     counts: Tensor  # [2, N] int64
@@ -101,7 +102,7 @@ def perceive_first(
 
 def perceive(
     previous: Previous,
-    frame: Frame,
+    frame: PlantOutput,
     *,
     settings: ObservationSettings,
     task: TaskSettings,
@@ -118,7 +119,7 @@ def perceive(
     terminated = off_track | fallen(state, task.angle_limit)
     ended = terminated | frame.truncated | (step_count >= task.time_limit)
     values = {  # each once: the reward is often a score
-        kind: REWARDS[kind](state, task.x_max).unsqueeze(0) for kind in {rewards.kind, SCORE, SCORE_UPRIGHT}
+        kind: kind.formula(state, task.x_max).unsqueeze(0) for kind in {rewards.kind, SCORE, SCORE_UPRIGHT}
     }
     return Percept(
         torch.stack(state),

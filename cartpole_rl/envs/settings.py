@@ -1,13 +1,13 @@
-"""Settings of an environment: observation, reward, task."""
+"""Settings of the observation and of the track guard."""
 
 from typing import Annotated
 
 from pydantic import Field
 
-from cartpole_rl.settings import Count, Finite, NonNegative, Positive, Settings
-from cartpole_rl.tasks.settings import MIRROR_SIGNS, ObservationKind, Reward, StartSettings, observation_size
+from cartpole_rl.settings import NonNegative, Positive, Settings
+from cartpole_rl.tasks.features import ObservationKind
 
-POSITIONS = MIRROR_SIGNS[ObservationKind.POSITIONS]
+POSITIONS = ObservationKind.POSITIONS.mirror_signs
 
 
 class ObservationSettings(Settings):
@@ -27,13 +27,13 @@ class ObservationSettings(Settings):
     @property
     def size(self) -> int:
         """Size of an observation."""
-        return observation_size(self.kind) + self.past_size + int(self.pole_length)
+        return self.kind.size + self.past_size + int(self.pole_length)
 
     @property
     def mirror_signs(self) -> list[int]:
         """The factor of each number of an observation when left and right are swapped, [size]."""
         return [
-            *MIRROR_SIGNS[self.kind],
+            *self.kind.mirror_signs,
             *[-1] * (self.past_motors + 2 * self.past_velocities),
             *POSITIONS * self.past_positions,
             *[1] * self.pole_length,
@@ -50,15 +50,6 @@ class ObservationSettings(Settings):
         size, first = len(POSITIONS), self.size - int(self.pole_length) - len(POSITIONS) * self.past_positions
         places = [0, *range(first, first + size * self.past_positions, size)]  # of x, newest first
         return [[*range(place, place + size), size + age] for age, place in enumerate(places)][::-1]
-
-
-class RewardSettings(Settings):
-    """The reward: `kind` times `scale`, minus the costs of the track, which the scores do not have."""
-
-    kind: Reward
-    scale: Positive
-    track_penalty: NonNegative  # for leaving the track
-    position_cost: NonNegative  # of each step, times (x / x_max)^2
 
 
 class TrackGuard(Settings):
@@ -80,14 +71,3 @@ class GuardSettings(Settings):
     def active(self) -> TrackGuard | None:
         """The guard to drive with, None if it is disabled or not yet fitted."""
         return self.numbers if self.enabled else None
-
-
-class TaskSettings(Settings):
-    """The task."""
-
-    name: str
-    start: StartSettings  # of training episodes
-    evaluation_start: StartSettings
-    time_limit: Count  # control periods
-    angle_limit: Finite | None  # rad; None: the pole may hang
-    x_max: Positive  # m, of (5.4), (6.1), (6.2)

@@ -21,7 +21,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import nn
 
-from cartpole_rl.envs.make import CartPoleEnv
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.errors import CartPoleError, LinkError
 from cartpole_rl.evaluation.driving_policy import DrivingPolicy, Weights
 from cartpole_rl.evaluation.episodes import run_batch, warm_up
@@ -29,15 +29,15 @@ from cartpole_rl.plants.serial.faults import Confirm, nobody
 from cartpole_rl.plants.serial.plant import SerialPlant
 from cartpole_rl.plants.serial.statistics import LinkStatistics
 from cartpole_rl.scheduling import take_precedence
-from cartpole_rl.signals import RaiseOnce, end_with_parent, ending_signals
+from cartpole_rl.signals import UNWINDING, RaiseOnce, end_with_parent, ending_signals
 from cartpole_rl.tasks.episode import Episode
 
-GRACE = 5.0  # s from SIGTERM to SIGKILL
+GRACE = UNWINDING + 4.0  # s from SIGTERM to SIGKILL: after the unwinding, PyTorch takes seconds to end
 MakeEnv = Callable[[Confirm], CartPoleEnv]  # over a cart whose faults are cleared if a person confirms
 
 
 @dataclass(frozen=True)
-class Drive:
+class DriveRequest:
     """A request to drive one episode."""
 
     weights: Weights  # of the greedy policy
@@ -47,7 +47,7 @@ class Drive:
 
 @dataclass(frozen=True)
 class Driven:
-    """The result of a Drive: the episode, and the statistics of the link since the process started."""
+    """The result of a DriveRequest: the episode, and the statistics of the link since the process started."""
 
     episode: Episode
     link: LinkStatistics
@@ -99,7 +99,7 @@ class Driver:
         assert self._process.pid is not None
         return self._process.pid
 
-    def start(self, drive: Drive) -> None:
+    def start(self, drive: DriveRequest) -> None:
         """Start an episode, and return at once. Raises LinkError if the process died."""
         with _alive():
             self._ours.send(drive)
@@ -186,7 +186,7 @@ def _drive_on_demand(
     real_time: bool,
     parent: int,
 ) -> None:
-    """Drive an episode for each `Drive` in the pipe, until it is closed."""
+    """Drive an episode for each `DriveRequest` in the pipe, until it is closed."""
     with closing(make_env(partial(_ask, pipe))) as env:
         if compiled:
             env.hardware.compile_arithmetic()
@@ -202,7 +202,7 @@ def _ask(pipe: Connection, text: str) -> bool:
     return bool(pipe.recv())
 
 
-def _drive(env: CartPoleEnv, policy: DrivingPolicy, drive: Drive, parent: int) -> Driven:
+def _drive(env: CartPoleEnv, policy: DrivingPolicy, drive: DriveRequest, parent: int) -> Driven:
     policy.load(drive.weights)
     random = np.random.default_rng(drive.seed)
     actions = len(env.hardware.motors)

@@ -13,10 +13,10 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from cartpole_rl.envs.make import CartPoleEnv
-from cartpole_rl.tasks.actions import NO_ACTION
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.tasks.settings import NO_ACTION
 
 # reads `observation` [N, K]; writes `action` [N] and, if it has them, the `action_value` [N, A]
 Policy = Callable[[TensorDictBase], TensorDictBase]
@@ -41,7 +41,7 @@ def warm_up(env: CartPoleEnv, policy: Policy) -> None:
 
 
 def choose(policy: Policy, current: TensorDictBase) -> Tensor:
-    """Return the policy's actions [N]; NO_ACTION where the observation or an action value is not finite.
+    """Return the policy's actions [N]; NO_ACTION if the observation or an action value is not finite.
 
     The argmax of NaN values is the first action, full motor to the left.
     """
@@ -100,7 +100,7 @@ def _note_endings(
 
 
 def _ending(env: CartPoleEnv, action: int, last: TensorDictBase) -> str:
-    reported = getattr(env.plant, "ended_by", "")
+    reported = env.plant.ended_by
     if reported:
         return str(Ending(reported))
     if action == NO_ACTION:

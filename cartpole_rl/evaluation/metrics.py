@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
+from cartpole_rl.intervals import CONFIDENCE, student_interval
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.tasks.upright import is_upright, upright_since, wrap
 
-CONFIDENCE = 0.95
 RESAMPLES = 5000
 
 
 def episode_metrics(episode: Episode, track_half_length: float) -> dict[str, Any]:
-    """Return the metrics of one episode for metrics.json; None where a metric is undefined.
+    """Return the metrics of one episode for metrics.json; None if a metric is undefined.
 
     `score` and `score_upright` are the sums of (6.2) and (6.1); `time_to_upright_s` the first time from which
     the pole stays within 5 degrees for 1 s; `upright_fraction` the share of periods within 5 degrees, over
@@ -62,9 +62,8 @@ def interval(values: Sequence[float]) -> tuple[float, float] | tuple[None, None]
     low, high = (float(edge) for edge in result.confidence_interval)
     if math.isfinite(low) and math.isfinite(high):
         return low, high
-    # BCa is undefined for those; use Student's t
-    half = float(stats.sem(data) * stats.t.ppf((1 + CONFIDENCE) / 2, len(data) - 1))
-    return float(data.mean()) - half, float(data.mean()) + half
+    # BCa is undefined for those
+    return student_interval(data)
 
 
 def summarize(episodes: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -13,6 +13,7 @@ import numpy as np
 
 from cartpole_rl.errors import RecordingError
 from cartpole_rl.files import replacing
+from cartpole_rl.physics.motor import LARGEST_MOTOR
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
 
@@ -25,7 +26,6 @@ STATE = {  # column: field of Episode
     "theta_dot_rad_per_s": "theta_dot",
 }
 STEP = {"score": "score", "score_upright": "score_upright", "reward": "reward"}
-LARGEST_MOTOR = 255
 COUNTS = ("cart_counts", "pole_counts")
 LENGTH = "pole_length_m"  # in the heading: twice pivot to centre of mass, empty if not known
 GUARDED = "guarded"  # 1 where the track guard replaced the agent's motor value; empty without a guard
@@ -51,7 +51,7 @@ def write_recording(path: Path, episode: Episode, facts: Mapping[str, Any] | Non
 
 
 def read_recording(path: Path) -> Episode:
-    """Read the episode in a file. Raises RecordingError if it is no recording, or damaged."""
+    """Read the episode in a file. Raises RecordingError if it is damaged or not a recording."""
     facts, text = {}, []
     try:
         for line in path.read_text().splitlines():
@@ -63,7 +63,7 @@ def read_recording(path: Path) -> Episode:
     except (OSError, UnicodeDecodeError) as error:
         raise RecordingError(f"{path} cannot be read: {error}") from None
     if facts.get("format") != FORMAT:
-        raise RecordingError(f"{path} is no recording: its first line is not '# format: {FORMAT}'")
+        raise RecordingError(f"{path} is not a recording: its first line is not '# format: {FORMAT}'")
     rows = list(csv.DictReader(text))
     if missing := [name for name in COLUMNS if not rows or name not in rows[0]]:
         raise RecordingError(f"{path} lacks {', '.join(missing)}")

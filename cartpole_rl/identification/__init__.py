@@ -1,1 +1,1 @@
-"""Identification: what a recording says about the cart that it was made on."""
+"""Identification: the parameters of a cart, estimated from recordings."""

@@ -1,6 +1,6 @@
 """Checks of recordings before a cart is fitted to them. A message says what is wrong and what to do.
 
-A fit finds a cart for any numbers. These checks refuse numbers that no cart could have made.
+A fit returns a cart for any data. These checks refuse data that no cart could have produced.
 """
 
 from collections.abc import Sequence
@@ -49,7 +49,7 @@ def check_recordings(episodes: Sequence[Episode], period: float) -> None:
         )
     if not any(_hangs_still(episode, period) for episode in episodes):
         raise RecordingError(
-            "the pole hangs still nowhere in the recordings, so its zero cannot be checked; "
+            "the pole never hangs still in the recordings, so its zero cannot be checked; "
             "start one with half a second of the pole at rest"
         )
     _check_signs(episodes, period)
@@ -72,7 +72,7 @@ def _check_units(episode: Episode, number: int) -> None:
 
 
 def _check_encoders(episode: Episode, number: int, period: float) -> None:
-    """Refuse a count that stands while the other one, or the motor, shows that it should move."""
+    """Refuse a count that is constant while the other count or the motor shows that it should change."""
     long = round(FROZEN / period)
     cart, pole = episode.counts[:, 0], episode.counts[:, 1]
     for name, own, other, enough in (

@@ -2,9 +2,9 @@
 
 Windows of recorded motion are predicted by physics and residual together, and gradients flow through the
 whole window: the same encoder counts of positions as in the fit, no measured velocity, no one-step target.
-The initial state of each window is a nuisance. It is matched anew at intervals, for the current residual; in
+Initial states of windows are nuisance parameters, matched again at intervals, for the current residual; in
 between, any effect that a changed initial state could explain is projected out of the errors (variable
-projection, as in the fit). With initial states merely held, learning is several times as slow.
+projection, as in the fit). With fixed initial states learning is several times slower.
 
 Members differ by their first weights and by the weights of the windows, which are drawn for each (the
 Bayesian bootstrap; Rubin, 1981). A share of the windows is left out for each member: it keeps the parameters
@@ -34,8 +34,8 @@ from cartpole_rl.identification.settings import EnsembleSettings
 from cartpole_rl.identification.windows import Windows
 from cartpole_rl.physics.residual import INPUTS, UNDER_WAY, Residual
 
-REFRESHING = 2  # steps towards the initial states each time after the first
-BACKGROUND = 256  # random motions an update
+REFRESHING = 2  # matching steps in each refresh after the first
+BACKGROUND = 256  # random motions per update
 
 
 class Ensemble:
@@ -84,7 +84,7 @@ class Ensemble:
         return self.best
 
     def refresh(self, rounds: int, update: int) -> None:
-        """Match the initial states anew, and keep the members that are better than ever before."""
+        """Match the initial states again, and keep each member that beats its best loss so far."""
         self.initial = match_initial_states(
             self.dynamics,
             self.positions,

@@ -1,12 +1,11 @@
-"""Experiments on a cart: motor values under which its parameters show.
+"""Experiments on a cart: motor values that make its parameters observable.
 
-An experiment is a generator: it yields the motor value of the next period and is sent the observation at its
-end. Only motor values and encoder positions go in and out, so that any plant can be used. A guard keeps the
-cart clear of the track's ends: it brakes, whatever an experiment requests.
+An experiment is a sequence of `moves`. Only motor values and encoder positions go in and out, so that any
+plant can be used. A guard keeps the cart clear of the track's ends: it brakes, whatever the experiment.
 """
 
 import math
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import NamedTuple
 
@@ -16,54 +15,33 @@ from tensordict import TensorDictBase
 
 from cartpole_rl.envs.guard import guard_side
 from cartpole_rl.envs.settings import TrackGuard
+from cartpole_rl.identification.moves import (
+    SIDE,
+    Moves,
+    Observed,
+    Task,
+    and_stop,
+    go_to,
+    hold,
+    push,
+    until_stopped,
+)
 from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
+from cartpole_rl.physics.motor import LARGEST_MOTOR
 from cartpole_rl.plants.specs import Plant
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
 
 REACH = 0.27  # m from the middle; the shortest track ends at 0.3
-SIDE = 0.2  # m, start of a run to the other side
 GUARD = TrackGuard(margin=0.0, delay=0.12, deceleration=1 / 0.24)  # of carts that are not known yet
 BRAKE = 220  # motor value of the guard
 BREAKAWAY = 90  # motor value that moves most carts, before it is known
-STRONGEST = 255
 BROKEN_AWAY = 0.002  # m
-CLOSE, SLOW = 0.02, 0.05  # m, m/s: at the target, and at rest
-LONGEST_MOVE = 4.0  # s
-STANDING, LONGEST_STOP = 0.005, 3.0  # m/s, s: at the end of an experiment
 RIGHT, LEFT = 1, -1
 
 
-class Observed(NamedTuple):
-    """The observation at the end of a period."""
-
-    x: float  # m
-    x_dot: float  # m/s, a difference
-    theta: float  # rad, 0 upright
-    theta_dot: float  # rad/s, a difference
-
-
-Moves = Generator[int, Observed, int | None]
-
-
-class Task(NamedTuple):
-    """The conditions of an experiment."""
-
-    period: float  # s, of control
-    random: np.random.Generator
-    breakaway: int  # motor value that moves the cart from rest
-
-    def periods(self, seconds: float) -> int:
-        """Return the number of control periods in a time."""
-        return round(seconds / self.period)
-
-    def moving(self, more: int) -> int:
-        """Return a motor value that moves the cart, by `more` than needed."""
-        return min(STRONGEST, self.breakaway + more)
-
-
 class Experiment(NamedTuple):
-    """A named sequence of moves, which return a motor value that moves the cart if they show one."""
+    """A named sequence of moves; they return the breakaway motor value if they measure it."""
 
     name: str
     shows: str  # the parameters, in words
@@ -73,13 +51,13 @@ class Experiment(NamedTuple):
 def ramps(task: Task) -> Moves:
     """Raise the motor value to each side until the cart breaks away; return a value that always moves it."""
     needed = 0
-    yield from hold(0, 0.6, task)  # the pole at rest: where its zero is
+    yield from hold(0, 0.6, task)  # the pole at rest shows its zero
     for side in 3 * (RIGHT, LEFT):
         yield from go_to(-side * 0.08, task)
         yield from hold(0, 0.4, task)
         start = now = yield 0
         size = 20
-        while abs(now.x - start.x) < BROKEN_AWAY and size < STRONGEST:
+        while abs(now.x - start.x) < BROKEN_AWAY and size < LARGEST_MOTOR:
             size += 1
             now = yield side * size
         needed = max(needed, size)
@@ -100,7 +78,7 @@ def free_swing(task: Task, swing: float = 1.6, seconds: float = 24.0) -> Moves:
 
 
 def coast(task: Task) -> Moves:
-    """Push the cart to each side, weakly and strongly, and let it run out."""
+    """Push the cart to each side, weakly and strongly, and let it coast."""
     for more in (20, 50, 90, 140):
         for side in (RIGHT, LEFT):
             yield from go_to(-side * SIDE, task)
@@ -110,7 +88,7 @@ def coast(task: Task) -> Moves:
 
 
 def levels(task: Task) -> Moves:
-    """Hold small motor values on a moving cart: the force near the dead-band does not show at rest."""
+    """Hold small motor values on a moving cart: the force near the dead-band is not observable at rest."""
     for size in (40, 50, 55, 60, 65, 70, 80, 95):
         for side in (RIGHT, LEFT):
             yield from go_to(-side * SIDE, task)
@@ -120,7 +98,7 @@ def levels(task: Task) -> Moves:
 
 
 def square(task: Task) -> Moves:
-    """Reverse the force at regular times: the delay shows."""
+    """Reverse the force at regular intervals, which makes the delay observable."""
     for more in (50, 100):
         yield from go_to(0.0, task)
         for half in (0.1, 0.14, 0.2):
@@ -149,56 +127,9 @@ EXPERIMENTS = (
     Experiment("levels", "the force of small motor values", levels),
     Experiment("square", "latency and lag", square),
     Experiment("excite", "everything at once", excite),
-    Experiment("held_out", "nothing: kept to judge the fit by", partial(excite, seconds=40.0)),
+    Experiment("held_out", "nothing: held out to judge the fit", partial(excite, seconds=40.0)),
 )
 HELD_OUT = "held_out"
-
-
-# the moves of which experiments consist
-
-
-def hold(motor: int, seconds: float, task: Task) -> Moves:
-    """Hold one motor value for `seconds` s."""
-    for _ in range(task.periods(seconds)):
-        yield motor
-    return None
-
-
-def push(motor: int, speed: float, task: Task) -> Moves:
-    """Hold one motor value until the cart reaches a speed, m/s, or has moved 0.1 m, at most half a second."""
-    start = now = yield motor
-    for _ in range(task.periods(0.5)):
-        if abs(now.x - start.x) > 0.1 or abs(now.x_dot) > speed:
-            break
-        now = yield motor
-    return None
-
-
-def until_stopped(motor: int, side: int, task: Task) -> Moves:
-    """Hold one motor value until the cart stops or gets near the end at `side`, then rest briefly."""
-    now = yield motor
-    for _ in range(task.periods(LONGEST_MOVE)):
-        if abs(now.x_dot) < SLOW / 5 or side * now.x > SIDE + 0.03:
-            break
-        now = yield motor
-    yield from hold(0, 0.2, task)
-    return None
-
-
-def go_to(target: float, task: Task) -> Moves:
-    """Bring the cart near `target` m."""
-    now = yield 0
-    for _ in range(task.periods(LONGEST_MOVE)):
-        away = target - now.x
-        if abs(away) < CLOSE and abs(now.x_dot) < SLOW:
-            break
-        wish = np.clip(6 * away, -0.5, 0.5) - now.x_dot  # m/s
-        now = yield round(np.sign(wish) * 0.8 * task.breakaway + 250 * wish)
-    yield 0
-    return None
-
-
-# making recordings of experiments
 
 
 def conduct(
@@ -224,16 +155,6 @@ def conduct(
         yield experiment, recorded
 
 
-def and_stop(moves: Moves, task: Task) -> Moves:
-    """Make the moves, then hold motor 0 until the cart stands; return the result of the moves."""
-    breakaway = yield from moves
-    for _ in range(task.periods(LONGEST_STOP)):
-        now = yield 0
-        if abs(now.x_dot) < STANDING:
-            break
-    return breakaway
-
-
 def driven(plant: Plant, present: TensorDictBase, motor: int) -> TensorDictBase:
     """Return the frame at the end of a period under a motor value."""
     return plant.step(present.set("motor", torch.tensor([[motor]])))["next"]
@@ -255,7 +176,7 @@ def run(plant: Plant, present: TensorDictBase, moves: Moves) -> tuple[Episode, T
         gaps.append(float(following["dt"]))
         present = following
         if following["terminated"] or following["truncated"]:
-            ended = str(getattr(plant, "ended_by", "") or Ending.TRACK)
+            ended = str(plant.ended_by or Ending.TRACK)
             break
         try:
             requested = moves.send(observed(counts, gaps))
@@ -284,11 +205,11 @@ def observed(counts: list[tuple[int, int]], gaps: list[float]) -> Observed:
 
 
 def guarded(motor: float, now: Observed) -> int:
-    """Return the motor value, or one that brakes where the cart would get beyond REACH."""
+    """Return the motor value, or one that brakes if the cart would get beyond REACH."""
     side = guard_side(now.x, now.x_dot, REACH, GUARD)
     if side and motor * side < BRAKE:
         return int(side) * BRAKE
-    return int(np.clip(motor, -255, 255))
+    return int(np.clip(motor, -LARGEST_MOTOR, LARGEST_MOTOR))
 
 
 def recording(counts: np.ndarray, gaps: np.ndarray, motors: np.ndarray, ended_by: str) -> Episode:

@@ -1,10 +1,10 @@
-"""Fits the cart whose predictions match recorded windows.
+"""Fit of a cart whose predictions match recorded windows.
 
 Residuals are encoder counts of positions only; see `matching`. One-step regression, the thesis's way, puts
 the same quantized sample into regressor and target, and one count at 50 Hz is 0.077 rad/s.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -57,6 +57,18 @@ class Fit:
         return parameters_at(points, self.unknowns, self.nominal).numpy()
 
 
+def best_fit(
+    windows: Windows,
+    nominal: Mapping[str, float],
+    candidates: Iterable[Models],
+    period: float,
+    substeps: int = 4,
+) -> tuple[Fit, Models]:
+    """Return the fit with the lowest cost among those under each of the `candidates`, and its models."""
+    fits = [(fit_cart(windows, nominal, models, period, substeps), models) for models in candidates]
+    return min(fits, key=lambda each: each[0].cost)
+
+
 def fit_cart(
     windows: Windows,
     nominal: Mapping[str, float],
@@ -66,13 +78,13 @@ def fit_cart(
     iterations: int = 25,
     known: Sequence[str] = (),
     sharpened: bool = False,
-    lead: float = 0.0,
+    extra_latency: float = 0.0,
 ) -> Fit:
     """Return the most probable cart, searched for from several starts.
 
-    The names `known`, of UNKNOWNS, keep their nominal values. Motion shows nothing but ratios of forces and
-    masses: without WEIGHED among them the scale is that of the prior. `lead` is that of `rollout`. With
-    `sharpened`, a second search weighs errors by the size that the first one left.
+    The names `known`, of UNKNOWNS, keep their nominal values. Motion shows only ratios of forces and
+    masses: unless WEIGHED are known, the prior sets the scale. `extra_latency` is that of `rollout`.
+    With `sharpened`, a second search weighs errors by the size that the first one left.
     """
     unknowns, nominal = unknowns_of(models, known), dict(nominal)
     positions, motors = torch.from_numpy(windows.positions), torch.from_numpy(windows.motors)
@@ -83,29 +95,39 @@ def fit_cart(
         variants = points.shape[1]
         table = parameters_at(points.numpy(), unknowns, nominal).repeat(1, windows.number)
         every = motors.repeat_interleave(variants, 1)
-        counts = rollout(table, motion.flatten(1), every, models, period, substeps, lead)
+        counts = rollout(table, motion.flatten(1), every, models, period, substeps, extra_latency)
         return counts.unflatten(2, (windows.number, variants))
 
     problem = Matching(simulate, positions, COARSE, guess, (low, high))
-    names = [unknown.name for unknown in unknowns]
-    starts = [
-        torch.tensor([start.get(name, 0.0) for name in names], dtype=torch.float64)
-        for start in STARTS
-        if start.keys() <= {*names}
-    ]
-    best = min((problem.minimize(start, guess, SCREENING) for start in starts), key=lambda each: each.cost)
+    screened = [problem.minimize(start, guess, SCREENING) for start in starting_points(unknowns)]
+    best = min(screened, key=lambda each: each.cost)
     best = problem.minimize(best.point, best.motion, iterations)
     if sharpened:
         scale = torch.maximum(spread(problem, best), FINEST)
         problem = Matching(simulate, positions, scale, guess, (low, high))
         best = problem.minimize(best.point, best.motion, iterations)
-    residuals = by_encoder(problem, best)
+    return described(problem, best, windows, unknowns, nominal)
+
+
+def starting_points(unknowns: Sequence[Unknown]) -> list[Tensor]:
+    """Return those of STARTS, [U] each, whose names are all among the unknowns."""
+    names = [unknown.name for unknown in unknowns]
+    return [
+        torch.tensor([start.get(name, 0.0) for name in names], dtype=torch.float64)
+        for start in STARTS
+        if start.keys() <= {*names}
+    ]
+
+
+def described(
+    problem: Matching, best: Match, windows: Windows, unknowns: list[Unknown], nominal: dict[str, float]
+) -> Fit:
+    """Return the cart of a match with its uncertainty and residuals."""
+    residuals, normal = by_encoder(problem, best), problem.normal_equations(best.point, best.motion)
     return Fit(
         unknowns,
         best.point.numpy(),
-        problem.normal_equations(best.point, best.motion)
-        .covariance(torch.from_numpy(windows.episode))
-        .numpy(),
+        normal.covariance(torch.from_numpy(windows.episode)).numpy(),
         nominal,
         spread(problem, best).numpy(),
         np.array([neighbours_correlate(residuals[..., encoder].numpy()) for encoder in range(2)]),

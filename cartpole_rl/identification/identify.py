@@ -1,4 +1,4 @@
-"""From recordings to a cart: its friction model, its numbers with their uncertainty, and warnings."""
+"""Identification of a cart from recordings: friction model, parameters with uncertainty, warnings."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -9,19 +9,19 @@ from numpy.typing import NDArray
 
 from cartpole_rl.identification.fit import Fit, fit_cart
 from cartpole_rl.identification.replay import Replayed, replay
+from cartpole_rl.identification.rollout import Dynamics
 from cartpole_rl.identification.unknowns import WEIGHED, limits
 from cartpole_rl.identification.windows import cut_windows
 from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 from cartpole_rl.physics.models import CartFriction, Models
+from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.tasks.upright import wrap
 
 Array = NDArray[np.floating]
 CART_FRICTIONS = (CartFriction.LINEAR, CartFriction.SIGMOID, CartFriction.STEP, CartFriction.STRIBECK)
-WINDOW = 0.5  # s
 HORIZON = 1.0  # s of held-out motion, predicted
-AWAY = 0.6  # rad from upright; nearer to it, an error grows e times in 0.15 s, whatever the cart
-UNIT = np.array([5e-3, np.radians(2.0)])  # m, rad: errors of cart and pole that weigh alike
+AWAY = 0.6  # rad from upright; nearer to it, an error grows e times in 0.15 s for any cart
 SCREENING_STEPS = 4  # integration steps a period when a friction model is screened
 CONTENDS = 1.5  # a screened model stays a candidate up to this multiple of the best one's error
 FALLOFF = 4  # a model with twice the error of the best one has a weight of 2^-FALLOFF
@@ -32,18 +32,33 @@ ROUNDING = np.array([0.6, 0.6])  # counts: a generous bound of the effect of qua
 CORRELATED = 0.5  # correlation of neighbouring residuals from which they are not white
 
 
-class Candidate(NamedTuple):
-    """A fit under one model of the cart's friction, and its errors on held-out motion."""
+class PredictionError(NamedTuple):
+    """RMS error of a prediction over HORIZON s, in the median stretch away from upright."""
 
-    cart_friction: CartFriction
-    fit: Fit
-    x_error: float  # m, RMS over HORIZON of the median stretch
-    theta_error: float  # rad, the same
+    x: float  # m
+    theta: float  # rad
 
     @property
-    def error(self) -> float:
+    def size(self) -> float:
         """Both errors in one number."""
-        return float(np.hypot(self.x_error / UNIT[0], self.theta_error / UNIT[1]))
+        return float(np.hypot(self.x / ALIKE.x, self.theta / ALIKE.theta))
+
+
+ALIKE = PredictionError(5e-3, np.radians(2.0))  # errors of cart and pole with equal weight
+
+
+class Candidate(NamedTuple):
+    """A fit under one model of the cart's friction, and its predictions of held-out motion."""
+
+    fit: Fit
+    dynamics: Dynamics
+    held_out: list[Replayed]
+    error: PredictionError
+
+    @property
+    def cart_friction(self) -> CartFriction:
+        """The model of the cart's friction."""
+        return self.dynamics.models.cart_friction
 
 
 @dataclass(frozen=True)
@@ -51,10 +66,16 @@ class Identification:
     """The result of an identification."""
 
     fit: Fit  # under the best friction model; its covariance includes how far the other fits lie from it
-    models: Models
+    dynamics: Dynamics  # of the identified cart
     candidates: list[Candidate]
     held_out: list[Replayed]
+    error: PredictionError  # of `held_out`
     warnings: list[str]  # sentences: results that may be wrong
+
+    @property
+    def models(self) -> Models:
+        """The physics models of the identified cart."""
+        return self.dynamics.models
 
 
 def identify(
@@ -68,13 +89,13 @@ def identify(
 ) -> Identification:
     """Identify the cart that `episodes` were recorded on, judged by `held_out`, with the pole of `nominal`.
 
-    The model of the cart's friction is chosen here; `models` gives the others. Raises RecordingError where
-    the recordings are not sufficient.
+    The model of the cart's friction is chosen here; `models` gives the others. At most `most` windows are
+    fitted to. Raises RecordingError where the recordings are not sufficient.
     """
 
     def attempt(cart_friction: CartFriction, count: int, steps: int, sharpened: bool) -> Candidate:
-        windows = cut_windows(episodes, period, round(WINDOW / period), count)
-        under = models._replace(cart_friction=cart_friction)
+        under, half_step = models._replace(cart_friction=cart_friction), period / steps / 2
+        windows = cut_windows(episodes, period, most=count)
         fit = fit_cart(
             windows,
             nominal,
@@ -83,41 +104,28 @@ def identify(
             steps,
             known=WEIGHED,
             sharpened=sharpened,
-            lead=lead(period, steps),
+            extra_latency=half_step,  # (3.8) moves a cart half a step early
         )
-        return Candidate(
-            cart_friction, fit, *prediction_errors(predicted(held_out, fit, under, period, steps))
-        )
+        dynamics = Dynamics.of(fit.parameters, under, period, steps, half_step)
+        replays = replay(held_out, dynamics, HORIZON)
+        return Candidate(fit, dynamics, replays, prediction_error(replays))
 
     screened = [attempt(each, most // 3, SCREENING_STEPS, False) for each in CART_FRICTIONS]
-    good = CONTENDS * min(each.error for each in screened)
-    candidates = [
-        attempt(each.cart_friction, most, substeps, True) if each.error < good else each for each in screened
-    ]
-    contenders = [now for now, then in zip(candidates, screened, strict=True) if now is not then]
-    best = min(contenders, key=lambda each: each.error)
-    chosen, fit = models._replace(cart_friction=best.cart_friction), widened(best, contenders)
-    cut = [each.ended_by for each in (*episodes, *held_out) if each.ended_by in ("link", "fault")]
-    early = [f"{len(cut)} of the recordings ended early, by {' and '.join(sorted({*cut}))}"] if cut else []
-    return Identification(
-        fit, chosen, candidates, predicted(held_out, fit, chosen, period, substeps), early + warnings(fit)
-    )
+    largest = CONTENDS * min(each.error.size for each in screened)
+    contenders = {
+        each.cart_friction: attempt(each.cart_friction, most, substeps, True)
+        for each in screened
+        if each.error.size < largest
+    }
+    candidates = [contenders.get(each.cart_friction, each) for each in screened]
+    best = min(contenders.values(), key=lambda each: each.error.size)
+    fit = widened(best, [*contenders.values()])
+    found = [*early_endings([*episodes, *held_out]), *warnings(fit)]
+    return Identification(fit, best.dynamics, candidates, best.held_out, best.error, found)
 
 
-def lead(period: float, substeps: int) -> float:
-    """Return half a step, s: the time by which (3.8) moves a cart early."""
-    return period / substeps / 2
-
-
-def predicted(
-    episodes: Sequence[Episode], fit: Fit, models: Models, period: float, substeps: int
-) -> list[Replayed]:
-    """Return recordings beside the identified cart, which is put back onto them every HORIZON s."""
-    return replay(episodes, fit.parameters, models, period, substeps, HORIZON, lead(period, substeps))
-
-
-def prediction_errors(replays: Sequence[Replayed]) -> tuple[float, float]:
-    """Return the RMS of x (m) and theta (rad) over a stretch: the medians of those away from upright."""
+def prediction_error(replays: Sequence[Replayed]) -> PredictionError:
+    """Return the RMS errors over a stretch: the medians of the complete stretches away from upright."""
     x = np.concatenate([each.x_error for each in replays])
     theta = np.concatenate([each.theta_error for each in replays])
     angle = np.concatenate([each.theta - each.theta_error for each in replays])  # as measured
@@ -125,7 +133,13 @@ def prediction_errors(replays: Sequence[Replayed]) -> tuple[float, float]:
     away = whole & (np.abs(wrap(np.where(np.isfinite(angle), angle, np.pi))) > AWAY).all(1)
     kept = away if away.any() else whole
     x_error, theta_error = (float(np.median(np.sqrt((each[kept] ** 2).mean(1)))) for each in (x, theta))
-    return x_error, theta_error
+    return PredictionError(x_error, theta_error)
+
+
+def early_endings(episodes: Sequence[Episode]) -> list[str]:
+    """Return a warning if the cart or its link ended recordings early."""
+    cut = [each.ended_by for each in episodes if each.ended_by in (Ending.LINK, Ending.FAULT)]
+    return [f"{len(cut)} of the recordings ended early, by {' and '.join(sorted({*cut}))}"] if cut else []
 
 
 def widened(best: Candidate, candidates: Sequence[Candidate]) -> Fit:
@@ -138,7 +152,7 @@ def widened(best: Candidate, candidates: Sequence[Candidate]) -> Fit:
     for other in candidates:
         if other is best:
             continue
-        weight = (best.error / other.error) ** FALLOFF
+        weight = (best.error.size / other.error.size) ** FALLOFF
         theirs = {
             unknown.name: value for unknown, value in zip(other.fit.unknowns, other.fit.point, strict=True)
         }

@@ -16,7 +16,7 @@ from cartpole_rl.identification.rollout import Dynamics
 from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 from cartpole_rl.physics.residual import Residual
 
-COARSE = torch.tensor([20.0, 3.0], dtype=torch.float64)  # counts that count as one: 0.5 mm, 0.26 degrees
+COARSE = torch.tensor([20.0, 3.0], dtype=torch.float64)  # counts, first residual scale: 0.5 mm, 0.26 deg
 FINEST = torch.tensor([1.0, 0.4], dtype=torch.float64)  # counts: the effect of quantization alone, about
 ROBUST = 3.0  # scaled residuals beyond this count linearly (Huber)
 RUNAWAY = 1e6  # scaled residual of a prediction that diverged
@@ -25,11 +25,11 @@ STATE_STEP = torch.tensor([1e-7, 1e-6, 1e-6, 1e-5], dtype=torch.float64)  # m, m
 STATE_SPREAD = torch.tensor([5e-4, 0.5, 5e-3, 3.0], dtype=torch.float64)  # of an initial state's first guess
 FARTHEST = 3.0  # of STATE_SPREAD: the largest distance of an initial state from its first guess
 GUESSED_FROM = 3  # positions; when the motor reverses, later ones bend away from any parabola
-CORRELATED = 10.0  # residuals of one window resemble each other: this many carry the information of one
+CORRELATED = 10.0  # this many correlated residuals of a window count as one independent residual
 FIRST_DAMPING, LEAST_DAMPING = 1e-3, 1e-6
 ATTEMPTS = 6  # to lower the cost from one linearization, with ever more damping
 CONVERGED = 1e-4  # relative fall of the cost
-ROUNDS = 10  # steps towards initial states of which there is no more than a guess
+ROUNDS = 10  # steps from a first guess of the initial states
 
 
 def huber(residuals: Tensor) -> Tensor:
@@ -87,7 +87,7 @@ class NormalEquations(NamedTuple):
     def covariance(self, episode: Tensor) -> Tensor:
         """Return that of the point, [U, U]: prior, and disagreement of windows and episodes (`episode` [W]).
 
-        Errors within a window resemble each other, so that a window counts as one observation (White, 1980).
+        Errors within a window are correlated, so a window counts as one observation (White, 1980).
         Shortcomings of the physics show as episodes that would each have another cart: the point moves when
         one is left out, which is the jackknife's variance (Tukey, 1958), to first order.
         """
@@ -125,16 +125,16 @@ class Linearization(NamedTuple):
 
     def normal_equations(self, point: Tensor, offset: Tensor) -> NormalEquations:
         """Return the quadratic that touches the cost, for initial states `offset` [4, W] off their guess."""
-        weights, doubt = self.weights.unsqueeze(-1), STATE_SPREAD**-2 / CORRELATED
+        weights, prior = self.weights.unsqueeze(-1), STATE_SPREAD**-2 / CORRELATED
         weighted_point, weighted_state = self.by_point * weights, self.by_state * weights
         residuals = self.residuals.unsqueeze(-1)
         return NormalEquations(
             point_points=weighted_point.mT @ self.by_point,
             point_state=weighted_point.mT @ self.by_state,
-            state_state=weighted_state.mT @ self.by_state + torch.diag(doubt),
+            state_state=weighted_state.mT @ self.by_state + torch.diag(prior),
             point_slopes=(weighted_point.mT @ residuals).squeeze(-1),
             prior_slope=point,
-            state_slope=(weighted_state.mT @ residuals).squeeze(-1) + offset.T * doubt,
+            state_slope=(weighted_state.mT @ residuals).squeeze(-1) + offset.T * prior,
         )
 
 
@@ -151,7 +151,7 @@ class Matching:
     """The least-squares problem of W windows.
 
     `simulate` takes K points [U, K] and K initial states of each window [4, W, K] to counts [F, 2, W, K];
-    `measured` [F, 2, W] are counts, `scale` [2] the counts that count as one, and `guess` [4, W] the initial
+    `measured` [F, 2, W] are counts, `scale` [2] scales residuals, in counts, and `guess` [4, W] the initial
     states before the search. A point is prior to measurement 0 with standard deviation 1, and stays within
     `limits`, [U] each.
     """
@@ -176,14 +176,14 @@ class Matching:
         return scaled.permute(2, 0, 1, 3).flatten(1, 2)
 
     def cost(self, point: Tensor, motion: Tensor) -> Tensor:
-        """Return Huber's cost and that of the prior: [W], or [1] for all windows where they share a point."""
+        """Return Huber's cost and that of the prior: [W], or [1] for all windows if they share a point."""
         residuals = self.residuals(point.unsqueeze(1), motion.unsqueeze(2)).squeeze(2)
         offset = (motion - self.guess) / STATE_SPREAD.unsqueeze(1)
         each = (huber(residuals).sum(1) + (offset**2).sum(0)) / CORRELATED
         return each.sum(0, keepdim=True) + point @ point if len(point) else each
 
     def linearize(self, point: Tensor, motion: Tensor) -> Linearization:
-        """Return the residuals and their differences: one simulation of U + 5 carts a window."""
+        """Return the residuals and their differences: one simulation of U + 5 carts per window."""
         size = len(point)
         moves = torch.block_diag(POINT_STEP * torch.eye(size, dtype=point.dtype), torch.diag(STATE_STEP))
         moves = torch.cat((moves.new_zeros(size + 4, 1), moves), 1)  # [U + 4, U + 5]
@@ -200,7 +200,7 @@ class Matching:
     def minimize(self, point: Tensor, motion: Tensor, iterations: int) -> Match:
         """Search by Levenberg-Marquardt from a point and initial states.
 
-        Windows that share no point have a damping each: where a cart sticks or not, steps overshoot.
+        Windows without a shared point have their own damping, since steps overshoot near sticking.
         """
         shared, made = len(point) > 0, 0
         cost = self.cost(point, motion)
@@ -242,7 +242,7 @@ def match_initial_states(
 ) -> InitialStates:
     """Return the initial states that lead nearest to `positions` [T + 1, 2, W], in counts.
 
-    `motors` [HISTORY + T, W] are motor values; each member of `residual` has initial states of its own. The
+    `motors` [H + T, W] are motor values; each member of `residual` has initial states of its own. The
     search is from `start` [4, M, W], or from the first guess. Components that the positions do not show, such
     as the speed of a cart that sticks at once, stay near that guess.
     """

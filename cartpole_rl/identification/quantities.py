@@ -8,11 +8,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cartpole_rl.identification.fit import Fit
+from cartpole_rl.intervals import CONFIDENCE
 from cartpole_rl.physics.parameters import GRAVITY, CartParameters
 
 Array = NDArray[np.floating]
-CONFIDENCE = 0.95
 TYPICAL = 5.0  # rad/s, the speed of a wide swing, for which the pole's damping is given
+
+
+WORDS = {  # name: words, unit
+    "pole_frequency": ("frequency of the pole's small swing", "Hz"),
+    "pole_damping": (f"damping of the pole at {TYPICAL:g} rad/s", "rad/s^2"),
+    "force_gain": ("motor: force per motor value over mass", "mm/s^2"),
+    "force_asymmetry": ("motor: more force to the right by", "%"),
+    "deadband": ("motor: no force up to motor value", ""),
+    "viscous": ("cart: viscous friction over mass", "1/s"),
+    "coulomb": ("cart: Coulomb friction over mass", "m/s^2"),
+    "coulomb_asymmetry": ("cart: more Coulomb friction to the right by", "%"),
+    "stiction": ("cart: breakaway over Coulomb friction", ""),
+    "latency": ("latency", "ms"),
+    "lag": ("motor: time constant", "ms"),
+    "tilt": ("track: the right end is lower by", "deg"),
+    "angle_offset": ("pole: measured minus true angle", "deg"),
+}
 
 
 class Quantity(NamedTuple):
@@ -24,11 +41,7 @@ class Quantity(NamedTuple):
     value: float
     low: float = math.nan  # of its 95 % interval
     high: float = math.nan
-
-    @property
-    def interval(self) -> tuple[float, float, float]:
-        """Value, low, high."""
-        return self.value, self.low, self.high
+    prior: float = math.nan
 
 
 def quantities(cart: Mapping[str, float]) -> list[Quantity]:
@@ -36,42 +49,24 @@ def quantities(cart: Mapping[str, float]) -> list[Quantity]:
     mass = cart["cart_mass"] + cart["pole_mass"]
     moment = cart["pole_mass"] * cart["pole_com"]
     inertia = cart["pole_inertia"] + moment * cart["pole_com"]
+    damping = cart["pole_viscous"] * TYPICAL + cart["pole_drag"] * TYPICAL**2 + cart["pole_coulomb"]
     gain = cart["force_linear"] + 400 * cart["force_quadratic"]
-    damping = (
-        cart["pole_viscous"] * TYPICAL + cart["pole_drag"] * TYPICAL**2 + cart["pole_coulomb"]
-    ) / inertia
-    return [
-        Quantity(
-            "pole_frequency",
-            "frequency of the pole's small swing",
-            "Hz",
-            math.sqrt(moment * GRAVITY / inertia) / (2 * math.pi),
-        ),
-        Quantity("pole_damping", f"damping of the pole at {TYPICAL:g} rad/s", "rad/s^2", damping),
-        Quantity(
-            "force_gain",
-            "motor: force per motor value over mass",
-            "mm/s^2",
-            1e3 * gain * (1 + cart["force_asymmetry"] / 2) / mass,
-        ),
-        Quantity("force_asymmetry", "motor: more force to the right by", "%", 100 * cart["force_asymmetry"]),
-        Quantity("deadband", "motor: no force up to motor value", "", no_force_up_to(cart)),
-        Quantity("viscous", "cart: viscous friction over mass", "1/s", cart["cart_viscous"] / mass),
-        Quantity("coulomb", "cart: Coulomb friction over mass", "m/s^2", cart["cart_coulomb"] / mass),
-        Quantity(
-            "coulomb_asymmetry",
-            "cart: more Coulomb friction to the right by",
-            "%",
-            200 * cart["cart_coulomb_asymmetry"],
-        ),
-        Quantity("stiction", "cart: breakaway over Coulomb friction", "", cart["cart_stiction_ratio"]),
-        Quantity("latency", "latency", "ms", 1e3 * cart["latency"]),
-        Quantity("lag", "motor: time constant", "ms", 1e3 * cart["motor_time_constant"]),
-        Quantity("tilt", "track: the right end is lower by", "deg", math.degrees(cart["track_tilt"])),
-        Quantity(
-            "angle_offset", "pole: measured minus true angle", "deg", math.degrees(cart["angle_offset"])
-        ),
-    ]
+    values = {
+        "pole_frequency": math.sqrt(moment * GRAVITY / inertia) / (2 * math.pi),
+        "pole_damping": damping / inertia,
+        "force_gain": 1e3 * gain * (1 + cart["force_asymmetry"] / 2) / mass,
+        "force_asymmetry": 100 * cart["force_asymmetry"],
+        "deadband": no_force_up_to(cart),
+        "viscous": cart["cart_viscous"] / mass,
+        "coulomb": cart["cart_coulomb"] / mass,
+        "coulomb_asymmetry": 200 * cart["cart_coulomb_asymmetry"],
+        "stiction": cart["cart_stiction_ratio"],
+        "latency": 1e3 * cart["latency"],
+        "lag": 1e3 * cart["motor_time_constant"],
+        "tilt": math.degrees(cart["track_tilt"]),
+        "angle_offset": math.degrees(cart["angle_offset"]),
+    }
+    return [Quantity(name, *WORDS[name], value) for name, value in values.items()]
 
 
 def no_force_up_to(cart: Mapping[str, float]) -> float:
@@ -82,13 +77,15 @@ def no_force_up_to(cart: Mapping[str, float]) -> float:
 
 
 def intervals(fit: Fit, carts: Array) -> list[Quantity]:
-    """Return the quantities that were identified, with 95 % intervals of carts [P, N] drawn from the fit."""
+    """Return the identified quantities: prior values, and 95 % intervals of `carts` [P, N] from the fit."""
     names = CartParameters.names()
     drawn = [quantities(dict(zip(names, cart.tolist(), strict=True))) for cart in carts.T]
+    values = np.array([[quantity.value for quantity in cart] for cart in drawn])  # [N, Q]
     tail = 100 * (1 - CONFIDENCE) / 2
-    identified = []
-    for index, each in enumerate(quantities(fit.parameters)):
-        low, high = np.percentile([quantity[index].value for quantity in drawn], [tail, 100 - tail])
-        if high > low:  # a quantity that the models do not read has no interval
-            identified.append(each._replace(low=float(low), high=float(high)))
-    return identified
+    low, high = np.percentile(values, [tail, 100 - tail], axis=0).tolist()
+    prior = [quantity.value for quantity in quantities(fit.nominal)]
+    return [
+        each._replace(low=least, high=most, prior=before)
+        for each, least, most, before in zip(quantities(fit.parameters), low, high, prior, strict=True)
+        if most > least  # a quantity that the models do not read has no interval
+    ]

@@ -1,5 +1,6 @@
 """Simulates recorded windows with the project's own physics, many carts at once, and reads their encoders."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Self
@@ -7,7 +8,8 @@ from typing import Self
 import torch
 from torch import Tensor
 
-from cartpole_rl.identification.windows import HISTORY
+from cartpole_rl.identification.unknowns import LONGEST_LATENCY
+from cartpole_rl.identification.windows import history_periods
 from cartpole_rl.physics.actuator import step_forces
 from cartpole_rl.physics.dynamics import Drive, MakeAddition, State, run_period
 from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
@@ -23,26 +25,33 @@ def rollout(
     models: Models,
     period: float,
     substeps: int,
-    lead: float = 0.0,
+    extra_latency: float = 0.0,
     addition: MakeAddition | None = None,
 ) -> Tensor:
     """Return counts [T + 1, 2, N], not rounded, of carts `table` [P, N] from initial states `motion` [4, N].
 
-    `motors` [HISTORY + T, N] holds the values chosen before the window as well: the actuator runs through
-    them first, since its force lags behind. `lead`, s, is added to each latency: (3.8) moves a cart half a
-    step early, so that with half a step of it a latency means the same however long the step.
+    The first `history_periods` of `motors` [H + T, N] are older than the window: the actuator runs through
+    them, since its force lags behind. `extra_latency`, s, is added to each latency: (3.8) moves a cart half a
+    step early, so a lead of half a step makes latencies independent of the step.
     """
     cart = CartParameters.from_table(table)
-    state, force, latency = State(*motion.unbind(0)), torch.zeros_like(motion[0]), cart.latency + lead
+    state, force = State(*motion.unbind(0)), torch.zeros_like(motion[0])
+    latency = cart.latency + extra_latency
+    history, in_effect = history_periods(period), motors_in_effect(period)
     counts = [as_counts(state, cart)]
-    for now in range(UNDER_WAY - 1, len(motors)):
-        drive = Drive(force, [motors[now - age] for age in range(UNDER_WAY)])
-        if now < HISTORY:
+    for now in range(in_effect - 1, len(motors)):
+        drive = Drive(force, [motors[now - age] for age in range(in_effect)])
+        if now < history:
             _, force = step_forces(*drive, latency, cart, models.actuator, period, substeps)
             continue
         state, (force, _) = run_period(state, drive, latency, cart, models, period, substeps, addition)
         counts.append(as_counts(state, cart))
     return torch.stack(counts)
+
+
+def motors_in_effect(period: float) -> int:
+    """Return the number of motor values, newest first, that can act on a cart within a control period."""
+    return max(UNDER_WAY, 1 + math.ceil(LONGEST_LATENCY / period - 1e-9))
 
 
 def as_counts(state: State, cart: CartParameters) -> Tensor:
@@ -60,18 +69,23 @@ class Dynamics:
     models: Models
     period: float  # s
     substeps: int
-    lead: float = 0.0  # s; see `rollout`
+    extra_latency: float = 0.0  # s; see `rollout`
 
     @classmethod
     def of(
-        cls, parameters: Mapping[str, float], models: Models, period: float, substeps: int, lead: float = 0.0
+        cls,
+        parameters: Mapping[str, float],
+        models: Models,
+        period: float,
+        substeps: int,
+        extra_latency: float = 0.0,
     ) -> Self:
         """Return the dynamics of `parameters` by name."""
         table = [[float(parameters[name])] for name in CartParameters.names()]
-        return cls(torch.tensor(table, dtype=torch.float64), models, period, substeps, lead)
+        return cls(torch.tensor(table, dtype=torch.float64), models, period, substeps, extra_latency)
 
     def counts(self, motion: Tensor, motors: Tensor, residual: Residual | None = None) -> Tensor:
-        """Return counts [T + 1, 2, M, W] from initial states [4, M, W] and motor values [HISTORY + T, W].
+        """Return counts [T + 1, 2, M, W] from initial states [4, M, W] and motor values [H + T, W].
 
         M is the number of members of `residual`, W that of windows.
         """
@@ -83,7 +97,7 @@ class Dynamics:
             self.models,
             self.period,
             self.substeps,
-            self.lead,
+            self.extra_latency,
             None if residual is None else members_in_turn(residual, windows),
         )
         return simulated.reshape(-1, 2, members, windows)

@@ -53,7 +53,7 @@ UNKNOWNS: tuple[Unknown, ...] = (
 )
 
 
-WEIGHED = (POLE_LENGTH, "pole_mass")  # measured with a known pole; they give forces and masses their scale
+WEIGHED = (POLE_LENGTH, "pole_mass")  # measured with a known pole; they set the scale of forces and masses
 
 
 def unknowns_of(models: Models, known: Sequence[str] = ()) -> list[Unknown]:
@@ -80,10 +80,10 @@ def limits(unknowns: Sequence[Unknown], nominal: Mapping[str, float]) -> tuple[A
 
 
 def parameters_at(points: Array, unknowns: Sequence[Unknown], nominal: Mapping[str, float]) -> Tensor:
-    """Return carts [P, N] float64 at `points` [U, N], a row a parameter in the order of `CartParameters`.
+    """Return carts [P, N] float64 at `points` [U, N], one row per parameter in the order of `CartParameters`.
 
-    A pole of another length is the nominal one scaled: its mass goes with the length, its centre of mass too,
-    its inertia with the third power. Values stay within their bounds.
+    A pole of another length is the nominal one scaled: its mass and centre of mass scale with the length,
+    its inertia with the cube of the length. Values stay within their bounds.
     """
     values = {
         name: np.full(points.shape[1], float(nominal[name]), dtype=np.float64)

@@ -4,8 +4,9 @@ A prediction over a whole swing-up forgets its initial state: an error doubles e
 upright. Half a second is long enough for parameters to show and short enough for a search to converge.
 """
 
-from collections.abc import Sequence
-from typing import NamedTuple
+import math
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,16 +14,40 @@ from numpy.typing import NDArray
 from cartpole_rl.errors import RecordingError
 from cartpole_rl.tasks.episode import Episode
 
-HISTORY = 6  # periods of motor values before a window: longer than latency and lag together
+WINDOW = 0.5  # s, of the windows that a cart is fitted to
+HISTORY, LEAST_HISTORY = 0.12, 6  # s and periods of motor values before a window: more than latency and lag
+LEAST_LEAD = 5  # periods whose positions give an initial state
 IRREGULAR = 0.2  # share of the period that a frame may come early or late
 
 
+class Piece(NamedTuple):
+    """One window of an episode."""
+
+    positions: NDArray[np.float64]  # [T + 1, 2]
+    motors: NDArray[np.float64]  # [H + T]
+    episode: int
+    first: int  # row of the episode
+
+
 class Windows(NamedTuple):
-    """W windows of T periods."""
+    """W windows of T periods, with the motor values of the H periods before them."""
 
     positions: NDArray[np.float64]  # [T + 1, 2, W] encoder counts of cart and pole, as measured
-    motors: NDArray[np.float64]  # [HISTORY + T, W] motor values chosen, oldest first
+    motors: NDArray[np.float64]  # [H + T, W] motor values chosen, oldest first
     episode: NDArray[np.int64]  # [W] number of the episode of each
+    first: NDArray[np.int64]  # [W] row of that episode at which each starts
+    lead: int = 0  # periods at the start of each that give its initial state and are not predicted
+
+    @classmethod
+    def of(cls, pieces: Sequence[Piece], lead: int = 0) -> Self:
+        """Return one window for each piece."""
+        return cls(
+            np.stack([piece.positions for piece in pieces], -1),
+            np.stack([piece.motors for piece in pieces], -1),
+            np.array([piece.episode for piece in pieces]),
+            np.array([piece.first for piece in pieces]),
+            lead,
+        )
 
     @property
     def periods(self) -> int:
@@ -35,34 +60,84 @@ class Windows(NamedTuple):
         return self.positions.shape[2]
 
 
-def cut_windows(episodes: Sequence[Episode], period: float, periods: int = 25, most: int = 240) -> Windows:
-    """Cut windows of `periods` periods of `period` s, one after another, evenly thinned to at most `most`.
+def history_periods(period: float) -> int:
+    """Return the number H of motor values before a window, at a control period in s."""
+    return max(LEAST_HISTORY, math.ceil(HISTORY / period - 1e-9))
 
-    A window over a lost or late frame is left out. Raises RecordingError where nothing is left, or where the
-    recordings are of another rate.
+
+def lead_periods(seconds: float, period: float) -> int:
+    """Return the number of periods in a lead of about `seconds`."""
+    return max(LEAST_LEAD, round(seconds / period))
+
+
+def cut_windows(
+    episodes: Sequence[Episode], period: float, seconds: float = WINDOW, most: int = 240
+) -> Windows:
+    """Cut windows of `seconds` s, one after another, evenly thinned to at most `most`.
+
+    A window over a lost or late frame is left out. Raises RecordingError if nothing is left, or if the
+    recordings have another control period than `period` s.
     """
-    counts, motors, origins = [], [], []
-    for number, episode in enumerate(episodes):
-        gaps = np.diff(episode.time)
-        if len(gaps) and abs(np.median(gaps) / period - 1) > IRREGULAR:
-            raise RecordingError(
-                f"a recording has a frame every {np.median(gaps) * 1e3:.1f} ms, and not every "
-                f"{period * 1e3:.1f} ms"
-            )
-        regular = np.abs(gaps / period - 1) < IRREGULAR
-        padded = np.concatenate((np.zeros(HISTORY), episode.motor))
-        for first in range(0, episode.measured_steps - periods + 1, periods):
-            if regular[max(0, first - HISTORY) : first + periods].all():
-                counts.append(episode.counts[first : first + periods + 1])
-                motors.append(padded[first : first + HISTORY + periods])
-                origins.append(number)
-    if not counts:
+    periods = round(seconds / period)
+    pieces = [
+        piece
+        for number, episode in enumerate(episodes)
+        for piece in _pieces(episode, period, periods, step=periods, least=periods, number=number)
+    ]
+    if not pieces:
         raise RecordingError(
             f"no recording holds {periods * period:g} s without a lost frame: record longer, check the cable"
         )
-    chosen = np.unique(np.linspace(0, len(counts) - 1, min(most, len(counts))).round().astype(int))
-    return Windows(
-        np.stack([counts[index] for index in chosen], -1).astype(np.float64),
-        np.stack([motors[index] for index in chosen], -1).astype(np.float64),
-        np.array([origins[index] for index in chosen]),
-    )
+    chosen = np.unique(np.linspace(0, len(pieces) - 1, min(most, len(pieces))).round().astype(int))
+    return Windows.of([pieces[index] for index in chosen])
+
+
+def cut_stretches(episode: Episode, period: float, seconds: float, lead: int) -> Windows:
+    """Cut a window of `lead` periods and `seconds` s at every `seconds` s of an episode.
+
+    Positions are NaN from the first lost or late frame on; a window with such a frame in its lead is left
+    out. Raises RecordingError where nothing is left, or for another control period than `period` s.
+    """
+    periods = max(1, round(seconds / period))
+    pieces = [*_pieces(episode, period, lead + periods, step=periods, least=lead + 1)]
+    if not pieces:
+        raise RecordingError(
+            f"a recording of {episode.steps * period:.2f} s is too short to be replayed, or its frames are "
+            "late or lost"
+        )
+    return Windows.of(pieces, lead)
+
+
+def _pieces(
+    episode: Episode, period: float, length: int, step: int, least: int, number: int = 0
+) -> Iterator[Piece]:
+    """Yield windows of `length` periods, every `step` periods, whose history and first `least` are known."""
+    history, end = history_periods(period), episode.measured_steps
+    late = np.flatnonzero(~regular_frames(episode, period)[:end])
+    last_known = np.append(late, end)  # rows after which the motion is not known
+    motors = np.concatenate((np.zeros(history), episode.motor.astype(np.float64), np.zeros(length)))
+    for first in range(0, end - least + 1, step):
+        known = last_known[np.searchsorted(last_known, max(0, first - history))] - first
+        if known >= least:
+            positions = np.full((length + 1, 2), np.nan)
+            measured = episode.counts[first : first + min(known, length) + 1]
+            positions[: len(measured)] = measured
+            yield Piece(positions, motors[first : first + history + length], number, first)
+
+
+def regular_frames(episode: Episode, period: float) -> NDArray[np.bool_]:
+    """Return for each control period, [T], whether the frame at its end came in time.
+
+    Raises RecordingError for a recording of another control period.
+    """
+    gaps = np.diff(episode.time)
+    if len(gaps) and abs(np.median(gaps) / period - 1) > IRREGULAR:
+        raise RecordingError(
+            f"a recording has a frame every {np.median(gaps) * 1e3:.1f} ms, not every {period * 1e3:.1f} ms"
+        )
+    return np.abs(gaps / period - 1) < IRREGULAR
+
+
+def recorded_period(episode: Episode) -> float:
+    """Return the control period of a recording, s: the median time between frames, to 0.1 ms."""
+    return round(float(np.median(np.diff(episode.time))), 4)

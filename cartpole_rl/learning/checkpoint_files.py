@@ -3,8 +3,7 @@
 from pathlib import Path
 
 from cartpole_rl.errors import CheckpointError
-
-FOLDER, LAST, BEST, RESUME = "checkpoints", "last.pt", "best.pt", "resume.pt"
+from cartpole_rl.run_files import CHECKPOINTS, LAST, RESUME
 
 
 def find_agent(run: Path) -> Path:
@@ -15,9 +14,9 @@ def find_agent(run: Path) -> Path:
         )
     if run.is_file():
         return run
-    path = run / FOLDER / LAST
+    path = run / CHECKPOINTS / LAST
     if not path.exists():
-        raise CheckpointError(f"run={run}: it holds no {FOLDER}/{LAST}; give the folder of a training")
+        raise CheckpointError(f"run={run}: it holds no {CHECKPOINTS}/{LAST}; give the folder of a training")
     return path
 
 
@@ -25,10 +24,10 @@ def find_training(run: Path) -> Path:
     """Return the file to resume the training in the folder `run` from. Raises CheckpointError."""
     if not run.is_dir():
         raise CheckpointError(f"resume={run}: there is no such folder; give the run folder of a training")
-    path = run / FOLDER / RESUME
+    path = run / CHECKPOINTS / RESUME
     if not path.exists():
         raise CheckpointError(
-            f"resume={run}: it holds no {FOLDER}/{RESUME}; give the folder of a training that was interrupted"
-            " after its first checkpoint"
+            f"resume={run}: it holds no {CHECKPOINTS}/{RESUME}; give the folder of a training that was "
+            "interrupted after its first checkpoint"
         )
     return path

@@ -13,11 +13,12 @@ from torch import nn
 
 from cartpole_rl.errors import CheckpointError
 from cartpole_rl.files import replacing
-from cartpole_rl.learning.checkpoint_files import FOLDER, RESUME, find_agent, find_training
+from cartpole_rl.learning.checkpoint_files import find_agent, find_training
+from cartpole_rl.run_files import CHECKPOINTS, RESUME
 
 AGENT_FORMAT = "cartpole_rl agent 1"
-TRAINING_FORMAT = "cartpole_rl training 2"
-FINETUNING_FORMAT = "cartpole_rl fine-tuning 1"
+TRAINING_FORMAT = "cartpole_rl training 3"
+FINETUNING_FORMAT = "cartpole_rl fine-tuning 2"
 CONTENT = {  # format: what a file of it holds
     AGENT_FORMAT: "an agent",
     TRAINING_FORMAT: "the state that a training resumes from",
@@ -40,8 +41,8 @@ class TrainingCheckpoint:
     """The state that a training or a fine-tuning resumes from."""
 
     config: dict[str, Any]
-    state: dict[str, Any]  # of a training: from `Training.snapshot`
-    transitions: int
+    state: dict[str, Any]  # of `Training.snapshot` or `CartLearner.snapshot`
+    step: int  # on the axis of TensorBoard: transitions of a training, episodes of a fine-tuning
 
 
 def save_agent(path: Path, agent: AgentCheckpoint) -> None:
@@ -83,14 +84,14 @@ def check_finite(weights: Mapping[str, Any], consequence: str) -> None:
 
 def save_training(run: Path, training: TrainingCheckpoint, file_format: str = TRAINING_FORMAT) -> None:
     """Write the state for `load_training`. Raises CheckpointError if a weight is not finite."""
-    path = run / FOLDER / RESUME
+    path = run / CHECKPOINTS / RESUME
     check_finite(training.state.get("agent", {}), f"{path} is not written")
     _save(path, file_format, vars(training))
 
 
 def forget_training(run: Path) -> None:
     """Remove the file of `save_training`: the training has ended, and the buffer in it is large."""
-    (run / FOLDER / RESUME).unlink(missing_ok=True)
+    (run / CHECKPOINTS / RESUME).unlink(missing_ok=True)
 
 
 def load_training(run: Path, file_format: str = TRAINING_FORMAT) -> TrainingCheckpoint:
@@ -111,7 +112,7 @@ def _load(path: Path, expected: str) -> dict[str, Any]:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch.load raises errors of many kinds for damaged files
         raise CheckpointError(
-            f"{path} is no checkpoint of this package, or it is damaged ({type(error).__name__}); "
+            f"{path} is not a checkpoint of this package, or is damaged ({type(error).__name__}); "
             f"give one that cartpole-train wrote"
         ) from None
     found = content.pop("format", None) if isinstance(content, dict) else None

@@ -8,7 +8,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from cartpole_rl.envs.make import CartPoleEnv
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 
 COLLECTED = (
     "observation",
@@ -103,16 +103,16 @@ class Collector:
     def snapshot(self) -> dict[str, Any]:
         """Return the state of the collector, without that of the plant."""
         return {
-            "present": self._current.to_dict(),
+            "current": self._current.to_dict(),
             "score": self._score.clone(),
-            "usual": self._mean_score,
+            "mean_score": self._mean_score,
             "finished": list(self._finished),
             "generator": self._generator.get_state(),
         }
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         """Restore the state in `snapshot`."""
-        self._current = TensorDict(snapshot["present"], batch_size=self.env.batch_size)
-        self._score, self._mean_score = snapshot["score"].clone(), snapshot["usual"]
+        self._current = TensorDict(snapshot["current"], batch_size=self.env.batch_size)
+        self._score, self._mean_score = snapshot["score"].clone(), snapshot["mean_score"]
         self._finished = list(snapshot["finished"])
         self._generator.set_state(snapshot["generator"])

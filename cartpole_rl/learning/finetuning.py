@@ -4,13 +4,13 @@ The simulator is fitted to all recordings; carts are drawn from the uncertainty 
 continues on both, with the same loop and the same loss.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 
-from cartpole_rl.envs.make import CartPoleEnv
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.learning.buffer import n_step_transitions
 from cartpole_rl.learning.collector import COLLECTED
 from cartpole_rl.learning.settings import FinetuningSettings
@@ -49,7 +49,7 @@ class Finetuning(Training):
         super().__init__(*arguments, **named)
         self.finetuning = finetuning
         self.recorded: TensorDictBase | None = None
-        self._chooser = torch.Generator().manual_seed(0)
+        self._chooser = torch.Generator().manual_seed(self.seed)
 
     def add(self, chunk: TensorDictBase | None) -> None:
         """Add a recorded episode; None adds nothing."""
@@ -92,3 +92,12 @@ class Finetuning(Training):
         mixed = simulated.select(*self.recorded.keys(True, True)).clone()
         mixed[places] = self.recorded[which]
         return mixed
+
+    def snapshot(self) -> dict[str, Any]:
+        """Return the state of the training, without the recorded transitions."""
+        return {**super().snapshot(), "chooser": self._chooser.get_state()}
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        """Restore the state in `snapshot`."""
+        super().restore(snapshot)
+        self._chooser.set_state(snapshot["chooser"])

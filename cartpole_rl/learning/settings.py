@@ -34,7 +34,7 @@ class LearningSettings(Settings):
     carts: Count  # simulated in parallel
     chunk: Count  # periods
     retry_probability: Fraction  # that a cart is kept for another episode after a failed one
-    updates: Count  # gradient steps an iteration
+    updates: Count  # gradient steps per iteration
     batch_size: Count
     n_step: Annotated[int, Field(ge=1, le=20)]  # the longest return
     carry: bool  # the last n_step - 1 periods of a chunk wait for the next one, for whole returns

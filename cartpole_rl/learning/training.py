@@ -16,7 +16,7 @@ from tensordict import TensorDictBase
 
 from cartpole_rl.agents.dqn import QAgent
 from cartpole_rl.agents.loss import Columns, LossGradient, columns_of
-from cartpole_rl.envs.make import CartPoleEnv
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.errors import LearningError
 from cartpole_rl.learning.buffer import NStepReturns, buffer_snapshot, make_buffer, restore_buffer
 from cartpole_rl.learning.collector import Collector
@@ -58,7 +58,7 @@ class Training:
         compiled: bool = False,
     ) -> None:
         self.settings, self.agent, self.env = settings, agent, env
-        self.evaluate, self.monitor = evaluate, monitor
+        self.evaluate, self.monitor, self.seed = evaluate, monitor, seed
         self.collector = Collector(
             env, agent.actor, len(env.hardware.motors), seed, settings.retry_probability
         )

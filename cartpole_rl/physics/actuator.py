@@ -1,4 +1,4 @@
-"""From motor value to force on the cart: a measured force curve, or plain newtons; a lag; a delay.
+"""The actuator: force curve (or plain newtons), lag and delay from motor value to force on the cart.
 
 The force curve is the thesis's quadratic fit (figure 5.5), F = sign(u) max(0, a u^2 + b |u| + c), with an
 asymmetry, and a dead-band per direction. Plain newtons are the thesis's estimated levels: 1, 2, 3, 4 N at
@@ -44,7 +44,7 @@ def force_curve(motor: "Tensor", cart: "CartParameters") -> "Tensor":
 
 
 class Actuator(PhysicsModel):
-    """How a motor value becomes a force; the formula gives the force of a held motor value, N."""
+    """Actuator models; the formula of each gives the steady force of a motor value, N."""
 
     NEWTONS = "newtons", (), newtons  # exact: without lag, dead-band or asymmetry
     FORCE_CURVE = "force_curve", CURVE, force_curve
@@ -85,9 +85,9 @@ def mean_commands(
 ) -> "list[Tensor]":
     """Return for each step of a period the mean of the forces in effect, [N] each.
 
-    `held` is the force that each command settles at, [N] each, newest first, each next one a period older,
-    the oldest in effect for ever. A command takes effect `latency` s, [N], after its period began and is
-    replaced a period later by the next.
+    `held` is the force that each command settles at, [N] each, newest first, one period older each,
+    the oldest always in effect. A command takes effect `latency` s, [N], after its period began and is
+    replaced one period later by the next.
     """
     onset = latency * (substeps / period)  # in steps
     means = []

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 from cartpole_rl.errors import ConfigError
+from cartpole_rl.physics.motor import LARGEST_MOTOR
 
 
 class Bound(NamedTuple):
@@ -52,8 +53,8 @@ BOUNDS: dict[str, Bound] = {
     "force_linear": ANY,
     "force_offset": ANY,
     "force_asymmetry": ASYMMETRY,
-    "deadband_left": Bound(0, 255),
-    "deadband_right": Bound(0, 255),
+    "deadband_left": Bound(0, LARGEST_MOTOR),
+    "deadband_right": Bound(0, LARGEST_MOTOR),
     "motor_time_constant": DELAY,
     "latency": DELAY,
     "latency_jitter": DELAY,
@@ -72,7 +73,7 @@ def check_names(names: Iterable[str]) -> None:
 
 
 def check_value(name: str, value: float) -> None:
-    """Raise ConfigError where `value` is physically impossible for the parameter `name`."""
+    """Raise ConfigError if `value` is physically impossible for the parameter `name`."""
     if not BOUNDS[name].holds(value):
         raise ConfigError(f"{name} is {value:g}; it must be {BOUNDS[name]}")
 

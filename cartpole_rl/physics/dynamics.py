@@ -41,7 +41,7 @@ class Addition(NamedTuple):
     angular_acceleration: Tensor  # rad/s^2 of the pole
 
 
-MakeAddition = Callable[[State, Drive], Addition]  # the addition of a period, from where it starts
+MakeAddition = Callable[[State, Drive], Addition]  # from the state at the start of a period to its addition
 
 
 class Mechanism(NamedTuple):
@@ -85,7 +85,7 @@ def coupling(state: State, cart: CartParameters, body: Mechanism) -> Coupling:
     """Return the shared terms. On a track tilted by t the pole stands theta - t from the track's normal."""
     from_normal = state.theta - cart.track_tilt
     sin, cos = torch.sin(from_normal), torch.cos(from_normal)
-    sin_theta = sin * body.cos_tilt + cos * body.sin_tilt  # costs less than a third function of an angle
+    sin_theta = sin * body.cos_tilt + cos * body.sin_tilt  # cheaper than a third trigonometric function
     return Coupling(
         sin=sin,
         cos=cos,
@@ -170,7 +170,7 @@ def run_period(
     """Integrate one control period of `period` s in `substeps` equal steps.
 
     `drive.motors` holds this period's motor value first; `latency` [N] s is this period's own draw, for all
-    commands under way. Where the command in force changes inside a step, the step takes the mean of both
+    pending commands. If the command in force changes inside a step, the step takes the mean of both
     forces by their share of time. `addition` acts in every step.
     """
     step = period / substeps
@@ -190,16 +190,3 @@ def turned(state: State, acceleration: Tensor, step: float) -> State:
     """Return the state after a further angular acceleration, rad/s^2, [N], for `step` s."""
     faster = step * acceleration
     return state._replace(theta=state.theta + step * faster, theta_dot=state.theta_dot + faster)
-
-
-def energy(state: State, cart: CartParameters) -> Tensor:
-    """Return kinetic and potential energy, J, [N]; 0 for a cart at rest in the middle with the pole level."""
-    angle = state.theta - cart.track_tilt
-    kinetic = (
-        0.5 * cart.total_mass * state.x_dot**2
-        + cart.first_moment * state.x_dot * state.theta_dot * torch.cos(angle)
-        + 0.5 * cart.pivot_inertia * state.theta_dot**2
-    )
-    height = cart.first_moment * GRAVITY * torch.cos(state.theta)
-    slope = -cart.total_mass * GRAVITY * state.x * torch.sin(cart.track_tilt)
-    return kinetic + height + slope

@@ -61,7 +61,7 @@ def bearing_torque(theta_dot: "Tensor", cart: "CartParameters") -> "Tensor":
 class CartFriction(PhysicsModel):
     """Models of the cart's friction; their formula is that of dry friction, N, with the velocity's sign.
 
-    A model that reads `cart_viscous` has the viscous term (5.7) besides.
+    A model that reads `cart_viscous` also has the viscous term (5.7).
     """
 
     NONE = "none"

@@ -28,7 +28,7 @@ class CartParameters(TensorClass["frozen", "tensor_only"]):  # type: ignore[name
 
     cart_viscous: Tensor  # N s/m, the mu of (5.7)
     cart_coulomb: Tensor  # N, mu * F_norm of (5.6) and (5.8) on a resting pole
-    cart_coulomb_asymmetry: Tensor  # 1, Coulomb friction is (1 + it) moving right, (1 - it) moving left
+    cart_coulomb_asymmetry: Tensor  # 1, Coulomb friction times 1 + this moving right, 1 - this left
     cart_stiction_ratio: Tensor  # 1, breakaway / Coulomb friction (Stribeck only)
     stribeck_velocity: Tensor  # m/s, where the excess of static friction has fallen to 1/e
     sigmoid_slope: Tensor  # s/m, the rho of (5.8)
@@ -40,7 +40,7 @@ class CartParameters(TensorClass["frozen", "tensor_only"]):  # type: ignore[name
     force_quadratic: Tensor  # N per motor value squared
     force_linear: Tensor  # N per motor value
     force_offset: Tensor  # N, negative: the force curve is zero for small motor values
-    force_asymmetry: Tensor  # 1, a force to the right is (1 + it) times as large
+    force_asymmetry: Tensor  # 1, a force to the right is 1 + this times as large
     deadband_left: Tensor  # motor values up to this give no force to the left
     deadband_right: Tensor  # motor values up to this give no force to the right
     motor_time_constant: Tensor  # s, first-order lag of the force
@@ -78,5 +78,5 @@ class CartParameters(TensorClass["frozen", "tensor_only"]):  # type: ignore[name
 
     @classmethod
     def from_table(cls, table: Tensor) -> Self:
-        """Return N carts from `table` [P, N], a row a field in the order of `names`, sharing memory."""
+        """Return N carts from `table` [P, N], one row per field in the order of `names`, sharing memory."""
         return cls(**dict(zip(cls.names(), table.unbind(0), strict=True)), batch_size=[table.shape[1]])

@@ -1,8 +1,8 @@
 """The learned residual: a force on the cart and an angular acceleration of the pole, added to the physics.
 
-An ensemble of M members, of two parts each: a table of forces along the track, for effects of position
-(gears, a dent in the rail), and a small network of the motion and the motor values under way, for all others.
-Both act within the integration, in front of friction, so that a cart that sticks stays at rest. Zeros change
+An ensemble of M members with two parts each: a table of forces along the track, for effects of position
+(gears, a dent in the rail), and a small network of the motion and the pending motor values, for all others.
+Both act within the integration, before friction, so a sticking cart stays at rest. Weights of zero change
 nothing.
 """
 
@@ -18,11 +18,11 @@ UNDER_WAY = 4  # motor values that the network reads, newest first
 INPUTS = 6 + UNDER_WAY
 PLACES = 211  # entries of a table
 SPACING = 0.004  # m between entries; the middle one is the middle of the track
-UNITS = (0.5, 2.0)  # N and rad/s^2: what an output of 1 stands for
+UNITS = (0.5, 2.0)  # N and rad/s^2 per unit of output
 
 
 class Residual(NamedTuple):
-    """M members, each a table and a network of one hidden layer after another, of H units each."""
+    """M members, each with a table and a network with two hidden layers of H units."""
 
     places: Tensor  # [M, PLACES] in UNITS[0]
     first: Tensor  # [M, H, INPUTS]
@@ -77,7 +77,7 @@ class Residual(NamedTuple):
 
 
 def chosen_members(residual: Residual, member: Tensor) -> MakeAddition:
-    """Return the addition for carts of `member` [N] int64 each: all networks run, each cart takes its own."""
+    """Return the addition for carts of `member` [N] int64 each: all networks run; each cart uses its own."""
 
     def network(inputs: Tensor) -> Tensor:
         own = torch.arange(residual.members, device=member.device).unsqueeze(1) == member  # [M, N]

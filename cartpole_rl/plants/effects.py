@@ -1,9 +1,9 @@
 """Finds randomized parameters without any effect on a simulated cart, by simulation.
 
-A range can be without effect for many reasons: the chosen friction does not read the parameter, a dead-band
+A range can have no effect for several reasons: the chosen friction does not read the parameter, a dead-band
 ends below the smallest motor value, no cart is drawn from it. Each range is tested: carts are drawn twice,
 with the parameter at the low and at the high end of its range and all else equal, and simulated for a few
-periods under the motor values of the agent. If they move alike and report alike, the range has no effect.
+periods under the motor values of the agent. If all motions and reports are equal, the range has no effect.
 """
 
 import math
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import CartParameters
-from cartpole_rl.plants.simulation import Carts, Inputs, Period, run_carts
+from cartpole_rl.plants.simulation import Carts, Inputs, Period, commands_under_way, run_carts
 from cartpole_rl.randomization.draws import Draws
 
 TESTED = 256  # carts for each parameter
@@ -37,7 +37,7 @@ def without_effect(
     ends = [draws.ends(name, TESTED, torch.Generator().manual_seed(0)) for name in names]
     low, high = (torch.cat(tables, 1) for tables in zip(*ends, strict=True))
     track_end = (low[TRACK_HALF_LENGTH] + high[TRACK_HALF_LENGTH]) / 2
-    commands = 1 + max(1, math.ceil(draws.longest_delay() / period - 1e-9))  # that can be under way
+    commands = commands_under_way(draws.longest_delay(), period)
     motion, drive, inputs = _situations(track_end, motors, commands)
     carts = [Carts(table, motion, drive) for table in (low, high)]
     same = torch.ones_like(track_end, dtype=torch.bool)
@@ -77,6 +77,6 @@ def _situations(
 
 
 def _alike(one: Period, other: Period) -> Tensor:
-    """Return which carts moved and reported alike, [N] bool."""
+    """Return which carts had equal motions and reports, [N] bool."""
     parts = ("motion", "counts", "motor_applied", "off_track")
     return torch.stack([(getattr(one, part) == getattr(other, part)).all(0) for part in parts]).all(0)

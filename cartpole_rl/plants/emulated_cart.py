@@ -12,7 +12,7 @@ from typing import Self
 
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import EmulatorError
-from cartpole_rl.plants.serial.settings import SerialSettings
+from cartpole_rl.plants.serial.settings import LONGEST_WRITE, SerialSettings
 
 READY_TIMEOUT = 60.0  # s for the first line; the process loads MuJoCo before it
 GRACE = 3.0  # s from SIGTERM to SIGKILL
@@ -22,8 +22,8 @@ STDERR_BYTES = 2000  # of the end of its stderr, for an error
 class EmulatedCart:
     """A running emulator: `port` to open with pyserial, `pid`. A context manager that ends the process.
 
-    The process ends by itself when this one dies. Ctrl-C in a terminal reaches this process alone, so the
-    cart can still be stopped. Raises EmulatorError if it does not get ready, and at the end of a `with`
+    The process ends when this one dies. Ctrl-C in a terminal reaches only this process, so the
+    cart can still be stopped. Raises EmulatorError if it does not become ready, and at the end of a `with`
     without another error if it had died before.
     """
 
@@ -54,7 +54,8 @@ class EmulatedCart:
 
         Without disturbed frames the host repeats a question late: a busy computer then adds no period to a
         lockstep run, which is repeatable. With disturbed frames it repeats early, so that a lost answer costs
-        little time.
+        little time. Its system may take a write for stalled when the host was only suspended, hence the long
+        write timeout.
         """
         truth = self.truth
         disturbed = bool(truth.frame_loss or truth.frame_corruption or truth.frame_reordering)
@@ -64,12 +65,13 @@ class EmulatedCart:
             connect_timeout=10.0,
             answer_timeout=0.1 if disturbed else 2.0,
             retries=20 if disturbed else 2,
+            write_timeout=LONGEST_WRITE,
             nudge_after=2.0,
         )
 
     @property
     def died(self) -> str:
-        """How the process ended by itself, in one line with the end of its stderr; empty while it runs."""
+        """The reason why the process ended early, with the end of its stderr; empty while it runs."""
         code = self._process.poll()
         return "" if code is None else f"the emulated cart ended with exit code {code}: {self._stderr_end()}"
 

@@ -5,7 +5,7 @@ as well. Carts are drawn as in any simulated plant; the learned residual is adde
 """
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from tensordict import TensorDict
@@ -20,22 +20,11 @@ from cartpole_rl.randomization.draws import Draws
 from cartpole_rl.tasks.settings import StartSettings
 
 
-class Weights(NamedTuple):
-    """The residual of a period: the member of each cart and the fields of `Residual`, in one tuple."""
-
-    member: Tensor  # [N] int64, of each cart's episode
-    places: Tensor
-    first: Tensor
-    first_bias: Tensor
-    second: Tensor
-    second_bias: Tensor
-    last: Tensor
-
-
-def run_learned_carts(carts: Carts, inputs: Inputs, weights: Weights, **settings: Any) -> Period:
-    """Run `run_carts` with the addition of the members of `weights`."""
-    member, *residual = weights
-    return run_carts(carts, inputs, addition=chosen_members(Residual(*residual), member), **settings)
+def run_learned_carts(
+    carts: Carts, inputs: Inputs, residual: Residual, members: tuple[Tensor], **settings: Any
+) -> Period:
+    """Run `run_carts` with the addition of `residual`; `members` holds the member of each cart, [N] int64."""
+    return run_carts(carts, inputs, addition=chosen_members(residual, *members), **settings)
 
 
 class LearnedPlant(SimulatedPlant):
@@ -81,7 +70,7 @@ class LearnedPlant(SimulatedPlant):
         return self._member
 
     def _run_members(self, carts: Carts, inputs: Inputs) -> Period:
-        return self._run_learned(carts, inputs, Weights(self._member, *self._residual))
+        return self._run_learned(carts, inputs, self._residual, (self._member,))
 
     def restart(self, rows: Tensor, again: Tensor | None = None) -> TensorDict:
         """Start an episode on the carts `rows` [R], each with a new member, except for `again`."""

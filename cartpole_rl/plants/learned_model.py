@@ -50,7 +50,7 @@ def load_model(source: Path) -> LearnedModel:
     path = find_model(source)
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # damaged bytes make torch raise anything
+    except Exception as error:  # torch raises errors of many types for damaged bytes
         raise CheckpointError(
             f"plant.model={source} is not a learned model, or is damaged ({type(error).__name__}); {REMEDY}"
         ) from None

@@ -9,7 +9,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.plants.specs import Plant, one_cart
+from cartpole_rl.plants.specs import Plant, Report, one_cart
 from cartpole_rl.tasks.episode import Episode
 
 
@@ -39,17 +39,17 @@ class RecordedPlant(Plant):
         return torch.tensor([torch.inf])
 
     def _set_seed(self, seed: int | None) -> None:
-        """Do nothing: there is no randomness."""
+        """Do nothing: a recording is not random."""
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDict:
         self._row = 0
-        return self.frame(*self._report())
+        return self.frame(self._report())
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         self._row += 1
-        return self.step_frame(*self._report())
+        return self.step_frame(self._report())
 
-    def _report(self) -> tuple[Tensor, ...]:
+    def _report(self) -> Report:
         episode, row = self.episode, self._row
         last = row == episode.steps
         since = episode.time[row] - episode.time[max(0, row - 1)]

@@ -1,4 +1,4 @@
-"""Settings of the simulated plants: plant=simulated and plant=learned."""
+"""Settings of the plants: plant=simulated, learned and emulated; plant=serial has its own module."""
 
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
@@ -6,6 +6,7 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field
 
 from cartpole_rl.physics.models import Integrator
+from cartpole_rl.plants.serial.settings import Rehome
 from cartpole_rl.settings import Fraction, Settings
 
 
@@ -27,3 +28,15 @@ class LearnedSettings(Settings):
     integrator: ClassVar = Integrator.SEMI_IMPLICIT
     substeps: ClassVar = 4
     pole_presses: ClassVar = False
+
+    @property
+    def without_prior(self) -> "LearnedSettings":
+        """These settings with carts of the model alone, as an evaluation has them."""
+        return self.model_copy(update={"prior_share": 0.0})
+
+
+class EmulatedSettings(Settings):
+    """plant=emulated."""
+
+    kind: Literal["emulated"]
+    rehome: Rehome = "once"

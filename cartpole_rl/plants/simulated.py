@@ -1,9 +1,8 @@
-"""N simulated carts as one plant: parameters and starts drawn anew for each episode, physics, encoders.
+"""N simulated carts as one plant: parameters and starts drawn for each episode, physics, encoders.
 
 The true state stays inside; the frames hold what a cart reports over its serial port.
 """
 
-import math
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, NamedTuple
@@ -16,18 +15,18 @@ from cartpole_rl.compilation import Compiled
 from cartpole_rl.physics.dynamics import State
 from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import CartParameters
-from cartpole_rl.plants.simulation import Carts, Inputs, Period, encoder_counts, run_carts
-from cartpole_rl.plants.specs import Plant
+from cartpole_rl.plants.simulation import Carts, Inputs, Period, commands_under_way, encoder_counts, run_carts
+from cartpole_rl.plants.specs import Plant, Report
 from cartpole_rl.randomization.draws import Draws
 from cartpole_rl.tasks.episode import Origin
 from cartpole_rl.tasks.settings import StartSettings
 from cartpole_rl.tasks.starts import draw_start
 
-NOISE_PARAMETERS = ("latency_jitter", "position_noise", "angle_noise")  # drawn anew in each period
+NOISE_PARAMETERS = ("latency_jitter", "position_noise", "angle_noise")  # drawn in each period
 DRAWN_AT_ONCE = 1024  # episodes; drawing a few takes about as long
 
 
-class Episodes(NamedTuple):
+class Starts(NamedTuple):
     """Starts of coming episodes, drawn in advance."""
 
     table: Tensor  # [P, M]
@@ -64,8 +63,7 @@ class SimulatedPlant(Plant):
         self._generator = torch.Generator(device=self.device)
         self._noisy = any(randomizer.can_differ_from_zero(name) for name in NOISE_PARAMETERS)
         self._no_noise = torch.zeros(3, carts, device=self.device)
-        delay = randomizer.longest_delay()
-        commands = 1 + max(1, math.ceil(delay / period - 1e-9))  # motor values under way at most
+        commands = commands_under_way(randomizer.longest_delay(), period)
         self._carts = Carts(
             randomizer.nominal.unsqueeze(1).repeat(1, carts),
             torch.zeros(4, carts, device=self.device),
@@ -114,12 +112,12 @@ class SimulatedPlant(Plant):
         counts = encoder_counts(
             State(*motion), CartParameters.from_table(table), self._draw_noise(self.carts)
         )
-        self._coming = Episodes(table, motion, counts)
+        self._coming = Starts(table, motion, counts)
 
     def replace_randomizer(self, randomizer: Draws) -> None:
         """Draw the next episodes from `randomizer`, whose delays are no longer than those of the first."""
         self.randomizer = randomizer
-        self._coming = self._draw_episodes(0)
+        self._coming = self._draw_starts(0)
 
     def snapshot(self) -> dict[str, Any]:
         """Return everything on which the next step depends, for `restore`."""
@@ -131,16 +129,16 @@ class SimulatedPlant(Plant):
         """Return to `snapshot`."""
         self._carts.table.copy_(snapshot["table"])
         self._carts = Carts(self._carts.table, snapshot["motion"].clone(), snapshot["drive"].clone())
-        self._coming = Episodes(*(snapshot[f"next_{name}"].clone() for name in Episodes._fields))
+        self._coming = Starts(*(snapshot[f"next_{name}"].clone() for name in Starts._fields))
         self._generator.set_state(snapshot["generator"])
 
     def _set_seed(self, seed: int | None) -> None:
         self._generator.manual_seed(0 if seed is None else seed)
-        self._coming = self._draw_episodes(0)
+        self._coming = self._draw_starts(0)
 
     def restart(self, rows: Tensor, again: Tensor | None = None) -> TensorDict:
-        """Start an episode on the carts `rows` [R], new but for `again`; return their first frame, [R]."""
-        table, motion, counts = self._next_episodes(len(rows))
+        """Start an episode on the carts `rows` [R], new except for `again`; return their first frame, [R]."""
+        table, motion, counts = self._next_starts(len(rows))
         if again is not None and again.any():
             table = torch.where(again, self._carts.table[:, rows], table)
             cart = CartParameters.from_table(table)
@@ -152,20 +150,20 @@ class SimulatedPlant(Plant):
             self._carts.drive.index_fill(1, rows, 0),
         )
         no_motor = torch.zeros_like(counts[:1])
-        return self._report(self.frame, counts, no_motor, no_motor.bool())
+        return self.frame(self._report(counts, no_motor, no_motor.bool()))
 
-    def _next_episodes(self, count: int) -> Episodes:
+    def _next_starts(self, count: int) -> Starts:
         if count > self._coming.counts.shape[1]:
-            self._coming = self._draw_episodes(max(count, DRAWN_AT_ONCE))
-        taken = Episodes(*(value[:, :count] for value in self._coming))
-        self._coming = Episodes(*(value[:, count:] for value in self._coming))
+            self._coming = self._draw_starts(max(count, DRAWN_AT_ONCE))
+        taken = Starts(*(value[:, :count] for value in self._coming))
+        self._coming = Starts(*(value[:, count:] for value in self._coming))
         return taken
 
-    def _draw_episodes(self, count: int) -> Episodes:
+    def _draw_starts(self, count: int) -> Starts:
         table = self.randomizer.draw(count, self._generator)
         motion = draw_start(count, self.start, self._generator).T
         counts = encoder_counts(State(*motion), CartParameters.from_table(table), self._draw_noise(count))
-        return Episodes(table, motion, counts)
+        return Starts(table, motion, counts)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDict:
         """Return the first frame of the carts that reset; TorchRL keeps the others', which are zeros here."""
@@ -182,18 +180,16 @@ class SimulatedPlant(Plant):
         inputs = Inputs(tensordict.get("motor").T, self._draw_noise(self.carts))
         after = self._run(self._carts, inputs)
         self._carts = Carts(self._carts.table, after.motion, after.drive)
-        return self._report(self.step_frame, after.counts, after.motor_applied, after.off_track)
+        return self.step_frame(self._report(after.counts, after.motor_applied, after.off_track))
 
     def _draw_noise(self, count: int) -> Tensor:
-        """Return the noise of one period of `count` carts, [3, count]; 0 where no parameter is noisy."""
+        """Return the noise of one period of `count` carts, [3, count]; 0 if no parameter is noisy."""
         if not self._noisy:
             return self._no_noise if count == self.carts else self._no_noise.new_zeros(3, count)
         draws = {"generator": self._generator, "device": self.device}
         return torch.cat((2 * torch.rand(1, count, **draws) - 1, torch.randn(2, count, **draws)))
 
-    def _report(
-        self, frame: Callable[..., TensorDict], counts: Tensor, motor_applied: Tensor, off_track: Tensor
-    ) -> TensorDict:
-        """Return the frame of tensors that are transposed here."""
+    def _report(self, counts: Tensor, motor_applied: Tensor, off_track: Tensor) -> Report:
+        """Return the report of tensors that are transposed here."""
         dt = torch.full(off_track.shape, self.period, device=self.device)
-        return frame(counts.T, dt.T, motor_applied.T, off_track.T, torch.zeros_like(off_track).T)
+        return Report(counts.T, dt.T, motor_applied.T, off_track.T, torch.zeros_like(off_track).T)

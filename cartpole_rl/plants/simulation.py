@@ -1,9 +1,10 @@
 """One control period of N simulated carts as pure functions: a motor value in, encoder counts out.
 
-Random numbers are drawn beforehand, so that this can be compiled. Tensors are [N] or [k, N], the
-transpose of what stands in the tensordict: compiled code then runs along the carts.
+Random numbers are drawn in advance, so that this can be compiled. Tensors are [N] or [k, N], the
+transpose of the tensors in the tensordict: compiled code then runs along the carts.
 """
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -21,7 +22,7 @@ LARGEST_COUNT = 2**30  # STATE's counts are 32-bit numbers
 class Carts(NamedTuple):
     """The state before a period, in few tensors: each one costs time in every call."""
 
-    table: Tensor  # [P, N], a row a parameter, for `CartParameters.from_table`
+    table: Tensor  # [P, N], one row per parameter, for `CartParameters.from_table`
     motion: Tensor  # [4, N], the true `State`
     drive: Tensor  # [1 + D, N], the `Drive`: force, then motor values, newest first
 
@@ -41,6 +42,11 @@ class Period(NamedTuple):
     counts: Tensor  # [2, N] int64
     motor_applied: Tensor  # [1, N] int64
     off_track: Tensor  # [1, N] bool
+
+
+def commands_under_way(delay: float, period: float) -> int:
+    """Return how many motor values are under way at most with delays of up to `delay` s."""
+    return 1 + max(1, math.ceil(delay / period - 1e-9))
 
 
 def run_carts(
@@ -64,7 +70,7 @@ def run_carts(
         torch.stack((drive.force, *drive.motors)),
         encoder_counts(state, cart, inputs.noise),
         motor_in_force(drive.motors, cart.latency, period),
-        ~(state.x.abs() <= cart.track_half_length).unsqueeze(0),  # also where it is not a number
+        ~(state.x.abs() <= cart.track_half_length).unsqueeze(0),  # also if it is NaN
     )
 
 

@@ -1,7 +1,7 @@
 """The contract of every plant: its inputs and outputs, with shapes and types."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -9,11 +9,21 @@ from tensordict import TensorDict
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from cartpole_rl.physics.motor import LARGEST_MOTOR
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Origin
 
-MOTOR_LIMIT = 255
 TERMINATING, TRUNCATING = (Ending.TRACK, Ending.FAULT), (Ending.LINK,)  # the endings that plants report
+
+
+class Report(NamedTuple):
+    """The outputs of N carts after a period: see `Plant`."""
+
+    counts: torch.Tensor  # [N, 2] int64
+    dt: torch.Tensor  # [N, 1] float32
+    motor_applied: torch.Tensor  # [N, 1] int64
+    terminated: torch.Tensor  # [N, 1] bool
+    truncated: torch.Tensor  # [N, 1] bool
 
 
 class Plant(EnvBase):
@@ -24,22 +34,23 @@ class Plant(EnvBase):
     right, the pole not wrapped), `dt` [N, 1] float32 seconds since the previous frame by the plant's clock,
     `motor_applied` [N, 1] int64, `terminated` [N, 1] bool (left the track, or a device fault),
     `truncated` [N, 1] bool (link lost; time limits belong to the task).
-    A plant has no reward of its own and gives zeros.
+    A plant computes no reward; it returns zeros.
     """
 
     compiled = False  # whether the hardware transform above it may compile its arithmetic as well
+    ended_by = ""  # the `Ending` that a plant of one cart reports; "" while it reports none
 
     def __init__(self, carts: int, device: torch.device | str = "cpu") -> None:
         super().__init__(device=torch.device(device), batch_size=torch.Size([carts]))
         self.action_spec = Composite(
-            motor=Bounded(-MOTOR_LIMIT, MOTOR_LIMIT, shape=(carts, 1), dtype=torch.int64, device=device),
+            motor=Bounded(-LARGEST_MOTOR, LARGEST_MOTOR, shape=(carts, 1), dtype=torch.int64, device=device),
             shape=(carts,),
         )
         self.observation_spec = Composite(
             counts=Unbounded(shape=(carts, 2), dtype=torch.int64, device=device),
             dt=Unbounded(shape=(carts, 1), dtype=torch.float32, device=device),
             motor_applied=Bounded(
-                -MOTOR_LIMIT, MOTOR_LIMIT, shape=(carts, 1), dtype=torch.int64, device=device
+                -LARGEST_MOTOR, LARGEST_MOTOR, shape=(carts, 1), dtype=torch.int64, device=device
             ),
             shape=(carts,),
         )
@@ -80,30 +91,13 @@ class Plant(EnvBase):
         """N, the number of carts in the batch."""
         return self.batch_size[0]
 
-    def frame(
-        self,
-        counts: torch.Tensor,
-        dt: torch.Tensor,
-        motor_applied: torch.Tensor,
-        terminated: torch.Tensor,
-        truncated: torch.Tensor,
-    ) -> TensorDict:
+    def frame(self, report: Report) -> TensorDict:
         """Return the result of `_reset`, of all carts or some; `done` is `terminated | truncated`."""
-        return tensordict_of(
-            {
-                "counts": counts,
-                "dt": dt,
-                "motor_applied": motor_applied,
-                "terminated": terminated,
-                "truncated": truncated,
-                "done": terminated | truncated,
-            }
-        )
+        return tensordict_of({**report._asdict(), "done": report.terminated | report.truncated})
 
-    def step_frame(self, *frame: torch.Tensor) -> TensorDict:
-        """Return the result of `_step`: `frame` of the same arguments, and the reward 0 for TorchRL."""
-        result = self.frame(*frame)
-        return result.set("reward", torch.zeros_like(result.get("dt")))
+    def step_frame(self, report: Report) -> TensorDict:
+        """Return the result of `_step`: `frame` of the same report, and the reward 0 for TorchRL."""
+        return self.frame(report).set("reward", torch.zeros_like(report.dt))
 
 
 def tensordict_of(entries: dict[str, Any]) -> TensorDict:
@@ -118,11 +112,11 @@ def tensordict_of(entries: dict[str, Any]) -> TensorDict:
 
 def one_cart(
     counts: Sequence[int], dt: float, motor_applied: int, ended_by: str, halted: bool = False
-) -> tuple[torch.Tensor, ...]:
-    """Return the arguments of `Plant.frame` for a single cart.
+) -> Report:
+    """Return the report of a single cart.
 
     `ended_by` is why the plant ended the episode, or anything else while it has not; a plant that was
-    `halted` by its user is truncated. The cart waits meanwhile: NumPy is five times as fast as torch.tensor.
+    `halted` by its user is truncated. NumPy is five times as fast as torch.tensor; the cart is waiting.
     """
     rows = (
         np.array([counts], np.int64),
@@ -131,7 +125,7 @@ def one_cart(
         np.array([[ended_by in TERMINATING]]),
         np.array([[halted or ended_by in TRUNCATING]]),
     )
-    return tuple(map(torch.from_numpy, rows))
+    return Report(*map(torch.from_numpy, rows))
 
 
 DONE_KEYS = ("done", "terminated", "truncated")

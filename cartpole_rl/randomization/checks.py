@@ -9,10 +9,10 @@ from cartpole_rl.randomization.ranges import Range
 
 
 def check_carts(cart: Mapping[str, float], poles: PoleSettings, ranges: Mapping[str, Range]) -> None:
-    """Raise ConfigError where no such carts can be drawn:
+    """Raise ConfigError if such carts cannot be drawn.
 
-    a name is unknown, a nominal value is impossible, a range reaches an impossible value, or `cart` has a
-    number of the pole's.
+    Causes: an unknown name, an impossible nominal value, a range that reaches an impossible value, or a
+    parameter of the pole in `cart`.
     """
     for name in Pole.model_fields:
         if name in cart:
@@ -26,12 +26,12 @@ def check_carts(cart: Mapping[str, float], poles: PoleSettings, ranges: Mapping[
 
 
 def possible_poles(poles: PoleSettings) -> list[Pole]:
-    """Return the choices; the rod of middle length stands for rods of random length."""
+    """Return the choices; the rod of middle length represents rods of random length."""
     return [poles.nominal] if poles.choices is None else list(poles.choices.values())
 
 
 def check_one_pole(owner: str, poles: PoleSettings) -> Pole:
-    """Return the pole. Raises ConfigError where `poles` are several, naming `owner`, which takes one."""
+    """Return the pole. Raises ConfigError, which names `owner`, if there are several `poles`."""
     if not poles.is_single:
         raise ConfigError(f"pole: {owner} takes one pole, not {poles.name}; choose one, as pole=medium")
     return poles.nominal

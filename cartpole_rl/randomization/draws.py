@@ -1,4 +1,4 @@
-"""The interface of everything that draws the carts of a simulated plant."""
+"""The interface of a source of simulated carts."""
 
 from typing import Protocol
 
@@ -7,7 +7,7 @@ from torch import Tensor
 
 
 class Draws(Protocol):
-    """Draws carts."""
+    """A source of carts with drawn parameters."""
 
     nominal: Tensor  # [P]
 

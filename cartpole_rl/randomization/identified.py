@@ -49,7 +49,7 @@ class IdentifiedCarts(Draws):
     def ends(self, name: str, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Return a draw with `name` at the low end of its range, and the same with it at the high end.
 
-        Two tables [P, count], equal where a cart has the identified `name`. If the prior has a share, it
+        Two tables [P, count], equal if a cart has the identified `name`. If the prior has a share, it
         has at least half of the carts here, so that a small share is not overlooked.
         """
         share = max(self.prior_share, 0.5) if self.prior_share else 0.0
@@ -82,12 +82,12 @@ class IdentifiedCarts(Draws):
 def identified_carts(
     settings: IdentifiedSettings, cart: Mapping[str, float], poles: PoleSettings
 ) -> IdentifiedCarts:
-    """Return the draws that `settings` describe. Raises ConfigError where the file is missing or damaged."""
+    """Return the draws that `settings` describe. Raises ConfigError if the file is missing or damaged."""
     prior = Randomizer(cart, poles, settings.ranges)
     try:
         with np.load(settings.posterior) as stored:
             posterior = dict(zip(stored["names"].tolist(), stored["carts"], strict=True))
-            identified = [str(name) for name in stored["told"]]
+            identified = [str(name) for name in stored["identified"]]
     except (OSError, ValueError, KeyError) as error:
         raise ConfigError(f"randomization.posterior={settings.posterior} cannot be read: {error}") from None
     rows = []

@@ -5,6 +5,7 @@ from pydantic import model_validator
 from cartpole_rl.physics.rod import uniform_rod
 from cartpole_rl.settings import NonNegative, Positive, Settings
 
+SIMILAR = 0.1  # largest relative difference between two lengths of the same pole
 JUDGED_LENGTHS = 5  # rods on which an agent of a range of lengths is evaluated
 
 
@@ -19,6 +20,15 @@ class Pole(Settings):
     def rod(cls, length: float) -> "Pole":
         """Return a uniform rod of `length` m and the thesis's 0.7 kg/m."""
         return cls(**uniform_rod(length))
+
+    @property
+    def length(self) -> float:
+        """The length of a uniform rod with the same centre of mass, m."""
+        return 2 * self.pole_com
+
+    def is_about(self, length: float) -> bool:
+        """Return True where a pole of `length` m may be this one, since lengths are measured by hand."""
+        return abs(length / self.length - 1) < SIMILAR
 
 
 class PoleSettings(Settings):
@@ -43,7 +53,7 @@ class PoleSettings(Settings):
 
     @property
     def nominal(self) -> Pole:
-        """The pole that stands for the whole choice: the first one, or the rod of middle length."""
+        """The pole that represents the whole choice: the first one, or the rod of middle length."""
         if self.choices is not None:
             return next(iter(self.choices.values()))
         assert self.lengths is not None
@@ -51,12 +61,12 @@ class PoleSettings(Settings):
 
     @property
     def is_single(self) -> bool:
-        """True where every cart carries the same pole."""
+        """True if every cart carries the same pole."""
         return self.choices is not None and len(self.choices) == 1
 
     @property
     def each(self) -> "PoleSettings":
-        """The poles that stand for all, in turn: every choice, or rods from the shortest to the longest."""
+        """The poles that represent the choice: every choice, or rods from the shortest to the longest."""
         if self.choices is not None:
             return PoleSettings(choices=self.choices, in_turn=True)
         assert self.lengths is not None

@@ -1,6 +1,6 @@
 """Draws the parameters of carts: first a pole, then each randomized parameter about its nominal value.
 
-A draw is a table [P, N] with a row a parameter in the order of `CartParameters.names()`, so that the rows of
+A draw is a table [P, N] with rows in the order of `CartParameters.names()`, so that the rows of
 finished episodes are replaced by one assignment.
 """
 
@@ -22,7 +22,7 @@ class Randomizer:
     """Draws carts about `cart` (every parameter but the pole's), with `poles` and `ranges` by parameter name.
 
     Raises ConfigError when a name is unknown, a nominal value is impossible, a range reaches an impossible
-    value, or `cart` has a number of the pole's.
+    value, or `cart` contains a parameter of the pole.
     """
 
     def __init__(

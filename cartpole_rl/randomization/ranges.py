@@ -54,7 +54,7 @@ class Range(Settings):
         return 1 + self.relative[0], 1 + self.relative[1]
 
     def check(self, name: str, nominal: float) -> None:
-        """Raise ConfigError where the range makes no sense for this parameter's nominal value."""
+        """Raise ConfigError if the range makes no sense for this parameter's nominal value."""
         low, high = self.limits()
         if self.scales_nominal:
             if nominal == 0:

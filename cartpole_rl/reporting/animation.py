@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw
 
+from cartpole_rl.files import replacing
 from cartpole_rl.reporting.drawing import FINER, CartDrawing, palette
 from cartpole_rl.tasks.episode import Episode
 
@@ -28,8 +29,8 @@ def write_gif(
 ) -> Path:
     """Write the animation of `gif` to `path`, and create its folder."""
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(gif(episode, pole_length, track_half_length, title, every))
+    with replacing(path) as beside:
+        beside.write_bytes(gif(episode, pole_length, track_half_length, title, every))
     return path
 
 

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from cartpole_rl.physics.actuator import static_force
 from cartpole_rl.physics.friction import dry_friction, viscous_coefficient
 from cartpole_rl.physics.models import Actuator, CartFriction
+from cartpole_rl.physics.motor import LARGEST_MOTOR
 from cartpole_rl.physics.parameters import CartParameters
 
 FASTEST = 0.6  # m/s
-LARGEST_MOTOR = 255
 MOST_SAMPLES = 500  # carts in a band
 
 Array = NDArray[np.floating]

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageColor, ImageDraw, ImageFont
 
+from cartpole_rl.physics.motor import LARGEST_MOTOR
 from cartpole_rl.reporting import style
 from cartpole_rl.reporting.words import ending_text
 from cartpole_rl.tasks.endings import Ending
@@ -29,7 +30,7 @@ MARGIN = 20  # pixels, left and right
 PIVOT_HEIGHT = 172  # pixels from the top
 REACH = 118  # pixels that the pole may take above and below the pivot
 CART_WIDTH, CART_HEIGHT, WHEEL = 40, 20, 5  # pixels; only the cart is not to scale
-FULL_MOTOR, LONGEST_ARROW = 255, 70  # motor value, and the pixels of its arrow
+LONGEST_ARROW = 70  # pixels, of the largest motor value
 BAR = (294, 301)  # pixels from the top: the time bar
 LEGEND = 311  # pixels from the top
 TITLE_WIDTH = 270  # pixels; a longer title is cut
@@ -56,7 +57,7 @@ class CartDrawing:
     episode: Episode
     pole: float  # fine pixels
     track: float  # fine pixels, half length
-    scale: float  # fine pixels a metre
+    scale: float  # fine pixels per metre
     upright: NDArray[np.bool_]  # [T+1]
     score: NDArray[np.float64]  # [T+1] sum of equation (6.2) so far
 
@@ -143,7 +144,7 @@ class CartDrawing:
         side = math.copysign(1, motor)
         head = FINER * 9.0
         start = x + side * FINER * (CART_WIDTH / 2 + 4)
-        end = start + side * (FINER * LONGEST_ARROW * abs(motor) / FULL_MOTOR + head)
+        end = start + side * (FINER * LONGEST_ARROW * abs(motor) / LARGEST_MOTOR + head)
         draw.line((start, y, end - side * head, y), fill=style.MOTOR, width=FINER * 6)
         draw.polygon(
             [(end, y), (end - side * head, y - head), (end - side * head, y + head)], fill=style.MOTOR

@@ -5,7 +5,9 @@ from typing import Any
 
 from cartpole_rl.reporting.table import number_text, table
 
+REPORTED_TIMES = (0.1, 0.5, 1.0)  # s after a reset
 Errors = Sequence[Mapping[str, Any]]  # one mapping for each time after a reset
+REPORTED_TIMES = (0.1, 0.5, 1.0)  # s after a reset
 ERROR_COLUMNS = {
     "rms_x_mm": "cart RMS (mm)",
     "median_x_mm": "cart median (mm)",
@@ -15,7 +17,7 @@ ERROR_COLUMNS = {
 
 
 def replay_table(errors: Errors, heading: str) -> str:
-    """Return the errors of a replay (`replays.errors_at`) as a table below `heading`."""
+    """Return the errors of a replay (`prediction.errors_at`) as a table below `heading`."""
     rows = [{"time": f"{line['after_s']:g}", **_error_cells(line)} for line in errors]
     return f"{heading}\n{table(rows, {'time': 'time (s)', **ERROR_COLUMNS})}"
 

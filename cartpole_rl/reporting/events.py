@@ -47,7 +47,7 @@ def _records(source: BinaryIO) -> Iterator[tuple[bytes, Event]]:
 
 
 def _is_kept(event: Event, first_step: int) -> bool:
-    """Return True for an event before `first_step` that is no final result."""
+    """Return True for an event before `first_step` that is not a final result."""
     tags = [value.tag for value in event.summary.value]
     is_final = any(tag.startswith((HPARAMS, FINAL)) for tag in tags)
     return event.step < first_step and not is_final

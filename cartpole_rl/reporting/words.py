@@ -1,4 +1,4 @@
-"""Texts that several figures share."""
+"""Texts that several figures, tables and messages share."""
 
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
@@ -9,7 +9,14 @@ ENDINGS = {
     Ending.ANGLE: "the pole fell",
     Ending.FAULT: "the cart reported a fault",
     Ending.LINK: "the link was lost",
+    Ending.NON_FINITE: "a value was not finite",
 }
+PHYSICS, LEARNED = "physics alone", "physics + network"  # models that are compared
+
+
+def count_text(episodes: int) -> str:
+    """Return "1 episode" or "20 episodes"."""
+    return f"{episodes} episode{'s' if episodes > 1 else ''}"
 
 
 def ending_text(episode: Episode) -> str:

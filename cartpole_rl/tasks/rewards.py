@@ -1,16 +1,22 @@
 """Rewards (5.1) to (5.5) and the scores (6.1) and (6.2): functions of the measured state, [N] -> [N].
 
+To add a reward, add its formula and a member to `Reward`; and a choice in `conf/reward/`. Formulas use
+methods of tensors alone, so that settings import this module without PyTorch.
+
 Both scores are reported for every agent, whatever its reward.
 """
 
 import math
 from collections.abc import Callable
-
-import torch
-from torch import Tensor
+from enum import StrEnum
+from typing import TYPE_CHECKING, Self
 
 from cartpole_rl.tasks.features import Measured
-from cartpole_rl.tasks.settings import Reward
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+Formula = Callable[[Measured, float], "Tensor"]  # of the measured state and x_max, m, to [N]
 
 UPRIGHT_ANGLE = math.radians(5)  # rad
 UPRIGHT_SPEED = math.radians(6)  # rad/s
@@ -19,45 +25,56 @@ UPRIGHT_BONUS = 10.0  # (5.5)
 BALANCE_ANGLE = math.radians(12)  # rad, theta_thr of (5.5): where the classical task ends
 
 
-def constant(state: Measured, x_max: float) -> Tensor:
+def constant(state: Measured, x_max: float) -> "Tensor":
     """(5.1): 1."""
-    return torch.ones_like(state.x)
+    return state.x.new_ones(state.x.shape)
 
 
-def cosine(state: Measured, x_max: float) -> Tensor:
+def cosine(state: Measured, x_max: float) -> "Tensor":
     """(5.2): cos(theta / 2)."""
-    return torch.cos(0.5 * state.theta)
+    return (0.5 * state.theta).cos()
 
 
-def linear_angle(state: Measured, x_max: float) -> Tensor:
+def linear_angle(state: Measured, x_max: float) -> "Tensor":
     """(5.3): (pi - |theta|) / pi."""
     return 1 - state.theta.abs() / math.pi
 
 
-def position(state: Measured, x_max: float) -> Tensor:
-    """(5.4) and (6.1): cos(theta / 2) (x_max - |x|) / x_max, not below 0, at most 1 a step."""
+def position(state: Measured, x_max: float) -> "Tensor":
+    """(5.4) and (6.1): cos(theta / 2) (x_max - |x|) / x_max, from 0 to 1 per step."""
     return cosine(state, x_max) * (1 - state.x.abs() / x_max).clamp(min=0)
 
 
-def upright_bonus(state: Measured, x_max: float) -> Tensor:
+def upright_bonus(state: Measured, x_max: float) -> "Tensor":
     """(5.5): (5.4) and 10 while |theta| < 12 degrees."""
     return position(state, x_max) + UPRIGHT_BONUS * (state.theta.abs() < BALANCE_ANGLE)
 
 
-def score(state: Measured, x_max: float) -> Tensor:
+def score(state: Measured, x_max: float) -> "Tensor":
     """(6.2): (6.1), 5 while |theta| < 5 degrees, 5 more if also |theta_dot| < 6 degrees/s; at most 11."""
     upright = state.theta.abs() < UPRIGHT_ANGLE
     still = upright & (state.theta_dot.abs() < UPRIGHT_SPEED)
     return position(state, x_max) + BONUS * (upright.to(state.theta.dtype) + still.to(state.theta.dtype))
 
 
-REWARDS: dict[Reward, Callable[[Measured, float], Tensor]] = {
-    Reward.CONSTANT: constant,
-    Reward.COSINE: cosine,
-    Reward.LINEAR_ANGLE: linear_angle,
-    Reward.POSITION: position,
-    Reward.UPRIGHT_BONUS: upright_bonus,
-    Reward.SCORE: score,
-}
+class Reward(StrEnum):
+    """The rewards to choose from: name and formula. The value of a member is its name."""
+
+    formula: Formula
+
+    CONSTANT = "constant", constant
+    COSINE = "cosine", cosine
+    LINEAR_ANGLE = "linear_angle", linear_angle
+    POSITION = "position", position
+    UPRIGHT_BONUS = "upright_bonus", upright_bonus
+    SCORE = "score", score
+
+    def __new__(cls, name: str, formula: Formula) -> Self:
+        """Make a member."""
+        member = str.__new__(cls, name)
+        member._value_, member.formula = name, formula
+        return member
+
+
 SCORE_UPRIGHT = Reward.POSITION  # (6.1) is (5.4)
 SCORE = Reward.SCORE  # (6.2)

@@ -1,8 +1,30 @@
-"""Choices of a task: starts, observations, rewards."""
+"""Settings of a task: actions, starts, rewards."""
 
 from enum import StrEnum
+from typing import Annotated, Literal
 
-from cartpole_rl.settings import Fraction, NonNegative, Settings
+from pydantic import Field, model_validator
+
+from cartpole_rl.physics.motor import LARGEST_MOTOR
+from cartpole_rl.settings import Count, Finite, Fraction, NonNegative, Positive, Settings
+from cartpole_rl.tasks.rewards import Reward
+
+NO_ACTION = -1  # where an observation or action value is not finite: motor 0, and the episode ends
+
+MotorValue = Annotated[int, Field(ge=-LARGEST_MOTOR, le=LARGEST_MOTOR)]
+
+
+class ActionSettings(Settings):
+    """Motor values by action index, and the simulated actuator that interprets them."""
+
+    motors: tuple[MotorValue, ...]
+    actuator: Literal["newtons", "force_curve"]
+
+    @model_validator(mode="after")
+    def _distinct(self) -> "ActionSettings":
+        if len(set(self.motors)) != len(self.motors) or len(self.motors) < 2:
+            raise ValueError(f"motors {list(self.motors)} must be two or more different values")
+        return self
 
 
 class Start(StrEnum):
@@ -24,33 +46,21 @@ class StartSettings(Settings):
     resting_share: Fraction = 0.0  # of the episodes start with a hanging pole at rest
 
 
-class ObservationKind(StrEnum):
-    """The form in which the agent observes the measured state."""
+class RewardSettings(Settings):
+    """The reward: `kind` times `scale`, minus the costs of the track, which the scores do not have."""
 
-    RAW = "raw"  # x, x_dot, theta wrapped, theta_dot: the thesis's four numbers
-    COS_SIN = "cos_sin"  # x, x_dot, cos theta, sin theta, theta_dot, each scaled to about one
-    POSITIONS = "positions"  # x, cos theta, sin theta: as cos_sin, without velocities
-
-
-# The factor of each number of an observation when left and right are swapped.
-MIRROR_SIGNS = {
-    ObservationKind.RAW: (-1, -1, -1, -1),
-    ObservationKind.COS_SIN: (-1, -1, 1, -1, -1),
-    ObservationKind.POSITIONS: (-1, 1, -1),
-}
+    kind: Reward
+    scale: Positive
+    track_penalty: NonNegative  # for leaving the track
+    position_cost: NonNegative  # of each step, times (x / x_max)^2
 
 
-def observation_size(kind: ObservationKind) -> int:
-    """Return how many numbers `features.observe` returns."""
-    return len(MIRROR_SIGNS[kind])
+class TaskSettings(Settings):
+    """The task."""
 
-
-class Reward(StrEnum):
-    """The formulas to choose the reward from."""
-
-    CONSTANT = "constant"
-    COSINE = "cosine"
-    LINEAR_ANGLE = "linear_angle"
-    POSITION = "position"
-    UPRIGHT_BONUS = "upright_bonus"
-    SCORE = "score"
+    name: str
+    start: StartSettings  # of training episodes
+    evaluation_start: StartSettings
+    time_limit: Count  # control periods
+    angle_limit: Finite | None  # rad; None: the pole may hang
+    x_max: Positive  # m, of (5.4), (6.1), (6.2)

@@ -2,6 +2,8 @@
 
 Host to cart: HELLO, START, STOP, SET_MOTOR, HOME, CLEAR_FAULT, SET_PERIOD.
 Cart to host: INFO, STATE (each period), ACK, NACK, FAULT.
+
+To add a message, add its type and its class; docs/extending.md shows all steps.
 """
 
 import struct
@@ -11,9 +13,11 @@ from typing import ClassVar, Self
 
 from cartpole_rl.errors import FrameError
 
+FROM_CART = 0x80  # the bit of a type byte that is set in frames from the cart
+
 
 class MessageType(IntEnum):
-    """The type byte of a frame. The top bit is the direction: 0 host to cart, 1 cart to host."""
+    """The type byte of a frame."""
 
     HELLO = 0x01
     START = 0x02
@@ -64,11 +68,17 @@ class Reason(IntEnum):
     BAD_VERSION = 8
 
 
+MESSAGES: dict[int, "type[Message]"] = {}  # by type byte; each message enters itself
+
+
 class Message:
     """Base class of the messages; packs and unpacks the fields in their order."""
 
     TYPE: ClassVar[MessageType]
     LAYOUT: ClassVar[str] = ""
+
+    def __init_subclass__(cls) -> None:
+        MESSAGES[cls.TYPE] = cls
 
     def pack(self) -> bytes:
         """Return the payload. Raises FrameError if a field does not fit its width."""
@@ -205,22 +215,3 @@ class FaultReport(Message):
     LAYOUT = "HI"
     fault: int
     tick: int
-
-
-MESSAGES: dict[int, type[Message]] = {
-    message.TYPE: message
-    for message in (
-        Hello,
-        Start,
-        Stop,
-        SetMotor,
-        Home,
-        ClearFault,
-        SetPeriod,
-        Info,
-        State,
-        Ack,
-        Nack,
-        FaultReport,
-    )
-}

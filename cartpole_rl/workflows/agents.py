@@ -1,21 +1,17 @@
 """Agents: new ones, those in checkpoints, and the controller of run=lqr."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from cartpole_rl.agents.baseline import EnergyAndRegulator
 from cartpole_rl.agents.dqn import QAgent
-from cartpole_rl.checking import checked
-from cartpole_rl.errors import CheckpointError, ConfigError
 from cartpole_rl.evaluation.episodes import Policy
 from cartpole_rl.learning.checkpoints import load_agent, restore_weights
 from cartpole_rl.randomization.checks import check_one_pole
 from cartpole_rl.workflows.build import evaluated_settings
 from cartpole_rl.workflows.checks import BASELINE, check_has_agent
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
-from cartpole_rl.workflows.settings import load_settings
+from cartpole_rl.workflows.settings import load_settings, recorded_settings
 
 OF_BASELINE = {"observation": "raw", "observation.past_motors": 1}
 
@@ -24,14 +20,6 @@ def new_agent(config: TrainConfig) -> QAgent:
     """Return an untrained agent."""
     observation = config.observation
     return QAgent(config.agent, observation.mirror_signs, len(config.actions.motors), observation.frames)
-
-
-def recorded_config(config: Mapping[str, Any], source: str) -> TrainConfig:
-    """Return the config in a checkpoint. Raises CheckpointError where another version wrote it."""
-    try:
-        return checked(TrainConfig, config)
-    except ConfigError as error:
-        raise CheckpointError(f"{source} is of another version of this package: {error}") from None
 
 
 @dataclass(frozen=True)
@@ -46,7 +34,7 @@ def trained_agent(run: Path) -> TrainedAgent:
     """Return the agent of a run folder or a checkpoint file. Raises CheckpointError, ConfigError."""
     check_has_agent(run)
     checkpoint = load_agent(run)
-    training = recorded_config(checkpoint.config, f"run={run}")
+    training = recorded_settings(TrainConfig, checkpoint.config, f"run={run}")
     agent = new_agent(training)
     restore_weights(agent, checkpoint.weights, f"run={run}")
     return TrainedAgent(training, agent.greedy_policy())
@@ -67,7 +55,7 @@ def baseline_agent(config: EvaluateConfig, training: TrainConfig) -> TrainedAgen
     poles = evaluated_settings(training, config.model_copy(update={"parameters": None})).pole
     pole = check_one_pole(f"run={BASELINE}", poles)
     policy = EnergyAndRegulator(
-        {**training.nominal, **pole.model_dump()},
+        training.nominal_with(pole),
         training.models(training.plant),
         training.actions.motors,
         training.observation.kind,

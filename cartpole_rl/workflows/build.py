@@ -1,27 +1,26 @@
 """Builds the environment of an evaluation, from the settings of the agent's training and its own."""
 
 from collections.abc import Callable, Mapping
-from typing import Literal
 
 import torch
 
 from cartpole_rl.checking import checked
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.envs.build import environment, simulated_env, with_fitted_guard
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
-from cartpole_rl.envs.make import CartPoleEnv
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.physics.bounds import check_names
-from cartpole_rl.plants.emulated import emulated_plant
+from cartpole_rl.plants.cart_plant import cart_plant
 from cartpole_rl.plants.learned_model import load_model
 from cartpole_rl.plants.serial.faults import Confirm, nobody
-from cartpole_rl.plants.serial.plant import SerialPlant
-from cartpole_rl.plants.settings import LearnedSettings, SimulatedSettings
+from cartpole_rl.plants.serial.preparation import StartPosition
+from cartpole_rl.plants.settings import EmulatedSettings, LearnedSettings, SimulatedSettings
 from cartpole_rl.randomization.poles import Pole, PoleSettings
 from cartpole_rl.settings import evaluation_seed
 from cartpole_rl.tasks.settings import Start
 from cartpole_rl.workflows.checks import simulated_carts
-from cartpole_rl.workflows.config import EmulatedSettings, EvaluateConfig, TrainConfig
+from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
 
 REPLACEABLE = (
     "cart",
@@ -55,7 +54,7 @@ def emulated_pole(truth: EmulatorSettings) -> PoleSettings:
 
 def one_pole(pole: Pole) -> PoleSettings:
     """Return the choice of this pole alone, named by its length."""
-    return PoleSettings(choices={f"{2 * pole.pole_com:.2f} m": pole})
+    return PoleSettings(choices={f"{pole.length:.2f} m": pole})
 
 
 def with_parameters(settings: CartPoleSettings, parameters: Mapping[str, float]) -> CartPoleSettings:
@@ -70,7 +69,7 @@ def with_parameters(settings: CartPoleSettings, parameters: Mapping[str, float])
     poles = {name: pole.model_copy(update=of_pole) for name, pole in (settings.pole.choices or {}).items()}
     return settings.model_copy(
         update={
-            "cart": {**settings.nominal, **of_cart},
+            "cart": {**settings.nominal_cart, **of_cart},
             "cart_friction": settings.cart_friction.model_copy(update={"parameters": {}}),
             "pole_friction": settings.pole_friction.model_copy(update={"parameters": {}}),
             "pole": PoleSettings(choices=poles) if poles else settings.pole,
@@ -91,21 +90,15 @@ def evaluated_env(
     start = settings.task.evaluation_start
     carts, seed = simulated_carts(config), evaluation_seed(config.seed)
     if isinstance(config.plant, LearnedSettings):
-        found = config.plant.model_copy(update={"prior_share": 0.0})
-        return simulated_env(settings, found, carts, start, seed)
+        return simulated_env(settings, config.plant.without_prior, carts, start, seed)
     if isinstance(config.plant, SimulatedSettings):
         return simulated_env(settings, config.plant, carts, start, seed)
     if start.angle is Start.ANY:
         raise ConfigError("task.evaluation_start.angle=any: a cart can start only upright or hanging")
-    angle: Literal["hanging", "upright"] = "upright" if start.angle is Start.UPRIGHT else "hanging"
-    if isinstance(config.plant, EmulatedSettings):
-        truth = config.emulator.model_copy(
-            update={"start": angle, "seed": config.emulator.seed + config.seed}
-        )
-        plant = emulated_plant(truth, settings.control_period, prompt, config.plant.rehome)
-        return environment(settings, plant)
-    serial = SerialPlant(config.plant, angle, settings.control_period, prompt, confirm=confirm)
-    return environment(settings, serial)
+    angle: StartPosition = "upright" if start.angle is Start.UPRIGHT else "hanging"
+    emulator = config.emulator.model_copy(update={"seed": config.emulator.seed + config.seed})
+    plant = cart_plant(config.plant, emulator, settings.control_period, angle, prompt, confirm)
+    return environment(settings, plant)
 
 
 def use_threads(threads: int | None) -> None:

@@ -11,11 +11,12 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.learning.checkpoint_files import FOLDER, LAST, find_agent, find_training
+from cartpole_rl.learning.checkpoint_files import find_agent, find_training
 from cartpole_rl.physics.bounds import check_names, check_value, check_values
 from cartpole_rl.plants.model_file import find_model
 from cartpole_rl.plants.settings import LearnedSettings
 from cartpole_rl.randomization.checks import check_carts, check_one_pole
+from cartpole_rl.run_files import CHECKPOINTS, LAST
 from cartpole_rl.workflows.config import (
     EvaluateConfig,
     FinetuneConfig,
@@ -36,16 +37,16 @@ LONGER = {  # command: how to train further than a run that has ended
 
 
 def check_training(config: TrainConfig) -> None:
-    """Raise CartPoleError where a new training cannot start."""
+    """Raise CartPoleError if a new training cannot start."""
     if config.compile:
         check_compiler()
-    check_carts(config.nominal, config.pole, config.ranges)
+    check_carts(config.nominal_cart, config.pole, config.ranges)
     if isinstance(config.plant, LearnedSettings):
         check_model(config.plant)
 
 
 def check_evaluation(config: EvaluateConfig) -> None:
-    """Raise CartPoleError where there is no such agent, or no such cart."""
+    """Raise CartPoleError if the agent or the cart does not exist."""
     if config.run != BASELINE:
         check_agent(config.run)
     if isinstance(config.plant, LearnedSettings):
@@ -54,7 +55,7 @@ def check_evaluation(config: EvaluateConfig) -> None:
 
 
 def check_finetuning(config: FinetuneConfig) -> Path:
-    """Return the run to fine-tune. Raises CartPoleError where it has no agent."""
+    """Return the run to fine-tune. Raises CartPoleError if it has no agent."""
     if config.run is None:
         raise ConfigError("run is missing; give run=..., the run folder of a training")
     if config.compile:
@@ -64,16 +65,15 @@ def check_finetuning(config: FinetuneConfig) -> Path:
 
 
 def check_replay(config: ReplayConfig) -> None:
-    """Raise CartPoleError where there is no recording, or the cart or its pole is impossible."""
+    """Raise CartPoleError if there is no recording, or the cart or its pole is impossible."""
     recordings(config.source)
     if config.pole is not None:
         check_one_pole("a replay", config.pole)
-    friction = {**config.cart_friction.parameters, **config.pole_friction.parameters}
-    check_parameters({**config.cart, **friction, **(config.parameters or {})})
+    check_parameters({**config.nominal_cart, **(config.parameters or {})})
 
 
 def check_modelling(config: ModelConfig) -> None:
-    """Raise CartPoleError where there is no recording, or more than one pole is chosen."""
+    """Raise CartPoleError if there is no recording, or more than one pole is chosen."""
     for source in config.source:
         recordings(source)
     if config.pole is not None:
@@ -81,14 +81,14 @@ def check_modelling(config: ModelConfig) -> None:
 
 
 def check_identification(config: IdentifyConfig) -> None:
-    """Raise CartPoleError where the prior cart is impossible, or there is no recording."""
+    """Raise CartPoleError if the prior cart is impossible, or there is no recording."""
     check_values(config.nominal)
     if config.source is not None:
         experiments(config.source)
 
 
 def check_resumable(program: str, resume: str, folder: Path) -> None:
-    """Raise CartPoleError where cartpole-<program> cannot resume the run `resume` in `folder`."""
+    """Raise CartPoleError if cartpole-<program> cannot resume the run `resume` in `folder`."""
     run = Path(resume)
     check_program("resume", run, program)
     if run.is_dir() and not folder.samefile(run):
@@ -102,22 +102,22 @@ def check_resumable(program: str, resume: str, folder: Path) -> None:
 
 
 def check_agent(run: Path) -> None:
-    """Raise ConfigError or CheckpointError where `run` is not a run folder or file with an agent."""
+    """Raise ConfigError or CheckpointError if `run` is not a run folder or file with an agent."""
     check_has_agent(run)
     find_agent(run)
 
 
 def check_has_agent(run: Path) -> None:
-    """Raise ConfigError where `run` is a run folder without an agent."""
+    """Raise ConfigError if `run` is a run folder without an agent."""
     check_program("run", run, "train", "finetune")
-    if (program := program_of(run)) and not (run / FOLDER / LAST).exists():
+    if (program := program_of(run)) and not (run / CHECKPOINTS / LAST).exists():
         raise ConfigError(
             f"run={run}: this run of {PREFIX}{program} has no agent yet; {use_of(run, program)}"
         )
 
 
 def check_model(plant: LearnedSettings) -> None:
-    """Raise CheckpointError or ConfigError where plant.model= names no learned model."""
+    """Raise CheckpointError or ConfigError if plant.model= names no learned model."""
     check_program("plant.model", plant.model, "model")
     find_model(plant.model)
 
@@ -135,7 +135,7 @@ def simulated_carts(config: EvaluateConfig) -> int:
 
 
 def check_compiler() -> None:
-    """Raise ConfigError where torch.compile has no C++ compiler or no header of Python to build with."""
+    """Raise ConfigError if torch.compile has no C++ compiler or no header of Python to build with."""
     compiler = os.environ.get("CXX", {"darwin": "clang++", "win32": "cl"}.get(sys.platform, "g++"))
     header = Path(sysconfig.get_path("include"), "Python.h")
     if shutil.which(compiler) is None:

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from pydantic import Field, field_validator, model_validator
 
@@ -11,11 +11,13 @@ from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.envs.cart_pole_settings import (
     CartFrictionSettings,
     CartPoleSettings,
+    CartSettings,
     ControlPeriod,
     PoleFrictionSettings,
     Randomization,
+    SimulatedCartSettings,
 )
-from cartpole_rl.envs.settings import GuardSettings, RewardSettings
+from cartpole_rl.envs.settings import GuardSettings
 from cartpole_rl.identification.settings import EnsembleSettings
 from cartpole_rl.learning.settings import (
     BufferSettings,
@@ -25,23 +27,32 @@ from cartpole_rl.learning.settings import (
 )
 from cartpole_rl.physics.bounds import check_values
 from cartpole_rl.physics.models import Actuator
-from cartpole_rl.plants.serial.settings import Rehome, SerialSettings
-from cartpole_rl.plants.settings import LearnedSettings, SimulatedSettings
+from cartpole_rl.plants.serial.settings import SerialSettings
+from cartpole_rl.plants.settings import EmulatedSettings, LearnedSettings, SimulatedSettings
 from cartpole_rl.randomization.checks import check_one_pole
 from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.settings import Count, Finite, Seed, Settings
+from cartpole_rl.tasks.settings import RewardSettings
 
 OF_SIMULATION = ("parameters", "randomization", "cart", "cart_friction", "pole_friction")
 
 
-class EmulatedSettings(Settings):
-    """plant=emulated."""
+class RunSettings(Settings):
+    """Settings of most commands that write a run folder."""
 
-    kind: Literal["emulated"]
-    rehome: Rehome = "once"
+    seed: Seed
+    label: str
+    threads: Count | None
 
 
-class TrainConfig(CartPoleSettings):
+class OnCart(Settings):
+    """The cart on a port: `plant`, which is a real one or one with the settings `emulator`."""
+
+    plant: Annotated[EmulatedSettings | SerialSettings, Field(discriminator="kind")]
+    emulator: EmulatorSettings
+
+
+class TrainConfig(RunSettings, CartPoleSettings):
     """cartpole-train."""
 
     plant: Annotated[SimulatedSettings | LearnedSettings, Field(discriminator="kind")]
@@ -49,9 +60,6 @@ class TrainConfig(CartPoleSettings):
     buffer: BufferSettings
     optimizer: OptimizerSettings
     learning: LearningSettings
-    seed: Seed
-    label: str
-    threads: Count | None
     compile: bool
     resume: str | None
 
@@ -101,7 +109,7 @@ class RepeatSettings(Settings):
     episode: Annotated[int, Field(ge=0)] | None = None  # from 0, in the order of metrics.json
 
 
-class EvaluateConfig(Settings):
+class EvaluateConfig(RunSettings):
     """cartpole-evaluate. Groups that are None are those of the agent's training."""
 
     run: Path
@@ -120,9 +128,6 @@ class EvaluateConfig(Settings):
     reward: RewardSettings | None = None
     guard: GuardSettings | None = None
     repeat: RepeatSettings = RepeatSettings()
-    seed: Seed
-    label: str
-    threads: Count | None
 
     @model_validator(mode="after")
     def _plant_reads_every_setting(self) -> "EvaluateConfig":
@@ -143,29 +148,21 @@ class RecordConfig(EvaluateConfig):
     """cartpole-record. It has the settings of an evaluation."""
 
 
-class FinetuneConfig(Settings):
+class FinetuneConfig(RunSettings, OnCart):
     """cartpole-finetune."""
 
     run: Path | None
-    plant: Annotated[EmulatedSettings | SerialSettings, Field(discriminator="kind")]
-    emulator: EmulatorSettings
     episodes: Annotated[int, Field(ge=1, le=1000)]
     evaluation_episodes: Annotated[int, Field(ge=1, le=1000)]
     finetuning: FinetuningSettings
-    seed: Seed
-    label: str
-    threads: Count | None
     compile: bool
     resume: str | None
 
 
-class ReplayConfig(Settings):
+class ReplayConfig(SimulatedCartSettings):
     """cartpole-replay."""
 
     source: Annotated[Path, Field(alias="from")]
-    cart: dict[str, Finite]
-    cart_friction: CartFrictionSettings
-    pole_friction: PoleFrictionSettings
     pole: PoleSettings | None = None
     plant: SimulatedSettings
     actuator: Actuator
@@ -174,45 +171,32 @@ class ReplayConfig(Settings):
     label: str
 
 
-class IdentifyConfig(Settings):
+class IdentifyConfig(RunSettings, CartSettings, OnCart):
     """cartpole-identify."""
 
     source: Annotated[Path | None, Field(alias="from")]
-    plant: Annotated[EmulatedSettings | SerialSettings, Field(discriminator="kind")]
-    emulator: EmulatorSettings
-    cart: dict[str, Finite]
     pole: PoleSettings
-    pole_friction: PoleFrictionSettings
     control_period: ControlPeriod
     windows: Annotated[int, Field(ge=20, le=5000)]
     substeps: Annotated[int, Field(ge=1, le=200)]
     carts: Count
-    seed: Seed
-    label: str
-    threads: Count | None
 
     @property
     def nominal(self) -> dict[str, float]:
         """The prior values of the cart's and the pole's parameters. Raises ConfigError."""
-        pole = check_one_pole("an identification", self.pole)
-        values = {**self.cart, **self.pole_friction.parameters, **pole.model_dump()}
+        values = self.nominal_with(check_one_pole("an identification", self.pole))
         check_values(values)
         return values
 
 
-class ModelConfig(Settings):
+class ModelConfig(RunSettings, CartSettings):
     """cartpole-model."""
 
     source: Annotated[tuple[Path, ...], Field(alias="from", min_length=1)]
-    cart: dict[str, Finite]
-    pole_friction: PoleFrictionSettings
     pole: PoleSettings | None = None
     actuator: Actuator
     windows: Annotated[int, Field(ge=10, le=10_000)]
     ensemble: EnsembleSettings
-    seed: Seed
-    label: str
-    threads: Count | None
 
     @field_validator("source", mode="before")
     @classmethod
@@ -220,11 +204,8 @@ class ModelConfig(Settings):
         return [source] if isinstance(source, str) else source
 
 
-class PreflightConfig(Settings):
+class PreflightConfig(OnCart):
     """cartpole-preflight."""
-
-    plant: Annotated[EmulatedSettings | SerialSettings, Field(discriminator="kind")]
-    emulator: EmulatorSettings
 
 
 class EmulateConfig(Settings):

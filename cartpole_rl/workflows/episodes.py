@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 from tqdm import tqdm
 
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
-from cartpole_rl.envs.make import CartPoleEnv
 from cartpole_rl.evaluation.episodes import Policy, run_batch, run_episodes
 from cartpole_rl.learning.randomness import seed_everything
 from cartpole_rl.plants.simulated import SimulatedPlant
@@ -62,8 +62,3 @@ def with_progress(env: CartPoleEnv, policy: Policy, episodes: int) -> Iterator[E
             progress.set_postfix_str(f"score {episode.score.sum():.0f}", refresh=False)
             progress.update()
             yield episode
-
-
-def count_text(episodes: int) -> str:
-    """Return "1 episode" or "20 episodes"."""
-    return f"{episodes} episode{'s' if episodes > 1 else ''}"

@@ -1,31 +1,23 @@
 """Drive whole episodes of a trained agent, in simulation or on a cart, and report their scores."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from cartpole_rl.envs.make import CartPoleEnv
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.plants.serial.plant import SerialPlant
 from cartpole_rl.plants.simulated import NOISE_PARAMETERS
-from cartpole_rl.reporting.table import interval_text, table
+from cartpole_rl.reporting.scores import score_table
+from cartpole_rl.reporting.words import count_text
+from cartpole_rl.run_files import FIGURES, METRICS
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.config import EvaluateConfig
-from cartpole_rl.workflows.episodes import Evaluation, count_text, prepared
+from cartpole_rl.workflows.episodes import Evaluation, prepared
 from cartpole_rl.workflows.repeating import Repetition
 from cartpole_rl.workflows.report import report
-from cartpole_rl.workflows.run_folder import METRICS, write_config
-
-SHOWN = {
-    "score": "score (6.2)",
-    "score_upright": "score upright (6.1)",
-    "time_to_upright_s": "time to upright, s",
-    "upright_fraction": "share of time upright",
-    "rms_angle_rad": "RMS angle while upright, rad",
-    "rms_position_m": "RMS position while upright, m",
-    "min_track_margin_m": "nearest to the track's end, m",
-}
+from cartpole_rl.workflows.run_folder import write_config
 
 
 def evaluate(config: EvaluateConfig, folder: Path) -> None:
@@ -62,7 +54,7 @@ def report_evaluation(evaluation: Evaluation, episodes: Sequence[Episode], folde
         print(compared(evaluation.repetition, episodes[0]))
     if link.get("latency_override"):
         print(f"latency as measured, for cartpole-train: '{link['latency_override']}'")
-    print(f"{folder}/{METRICS} and figures/ are written")
+    print(f"{folder}/{METRICS} and {FIGURES}/ are written")
 
 
 def cut_off(episodes: Sequence[Episode]) -> Iterator[str]:
@@ -78,7 +70,7 @@ def compared(again: Repetition, episode: Episode) -> str:
     then = f"episode {repeat.episode} of {repeat.run} had score {again.score:.1f}"
     if by_chance := left_to_chance(again):
         chance = ", ".join(by_chance)
-        return f"{then}, now {score:.1f}: {chance} is left to chance, so it cannot be repeated exactly"
+        return f"{then}, now {score:.1f}: {chance} is random, so the episode cannot be repeated exactly"
     return f"{then}, now {'exactly the same' if score == again.score else f'{score:.1f}'}"
 
 
@@ -98,13 +90,3 @@ def link_figures(env: CartPoleEnv) -> dict[str, Any]:
         "bad_frames": statistics.bad_frames,
         "latency_override": statistics.latency_override(),
     }
-
-
-def score_table(summary: Mapping[str, Any], heading: str) -> str:
-    """Return a table of the mean scores."""
-    rows = [
-        {"figure": label, "mean": interval_text(value["mean"], value["low"], value["high"])}
-        for key, label in SHOWN.items()
-        if (value := summary[key]) is not None
-    ]
-    return table(rows, {"figure": heading, "mean": "mean"})

@@ -2,7 +2,7 @@
 
 Three stages: episodes without exploration (before), episodes to learn from (tune), episodes without
 exploration (after). A separate process drives the cart while this one learns. Each finished episode is on
-disk before the next one starts: an interruption costs at most the one under way.
+disk before the next one starts: an interruption costs at most the current one.
 """
 
 from functools import partial
@@ -17,23 +17,30 @@ from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
 from cartpole_rl.evaluation.driver import Driver
 from cartpole_rl.evaluation.driving_policy import as_weights
 from cartpole_rl.evaluation.metrics import episode_metrics, summarize
-from cartpole_rl.learning.checkpoint_files import LAST
-from cartpole_rl.learning.checkpoints import AgentCheckpoint, forget_training, load_agent
+from cartpole_rl.learning.checkpoints import (
+    AgentCheckpoint,
+    TrainingCheckpoint,
+    forget_training,
+    load_agent,
+)
 from cartpole_rl.learning.randomness import seed_everything
+from cartpole_rl.reporting.scores import score_table
 from cartpole_rl.reporting.tensorboard import TensorBoardLog
+from cartpole_rl.reporting.words import count_text
+from cartpole_rl.run_files import CHECKPOINTS, LAST, METRICS, RECORDINGS
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.agents import new_agent, trained_agent
 from cartpole_rl.workflows.build import evaluated_env, evaluated_settings, use_threads
 from cartpole_rl.workflows.checks import check_finetuning
 from cartpole_rl.workflows.config import EvaluateConfig, FinetuneConfig, TrainConfig
-from cartpole_rl.workflows.evaluate import count_text, score_table
 from cartpole_rl.workflows.finetuning_cart import DrivenCart, yield_to
-from cartpole_rl.workflows.finetuning_files import FinetuningFiles, Stage, resumed_config
+from cartpole_rl.workflows.finetuning_files import FinetuningFiles, Stage
 from cartpole_rl.workflows.finetuning_learner import CartLearner
 from cartpole_rl.workflows.person import confirm
 from cartpole_rl.workflows.report import report
 from cartpole_rl.workflows.resuming import resumed
-from cartpole_rl.workflows.run_folder import METRICS, write_config, write_json
+from cartpole_rl.workflows.run_folder import write_config, write_json
+from cartpole_rl.workflows.settings import recorded_settings
 
 COMPARISON = "comparison.json"
 SIMULATED_SCORE = "cart/score_in_simulation"  # TensorBoard's curve beside those of the cart
@@ -45,11 +52,12 @@ def finetune(config: FinetuneConfig, folder: Path) -> None:
     Writes config.yaml, provenance.json, recordings/, TensorBoard events, comparison.json (before and after),
     metrics.json, figures/ and checkpoints/last.pt with the better of both policies; until the end also
     checkpoints/resume.pt. Prints both scores. Raises ConfigError and CheckpointError before the cart moves,
-    PlantError and LinkError for a cart that fails, LearningError where learning diverges.
+    PlantError and LinkError for a cart that fails, LearningError if learning diverges.
     """
     checkpoint = resumed("finetune", config.resume, folder)
     if checkpoint:
-        config = resumed_config(checkpoint, config.resume)
+        values = {**checkpoint.config, "resume": config.resume}
+        config = recorded_settings(FinetuneConfig, values, f"resume={config.resume}")
     run = check_finetuning(config)
     use_threads(config.threads)
     seed_everything(config.seed)
@@ -70,7 +78,7 @@ def finetune(config: FinetuneConfig, folder: Path) -> None:
             yield_to(driver)
         session = Session(files, DrivenCart(driver, files, log), load_agent(run), training, settings)
         if checkpoint and checkpoint.state:
-            session.restore(checkpoint.state)
+            session.restore(checkpoint)
         session.run()
 
 
@@ -104,7 +112,7 @@ class Session:
         self.first_weights = as_weights(self.agent.greedy_policy())
         self.learner = CartLearner(self.config, training, settings, self.agent)
         self.num_learned = 0  # episodes of the stage TUNE
-        self.optimizer_state: dict[str, Any] | None = None  # of a resumed run
+        self.learner_state: dict[str, Any] | None = None  # of a resumed run
 
     def run(self) -> None:
         """Run all stages, as far as they are not on disk."""
@@ -121,9 +129,11 @@ class Session:
         if self.num_learned >= count:
             return
         recorded = files.episodes(Stage.BEFORE) + files.episodes(Stage.TUNE)[: self.num_learned]
-        self.learner.start(recorded, self.num_learned, self.optimizer_state)
-        if not self.num_learned:
+        if self.learner_state is None:
+            self.learner.start(recorded)
             self.log({SIMULATED_SCORE: self.learner.simulated_score()})
+        else:
+            self.learner.restore(recorded, self.learner_state)
         while self.num_learned < count:
             scalars = self.learn_from_next()
             if self.num_learned % self.config.finetuning.refit == 0 and self.num_learned < count:
@@ -168,7 +178,7 @@ class Session:
         if link.get("latency_override"):
             print(f"latency as measured, for cartpole-train: '{link['latency_override']}'")
         print(f"kept: the policy {kept} fine-tuning")
-        print(f"{folder}/{METRICS}, {COMPARISON}, checkpoints/{LAST} and recordings/ are written")
+        print(f"{folder}/{METRICS}, {COMPARISON}, {CHECKPOINTS}/{LAST} and {RECORDINGS}/ are written")
 
     def summarize(self, episodes: list[Episode]) -> dict[str, Any]:
         """Return the summary of the metrics of `episodes`."""
@@ -176,15 +186,9 @@ class Session:
 
     def save(self) -> None:
         """Write the checkpoint to resume from."""
-        state = {
-            "learned": self.num_learned,
-            "agent": self.agent.state_dict(),
-            "optimizer": self.learner.started.optimizer.state_dict(),
-        }
-        self.files.save(state, self.num_learned)
+        self.files.save(self.learner.snapshot(), self.num_learned)
 
-    def restore(self, state: dict[str, Any]) -> None:
+    def restore(self, checkpoint: TrainingCheckpoint) -> None:
         """Continue from what `save` wrote."""
-        self.num_learned = state["learned"]
-        self.agent.load_state_dict(state["agent"])
-        self.optimizer_state = state["optimizer"]
+        self.num_learned, self.learner_state = checkpoint.step, checkpoint.state
+        self.agent.load_state_dict(checkpoint.state["agent"])

@@ -5,7 +5,7 @@ from typing import Any
 from tqdm import tqdm
 
 from cartpole_rl.errors import LearningError
-from cartpole_rl.evaluation.driver import Drive, Driver
+from cartpole_rl.evaluation.driver import Driver, DriveRequest
 from cartpole_rl.evaluation.driving_policy import Weights
 from cartpole_rl.plants.serial.statistics import LinkStatistics
 from cartpole_rl.reporting.tensorboard import TensorBoardLog
@@ -36,12 +36,12 @@ class DrivenCart:
 
     def start(self, weights: Weights, epsilon: float, seed: int) -> None:
         """Start an episode and return at once. Raises LinkError."""
-        self.driver.start(Drive(weights, epsilon, seed))
+        self.driver.start(DriveRequest(weights, epsilon, seed))
 
     def finish(self, stage: Stage, number: int) -> None:
         """Wait for the started episode, write and log it.
 
-        Raises LinkError, and LearningError where the network's numbers were not finite: the cart was stopped.
+        Raises LinkError, and LearningError if the network's numbers were not finite: the cart was stopped.
         """
         driven = self.driver.result()
         self.link = driven.link

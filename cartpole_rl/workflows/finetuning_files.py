@@ -7,10 +7,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
-from cartpole_rl.checking import checked
-from cartpole_rl.errors import CheckpointError, ConfigError
 from cartpole_rl.evaluation.recordings import LENGTH, read_recording, write_recording
-from cartpole_rl.learning.checkpoint_files import FOLDER, LAST
 from cartpole_rl.learning.checkpoints import (
     FINETUNING_FORMAT,
     AgentCheckpoint,
@@ -19,9 +16,9 @@ from cartpole_rl.learning.checkpoints import (
     save_training,
 )
 from cartpole_rl.plants.serial.settings import SerialSettings
+from cartpole_rl.run_files import CHECKPOINTS, LAST, RECORDINGS
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.config import FinetuneConfig
-from cartpole_rl.workflows.recordings import RECORDINGS
 
 
 class Stage(StrEnum):
@@ -70,18 +67,10 @@ class FinetuningFiles:
 
     def save_agent(self, agent: AgentCheckpoint) -> None:
         """Write the run's last agent, the one that other commands read."""
-        save_agent(self.folder / FOLDER / LAST, agent)
+        save_agent(self.folder / CHECKPOINTS / LAST, agent)
 
 
 def pole_length(config: FinetuneConfig) -> float | None:
-    """Return the length (m) of the pole on the cart; None where the settings do not state it."""
+    """Return the length (m) of the pole on the cart; None if the settings do not state it."""
     plant = config.plant
     return plant.pole_length if isinstance(plant, SerialSettings) else 2 * config.emulator.pole_com
-
-
-def resumed_config(checkpoint: TrainingCheckpoint, resume: str | None) -> FinetuneConfig:
-    """Return the settings in a checkpoint. Raises CheckpointError where this version has other settings."""
-    try:
-        return checked(FinetuneConfig, {**checkpoint.config, "resume": resume})
-    except ConfigError as error:
-        raise CheckpointError(f"resume={resume} is of another version of this package: {error}") from None

@@ -1,7 +1,7 @@
 """Learning of a fine-tuning: from one cart's recordings, and from simulations that are fitted to them."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -9,10 +9,10 @@ import torch
 
 from cartpole_rl.agents.dqn import QAgent
 from cartpole_rl.envs.build import environment, randomizer, simulated_env
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
-from cartpole_rl.envs.make import CartPoleEnv
 from cartpole_rl.evaluation.episodes import run_batch
-from cartpole_rl.identification.fit import Fit, fit_cart
+from cartpole_rl.identification.fit import Fit, best_fit
 from cartpole_rl.identification.unknowns import LONGEST_LATENCY
 from cartpole_rl.identification.windows import cut_windows
 from cartpole_rl.learning.finetuning import Finetuning, recorded_chunk
@@ -50,7 +50,7 @@ class CartLearner:
     """An agent that learns from the recordings of a cart and from simulations of it.
 
     `training` are the settings that the agent was trained with, `settings` those of the cart that it drives.
-    `start` must be called before the agent can learn.
+    `start` or `restore` must be called before the agent can learn.
     """
 
     def __init__(
@@ -62,27 +62,38 @@ class CartLearner:
         if models.cart_friction is CartFriction.SIGMOID:
             self.candidates.append(models._replace(cart_friction=CartFriction.STEP))
         self.loop: Finetuning | None = None
+        self.carts: torch.Tensor  # [P, SAMPLES], drawn from the newest fit
 
-    def start(
-        self, recorded: Sequence[Episode], episodes: int, optimizer_state: dict[str, Any] | None
-    ) -> None:
-        """Fit the simulator to the `recorded` episodes and prepare learning.
+    def start(self, recorded: Sequence[Episode]) -> None:
+        """Fit the simulator to the `recorded` episodes and prepare learning."""
+        fit, models = self.fit_simulator(recorded)
+        self.carts = self.draw_carts(fit)
+        self.prepare(recorded, models)
+        self.started.fill()
 
-        A resumed fine-tuning gives the number of `episodes` that it learned from, and its optimizer's state.
-        """
-        fit, models = self.best_fit(recorded)
+    def restore(self, recorded: Sequence[Episode], snapshot: Mapping[str, Any]) -> None:
+        """Continue from `snapshot`; `recorded` are the episodes that were learned from until then."""
+        self.carts = snapshot["carts"]
+        friction = CartFriction(snapshot["cart_friction"])
+        self.prepare(recorded, self.candidates[0]._replace(cart_friction=friction))
+        self.started.restore(snapshot)
+
+    def snapshot(self) -> dict[str, Any]:
+        """Return the state from which `restore` continues, to be saved at once."""
+        (models,) = self.candidates
+        state = {"carts": self.carts, "cart_friction": models.cart_friction.value}
+        return {**self.started.snapshot(), **state}
+
+    def prepare(self, recorded: Sequence[Episode], models: Models) -> None:
+        """Make the learning loop for `models`, with the transitions of the `recorded` episodes."""
         self.candidates = [models]
-        self.loop = self.make_loop(fit, models)
-        self.loop.iteration = episodes * self.config.finetuning.iterations
+        self.loop = self.make_loop(models)
         for episode in recorded:
             self.add(episode)
-        if optimizer_state is not None:
-            self.loop.optimizer.load_state_dict(optimizer_state)
-        self.loop.fill()
 
     @property
     def started(self) -> Finetuning:
-        """The learning loop, once `start` has made it."""
+        """The learning loop, once `start` or `restore` has made it."""
         assert self.loop is not None
         return self.loop
 
@@ -96,15 +107,16 @@ class CartLearner:
 
     def refit(self, recorded: Sequence[Episode]) -> None:
         """Fit the simulator to the `recorded` episodes, and continue with carts drawn from that fit."""
-        fit, _ = self.best_fit(recorded)
-        self.started.simulate(self.draws(fit))
+        fit, _ = self.fit_simulator(recorded)
+        self.carts = self.draw_carts(fit)
+        self.started.simulate(self.randomizer())
 
-    def make_loop(self, fit: Fit, models: Models) -> Finetuning:
-        """Return the learning loop over carts drawn from `fit`."""
+    def make_loop(self, models: Models) -> Finetuning:
+        """Return the learning loop over simulated carts."""
         config, training, finetuning = self.config, self.training, self.config.finetuning
         plant = SimulatedPlant(
             training.learning.carts,
-            self.draws(fit),
+            self.randomizer(),
             training.task.start,
             models,
             training.control_period,
@@ -125,31 +137,32 @@ class CartLearner:
             config.compile,
         )
 
-    def best_fit(self, recorded: Sequence[Episode]) -> tuple[Fit, Models]:
+    def fit_simulator(self, recorded: Sequence[Episode]) -> tuple[Fit, Models]:
         """Return the fit with the lowest cost among the candidate models, and its models."""
-        windows = cut_windows(recorded, self.settings.control_period)
-        nominal = {**self.training.nominal, **self.training.pole.nominal.model_dump()}
-        fits = [
-            (fit_cart(windows, nominal, models, self.settings.control_period), models)
-            for models in self.candidates
-        ]
-        fit, models = min(fits, key=lambda each: each[0].cost)
+        period = self.settings.control_period
+        windows = cut_windows(recorded, period)
+        nominal = self.training.nominal_with(self.training.pole.nominal)
+        fit, models = best_fit(windows, nominal, self.candidates, period)
         print_message(
             "finetune",
-            f"simulator fitted to {windows.number} windows of 0.5 s: RMS error "
+            f"simulator fitted to {windows.number} windows of {windows.periods * period:g} s: RMS error "
             f"{1e3 * CART_METRES_PER_COUNT * fit.rms[0]:.2f} mm and "
             f"{math.degrees(POLE_RADIANS_PER_COUNT) * fit.rms[1]:.2f} deg",
         )
         return fit, models
 
-    def draws(self, fit: Fit) -> IdentifiedCarts:
-        """Return what draws simulated carts: from `fit`, and a share as in training."""
-        finetuning, random = self.config.finetuning, np.random.default_rng(self.config.seed)
-        table = torch.from_numpy(fit.draw(SAMPLES, random, finetuning.widen)).float()
-        return IdentifiedCarts(table, randomizer(self.training), finetuning.prior_share, LONGEST_LATENCY)
+    def draw_carts(self, fit: Fit) -> torch.Tensor:
+        """Return carts drawn from `fit`, [P, SAMPLES]."""
+        random = np.random.default_rng(self.config.seed)
+        return torch.from_numpy(fit.draw(SAMPLES, random, self.config.finetuning.widen)).float()
+
+    def randomizer(self) -> IdentifiedCarts:
+        """Return the randomizer of the simulated carts: of the newest fit, and a share of the prior."""
+        prior, share = randomizer(self.training), self.config.finetuning.prior_share
+        return IdentifiedCarts(self.carts, prior, share, LONGEST_LATENCY)
 
     def transitions(self, episode: Episode) -> Any:
-        """Return an episode's transitions as the agent observes them; None where it has none."""
+        """Return an episode's transitions as the agent observes them; None if it has none."""
 
         def make_env(plant: RecordedPlant) -> CartPoleEnv:
             return environment(self.settings, plant)

@@ -6,13 +6,14 @@ from typing import Any
 import numpy as np
 import yaml
 
-from cartpole_rl.identification.identify import Identification, prediction_errors
+from cartpole_rl.files import replacing, write_text
+from cartpole_rl.identification.identify import Identification
 from cartpole_rl.identification.quantities import intervals
 from cartpole_rl.identification.unknowns import WEIGHED
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.randomization.poles import Pole
+from cartpole_rl.run_files import CART, POLE, POSTERIOR, RANDOMIZATION
 
-CART, POLE, RANDOMIZATION, POSTERIOR = "cart.yaml", "pole.yaml", "randomization.yaml", "posterior.npz"
 UNIDENTIFIABLE = {  # randomized about the identified cart, since no experiment shows them
     "track_half_length": {"distribution": "uniform", "relative": [-0.1, 0.0]},
     "latency_jitter": {"distribution": "uniform", "absolute": [0.0, 0.002]},
@@ -50,25 +51,27 @@ def write_choices(found: Identification, carts: np.ndarray, folder: Path) -> Non
     parameters = found.fit.parameters
     pole = Pole(**{name: parameters[name] for name in Pole.model_fields})
     choices = {"choices": {"identified": pole.model_dump()}}
-    (folder / POLE).write_text(yaml.safe_dump(choices, sort_keys=False))
-    np.savez(
-        folder / POSTERIOR,
-        names=np.array(CartParameters.names()),
-        carts=carts,
-        told=np.array(identified_names(found)),
-        unknowns=np.array([unknown.name for unknown in found.fit.unknowns]),
-        point=found.fit.point,
-        covariance=found.fit.covariance,
-    )
+    write_text(folder / POLE, yaml.safe_dump(choices, sort_keys=False))
+    with replacing(folder / POSTERIOR) as beside, beside.open("wb") as file:  # a path would get ".npz"
+        np.savez(
+            file,
+            names=np.array(CartParameters.names()),
+            carts=carts,
+            identified=np.array(identified_names(found)),
+            unknowns=np.array([unknown.name for unknown in found.fit.unknowns]),
+            point=found.fit.point,
+            covariance=found.fit.covariance,
+        )
     randomization = {
         "posterior": "${here}/" + POSTERIOR,
         "widen": WIDEN,
         "prior_share": 0.0,
         "ranges": UNIDENTIFIABLE,
     }
-    (folder / RANDOMIZATION).write_text(
+    write_text(
+        folder / RANDOMIZATION,
         f"# Carts drawn from the posterior, correlations included; standard deviations times {WIDEN:g}.\n"
-        + yaml.safe_dump(randomization, sort_keys=False)
+        + yaml.safe_dump(randomization, sort_keys=False),
     )
 
 
@@ -85,7 +88,7 @@ def write_cart(found: Identification, carts: np.ndarray, path: Path) -> None:
         if name not in Pole.model_fields:
             error = f"+- {deviations[name]:.2g}" if name in identified else "prior value"
             lines.append(f"{name}: {parameters[name]:.6g}  # {UNITS.get(name, '1')}, {error}")
-    path.write_text("\n".join(lines) + "\n")
+    write_text(path, "\n".join(lines) + "\n")
 
 
 def standard_deviations(carts: np.ndarray) -> dict[str, float]:
@@ -99,10 +102,9 @@ def identified_names(found: Identification) -> list[str]:
     return [*names, *Pole.model_fields]
 
 
-def summary(found: Identification, carts: np.ndarray) -> dict[str, Any]:
+def report(found: Identification, carts: np.ndarray) -> dict[str, Any]:
     """Return the content of identification.json."""
     deviations = standard_deviations(carts)
-    x_error, theta_error = prediction_errors(found.held_out)
     return {
         "cart_friction": found.models.cart_friction,
         "parameters": found.fit.parameters,
@@ -111,11 +113,11 @@ def summary(found: Identification, carts: np.ndarray) -> dict[str, Any]:
             each.name: {"value": each.value, "low": each.low, "high": each.high, "unit": each.unit}
             for each in intervals(found.fit, carts)
         },
-        "tried": {
-            each.cart_friction: {"x_m": each.x_error, "theta_rad": each.theta_error}
+        "candidates": {
+            each.cart_friction: {"x_m": each.error.x, "theta_rad": each.error.theta}
             for each in found.candidates
         },
-        "held_out_1_s": {"x_m": x_error, "theta_rad": theta_error},
+        "held_out_1_s": {"x_m": found.error.x, "theta_rad": found.error.theta},
         "residual_counts": found.fit.rms.tolist(),
-        "doubts": found.warnings,
+        "warnings": found.warnings,
     }

@@ -7,48 +7,35 @@ from contextlib import closing
 from pathlib import Path
 
 import numpy as np
-from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from cartpole_rl.errors import RecordingError
 from cartpole_rl.evaluation.recordings import read_recording, write_recording
+from cartpole_rl.files import write_text
 from cartpole_rl.identification.checks import check_recordings
 from cartpole_rl.identification.experiments import EXPERIMENTS, HELD_OUT, conduct
-from cartpole_rl.identification.identify import Identification, identify, predicted, prediction_errors
-from cartpole_rl.identification.quantities import intervals, quantities
+from cartpole_rl.identification.identify import Identification, identify
+from cartpole_rl.identification.quantities import intervals
 from cartpole_rl.physics.models import Actuator, CartFriction, Models
-from cartpole_rl.plants.emulated import emulated_plant
+from cartpole_rl.plants.cart_plant import cart_plant
 from cartpole_rl.plants.serial.plant import SerialPlant
-from cartpole_rl.reporting.curves import force_curve, friction_curve
 from cartpole_rl.reporting.figures import save
-from cartpole_rl.reporting.figures.identified import (
-    experiments_figure,
-    friction_and_force_figure,
-    interval_figure,
-    spectrum_figure,
-)
 from cartpole_rl.reporting.identification import (
-    Estimate,
-    PredictionError,
-    Recording,
-    estimates_table,
+    error_text,
+    identification_figures,
     identification_page,
+    quantities_table,
 )
+from cartpole_rl.run_files import CART, FIGURES, POLE, RANDOMIZATION, RECORDINGS
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.build import use_threads
-from cartpole_rl.workflows.config import EmulatedSettings, IdentifyConfig
-from cartpole_rl.workflows.identified_files import (
-    CART,
-    POLE,
-    RANDOMIZATION,
-    summary,
-    write_choices,
-)
+from cartpole_rl.workflows.config import IdentifyConfig
+from cartpole_rl.workflows.identified_files import report, write_choices
 from cartpole_rl.workflows.person import confirm, print_message
-from cartpole_rl.workflows.recordings import RECORDINGS, experiments
+from cartpole_rl.workflows.recordings import experiments
 from cartpole_rl.workflows.run_folder import write_config, write_json
 
-PAGE, SUMMARY = "page.html", "identification.json"
+PAGE, REPORT = "page.html", "identification.json"
 Episodes = dict[str, Episode]  # by the name of the experiment, or of the file
 
 
@@ -77,11 +64,13 @@ def identify_cart(config: IdentifyConfig, folder: Path) -> None:
     found = identify([*fitted.values()], [held_out], nominal, models, period, substeps, config.windows)
     carts = found.fit.draw(config.carts, np.random.default_rng(config.seed))
     write_choices(found, carts, folder)
-    write_json(folder / SUMMARY, summary(found, carts))
-    for name, figure in figures(config, found, carts, fitted).items():
-        save(figure, folder / "figures" / f"{name}.png")
-    (folder / PAGE).write_text(html_page(config, found, carts, fitted, folder))
-    print(estimates_table(estimates(config, found, carts)))
+    write_json(folder / REPORT, report(found, carts))
+    for name, figure in identification_figures(found, carts, fitted).items():
+        save(figure, folder / FIGURES / f"{name}.png")
+    identified = intervals(found.fit, carts)
+    page = identification_page(found, identified, fitted, next_command(found, folder))
+    write_text(folder / PAGE, page)
+    print(quantities_table(identified))
     print_verdict(found, folder)
 
 
@@ -99,10 +88,8 @@ def record_experiments(config: IdentifyConfig, folder: Path) -> None:
 
 def make_plant(config: IdentifyConfig) -> SerialPlant:
     """Connect to the cart that is identified."""
-    if isinstance(config.plant, EmulatedSettings):
-        truth = config.emulator.model_copy(update={"start": "hanging"})
-        return emulated_plant(truth, config.control_period, tqdm.write, config.plant.rehome)
-    return SerialPlant(config.plant, control_period=config.control_period, prompt=tqdm.write, confirm=confirm)
+    period = config.control_period
+    return cart_plant(config.plant, config.emulator, period, "hanging", tqdm.write, confirm)
 
 
 def read_recordings(source: Path) -> Episodes:
@@ -119,55 +106,6 @@ def split(recordings: Episodes, source: Path) -> tuple[Episodes, Episode]:
     return fitted, recordings[held_out]
 
 
-def estimates(config: IdentifyConfig, found: Identification, carts: np.ndarray) -> list[Estimate]:
-    """Return the identified quantities beside their prior values."""
-    prior = {each.name: each.value for each in quantities(config.nominal)}
-    return [
-        Estimate(each.words, each.unit, *each.interval, prior[each.name])
-        for each in intervals(found.fit, carts)
-    ]
-
-
-def figures(
-    config: IdentifyConfig, found: Identification, carts: np.ndarray, fitted: Episodes
-) -> dict[str, Figure]:
-    """Return the figures of `reporting.identification.CAPTIONS`."""
-    fit, models, nominal = found.fit, found.models, config.nominal
-    period, substeps = config.control_period, config.substeps
-    replays = {
-        name: predicted([episode], fit, models, period, substeps)[0] for name, episode in fitted.items()
-    }
-    return {
-        "friction_and_force": friction_and_force_figure(
-            friction_curve(fit.parameters, carts, nominal, models.cart_friction),
-            force_curve(fit.parameters, carts, nominal, models.actuator),
-        ),
-        "intervals": interval_figure(estimates(config, found, carts)),
-        "experiments": experiments_figure(replays),
-        "held_out": experiments_figure({HELD_OUT: found.held_out[0]}),
-        "spectrum": spectrum_figure(fit.covariance, [unknown.name for unknown in fit.unknowns]),
-    }
-
-
-def html_page(
-    config: IdentifyConfig, found: Identification, carts: np.ndarray, fitted: Episodes, folder: Path
-) -> str:
-    """Return the page that shows all results."""
-    purposes = {experiment.name: experiment.shows for experiment in EXPERIMENTS}
-    recordings = [
-        Recording(name, episode.steps * config.control_period, purposes.get(name, ""), episode.ended_by)
-        for name, episode in fitted.items()
-    ]
-    return identification_page(
-        recordings,
-        estimates(config, found, carts),
-        {each.cart_friction: PredictionError(each.x_error, each.theta_error) for each in found.candidates},
-        PredictionError(*prediction_errors(found.held_out)),
-        found.warnings,
-        next_command(found, folder),
-    )
-
-
 def next_command(found: Identification, folder: Path) -> str:
     """Return the command that trains on carts like the identified one."""
     return (
@@ -178,12 +116,11 @@ def next_command(found: Identification, folder: Path) -> str:
 
 def print_verdict(found: Identification, folder: Path) -> None:
     """Print the prediction error, the warnings and the next command."""
-    error = PredictionError(*prediction_errors(found.held_out))
     print(
-        f"RMS prediction error over one second of held-out motion: {error.text}, with "
+        f"RMS prediction error over one second of held-out motion: {error_text(found.error)}, with "
         f"cart_friction={found.models.cart_friction}"
     )
     for warning in found.warnings:
         print(f"warning: {warning}")
-    print(f"{folder}/{PAGE}, {CART}, {POLE}, {RANDOMIZATION} and figures/ are written; next:")
+    print(f"{folder}/{PAGE}, {CART}, {POLE}, {RANDOMIZATION} and {FIGURES}/ are written; next:")
     print(next_command(found, folder))

@@ -8,38 +8,34 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from cartpole_rl.evaluation.recordings import read_recording
 from cartpole_rl.identification.ensemble import Ensemble
-from cartpole_rl.identification.fit import Fit, fit_cart
-from cartpole_rl.identification.held_out import CERTAIN, Prediction, errors_at, predict_held_out
-from cartpole_rl.identification.replay import recorded_period
+from cartpole_rl.identification.fit import Fit, best_fit
+from cartpole_rl.identification.held_out import held_out_windows, split
+from cartpole_rl.identification.prediction import CERTAIN, errors_at, predict
 from cartpole_rl.identification.rollout import Dynamics
-from cartpole_rl.identification.windows import Windows, cut_windows
-from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT
+from cartpole_rl.identification.windows import Windows, cut_windows, recorded_period
 from cartpole_rl.physics.models import CartFriction, Models
 from cartpole_rl.plants.learned_model import LearnedModel, save_model
 from cartpole_rl.plants.model_file import MODEL
 from cartpole_rl.plants.settings import LearnedSettings
-from cartpole_rl.randomization.checks import check_one_pole
 from cartpole_rl.randomization.poles import Pole
-from cartpole_rl.reporting.error_tables import model_table, spread_table
+from cartpole_rl.reporting.error_tables import REPORTED_TIMES, model_table, spread_table
 from cartpole_rl.reporting.figures import save
-from cartpole_rl.reporting.figures.learned_models import forces_along_track, learned_model_figure
+from cartpole_rl.reporting.figures.learned_models import ensemble_figure
+from cartpole_rl.reporting.words import LEARNED, PHYSICS, count_text
+from cartpole_rl.run_files import FIGURES
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.build import use_threads
 from cartpole_rl.workflows.config import ModelConfig
-from cartpole_rl.workflows.evaluate import count_text
-from cartpole_rl.workflows.held_out import held_out_windows, split
+from cartpole_rl.workflows.poles import chosen_pole
 from cartpole_rl.workflows.recordings import recordings
-from cartpole_rl.workflows.replay import REPORTED_TIMES, recorded_pole
 from cartpole_rl.workflows.run_folder import write_config, write_json
 
-REPORT, FIGURE = "model.json", "figures/model.png"
+REPORT, FIGURE = "model.json", f"{FIGURES}/model.png"
 FRICTION_MODELS = (CartFriction.SIGMOID, CartFriction.STEP)  # candidates for the cart
-PHYSICS, LEARNED = "physics alone", "physics + network"
 
 
 def learn_model(config: ModelConfig, folder: Path) -> None:
@@ -53,23 +49,24 @@ def learn_model(config: ModelConfig, folder: Path) -> None:
     use_threads(config.threads)
     paths = [path for source in config.source for path in recordings(source)]
     episodes = [read_recording(path) for path in paths]
-    pole_name, pole = modelled_pole(config, paths)
+    pole_name, pole = chosen_pole("a model", config.pole, paths)
     period = recorded_period(episodes[0])
     training, held_out = split(episodes)
     windows = held_out_windows(held_out, period, max(REPORTED_TIMES))
     fit, ensemble = fit_and_learn(training, config, pole, period)
     model = learned_model(fit, ensemble)
-    predictions = {
-        PHYSICS: predict_held_out(windows, ensemble.dynamics, None),
-        LEARNED: predict_held_out(windows, ensemble.dynamics, ensemble.best),
+    physics = predict(windows, ensemble.dynamics)
+    learned = predict(windows, ensemble.dynamics, ensemble.best)
+    errors = {
+        name: errors_at(each.error, REPORTED_TIMES, period, each.spread)
+        for name, each in ((PHYSICS, physics), (LEARNED, learned))
     }
-    errors = {name: errors_at(each, REPORTED_TIMES, period) for name, each in predictions.items()}
     write_config(folder, "model", config.model_dump(mode="json", by_alias=True))
     save_model(folder / MODEL, model)
     data = {"pole": pole_name, "control_period_s": period, "recordings": [str(path) for path in paths]}
     write_json(folder / REPORT, {**data, **results(model, ensemble, windows, errors)})
     subtitle = f"{count_text(len(episodes))}, pole={pole_name}, {windows.number} held-out windows"
-    save(make_figure(predictions, model, ensemble, subtitle), folder / FIGURE)
+    save(ensemble_figure(physics, learned, ensemble, subtitle), folder / FIGURE)
     print(model_table(errors, f"errors on {windows.number} held-out windows, over the time predicted"))
     print(
         f"\n{spread_table(errors[LEARNED], CERTAIN, 'RMS errors and ensemble spreads on the same windows')}"
@@ -77,19 +74,11 @@ def learn_model(config: ModelConfig, folder: Path) -> None:
     print(f"{folder}/{MODEL}, {REPORT} and {FIGURE} are written")
 
 
-def modelled_pole(config: ModelConfig, paths: Sequence[Path]) -> tuple[str, Pole]:
-    """Return name and prior parameters of the pole. Raises ConfigError where several are chosen."""
-    if config.pole is None:
-        return recorded_pole(paths)
-    check_one_pole("a model", config.pole)
-    return config.pole.name, config.pole.nominal
-
-
 def fit_and_learn(
     episodes: Sequence[Episode], config: ModelConfig, pole: Pole, period: float
 ) -> tuple[Fit, Ensemble]:
     """Return the fit of the physics and the ensemble that has learned the residual."""
-    fit, models = best_fit(episodes, config, pole, period)
+    fit, models = fit_physics(cut_windows(episodes, period), config, pole, period)
     dynamics = Dynamics.of(fit.parameters, models, period, LearnedSettings.substeps)
     windows = cut_windows(episodes, period, most=config.windows)
     ensemble = Ensemble(windows, dynamics, fit.rms, config.ensemble, config.seed)
@@ -103,27 +92,18 @@ def fit_and_learn(
     return fit, ensemble
 
 
-def best_fit(
-    episodes: Sequence[Episode], config: ModelConfig, pole: Pole, period: float
-) -> tuple[Fit, Models]:
-    """Return the fit with the lowest cost, and its physics models."""
-    windows = cut_windows(episodes, period)
-    nominal = {**config.cart, **config.pole_friction.parameters, **pole.model_dump()}
-    fits = []
-    for friction in FRICTION_MODELS:
-        models = Models(
-            friction,
-            config.pole_friction.model,
-            config.actuator,
-            LearnedSettings.integrator,
-            LearnedSettings.pole_presses,
-        )
-        fit = fit_cart(windows, nominal, models, period, LearnedSettings.substeps)
-        fits.append((fit, models))
-    fit, models = min(fits, key=lambda each: each[0].cost)
+def fit_physics(windows: Windows, config: ModelConfig, pole: Pole, period: float) -> tuple[Fit, Models]:
+    """Return the fit under the best model of the cart's friction, and its physics models."""
+    nominal = config.nominal_with(pole)
+    plant = LearnedSettings
+    candidates = [
+        Models(each, config.pole_friction.model, config.actuator, plant.integrator, plant.pole_presses)
+        for each in FRICTION_MODELS
+    ]
+    fit, models = best_fit(windows, nominal, candidates, period, plant.substeps)
     print(
         f"physics with cart_friction={models.cart_friction}: RMS error {fit.rms[0]:.1f} counts (cart) and "
-        f"{fit.rms[1]:.2f} counts (pole) over {windows.number} windows of 0.5 s"
+        f"{fit.rms[1]:.2f} counts (pole) over {windows.number} windows of {windows.periods * period:g} s"
     )
     return fit, models
 
@@ -148,21 +128,3 @@ def results(
         "errors": errors,
         "left_out_loss": ensemble.history,
     }
-
-
-def make_figure(
-    predictions: Mapping[str, Prediction], model: LearnedModel, ensemble: Ensemble, subtitle: str
-) -> Figure:
-    """Return the figure of the prediction errors and of the residual."""
-    physics, learned = predictions[PHYSICS], predictions[LEARNED]
-    visited = ensemble.positions[:, 0].flatten().numpy() * CART_METRES_PER_COUNT
-    return learned_model_figure(
-        model.period * np.arange(len(physics.error), dtype=np.float64),
-        physics.error,
-        learned.error,
-        learned.spread,
-        *forces_along_track(model.residual.places.numpy(), visited),
-        np.array(ensemble.updates, dtype=np.float64),
-        np.array(ensemble.history),
-        subtitle=subtitle,
-    )

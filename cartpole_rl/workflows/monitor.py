@@ -10,14 +10,14 @@ import numpy as np
 from tqdm import tqdm
 
 from cartpole_rl.evaluation.metrics import episode_metrics
-from cartpole_rl.files import replacing
-from cartpole_rl.learning.checkpoint_files import BEST, FOLDER, LAST
+from cartpole_rl.files import write_text
 from cartpole_rl.learning.checkpoints import AgentCheckpoint, TrainingCheckpoint, save_agent, save_training
 from cartpole_rl.learning.training import Scalars, Training
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.reporting.animation import gif
 from cartpole_rl.reporting.figures import behaviour
 from cartpole_rl.reporting.tensorboard import TensorBoardLog
+from cartpole_rl.run_files import BEST, CHECKPOINTS, LAST
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.config import TrainConfig
 
@@ -74,7 +74,7 @@ class TrainingMonitor:
             self._log_pictures(episodes[0], transitions)
         agent = AgentCheckpoint(self._settings, training.agent.state_dict(), transitions, record["score"])
         for name in (LAST, BEST) if is_best else (LAST,):
-            save_agent(self.folder / FOLDER / name, agent)
+            save_agent(self.folder / CHECKPOINTS / name, agent)
         self._bar.set_postfix_str(f"score {record['score']:.0f}")
         self._advance(transitions)
 
@@ -114,7 +114,7 @@ class TrainingMonitor:
 
     def _log_pictures(self, episode: Episode, transitions: int) -> None:
         half = self.config.task.x_max
-        length = 2 * self.config.pole.nominal.pole_com
+        length = self.config.pole.nominal.length
         self._log.figure(
             "behaviour", behaviour(episode, f"After {transitions / 1e6:.1f} M transitions", half), transitions
         )
@@ -129,5 +129,4 @@ def read_history(folder: Path) -> list[dict[str, float]]:
 
 def write_history(folder: Path, history: Sequence[dict[str, float]]) -> None:
     """Write the evaluations for `read_history`, all or none."""
-    with replacing(folder / HISTORY) as beside:
-        beside.write_text("".join(json.dumps(record) + "\n" for record in history))
+    write_text(folder / HISTORY, "".join(json.dumps(record) + "\n" for record in history))

@@ -11,7 +11,7 @@ from cartpole_rl.tasks.episode import Episode, Origin
 def stored_origins(episodes: Sequence[Episode]) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """Return the parameters that all simulated carts share, and the rest for each, for metrics.json.
 
-    Both are empty where a cart was not simulated. `read_origin` is the inverse.
+    Both are empty if a cart was not simulated. `read_origin` is the inverse.
     """
     stored = [stored_origin(episode.origin) for episode in episodes if episode.origin is not None]
     if len(stored) < len(episodes):

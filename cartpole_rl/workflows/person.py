@@ -5,7 +5,7 @@ from contextlib import suppress
 
 
 def confirm(text: str) -> bool:
-    """Show `text` and wait for Enter. Return False at once if standard input is no terminal."""
+    """Show `text` and wait for Enter. Return False at once if standard input is not a terminal."""
     if sys.stdin is None or not sys.stdin.isatty():
         return False
     print(f"{text}.", file=sys.stderr)

@@ -9,14 +9,15 @@ from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.faults import FaultClearing, always
 from cartpole_rl.plants.serial.preflight import Finding, preflight
 from cartpole_rl.plants.serial.settings import SerialSettings
-from cartpole_rl.workflows.config import EmulatedSettings, PreflightConfig
+from cartpole_rl.plants.settings import EmulatedSettings
+from cartpole_rl.workflows.config import PreflightConfig
 from cartpole_rl.workflows.person import confirm
 
 
 def check_cart(config: PreflightConfig) -> None:
     """Check the cart of `config.plant` by small moves, and print a line for each check.
 
-    Writes no files. Raises PlantError after the first check that fails, LinkError where no cart answers.
+    Writes no files. Raises PlantError after the first check that fails, LinkError if no cart answers.
     """
     with connected_cart(config) as cart:
         finding: Finding | None = None
@@ -24,7 +25,7 @@ def check_cart(config: PreflightConfig) -> None:
             print(finding, flush=True)
     if finding is None or not finding.ready:
         raise PlantError(
-            f"the cart is not ready: {finding.check if finding else 'nothing was checked'} is off"
+            f"the cart is not ready: {finding.check if finding else 'nothing was checked'} failed"
         )
     print("The cart is ready.")
 

@@ -11,11 +11,12 @@ from typing import Any
 
 from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
 from cartpole_rl.evaluation.recordings import LENGTH, write_recording
+from cartpole_rl.reporting.words import count_text
+from cartpole_rl.run_files import RECORDINGS
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.config import EvaluateConfig, RecordConfig
-from cartpole_rl.workflows.episodes import count_text, prepared
+from cartpole_rl.workflows.episodes import prepared
 from cartpole_rl.workflows.origins import stored_origin
-from cartpole_rl.workflows.recordings import RECORDINGS
 from cartpole_rl.workflows.run_folder import write_config
 
 
@@ -48,7 +49,7 @@ def heading(config: EvaluateConfig, settings: CartPoleSettings, episode: Episode
     return {
         "plant": config.plant.kind,
         "pole": settings.pole.name,
-        LENGTH: f"{2 * settings.pole.nominal.pole_com:.4f}" if settings.pole.is_single else "",
+        LENGTH: f"{settings.pole.nominal.length:.4f}" if settings.pole.is_single else "",
         "control_period_s": settings.control_period,
         "run": config.run,
         **{name: json.dumps(values) for name, values in origin.items()},

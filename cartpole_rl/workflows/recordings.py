@@ -3,16 +3,16 @@
 from pathlib import Path
 
 from cartpole_rl.errors import RecordingError
+from cartpole_rl.run_files import RECORDINGS
 from cartpole_rl.workflows.run_folder import check_program
 
-RECORDINGS = "recordings"
 RECORDING = ("record", "identify", "finetune")  # commands whose runs hold recordings
 
 
 def recordings(source: Path) -> list[Path]:
     """Return `source` itself if it is a file, else the recordings in that folder or run folder.
 
-    Raises RecordingError where there is none, and ConfigError for a run of a command that records nothing.
+    Raises RecordingError if there is none, and ConfigError for a run of a command that records nothing.
     """
     if source.is_file():
         return [source]
@@ -20,8 +20,8 @@ def recordings(source: Path) -> list[Path]:
     inner = source / RECORDINGS
     found = sorted((inner if inner.is_dir() else source).glob("*.csv"))
     if not found:
-        missing = "it holds no recording" if source.exists() else "there is no such file or folder"
-        raise RecordingError(f"from={source}: {missing}; give what cartpole-record wrote")
+        missing = "it contains no recording" if source.exists() else "there is no such file or folder"
+        raise RecordingError(f"from={source}: {missing}; give a run of cartpole-record or cartpole-identify")
     return found
 
 

@@ -11,11 +11,12 @@ import yaml
 from cartpole_rl.checking import checked
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.randomization.poles import Pole
+from cartpole_rl.run_files import CONFIG, METRICS
 from cartpole_rl.tasks.episode import Origin
 from cartpole_rl.workflows.checks import simulated_carts
 from cartpole_rl.workflows.config import EvaluateConfig
 from cartpole_rl.workflows.origins import read_origin
-from cartpole_rl.workflows.run_folder import CONFIG, METRICS, check_program
+from cartpole_rl.workflows.run_folder import check_program
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,7 @@ class Repetition:
 
 
 def repetition(config: EvaluateConfig) -> Repetition | None:
-    """Return the episode that `config` repeats; None where it repeats none. Raises ConfigError."""
+    """Return the episode that `config` repeats; None if it repeats none. Raises ConfigError."""
     run, number = config.repeat.run, config.repeat.episode
     if run is None and number is None:
         return None

@@ -8,9 +8,10 @@ from cartpole_rl.evaluation.metrics import episode_metrics, summarize
 from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.reporting.animation import write_gif
 from cartpole_rl.reporting.figures import behaviour, learning_curve, save
+from cartpole_rl.run_files import FIGURES, METRICS
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.origins import stored_origins
-from cartpole_rl.workflows.run_folder import METRICS, write_json
+from cartpole_rl.workflows.run_folder import write_json
 
 
 def report(
@@ -32,9 +33,9 @@ def report(
     cart, origins = stored_origins(episodes)
     listed = [{**each, **origin} for each, origin in zip(metrics, origins, strict=True)]
     write_json(folder / METRICS, {**header, **summary, **cart, "episodes": listed})
-    figures = folder / "figures"
+    figures = folder / FIGURES
     save(behaviour(episodes[0], f"First episode, plant={plant}", x_max), figures / "behaviour.png")
-    write_gif(episodes[0], figures / "episode.gif", 2 * pole.nominal.pole_com, x_max, f"plant={plant}")
+    write_gif(episodes[0], figures / "episode.gif", pole.nominal.length, x_max, f"plant={plant}")
     if history:
         save(learning_curve([("score", list(history))]), figures / "learning_curve.png")
     return summary

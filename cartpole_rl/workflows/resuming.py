@@ -16,7 +16,7 @@ FORMATS = {"train": TRAINING_FORMAT, "finetune": FINETUNING_FORMAT}
 def resumed(program: str, resume: str | None, folder: Path) -> TrainingCheckpoint | None:
     """Return the state from which cartpole-<program> continues in `folder`; None for a new run.
 
-    Raises ConfigError where the run has ended or is of another command, CheckpointError where it holds no
+    Raises ConfigError if the run has ended or is of another command, CheckpointError if it holds no
     state.
     """
     if resume is None:

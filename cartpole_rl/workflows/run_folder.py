@@ -15,20 +15,30 @@ from typing import Any
 import yaml
 
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.files import replacing
-from cartpole_rl.learning.checkpoint_files import FOLDER, LAST, RESUME
+from cartpole_rl.files import write_text
+from cartpole_rl.run_files import (
+    CART,
+    CHECKPOINTS,
+    CONFIG,
+    FIGURES,
+    LAST,
+    METRICS,
+    MULTIRUN,
+    POLE,
+    PROVENANCE,
+    RANDOMIZATION,
+    RESUME,
+)
 
-CONFIG, PROVENANCE, MULTIRUN = "config.yaml", "provenance.json", "multirun.yaml"
-METRICS = "metrics.json"
 PREFIX = "cartpole-"
 USES = {  # command: how its runs can be used
     "train": "cartpole-evaluate, cartpole-record and cartpole-finetune take it as run={0}",
     "finetune": "cartpole-evaluate, cartpole-record and cartpole-finetune take it as run={0}",
     "evaluate": "cartpole-evaluate drives one of its episodes again: repeat.run={0}",
     "record": "cartpole-replay, cartpole-identify and cartpole-model take it as from={0}",
-    "replay": "its results are replay.json and figures/; cartpole-replay from=... makes others",
-    "identify": "cartpole-train takes its files: cart={0}/cart.yaml pole={0}/pole.yaml "
-    "randomization={0}/randomization.yaml",
+    "replay": f"its results are replay.json and {FIGURES}/; cartpole-replay from=... makes new ones",
+    "identify": f"cartpole-train takes its files: cart={{0}}/{CART} pole={{0}}/{POLE} "
+    f"randomization={{0}}/{RANDOMIZATION}",
     "model": "cartpole-train, cartpole-evaluate and cartpole-record take it as plant=learned plant.model={0}",
 }
 PACKAGES = ("cartpole_rl", "torch", "torchrl", "tensordict", "numpy", "hydra-core", "mujoco", "pyserial")
@@ -37,7 +47,7 @@ PACKAGES = ("cartpole_rl", "torch", "torchrl", "tensordict", "numpy", "hydra-cor
 def write_config(folder: Path, program: str, config: Mapping[str, Any], resumed: bool = False) -> None:
     """Write config.yaml and provenance.json of a run of cartpole-<program>.
 
-    A resumed run adds its provenance to that of the first start. Raises ConfigError where a new run would
+    A resumed run adds its provenance to that of the first start. Raises ConfigError if a new run would
     overwrite another one.
     """
     if resumed:
@@ -48,8 +58,7 @@ def write_config(folder: Path, program: str, config: Mapping[str, Any], resumed:
     if (folder / CONFIG).exists():
         raise ConfigError(f"hydra.run.dir={folder}: it holds a run already; give another folder")
     folder.mkdir(parents=True, exist_ok=True)
-    with replacing(folder / CONFIG) as beside:
-        beside.write_text(yaml.safe_dump(dict(config), sort_keys=False))
+    write_text(folder / CONFIG, yaml.safe_dump(dict(config), sort_keys=False))
     head = {"program": f"{PREFIX}{program}", "seed": config["seed"]}
     write_json(folder / PROVENANCE, {**head, **provenance()})
 
@@ -65,7 +74,7 @@ def program_of(folder: Path) -> str | None:
 
 
 def check_program(setting: str, folder: Path, *taken: str) -> None:
-    """Raise ConfigError where `folder` is a run of a command that is not among `taken`."""
+    """Raise ConfigError if `folder` is a run of a command that is not among `taken`."""
     if (folder / MULTIRUN).is_file():
         jobs = sorted(path for path in folder.iterdir() if path.is_dir())
         example = f": {setting}={jobs[0]}" if jobs else ""
@@ -84,16 +93,16 @@ def check_program(setting: str, folder: Path, *taken: str) -> None:
 def use_of(folder: Path, program: str) -> str:
     """Return how a run of cartpole-<program> can be used."""
     if program in ("train", "finetune") and not (folder / METRICS).exists():
-        if (folder / FOLDER / RESUME).exists():
+        if (folder / CHECKPOINTS / RESUME).exists():
             return f"{PREFIX}{program} resume={folder} continues it"
         return f"it was stopped before its first checkpoint; start {PREFIX}{program} again"
     return USES[program].format(folder)
 
 
 def has_ended(run: Path) -> bool:
-    """True where a training or fine-tuning has results and no state to resume from."""
-    results = (run / METRICS).exists() and (run / FOLDER / LAST).exists()
-    return results and not (run / FOLDER / RESUME).exists()
+    """True if a training or fine-tuning has results and no state to resume from."""
+    results = (run / METRICS).exists() and (run / CHECKPOINTS / LAST).exists()
+    return results and not (run / CHECKPOINTS / RESUME).exists()
 
 
 def provenance() -> dict[str, Any]:
@@ -121,8 +130,7 @@ def git_commit() -> str | None:
 
 def write_json(path: Path, content: Any) -> None:
     """Write indented JSON. Raises ValueError for NaN."""
-    with replacing(path) as beside:
-        beside.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
+    write_text(path, json.dumps(content, indent=2, allow_nan=False) + "\n")
 
 
 def _version(name: str) -> str | None:

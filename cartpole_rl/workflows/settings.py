@@ -1,10 +1,11 @@
-"""Settings from conf/ for Python: what a command composes with Hydra, composed here without it."""
+"""Settings from conf/ as a command composes them, but without Hydra; and settings from a checkpoint."""
 
 from collections.abc import Mapping
 from typing import Any, TypeVar
 
 from cartpole_rl.checking import checked
 from cartpole_rl.choices import compose
+from cartpole_rl.errors import CheckpointError, ConfigError
 from cartpole_rl.settings import Settings
 from cartpole_rl.workflows.config import (
     EvaluateConfig,
@@ -41,3 +42,11 @@ def load_settings(schema: type[Config], overrides: Mapping[str, Any] | None = No
     an unknown name or a value out of range.
     """
     return checked(schema, compose(COMMANDS[schema], overrides))
+
+
+def recorded_settings(schema: type[Config], values: Mapping[str, Any], source: str) -> Config:
+    """Return the settings in a checkpoint. Raises CheckpointError that names `source` of another version."""
+    try:
+        return checked(schema, values)
+    except ConfigError as error:
+        raise CheckpointError(f"{source} is of another version of this package: {error}") from None

@@ -4,7 +4,7 @@ from functools import partial
 from pathlib import Path
 
 from cartpole_rl.envs.build import simulated_env, with_fitted_guard
-from cartpole_rl.envs.make import CartPoleEnv
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.evaluation.driving_policy import DrivingPolicy
 from cartpole_rl.evaluation.episodes import Policy, run_batch
 from cartpole_rl.learning.checkpoints import forget_training, restore_weights
@@ -13,9 +13,10 @@ from cartpole_rl.learning.training import Training
 from cartpole_rl.plants.effects import without_effect
 from cartpole_rl.plants.settings import LearnedSettings
 from cartpole_rl.randomization.draws import Draws
+from cartpole_rl.run_files import CHECKPOINTS, FIGURES, METRICS
 from cartpole_rl.settings import evaluation_seed
 from cartpole_rl.tasks.episode import Episode
-from cartpole_rl.workflows.agents import new_agent, recorded_config
+from cartpole_rl.workflows.agents import new_agent
 from cartpole_rl.workflows.build import use_threads
 from cartpole_rl.workflows.checks import check_compiler
 from cartpole_rl.workflows.config import TrainConfig
@@ -24,6 +25,7 @@ from cartpole_rl.workflows.person import print_message
 from cartpole_rl.workflows.report import report
 from cartpole_rl.workflows.resuming import resumed
 from cartpole_rl.workflows.run_folder import write_config
+from cartpole_rl.workflows.settings import recorded_settings
 
 
 def train(config: TrainConfig, folder: Path) -> None:
@@ -32,11 +34,11 @@ def train(config: TrainConfig, folder: Path) -> None:
     Writes config.yaml, provenance.json, TensorBoard events, history.jsonl (evaluations), checkpoints/last.pt
     and best.pt, metrics.json and figures/; until the end also checkpoints/resume.pt. Raises ConfigError for
     settings that do not fit together or a folder that already holds a run, CheckpointError for a resumed run
-    without a checkpoint, LearningError where learning diverges.
+    without a checkpoint, LearningError if learning diverges.
     """
     checkpoint = resumed("train", config.resume, folder)
     if checkpoint:
-        config = recorded_config(checkpoint.config, f"resume={folder}")
+        config = recorded_settings(TrainConfig, checkpoint.config, f"resume={folder}")
     if config.compile:
         check_compiler()
     use_threads(config.threads)
@@ -53,7 +55,7 @@ def train(config: TrainConfig, folder: Path) -> None:
     policy = DrivingPolicy(agent.greedy_policy(), config.compile)
     evaluate = partial(judge, nominal_env(config), policy, config.seed)
     write_config(folder, "train", config.model_dump(mode="json"), resumed=checkpoint is not None)
-    with TrainingMonitor(folder, config, checkpoint.transitions if checkpoint else None) as monitor:
+    with TrainingMonitor(folder, config, checkpoint.step if checkpoint else None) as monitor:
         training = Training(
             config.learning,
             config.buffer,
@@ -75,7 +77,7 @@ def train(config: TrainConfig, folder: Path) -> None:
         )
         monitor.finished(metrics)
     forget_training(folder)
-    print(f"trained for {training.seconds:.0f} s; {folder}/metrics.json, figures/, checkpoints/ are written")
+    print(f"trained for {training.seconds:.0f} s; {folder}/{METRICS}, {FIGURES}/, {CHECKPOINTS}/ are written")
 
 
 def note_unused_randomization(config: TrainConfig, draws: Draws) -> None:
@@ -95,9 +97,7 @@ def nominal_env(config: TrainConfig) -> CartPoleEnv:
     assert poles.choices is not None
     carts = len(poles.choices) * max(1, config.learning.evaluation_episodes // len(poles.choices))
     nominal = config.model_copy(update={"pole": poles, "randomization": {}})
-    plant = config.plant
-    if isinstance(plant, LearnedSettings):
-        plant = plant.model_copy(update={"prior_share": 0.0})
+    plant = config.plant.without_prior if isinstance(config.plant, LearnedSettings) else config.plant
     return simulated_env(nominal, plant, carts, config.task.evaluation_start, 0, config.compile)
 
 

@@ -1,5 +1,5 @@
 #!/usr/bin/env python
-"""How much does each means of docs/learning.md contribute? Trains the medium pole without one at a time.
+"""How much does each technique of docs/learning.md contribute? Trains the medium pole without one at a time.
 
     scripts/bench/ablation.py --seeds 5 --jobs 2 --json ablation.json
 

@@ -125,7 +125,7 @@ def dynamics(carts: int, periods: int, substeps: int, compiled: bool) -> Row:
         state = run(state, draws[calls % len(draws)])
         calls += 1
 
-    fused = f"{periods} periods a call" if periods > 1 else "1 period a call"
+    fused = f"{periods} periods per call" if periods > 1 else "1 period per call"
     name = f"dynamics, {fused}, {substeps} substep{'s' if substeps > 1 else ''}"
     return Row(name, carts, periods, step, CARTPOLE, seconds(step))
 

@@ -1,5 +1,5 @@
 #!/usr/bin/env python
-"""Does fine-tuning help on carts for which an agent was not trained? The table of docs/fine-tuning.md.
+"""Does fine-tuning help on carts for which an agent was not trained? Table: docs/results/fine-tuning.md.
 
     scripts/bench/fine_tuning.py runs/bench/medium/0 runs/bench/medium/1 runs/bench/medium/2 --json tuned.json
 

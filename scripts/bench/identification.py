@@ -1,5 +1,5 @@
 #!/usr/bin/env python
-"""How accurate is identification? The tables of docs/identification.md.
+"""How accurate is identification? The tables of docs/results/identification.md.
 
     scripts/bench/identification.py --truths 20 --json identification.json
 

@@ -1,5 +1,5 @@
 #!/usr/bin/env python
-"""How well, and how fast, does each experiment learn? One row of docs/learning.md for each experiment.
+"""How well, and how fast, does each experiment learn? Rows of docs/results/learning.md.
 
     scripts/bench/learning.py medium large --seeds 10 --jobs 2 --json learning.json
 

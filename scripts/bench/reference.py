@@ -32,18 +32,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+import yaml
 from best_score.beam import held, landed, risk
 from best_score.cart import MOST, KnownCart, hanging, wrapped
 from best_score.swing_up import GENERATIONS, evolved, lacking, pushed
 from common import option_parser, read_json, write_json
-from hydra import compose, initialize_config_dir
-from hydra.errors import HydraException
-from omegaconf import open_dict
-from omegaconf.errors import OmegaConfBaseException
 
-from cartpole_rl.checking import checked
-from cartpole_rl.choices import conf_folder
-from cartpole_rl.commands.composition import as_mapping
 from cartpole_rl.envs.build import simulated_env
 from cartpole_rl.errors import CartPoleError, ConfigError
 from cartpole_rl.plants.simulated import SimulatedPlant
@@ -52,6 +46,7 @@ from cartpole_rl.tasks.rewards import UPRIGHT_ANGLE, UPRIGHT_SPEED
 from cartpole_rl.tasks.settings import Start, StartSettings
 from cartpole_rl.tasks.upright import upright_since
 from cartpole_rl.workflows.config import TrainConfig
+from cartpole_rl.workflows.settings import load_settings
 
 STARTS = (-0.1, -0.05, 0.0, 0.05, 0.1)  # m: an evaluation places the cart within 0.1 m of the middle
 POLES = ("medium", "large")
@@ -166,12 +161,10 @@ def reference(config: TrainConfig, states: int) -> dict[str, Any]:
 
 
 def composed(overrides: Sequence[str]) -> TrainConfig:
-    """Return the config of cartpole-train on the nominal cart. Raises ConfigError and Hydra's errors."""
-    with initialize_config_dir(version_base="1.3", config_dir=str(conf_folder())):
-        config = compose("train", [*overrides, "randomization=none"])
-    with open_dict(config):
-        config.pop("hydra", None)
-    return checked(TrainConfig, as_mapping(config))
+    """Return the settings of cartpole-train with `overrides`, on the nominal cart. Raises ConfigError."""
+    pairs = (word.partition("=") for word in overrides)
+    values = {name: yaml.safe_load(value) for name, _, value in pairs}
+    return load_settings(TrainConfig, {**values, "randomization": "none"})
 
 
 def with_rod(config: TrainConfig, length: float) -> TrainConfig:
@@ -181,7 +174,7 @@ def with_rod(config: TrainConfig, length: float) -> TrainConfig:
 
 
 def plants(options: argparse.Namespace) -> list[TrainConfig]:
-    """Return the configs that the options ask for. Raises ConfigError and Hydra's errors."""
+    """Return the configs that the options ask for. Raises ConfigError."""
     if options.states < 1:
         raise ConfigError(f"--states {options.states} must be at least 1")
     if options.length is not None and not options.length > 0:
@@ -217,7 +210,7 @@ def main() -> None:
     torch.set_num_threads(1)
     try:
         configs = plants(options)
-    except (CartPoleError, HydraException, OmegaConfBaseException) as error:
+    except CartPoleError as error:
         sys.exit(f"reference: {error}")
     for config in configs:
         found = reference(config, options.states)

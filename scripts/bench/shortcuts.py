@@ -1,5 +1,5 @@
 #!/usr/bin/env python
-"""Speed of the shortcuts that this package takes beside TorchRL's own ways, in one process and in turns.
+"""Speed of this package's replacements of TorchRL parts, measured in one process and in turns.
 
     scripts/bench/shortcuts.py [--json shortcuts.json] [--carts 1024] [--seconds 60] [--quick]
 
@@ -34,16 +34,16 @@ from cartpole_rl.agents.dqn import QAgent
 from cartpole_rl.agents.loss import LossGradient, columns_of
 from cartpole_rl.agents.settings import AgentSettings
 from cartpole_rl.choices import choice
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.gymnasium import simulated_environment
 from cartpole_rl.envs.hardware import HardwareTransform
-from cartpole_rl.envs.make import CartPoleEnv
 from cartpole_rl.evaluation.driving_policy import DrivingPolicy
 from cartpole_rl.learning.buffer import n_step_transitions
 from cartpole_rl.learning.collector import Collector
 from cartpole_rl.reporting.table import table
 
 CHUNK, EPSILON, BATCH = 8, 0.1, 512
-Pair = dict[str, Step]  # TorchRL's way first
+Pair = dict[str, Step]  # TorchRL's part first
 
 
 def environment(carts: int, compiled: bool) -> CartPoleEnv:
@@ -125,7 +125,7 @@ def seconds(call: Step) -> float:
 
 
 def measure(carts: int, budget: float, compiled: bool) -> list[dict[str, Any]]:
-    """Milliseconds a call of each way, and how many times TorchRL's own takes as long."""
+    """Return the milliseconds per call of each variant, and its speed-up over TorchRL."""
     env = environment(carts, compiled)
     agent = make_agent(env)
     chunk = Collector(env, agent.actor, len(env.hardware.motors), seed=0).collect(CHUNK)
@@ -161,7 +161,7 @@ def main() -> None:
     torch.manual_seed(0)
     torch.set_num_threads(1)
     results = measure(options.carts, 0.0 if options.quick else options.seconds, not options.quick)
-    print(table(results, {"name": "", "ms": "ms a call", "ratio": "times as fast", "to": "as"}))
+    print(table(results, {"name": "", "ms": "ms per call", "ratio": "speed-up", "to": "as"}))
     if options.json:
         options.json.write_text(json.dumps(results, indent=2) + "\n")
 

@@ -15,7 +15,7 @@ COMPARED, REPORTED = (
     0,
     1000,
 )  # seeds: settings were compared on the first one's carts; report the second one's
-IDENTIFIED = 2026  # seed of the carts of docs/identification.md
+IDENTIFIED = 2026  # seed of the carts of docs/results/identification.md
 CART_MASS, CART_VISCOUS, CART_COULOMB = 0.703, 0.5, 0.5  # nominal: kg, N s/m, N (conf/cart/ip02.yaml)
 POLE_MASS, POLE_COM, POLE_INERTIA = 0.127, 0.1778, 1.199e-3  # nominal: kg, m, kg m^2 (conf/pole/medium.yaml)
 

@@ -28,13 +28,14 @@ from tensordict import TensorDictBase
 
 from cartpole_rl.choices import choice
 from cartpole_rl.emulator.settings import EmulatorSettings
-from cartpole_rl.envs.make import CartPoleEnv, make_env
-from cartpole_rl.envs.settings import ObservationSettings, RewardSettings, TaskSettings
+from cartpole_rl.envs.build import make_env
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
+from cartpole_rl.envs.settings import ObservationSettings
 from cartpole_rl.errors import PlantError
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.plants.emulated import emulated_plant
 from cartpole_rl.reporting.table import table
-from cartpole_rl.tasks.actions import ActionSettings
+from cartpole_rl.tasks.settings import ActionSettings, RewardSettings, TaskSettings
 
 EPISODES_PER_CART = 4  # fewer if the cart fails for good
 LARGEST_SHARE = 0.05  # of frames, of each disturbance

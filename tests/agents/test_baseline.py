@@ -1,4 +1,4 @@
-"""Energy and LQR: the regulator is one, the state is read and led on rightly, and it masters the task."""
+"""Energy and LQR: a stable regulator, correct decoding and prediction of the state, and the whole task."""
 
 from collections.abc import Callable
 from typing import Any
@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from cartpole_rl.agents.baseline import EnergyAndRegulator, decode, linearized, regulator
 from cartpole_rl.choices import choice
 from cartpole_rl.emulator.settings import EmulatorSettings
-from cartpole_rl.envs.make import CartPoleEnv
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.physics.dynamics import State
@@ -20,8 +20,8 @@ from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.emulated import emulated_plant
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.randomization.poles import PoleSettings
-from cartpole_rl.tasks.features import Measured, observe
-from cartpole_rl.tasks.settings import ObservationKind, Start, StartSettings
+from cartpole_rl.tasks.features import Measured, ObservationKind, observe
+from cartpole_rl.tasks.settings import Start, StartSettings
 from cartpole_rl.tasks.upright import is_upright
 
 PERIOD = 0.02
@@ -59,7 +59,7 @@ def test_the_regulator_makes_upright_stable(ip02: dict[str, float], pole: str) -
 
 
 @pytest.mark.parametrize("kind", [ObservationKind.RAW, ObservationKind.COS_SIN])
-def test_an_observation_is_read_backwards(kind: ObservationKind) -> None:
+def test_decoding_inverts_the_observation(kind: ObservationKind) -> None:
     state = Measured(*torch.tensor([[0.1, -0.2], [-0.5, 0.7], [3.0, -1.2], [4.0, -9.0]]))
     motors = torch.tensor([[200.0, 0.0], [-150.0, 50.0]])
     seen = torch.cat((torch.stack(observe(state, kind), 1), motors / 255), 1)
@@ -68,8 +68,8 @@ def test_an_observation_is_read_backwards(kind: ObservationKind) -> None:
     torch.testing.assert_close(motor, motors[:, 0])
 
 
-def test_what_it_expects_comes_true(ip02: dict[str, float], make_plant: MakePlant) -> None:
-    """Measured velocities are half a period old; led on, they are those that the command will find."""
+def test_predictions_match_the_simulation(ip02: dict[str, float], make_plant: MakePlant) -> None:
+    """Measured velocities are half a period old; predicted ones are those when the command takes effect."""
     plant = make_plant(1, cart={"latency": 0.0, "track_half_length": 2.0})
     plant.reset()
     plant.place(State(*torch.tensor([[0.0], [0.3], [0.8], [2.0]])))

@@ -97,7 +97,7 @@ def test_masks_and_reductions_are_those_of_torchrl(reduction: str) -> None:
     torch.testing.assert_close(own, stock)
 
 
-def test_the_action_gap_is_a_reward_less_what_the_online_network_finds_lost() -> None:
+def test_the_action_gap_equals_a_reward_reduced_by_the_online_shortfall() -> None:
     plain, gap = (make_loss(AdvantageLearningLoss, action_gap=alpha, double_dqn=True) for alpha in (0.0, 0.5))
     batch = transitions(64)
     lowered = batch.clone()
@@ -121,7 +121,7 @@ def test_it_learns_in_a_loop_of_torchrls_own_parts(updater: str) -> None:
         batch_size=64,
         priority_key="td_error",
     )
-    data = transitions(256)  # each leads to a state that is worth 0, so an action is worth its reward
+    data = transitions(256)  # each next state has value 0, so the value of an action is its reward
     data["next", "observation"] = torch.zeros(256, 3)
     data["next", "reward"] = data["observation"][:, :1]
     replay.extend(data)
@@ -162,7 +162,7 @@ def test_actions_without_an_index_are_refused() -> None:
         AdvantageLearningLoss(actor, action_space="binary")
 
 
-def test_another_target_than_that_of_td0_is_refused() -> None:
+def test_estimators_other_than_td0_are_refused() -> None:
     loss = make_loss(AdvantageLearningLoss)
     for estimator in (ValueEstimators.TDLambda, ValueEstimators.TD1):
         with pytest.raises(NotImplementedError, match="TD0"):

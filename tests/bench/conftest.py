@@ -1,24 +1,11 @@
-"""Runs scripts in this process, so that PyTorch is imported once, and trains one agent a little."""
+"""Trains one agent a little, for the benchmarks that judge agents."""
 
 import sys
 from pathlib import Path
-from types import ModuleType
 
 import pytest
-from bench_scripts import TINY, Run
-
-
-@pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
-    """Run a script's `main` with words in a folder; return its output."""
-
-    def call(script: ModuleType, folder: Path, *words: str) -> str:
-        monkeypatch.chdir(folder)
-        monkeypatch.setattr(sys, "argv", [f"{script.__name__}.py", *words])
-        script.main()
-        return capsys.readouterr().out
-
-    return call
+from bench_scripts import TINY
+from bench_scripts import run as run
 
 
 @pytest.fixture(scope="session")

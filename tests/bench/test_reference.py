@@ -57,7 +57,7 @@ def test_states_among_many_are_scored_as_alone(cart: KnownCart) -> None:
         assert torch.equal(alone.counts[:, 0], together.counts[:, action])
 
 
-def test_leaving_the_track_ends_what_is_counted(config: Any, cart: KnownCart) -> None:
+def test_leaving_the_track_ends_the_score(config: Any, cart: KnownCart) -> None:
     rightward = [len(cart.motors) - 1] * STEPS
     played = reference.replay(config, 0.1, rightward)
     assert len(played.points) < STEPS
@@ -86,7 +86,7 @@ def test_pushes_give_the_mean_force_of_each_step(cart: KnownCart) -> None:
     assert forces.tolist() == pytest.approx([4, 4, 2, 4, 0])
 
 
-def test_a_state_that_stands_in_the_middle_lacks_nothing(cart: KnownCart) -> None:
+def test_a_state_upright_in_the_middle_has_no_shortfall(cart: KnownCart) -> None:
     zero = torch.zeros(1)
     standing = State(zero, zero, zero, zero)
     assert float(lacking(cart, standing)) == 0
@@ -94,7 +94,7 @@ def test_a_state_that_stands_in_the_middle_lacks_nothing(cart: KnownCart) -> Non
         assert float(lacking(cart, standing._replace(**change))) > 1
 
 
-def test_only_a_cart_that_is_alike_to_both_sides_is_mirrored(cart: KnownCart) -> None:
+def test_only_a_symmetric_cart_is_mirrored(cart: KnownCart) -> None:
     assert cart.symmetric
     for change in ("cart.force_asymmetry=0.1", "cart.track_tilt=0.01", "cart.deadband_left=20"):
         assert not KnownCart(reference.composed([change])).symmetric

@@ -1,14 +1,22 @@
-"""Runs that several tests use: a training that came to its end, and one that was stopped before."""
+"""Runs that several test files share: two trainings (one interrupted), an identification, a fine-tuning."""
 
 from pathlib import Path
 
 import pytest
-from command_line import TINY, Outcome, in_process, interrupt_after, prints_only_progress
+from command_line import (
+    FINETUNING,
+    IDENTIFICATION,
+    TINY,
+    Outcome,
+    in_process,
+    interrupt_after,
+    prints_only_progress,
+)
 
 
 @pytest.fixture(scope="session")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The run folder of a tiny training; with two actions its agent cannot but move the cart."""
+    """The run folder of a tiny training; with two actions its agent always moves the cart."""
     folder = tmp_path_factory.mktemp("trained")
     done = in_process("train", *TINY, "actions=two", "hydra.run.dir=run", folder=folder)
     assert done.code == 0, done.err
@@ -31,3 +39,21 @@ def stopped(interrupted: tuple[Path, Outcome]) -> Path:
     folder, done = interrupted
     assert done.code == 130, done.err
     return folder
+
+
+@pytest.fixture(scope="session")
+def identified(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Outcome]:
+    """The run folder and the outcome of an identification of an emulated cart."""
+    folder = tmp_path_factory.mktemp("identified")
+    done = in_process("identify", "plant=emulated", *IDENTIFICATION, "hydra.run.dir=run", folder=folder)
+    assert done.code == 0, done.err
+    return folder / "run", done
+
+
+@pytest.fixture(scope="session")
+def tuned(trained: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Outcome]:
+    """The run folder and the outcome of a short fine-tuning on an emulated cart."""
+    folder = tmp_path_factory.mktemp("tuned")
+    done = in_process("finetune", f"run={trained}", *FINETUNING, "hydra.run.dir=run", folder=folder)
+    assert done.code == 0, done.err
+    return folder / "run", done

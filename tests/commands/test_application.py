@@ -1,4 +1,4 @@
-"""What every command makes of the signals that ask it to end."""
+"""Response of every command to signals that end it."""
 
 import os
 import signal
@@ -10,13 +10,13 @@ import pytest
 from command_line import HANDLED
 from hydra.core.global_hydra import GlobalHydra
 
-from cartpole_rl.commands.application import application
 from cartpole_rl.commands.find_port import FindPortConfig
+from cartpole_rl.commands.hydra_application.application import application
 from cartpole_rl.signals import UNWINDING, RaiseOnce, ending_signals
 
 
 def run_until_signalled(number: signal.Signals, folder: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Send `number` to a command in the middle of its work; what happened then."""
+    """Send signal `number` to a command at work; return what it did."""
     happened: list[str] = []
 
     @application("find_port", FindPortConfig)
@@ -54,14 +54,14 @@ def test_a_signal_unwinds_the_work(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """So that every `with` stops its motor."""
+    """Every `with` then stops its motor."""
     signal.signal(number, signal.SIG_DFL)
     assert run_until_signalled(number, tmp_path, monkeypatch) == ["unwound", f"exit code {code}"]
     assert capsys.readouterr().err == "cartpole-find-port: terminated\n"
 
 
 def test_a_second_signal_does_not_interrupt_the_unwinding(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A `with` that stops a motor gets to its end; a program that hangs can be ended later."""
+    """A `with` that stops a motor completes; a program that hangs can be ended later."""
     handler = RaiseOnce(lambda number: InterruptedError(number))
     handler.handle(*HANDLED)
     with pytest.raises(InterruptedError, match=str(int(signal.SIGHUP))):

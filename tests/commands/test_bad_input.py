@@ -10,7 +10,7 @@ import torch
 from command_line import ONCE, TINY, Outcome, console_script, in_process, outcome
 
 WRONG_TRAINING = [
-    # the words, and what the line has to say
+    # arguments, setting named in the line, remedy in the line
     ("agent.gama=0.9", "agent.gama", "did you mean agent.gamma?"),
     ("+agent.foo=1", "agent.foo", "there is no such setting"),
     ("gamma=0.9", "gamma", "did you mean agent.gamma?"),
@@ -22,6 +22,10 @@ WRONG_TRAINING = [
     ("agent.loss=l1", "agent.loss=l1", "'l2' or 'smooth_l1'"),
     ("control_period=1", "control_period=1", "less than or equal to 0.1"),
     ("pole=tiny", "pole=tiny", "both, large, medium, range"),
+    ("pole=null", "pole=null", "leave pole=null out"),
+    ("task=null", "task=null", "leave task=null out"),
+    ("plant=null", "plant=null", "leave plant=null out"),
+    ("randomization=null", "randomization=null", "leave randomization=null out"),
     ("pole=medum", "pole=medum", "did you mean medium?"),
     ("pole=medium,large", "pole=medium,large", "-m runs each"),
     ("seed", "seed", "key=value"),
@@ -58,6 +62,14 @@ def test_training(words: str, named: str, remedy: str, tmp_path: Path) -> None:
     assert not list(tmp_path.glob("runs/train/*"))
 
 
+def test_a_choice_file_that_is_no_yaml(tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_text("pole_mass: [0.1\n")
+    done = in_process("train", "pole=mine.yaml", folder=tmp_path)
+    problem = "expected ',' or ']', but got '<stream end>'"
+    assert done.complaint == f"cartpole-train: pole=mine.yaml is not valid YAML, line 2: {problem}"
+    assert done.code == 2
+
+
 WRONG_EVALUATION = [
     ("", "run is missing", "give run=...", 2),
     ("run=nowhere", "run=nowhere", "give a run folder or a checkpoint", 1),
@@ -85,7 +97,7 @@ WRONG_EVALUATION = [
 
 @pytest.fixture(scope="module")
 def files(trained: Path, stopped: Path) -> Path:
-    """A folder with a trained run, and files that are none."""
+    """A folder with a trained run, and files that are not checkpoints."""
     folder = trained.parent
     shutil.copy(stopped / "checkpoints/resume.pt", folder)
     (folder / "text.pt").write_text("no checkpoint at all\n")
@@ -110,7 +122,7 @@ def test_evaluation(words: str, named: str, remedy: str, code: int, files: Path)
 
 @pytest.fixture
 def port() -> str:
-    """A serial port with nobody at its other end."""
+    """A serial port without a cart."""
     host, device = os.openpty()
     yield os.ttyname(device)
     os.close(host)
@@ -167,7 +179,7 @@ def test_resuming_takes_no_other_setting(words: str, remedy: str, trained: Path)
     assert not (trained.parent / "other").exists()
 
 
-def test_resuming_what_is_no_training(files: Path) -> None:
+def test_resuming_a_folder_without_a_training(files: Path) -> None:
     done = in_process("train", "resume=resume.pt", folder=files)
     assert "give the run folder of a training" in done.complaint
     assert done.code == 1
@@ -208,7 +220,7 @@ def test_a_training_that_has_ended_is_not_resumed(trained: Path) -> None:
     assert {path: path.read_bytes() for path in trained.rglob("*") if path.is_file()} == before
 
 
-def test_a_training_with_another_network_does_not_go_on(stopped: Path, tmp_path: Path) -> None:
+def test_a_training_with_another_network_is_not_resumed(stopped: Path, tmp_path: Path) -> None:
     older = shutil.copytree(stopped, tmp_path / "older")
     content = torch.load(older / "checkpoints/resume.pt", weights_only=True)
     agent = {f"{name}_of_before": weight for name, weight in content["state"]["agent"].items()}
@@ -220,7 +232,7 @@ def test_a_training_with_another_network_does_not_go_on(stopped: Path, tmp_path:
     assert (older / "history.jsonl").read_text() == before
 
 
-def test_without_a_compiler_the_remedy_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_compiler_the_remedy_is_stated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CXX", "no-such-compiler")
     done = in_process("train", "compile=true", folder=tmp_path)
     assert "no-such-compiler" in done.complaint
@@ -239,7 +251,7 @@ def test_in_a_multirun_the_other_jobs_run(tmp_path: Path) -> None:
 
 
 def test_through_a_real_process(tmp_path: Path) -> None:
-    """As above, with nothing around the command that could hide a trace."""
+    """As above, in a separate process that could show a traceback."""
     done = outcome(console_script("evaluate", "run=nowhere", folder=tmp_path))
     assert done.complaint == (
         "cartpole-evaluate: run=nowhere: there is no such file or folder; give a run folder or a checkpoint"

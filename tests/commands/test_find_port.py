@@ -1,4 +1,4 @@
-"""cartpole-find-port, and what it says of lists of ports."""
+"""cartpole-find-port and its listings."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,7 +16,7 @@ FTDI = UsbPort("/dev/ttyUSB1", 0x0403, 0x6001)
 MODEM = UsbPort("/dev/ttyACM0", 0x2C7C, 0x0125)
 
 
-def test_the_command_lists_what_there_is(tmp_path: Path) -> None:
+def test_the_command_lists_the_ports(tmp_path: Path) -> None:
     ports = found_ports()
     done = in_process("find_port", folder=tmp_path)
     if ports:
@@ -28,14 +28,14 @@ def test_the_command_lists_what_there_is(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_a_watch_in_which_nothing_happens_ends(tmp_path: Path) -> None:
+def test_a_watch_without_changes_times_out(tmp_path: Path) -> None:
     done = in_process("find_port", "watch=true", "timeout=0.3", folder=tmp_path)
     assert done.code == 1
     assert "Unplug the cart now" in done.out
     assert "no port appeared or vanished within 0.3 s" in done.complaint
 
 
-def test_a_wrong_setting_is_told(tmp_path: Path) -> None:
+def test_a_wrong_setting_is_reported(tmp_path: Path) -> None:
     assert in_process("find_port", "timeout=-1", folder=tmp_path).code == 2
 
 
@@ -48,7 +48,7 @@ def test_help_has_examples(tmp_path: Path) -> None:
     [
         ([CH340, MODEM], "The cart is probably on it: plant.port=/dev/ttyUSB0, or plant.port=auto"),
         ([CH340, FTDI], "`cartpole-find-port watch=true` finds out which of them is the cart"),
-        ([MODEM], "None of them has a chip that carts have (CP210x, CH340, FTDI, Espressif)"),
+        ([MODEM], "None of them has a chip used on carts (CP210x, CH340, FTDI, Espressif)"),
     ],
 )
 def test_a_listing_ends_in_what_to_do(ports: list[UsbPort], last: str) -> None:

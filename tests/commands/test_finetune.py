@@ -8,41 +8,22 @@ import time
 from collections import defaultdict
 from pathlib import Path
 
-import pytest
 import torch
-from command_line import ONCE, TINY, Outcome, console_script, in_process, outcome
+from command_line import FINETUNING, ONCE, TINY, Outcome, console_script, in_process, outcome
 from tensorboard.backend.event_processing.event_file_loader import EventFileLoader
 
 from cartpole_rl.evaluation.recordings import read_recording
 from cartpole_rl.workflows.agents import trained_agent
 
-SHORT = (
-    "plant=emulated",
-    "episodes=2",
-    "evaluation_episodes=1",
-    "finetuning.iterations=2",
-    "finetuning.refit=1",
-    "compile=false",
-)
-
 
 def finetune(trained: Path, folder: Path, *words: str) -> Outcome:
     return in_process(
-        "finetune", f"run={trained}", *SHORT, *words, f"hydra.run.dir={folder}/run", folder=folder
+        "finetune", f"run={trained}", *FINETUNING, *words, f"hydra.run.dir={folder}/run", folder=folder
     )
 
 
 def recordings(run: Path) -> list[str]:
     return sorted(path.name for path in (run / "recordings").iterdir())
-
-
-@pytest.fixture(scope="module")
-def tuned(trained: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Outcome]:
-    """The run folder of a short fine-tuning, and what was seen of it."""
-    folder = tmp_path_factory.mktemp("tuned")
-    done = finetune(trained, folder)
-    assert done.code == 0, done.err
-    return folder / "run", done
 
 
 def test_every_episode_is_on_disk_once(tuned: tuple[Path, Outcome]) -> None:
@@ -51,7 +32,7 @@ def test_every_episode_is_on_disk_once(tuned: tuple[Path, Outcome]) -> None:
     assert all(read_recording(path).steps > 1 for path in (run / "recordings").iterdir())
 
 
-def test_the_better_policy_is_kept_and_said(tuned: tuple[Path, Outcome]) -> None:
+def test_the_better_policy_is_kept_and_reported(tuned: tuple[Path, Outcome]) -> None:
     run, done = tuned
     compared = json.loads((run / "comparison.json").read_text())
     better = (
@@ -129,10 +110,16 @@ def contents(run: Path) -> dict[str, bytes]:
 
 def test_a_run_continues_after_each_kind_of_interruption(trained: Path, tmp_path: Path) -> None:
     """One run: killed, then interrupted, then terminated, each time after one more episode to learn from."""
-    words = (f"run={trained}", *SHORT, "episodes=4", f"hydra.run.dir={tmp_path}/run")
+    words = (
+        f"run={trained}",
+        *FINETUNING,
+        "finetuning.refit=2",
+        "episodes=4",
+        f"hydra.run.dir={tmp_path}/run",
+    )
     process = console_script("finetune", *words, folder=tmp_path)
-    deadline = time.monotonic() + 100
-    while not (tmp_path / "run/recordings/tune_000.csv").exists() and time.monotonic() < deadline:
+    while not (tmp_path / "run/recordings/tune_000.csv").exists():
+        assert process.poll() is None, process.communicate()
         time.sleep(0.02)
     os.kill(process.pid, signal.SIGKILL)
     assert outcome(process).code == -signal.SIGKILL

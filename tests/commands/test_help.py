@@ -1,4 +1,4 @@
-"""What a command says of itself, and choices of a user's own."""
+"""Help of every command, and a user's own choices."""
 
 import re
 from pathlib import Path
@@ -61,7 +61,7 @@ def test_help_shows_the_plants_that_the_command_takes(command: str, plants: str,
     assert f"\n  plant: {plants}\n" in in_process(command, "--help", folder=tmp_path).out
 
 
-def test_help_shows_choices_of_ones_own(tmp_path: Path) -> None:
+def test_help_shows_a_users_own_choices(tmp_path: Path) -> None:
     (tmp_path / "mine/pole").mkdir(parents=True)
     (tmp_path / "mine/pole/broomstick.yaml").write_text("choices: {}\n")
     done = in_process("train", "--config-dir=mine", "--help", folder=tmp_path)
@@ -80,7 +80,7 @@ def test_cfg_job_shows_every_setting(command: str, tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_a_folder_of_ones_own_choices_is_added(tmp_path: Path) -> None:
+def test_a_folder_of_a_users_own_choices_is_added(tmp_path: Path) -> None:
     (tmp_path / "mine/pole").mkdir(parents=True)
     (tmp_path / "mine/experiment").mkdir()
     (tmp_path / "mine/pole/broomstick.yaml").write_text(

@@ -89,7 +89,7 @@ print(json.dumps(sorted({{name.partition(".")[0] for name in sys.modules}})))
 
 @dataclass(frozen=True)
 class Run:
-    """What a command came to, and the top-level modules of its process by then."""
+    """The outcome of a command, and the top-level modules imported by its process."""
 
     code: int
     said: str
@@ -97,7 +97,7 @@ class Run:
 
 
 def process(script: str, folder: Path, **environment: str) -> str:
-    """The last line that a script prints in a process of its own."""
+    """Return the last line that a script prints in a separate process."""
     done = subprocess.run(
         [sys.executable, "-c", script],
         cwd=folder,
@@ -110,7 +110,7 @@ def process(script: str, folder: Path, **environment: str) -> str:
 
 
 def in_turn(command: str, *words: str, folder: Path, **environment: str) -> list[Run]:
-    """What `cartpole-<command>` comes to with each of `words`, in one process."""
+    """Run `cartpole-<command>` with each of `words` in one process; return the outcomes."""
     script = RUN_IN_TURN.format(command=command, words=repr(words))
     runs = json.loads(process(script, folder, **environment))
     return [Run(code, said, set(modules)) for code, said, modules in runs]
@@ -127,7 +127,7 @@ def test_every_command_is_here() -> None:
 
 
 @pytest.mark.parametrize("command", COMPLAINS)
-def test_it_helps_and_complains_without_what_work_needs(command: str, tmp_path: Path) -> None:
+def test_help_and_errors_need_no_slow_imports(command: str, tmp_path: Path) -> None:
     cases = [*SHOWS, *COMPLAINS[command]]
     runs = in_turn(command, *(words for words, _, _ in cases), folder=tmp_path)
     for (words, code, said), run in zip(cases, runs, strict=True):
@@ -136,7 +136,7 @@ def test_it_helps_and_complains_without_what_work_needs(command: str, tmp_path: 
         assert run.modules & {*WORK, "numpy"} == set(), words
 
 
-def test_a_missing_port_is_told_without_pytorch(tmp_path: Path) -> None:
+def test_a_missing_port_is_reported_without_pytorch(tmp_path: Path) -> None:
     (run,) = in_turn("preflight", "plant.port=nowhere", folder=tmp_path)
     assert run.code == 1
     assert run.modules & WORK == set()
@@ -149,8 +149,9 @@ def test_completion_needs_no_work(tmp_path: Path) -> None:
     assert run.modules & {*WORK, "numpy"} == set()
 
 
-def test_what_is_imported_for_the_work_is_quiet_too(tmp_path: Path) -> None:
-    quiet = "from cartpole_rl.commands.application import quieten; quieten(); import logging, torchrl"
+def test_slow_imports_print_nothing(tmp_path: Path) -> None:
+    module = "cartpole_rl.commands.hydra_application.application"
+    quiet = f"from {module} import quieten; quieten(); import logging, torchrl"
     level = "assert logging.getLogger('torchrl').getEffectiveLevel() == logging.WARNING"
     assert "torchrl" in modules_after(f"{quiet}; {level}", tmp_path)
 

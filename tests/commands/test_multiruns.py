@@ -11,10 +11,8 @@ import hydra
 import pytest
 from command_line import in_process
 from hydra.core.global_hydra import GlobalHydra
+from hydra_configs import shipped_choices
 from omegaconf import DictConfig
-
-import cartpole_rl.commands.composition  # noqa: F401 - registers what conf/ refers to
-from cartpole_rl.choices import conf_folder
 
 COMMANDS = ("evaluate", "finetune", "identify", "model", "record", "replay", "train")
 
@@ -29,38 +27,38 @@ class StoppedClock(datetime):
 
 @pytest.fixture
 def same_second(monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in ("cartpole_rl.commands.composition", "hydra.core.utils"):
+    for module in ("cartpole_rl.commands.hydra_application.composition", "hydra.core.utils"):
         monkeypatch.setattr(f"{module}.datetime", StoppedClock)
 
 
 @pytest.fixture
-def shipped_choices(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def composing_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.chdir(tmp_path)
-    with composing():
-        yield
-
-
-@contextlib.contextmanager
-def composing() -> Iterator[None]:
-    GlobalHydra.instance().clear()
-    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(conf_folder())):
+    with shipped_choices():
         yield
 
 
 def folder_of_a_job(multirun: DictConfig, word: str) -> str:
-    """What Hydra's launchers do to start a job, in this process or another."""
+    """Compose a job as Hydra's launchers do, in this process or another."""
     loader = GlobalHydra.instance().config_loader()
     return loader.load_sweep_config(multirun, [word]).hydra.sweep.dir
 
 
 def folder_in_another_process(multirun: DictConfig, word: str, cwd: str) -> str:
-    with contextlib.chdir(cwd), composing():
+    with contextlib.chdir(cwd), shipped_choices():
         return folder_of_a_job(multirun, word)
 
 
 def test_two_multiruns_of_the_same_second(tmp_path: Path, same_second: None) -> None:
     for start in ("hanging", "upright"):
-        words = ("run=lqr", "episodes=1", "seed=0,1", "task=swingup", f"task.evaluation_start.angle={start}")
+        words = (
+            "run=lqr",
+            "episodes=1",
+            "seed=0,1",
+            "task=swingup",
+            "task.time_limit=10",
+            f"task.evaluation_start.angle={start}",
+        )
         done = in_process("record", "-m", *words, folder=tmp_path)
         assert done.code == 0, done.err
     jobs = {
@@ -74,7 +72,7 @@ def test_two_multiruns_of_the_same_second(tmp_path: Path, same_second: None) -> 
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_gives_each_multirun_its_own(
-    command: str, shipped_choices: None, same_second: None
+    command: str, composing_here: None, same_second: None
 ) -> None:
     given = {"evaluate": ["run=any"], "record": ["run=any"], "replay": ["from=any"], "model": ["from=any"]}
     multiruns = [hydra.compose(command, given.get(command, []), return_hydra_config=True) for _ in range(3)]
@@ -87,7 +85,7 @@ def test_every_command_gives_each_multirun_its_own(
     assert len(list(Path("runs", command).iterdir())) == 3
 
 
-def test_jobs_in_other_processes_share_the_folder(tmp_path: Path, shipped_choices: None) -> None:
+def test_jobs_in_other_processes_share_the_folder(tmp_path: Path, composing_here: None) -> None:
     multirun = hydra.compose("train", return_hydra_config=True)
     folder = multirun.hydra.sweep.dir  # Hydra makes it before it launches the jobs
     with ProcessPoolExecutor(1, get_context("spawn")) as pool:

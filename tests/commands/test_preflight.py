@@ -1,15 +1,12 @@
 """cartpole-preflight as a user runs it: on the emulated cart, and on a port whose cart is wired wrongly."""
 
-import sys
 from pathlib import Path
 
 from command_line import in_process
+from serial_peer import Between
 
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.plants.emulated_cart import EmulatedCart
-
-sys.path.append(str(Path(__file__).parents[1] / "plants"))
-from serial_peer import Between
 
 
 def test_the_emulated_cart_is_ready(tmp_path: Path) -> None:
@@ -30,14 +27,14 @@ def test_a_motor_the_wrong_way_round_is_refused(tmp_path: Path) -> None:
     ):
         done = in_process("preflight", "plant=serial", f"plant.port={cable.port}", folder=tmp_path)
     assert done.code == 1
-    assert done.complaint.endswith("the cart is not ready: cart encoder is off")
+    assert done.complaint.endswith("the cart is not ready: cart encoder failed")
     *before, last = done.out.splitlines()
     assert [line.split()[0] for line in before] == ["OK", "OK", "OK"]
     assert last.startswith("BAD  cart encoder: ")
     assert "swap the motor's two" in last
 
 
-def test_no_cart_on_the_port_is_told_in_words(tmp_path: Path) -> None:
+def test_a_port_without_a_cart_is_reported(tmp_path: Path) -> None:
     done = in_process("preflight", "plant.port=/dev/nosuch0", folder=tmp_path)
     assert done.code == 1
     assert done.out.startswith("BAD  link: /dev/nosuch0 does not exist: plug the cart in")

@@ -69,7 +69,7 @@ def test_the_baseline_has_one_pole(pole: str, tmp_path: Path) -> None:
     assert not list(tmp_path.glob("runs/record/*"))
 
 
-def test_nothing_is_recorded_of_no_run(tmp_path: Path) -> None:
+def test_recording_needs_a_run(tmp_path: Path) -> None:
     assert "run is missing; give run=..." in in_process("record", folder=tmp_path).complaint
 
 

@@ -1,4 +1,4 @@
-"""What a run leaves behind, equal seeds, sweeps, and trainings that were killed."""
+"""Contents of run folders, equal seeds, sweeps, and trainings that were killed."""
 
 import json
 import subprocess
@@ -14,8 +14,8 @@ import yaml
 from command_line import TINY, console_script, in_process, outcome, prints_only_progress
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from cartpole_rl.commands.composition import job_name, run_folder
-from cartpole_rl.envs.make import CartPoleEnv
+from cartpole_rl.commands.hydra_application.composition import job_name, run_folder
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.errors import LinkError
 from cartpole_rl.evaluation.episodes import Policy, run_episodes
 from cartpole_rl.tasks.episode import Episode
@@ -36,7 +36,7 @@ def weights(run: Path) -> dict[str, torch.Tensor]:
 
 
 def curves(run: Path) -> dict[str, list[tuple[int, float]]]:
-    """The points of every TensorBoard curve that does not tell a time."""
+    """Return the points of every TensorBoard curve that is not a duration."""
     events = EventAccumulator(str(run), size_guidance={"scalars": 0})
     events.Reload()
     names = [tag for tag in events.Tags()["scalars"] if "second" not in tag]
@@ -44,14 +44,14 @@ def curves(run: Path) -> dict[str, list[tuple[int, float]]]:
 
 
 def timeless(value: Any) -> bool:
-    """Whether no key tells a duration or a date of the run itself."""
+    """Return True if no key holds a duration or a date."""
     if isinstance(value, dict):
         told = [key for key in value if "second" in key or "date" in key or "wall" in key]
         return not told and all(timeless(each) for each in value.values())
     return not isinstance(value, list) or all(timeless(each) for each in value)
 
 
-def test_a_training_leaves_what_runs_readme_says(trained: Path) -> None:
+def test_a_training_writes_the_files_of_runs_readme(trained: Path) -> None:
     files = {str(path.relative_to(trained)) for path in trained.rglob("*") if path.is_file()}
     events = {name for name in files if name.startswith("events.out.tfevents.")}
     assert len(events) == 1
@@ -132,7 +132,7 @@ def test_an_evaluation_may_take_another_task_cart_and_pole(trained: Path, tmp_pa
     assert evaluated["task"]["x_max"] == 0.38
 
 
-def test_the_emulated_pole_is_the_one_that_is_told(trained: Path, tmp_path: Path) -> None:
+def test_the_reported_pole_is_that_of_the_emulator(trained: Path, tmp_path: Path) -> None:
     words = ["plant=emulated", "emulator=large", "episodes=1", "hydra.run.dir=it"]
     done = in_process("evaluate", f"run={trained}", *words, folder=tmp_path)
     assert done.code == 0, done.err
@@ -183,7 +183,7 @@ def test_the_name_of_a_job_needs_no_quotes(sweep: list[Path], tmp_path: Path) ->
     assert len(list(tmp_path.glob("runs/evaluate/*/metrics.json"))) == 1
 
 
-def test_names_of_jobs_tell_what_differs(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_names_of_jobs_show_what_differs(monkeypatch: pytest.MonkeyPatch) -> None:
     words = ["-m", "compile=false", "agent.hidden=[64,64],[8]", "run=runs/a,runs/b", "seed=range(0,2)"]
     monkeypatch.setattr(sys, "argv", ["cartpole-train", *words])
     job = ["compile=False", "agent.hidden=[64,64]", "run=runs/a", "seed=0"]
@@ -208,7 +208,7 @@ def when_saved(process: "subprocess.Popen[str]", checkpoint: Path) -> None:
         time.sleep(0.002)
 
 
-def test_a_training_that_was_stopped_goes_on_as_if_it_had_not_been(tmp_path: Path) -> None:
+def test_a_stopped_training_resumes_identically(tmp_path: Path) -> None:
     """Killed, resumed, terminated, resumed: the same to the bit as one that ran through."""
     words = (*TINY, "learning.transitions=4096", "learning.evaluations=8", "buffer=prioritized", "pole=both")
     checkpoint = tmp_path / "stopped/checkpoints/resume.pt"
@@ -242,15 +242,15 @@ def test_a_training_that_was_stopped_goes_on_as_if_it_had_not_been(tmp_path: Pat
     assert not any((run / "checkpoints/resume.pt").exists() for run in runs)
 
 
-def test_a_training_that_was_stopped_keeps_no_more_than_it_has_seen(stopped: Path) -> None:
-    """Its replay buffer has room for 1500 transitions, the default one for a million."""
+def test_a_resume_file_holds_only_the_filled_buffer(stopped: Path) -> None:
+    """Its replay buffer holds 1500 transitions; the default one holds a million."""
     state = torch.load(stopped / "checkpoints/resume.pt", weights_only=True)
     kept = state["state"]["replay"]["transitions"]
     assert {len(column) for column in kept.values()} == {min(state["transitions"], 1500)}
     assert not (stopped / "metrics.json").exists()
 
 
-def test_what_a_broken_link_leaves_is_reported(
+def test_episodes_before_a_broken_link_are_reported(
     trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One episode ran when the cable was pulled out."""

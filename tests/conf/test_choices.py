@@ -7,15 +7,16 @@ from typing import Any
 import hydra
 import pytest
 import yaml
-from hydra.core.global_hydra import GlobalHydra
 
 from cartpole_rl.checking import checked
 from cartpole_rl.choices import conf_folder, default_choices
-from cartpole_rl.commands.composition import as_mapping
+from cartpole_rl.commands.hydra_application.composition import as_mapping
 from cartpole_rl.envs.build import randomizer
-from cartpole_rl.tasks.settings import Reward
+from cartpole_rl.tasks.rewards import Reward
 from cartpole_rl.workflows.build import evaluated_settings
 from cartpole_rl.workflows.config import EmulateConfig, EvaluateConfig, FinetuneConfig, TrainConfig
+
+pytestmark = pytest.mark.usefixtures("hydra_reads_conf")
 
 CONF = conf_folder()
 GROUPS = sorted(path.name for path in CONF.iterdir() if path.is_dir() and path.name != "hydra")
@@ -29,20 +30,13 @@ def group_of(choice: str) -> str:
     return choice.split("=")[0]
 
 
-@pytest.fixture(autouse=True, scope="module")
-def composer() -> Iterator[None]:
-    GlobalHydra.instance().clear()
-    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
-        yield
-
-
 @cache
 def composed(name: str, *overrides: str) -> dict[str, Any]:
     return as_mapping(hydra.compose(name, list(overrides)))
 
 
 @pytest.fixture(scope="module")
-def trained() -> TrainConfig:
+def trained(hydra_reads_conf: None) -> TrainConfig:
     return checked(TrainConfig, composed("train"))
 
 
@@ -55,7 +49,7 @@ def test_training_takes_it(chosen: str) -> None:
 
 
 @pytest.mark.parametrize("chosen", [case for case in CHOICES if group_of(case) in REPLACEABLE])
-def test_an_evaluation_takes_it_in_place_of_the_agents_own(chosen: str, trained: TrainConfig) -> None:
+def test_an_evaluation_can_replace_the_agents_choice(chosen: str, trained: TrainConfig) -> None:
     config = checked(EvaluateConfig, composed("evaluate", "run=somewhere", chosen))
     settings = evaluated_settings(trained, config)
     randomizer(settings)
@@ -63,7 +57,7 @@ def test_an_evaluation_takes_it_in_place_of_the_agents_own(chosen: str, trained:
     group = group_of(chosen)
     if group not in ("cart_friction", "pole_friction"):  # whose numbers are then the cart's
         assert getattr(settings, group) == getattr(wanted, group)
-    assert settings.nominal == wanted.nominal
+    assert settings.nominal_cart == wanted.nominal_cart
 
 
 @pytest.mark.parametrize("chosen", [case for case in CHOICES if group_of(case) == "finetuning"])
@@ -132,6 +126,6 @@ def test_an_experiment_holds_only_differences(experiment: str) -> None:
     assert not [name for name, value in leaves(content) if before[name] == value]
 
 
-def test_every_file_says_what_it_is() -> None:
+def test_every_file_starts_with_a_description() -> None:
     for path in CONF.rglob("*.yaml"):
         assert path.read_text().lstrip().startswith("#"), path

@@ -1,6 +1,6 @@
-"""experiment=thesis_balance and thesis_swingup are what the thesis says, each number with its source.
+"""experiment=thesis_balance and thesis_swingup match the thesis; each number has its source.
 
-Where the thesis is silent the number is ours; it is listed too, so that none of the settings is overlooked.
+If the thesis gives no value, ours is listed as "silent", so that no setting is overlooked.
 """
 
 import math
@@ -8,14 +8,11 @@ from collections.abc import Iterator, Mapping
 from functools import cache
 from typing import Any
 
-import hydra
 import pytest
-from hydra.core.global_hydra import GlobalHydra
 
-from cartpole_rl.checking import checked
 from cartpole_rl.choices import conf_folder
-from cartpole_rl.commands.composition import as_mapping
 from cartpole_rl.workflows.config import TrainConfig
+from cartpole_rl.workflows.settings import load_settings
 
 SILENT = "silent"
 UNREAD = "not read with these settings"
@@ -159,17 +156,10 @@ EXPECTED = {
 }
 
 
-@pytest.fixture(autouse=True, scope="module")
-def composer() -> Iterator[None]:
-    GlobalHydra.instance().clear()
-    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(conf_folder())):
-        yield
-
-
 @cache
 def settings(experiment: str) -> dict[str, Any]:
     """Each setting of an experiment by its whole name."""
-    config = checked(TrainConfig, as_mapping(hydra.compose("train", [f"experiment={experiment}"])))
+    config = load_settings(TrainConfig, {"experiment": experiment})
     return dict(leaves(config.model_dump(mode="json", exclude=OF_THE_RUN)))
 
 
@@ -196,7 +186,7 @@ def test_no_setting_is_overlooked(experiment: str) -> None:
 
 
 @pytest.mark.parametrize("experiment", EXPECTED)
-def test_a_source_stands_beside_each_number_of_the_file(experiment: str) -> None:
+def test_each_number_in_the_file_has_a_source(experiment: str) -> None:
     lines = (conf_folder() / f"experiment/{experiment}.yaml").read_text().splitlines()
     for line in lines[lines.index("defaults:") + 1 :]:
         if not line.rstrip().endswith(":"):

@@ -12,8 +12,8 @@ pytest.importorskip("mujoco")
 
 from cartpole_rl.choices import choice
 from cartpole_rl.emulator.device import CartDevice
+from cartpole_rl.emulator.encoders import CART_METRES
 from cartpole_rl.emulator.firmware import SOFT_LIMIT
-from cartpole_rl.emulator.homing import CART_METRES
 from cartpole_rl.emulator.motor import Motor
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.wire import Flags, Home, Message, SetMotor, Start, State, decode_frame, encode_frame
@@ -135,8 +135,8 @@ def driven(name: str | None) -> list[tuple[int, int]]:
     return counts
 
 
-def test_the_same_cart_moves_alike() -> None:
-    """Without this the next test would prove nothing."""
+def test_equal_carts_move_equally() -> None:
+    """The control for the next test."""
     assert driven.__wrapped__(None) == driven(None)
 
 
@@ -146,7 +146,7 @@ def test_each_number_that_is_off_changes_the_motion(name: str) -> None:
 
 
 @pytest.mark.parametrize("side", [-1, 1])
-def test_the_dead_bands_show_in_the_force(side: int) -> None:
+def test_the_dead_bands_affect_the_force(side: int) -> None:
     """Inside the dead-band the force is 0 although the curve gives one; outside it is that of the page."""
     settings = EmulatorSettings()
     edge = int(settings.deadband_right if side > 0 else settings.deadband_left)

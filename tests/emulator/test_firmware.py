@@ -170,7 +170,7 @@ def test_watchdog_stops_the_motor_after_three_periods_and_a_command_revives_it(b
     assert not flags & Flags.WATCHDOG
 
 
-def test_watchdog_is_not_fed_by_other_or_refused_frames(bench):
+def test_other_or_refused_frames_do_not_reset_the_watchdog(bench):
     bench.send(SetMotor(100))
     for message in (Hello(), SetMotor(300), Start()):
         bench.send(message)
@@ -242,14 +242,14 @@ def test_stall_is_a_hard_push_that_moves_nothing(bench):
         (([255] * 20 + [0] * 2) * 4, [0] * 88),  # short pushes
     ],
 )
-def test_less_than_that_is_no_stall(bench, motors, counts):
+def test_a_weaker_or_shorter_push_is_not_a_stall(bench, motors, counts):
     assert push(bench, motors, counts).fault == 0
 
 
 @pytest.mark.parametrize(
     ("counts", "fault"), [((5_000, 0), Fault.CART_ENCODER), ((0, 2_000), Fault.POLE_ENCODER)]
 )
-def test_a_count_that_jumps_is_a_fault_and_loses_the_zeros(bench, counts, fault):
+def test_a_count_that_jumps_is_a_fault_and_invalidates_the_zeros(bench, counts, fault):
     bench.tick(0, 0)
     state, flags = bench.tick(*counts)
     assert state.fault == fault

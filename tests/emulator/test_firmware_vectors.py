@@ -12,7 +12,7 @@ PATH = Path(__file__).parents[1] / "wire" / "vectors.json"
 VECTORS = json.loads(PATH.read_text(encoding="utf-8"))
 
 
-def test_a_booted_cart_answers_as_the_vectors_say():
+def test_a_booted_cart_answers_according_to_the_vectors():
     firmware, splitter = Firmware(lambda: 0), FrameSplitter()
     for vector in VECTORS["dialogue"]:
         runs = splitter.feed(bytes.fromhex(vector["send"]))

@@ -9,7 +9,7 @@ import pytest
 import torch
 from tensordict import TensorDictBase
 
-from cartpole_rl.envs.make import CartPoleEnv
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.randomization.ranges import Range
 from cartpole_rl.tasks.settings import Start, StartSettings
@@ -50,7 +50,7 @@ def course(
     return run
 
 
-def test_is_the_plain_one(course: Callable[[bool], list[TensorDictBase]]) -> None:
+def test_equals_the_plain_environment(course: Callable[[bool], list[TensorDictBase]]) -> None:
     plain, compiled = (torch.stack(course(compiled)) for compiled in (False, True))
     assert set(plain.keys(True, True)) == set(compiled.keys(True, True))
     for key in plain.keys(True, True):
@@ -67,7 +67,7 @@ def test_is_the_plain_one(course: Callable[[bool], list[TensorDictBase]]) -> Non
         )
 
 
-def test_what_it_gave_out_stays_as_it_was(course: Callable[[bool], list[TensorDictBase]]) -> None:
+def test_earlier_results_are_not_overwritten(course: Callable[[bool], list[TensorDictBase]]) -> None:
     """No step writes into the tensors of another."""
     taken = course(True)
     for earlier, later in pairwise(taken):

@@ -19,7 +19,7 @@ from cartpole_rl.registration import ENVIRONMENTS, register
 STEPS = 520  # longer than an episode may be
 
 
-def test_importing_the_package_registers_and_again_changes_nothing() -> None:
+def test_importing_registers_once() -> None:
     known = {name: gymnasium.registry[name] for name in ENVIRONMENTS}
     register()
     assert {name: gymnasium.registry[name] for name in ENVIRONMENTS} == known
@@ -38,7 +38,7 @@ def test_importing_the_package_registers_and_again_changes_nothing() -> None:
     ],
 )
 def test_the_order_of_imports_does_not_matter(imports: str) -> None:
-    """Looking whether Gymnasium is there, as TorchRL does, is no import of it."""
+    """Checking whether Gymnasium is installed, as TorchRL does, does not import it."""
     known = f"import sys; {imports}; print(sorted(name for name in gymnasium.registry if 'cartpole' in name))"
     done = subprocess.run([sys.executable, "-c", known], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
@@ -58,7 +58,7 @@ def course(env: VectorEnv, seed: int) -> Iterator[tuple]:
 
 
 @pytest.mark.parametrize("name", ENVIRONMENTS)
-def test_gymnasiums_checker_is_content(name: str) -> None:
+def test_passes_gymnasiums_checker(name: str) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warnings.filterwarnings("ignore", message=".*infinity.*")  # a measured state has no bounds
@@ -67,7 +67,7 @@ def test_gymnasiums_checker_is_content(name: str) -> None:
 
 
 @pytest.mark.parametrize(("name", "actions", "limit"), [("SwingUp", 9, None), ("Balance", 3, np.radians(12))])
-def test_the_tasks_are_conf_s(name: str, actions: int, limit: float | None) -> None:
+def test_the_tasks_are_those_of_conf(name: str, actions: int, limit: float | None) -> None:
     env = gymnasium.make(f"cartpole_rl/{name}-v0").unwrapped
     assert env.action_space.n == actions
     assert env.env.hardware.task.angle_limit == pytest.approx(limit)
@@ -75,7 +75,7 @@ def test_the_tasks_are_conf_s(name: str, actions: int, limit: float | None) -> N
     assert env.env.hardware.task.x_max == pytest.approx(env.env.plant.parameters.track_half_length.item())
 
 
-def test_an_episode_is_cut_off_after_ten_seconds() -> None:
+def test_an_episode_is_truncated_after_ten_seconds() -> None:
     env = gymnasium.make("cartpole_rl/SwingUp-v0")
     env.reset(seed=0)
     ends = [env.step(4)[2:4] for _ in range(500)]  # the middle action: no motor
@@ -98,13 +98,13 @@ class TestVector:
         assert (first == again).all()
         assert (first != other).any()
 
-    def test_leaves_torchs_own_random_numbers_alone(self, name: str) -> None:
+    def test_does_not_touch_torchs_global_generator(self, name: str) -> None:
         env = vector(name)
         before = torch.random.get_rng_state()
         env.reset(seed=3)
         assert torch.equal(torch.random.get_rng_state(), before)
 
-    def test_an_ended_episode_shows_its_end_and_begins_anew(self, name: str) -> None:
+    def test_an_ended_episode_reports_its_final_observation_and_restarts(self, name: str) -> None:
         env = vector(name)
         assert env.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
         ends = 0
@@ -119,7 +119,7 @@ class TestVector:
                 ends += 1
         assert ends >= 8
 
-    def test_one_of_many_is_the_one_alone(self, name: str) -> None:
+    def test_a_cart_in_a_batch_equals_a_single_cart(self, name: str) -> None:
         alone, batch = gymnasium.make(name), vector(name, carts=1)
         first = alone.reset(seed=5)[0], batch.reset(seed=5)[0][0]
         assert (first[0] == first[1]).all()

@@ -11,15 +11,14 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import check_env_specs
 
 from cartpole_rl.emulator.settings import EmulatorSettings
-from cartpole_rl.envs.make import CartPoleEnv
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.plants.emulated import emulated_plant
 from cartpole_rl.plants.serial.plant import SerialPlant
 from cartpole_rl.plants.simulated import SimulatedPlant
-from cartpole_rl.plants.specs import Plant
+from cartpole_rl.plants.specs import Plant, Report
 
 MakePlant = Callable[..., SimulatedPlant]
 MakeEnvironment = Callable[..., CartPoleEnv]
-FRAME = ("counts", "dt", "motor_applied", "terminated", "truncated")
 SEEN = ("state", "past", "observation", "reward", "score", "score_upright", "step_count", "done")
 STEPS = 40
 
@@ -41,7 +40,7 @@ def over_simulated(make_plant: MakePlant, make_environment: MakeEnvironment) -> 
 
 
 class RecordedPlant(Plant):
-    """Carts that say what a recording says, each the same."""
+    """Carts that all report a given recording."""
 
     def __init__(self, frames: TensorDictBase, carts: int, length: float) -> None:
         super().__init__(carts)
@@ -53,15 +52,15 @@ class RecordedPlant(Plant):
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDict:
         self._next = 0
-        return self.frame(*self._read())
+        return self.frame(self._read())
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        return self.step_frame(*self._read())
+        return self.step_frame(self._read())
 
-    def _read(self) -> list[Tensor]:
+    def _read(self) -> Report:
         frame = self._frames[self._next]
         self._next += 1
-        return [frame[key].expand(self.carts, -1).clone() for key in FRAME]
+        return Report(*(frame[key].expand(self.carts, -1).clone() for key in Report._fields))
 
     def _set_seed(self, seed: int | None) -> None: ...
 
@@ -81,7 +80,7 @@ def specs(env: EnvBase) -> tuple:
     return env.input_spec, env.output_spec
 
 
-def test_both_plants_keep_the_same_contract(serial: SerialPlant, make_plant: MakePlant) -> None:
+def test_both_plants_have_the_same_specs(serial: SerialPlant, make_plant: MakePlant) -> None:
     assert specs(serial) == specs(make_plant())
 
 
@@ -99,11 +98,11 @@ def test_specs_hold(over_serial: CartPoleEnv, over_simulated: CartPoleEnv) -> No
 def test_the_same_counts_give_the_same_observations(
     request: pytest.FixtureRequest, make_environment: MakeEnvironment, source: str, carts: int
 ) -> None:
-    """What either cart said, said again by a third plant, is seen alike, alone and in a batch."""
+    """Counts of either cart, replayed by a third plant, give the same observations, alone and in a batch."""
     env: CartPoleEnv = request.getfixturevalue(source)
     actions = torch.randint(3, (STEPS,), generator=torch.Generator().manual_seed(0))
     original = drive(env, actions)
-    recorded = torch.stack([frame.select(*FRAME) for frame in original])
+    recorded = torch.stack([frame.select(*Report._fields) for frame in original])
     plant = RecordedPlant(recorded[:, 0], carts, env.plant.pole_length.item())
     again = drive(make_environment(plant, pole_length=True, past_motors=2, past_velocities=2), actions)
     for first, second in zip(original, again, strict=True):

@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from cartpole_rl.envs.make import CartPoleEnv
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.physics.models import CartFriction, Models, PoleFriction
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.simulated import SimulatedPlant
@@ -28,7 +28,7 @@ UPRIGHT = StartSettings(
 
 @dataclass(frozen=True)
 class Case:
-    """Between which bounds a parameter is drawn, and where it acts."""
+    """The bounds of a parameter, and the environment in which it acts."""
 
     low: float
     high: float
@@ -69,7 +69,7 @@ CHANCE = {
 }
 
 
-def test_no_parameter_is_forgotten() -> None:
+def test_every_parameter_is_tested() -> None:
     assert {*CASES, *CHANCE, "track_half_length"} == set(CartParameters.names())
 
 
@@ -114,13 +114,13 @@ def test_another_value_ends_in_another_state(environment: Callable[..., CartPole
 
 
 def test_equal_values_end_in_equal_states(environment: Callable[..., CartPoleEnv]) -> None:
-    """What the test above would miss: a difference that comes from elsewhere."""
+    """Control for the test above: equal parameters cause no difference."""
     for _, counts in two_episodes(environment("cart_mass", Case(0.7, 0.7))):
         assert (counts == counts[:, :1]).all()
 
 
 @pytest.mark.parametrize("name", CHANCE)
-def test_more_chance_spreads_wider(environment: Callable[..., CartPoleEnv], name: str) -> None:
+def test_larger_noise_spreads_wider(environment: Callable[..., CartPoleEnv], name: str) -> None:
     """The half of the carts with larger values strays half as far again, or more, from the middle course."""
     for drawn, counts in two_episodes(environment(name, CHANCE[name], carts=256)):
         large = getattr(drawn, name) > (CHANCE[name].low + CHANCE[name].high) / 2

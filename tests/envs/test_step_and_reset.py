@@ -8,8 +8,8 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase, TransformedEnv
 
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.hardware import HardwareTransform
-from cartpole_rl.envs.make import CartPoleEnv
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.randomization.ranges import Range
@@ -35,7 +35,7 @@ def environments(
     make_environment: Callable[..., CartPoleEnv],
     both_poles: PoleSettings,
 ) -> tuple[CartPoleEnv, TransformedEnv]:
-    """Ours, and the same parts under TorchRL's own."""
+    """Our environment, and the same parts in TorchRL's TransformedEnv."""
 
     def plant() -> SimulatedPlant:
         return make_plant(CARTS, poles=both_poles, ranges=RANGES, start=ANYWHERE, seed=7)
@@ -47,7 +47,7 @@ def environments(
 
 
 def course(env: EnvBase) -> list[tuple[TensorDictBase, TensorDictBase]]:
-    """What each step returns, under actions that drive the carts about."""
+    """Return the result of each step under actions that move the carts."""
     generator = torch.Generator().manual_seed(0)
     present, course = env.reset(), []
     for _ in range(STEPS):
@@ -66,7 +66,7 @@ def assert_equal(ours: TensorDictBase, theirs: TensorDictBase, but: tuple[str, .
             assert torch.equal(ours[key], theirs[key]), key
 
 
-def test_is_that_of_torchrl(environments: tuple[CartPoleEnv, TransformedEnv]) -> None:
+def test_equals_torchrls_step(environments: tuple[CartPoleEnv, TransformedEnv]) -> None:
     endings: dict[str, Any] = {"terminated": [], "truncated": []}
     for ours, theirs in zip(*(course(env) for env in environments), strict=True):
         assert_equal(ours[0], theirs[0])
@@ -78,7 +78,7 @@ def test_is_that_of_torchrl(environments: tuple[CartPoleEnv, TransformedEnv]) ->
         assert any(0 < count < CARTS for count in rows)
 
 
-def test_carries_on_what_a_policy_wrote(environments: tuple[CartPoleEnv, TransformedEnv]) -> None:
+def test_keeps_the_keys_that_a_policy_wrote(environments: tuple[CartPoleEnv, TransformedEnv]) -> None:
     env = environments[0]
     present = env.reset().set("action", torch.ones(CARTS, dtype=torch.int64))
     present["memory"] = torch.arange(CARTS)

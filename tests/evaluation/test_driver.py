@@ -1,36 +1,33 @@
-"""The process that drives: what a person is asked, what it refuses, and how it ends, on a scripted cart."""
+"""The driving process on a scripted cart: confirmation, refusals and exit."""
 
 import os
 import signal
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import pytest
 import torch
+from serial_peer import CartPeer
 from torch import nn
 
 from cartpole_rl.agents.dqn import QAgent
 from cartpole_rl.agents.settings import AgentSettings
 from cartpole_rl.choices import choice
-from cartpole_rl.envs.make import CartPoleEnv, make_env
-from cartpole_rl.envs.settings import ObservationSettings, RewardSettings, TaskSettings
+from cartpole_rl.envs.build import make_env
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
+from cartpole_rl.envs.settings import ObservationSettings
 from cartpole_rl.errors import FaultError, LinkError
-from cartpole_rl.evaluation.driver import Drive, Driver
+from cartpole_rl.evaluation.driver import Driver, DriveRequest
 from cartpole_rl.evaluation.driving_policy import as_weights
 from cartpole_rl.plants.serial.errors import NotReadyError
 from cartpole_rl.plants.serial.faults import Confirm
 from cartpole_rl.plants.serial.plant import SerialPlant
 from cartpole_rl.plants.serial.settings import SerialSettings
-from cartpole_rl.tasks.actions import ActionSettings
+from cartpole_rl.tasks.settings import ActionSettings, RewardSettings, TaskSettings
 from cartpole_rl.wire import ClearFault, Fault, Message, SetMotor, Stop
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "plants"))
-from serial_peer import CartPeer
 
 LONG = 100_000  # periods
 
@@ -88,8 +85,8 @@ def wait_for(condition: Callable[[], bool]) -> None:
 def test_a_person_is_asked_and_a_hangup_stops_the_motor(
     peer: Faulty, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """First the person says no, then yes; the terminal is closed while the cart is driven."""
-    drive, asked = Drive(as_weights(network()), 0.0, 0), []
+    """The person declines, then confirms; the terminal is closed while the cart is driven."""
+    drive, asked = DriveRequest(as_weights(network()), 0.0, 0), []
 
     def disagree(text: str) -> bool:
         asked.append(text)
@@ -120,7 +117,7 @@ def test_a_person_is_asked_and_a_hangup_stops_the_motor(
     assert peer.state.motor_applied == 0
 
 
-def test_a_refusal_keeps_its_words(peer: Faulty) -> None:
+def test_a_refusal_keeps_its_message(peer: Faulty) -> None:
     peer.info = replace(peer.info, motor_limit=100)
     with pytest.raises(NotReadyError, match="INFO says motor limit 100, not 255") as refused:
         driver(peer, lambda text: True)

@@ -23,7 +23,7 @@ def network(seed: int, **changes: object) -> nn.Module:
 @pytest.mark.parametrize(
     "changes", [{}, {"mirrored": True}, {"recurrent": 4}, {"recurrent": 4, "mirrored": True}]
 )
-def test_it_acts_as_the_network_whose_weights_it_was_given(compiled: bool, changes: dict) -> None:
+def test_it_acts_like_the_network_whose_weights_it_loaded(compiled: bool, changes: dict) -> None:
     policy = DrivingPolicy(network(0, **changes), compiled)
     observations = torch.randn(200, 1, 4, generator=torch.Generator().manual_seed(5))
     for seed in (0, 1):  # the second has other weights than the one that was compiled
@@ -44,7 +44,7 @@ def test_weights_are_copies() -> None:
 
 
 @pytest.mark.parametrize("compiled", [False, True])
-def test_it_follows_its_network_until_others_are_loaded(compiled: bool) -> None:
+def test_it_shares_weights_until_others_are_loaded(compiled: bool) -> None:
     learning, present = network(0), TensorDict({"observation": torch.randn(50, 4)}, batch_size=[50])
     policy = DrivingPolicy(learning, compiled)
     policy(present)

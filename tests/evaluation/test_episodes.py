@@ -8,7 +8,7 @@ import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
 
-from cartpole_rl.envs.make import CartPoleEnv
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.evaluation.episodes import run_episodes
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.tasks.settings import Start, StartSettings
@@ -25,7 +25,7 @@ def scattered(angle: Start = Start.HANGING, **spreads: float) -> StartSettings:
     return StartSettings(angle=angle, **{**none, **spreads})
 
 
-def test_as_many_as_asked_whatever_the_batch(make_plant: Callable, make_environment: Callable) -> None:
+def test_the_batch_does_not_change_the_count(make_plant: Callable, make_environment: Callable) -> None:
     env = make_environment(make_plant(4), time_limit=3)
     for count in (1, 4, 6):
         assert len(list(run_episodes(env, always(NONE), count))) == count
@@ -73,9 +73,7 @@ def test_each_row_is_cut_at_its_own_first_end(make_plant: Callable, make_environ
     assert all((np.abs(episode.x[:-1]) < 0.38 + 1e-4).all() for episode in episodes)
 
 
-def test_short_episodes_do_not_come_round_more_often(
-    make_plant: Callable, make_environment: Callable
-) -> None:
+def test_short_episodes_are_not_over_represented(make_plant: Callable, make_environment: Callable) -> None:
     """The mean length of 64 episodes on 8 carts is that of 64 carts with an episode each."""
     start = scattered(position_spread=0.3)
     means = []
@@ -118,7 +116,7 @@ def test_the_angle_of_a_pole_that_turns_over_is_not_wrapped(
 def test_an_action_value_that_is_not_finite_stops_the_motor_and_ends_the_episode(
     make_plant: Callable, make_environment: Callable, unsound: float
 ) -> None:
-    """On one cart of three, in the fifth period. Of values that are not numbers the first is the largest."""
+    """On one cart of three, in the fifth period. The argmax of NaN values is the first action."""
     env, periods = make_environment(make_plant(3), motors=(-200, 0, 200), time_limit=20), iter(range(100))
 
     def policy(seen: TensorDictBase) -> TensorDictBase:

@@ -1,4 +1,4 @@
-"""Metrics by hand on episodes written down here, and intervals that are what they say."""
+"""Metrics of hand-made episodes, and the coverage of the intervals."""
 
 import math
 
@@ -41,7 +41,7 @@ def test_sums_and_steps() -> None:
     assert metrics["ended_by"] == "time"
 
 
-def test_what_is_measured_over_the_upright_part_is_null_without_one() -> None:
+def test_metrics_over_the_upright_part_are_none_without_one() -> None:
     metrics = episode_metrics(episode([180, 170, 160, 150]), 0.4)
     assert metrics["upright_fraction"] == 0
     assert metrics["time_to_upright_s"] is None
@@ -57,7 +57,7 @@ def test_rms_is_over_the_upright_part_alone() -> None:
     assert metrics["rms_position_m"] == pytest.approx(math.sqrt((0.01 + 0.04) / 2))
 
 
-def test_time_to_upright_is_when_the_pole_came_to_stay() -> None:
+def test_time_to_upright_is_the_start_of_lasting_balance() -> None:
     passing = [180.0] * 10 + [0.0] * 20 + [90.0] * 10  # upright at 0.2 s, for 0.4 s
     metrics = episode_metrics(episode(passing + [1.0] * 60), 0.4)
     assert metrics["time_to_upright_s"] == pytest.approx(40 * PERIOD)
@@ -90,7 +90,7 @@ def test_values_equal_but_for_rounding_have_a_finite_interval(recwarn: pytest.Wa
     assert not recwarn.list
 
 
-def test_an_interval_holds_the_true_mean_about_as_often_as_it_says() -> None:
+def test_interval_coverage_is_about_nominal() -> None:
     """Of 200 samples of twenty skewed values, some 190 intervals; BCa is known to fall short a little."""
     random = np.random.default_rng(0)
     hits = 0
@@ -107,7 +107,7 @@ def test_an_interval_is_the_same_each_time_and_narrows_with_more_values() -> Non
     assert many[1] - many[0] < 0.5 * (few[1] - few[0])
 
 
-def test_the_summary_counts_endings_and_leaves_out_what_an_episode_has_not() -> None:
+def test_the_summary_counts_endings_and_skips_missing_metrics() -> None:
     upright, hanging = episode([180] + [0.0] * 60), episode([180.0] * 3)
     summary = summarize([episode_metrics(each, 0.4) for each in (upright, hanging, hanging)])
     assert summary["ended_by"] == {"time": 3}

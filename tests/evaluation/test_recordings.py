@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from cartpole_rl.envs.make import CartPoleEnv
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.errors import RecordingError
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.evaluation.recordings import COLUMNS, read_recording, write_recording
@@ -38,7 +38,7 @@ def with_cell(text: str, row: int, column: str, value: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def test_a_recording_comes_back_as_it_was(tmp_path: Path, episode: Episode) -> None:
+def test_a_recording_round_trips(tmp_path: Path, episode: Episode) -> None:
     write_recording(tmp_path / "deep" / "one.csv", episode)
     again = read_recording(tmp_path / "deep" / "one.csv")
     assert again.origin is None  # no column of it; cartpole-record writes it into the heading

@@ -1,4 +1,4 @@
-"""A residual learned from recordings: it finds what the physics lacks, and leaves right physics alone."""
+"""A residual learned from recordings: it finds what the physics lacks, and is zero if nothing does."""
 
 from collections.abc import Callable, Mapping
 from functools import cache, partial
@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import torch
 
-from cartpole_rl.envs.make import CartPoleEnv
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.identification.ensemble import Ensemble
-from cartpole_rl.identification.held_out import LEAD, errors_at, predict_held_out
 from cartpole_rl.identification.matching import match_initial_states
+from cartpole_rl.identification.prediction import errors_at, predict
 from cartpole_rl.identification.rollout import Dynamics
 from cartpole_rl.identification.settings import EnsembleSettings
 from cartpole_rl.identification.windows import Windows, cut_windows
@@ -34,6 +34,7 @@ START = StartSettings(
 TRACK = {"track_half_length": 2.0}
 RIPPLE = 0.6  # N
 PITCH = 0.08  # m
+LEAD = 10  # periods
 SETTINGS = EnsembleSettings(
     members=2,
     hidden=6,
@@ -49,7 +50,7 @@ MakeEnvironment = Callable[..., CartPoleEnv]
 
 
 def rippled() -> Residual:
-    """One member that adds a force ripple along the track, and no more."""
+    """A residual of one member that adds only a force ripple along the track."""
     places = SPACING * (torch.arange(PLACES) - PLACES // 2)
     zeros = Residual.untrained(1, 6, torch.Generator().manual_seed(0))
     return zeros._replace(places=(RIPPLE / UNITS[0] * torch.sin(2 * torch.pi * places / PITCH)).unsqueeze(0))
@@ -95,7 +96,7 @@ def record(
         else:
             plant = SimulatedPlant(8, randomizer, START, STEP, seed=1)
         recorded = shaken(make_environment(plant, MOTORS, time_limit=300), seed=0)
-        held_out = cut_windows(recorded[6:], PERIOD, periods=LEAD + 50)
+        held_out = cut_windows(recorded[6:], PERIOD, LEAD * PERIOD + 1.0)._replace(lead=LEAD)
         return cut_windows(recorded[:6], PERIOD, most=40), held_out
 
     return build
@@ -104,7 +105,8 @@ def record(
 def judged(
     windows: Windows, dynamics: Dynamics, residual: Residual | None, moment: float = 0.5
 ) -> dict[str, float]:
-    (errors,) = errors_at(predict_held_out(windows, dynamics, residual), [moment], PERIOD)
+    error, spread = predict(windows, dynamics, residual)[1:]
+    (errors,) = errors_at(error, [moment], PERIOD, spread)
     return errors
 
 
@@ -125,7 +127,7 @@ def test_an_effect_that_the_physics_lacks_is_learned(
     assert np.corrcoef(mean, rippled().places[0, near].numpy())[0, 1] > 0.5
 
 
-def test_right_physics_is_left_alone(
+def test_complete_physics_gets_no_residual(
     record: Callable[[bool], tuple[Windows, Windows]], dynamics: Dynamics
 ) -> None:
     windows, held_out = record(False)
@@ -136,7 +138,7 @@ def test_right_physics_is_left_alone(
         assert learned[key] < 1.2 * physics[key]
 
 
-def test_the_true_model_knows_the_rest(
+def test_the_true_model_predicts_held_out_motion(
     record: Callable[[bool], tuple[Windows, Windows]], dynamics: Dynamics
 ) -> None:
     _, held_out = record(True)
@@ -150,15 +152,15 @@ def test_nothing_after_the_lead_affects_an_initial_state(
     _, windows = record(False)
     changed = windows.positions.copy()
     changed[LEAD + 1 :] += 1000
-    before = predict_held_out(windows, dynamics, None).error
-    after = predict_held_out(windows._replace(positions=changed), dynamics, None).error
+    before = predict(windows, dynamics).error
+    after = predict(windows._replace(positions=changed), dynamics).error
     assert np.array_equal(before[0], after[0])
 
 
 def test_initial_states_are_found(
     record: Callable[[bool], tuple[Windows, Windows]], dynamics: Dynamics
 ) -> None:
-    """Those of a cart whose motion they were, from encoder counts alone."""
+    """The estimates from encoder counts are the true initial states."""
     windows, _ = record(False)
     positions, motors = torch.from_numpy(windows.positions), torch.from_numpy(windows.motors)
     unscaled = torch.ones(2, dtype=torch.float64)

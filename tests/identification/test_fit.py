@@ -5,14 +5,16 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDictBase
 
-from cartpole_rl.envs.make import CartPoleEnv
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.errors import RecordingError
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.identification.fit import fit_cart
-from cartpole_rl.identification.rollout import rollout
+from cartpole_rl.identification.prediction import predict
+from cartpole_rl.identification.rollout import Dynamics, rollout
 from cartpole_rl.identification.unknowns import limits, parameters_at, unknowns_of
-from cartpole_rl.identification.windows import HISTORY, cut_windows
+from cartpole_rl.identification.windows import WINDOW, cut_windows, history_periods
 from cartpole_rl.physics.models import CartFriction, Models
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.simulated import SimulatedPlant
@@ -64,7 +66,7 @@ def nominal(ip02: dict[str, float], medium: PoleSettings) -> dict[str, float]:
 def test_the_true_cart_predicts_every_count(episodes: list[Episode], nominal: dict[str, float]) -> None:
     """From the true initial state at rest, to the rounding of the encoders."""
     first = episodes[0]
-    motors = np.concatenate((np.zeros(HISTORY), first.motor[:50]))
+    motors = np.concatenate((np.zeros(history_periods(PERIOD)), first.motor[:50]))
     values = {**nominal, **TRUTH}
     table = torch.tensor([[values[name]] for name in CartParameters.names()], dtype=torch.float64)
     motion = torch.tensor([[0.0], [0.0], [np.pi], [0.0]], dtype=torch.float64)
@@ -102,7 +104,7 @@ def test_a_fit_finds_another_pole(
     assert found["pole_com"] == pytest.approx(large.nominal.pole_com, rel=0.05)
 
 
-def test_draws_stay_what_carts_can_be(episodes: list[Episode], nominal: dict[str, float]) -> None:
+def test_draws_are_physically_possible(episodes: list[Episode], nominal: dict[str, float]) -> None:
     fit = fit_cart(cut_windows(episodes, PERIOD, most=10), nominal, STEP, PERIOD, iterations=3)
     drawn = dict(
         zip(CartParameters.names(), fit.draw(500, np.random.default_rng(0), widen=20.0), strict=True)
@@ -112,7 +114,7 @@ def test_draws_stay_what_carts_can_be(episodes: list[Episode], nominal: dict[str
     assert drawn["cart_viscous"].std() > 0
 
 
-def test_limits_are_where_parameters_end(nominal: dict[str, float]) -> None:
+def test_limits_match_the_parameter_bounds(nominal: dict[str, float]) -> None:
     unknowns = unknowns_of(STEP)
     low, _ = limits(unknowns, nominal)
     at_low = np.where(np.isfinite(low), low, 0.0)[:, None]
@@ -130,13 +132,36 @@ class TestWindows:
         broken = Episode(**{**vars(episodes[0]), "time": gap})
         assert cut_windows([broken], PERIOD).number < whole.number
 
-    def test_another_rate_is_named(self, episodes: list[Episode]) -> None:
-        with pytest.raises(RecordingError, match=r"every 20\.0 ms, and not every 10\.0 ms"):
+    def test_another_rate_is_refused(self, episodes: list[Episode]) -> None:
+        with pytest.raises(RecordingError, match=r"every 20\.0 ms, not every 10\.0 ms"):
             cut_windows(episodes, 0.01)
 
-    def test_too_short_is_named(self, episodes: list[Episode]) -> None:
+    def test_too_short_recordings_are_refused(self, episodes: list[Episode]) -> None:
         with pytest.raises(RecordingError, match="record longer"):
-            cut_windows(episodes, PERIOD, periods=600)
+            cut_windows(episodes, PERIOD, seconds=12.0)
 
     def test_windows_are_thinned_evenly(self, episodes: list[Episode]) -> None:
         assert cut_windows(episodes, PERIOD, most=7).number == 7
+
+    def test_their_length_is_in_seconds(
+        self, make_plant: MakePlant, make_environment: MakeEnvironment, nominal: dict[str, float]
+    ) -> None:
+        """At a control period of 5 ms, motor values 50 ms ago still act on the cart."""
+        period, latency = 0.005, 0.05
+        random = torch.Generator().manual_seed(0)
+        held: list[torch.Tensor] = []
+
+        def shake(present: TensorDictBase) -> TensorDictBase:
+            again = held and len(held) % 40
+            held.append(held[-1] if again else torch.randint(len(MOTORS), (2,), generator=random))
+            return present.set("action", held[-1])
+
+        cart = {**TRUTH, "latency": latency}
+        plant = make_plant(2, cart=cart, models=STEP, period=period, substeps=4)
+        recorded = run_batch(make_environment(plant, MOTORS, time_limit=800), shake)
+        windows = cut_windows(recorded, period)
+        assert windows.periods * period == pytest.approx(WINDOW)
+        assert len(windows.motors) == windows.periods + history_periods(period)
+        assert history_periods(period) * period >= latency
+        dynamics = Dynamics.of({**nominal, **cart}, STEP, period, 4)
+        assert np.abs(predict(windows._replace(lead=20), dynamics).error[-1, 0]).max() < 1e-3

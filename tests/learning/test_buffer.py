@@ -61,7 +61,7 @@ def test_the_error_of_the_loss_becomes_the_priority() -> None:
     assert (drawn == 2).float().mean() > 0.98  # the others keep priority_eps
 
 
-def test_uniform_replay_samples_all_alike() -> None:
+def test_uniform_replay_samples_uniformly() -> None:
     torch.manual_seed(0)
     replay = make_buffer(BufferSettings(**UNIFORM), batch_size=4)
     replay.extend(numbered(4))
@@ -182,7 +182,7 @@ def test_n_step_transitions_are_those_of_a_loop_over_rows(n: int, periods: int) 
 
 @pytest.mark.parametrize("terminated", [True, False])
 def test_a_return_ends_where_the_episode_ends(terminated: bool) -> None:
-    """Rewards 1, 10, 100, 1000, the second step ends the episode: the third begins another one."""
+    """Rewards 1, 10, 100, 1000, the second step ends the episode; the third starts the next."""
     chunk = TensorDict(
         {
             "observation": torch.tensor([[[0.0], [1.0], [20.0], [21.0]]]),
@@ -205,7 +205,7 @@ def test_a_return_ends_where_the_episode_ends(terminated: bool) -> None:
 
 
 def collected(returns: NStepReturns, chunk: TensorDict, size: int) -> list[TensorDict]:
-    """What `returns` gives of each part of `chunk`, `size` periods long."""
+    """Return the transitions of `returns` for each part of `chunk`, `size` periods long."""
     return [returns(part) for part in chunk.split(size, 1)]
 
 
@@ -231,7 +231,7 @@ def test_without_carry_returns_end_with_their_chunk() -> None:
     assert (torch.cat(collected(NStepReturns(5, 0.9, carry=False), chunk, 8)) == torch.cat(alone)).all()
 
 
-def test_periods_held_back_are_forgotten_at_a_reset() -> None:
+def test_waiting_periods_are_discarded_at_a_reset() -> None:
     returns, chunk = NStepReturns(3, 0.9, carry=True), random_chunk(16, 8, seed=0)
     first = returns(chunk)
     returns.reset()

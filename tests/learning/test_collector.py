@@ -7,7 +7,7 @@ import torch
 from tensordict.nn import TensorDictModule
 from torchrl.collectors import Collector as TorchRLCollector
 
-from cartpole_rl.envs.make import CartPoleEnv
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.learning.collector import COLLECTED, Collector
 from cartpole_rl.randomization.ranges import Range
 from cartpole_rl.tasks.settings import Start, StartSettings
@@ -38,7 +38,7 @@ def test_shapes_and_keys(env: CartPoleEnv) -> None:
     assert set(chunk.keys(True, True)) == set(COLLECTED)
 
 
-def test_each_transition_begins_where_the_last_one_ended(env: CartPoleEnv) -> None:
+def test_each_transition_starts_where_the_last_one_ended(env: CartPoleEnv) -> None:
     chunk = collector(env).collect(3 * LIMIT)
     ended = chunk["next", "done"].squeeze(-1)[:, :-1]
     follows = (chunk["next", "observation"][:, :-1] == chunk["observation"][:, 1:]).all(-1)

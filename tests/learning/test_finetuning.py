@@ -1,4 +1,4 @@
-"""What fine-tuning learns from: a cart's own transitions are what the agent saw while it drove."""
+"""Recorded transitions for fine-tuning equal what the agent observed while driving."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -54,6 +54,32 @@ def drive(make_plant: Callable, make_environment: Callable, observation: dict[st
     return episode, torch.cat(seen)
 
 
+def make_learner(
+    make_plant: Callable,
+    make_environment: Callable,
+    observation: dict[str, Any],
+    cart_share: float,
+    seed: int = 0,
+) -> tuple[Finetuning, QAgent]:
+    """A fine-tuning of a new agent on 16 simulated carts, and the agent."""
+    env = make_environment(make_plant(16), MOTORS, time_limit=40, **observation)
+    observed = env.hardware.observation_settings
+    agent = QAgent(AgentSettings(**choice("agent/dqn")), observed.mirror_signs, len(MOTORS), observed.frames)
+    finetuning = choice("finetuning/gentle") | {"iterations": 3, "cart_share": cart_share}
+    learner = Finetuning(
+        FinetuningSettings(**finetuning),
+        LearningSettings(**LEARNING),
+        BufferSettings(**choice("buffer/uniform") | {"size": 5000}),
+        OptimizerSettings(**choice("optimizer/adam")),
+        agent,
+        env,
+        list,
+        None,
+        seed,
+    )
+    return learner, agent
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_recording_has_what_the_agent_saw_and_tunes_it(
     make_plant: Callable, make_environment: Callable, kind: str
@@ -69,22 +95,7 @@ def test_a_recording_has_what_the_agent_saw_and_tunes_it(
     torch.testing.assert_close(chunk["observation"][0], seen)
     assert all(value.isfinite().all() for value in chunk.values(True, True) if value.is_floating_point())
 
-    env = make_environment(make_plant(16), MOTORS, time_limit=40, **observation)
-    observation = env.hardware.observation_settings
-    agent = QAgent(
-        AgentSettings(**choice("agent/dqn")), observation.mirror_signs, len(MOTORS), observation.frames
-    )
-    learner = Finetuning(
-        FinetuningSettings(**choice("finetuning/gentle") | {"iterations": 3, "cart_share": 0.5}),
-        LearningSettings(**LEARNING),
-        BufferSettings(**choice("buffer/uniform") | {"size": 5000}),
-        OptimizerSettings(**choice("optimizer/adam")),
-        agent,
-        env,
-        list,
-        None,
-        0,
-    )
+    learner, agent = make_learner(make_plant, make_environment, observation, cart_share=0.5)
     learner.add(chunk)
     learner.fill()
     before = {name: weight.clone() for name, weight in agent.named_parameters()}
@@ -94,7 +105,21 @@ def test_a_recording_has_what_the_agent_saw_and_tunes_it(
     assert all(weight.isfinite().all() for weight in after.values())
 
 
-def test_what_nobody_measured_is_not_learned_from(make_plant: Callable, make_environment: Callable) -> None:
+def test_the_seed_chooses_the_recorded_transitions(make_plant: Callable, make_environment: Callable) -> None:
+    episode, _ = drive(make_plant, make_environment, {})
+    env = make_environment
+    chunk = recorded_chunk(episode, lambda plant: env(plant, MOTORS, time_limit=40), MOTORS, None)
+    batches = []
+    for seed in (5, 5, 6):
+        learner, _ = make_learner(make_plant, make_environment, {}, cart_share=1.0, seed=seed)
+        learner.add(chunk)
+        learner.fill()
+        batches.append(learner.sample()["observation"])
+    assert torch.equal(batches[0], batches[1])
+    assert not torch.equal(batches[0], batches[2])
+
+
+def test_unmeasured_transitions_are_left_out(make_plant: Callable, make_environment: Callable) -> None:
     """The last counts are repeated where the link is lost: as if the cart had stopped at once."""
     episode, _ = drive(make_plant, make_environment, {})
     lost = replace(episode, ended_by="link")

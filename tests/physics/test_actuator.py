@@ -1,4 +1,4 @@
-"""From motor value to force: curve, dead-bands, lag and latency."""
+"""The actuator: force curve, dead-bands, lag and latency."""
 
 import math
 from collections.abc import Callable
@@ -58,7 +58,7 @@ class TestForceCurve:
     def test_no_motor_value_no_force(self, make_cart: MakeCart) -> None:
         assert static_force(at(0), make_cart(1, force_offset=1.0), Actuator.FORCE_CURVE).item() == 0
 
-    def test_newtons_hold_whatever_the_cart_has(self, make_cart: MakeCart) -> None:
+    def test_newtons_ignore_the_parameters_of_the_cart(self, make_cart: MakeCart) -> None:
         cart = make_cart(9, force_linear=0.5, force_asymmetry=0.3, deadband_left=200.0)
         torch.testing.assert_close(static_force(LEVELS, cart, Actuator.NEWTONS), NEWTONS)
 
@@ -126,7 +126,7 @@ class TestLatency:
 
     @pytest.mark.parametrize("actuator", Actuator)
     @pytest.mark.parametrize("periods", [0.0, 0.5, 1.0, 1.7])
-    def test_motion_is_that_of_commands_given_so_much_later(
+    def test_latency_equals_later_commands(
         self, make_cart: MakeCart, periods: float, actuator: Actuator
     ) -> None:
         period, substeps, count = 0.02, 10, 40

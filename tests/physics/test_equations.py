@@ -83,7 +83,7 @@ def test_one_explicit_step_is_gymnasiums(make_cart: MakeCart, monkeypatch: pytes
 
 
 class TestAgainstMujoco:
-    """2 s from 50 states that hang, swing, stand and spin, each under a constant force of its own.
+    """2 s from 50 states that hang, swing, stand and spin, each under its own constant force.
 
     Semi-implicit Euler's error falls with the step. With 80 substeps, 0.25 ms, the worst of the 50 is off by
     less than 5 mm and 0.1 rad, half of them by less than 1 mm and 3 mrad. Extrapolated to step 0 the worst
@@ -168,7 +168,7 @@ def test_normal_force_is_newtons_second_law_across_the_track(make_cart: MakeCart
     torch.testing.assert_close(normal_force_ratio(state, theta_ddot, body, terms), normal / weight)
 
 
-def test_a_batch_moves_as_its_carts_alone(make_cart: MakeCart) -> None:
+def test_a_batch_equals_its_carts_simulated_alone(make_cart: MakeCart) -> None:
     count = 16
     mass, coulomb, lag, tilt = draw(count, 0.3, 0.4, 0.01, 0.1, seed=2)
     changes = {

@@ -107,7 +107,7 @@ class TestFormulas:
         torque = pole_torque(at(2.0, -4.0), cart, PoleFriction.EXPONENTIAL_DRAG)
         torch.testing.assert_close(torque, at(-4e-3, 16e-3))
 
-    def test_a_bearing_takes_the_same_at_any_speed_but_the_slowest(self, make_cart: MakeCart) -> None:
+    def test_bearing_friction_is_constant_except_at_low_speed(self, make_cart: MakeCart) -> None:
         cart = make_cart(3, pole_viscous=0.0, pole_drag=0.0, pole_coulomb=1e-3)
         torque = pole_torque(at(0.0, 0.5, -4.0), cart, PoleFriction.BEARING)
         torch.testing.assert_close(torque, at(0.0, -1e-3, 1e-3))
@@ -138,7 +138,7 @@ class TestCart:
     @pytest.mark.parametrize(("model", "breakaway"), [(CartFriction.STEP, 0.5), (CartFriction.STRIBECK, 0.6)])
     @pytest.mark.parametrize("step", [0.02, 0.01, 0.002])
     @pytest.mark.parametrize("side", [1, -1])
-    def test_moves_under_more_than_breakaway_force_alone(
+    def test_moves_only_above_the_breakaway_force(
         self, make_cart: MakeCart, model: CartFriction, breakaway: float, step: float, side: int
     ) -> None:
         cart = make_cart(1, cart_coulomb=0.5, cart_stiction_ratio=1.2)

@@ -42,7 +42,7 @@ def test_fields_share_the_tables_memory_and_cannot_be_set() -> None:
         cart.latency = torch.zeros(3)
 
 
-def test_an_unknown_name_is_answered_with_the_nearest() -> None:
+def test_an_unknown_name_suggests_the_nearest() -> None:
     with pytest.raises(ConfigError, match="'cart_colomb'; did you mean 'cart_coulomb'"):
         check_names(["cart_mass", "cart_colomb"])
 

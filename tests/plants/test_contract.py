@@ -1,4 +1,4 @@
-"""Whatever a cart says, in whatever order: no observation is other than finite, no motor value is unsound.
+"""For any behaviour of a cart: all observations are finite, and all motor values are valid.
 
 Hypothesis scripts the cart: counts, clock, ticks, flags, faults and acknowledgements are arbitrary, and so
 are the values by which the policy chooses. The wire is a real pseudo-terminal.
@@ -61,7 +61,7 @@ values = st.lists(value, min_size=len(MOTORS), max_size=len(MOTORS))
 
 @dataclass
 class Script:
-    """What the cart says and the policy thinks in the periods of an episode."""
+    """The script of an episode: the cart's reports and the policy's action values."""
 
     states: list[dict[str, int | None]]
     values: list[list[float]]
@@ -80,7 +80,7 @@ scripts = st.builds(  # sound states first, so that the rest is said in every pe
 
 
 class ScriptedCart(CartPeer):
-    """Behaves until it is armed, and from then on says what the script has."""
+    """A cart that behaves until it is armed, then reports what the script contains."""
 
     def __init__(self, script: Script) -> None:
         super().__init__()
@@ -126,9 +126,9 @@ class Policy:
 
 @RELAXED
 @given(script=scripts)
-def test_a_serial_cart_that_says_anything(script: Script, make_environment: Callable) -> None:
+def test_a_serial_cart_with_arbitrary_reports(script: Script, make_environment: Callable) -> None:
     with ScriptedCart(script) as peer:
-        plant = SerialPlant(SerialSettings(port=peer.port, **QUICK))
+        plant = SerialPlant(SerialSettings(port=peer.port).model_copy(update=QUICK))
         env = make_environment(plant, MOTORS, time_limit=PERIODS)
         policy, episode = Policy(script), None
         try:
@@ -150,10 +150,10 @@ def test_a_serial_cart_that_says_anything(script: Script, make_environment: Call
 
 
 @pytest.mark.parametrize("motor", [300, -400, 40_000, -(2**40)])
-def test_a_motor_value_beyond_the_limit_is_cut_to_it(motor: int) -> None:
-    """Whatever a loop gives to the plant; SET_MOTOR could not even carry the largest."""
+def test_a_motor_value_beyond_the_limit_is_saturated(motor: int) -> None:
+    """For any value given to the plant, even one too large for SET_MOTOR."""
     with CartPeer() as peer:
-        plant = SerialPlant(SerialSettings(port=peer.port, **QUICK))
+        plant = SerialPlant(SerialSettings(port=peer.port).model_copy(update=QUICK))
         plant.reset()
         plant.step(TensorDict({"motor": torch.tensor([[motor]])}, [1]))
         sent = peer.messages(SetMotor)[-1].motor
@@ -162,7 +162,7 @@ def test_a_motor_value_beyond_the_limit_is_cut_to_it(motor: int) -> None:
 
 
 def drive_on(env: Any) -> None:
-    """What a loop that overlooks the end of an episode does."""
+    """Drive on after the end of an episode."""
     present = env.fake_tensordict()
     for _ in range(3):
         env.step(present.set("action", torch.tensor([3])))

@@ -1,4 +1,4 @@
-"""Ranges without effect are found by trying, whatever the reason."""
+"""Ranges without effect are found by simulation, for every cause."""
 
 from typing import Any
 
@@ -97,7 +97,7 @@ def test_one_side_may_have_none(ip02: dict[str, float], medium: PoleSettings) ->
 @pytest.mark.parametrize("cart_friction", CartFriction)
 @pytest.mark.parametrize("pole_friction", PoleFriction)
 @pytest.mark.parametrize("actions", ["nine_levels", "nine_newtons"])
-def test_a_parameter_that_the_laws_do_not_read_has_none(
+def test_a_parameter_that_no_model_reads_has_none(
     ip02: dict[str, float],
     medium: PoleSettings,
     cart_friction: CartFriction,
@@ -129,7 +129,7 @@ def test_a_narrow_range_has_an_effect(ip02: dict[str, float], medium: PoleSettin
     assert idle(ip02, {name: line}, medium, models=READ_BY.get(name, Models())) == set()
 
 
-def test_the_track_shows_at_its_end_alone(ip02: dict[str, float], medium: PoleSettings) -> None:
+def test_the_track_length_matters_only_at_its_end(ip02: dict[str, float], medium: PoleSettings) -> None:
     line = {"track_half_length": Range(absolute=(0.379, 0.38)), **ranges_of("friction_3")}
     assert idle(ip02, line, medium) == set()
 
@@ -138,7 +138,7 @@ def test_a_range_that_is_a_point_has_none(ip02: dict[str, float], medium: PoleSe
     assert idle(ip02, {"cart_mass": Range(absolute=(0.7, 0.7))}, medium) == {"cart_mass"}
 
 
-def test_of_carts_that_were_found_only_what_is_drawn(ip02: dict[str, float], medium: PoleSettings) -> None:
+def test_identified_carts_report_only_drawn_parameters(ip02: dict[str, float], medium: PoleSettings) -> None:
     """A range that no cart is drawn from has no effect."""
     ranges = {"cart_mass": Range(relative=(-0.2, 0.2)), "latency": Range(absolute=(0.0, 0.02))}
     others = Randomizer(ip02, medium, ranges)
@@ -153,7 +153,7 @@ def test_of_carts_that_were_found_only_what_is_drawn(ip02: dict[str, float], med
     assert unread(0.001, None) == []
 
 
-def test_the_search_leaves_the_random_state_alone(ip02: dict[str, float], medium: PoleSettings) -> None:
+def test_the_search_does_not_change_the_random_state(ip02: dict[str, float], medium: PoleSettings) -> None:
     before = torch.get_rng_state()
     first, second = (idle(ip02, ranges_of("wide"), medium, "nine_newtons") for _ in range(2))
     assert first == second

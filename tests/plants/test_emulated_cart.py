@@ -24,7 +24,7 @@ fast = partial(EmulatorSettings, physics_step=1e-3)
 
 @pytest.fixture(scope="module")
 def homed() -> Iterator[SerialCart]:
-    """A homed and disarmed cart; a test leaves it so."""
+    """A homed and disarmed cart; every test restores this state."""
     with EmulatedCart(fast()) as emulated, SerialCart(settings(emulated)) as cart:
         cart.home()
         yield cart
@@ -44,7 +44,7 @@ def settings(emulated: EmulatedCart) -> SerialSettings:
 
 
 def ended(pid: int, seconds: float = 10.0) -> bool:
-    """Whether the process is gone within `seconds`."""
+    """Return True if the process ends within `seconds`."""
     for _ in range(int(seconds / 0.05)):
         try:
             os.kill(pid, 0)
@@ -55,7 +55,7 @@ def ended(pid: int, seconds: float = 10.0) -> bool:
 
 
 class TestProcess:
-    def test_it_lives_as_long_as_the_with(self) -> None:
+    def test_it_runs_within_the_with(self) -> None:
         with EmulatedCart(fast()) as emulated:
             os.kill(emulated.pid, 0)
             assert emulated.died == ""
@@ -69,7 +69,7 @@ class TestProcess:
         with pytest.raises(ValueError, match="mine"), EmulatedCart(fast()) as emulated:
             kill(emulated, ValueError("mine"))
 
-    def test_a_process_that_cannot_start_tells_why(self) -> None:
+    def test_a_process_that_cannot_start_reports_the_reason(self) -> None:
         wrong = EmulatorSettings.model_construct(cart_mass=-1.0)
         with pytest.raises(EmulatorError, match=r"exit code 2: .*cart_mass"):
             EmulatedCart(wrong)
@@ -133,7 +133,7 @@ class TestLoop:
         with pytest.raises(RefusedError, match="out of range"):
             cart.stop() or cart.set_period(1)
 
-    def test_a_step_from_each_question_is_taken_in_order(self, cart: SerialCart) -> None:
+    def test_states_from_questions_are_read_in_order(self, cart: SerialCart) -> None:
         ticks = [cart.poll_state().tick for _ in range(5)]
         assert ticks == list(range(ticks[0], ticks[0] + 5))
         cart.start()
@@ -166,7 +166,7 @@ def drive_and_fail(cart: SerialCart) -> None:
     raise ZeroDivisionError
 
 
-def test_a_bad_cable_costs_frames_and_nothing_else() -> None:
+def test_a_bad_cable_only_loses_frames() -> None:
     bad = fast(frame_loss=0.05, frame_corruption=0.05)
     with EmulatedCart(bad) as emulated:
         quick = SerialSettings(port=emulated.port, timeout=5, answer_timeout=0.1, retries=20)
@@ -196,7 +196,7 @@ def test_a_dead_emulator_is_a_lost_link() -> None:
             cart.poll_state()
 
 
-def test_a_pause_on_the_wall_clock_brings_up_the_present() -> None:
+def test_after_a_pause_the_newest_state_is_returned() -> None:
     with EmulatedCart(fast(clock="real")) as emulated, SerialCart(settings(emulated)) as cart:
         before = cart.get_state()
         time.sleep(1.0)

@@ -1,4 +1,4 @@
-"""However a host ends, the motor is at 0 soon after its last command: told by the emulated cart itself.
+"""After every kind of end of a host, the motor is soon at 0, according to the emulated cart's journal.
 
 The cart runs on the wall clock and writes down, by its own clock, which commands it took and which motor
 value was in force from when on. It homes at once, and is too heavy for full motor to take it off the track.
@@ -20,7 +20,8 @@ from serial_peer import Between
 from tensordict import TensorDictBase
 
 from cartpole_rl.evaluation.episodes import run_batch
-from cartpole_rl.identification.experiments import Experiment, Moves, Task, conduct, hold
+from cartpole_rl.identification.experiments import Experiment, conduct
+from cartpole_rl.identification.moves import Moves, Task, hold
 from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.plant import SerialPlant
 from cartpole_rl.plants.serial.settings import SerialSettings
@@ -36,7 +37,8 @@ import math, sys
 from pathlib import Path
 from cartpole_rl.emulator import firmware, process
 from cartpole_rl.emulator.device import CartDevice
-from cartpole_rl.emulator.homing import CART_METRES, SPAN, Zeros
+from cartpole_rl.emulator.encoders import CART_METRES, SPAN
+from cartpole_rl.emulator.homing import Zeros
 from cartpole_rl.emulator.settings import EmulatorSettings
 
 def home_at_once(hanging):
@@ -87,7 +89,7 @@ with SerialCart(SerialSettings(port=sys.argv[1])) as cart:
 
 
 class TellingCart:
-    """The emulated cart, and what it has told since `listen`."""
+    """The emulated cart, and its journal since `listen`."""
 
     def __init__(self, journal: Path) -> None:
         self.process = subprocess.Popen(
@@ -99,7 +101,7 @@ class TellingCart:
         self.listen()
 
     def listen(self) -> None:
-        """Forget what was told so far."""
+        """Ignore journal entries so far."""
         self._from = self._told.seek(0, 2)
 
     def told(self) -> list[dict[str, Any]]:
@@ -110,7 +112,7 @@ class TellingCart:
     def stopped(self) -> tuple[float, str]:
         """Wait until the motor stays at 0 after full motor: ms from the last command until then, and by what.
 
-        A host on a busy machine may fall silent for longer than the watchdog allows, and go on to drive.
+        A host on a busy machine may pause for longer than the watchdog allows, and then drive again.
         """
         end = time.monotonic() + 10
         before: list[dict[str, Any]] = []
@@ -128,7 +130,7 @@ class TellingCart:
 
     def close(self) -> None:
         self.process.terminate()
-        self.process.wait(10)
+        self.process.wait(100)
         assert self.process.stdout is not None
         self.process.stdout.close()
         self._told.close()
@@ -198,7 +200,7 @@ def test_a_pulled_cable(cart: TellingCart, host: Callable[..., "subprocess.Popen
         after, through = cart.stopped()
         assert 0 < after <= WATCHDOG_MS
         assert through == "watchdog"
-        _, said = process.communicate(timeout=10)
+        _, said = process.communicate(timeout=100)
         assert b"is the cart unplugged" in said
 
 

@@ -1,4 +1,4 @@
-"""Whatever tests are skipped without is there where `CI` is set; elsewhere the skip says what to install."""
+"""With `CI` set nothing that tests need is missing; otherwise a skip says what to install."""
 
 import importlib
 import os
@@ -18,7 +18,7 @@ REMEDIES = {
 
 
 def is_there(what: str) -> bool:
-    """Whether a module can be imported, a program or Python's header be found."""
+    """Return True if a module, a program or Python's header is available."""
     if what == "Python.h":
         return Path(sysconfig.get_path("include"), what).exists()
     if what == "g++":
@@ -31,7 +31,7 @@ def is_there(what: str) -> bool:
 
 
 def require(what: str) -> None:
-    """Fail in CI, skip elsewhere, where it is missing."""
+    """Fail in CI, otherwise skip, if it is missing."""
     if is_there(what):
         return
     message = f"{what} is missing, and tests are skipped without it: {REMEDIES[what]}"
@@ -41,7 +41,7 @@ def require(what: str) -> None:
 
 
 @pytest.mark.parametrize("what", list(REMEDIES))
-def test_what_tests_need_is_there(what: str) -> None:
+def test_requirements_of_tests_are_installed(what: str) -> None:
     require(what)
 
 

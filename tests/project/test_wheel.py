@@ -55,7 +55,7 @@ def run(installed: Path, *commands: list[str]) -> Path:
         f"sys.argv = {['cartpole-' + name, *words]!r}\n{name}.main()\n" for name, *words in commands
     )
     done = subprocess.run(
-        [sys.executable, "-c", script], cwd=home, env=environment, capture_output=True, text=True, timeout=200
+        [sys.executable, "-c", script], cwd=home, env=environment, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
     return home

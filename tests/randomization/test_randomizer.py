@@ -36,7 +36,7 @@ def farthest_from_uniform(values: Tensor) -> float:
         ("factor", (0.3, 4.8), (0.15, 2.4)),
     ],
 )
-def test_draws_are_inside_their_bounds_and_distributed_as_said(
+def test_draws_are_within_bounds_and_distributed_as_specified(
     ip02: dict[str, float],
     medium: PoleSettings,
     kind: str,
@@ -55,7 +55,7 @@ def test_draws_are_inside_their_bounds_and_distributed_as_said(
     assert farthest_from_uniform((values - low) / (high - low)) < 0.015
 
 
-def test_what_no_line_names_is_nominal(ip02: dict[str, float], medium: PoleSettings) -> None:
+def test_parameters_without_a_range_are_nominal(ip02: dict[str, float], medium: PoleSettings) -> None:
     carts = draw(Randomizer(ip02, medium, {"cart_mass": Range(relative=(-0.2, 0.2))}), count=10)
     for name, value in {**ip02, **medium.nominal.model_dump()}.items():
         if name != "cart_mass":

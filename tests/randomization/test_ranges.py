@@ -1,4 +1,4 @@
-"""One line of randomization: what it may say, and what is refused before any work."""
+"""One line of randomization: valid lines, and those that are refused."""
 
 import math
 

@@ -1,7 +1,7 @@
 """Every command of the README does what it says, with budgets that take seconds.
 
-A training, the emulator and the demo run as processes of their own; the rest runs in this one, since PyTorch
-takes seconds to import.
+One training, the emulator, TensorBoard and the demo run in processes of their own. The rest runs in this one,
+because PyTorch takes seconds to import.
 """
 
 import json
@@ -9,14 +9,11 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "commands"))
-from command_line import in_process
+from command_line import in_process, interrupt_after
 
 ROOT = Path(__file__).parents[2]
 BIN = Path(sys.executable).parent
@@ -31,7 +28,9 @@ BUDGET = [
     "learning.evaluations=1",
     "learning.evaluation_episodes=2",
     "buffer.size=2000",
+    "task.time_limit=100",
 ]
+COARSE = "emulator.physics_step=1e-3"
 VERBS = (
     "train",
     "evaluate",
@@ -52,9 +51,9 @@ COMMANDS = re.findall(
 
 
 def run(command: str, *more: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    """The installed command, in a process of its own."""
+    """Run the installed command in a separate process."""
     name, *words = command.split()
-    return subprocess.run([BIN / name, *words, *more], cwd=cwd, capture_output=True, text=True, timeout=200)
+    return subprocess.run([BIN / name, *words, *more], cwd=cwd, capture_output=True, text=True)
 
 
 def run_here(command: str, *more: str, cwd: Path) -> subprocess.CompletedProcess[str]:
@@ -102,30 +101,23 @@ def test_train(command: str, tmp_path: Path) -> None:
 
 
 def test_resume(trained: Path) -> None:
-    """A training is interrupted, goes on, and is interrupted again."""
+    """A training is interrupted, resumed, and interrupted again."""
     (command,) = [command for command in listed("cartpole-train") if "resume" in command]
     folder = trained / "runs/train/stopped"
     longer = ["learning.transitions=10000000", "learning.evaluations=5000", f"hydra.run.dir={folder}"]
-    interrupt_when_saved(["cartpole-train", *BUDGET, *longer], folder, trained)
-    seen = len((folder / "history.jsonl").read_text().splitlines())
-    interrupt_when_saved(command.replace("<run>", "stopped").split(), folder, trained)
-    assert len((folder / "history.jsonl").read_text().splitlines()) > seen
+    for words in (["cartpole-train", *BUDGET, *longer], [command.replace("<run>", "stopped")]):
+        evaluations = num_evaluations(folder)
+        interrupt_after(folder / "checkpoints/resume.pt")
+        interrupted = run_here(" ".join(words), cwd=trained)
+        assert interrupted.returncode == 130, interrupted.stderr
+        assert num_evaluations(folder) > evaluations
     assert len(json.loads((folder / "provenance.json").read_text())["resumed"]) == 1
 
 
-def interrupt_when_saved(words: list[str], folder: Path, cwd: Path) -> None:
-    """Ctrl-C to a training in `folder` once it has written, in this process, what it can go on from."""
-    state = folder / "checkpoints/resume.pt"
-    before = state.stat().st_mtime_ns if state.exists() else None
-    with subprocess.Popen(
-        [BIN / words[0], *words[1:]], cwd=cwd, stderr=subprocess.PIPE, text=True
-    ) as process:
-        while not state.exists() or state.stat().st_mtime_ns == before:
-            assert process.poll() is None, process.communicate()
-            time.sleep(0.01)
-        process.send_signal(signal.SIGINT)
-        process.communicate()
-        assert process.returncode == 130
+def num_evaluations(folder: Path) -> int:
+    """The number of evaluations that a training has written."""
+    history = folder / "history.jsonl"
+    return len(history.read_text().splitlines()) if history.exists() else 0
 
 
 @pytest.mark.parametrize("command", listed("cartpole-evaluate"))
@@ -133,6 +125,8 @@ def test_evaluate(command: str, trained: Path, serial_port: Callable[[], str]) -
     command = command.replace("<run>", "first").replace("/dev/ttyUSB0", "PORT")
     if "PORT" in command:
         command = command.replace("PORT", serial_port())
+    elif "plant=emulated" in command:
+        command = f"{command} {COARSE}"
     folder = f"runs/evaluate/{abs(hash(command))}"
     more = [] if "episodes" in command else ["episodes=1"]
     result = run_here(command, f"hydra.run.dir={folder}", *more, cwd=trained)
@@ -144,11 +138,11 @@ def test_evaluate(command: str, trained: Path, serial_port: Callable[[], str]) -
 
 @pytest.fixture
 def serial_port() -> Callable[[], str]:
-    """Starts `cartpole-emulate` when called; gives its port, and interrupts it afterwards."""
+    """Start `cartpole-emulate` when called, return its port, and interrupt it after the test."""
     running: list[subprocess.Popen[str]] = []
 
     def start() -> str:
-        process = subprocess.Popen([BIN / "cartpole-emulate"], stdout=subprocess.PIPE, text=True)
+        process = subprocess.Popen([BIN / "cartpole-emulate", COARSE], stdout=subprocess.PIPE, text=True)
         running.append(process)
         assert process.stdout is not None
         return json.loads(process.stdout.readline())["port"]
@@ -156,7 +150,7 @@ def serial_port() -> Callable[[], str]:
     yield start
     for process in running:
         process.send_signal(signal.SIGINT)
-        assert process.wait(timeout=20) in (0, 130)
+        assert process.wait(timeout=100) in (0, 130)
 
 
 def test_identify_train_on_it_and_model_it(trained: Path, serial_port: Callable[[], str]) -> None:
@@ -177,7 +171,9 @@ def test_identify_train_on_it_and_model_it(trained: Path, serial_port: Callable[
 
 def test_record_and_replay(trained: Path) -> None:
     (record,), (replay,) = listed("cartpole-record"), listed("cartpole-replay")
-    recorded = run_here(record.replace("<run>", "first"), "hydra.run.dir=runs/record/first", cwd=trained)
+    recorded = run_here(
+        record.replace("<run>", "first"), COARSE, "hydra.run.dir=runs/record/first", cwd=trained
+    )
     assert recorded.returncode == 0, recorded.stderr
     replayed = run_here(replay.replace("<run>", "first"), "hydra.run.dir=runs/replay/first", cwd=trained)
     assert replayed.returncode == 0, replayed.stderr
@@ -189,6 +185,8 @@ def test_finetune(command: str, trained: Path, serial_port: Callable[[], str]) -
     command = command.replace("<run>", "first").replace("episodes=20", "")
     if "/dev/ttyUSB0" in command:
         command = command.replace("/dev/ttyUSB0", serial_port())
+    else:
+        command = f"{command} {COARSE}"
     short = ["episodes=1", "evaluation_episodes=1", "finetuning.iterations=1", "compile=false"]
     folder = f"runs/finetune/{abs(hash(command))}"
     result = run_here(command, *short, f"hydra.run.dir={folder}", cwd=trained)
@@ -196,7 +194,7 @@ def test_finetune(command: str, trained: Path, serial_port: Callable[[], str]) -
     assert (trained / folder / "checkpoints/last.pt").exists()
 
 
-def test_find_port_tells_what_there_is(tmp_path: Path) -> None:
+def test_find_port_lists_the_ports(tmp_path: Path) -> None:
     (command,) = listed("cartpole-find-port")
     result = run_here(command, cwd=tmp_path)
     assert "USB serial port" in result.stdout + result.stderr
@@ -204,7 +202,7 @@ def test_find_port_tells_what_there_is(tmp_path: Path) -> None:
 
 def test_preflight(tmp_path: Path, serial_port: Callable[[], str]) -> None:
     (command,) = listed("cartpole-preflight")
-    result = run_here(command.replace("/dev/ttyUSB0", serial_port()), cwd=tmp_path)
+    result = run_here(command.replace("/dev/ttyUSB0", serial_port()), "plant.write_timeout=2", cwd=tmp_path)
     assert result.returncode == 0, result.stdout + result.stderr
 
 
@@ -216,15 +214,13 @@ def test_emulate() -> None:
         port = json.loads(process.stdout.readline())["port"]
         assert Path(port).exists()
         process.send_signal(signal.SIGINT)
-        assert process.wait(timeout=20) in (0, 130)
+        assert process.wait(timeout=100) in (0, 130)
 
 
 def test_tensorboard_reads_the_runs(trained: Path) -> None:
     (command,) = listed("tensorboard")
     name, *words = command.split()
-    result = subprocess.run(
-        [BIN / name, *words, "--inspect"], cwd=trained, capture_output=True, text=True, timeout=100
-    )
+    result = subprocess.run([BIN / name, *words, "--inspect"], cwd=trained, capture_output=True, text=True)
     assert "evaluation/score" in result.stdout, result.stderr
 
 
@@ -234,7 +230,6 @@ def test_the_demo_after_its_installation(tmp_path: Path) -> None:
         cwd=tmp_path,
         capture_output=True,
         text=True,
-        timeout=280,
     )
     assert result.returncode == 0, result.stderr
     assert "ratio of the scores" in result.stdout

@@ -1,11 +1,11 @@
 """Episodes of a simple cart that swings its pole up by energy and balances it by linear feedback."""
 
-import dataclasses
 import math
 
 import numpy as np
 import pytest
 
+from cartpole_rl.identification.replay import Replayed
 from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 from cartpole_rl.tasks.episode import Episode
 
@@ -99,25 +99,13 @@ def runaway() -> Episode:
     return drive(math.pi - 0.35, 10.0, loss_of_control=6.2)
 
 
-@dataclasses.dataclass(frozen=True)
-class Replay:
-    """An episode beside its simulation, as `cartpole_rl.reporting.replays.ReplayedEpisode` asks for."""
-
-    episode: Episode
-    time: np.ndarray
-    x: np.ndarray
-    theta: np.ndarray
-    x_error: np.ndarray
-    theta_error: np.ndarray
-
-
 @pytest.fixture(scope="session")
-def replay(swing_up: Episode) -> Replay:
+def replay(swing_up: Episode) -> Replayed:
     """Nine stretches of 1 s, 20 mm and 3 degrees off; the last one ends after 0.6 s."""
     rows = np.arange(0, 450, 50)[:, None] + np.arange(51)
     known = np.ones(rows.shape)
     known[-1, 30:] = math.nan
-    return Replay(
+    return Replayed(
         swing_up,
         swing_up.time[rows],
         swing_up.x[rows] + 0.02 * known,

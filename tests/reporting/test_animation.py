@@ -54,7 +54,7 @@ def test_ten_seconds_are_251_frames_of_real_time_and_a_rest(animation: bytes) ->
     assert waits[-1] == LAST_FRAME
 
 
-def test_it_is_small_loops_for_ever_and_has_the_promised_size(animation: bytes) -> None:
+def test_it_is_small_loops_endlessly_and_has_the_stated_size(animation: bytes) -> None:
     assert len(animation) < 1_500_000
     with Image.open(io.BytesIO(animation)) as picture:
         assert picture.size == SIZE == (480, 320)
@@ -125,7 +125,7 @@ def test_a_large_pole_fits_too(swing_up: Episode) -> None:
     assert pole[:, 1].min() > 40
 
 
-def test_time_that_jitters_does_not_drift(balance: Episode) -> None:
+def test_jitter_does_not_accumulate(balance: Episode) -> None:
     generator = np.random.default_rng(3)
     time = np.concatenate(([0.0], np.cumsum(generator.uniform(0.017, 0.0237, 500))))
     jittered = dataclasses.replace(balance, time=time)
@@ -139,7 +139,7 @@ def test_the_last_row_is_always_drawn(swing_up: Episode) -> None:
     assert len(list(frames(part(swing_up, 0, 7), POLE, TRACK, every=3))) == 4
 
 
-def test_a_cart_that_left_the_track_says_so(runaway: Episode) -> None:
+def test_leaving_the_track_is_shown(runaway: Episode) -> None:
     *_, before, last = frames(part(runaway, runaway.steps - 4, 4), POLE, TRACK)
     header = (0, 36, 300, 56)
     assert len(places(last.crop(header), style.LIMIT)) > 50

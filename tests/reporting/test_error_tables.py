@@ -25,7 +25,7 @@ def test_models_are_compared_at_each_time() -> None:
     assert [row.split()[:2] for row in rows] == [["0.1", "physics"], ["learned", "1.23"]]
 
 
-def test_errors_stand_beside_spreads() -> None:
+def test_errors_are_listed_with_spreads() -> None:
     text = spread_table([{"after_s": 0.5, **ERRORS, **SPREADS}], 2.0, "spreads")
     assert "within 2 spreads" in text
     assert text.splitlines()[-1].split() == ["0.5", "1.23", "/", "2.00", "90%", "0.500", "/", "1.00", "100%"]

@@ -7,7 +7,7 @@ import pytest
 from cartpole_rl.reporting.table import interval_text, number_text, table
 
 
-def test_a_table_looks_like_this() -> None:
+def test_layout_of_a_table() -> None:
     rows = [
         {"plant": "simulated", "score": "4210 ± 85", "ratio": None, "episodes": 20, "rms": 0.01234},
         {"plant": "emulated", "score": "912 ± 5", "ratio": 0.2166, "episodes": 5, "rms": 0.3},
@@ -30,11 +30,11 @@ def test_columns_may_be_just_keys_and_rows_may_lack_them() -> None:
     ]
 
 
-def test_no_rows_leave_the_heading() -> None:
+def test_without_rows_only_the_heading_is_printed() -> None:
     assert table([], ["a", "b"]).splitlines() == ["a  b", "─  ─"]
 
 
-def test_nan_is_missing_and_does_not_spoil_its_column() -> None:
+def test_nan_is_a_dash_and_does_not_affect_its_column() -> None:
     assert table([{"a": math.nan}, {"a": 4210.37}], ["a"]).splitlines()[2:] == ["   –", "4210"]
 
 

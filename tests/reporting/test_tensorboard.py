@@ -1,4 +1,4 @@
-"""What TensorBoard reads back is what was logged, after a resume too."""
+"""TensorBoard reads back what was logged, also after a resume."""
 
 import io
 from pathlib import Path
@@ -30,7 +30,7 @@ def points(folder: Path, name: str) -> dict[int, float]:
     return {event.step: event.value for event in events}
 
 
-def test_scalars_come_back(tmp_path: Path) -> None:
+def test_scalars_round_trip(tmp_path: Path) -> None:
     with TensorBoardLog(tmp_path) as log:
         log.scalars({"train/loss": 0.5, "evaluation/score": 100}, 10)
         log.scalars({"train/loss": 0.25, "evaluation/score": None}, 20)
@@ -55,7 +55,7 @@ def test_a_histogram_counts_every_finite_value(tmp_path: Path) -> None:
     assert sum(log_read.Histograms("constant")[0].histogram_value.bucket) == 9
 
 
-def test_figures_and_animations_come_back_as_they_are(tmp_path: Path, runaway: Episode) -> None:
+def test_figures_and_animations_round_trip(tmp_path: Path, runaway: Episode) -> None:
     animation = gif(runaway, 0.3365, 0.407, every=20)
     with TensorBoardLog(tmp_path) as log:
         log.figure("behaviour", behaviour(runaway), 1)
@@ -107,7 +107,7 @@ def test_flatten_gives_dotted_names_and_plain_values() -> None:
 
 
 class TestResume:
-    def test_later_points_are_written_anew_and_earlier_ones_stay(self, tmp_path: Path) -> None:
+    def test_later_points_are_rewritten_and_earlier_ones_kept(self, tmp_path: Path) -> None:
         with TensorBoardLog(tmp_path) as log:
             for step in (0, 10, 20, 25, 30):
                 log.scalars({"a": step, "b": -step}, step)
@@ -126,7 +126,7 @@ class TestResume:
                     log.scalars({"a": step}, step)
         assert sorted(points(tmp_path, "a")) == [0, 10, 20, 30, 40]
 
-    def test_a_finished_run_that_goes_on_has_one_end(self, tmp_path: Path) -> None:
+    def test_a_finished_run_that_is_continued_has_one_final_result(self, tmp_path: Path) -> None:
         with TensorBoardLog(tmp_path) as log:
             log.scalars({"a": 1.0}, 10)
             log.hparams({"frames": 10}, {"score": 1.0}, 10)
@@ -148,7 +148,7 @@ class TestResume:
             log.scalars({"a": 3.0}, 2)
         assert points(tmp_path, "a") == {1: 1.0, 2: 3.0}
 
-    def test_resuming_into_an_empty_folder_is_a_start(self, tmp_path: Path) -> None:
+    def test_resuming_into_an_empty_folder_starts_a_new_log(self, tmp_path: Path) -> None:
         with TensorBoardLog(tmp_path / "new", purge_step=5) as log:
             log.scalars({"a": 1.0}, 5)
         assert points(tmp_path / "new", "a") == {5: 1.0}

@@ -1,4 +1,4 @@
-"""Where episodes start, when they end, and what counts as upright."""
+"""Starts and ends of episodes, and the definition of upright."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""From encoder counts to the measured state and the observation."""
+"""Conversion of encoder counts to the measured state and the observation."""
 
 import math
 
@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_COUNTS_PER_TURN
 from cartpole_rl.tasks.features import (
     Measured,
+    ObservationKind,
     measured_position,
     measured_velocity,
     observe,
 )
-from cartpole_rl.tasks.settings import ObservationKind, observation_size
 
 
 def counts(cart: int, pole: int) -> torch.Tensor:
@@ -78,4 +78,4 @@ class TestObservation:
     @pytest.mark.parametrize("kind", ObservationKind)
     def test_size(self, kind: ObservationKind) -> None:
         seen = observe(self.state, kind)
-        assert [len(number) for number in seen] == [2] * observation_size(kind)
+        assert [len(number) for number in seen] == [2] * kind.size

@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from cartpole_rl.tasks.features import Measured
-from cartpole_rl.tasks.rewards import REWARDS, SCORE, SCORE_UPRIGHT
-from cartpole_rl.tasks.settings import Reward
+from cartpole_rl.tasks.rewards import SCORE, SCORE_UPRIGHT, Reward
 
 X_MAX = 0.4
 DEGREE = math.pi / 180
@@ -17,7 +16,7 @@ def value(
     kind: Reward, x: float = 0.0, theta: float = 0.0, theta_dot: float = 0.0, x_dot: float = 0.0
 ) -> float:
     state = torch.tensor([[x, x_dot, theta, theta_dot]], dtype=torch.float64)
-    return REWARDS[kind](Measured(*state.unbind(1)), X_MAX).item()
+    return kind.formula(Measured(*state.unbind(1)), X_MAX).item()
 
 
 def random_states(count: int, side: int = 1) -> Measured:
@@ -59,9 +58,9 @@ def test_value(kind: Reward, state: dict[str, float], expected: float) -> None:
         (Reward.SCORE, 11),
     ],
 )
-def test_most_is_earned_upright_in_the_middle_and_least_is_zero(kind: Reward, most: float) -> None:
+def test_rewards_are_largest_upright_in_the_middle_and_never_negative(kind: Reward, most: float) -> None:
     assert value(kind) == most
-    values = REWARDS[kind](random_states(10_000), X_MAX)
+    values = kind.formula(random_states(10_000), X_MAX)
     assert values.max() <= most
     assert values.min() >= 0
 
@@ -73,10 +72,6 @@ def test_scores_of_an_episode_are_at_most_500_and_5500() -> None:
 
 
 @pytest.mark.parametrize("kind", Reward)
-def test_left_and_right_are_worth_the_same(kind: Reward) -> None:
-    right, left = (REWARDS[kind](random_states(1000, side), X_MAX) for side in (1, -1))
+def test_rewards_are_symmetric(kind: Reward) -> None:
+    right, left = (kind.formula(random_states(1000, side), X_MAX) for side in (1, -1))
     torch.testing.assert_close(right, left)
-
-
-def test_every_reward_has_its_function() -> None:
-    assert set(REWARDS) == set(Reward)

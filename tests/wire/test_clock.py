@@ -14,7 +14,7 @@ def test_differences_are_right_across_the_wrap(before: int, after: int, differen
     assert seconds_between(before, after) == pytest.approx(difference * 1e-6)
 
 
-def test_an_older_number_went_back() -> None:
+def test_an_older_number_is_recognized() -> None:
     assert went_back(ticks_between(7, 5))
     assert went_back(ticks_between(3, 2**32 - 3))
     assert not went_back(ticks_between(5, 7))

@@ -29,7 +29,7 @@ def frame_of(body: bytes) -> bytes:
 
 
 @given(messages(), st.integers(0, 255), st.integers(0, 255))
-def test_every_message_survives_a_round_trip(message, sequence, flags):
+def test_every_message_round_trips(message, sequence, flags):
     frame = encode_frame(message, sequence, flags)
     assert frame.count(0) == 1
     assert frame[-1] == 0

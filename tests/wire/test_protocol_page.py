@@ -91,7 +91,7 @@ def test_the_longest_messages_fit_a_frame():
 
 @pytest.mark.parametrize("rule", ["Watchdog", "Soft limit", "Faults"])
 def test_each_rule_says_when_it_holds(rule):
-    """Homing has to touch the stops, so a page without these words would be wrong."""
+    """Homing touches the stops, so the page must state these exceptions."""
     text = re.search(rf"^\d\. \*\*{rule}\*\*(.*?)(?=^\d\. |^$)", PAGE, re.MULTILINE | re.DOTALL).group(1)
     assert "while armed" in text
     assert "homing" in text

@@ -1,4 +1,4 @@
-"""What a fine-tuning keeps on disk, and the settings that it learns with."""
+"""Files of a fine-tuning, and the settings of its learning."""
 
 from pathlib import Path
 
@@ -11,9 +11,9 @@ from cartpole_rl.learning.checkpoints import FINETUNING_FORMAT, TrainingCheckpoi
 from cartpole_rl.learning.settings import FinetuningSettings, LearningSettings
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.config import FinetuneConfig
-from cartpole_rl.workflows.finetuning_files import FinetuningFiles, Stage, resumed_config
+from cartpole_rl.workflows.finetuning_files import FinetuningFiles, Stage
 from cartpole_rl.workflows.finetuning_learner import simulated_learning
-from cartpole_rl.workflows.settings import load_settings
+from cartpole_rl.workflows.settings import load_settings, recorded_settings
 
 EPISODE = Episode(
     time=0.02 * np.arange(3),
@@ -46,17 +46,17 @@ def test_recorded_episodes_are_counted_by_stage(files: FinetuningFiles) -> None:
     assert "# pole_length_m: 0.3530" in files.path(Stage.BEFORE, 0).read_text()
 
 
-def test_a_checkpoint_brings_its_settings_back(files: FinetuningFiles) -> None:
+def test_a_checkpoint_restores_its_settings(files: FinetuningFiles) -> None:
     files.save({}, 2)
     checkpoint = load_training(files.folder, FINETUNING_FORMAT)
-    assert checkpoint.transitions == 2
-    assert resumed_config(checkpoint, None) == files.config
+    assert checkpoint.step == 2
+    assert recorded_settings(FinetuneConfig, checkpoint.config, "resume=run") == files.config
 
 
 def test_settings_of_another_version_are_named() -> None:
     old = TrainingCheckpoint({"run": "somewhere", "prior": 0.1}, {}, 0)
     with pytest.raises(CheckpointError, match=r"resume=run is of another version .*prior: there is no such"):
-        resumed_config(old, "run")
+        recorded_settings(FinetuneConfig, old.config, "resume=run")
 
 
 def test_learning_in_simulation_follows_the_settings() -> None:

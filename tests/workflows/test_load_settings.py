@@ -1,21 +1,21 @@
 """Settings that Python composes from conf/ are those that the commands compose with Hydra."""
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import hydra
 import pytest
 import yaml
-from hydra.core.global_hydra import GlobalHydra
 
 from cartpole_rl.checking import checked
 from cartpole_rl.choices import conf_folder
-from cartpole_rl.commands.composition import as_mapping
+from cartpole_rl.commands.hydra_application.composition import as_mapping
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.settings import Settings
 from cartpole_rl.workflows.config import EvaluateConfig, PreflightConfig, TrainConfig
 from cartpole_rl.workflows.settings import COMMANDS, load_settings
+
+pytestmark = pytest.mark.usefixtures("hydra_reads_conf")
 
 REQUIRED = {
     "evaluate": {"run": "lqr"},
@@ -26,15 +26,8 @@ REQUIRED = {
 EXPERIMENTS = sorted(path.stem for path in (conf_folder() / "experiment").glob("*.yaml"))
 
 
-@pytest.fixture(autouse=True, scope="module")
-def composer() -> Iterator[None]:
-    GlobalHydra.instance().clear()
-    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(conf_folder())):
-        yield
-
-
 def of_hydra(schema: type[Settings], overrides: dict[str, Any]) -> Settings:
-    """What the command of `schema` reads with these overrides."""
+    """Return the settings that Hydra composes for `schema` with these overrides."""
     words = [f"{name}={value}" for name, value in overrides.items()]
     return checked(schema, as_mapping(hydra.compose(COMMANDS[schema], words)))
 
@@ -65,7 +58,7 @@ def test_choices_and_values_are_those_of_the_command(overrides: dict[str, Any]) 
     assert load_settings(TrainConfig, overrides) == of_hydra(TrainConfig, overrides)
 
 
-def test_an_evaluation_of_a_task_leaves_the_track_to_the_agent() -> None:
+def test_an_evaluation_of_a_task_uses_the_agents_track() -> None:
     overrides = {"run": "lqr", "task": "balance", "plant": "emulated", "emulator": "large"}
     assert load_settings(EvaluateConfig, overrides) == of_hydra(EvaluateConfig, overrides)
 
@@ -80,6 +73,30 @@ def test_a_file_or_a_mapping_takes_the_place_of_a_choice(tmp_path: Path) -> None
     )
 
 
+def test_a_file_extends_choices_of_its_group(tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_text("defaults: [serial]\nport: COM3\ntimeout: 2.0\n")
+    config = load_settings(PreflightConfig, {"plant": tmp_path / "mine.yaml"})
+    assert config == load_settings(
+        PreflightConfig, {"plant": "serial", "plant.port": "COM3", "plant.timeout": 2.0}
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("kind: [serial\n", r"plant=.*mine\.yaml is not valid YAML, line 2: expected ',' or ']'"),
+        ("just words\n", r"plant=.*mine\.yaml holds no settings"),
+        ("\x01", r"plant=.*mine\.yaml is not valid YAML: unacceptable character"),
+        ("defaults: [{override /task: balance}]\n", r"plant=.*mine\.yaml: defaults is a list of choices"),
+    ],
+)
+def test_what_is_wrong_with_a_file_is_one_line(text: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_text(text)
+    with pytest.raises(ConfigError, match=message) as caught:
+        load_settings(PreflightConfig, {"plant": tmp_path / "mine.yaml"})
+    assert len(str(caught.value).splitlines()) == 1
+
+
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
@@ -89,6 +106,6 @@ def test_a_file_or_a_mapping_takes_the_place_of_a_choice(tmp_path: Path) -> None
         ({"seed": -1}, "seed=-1"),
     ],
 )
-def test_what_is_wrong_is_named(overrides: dict[str, Any], message: str) -> None:
+def test_errors_name_the_wrong_setting(overrides: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         load_settings(TrainConfig, overrides)

@@ -19,7 +19,7 @@ print("agreed" if confirm("the cart latched a fault: STALL") else "not agreed", 
 
 
 def read_until(master: int, words: bytes, deadline: float = 60) -> bytes:
-    """What the terminal shows, up to and with `words`."""
+    """Return the terminal output up to and including `words`."""
     seen, end = b"", time.monotonic() + deadline
     while words not in seen:
         assert time.monotonic() < end, seen
@@ -27,7 +27,7 @@ def read_until(master: int, words: bytes, deadline: float = 60) -> bytes:
     return seen
 
 
-def test_an_enter_from_before_the_question_does_not_answer_it(tmp_path: Path) -> None:
+def test_an_earlier_enter_does_not_answer_the_question(tmp_path: Path) -> None:
     gate = tmp_path / "gate"
     os.mkfifo(gate)
     master, slave = pty.openpty()
@@ -48,5 +48,5 @@ def test_an_enter_from_before_the_question_does_not_answer_it(tmp_path: Path) ->
         os.close(master)
 
 
-def test_nobody_is_asked_without_a_terminal() -> None:
+def test_without_a_terminal_no_question_is_asked() -> None:
     assert not confirm("the cart latched a fault")

@@ -13,7 +13,7 @@ from types import TracebackType
 from typing import Self
 
 from cartpole_rl.errors import LinkError, PlantError
-from cartpole_rl.plants.serial.connection import Connection
+from cartpole_rl.plants.serial.connection import WATCHDOG_PERIODS, Connection
 from cartpole_rl.plants.serial.errors import RefusedError, fault_error
 from cartpole_rl.plants.serial.information import check_limits, check_scales
 from cartpole_rl.plants.serial.link import SerialLink
@@ -21,7 +21,7 @@ from cartpole_rl.plants.serial.port import open_port, resolved_port
 from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.plants.serial.statistics import LinkStatistics
 from cartpole_rl.plants.serial.tracking import StateTracker
-from cartpole_rl.wire import (
+from cartpole_rl.wire.messages import (
     Ack,
     ClearFault,
     Flags,
@@ -38,7 +38,9 @@ from cartpole_rl.wire import (
 
 LOGGER = logging.getLogger(__name__)
 
-WATCHDOG_PERIODS = 3  # without a command, after which the cart sets its motor to 0
+LONGEST_SUSPENSION = 1.0  # s without an answer of this computer, after which somebody may have moved the cart
+LONGEST_STOP = 3.0  # s to wait for the answer to STOP, whatever the settings: signals.UNWINDING is longer
+LAST_STOP = 0.5  # s to wait for it in `close` if the STOP before was not answered
 RESTARTED = "the cart has restarted; check its power"
 
 
@@ -64,6 +66,7 @@ class SerialCart:
         self._tracker = StateTracker()
         self._open_connection: Connection | None = None
         self._information: Info | None = None
+        self._stop_unanswered = False
 
     def __enter__(self) -> Self:
         self.open()
@@ -104,7 +107,7 @@ class SerialCart:
         if self._open_connection is None:
             return
         try:
-            self.stop()
+            self._stop(LAST_STOP if self._stop_unanswered else LONGEST_STOP)
         except PlantError as error:
             LOGGER.warning(
                 "the cart did not confirm that it is disarmed (%s); its watchdog stops it, unless it was "
@@ -116,14 +119,14 @@ class SerialCart:
 
     @property
     def is_open(self) -> bool:
-        """Whether the port is open."""
+        """True while the port is open."""
         return self._open_connection is not None
 
     @property
     def information(self) -> Info:
         """The newest INFO of the cart, without asking again."""
         if self._information is None:
-            raise LinkError(f"the cart on {self.port} was never reached: open() it first")
+            raise LinkError(f"the cart on {self.port} is not connected yet: call open() first")
         return self._information
 
     @property
@@ -157,7 +160,7 @@ class SerialCart:
 
     def stop(self) -> None:
         """Set the motor to 0 and disarm; ends a homing. The bytes go out before anything that can block."""
-        self._connection.request(Stop(), Ack, before=(SetMotor(0),))
+        self._stop(LONGEST_STOP)
 
     def clear_fault(self) -> None:
         """Clear the latched faults. Raises FaultError, naming them, if the cause of one is still there."""
@@ -206,10 +209,11 @@ class SerialCart:
         """Send a motor value; return the value sent.
 
         That is `value` within the cart's limits, or 0 if it answers a state so old that the cart's watchdog
-        has stopped the motor. Raises LinkError if that state is older than `settings.timeout`.
+        has stopped the motor. Raises LinkError if that state is older than `settings.timeout` or
+        LONGEST_SUSPENSION, or if the operating system delayed the value for as long as the watchdog waits.
         """
         connection = self._connection
-        limit = max(0, self.information.motor_limit)  # whatever INFO says, 0 stays 0
+        limit = max(0, self.information.motor_limit)  # 0 stays 0 for any limit in INFO
         sent = self._in_time(max(-limit, min(limit, int(value))))
         connection.send_motor(sent)
         return sent
@@ -238,6 +242,12 @@ class SerialCart:
         finally:
             self._tracker.measuring = True
 
+    def _stop(self, within: float) -> None:
+        """Set the motor to 0 and disarm; wait `within` s at most for the answer."""
+        self._stop_unanswered = True
+        self._connection.request(Stop(), Ack, before=(SetMotor(0),), within=within)
+        self._stop_unanswered = False
+
     def _in_time(self, motor: int) -> int:
         """The motor value, or 0 if it is too late for it; see `set_motor`.
 
@@ -246,7 +256,7 @@ class SerialCart:
         if not motor or not self._tracker.awaits_command or not self._connection.link.waiting():
             return motor
         late = time.perf_counter() - self._tracker.newest_at
-        if late > self.settings.timeout:  # somebody may have moved the cart meanwhile
+        if late > min(self.settings.timeout, LONGEST_SUSPENSION):
             raise LinkError(
                 f"this computer did not answer the cart on {self.port} for {late:.1f} s; end what keeps it "
                 "busy, and do not suspend a command that drives"
@@ -269,7 +279,7 @@ class SerialCart:
         return self._open_connection
 
     def _abandon(self) -> None:
-        """`close` without waiting for an answer: whatever is there may be no cart."""
+        """`close` without waiting for an answer: the device may not be a cart."""
         connection = self._connection
         try:
             with suppress(LinkError):

@@ -6,7 +6,9 @@ the inverse of the motor curve turns the force into a motor value. All of it sta
 which the cart watches for stalls.
 
 The model is that of the nominal cart. The motor value that its friction needs may be known better: the
-preflight measures the dead-band of each side, the re-centring between episodes uses the nominal one. The
+preflight measures the dead-band of each side, the re-centring between episodes uses the nominal one. A
+dead-band below the nominal one is taken as friction with a smaller offset: an offset larger than the
+dead-band would drive the cart the wrong way. The
 moves in `identification.experiments` do not use this controller: they are fast on purpose, as part of what is
 recorded, and work on any plant.
 """
@@ -51,6 +53,7 @@ class Centring:
 
     period: float  # s
     deadband: Mapping[int, float]  # motor values that just move the cart, to the RIGHT and to the LEFT
+    slowest: float = 0.0  # m/s
     planned: float = 0.0  # m/s
     integral: float = 0.0  # N
 
@@ -58,25 +61,32 @@ class Centring:
         """Return the next motor value from the last two states."""
         passed = interval(before, state)
         away = -metres(state.cart_counts)
-        self.planned += within(GENTLE * passed, within(TRAVEL_SPEED, away / SLOWING) - self.planned)
+        target = math.copysign(max(self.slowest, min(TRAVEL_SPEED, abs(away) / SLOWING)), away)
+        self.planned += within(GENTLE * passed, target - self.planned)
         lag = self.planned - metres(state.cart_counts - before.cart_counts) / passed
         share = min(1.0, TUNED_FOR / self.period)
         self.integral = within(LARGEST_PUSH, self.integral + share**2 * SPEED_INTEGRAL * lag * passed)
-        return rough_motor(self._friction() + share * SPEED_GAIN * lag + self.integral)
+        return rough_motor(self._friction() + share * SPEED_GAIN * lag + self.integral, self.deadband)
 
     def _friction(self) -> float:
         """Force in N that the friction needs in the planned direction."""
         if not self.planned:
             return 0.0
         side = RIGHT if self.planned > 0 else LEFT
-        return side * (self.deadband[side] - MOTOR_OFFSET) / MOTOR_PER_NEWTON
+        return side * (self.deadband[side] - motor_offset(self.deadband, side)) / MOTOR_PER_NEWTON
 
 
 def centre(
-    moves: ArmedCart, deadband: Mapping[int, float] = NOMINAL_DEADBAND, tolerance: float = CENTRED
+    moves: ArmedCart,
+    deadband: Mapping[int, float] = NOMINAL_DEADBAND,
+    tolerance: float = CENTRED,
+    slowest: float = 0.0,
 ) -> None:
-    """Move the cart to within `tolerance` m of the middle. Raises NotReadyError if it does not get there."""
-    controller = Centring(moves.period, deadband)
+    """Move the cart to within `tolerance` m of the middle, at least `slowest` m/s fast.
+
+    Raises NotReadyError if it does not get there.
+    """
+    controller = Centring(moves.period, deadband, slowest)
     before = moves.drive(0)
     state = moves.drive(0)
     for _ in range(moves.periods(LONGEST_CENTRING)):
@@ -89,11 +99,20 @@ def centre(
     )
 
 
-def rough_motor(force: float) -> int:
+def rough_motor(force: float, deadband: Mapping[int, float] = NOMINAL_DEADBAND) -> int:
     """Return the motor value for about a force in N, at most `GENTLE_MOTOR`."""
     if abs(force) < SMALLEST_FORCE:
         return 0
-    return round(within(GENTLE_MOTOR, math.copysign(MOTOR_OFFSET, force) + MOTOR_PER_NEWTON * force))
+    side = RIGHT if force > 0 else LEFT
+    return round(within(GENTLE_MOTOR, side * motor_offset(deadband, side) + MOTOR_PER_NEWTON * force))
+
+
+def motor_offset(deadband: Mapping[int, float], side: int) -> float:
+    """Return the motor value at which the force to a side starts, at most the nominal one.
+
+    It falls to 0 with the dead-band: a jump of the motor value where the force changes its sign rattles.
+    """
+    return max(0.0, min(MOTOR_OFFSET, MOTOR_OFFSET - 2 * (NOMINAL_DEADBAND[side] - deadband[side])))
 
 
 def interval(before: State, state: State) -> float:

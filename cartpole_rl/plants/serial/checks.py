@@ -1,7 +1,7 @@
-"""The checks of the preflight: small moves that show how a cart is wired and limited, and how quick it is.
+"""The checks of the preflight: small moves that show a cart's wiring, limits and latency.
 
-Each check moves the cart a few centimetres at most, brings it back to the middle, and returns its result in
-words. It raises NotReadyError, which says what is wrong and what to do about it.
+Each check moves the cart a few centimetres at most, brings it back to the middle, and returns its result as
+text. It raises NotReadyError, which says what is wrong and what to do about it.
 
 Signs: a positive motor value moves the cart to the right, and the cart's count goes up. The hanging pole of a
 cart that accelerates to the right stays behind: its tip swings left, its angle grows beyond pi, its count
@@ -12,7 +12,7 @@ import math
 import statistics
 import time
 
-from cartpole_rl.physics.encoders import POLE_COUNTS_PER_TURN
+from cartpole_rl.physics.encoders import POLE_COUNTS_PER_TURN, cart_counts, pole_counts
 from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.centring import LEFT, RIGHT
 from cartpole_rl.plants.serial.errors import NotReadyError
@@ -27,12 +27,12 @@ LOST_SHARE = 0.05  # of the frames; a good cable loses none
 PERIOD_TOLERANCE = 0.02  # of the period in INFO
 ROUND_TRIP_SHARE = 0.5  # of a period: a command that comes later acts in the next one
 
-SURELY_MOVED = 44  # counts, 1 mm
-POLE_MOVED = 14  # counts; more, where the pole still swings
+SURELY_MOVED = cart_counts(0.001)
+POLE_MOVED = pole_counts(1.25)  # more, where the pole still swings
 PUSH = 60  # motor values above the dead-band: about 1.5 m/s^2
 LONGEST_PUSH, FARTHEST_PUSH = 0.3, 0.035  # s, m
 DRIFT = 4  # periods over which a remaining swing is measured
-NO_SWING, LONG_PATIENCE = 6, 15.0  # counts peak to peak, s
+NO_SWING, LONG_PATIENCE = pole_counts(0.5), 15.0  # peak to peak, s
 LARGEST_DEADBAND = 150  # motor value; of nine_levels the two weakest, 100 and 150, would not move such a cart
 STEPS = 4  # for the latency, two to each side
 LONGEST_LATENCY_PERIODS = 2.0  # agents are trained on up to about one period
@@ -53,7 +53,7 @@ def link(cart: SerialCart) -> str:
     bad = counted.bad_frames + counted.lost_frames
     if bad > LOST_SHARE * (counted.frames_received + counted.lost_frames):
         raise NotReadyError(
-            f"{counted.lost_frames} frames were lost and {counted.bad_frames} spoilt of "
+            f"{counted.lost_frames} frames were lost and {counted.bad_frames} damaged of "
             f"{counted.frames_received}",
             "use a short shielded cable, away from the motor's, or baud=115200",
         )
@@ -76,7 +76,7 @@ def link(cart: SerialCart) -> str:
 
 
 def limits(information: Info) -> str:
-    """Check that INFO describes the kind of cart that everything above the wire takes it for."""
+    """Check that the scales and limits in INFO are those that this package assumes."""
     check_scales(information)
     check_limits(information)
     soft, hard = metres(information.soft_limit_counts), metres(information.hard_limit_counts)

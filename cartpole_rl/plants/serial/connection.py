@@ -9,11 +9,16 @@ acknowledged; one and a half periods after it was sent the newest state is retur
 
 If nothing arrives for `nudge_after` seconds, the host sends HELLO. That is harmless to a cart with its own
 clock. A lockstep emulator, which advances by one period per frame, continues after a lost frame.
+
+A motor value that the operating system delayed for three periods or more, as behind a full buffer, answers
+a state that is too old. The link then counts as broken.
 """
 
+import math
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import TypeVar
 
 from cartpole_rl.errors import LinkError
@@ -32,11 +37,14 @@ from cartpole_rl.wire import (
     Nack,
     SetMotor,
     State,
+    Stop,
+    ticks_between,
 )
 from cartpole_rl.wire.frames import END
 
 Answer = TypeVar("Answer", bound=Message)
 
+WATCHDOG_PERIODS = 3  # without a command, after which the cart sets its motor to 0
 BACKLOG_BYTES = 1000  # with more waiting, the system's buffer (4096) may have dropped newer bytes
 UNACKNOWLEDGED_PERIODS = 1.5  # after a frame: by then the next state has come, if the frame has arrived
 KEPT_ANSWERS = 64
@@ -61,7 +69,7 @@ class Connection:
         pause = min(self._settings.answer_timeout, self._settings.connect_timeout)
         while time.perf_counter() < deadline:
             self._answers.clear()
-            self.link.write(END)  # ends whatever the cart has taken for the start of a frame
+            self.link.write(END)  # ends a partial frame that the cart may have read
             self.link.send(Hello())
             until = min(deadline, time.perf_counter() + pause)
             answer = self._await_answer(until, (), Info, lambda info: True)
@@ -75,8 +83,9 @@ class Connection:
         kind: type[Answer],
         fits: Callable[[Answer], bool] = lambda answer: True,
         before: tuple[Message, ...] = (),
+        within: float = math.inf,
     ) -> Answer:
-        """Send `before` and `message` until the cart answers `message`; return the answer.
+        """Send `before` and `message` until the cart answers `message`, or `within` s; return the answer.
 
         Raises RefusedError or FaultError for a NACK, LinkError without an answer.
         """
@@ -84,25 +93,32 @@ class Connection:
         self._refused_sequence = -1
         self._answers.clear()
         asked: list[int] = []
+        end, pause = time.perf_counter() + within, min(self._settings.answer_timeout, within / 2)
         for _ in range(1 + self._settings.retries):
             asked.append(self.link.send(*before, message))
             self.notice_backlog()
             self._asked_sequence = asked[-1]
-            deadline = time.perf_counter() + self._settings.answer_timeout
+            deadline = min(end, time.perf_counter() + pause)
             answer = self._await_answer(deadline, asked, kind, fits)
             if answer is not None:
                 self._refused = None  # of an earlier motor value, which has no meaning any more
                 return answer
+            if deadline == end:
+                break
         raise LinkError(
             f"the cart on {self.link.port} did not answer {message.TYPE.name}, asked {len(asked)} times: "
             "check its cable and power"
         )
 
     def send_motor(self, value: int) -> None:
-        """Send a motor value once."""
+        """Send a motor value once. Raises LinkError if it was delayed for as long as the watchdog waits."""
         self._refused_sequence = -1
+        before, started = self._tracker.last, time.perf_counter()
         self.link.send(SetMotor(value))
         self._tracker.send_command(self.link.sequence, self.link.sent_at)
+        period_us = min(self._tracker.period_us or LONGEST_PERIOD_US, LONGEST_PERIOD_US)
+        if self.link.sent_at - started > WATCHDOG_PERIODS * period_us * 1e-6:
+            self._check_delay(before)
 
     def current_state(self) -> State:
         """Wait for the newest state that was measured after the cart took the last frame.
@@ -136,6 +152,27 @@ class Connection:
         if backlog:
             self._tracker.catch_up()
         return backlog
+
+    def _check_delay(self, before: State | None) -> None:
+        """Stop the cart and raise LinkError if it has ticked on during a slow write.
+
+        `before` is the newest state before the write. A lockstep emulator waits for the host.
+        """
+        deadline = time.perf_counter() + self._settings.timeout
+        while True:
+            state = self._tracker.last
+            if before is None or state is None or ticks_between(before.tick, state.tick) >= WATCHDOG_PERIODS:
+                break
+            if state is not before and self._is_current(state):
+                return
+            self._endure_silence(deadline)
+            self._read()
+        with suppress(LinkError):
+            self.link.send(SetMotor(0), Stop())
+        raise LinkError(
+            f"{self.link.port} took a motor value too slowly: check the cart's cable, "
+            "end what keeps this computer busy"
+        )
 
     def _await_answer(
         self, deadline: float, asked: Sequence[int], kind: type[Answer], fits: Callable[[Answer], bool]
@@ -172,7 +209,7 @@ class Connection:
                 return older
 
     def _is_current(self, state: State) -> bool:
-        """Whether the state was measured after the cart took the last frame, or that frame must be lost."""
+        """Return True if the state was measured after the last frame arrived, or if that frame is lost."""
         link = self.link
         if link.sequence == state.last_sequence:
             return True

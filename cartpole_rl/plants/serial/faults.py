@@ -1,4 +1,4 @@
-"""Clearing latched faults: a cart that stopped itself moves again only after somebody has agreed."""
+"""Clearing latched faults: a cart that stopped itself moves again only after a person has confirmed."""
 
 import logging
 from collections.abc import Callable
@@ -33,7 +33,7 @@ class FaultClearing:
     def clear(self, cart: SerialCart, fault: int) -> None:
         """Clear the latched `fault` bits of the cart.
 
-        Raises FaultError if nobody confirms, or if the cause of a fault is still there.
+        Raises FaultError if no person confirms, or if the cause of a fault persists.
         """
         words = f"the cart latched a fault: {fault_words(fault)}"
         if self.cleared < self.unattended:

@@ -4,12 +4,11 @@ Positions, angles and forces are computed from constants: encoder counts per tur
 of motor values. With a cart that has other constants every number would be wrong, so it is refused.
 """
 
-from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_COUNTS_PER_TURN
+from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, HALF_SPAN, POLE_COUNTS_PER_TURN
+from cartpole_rl.physics.motor import LARGEST_MOTOR
 from cartpole_rl.plants.serial.errors import NotReadyError
 from cartpole_rl.wire import Info
 
-MOTOR_LIMIT = 255
-HALF_SPAN = 0.407  # m, Quanser IP02: middle of the track to a stop
 SPAN_TOLERANCE = 0.05  # share; homing accepts 3 %
 SHORTEST_PERIOD_US, LONGEST_PERIOD_US = 5_000, 100_000  # docs/protocol.md, SET_PERIOD
 NANOMETRES_PER_COUNT = round(CART_METRES_PER_COUNT * 1e9)
@@ -20,7 +19,7 @@ def check_scales(information: Info) -> None:
     constants = {
         "cart nm per count": (information.cart_nanometres_per_count, NANOMETRES_PER_COUNT),
         "pole counts per turn": (information.pole_counts_per_turn, POLE_COUNTS_PER_TURN),
-        "motor limit": (information.motor_limit, MOTOR_LIMIT),
+        "motor limit": (information.motor_limit, LARGEST_MOTOR),
     }
     for name, (reported, expected) in constants.items():
         if reported != expected:

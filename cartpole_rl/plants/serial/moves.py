@@ -31,7 +31,7 @@ class ArmedCart:
         return self.check(self.cart.get_state())
 
     def rest(self) -> State:
-        """Apply motor 0 until the cart stands. Raises NotReadyError if it never does."""
+        """Apply motor 0 until the cart is at rest. Raises NotReadyError if it never does."""
         states = [self.drive(0)]
         for _ in range(self.periods(LONGEST_REST)):
             states.append(self.drive(0))

@@ -21,7 +21,7 @@ from cartpole_rl.plants.serial.faults import Confirm, FaultClearing, nobody
 from cartpole_rl.plants.serial.information import check_scales
 from cartpole_rl.plants.serial.preparation import Preparation, StartPosition
 from cartpole_rl.plants.serial.settings import SerialSettings
-from cartpole_rl.plants.specs import Plant, one_cart
+from cartpole_rl.plants.specs import Plant, Report, one_cart
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.wire import Fault, Flags, State, seconds_between, ticks_between, went_back
 
@@ -31,7 +31,7 @@ class Owned(Protocol):
 
     @property
     def died(self) -> str:
-        """How it ended by itself, in words; empty while it lives."""
+        """The reason why it ended early; empty while it runs."""
 
     def close(self) -> None:
         """End it."""
@@ -93,7 +93,7 @@ class SerialPlant(Plant):
     def halt(self) -> None:
         """Set the motor to 0 and disarm, between episodes; does not raise."""
         self._driving = False
-        with suppress(PlantError):  # the cart's watchdog does it where the link cannot
+        with suppress(PlantError):  # the cart's watchdog does it if the link cannot
             self.cart.stop()
 
     def close(self, *, raise_if_closed: bool = True) -> None:
@@ -115,7 +115,7 @@ class SerialPlant(Plant):
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDict:
         if tensordict is not None and "_reset" in tensordict and not tensordict["_reset"].any():
-            return self.frame(*self._report(self._preparation.control_period))
+            return self.frame(self._report(self._preparation.control_period))
         self._reach()
         self._preparation.prepare()
         self.cart.start()
@@ -124,11 +124,11 @@ class SerialPlant(Plant):
         self.ended_by = ""
         self.last_error = None
         self._driving = True
-        return self.frame(*self._report(self._preparation.control_period))
+        return self.frame(self._report(self._preparation.control_period))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         if not self._driving:
-            return self.step_frame(*self._report(self._preparation.control_period))
+            return self.step_frame(self._report(self._preparation.control_period))
         before = self._state
         try:
             self.cart.set_motor(int(tensordict["motor"]))
@@ -138,9 +138,9 @@ class SerialPlant(Plant):
             self._state = state
         except (LinkError, RefusedError, FaultError) as error:
             self._break_off(error)
-            return self.step_frame(*self._report(self._preparation.control_period))
+            return self.step_frame(self._report(self._preparation.control_period))
         self._end_if_due()
-        return self.step_frame(*self._report(seconds_between(before.time_us, self._state.time_us)))
+        return self.step_frame(self._report(seconds_between(before.time_us, self._state.time_us)))
 
     def _end_if_due(self) -> None:
         """Set `ended_by` and stop the motor if the new state ends the episode."""
@@ -168,8 +168,8 @@ class SerialPlant(Plant):
             self.halt()
         self._state = replace(self._state, motor_applied=0, command_age_ms=0)
 
-    def _report(self, dt: float) -> tuple[Tensor, ...]:
-        """Return the arguments of `frame` for the newest state; `dt` in s."""
+    def _report(self, dt: float) -> Report:
+        """Return the report of the newest state; `dt` in s."""
         state = self._state
         counts = (state.cart_counts, state.pole_counts - self._turns)
         halted = not self._driving and not self.ended_by
@@ -194,7 +194,7 @@ class SerialPlant(Plant):
         except (PortError, LinkError) as error:
             lost = f" ({self.last_error})" if self.last_error else ""
             why = self._owned.died if self._owned is not None and self._owned.died else error
-            raise LinkError(f"the link to the cart was lost{lost} and is not there again: {why}") from error
+            raise LinkError(f"the link to the cart was lost{lost} and not restored: {why}") from error
 
     def _connect(self) -> None:
         """Open the port and check the cart's scales. Raises PortError, LinkError, NotReadyError."""

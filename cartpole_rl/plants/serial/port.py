@@ -1,4 +1,4 @@
-"""Find and open the serial port of a cart; say in words why it cannot be found or opened.
+"""Find and open the serial port of a cart; explain why it cannot be found or opened.
 
 An ESP32 board restarts when DTR or RTS rise, so both are set low before the port is opened. The operating
 system may still pulse them for a moment; `SerialCart` therefore sends HELLO until the cart has booted.
@@ -35,7 +35,7 @@ def open_port(port: str, baud: int, write_timeout: float) -> serial.SerialBase:
         line.dtr = False
         line.rts = False
         line.open()
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, OverflowError) as error:
         raise PortError(why_not_open(port, error)) from error
     return line
 
@@ -65,7 +65,7 @@ def found_ports() -> list[UsbPort]:
     return usb_ports(list_ports.comports())
 
 
-def why_not_open(port: str, error: OSError | ValueError) -> str:
+def why_not_open(port: str, error: OSError | ValueError | OverflowError) -> str:
     """Return one line: the port, what is wrong with it, and the remedy."""
     number = getattr(error, "errno", None)
     if number in (errno.ENOENT, errno.ENODEV, errno.ENXIO):

@@ -19,7 +19,7 @@ BOARDS = {  # vendor ids of chips on ESP32 and Arduino boards
 
 @dataclass(frozen=True, order=True)
 class UsbPort:
-    """A serial port on USB. Texts are empty where the device has none."""
+    """A serial port on USB. Texts are empty if the device has none."""
 
     device: str  # path or name to open
     vendor: int  # USB vendor id

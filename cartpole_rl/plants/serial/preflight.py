@@ -1,4 +1,4 @@
-"""The preflight: checks in an order in which none relies on one that failed."""
+"""The preflight: checks in order; each relies only on checks that passed before."""
 
 from collections.abc import Callable, Iterator
 from contextlib import suppress

@@ -45,7 +45,7 @@ POSITIONS: dict[StartPosition, PolePosition] = {
     "hanging": PolePosition(
         math.pi,
         math.radians(5),
-        math.radians(1),  # homing accepts eight counts of 4096 a turn
+        math.radians(1),  # homing accepts 0.7 degrees
         "let it hang until it is still; it may not be touched during homing",
     ),
 }
@@ -76,7 +76,7 @@ class Preparation:
     def prepare(self) -> None:
         """Bring the cart to the middle and wait for the pole; the cart is disarmed.
 
-        Raises FaultError for a fault that does not clear or that nobody agrees to clear, or for a homing that
+        Raises FaultError for a fault that does not clear or that no one agrees to clear, or for a homing that
         fails; PlantError if the pole does not reach its position in time; LinkError.
         """
         restarts = self._cart.restarts
@@ -102,7 +102,7 @@ class Preparation:
         self._await_pole(POSITIONS[self.start])
 
     def _clear_faults(self) -> None:
-        """Clear latched faults if there are any and somebody agrees. Raises FaultError."""
+        """Clear latched faults if there are any and a person confirms. Raises FaultError."""
         if fault := self._cart.poll_state().fault:
             self.require_homing()
             self._faults.clear(self._cart, fault)

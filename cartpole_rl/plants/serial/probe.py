@@ -1,5 +1,6 @@
 """The moves of the preflight, on a cart that may be wired wrongly."""
 
+from cartpole_rl.physics.encoders import cart_counts, pole_counts
 from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.centring import NOMINAL_DEADBAND, centre
 from cartpole_rl.plants.serial.errors import NotReadyError
@@ -7,10 +8,12 @@ from cartpole_rl.plants.serial.moves import GENTLE_MOTOR, ArmedCart, metres
 from cartpole_rl.wire import Flags, State
 
 FARTHEST = 0.08  # m from the middle: no check needs more
+LEAST_SPEED = 0.03  # m/s of the way back to the middle; slower would take long and show nothing
 NEAR = 0.004  # m from the middle: no check needs to start closer
-RAMP_STEP = 1  # motor values a period
-SMALL_SWING, SHORT_PATIENCE = 40, 5.0  # counts peak to peak, s; pushes the cart like three motor values
-MOVED = 4  # counts, 0.09 mm: more than a pole that swings can press into the gears' play
+RAMP_STEP = 1  # motor values per period
+SMALL_SWING = pole_counts(3.5)  # peak to peak; pushes the cart like three motor values
+SHORT_PATIENCE = 5.0  # s
+MOVED = cart_counts(0.09e-3)  # more than a pole that swings can press into the gears' play
 
 
 class Probe(ArmedCart):
@@ -48,7 +51,7 @@ class Probe(ArmedCart):
         )
 
     def centre(self) -> None:
-        """Bring the cart back to the middle and let it stand. Needs the sign of the cart's count to be right.
+        """Bring the cart to the middle and to rest. Needs the sign of the cart's count to be right.
 
         A dead-band that is not measured yet is taken from the other side. Raises NotReadyError if the cart
         does not get there.
@@ -56,18 +59,18 @@ class Probe(ArmedCart):
         other_side = {-side: motor for side, motor in self.deadband.items()}
         known = NOMINAL_DEADBAND | other_side | self.deadband
         self.rest()
-        centre(self, known, NEAR)
+        centre(self, known, NEAR, LEAST_SPEED)
         self.rest()
 
     def check(self, state: State) -> State:
-        """Note where the cart is; return the state, or raise what is wrong with it."""
+        """Record the cart's position and return the state. Raises NotReadyError or FaultError."""
         self.farthest = max(self.farthest, abs(state.cart_counts))
         self.limited = self.limited or bool(self.cart.flags & Flags.SOFT_LIMIT)
         super().check(state)
         if metres(abs(state.cart_counts)) > FARTHEST:
             self.cart.stop()
             raise NotReadyError(
-                f"the cart went {metres(state.cart_counts) * 1e3:+.0f} mm, more than any move that was asked",
+                f"the cart went {metres(state.cart_counts) * 1e3:+.0f} mm, further than any requested move",
                 "put the track level, check the motor driver",
             )
         return state

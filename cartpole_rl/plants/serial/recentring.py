@@ -12,22 +12,22 @@ import math
 from contextlib import suppress
 
 from cartpole_rl.errors import PlantError
-from cartpole_rl.physics.encoders import POLE_RADIANS_PER_COUNT
+from cartpole_rl.physics.encoders import POLE_RADIANS_PER_COUNT, pole_counts
 from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.centring import FRICTION, MASS, centre, interval, rough_motor, within
 from cartpole_rl.plants.serial.errors import NotReadyError
 from cartpole_rl.plants.serial.moves import SWING_SECONDS, ArmedCart, metres, spread
 from cartpole_rl.wire import State, seconds_between
 
-ROLLING_PERIODS, ROLLING = 10, 0.04  # m in so many periods, 0.2 m/s: a cart that still rolls
+ROLLING_PERIODS, ROLLING = 10, 0.04  # periods, and m in them: 0.2 m/s, a cart that still rolls
 LONGEST_ROLLING = 5.0  # s
 
 ROUNDS = 3  # of braking, centring and waiting
 LONGEST_BRAKING, LONGEST_CALM = 12.0, 4.0  # s
-STILL = 11  # pole counts peak to peak, 1 degree: worth waiting for, up to LONGEST_CALM
-NEARLY_STILL = 24  # pole counts peak to peak, 1 degree to each side: good enough
-BRAKED = 30  # pole counts peak to peak; the cart's friction keeps it from braking smaller swings
-SLIPPED = 17  # pole counts, 1.5 degrees: a pole that rests so far from where it did has lost its zero
+STILL = pole_counts(1.0)  # peak to peak: worth waiting for, up to LONGEST_CALM
+NEARLY_STILL = pole_counts(2.1)  # peak to peak: good enough
+BRAKED = pole_counts(2.6)  # peak to peak; the cart's friction keeps it from braking smaller swings
+SLIPPED = pole_counts(1.5)  # a pole that rests this far off after homing lost its zero
 
 FOLLOW = 0.9  # m/s^2 of the cart for 1 rad/s of the pole
 HARDEST_FOLLOW = 2.0  # m/s^2 in the middle, ...
@@ -58,7 +58,7 @@ def recentre(cart: SerialCart, hanging: int) -> None:
     if abs(off) > SLIPPED:
         raise NotReadyError(
             f"the pole rests {off * 360 / turn:+.1f} deg from where it did after homing",
-            "check how its encoder is coupled to it",
+            "check the coupling of its encoder",
         )
 
 
@@ -73,7 +73,7 @@ def stop_rolling(cart: SerialCart) -> None:
         newest = cart.poll_state()
         counts.append(newest.cart_counts)
         if seconds_between(began, newest.time_us) > LONGEST_ROLLING:
-            raise NotReadyError("the cart rolls on with its motor off", "put the track level")
+            raise NotReadyError("the cart keeps rolling with its motor off", "put the track level")
     if abs(newest.cart_counts) >= cart.information.hard_limit_counts:
         raise NotReadyError("the cart stands at the end of the track", "home it")
 

@@ -35,7 +35,7 @@ class StateTracker:
         self.measuring = True  # latencies and late ticks are counted
         self.stopped_clock: tuple[State, State] | None = None  # two states between which no time passed
         self._newest: State | None = None  # arrived, and not handed out yet
-        self._last: State | None = None  # the newest that arrived, handed out or not
+        self.last: State | None = None  # the newest that arrived, handed out or not
         self._missing: set[int] = set()  # ticks that were counted as lost, and may still arrive
         self._catching_up = False  # the operating system dropped states while the host was busy
         self._driving = False  # states are answered with motor values
@@ -45,7 +45,7 @@ class StateTracker:
 
     @contextmanager
     def uncounted(self) -> Iterator[LinkStatistics]:
-        """Count into statistics that are thrown away: a boot banner is no fault of the link."""
+        """Discard what is counted within: a boot banner is not a fault of the link."""
         kept, self.statistics = self.statistics, LinkStatistics()
         try:
             yield self.statistics
@@ -55,12 +55,12 @@ class StateTracker:
 
     def disconnect(self) -> None:
         """Forget the states of this connection; the cart may restart before the next one."""
-        self._newest = self._last = self.stopped_clock = self.period_us = None
+        self._newest = self.last = self.stopped_clock = self.period_us = None
         self._missing.clear()
 
     def receive(self, state: State, flags: Flags, arrived_at: float) -> bool:
         """Take in a state that has arrived; return True if it is the newest now."""
-        last = self._last
+        last = self.last
         if last is not None:
             if ticks_between(state.tick, last.tick) < OVERTAKEN_TICKS:
                 self._count_dropped(state.tick)
@@ -73,7 +73,7 @@ class StateTracker:
                 self._count_missing(state.tick, ticks - 1)
         if self._newest is not None:
             self.count_passed_over()
-        self._last = self._newest = state
+        self.last = self._newest = state
         self.newest_at = arrived_at
         self.flags = flags
         return True
@@ -104,7 +104,7 @@ class StateTracker:
         self._overdue = self._handed_out if delay > self.period_us * 1e-6 else None
 
     def send_question(self) -> None:
-        """Note that something else than a motor value is sent: waiting for its answer is no delay."""
+        """Note that a question is sent, not a motor value: waiting for its answer is not a delay."""
         self._driving = self.awaits_command = False
         self._overdue = self._commanded = None
 

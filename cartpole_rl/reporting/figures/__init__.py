@@ -6,15 +6,12 @@ No function touches pyplot or a global setting, so that they may be called from 
 from cartpole_rl.reporting.figures.behaviours import behaviour
 from cartpole_rl.reporting.figures.comparisons import comparison
 from cartpole_rl.reporting.figures.files import png, save
-from cartpole_rl.reporting.figures.histograms import randomization_histograms
-from cartpole_rl.reporting.figures.learning_curves import THESIS_GUIDES, learning_curve
+from cartpole_rl.reporting.figures.learning_curves import learning_curve
 
 __all__ = [
-    "THESIS_GUIDES",
     "behaviour",
     "comparison",
     "learning_curve",
     "png",
-    "randomization_histograms",
     "save",
 ]

@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from cartpole_rl.physics.motor import LARGEST_MOTOR
 from cartpole_rl.reporting import style
 from cartpole_rl.reporting.figures.annotations import at_time, beside
 from cartpole_rl.reporting.words import ending_text
@@ -18,7 +19,6 @@ from cartpole_rl.tasks.rewards import UPRIGHT_ANGLE
 from cartpole_rl.tasks.upright import is_upright, upright_since
 
 SMALL_SWING = 40.0  # deg; the angle axis of an episode within it is enlarged
-MOTOR_LIMIT = 255
 MOTOR_TICKS = (-250, -125, 0, 125, 250)
 
 Array = NDArray[np.float64]
@@ -113,7 +113,7 @@ def _draw_motor(axes: Axes, episode: Episode) -> None:
         guarded = np.where(episode.guarded, episode.motor, 0)
         axes.stairs(guarded, episode.time, fill=True, color=style.VERMILLION, label="track guard")
         axes.legend(loc="upper right")
-    axes.set_ylim(-1.15 * MOTOR_LIMIT, 1.15 * MOTOR_LIMIT)
+    axes.set_ylim(-1.15 * LARGEST_MOTOR, 1.15 * LARGEST_MOTOR)
     axes.set_yticks(MOTOR_TICKS)
     beside(axes, MOTOR_TICKS[-1], "pushes right", style.MUTED)
     beside(axes, MOTOR_TICKS[0], "pushes left", style.MUTED)

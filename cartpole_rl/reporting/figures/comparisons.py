@@ -10,14 +10,13 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
-from scipy import stats
 
 from cartpole_rl.errors import ConfigError
+from cartpole_rl.intervals import student_interval
 from cartpole_rl.reporting import style
 from cartpole_rl.reporting.figures.annotations import guide
 from cartpole_rl.reporting.table import interval_text
 
-CONFIDENCE = 0.95
 DOTS = -0.15  # offset of a column's dots, in columns
 MEAN = 0.12  # offset of its mean and interval
 SPREAD = 0.11  # half width of the cloud of dots
@@ -36,7 +35,7 @@ def comparison(
     """Draw each episode's score as a dot, the mean with a 95 % interval, and its ratio to the first mean.
 
     `results` maps a name, such as "simulated", to the scores of its episodes [episodes]. `intervals` maps a
-    name to (low, high) of its mean; where it is missing, Student's t interval is drawn, and none for a single
+    name to (low, high) of its mean; if it is missing, Student's t interval is drawn, and none for a single
     episode. `guides` names scores to draw as lines. Raises ConfigError for no result or one without episodes.
     """
     scores = {name: np.asarray(values, dtype=np.float64).ravel() for name, values in results.items()}
@@ -56,15 +55,6 @@ def comparison(
     style.label(axes, y="score of an episode")
     style.title(axes, title, "dots: episodes,  line and box: their mean and its 95 % interval")
     return figure
-
-
-def student_interval(scores: Array) -> Interval:
-    """Return the 95 % interval of the mean of scores [episodes] by Student's t; NaN for a single episode."""
-    if scores.size < 2:
-        return math.nan, math.nan
-    error = float(scores.std(ddof=1)) / math.sqrt(scores.size)
-    half = float(stats.t.ppf(0.5 + CONFIDENCE / 2, scores.size - 1)) * error
-    return float(scores.mean()) - half, float(scores.mean()) + half
 
 
 def _draw_result(axes: Axes, column: int, scores: Array, interval: Interval) -> None:

@@ -5,14 +5,15 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
+from cartpole_rl.files import replacing
 from cartpole_rl.reporting import style
 
 
 def save(figure: Figure, path: Path | str) -> Path:
     """Write `figure` to `path` in the format of its suffix (.png, .pdf, .svg), and create its folder."""
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=style.DPI)
+    with replacing(path) as beside:
+        figure.savefig(beside, format=path.suffix.removeprefix("."), dpi=style.DPI)
     return path
 
 

@@ -10,13 +10,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from cartpole_rl.identification.quantities import Quantity
+from cartpole_rl.identification.replay import Replayed
 from cartpole_rl.reporting import style
 from cartpole_rl.reporting.curves import Curve
 from cartpole_rl.reporting.figures.annotations import beside
 from cartpole_rl.reporting.figures.behaviours import wrapped_line
-from cartpole_rl.reporting.identification import Estimate
-from cartpole_rl.reporting.replays import ReplayedEpisode
-from cartpole_rl.reporting.table import number_text
+from cartpole_rl.reporting.table import interval_text, number_text
 from cartpole_rl.tasks.episode import Episode
 
 IDENTIFIED, PRIOR, SIMULATED = style.BLUE, style.MUTED, style.VERMILLION
@@ -49,14 +49,14 @@ def _draw_curve(axes: Axes, curve: Curve, title: str, x: str, y: str) -> None:
     style.title(axes, title)
 
 
-def interval_figure(estimates: Sequence[Estimate]) -> Figure:
+def interval_figure(quantities: Sequence[Quantity]) -> Figure:
     """Draw the 95 % interval of each quantity and its prior value, in units of the interval's half width."""
-    figure = style.new_figure(height=1.2 + 0.36 * len(estimates))
+    figure = style.new_figure(height=1.2 + 0.36 * len(quantities))
     axes = figure.subplots()
     style.dress(axes, grid="x")
-    for height, estimate in enumerate(reversed(estimates)):
-        _draw_interval(axes, height, estimate)
-    names = [estimate.name for estimate in reversed(estimates)]
+    for height, quantity in enumerate(reversed(quantities)):
+        _draw_interval(axes, height, quantity)
+    names = [quantity.words for quantity in reversed(quantities)]
     axes.set_yticks(range(len(names)), names, fontsize=style.SMALL_SIZE)
     axes.set_xlim(-FARTHEST - 1, FARTHEST + 1)
     style.label(axes, x="difference from the identified value\n(half widths of the 95 % interval)")
@@ -64,10 +64,11 @@ def interval_figure(estimates: Sequence[Estimate]) -> Figure:
     return figure
 
 
-def _draw_interval(axes: Axes, height: int, estimate: Estimate) -> None:
-    value, half = estimate.value, max((estimate.high - estimate.low) / 2, 1e-12)
+def _draw_interval(axes: Axes, height: int, quantity: Quantity) -> None:
+    value, low, high, prior = quantity[3:]
+    half = max((high - low) / 2, 1e-12)
     axes.plot(
-        [(estimate.low - value) / half, (estimate.high - value) / half],
+        [(low - value) / half, (high - value) / half],
         [height, height],
         color=IDENTIFIED,
         linewidth=5,
@@ -75,13 +76,14 @@ def _draw_interval(axes: Axes, height: int, estimate: Estimate) -> None:
         solid_capstyle="butt",
     )
     axes.plot(0, height, "o", color=IDENTIFIED)
-    away = (estimate.prior - value) / half
+    away = (prior - value) / half
     marker = "D" if abs(away) <= FARTHEST else (">" if away > 0 else "<")
     axes.plot(np.clip(away, -FARTHEST, FARTHEST), height, marker, color=PRIOR, markersize=6)
-    beside(axes, height, f"{estimate.text}   (prior {number_text(estimate.prior)})", style.INK)
+    text = f"{interval_text(value, low, high)} {quantity.unit}   (prior {number_text(prior)})"
+    beside(axes, height, text, style.INK)
 
 
-def experiments_figure(replays: Mapping[str, ReplayedEpisode]) -> Figure:
+def experiments_figure(replays: Mapping[str, Replayed]) -> Figure:
     """Draw each experiment, measured and simulated: position (cm) and angle from hanging (deg) over time."""
     figure = style.new_figure(height=1.0 + 2.1 * len(replays), width=10.0)
     panels = figure.subplots(len(replays), 2, squeeze=False)
@@ -110,7 +112,7 @@ def _liveliest(episode: Episode) -> float:
     return float(starts[int(np.argmax(covered))])
 
 
-def _draw_positions(axes: Axes, replay: ReplayedEpisode) -> None:
+def _draw_positions(axes: Axes, replay: Replayed) -> None:
     style.dress(axes)
     episode = replay.episode
     axes.plot(episode.time, 100 * episode.x, color=style.CART, linewidth=3, alpha=0.55, label="measured")
@@ -119,7 +121,7 @@ def _draw_positions(axes: Axes, replay: ReplayedEpisode) -> None:
         axes.plot(times[known], 100 * positions[known], color=SIMULATED, linewidth=1.1)
 
 
-def _draw_angles(axes: Axes, replay: ReplayedEpisode) -> None:
+def _draw_angles(axes: Axes, replay: Replayed) -> None:
     style.dress(axes)
     measured = wrapped_line(replay.episode.time, replay.episode.theta - np.pi)
     axes.plot(*measured, color=style.POLE, linewidth=3, alpha=0.45, label="measured")

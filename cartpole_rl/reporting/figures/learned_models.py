@@ -5,8 +5,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from cartpole_rl.identification.ensemble import Ensemble
+from cartpole_rl.identification.prediction import Prediction, root_mean_square
+from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT
 from cartpole_rl.physics.residual import SPACING, UNITS
-from cartpole_rl.reporting import style
+from cartpole_rl.reporting import style, words
 
 PHYSICS, LEARNED = style.VERMILLION, style.BLUE
 SMALLEST = 0.01  # mm and deg, of the logarithmic axes: less than one encoder count
@@ -14,11 +17,26 @@ SMALLEST = 0.01  # mm and deg, of the logarithmic axes: less than one encoder co
 Array = NDArray[np.float64]
 
 
+def ensemble_figure(
+    physics: Prediction, learned: Prediction, ensemble: Ensemble, subtitle: str = ""
+) -> Figure:
+    """Draw predictions by physics alone and by the ensemble, and what the ensemble has learned."""
+    visited = ensemble.positions[:, 0].flatten().numpy() * CART_METRES_PER_COUNT
+    return learned_model_figure(
+        ensemble.dynamics.period,
+        physics,
+        learned,
+        *forces_along_track(ensemble.best.as_float().places.numpy(), visited),
+        np.array(ensemble.updates, dtype=np.float64),
+        np.array(ensemble.history),
+        subtitle=subtitle,
+    )
+
+
 def learned_model_figure(
-    time: Array,
-    physics: Array,
-    learned: Array,
-    spread: Array,
+    period: float,
+    physics: Prediction,
+    learned: Prediction,
     places: Array,
     forces: Array,
     updates: Array,
@@ -28,15 +46,19 @@ def learned_model_figure(
 ) -> Figure:
     """Draw prediction errors above the learned force and the loss.
 
-    Above: RMS errors of cart (mm) and angle (deg) over the prediction `time` [H] s, and the spread of the
-    ensemble; `physics`, `learned` and `spread` are [H, 2, W] in m and rad. Below: the `forces` [M, K] N of
-    the members at `places` [K] m of the track, NaN for places that were never visited, and the validation
-    `losses` [R, M] after `updates` [R]. Thin lines are members, thick lines their mean.
+    Above: RMS errors of cart (mm) and angle (deg) over the time predicted, and the spread of the ensemble.
+    Below: the `forces` [M, K] N of the members at `places` [K] m of the track, NaN for places that were never
+    visited, and the validation `losses` [R, M] after `updates` [R]. Thin lines are members, thick lines their
+    mean. `period` is the control period, s.
     """
     figure = style.new_figure(height=6.6)
+    time = period * np.arange(len(physics.error), dtype=np.float64)
     (cart, angle), (track, learning) = figure.subplots(2, 2)
     for axes, channel, factor in ((cart, 0, 1e3), (angle, 1, 180 / np.pi)):
-        curves = [factor * root_mean_square(each[:, channel]) for each in (physics, learned, spread)]
+        curves = [
+            factor * root_mean_square(each[:, channel])
+            for each in (physics.error, learned.error, learned.spread)
+        ]
         _draw_errors(axes, time, [np.maximum(curve, SMALLEST) for curve in curves])
     style.title(cart, title, subtitle)
     style.label(cart, x="prediction time (s)", y="RMS error, cart (mm)")
@@ -64,16 +86,11 @@ def forces_along_track(outputs: Array, visited: Array) -> tuple[Array, Array]:
     return places, np.where(counts > 0, UNITS[0] * outputs.astype(np.float64), np.nan)
 
 
-def root_mean_square(values: Array) -> Array:
-    """Return the RMS over the last axis."""
-    return np.sqrt((values**2).mean(-1))
-
-
 def _draw_errors(axes: Axes, time: Array, curves: list[Array]) -> None:
     style.dress(axes)
     lines = (
-        ("physics alone", PHYSICS, "-", 2.2),
-        ("physics + network", LEARNED, "-", 2.2),
+        (words.PHYSICS, PHYSICS, "-", 2.2),
+        (words.LEARNED, LEARNED, "-", 2.2),
         ("spread of the ensemble", LEARNED, (0, (2, 2)), 1.4),
     )
     for curve, (name, colour, dashes, width) in zip(curves, lines, strict=True):

@@ -16,9 +16,6 @@ from cartpole_rl.errors import ConfigError
 from cartpole_rl.reporting import style
 from cartpole_rl.reporting.figures.annotations import guide
 
-THESIS_GUIDES = {"good": 2000.0, "very good": 2500.0}
-"""The thesis's grades of a swing-up by score (6.2)."""
-
 MILLION = 1e6
 
 Record = Mapping[str, Any]
@@ -38,7 +35,7 @@ def learning_curve(
     and over the episodes of that evaluation `score` (mean), `score_min`, `score_max`.
     **Runs that share a label are seeds of one set-up**: each is a thin line, their median a thick one. A
     single run is a thick line. The band spans the worst to the best episode of all runs of that label.
-    `threshold` is a target score; `guides` are other named scores, such as THESIS_GUIDES.
+    `threshold` is a target score; `guides` are other named scores.
     Raises ConfigError for no history and for one without a record.
     """
     if not histories or not all(records for _, records in histories):

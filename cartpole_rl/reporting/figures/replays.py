@@ -7,10 +7,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from cartpole_rl.identification.prediction import root_mean_square
+from cartpole_rl.identification.replay import Replayed, all_errors
 from cartpole_rl.reporting import style
 from cartpole_rl.reporting.figures.annotations import beside
 from cartpole_rl.reporting.figures.behaviours import wrapped_line
-from cartpole_rl.reporting.replays import ReplayedEpisode, root_mean_square, stack_errors
 from cartpole_rl.reporting.table import number_text
 
 SIMULATED = style.VERMILLION
@@ -20,7 +21,7 @@ Array = NDArray[np.float64]
 
 
 def replay_figure(
-    replays: Sequence[ReplayedEpisode],
+    replays: Sequence[Replayed],
     period: float,
     times: Sequence[float],
     title: str = "Replay",
@@ -40,18 +41,19 @@ def replay_figure(
     style.title(angle, title, subtitle)
     above.align_ylabels()
     left, right = below.subplots(1, 2, sharex=True)
-    x_errors, theta_errors = stack_errors(replays)
-    lag = period * np.arange(x_errors.shape[1], dtype=np.float64)
-    _draw_errors(left, lag, 1e3 * x_errors, style.CART)
-    _mark_times(left, lag, 1e3 * x_errors, times, "mm")
-    _draw_errors(right, lag, np.degrees(theta_errors), style.POLE)
-    _mark_times(right, lag, np.degrees(theta_errors), times, "deg")
+    errors = all_errors(replays)
+    x_errors, theta_errors = 1e3 * errors[:, 0], np.degrees(errors[:, 1])
+    lag = period * np.arange(len(errors), dtype=np.float64)
+    _draw_errors(left, lag, x_errors, style.CART)
+    _mark_times(left, lag, x_errors, times, "mm")
+    _draw_errors(right, lag, theta_errors, style.POLE)
+    _mark_times(right, lag, theta_errors, times, "deg")
     style.label(left, x="time since the reset (s)", y="cart error (mm)")
     style.label(right, x="time since the reset (s)", y="angle error (deg)")
     return figure
 
 
-def _draw_angle(axes: Axes, replay: ReplayedEpisode) -> None:
+def _draw_angle(axes: Axes, replay: Replayed) -> None:
     style.dress(axes)
     style.label(axes, y="pole angle (deg)")
     episode = replay.episode
@@ -67,7 +69,7 @@ def _draw_angle(axes: Axes, replay: ReplayedEpisode) -> None:
     beside(axes, 180, "hanging", style.MUTED)
 
 
-def _draw_position(axes: Axes, replay: ReplayedEpisode) -> None:
+def _draw_position(axes: Axes, replay: Replayed) -> None:
     style.dress(axes)
     style.label(axes, y="cart (cm)")
     episode = replay.episode
@@ -84,16 +86,17 @@ def _draw_position(axes: Axes, replay: ReplayedEpisode) -> None:
 
 
 def _draw_errors(axes: Axes, lag: Array, errors: Array, colour: str) -> None:
-    """Draw the absolute error of each stretch and their RMS on a logarithmic axis."""
+    """Draw the absolute `errors` [T + 1, S] of all stretches and their RMS on a logarithmic axis."""
     style.dress(axes)
     sizes = np.maximum(np.abs(errors), SMALLEST)
-    axes.plot(lag[1:], sizes[:, 1:].T, color=colour, linewidth=0.7, alpha=min(0.5, 6 / len(errors) + 0.05))
+    number = errors.shape[1]
+    axes.plot(lag[1:], sizes[1:], color=colour, linewidth=0.7, alpha=min(0.5, 6 / number + 0.05))
     rms = np.maximum(root_mean_square(errors), SMALLEST)
     axes.plot(lag[1:], rms[1:], color=style.INK, linewidth=2.2)
     axes.set_yscale("log")
     axes.yaxis.set_major_formatter("{x:g}")
     axes.set_xlim(0, float(lag[-1]))
-    style.title(axes, "", f"thick line: RMS of {len(errors)} stretches")
+    style.title(axes, "", f"thick line: RMS of {number} stretches")
 
 
 def _mark_times(axes: Axes, lag: Array, errors: Array, times: Sequence[float], unit: str) -> None:

@@ -9,9 +9,9 @@ from torch import Tensor
 
 from cartpole_rl.envs.build import randomizer
 from cartpole_rl.physics.actuator import static_force
-from cartpole_rl.physics.dynamics import Drive, State, run_period
-from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
+from cartpole_rl.physics.dynamics import State
 from cartpole_rl.physics.parameters import GRAVITY, CartParameters
+from cartpole_rl.plants.simulation import Carts, Inputs, commands_under_way, encoder_counts, run_carts
 from cartpole_rl.tasks.features import (
     Measured,
     measured_position,
@@ -28,16 +28,19 @@ ASYMMETRIES = ("track_tilt", "cart_coulomb_asymmetry", "force_asymmetry", "angle
 class Nodes(NamedTuple):
     """N states of a search, with everything on which the next step and its score depend."""
 
-    state: State  # true, [N] each
-    force: Tensor  # [N] N, behind the actuator's lag
-    motors: Tensor  # [D, N] delayed motor values, newest first
+    motion: Tensor  # [4, N], the true state
+    drive: Tensor  # [1 + D, N]: force N, then delayed motor values, newest first
     counts: Tensor  # [2, N] encoder counts
     points: Tensor  # [N] score so far
 
+    @property
+    def state(self) -> State:
+        """The true state, [N] each."""
+        return State(*self.motion)
+
     def at(self, rows: Tensor) -> "Nodes":
         """Return the nodes `rows`, which may repeat."""
-        state = State(*(value[rows] for value in self.state))
-        return Nodes(state, self.force[rows], self.motors[:, rows], self.counts[:, rows], self.points[rows])
+        return Nodes(*(value[..., rows] for value in self))
 
 
 class KnownCart:
@@ -47,14 +50,14 @@ class KnownCart:
         self.config = config
         self.randomizer = randomizer(config)
         self.models = config.models(config.plant)
-        self.motors = torch.tensor(config.actions.motors, dtype=torch.float32)
-        self.forces = static_force(self.motors, self.carts(len(self.motors)), self.models.actuator)
-        self.commands = 1 + max(1, math.ceil(self.randomizer.longest_delay() / config.control_period - 1e-9))
-        self.one = self.carts(1)
+        self.motors = torch.tensor(config.actions.motors)
+        carts = CartParameters.from_table(self.table(len(self.motors)))
+        self.forces = static_force(self.motors.float(), carts, self.models.actuator)
+        self.commands = commands_under_way(self.randomizer.longest_delay(), config.control_period)
+        self.one = CartParameters.from_table(self.table(1))
         self.reach = float(self.one.track_half_length)
         stiffness = self.one.first_moment * GRAVITY / self.one.pivot_inertia
         self.growth = float(stiffness.sqrt())  # 1/s, growth rate of the angle of a falling pole
-        self._carts = self.one
 
     @property
     def steps(self) -> int:
@@ -63,7 +66,7 @@ class KnownCart:
 
     @property
     def symmetric(self) -> bool:
-        """Whether left and right are alike, so that a mirrored start has the same best score."""
+        """True if left and right are symmetric, so that a mirrored start has the same best score."""
         motors = self.config.actions.motors
         mirrored = sorted(motors) == sorted(-motor for motor in motors)
         same_dead_band = bool(self.one.deadband_left == self.one.deadband_right)
@@ -71,32 +74,28 @@ class KnownCart:
             mirrored and same_dead_band and all(float(getattr(self.one, name)) == 0 for name in ASYMMETRIES)
         )
 
-    def carts(self, count: int) -> CartParameters:
-        """Return `count` nominal carts."""
-        return CartParameters.from_table(self.randomizer.nominal.unsqueeze(1).repeat(1, count))
+    def table(self, count: int) -> Tensor:
+        """Return the parameters of `count` nominal carts, [P, count]."""
+        return self.randomizer.nominal.unsqueeze(1).repeat(1, count)
 
     def hanging(self, position: float) -> Nodes:
         """Return one node: at rest at `position` m, the pole hanging."""
         state = hanging(position)
-        zero = torch.zeros(1)
-        return Nodes(state, zero, torch.zeros(self.commands, 1), self.encoders(state, self.one), zero)
+        counts = encoder_counts(state, self.one, torch.zeros(3, 1))
+        return Nodes(torch.stack(state), torch.zeros(1 + self.commands, 1), counts, torch.zeros(1))
 
     def step(self, nodes: Nodes, action: Tensor) -> tuple[Nodes, Tensor, Tensor]:
         """Take actions [N]; return (nodes a period later, points [N], which are on the track [N])."""
         period, count = self.config.control_period, len(action)
-        if len(self._carts) != count:
-            self._carts = self.carts(count)
-        cart = self._carts
-        motors = torch.cat((self.motors[action].unsqueeze(0), nodes.motors[:-1]))
-        drive = Drive(nodes.force, motors.unbind(0))
+        carts = Carts(self.table(count), nodes.motion, nodes.drive)
+        inputs = Inputs(self.motors[action].unsqueeze(0), torch.zeros(3, count))
         substeps = self.config.plant.substeps
-        state, drive = run_period(nodes.state, drive, cart.latency, cart, self.models, period, substeps)
-        counts = self.encoders(state, cart)
-        x, theta = measured_position(counts)
-        x_dot, theta_dot = measured_velocity(counts, nodes.counts, torch.full((count,), period))
+        after = run_carts(carts, inputs, models=self.models, period=period, substeps=substeps)
+        x, theta = measured_position(after.counts)
+        x_dot, theta_dot = measured_velocity(after.counts, nodes.counts, torch.full((count,), period))
         points = score(Measured(x, x_dot, theta, theta_dot), self.config.task.x_max)
-        on_track = state.x.abs() <= cart.track_half_length
-        return Nodes(state, drive.force, motors, counts, nodes.points + points), points, on_track
+        following = Nodes(after.motion, after.drive, after.counts, nodes.points + points)
+        return following, points, ~after.off_track[0]
 
     def run(self, nodes: Nodes, actions: Sequence[int]) -> Nodes:
         """Return one node after a sequence of actions, which ends early if the cart leaves the track."""
@@ -105,12 +104,6 @@ class KnownCart:
             if not on_track:
                 break
         return nodes
-
-    @staticmethod
-    def encoders(state: State, cart: CartParameters) -> Tensor:
-        """Return counts [2, N] without noise."""
-        angle = state.theta + cart.angle_offset
-        return torch.stack((state.x / CART_METRES_PER_COUNT, angle / POLE_RADIANS_PER_COUNT)).round().long()
 
 
 def hanging(position: float) -> State:

@@ -54,7 +54,7 @@ def test_track_ends_are_drawn_where_they_are(swing_up: Episode) -> None:
     assert high > 40.7
 
 
-def test_says_score_ending_and_time_upright(swing_up: Episode, runaway: Episode) -> None:
+def test_subtitle_has_score_ending_and_time_upright(swing_up: Episode, runaway: Episode) -> None:
     text = words(behaviour(swing_up, "A title"))
     assert "A title" in text
     assert f"score {swing_up.score.sum():.0f}" in text
@@ -64,7 +64,7 @@ def test_says_score_ending_and_time_upright(swing_up: Episode, runaway: Episode)
     assert "left the track" in words(behaviour(runaway))
 
 
-def test_the_mark_stands_where_the_pole_stays_up(swing_up: Episode) -> None:
+def test_the_mark_is_where_the_pole_stays_up(swing_up: Episode) -> None:
     angle = behaviour(swing_up).axes[0]
     moment = next(line for line in angle.lines if line.get_color() == style.UPRIGHT).get_xdata()[0]
     lean = np.abs((swing_up.theta + math.pi) % (2 * math.pi) - math.pi)
@@ -105,7 +105,7 @@ def test_a_wrapped_line_never_jumps(steps: list[float], start: float, wrapped: b
     assert np.all(np.diff(times) >= -1e-12)
 
 
-def test_a_line_leaves_and_comes_in_at_the_edges() -> None:
+def test_a_wrapped_line_exits_and_enters_at_the_edges() -> None:
     times, degrees = wrapped_line(np.array([0.0, 1.0]), np.radians([170.0, 200.0]))
     np.testing.assert_allclose(times, [0, 1 / 3, 1 / 3, 1 / 3, 1])
     np.testing.assert_allclose(degrees, [170, 180, np.nan, -180, -160])

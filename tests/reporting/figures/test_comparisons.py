@@ -7,11 +7,11 @@ import pytest
 from figure_contents import words
 
 from cartpole_rl.errors import ConfigError
+from cartpole_rl.intervals import student_interval
 from cartpole_rl.reporting.figures import (
     comparison,
     png,
 )
-from cartpole_rl.reporting.figures.comparisons import student_interval
 
 RESULTS = {"simulated": [4000.0, 4100.0, 4200.0], "emulated": [3000.0, 3200.0]}
 
@@ -24,7 +24,7 @@ def test_dots_are_the_episodes_and_lines_their_means() -> None:
     assert axes.get_ylabel() == "score of an episode"
 
 
-def test_says_interval_and_ratio() -> None:
+def test_labels_have_interval_and_ratio() -> None:
     text = words(comparison(RESULTS, intervals={"simulated": (4080.0, 4120.0)}))
     assert "4100 ± 20" in text
     assert "0.76 × simulated" in text

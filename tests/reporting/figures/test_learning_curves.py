@@ -7,7 +7,6 @@ from figure_contents import line_of, words
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.reporting import style
 from cartpole_rl.reporting.figures import (
-    THESIS_GUIDES,
     learning_curve,
 )
 
@@ -52,7 +51,7 @@ def test_each_label_has_its_colour() -> None:
     assert len(axes.get_legend().get_texts()) == 2
 
 
-def test_runs_with_other_evaluation_points_meet_in_between() -> None:
+def test_runs_with_different_evaluation_points_are_interpolated() -> None:
     runs = [("a", records([0, 300], 300_000)), ("a", records([0, 100, 200, 300, 400, 500, 600]))]
     axes = learning_curve(runs).axes[0]
     thick = max(axes.lines, key=lambda line: line.get_linewidth())
@@ -63,9 +62,9 @@ def test_runs_with_other_evaluation_points_meet_in_between() -> None:
     assert scores[-1] == pytest.approx((300 + 500) / 2)
 
 
-def test_says_when_the_target_was_reached() -> None:
+def test_label_has_the_time_at_which_the_target_was_reached() -> None:
     runs = [("a", records([0, 4000, 5000])), ("a", records([0, 0, 4500])), ("a", records([0, 0, 0]))]
-    text = words(learning_curve(runs, threshold=4000, guides=THESIS_GUIDES))
+    text = words(learning_curve(runs, threshold=4000, guides={"good": 2000, "very good": 2500}))
     assert "target 4000\n2 of 3 runs,\nmedian 2 s" in text
     assert "very good" in text
     assert "not reached" in words(learning_curve(runs, threshold=6000))

@@ -1,0 +1,61 @@
+"""Ends a command: after an expected error with one line and an exit code, after a signal with its code.
+
+Exit codes: 0; 1 where the work failed; 2 where the config is wrong; 130 after Ctrl-C; 143 after SIGTERM; 129
+after SIGHUP, which a closed terminal or a dropped ssh connection sends.
+"""
+
+import signal
+import sys
+from typing import NoReturn
+
+from hydra.errors import HydraException
+from omegaconf.errors import OmegaConfBaseException
+
+from cartpole_rl.commands.hydra_application.complaints import in_one_line
+from cartpole_rl.errors import CartPoleError, ConfigError
+from cartpole_rl.signals import RaiseOnce, ending_signals
+from cartpole_rl.workflows.person import print_message
+
+SIGNALLED = 128  # added to the number of a signal, as a shell does
+EXPECTED = (CartPoleError, HydraException, OmegaConfBaseException, OSError)  # printed without a traceback
+
+
+class Terminated(BaseException):
+    """SIGTERM or SIGHUP arrived. It unwinds like an exception, so every `with` stops its motor."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(number)
+        self.number = number
+
+
+def exit_with_message(name: str, error: Exception) -> NoReturn:
+    """Print an error and exit. Raises an OSError that names no file: it is a defect of this package."""
+    code = CartPoleError.exit_code
+    if isinstance(error, CartPoleError):
+        code = error.exit_code
+    elif isinstance(error, HydraException | OmegaConfBaseException):  # some of which are OSErrors too
+        code = ConfigError.exit_code
+    elif isinstance(error, OSError) and not error.filename:
+        raise error
+    print_message(name, in_one_line(error, name))
+    sys.exit(code)
+
+
+def exit_after_signal(name: str, signalled: BaseException) -> NoReturn:
+    """Print which kind of signal ended the command, and exit."""
+    number = signalled.number if isinstance(signalled, Terminated) else signal.SIGINT
+    print_message(name, "interrupted" if number == signal.SIGINT else "terminated")
+    sys.exit(SIGNALLED + number)
+
+
+def catch_signals() -> None:
+    """Make SIGTERM, SIGHUP and SIGINT raise, except for those that the parent process ignores."""
+    handler = RaiseOnce(_exception_of)
+    handler.handle(*ending_signals())
+    if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
+        handler.handle(signal.SIGINT)
+
+
+def _exception_of(number: int) -> BaseException:
+    """Return the exception that a signal raises."""
+    return KeyboardInterrupt() if number == signal.SIGINT else Terminated(number)

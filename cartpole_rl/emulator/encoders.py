@@ -1,0 +1,8 @@
+"""The emulated cart's encoders and track. The host has its own numbers: `physics/encoders.py`."""
+
+import math
+
+CART_METRES = 22749e-9  # a count; INFO reports whole nanometres
+POLE_COUNTS = 4096  # a turn
+POLE_RADIANS = 2 * math.pi / POLE_COUNTS  # a count
+SPAN = 0.814  # m, nominal distance between the stops

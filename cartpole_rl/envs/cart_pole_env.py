@@ -1,0 +1,65 @@
+"""The environment: a plant under the hardware transform. `envs.build` builds it."""
+
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs import TransformedEnv
+
+from cartpole_rl.envs.hardware import HardwareTransform
+from cartpole_rl.plants.specs import Plant, tensordict_of
+
+
+class CartPoleEnv(TransformedEnv):
+    """A plant under the hardware transform; `plant` and `hardware` are the two parts.
+
+    `step` and `step_and_maybe_reset` return what TorchRL's TransformedEnv returns, to the bit
+    (tests/envs/test_step_and_reset.py), but they call the private `_step` of the plant. TransformedEnv copies
+    the tensordict before and after the plant's step, and resets all rows to keep those that ended. A step of
+    1024 compiled carts is 1.7 times as fast here (scripts/bench/shortcuts.py).
+    """
+
+    @property
+    def plant(self) -> Plant:
+        """The plant below."""
+        return self.base_env
+
+    @property
+    def hardware(self) -> HardwareTransform:
+        """The transform above it."""
+        return self.transform
+
+    def step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Step all carts; return `tensordict` with the outcome under "next". Nothing is checked."""
+        return tensordict.set("next", self._step(tensordict))
+
+    def step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
+        """Step all carts and reset those whose episode ended.
+
+        Return `tensordict` with the outcome under "next", and the tensordict of the next step.
+        """
+        stepped = self.step(tensordict)
+        return stepped, self.advance(stepped)
+
+    def advance(self, stepped: TensorDictBase, retry: Tensor | None = None) -> TensorDictBase:
+        """Return the tensordict of the step after `stepped`; carts whose episode ended are reset.
+
+        Of these, the carts in `retry`, [N] bool, keep their parameters; the others draw new ones.
+        """
+        outcome = stepped.get("next")
+        current = dict(stepped.items()) | dict(outcome.items())
+        del current["reward"]  # of the step before
+        del current["next"]
+        ended = outcome.get("done").squeeze(-1).nonzero().squeeze(-1)
+        if len(ended):
+            frames = self.plant.restart(ended, None if retry is None else retry[ended])
+            first = self.hardware.reset_rows(frames, ended)
+            current |= {key: replaced(current[key], ended, value) for key, value in first.items()}
+        return tensordict_of(current)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        command = self.hardware.command(tensordict)
+        return self.hardware.perceive(tensordict, command, self.plant._step(command))
+
+
+def replaced(values: Tensor, rows: Tensor, new: Tensor) -> Tensor:
+    """Return `values` [N, k] with `new` [R, k] in the rows [R]; along the last dimension, which is faster."""
+    return values.T.index_copy(1, rows, new.T).T

@@ -1,0 +1,95 @@
+"""Moves of a cart, of which experiments consist.
+
+A move is a generator: it yields the motor value of the next period and is sent the observation at its end.
+"""
+
+from collections.abc import Generator
+from typing import NamedTuple
+
+import numpy as np
+
+from cartpole_rl.physics.motor import LARGEST_MOTOR
+
+SIDE = 0.2  # m, start of a run to the other side
+CLOSE, SLOW = 0.02, 0.05  # m, m/s: at the target, and at rest
+LONGEST_MOVE = 4.0  # s
+STANDING, LONGEST_STOP = 0.005, 3.0  # m/s, s: at the end of an experiment
+
+
+class Observed(NamedTuple):
+    """The observation at the end of a period."""
+
+    x: float  # m
+    x_dot: float  # m/s, a difference
+    theta: float  # rad, 0 upright
+    theta_dot: float  # rad/s, a difference
+
+
+Moves = Generator[int, Observed, int | None]
+
+
+class Task(NamedTuple):
+    """The conditions of an experiment."""
+
+    period: float  # s, of control
+    random: np.random.Generator
+    breakaway: int  # motor value that moves the cart from rest
+
+    def periods(self, seconds: float) -> int:
+        """Return the number of control periods in a time."""
+        return round(seconds / self.period)
+
+    def moving(self, more: int) -> int:
+        """Return a motor value that moves the cart, by `more` than needed."""
+        return min(LARGEST_MOTOR, self.breakaway + more)
+
+
+def hold(motor: int, seconds: float, task: Task) -> Moves:
+    """Hold one motor value for `seconds` s."""
+    for _ in range(task.periods(seconds)):
+        yield motor
+    return None
+
+
+def push(motor: int, speed: float, task: Task) -> Moves:
+    """Hold one motor value until the cart reaches a speed, m/s, or has moved 0.1 m, at most half a second."""
+    start = now = yield motor
+    for _ in range(task.periods(0.5)):
+        if abs(now.x - start.x) > 0.1 or abs(now.x_dot) > speed:
+            break
+        now = yield motor
+    return None
+
+
+def until_stopped(motor: int, side: int, task: Task) -> Moves:
+    """Hold one motor value until the cart stops or gets near the end at `side`, then rest briefly."""
+    now = yield motor
+    for _ in range(task.periods(LONGEST_MOVE)):
+        if abs(now.x_dot) < SLOW / 5 or side * now.x > SIDE + 0.03:
+            break
+        now = yield motor
+    yield from hold(0, 0.2, task)
+    return None
+
+
+def go_to(target: float, task: Task) -> Moves:
+    """Bring the cart near `target` m."""
+    now = yield 0
+    for _ in range(task.periods(LONGEST_MOVE)):
+        away = target - now.x
+        if abs(away) < CLOSE and abs(now.x_dot) < SLOW:
+            break
+        wish = np.clip(6 * away, -0.5, 0.5) - now.x_dot  # m/s
+        now = yield round(np.sign(wish) * 0.8 * task.breakaway + 250 * wish)
+    yield 0
+    return None
+
+
+def and_stop(moves: Moves, task: Task) -> Moves:
+    """Make the moves, then hold motor 0 until the cart stands; return the result of the moves."""
+    breakaway = yield from moves
+    for _ in range(task.periods(LONGEST_STOP)):
+        now = yield 0
+        if abs(now.x_dot) < STANDING:
+            break
+    return breakaway

@@ -1,0 +1,26 @@
+"""Table of the scores of an evaluation."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from cartpole_rl.reporting.table import interval_text, table
+
+SCORES = {  # key in metrics.json: label
+    "score": "score (6.2)",
+    "score_upright": "score upright (6.1)",
+    "time_to_upright_s": "time to upright, s",
+    "upright_fraction": "share of time upright",
+    "rms_angle_rad": "RMS angle while upright, rad",
+    "rms_position_m": "RMS position while upright, m",
+    "min_track_margin_m": "nearest to the track's end, m",
+}
+
+
+def score_table(summary: Mapping[str, Any], heading: str) -> str:
+    """Return a table of the means in a summary of episodes (`evaluation.metrics.summarize`)."""
+    rows = [
+        {"figure": label, "mean": interval_text(value["mean"], value["low"], value["high"])}
+        for key, label in SCORES.items()
+        if (value := summary[key]) is not None
+    ]
+    return table(rows, {"figure": heading, "mean": "mean"})

@@ -1,0 +1,64 @@
+"""Errors of Hydra and of the operating system as one line with a remedy."""
+
+import errno
+
+import pytest
+from hydra.errors import HydraException, OverrideParseException
+
+from cartpole_rl.commands.hydra_application.complaints import (
+    dashed_setting,
+    hydra_complaint,
+    in_one_line,
+    nearest_choice,
+)
+
+
+def test_a_file_error_names_the_file_and_the_reason() -> None:
+    assert in_one_line(FileNotFoundError(errno.ENOENT, "No such file", "agent.pt"), "train") == (
+        "agent.pt: No such file"
+    )
+
+
+def test_a_word_that_is_no_setting_is_repeated() -> None:
+    complaint = in_one_line(OverrideParseException("seed", "LexerNoViableAlt"), "train")
+    assert complaint.startswith("seed: settings are given as key=value")
+
+
+def test_other_errors_keep_their_first_line() -> None:
+    assert in_one_line(ValueError("the first\nthe second"), "train") == "the first"
+    assert in_one_line(ValueError(), "train") == "ValueError"
+    assert in_one_line(HydraException("broken\n  in two"), "train") == "broken in two"
+
+
+def test_a_missing_choice_is_named_with_the_nearest_one() -> None:
+    text = "Could not find 'pole/mediun' Available options in 'pole': both large medium Config search path: x"
+    assert hydra_complaint(text, "train") == (
+        "pole=mediun: there is no such choice; did you mean medium? there are both, large, medium"
+    )
+
+
+def test_several_values_without_a_multirun_are_explained() -> None:
+    assert hydra_complaint("Ambiguous value for argument 'seed=0,1': ...", "train").startswith("seed=0,1: -m")
+
+
+def test_an_unknown_setting_gets_the_nearest_known_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.argv", ["cartpole-train", "learning.cart=3"])
+    complaint = hydra_complaint("Could not override 'learning.cart'.", "train")
+    assert "learning.carts" in complaint
+
+
+def test_no_hint_without_a_near_choice() -> None:
+    assert nearest_choice("zzz", ["adam", "adamw"]) == "there are adam, adamw"
+
+
+@pytest.mark.parametrize(
+    ("words", "found"),
+    [
+        (["seed=1", "--seed=1"], "--seed=1"),
+        (["-seed=1"], "-seed=1"),
+        (["--config-dir=mine", "--cfg", "job"], None),
+        (["parameters={cart_mass:1}", "seed=-1"], None),
+    ],
+)
+def test_a_setting_with_dashes_is_found(words: list[str], found: str | None) -> None:
+    assert dashed_setting(words) == found

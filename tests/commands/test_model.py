@@ -1,0 +1,131 @@
+"""A model is learned from recordings, judged by what it did not see, and is a plant to train on."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import yaml
+from command_line import ONCE, TINY, Outcome, in_process
+
+SMALL = (
+    "windows=20",
+    "ensemble.members=2",
+    "ensemble.hidden=4",
+    "ensemble.updates=4",
+    "ensemble.refresh=2",
+)
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run folder of two short recorded episodes of a simulated cart."""
+    folder = tmp_path_factory.mktemp("recorded")
+    shorter = ["task=swingup", "task.time_limit=400"]
+    done = in_process("record", "run=lqr", "episodes=2", *shorter, "hydra.run.dir=run", folder=folder)
+    assert done.code == 0, done.err
+    return folder / "run"
+
+
+@pytest.fixture(scope="module")
+def learned(recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Outcome]:
+    """The run folder of a small ensemble, and what was printed."""
+    folder = tmp_path_factory.mktemp("model")
+    both = ",".join(str(recorded / f"recordings/episode_00{number}.csv") for number in range(2))
+    done = in_process("model", f"from=[{both}]", *SMALL, "hydra.run.dir=run", folder=folder)
+    assert done.code == 0, done.err
+    return folder / "run", done
+
+
+def report(folder: Path) -> dict[str, Any]:
+    return json.loads((folder / "model.json").read_text())
+
+
+def test_its_errors_are_written_and_printed(learned: tuple[Path, Outcome], recorded: Path) -> None:
+    folder, done = learned
+    results = report(folder)
+    assert (results["pole"], results["control_period_s"], len(results["recordings"])) == ("medium", 0.02, 2)
+    for model in ("physics alone", "physics + network"):
+        assert [line["after_s"] for line in results["errors"][model]] == [0.1, 0.5, 1.0]
+        assert model in done.out
+        assert 0 < results["errors"][model][0]["rms_x_mm"] < 5
+    assert results["errors"]["physics alone"][0]["windows"] == results["held_out_windows"] > 0
+    assert "RMS errors and ensemble spreads" in done.out
+    assert len(results["left_out_loss"]) == 3
+    assert (folder / "figures/model.png").stat().st_size > 10_000
+    config = yaml.safe_load((folder / "config.yaml").read_text())
+    assert config["from"][1] == str(recorded / "recordings/episode_001.csv")
+    assert config["ensemble"]["members"] == 2
+
+
+def test_an_agent_is_trained_on_it_and_judged_on_it(learned: tuple[Path, Outcome], tmp_path: Path) -> None:
+    model = f"plant.model={learned[0]}"
+    done = in_process("train", "plant=learned", model, *TINY, ONCE, "hydra.run.dir=run", folder=tmp_path)
+    assert done.code == 0, done.err
+    assert json.loads((tmp_path / "run/metrics.json").read_text())["plant"] == "learned"
+    for kind, words in {"learned": [model], "simulated": []}.items():
+        words = [f"plant={kind}", *words, "run=run", "episodes=2", f"hydra.run.dir={kind}"]
+        done = in_process("evaluate", *words, folder=tmp_path)
+        assert done.code == 0, done.err
+        metrics = json.loads((tmp_path / kind / "metrics.json").read_text())
+        assert (metrics["plant"], len(metrics["episodes"])) == (kind, 2)
+
+
+def test_a_model_that_does_not_fit_is_refused(learned: tuple[Path, Outcome], tmp_path: Path) -> None:
+    model = f"plant.model={learned[0]}"
+    for word, complaint in {
+        "pole=large": "pole: plant.model has one of 0.36 m, not 0.66 m",
+        "pole=both": "pole: plant.model takes one pole, not medium or large; choose one, as pole=medium",
+        "control_period=0.01": "control_period=0.01: plant.model has 0.02 s",
+        "actions=nine_newtons": "actions: plant.model has actuator force_curve",
+    }.items():
+        done = in_process("train", "plant=learned", model, word, *TINY, folder=tmp_path)
+        assert done.complaint.startswith(f"cartpole-train: {complaint}"[:60]), done.complaint
+        assert done.code == 2
+    done = in_process(
+        "evaluate", "run=lqr", "plant=learned", model, "randomization=wide", "pole=medium", folder=tmp_path
+    )
+    assert done.complaint == "cartpole-evaluate: randomization, pole: plant=learned does not read it"
+
+
+def test_a_missing_or_damaged_model_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "damaged.pt").write_bytes(b"not a model")
+    torch.save({"format": "cartpole_rl agent 1"}, tmp_path / "agent.pt")
+    for source, complaint in {
+        "nowhere": "nowhere: there is no such file or folder; give a run of cartpole-model",
+        ".": ".: it holds no model.pt; give a run of cartpole-model",
+        "damaged.pt": "damaged.pt is not a learned model, or is damaged",
+        "agent.pt": "agent.pt is not a learned model: its format is 'cartpole_rl agent 1'",
+    }.items():
+        done = in_process("train", "plant=learned", f"plant.model={source}", *TINY, folder=tmp_path)
+        assert done.complaint.startswith(f"cartpole-train: plant.model={complaint}")
+        assert done.code == 1
+    done = in_process("train", "plant=learned", *TINY, folder=tmp_path)
+    assert done.complaint == "cartpole-train: plant.model is missing; give plant.model=..."
+    assert done.code == 2
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint", "code"),
+    [
+        ("from=nowhere", "from=nowhere: there is no such file or folder; give a run of cartpole-record", 1),
+        ("", "from is missing; give from=...", 2),
+        ("from=. windows=2", "windows=2: input should be greater than or equal to 10", 2),
+        ("from=. ensemble.validation=0", "ensemble.validation=0: input should be greater than 0", 2),
+    ],
+)
+def test_what_cannot_be_learned_from(words: str, complaint: str, code: int, tmp_path: Path) -> None:
+    done = in_process("model", *words.split(), folder=tmp_path)
+    assert done.complaint == f"cartpole-model: {complaint}"
+    assert done.code == code
+    assert not list(tmp_path.glob("runs/model/*"))
+
+
+def test_too_short_a_recording_says_so(recorded: Path, tmp_path: Path) -> None:
+    lines = (recorded / "recordings/episode_000.csv").read_text().splitlines()
+    heading = sum(line.startswith("#") for line in lines)
+    (tmp_path / "short.csv").write_text("\n".join([*lines[: heading + 80], lines[-1]]) + "\n")
+    done = in_process("model", "from=short.csv", *SMALL, folder=tmp_path)
+    assert "the held-out recordings have no 1.32 s without a lost frame: record longer" in done.err
+    assert done.code == 1

@@ -1,0 +1,112 @@
+"""A replay of the recorded cart follows it; that of another cart does not, and its errors are reported."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from command_line import Outcome, in_process
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run folder of two recorded episodes of the nominal cart."""
+    folder = tmp_path_factory.mktemp("recorded")
+    done = in_process("record", "run=lqr", "episodes=2", "hydra.run.dir=run", folder=folder)
+    assert done.code == 0, done.err
+    return folder / "run"
+
+
+def replay(source: Path, folder: Path, *words: str) -> tuple[Outcome, dict[str, Any]]:
+    done = in_process("replay", f"from={source}", *words, "hydra.run.dir=run", folder=folder)
+    assert done.code == 0, done.err
+    return done, json.loads((folder / "run/replay.json").read_text())
+
+
+def test_the_same_cart_is_followed(recorded: Path, tmp_path: Path) -> None:
+    done, results = replay(recorded, tmp_path)
+    soon, later, last = results["errors"]
+    assert [each["after_s"] for each in results["errors"]] == [0.1, 0.5, 1.0]
+    assert (soon["rms_x_mm"], soon["rms_theta_deg"]) < (0.05, 0.3)
+    assert soon["rms_theta_deg"] < 0.3
+    assert later["rms_x_mm"] < 2
+    assert later["median_theta_deg"] < 3
+    assert soon["windows"] == 20
+    assert last["windows"] < 20  # the last stretch of an episode is cut by its end
+    assert (results["pole"], results["control_period_s"], len(results["recordings"])) == ("medium", 0.02, 2)
+    assert "errors of 2 episodes, pole=medium" in done.out
+    assert (tmp_path / "run/figures/replay.png").stat().st_size > 10_000
+    config = yaml.safe_load((tmp_path / "run/config.yaml").read_text())
+    assert config["from"] == str(recorded)
+
+
+def test_another_cart_is_not_followed(recorded: Path, tmp_path: Path) -> None:
+    _, results = replay(recorded / "recordings/episode_000.csv", tmp_path, "parameters={cart_coulomb:0.8}")
+    assert len(results["recordings"]) == 1
+    assert results["parameters"]["cart_coulomb"] == 0.8
+    assert results["errors"][0]["rms_x_mm"] > 0.3
+
+
+def test_a_longer_stretch_is_one_of_fewer(recorded: Path, tmp_path: Path) -> None:
+    _, results = replay(recorded, tmp_path, "restart=0.5", "cart_friction=step", "plant.substeps=8")
+    assert [each["after_s"] for each in results["errors"]] == [0.1, 0.5]
+    assert results["errors"][0]["windows"] == 40
+
+
+def test_the_recorded_pole_is_the_simulated_one(recorded: Path, tmp_path: Path) -> None:
+    text = (recorded / "recordings/episode_000.csv").read_text()
+    (tmp_path / "large.csv").write_text(text.replace("pole_length_m: 0.3556", "pole_length_m: 0.6560"))
+    _, results = replay(tmp_path / "large.csv", tmp_path)
+    assert results["pole"] == "large"
+
+
+def test_recordings_of_two_poles_are_refused(recorded: Path, tmp_path: Path) -> None:
+    text = (recorded / "recordings/episode_000.csv").read_text()
+    for name, length in {"a.csv": "0.3556", "b.csv": "0.6560", "c.csv": "long"}.items():
+        (tmp_path / name).write_text(text.replace("pole_length_m: 0.3556", f"pole_length_m: {length}"))
+    assert "length_m is 'long'" in in_process("replay", "from=c.csv", folder=tmp_path).complaint
+    (tmp_path / "c.csv").unlink()
+    done = in_process("replay", "from=.", folder=tmp_path)
+    assert "poles of 0.3556, 0.656 m were recorded; replay those of one pole" in done.complaint
+
+
+def test_a_pole_of_another_length_has_to_be_given(recorded: Path, tmp_path: Path) -> None:
+    text = (recorded / "recordings/episode_000.csv").read_text()
+    (tmp_path / "own.csv").write_text(text.replace("pole_length_m: 0.3556", "pole_length_m: 0.5000"))
+    done = in_process("replay", "from=own.csv", folder=tmp_path)
+    assert done.complaint == (
+        "cartpole-replay: pole: one of 0.5 m was recorded; give pole=medium, large or your own"
+    )
+    assert done.code == 2
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint", "code"),
+    [
+        (
+            "from=nowhere",
+            "from=nowhere: there is no such file or folder; give a run of cartpole-record",
+            1,
+        ),
+        ("from=.", "from=.: it contains no recording; give a run of cartpole-record", 1),
+        ("", "from is missing; give from=...", 2),
+        ("from=. restart=0", "restart=0: input should be greater than or equal to 0.1", 2),
+    ],
+)
+def test_what_cannot_be_replayed(words: str, complaint: str, code: int, tmp_path: Path) -> None:
+    done = in_process("replay", *words.split(), folder=tmp_path)
+    assert done.complaint == f"cartpole-replay: {complaint}"
+    assert done.code == code
+    assert not list(tmp_path.glob("runs/replay/*"))
+
+
+def test_wrong_parameters_and_poles_are_named(recorded: Path, tmp_path: Path) -> None:
+    for word, named in {
+        "parameters={cart_coulom:1}": "did you mean 'cart_coulomb'?",
+        "parameters={cart_mass:-1}": "cart_mass is -1; it must be above 0",
+        "pole=both": "choose one, as pole=medium",
+    }.items():
+        done = in_process("replay", f"from={recorded}", word, folder=tmp_path)
+        assert named in done.complaint
+        assert done.code == 2

@@ -1,0 +1,101 @@
+"""Each command refuses the run folders of the others in one line, which says what can be done with them."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+from command_line import Outcome, in_process
+
+from cartpole_rl.workflows.run_folder import USES, program_of
+
+MADE_BY = (*USES, "unfinished", "multirun")
+WHAT_TO_DO = {  # with a folder, by what made it
+    "train": "cartpole-evaluate, cartpole-record and cartpole-finetune take it as run={0}",
+    "finetune": "cartpole-evaluate, cartpole-record and cartpole-finetune take it as run={0}",
+    "evaluate": "cartpole-evaluate drives one of its episodes again: repeat.run={0}",
+    "record": "cartpole-replay, cartpole-identify and cartpole-model take it as from={0}",
+    "replay": "cartpole-replay from=... makes others",
+    "identify": "cartpole-train takes its files: cart={0}/cart.yaml",
+    "model": "plant=learned plant.model={0}",
+    "unfinished": "cartpole-train resume={0} continues it",
+    "multirun": "give that of one of its jobs",
+}
+ENDED = "has ended; cartpole-evaluate run={0} drives its agent"
+AGENTS, RECORDINGS = {"train", "finetune", "unfinished"}, {"record", "identify", "finetune"}
+SETTINGS = {  # words, with the folder at {0} and an agent at {1}: what is taken, what is said of others
+    "train resume={0}": ({"unfinished"}, {"train": ENDED}),
+    "finetune run={0} plant=emulated": (AGENTS, {}),
+    "finetune resume={0}": (set(), {"finetune": ENDED}),
+    "evaluate run={0}": (AGENTS, {}),
+    "record run={0}": (AGENTS, {}),
+    "replay from={0}": (RECORDINGS, {}),
+    "model from={0}": (RECORDINGS, {}),
+    "identify from={0}": (RECORDINGS, {}),
+    "evaluate run={1} plant=learned plant.model={0}": ({"model"}, {}),
+    "train compile=false plant=learned plant.model={0}": ({"model"}, {}),
+    "evaluate run={1} repeat.run={0} repeat.episode=0": ({"evaluate"}, {}),
+    "train cart=./{0}": (set(), {"identify": "give cart={0}/cart.yaml"}),
+    "train randomization=./{0}": (set(), {"identify": "give randomization={0}/randomization.yaml"}),
+    "train pole={0}/config.yaml": ({"multirun"}, {"identify": "give pole={0}/pole.yaml"}),
+}
+
+
+@pytest.fixture(scope="module")
+def runs(
+    trained: Path,
+    stopped: Path,
+    identified: tuple[Path, Outcome],
+    tuned: tuple[Path, Outcome],
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Path:
+    """A folder with a toy run of each command, named after it, and an interrupted training."""
+    folder = tmp_path_factory.mktemp("runs")
+    shutil.copytree(trained, folder / "train")
+    shutil.copytree(stopped, folder / "unfinished")
+    shutil.copytree(identified[0], folder / "identify")
+    shutil.copytree(tuned[0], folder / "finetune")
+    model = ("windows=20", "ensemble.members=1", "ensemble.hidden=4", "ensemble.updates=2")
+    made = (
+        ("evaluate", "run=train", "episodes=1", "hydra.run.dir=evaluate"),
+        ("record", "run=lqr", "episodes=3", "hydra.run.dir=record"),
+        ("record", "-m", "run=train", "episodes=1", "seed=0,1", "hydra.sweep.dir=multirun"),
+        ("replay", "from=record", "hydra.run.dir=replay"),
+        ("model", "from=record", *model, "hydra.run.dir=model"),
+    )
+    for command, *words in made:
+        done = in_process(command, *words, folder=folder)
+        assert done.code == 0, done.err
+    return folder
+
+
+def contents(folder: Path) -> dict[str, tuple[int, int]]:
+    """Size and time of every file."""
+    files = (path for path in folder.rglob("*") if path.is_file())
+    return {str(path): (path.stat().st_size, path.stat().st_mtime_ns) for path in files}
+
+
+def test_every_run_says_what_made_it(runs: Path) -> None:
+    for command in USES:
+        provenance = json.loads((runs / command / "provenance.json").read_text())
+        assert provenance["program"] == f"cartpole-{command}"
+        assert program_of(runs / command) == command
+    assert program_of(runs) is None
+
+
+@pytest.mark.parametrize("words", SETTINGS)
+def test_the_runs_of_other_commands_are_refused(words: str, runs: Path) -> None:
+    (command, *_), (taken, special) = words.split(), SETTINGS[words]
+    for maker in MADE_BY:
+        if maker in taken:
+            continue
+        before = contents(runs)
+        done = in_process(command, *words.format(maker, "train").split()[1:], folder=runs)
+        assert done.code in (1, 2), done
+        remedy = special.get(maker, WHAT_TO_DO[maker]).format(maker)
+        assert remedy in done.complaint, done.complaint
+        assert maker in done.complaint
+        assert "Traceback" not in done.complaint
+        assert done.out == ""
+        assert contents(runs) == before
+        assert not list(runs.glob("runs/*/*"))

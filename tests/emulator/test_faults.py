@@ -1,0 +1,261 @@
+"""Faults on purpose: pulled cables, restarts, frozen encoders, duplicated and reordered frames.
+
+Processes are driven over their real pseudo-terminal, with pyserial and with the host's own code.
+"""
+
+import itertools
+import math
+import random
+import re
+
+import pytest
+import serial
+
+pytest.importorskip("mujoco", reason='pip install "cartpole_rl[emulator]"')
+
+from driven_cart import Driven, check_homed
+from emulator_host import SILENCE, EmulatorHost, emulator
+
+from cartpole_rl.emulator.firmware import BANNER
+from cartpole_rl.emulator.settings import EmulatorSettings
+from cartpole_rl.errors import LinkError
+from cartpole_rl.plants.emulated_cart import EmulatedCart
+from cartpole_rl.plants.serial.cart import SerialCart
+from cartpole_rl.plants.serial.errors import RefusedError
+from cartpole_rl.plants.serial.settings import SerialSettings
+from cartpole_rl.wire import (
+    ClearFault,
+    Fault,
+    Flags,
+    Hello,
+    Reason,
+    SetMotor,
+    Start,
+    State,
+    decode_frame,
+)
+from cartpole_rl.wire.frames import LONGEST_FRAME
+
+COARSE = {"physics_step": 1e-3}
+CLOCKS = pytest.mark.parametrize("clock", ["lockstep", "real"])
+
+
+def host_settings(emulated: EmulatedCart) -> SerialSettings:
+    return SerialSettings(
+        port=emulated.port, timeout=60, write_timeout=2, nudge_after=0.2, answer_timeout=0.2, retries=100
+    )
+
+
+def until_unplugged(host: EmulatorHost) -> list[State]:
+    """Return the states that arrive before the cable is pulled."""
+    states = []
+    try:
+        while True:
+            states.append(host.ask(Hello())[-1].message)
+    except OSError:  # pyserial's own is one
+        return states
+
+
+@CLOCKS
+def test_a_pulled_cable_ends_the_line_and_the_process(clock):
+    with emulator(clock=clock, unplug_at=0.3) as host:
+        states = until_unplugged(host)
+        assert host.process.wait(SILENCE) == 0
+    assert max((state.time_us for state in states), default=0) < 300_000
+    if clock == "lockstep":
+        assert len(states) == 14
+
+
+@CLOCKS
+def test_a_pulled_cable_is_a_lost_link_to_the_host(clock):
+    with (
+        pytest.raises(LinkError, match="unplugged"),
+        EmulatedCart(EmulatorSettings(clock=clock, unplug_at=1.0)) as emulated,
+        SerialCart(host_settings(emulated)) as cart,
+    ):
+        poll(cart)
+
+
+@CLOCKS
+def test_a_reset_is_a_boot(clock):
+    with emulator(clock=clock, reset_at=1.5) as host:
+        ticks = [host.ask(Hello())[-1].message.tick]
+        while len(ticks) < 2 or ticks[-1] > ticks[-2]:
+            ticks.append(host.ask(Hello())[-1].message.tick)
+            assert ticks[-1] <= 75
+        after = host.ask(Hello())[-1].message
+    assert after.time_us == 20_000 * after.tick
+    assert after.command_age_ms == 65535
+    assert host.came.count(BANNER) == 2
+    if clock == "lockstep":
+        assert ticks == [*range(1, 76), 1]
+
+
+def test_a_reset_while_driving_stops_the_motor_and_loses_the_zeros():
+    driven = Driven(reset_at=45.0)
+    driven.home()
+    while driven.cart.now_us < 44.7e6:
+        driven.tick()
+    driven.ask(Start())
+    while driven.cart.now_us < 45e6:
+        assert driven.ask(SetMotor(150)).motor_applied == 150
+    frames = driven.cart.pass_period(driven.cart.period_end_us)
+    assert frames[0] == BANNER
+    booted = decode_frame(frames[1][:-1])
+    assert booted.message.tick == 1
+    assert (booted.message.motor_applied, booted.message.fault, booted.sequence) == (0, 0, 0)
+    assert Flags(booted.flags) == Flags(0)
+    assert abs(booted.message.cart_counts) < 2000  # counted from where the cart was at the reset
+    driven.ask(SetMotor(150))
+    assert driven.tick().motor_applied == 0
+    driven.cart.physics.place(0.0, math.pi)
+    check_homed(driven, driven.home())
+
+
+def test_the_host_notices_a_reset():
+    truth = EmulatorSettings(reset_at=60.0, **COARSE)
+    with EmulatedCart(truth) as emulated, SerialCart(host_settings(emulated)) as cart:
+        cart.home()
+        cart.start()
+        with pytest.raises(RefusedError, match="SET_MOTOR") as caught:
+            stand_still(cart)
+        assert caught.value.reason == Reason.NOT_ARMED
+        assert not cart.flags & Flags.HOMED
+
+
+def poll(cart: SerialCart) -> None:
+    while True:
+        cart.poll_state()
+
+
+def stand_still(cart: SerialCart) -> None:
+    while True:
+        cart.set_motor(0)
+        cart.get_state()
+
+
+def test_a_booted_board_prints_text_and_the_host_is_in_step_after_it():
+    assert BANNER.endswith(b"\n\x00")
+    assert BANNER.count(0) == 1
+    assert len(BANNER) > LONGEST_FRAME  # longer than a reader collects
+    with EmulatedCart(EmulatorSettings()) as emulated:
+        raw = serial.Serial(emulated.port, timeout=SILENCE)
+        assert raw.read(len(BANNER)) == BANNER
+        raw.close()
+    with EmulatedCart(EmulatorSettings()) as emulated:
+        for _ in range(2):  # the board prints once and keeps running
+            with SerialCart(host_settings(emulated)) as cart:
+                ticks = [cart.poll_state().tick for _ in range(5)]
+                assert ticks == list(range(ticks[0], ticks[0] + 5))
+                assert cart.statistics.summary().bad_frames == 0
+
+
+def test_every_boot_anywhere_is_homed():
+    places = []
+    for seed in range(4):
+        driven = Driven(boot="anywhere", seed=seed)
+        places.append((driven.x, driven.angle))
+        check_homed(driven, driven.home())
+    assert max(abs(x) for x, _ in places) > 0.15
+    assert max(abs(math.remainder(angle - math.pi, 2 * math.pi)) for _, angle in places) > 1.0
+
+
+def frozen(encoder: str, motors: list[int]) -> tuple[State, float]:
+    """Return the STATE with a fault and the seconds of driving since an encoder froze after homing."""
+    driven = Driven(stuck_encoder=encoder, stuck_at=40.0)
+    assert driven.home().fault == 0
+    while driven.cart.now_us < 40e6:
+        driven.tick()
+    driven.ask(Start())
+    for motor in itertools.islice(itertools.cycle(motors), 100):
+        state = driven.ask(SetMotor(motor))
+        if state.fault:
+            break
+    return state, driven.cart.now_us / 1e6 - 40
+
+
+@pytest.mark.parametrize(("encoder", "fault"), [("cart", Fault.CART_ENCODER), ("pole", Fault.POLE_ENCODER)])
+def test_a_frozen_encoder_is_detected_after_a_push_each_way(encoder, fault):
+    state, seconds = frozen(encoder, [200] * 10 + [-200] * 10)
+    assert state.fault == fault
+    assert state.motor_applied == 0
+    assert seconds < 0.6
+
+
+def test_a_frozen_cart_count_under_a_push_one_way_is_a_stall():
+    state, seconds = frozen("cart", [200])
+    assert state.fault == Fault.STALL
+    assert seconds < 0.7
+
+
+@pytest.mark.parametrize(("encoder", "fault"), [("cart", Fault.HOMING), ("pole", Fault.POLE_ENCODER)])
+def test_homing_fails_with_a_frozen_encoder(encoder, fault):
+    driven = Driven(stuck_encoder=encoder)
+    assert driven.home().fault == fault
+    assert driven.flags == Flags.FAULTED
+
+
+@pytest.mark.parametrize(
+    "settings", [{}, {"pole_mass": 0.233, "pole_com": 0.328, "pole_inertia": 8e-3}, {"start": "upright"}]
+)
+def test_random_driving_through_swing_ups_raises_no_false_alarm(settings):
+    """Drive 1500 periods with random values and durations; put the cart back after it reaches an end."""
+    dice, driven = random.Random(5), Driven(**settings)
+    driven.home()
+    driven.ask(Start())
+    lasts, fastest, faults = 0, 0.0, set()
+    for _ in range(1500):
+        if lasts == 0:
+            lasts, motor = (
+                dice.randint(1, 25),
+                dice.choice([dice.randint(-255, 255), 200, -200, 255, -255, 0]),
+            )
+        lasts -= 1
+        if abs(driven.x) > 0.2 and motor * driven.x > 0:
+            motor = -motor
+        state = driven.ask(SetMotor(motor))
+        fastest = max(fastest, abs(driven.cart.physics.angle_dot))
+        if state.fault:
+            faults.add(Fault(state.fault))
+            driven.cart.physics.place(0.0, driven.angle)
+            driven.ask(ClearFault())
+            driven.ask(Start())
+    assert faults <= {Fault.HARD_LIMIT}
+    assert fastest > 8.0  # rad/s: the pole went far up
+
+
+def test_a_session_over_a_line_that_doubles_frames_loses_nothing():
+    truth = EmulatorSettings(frame_duplication=0.3, **COARSE)
+    with EmulatedCart(truth) as emulated, SerialCart(host_settings(emulated)) as cart:
+        cart.home()
+        cart.start()
+        cart.statistics.clear()
+        first, ticks = cart.get_state().tick, []
+        for period in range(200):
+            cart.set_motor(60 if period % 20 < 10 else -60)
+            ticks.append(cart.get_state().tick)
+        assert cart.statistics.summary().bad_frames == 0
+        assert cart.statistics.summary().lost_frames == 0
+    assert ticks[-1] - first >= 200
+
+
+@pytest.mark.parametrize("settings", [{"frame_reordering": 0.3}, {"frame_duplication": 0.3}])
+def test_at_least_one_state_comes_for_each_frame_and_lockstep_repeats(settings):
+    def session() -> bytes:
+        with emulator(seed=3, **settings) as host:
+            for _ in range(150):
+                host.send(Hello())
+                host.state()
+            return host.came
+
+    first = session()
+    assert len(set(re.findall(rb"[^\x00]+", first))) > 150
+    length = min(len(first), len(again := session()))
+    assert first[:length] == again[:length]  # the last answers may not have arrived
+
+
+def test_a_reordered_frame_is_recognized_by_its_tick():
+    with emulator(frame_reordering=0.3, clock="real") as host:
+        ticks = [host.state().tick for _ in range(60)]
+    assert any(after < before for before, after in itertools.pairwise(ticks))
+    assert len(set(ticks)) == len(ticks)

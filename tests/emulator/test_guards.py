@@ -1,0 +1,105 @@
+"""Each guard alone, fed with counts: where it is silent, and the first period in which it is not."""
+
+import math
+
+import pytest
+
+from cartpole_rl.emulator.guards import (
+    PUSH_SECONDS,
+    SPEED_CHANGE,
+    STALL_COUNTS,
+    STALL_MOTOR,
+    STALL_SECONDS,
+    FrozenCartWatch,
+    FrozenPoleWatch,
+    JumpWatch,
+    StallWatch,
+)
+
+PERIOD = 0.0625  # s; a power of two, so that sums are exact
+
+
+@pytest.mark.parametrize("motor", [STALL_MOTOR, -255])
+def test_a_cart_that_does_not_move_under_a_long_push_stalls(motor: int) -> None:
+    watch = StallWatch()
+    answers = [watch.stalled(STALL_COUNTS - 1, motor, PERIOD) for _ in range(10)]
+    assert answers.index(True) == STALL_SECONDS / PERIOD
+    assert all(answers[answers.index(True) :])
+
+
+@pytest.mark.parametrize(
+    ("count", "motor"),
+    [
+        (lambda period: 0, lambda period: STALL_MOTOR - 1),
+        (lambda period: period * STALL_COUNTS // 4, lambda period: 255),
+        (lambda period: 0, lambda period: 255 if period % 8 < 4 else -255),
+    ],
+    ids=["weak push", "moving cart", "alternating push"],
+)
+def test_no_stall(count, motor) -> None:
+    watch = StallWatch()
+    assert not any(watch.stalled(count(period), motor(period), PERIOD) for period in range(100))
+
+
+def test_a_jump_is_a_change_faster_than_the_limit() -> None:
+    watch = JumpWatch(fastest=1000.0)
+    assert not watch.jumped(10**6, PERIOD)  # the first count has no predecessor
+    assert not watch.jumped(10**6 - 62, PERIOD)
+    assert watch.jumped(10**6 - 62 + 63, PERIOD)
+    assert not watch.jumped(10**6 + 1, PERIOD)  # judged by the newest count
+
+
+def cart_encoder_frozen(counts: list[int], motors: list[int]) -> list[bool]:
+    watch = FrozenCartWatch()
+    return [watch.frozen(count, motor, PERIOD) for count, motor in zip(counts, motors, strict=True)]
+
+
+def test_a_cart_count_is_frozen_after_a_long_push_each_way() -> None:
+    long = math.ceil(PUSH_SECONDS / PERIOD) + 1
+    motors = [255] * long + [-255] * long
+    answers = cart_encoder_frozen([7] * len(motors), motors)
+    assert answers == [False] * (2 * long - 1) + [True]
+
+
+@pytest.mark.parametrize(
+    ("counts", "motors"),
+    [
+        ([7] * 40, [255] * 40),
+        ([7] * 40, [255, -255] * 20),
+        ([7] * 20 + [8] * 20, [255] * 20 + [-255] * 20),
+        ([7] * 40, [199] * 20 + [-199] * 20),
+    ],
+    ids=["one way", "short pushes", "one count", "weak pushes"],
+)
+def test_no_frozen_cart_count(counts: list[int], motors: list[int]) -> None:
+    assert not any(cart_encoder_frozen(counts, motors))
+
+
+def pole_encoder_frozen(speeds: list[float], poles: list[int]) -> bool:
+    watch, cart, answers = FrozenPoleWatch(), 0, [False]
+    watch.frozen(poles[0], cart, PERIOD)
+    for speed, pole in zip(speeds, poles, strict=True):
+        cart += math.ceil(speed * PERIOD)
+        answers.append(watch.frozen(pole, cart, PERIOD))
+    return answers[-1]
+
+
+FAST = 1.1 * SPEED_CHANGE
+
+
+def test_a_pole_count_is_frozen_when_the_cart_speeds_up_and_slows_down() -> None:
+    assert pole_encoder_frozen([0, FAST, 0], [5, 5, 5])
+    assert pole_encoder_frozen([0, -FAST, 0], [5, 5, 5])
+
+
+@pytest.mark.parametrize(
+    ("speeds", "poles"),
+    [
+        ([0, FAST, FAST], [5, 5, 5]),
+        ([0, 0.8 * SPEED_CHANGE, 0], [5, 5, 5]),
+        ([0, FAST, 0], [5, 6, 6]),
+    ],
+    ids=["only faster", "too little", "one count"],
+)
+def test_no_frozen_pole_count(speeds: list[float], poles: list[int]) -> None:
+    assert not pole_encoder_frozen(speeds, poles)

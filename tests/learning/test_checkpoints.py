@@ -1,0 +1,142 @@
+"""Checkpoints are written whole or not at all, and a file that is none is named in one clear line."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from cartpole_rl.errors import CheckpointError
+from cartpole_rl.files import replacing
+from cartpole_rl.learning.checkpoints import (
+    FINETUNING_FORMAT,
+    TRAINING_FORMAT,
+    AgentCheckpoint,
+    TrainingCheckpoint,
+    forget_training,
+    load_agent,
+    load_training,
+    save_agent,
+    save_training,
+)
+
+AGENT = AgentCheckpoint(config={"seed": 1}, weights={"w": torch.arange(3.0)}, transitions=10, score=2.5)
+TRAINING = TrainingCheckpoint(config={"seed": 1}, state={"counters": [1, 2]}, step=10)
+LAST = Path("checkpoints/last.pt")
+
+
+def complaint(load, path: Path) -> str:
+    with pytest.raises(CheckpointError) as caught:
+        load(path)
+    text = str(caught.value)
+    assert str(path) in text
+    assert "\n" not in text
+    return text
+
+
+def test_an_agent_comes_back_from_its_folder_and_from_its_file(tmp_path: Path) -> None:
+    save_agent(tmp_path / LAST, AGENT)
+    for run in (tmp_path, tmp_path / LAST):
+        found = load_agent(run)
+        assert (found.config, found.transitions, found.score) == ({"seed": 1}, 10, 2.5)
+        assert torch.equal(found.weights["w"], torch.arange(3.0))
+
+
+def test_a_training_comes_back(tmp_path: Path) -> None:
+    save_training(tmp_path, TRAINING)
+    assert load_training(tmp_path) == TRAINING
+    forget_training(tmp_path)
+    forget_training(tmp_path)  # once more does no harm
+    assert not list((tmp_path / "checkpoints").iterdir())
+
+
+def test_a_training_is_no_fine_tuning(tmp_path: Path) -> None:
+    save_training(tmp_path, TRAINING, FINETUNING_FORMAT)
+    assert load_training(tmp_path, FINETUNING_FORMAT) == TRAINING
+    with pytest.raises(CheckpointError, match="it is the state that a fine-tuning resumes from"):
+        load_training(tmp_path)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_weights_that_are_not_finite_are_neither_written_nor_read(value: float, tmp_path: Path) -> None:
+    save_agent(tmp_path / LAST, AGENT)
+    whole = (tmp_path / LAST).read_bytes()
+    diverged = AgentCheckpoint({}, {"w": torch.tensor([1.0, value])}, transitions=20, score=None)
+    with pytest.raises(CheckpointError, match=r"last\.pt is not written: its weight w is not finite"):
+        save_agent(tmp_path / LAST, diverged)
+    assert (tmp_path / LAST).read_bytes() == whole
+    with pytest.raises(CheckpointError, match=r"resume\.pt is not written: its weight w is not finite"):
+        save_training(tmp_path, TrainingCheckpoint({}, {"agent": diverged.weights}, step=20))
+    torch.save({"format": "cartpole_rl agent 1", **vars(diverged)}, tmp_path / LAST)
+    assert "is refused: its weight w is not finite" in complaint(load_agent, tmp_path / LAST)
+    torch.save(
+        {
+            "format": TRAINING_FORMAT,
+            "config": {},
+            "state": {"agent": diverged.weights},
+            "step": 20,
+        },
+        tmp_path / "checkpoints/resume.pt",
+    )
+    assert "is refused: its weight w is not finite" in complaint(load_training, tmp_path)
+
+
+def test_a_missing_path_is_named(tmp_path: Path) -> None:
+    assert "there is no such file or folder" in complaint(load_agent, tmp_path / "nowhere")
+    assert "there is no such folder" in complaint(load_training, tmp_path / "nowhere")
+
+
+def test_a_folder_without_checkpoints_is_named(tmp_path: Path) -> None:
+    assert "holds no checkpoints/last.pt" in complaint(load_agent, tmp_path)
+    assert "holds no checkpoints/resume.pt" in complaint(load_training, tmp_path)
+
+
+@pytest.mark.parametrize("content", [b"", b"hello, I am a text file\n", b"PK\x03\x04 and no more of a zip"])
+def test_a_foreign_file_is_named(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "foreign.pt").write_bytes(content)
+    assert "is no checkpoint of this package, or it is damaged" in complaint(
+        load_agent, tmp_path / "foreign.pt"
+    )
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.99])
+def test_a_truncated_checkpoint_is_named(share: float, tmp_path: Path) -> None:
+    save_agent(tmp_path / LAST, AGENT)
+    whole = (tmp_path / LAST).read_bytes()
+    (tmp_path / LAST).write_bytes(whole[: int(share * len(whole))])
+    assert "damaged" in complaint(load_agent, tmp_path / LAST)
+
+
+def test_a_torch_file_of_another_kind_is_named(tmp_path: Path) -> None:
+    torch.save({"state_dict": {}}, tmp_path / "other.pt")
+    assert "its format is None" in complaint(load_agent, tmp_path / "other.pt")
+    torch.save(torch.zeros(3), tmp_path / "tensor.pt")
+    assert "its format is None" in complaint(load_agent, tmp_path / "tensor.pt")
+    save_training(tmp_path, TRAINING)
+    assert "not an agent" in complaint(load_agent, tmp_path / "checkpoints/resume.pt")
+
+
+def test_a_file_that_would_run_code_is_refused(tmp_path: Path) -> None:
+    class Malicious:
+        def __reduce__(self):
+            return (Path.touch, (tmp_path / "touched",))
+
+    torch.save(Malicious(), tmp_path / "malicious.pt")
+    complaint(load_agent, tmp_path / "malicious.pt")
+    assert not (tmp_path / "touched").exists()
+
+
+def test_a_file_left_half_written_does_no_harm(tmp_path: Path) -> None:
+    save_agent(tmp_path / LAST, AGENT)
+
+    def killed_while_writing() -> None:
+        with replacing(tmp_path / LAST) as beside:
+            beside.write_bytes(b"half a check")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        killed_while_writing()
+    assert len(list((tmp_path / "checkpoints").iterdir())) == 2  # the half lies beside the whole
+    assert load_agent(tmp_path).transitions == 10
+    save_agent(tmp_path / LAST, AgentCheckpoint({}, {}, transitions=20, score=None))
+    assert load_agent(tmp_path).transitions == 20
+    assert [path.name for path in (tmp_path / "checkpoints").iterdir()] == ["last.pt"]

@@ -1,0 +1,290 @@
+"""The checks of a cart, on the emulated one: a good one, wires the wrong way round, and other faults."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
+from itertools import pairwise
+from typing import Any
+
+import pytest
+from serial_peer import INFO, Between, CartPeer
+
+from cartpole_rl.emulator.settings import EmulatorSettings
+from cartpole_rl.errors import FaultError
+from cartpole_rl.plants.emulated_cart import EmulatedCart
+from cartpole_rl.plants.serial.cart import SerialCart
+from cartpole_rl.plants.serial.checks import (
+    cart_direction,
+    deadband,
+    latency,
+    limits,
+    pole_direction,
+    soft_limit,
+)
+from cartpole_rl.plants.serial.errors import NotReadyError
+from cartpole_rl.plants.serial.preflight import Finding, preflight
+from cartpole_rl.plants.serial.probe import Probe
+from cartpole_rl.plants.serial.settings import SerialSettings
+from cartpole_rl.wire import Flags, Home, State
+
+TRUTH: dict[str, Any] = {
+    "deadband_right": 100.0,
+    "deadband_left": 0.0,
+    "cart_coulomb_left": 0.5,  # the breakaway force, 0.6 N, is that of motor value 80
+    "cart_coulomb_right": 0.5,
+    "force_curve": (0.0, 0.02, -1.0),
+    "latency": 0.012,
+    "latency_jitter": 0.0,
+    "motor_time_constant": 0.0,
+    "track_tilt": 0.0,
+}
+CHECKS = ["link", "limits", "homing", "cart encoder", "pole encoder", "dead-band", "latency", "soft limit"]
+fast = partial(EmulatorSettings, physics_step=1e-3)
+good_limits = replace(INFO, soft_limit_counts=16704, hard_limit_counts=17539)
+
+
+def patient(port: str) -> SerialSettings:
+    return SerialSettings(port=port, timeout=5, nudge_after=2, answer_timeout=2, connect_timeout=10)
+
+
+@pytest.fixture(scope="module")
+def emulated() -> Iterator[EmulatedCart]:
+    """A cart that is homed."""
+    with EmulatedCart(fast(**TRUTH)) as emulated:
+        with SerialCart(patient(emulated.port)) as cart:
+            cart.home()
+        yield emulated
+
+
+@pytest.fixture
+def probe(emulated: EmulatedCart) -> Iterator[Probe]:
+    with SerialCart(patient(emulated.port)) as cart:
+        yield Probe(cart)
+    settle(emulated)
+
+
+def settle(emulated: EmulatedCart) -> None:
+    """Bring the cart back to the middle, for the next test."""
+    with SerialCart(patient(emulated.port)) as cart:
+        probe = Probe(cart)
+        probe.arm()
+        probe.centre()
+
+
+def test_a_good_cart_passes_and_is_left_disarmed() -> None:
+    with EmulatedCart(fast()) as emulated:
+        cart = SerialCart(patient(emulated.port))
+        findings = list(preflight(cart))
+        assert [finding.check for finding in findings if finding.ready] == CHECKS
+        assert cart.poll_state().motor_applied == 0
+        assert not cart.flags & Flags.ARMED
+        cart.close()
+
+
+def test_what_is_measured_is_the_truth(probe: Probe) -> None:
+    assert "motor value +10" in cart_direction(probe)
+    assert "swings the hanging pole to the left" in pole_direction(probe)
+    deadband(probe)
+    assert 100 < probe.deadband[+1] < 106  # a ramp goes on by one a period until the motion is seen
+    assert 80 < probe.deadband[-1] < 88
+    words = latency(probe)
+    assert 11 <= float(words.split(" ms")[0].split()[-1]) <= 15
+    assert "command age of 20 ms" in words
+    assert "not reached" in soft_limit(probe)
+    assert probe.farthest * 22749e-9 < 0.05
+
+
+class Recording(Probe):
+    """A probe that notes its motor values."""
+
+    def __init__(self, cart: SerialCart) -> None:
+        super().__init__(cart)
+        self.motors: list[int] = []
+
+    def drive(self, motor: int) -> State:
+        self.motors.append(motor)
+        return super().drive(motor)
+
+
+@pytest.mark.parametrize("small", [16, 25, 48])
+def test_a_small_dead_band_does_not_make_the_way_back_rattle(small: int) -> None:
+    breakaway = small * 0.02  # N
+    easy = {
+        "deadband_right": 0.0,
+        "cart_coulomb_left": breakaway / 1.2,
+        "cart_coulomb_right": breakaway / 1.2,
+    }
+    with (
+        EmulatedCart(fast(**TRUTH | easy | {"force_curve": (0.0, 0.02, 0.0)})) as emulated,
+        SerialCart(patient(emulated.port)) as cart,
+    ):
+        cart.home()
+        probe = Recording(cart)
+        probe.arm()
+        deadband(probe)
+        assert max(probe.deadband.values()) == pytest.approx(small, abs=8)
+        for side in (+1, -1):
+            before = state = probe.settle()
+            while abs(state.cart_counts - before.cart_counts) < 440:  # 10 mm; it rolls on
+                state = probe.drive(side * (probe.deadband[side] + 60))
+            probe.motors = []
+            probe.centre()
+            driven = [motor for motor in probe.motors if motor]
+            assert len(driven) > 5
+            assert sum(one * other < 0 for one, other in pairwise(driven)) <= 2
+            assert len(probe.motors) < 150
+        assert probe.farthest * 22749e-9 < 0.07
+
+
+@pytest.mark.parametrize("signs", [{"motor": -1}, {"cart": -1}])
+def test_a_motor_or_a_cart_encoder_the_wrong_way_round(emulated: EmulatedCart, signs: dict[str, int]) -> None:
+    with Between(emulated.port, **signs) as cable, SerialCart(patient(cable.port)) as cart:
+        with pytest.raises(
+            NotReadyError, match=r"moves the cart's count down, .*swap its encoder's wires A and B"
+        ):
+            cart_direction(Probe(cart))
+        assert abs(cart.poll_state().cart_counts) < 2000
+    settle(emulated)
+
+
+@pytest.mark.parametrize("signs", [{"pole": -1}, {"motor": -1, "cart": -1}])
+def test_a_pole_encoder_the_wrong_way_round(emulated: EmulatedCart, signs: dict[str, int]) -> None:
+    with Between(emulated.port, **signs) as cable, SerialCart(patient(cable.port)) as cart:
+        probe = Probe(cart)
+        cart_direction(probe)
+        with pytest.raises(
+            NotReadyError, match=r"pole's count down, by \d+: swap the wires A and B of the pole"
+        ):
+            pole_direction(probe)
+
+
+def test_a_motor_without_power(probe: Probe, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = probe.cart.set_motor
+    monkeypatch.setattr(probe.cart, "set_motor", lambda value: asked(0))
+    with pytest.raises(NotReadyError, match=r"up to \+199 do not move .*switch the motor's supply on"):
+        cart_direction(probe)
+
+
+def test_a_cart_that_hardly_moves(emulated: EmulatedCart) -> None:
+    with (
+        EmulatedCart(fast(**{**TRUTH, "deadband_left": 170.0})) as stiff,
+        SerialCart(patient(stiff.port)) as cart,
+    ):
+        cart.home()
+        probe = Probe(cart)
+        cart_direction(probe)
+        with pytest.raises(NotReadyError, match=r"-17\d left: clean the track"):
+            deadband(probe)
+
+
+def test_a_slow_motor(probe: Probe) -> None:
+    cart_direction(probe)
+    deadband(probe)
+    probe.cart.__class__ = Sluggish
+    with pytest.raises(NotReadyError, match=r"begins to move \d+ ms after .*look for a ramp"):
+        latency(probe)
+
+
+class Sluggish(SerialCart):
+    """Hands each motor value on three periods late."""
+
+    def set_motor(self, value: int) -> int:
+        waiting = self.__dict__.setdefault("waiting", [0, 0, 0])
+        waiting.append(value)
+        return super().set_motor(waiting.pop(0))
+
+
+def test_a_restart_is_a_finding_whatever_the_check_made_of_it() -> None:
+    """The counts begin anew, which looks like wires the wrong way round."""
+    with EmulatedCart(fast(reset_at=28)) as emulated, SerialCart(patient(emulated.port)) as cart:
+        finding = list(preflight(cart))[-1]
+    assert not finding.ready
+    assert finding.words == "the cart has restarted; check its power"
+
+
+def test_a_fault_is_a_finding_with_its_remedy() -> None:
+    stuck = fast(stuck_encoder="cart", stuck_at=0.0)
+    with EmulatedCart(stuck) as emulated:
+        cart = SerialCart(patient(emulated.port))
+        *before, last = preflight(cart)
+        cart.close()
+    assert [finding.check for finding in before] == ["link", "limits"]
+    assert (last.check, last.ready) == ("homing", False)
+    assert str(last).startswith("BAD  homing: the cart latched a fault: homing failed")
+
+
+def test_a_bad_cable_is_told_before_anything_moves() -> None:
+    with EmulatedCart(fast(frame_corruption=0.2)) as emulated:
+        cart = SerialCart(
+            patient(emulated.port).model_copy(
+                update={"answer_timeout": 0.05, "nudge_after": 0.05, "retries": 30}
+            )
+        )
+        (finding,) = preflight(cart)
+        cart.close()
+    assert not finding.ready
+    assert "use a short shielded cable" in finding.words
+
+
+def test_a_port_that_does_not_exist() -> None:
+    (finding,) = preflight(SerialCart(patient("/dev/nosuch0")))
+    assert not finding.ready
+    assert finding.words.startswith("/dev/nosuch0 does not exist")
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"pole_counts_per_turn": 2048}, "INFO says pole counts per turn 2048, not 4096"),
+        ({"cart_nanometres_per_count": 45498}, "INFO says cart nm per count 45498, not 22749"),
+        ({"motor_limit": 100}, "INFO says motor limit 100, not 255"),
+        ({"soft_limit_counts": 18000}, "soft limit 409 mm, hard limit 399 mm"),
+        ({"hard_limit_counts": 35000}, "hard limit 796 mm"),
+        ({"soft_limit_counts": 5000}, "soft limit 114 mm"),
+    ],
+)
+def test_limits_that_are_not_this_carts(change: dict[str, int], words: str) -> None:
+    assert "soft 380 mm" in limits(good_limits)
+    with pytest.raises(NotReadyError, match=words):
+        limits(replace(good_limits, **change))
+
+
+def test_the_check_ends_with_what_is_off_and_the_motor_is_off() -> None:
+    with CartPeer() as peer:
+        peer.info = replace(INFO, motor_limit=100)
+        cart = SerialCart(patient(peer.port))
+        findings = list(preflight(cart))
+        cart.close()
+        assert [finding.ready for finding in findings] == [True, False]
+        assert peer.state.motor_applied == 0
+
+
+def test_a_cart_that_falls_silent_is_a_finding() -> None:
+    with CartPeer() as peer:
+        talk, peer.info = peer.answer, good_limits
+        peer.answer = lambda frame: () if peer.messages(Home) else talk(frame)
+        cart = SerialCart(patient(peer.port).model_copy(update={"answer_timeout": 0.05, "retries": 1}))
+        *before, last = preflight(cart)
+        cart.close()
+    assert [finding.check for finding in before] == ["link", "limits"]
+    assert (last.check, last.ready) == ("homing", False)
+    assert "did not answer HOME, asked 2 times: check its cable and power" in last.words
+
+
+def test_a_finding_is_a_line() -> None:
+    assert str(Finding("link", True, "good")) == "OK   link: good"
+
+
+def test_a_cart_too_far_out_is_stopped() -> None:
+    with CartPeer() as peer, SerialCart(patient(peer.port)) as cart:
+        peer.state = replace(peer.state, cart_counts=4000)
+        with pytest.raises(NotReadyError, match=r"went \+91 mm, more than any move"):
+            Probe(cart).arm()
+        assert not peer.flags & Flags.ARMED
+
+
+def test_a_fault_ends_a_move() -> None:
+    with CartPeer() as peer, SerialCart(patient(peer.port)) as cart:
+        peer.state = replace(peer.state, fault=2)
+        with pytest.raises(FaultError, match="did not move"):
+            Probe(cart).arm()

@@ -1,0 +1,392 @@
+"""States that are lost, repeated, overtaken or answered late, between a host and a scripted cart."""
+
+import time
+from collections.abc import Iterable
+from dataclasses import replace
+
+import pytest
+from serial_peer import CartPeer, Forgetful, quick_settings, wait_for
+
+from cartpole_rl.errors import LinkError
+from cartpole_rl.plants.serial.cart import SerialCart
+from cartpole_rl.wire import Frame, Hello, SetMotor
+
+
+def leave_unread(peer: CartPeer, waiting: int, thrown_away: int) -> None:
+    """States that nobody reads: some wait, the system had no room for others; then the cart is unpaced."""
+    for _ in range(waiting):
+        peer.tick()
+    wait_for(lambda: peer.unread() > 30 * waiting)
+    for _ in range(thrown_away):
+        peer.next_state()
+    peer.paced = False
+
+
+class HostClock:
+    """The host's clock, which can be put ahead: as if the host had been suspended meanwhile."""
+
+    def __init__(self) -> None:
+        self.ahead = 0.0  # s
+
+
+@pytest.fixture
+def host_clock(monkeypatch: pytest.MonkeyPatch) -> HostClock:
+    clock, real = HostClock(), time.perf_counter
+    monkeypatch.setattr(time, "perf_counter", lambda: real() + clock.ahead)
+    return clock
+
+
+def test_the_newest_of_several_is_returned_and_the_others_are_late() -> None:
+    with CartPeer(paced=True) as peer, SerialCart(quick_settings(peer.port)) as cart:
+        peer.tick()
+        cart.get_state()
+        cart.set_motor(10)
+        wait_for(lambda: peer.messages(SetMotor)[-1] == SetMotor(10))
+        for place in (1, 2, 3, 4):
+            peer.tick(cart_counts=place)
+        wait_for(lambda: peer.unread() > 80)
+        assert cart.get_state().cart_counts == 4
+        assert cart.statistics.late_ticks == 3
+        assert cart.statistics.lost_frames == 0
+
+
+def test_a_state_from_before_the_command_is_not_taken_for_its_effect() -> None:
+    with CartPeer(paced=True) as peer, SerialCart(quick_settings(peer.port)) as cart:
+        cart.set_period(100_000)  # long, so that a busy computer does not make the answer overdue
+        peer.tick()
+        cart.get_state()
+        peer.tick(cart_counts=1)  # comes while the host thinks
+        peer.answer = lambda frame: [peer.next_state(cart_counts=2, last_sequence=frame.sequence)]
+        cart.set_motor(50)
+        assert cart.get_state().cart_counts == 2
+        assert cart.statistics.late_ticks == 1
+
+
+def test_a_command_that_is_lost_does_not_hold_the_loop_up() -> None:
+    with CartPeer(paced=True) as peer, SerialCart(quick_settings(peer.port, nudge_after=10)) as cart:
+        peer.answer = lambda frame: ()
+        cart.set_motor(50)
+        peer.tick(cart_counts=5)
+        assert cart.get_state().cart_counts == 5
+        assert cart.statistics.late_ticks == 0
+
+
+def test_a_command_later_than_a_period_is_late_and_so_is_the_state_that_it_passed_over() -> None:
+    with CartPeer(paced=True) as peer, SerialCart(quick_settings(peer.port)) as cart:
+        cart.set_period(40_000)
+        peer.tick()
+        cart.get_state()
+        time.sleep(0.05)
+        peer.tick()  # comes while the host is busy
+        peer.answer = lambda frame: [peer.next_state(last_sequence=frame.sequence)]
+        cart.set_motor(50)
+        assert cart.get_state().tick == 3
+        assert cart.statistics.late_ticks == 2
+        cart.set_motor(50)  # at once
+        cart.get_state()
+        assert cart.statistics.late_ticks == 2
+
+
+def test_a_late_command_counts_though_the_state_meanwhile_was_lost() -> None:
+    with CartPeer(paced=True) as peer, SerialCart(quick_settings(peer.port)) as cart:
+        cart.set_period(5_000)
+        peer.tick()
+        cart.get_state()
+        time.sleep(0.02)
+        peer.next_state()  # is lost
+        peer.answer = lambda frame: [peer.next_state(last_sequence=frame.sequence)]
+        cart.set_motor(50)
+        cart.get_state()
+        assert (cart.statistics.late_ticks, cart.statistics.lost_frames) == (1, 1)
+
+
+def test_a_cart_that_waits_for_the_host_is_never_answered_late() -> None:
+    with CartPeer() as peer, SerialCart(quick_settings(peer.port)) as cart:
+        cart.set_period(5_000)
+        cart.get_state()
+        time.sleep(0.02)
+        cart.set_motor(50)
+        cart.get_state()
+        assert cart.statistics.late_ticks == 0
+        assert cart.statistics.summary().latency_max_ms > 20
+
+
+def test_states_that_did_not_fit_while_the_host_was_busy_are_late_and_not_lost() -> None:
+    with CartPeer(paced=True) as peer, SerialCart(quick_settings(peer.port)) as cart:
+        cart.set_period(100_000)
+        peer.tick()
+        cart.get_state()
+        cart.set_motor(50)
+        wait_for(lambda: bool(peer.messages(SetMotor)))
+        leave_unread(peer, waiting=50, thrown_away=30)
+        cart.get_state()
+        assert cart.statistics.lost_frames == 0
+        assert 80 <= cart.statistics.late_ticks <= 82  # and those that came while this was looked at
+
+
+def test_a_long_pause_does_not_bring_up_the_past() -> None:
+    with CartPeer(paced=True) as peer, SerialCart(quick_settings(peer.port)) as cart:
+        for place in range(100):
+            peer.tick(cart_counts=place)
+        wait_for(lambda: peer.unread() > 2000)
+        peer.paced = False
+        assert cart.get_state().tick == peer.state.tick
+        assert cart.statistics.lost_frames == 0
+
+
+def test_states_that_did_not_fit_between_two_episodes_are_neither_lost_nor_late() -> None:
+    with CartPeer(paced=True) as peer, SerialCart(quick_settings(peer.port)) as cart:
+        cart.start()
+        peer.tick()
+        cart.get_state()
+        cart.set_motor(50)
+        cart.stop()
+        leave_unread(peer, waiting=100, thrown_away=200)
+        cart.stop()
+        cart.start()
+        cart.get_state()
+        seen = cart.statistics
+        assert (seen.lost_frames, seen.late_ticks) == (0, 0)
+        for _ in range(3):
+            peer.next_state()  # and these are lost
+        cart.poll_state()
+        assert seen.lost_frames == 3
+
+
+def test_an_info_that_makes_no_sense_neither_moves_the_cart_nor_holds_the_loop_up() -> None:
+    with CartPeer(paced=True) as peer:
+        peer.info = replace(peer.info, period_us=2**32 - 1, motor_limit=-5)
+        with SerialCart(quick_settings(peer.port)) as cart:
+            assert cart.set_motor(0) == 0
+            peer.answer = lambda frame: ()
+            cart.set_motor(50)  # is lost
+            peer.tick(cart_counts=5, last_sequence=0)
+            assert cart.get_state().cart_counts == 5
+            peer.answer = lambda frame: CartPeer.answer(peer, frame)
+
+
+@pytest.mark.parametrize("passed_us", [0, -20_000, -1])
+def test_a_clock_that_does_not_advance_with_the_tick_is_refused(passed_us: int) -> None:
+    with CartPeer(paced=True) as peer, SerialCart(quick_settings(peer.port)) as cart:
+        peer.tick()
+        before = cart.get_state()
+        peer.tick(time_us=before.time_us + passed_us)
+        with pytest.raises(LinkError, match=rf"does not advance: STATE {before.tick} is of"):
+            cart.get_state()
+
+
+def test_a_clock_that_stood_still_before_the_port_was_closed_is_no_matter_after_it() -> None:
+    with CartPeer(paced=True) as peer, SerialCart(quick_settings(peer.port)) as cart:
+        peer.tick()
+        before = cart.get_state()
+        peer.tick(time_us=before.time_us)
+        cart.close()  # reads the state, and hands it to nobody
+        cart.open()
+        peer.tick(time_us=before.time_us + 20_000)
+        assert cart.get_state().time_us == before.time_us + 20_000
+
+
+def test_states_lost_before_the_first_info_are_no_matter() -> None:
+    """A cart that is switched on sends states before anybody asks what it is."""
+    with CartPeer(paced=True) as peer:
+        answer = CartPeer.answer
+
+        def state_first(frame: Frame) -> Iterable[bytes]:
+            yield peer.next_state()
+            peer.next_state()  # is lost
+            yield peer.next_state()
+            yield from answer(peer, frame)
+
+        peer.answer = state_first
+        with SerialCart(quick_settings(peer.port)) as cart:
+            assert cart.information.motor_limit == 255
+
+
+def test_a_clock_that_may_have_wrapped_unseen_is_believed() -> None:
+    """A person may take an hour to answer a question; nobody reads states meanwhile."""
+    for minutes in (1, 30, 40, 60, 71, 75, 140):
+        with CartPeer(paced=True) as peer, SerialCart(quick_settings(peer.port)) as cart:
+            peer.tick()
+            before = cart.get_state()
+            ticks = minutes * 60 * 50
+            time_us = (before.time_us + ticks * 20_000) % 2**32
+            peer.tick(tick=before.tick + ticks, time_us=time_us, cart_counts=7)
+            assert cart.get_state().cart_counts == 7
+
+
+def test_a_command_that_comes_too_late_is_0(host_clock: HostClock) -> None:
+    """The cart's watchdog has stopped the motor long ago; newer states wait to be read."""
+    with CartPeer(paced=True) as peer, SerialCart(quick_settings(peer.port, timeout=10.0)) as cart:
+        peer.tick()
+        cart.get_state()
+        peer.tick()
+        wait_for(lambda: peer.unread() > 0)
+        host_clock.ahead += 0.07
+        assert cart.set_motor(200) == 0
+        cart.get_state()
+        assert cart.set_motor(200) == 200
+        peer.tick(last_sequence=peer.state.last_sequence)
+        cart.get_state()
+        peer.tick()
+        wait_for(lambda: peer.unread() > 0)
+        host_clock.ahead += 3.0
+        with pytest.raises(LinkError, match=r"did not answer the cart on .* for 3\.\d s"):
+            cart.set_motor(200)
+        assert cart.set_motor(0) == 0
+    assert [message.motor for message in peer.messages(SetMotor)] == [0, 0, 200, 0, 0]
+
+
+def test_time_that_passes_for_the_host_alone_makes_no_command_late(host_clock: HostClock) -> None:
+    with CartPeer() as peer, SerialCart(quick_settings(peer.port)) as cart:
+        cart.get_state()
+        host_clock.ahead += 100.0
+        assert cart.set_motor(200) == 200
+
+
+def test_a_state_overtaken_while_opening_is_not_counted_back() -> None:
+    with CartPeer() as peer:
+        answer = CartPeer.answer
+        late: list[bytes] = []
+
+        def lose_one(frame: Frame) -> Iterable[bytes]:
+            if not late:
+                late.append(peer.next_state())
+            yield from answer(peer, frame)
+
+        peer.answer = lose_one
+        with SerialCart(quick_settings(peer.port)) as cart:
+            cart.statistics.lost_frames = 5
+            peer.send(late[0])
+            cart.poll_state()
+            assert cart.statistics.lost_frames == 5
+
+
+def test_statistics_of_all_connections_are_kept() -> None:
+    """A reconnection adds to them, but neither a boot banner nor what was said before it does."""
+    with CartPeer(boot=b"ets Jul 29 2019\r\n\x00", paced=True) as peer:
+        with SerialCart(quick_settings(peer.port)) as cart:
+            peer.tick()
+            peer.tick(tick=peer.state.tick + 3)
+            cart.get_state()
+            peer.send(b"no frame\x00")
+            peer.tick()
+            cart.get_state()
+        seen = cart.statistics
+        first = (seen.lost_frames, seen.bad_frames)
+        assert first == (2, 1)
+        with cart:
+            peer.tick(tick=peer.state.tick + 2)
+            cart.get_state()
+            peer.tick(tick=peer.state.tick + 2)
+            cart.get_state()
+        assert (seen.lost_frames, seen.bad_frames) == (3, 1)
+        assert cart.statistics is seen
+
+
+def test_gaps_in_the_tick_are_lost_frames() -> None:
+    with CartPeer(paced=True) as peer, SerialCart(quick_settings(peer.port)) as cart:
+        peer.tick(tick=2**32 - 2)
+        cart.get_state()
+        peer.tick(tick=3)
+        cart.get_state()
+        assert cart.statistics.lost_frames == 4  # the last before the wrap, 0, 1 and 2
+
+
+def test_a_state_that_was_overtaken_is_neither_taken_nor_lost() -> None:
+    with CartPeer(paced=True) as peer, SerialCart(quick_settings(peer.port)) as cart:
+        peer.tick(cart_counts=1)
+        assert cart.get_state().cart_counts == 1
+        overtaken, newer = peer.next_state(cart_counts=2), peer.next_state(cart_counts=3)
+        peer.send(newer)
+        assert cart.get_state().cart_counts == 3
+        assert cart.statistics.lost_frames == 1
+        peer.send(overtaken)
+        peer.tick(cart_counts=4)
+        assert cart.get_state().cart_counts == 4
+        seen = cart.statistics
+        assert (seen.overtaken_frames, seen.repeated_frames, seen.lost_frames) == (1, 0, 0)
+
+
+def test_a_state_that_comes_twice_is_taken_once() -> None:
+    with CartPeer(paced=True) as peer, SerialCart(quick_settings(peer.port)) as cart:
+        peer.tick(tick=2**32 - 1, cart_counts=6)
+        assert cart.get_state().cart_counts == 6
+        tick = peer.next_state(tick=0, cart_counts=7)  # across the wrap
+        peer.send(tick + tick)
+        assert cart.get_state().cart_counts == 7
+        wait_for(lambda: peer.unread() == 0)
+        peer.send(tick)
+        peer.tick(cart_counts=8)
+        assert cart.get_state().cart_counts == 8
+        seen = cart.statistics
+        assert (seen.overtaken_frames, seen.repeated_frames, seen.lost_frames) == (0, 2, 0)
+
+
+def test_a_tick_that_goes_far_back_is_a_restart_and_is_taken() -> None:
+    with CartPeer(paced=True) as peer, SerialCart(quick_settings(peer.port)) as cart:
+        peer.tick(tick=500, cart_counts=5)
+        assert cart.get_state().cart_counts == 5
+        peer.tick(tick=1, time_us=20_000, cart_counts=0)
+        assert cart.get_state().cart_counts == 0
+        seen = cart.statistics
+        assert (seen.overtaken_frames, seen.repeated_frames, seen.lost_frames) == (0, 0, 0)
+
+
+def test_silence_is_broken_by_a_hello() -> None:
+    with Forgetful(SetMotor, 0) as peer, SerialCart(quick_settings(peer.port)) as cart:
+        cart.get_state()
+        peer.deaf_to = 1
+        hellos = len(peer.messages(Hello))
+        cart.set_motor(50)
+        cart.get_state()
+        assert len(peer.messages(Hello)) == hellos + 1
+
+
+def test_lasting_silence_is_a_lost_link() -> None:
+    with CartPeer() as peer, SerialCart(quick_settings(peer.port)) as cart:
+        cart.get_state()
+        peer.answer = lambda frame: ()
+        with pytest.raises(LinkError, match=r"no state came from .* for 0\.4 s"):
+            cart.get_state()
+
+
+def test_a_pulled_cable_is_a_lost_link() -> None:
+    with CartPeer() as peer, SerialCart(quick_settings(peer.port)) as cart:
+        cart.get_state()
+        peer.unplug()
+        with pytest.raises(LinkError, match="unplugged"):
+            cart.poll_state()
+
+
+def test_latencies_are_summed_up_without_growing() -> None:
+    with CartPeer() as peer, SerialCart(quick_settings(peer.port)) as cart:
+        for _ in range(30):
+            cart.set_motor(0)
+            cart.get_state()
+        summary = cart.statistics.summary()
+        assert summary.latency_samples == 29  # nothing had been read before the first command
+        times = [
+            summary.latency_median_ms,
+            summary.latency_p99_ms,
+            summary.latency_p999_ms,
+            summary.latency_max_ms,
+        ]
+        assert times[0] > 0
+        assert times == sorted(times)
+        assert (summary.bad_frames, summary.lost_frames, summary.late_ticks) == (0, 0, 0)
+
+
+def test_the_loop_is_timed_by_the_carts_clock() -> None:
+    with CartPeer(paced=True) as peer, SerialCart(quick_settings(peer.port)) as cart:
+        peer.tick()
+        cart.get_state()
+        for age in (13, 20):
+            peer.answer = lambda frame, age=age: [
+                peer.next_state(last_sequence=frame.sequence, command_age_ms=age)
+            ]
+            cart.set_motor(50)
+            cart.get_state()
+        peer.answer = lambda frame: [peer.next_state(last_sequence=frame.sequence - 1)]
+        cart.set_motor(50)  # is lost
+        cart.get_state()
+        assert sorted(cart.statistics.loop_times.samples()) == pytest.approx([0, 0.0065])

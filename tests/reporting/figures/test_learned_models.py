@@ -1,0 +1,38 @@
+"""The figure of a learned model shows errors in the units of its axes, and forces where the cart was."""
+
+import numpy as np
+import pytest
+from figure_contents import line_of
+
+from cartpole_rl.identification.prediction import Prediction
+from cartpole_rl.physics.residual import PLACES, SPACING, UNITS
+from cartpole_rl.reporting.figures import png
+from cartpole_rl.reporting.figures.learned_models import (
+    LEARNED,
+    PHYSICS,
+    forces_along_track,
+    learned_model_figure,
+)
+
+
+def test_forces_are_known_where_the_cart_was() -> None:
+    outputs = np.arange(2.0 * PLACES).reshape(2, PLACES)
+    places, forces = forces_along_track(outputs, np.array([0.0, 3 * SPACING, 3.1 * SPACING]))
+    visited = np.isfinite(forces[0])
+    np.testing.assert_allclose(places[visited], [0.0, 3 * SPACING], atol=1e-12)
+    np.testing.assert_allclose(forces[:, visited], UNITS[0] * outputs[:, visited])
+
+
+def test_errors_are_in_the_units_of_the_axes() -> None:
+    physics, learned = (
+        Prediction(*(np.full((51, 2, 7), each) for each in (0.1, error, 0.005))) for error in (0.02, 0.01)
+    )
+    places, forces = forces_along_track(np.ones((3, PLACES)), np.linspace(-0.1, 0.1, 500))
+    updates, losses = np.array([0.0, 20.0]), np.ones((2, 3))
+    figure = learned_model_figure(0.02, physics, learned, places, forces, updates, losses)
+    cart, angle, track, learning = figure.axes
+    assert line_of(cart, PHYSICS)[:, 1] == pytest.approx(20)
+    assert line_of(angle, LEARNED)[:, 1] == pytest.approx(np.degrees(0.01))
+    assert track.get_xlim() == pytest.approx((-10, 10), abs=0.5)
+    assert learning.get_ylabel() == "validation loss"
+    assert len(png(figure, dpi=60)) > 10_000

@@ -1,0 +1,30 @@
+"""Makes the scripts of scripts/bench and scripts/fuzz importable, and runs them in this process.
+
+PyTorch takes seconds to import, so a process for each script would take longer than most of the scripts.
+"""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+SCRIPTS = Path(__file__).parents[2] / "scripts"
+TINY = ["learning.transitions=2048", "learning.carts=16", "learning.evaluations=2", "compile=false"]
+Run = Callable[..., str]  # (script, folder, *words) -> output; the fixture `run`
+
+sys.path[:0] = [str(SCRIPTS / "bench"), str(SCRIPTS / "fuzz")]
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
+    """Run a script's `main` with words in a folder; return its output."""
+
+    def call(script: ModuleType, folder: Path, *words: str) -> str:
+        monkeypatch.chdir(folder)
+        monkeypatch.setattr(sys, "argv", [f"{script.__name__}.py", *words])
+        script.main()
+        return capsys.readouterr().out
+
+    return call

@@ -1,0 +1,129 @@
+"""Runs the commands as a user does, in this process (torch takes long to import) or in one of their own."""
+
+import contextlib
+import importlib
+import io
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from unittest.mock import patch
+
+from hydra.core.global_hydra import GlobalHydra
+
+BIN = Path(sys.executable).parent
+TINY = (
+    "learning.transitions=2048",
+    "learning.carts=32",
+    "learning.chunk=8",
+    "learning.updates=2",
+    "learning.batch_size=32",
+    "learning.warmup_transitions=256",
+    "learning.evaluations=2",
+    "learning.evaluation_episodes=2",
+    "learning.checkpoint_interval=1",
+    "buffer.size=1500",
+    "task.time_limit=60",
+    "compile=false",
+)
+COARSE = "emulator.physics_step=1e-3"  # s; the default is half of it
+FINETUNING = (
+    "plant=emulated",
+    COARSE,
+    "episodes=2",
+    "evaluation_episodes=1",
+    "finetuning.iterations=2",
+    "finetuning.refit=1",
+    "compile=false",
+)
+TRUTH = ("emulator.cart_viscous=1.1", "emulator.latency=0.012", "emulator.angle_offset=-0.01")
+QUICK = ("windows=80", "substeps=4", "carts=200")
+IDENTIFICATION = (*TRUTH, *QUICK)
+HANDLED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # by a command; a test restores its own
+ONCE = "learning.evaluations=1"  # most of a tiny training's time goes into pictures of its evaluations
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The exit code and the output of a command."""
+
+    code: int
+    out: str
+    err: str
+
+    @property
+    def complaint(self) -> str:
+        """The one line that a failed command leaves on stderr."""
+        lines = self.err.splitlines()
+        assert len(lines) == 1, self.err
+        return lines[0]
+
+
+def in_process(command: str, *words: str, folder: Path) -> Outcome:
+    """`cartpole-<command> words...`, with `folder` as the working directory."""
+    GlobalHydra.instance().clear()
+    handlers = {number: signal.getsignal(number) for number in HANDLED}
+    out, err, code = io.StringIO(), io.StringIO(), 0
+    main = importlib.import_module(f"cartpole_rl.commands.{command}").main
+    with (
+        patch.object(sys, "argv", [f"cartpole-{command}", *words]),
+        contextlib.chdir(folder),
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+    ):
+        try:
+            main()
+        except SystemExit as exit_:
+            code = int(exit_.code or 0)
+        finally:
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
+    return Outcome(code, out.getvalue(), err.getvalue())
+
+
+def interrupt_after(file: Path) -> None:
+    """Send SIGINT to this process as soon as `file` is written, for the first time or again."""
+    before = modified(file)
+
+    def interrupt() -> None:
+        while modified(file) == before:
+            time.sleep(0.01)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    threading.Thread(target=interrupt, daemon=True).start()
+
+
+def modified(file: Path) -> int | None:
+    """Return when a file was written, ns; None if there is none."""
+    return file.stat().st_mtime_ns if file.exists() else None
+
+
+def console_script(command: str, *words: str, folder: Path) -> "subprocess.Popen[str]":
+    """The installed `cartpole-<command>`, just started."""
+    return subprocess.Popen(
+        [BIN / f"cartpole-{command}", *words],
+        cwd=folder,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def outcome(process: "subprocess.Popen[str]", timeout: float = 1000) -> Outcome:
+    """Wait for a started command, and return its outcome."""
+    try:
+        out, err = process.communicate(timeout=timeout)
+    finally:
+        process.kill()
+    return Outcome(process.returncode, out, err)
+
+
+def prints_only_progress(done: Outcome, trainings: int = 1) -> bool:
+    """True where trainings printed progress bars and a line each, and no warning or log of a library."""
+    lines = done.err.replace("\r", "\n").splitlines()
+    bars = all("transitions/s" in line for line in lines if line.strip())
+    return bars and len(done.out.splitlines()) == trainings

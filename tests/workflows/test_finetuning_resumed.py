@@ -1,0 +1,94 @@
+"""A fine-tuning that was stopped and resumed learns as if it had not stopped."""
+
+import io
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from cartpole_rl.envs.build import simulated_env
+from cartpole_rl.evaluation.episodes import run_batch
+from cartpole_rl.learning.randomness import seed_everything
+from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.workflows.agents import new_agent
+from cartpole_rl.workflows.build import evaluated_settings
+from cartpole_rl.workflows.config import FinetuneConfig, TrainConfig
+from cartpole_rl.workflows.finetune import evaluation_config
+from cartpole_rl.workflows.finetuning_learner import CartLearner
+from cartpole_rl.workflows.settings import load_settings
+
+TRAINING = load_settings(
+    TrainConfig,
+    {
+        "task.time_limit": 80,
+        "learning.carts": 16,
+        "learning.chunk": 8,
+        "learning.batch_size": 32,
+        "learning.updates": 2,
+    },
+)
+CONFIG = load_settings(
+    FinetuneConfig,
+    {
+        "run": "somewhere",
+        "seed": 5,
+        "episodes": 4,
+        "compile": False,
+        "finetuning.iterations": 3,
+        "finetuning.cart_share": 0.5,
+    },
+)
+
+
+def learner() -> CartLearner:
+    """A learner with a new agent, the same one each time."""
+    seed_everything(3)
+    settings = evaluated_settings(TRAINING, evaluation_config(CONFIG))
+    return CartLearner(CONFIG, TRAINING, settings, new_agent(TRAINING))
+
+
+def weights(learned: CartLearner) -> dict[str, Tensor]:
+    """A copy of the agent's weights."""
+    return {name: weight.clone() for name, weight in learned.agent.state_dict().items()}
+
+
+def from_disk(state: dict[str, Any]) -> dict[str, Any]:
+    """`state` as `save_training` and `load_training` would return it."""
+    file = io.BytesIO()
+    torch.save(state, file)
+    file.seek(0)
+    return torch.load(file, weights_only=True)
+
+
+@pytest.fixture(scope="module")
+def recorded() -> list[Episode]:
+    """Three episodes of random motor values."""
+    env = simulated_env(TRAINING, TRAINING.plant, 3, TRAINING.task.start, seed=1)
+    random, actions = torch.Generator().manual_seed(0), len(TRAINING.actions.motors)
+    return run_batch(
+        env, lambda current: current.set("action", torch.randint(actions, (3,), generator=random))
+    )
+
+
+def test_a_resumed_fine_tuning_equals_one_that_was_not_stopped(recorded: list[Episode]) -> None:
+    first, *others = recorded
+    whole = learner()
+    whole.start([first])
+    whole.round()
+    whole.add(others[0])
+    whole.refit([first, others[0]])
+    saved = from_disk(whole.snapshot())
+    whole.round()
+    whole.add(others[1])
+    whole.round()
+
+    resumed = learner()
+    resumed.agent.load_state_dict(saved["agent"])
+    resumed.restore([first, others[0]], saved)
+    resumed.round()
+    resumed.add(others[1])
+    resumed.round()
+    assert resumed.started.iteration == 9
+    expected = weights(whole)
+    assert all(torch.equal(expected[name], weight) for name, weight in weights(resumed).items())
