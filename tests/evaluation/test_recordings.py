@@ -62,8 +62,8 @@ def test_any_reader_of_csv_sees_columns_with_units(tmp_path: Path, episode: Epis
 @pytest.mark.parametrize(
     ("harm", "named"),
     [
-        (lambda text: "nonsense", "no recording"),
-        (lambda text: text.replace("recording 1", "recording 9"), "no recording"),
+        (lambda text: "nonsense", "not a recording"),
+        (lambda text: text.replace("recording 1", "recording 9"), "not a recording"),
         (lambda text: text.replace("theta_rad", "theta"), "lacks theta_rad"),
         (lambda text: "\n".join(text.splitlines()[:3]), "lacks"),
         (lambda text: "\n".join(text.splitlines()[:4]), "no control period"),

@@ -93,7 +93,7 @@ def test_a_folder_without_checkpoints_is_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize("content", [b"", b"hello, I am a text file\n", b"PK\x03\x04 and no more of a zip"])
 def test_a_foreign_file_is_named(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "foreign.pt").write_bytes(content)
-    assert "is no checkpoint of this package, or it is damaged" in complaint(
+    assert "is not a checkpoint of this package, or is damaged" in complaint(
         load_agent, tmp_path / "foreign.pt"
     )
 
