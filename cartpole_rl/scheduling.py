@@ -1,6 +1,8 @@
-"""Scheduling priority of a whole process, until it ends: driving a cart takes precedence over learning."""
+"""Scheduling priority of a whole process: driving a cart takes precedence over learning."""
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 
 PRIORITY = 20  # real-time priority, 1 to 99; interrupt threads of Linux's real-time kernels have 50
 
@@ -19,9 +21,21 @@ def take_precedence() -> bool:
     return True
 
 
-def give_precedence() -> None:
-    """Give this process the lowest priority: `SCHED_IDLE`, or niceness 19 on other systems."""
-    if hasattr(os, "SCHED_IDLE"):
-        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
-    elif hasattr(os, "nice"):
-        os.nice(19)
+@contextmanager
+def giving_precedence() -> Iterator[None]:
+    """Give this process the lowest priority: `SCHED_IDLE`, or niceness 19 on other systems.
+
+    The earlier priority returns at the end, if the system allows it; niceness stays.
+    """
+    if not hasattr(os, "SCHED_IDLE"):
+        if hasattr(os, "nice"):
+            os.nice(19)
+        yield
+        return
+    policy, param = os.sched_getscheduler(0), os.sched_getparam(0)
+    os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+    try:
+        yield
+    finally:
+        with suppress(PermissionError):
+            os.sched_setscheduler(0, policy, param)

@@ -10,7 +10,7 @@ pytestmark = pytest.mark.skipif(not hasattr(os, "SCHED_FIFO"), reason="Linux onl
 
 
 def in_a_process(lines: str) -> str:
-    imports = "import os, resource\nfrom cartpole_rl.scheduling import give_precedence, take_precedence"
+    imports = "import os, resource\nfrom cartpole_rl.scheduling import giving_precedence, take_precedence"
     program = f"{imports}\n{lines}"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     return done.stdout.strip()
@@ -30,4 +30,7 @@ def test_without_permission_all_stays_as_it_was() -> None:
 
 
 def test_it_goes_last() -> None:
-    assert in_a_process("give_precedence(); print(os.sched_getscheduler(0))") == str(os.SCHED_IDLE)
+    lines = "with giving_precedence():\n    print(os.sched_getscheduler(0))\nprint(os.sched_getscheduler(0))"
+    within, after = map(int, in_a_process(lines).split())
+    assert within == os.SCHED_IDLE
+    assert after == os.sched_getscheduler(0)

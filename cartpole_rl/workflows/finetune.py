@@ -5,6 +5,7 @@ exploration (after). A separate process drives the cart while this one learns. E
 disk before the next one starts: an interruption costs at most the current one.
 """
 
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -33,7 +34,7 @@ from cartpole_rl.workflows.agents import new_agent, trained_agent
 from cartpole_rl.workflows.build import evaluated_env, evaluated_settings, use_threads
 from cartpole_rl.workflows.checks import check_finetuning
 from cartpole_rl.workflows.config import EvaluateConfig, FinetuneConfig, TrainConfig
-from cartpole_rl.workflows.finetuning_cart import DrivenCart, yield_to
+from cartpole_rl.workflows.finetuning_cart import DrivenCart, yielding_to
 from cartpole_rl.workflows.finetuning_files import FinetuningFiles, Stage
 from cartpole_rl.workflows.finetuning_learner import CartLearner
 from cartpole_rl.workflows.person import confirm
@@ -73,9 +74,8 @@ def finetune(config: FinetuneConfig, folder: Path) -> None:
     with (
         TensorBoardLog(folder) as log,
         Driver(make_env, partial(greedy_network, training), config.compile, real_time, confirm) as driver,
+        yielding_to(driver) if real_time else nullcontext(),
     ):
-        if real_time:
-            yield_to(driver)
         session = Session(files, DrivenCart(driver, files, log), load_agent(run), training, settings)
         if checkpoint and checkpoint.state:
             session.restore(checkpoint)

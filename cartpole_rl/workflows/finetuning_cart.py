@@ -1,5 +1,7 @@
 """The cart of a fine-tuning, driven by its own process; each finished episode is written and logged."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from tqdm import tqdm
@@ -9,7 +11,7 @@ from cartpole_rl.evaluation.driver import Driver, DriveRequest
 from cartpole_rl.evaluation.driving_policy import Weights
 from cartpole_rl.plants.serial.statistics import LinkStatistics
 from cartpole_rl.reporting.tensorboard import TensorBoardLog
-from cartpole_rl.scheduling import give_precedence
+from cartpole_rl.scheduling import giving_precedence
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.workflows.config import FinetuneConfig
 from cartpole_rl.workflows.finetuning_files import FinetuningFiles, Stage
@@ -71,10 +73,12 @@ class DrivenCart:
         return {**vars(self.link.summary()), "latency_override": self.link.latency_override()}
 
 
-def yield_to(driver: Driver) -> None:
+@contextmanager
+def yielding_to(driver: Driver) -> Iterator[None]:
     """Lower this process's priority, but not that of the driver or of an emulated cart: they have started."""
-    give_precedence()
     if not driver.has_priority:
         print_message(
             "finetune", "other processes may delay the cart: no real-time priority (see `ulimit -r`)"
         )
+    with giving_precedence():
+        yield

@@ -109,7 +109,12 @@ def test_a_missing_or_damaged_model_is_one_line(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "complaint", "code"),
     [
-        ("from=nowhere", "from=nowhere: there is no such file or folder; give a run of cartpole-record", 1),
+        (
+            "from=nowhere",
+            "from=nowhere: there is no such file or folder; "
+            "give a run of cartpole-record or cartpole-identify",
+            1,
+        ),
         ("", "from is missing; give from=...", 2),
         ("from=. windows=2", "windows=2: input should be greater than or equal to 10", 2),
         ("from=. ensemble.validation=0", "ensemble.validation=0: input should be greater than 0", 2),

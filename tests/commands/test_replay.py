@@ -86,10 +86,11 @@ def test_a_pole_of_another_length_has_to_be_given(recorded: Path, tmp_path: Path
     [
         (
             "from=nowhere",
-            "from=nowhere: there is no such file or folder; give a run of cartpole-record",
+            "from=nowhere: there is no such file or folder; "
+            "give a run of cartpole-record or cartpole-identify",
             1,
         ),
-        ("from=.", "from=.: it contains no recording; give a run of cartpole-record", 1),
+        ("from=.", "from=.: it contains no recording; give a run of cartpole-record or cartpole-identify", 1),
         ("", "from is missing; give from=...", 2),
         ("from=. restart=0", "restart=0: input should be greater than or equal to 0.1", 2),
     ],

@@ -246,7 +246,7 @@ def test_a_resume_file_holds_only_the_filled_buffer(stopped: Path) -> None:
     """Its replay buffer holds 1500 transitions; the default one holds a million."""
     state = torch.load(stopped / "checkpoints/resume.pt", weights_only=True)
     kept = state["state"]["replay"]["transitions"]
-    assert {len(column) for column in kept.values()} == {min(state["transitions"], 1500)}
+    assert {len(column) for column in kept.values()} == {min(state["step"], 1500)}
     assert not (stopped / "metrics.json").exists()
 
 

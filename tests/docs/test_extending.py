@@ -46,7 +46,7 @@ def test_path(number: int, tmp_path: Path) -> None:
         step.apply(tmp_path)
     assert_tidy(tmp_path, {step.file for step in PATHS[number].steps})
     done = subprocess.run(
-        [sys.executable, Path(__file__).with_name("extended_package.py"), str(number), tmp_path],
+        [sys.executable, ROOT / "tests/support/extended_package.py", str(number), tmp_path],
         env={**os.environ, "PYTHONPATH": str(tmp_path)},
         cwd=tmp_path,
         capture_output=True,
