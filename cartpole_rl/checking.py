@@ -3,7 +3,7 @@
 import difflib
 import re
 from collections.abc import Iterable, Mapping
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args
 
 from pydantic import ValidationError
 
@@ -16,6 +16,28 @@ TAGS = re.compile(
 )
 NEAR = 0.8  # similarity of two names, 0 to 1, from which one is suggested for the other
 SAME_GROUP = 0.15  # added to the similarity within one group
+EXAMPLES = {  # of required settings
+    "run": "run=runs/train/<run>",
+    "from": "from=runs/record/<run>",
+    "plant.port": "plant.port=/dev/ttyUSB0 (cartpole-find-port lists the ports) or plant.port=auto",
+    "plant.model": "plant.model=runs/model/<run>",
+}
+REMEDIES = {  # by pydantic's type of error; the others keep pydantic's text
+    **dict.fromkeys(("int_type", "int_parsing", "int_from_float"), "give an integer"),
+    **dict.fromkeys(("float_type", "float_parsing"), "give a number"),
+    **dict.fromkeys(("bool_type", "bool_parsing"), "give true or false"),
+    **dict.fromkeys(("string_type", "path_type"), "give text"),
+    **dict.fromkeys(("dict_type", "model_type"), "give a mapping, as {{name:value}}"),
+    **dict.fromkeys(("literal_error", "enum"), "give {expected}"),
+    "tuple_type": "give a list, as [0.5,0.02]",
+    "finite_number": "give a finite number",
+    "greater_than": "give more than {gt}",
+    "greater_than_equal": "give at least {ge}",
+    "less_than": "give less than {lt}",
+    "less_than_equal": "give at most {le}",
+    "too_short": "give {min_length} or more values",
+    "too_long": "give {max_length} or fewer values",
+}
 
 Config = TypeVar("Config", bound=Settings)
 
@@ -25,40 +47,82 @@ def checked(schema: type[Config], values: Mapping[str, Any]) -> Config:
     try:
         return schema(**values)
     except ValidationError as error:
-        complaints = (_complaint(detail, values) for detail in error.errors())
+        complaints = (_complaint(detail, schema, values) for detail in error.errors())
         raise ConfigError("; ".join(complaints)) from None
 
 
-def _complaint(detail: Mapping[str, Any], values: Mapping[str, Any]) -> str:
+def _complaint(detail: Mapping[str, Any], schema: type[Settings], values: Mapping[str, Any]) -> str:
     key = TAGS.sub("", ".".join(map(str, detail["loc"])))
-    if detail["type"] == "extra_forbidden":
-        return no_such_setting(key, (name for name in setting_names(values) if not name.startswith(key)))
-    if detail["type"] == "missing":
-        return f"{key} is missing; give {key}=..."
-    if detail["type"] == "union_tag_invalid":  # a plant that this command does not take
-        taken = detail["ctx"]["expected_tags"].replace("'", "")
-        return f"{key}={detail['ctx']['tag']}: this command takes {taken}"
-    reason = detail["msg"].removeprefix("Value error, ")
-    if not key:
-        return reason
-    reason = reason[0].lower() + reason[1:]
+    match detail["type"]:
+        case "extra_forbidden":
+            return no_such_setting(key, (name for name in setting_names(values) if not name.startswith(key)))
+        case "missing":
+            return missing(key)
+        case "union_tag_invalid":  # a plant that this command does not take
+            taken = detail["ctx"]["expected_tags"].replace("'", "")
+            return f"{key}={detail['ctx']['tag']}: this command takes {taken}"
+        case "union_tag_not_found":  # a plant's file without its kind
+            return f"{key}: kind is missing; give {key}={', '.join(kinds(schema, key))}"
     value = "null" if detail["input"] is None else detail["input"]
-    return f"{key}={value}: {reason}" if isinstance(value, int | float | str) else f"{key}: {reason}"
+    named = f"{key}={value}" if isinstance(value, int | float | str) else key
+    return f"{named}: {_reason(detail)}" if key else _reason(detail)
+
+
+def _reason(detail: Mapping[str, Any]) -> str:
+    """Return the remedy for a wrong value, or what is wrong with it."""
+    if remedy := REMEDIES.get(detail["type"]):
+        return remedy.format(**{name: _plain(limit) for name, limit in detail.get("ctx", {}).items()})
+    reason: str = detail["msg"].removeprefix("Value error, ")
+    return reason[0].lower() + reason[1:] if detail["loc"] else reason
+
+
+def _plain(limit: Any) -> Any:
+    """Return a limit as one writes it: 1 for 1.0."""
+    return int(limit) if isinstance(limit, float) and limit.is_integer() else limit
+
+
+def missing(key: str) -> str:
+    """Return the message for a required setting that is not given."""
+    above, _, last = key.rpartition(".")
+    if last.isdecimal():  # in a list
+        return f"{above}: value {int(last) + 1} is missing"
+    return f"{key} is missing; give {EXAMPLES.get(key, f'{key}=...')}"
+
+
+def kinds(schema: type[Settings], field: str) -> list[str]:
+    """Return the kinds that the setting `field` of `schema` takes; none if it has no such setting."""
+    if field not in schema.model_fields:
+        return []
+    annotation = schema.model_fields[field].annotation
+    classes = get_args(annotation) or (annotation,)
+    return [kind for each in classes for kind in get_args(each.model_fields["kind"].annotation)]
 
 
 def no_such_setting(key: str, known: Iterable[str]) -> str:
     """Return the message for an unknown setting, with the most similar one if there is any."""
     above, _, wrong = key.rpartition(".")
 
-    def similarity(setting: str) -> float:
+    def similar(setting: str) -> tuple[float, float]:
         place, _, name = setting.rpartition(".")
-        return difflib.SequenceMatcher(None, wrong, name).ratio() + SAME_GROUP * (place == above)
+        ratio, letters = similarity(wrong, name)
+        return ratio + SAME_GROUP * (place == above), letters
 
-    nearest = max(sorted(known), key=similarity, default="")
-    near = bool(nearest) and similarity(nearest) > NEAR
+    nearest = max(sorted(known), key=similar, default="")
+    near = bool(nearest) and similar(nearest)[0] > NEAR
     return f"{key}: there is no such setting; " + (
         f"did you mean {nearest}?" if near else "--cfg job shows the settings"
     )
+
+
+def most_similar(wrong: str, names: Iterable[str]) -> str:
+    """Return the name that was probably meant by `wrong`."""
+    return max(sorted(names), key=lambda name: similarity(wrong, name))
+
+
+def similarity(wrong: str, name: str) -> tuple[float, float]:
+    """Return the similarity of two names, 0 to 1, and that of their letters in any order, for equal ones."""
+    matcher = difflib.SequenceMatcher(None, name, wrong)
+    return matcher.ratio(), matcher.quick_ratio()
 
 
 def setting_names(tree: Any, prefix: str = "") -> set[str]:

@@ -31,7 +31,10 @@ def test_the_kind_of_a_plant_is_no_part_of_a_key(kind: str) -> None:
     [
         ({"cart_mass": {"spread": 1}}, r"randomization\.cart_mass\.spread: there is no such setting"),
         ({**IDENTIFIED, "widen": -1}, r"randomization\.widen=-1: "),
-        ({**IDENTIFIED, "ranges": {"latency": 1}}, r"randomization\.ranges\.latency"),
+        (
+            {**IDENTIFIED, "ranges": {"latency": 1}},
+            r"randomization\.ranges\.latency=1: give a mapping, as \{name:value\}",
+        ),
     ],
 )
 def test_the_kind_of_a_randomization_is_no_part_of_a_key(randomization: dict[str, Any], message: str) -> None:
@@ -40,5 +43,5 @@ def test_the_kind_of_a_randomization_is_no_part_of_a_key(randomization: dict[str
 
 
 def test_a_missing_setting_is_named_with_its_remedy() -> None:
-    with pytest.raises(ConfigError, match=r"run is missing; give run=\.\.\."):
+    with pytest.raises(ConfigError, match="run is missing; give run=runs/train/<run>"):
         checked(EvaluateConfig, compose("evaluate"))

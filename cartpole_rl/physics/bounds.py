@@ -1,10 +1,10 @@
 """Physical bounds of each parameter of a cart and its pole, by name."""
 
-import difflib
 import math
 from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
+from cartpole_rl.checking import most_similar
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.physics.motor import LARGEST_MOTOR
 
@@ -64,12 +64,16 @@ BOUNDS: dict[str, Bound] = {
 }
 
 
-def check_names(names: Iterable[str]) -> None:
-    """Raise ConfigError for a name that is not a parameter, with the nearest one that is."""
+def check_names(names: Iterable[str], setting: str = "") -> None:
+    """Raise ConfigError for a name that is not a parameter, with the nearest one that is.
+
+    The message starts with the name of the `setting`, if it is given.
+    """
+    key = f"{setting}: " if setting else ""
     for name in names:
         if name not in BOUNDS:
-            nearest = difflib.get_close_matches(name, BOUNDS, n=1, cutoff=0)[0]
-            raise ConfigError(f"unknown cart parameter {name!r}; did you mean {nearest!r}?")
+            nearest = most_similar(name, BOUNDS)
+            raise ConfigError(f"{key}unknown cart parameter {name!r}; did you mean {nearest!r}?")
 
 
 def check_value(name: str, value: float) -> None:

@@ -11,7 +11,7 @@ from cartpole_rl.randomization.checks import check_one_pole
 from cartpole_rl.workflows.build import evaluated_settings
 from cartpole_rl.workflows.checks import BASELINE, check_has_agent
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
-from cartpole_rl.workflows.settings import load_settings, recorded_settings
+from cartpole_rl.workflows.loading import load_settings, recorded_settings
 
 OF_BASELINE = {"observation": "raw", "observation.past_motors": 1}
 

@@ -59,7 +59,7 @@ def one_pole(pole: Pole) -> PoleSettings:
 
 def with_parameters(settings: CartPoleSettings, parameters: Mapping[str, float]) -> CartPoleSettings:
     """Return `settings` with `parameters` of the cart and the pole replaced. Raises ConfigError."""
-    check_names(parameters)
+    check_names(parameters, "parameters")
     of_pole = {name: value for name, value in parameters.items() if name in Pole.model_fields}
     of_cart = {name: value for name, value in parameters.items() if name not in Pole.model_fields}
     if of_pole and settings.pole.choices is None:

@@ -10,6 +10,7 @@ import sysconfig
 from collections.abc import Mapping
 from pathlib import Path
 
+from cartpole_rl.checking import missing
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.learning.checkpoint_files import find_agent, find_training
 from cartpole_rl.physics.bounds import check_names, check_value, check_values
@@ -57,7 +58,7 @@ def check_evaluation(config: EvaluateConfig) -> None:
 def check_finetuning(config: FinetuneConfig) -> Path:
     """Return the run to fine-tune. Raises CartPoleError if it has no agent."""
     if config.run is None:
-        raise ConfigError("run is missing; give run=..., the run folder of a training")
+        raise ConfigError(missing("run"))
     if config.compile:
         check_compiler()
     check_agent(config.run)
@@ -69,6 +70,7 @@ def check_replay(config: ReplayConfig) -> None:
     recordings(config.source)
     if config.pole is not None:
         check_one_pole("a replay", config.pole)
+    check_names(config.nominal_cart)
     check_parameters({**config.nominal_cart, **(config.parameters or {})})
 
 
@@ -123,8 +125,8 @@ def check_model(plant: LearnedSettings) -> None:
 
 
 def check_parameters(given: Mapping[str, float]) -> None:
-    """Raise ConfigError for an unknown name or an impossible value."""
-    check_names(given)
+    """Raise ConfigError for an unknown name in `parameters` or an impossible value."""
+    check_names(given, "parameters")
     for name, value in given.items():
         check_value(name, value)
 

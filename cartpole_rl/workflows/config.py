@@ -7,6 +7,7 @@ from typing import Annotated, Any
 from pydantic import Field, field_validator, model_validator
 
 from cartpole_rl.agents.settings import AgentSettings
+from cartpole_rl.checking import kinds
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.envs.cart_pole_settings import (
     CartFrictionSettings,
@@ -63,15 +64,17 @@ class TrainConfig(RunSettings, CartPoleSettings):
     compile: bool
     resume: str | None
 
-    @field_validator("plant", mode="before")
+    @model_validator(mode="before")
     @classmethod
-    def _training_is_simulated(cls, plant: Any) -> Any:
+    def _training_is_simulated(cls, values: Any) -> Any:
+        plant = values.get("plant") if isinstance(values, Mapping) else None
         kind = plant.get("kind") if isinstance(plant, Mapping) else None
         if kind in ("emulated", "serial"):
+            taken = ", ".join(kinds(cls, "plant"))
             raise ValueError(
-                f"training is in simulation, plant=simulated; cartpole-evaluate takes plant={kind}"
+                f"plant={kind}: cartpole-train takes {taken}; use cartpole-evaluate for plant={kind}"
             )
-        return plant
+        return values
 
     @model_validator(mode="after")
     def _mirrored_actions_are_symmetric(self) -> "TrainConfig":
@@ -137,8 +140,10 @@ class EvaluateConfig(RunSettings):
         if kind in ("emulated", "learned") and self.pole is not None:
             unread.append("pole")
         if unread:
-            remedy = "; its own are emulator.*, emulator=large" if kind == "emulated" else ""
-            raise ValueError(f"{', '.join(unread)}: plant={kind} does not read it{remedy}")
+            reason = "does not read it"
+            if kind == "emulated":
+                reason = "has its own cart; set emulator.* or emulator=large"
+            raise ValueError(f"{', '.join(unread)}: plant={kind} {reason}")
         if kind != "emulated" and self.emulator != EmulatorSettings():
             raise ValueError(f"emulator: plant={kind} does not read it; give plant=emulated")
         return self

@@ -37,11 +37,11 @@ from cartpole_rl.workflows.config import EvaluateConfig, FinetuneConfig, TrainCo
 from cartpole_rl.workflows.finetuning_cart import DrivenCart, yielding_to
 from cartpole_rl.workflows.finetuning_files import FinetuningFiles, Stage
 from cartpole_rl.workflows.finetuning_learner import CartLearner
+from cartpole_rl.workflows.loading import recorded_settings
 from cartpole_rl.workflows.person import confirm
 from cartpole_rl.workflows.report import report
 from cartpole_rl.workflows.resuming import resumed
 from cartpole_rl.workflows.run_folder import write_config, write_json
-from cartpole_rl.workflows.settings import recorded_settings
 
 COMPARISON = "comparison.json"
 SIMULATED_SCORE = "cart/score_in_simulation"  # TensorBoard's curve beside those of the cart

@@ -55,7 +55,7 @@ def replay_recordings(config: ReplayConfig, folder: Path) -> None:
 def simulated_parameters(config: ReplayConfig, pole: Pole) -> dict[str, float]:
     """Return all parameters of the simulated cart. Raises ConfigError."""
     explicit = config.parameters or {}
-    check_names(explicit)
+    check_names(explicit, "parameters")
     parameters = {**config.nominal_with(pole), **explicit}
     check_values(parameters)
     return parameters

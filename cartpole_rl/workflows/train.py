@@ -20,12 +20,12 @@ from cartpole_rl.workflows.agents import new_agent
 from cartpole_rl.workflows.build import use_threads
 from cartpole_rl.workflows.checks import check_compiler
 from cartpole_rl.workflows.config import TrainConfig
+from cartpole_rl.workflows.loading import recorded_settings
 from cartpole_rl.workflows.monitor import TrainingMonitor
 from cartpole_rl.workflows.person import print_message
 from cartpole_rl.workflows.report import report
 from cartpole_rl.workflows.resuming import resumed
 from cartpole_rl.workflows.run_folder import write_config
-from cartpole_rl.workflows.settings import recorded_settings
 
 
 def train(config: TrainConfig, folder: Path) -> None:

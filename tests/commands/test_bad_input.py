@@ -17,24 +17,33 @@ WRONG_TRAINING = [
     ("polee=large", "polee", "did you mean pole?"),
     ("cart.cart_mas=1", "cart.cart_mas", "did you mean cart.cart_mass?"),
     ("~agent.gamma", "agent.gamma is missing", "give agent.gamma=..."),
-    ("seed=abc", "seed=abc", "valid integer"),
-    ("agent.gamma=1.5", "agent.gamma=1.5", "less than 1"),
+    ("seed=abc", "seed=abc", "give an integer"),
+    ("agent.gamma=1.5", "agent.gamma=1.5", "give less than 1"),
     ("agent.loss=l1", "agent.loss=l1", "'l2' or 'smooth_l1'"),
-    ("control_period=1", "control_period=1", "less than or equal to 0.1"),
+    ("control_period=1", "control_period=1", "give at most 0.1"),
     ("pole=tiny", "pole=tiny", "both, large, medium, range"),
     ("pole=null", "pole=null", "leave pole=null out"),
     ("task=null", "task=null", "leave task=null out"),
     ("plant=null", "plant=null", "leave plant=null out"),
     ("randomization=null", "randomization=null", "leave randomization=null out"),
     ("pole=medum", "pole=medum", "did you mean medium?"),
+    ("pole=lrage", "pole=lrage", "did you mean large?"),
     ("pole=medium,large", "pole=medium,large", "-m runs each"),
     ("seed", "seed", "key=value"),
     ("--seed=1", "--seed=1", "without dashes: seed=1"),
+    ("--seed 1", "--seed: ", "without dashes: seed=1"),
+    ("learning.epsilon=0.5", "learning.epsilon=0.5", "give a list, as [0.5,0.02]"),
+    ("learning.epsilon=[0.5]", "learning.epsilon: ", "value 2 is missing"),
+    ("learning.transitions=many", "learning.transitions=many", "give an integer"),
+    ("agent.mirrored=maybe", "agent.mirrored=maybe", "give true or false"),
+    ("label=a(b", "label=a(b", "text with special characters in quotes"),
+    ("emulator=large", "emulator: ", "cartpole-train does not read this group"),
+    ("+emulator.latency=0", "emulator", "there is no such setting"),
     ("+seed=1", "seed", "Either remove + prefix"),
     ("--config-dir=nowhere", "nowhere", "not found"),
-    ("pole=range pole.lengths=[0,1]", "pole.lengths", "greater than 0"),
+    ("pole=range pole.lengths=[0,1]", "pole.lengths", "give more than 0"),
     ("cart.cart_mass=-1", "cart_mass is -1", "above 0"),
-    ("pole.choices.medium.pole_mass=-0.1", "pole.choices.medium.pole_mass=-0.1", "greater than 0"),
+    ("pole.choices.medium.pole_mass=-0.1", "pole.choices.medium.pole_mass=-0.1", "give more than 0"),
     ("+cart.pole_mass=1", "pole_mass", "belongs to the pole"),
     ("+randomization.cart_masss={absolute:[1,2]}", "cart_masss", "did you mean 'cart_mass'?"),
     ("randomization.cart_mass.relative=[-1.5,0]", "cart_mass", "above 0"),
@@ -43,8 +52,8 @@ WRONG_TRAINING = [
     ("learning.transitions=100", "learning", "must be at least"),
     ("agent.target_period=10", "agent", "either target_tau or target_period"),
     ("actions.motors=[100,100]", "actions", "two or more different values"),
-    ("plant=emulated", "plant", "cartpole-evaluate takes plant=emulated"),
-    ("plant=serial", "plant", "cartpole-evaluate takes plant=serial"),
+    ("plant=emulated", "plant=emulated: ", "use cartpole-evaluate for plant=emulated"),
+    ("plant=serial", "plant=serial: ", "cartpole-train takes simulated, learned"),
     ("resume=nowhere", "resume=nowhere", "give the run folder of a training"),
 ]
 
@@ -59,7 +68,7 @@ def test_training(words: str, named: str, remedy: str, tmp_path: Path) -> None:
     assert remedy in done.complaint
     assert done.code == (1 if words.startswith("resume") else 2)
     assert done.out == ""
-    assert not list(tmp_path.glob("runs/train/*"))
+    assert not (tmp_path / "runs").exists()
 
 
 def test_a_choice_file_that_is_no_yaml(tmp_path: Path) -> None:
@@ -70,28 +79,59 @@ def test_a_choice_file_that_is_no_yaml(tmp_path: Path) -> None:
     assert done.code == 2
 
 
+def test_a_plant_file_without_a_kind(tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_text("")
+    done = in_process("finetune", "run=run", "plant=mine.yaml", folder=tmp_path)
+    assert done.complaint == "cartpole-finetune: plant: kind is missing; give plant=emulated, serial"
+    assert done.code == 2
+
+
+def test_a_refused_command_leaves_the_other_runs(tmp_path: Path) -> None:
+    earlier = tmp_path / "runs/evaluate/earlier"
+    earlier.mkdir(parents=True)
+    (tmp_path / "mine").mkdir()
+    for words in ((), ("hydra.run.dir=mine/run",)):
+        assert in_process("train", "seed=abc", *words, folder=tmp_path).code == 2
+        assert [path.relative_to(tmp_path).as_posix() for path in sorted(tmp_path.rglob("*"))] == [
+            "mine",
+            "runs",
+            "runs/evaluate",
+            "runs/evaluate/earlier",
+        ]
+
+
 WRONG_EVALUATION = [
-    ("", "run is missing", "give run=...", 2),
+    ("", "run is missing", "give run=runs/train/<run>", 2),
     ("run=nowhere", "run=nowhere", "give a run folder or a checkpoint", 1),
     ("run=text.pt", "text.pt", "give one that cartpole-train wrote", 1),
     ("run=cut.pt", "cut.pt", "damaged", 1),
     ("run=other.pt", "other.pt", "not an agent of this package", 1),
     ("run=empty", "run=empty", "holds no checkpoints/last.pt", 1),
     ("run=resume.pt", "resume.pt", "not an agent of this package: it is the state that a training", 1),
-    ("run=run plant.substeps=0", "plant.substeps=0", "greater than or equal to 1", 2),
-    ("run=run parameters={cart_mas:1}", "cart_mas", "did you mean 'cart_mass'?", 2),
+    ("run=run plant.substeps=0", "plant.substeps=0", "give at least 1", 2),
+    ("run=run parameters={cart_mas:1}", "parameters: ", "did you mean 'cart_mass'?", 2),
     ("run=run parameters={cart_mass:-1}", "cart_mass is -1", "above 0", 2),
     ("run=run parameters={pole_mass:0.2} pole=range", "pole_mass", "choose one pole", 2),
-    ("run=run task=balance task.time_limit=0", "task.time_limit=0", "greater than or equal to 1", 2),
-    ("run=run plant=emulated parameters={cart_mass:1}", "parameters", "its own are emulator.*", 2),
+    ("run=run task=balance task.time_limit=0", "task.time_limit=0", "give at least 1", 2),
+    (
+        "run=run plant=emulated parameters={cart_mass:1}",
+        "parameters: ",
+        "has its own cart; set emulator.*",
+        2,
+    ),
     ("run=run plant=emulated pole=large", "pole", "emulator=large", 2),
     ("run=run plant=emulated emulator.latencyy=1", "emulator.latencyy", "did you mean emulator.latency?", 2),
     ("run=run plant=emulated task=swingup task.evaluation_start.angle=any", "angle=any", "hanging", 2),
     ("run=run emulator.latency=0.01", "emulator", "give plant=emulated", 2),
-    ("run=run plant=serial", "plant.port is missing", "give plant.port=...", 2),
+    ("run=run plant=serial", "plant.port is missing", "give plant.port=/dev/ttyUSB0", 2),
     ("run=run plant=serial plant.prot=/dev/ttyUSB0", "plant.prot", "did you mean plant.port?", 2),
     ("run=run plant=serial plant.port=nowhere", "nowhere does not exist", "plug the cart in", 1),
-    ("run=run plant=serial plant.port=/dev/null", "/dev/null", "cannot be opened as a serial port", 1),
+    (
+        "run=run plant=serial plant.port=/dev/null",
+        "/dev/null is not a serial port",
+        "cartpole-find-port lists them",
+        1,
+    ),
 ]
 
 
@@ -117,7 +157,7 @@ def test_evaluation(words: str, named: str, remedy: str, code: int, files: Path)
     assert remedy in done.complaint
     assert done.code == code
     assert done.out == ""
-    assert not list(files.glob("runs/evaluate/*"))
+    assert not (files / "runs/evaluate").exists()
 
 
 @pytest.fixture
@@ -244,7 +284,7 @@ def test_without_a_compiler_the_remedy_is_stated(tmp_path: Path, monkeypatch: py
 def test_in_a_multirun_the_other_jobs_run(tmp_path: Path) -> None:
     done = in_process("train", "-m", *TINY, ONCE, "agent.gamma=1.5,0.9", folder=tmp_path)
     assert done.code == 2
-    assert "agent.gamma=1.5: input should be less than 1" in done.err.splitlines()[0]
+    assert "agent.gamma=1.5: give less than 1" in done.err.splitlines()[0]
     assert "Traceback" not in done.err
     finished = list(tmp_path.glob("runs/train/*_multirun/*/metrics.json"))
     assert [path.parent.name for path in finished] == ["1_agent.gamma-0.9"]

@@ -47,18 +47,38 @@ def test_an_unknown_setting_gets_the_nearest_known_one(monkeypatch: pytest.Monke
     assert "learning.carts" in complaint
 
 
+def test_of_similar_choices_the_one_with_the_same_letters_is_suggested() -> None:
+    assert nearest_choice("lrage", ["large", "medium", "range"]).startswith("did you mean large?")
+
+
+@pytest.mark.parametrize("key", ["emulator", "emulator.cart_viscous"])
+def test_a_group_of_other_commands_is_named(key: str) -> None:
+    complaint = hydra_complaint(f"Could not override '{key}'.", "train")
+    assert complaint == f"{key}: cartpole-train does not read this group"
+
+
 def test_no_hint_without_a_near_choice() -> None:
     assert nearest_choice("zzz", ["adam", "adamw"]) == "there are adam, adamw"
 
 
 @pytest.mark.parametrize(
-    ("words", "found"),
+    ("words", "message"),
     [
-        (["seed=1", "--seed=1"], "--seed=1"),
-        (["-seed=1"], "-seed=1"),
+        (["seed=1", "--seed=1"], "--seed=1: settings are given without dashes: seed=1"),
+        (["-seed=1"], "-seed=1: settings are given without dashes: seed=1"),
+        (["--seed", "1"], "--seed: settings are given without dashes: seed=1"),
+        (["--learning.carts", "4"], "--learning.carts: settings are given without dashes: learning.carts=4"),
+        (["--experiment", "large"], "--experiment: settings are given without dashes: experiment=large"),
+        (["--run", "lqr"], "--run: settings are given without dashes: run=lqr"),
+        (["--compile", "seed=1"], "--compile: settings are given without dashes: compile=..."),
+        ([], None),
+        (["--compile"], "--compile: settings are given without dashes: compile=..."),
         (["--config-dir=mine", "--cfg", "job"], None),
+        (["--config-dir", "mine", "--help"], None),
+        (["--multirun", "--info", "all", "--hydra-help", "--resolve"], None),
+        (["-m", "-sc", "install=bash"], None),
         (["parameters={cart_mass:1}", "seed=-1"], None),
     ],
 )
-def test_a_setting_with_dashes_is_found(words: list[str], found: str | None) -> None:
-    assert dashed_setting(words) == found
+def test_a_setting_with_dashes_is_found(words: list[str], message: str | None) -> None:
+    assert dashed_setting(words) == message

@@ -81,7 +81,7 @@ def test_a_repetition_can_be_repeated(trained: Path, evaluated: Path) -> None:
 def test_what_is_left_to_chance_is_said(trained: Path, evaluated: Path) -> None:
     done = repeat(trained, evaluated, "noisy", 2)
     assert done.code == 0, done.err
-    assert "latency_jitter, angle_noise is left to chance, so it cannot be repeated exactly" in done.out
+    assert "latency_jitter, angle_noise is random, so the episode cannot be repeated exactly" in done.out
     then, now = read(evaluated / "noisy"), read(evaluated / "again_noisy_2")
     assert read_origin(now, 0) == read_origin(then, 2)
 
@@ -112,7 +112,7 @@ def test_numbers_come_back_to_the_bit() -> None:
     ("words", "named", "remedy"),
     [
         ("repeat.run=wide repeat.episode=7", "repeat.episode=7", "has episodes 0 to 6"),
-        ("repeat.run=wide repeat.episode=-1", "repeat.episode=-1", "greater than or equal to 0"),
+        ("repeat.run=wide repeat.episode=-1", "repeat.episode=-1", "give at least 0"),
         ("repeat.run=wide", "repeat.episode is missing", "repeat.episode=0 to 6"),
         ("repeat.episode=1", "repeat.run is missing", "the run folder of an evaluation"),
         ("repeat.run=nowhere repeat.episode=1", "repeat.run=nowhere", "give the run folder of one"),

@@ -17,7 +17,7 @@ from cartpole_rl.settings import Settings
 
 SHOWS = (("--help", 0, ""), ("--cfg job", 0, ""), ("seeed=1", 2, "seeed: there is no such setting"))
 COMPLAINS = {  # command: words, exit code, part of the line on stderr
-    "emulate": [("emulator.latency=2", 2, "less than or equal to 1")],
+    "emulate": [("emulator.latency=2", 2, "give at most 1")],
     "evaluate": [
         ("run=nowhere", 1, "run=nowhere: there is no such file or folder"),
         ("run=lqr repeat.run=nowhere seed=1", 2, "leave out seed=1"),
@@ -25,11 +25,11 @@ COMPLAINS = {  # command: words, exit code, part of the line on stderr
         ("run=lqr parameters={latencyy:1}", 2, "did you mean 'latency'?"),
         ("run=lqr plant=learned plant.model=nowhere", 1, "plant.model=nowhere: there is no such file"),
     ],
-    "find_port": [("timeout=0", 2, "greater than 0")],
+    "find_port": [("timeout=0", 2, "give more than 0")],
     "finetune": [
         ("run=nowhere", 1, "run=nowhere: there is no such file or folder"),
         ("resume=nowhere", 1, "resume=nowhere: there is no such folder"),
-        ("finetuning.epsilon=0.5", 2, "less than or equal to 0.2"),
+        ("finetuning.epsilon=0.5", 2, "give at most 0.2"),
     ],
     "identify": [
         ("from=nowhere", 1, "from=nowhere: there is no such file or folder"),
@@ -37,15 +37,15 @@ COMPLAINS = {  # command: words, exit code, part of the line on stderr
     ],
     "model": [
         ("from=nowhere", 1, "from=nowhere: there is no such file or folder"),
-        ("from=nowhere windows=1", 2, "greater than or equal to 10"),
+        ("from=nowhere windows=1", 2, "give at least 10"),
     ],
-    "preflight": [("plant.port=nowhere plant.home_timeout=0", 2, "greater than 0")],
+    "preflight": [("plant.port=nowhere plant.home_timeout=0", 2, "give more than 0")],
     "record": [("run=nowhere", 1, "run=nowhere: there is no such file or folder")],
     "replay": [("from=nowhere", 1, "from=nowhere: there is no such file or folder")],
     "train": [
         ("resume=nowhere", 1, "resume=nowhere: there is no such folder"),
-        ("seed=abc", 2, "valid integer"),
-        ("agent.gamma=1.5", 2, "less than 1"),
+        ("seed=abc", 2, "give an integer"),
+        ("agent.gamma=1.5", 2, "give less than 1"),
         ("agent.hidden=[7]", 2, "even numbers of units"),
         ("cart.cart_mass=-1", 2, "cart_mass is -1"),
         ("randomization.cart_mass.relative=[-1.5,0]", 2, "it must be above 0"),

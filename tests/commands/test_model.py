@@ -102,7 +102,7 @@ def test_a_missing_or_damaged_model_is_one_line(tmp_path: Path) -> None:
         assert done.complaint.startswith(f"cartpole-train: plant.model={complaint}")
         assert done.code == 1
     done = in_process("train", "plant=learned", *TINY, folder=tmp_path)
-    assert done.complaint == "cartpole-train: plant.model is missing; give plant.model=..."
+    assert done.complaint == "cartpole-train: plant.model is missing; give plant.model=runs/model/<run>"
     assert done.code == 2
 
 
@@ -115,9 +115,9 @@ def test_a_missing_or_damaged_model_is_one_line(tmp_path: Path) -> None:
             "give a run of cartpole-record or cartpole-identify",
             1,
         ),
-        ("", "from is missing; give from=...", 2),
-        ("from=. windows=2", "windows=2: input should be greater than or equal to 10", 2),
-        ("from=. ensemble.validation=0", "ensemble.validation=0: input should be greater than 0", 2),
+        ("", "from is missing; give from=runs/record/<run>", 2),
+        ("from=. windows=2", "windows=2: give at least 10", 2),
+        ("from=. ensemble.validation=0", "ensemble.validation=0: give more than 0", 2),
     ],
 )
 def test_what_cannot_be_learned_from(words: str, complaint: str, code: int, tmp_path: Path) -> None:

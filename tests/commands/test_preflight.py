@@ -43,7 +43,7 @@ def test_a_port_without_a_cart_is_reported(tmp_path: Path) -> None:
 def test_a_port_has_to_be_given(tmp_path: Path) -> None:
     done = in_process("preflight", folder=tmp_path)
     assert done.code == 2
-    assert "plant.port is missing; give plant.port=..." in done.complaint
+    assert "plant.port is missing; give plant.port=/dev/ttyUSB0" in done.complaint
 
 
 def test_a_simulated_cart_has_nothing_to_check(tmp_path: Path) -> None:

@@ -70,7 +70,7 @@ def test_the_baseline_has_one_pole(pole: str, tmp_path: Path) -> None:
 
 
 def test_recording_needs_a_run(tmp_path: Path) -> None:
-    assert "run is missing; give run=..." in in_process("record", folder=tmp_path).complaint
+    assert "run is missing; give run=runs/train/<run>" in in_process("record", folder=tmp_path).complaint
 
 
 def test_an_interrupt_keeps_the_finished_episodes(tmp_path: Path) -> None:

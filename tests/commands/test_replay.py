@@ -91,8 +91,8 @@ def test_a_pole_of_another_length_has_to_be_given(recorded: Path, tmp_path: Path
             1,
         ),
         ("from=.", "from=.: it contains no recording; give a run of cartpole-record or cartpole-identify", 1),
-        ("", "from is missing; give from=...", 2),
-        ("from=. restart=0", "restart=0: input should be greater than or equal to 0.1", 2),
+        ("", "from is missing; give from=runs/record/<run>", 2),
+        ("from=. restart=0", "restart=0: give at least 0.1", 2),
     ],
 )
 def test_what_cannot_be_replayed(words: str, complaint: str, code: int, tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import pytest
 
 from cartpole_rl.choices import conf_folder
 from cartpole_rl.workflows.config import TrainConfig
-from cartpole_rl.workflows.settings import load_settings
+from cartpole_rl.workflows.loading import load_settings
 
 SILENT = "silent"
 UNREAD = "not read with these settings"

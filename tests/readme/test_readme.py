@@ -45,7 +45,7 @@ VERBS = (
 )
 COMMANDS = re.findall(
     r"^    ((?:cartpole-|tensorboard|\./scripts/|pip ).*?)(?:\s+#.*)?$",
-    (ROOT / "README.md").read_text(),
+    re.sub(r" \\\n +", " ", (ROOT / "README.md").read_text()),
     re.M,
 )
 

@@ -58,7 +58,7 @@ def course(**chosen: str) -> Any:
 
     from cartpole_rl.envs.build import simulated_env
     from cartpole_rl.workflows.config import TrainConfig
-    from cartpole_rl.workflows.settings import load_settings
+    from cartpole_rl.workflows.loading import load_settings
 
     torch.manual_seed(0)
     config = load_settings(TrainConfig, chosen)

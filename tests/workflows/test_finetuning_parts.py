@@ -13,7 +13,7 @@ from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.config import FinetuneConfig
 from cartpole_rl.workflows.finetuning_files import FinetuningFiles, Stage
 from cartpole_rl.workflows.finetuning_learner import simulated_learning
-from cartpole_rl.workflows.settings import load_settings, recorded_settings
+from cartpole_rl.workflows.loading import load_settings, recorded_settings
 
 EPISODE = Episode(
     time=0.02 * np.arange(3),

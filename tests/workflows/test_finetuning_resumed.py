@@ -16,7 +16,7 @@ from cartpole_rl.workflows.build import evaluated_settings
 from cartpole_rl.workflows.config import FinetuneConfig, TrainConfig
 from cartpole_rl.workflows.finetune import evaluation_config
 from cartpole_rl.workflows.finetuning_learner import CartLearner
-from cartpole_rl.workflows.settings import load_settings
+from cartpole_rl.workflows.loading import load_settings
 
 TRAINING = load_settings(
     TrainConfig,

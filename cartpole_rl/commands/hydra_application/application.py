@@ -57,7 +57,7 @@ def application(name: str, schema: type[Config]) -> Callable[[Body[Config]], Cal
                     raise  # Hydra keeps it until all jobs have ended
                 exit_with_message(name, error)
             finally:
-                remove_if_empty(folder)
+                remove_if_empty(folder, name)
 
         def main() -> None:
             given[:] = sys.argv[1:]
@@ -66,7 +66,7 @@ def application(name: str, schema: type[Config]) -> Callable[[Body[Config]], Cal
             os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra raises its errors instead of printing them
             try:
                 if dashed := dashed_setting(sys.argv[1:]):
-                    raise ConfigError(f"{dashed}: settings are given without dashes: {dashed.lstrip('-')}")
+                    raise ConfigError(dashed)
                 with with_choice_files(given) as words:
                     sys.argv[1:] = words
                     hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=name)(task)()
@@ -89,8 +89,12 @@ def quieten() -> None:
     warnings.filterwarnings("ignore", r"torch\._dynamo\.config\.inline_inbuilt_nn_modules", FutureWarning)
 
 
-def remove_if_empty(folder: Path) -> None:
-    """Remove a run folder if nothing was written to it."""
-    if folder != Path.cwd():
-        with suppress(OSError):  # it is not empty
-            folder.rmdir()
+def remove_if_empty(folder: Path, name: str) -> None:
+    """Remove a run folder if nothing was written to it, then runs/<name>/ and runs/ if they are empty."""
+    if folder == Path.cwd():
+        return
+    runs = Path.cwd() / "runs"
+    above = (runs / name, runs) if folder.parent == runs / name else ()
+    with suppress(OSError):  # one is not empty
+        for each in (folder, *above):
+            each.rmdir()

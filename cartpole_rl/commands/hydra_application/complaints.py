@@ -1,24 +1,40 @@
 """Rewrites errors of Hydra, OmegaConf and the operating system as one line with the remedy."""
 
-import difflib
 import re
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
+from itertools import pairwise
 
 import hydra
 from hydra.errors import HydraException, OverrideParseException
 from omegaconf import OmegaConf
 
-from cartpole_rl.checking import no_such_setting, setting_names
-from cartpole_rl.choices import conf_folder
+from cartpole_rl.checking import most_similar, no_such_setting, setting_names, similarity
+from cartpole_rl.choices import conf_folder, default_choices
 
-HYDRA_OPTIONS = ("--config-", "--package", "--info", "--cfg", "--experimental-rerun")
+# Hydra's, each up to its first hyphen; without --run, which has no effect: a user means run=
+HYDRA_OPTIONS = (
+    "help",
+    "hydra",
+    "version",
+    "cfg",
+    "resolve",
+    "package",
+    "multirun",
+    "shell",
+    "config",
+    "info",
+)
+NEAR_CHOICE = 0.6  # similarity from which a choice is suggested
 
 
 def in_one_line(error: Exception, command: str) -> str:
     """Return the message of `error` for the user of cartpole-<command>."""
     if isinstance(error, OverrideParseException):
-        return f"{error.override}: settings are given as key=value, lists as [1,2], text with signs in quotes"
+        return (
+            f"{error.override}: settings are given as key=value, lists as [1,2], "
+            "text with special characters in quotes"
+        )
     if isinstance(error, HydraException):
         return hydra_complaint(" ".join(str(error).split()), command)
     if isinstance(error, OSError):
@@ -29,6 +45,9 @@ def in_one_line(error: Exception, command: str) -> str:
 def hydra_complaint(text: str, command: str) -> str:
     """Return Hydra's message, shorter where it is a frequent one."""
     if unknown := re.match(r"Could not override '([^']+)'", text):
+        group = unknown[1].partition(".")[0]
+        if group not in default_choices(command) and (conf_folder() / group).is_dir():
+            return f"{unknown[1]}: cartpole-{command.replace('_', '-')} does not read this group"
         return no_such_setting(unknown[1], known_settings(command))
     if choice := re.search(r"Could not find '([^']+)' Available options in '([^']+)': (.*)", text):
         wrong = choice[1].removeprefix(f"{choice[2]}/")
@@ -41,8 +60,9 @@ def hydra_complaint(text: str, command: str) -> str:
 
 def nearest_choice(wrong: str, choices: Sequence[str]) -> str:
     """Return a hint: the choice that was probably meant, and all choices."""
-    near = difflib.get_close_matches(wrong, choices, 1)
-    return (f"did you mean {near[0]}? " if near else "") + f"there are {', '.join(choices)}"
+    near = most_similar(wrong, choices)
+    hint = f"did you mean {near}? " if similarity(wrong, near)[0] >= NEAR_CHOICE else ""
+    return f"{hint}there are {', '.join(choices)}"
 
 
 def known_settings(command: str) -> set[str]:
@@ -57,7 +77,13 @@ def known_settings(command: str) -> set[str]:
     return set()
 
 
-def dashed_setting(words: Iterable[str]) -> str | None:
-    """Return the first word like `--seed=1`, which Hydra does not take."""
-    dashed = (word for word in words if re.match(r"--?[A-Za-z_.]+=", word))
-    return next((word for word in dashed if not word.startswith(HYDRA_OPTIONS)), None)
+def dashed_setting(words: Sequence[str]) -> str | None:
+    """Return the message about the first word like `--seed=1` or `--seed 1`, which Hydra does not take."""
+    for word, following in pairwise([*words, ""]):
+        dashed = re.fullmatch(r"--?([A-Za-z_.]+)=.*", word) or re.fullmatch(r"--([A-Za-z_.]+)", word)
+        if dashed and not any(option.startswith(dashed[1]) for option in HYDRA_OPTIONS):
+            setting = word.lstrip("-")
+            if "=" not in word:
+                setting += "=..." if re.search("=|^--|^$", following) else f"={following}"
+            return f"{word}: settings are given without dashes: {setting}"
+    return None

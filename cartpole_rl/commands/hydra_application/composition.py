@@ -7,13 +7,14 @@ from contextlib import suppress
 from datetime import datetime
 from itertools import count
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import MISSING, DictConfig, OmegaConf
 
+from cartpole_rl.checking import kinds
 from cartpole_rl.choices import default_choices, without_missing
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.plants.serial.settings import SerialSettings
@@ -48,9 +49,17 @@ def new_folder(command: str, label: str) -> str:
     for number in count(1):
         folder = Path("runs", command, name if number == 1 else f"{name}_{number}")
         with suppress(FileExistsError):
-            folder.mkdir(parents=True)
+            _make(folder)
             break
     return str(folder)
+
+
+def _make(folder: Path) -> None:
+    """Make `folder`. Raises FileExistsError if it exists."""
+    try:
+        folder.mkdir(parents=True)
+    except FileNotFoundError:  # a command that failed has just removed the empty parent
+        folder.mkdir(parents=True)
 
 
 def job_name(number: int, overrides: Sequence[str]) -> str:
@@ -72,21 +81,12 @@ def choices_of(command: str, schema: type[Settings]) -> str:
     Choices in folders of a user's own are listed too; plants that `schema` does not take are not.
     """
     loader = GlobalHydra.instance().config_loader()
-    refused = {"plant": plant_kinds(EvaluateConfig) - plant_kinds(schema)}
+    refused = {"plant": {*kinds(EvaluateConfig, "plant")} - {*kinds(schema, "plant")}}
     lines = [
         f"  {group}: {', '.join(sorted({*loader.get_group_options(group)} - refused.get(group, set())))}\n"
         for group in sorted(default_choices(command))
     ]
     return "".join(("Choices (group=choice)\n", *lines, "\n")) if lines else ""
-
-
-def plant_kinds(schema: type[Settings]) -> set[str]:
-    """Return the choices of plant= that a command with the settings `schema` takes."""
-    if "plant" not in schema.model_fields:
-        return set()
-    annotation = schema.model_fields["plant"].annotation
-    classes = get_args(annotation) or (annotation,)
-    return {kind for plant in classes for kind in get_args(plant.model_fields["kind"].annotation)}
 
 
 def as_mapping(composed: DictConfig) -> dict[str, Any]:

@@ -64,7 +64,7 @@ class TestOpening:
     def test_a_file_that_is_no_port(self, tmp_path) -> None:
         path = tmp_path / "plain.txt"
         path.write_text("no cart")
-        with pytest.raises(PortError, match="cannot be opened as a serial port"):
+        with pytest.raises(PortError, match="is not a serial port; cartpole-find-port lists them"):
             SerialCart(quick_settings(str(path))).open()
 
     def test_an_unknown_kind_of_url(self) -> None:

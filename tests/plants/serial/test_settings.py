@@ -14,7 +14,7 @@ from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.wire import Flags
 from cartpole_rl.workflows.build import evaluated_env, evaluated_settings
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
-from cartpole_rl.workflows.settings import load_settings
+from cartpole_rl.workflows.loading import load_settings
 
 TIMEOUTS = {
     "timeout": 0.35,
@@ -75,16 +75,16 @@ def test_timeouts_reach_the_port_and_the_calls_that_wait(
 @pytest.mark.parametrize(
     ("name", "value", "complaint"),
     [
-        ("timeout", 0, "plant.timeout=0: input should be greater than 0"),
-        ("home_timeout", -1, "plant.home_timeout=-1: input should be greater than 0"),
-        ("clear_faults", None, "plant.clear_faults=null: input should be a valid integer"),
-        ("timeout", 1e300, "plant.timeout=1e[+]?300: input should be less than or equal to 60"),
-        ("home_timeout", 601, "plant.home_timeout=601: input should be less than or equal to 600"),
-        ("write_timeout", 3, "plant.write_timeout=3: input should be less than or equal to 2"),
-        ("nudge_after", 0.1, "plant.nudge_after=0.1: input should be greater than or equal to 0.2"),
-        ("retries", 10**9, "plant.retries=1000000000: input should be less than or equal to 100"),
-        ("baud", 10**10, "plant.baud=10000000000: input should be less than or equal to 12000000"),
-        ("pole_length", 33, "plant.pole_length=33: input should be less than or equal to 3"),
+        ("timeout", 0, "plant.timeout=0: give more than 0"),
+        ("home_timeout", -1, "plant.home_timeout=-1: give more than 0"),
+        ("clear_faults", None, "plant.clear_faults=null: give an integer"),
+        ("timeout", 1e300, "plant.timeout=1e[+]?300: give at most 60"),
+        ("home_timeout", 601, "plant.home_timeout=601: give at most 600"),
+        ("write_timeout", 3, "plant.write_timeout=3: give at most 2"),
+        ("nudge_after", 0.1, "plant.nudge_after=0.1: give at least 0.2"),
+        ("retries", 10**9, "plant.retries=1000000000: give at most 100"),
+        ("baud", 10**10, "plant.baud=10000000000: give at most 12000000"),
+        ("pole_length", 33, "plant.pole_length=33: give at most 3"),
     ],
 )
 def test_values_out_of_range_are_refused(name: str, value: float | None, complaint: str) -> None:

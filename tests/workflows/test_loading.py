@@ -13,7 +13,7 @@ from cartpole_rl.commands.hydra_application.composition import as_mapping
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.settings import Settings
 from cartpole_rl.workflows.config import EvaluateConfig, PreflightConfig, TrainConfig
-from cartpole_rl.workflows.settings import COMMANDS, load_settings
+from cartpole_rl.workflows.loading import COMMANDS, load_settings
 
 pytestmark = pytest.mark.usefixtures("hydra_reads_conf")
 
