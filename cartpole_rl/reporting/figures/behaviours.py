@@ -111,8 +111,8 @@ def _draw_motor(axes: Axes, episode: Episode) -> None:
     axes.stairs(episode.motor, episode.time, baseline=None, color=style.MOTOR, linewidth=1.0)
     if episode.guarded is not None and episode.guarded.any():
         guarded = np.where(episode.guarded, episode.motor, 0)
-        axes.stairs(guarded, episode.time, fill=True, color=style.VERMILLION, label="track guard")
-        axes.legend(loc="upper right")
+        axes.stairs(guarded, episode.time, fill=True, color=style.LIMIT)
+        beside(axes, 0, "track guard", style.LIMIT)
     axes.set_ylim(-1.15 * LARGEST_MOTOR, 1.15 * LARGEST_MOTOR)
     axes.set_yticks(MOTOR_TICKS)
     beside(axes, MOTOR_TICKS[-1], "pushes right", style.MUTED)
