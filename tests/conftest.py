@@ -21,7 +21,7 @@ from hydra_configs import shipped_choices
 
 from cartpole_rl.envs.build import make_env
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
-from cartpole_rl.envs.settings import ObservationSettings
+from cartpole_rl.envs.settings import ObservationSettings, TrackGuard
 from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.simulated import SimulatedPlant
@@ -126,6 +126,7 @@ def make_environment() -> Callable[..., CartPoleEnv]:
         time_limit: int = 500,
         angle_limit: float | None = None,
         reward: dict[str, Any] | None = None,
+        guard: TrackGuard | None = None,
         **observation: Any,
     ) -> CartPoleEnv:
         return make_env(
@@ -141,6 +142,7 @@ def make_environment() -> Callable[..., CartPoleEnv]:
             ),
             ObservationSettings(**{**conf("observation/history"), **observation}),
             RewardSettings(**{**conf("reward/score"), **(reward or {})}),
+            guard,
         )
 
     return build

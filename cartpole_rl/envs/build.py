@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 
@@ -10,9 +10,11 @@ from cartpole_rl.checking import checked
 from cartpole_rl.choices import compose
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
+from cartpole_rl.envs.guard_fitting import fitted_guard
 from cartpole_rl.envs.hardware import HardwareTransform
-from cartpole_rl.envs.settings import ObservationSettings
+from cartpole_rl.envs.settings import ObservationSettings, TrackGuard
 from cartpole_rl.errors import ConfigError
+from cartpole_rl.physics.models import Actuator, Models
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.physics.residual import UNDER_WAY
 from cartpole_rl.plants.learned import LearnedPlant
@@ -34,21 +36,39 @@ def shipped_settings(overrides: Mapping[str, Any] | None = None) -> CartPoleSett
     return checked(CartPoleSettings, {name: composed[name] for name in CartPoleSettings.model_fields})
 
 
+Config = TypeVar("Config", bound=CartPoleSettings)
+
+
+def with_fitted_guard(config: Config) -> Config:
+    """Return `config` with the numbers of its track guard, fitted to its carts if they are not given."""
+    guard = config.guard
+    if not guard.enabled or guard.numbers:
+        return config
+    actuator = Actuator(config.actions.actuator)
+    models = Models(config.cart_friction.model, config.pole_friction.model, actuator)
+    motors, period = config.actions.motors, config.control_period
+    numbers = fitted_guard(guard.quantile, randomizer(config), motors, models, period)
+    return config.model_copy(update={"guard": guard.model_copy(update={"numbers": numbers})})
+
+
 def make_env(
     plant: Plant,
     actions: ActionSettings,
     task: TaskSettings,
     observation: ObservationSettings,
     reward: RewardSettings,
+    guard: TrackGuard | None = None,
 ) -> CartPoleEnv:
     """Return the environment over `plant`; its specs do not depend on the plant."""
-    hardware = HardwareTransform(actions.motors, task, observation, reward, compiled=plant.compiled)
+    hardware = HardwareTransform(actions.motors, task, observation, reward, guard, compiled=plant.compiled)
     return CartPoleEnv(plant, hardware)
 
 
 def environment(config: CartPoleSettings, plant: Plant) -> CartPoleEnv:
     """Return the environment of `config` over `plant`."""
-    return make_env(plant, config.actions, config.task, config.observation, config.reward)
+    return make_env(
+        plant, config.actions, config.task, config.observation, config.reward, config.guard.active
+    )
 
 
 def simulated_env(

@@ -4,7 +4,7 @@ from typing import Annotated, Any
 
 from pydantic import Discriminator, Field, Tag
 
-from cartpole_rl.envs.settings import ObservationSettings
+from cartpole_rl.envs.settings import GuardSettings, ObservationSettings
 from cartpole_rl.physics.models import Actuator, CartFriction, Models, PoleFriction
 from cartpole_rl.plants.settings import LearnedSettings, SimulatedSettings
 from cartpole_rl.randomization.poles import Pole, PoleSettings
@@ -80,6 +80,7 @@ class CartPoleSettings(SimulatedCartSettings):
     task: TaskSettings
     reward: RewardSettings
     observation: ObservationSettings
+    guard: GuardSettings
     randomization: Randomization
     control_period: ControlPeriod
 

@@ -43,12 +43,12 @@ from functools import partial
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Categorical, Composite, Unbounded
+from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import Transform
 
 from cartpole_rl.compilation import Compiled
 from cartpole_rl.envs.perception import FirstPercept, Percept, PlantOutput, Previous, perceive, perceive_first
-from cartpole_rl.envs.settings import ObservationSettings
+from cartpole_rl.envs.settings import ObservationSettings, TrackGuard
 from cartpole_rl.plants.specs import Plant, tensordict_of
 from cartpole_rl.tasks.features import LENGTH_SCALE
 from cartpole_rl.tasks.settings import NO_ACTION, RewardSettings, TaskSettings
@@ -63,14 +63,18 @@ class HardwareTransform(Transform):
         task: TaskSettings,
         observation: ObservationSettings,
         reward: RewardSettings,
+        guard: TrackGuard | None = None,
         compiled: bool = False,
     ) -> None:
         super().__init__()
         self.task, self.observation_settings, self.reward = task, observation, reward
         self.register_buffer("motors", torch.tensor(list(motors), dtype=torch.int64))
+        inward = torch.tensor([0, max(0, *motors), min(0, *motors)])  # by the guard's direction: 0, 1, -1
+        self.register_buffer("_inward", inward)
+        self.guard = guard
         self.register_buffer("_by_action", torch.tensor([0, *motors], dtype=torch.int64))  # from NO_ACTION on
         self._perceive: Callable[[Previous, PlantOutput], Percept] = partial(
-            perceive, settings=observation, task=task, rewards=reward
+            perceive, settings=observation, task=task, rewards=reward, guard=guard
         )
         if compiled:
             self.compile_arithmetic()
@@ -102,6 +106,7 @@ class HardwareTransform(Transform):
         floats = {"state": 4, "observation": settings.size, "past": settings.past_size}
         for key, size in {**floats, "score": 1, "score_upright": 1}.items():
             observation_spec[key] = Unbounded((carts, size), dtype=torch.float32, device=device)
+        observation_spec["guard"] = Bounded(-1, 1, (carts, 1), dtype=torch.int64, device=device)
         observation_spec["step_count"] = Unbounded((carts, 1), dtype=torch.int64, device=device)
         return observation_spec
 
@@ -115,8 +120,20 @@ class HardwareTransform(Transform):
         return self._by_action.index_select(0, action.reshape(-1) - NO_ACTION).reshape(action.shape)
 
     def command(self, tensordict: TensorDictBase) -> TensorDict:
-        """Return the `motor` values [N, 1] of the actions."""
-        return tensordict_of({"motor": self.motor_values(tensordict.get("action")).unsqueeze(-1)})
+        """Return the `motor` values [N, 1] to send: those of the actions, or the track guard's."""
+        action, guard = tensordict.get("action").unsqueeze(-1), tensordict.get("guard")
+        return tensordict_of({"motor": self.sent_motors(action, guard)})
+
+    def sent_motors(self, action: Tensor, guard: Tensor) -> Tensor:
+        """Return the motor values to send, int64: those of `action`, or full motor inward under the guard.
+
+        Both have the same shape. NO_ACTION stays 0.
+        """
+        motor = self.motor_values(action)
+        if self.guard is None:
+            return motor
+        inward = self._inward.index_select(0, guard.reshape(-1) % 3).reshape(guard.shape)
+        return torch.where((guard == 0) | (action == NO_ACTION), motor, inward)
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         return tensordict.update(self.command(tensordict)) if "action" in tensordict else tensordict
@@ -126,7 +143,10 @@ class HardwareTransform(Transform):
     def reset_rows(self, first: TensorDictBase, rows: Tensor | None = None) -> TensorDictBase:
         """Add state and observation to the first frames of the carts `rows` [R]; None means all carts."""
         counts, length = first.get("counts").T, self._scaled_length(rows)
-        return added(first, perceive_first(counts, length, self.observation_settings))
+        percept = perceive_first(
+            counts, length, self._track_end(rows), settings=self.observation_settings, guard=self.guard
+        )
+        return added(first, percept)
 
     def perceive(
         self, current: TensorDictBase, command: TensorDictBase, next_frame: TensorDictBase
@@ -139,6 +159,7 @@ class HardwareTransform(Transform):
             current.get("step_count").T,
             command.get("motor").T,
             self._scaled_length(),
+            self._track_end(),
         )
         frame = PlantOutput(*(next_frame.get(key).T for key in PlantOutput._fields))
         frame = frame._replace(truncated=frame.truncated | (current.get("action") == NO_ACTION))
@@ -158,6 +179,14 @@ class HardwareTransform(Transform):
             )
         lengths = self.plant.pole_length if rows is None else self.plant.pole_length[rows]
         return (lengths / LENGTH_SCALE).unsqueeze(0)
+
+    def _track_end(self, rows: Tensor | None = None) -> Tensor:
+        """Return where the tracks of the carts `rows` end, m, [1, R]; unbounded without a guard."""
+        if self.guard is None:
+            carts = self.plant.carts if rows is None else len(rows)
+            return torch.full((1, carts), torch.inf, device=self.motors.device)
+        ends = self.plant.track_half_length
+        return (ends if rows is None else ends[rows]).unsqueeze(0)
 
 
 def added(frame: TensorDictBase, percept: FirstPercept | Percept) -> TensorDict:

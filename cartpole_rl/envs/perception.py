@@ -9,7 +9,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from cartpole_rl.envs.settings import ObservationSettings
+from cartpole_rl.envs.guard import guard_side
+from cartpole_rl.envs.settings import ObservationSettings, TrackGuard
 from cartpole_rl.tasks.endings import fallen
 from cartpole_rl.tasks.features import (
     ANGULAR_SPEED_SCALE,
@@ -34,6 +35,7 @@ class Previous(NamedTuple):
     step_count: Tensor  # [1, N] int64
     motor: Tensor  # [1, N] int64, the value chosen
     length: Tensor  # [1, N] scaled length of the pole if it is observed, otherwise [0, N]
+    track_end: Tensor  # [1, N] m from the middle
 
 
 class PlantOutput(NamedTuple):
@@ -51,6 +53,7 @@ class FirstPercept(NamedTuple):
     state: Tensor  # [4, N]
     past: Tensor  # [past_size, N]
     observation: Tensor  # [size, N]
+    guard: Tensor  # [1, N] int64, direction of the track guard's motor value, 0 if the agent's is sent
     score: Tensor  # [1, N], 0
     score_upright: Tensor  # [1, N], 0
     step_count: Tensor  # [1, N] int64
@@ -62,6 +65,7 @@ class Percept(NamedTuple):
     state: Tensor  # [4, N]
     past: Tensor  # [past_size, N]
     observation: Tensor  # [size, N]
+    guard: Tensor  # [1, N] int64, as above
     reward: Tensor  # [1, N]
     score: Tensor  # [1, N] equation (6.2)
     score_upright: Tensor  # [1, N] equation (6.1)
@@ -71,7 +75,14 @@ class Percept(NamedTuple):
     done: Tensor  # [1, N] bool
 
 
-def perceive_first(counts: Tensor, length: Tensor, settings: ObservationSettings) -> FirstPercept:
+def perceive_first(
+    counts: Tensor,
+    length: Tensor,
+    track_end: Tensor,
+    *,
+    settings: ObservationSettings,
+    guard: TrackGuard | None,
+) -> FirstPercept:
     """Return the percept of a first frame: velocities and memory are 0."""
     x, theta = measured_position(counts)
     unknown = torch.zeros_like(x)
@@ -82,6 +93,7 @@ def perceive_first(counts: Tensor, length: Tensor, settings: ObservationSettings
         torch.stack(state),
         past,
         observation(state, past, length, settings),
+        guarded(state, track_end, guard),
         score=nothing,
         score_upright=nothing.clone(),
         step_count=torch.zeros_like(counts[:1]),
@@ -95,6 +107,7 @@ def perceive(
     settings: ObservationSettings,
     task: TaskSettings,
     rewards: RewardSettings,
+    guard: TrackGuard | None,
 ) -> Percept:
     """Return the percept of the frame after `previous`."""
     x, theta = measured_position(frame.counts)
@@ -112,6 +125,7 @@ def perceive(
         torch.stack(state),
         past,
         observation(state, past, previous.length, settings),
+        guarded(state, previous.track_end, guard),
         rewards.scale * values[rewards.kind] - track_cost(x, off_track, task, rewards),
         values[SCORE],
         values[SCORE_UPRIGHT],
@@ -140,6 +154,13 @@ def remember(previous: Previous, settings: ObservationSettings) -> Tensor:
 def observation(state: Measured, past: Tensor, length: Tensor, settings: ObservationSettings) -> Tensor:
     """Return the observation, [size, N]."""
     return torch.cat((torch.stack(observe(state, settings.kind)), past, length))
+
+
+def guarded(state: Measured, track_end: Tensor, guard: TrackGuard | None) -> Tensor:
+    """Return the direction of the track guard's motor value, int64 [1, N]; 0 without a guard."""
+    if guard is None:
+        return torch.zeros_like(track_end, dtype=torch.int64)
+    return guard_side(state.x, state.x_dot, track_end[0], guard).unsqueeze(0)
 
 
 def track_cost(x: Tensor, off_track: Tensor, task: TaskSettings, rewards: RewardSettings) -> Tensor:

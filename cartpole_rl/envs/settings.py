@@ -1,8 +1,10 @@
-"""Settings of the observation."""
+"""Settings of the observation and of the track guard."""
+
+from typing import Annotated
 
 from pydantic import Field
 
-from cartpole_rl.settings import Settings
+from cartpole_rl.settings import NonNegative, Positive, Settings
 from cartpole_rl.tasks.features import ObservationKind
 
 POSITIONS = ObservationKind.POSITIONS.mirror_signs
@@ -48,3 +50,24 @@ class ObservationSettings(Settings):
         size, first = len(POSITIONS), self.size - int(self.pole_length) - len(POSITIONS) * self.past_positions
         places = [0, *range(first, first + size * self.past_positions, size)]  # of x, newest first
         return [[*range(place, place + size), size + age] for age, place in enumerate(places)][::-1]
+
+
+class TrackGuard(Settings):
+    """The numbers of a track guard: see `envs/guard.py`."""
+
+    margin: NonNegative  # m
+    delay: NonNegative  # s
+    deceleration: Positive  # m/s^2
+
+
+class GuardSettings(Settings):
+    """The track guard: its numbers, or the quantile by which they are fitted to the carts."""
+
+    enabled: bool
+    quantile: Annotated[float, Field(gt=0, le=1)]  # of the ways that braking carts run on
+    numbers: TrackGuard | None  # None: fitted when a training starts
+
+    @property
+    def active(self) -> TrackGuard | None:
+        """The guard to drive with, None if it is disabled or not yet fitted."""
+        return self.numbers if self.enabled else None

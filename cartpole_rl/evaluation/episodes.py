@@ -73,12 +73,18 @@ def run_batch(env: CartPoleEnv, policy: Policy) -> list[Episode]:
     first, steps = frames[0], frames[1:]
     columns = {key: torch.cat([step[key] for step in steps], 1) for key in _FROM_NEXT}
     columns |= {key: torch.stack([frame[key] for frame in frames], 1) for key in ("state", "counts")}
-    columns["motor"] = env.hardware.motor_values(torch.stack(actions, 1))
+    action, guard = torch.stack(actions, 1), torch.cat([frame["guard"] for frame in frames[:-1]], 1)
+    columns["motor"] = env.hardware.sent_motors(action, guard)
+    columns["guarded"] = columns["motor"] != env.hardware.motor_values(action)
+    has_guard = env.hardware.guard is not None
     dt = torch.cat([torch.zeros_like(first["dt"]), *(step["dt"] for step in steps)], 1)
     columns["time"] = dt.cumsum(1)
     arrays = {key: values.cpu().numpy() for key, values in columns.items()}
     return [
-        replace(_episode({key: values[row] for key, values in arrays.items()}, ending), origin=origins[row])
+        replace(
+            _episode({key: values[row] for key, values in arrays.items()}, ending, has_guard),
+            origin=origins[row],
+        )
         for row, ending in enumerate(endings)
         if ending
     ]
@@ -106,7 +112,7 @@ def _ending(env: CartPoleEnv, action: int, last: TensorDictBase) -> str:
     return str(Ending.ANGLE if fallen else Ending.TRACK)
 
 
-def _episode(columns: dict[str, np.ndarray], ended_by: str) -> Episode:
+def _episode(columns: dict[str, np.ndarray], ended_by: str, has_guard: bool) -> Episode:
     """Return the episode of one row, cut at its end."""
     steps = 1 + int(np.argmax(columns["done"]))
     x, x_dot, theta, theta_dot = columns["state"][: steps + 1].astype(np.float64).T
@@ -123,4 +129,5 @@ def _episode(columns: dict[str, np.ndarray], ended_by: str) -> Episode:
         score_upright=step["score_upright"].astype(np.float64),
         reward=step["reward"].astype(np.float64),
         ended_by=ended_by,
+        guarded=step["guarded"] if has_guard else None,
     )

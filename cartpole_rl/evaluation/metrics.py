@@ -22,7 +22,8 @@ def episode_metrics(episode: Episode, track_half_length: float) -> dict[str, Any
     `score` and `score_upright` are the sums of (6.2) and (6.1); `time_to_upright_s` the first time from which
     the pole stays within 5 degrees for 1 s; `upright_fraction` the share of periods within 5 degrees, over
     which the RMS of angle and position are taken; `rms_motor_change` that of the step from one motor value to
-    the next; `min_track_margin_m` the smallest distance from `track_half_length`, negative beyond it.
+    the next; `guarded_fraction` the share of periods in which the track guard replaced the agent's motor
+    value; `min_track_margin_m` the smallest distance from `track_half_length`, negative beyond it.
     """
     upright = is_upright(episode.theta[1:])
     change = np.diff(episode.motor)
@@ -37,6 +38,7 @@ def episode_metrics(episode: Episode, track_half_length: float) -> dict[str, Any
         "rms_angle_rad": _rms(wrap(episode.theta[1:])[upright]),
         "rms_position_m": _rms(episode.x[1:][upright]),
         "rms_motor_change": _rms(change),
+        "guarded_fraction": None if episode.guarded is None else float(episode.guarded.mean()),
         "min_track_margin_m": float(track_half_length - np.abs(episode.x).max()),
     }
 

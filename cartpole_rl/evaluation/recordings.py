@@ -28,7 +28,8 @@ STATE = {  # column: field of Episode
 STEP = {"score": "score", "score_upright": "score_upright", "reward": "reward"}
 COUNTS = ("cart_counts", "pole_counts")
 LENGTH = "pole_length_m"  # in the heading: twice pivot to centre of mass, empty if not known
-COLUMNS = (*STATE, *COUNTS, "motor", *STEP)
+GUARDED = "guarded"  # 1 where the track guard replaced the agent's motor value; empty without a guard
+COLUMNS = (*STATE, *COUNTS, "motor", *STEP)  # that every recording has
 
 
 def write_recording(path: Path, episode: Episode, facts: Mapping[str, Any] | None = None) -> None:
@@ -37,15 +38,16 @@ def write_recording(path: Path, episode: Episode, facts: Mapping[str, Any] | Non
         for key, value in {"format": FORMAT, "ended_by": episode.ended_by, **(facts or {})}.items():
             file.write(f"# {key}: {value}\n")
         lines = csv.writer(file)
-        lines.writerow(COLUMNS)
+        lines.writerow((*COLUMNS, GUARDED))
         for row in range(episode.steps + 1):
             state = [repr(float(getattr(episode, field)[row])) for field in STATE.values()]
             counts = [int(count) for count in episode.counts[row]]
             if row < episode.steps:
                 step = [repr(float(getattr(episode, field)[row])) for field in STEP.values()]
-                lines.writerow([*state, *counts, int(episode.motor[row]), *step])
+                guarded = "" if episode.guarded is None else int(episode.guarded[row])
+                lines.writerow([*state, *counts, int(episode.motor[row]), *step, guarded])
             else:
-                lines.writerow([*state, *counts, "", *[""] * len(STEP)])
+                lines.writerow([*state, *counts, "", *[""] * len(STEP), ""])
 
 
 def read_recording(path: Path) -> Episode:
@@ -79,10 +81,12 @@ def read_recording(path: Path) -> Episode:
         }
         counts = np.array([[int(row[name]) for name in COUNTS] for row in rows])
         motor = np.array([int(row["motor"]) for row in rows[:-1]])
+        marks = [row.get(GUARDED) for row in rows[:-1]]
+        guarded = np.array([int(mark or 0) != 0 for mark in marks]) if any(marks) else None
     except (ValueError, TypeError) as error:
         raise RecordingError(f"{path} is damaged: {error}") from None
     _check_numbers(path, {**columns, **steps}, motor)
-    return Episode(**columns, **steps, counts=counts, motor=motor, ended_by=ended_by)
+    return Episode(**columns, **steps, counts=counts, motor=motor, ended_by=ended_by, guarded=guarded)
 
 
 def _check_numbers(path: Path, columns: Mapping[str, np.ndarray], motor: np.ndarray) -> None:

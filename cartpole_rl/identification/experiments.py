@@ -13,6 +13,8 @@ import numpy as np
 import torch
 from tensordict import TensorDictBase
 
+from cartpole_rl.envs.guard import guard_side
+from cartpole_rl.envs.settings import TrackGuard
 from cartpole_rl.identification.moves import (
     SIDE,
     Moves,
@@ -31,7 +33,7 @@ from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
 
 REACH = 0.27  # m from the middle; the shortest track ends at 0.3
-FORESIGHT = 0.12  # s in which the guard stops a cart
+GUARD = TrackGuard(margin=0.0, delay=0.12, deceleration=1 / 0.24)  # of carts that are not known yet
 BRAKE = 220  # motor value of the guard
 BREAKAWAY = 90  # motor value that moves most carts, before it is known
 BROKEN_AWAY = 0.002  # m
@@ -204,9 +206,9 @@ def observed(counts: list[tuple[int, int]], gaps: list[float]) -> Observed:
 
 def guarded(motor: float, now: Observed) -> int:
     """Return the motor value, or one that brakes if the cart would get beyond REACH."""
-    ahead = now.x + FORESIGHT * now.x_dot * (1 + abs(now.x_dot))
-    if abs(ahead) > REACH and ahead * (motor + BRAKE * np.sign(ahead)) > 0:
-        return int(-np.sign(ahead) * BRAKE)
+    side = guard_side(now.x, now.x_dot, REACH, GUARD)
+    if side and motor * side < BRAKE:
+        return int(side) * BRAKE
     return int(np.clip(motor, -LARGEST_MOTOR, LARGEST_MOTOR))
 
 

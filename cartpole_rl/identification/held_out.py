@@ -33,7 +33,8 @@ def part(episode: Episode, first: int, last: int) -> Episode:
     steps = {
         name: getattr(episode, name)[first:last] for name in ("motor", "score", "score_upright", "reward")
     }
-    return replace(episode, **cut, **steps)
+    guarded = None if episode.guarded is None else episode.guarded[first:last]
+    return replace(episode, **cut, **steps, guarded=guarded)
 
 
 def held_out_windows(episodes: Sequence[Episode], period: float, horizon: float) -> Windows:

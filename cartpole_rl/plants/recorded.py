@@ -33,6 +33,11 @@ class RecordedPlant(Plant):
             raise ConfigError("this agent observes the pole's length, which the recording does not have")
         return torch.tensor([self._pole_length])
 
+    @property
+    def track_half_length(self) -> Tensor:
+        """Unbounded, [1]: the recorded motor values include those of the track guard."""
+        return torch.tensor([torch.inf])
+
     def _set_seed(self, seed: int | None) -> None:
         """Do nothing: a recording is not random."""
 

@@ -87,6 +87,11 @@ class SimulatedPlant(Plant):
         """m, [N]: 2 l of the pole that each cart carries."""
         return self.parameters.pole_length
 
+    @property
+    def track_half_length(self) -> Tensor:
+        """m, [N]."""
+        return self.parameters.track_half_length
+
     def place(self, state: State) -> None:
         """Put the carts into `state`; for tests, knocks and replay."""
         self._carts = self._carts._replace(motion=torch.stack(state).to(self._carts.motion))

@@ -65,6 +65,11 @@ class Plant(EnvBase):
         """m, [N]: twice the distance from pivot to centre of mass; observed by a length-aware agent."""
         raise NotImplementedError
 
+    @property
+    def track_half_length(self) -> torch.Tensor:
+        """m, [N]: from the middle of the track to its end, or to the soft limit. The track guard reads it."""
+        raise NotImplementedError
+
     def halt(self) -> None:
         """Set the motor to 0 until the next reset. Nothing moves a simulated cart that is not stepped."""
 

@@ -30,12 +30,15 @@ class Episode:
     theta: Array  # [T+1] rad, 0 upright, positive to the right, not wrapped
     theta_dot: Array  # [T+1] rad/s
     counts: NDArray[np.int64]  # [T+1, 2] encoder counts of cart and pole, as the cart sent them
-    motor: NDArray[np.int64]  # [T] motor value chosen by the agent, -255 to 255
+    motor: NDArray[np.int64]  # [T] motor value sent, -255 to 255
     score: Array  # [T] equation (6.2) of each step, at state t+1
     score_upright: Array  # [T] equation (6.1) of each step, at state t+1
     reward: Array  # [T]
     ended_by: str  # an `endings.Ending`
     origin: Origin | None = None  # None on a real cart
+    guarded: NDArray[np.bool_] | None = (
+        None  # [T] the track guard replaced the agent's motor value; None without one
+    )
 
     @property
     def measured_steps(self) -> int:

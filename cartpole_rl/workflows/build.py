@@ -6,7 +6,7 @@ import torch
 
 from cartpole_rl.checking import checked
 from cartpole_rl.emulator.settings import EmulatorSettings
-from cartpole_rl.envs.build import environment, simulated_env
+from cartpole_rl.envs.build import environment, simulated_env, with_fitted_guard
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
 from cartpole_rl.errors import ConfigError
@@ -22,7 +22,14 @@ from cartpole_rl.tasks.settings import Start
 from cartpole_rl.workflows.checks import simulated_carts
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
 
-REPLACEABLE = ("cart", "cart_friction", "pole_friction", "pole", "reward")  # by an evaluation; and the task
+REPLACEABLE = (
+    "cart",
+    "cart_friction",
+    "pole_friction",
+    "pole",
+    "reward",
+    "guard",
+)  # by an evaluation; and the task
 
 
 def evaluated_settings(training: TrainConfig, config: EvaluateConfig) -> CartPoleSettings:
@@ -37,7 +44,7 @@ def evaluated_settings(training: TrainConfig, config: EvaluateConfig) -> CartPol
         found = load_model(config.plant.model).parameters
         given["pole"] = one_pole(Pole(**{name: found[name] for name in Pole.model_fields}))
     settings = checked(CartPoleSettings, {**own, **given, "randomization": config.randomization})
-    return with_parameters(settings, config.parameters or {})
+    return with_fitted_guard(with_parameters(settings, config.parameters or {}))
 
 
 def emulated_pole(truth: EmulatorSettings) -> PoleSettings:

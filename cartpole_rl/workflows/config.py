@@ -18,6 +18,7 @@ from cartpole_rl.envs.cart_pole_settings import (
     Randomization,
     SimulatedCartSettings,
 )
+from cartpole_rl.envs.settings import GuardSettings
 from cartpole_rl.identification.settings import EnsembleSettings
 from cartpole_rl.learning.settings import (
     BufferSettings,
@@ -128,6 +129,7 @@ class EvaluateConfig(RunSettings):
     pole: PoleSettings | None = None
     task: dict[str, Any] | None = None  # TaskSettings, whose x_max may be missing: it is then the agent's
     reward: RewardSettings | None = None
+    guard: GuardSettings | None = None
     repeat: RepeatSettings = RepeatSettings()
 
     @model_validator(mode="after")

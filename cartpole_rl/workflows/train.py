@@ -3,7 +3,7 @@
 from functools import partial
 from pathlib import Path
 
-from cartpole_rl.envs.build import simulated_env
+from cartpole_rl.envs.build import simulated_env, with_fitted_guard
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.evaluation.driving_policy import DrivingPolicy
 from cartpole_rl.evaluation.episodes import Policy, run_batch
@@ -43,6 +43,7 @@ def train(config: TrainConfig, folder: Path) -> None:
         check_compiler()
     use_threads(config.threads)
     seed_everything(config.seed)
+    config = with_fitted_guard(config)
     carts, start = config.learning.carts, config.task.start
     env = simulated_env(config, config.plant, carts, start, config.seed, config.compile)
     note_unused_randomization(config, env.plant.randomizer)

@@ -12,7 +12,7 @@ import torch
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.errors import RecordingError
 from cartpole_rl.evaluation.episodes import run_batch
-from cartpole_rl.evaluation.recordings import COLUMNS, read_recording, write_recording
+from cartpole_rl.evaluation.recordings import COLUMNS, GUARDED, read_recording, write_recording
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.tasks.episode import Episode
 
@@ -53,7 +53,7 @@ def test_any_reader_of_csv_sees_columns_with_units(tmp_path: Path, episode: Epis
     lines = (tmp_path / "one.csv").read_text().splitlines()
     assert "# pole: medium" in lines
     rows = list(csv.DictReader(line for line in lines if not line.startswith("#")))
-    assert tuple(rows[0]) == COLUMNS
+    assert tuple(rows[0]) == (*COLUMNS, GUARDED)
     assert len(rows) == episode.steps + 1
     assert float(rows[7]["x_m"]) == episode.x[7]
     assert rows[-1]["motor"] == ""

@@ -14,6 +14,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from cartpole_rl.errors import ConfigError, FaultError, LinkError, PlantError, PortError
+from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT
 from cartpole_rl.plants.serial.cart import RESTARTED, SerialCart
 from cartpole_rl.plants.serial.errors import RefusedError, fault_error
 from cartpole_rl.plants.serial.faults import Confirm, FaultClearing, nobody
@@ -103,6 +104,11 @@ class SerialPlant(Plant):
             if self._owned is not None:
                 self._owned.close()
             super().close(raise_if_closed=raise_if_closed)
+
+    @property
+    def track_half_length(self) -> Tensor:
+        """m, [1]: the soft limit of the cart, from the span that it measured in homing."""
+        return torch.tensor([self.cart.information.soft_limit_counts * CART_METRES_PER_COUNT])
 
     def _set_seed(self, seed: int | None) -> None:
         """Do nothing: a real cart has its own randomness, an emulated one has its seed in its settings."""

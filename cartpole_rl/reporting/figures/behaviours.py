@@ -104,11 +104,15 @@ def _draw_position(axes: Axes, episode: Episode, track_half_length: float | None
 
 
 def _draw_motor(axes: Axes, episode: Episode) -> None:
-    """Draw the commanded motor value of each period."""
+    """Draw the motor value sent in each period; the periods of the track guard are marked."""
     style.dress(axes)
     style.label(axes, y="motor value")
     axes.stairs(episode.motor, episode.time, fill=True, color=style.MOTOR, alpha=0.35)
     axes.stairs(episode.motor, episode.time, baseline=None, color=style.MOTOR, linewidth=1.0)
+    if episode.guarded is not None and episode.guarded.any():
+        guarded = np.where(episode.guarded, episode.motor, 0)
+        axes.stairs(guarded, episode.time, fill=True, color=style.LIMIT)
+        beside(axes, 0, "track guard", style.LIMIT)
     axes.set_ylim(-1.15 * LARGEST_MOTOR, 1.15 * LARGEST_MOTOR)
     axes.set_yticks(MOTOR_TICKS)
     beside(axes, MOTOR_TICKS[-1], "pushes right", style.MUTED)

@@ -83,7 +83,7 @@ def test_an_episode_of_one_period_can_be_drawn(swing_up: Episode) -> None:
     short = {
         name: each[: 2 if len(each) == 501 else 1]
         for name, each in short.items()
-        if name not in ("ended_by", "origin")
+        if name not in ("ended_by", "origin", "guarded")
     }
     assert png(behaviour(Episode(**short, ended_by="link")))
 
@@ -109,3 +109,10 @@ def test_a_wrapped_line_exits_and_enters_at_the_edges() -> None:
     times, degrees = wrapped_line(np.array([0.0, 1.0]), np.radians([170.0, 200.0]))
     np.testing.assert_allclose(times, [0, 1 / 3, 1 / 3, 1 / 3, 1])
     np.testing.assert_allclose(degrees, [170, 180, np.nan, -180, -160])
+
+
+def test_periods_of_the_track_guard_are_named_and_filled(swing_up: Episode) -> None:
+    guarded = np.zeros(swing_up.steps, bool)
+    assert "track guard" not in words(behaviour(dataclasses.replace(swing_up, guarded=guarded)))
+    guarded[3:6] = True
+    assert "track guard" in words(behaviour(dataclasses.replace(swing_up, guarded=guarded)))

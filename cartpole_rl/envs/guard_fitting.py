@@ -1,0 +1,108 @@
+"""Fits the track guard to carts: how far they run on, from any speed, before full motor stops them.
+
+Carts are drawn as in training and put into random states: a speed, an angle of the pole, and an energy of the
+pole up to somewhat more than upright. Each has full motor outward under way, keeps it for one more period,
+since the guard decides once a period, and then brakes with full motor inward. The way that a share `quantile`
+of them stays within, as a function of the measured speed, is bounded from above by the guard's
+
+    margin + delay v + v |v| / (2 deceleration),
+
+as closely as possible: a linear program in margin, delay and 1 / deceleration.
+"""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.optimize import linprog
+from torch import Tensor
+
+from cartpole_rl.envs.settings import TrackGuard
+from cartpole_rl.errors import ConfigError
+from cartpole_rl.physics.actuator import static_force
+from cartpole_rl.physics.dynamics import Drive, State, run_period
+from cartpole_rl.physics.models import Models
+from cartpole_rl.physics.parameters import GRAVITY, CartParameters
+from cartpole_rl.randomization.draws import Draws
+
+SAMPLES = 65536
+SPEEDS = (0.0, 2.2)  # m/s, of the cart at the start; agents of the shipped experiments stay within
+BIN = 0.1  # m/s
+LEAST_SAMPLES = 500  # in a bin, for its quantile
+MOST_ENERGY = 1.3  # of the pole, as a multiple of that of the upright pole at rest, above hanging
+BRAKING = 60  # periods; the slowest carts of randomization=wide stop within 50
+SUBSTEPS = 4
+
+Array = NDArray[np.float64]
+
+
+def fitted_guard(
+    quantile: float, draws: Draws, motors: Sequence[int], models: Models, period: float
+) -> TrackGuard:
+    """Return the guard that a share `quantile` of the carts of `draws` obeys in time.
+
+    `motors` are the motor values of the agent, `period` is the control period, s. Raises ConfigError if full
+    motor does not brake the carts.
+    """
+    speed, way = braking_distances(draws, max(motors), min(motors), models, period)
+    margin, delay, curvature = closest_bound(*quantiles(speed, way, quantile))
+    if curvature <= 0:
+        raise ConfigError("guard: full motor does not stop these carts; choose guard=none, or other actions")
+    return TrackGuard(margin=round(margin, 4), delay=round(delay, 4), deceleration=round(0.5 / curvature, 3))
+
+
+def braking_distances(
+    draws: Draws, outward: int, inward: int, models: Models, period: float
+) -> tuple[Array, Array]:
+    """Return the measured speeds, m/s, and the ways that the carts run on to the right, m, [SAMPLES] each."""
+    generator = torch.Generator().manual_seed(0)
+    table = draws.draw(SAMPLES, generator)
+    cart = CartParameters.from_table(table)
+    state = random_states(cart, generator)
+    commands = 1 + max(1, math.ceil(draws.longest_delay() / period - 1e-9))
+    full = torch.full((SAMPLES,), float(outward))
+    drive = Drive(static_force(full, cart, models.actuator), [full] * commands)
+    before, (state, drive) = state, run_period(state, drive, cart.latency, cart, models, period, SUBSTEPS)
+    speed, start, farthest = (state.x - before.x) / period, state.x, torch.zeros(SAMPLES)
+    for step in range(BRAKING):
+        motor = full if step == 0 else torch.full_like(full, float(inward))
+        drive = Drive(drive.force, [motor, *drive.motors[:-1]])
+        state, drive = run_period(state, drive, cart.latency, cart, models, period, SUBSTEPS)
+        farthest = torch.maximum(farthest, state.x - start)
+    return speed.double().numpy(), farthest.double().numpy()
+
+
+def random_states(cart: CartParameters, generator: torch.Generator) -> State:
+    """Return true states [N] in the middle of the track, with speeds in SPEEDS and a swinging pole."""
+    count = len(cart.cart_mass)
+
+    def uniform(low: float, high: float) -> Tensor:
+        return low + (high - low) * torch.rand(count, generator=generator)
+
+    theta = uniform(-math.pi, math.pi)
+    stiffness = cart.first_moment * GRAVITY / cart.pivot_inertia  # 1/s^2
+    kinetic = stiffness * (uniform(0, 2 * MOST_ENERGY) - 1 - torch.cos(theta))
+    theta_dot = (2 * kinetic.clamp(min=0)).sqrt() * uniform(-1, 1).sign()
+    return State(torch.zeros(count), uniform(*SPEEDS), theta, theta_dot)
+
+
+def quantiles(speed: Array, way: Array, quantile: float) -> tuple[Array, Array]:
+    """Return the upper ends of bins of `speed`, m/s, and the quantile of the `way` in each, m."""
+    bins = np.floor(speed / BIN).astype(int)
+    ends, ways = [], []
+    for number in np.unique(bins):
+        inside = bins == number
+        if inside.sum() >= LEAST_SAMPLES:
+            ends.append((number + 1) * BIN)
+            ways.append(np.quantile(way[inside], quantile))
+    return np.array(ends), np.array(ways)
+
+
+def closest_bound(speed: Array, way: Array) -> tuple[float, float, float]:
+    """Return (margin m, delay s, curvature s^2/m) of the least upper bound on `way` that is a guard's."""
+    terms = np.stack((np.ones_like(speed), speed, speed * np.abs(speed)), 1)
+    result = linprog(terms.sum(0), A_ub=-terms, b_ub=-way, bounds=[(0, None)] * 3)
+    margin, delay, curvature = result.x
+    return float(margin), float(delay), float(curvature)

@@ -1,0 +1,168 @@
+"""The track guard: when it brakes, what is sent and recorded, and how many carts it keeps on the track."""
+
+from collections.abc import Callable
+from contextlib import closing
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from cartpole_rl.choices import choice
+from cartpole_rl.emulator.settings import EmulatorSettings
+from cartpole_rl.envs.build import environment, shipped_settings, simulated_env, with_fitted_guard
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
+from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
+from cartpole_rl.envs.guard import guard_side
+from cartpole_rl.envs.guard_fitting import closest_bound
+from cartpole_rl.envs.settings import TrackGuard
+from cartpole_rl.evaluation.episodes import run_batch
+from cartpole_rl.physics.dynamics import State
+from cartpole_rl.plants.emulated import emulated_plant
+from cartpole_rl.plants.settings import SimulatedSettings
+from cartpole_rl.plants.simulated import SimulatedPlant
+from cartpole_rl.tasks.endings import Ending
+from cartpole_rl.tasks.features import MOTOR_SCALE
+from cartpole_rl.tasks.settings import NO_ACTION
+
+GUARD = TrackGuard(margin=0.01, delay=0.1, deceleration=5.0)
+END = 0.38  # m
+CARTS = 10_000
+
+
+@pytest.mark.parametrize(
+    ("x", "x_dot", "side"),
+    [
+        (0.0, 0.0, 0),
+        (0.36, 0.0, 0),
+        (0.375, 0.0, -1),  # within the margin
+        (0.0, 1.5, -1),  # 0.01 + 0.15 + 0.225 = 0.385
+        (0.17, 1.0, 0),  # 0.01 + 0.1 + 0.1 leave 0.17
+        (0.171, 1.0, -1),
+        (0.375, -0.5, 0),  # on its way back
+        (-0.171, -1.0, 1),
+    ],
+)
+def test_it_brakes_if_the_cart_would_stop_beyond_the_end(x: float, x_dot: float, side: int) -> None:
+    assert guard_side(x, x_dot, END, GUARD) == side
+    assert guard_side(-x, -x_dot, END, GUARD) == -side
+    assert guard_side(torch.tensor([x]), torch.tensor([x_dot]), torch.tensor([END]), GUARD).tolist() == [side]
+
+
+@pytest.fixture
+def env(
+    make_plant: Callable[..., SimulatedPlant], make_environment: Callable[..., CartPoleEnv]
+) -> CartPoleEnv:
+    """Two carts with motor values -250, 0 and 200: the second one is fast and near the right end."""
+    return make_environment(make_plant(2), (-250, 0, 200), guard=GUARD, past_motors=1, time_limit=60)
+
+
+def near_the_end(env: CartPoleEnv) -> None:
+    env.plant.place(
+        State(*torch.tensor([[0.0, 0.2], [0.0, 1.2], [np.pi, np.pi], [0.0, 0.0]], dtype=torch.float32))
+    )
+
+
+def step(env: CartPoleEnv, current, action: Tensor):
+    return env.step(current.set("action", action))["next"]
+
+
+def test_the_guard_replaces_the_motor_value_of_the_agent(env: CartPoleEnv) -> None:
+    current = env.reset()
+    near_the_end(env)
+    current = step(env, current, torch.tensor([2, 2]))  # the speed is measured from here on
+    assert current["guard"].flatten().tolist() == [0, -1]
+    command = env.hardware.command(current.set("action", torch.tensor([2, 2])))
+    assert command["motor"].flatten().tolist() == [200, -250]
+    after = step(env, current, torch.tensor([2, 2]))
+    sent = after["past"][:, 0] * MOTOR_SCALE
+    assert sent.tolist() == pytest.approx([200, -250])  # the agent observes what was sent
+
+
+def test_no_action_stays_motor_0(env: CartPoleEnv) -> None:
+    current = env.reset()
+    near_the_end(env)
+    current = step(env, current, torch.tensor([2, 2]))
+    assert env.hardware.command(current.set("action", torch.tensor([NO_ACTION, NO_ACTION])))[
+        "motor"
+    ].flatten().tolist() == [0, 0]
+
+
+def test_an_episode_holds_the_motor_values_that_were_sent(env: CartPoleEnv) -> None:
+    episodes = run_batch(env, lambda td: td.set("action", torch.full((2,), 2)))
+    for episode in episodes:
+        assert episode.guarded is not None
+        assert (episode.motor[episode.guarded] == -250).all()
+        assert (episode.motor[~episode.guarded] == 200).all()
+        assert 0 < episode.guarded.sum() < episode.steps
+
+
+def test_the_bound_is_the_least_one_above_all_quantiles() -> None:
+    speed = np.linspace(0.1, 2, 20)
+    way = 0.02 + 0.1 * speed + speed**2 / 8
+    margin, delay, curvature = closest_bound(speed, way)
+    assert (margin, delay, curvature) == pytest.approx((0.02, 0.1, 1 / 8))
+    lower = way - 0.005 * np.sin(speed * 20) ** 2
+    margin, delay, curvature = closest_bound(speed, lower)
+    assert (margin + delay * speed + curvature * speed**2 >= lower - 1e-9).all()
+
+
+# how many carts leave the track
+
+
+def outward(env: CartPoleEnv, current, number: int, carts: Tensor) -> Tensor:
+    """Always full motor to one side."""
+    return torch.where(carts % 2 == 0, 0, 8)
+
+
+def pumping(env: CartPoleEnv, current, number: int, carts: Tensor) -> Tensor:
+    """Full motor that pumps energy into the pole."""
+    state = current["state"]
+    return torch.where(state[:, 3] * torch.cos(state[:, 2]) > 0, 0, 8)
+
+
+def reversing(env: CartPoleEnv, current, number: int, carts: Tensor) -> Tensor:
+    """Full motor, reversed at random after half a second: the fastest way to the ends."""
+    generator = torch.Generator().manual_seed(number // 25)
+    return torch.where(torch.rand(len(carts), generator=generator) < 0.5, 0, 8)
+
+
+@pytest.mark.parametrize("policy", [outward, pumping, reversing])
+@pytest.mark.parametrize("guard", ["fitted", "careful"])
+def test_no_sequence_of_actions_overruns_the_quantile(
+    policy: Callable[[CartPoleEnv, object, int, Tensor], Tensor], guard: str
+) -> None:
+    """Of all brakings of 10 000 carts that the fit has not seen, no larger share ends off the track."""
+    settings = with_fitted_guard(shipped_settings({"guard": guard}))
+    plant = SimulatedSettings(**choice("plant/simulated"))
+    env = simulated_env(settings, plant, CARTS, settings.task.evaluation_start, seed=20_000)
+    current, carts = env.reset(), torch.arange(CARTS)
+    driven = torch.ones(CARTS, dtype=torch.bool)
+    braking, brakings, lost = torch.zeros_like(driven), 0, 0
+    for number in range(120):
+        now = current["guard"].squeeze(1) != 0
+        brakings += int((now & ~braking & driven).sum())
+        braking = now
+        current = step(env, current, policy(env, current, number, carts)).exclude("reward")
+        off = current["terminated"].squeeze(1) & driven
+        lost += int(off.sum())
+        driven &= ~off
+    assert brakings > CARTS
+    assert lost <= (1 - settings.guard.quantile) * brakings
+
+
+@pytest.mark.parametrize("action", [0, 8])
+def test_an_emulated_cart_stays_on_the_track(action: int) -> None:
+    """The guard reads where the track of the cart ends, from the span that the cart measured."""
+    settings = with_fitted_guard(shipped_settings({"guard": "careful"}))
+    settings = shortened(settings)
+    plant = emulated_plant(EmulatorSettings(physics_step=1e-3, cart_viscous=0.1, latency=0.015))
+    with closing(environment(settings, plant)) as env:
+        (episode,) = run_batch(env, lambda td: td.set("action", torch.tensor([action])))
+    assert episode.ended_by == Ending.TIME
+    assert episode.guarded is not None
+    assert episode.guarded.any()
+
+
+def shortened(settings: CartPoleSettings) -> CartPoleSettings:
+    return settings.model_copy(update={"task": settings.task.model_copy(update={"time_limit": 150})})
