@@ -1,4 +1,4 @@
-"""Who computes first, as the operating system tells."""
+"""The scheduling priority that the operating system reports."""
 
 import os
 import subprocess

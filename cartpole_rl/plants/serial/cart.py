@@ -38,7 +38,7 @@ from cartpole_rl.wire.messages import (
 
 LOGGER = logging.getLogger(__name__)
 
-LONGEST_SUSPENSION = 1.0  # s without an answer of this computer, after which somebody may have moved the cart
+LONGEST_SUSPENSION = 1.0  # s without an answer of this computer, after which a person may have moved the cart
 LONGEST_STOP = 3.0  # s to wait for the answer to STOP, whatever the settings: signals.UNWINDING is longer
 LAST_STOP = 0.5  # s to wait for it in `close` if the STOP before was not answered
 RESTARTED = "the cart has restarted; check its power"

@@ -155,7 +155,7 @@ class Stalling(CartPeer):
             return carry_on(frame)
 
         self.answer = answer
-        cart._connection.link.send(Hello())
+        cart.set_motor(0)
         assert stalled.wait(10)
         port = os.open(self.port, os.O_WRONLY | os.O_NONBLOCK | os.O_NOCTTY)
         for _ in range(20):  # the system moves bytes on for a moment

@@ -1,4 +1,4 @@
-"""What a link's statistics keep, and what they come to."""
+"""The statistics of a link: counts, latencies and their percentiles."""
 
 import math
 
