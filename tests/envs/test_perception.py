@@ -14,6 +14,7 @@ from cartpole_rl.tasks.features import ANGULAR_SPEED_SCALE, MOTOR_SCALE, SPEED_S
 from cartpole_rl.tasks.settings import RewardSettings, StartSettings, TaskSettings
 
 NO_LENGTH = torch.zeros(0, 2)
+TRACK_END = torch.full((1, 2), 0.4)
 RAW = ObservationSettings(kind="raw", past_motors=2, past_velocities=1, past_positions=0, pole_length=False)
 
 
@@ -36,6 +37,7 @@ def previous(steps: int = 3) -> Previous:
         step_count=torch.full((1, 2), steps),
         motor=torch.tensor([[-255, 51]]),
         length=NO_LENGTH,
+        track_end=TRACK_END,
     )
 
 
@@ -56,7 +58,12 @@ def perceived(
     steps: int = 3,
 ) -> Percept:
     return perceive(
-        previous(steps), later, settings=RAW, task=task or of_task(), rewards=rewards or of_reward()
+        previous(steps),
+        later,
+        settings=RAW,
+        task=task or of_task(),
+        rewards=rewards or of_reward(),
+        guard=None,
     )
 
 
@@ -75,7 +82,7 @@ def test_the_newest_of_the_past_comes_first_and_the_oldest_is_forgotten() -> Non
 
 def test_a_first_frame_has_no_velocity_and_no_memory() -> None:
     counts = torch.tensor([[100, 0], [0, 1024]])
-    first = perceive_first(counts, NO_LENGTH, RAW)
+    first = perceive_first(counts, NO_LENGTH, TRACK_END, settings=RAW, guard=None)
     assert first.state[1].tolist() == first.state[3].tolist() == [0, 0]
     assert first.state[2, 1] == pytest.approx(math.pi / 2)
     assert not first.past.any()
