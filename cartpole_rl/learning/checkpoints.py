@@ -66,7 +66,7 @@ def restore_weights(agent: nn.Module, weights: Mapping[str, Any], source: str) -
     """Load the weights of a checkpoint into `agent`. Raises CheckpointError if they do not fit."""
     try:
         agent.load_state_dict(weights)
-    except RuntimeError:  # a line for each weight
+    except (RuntimeError, ValueError):  # by name, a line for each weight; or by shape
         raise CheckpointError(
             f"{source} is of another version of this package: its network has other weights; train it again"
         ) from None

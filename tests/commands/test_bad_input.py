@@ -2,6 +2,7 @@
 
 import os
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -238,9 +239,20 @@ def test_a_checkpoint_of_another_version(trained: Path, files: Path) -> None:
     assert done.code == 1
 
 
-def test_a_checkpoint_with_another_network(trained: Path, files: Path) -> None:
+def renamed(weights: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    return {f"{name}_of_before": weight for name, weight in weights.items()}
+
+
+def resized(weights: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    return {name: torch.cat((weight, weight)) if weight.ndim else weight for name, weight in weights.items()}
+
+
+@pytest.mark.parametrize("change", [renamed, resized])
+def test_a_checkpoint_with_another_network(
+    trained: Path, files: Path, change: Callable[[dict[str, torch.Tensor]], dict[str, torch.Tensor]]
+) -> None:
     content = torch.load(trained / "checkpoints/last.pt", weights_only=True)
-    weights = {f"{name}_of_before": weight for name, weight in content["weights"].items()}
+    weights = change(content["weights"])
     torch.save({**content, "weights": weights}, files / "older.pt")
     done = in_process("evaluate", "run=older.pt", folder=files)
     assert done.complaint.endswith(
@@ -263,7 +275,7 @@ def test_a_training_that_has_ended_is_not_resumed(trained: Path) -> None:
 def test_a_training_with_another_network_is_not_resumed(stopped: Path, tmp_path: Path) -> None:
     older = shutil.copytree(stopped, tmp_path / "older")
     content = torch.load(older / "checkpoints/resume.pt", weights_only=True)
-    agent = {f"{name}_of_before": weight for name, weight in content["state"]["agent"].items()}
+    agent = renamed(content["state"]["agent"])
     torch.save({**content, "state": {**content["state"], "agent": agent}}, older / "checkpoints/resume.pt")
     before = (older / "history.jsonl").read_text()
     done = in_process("train", f"resume={older}", folder=tmp_path)
