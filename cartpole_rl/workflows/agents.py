@@ -8,7 +8,7 @@ from cartpole_rl.agents.dqn import QAgent
 from cartpole_rl.evaluation.episodes import Policy
 from cartpole_rl.learning.checkpoints import load_agent, restore_weights
 from cartpole_rl.randomization.checks import check_one_pole
-from cartpole_rl.workflows.build import evaluated_settings
+from cartpole_rl.workflows.build import replaced_settings
 from cartpole_rl.workflows.checks import BASELINE, check_has_agent
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
 from cartpole_rl.workflows.loading import load_settings, recorded_settings
@@ -52,7 +52,7 @@ def baseline_agent(config: EvaluateConfig, training: TrainConfig) -> TrainedAgen
 
     Raises ConfigError for several poles.
     """
-    poles = evaluated_settings(training, config.model_copy(update={"parameters": None})).pole
+    poles = replaced_settings(training, config.model_copy(update={"parameters": None})).pole
     pole = check_one_pole(f"run={BASELINE}", poles)
     policy = EnergyAndRegulator(
         training.nominal_with(pole),

@@ -33,6 +33,18 @@ REPLACEABLE = (
 
 
 def evaluated_settings(training: TrainConfig, config: EvaluateConfig) -> CartPoleSettings:
+    """Return the settings to evaluate with: `replaced_settings` with the numbers of the track guard.
+
+    A new guard is fitted to the carts that `config` randomizes, or else to those of the training: an
+    evaluation without randomization may drive a real cart. Raises ConfigError.
+    """
+    settings = replaced_settings(training, config)
+    fitted_to = config.randomization or training.randomization
+    guard = with_fitted_guard(settings.model_copy(update={"randomization": fitted_to})).guard
+    return settings.model_copy(update={"guard": guard})
+
+
+def replaced_settings(training: TrainConfig, config: EvaluateConfig) -> CartPoleSettings:
     """Return the settings of the agent's training, with those that `config` replaces. Raises ConfigError."""
     own = {name: getattr(training, name) for name in CartPoleSettings.model_fields}
     given = {name: value for name in REPLACEABLE if (value := getattr(config, name)) is not None}
@@ -44,7 +56,7 @@ def evaluated_settings(training: TrainConfig, config: EvaluateConfig) -> CartPol
         found = load_model(config.plant.model).parameters
         given["pole"] = one_pole(Pole(**{name: found[name] for name in Pole.model_fields}))
     settings = checked(CartPoleSettings, {**own, **given, "randomization": config.randomization})
-    return with_fitted_guard(with_parameters(settings, config.parameters or {}))
+    return with_parameters(settings, config.parameters or {})
 
 
 def emulated_pole(truth: EmulatorSettings) -> PoleSettings:
