@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from cartpole_rl.physics.motor import LARGEST_MOTOR
 from cartpole_rl.reporting import style
 from cartpole_rl.reporting.figures.annotations import at_time, beside
-from cartpole_rl.reporting.words import ending_text
+from cartpole_rl.reporting.words import ending_text, guard_text
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.tasks.rewards import UPRIGHT_ANGLE
 from cartpole_rl.tasks.upright import is_upright, upright_since
@@ -122,4 +122,5 @@ def _draw_motor(axes: Axes, episode: Episode) -> None:
 def _summary(episode: Episode) -> str:
     """Return the episode in one line."""
     share = 100 * is_upright(episode.theta[1:]).mean()
-    return f"score {episode.score.sum():.0f},  upright {share:.0f} % of the time,  {ending_text(episode)}"
+    score, ending = f"score {episode.score.sum():.0f}", ending_text(episode)
+    return f"{score},  upright {share:.0f} % of the time,  {ending}{guard_text(episode)}"
