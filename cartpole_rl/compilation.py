@@ -18,7 +18,7 @@ from torch import Tensor
 from torch._inductor import standalone_compile
 from torch.fx.experimental.proxy_tensor import make_fx
 
-OPTIONS = {"cpp.enable_floating_point_contract_flag": "fast"}  # allow fused multiply-add
+OPTIONS = {"cpp.enable_floating_point_contract_flag": "fast"}  # fused multiply-add on the CPU; Triton has it
 
 Result = TypeVar("Result", bound=tuple)
 
@@ -27,8 +27,8 @@ class Compiled(Generic[Result]):
     """A compiled `function` that takes tuples of tensors, named or plain, and returns another.
 
     It is compiled in its first call, whose shapes, types and devices all later calls must have; whatever else
-    `function` reads must not change. It needs a C++ compiler. TorchInductor caches the code on disk, also for
-    other processes. No gradient flows through it, though the function may compute one.
+    `function` reads must not change. It needs a C++ compiler, and Triton for a GPU. TorchInductor caches the
+    code on disk, also for other processes. No gradient flows through it, though the function may compute one.
     """
 
     def __init__(self, function: Callable[..., Result]) -> None:

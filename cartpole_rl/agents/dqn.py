@@ -30,6 +30,7 @@ class QAgent(nn.Module):
         mirror_signs: Sequence[int],
         actions: int,
         frames: Sequence[Sequence[int]] = (),
+        device: torch.device | str = "cpu",
     ) -> None:
         super().__init__()
         self.settings = settings
@@ -37,7 +38,7 @@ class QAgent(nn.Module):
         reader = None if settings.recurrent is None else FrameReader(size, frames, settings.recurrent)
         layers = actions, settings.hidden, settings.layer_norm, reader
         network = MirrorQNetwork(mirror_signs, *layers) if settings.mirrored else QNetwork(size, *layers)
-        self.actor = QValueActor(network, in_keys=["observation"], spec=Categorical(actions))
+        self.actor = QValueActor(network.to(device), in_keys=["observation"], spec=Categorical(actions))
         self.loss = AdvantageLearningLoss(
             self.actor,
             action_gap=settings.action_gap,
@@ -46,7 +47,7 @@ class QAgent(nn.Module):
             double_dqn=settings.double,
             action_space="categorical",
         )
-        self.loss.make_value_estimator(gamma=settings.gamma)
+        self.loss.make_value_estimator(gamma=settings.gamma, device=device)
         TargetNetUpdater(
             self.loss
         )  # copies the weights and marks the target as updated; `update_target` moves it

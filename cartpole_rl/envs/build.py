@@ -78,30 +78,32 @@ def simulated_env(
     start: StartSettings,
     seed: int,
     compiled: bool = False,
+    device: torch.device | str = "cpu",
 ) -> CartPoleEnv:
     """Return an environment over `carts` simulated carts. Raises CheckpointError, ConfigError."""
     if isinstance(plant, LearnedSettings):
-        return environment(config, learned_plant(config, plant, carts, start, seed, compiled))
+        return environment(config, learned_plant(config, plant, carts, start, seed, compiled, device))
     return environment(
         config,
         SimulatedPlant(
             carts,
-            randomizer(config),
+            randomizer(config, device),
             start,
             config.models(plant),
             config.control_period,
             plant.substeps,
             seed,
-            compiled=compiled,
+            device,
+            compiled,
         ),
     )
 
 
-def randomizer(config: CartPoleSettings) -> Draws:
+def randomizer(config: CartPoleSettings, device: torch.device | str = "cpu") -> Draws:
     """Return the source of the carts that `config` describes. Raises ConfigError for impossible carts."""
     if isinstance(config.randomization, IdentifiedSettings):
-        return identified_carts(config.randomization, config.nominal_cart, config.pole)
-    return Randomizer(config.nominal_cart, config.pole, config.randomization)
+        return identified_carts(config.randomization, config.nominal_cart, config.pole, device)
+    return Randomizer(config.nominal_cart, config.pole, config.randomization, device)
 
 
 def learned_plant(
@@ -111,13 +113,15 @@ def learned_plant(
     start: StartSettings,
     seed: int,
     compiled: bool,
+    device: torch.device | str,
 ) -> LearnedPlant:
     """Return carts of a learned model. Raises CheckpointError; ConfigError for a model of another cart."""
     model = load_model(plant.model)
     check_same_cart(model, config)
     found = torch.tensor([[model.parameters[name]] for name in CartParameters.names()])
-    draws = IdentifiedCarts(found, randomizer(config), plant.prior_share, UNDER_WAY * model.period)
-    return LearnedPlant(carts, model, draws, start, seed, compiled=compiled)
+    prior = randomizer(config, device)
+    draws = IdentifiedCarts(found, prior, plant.prior_share, UNDER_WAY * model.period)
+    return LearnedPlant(carts, model, draws, start, seed, device, compiled)
 
 
 def check_same_cart(model: LearnedModel, config: CartPoleSettings) -> None:

@@ -135,6 +135,10 @@ class HardwareTransform(Transform):
         inward = self._inward.index_select(0, guard.reshape(-1) % 3).reshape(guard.shape)
         return torch.where((guard == 0) | (action == NO_ACTION), motor, inward)
 
+    def guarded(self, action: Tensor, guard: Tensor) -> Tensor:
+        """Return where the track guard replaces the motor value of `action`, bool; arguments as above."""
+        return self.sent_motors(action, guard) != self.motor_values(action)
+
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         return tensordict.update(self.command(tensordict)) if "action" in tensordict else tensordict
 

@@ -59,6 +59,10 @@ class TrackGuard(Settings):
     delay: NonNegative  # s
     deceleration: Positive  # m/s^2
 
+    def __str__(self) -> str:
+        """Return the numbers with their units."""
+        return f"margin {self.margin:g} m, delay {self.delay:g} s, deceleration {self.deceleration:g} m/s^2"
+
 
 class GuardSettings(Settings):
     """The track guard: its numbers, or the quantile by which they are fitted to the carts."""

@@ -75,7 +75,7 @@ def run_batch(env: CartPoleEnv, policy: Policy) -> list[Episode]:
     columns |= {key: torch.stack([frame[key] for frame in frames], 1) for key in ("state", "counts")}
     action, guard = torch.stack(actions, 1), torch.cat([frame["guard"] for frame in frames[:-1]], 1)
     columns["motor"] = env.hardware.sent_motors(action, guard)
-    columns["guarded"] = columns["motor"] != env.hardware.motor_values(action)
+    columns["guarded"] = env.hardware.guarded(action, guard)
     has_guard = env.hardware.guard is not None
     dt = torch.cat([torch.zeros_like(first["dt"]), *(step["dt"] for step in steps)], 1)
     columns["time"] = dt.cumsum(1)

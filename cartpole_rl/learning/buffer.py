@@ -15,19 +15,26 @@ from cartpole_rl.learning.settings import BufferSettings
 TREES = ("_sum_tree", "_min_tree")
 
 
-def make_buffer(settings: BufferSettings, batch_size: int) -> TensorDictReplayBuffer:
-    """Return an empty buffer whose `sample` returns `batch_size` transitions.
+def make_buffer(
+    settings: BufferSettings, batch_size: int, device: torch.device | str = "cpu"
+) -> TensorDictReplayBuffer:
+    """Return an empty buffer on `device` whose `sample` returns `batch_size` transitions.
 
-    A prioritized one draws from NumPy's global generator, a uniform one from torch's.
+    A prioritized one draws from NumPy's global generator, a uniform one from torch's. Its priorities are on
+    the CPU on every device: TorchRL has trees on a GPU in its CUDA wheels alone.
     """
     if settings.kind == "prioritized":
         sampler = PrioritizedSampler(
-            settings.size, alpha=settings.alpha, beta=settings.beta[0], eps=settings.priority_eps
+            settings.size,
+            alpha=settings.alpha,
+            beta=settings.beta[0],
+            eps=settings.priority_eps,
+            device="cpu",
         )
     else:
         sampler = RandomSampler()
     return TensorDictReplayBuffer(
-        storage=LazyTensorStorage(settings.size),
+        storage=LazyTensorStorage(settings.size, device=device),
         sampler=sampler,
         batch_size=batch_size,
         priority_key="td_error",
@@ -71,7 +78,8 @@ def _filled_rows(storage: LazyTensorStorage, filled: int) -> dict[str, Tensor]:
     """Return the columns of the first `filled` rows, copied unless these are all rows."""
     if not filled:
         return {}
-    rows = storage.get(range(filled)) if filled < storage.max_size else storage.get(slice(None))
+    everything = filled == storage.max_size
+    rows = storage.get(slice(None) if everything else torch.arange(filled, device=storage.device))
     return dict(rows.flatten_keys(".").items())
 
 

@@ -11,14 +11,15 @@ from typing import Any
 import torch
 from torch import nn
 
+from cartpole_rl.devices import moved
 from cartpole_rl.errors import CheckpointError
 from cartpole_rl.files import replacing
 from cartpole_rl.learning.checkpoint_files import find_agent, find_training
 from cartpole_rl.run_files import CHECKPOINTS, RESUME
 
 AGENT_FORMAT = "cartpole_rl agent 1"
-TRAINING_FORMAT = "cartpole_rl training 3"
-FINETUNING_FORMAT = "cartpole_rl fine-tuning 2"
+TRAINING_FORMAT = "cartpole_rl training 4"
+FINETUNING_FORMAT = "cartpole_rl fine-tuning 3"
 CONTENT = {  # format: what a file of it holds
     AGENT_FORMAT: "an agent",
     TRAINING_FORMAT: "the state that a training resumes from",
@@ -104,7 +105,7 @@ def load_training(run: Path, file_format: str = TRAINING_FORMAT) -> TrainingChec
 
 def _save(path: Path, file_format: str, content: Mapping[str, Any]) -> None:
     with replacing(path) as beside:
-        torch.save({"format": file_format, **content}, beside)
+        torch.save({"format": file_format, **moved(content, "cpu")}, beside)
 
 
 def _load(path: Path, expected: str) -> dict[str, Any]:

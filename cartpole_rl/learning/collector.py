@@ -8,6 +8,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
+from cartpole_rl.devices import moved
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 
 COLLECTED = (
@@ -49,6 +50,8 @@ class Collector:
         self._generator = torch.Generator(device=env.device)
         self._generator.manual_seed(seed)
         self._finished: list[tuple[float, int]] = []  # score and length of the ended episodes
+        self._guarded = torch.zeros((), dtype=torch.int64, device=env.device)  # periods of the track guard
+        self._periods = 0  # of all carts, since `guarded_fraction` was read
         self.reset()
 
     def reset(self) -> None:
@@ -59,13 +62,18 @@ class Collector:
     @torch.no_grad()
     def collect(self, periods: int) -> TensorDictBase:
         """Return transitions [N, periods] with the keys COLLECTED."""
-        taken = []
+        taken, guards = [], []
         for _ in range(periods):
+            guards.append(self._current["guard"])
             self._act(self._current)
             stepped = self.env.step(self._current)
             taken.append(stepped.select(*COLLECTED))
             self._current = self.env.advance(stepped, self._record(stepped["next"]))
-        return torch.stack(taken, 1)
+        chunk: TensorDictBase = torch.stack(taken, 1)
+        if self.env.hardware.guard is not None:
+            self._guarded += self.env.hardware.guarded(chunk["action"], torch.cat(guards, 1)).sum()
+            self._periods += chunk.numel()
+        return chunk
 
     def finished(self) -> dict[str, float]:
         """Return mean score (6.2) and length of the episodes that ended since the last call, if any."""
@@ -74,6 +82,18 @@ class Collector:
         scores, lengths = zip(*self._finished, strict=True)
         self._finished.clear()
         return {"score": sum(scores) / len(scores), "episode_length": sum(lengths) / len(lengths)}
+
+    def guarded_fraction(self) -> dict[str, float]:
+        """Return the share of periods since the last call in which the track guard acted, if there is one.
+
+        It acted if it replaced the agent's motor value.
+        """
+        if not self._periods:
+            return {}
+        share = self._guarded.item() / self._periods
+        self._guarded.zero_()
+        self._periods = 0
+        return {"guarded_fraction": share}
 
     def _record(self, outcome: TensorDictBase) -> Tensor | None:
         """Add the step to the scores; return the carts to keep, [N] bool, or None if no episode ended."""
@@ -107,12 +127,17 @@ class Collector:
             "score": self._score.clone(),
             "mean_score": self._mean_score,
             "finished": list(self._finished),
+            "guarded": (self._guarded.clone(), self._periods),
             "generator": self._generator.get_state(),
         }
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         """Restore the state in `snapshot`."""
-        self._current = TensorDict(snapshot["current"], batch_size=self.env.batch_size)
-        self._score, self._mean_score = snapshot["score"].clone(), snapshot["mean_score"]
+        current = moved(snapshot["current"], self.env.device)
+        self._current = TensorDict(current, batch_size=self.env.batch_size)
+        self._score = snapshot["score"].to(self.env.device, copy=True)
+        self._mean_score = snapshot["mean_score"]
         self._finished = list(snapshot["finished"])
+        guarded, self._periods = snapshot["guarded"]
+        self._guarded.copy_(guarded)
         self._generator.set_state(snapshot["generator"])

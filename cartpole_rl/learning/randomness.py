@@ -20,8 +20,10 @@ def random_state() -> dict[str, Any]:
     """Return the state of both generators as tensors and plain values."""
     state = np.random.get_state(legacy=False)  # noqa: NPY002
     numbers = torch.from_numpy(state["state"]["key"].astype(np.int64))  # torch has few uint32 operations
+    cuda = {"cuda": torch.cuda.get_rng_state()} if torch.cuda.is_initialized() else {}
     return {
         "torch": torch.get_rng_state(),
+        **cuda,
         "numpy": {**state, "state": {**state["state"], "key": numbers}},
     }
 
@@ -29,6 +31,8 @@ def random_state() -> dict[str, Any]:
 def restore_random_state(snapshot: Mapping[str, Any]) -> None:
     """Restore the state that `random_state` returned."""
     torch.set_rng_state(snapshot["torch"])
+    if "cuda" in snapshot:
+        torch.cuda.set_rng_state(snapshot["cuda"])
     state = snapshot["numpy"]
     numbers = state["state"]["key"].numpy().astype(np.uint32)
     np.random.set_state({**state, "state": {**state["state"], "key": numbers}})  # noqa: NPY002

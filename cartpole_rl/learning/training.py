@@ -16,6 +16,7 @@ from tensordict import TensorDictBase
 
 from cartpole_rl.agents.dqn import QAgent
 from cartpole_rl.agents.loss import Columns, LossGradient, columns_of
+from cartpole_rl.devices import moved
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.errors import LearningError
 from cartpole_rl.learning.buffer import NStepReturns, buffer_snapshot, make_buffer, restore_buffer
@@ -43,7 +44,10 @@ class Monitor(Protocol):
 
 
 class Training:
-    """A DQN training of `agent` on `env`; `evaluate` runs the greedy policy on another plant."""
+    """A DQN training of `agent` on `env`, both on one device, where all its tensors are.
+
+    `evaluate` runs the greedy policy on another plant, on any device.
+    """
 
     def __init__(
         self,
@@ -64,7 +68,7 @@ class Training:
         )
         self.buffer_settings, self.optimizer_settings = buffer, optimizer
         self.returns = NStepReturns(settings.n_step, agent.settings.gamma, settings.carry)
-        self.buffer = make_buffer(buffer, settings.updates * settings.batch_size)
+        self.buffer = make_buffer(buffer, settings.updates * settings.batch_size, env.device)
         self.gradient = LossGradient(agent.loss, optimizer.max_grad_norm, compiled)
         self.weights = self.gradient.weights
         self.optimizer = OPTIMIZERS[optimizer.kind](
@@ -187,7 +191,8 @@ class Training:
             "learning/updates": float(self.updates),
             "speed/transitions_per_second": self.transitions / self.seconds,
         }
-        return scalars | {f"exploration/{key}": value for key, value in self.collector.finished().items()}
+        explored = self.collector.finished() | self.collector.guarded_fraction()
+        return scalars | {f"exploration/{key}": value for key, value in explored.items()}
 
     @contextmanager
     def timed(self) -> Iterator[None]:
@@ -221,7 +226,7 @@ class Training:
         self.agent.load_state_dict(snapshot["agent"])
         self.optimizer.load_state_dict(snapshot["optimizer"])
         restore_buffer(self.buffer, snapshot["replay"])
-        self.returns.restore(snapshot["returns"])
+        self.returns.restore(moved(snapshot["returns"], self.env.device))
         self.collector.restore(snapshot["collector"])
         self.env.plant.restore(snapshot["plant"])
         restore_random_state(snapshot["random"])

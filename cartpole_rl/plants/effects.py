@@ -34,8 +34,9 @@ def without_effect(
     """
     if not names:
         return []
-    ends = [draws.ends(name, TESTED, torch.Generator().manual_seed(0)) for name in names]
-    low, high = (torch.cat(tables, 1) for tables in zip(*ends, strict=True))
+    device = draws.nominal.device
+    ends = [draws.ends(name, TESTED, torch.Generator(device).manual_seed(0)) for name in names]
+    low, high = (torch.cat(tables, 1).cpu() for tables in zip(*ends, strict=True))
     track_end = (low[TRACK_HALF_LENGTH] + high[TRACK_HALF_LENGTH]) / 2
     commands = commands_under_way(draws.longest_delay(), period)
     motion, drive, inputs = _situations(track_end, motors, commands)

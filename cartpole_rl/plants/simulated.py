@@ -128,8 +128,12 @@ class SimulatedPlant(Plant):
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         """Return to `snapshot`."""
         self._carts.table.copy_(snapshot["table"])
-        self._carts = Carts(self._carts.table, snapshot["motion"].clone(), snapshot["drive"].clone())
-        self._coming = Starts(*(snapshot[f"next_{name}"].clone() for name in Starts._fields))
+
+        def copied(name: str) -> Tensor:
+            return snapshot[name].to(self.device, copy=True)
+
+        self._carts = Carts(self._carts.table, copied("motion"), copied("drive"))
+        self._coming = Starts(*(copied(f"next_{name}") for name in Starts._fields))
         self._generator.set_state(snapshot["generator"])
 
     def _set_seed(self, seed: int | None) -> None:

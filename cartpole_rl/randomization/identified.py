@@ -80,10 +80,13 @@ class IdentifiedCarts(Draws):
 
 
 def identified_carts(
-    settings: IdentifiedSettings, cart: Mapping[str, float], poles: PoleSettings
+    settings: IdentifiedSettings,
+    cart: Mapping[str, float],
+    poles: PoleSettings,
+    device: torch.device | str = "cpu",
 ) -> IdentifiedCarts:
     """Return the draws that `settings` describe. Raises ConfigError if the file is missing or damaged."""
-    prior = Randomizer(cart, poles, settings.ranges)
+    prior = Randomizer(cart, poles, settings.ranges, device)
     try:
         with np.load(settings.posterior) as stored:
             posterior = dict(zip(stored["names"].tolist(), stored["carts"], strict=True))

@@ -13,6 +13,7 @@ SCORES = {  # key in metrics.json: label
     "rms_angle_rad": "RMS angle while upright, rad",
     "rms_position_m": "RMS position while upright, m",
     "min_track_margin_m": "nearest to the track's end, m",
+    "guarded_fraction": "share of time under the track guard",  # None without a guard
 }
 
 

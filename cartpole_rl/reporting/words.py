@@ -19,6 +19,12 @@ def count_text(episodes: int) -> str:
     return f"{episodes} episode{'s' if episodes > 1 else ''}"
 
 
+def guard_text(*episodes: Episode) -> str:
+    """Return ", guarded 3.2 %", the mean share of periods under the track guard; empty without one."""
+    shares = [episode.guarded.mean() for episode in episodes if episode.guarded is not None]
+    return f", guarded {100 * sum(shares) / len(shares):.1f} %" if shares else ""
+
+
 def ending_text(episode: Episode) -> str:
     """Return why and when an episode ended: "left the track after 6.6 s"."""
     return f"{ENDINGS[Ending(episode.ended_by)]} after {episode.time[-1] - episode.time[0]:.1f} s"

@@ -16,10 +16,10 @@ from cartpole_rl.workflows.loading import load_settings, recorded_settings
 OF_BASELINE = {"observation": "raw", "observation.past_motors": 1}
 
 
-def new_agent(config: TrainConfig) -> QAgent:
-    """Return an untrained agent."""
-    observation = config.observation
-    return QAgent(config.agent, observation.mirror_signs, len(config.actions.motors), observation.frames)
+def new_agent(config: TrainConfig, device: str = "cpu") -> QAgent:
+    """Return an untrained agent on `device`."""
+    observation, actions = config.observation, len(config.actions.motors)
+    return QAgent(config.agent, observation.mirror_signs, actions, observation.frames, device)
 
 
 @dataclass(frozen=True)

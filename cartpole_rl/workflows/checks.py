@@ -8,6 +8,7 @@ import shutil
 import sys
 import sysconfig
 from collections.abc import Mapping
+from importlib.util import find_spec
 from pathlib import Path
 
 from cartpole_rl.checking import missing
@@ -136,11 +137,13 @@ def simulated_carts(config: EvaluateConfig) -> int:
     return min(config.episodes, LARGEST_BATCH)
 
 
-def check_compiler() -> None:
-    """Raise ConfigError if torch.compile has no C++ compiler or no header of Python to build with."""
+def check_compiler(device: str = "cpu") -> None:
+    """Raise ConfigError if torch.compile lacks a C++ compiler, a header of Python or, for a GPU, Triton."""
     compiler = os.environ.get("CXX", {"darwin": "clang++", "win32": "cl"}.get(sys.platform, "g++"))
     header = Path(sysconfig.get_path("include"), "Python.h")
     if shutil.which(compiler) is None:
         raise ConfigError(f"compile=true finds no C++ compiler {compiler}: install it, or give compile=false")
     if not header.exists():
         raise ConfigError(f"compile=true finds no {header}: install Python's headers, or give compile=false")
+    if device == "cuda" and find_spec("triton") is None:
+        raise ConfigError("compile=true with device=cuda needs Triton: install it, or give compile=false")

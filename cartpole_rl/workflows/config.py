@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
@@ -62,6 +62,7 @@ class TrainConfig(RunSettings, CartPoleSettings):
     optimizer: OptimizerSettings
     learning: LearningSettings
     compile: bool
+    device: Literal["cpu", "cuda", "auto"] = "cpu"  # missing in checkpoints of earlier versions
     resume: str | None
 
     @model_validator(mode="before")

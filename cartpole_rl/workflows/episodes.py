@@ -10,6 +10,7 @@ from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
 from cartpole_rl.evaluation.episodes import Policy, run_batch, run_episodes
 from cartpole_rl.learning.randomness import seed_everything
 from cartpole_rl.plants.simulated import SimulatedPlant
+from cartpole_rl.reporting.words import guard_text
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.agents import evaluated_agent
 from cartpole_rl.workflows.build import evaluated_env, evaluated_settings, use_threads
@@ -59,6 +60,6 @@ def with_progress(env: CartPoleEnv, policy: Policy, episodes: int) -> Iterator[E
     """Drive episodes behind a progress bar that shows the score of each."""
     with tqdm(total=episodes, unit=" episodes") as progress:
         for episode in run_episodes(env, policy, episodes):
-            progress.set_postfix_str(f"score {episode.score.sum():.0f}", refresh=False)
+            progress.set_postfix_str(f"score {episode.score.sum():.0f}{guard_text(episode)}", refresh=False)
             progress.update()
             yield episode

@@ -48,6 +48,8 @@ def report_evaluation(evaluation: Evaluation, episodes: Sequence[Episode], folde
     link = link_figures(evaluation.env)
     summary = report(folder, episodes, plant, settings.pole, settings.task.x_max, link)
     print(score_table(summary, f"plant={plant}, {count_text(len(episodes))}"))
+    if settings.guard.active:
+        print(f"track guard: {settings.guard.active}")
     for line in cut_off(episodes):
         print(line)
     if evaluation.repetition:

@@ -11,6 +11,7 @@ from cartpole_rl.evaluation.driver import Driver, DriveRequest
 from cartpole_rl.evaluation.driving_policy import Weights
 from cartpole_rl.plants.serial.statistics import LinkStatistics
 from cartpole_rl.reporting.tensorboard import TensorBoardLog
+from cartpole_rl.reporting.words import guard_text
 from cartpole_rl.scheduling import giving_precedence
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.workflows.config import FinetuneConfig
@@ -55,11 +56,14 @@ class DrivenCart:
             )
         self.files.write_episode(stage, number, episode)
         score, step = float(episode.score.sum()), self.step(stage, number + 1)
-        self.log.scalars({f"cart/score_{stage}": score}, step)
+        share = None if episode.guarded is None else float(episode.guarded.mean())
+        self.log.scalars({f"cart/score_{stage}": score, f"cart/guarded_{stage}": share}, step)
         summary = vars(driven.link.summary())
         self.log.scalars({f"link/{key}": float(value) for key, value in summary.items()}, step)
         self.log.flush()
-        tqdm.write(f"{stage} {number + 1}: score {score:.0f}, ended by {episode.ended_by}")
+        tqdm.write(
+            f"{stage} {number + 1}: score {score:.0f}, ended by {episode.ended_by}{guard_text(episode)}"
+        )
 
     def step(self, stage: Stage, number: int) -> int:
         """Return TensorBoard's step of a stage's episode `number`, from 1: the stages follow each other."""

@@ -22,7 +22,15 @@ from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.config import TrainConfig
 
 HISTORY = "history.jsonl"  # a line for each evaluation
-COMPARED = ("score", "score_upright", "steps", "time_to_upright_s", "upright_fraction")  # on the HPARAMS page
+GUARDED = "guarded_fraction"  # None without a track guard
+COMPARED = (  # on the HPARAMS page
+    "score",
+    "score_upright",
+    "steps",
+    "time_to_upright_s",
+    "upright_fraction",
+    GUARDED,
+)
 AVERAGED = ("score", "score_upright", "steps", "upright_fraction")  # over the episodes of an evaluation
 PICTURES = 4  # behaviour figures and animations in TensorBoard, over the whole training
 
@@ -103,7 +111,8 @@ class TrainingMonitor:
         """Return the evaluation's line in the history."""
         metrics = [episode_metrics(episode, self.config.task.x_max) for episode in episodes]
         scores = [each["score"] for each in metrics]
-        means = {key: float(np.mean([each[key] for each in metrics])) for key in AVERAGED}
+        averaged = AVERAGED if metrics[0][GUARDED] is None else (*AVERAGED, GUARDED)
+        means = {key: float(np.mean([each[key] for each in metrics])) for key in averaged}
         return {
             "transitions": training.transitions,
             "seconds": training.seconds,

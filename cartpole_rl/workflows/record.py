@@ -11,7 +11,7 @@ from typing import Any
 
 from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
 from cartpole_rl.evaluation.recordings import LENGTH, write_recording
-from cartpole_rl.reporting.words import count_text
+from cartpole_rl.reporting.words import count_text, guard_text
 from cartpole_rl.run_files import RECORDINGS
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.config import EvaluateConfig, RecordConfig
@@ -27,7 +27,7 @@ def record(config: RecordConfig, folder: Path) -> None:
     and CheckpointError for settings, PlantError and LinkError for a cart that fails.
     """
     evaluation = prepared(config)
-    written = 0
+    episodes: list[Episode] = []
     try:
         with closing(evaluation.env):
             settings = evaluation.settings.model_dump(mode="json")
@@ -35,12 +35,12 @@ def record(config: RecordConfig, folder: Path) -> None:
                 folder, "record", {**evaluation.config.model_dump(mode="json"), "recorded": settings}
             )
             for episode in evaluation.episodes():
-                path = folder / RECORDINGS / f"episode_{written:03d}.csv"
+                path = folder / RECORDINGS / f"episode_{len(episodes):03d}.csv"
                 write_recording(path, episode, heading(evaluation.config, evaluation.settings, episode))
-                written += 1
+                episodes.append(episode)
     finally:
-        if written:
-            print(f"{folder}/{RECORDINGS}/ holds {count_text(written)}")
+        if episodes:
+            print(f"{folder}/{RECORDINGS}/ holds {count_text(len(episodes))}{guard_text(*episodes)}")
 
 
 def heading(config: EvaluateConfig, settings: CartPoleSettings, episode: Episode) -> dict[str, Any]:

@@ -3,10 +3,13 @@
 from functools import partial
 from pathlib import Path
 
+from cartpole_rl.agents.dqn import QAgent
+from cartpole_rl.devices import available_device
 from cartpole_rl.envs.build import simulated_env, with_fitted_guard
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
-from cartpole_rl.evaluation.driving_policy import DrivingPolicy
-from cartpole_rl.evaluation.episodes import Policy, run_batch
+from cartpole_rl.envs.settings import GuardSettings
+from cartpole_rl.evaluation.driving_policy import DrivingPolicy, as_weights
+from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.learning.checkpoints import forget_training, restore_weights
 from cartpole_rl.learning.randomness import seed_everything
 from cartpole_rl.learning.training import Training
@@ -39,21 +42,23 @@ def train(config: TrainConfig, folder: Path) -> None:
     checkpoint = resumed("train", config.resume, folder)
     if checkpoint:
         config = recorded_settings(TrainConfig, checkpoint.config, f"resume={folder}")
+    config = config.model_copy(update={"device": available_device(config.device)})
     if config.compile:
-        check_compiler()
+        check_compiler(config.device)
     use_threads(config.threads)
     seed_everything(config.seed)
     config = with_fitted_guard(config)
     carts, start = config.learning.carts, config.task.start
-    env = simulated_env(config, config.plant, carts, start, config.seed, config.compile)
+    env = simulated_env(config, config.plant, carts, start, config.seed, config.compile, config.device)
     note_unused_randomization(config, env.plant.randomizer)
-    agent = new_agent(config)
+    note_guard(config.guard)
+    agent = new_agent(config, config.device)
     if checkpoint:
         restore_weights(
             agent, checkpoint.state["agent"], f"resume={folder}"
         )  # an error comes before any work
     policy = DrivingPolicy(agent.greedy_policy(), config.compile)
-    evaluate = partial(judge, nominal_env(config), policy, config.seed)
+    evaluate = partial(judge, nominal_env(config), agent, policy, config.seed)
     write_config(folder, "train", config.model_dump(mode="json"), resumed=checkpoint is not None)
     with TrainingMonitor(folder, config, checkpoint.step if checkpoint else None) as monitor:
         training = Training(
@@ -80,6 +85,12 @@ def train(config: TrainConfig, folder: Path) -> None:
     print(f"trained for {training.seconds:.0f} s; {folder}/{METRICS}, {FIGURES}/, {CHECKPOINTS}/ are written")
 
 
+def note_guard(guard: GuardSettings) -> None:
+    """Print the numbers of the track guard, if there is one."""
+    if guard.active:
+        print_message("train", f"track guard: {guard.active} (guard.quantile={guard.quantile:g})")
+
+
 def note_unused_randomization(config: TrainConfig, draws: Draws) -> None:
     """Print the ranges that change nothing with the chosen actions and friction models."""
     models = config.models(config.plant)
@@ -101,7 +112,11 @@ def nominal_env(config: TrainConfig) -> CartPoleEnv:
     return simulated_env(nominal, plant, carts, config.task.evaluation_start, 0, config.compile)
 
 
-def judge(env: CartPoleEnv, policy: Policy, seed: int) -> list[Episode]:
-    """Return episodes of the greedy policy in a training with `seed`, from the same starts each time."""
+def judge(env: CartPoleEnv, agent: QAgent, policy: DrivingPolicy, seed: int) -> list[Episode]:
+    """Return episodes of the greedy policy in a training with `seed`, from the same starts each time.
+
+    The carts are on the CPU, whatever the device of the training: `policy` acts with a copy of the weights.
+    """
+    policy.load(as_weights(agent.greedy_policy()))
     env.set_seed(evaluation_seed(seed))
     return run_batch(env, policy)

@@ -4,8 +4,8 @@
     scripts/bench/learning.py medium large --seeds 10 --jobs 2 --json learning.json
 
 Trains `--seeds` agents of each experiment of conf/experiment and judges every last checkpoint. Further
-words are passed to cartpole-train as overrides. The runs are in runs/bench/<experiment>/<seed>; one that
-exists is not trained again.
+words are passed to cartpole-train as overrides. The runs are in runs/bench/<experiment>/<seed>, with
+`--device cuda` in runs/bench/<experiment>_cuda/<seed>; one that exists is not trained again.
 
 A fraction is the mean score over 20 starts on the nominal simulated cart, divided by the best score that
 scripts/bench/reference.py found there (references.json). `drawn` is the mean score on a thousand carts of
@@ -139,6 +139,7 @@ def parse_options() -> tuple[argparse.Namespace, list[str]]:
     parser.add_argument(
         "--jobs", type=int, default=1, help="trainings at the same time (1); keep 1 to compare seconds"
     )
+    parser.add_argument("--device", default="cpu", choices=("cpu", "cuda"), help="of the training (cpu)")
     return parser.parse_known_args()
 
 
@@ -146,10 +147,12 @@ def main() -> None:
     """Train, judge, print a table and write the figures."""
     options, overrides = parse_options()
     use_threads(1)
-    references = reference_scores()
+    references, device = reference_scores(), options.device
     everything, rows = {}, []
     for experiment in options.experiments:
-        folders = train_seeds(experiment, options.seeds, options.jobs, overrides, RUNS / experiment)
+        parent = RUNS / (experiment if device == "cpu" else f"{experiment}_{device}")
+        words = [f"device={device}", *overrides]
+        folders = train_seeds(experiment, options.seeds, options.jobs, words, parent)
         results = [seed_result(experiment, folder, references) for folder in folders]
         everything[experiment] = dict(enumerate(results))
         rows += summary(experiment, results)

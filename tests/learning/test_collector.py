@@ -7,8 +7,11 @@ import torch
 from tensordict.nn import TensorDictModule
 from torchrl.collectors import Collector as TorchRLCollector
 
+from cartpole_rl.choices import choice
+from cartpole_rl.envs.build import shipped_settings, simulated_env, with_fitted_guard
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.learning.collector import COLLECTED, Collector
+from cartpole_rl.plants.settings import SimulatedSettings
 from cartpole_rl.randomization.ranges import Range
 from cartpole_rl.tasks.settings import Start, StartSettings
 
@@ -149,3 +152,30 @@ def test_a_failed_cart_is_retried(make_plant: Callable, make_environment: Callab
     assert len(stood) > 50
     assert sum(stood) == 0
     assert sum(failed) / len(failed) == pytest.approx(share, abs=0.05)
+
+
+def test_the_share_of_periods_under_the_track_guard() -> None:
+    """It is the share of motor values sent that are not those of the agent's actions."""
+
+    def build(guard: str) -> CartPoleEnv:
+        settings = with_fitted_guard(shipped_settings({"guard": guard}))
+        plant = SimulatedSettings(**choice("plant/simulated"))
+        return simulated_env(settings, plant, CARTS, settings.task.start, seed=5)
+
+    env, outward = build("careful"), 8
+    driven = Collector(env, always(outward), actions=9, seed=0)
+    driven.epsilon = 0.0
+    driven.collect(LIMIT)
+    driven.collect(LIMIT)
+    replaced, again = 0, build("careful")
+    current = again.reset()
+    for _ in range(2 * LIMIT):
+        current["action"] = torch.full((CARTS,), outward)
+        replaced += int((again.hardware.command(current)["motor"] != env.hardware.motors[outward]).sum())
+        _, current = again.step_and_maybe_reset(current)
+    assert 0 < replaced < 2 * LIMIT * CARTS
+    assert driven.guarded_fraction() == {"guarded_fraction": replaced / (2 * LIMIT * CARTS)}
+    assert driven.guarded_fraction() == {}
+    unguarded = Collector(build("none"), always(outward), actions=9, seed=0)
+    unguarded.collect(LIMIT)
+    assert unguarded.guarded_fraction() == {}

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from cartpole_rl.physics.motor import LARGEST_MOTOR
 from cartpole_rl.reporting import style
 from cartpole_rl.reporting.figures.annotations import at_time, beside
-from cartpole_rl.reporting.words import ending_text
+from cartpole_rl.reporting.words import ending_text, guard_text
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.tasks.rewards import UPRIGHT_ANGLE
 from cartpole_rl.tasks.upright import is_upright, upright_since
@@ -112,6 +112,17 @@ def _draw_motor(axes: Axes, episode: Episode) -> None:
     if episode.guarded is not None and episode.guarded.any():
         guarded = np.where(episode.guarded, episode.motor, 0)
         axes.stairs(guarded, episode.time, fill=True, color=style.LIMIT)
+        times = episode.time[:-1][
+            episode.guarded
+        ]  # a single period is a thin line: marked at the edge as well
+        axes.plot(
+            times,
+            np.full_like(times, 1.08 * LARGEST_MOTOR),
+            "v",
+            color=style.LIMIT,
+            markersize=4,
+            clip_on=False,
+        )
         beside(axes, 0, "track guard", style.LIMIT)
     axes.set_ylim(-1.15 * LARGEST_MOTOR, 1.15 * LARGEST_MOTOR)
     axes.set_yticks(MOTOR_TICKS)
@@ -122,4 +133,5 @@ def _draw_motor(axes: Axes, episode: Episode) -> None:
 def _summary(episode: Episode) -> str:
     """Return the episode in one line."""
     share = 100 * is_upright(episode.theta[1:]).mean()
-    return f"score {episode.score.sum():.0f},  upright {share:.0f} % of the time,  {ending_text(episode)}"
+    shares = f"upright {share:.0f} % of the time{guard_text(episode)}"
+    return f"score {episode.score.sum():.0f},  {shares},  {ending_text(episode)}"

@@ -115,4 +115,6 @@ def test_periods_of_the_track_guard_are_named_and_filled(swing_up: Episode) -> N
     guarded = np.zeros(swing_up.steps, bool)
     assert "track guard" not in words(behaviour(dataclasses.replace(swing_up, guarded=guarded)))
     guarded[3:6] = True
-    assert "track guard" in words(behaviour(dataclasses.replace(swing_up, guarded=guarded)))
+    shown = words(behaviour(dataclasses.replace(swing_up, guarded=guarded)))
+    assert "track guard" in shown
+    assert f"guarded {300 / swing_up.steps:.1f} %" in shown

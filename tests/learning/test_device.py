@@ -1,0 +1,139 @@
+"""A training on a device: every tensor is there, and what is computed and saved is the same as on the CPU."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from separate_device import DEVICE, SeparateTensor, separate_device
+from torch import Tensor
+from torch.utils._pytree import tree_leaves
+
+from cartpole_rl.devices import available_device, moved
+from cartpole_rl.envs.build import simulated_env, with_fitted_guard
+from cartpole_rl.errors import ConfigError
+from cartpole_rl.evaluation.driving_policy import DrivingPolicy
+from cartpole_rl.learning.checkpoints import TrainingCheckpoint, load_training, save_training
+from cartpole_rl.learning.randomness import seed_everything
+from cartpole_rl.learning.training import Training
+from cartpole_rl.workflows.agents import new_agent
+from cartpole_rl.workflows.config import TrainConfig
+from cartpole_rl.workflows.finetuning_learner import NoCallbacks
+from cartpole_rl.workflows.loading import load_settings
+from cartpole_rl.workflows.train import judge, nominal_env, note_unused_randomization, train
+
+SHORT = {
+    "learning.transitions": 2048,
+    "learning.carts": 16,
+    "learning.chunk": 8,
+    "learning.updates": 2,
+    "learning.batch_size": 32,
+    "learning.warmup_transitions": 256,
+    "learning.evaluations": 1,
+    "learning.retry_probability": 0.5,
+    "buffer.size": 500,
+    "task.time_limit": 6,
+    "compile": False,
+}
+ITERATIONS = 6
+
+
+def new_training(overrides: dict[str, Any], device: torch.device | str) -> Training:
+    config = with_fitted_guard(load_settings(TrainConfig, SHORT | overrides))
+    seed_everything(1)
+    env = simulated_env(config, config.plant, config.learning.carts, config.task.start, seed=1, device=device)
+    note_unused_randomization(config, env.plant.randomizer)
+    settings = config.learning, config.buffer, config.optimizer
+    return Training(*settings, new_agent(config, device), env, lambda: [], NoCallbacks(), seed=1)
+
+
+def trained(training: Training, iterations: int = ITERATIONS) -> dict[str, Tensor]:
+    """Train; return the weights on the CPU."""
+    for _ in range(iterations):
+        chunk, scalars = training.iterate()
+        training.describe(chunk)
+    assert scalars
+    return moved(training.agent.state_dict(), "cpu")
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        {},
+        {"experiment": "recurrent"},
+        {"buffer": "prioritized"},
+        {"pole": "both", "guard": "fitted"},
+        {"pole": "range", "observation.pole_length": True},
+    ],
+)
+def test_every_tensor_of_a_training_is_on_its_device(overrides: dict[str, Any]) -> None:
+    expected = trained(new_training(overrides, "cpu"))
+    with separate_device():
+        training = new_training(overrides, DEVICE)
+        weights = trained(training)
+        parts = training.env.plant.parameters, training.buffer.storage.get(slice(None))
+        assert all(isinstance(value, SeparateTensor) for part in parts for value in part.values(True, True))
+    assert weights.keys() == expected.keys()
+    for name, weight in weights.items():
+        assert torch.equal(weight, expected[name]), name
+
+
+@pytest.mark.filterwarnings("ignore:for .*copying from a non-meta parameter")  # here it is a copy
+@pytest.mark.parametrize(
+    "overrides", [{"learning.carry": True}, {"buffer": "prioritized", "guard": "fitted"}]
+)
+def test_a_training_is_saved_on_the_cpu_and_resumes_on_its_device(
+    overrides: dict[str, Any], tmp_path: Path
+) -> None:
+    with separate_device():
+        training = new_training(overrides, DEVICE)
+        trained(training, ITERATIONS - 2)
+        state = TrainingCheckpoint({}, training.snapshot(), training.transitions)
+        save_training(tmp_path, state)
+        expected = trained(training, 2)
+    saved = torch.load(tmp_path / "checkpoints" / "resume.pt", weights_only=True)  # where it was saved from
+    assert {part.device.type for part in tree_leaves(saved) if isinstance(part, Tensor)} == {"cpu"}
+    with separate_device():
+        resumed = new_training(overrides, DEVICE)
+        resumed.restore(load_training(tmp_path).state)
+        weights = trained(resumed, 2)
+    for name, weight in weights.items():
+        assert torch.equal(weight, expected[name]), name
+
+
+def test_a_training_is_evaluated_on_the_cpu() -> None:
+    config = load_settings(TrainConfig, SHORT)
+    with separate_device():
+        agent = new_agent(config, DEVICE)
+        policy = DrivingPolicy(agent.greedy_policy(), compiled=False)
+        episodes = judge(nominal_env(config), agent, policy, seed=3)
+        weights = moved(agent.state_dict(), "cpu")
+    on_cpu = new_agent(config)
+    on_cpu.load_state_dict(weights)
+    policy = DrivingPolicy(on_cpu.greedy_policy(), compiled=False)
+    for episode, expected in zip(episodes, judge(nominal_env(config), on_cpu, policy, seed=3), strict=True):
+        assert (episode.counts == expected.counts).all()
+        assert (episode.score == expected.score).all()
+
+
+def test_auto_takes_a_gpu_if_there_is_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert available_device("cpu") == "cpu"
+    assert available_device("auto") == ("cuda" if torch.cuda.is_available() else "cpu")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    assert available_device("auto") == available_device("cuda") == "cuda"
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_a_gpu_that_does_not_exist_is_one_line_before_any_work(tmp_path: Path) -> None:
+    config = load_settings(TrainConfig, {**SHORT, "device": "cuda"})
+    with pytest.raises(ConfigError, match="device=cuda: PyTorch finds no CUDA GPU on this machine"):
+        train(config, tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_devices_of_the_test_do_not_mix() -> None:
+    with separate_device():
+        there = torch.ones(3, device=DEVICE)
+        with pytest.raises(RuntimeError, match="add of tensors on two devices"):
+            there + torch.ones(3)
+        assert torch.equal((there + torch.tensor(1.0)).cpu(), torch.full((3,), 2.0))
