@@ -7,7 +7,8 @@ Fine-tunes the last checkpoint of each agent on each of `--truths` drawn carts, 
 `--starts` episodes without exploration, `--episodes` to learn from, then `--starts` without exploration. The
 carts are drawn as in zero_shot.py, with a seed of their own. Fractions are scores divided by the reference of
 the same cart (reference.py --truths). An episode with a score below 500 is lost. `after` is the policy after
-fine-tuning, even where `cartpole-finetune` keeps the one from before.
+fine-tuning, even where `cartpole-finetune` keeps the one from before. Further words are overrides of
+cartpole-finetune.
 
 The runs are in runs/bench/fine_tuning; one that was interrupted is resumed, and one that has ended is not
 made again. `seconds` are those of the last call, so they are too few for a run that was resumed.
@@ -141,7 +142,7 @@ def agent_row(agent: str, results: Sequence[dict[str, Any]]) -> dict[str, Cell]:
 def parse_options() -> tuple[argparse.Namespace, dict[str, Any]]:
     """Return the command-line options, and the overrides for cartpole-finetune."""
     parser = option_parser(__doc__)
-    parser.add_argument("agents", nargs="+", help="run folders of cartpole-train; then NAME=VALUE overrides")
+    parser.add_argument("agents", nargs="+", help="run folders; NAME=VALUE is an override")
     parser.add_argument("--truths", type=positive_int, default=20, help="number of carts (20)")
     parser.add_argument("--seed", type=int, default=TUNED, help=f"decides which carts are drawn ({TUNED})")
     parser.add_argument(
@@ -154,8 +155,8 @@ def parse_options() -> tuple[argparse.Namespace, dict[str, Any]]:
     parser.add_argument("--episodes", type=positive_int, default=5, help="to learn from on each cart (5)")
     parser.add_argument("--starts", type=positive_int, default=5, help="episodes before and after (5)")
     parser.add_argument("--jobs", type=positive_int, default=1, help="fine-tunings at the same time (1)")
-    options = parser.parse_args()
-    words = [word for word in options.agents if "=" in word]
+    options, words = parser.parse_known_args()
+    words += [word for word in options.agents if "=" in word]
     options.agents = [word for word in options.agents if word not in words]
     pairs = (word.partition("=") for word in words)
     return options, {name: yaml.safe_load(value) for name, _, value in pairs}
