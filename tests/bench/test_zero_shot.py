@@ -48,7 +48,8 @@ def test_fractions_are_relative_to_the_reference_of_the_cart(
         in shown
     )
     (agent,) = json.loads((trained / "zero_shot.json").read_text())["agents"]
-    assert agent["carts"][0]["scores"] == cart["scores"] and agent["mean_fraction"] is None
+    assert agent["carts"][0]["scores"] == cart["scores"]
+    assert agent["mean_fraction"] is None
     assert before != (trained / "zero_shot.json").read_text()
 
 
