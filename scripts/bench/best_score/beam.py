@@ -61,8 +61,8 @@ def beam(cart: KnownCart, root: Nodes, steps: int, states: int) -> list[int]:
 def risk(cart: KnownCart, state: State) -> Tensor:
     """Return the points [N] that states near upright are going to lose, roughly."""
     falls = wrapped(state.theta) + state.theta_dot / cart.growth
-    stops_at = ((state.x + 0.6 * state.x_dot) / cart.reach).abs()
-    return 100 * falls.abs() + 30 * stops_at**2 + 1000 * (stops_at - 0.5).clamp(min=0) ** 2
+    stops_at = ((state.x + 0.3 * state.x_dot) / cart.reach).abs()
+    return 100 * falls.abs() + 30 * stops_at**2 + 200 * (stops_at - 0.8).clamp(min=0) ** 2
 
 
 def cells(state: State) -> Tensor:
