@@ -2,16 +2,18 @@
 
 import argparse
 import json
+import multiprocessing
 import subprocess
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
 from cartpole_rl.reporting.table import Cell, table
+from cartpole_rl.workflows.build import use_threads
 
 RUNS = Path("runs/bench")  # the parent of every run folder that a bench script makes
 REFERENCES = Path(__file__).with_name("references.json")  # written by reference.py
@@ -31,6 +33,13 @@ def positive_int(text: str) -> int:
     """Convert an option to an integer of at least 1."""
     if (value := int(text)) < 1:
         raise argparse.ArgumentTypeError(f"{text} is less than 1")
+    return value
+
+
+def share(text: str) -> float:
+    """Convert `--wider` to a number from 0 to 1; beyond 1 some carts would have no mass."""
+    if not 0 <= (value := float(text)) <= 1:
+        raise argparse.ArgumentTypeError(f"{text} is not a share from 0 to 1")
     return value
 
 
@@ -66,6 +75,12 @@ def in_parallel(work: Callable[[Job], Result], items: Iterable[Job], jobs: int) 
     """Return `work(item)` for each item, in order, `jobs` at a time in threads."""
     with ThreadPoolExecutor(jobs) as pool:
         return list(pool.map(work, items))
+
+
+def processes(jobs: int) -> ProcessPoolExecutor:
+    """Return a pool of `jobs` processes; each computes with one thread."""
+    spawn = multiprocessing.get_context("spawn")
+    return ProcessPoolExecutor(jobs, spawn, initializer=use_threads, initargs=(1,))
 
 
 def mean_score(file: Path) -> float:

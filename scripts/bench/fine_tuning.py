@@ -1,62 +1,211 @@
 #!/usr/bin/env python
-"""Does fine-tuning help on carts for which an agent was not trained? Table: docs/results/fine-tuning.md.
+"""Does fine-tuning help on emulated carts that an agent never saw?
 
-    scripts/bench/fine_tuning.py runs/bench/medium/0 runs/bench/medium/1 runs/bench/medium/2 --json tuned.json
+    scripts/bench/fine_tuning.py runs/train/a runs/train/b runs/train/c --jobs 2 --json tuned.json
 
-Fine-tunes each agent on each cart with `cartpole-finetune plant=emulated`; further words are passed on as
-overrides. The target is the lower of 1.15 times the score before and 0.95 times the agent's score on the
-simulated nominal cart. The runs are in runs/bench/fine_tuning; one that exists is not made again.
+Fine-tunes the last checkpoint of each agent on each of `--truths` drawn carts, as `cartpole-finetune` does:
+`--starts` episodes without exploration, `--episodes` to learn from, then `--starts` without exploration. The
+carts are drawn as in zero_shot.py, with a seed of their own. Fractions are scores divided by the reference of
+the same cart (reference.py --truths). An episode with a score below 500 is lost. `after` is the policy after
+fine-tuning, even where `cartpole-finetune` keeps the one from before. Further words are overrides of
+cartpole-finetune.
+
+The runs are in runs/bench/fine_tuning; one that was interrupted is resumed, and one that has ended is not
+made again. `seconds` are those of the last call, so they are too few for a run that was resumed.
 """
 
+import argparse
+import time
+from collections.abc import Sequence
+from concurrent.futures import as_completed
 from pathlib import Path
+from typing import Any
 
-from common import RUNS, in_parallel, mean_score, option_parser, print_table, read_json, run_once, write_json
+import numpy as np
+import yaml
+from common import (
+    LOST_SCORE,
+    RUNS,
+    option_parser,
+    positive_int,
+    print_table,
+    processes,
+    read_json,
+    share,
+    write_json,
+)
+from truth_references import Draw, known_references, note_missing
+from truths import TUNED, Truth
 
-from cartpole_rl.emulator.settings import EmulatorSettings
+from cartpole_rl.errors import CartPoleError
+from cartpole_rl.reporting.table import Cell
+from cartpole_rl.run_files import CHECKPOINTS, RESUME
+from cartpole_rl.tasks.endings import Ending
+from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.workflows.config import FinetuneConfig
+from cartpole_rl.workflows.finetune import finetune
+from cartpole_rl.workflows.finetuning_files import FinetuningFiles, Stage
+from cartpole_rl.workflows.loading import load_settings
 
-DEFAULT = EmulatorSettings()
-CARTS = {  # each differs from the emulator's default in one property
-    "friction": [  # a quarter more Coulomb friction, and another 15 % to the left
-        f"emulator.cart_coulomb_left={1.25 * 1.15 * DEFAULT.cart_coulomb_left:.4f}",
-        f"emulator.cart_coulomb_right={1.25 * DEFAULT.cart_coulomb_right:.4f}",
-    ],
-    "force": [f"emulator.force_curve={[round(0.8 * number, 9) for number in DEFAULT.force_curve]}"],
-    "latency": [f"emulator.latency={DEFAULT.latency + 0.02}"],
-    "tilt": ["emulator.track_tilt=0.008727"],  # 0.5 degrees
-    "large pole": ["emulator=large"],
-}
-GAIN, SHARE = 1.15, 0.95
+PARENT = RUNS / "fine_tuning"
+FIGURES = "bench.json"  # in a run folder, written at the end
 
 
-def tune(agent: Path, cart: str, seed: int, overrides: list[str]) -> dict[str, float]:
-    """Return the scores in simulation, before and after, and whether the kept policy meets the target."""
-    folder = RUNS / "fine_tuning" / agent.parent.name / agent.name / cart.replace(" ", "_")
-    words = [f"run={agent}", "plant=emulated", *CARTS[cart], *overrides, f"seed={seed}"]
-    run_once(folder, "finetune", *words, result="comparison.json")
-    compared = read_json(folder / "comparison.json")
-    simulated = mean_score(agent / "metrics.json")
-    before, after = (compared[stage]["score"]["mean"] for stage in ("before", "after"))
-    target = min(GAIN * before, SHARE * simulated)
-    met = max(before, after) >= target
-    return {"simulated": simulated, "before": before, "after": after, "target": target, "met": met}
+def tuned(folder: Path, overrides: dict[str, Any]) -> dict[str, Any]:
+    """Fine-tune in `folder` unless it has been done, and return the figures; `error` if the cart fails."""
+    if (folder / FIGURES).exists():
+        figures: dict[str, Any] = read_json(folder / FIGURES)
+        return figures
+    interrupted = (folder / CHECKPOINTS / RESUME).exists()
+    config = load_settings(FinetuneConfig, {"resume": str(folder)} if interrupted else overrides)
+    started = time.perf_counter()
+    try:
+        finetune(config, folder)
+    except CartPoleError as error:  # high friction can prevent homing
+        return {"error": str(error)}
+    seconds = time.perf_counter() - started
+    episodes = {stage: FinetuningFiles(folder, config).episodes(stage) for stage in Stage}
+    found = {**stage_figures(episodes), "seconds": round(seconds, 1)}
+    write_json(folder / FIGURES, found)
+    return found
+
+
+def stage_figures(episodes: dict[Stage, list[Episode]]) -> dict[str, Any]:
+    """Return the scores of each stage, and how many tuning episodes left the track."""
+    left = [episode.ended_by == Ending.TRACK for episode in episodes[Stage.TUNE]]
+    scores = {str(stage): [float(each.score.sum()) for each in found] for stage, found in episodes.items()}
+    return {"scores": scores, "left_track": sum(left), "left_track_first": bool(left[0])}
+
+
+def cart_figures(
+    agent: str, number: int, truth: Truth, reference: float | None, found: dict[str, Any]
+) -> dict[str, Any]:
+    """Return the figures of one fine-tuning; the fractions are None without a reference."""
+    figures = {"agent": agent, "cart": number, "truth": truth, "reference": reference, **found}
+    if "error" in found:
+        return figures
+    before, after = (float(np.mean(found["scores"][stage])) for stage in (Stage.BEFORE, Stage.AFTER))
+    fractions = {"before": before, "after": after}
+    return figures | {
+        "before": before,
+        "after": after,
+        "fraction": {name: score / reference if reference else None for name, score in fractions.items()},
+        "lost": {
+            stage: sum(score < LOST_SCORE for score in scores) for stage, scores in found["scores"].items()
+        },
+    }
+
+
+def cart_row(figures: dict[str, Any]) -> dict[str, Cell]:
+    """Return the table row of one fine-tuning."""
+    row: dict[str, Cell] = {"agent": figures["agent"], "cart": figures["cart"]}
+    if "error" in figures:
+        return {**row, "before": figures["error"]}
+    tuning = " ".join(f"{score:.0f}" for score in figures["scores"][Stage.TUNE])
+    return {
+        **row,
+        "before": f"{figures['before']:.0f}",
+        "tuning": tuning,
+        "after": f"{figures['after']:.0f}",
+        "fraction before": figures["fraction"]["before"],
+        "after, fraction": figures["fraction"]["after"],
+        "left track": figures["left_track"],
+        "seconds": f"{figures['seconds']:.0f}",
+    }
+
+
+def agent_row(agent: str, results: Sequence[dict[str, Any]]) -> dict[str, Cell]:
+    """Return the table row that summarizes the fine-tunings of one agent."""
+    done = [each for each in results if "error" not in each]
+    if not done:
+        return {"agent": agent, "carts": 0, "not tuned": len(results)}
+    row: dict[str, Cell] = {"agent": agent, "carts": len(done), "not tuned": len(results) - len(done)}
+    for stage in ("before", "after"):
+        scores = [each[stage] for each in done]
+        row |= {f"mean {stage}": f"{np.mean(scores):.0f}", f"worst {stage}": f"{min(scores):.0f}"}
+        fractions = [each["fraction"][stage] for each in done if each["fraction"][stage] is not None]
+        row |= {
+            f"mean fraction {stage}": float(np.mean(fractions)) if fractions else None,
+            f"worst fraction {stage}": min(fractions, default=None),
+        }
+    return row | {
+        "ended below": sum(each["after"] < each["before"] for each in done),
+        "lost before, tuning, after": ", ".join(
+            str(sum(each["lost"][stage] for each in done)) for stage in Stage
+        ),
+        "left track": sum(each["left_track"] for each in done),
+        "in first episode": sum(each["left_track_first"] for each in done),
+        "seconds a cart": f"{np.mean([each['seconds'] for each in done]):.0f}",
+    }
+
+
+def parse_options() -> tuple[argparse.Namespace, dict[str, Any]]:
+    """Return the command-line options, and the overrides for cartpole-finetune."""
+    parser = option_parser(__doc__)
+    parser.add_argument("agents", nargs="+", help="run folders; NAME=VALUE is an override")
+    parser.add_argument("--truths", type=positive_int, default=20, help="number of carts (20)")
+    parser.add_argument("--seed", type=int, default=TUNED, help=f"decides which carts are drawn ({TUNED})")
+    parser.add_argument(
+        "--wider",
+        type=share,
+        default=0.0,
+        metavar="SHARE",
+        help="widens their ranges, as in zero_shot.py (0)",
+    )
+    parser.add_argument("--episodes", type=positive_int, default=5, help="to learn from on each cart (5)")
+    parser.add_argument("--starts", type=positive_int, default=5, help="episodes before and after (5)")
+    parser.add_argument("--jobs", type=positive_int, default=1, help="fine-tunings at the same time (1)")
+    options, words = parser.parse_known_args()
+    words += [word for word in options.agents if "=" in word]
+    options.agents = [word for word in options.agents if word not in words]
+    pairs = (word.partition("=") for word in words)
+    return options, {name: yaml.safe_load(value) for name, _, value in pairs}
+
+
+def fine_tunings(
+    options: argparse.Namespace, overrides: dict[str, Any]
+) -> dict[tuple[str, int], tuple[Path, dict[str, Any]]]:
+    """Return the folder and the overrides of each fine-tuning, by agent and number of the cart."""
+    work = {}
+    for number, truth in enumerate(Draw(options.seed, options.wider).truths(options.truths)):
+        for agent in options.agents:
+            path = Path(agent)
+            names = f"{path.parent.name}_{path.name}", f"{options.seed}_{options.wider:g}_{number:02d}"
+            words = {
+                "run": agent,
+                "plant": "emulated",
+                "episodes": options.episodes,
+                "evaluation_episodes": options.starts,
+                **{f"emulator.{name}": value for name, value in truth.items()},
+                **overrides,
+            }
+            work[agent, number] = PARENT.joinpath(*names), words
+    return work
 
 
 def main() -> None:
-    """Fine-tune every agent on every cart, print a table and write the figures."""
-    parser = option_parser(__doc__)
-    parser.add_argument("agents", nargs="+", type=Path, help="run folders of cartpole-train")
-    parser.add_argument("--carts", nargs="+", choices=list(CARTS), default=list(CARTS))
-    parser.add_argument("--jobs", type=int, default=1, help="fine-tunings at the same time (1)")
-    options, overrides = parser.parse_known_args()
-    jobs = [(agent, cart, seed) for seed, agent in enumerate(options.agents) for cart in options.carts]
-    tuned = in_parallel(lambda job: tune(*job, overrides), jobs, options.jobs)
-    results = [
-        {"agent": str(agent), "cart": cart, **figures}
-        for (agent, cart, _), figures in zip(jobs, tuned, strict=True)
-    ]
-    scores = ("simulated", "before", "after", "target")
-    print_table([{**result, **{key: f"{result[key]:.0f}" for key in scores}} for result in results])
-    write_json(options.json, results)
+    """Fine-tune every agent on every cart, print the tables and write the figures."""
+    options, overrides = parse_options()
+    draw = Draw(options.seed, options.wider)
+    truths = draw.truths(options.truths)
+    references = known_references(draw, truths)
+    note_missing(draw, references)
+    results: dict[tuple[str, int], dict[str, Any]] = {}
+    with processes(options.jobs) as pool:
+        jobs = fine_tunings(options, overrides)
+        tunings = {pool.submit(tuned, *arguments): key for key, arguments in jobs.items()}
+        for done in as_completed(tunings):
+            agent, number = tunings[done]
+            results[agent, number] = cart_figures(
+                agent, number, truths[number], references[number], done.result()
+            )
+            write_json(options.json, [results[key] for key in jobs if key in results])
+    rows = [results[key] for key in jobs]
+    print_table([cart_row(each) for each in rows])
+    print()
+    print_table(
+        [agent_row(agent, [each for each in rows if each["agent"] == agent]) for agent in options.agents]
+    )
 
 
 if __name__ == "__main__":

@@ -13,12 +13,9 @@ from typing import Any
 import numpy as np
 import yaml
 from common import RUNS, failure, option_parser, print_table, read_json, write_json
-from truths import identification_truths, overrides
+from truths import identification_truths, overrides, simulated_cart
 
-from cartpole_rl.choices import choice
-from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.identification.quantities import quantities
-from cartpole_rl.physics.parameters import CartParameters
 
 TARGETS = {  # quantity: target of the median error, and whether errors are relative to the truth
     "pole_frequency": (0.01, True),
@@ -34,16 +31,7 @@ COVERAGE = 0.85  # target: share of the true values that lie in their intervals
 
 def true_quantities(truth: dict[str, object]) -> dict[str, float]:
     """Return the true values of the quantities that identification reports."""
-    settings = EmulatorSettings(**truth).model_dump()
-    left, right = settings["cart_coulomb_left"], settings["cart_coulomb_right"]
-    a, b, c = settings["force_curve"]
-    cart = {
-        **choice("cart/ip02"),
-        **{name: settings[name] for name in CartParameters.names() if name in settings},
-    }
-    cart |= {"force_quadratic": a, "force_linear": b, "force_offset": c}
-    cart |= {"cart_coulomb": (left + right) / 2, "cart_coulomb_asymmetry": (right - left) / (right + left)}
-    return {each.name: each.value for each in quantities(cart)}
+    return {each.name: each.value for each in quantities(simulated_cart(truth))}
 
 
 def identify(number: int, truth: dict[str, object]) -> dict[str, Any] | None:

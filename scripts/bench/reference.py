@@ -4,6 +4,7 @@
     scripts/bench/reference.py pole=large                          # overrides of cartpole-train
     scripts/bench/reference.py --length 0.4 --states 1000          # a rod of the length experiment
     scripts/bench/reference.py --all --json scripts/bench/references.json
+    scripts/bench/reference.py --truths 100 --seed 2026 --wider 0.333 --jobs 2   # carts of zero_shot.py
 
 The search runs offline and learns nothing. It could not run on a cart: it knows the true state, the
 equations and every encoder count. Its result is a score that was reached by replaying the actions in the
@@ -22,12 +23,17 @@ For each start the search has three stages (scripts/bench/best_score):
 
 The search runs with 1000 states (swing-ups in a generation, states in a landing), then with three times as
 many, up to `--states`. The best result is kept, so that more states never find less.
+
+`--truths` searches a simulated cart with the numbers of each drawn truth (truths.py), from 0 m only and with
+1000 states unless `--states` says otherwise. Its latency has no jitter. Each score is written to
+truth_references/ when it is found; the ones that are there are not searched again.
 """
 
 import argparse
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import as_completed
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -36,7 +42,9 @@ import yaml
 from best_score.beam import held, landed, risk
 from best_score.cart import MOST, KnownCart, hanging, wrapped
 from best_score.swing_up import GENERATIONS, evolved, lacking, pushed
-from common import option_parser, read_json, write_json
+from common import option_parser, positive_int, processes, read_json, share, write_json
+from truth_references import Draw, add_reference, known_references
+from truths import REPORTED, Truth, simulated_cart
 
 from cartpole_rl.envs.build import simulated_env
 from cartpole_rl.errors import CartPoleError, ConfigError
@@ -52,7 +60,9 @@ STARTS = (-0.1, -0.05, 0.0, 0.05, 0.1)  # m: an evaluation places the cart withi
 POLES = ("medium", "large")
 LENGTHS = tuple(tenths / 10 for tenths in range(2, 11))  # m, of the length experiment
 FIRST_RUNG, RUNG = 1000, 3  # states of the first search, and the factor to the next
+WIDEST = 3000  # states, unless given
 LANDED = 4  # populations whose winners land
+HELD = 2  # landings that continue to the end of the episode
 
 
 # the search
@@ -68,7 +78,8 @@ def search(cart: KnownCart, position: float, states: int, generations: int = GEN
         swings = swings.at(torch.arange(LANDED))
         for swing, arrival in zip(pushed(cart, swings.pushes, cart.steps), swings.arrival, strict=True):
             sequences += landed(cart, position, swing.tolist(), int(arrival), rung)
-        found.append(held(cart, position, min(sequences, key=partial_loss(cart, position))))
+        sequences.sort(key=partial_loss(cart, position))
+        found += [held(cart, position, sequence) for sequence in sequences[:HELD]]
     return max(found, key=lambda actions: float(cart.run(cart.hanging(position), actions).points))
 
 
@@ -157,6 +168,36 @@ def reference(config: TrainConfig, states: int) -> dict[str, Any]:
     }
 
 
+def truth_config(truth: Truth) -> TrainConfig:
+    """Return the settings of a simulated cart with the numbers of a truth."""
+    cart = {**simulated_cart(truth), "latency_jitter": 0.0}  # a search cannot foresee draws
+    pole = {name: cart.pop(name) for name in Pole.model_fields}
+    friction = {"cart_friction": "stribeck", "pole_friction": "bearing"}
+    choices = {"cart": cart, "pole": {"choices": {"truth": pole}}, "randomization": "none"}
+    return load_settings(TrainConfig, {**choices, **friction})
+
+
+def truth_reference(states: int, truth: Truth) -> dict[str, Any]:
+    """Return the best score found on the simulated cart of a truth from 0 m, and the cost of the search."""
+    config, started = truth_config(truth), time.process_time()
+    actions = search(KnownCart(config, compiled=True), 0.0, states)
+    score = round(sum(replay(config, 0.0, actions).points), 1)
+    return {"score": score, "states": states, "seconds": round(time.process_time() - started, 1)}
+
+
+def search_truths(draw: Draw, count: int, states: int, jobs: int) -> None:
+    """Search the references of the first truths of a draw that are not known, and write each when found."""
+    truths = draw.truths(count)
+    known = known_references(draw, truths)
+    numbers = [number for number, score in enumerate(known) if score is None]
+    with processes(jobs) as pool:
+        searches = {pool.submit(truth_reference, states, truths[number]): number for number in numbers}
+        for done in as_completed(searches):
+            number, found = searches[done], done.result()
+            add_reference(draw, number, truths[number], found)
+            print(f"truth {number}: {found['score']:.0f}, {found['seconds']:.0f} s", flush=True)
+
+
 # the command
 
 
@@ -203,11 +244,26 @@ def main() -> None:
     """Search, print the scores, and add them to a JSON file whose keys are the names of the plants."""
     parser = option_parser(__doc__)
     parser.add_argument("overrides", nargs="*", help="overrides of cartpole-train")
-    parser.add_argument("--states", type=int, default=3000, help="of the widest search (3000)")
+    parser.add_argument("--states", type=int, help="of the widest search (3000; with --truths 1000)")
     parser.add_argument("--length", type=float, metavar="M", help="a uniform rod of M metres as the pole")
     parser.add_argument("--all", action="store_true", help="both poles and rods of 0.2 to 1.0 m")
+    parser.add_argument("--truths", type=positive_int, metavar="N", help="the first N drawn truths")
+    parser.add_argument("--seed", type=int, default=REPORTED, help=f"of the truths ({REPORTED})")
+    parser.add_argument(
+        "--wider",
+        type=share,
+        default=0.0,
+        metavar="SHARE",
+        help="widens their ranges, as in zero_shot.py (0)",
+    )
+    parser.add_argument("--jobs", type=positive_int, default=1, help="truths searched at the same time (1)")
     options = parser.parse_args()
     torch.set_num_threads(1)
+    if options.truths:
+        draw = Draw(options.seed, options.wider)
+        search_truths(draw, options.truths, options.states or FIRST_RUNG, options.jobs)
+        return
+    options.states = WIDEST if options.states is None else options.states
     try:
         configs = plants(options)
     except CartPoleError as error:

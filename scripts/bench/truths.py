@@ -6,15 +6,20 @@ covers the wider ranges in which identification has to work (identification.py).
 """
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
 
+from cartpole_rl.choices import choice
+from cartpole_rl.emulator.encoders import CART_METRES
+from cartpole_rl.emulator.firmware import SOFT_LIMIT
+from cartpole_rl.emulator.physics import AT_REST
 from cartpole_rl.emulator.settings import EmulatorSettings
+from cartpole_rl.physics.parameters import CartParameters
 
-COMPARED, REPORTED = (
-    0,
-    1000,
-)  # seeds: settings were compared on the first one's carts; report the second one's
+COMPARED = 0  # seed of the carts on which settings are compared
+REPORTED = 2026  # seed of the carts that are reported; no setting was chosen on them
+TUNED = 2027  # seed of the carts on which fine-tuning is reported
 IDENTIFIED = 2026  # seed of the carts of docs/results/identification.md
 CART_MASS, CART_VISCOUS, CART_COULOMB = 0.703, 0.5, 0.5  # nominal: kg, N s/m, N (conf/cart/ip02.yaml)
 POLE_MASS, POLE_COM, POLE_INERTIA = 0.127, 0.1778, 1.199e-3  # nominal: kg, m, kg m^2 (conf/pole/medium.yaml)
@@ -68,6 +73,29 @@ def widened(bounds: tuple[float, float], share: float, smallest: float = -math.i
     low, high = bounds
     margin = share * (high - low)
     return max(low - margin, smallest), high + margin
+
+
+def simulated_cart(truth: Mapping[str, object]) -> dict[str, float]:
+    """Return the simulator's parameters of the cart and its pole for a truth. Some are nominal.
+
+    The simulator's `stribeck_velocity` is the speed below which the emulator applies the breakaway friction,
+    and its track ends at the soft limit.
+    """
+    settings = EmulatorSettings(**truth).model_dump()
+    left, right = settings["cart_coulomb_left"], settings["cart_coulomb_right"]
+    a, b, c = settings["force_curve"]
+    same = {name: settings[name] for name in CartParameters.names() if name in settings}
+    return {
+        **choice("cart/ip02"),
+        **same,
+        "cart_coulomb": (left + right) / 2,
+        "cart_coulomb_asymmetry": (right - left) / (right + left),
+        "stribeck_velocity": AT_REST,
+        "track_half_length": settings["track_half_length"] - SOFT_LIMIT * CART_METRES,
+        "force_quadratic": a,
+        "force_linear": b,
+        "force_offset": c,
+    }
 
 
 def identification_truths(count: int) -> list[dict[str, object]]:

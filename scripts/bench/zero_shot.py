@@ -1,185 +1,227 @@
 #!/usr/bin/env python
 """How well do agents drive emulated carts that they never saw?
 
-    scripts/bench/zero_shot.py runs/train/a runs/train/b --truths 20 --starts 5 --jobs 2 --json zero_shot.json
-    scripts/bench/zero_shot.py runs/train/a runs/train/b --wider 0.333 --json wider.json
+    scripts/bench/zero_shot.py runs/train/a runs/train/b --jobs 2 --json zero_shot.json
+    scripts/bench/zero_shot.py runs/train/a runs/train/b --wider 0.333 --jobs 2 --json wider.json
 
-The last checkpoint of each agent drives the same `--truths` carts, `--starts` episodes on each. Every cart
-is a separate process with MuJoCo physics, driven over its serial port. A ratio is a score divided by the
-same agent's mean score over 20 starts on the nominal simulated cart. An episode with a score below 500 is
+The last checkpoint of each agent drives the same `--truths` carts, `--starts` episodes on each. A cart is a
+separate process with MuJoCo physics, driven over its serial port; it is new for each agent and homes once. A
+fraction is the mean score on a cart divided by the reference of the same cart (reference.py --truths), the
+best score that a search with full knowledge found on a simulated cart with the same numbers. A cart is beaten
+if an episode scores more than its reference, which is then too low. An episode with a score below 500 is
 lost. An episode that cannot be driven, because homing fails, has no score and is counted separately.
 
 The carts are drawn inside the ranges of `randomization=wide`, except for the stiction ratio, which training
 does not vary. With `--wider` most carts have some numbers outside those ranges. Settings were compared on
 the carts of `--seed 0`, so scores on those carts are biased: report the carts of another seed.
 
-The JSON file is written after each agent. If it exists, the agents that it holds are not driven again.
+The JSON file is written after each cart. If it exists, the carts that it holds are not driven again.
 """
 
 import argparse
 import json
-import math
-import multiprocessing
-from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Iterator
+from concurrent.futures import as_completed
 from contextlib import closing
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import LOST_SCORE, option_parser, positive_int, print_table, read_json, write_json
-from numpy.typing import NDArray
-from truths import COMPARED, REPORTED, Truth, draw_truths
+from common import (
+    LOST_SCORE,
+    min_median_max,
+    option_parser,
+    positive_int,
+    print_table,
+    processes,
+    read_json,
+    share,
+    write_json,
+)
+from truth_references import Draw, known_references, note_missing
+from truths import COMPARED, REPORTED, Truth
 
 from cartpole_rl.checking import checked
 from cartpole_rl.emulator.settings import EmulatorSettings
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.errors import PlantError
-from cartpole_rl.evaluation.episodes import run_episodes
+from cartpole_rl.evaluation.episodes import Policy, run_episodes
 from cartpole_rl.reporting.table import Cell
 from cartpole_rl.workflows.agents import TrainedAgent, trained_agent
-from cartpole_rl.workflows.build import evaluated_env, evaluated_settings, use_threads
+from cartpole_rl.workflows.build import evaluated_env, evaluated_settings
 from cartpole_rl.workflows.config import EvaluateConfig
 
-NOMINAL_STARTS = 20
-DRAW = ("truths", "starts", "seed", "wider")  # the options that decide which episodes are driven
+Scores = list[float | None]  # of the episodes on one cart; None for one that was not driven
+DRAW = ("seed", "wider", "starts")  # the options that decide which episodes are driven
+Driven = dict[str, dict[int, Scores]]  # by run folder and number of the cart
+
+
+# driving
 
 
 @cache
-def agent_of(run: Path) -> TrainedAgent:
+def agent_of(run: str) -> TrainedAgent:
     """Return the agent of a run folder's last checkpoint."""
-    return trained_agent(run)
+    return trained_agent(Path(run))
 
 
-def mean_score(run: Path, plant: dict[str, Any], truth: Truth, episodes: int, seed: int = 1) -> float:
-    """Return the mean score of the agent's last checkpoint on a plant; the seed decides the starts."""
+def drive(run: str, truth: Truth, starts: int) -> Scores:
+    """Return the scores of the agent of `run` on a new emulated cart."""
     settings = {
         "run": run,
-        "episodes": episodes,
-        "plant": plant,
+        "episodes": starts,
+        "plant": {"kind": "emulated"},
         "emulator": EmulatorSettings(**truth),
         "randomization": {},
         "parameters": None,
-        "seed": seed,
+        "seed": 1,
         "label": "",
         "threads": 1,
     }
     config, agent = checked(EvaluateConfig, settings), agent_of(run)
     with closing(evaluated_env(evaluated_settings(agent.training, config), config, print)) as env:
-        return float(np.mean([each.score.sum() for each in run_episodes(env, agent.policy, episodes)]))
+        return [episode_score(env, agent.policy, truth) for _ in range(starts)]
 
 
-def emulated_score(run: Path, job: tuple[Truth, int]) -> float:
-    """Return the score of one episode, given (truth, seed); NaN if the cart cannot be driven."""
-    truth, seed = job
+def episode_score(env: CartPoleEnv, policy: Policy, truth: Truth) -> float | None:
+    """Return the score of one episode; None if the cart cannot be driven."""
     try:
-        return mean_score(run, {"kind": "emulated"}, truth, 1, seed)
+        (episode,) = run_episodes(env, policy, 1)
     except PlantError as error:  # high friction can prevent homing
-        print(f"not driven, seed {seed}: {error}; {json.dumps(truth)}", flush=True)
-        return math.nan
+        print(f"not driven: {error}; {json.dumps(truth)}", flush=True)
+        return None
+    return float(episode.score.sum())
 
 
-def emulated_scores(run: Path, truths: Sequence[Truth], starts: int, jobs: int) -> NDArray[np.float64]:
-    """Return scores [truths, starts], driving `jobs` carts at once; NaN for episodes that were not driven."""
-    work = [(truth, 1 + start) for truth in truths for start in range(starts)]
-    drive = partial(emulated_score, run)
-    if jobs == 1:
-        return np.reshape(list(map(drive, work)), (len(truths), starts))
-    spawn = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(jobs, spawn, initializer=use_threads, initargs=(1,)) as pool:
-        return np.reshape(list(pool.map(drive, work)), (len(truths), starts))
+def drive_missing(
+    driven: Driven, runs: list[str], truths: list[Truth], starts: int, jobs: int
+) -> Iterator[tuple[str, int]]:
+    """Drive each cart that `driven` does not hold and add its scores; yield its agent and number."""
+    work = [(run, number) for number in range(len(truths)) for run in runs if number not in driven[run]]
+    with processes(jobs) as pool:
+        episodes = {pool.submit(drive, run, truths[number], starts): (run, number) for run, number in work}
+        for done in as_completed(episodes):
+            run, number = episodes[done]
+            driven[run][number] = done.result()
+            yield run, number
 
 
-def judge(run: Path, draw: dict[str, Any], truths: list[Truth], jobs: int) -> dict[str, Any]:
-    """Return all figures of one agent, as the JSON file holds them."""
-    nominal = mean_score(run, agent_of(run).training.plant.model_dump(), {}, NOMINAL_STARTS)
-    scores = emulated_scores(run, truths, draw["starts"], jobs)
+# figures
+
+
+def cart_figures(number: int, truth: Truth, reference: float | None, scores: Scores) -> dict[str, Any]:
+    """Return the figures of one cart; `score` and `fraction` are None where they are not known."""
+    driven = [score for score in scores if score is not None]
+    score = float(np.mean(driven)) if driven else None
+    known = reference is not None and score is not None
     return {
-        "run": str(run),
-        **draw,
-        "nominal": nominal,
-        "carts": [cart_figures(truth, row, nominal) for truth, row in zip(truths, scores, strict=True)],
-    }
-
-
-def cart_figures(truth: Truth, scores: NDArray[np.float64], nominal: float) -> dict[str, Any]:
-    """Return the figures of one cart; the ratios are None if no episode could be driven."""
-    driven = scores[np.isfinite(scores)]
-    return {
+        "cart": number,
         "truth": truth,
-        "scores": [float(each) if np.isfinite(each) else None for each in scores],
-        "mean_ratio": float(driven.mean()) / nominal if len(driven) else None,
-        "worst_ratio": float(driven.min()) / nominal if len(driven) else None,
-        "lost": int((driven < LOST_SCORE).sum()),
+        "reference": reference,
+        "scores": scores,
+        "score": score,
+        "fraction": score / reference if known else None,
+        "beaten": known and max(driven) > reference,
+        "lost": sum(each < LOST_SCORE for each in driven),
         "not_driven": len(scores) - len(driven),
     }
 
 
-def cart_row(number: int, cart: dict[str, Any]) -> dict[str, Cell]:
-    """Return the table row of one cart."""
-    truth = cart["truth"]
+def agent_figures(run: str, carts: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return the figures of one agent; a fraction is None if no cart has one."""
+    fractions = [cart["fraction"] for cart in carts if cart["fraction"] is not None]
+    episodes = sum(len(cart["scores"]) - cart["not_driven"] for cart in carts)
+    lost = sum(cart["lost"] for cart in carts)
     return {
-        "cart": number,
-        "viscous": truth["cart_viscous"],
-        "coulomb": (truth["cart_coulomb_left"] + truth["cart_coulomb_right"]) / 2,
-        "mean ratio": cart["mean_ratio"],
-        "worst ratio": cart["worst_ratio"],
-        "lost": cart["lost"],
-        "not driven": cart["not_driven"],
+        "run": run,
+        "mean_fraction": float(np.mean(fractions)) if fractions else None,
+        "worst_fraction": min(fractions, default=None),
+        "lost": lost,
+        "lost_share": lost / episodes if episodes else None,
+        "not_driven": sum(cart["not_driven"] for cart in carts),
+        "beaten": sum(cart["beaten"] for cart in carts),
+        "episodes": episodes,
+        "carts": carts,
     }
 
 
-def agent_row(result: dict[str, Any]) -> dict[str, Cell]:
-    """Return the table row of one agent; its ratios are those of the carts that could be driven."""
-    carts = result["carts"]
-    means = [cart["mean_ratio"] for cart in carts if cart["mean_ratio"] is not None]
-    worst = [cart["worst_ratio"] for cart in carts if cart["worst_ratio"] is not None]
+def all_figures(driven: Driven, truths: list[Truth], references: list[float | None]) -> list[dict[str, Any]]:
+    """Return the figures of every agent."""
+    return [
+        agent_figures(
+            run,
+            [
+                cart_figures(number, truths[number], references[number], carts[number])
+                for number in sorted(carts)
+            ],
+        )
+        for run, carts in driven.items()
+    ]
+
+
+def agent_row(agent: dict[str, Any]) -> dict[str, Cell]:
+    """Return the table row of one agent."""
     return {
-        "run": result["run"],
-        "nominal": f"{result['nominal']:.0f}",
-        "mean ratio": float(np.mean(means)) if means else None,
-        "worst cart": min(means, default=None),
-        "worst start": min(worst, default=None),
-        "lost": sum(cart["lost"] for cart in carts),
-        "not driven": sum(cart["not_driven"] for cart in carts),
-        "episodes": sum(len(cart["scores"]) for cart in carts),
+        "run": agent["run"],
+        "carts": len(agent["carts"]),
+        "mean fraction": agent["mean_fraction"],
+        "worst cart": agent["worst_fraction"],
+        "lost": agent["lost"],
+        "lost share": agent["lost_share"],
+        "not driven": agent["not_driven"],
+        "beaten": agent["beaten"],
     }
 
 
-def earlier_results(file: Path | None, draw: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return the results in the JSON file; exit if they are of other carts or starts."""
+def overall_rows(agents: list[dict[str, Any]]) -> list[dict[str, Cell]]:
+    """Return the table rows with minimum, median and maximum over the agents."""
+    decimals = {"mean_fraction": 3, "worst_fraction": 3, "lost": 0, "lost_share": 4, "not_driven": 0}
+    figures = {name: [agent[name] for agent in agents] for name in decimals}
+    return [
+        {"figure": name.replace("_", " "), "agents": len(values), **min_median_max(values, decimals[name])}
+        for name, values in figures.items()
+        if None not in values
+    ]
+
+
+def note_beaten(agents: list[dict[str, Any]]) -> None:
+    """Print how many references are too low, if any."""
+    if beaten := {cart["cart"] for agent in agents for cart in agent["carts"] if cart["beaten"]}:
+        numbers = ", ".join(map(str, sorted(beaten)))
+        print(f"the references of {len(beaten)} truths are too low, an agent scored more: {numbers}")
+
+
+# the command
+
+
+def earlier_scores(file: Path | None, draw: dict[str, Any], count: int) -> Driven:
+    """Return the scores of the first `count` carts in the JSON file; exit if they are of another draw."""
     if file is None or not file.exists():
-        return []
-    results = read_json(file)
-    for result in results:
-        if others := [f"--{key} {result.get(key)}" for key in draw if result.get(key) != draw[key]]:
-            raise SystemExit(f"{file} was made with {', '.join(others)}: use that, or another --json file")
-    return results
-
-
-def share(text: str) -> float:
-    """Convert `--wider` to a number from 0 to 1; beyond 1 some carts would have no mass."""
-    if not 0 <= (value := float(text)) <= 1:
-        raise argparse.ArgumentTypeError(f"{text} is not a share from 0 to 1")
-    return value
+        return {}
+    known = read_json(file)
+    if others := [f"--{key} {known.get(key)}" for key in draw if known.get(key) != draw[key]]:
+        raise SystemExit(f"{file} was made with {', '.join(others)}: use that, or another --json file")
+    return {
+        agent["run"]: {cart["cart"]: cart["scores"] for cart in agent["carts"] if cart["cart"] < count}
+        for agent in known["agents"]
+    }
 
 
 def parse_options() -> argparse.Namespace:
     """Return the command-line options."""
     parser = option_parser(__doc__)
-    parser.add_argument("runs", nargs="+", type=Path, help="run folders of cartpole-train")
+    parser.add_argument("runs", nargs="+", help="run folders of cartpole-train")
     parser.add_argument(
-        "--truths", type=positive_int, default=20, help="number of carts, the same for every agent (20)"
+        "--truths", type=positive_int, default=100, help="number of carts, the same for every agent (100)"
     )
-    parser.add_argument(
-        "--starts", type=positive_int, default=1, help="episodes on each cart, each from another start (1)"
-    )
+    parser.add_argument("--starts", type=positive_int, default=5, help="episodes on each cart (5)")
     parser.add_argument(
         "--seed",
         type=int,
         default=REPORTED,
         help=f"decides which carts are drawn: {REPORTED} (default) for reports; {COMPARED} gives the carts "
-        "on which settings were compared",
+        "on which settings are compared",
     )
     parser.add_argument(
         "--wider",
@@ -195,19 +237,21 @@ def parse_options() -> argparse.Namespace:
 def main() -> None:
     """Judge each agent, print the tables and write the figures."""
     options = parse_options()
-    use_threads(1)
-    draw = {name: getattr(options, name) for name in DRAW}
-    truths = draw_truths(options.seed, options.truths, options.wider)
-    results = earlier_results(options.json, draw)
-    for run in options.runs:
-        if str(run) in [result["run"] for result in results]:
-            continue
-        results.append(judge(run, draw, truths, options.jobs))
-        write_json(options.json, results)
-        print(run)
-        print_table([cart_row(number, cart) for number, cart in enumerate(results[-1]["carts"])])
-        print()
-    print_table([agent_row(result) for result in results])
+    draw, options_of_draw = Draw(options.seed, options.wider), {name: getattr(options, name) for name in DRAW}
+    truths = draw.truths(options.truths)
+    references = known_references(draw, truths)
+    note_missing(draw, references)
+    driven: Driven = {run: {} for run in options.runs}
+    driven |= earlier_scores(options.json, options_of_draw, options.truths)
+    for run, number in drive_missing(driven, options.runs, truths, options.starts, options.jobs):
+        print(f"{run}, cart {number}: {driven[run][number]}", flush=True)
+        write_json(options.json, {**options_of_draw, "agents": all_figures(driven, truths, references)})
+    agents = all_figures(driven, truths, references)
+    write_json(options.json, {**options_of_draw, "agents": agents})
+    print_table([agent_row(agent) for agent in agents])
+    print()
+    print_table(overall_rows(agents))
+    note_beaten(agents)
 
 
 if __name__ == "__main__":

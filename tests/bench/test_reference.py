@@ -10,6 +10,7 @@ import torch
 from best_score.cart import KnownCart
 from best_score.swing_up import PUSHES, lacking, pushed
 from common import REFERENCES
+from truths import REPORTED, draw_truths
 
 from cartpole_rl.physics.dynamics import State
 from cartpole_rl.tasks.rewards import UPRIGHT_ANGLE
@@ -101,6 +102,20 @@ def test_only_a_symmetric_cart_is_mirrored(cart: KnownCart) -> None:
     assert not KnownCart(
         reference.composed(["actions.motors=[-250,0,200]", "agent.mirrored=false"])
     ).symmetric
+
+
+def test_the_cart_of_a_truth_is_searched_and_replayed_with_its_numbers() -> None:
+    (truth,) = draw_truths(REPORTED, 1)
+    config = reference.truth_config(truth)
+    cart = KnownCart(config)
+    assert not cart.symmetric
+    assert float(cart.one.cart_mass) == pytest.approx(truth["cart_mass"])
+    assert float(cart.one.latency) == pytest.approx(truth["latency"])
+    coulomb = cart.one.cart_coulomb * (1 + cart.one.cart_coulomb_asymmetry)
+    assert float(coulomb) == pytest.approx(truth["cart_coulomb_right"])
+    actions = [8] * 6 + [0] * 12 + [8] * 4
+    points = cart.run(cart.hanging(0.0), actions).points
+    assert sum(reference.replay(config, 0.0, actions).points) == pytest.approx(float(points), abs=1e-4)
 
 
 def test_references_are_of_both_poles_and_better_than_the_thesis_asks() -> None:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import truths as script
-from truths import COMPARED, REPORTED, Truth, draw_truths
+from truths import COMPARED, REPORTED, Truth, draw_truths, simulated_cart
 
 from cartpole_rl.choices import choice
 from cartpole_rl.emulator.settings import EmulatorSettings
@@ -12,15 +12,10 @@ from cartpole_rl.randomization.ranges import Range
 CARTS = 200
 
 
-def simulated(truth: Truth) -> dict[str, float]:
-    """Return a truth with the names of the simulator's parameters."""
-    left, right = truth["cart_coulomb_left"], truth["cart_coulomb_right"]
-    others = {name: value for name, value in truth.items() if not name.startswith("cart_coulomb")}
-    return {
-        **others,
-        "cart_coulomb": (left + right) / 2,
-        "cart_coulomb_asymmetry": (right - left) / (right + left),
-    }
+def drawn(truth: Truth) -> dict[str, float]:
+    """Return the drawn numbers of a truth with the names of the simulator's parameters."""
+    names = {name.removesuffix("_left").replace("coulomb_right", "coulomb_asymmetry") for name in truth}
+    return {name: value for name, value in simulated_cart(truth).items() if name in names}
 
 
 def trained_on() -> dict[str, tuple[float, float]]:
@@ -44,7 +39,7 @@ def outside(truths: list[Truth]) -> list[set[str]]:
     return [
         {
             name
-            for name, value in simulated(truth).items()
+            for name, value in drawn(truth).items()
             if name in bounds and not bounds[name][0] <= value <= bounds[name][1]
         }
         for truth in truths
@@ -53,7 +48,7 @@ def outside(truths: list[Truth]) -> list[set[str]]:
 
 def test_carts_lie_inside_the_ranges_of_training() -> None:
     truths = draw_truths(REPORTED, CARTS)
-    assert set(simulated(truths[0])) - set(trained_on()) == {"cart_stiction_ratio"}
+    assert set(drawn(truths[0])) - set(trained_on()) == {"cart_stiction_ratio"}
     assert outside(truths) == [set()] * CARTS
 
 
@@ -61,14 +56,14 @@ def test_wider_carts_lie_outside_those_ranges_and_inside_the_wider_ones() -> Non
     truths = draw_truths(REPORTED, CARTS, 1 / 3)
     beyond = outside(truths)
     assert np.mean([bool(names) for names in beyond]) > 0.9
-    assert set.union(*beyond) == set(trained_on()) & set(simulated(truths[0]))
+    assert set.union(*beyond) == set(trained_on()) & set(drawn(truths[0]))
     for name, (low, high) in {**script.UNIFORM, "cart_coulomb_asymmetry": script.COULOMB_ASYMMETRY}.items():
-        values = [simulated(truth)[name] for truth in truths]
+        values = [drawn(truth)[name] for truth in truths]
         lowest, highest = low - (high - low) / 3, high + (high - low) / 3
         assert min(values) >= max(lowest, script.SMALLEST.get(name, lowest)) - 1e-12
         assert highest - 0.05 * (high - low) < max(values) <= highest + 1e-12
     for name, (low, high) in script.LOG_UNIFORM.items():
-        values, factor = [simulated(truth)[name] for truth in truths], (high / low) ** (1 / 3)
+        values, factor = [drawn(truth)[name] for truth in truths], (high / low) ** (1 / 3)
         assert low / factor <= min(values) < low < high < max(values) <= high * factor
 
 

@@ -2,16 +2,19 @@
 
 import math
 from collections.abc import Sequence
+from functools import cache, partial
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from cartpole_rl.compilation import Compiled
 from cartpole_rl.envs.build import randomizer
 from cartpole_rl.physics.actuator import static_force
 from cartpole_rl.physics.dynamics import State
+from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import GRAVITY, CartParameters
-from cartpole_rl.plants.simulation import Carts, Inputs, commands_under_way, encoder_counts, run_carts
+from cartpole_rl.plants.simulation import Carts, Inputs, Period, commands_under_way, encoder_counts, run_carts
 from cartpole_rl.tasks.features import (
     Measured,
     measured_position,
@@ -22,6 +25,7 @@ from cartpole_rl.workflows.config import TrainConfig
 
 MOST = 1 + 2 * BONUS  # points of a step, standing still in the middle
 LOST = 1e9  # points: the loss of leaving the track, more than any score
+COMPILED_SIZES = (1000, 2700, 9000)  # carts in a batch
 ASYMMETRIES = ("track_tilt", "cart_coulomb_asymmetry", "force_asymmetry", "angle_offset")
 
 
@@ -44,10 +48,10 @@ class Nodes(NamedTuple):
 
 
 class KnownCart:
-    """The nominal cart of a config."""
+    """The nominal cart of a config; `compiled` makes a search faster and needs a C++ compiler."""
 
-    def __init__(self, config: TrainConfig) -> None:
-        self.config = config
+    def __init__(self, config: TrainConfig, compiled: bool = False) -> None:
+        self.config, self.compiled = config, compiled
         self.randomizer = randomizer(config)
         self.models = config.models(config.plant)
         self.motors = torch.tensor(config.actions.motors)
@@ -89,13 +93,26 @@ class KnownCart:
         period, count = self.config.control_period, len(action)
         carts = Carts(self.table(count), nodes.motion, nodes.drive)
         inputs = Inputs(self.motors[action].unsqueeze(0), torch.zeros(3, count))
-        substeps = self.config.plant.substeps
-        after = run_carts(carts, inputs, models=self.models, period=period, substeps=substeps)
+        after = self._run(carts, inputs)
         x, theta = measured_position(after.counts)
         x_dot, theta_dot = measured_velocity(after.counts, nodes.counts, torch.full((count,), period))
         points = score(Measured(x, x_dot, theta, theta_dot), self.config.task.x_max)
         following = Nodes(after.motion, after.drive, after.counts, nodes.points + points)
         return following, points, ~after.off_track[0]
+
+    def _run(self, carts: Carts, inputs: Inputs) -> Period:
+        """Run the carts for a period; many carts run compiled, in batches of few sizes, if it is `compiled`.
+
+        One cart never does: it must move as it does in the environment, to the bit.
+        """
+        count, period, substeps = carts.table.shape[1], self.config.control_period, self.config.plant.substeps
+        size = next((size for size in COMPILED_SIZES if size >= count), 0)
+        if not self.compiled or count == 1 or not size:
+            return run_carts(carts, inputs, models=self.models, period=period, substeps=substeps)
+        rows = torch.arange(size).clamp(max=count - 1)
+        padded = (type(each)(*(value[:, rows] for value in each)) for each in (carts, inputs))
+        after = compiled_run(self.models, period, substeps, size)(*padded)
+        return Period(*(value[:, :count] for value in after))
 
     def run(self, nodes: Nodes, actions: Sequence[int]) -> Nodes:
         """Return one node after a sequence of actions, which ends early if the cart leaves the track."""
@@ -104,6 +121,12 @@ class KnownCart:
             if not on_track:
                 break
         return nodes
+
+
+@cache
+def compiled_run(models: Models, period: float, substeps: int, size: int) -> Compiled[Period]:
+    """Return `run_carts` for `size` carts, compiled; the same for every cart with these models."""
+    return Compiled(partial(run_carts, models=models, period=period, substeps=substeps))
 
 
 def hanging(position: float) -> State:
