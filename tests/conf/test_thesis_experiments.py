@@ -59,7 +59,7 @@ BOTH: Table = {
     "agent.loss": ("l2", SILENT),
     "agent.target_tau": (None, "4.1.2: the network is copied"),
     "agent.average_decay": (None, "not named"),
-    "learning.carry": (False, SILENT),
+    "learning.carry": (True, UNREAD),
     "buffer.kind": ("uniform", "5: typically equally distributed"),
     "buffer.alpha": (0.0, UNREAD),
     "buffer.beta": ([1.0, 1.0], UNREAD),
@@ -76,7 +76,7 @@ BOTH: Table = {
     "learning.epsilon": ([0.1, 0.1], "table 6.2"),
     "learning.epsilon_transitions": (500_000, UNREAD),
     "learning.evaluations": (10, SILENT),
-    "learning.evaluation_episodes": (20, SILENT),
+    "learning.evaluation_episodes": (100, SILENT),
     "learning.checkpoint_interval": (2, SILENT),
     "cart_friction.parameters": ({}, "6.3"),
     "pole_friction.parameters": ({}, "6.3"),
@@ -153,7 +153,7 @@ OF: dict[str, Table] = {
         "learning.batch_size": (256, "table 6.2"),
     },
 }
-OF_THE_RUN = {"seed", "label", "threads", "compile", "resume"}  # not of the experiment
+OF_THE_RUN = {"seed", "label", "device", "threads", "compile", "resume"}  # not of the experiment
 EXPECTED = {
     name: {**BOTH, **{f"cart.{key}": row for key, row in CART.items()}, **own} for name, own in OF.items()
 }
