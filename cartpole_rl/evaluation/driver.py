@@ -63,17 +63,15 @@ class Question:
 class Driver:
     """A context manager of a process that drives the cart of `make_env` with the network of `make_policy`.
 
-    The process calls both, and compiles them before the first episode if `compiled`. `confirm` is called in
-    this process, which has the terminal, while it waits for a result. For a cart with its own clock,
-    `real_time`, the process asks for real-time priority; `has_priority` says if it got it. Raises the errors
-    of `make_env`.
+    The process calls both. `confirm` is called in this process, which has the terminal, while it waits for a
+    result. For a cart with its own clock, `real_time`, the process asks for real-time priority;
+    `has_priority` says if it got it. Raises the errors of `make_env`.
     """
 
     def __init__(
         self,
         make_env: MakeEnv,
         make_policy: Callable[[], nn.Module],
-        compiled: bool,
         real_time: bool,
         confirm: Confirm = nobody,
     ) -> None:
@@ -82,7 +80,7 @@ class Driver:
         self._ours, theirs = context.Pipe()
         self._process = context.Process(
             target=_serve,
-            args=(theirs, make_env, make_policy, compiled, real_time, os.getpid()),
+            args=(theirs, make_env, make_policy, real_time, os.getpid()),
             daemon=True,
         )
         self._process.start()
@@ -157,7 +155,6 @@ def _serve(
     pipe: Connection,
     make_env: MakeEnv,
     make_policy: Callable[[], nn.Module],
-    compiled: bool,
     real_time: bool,
     parent: int,
 ) -> None:
@@ -168,9 +165,7 @@ def _serve(
     torch.set_num_threads(1)
     with suppress(_Ended, EOFError, ConnectionError):
         try:
-            _drive_on_demand(
-                pipe, make_env, DrivingPolicy(make_policy(), compiled), compiled, real_time, parent
-            )
+            _drive_on_demand(pipe, make_env, DrivingPolicy(make_policy()), real_time, parent)
         except CartPoleError as error:
             pipe.send(error)
         finally:
@@ -182,14 +177,11 @@ def _drive_on_demand(
     pipe: Connection,
     make_env: MakeEnv,
     policy: DrivingPolicy,
-    compiled: bool,
     real_time: bool,
     parent: int,
 ) -> None:
     """Drive an episode for each `DriveRequest` in the pipe, until it is closed."""
     with closing(make_env(partial(_ask, pipe))) as env:
-        if compiled:
-            env.hardware.compile_arithmetic()
         warm_up(env, policy)
         pipe.send(real_time and take_precedence())
         while True:
