@@ -37,7 +37,7 @@ MEMORY = 4  # steps, of an observation and the velocities in it
 def compare(tensors: CartPoleEnv, plain: CartPoleEnv, actions: Sequence[int], rounding: int = 0) -> int:
     """Drive both environments and compare every number of every step; return the number of steps.
 
-    A count may differ by `rounding` once in 50 steps, where float32 rounds it otherwise; the other numbers are
+    A count may differ by `rounding` once in 50 steps, where float32 rounds it otherwise; other numbers are
     then compared again when no observation contains it any more.
     """
     cart, present, percept = plain.one_cart, tensors.reset(), plain.one_cart.reset()
