@@ -4,7 +4,6 @@ The process waits for the weights of a policy, runs one episode, and sends it ba
 even during an episode, and every exit sets the motor to 0 and disarms the cart.
 """
 
-import gc
 import multiprocessing
 import os
 import signal
@@ -207,11 +206,6 @@ def _drive(env: CartPoleEnv, policy: DrivingPolicy, drive: DriveRequest, parent:
             chosen["action"] = torch.tensor([int(random.integers(actions))])
         return chosen
 
-    gc.collect()
-    gc.disable()  # garbage collection takes longer than a tick allows
-    try:
-        (episode,) = run_batch(env, act)
-    finally:
-        gc.enable()
+    (episode,) = run_batch(env, act)
     assert isinstance(env.plant, SerialPlant)
     return Driven(episode, env.plant.cart.statistics)

@@ -17,6 +17,7 @@ from torchrl.modules import QValueActor
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.evaluation.driving_policy import DrivingPolicy
 from cartpole_rl.plants.specs import OneCartPlant, tensordict_of
+from cartpole_rl.scheduling import no_garbage_collection
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.tasks.settings import NO_ACTION
@@ -83,24 +84,25 @@ def run_one(env: CartPoleEnv, policy: Policy) -> Episode:
     (origin,) = env.plant.origins()
     frames, steps, actions, motors = [cart.frame], [], [], []
     observation, done = first.observation, False
-    while not done:  # the cart waits for this loop; the rest is done afterwards
-        observed = torch.from_numpy(np.array([observation], np.float32))
-        action = int(choose(policy, tensordict_of({"observation": observed})))
-        actions.append(action)
-        motors.append(cart.sent_motor(action))
-        step = cart.step(action)
-        frames.append(cart.frame)
-        steps.append(step)
-        observation, (done,) = step.observation, step.done
-    env.plant.halt()  # a real cart would keep its last motor value
+    with no_garbage_collection():
+        while not done:  # the cart waits for this loop; the rest is done afterwards
+            observed = torch.from_numpy(np.array([observation], np.float32))
+            action = int(choose(policy, tensordict_of({"observation": observed})))
+            motors.append(cart.sent_motor(action))
+            step = cart.step(action)
+            actions.append(action)
+            frames.append(cart.frame)
+            steps.append(step)
+            observation, (done,) = step.observation, step.done
+        env.plant.halt()  # a real cart would keep its last motor value
     columns = {key: np.array([getattr(step, key) for step in steps])[:, 0] for key in _FROM_NEXT}
     columns["state"] = np.array([first.state, *(step.state for step in steps)])
     columns["counts"] = np.array([frame.counts for frame in frames])
+    columns["time"] = np.cumsum([0.0, *(frame.dt for frame in frames[1:])])
     columns["motor"] = np.array(motors)
     columns["guarded"] = columns["motor"] != np.array([cart.motor(action) for action in actions])
-    columns["time"] = np.cumsum([0.0, *(frame.dt for frame in frames[1:])])
     (truncated,), theta = step.truncated, step.state[2]
-    ending = _ending(env, actions[-1], truncated, theta)
+    ending = _ending(env, action, truncated, theta)
     return replace(_episode(columns, ending, env.hardware.guard is not None), origin=origin)
 
 
