@@ -11,11 +11,13 @@ those checks. If it is removed, replace it here with `torch.compile` and the `gu
 
 from collections.abc import Callable, Iterable, Sequence
 from itertools import chain, islice
+from types import BuiltinFunctionType
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
 from torch._inductor import standalone_compile
+from torch._ops import OpOverload
 from torch.fx import GraphModule
 from torch.fx.experimental.proxy_tensor import make_fx
 
@@ -53,12 +55,26 @@ def trace(
     return Trace(graph, *kinds)
 
 
+def bound(graph: GraphModule) -> GraphModule:
+    """Return `graph` with PyTorch's own functions for its operators, which are called in half the time.
+
+    Both are made of the same schemas, so their arguments are the same.
+    """
+    for node in graph.graph.nodes:
+        if isinstance(node.target, OpOverload):
+            function = getattr(torch, node.target._schema.name.removeprefix("aten::"), None)
+            if isinstance(function, BuiltinFunctionType):
+                node.target = function
+    graph.recompile()
+    return graph
+
+
 class Traced(Generic[Result]):
     """A `function` that takes tuples of tensors, named or plain, and returns another, as a graph.
 
     Its graph is that of the first call, whose shapes, types and devices all later calls must have; whatever
-    else `function` reads must not change. Without modules and tensordicts, a small network takes a quarter of
-    the time. No gradient flows through it, though the function may compute one.
+    else `function` reads must not change. No gradient flows through it, though the function may compute one.
+    Without modules and tensordicts, a small network takes a third of the time.
     """
 
     def __init__(self, function: Callable[..., Result]) -> None:
@@ -71,7 +87,7 @@ class Traced(Generic[Result]):
         """Return the function's result."""
         if self._call is None:
             traced = trace(self._function, arguments)
-            self._call, self._result = traced.graph.forward, traced.result
+            self._call, self._result = bound(traced.graph).forward, traced.result
         return self._result(self._call(*chain.from_iterable(arguments)))
 
 

@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch._ops import OpOverload
 from torch.fx import Node
 
 from cartpole_rl.compilation import trace
@@ -97,7 +98,7 @@ class Writer:
         named: Any = torch.fx.map_arg(node.kwargs, values.__getitem__)
         if node.target is operator.getitem:
             return arguments[0][arguments[1]]
-        assert isinstance(node.target, torch._ops.OpOverload)
+        assert isinstance(node.target, OpOverload)
         name = node.target._schema.name.removeprefix("aten::")
         if name in SHAPES:
             return SHAPES[name](*arguments, **named)

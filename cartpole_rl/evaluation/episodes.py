@@ -73,7 +73,7 @@ def run_batch(env: CartPoleEnv, policy: Policy) -> list[Episode]:
     """Return one episode of each cart, all from one reset."""
     if isinstance(env.plant, OneCartPlant):
         return [run_one(env, prepared(env, policy))]
-    return run_carts(env, policy)
+    return run_many(env, policy)
 
 
 @torch.no_grad()
@@ -107,7 +107,7 @@ def run_one(env: CartPoleEnv, policy: Policy) -> Episode:
 
 
 @torch.no_grad()
-def run_carts(env: CartPoleEnv, policy: Policy) -> list[Episode]:
+def run_many(env: CartPoleEnv, policy: Policy) -> list[Episode]:
     """Return one episode of each cart of any plant, all from one reset, on tensors."""
     current = env.reset()
     origins = env.plant.origins()

@@ -10,7 +10,7 @@ Three measurements, with one thread:
 - seconds per episode of 500 steps on an emulated lockstep cart, which includes its re-centring; the cart
   stands still, while a network of the default size computes its actions;
 - the host's part of a tick, from the arrival of a state to the end of writing its command: median, 99.9th
-  percentile and longest, alone and beside a process that multiplies matrices, as a learner does.
+  percentile and longest, alone and beside a process that multiplies matrices at a learner's priority.
 """
 
 import time
@@ -32,6 +32,7 @@ from cartpole_rl.envs.build import environment, shipped_settings
 from cartpole_rl.evaluation.driving_policy import DrivingPolicy
 from cartpole_rl.evaluation.episodes import run_episodes
 from cartpole_rl.plants.emulated import emulated_plant
+from cartpole_rl.scheduling import giving_precedence
 
 PEER = "CartPole-v1"
 OURS = ("cartpole_rl/SwingUp-v0", "cartpole_rl/Balance-v0")
@@ -65,11 +66,12 @@ class StandingStill:
 
 
 def multiply() -> None:
-    """Keep a core busy until the process ends."""
+    """Keep a core busy until the process ends, with the low priority of a fine-tuning's learner."""
     torch.set_num_threads(1)
     matrix = torch.rand(MATRIX, MATRIX)
-    while True:
-        matrix = torch.nn.functional.normalize(matrix @ matrix)
+    with giving_precedence():
+        while True:
+            matrix = torch.nn.functional.normalize(matrix @ matrix)
 
 
 @contextmanager
