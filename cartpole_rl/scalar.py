@@ -300,7 +300,7 @@ SHAPES: dict[str, Callable[..., Any]] = {
     "cat": lambda parts, dim=0: np.concatenate(parts, dim),
     "clone": placed,
     "select": lambda values, dim, place: placed(np.take(values, place, dim)),
-    "slice": lambda values, dim, start, end: np.take(
+    "slice": lambda values, dim=0, start=None, end=None: np.take(
         values, range(*slice(start, end).indices(values.shape[dim])), dim
     ),
     "split_with_sizes": lambda values, sizes, dim=0: np.split(values, np.cumsum(sizes)[:-1], dim),
