@@ -1,5 +1,6 @@
 """Scheduling priority of a whole process: driving a cart takes precedence over learning."""
 
+import gc
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -39,3 +40,15 @@ def giving_precedence() -> Iterator[None]:
     finally:
         with suppress(PermissionError):
             os.sched_setscheduler(0, policy, param)
+
+
+@contextmanager
+def no_garbage_collection() -> Iterator[None]:
+    """Collect no garbage within the `with`: it would take longer than a tick allows."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()

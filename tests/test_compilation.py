@@ -1,4 +1,4 @@
-"""A compiled function gives the results and the types of the plain one."""
+"""A compiled or traced function gives the results and the types of the plain one."""
 
 import shutil
 from typing import NamedTuple
@@ -6,7 +6,7 @@ from typing import NamedTuple
 import pytest
 import torch
 
-from cartpole_rl.compilation import Compiled, as_byte
+from cartpole_rl.compilation import Compiled, Traced, as_byte
 
 pytestmark = pytest.mark.skipif(shutil.which("g++") is None, reason="g++ is not installed: apt install g++")
 
@@ -36,8 +36,9 @@ def arguments(seed: int) -> tuple[State, tuple[torch.Tensor]]:
     return State(torch.rand(7, dtype=torch.float64), torch.rand(7, dtype=torch.float64)), (torch.arange(7),)
 
 
-def test_it_computes_the_same_in_every_call() -> None:
-    compiled = Compiled(move)
+@pytest.mark.parametrize("kind", [Compiled, Traced])
+def test_it_computes_the_same_in_every_call(kind: type[Compiled[Moved]] | type[Traced[Moved]]) -> None:
+    compiled = kind(move)
     for seed in range(3):
         result, expected = compiled(*arguments(seed)), move(*arguments(seed))
         assert isinstance(result, Moved)
@@ -50,6 +51,16 @@ def test_no_gradient_flows_through_it() -> None:
     state, steps = arguments(0)
     result = Compiled(move)(State(state.place.requires_grad_(), state.speed), steps)
     assert not result.state.requires_grad
+
+
+@pytest.mark.parametrize("kind", [Compiled, Traced])
+def test_one_tensor_may_be_two_arguments_of_the_first_call(kind: type[Compiled] | type[Traced]) -> None:
+    def difference(pair: tuple[torch.Tensor, torch.Tensor]) -> tuple[torch.Tensor]:
+        return (pair[0] - pair[1],)
+
+    compiled, first = kind(difference), torch.ones(3)
+    assert compiled((first, first))[0].tolist() == [0, 0, 0]
+    assert compiled((3 * first, first))[0].tolist() == [2, 2, 2]
 
 
 def test_flags_become_bytes() -> None:

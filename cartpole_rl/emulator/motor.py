@@ -22,9 +22,12 @@ class Motor:
         force = max(0.0, a * size * size + b * size + c)
         return force * (1 + settings.force_asymmetry) if motor > 0 else -force
 
-    def step(self, motor: int, seconds: float) -> float:
-        """Apply a motor value for `seconds`; return the force at the end, N."""
-        target = self.static_force(motor)
+    def decay(self, seconds: float) -> float:
+        """Return the share of the gap to the steady force that is left after `seconds`."""
         lag = self._settings.motor_time_constant
-        self.force = target + (self.force - target) * (math.exp(-seconds / lag) if lag else 0.0)
+        return math.exp(-seconds / lag) if lag else 0.0
+
+    def step(self, target: float, decay: float) -> float:
+        """Approach the steady force `target`, N, up to the share `decay` of the gap; return the force, N."""
+        self.force = target + (self.force - target) * decay
         return self.force

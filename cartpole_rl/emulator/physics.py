@@ -108,8 +108,9 @@ class CartPhysics:
         self._model.opt.timestep = step
         drag, friction = self._settings.pole_drag, self._model.dof_frictionloss
         applied, velocity = self._data.qfrc_applied, self._data.qvel
+        target, decay = self._motor.static_force(motor), self._motor.decay(step)
         for _ in range(steps):
-            applied[0] = self._motor.step(motor, step) + self._cogging(self._data.qpos[0])
+            applied[0] = self._motor.step(target, decay) + self._cogging(self._data.qpos[0])
             applied[1] = -drag * velocity[1] * abs(velocity[1])
             friction[0] = self._cart_friction(velocity[0])
             self._mj_step(self._model, self._data)

@@ -1,10 +1,13 @@
 """The environment: a plant under the hardware transform. `envs.build` builds it."""
 
+from functools import cached_property
+
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
 from cartpole_rl.envs.hardware import HardwareTransform
+from cartpole_rl.envs.one_cart import OneCart
 from cartpole_rl.plants.specs import Plant, tensordict_of
 
 
@@ -26,6 +29,11 @@ class CartPoleEnv(TransformedEnv):
     def hardware(self) -> HardwareTransform:
         """The transform above it."""
         return self.transform
+
+    @cached_property
+    def one_cart(self) -> OneCart:
+        """The same environment on plain numbers, for a plant of one cart. Raises ConfigError."""
+        return OneCart(self.plant, self.hardware)
 
     def step(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Step all carts; return `tensordict` with the outcome under "next". Nothing is checked."""

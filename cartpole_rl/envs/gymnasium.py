@@ -24,7 +24,7 @@ without bounds, as in conf/train.yaml:
 | 8, 9  | x_dot and theta_dot, a step ago   | as 1, 4 |
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium
@@ -84,28 +84,21 @@ class CartPoleGymnasium(gymnasium.Env[Array, np.int64]):
         self.observation_space, self.action_space = observation_space(self.env), action_space(self.env)
         self.render_mode = render_mode
         self.seeded = False  # the plant, from `np_random`
-        self._present: TensorDictBase
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Array, dict[str, Any]]:
         """Start an episode."""
         super().reset(seed=seed)
-        self._present = start_episodes(self, seed)
-        return first_row(self._present, "observation"), {}
+        seed_plant(self, seed)
+        return float32(self.env.one_cart.reset().observation), {}
 
     def step(self, action: np.int64) -> tuple[Array, float, bool, bool, dict[str, Any]]:
         """One control period."""
-        self._present.set("action", torch.tensor([int(action)]))
-        following = self.env.step(self._present).pop("next")
-        self._present = following.exclude("reward")
-        return (
-            first_row(following, "observation"),
-            float(first_row(following, "reward")[0]),
-            bool(first_row(following, "terminated")[0]),
-            bool(first_row(following, "truncated")[0]),
-            {key: float(first_row(following, key)[0]) for key in SCORES},
-        )
+        now = self.env.one_cart.step(int(action))
+        (reward,), (terminated,), (truncated,) = now.reward, now.terminated, now.truncated
+        scores = {"score": now.score[0], "score_upright": now.score_upright[0]}
+        return float32(now.observation), reward, terminated, truncated, scores
 
 
 class CartPoleVector(VectorEnv[Array, Array, Array]):
@@ -138,7 +131,8 @@ class CartPoleVector(VectorEnv[Array, Array, Array]):
     ) -> tuple[Array, dict[str, Any]]:
         """Start an episode on each cart; one seed serves all."""
         super().reset(seed=seed)
-        self._present = start_episodes(self, seed)
+        seed_plant(self, seed)
+        self._present = self.env.reset()
         return self._present["observation"].numpy().copy(), {}
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
@@ -170,17 +164,13 @@ def vector_info(last: Mapping[str, Array]) -> dict[str, Any]:
     return info
 
 
-def first_row(tensordict: TensorDictBase, key: str) -> Array:
-    """Return the first row of `key` as an array."""
-    return tensordict.get(key)[0].numpy().copy()
+def float32(numbers: Sequence[float]) -> Array:
+    """Return numbers as an array of float32."""
+    return np.array(numbers, np.float32)
 
 
-def start_episodes(wrapper: CartPoleGymnasium | CartPoleVector, seed: int | None) -> TensorDictBase:
-    """Return the first frames of new episodes.
-
-    The first ones and those after a new `seed` seed the plant's generator, and no other, from Gymnasium's.
-    """
+def seed_plant(wrapper: CartPoleGymnasium | CartPoleVector, seed: int | None) -> None:
+    """Before the first episodes and those after a new `seed`, seed the plant's generator from Gymnasium's."""
     if seed is not None or not wrapper.seeded:
         wrapper.env.set_seed(int(wrapper.np_random.integers(2**31)))
         wrapper.seeded = True
-    return wrapper.env.reset()

@@ -53,6 +53,8 @@ from cartpole_rl.plants.specs import Plant, tensordict_of
 from cartpole_rl.tasks.features import LENGTH_SCALE
 from cartpole_rl.tasks.settings import NO_ACTION, RewardSettings, TaskSettings
 
+Perception = Callable[[Previous[Tensor], PlantOutput[Tensor]], Percept[Tensor]]
+
 
 class HardwareTransform(Transform):
     """The transform over a `Plant`: counts to observations, rewards and scores; actions to motor values."""
@@ -73,15 +75,11 @@ class HardwareTransform(Transform):
         self.register_buffer("_inward", inward)
         self.guard = guard
         self.register_buffer("_by_action", torch.tensor([0, *motors], dtype=torch.int64))  # from NO_ACTION on
-        self._perceive: Callable[[Previous, PlantOutput], Percept] = partial(
+        self.first_perception = partial(perceive_first, settings=observation, guard=guard)
+        self.perception: Perception = partial(
             perceive, settings=observation, task=task, rewards=reward, guard=guard
         )
-        if compiled:
-            self.compile_arithmetic()
-
-    def compile_arithmetic(self) -> None:
-        """Compile the computation of observations and rewards, in the next step."""
-        self._perceive = Compiled(self._perceive)
+        self._perceive: Perception = Compiled(self.perception) if compiled else self.perception
 
     @property
     def plant(self) -> Plant:
@@ -146,11 +144,8 @@ class HardwareTransform(Transform):
 
     def reset_rows(self, first: TensorDictBase, rows: Tensor | None = None) -> TensorDictBase:
         """Add state and observation to the first frames of the carts `rows` [R]; None means all carts."""
-        counts, length = first.get("counts").T, self._scaled_length(rows)
-        percept = perceive_first(
-            counts, length, self._track_end(rows), settings=self.observation_settings, guard=self.guard
-        )
-        return added(first, percept)
+        counts, length = first.get("counts").T, self.scaled_length(rows)
+        return added(first, self.first_perception(counts, length, self.track_end(rows)))
 
     def perceive(
         self, current: TensorDictBase, command: TensorDictBase, next_frame: TensorDictBase
@@ -162,8 +157,8 @@ class HardwareTransform(Transform):
             current.get("past").T,
             current.get("step_count").T,
             command.get("motor").T,
-            self._scaled_length(),
-            self._track_end(),
+            self.scaled_length(),
+            self.track_end(),
         )
         frame = PlantOutput(*(next_frame.get(key).T for key in PlantOutput._fields))
         frame = frame._replace(truncated=frame.truncated | (current.get("action") == NO_ACTION))
@@ -175,7 +170,7 @@ class HardwareTransform(Transform):
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         return self.perceive(tensordict, tensordict, next_tensordict)
 
-    def _scaled_length(self, rows: Tensor | None = None) -> Tensor:
+    def scaled_length(self, rows: Tensor | None = None) -> Tensor:
         """Return the scaled pole lengths of the carts `rows`, [1, R]; [0, R] if they are not observed."""
         if not self.observation_settings.pole_length:
             return self.motors.new_empty(
@@ -184,7 +179,7 @@ class HardwareTransform(Transform):
         lengths = self.plant.pole_length if rows is None else self.plant.pole_length[rows]
         return (lengths / LENGTH_SCALE).unsqueeze(0)
 
-    def _track_end(self, rows: Tensor | None = None) -> Tensor:
+    def track_end(self, rows: Tensor | None = None) -> Tensor:
         """Return where the tracks of the carts `rows` end, m, [1, R]; unbounded without a guard."""
         if self.guard is None:
             carts = self.plant.carts if rows is None else len(rows)
@@ -193,6 +188,6 @@ class HardwareTransform(Transform):
         return (ends if rows is None else ends[rows]).unsqueeze(0)
 
 
-def added(frame: TensorDictBase, percept: FirstPercept | Percept) -> TensorDict:
+def added(frame: TensorDictBase, percept: FirstPercept[Tensor] | Percept[Tensor]) -> TensorDict:
     """Return the frame [N] with the entries of `percept`."""
     return tensordict_of(dict(frame.items()) | {key: rows.T for key, rows in percept._asdict().items()})

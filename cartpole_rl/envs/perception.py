@@ -1,10 +1,10 @@
 """Pure functions from frames to measured state, memory, observation, reward, scores and endings.
 
 They are the same for simulated and real carts. Every tensor is [k, N], the transpose of the tensordict's, so
-that compiled code runs along the carts.
+that compiled code runs along the carts; `one_cart.py` makes plain arithmetic for one cart of these functions.
 """
 
-from typing import NamedTuple
+from typing import Generic, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -25,54 +25,56 @@ from cartpole_rl.tasks.features import (
 from cartpole_rl.tasks.rewards import SCORE, SCORE_UPRIGHT
 from cartpole_rl.tasks.settings import RewardSettings, TaskSettings
 
+Values = TypeVar("Values")  # Tensor, or a tuple of numbers
 
-class Previous(NamedTuple):
+
+class Previous(NamedTuple, Generic[Values]):
     """The step before a frame, and the motor value chosen in it."""
 
-    counts: Tensor  # [2, N] int64
-    state: Tensor  # [4, N]: x m, x_dot m/s, theta rad, theta_dot rad/s
-    past: Tensor  # [past_size, N]
-    step_count: Tensor  # [1, N] int64
-    motor: Tensor  # [1, N] int64, the value chosen
-    length: Tensor  # [1, N] scaled length of the pole if it is observed, otherwise [0, N]
-    track_end: Tensor  # [1, N] m from the middle
+    counts: Values  # [2, N] int64
+    state: Values  # [4, N]: x m, x_dot m/s, theta rad, theta_dot rad/s
+    past: Values  # [past_size, N]
+    step_count: Values  # [1, N] int64
+    motor: Values  # [1, N] int64, the value chosen
+    length: Values  # [1, N] scaled length of the pole if it is observed, otherwise [0, N]
+    track_end: Values  # [1, N] m from the middle
 
 
-class PlantOutput(NamedTuple):
+class PlantOutput(NamedTuple, Generic[Values]):
     """The plant's output after the period: see `plants.specs.Plant`."""
 
-    counts: Tensor  # [2, N] int64
-    dt: Tensor  # [1, N] s
-    terminated: Tensor  # [1, N] bool
-    truncated: Tensor  # [1, N] bool
+    counts: Values  # [2, N] int64
+    dt: Values  # [1, N] s
+    terminated: Values  # [1, N] bool
+    truncated: Values  # [1, N] bool
 
 
-class FirstPercept(NamedTuple):
+class FirstPercept(NamedTuple, Generic[Values]):
     """Quantities computed from the first frame of an episode."""
 
-    state: Tensor  # [4, N]
-    past: Tensor  # [past_size, N]
-    observation: Tensor  # [size, N]
-    guard: Tensor  # [1, N] int64, direction of the track guard's motor value, 0 if the agent's is sent
-    score: Tensor  # [1, N], 0
-    score_upright: Tensor  # [1, N], 0
-    step_count: Tensor  # [1, N] int64
+    state: Values  # [4, N]
+    past: Values  # [past_size, N]
+    observation: Values  # [size, N]
+    guard: Values  # [1, N] int64, direction of the track guard's motor value, 0 if the agent's is sent
+    score: Values  # [1, N], 0
+    score_upright: Values  # [1, N], 0
+    step_count: Values  # [1, N] int64
 
 
-class Percept(NamedTuple):
+class Percept(NamedTuple, Generic[Values]):
     """Quantities computed from a later frame."""
 
-    state: Tensor  # [4, N]
-    past: Tensor  # [past_size, N]
-    observation: Tensor  # [size, N]
-    guard: Tensor  # [1, N] int64, as above
-    reward: Tensor  # [1, N]
-    score: Tensor  # [1, N] equation (6.2)
-    score_upright: Tensor  # [1, N] equation (6.1)
-    step_count: Tensor  # [1, N] int64
-    terminated: Tensor  # [1, N] bool
-    truncated: Tensor  # [1, N] bool
-    done: Tensor  # [1, N] bool
+    state: Values  # [4, N]
+    past: Values  # [past_size, N]
+    observation: Values  # [size, N]
+    guard: Values  # [1, N] int64, as above
+    reward: Values  # [1, N]
+    score: Values  # [1, N] equation (6.2)
+    score_upright: Values  # [1, N] equation (6.1)
+    step_count: Values  # [1, N] int64
+    terminated: Values  # [1, N] bool
+    truncated: Values  # [1, N] bool
+    done: Values  # [1, N] bool
 
 
 def perceive_first(
@@ -82,7 +84,7 @@ def perceive_first(
     *,
     settings: ObservationSettings,
     guard: TrackGuard | None,
-) -> FirstPercept:
+) -> FirstPercept[Tensor]:
     """Return the percept of a first frame: velocities and memory are 0."""
     x, theta = measured_position(counts)
     unknown = torch.zeros_like(x)
@@ -101,14 +103,14 @@ def perceive_first(
 
 
 def perceive(
-    previous: Previous,
-    frame: PlantOutput,
+    previous: Previous[Tensor],
+    frame: PlantOutput[Tensor],
     *,
     settings: ObservationSettings,
     task: TaskSettings,
     rewards: RewardSettings,
     guard: TrackGuard | None,
-) -> Percept:
+) -> Percept[Tensor]:
     """Return the percept of the frame after `previous`."""
     x, theta = measured_position(frame.counts)
     x_dot, theta_dot = measured_velocity(frame.counts, previous.counts, frame.dt[0])
@@ -136,7 +138,7 @@ def perceive(
     )
 
 
-def remember(previous: Previous, settings: ObservationSettings) -> Tensor:
+def remember(previous: Previous[Tensor], settings: ObservationSettings) -> Tensor:
     """Return the `past` of the next step: motor values, velocities, positions, each newest first."""
     sizes = settings.past_motors, 2 * settings.past_velocities
     motors, velocities, positions = previous.past.split([*sizes, len(previous.past) - sum(sizes)])

@@ -4,7 +4,6 @@ The process waits for the weights of a policy, runs one episode, and sends it ba
 even during an episode, and every exit sets the motor to 0 and disarms the cart.
 """
 
-import gc
 import multiprocessing
 import os
 import signal
@@ -63,17 +62,15 @@ class Question:
 class Driver:
     """A context manager of a process that drives the cart of `make_env` with the network of `make_policy`.
 
-    The process calls both, and compiles them before the first episode if `compiled`. `confirm` is called in
-    this process, which has the terminal, while it waits for a result. For a cart with its own clock,
-    `real_time`, the process asks for real-time priority; `has_priority` says if it got it. Raises the errors
-    of `make_env`.
+    The process calls both. `confirm` is called in this process, which has the terminal, while it waits for a
+    result. For a cart with its own clock, `real_time`, the process asks for real-time priority;
+    `has_priority` says if it got it. Raises the errors of `make_env`.
     """
 
     def __init__(
         self,
         make_env: MakeEnv,
         make_policy: Callable[[], nn.Module],
-        compiled: bool,
         real_time: bool,
         confirm: Confirm = nobody,
     ) -> None:
@@ -82,7 +79,7 @@ class Driver:
         self._ours, theirs = context.Pipe()
         self._process = context.Process(
             target=_serve,
-            args=(theirs, make_env, make_policy, compiled, real_time, os.getpid()),
+            args=(theirs, make_env, make_policy, real_time, os.getpid()),
             daemon=True,
         )
         self._process.start()
@@ -157,7 +154,6 @@ def _serve(
     pipe: Connection,
     make_env: MakeEnv,
     make_policy: Callable[[], nn.Module],
-    compiled: bool,
     real_time: bool,
     parent: int,
 ) -> None:
@@ -168,9 +164,7 @@ def _serve(
     torch.set_num_threads(1)
     with suppress(_Ended, EOFError, ConnectionError):
         try:
-            _drive_on_demand(
-                pipe, make_env, DrivingPolicy(make_policy(), compiled), compiled, real_time, parent
-            )
+            _drive_on_demand(pipe, make_env, DrivingPolicy(make_policy()), real_time, parent)
         except CartPoleError as error:
             pipe.send(error)
         finally:
@@ -182,14 +176,11 @@ def _drive_on_demand(
     pipe: Connection,
     make_env: MakeEnv,
     policy: DrivingPolicy,
-    compiled: bool,
     real_time: bool,
     parent: int,
 ) -> None:
     """Drive an episode for each `DriveRequest` in the pipe, until it is closed."""
     with closing(make_env(partial(_ask, pipe))) as env:
-        if compiled:
-            env.hardware.compile_arithmetic()
         warm_up(env, policy)
         pipe.send(real_time and take_precedence())
         while True:
@@ -215,11 +206,6 @@ def _drive(env: CartPoleEnv, policy: DrivingPolicy, drive: DriveRequest, parent:
             chosen["action"] = torch.tensor([int(random.integers(actions))])
         return chosen
 
-    gc.collect()
-    gc.disable()  # garbage collection takes longer than a tick allows
-    try:
-        (episode,) = run_batch(env, act)
-    finally:
-        gc.enable()
+    (episode,) = run_batch(env, act)
     assert isinstance(env.plant, SerialPlant)
     return Driven(episode, env.plant.cart.statistics)

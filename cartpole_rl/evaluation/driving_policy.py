@@ -9,7 +9,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torch.func import functional_call
 
-from cartpole_rl.compilation import Compiled
+from cartpole_rl.compilation import Compiled, Traced
 from cartpole_rl.plants.specs import tensordict_of
 
 Weights = dict[str, NDArray[Any]]
@@ -23,16 +23,16 @@ def as_weights(policy: nn.Module) -> Weights:
 class DrivingPolicy:
     """The policy `network`, from `observation` to `action`, optionally `compiled`.
 
-    It shares the network's weights until others are loaded. Its actions are those of the TorchRL module
-    (tests/evaluation/test_driving_policy.py), whose look-ups take most of the time of a small network:
-    compiled, the action for one cart takes a sixth of the time (scripts/bench/shortcuts.py).
+    It shares the network's weights until others are loaded. All calls must have as many carts as the first.
+    Its actions are those of the TorchRL module (tests/evaluation/test_driving_policy.py), whose look-ups take
+    most of the time of a small network (scripts/bench/shortcuts.py).
     """
 
-    def __init__(self, network: nn.Module, compiled: bool) -> None:
+    def __init__(self, network: nn.Module, compiled: bool = False) -> None:
         self.network = network
         state = network.state_dict()  # shares memory with the network
         self.names, self._weights = list(state), tuple(state.values())
-        self._choose = Compiled(self._compute) if compiled else self._compute
+        self._choose = Compiled(self._compute) if compiled else Traced(self._compute)
 
     def load(self, weights: Weights) -> None:
         """Act with `weights` from now on."""

@@ -12,8 +12,12 @@ import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from torchrl.modules import QValueActor
 
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
+from cartpole_rl.evaluation.driving_policy import DrivingPolicy
+from cartpole_rl.plants.specs import OneCartPlant, tensordict_of
+from cartpole_rl.scheduling import no_garbage_collection
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.tasks.settings import NO_ACTION
@@ -25,6 +29,7 @@ _FROM_NEXT = ("score", "score_upright", "reward", "done")
 
 def run_episodes(env: CartPoleEnv, policy: Policy, episodes: int) -> Iterator[Episode]:
     """Yield `episodes` episodes. Raises the errors of the plant's reset."""
+    policy = prepared(env, policy)
     warm_up(env, policy)
     for _ in range(math.ceil(episodes / env.plant.carts)):
         batch = run_batch(env, policy)
@@ -32,12 +37,22 @@ def run_episodes(env: CartPoleEnv, policy: Policy, episodes: int) -> Iterator[Ep
         episodes -= len(batch)
 
 
+def prepared(env: CartPoleEnv, policy: Policy) -> Policy:
+    """Return the policy to drive with: a Q-network that drives one cart becomes a DrivingPolicy."""
+    if isinstance(env.plant, OneCartPlant) and isinstance(policy, QValueActor):
+        return DrivingPolicy(policy)
+    return policy
+
+
 @torch.no_grad()
 def warm_up(env: CartPoleEnv, policy: Policy) -> None:
     """Compute a step on zeros: compilation and lazy loading must not delay the first ticks."""
     blank = env.fake_tensordict()
     choose(policy, blank)
-    env.hardware.perceive(blank, env.hardware.command(blank), blank["next"])
+    if isinstance(env.plant, OneCartPlant):
+        _ = env.one_cart
+    else:
+        env.hardware.perceive(blank, env.hardware.command(blank), blank["next"])
 
 
 def choose(policy: Policy, current: TensorDictBase) -> Tensor:
@@ -54,9 +69,46 @@ def choose(policy: Policy, current: TensorDictBase) -> Tensor:
     return chosen.get("action").where(finite, NO_ACTION)
 
 
-@torch.no_grad()
 def run_batch(env: CartPoleEnv, policy: Policy) -> list[Episode]:
     """Return one episode of each cart, all from one reset."""
+    if isinstance(env.plant, OneCartPlant):
+        return [run_one(env, prepared(env, policy))]
+    return run_many(env, policy)
+
+
+@torch.no_grad()
+def run_one(env: CartPoleEnv, policy: Policy) -> Episode:
+    """Return an episode of a plant of one cart, on plain numbers."""
+    cart = env.one_cart
+    first = cart.reset()
+    (origin,) = env.plant.origins()
+    frames, steps, actions, motors = [cart.frame], [], [], []
+    observation, done = first.observation, False
+    with no_garbage_collection():
+        while not done:  # the cart waits for this loop; the rest is done afterwards
+            observed = torch.from_numpy(np.array([observation], np.float32))
+            action = int(choose(policy, tensordict_of({"observation": observed})))
+            motors.append(cart.sent_motor(action))
+            step = cart.step(action)
+            actions.append(action)
+            frames.append(cart.frame)
+            steps.append(step)
+            observation, (done,) = step.observation, step.done
+        env.plant.halt()  # a real cart would keep its last motor value
+    columns = {key: np.array([getattr(step, key) for step in steps])[:, 0] for key in _FROM_NEXT}
+    columns["state"] = np.array([first.state, *(step.state for step in steps)])
+    columns["counts"] = np.array([frame.counts for frame in frames])
+    columns["time"] = np.cumsum([0.0, *(frame.dt for frame in frames[1:])])
+    columns["motor"] = np.array(motors)
+    columns["guarded"] = columns["motor"] != np.array([cart.motor(action) for action in actions])
+    (truncated,), theta = step.truncated, step.state[2]
+    ending = _ending(env, action, truncated, theta)
+    return replace(_episode(columns, ending, env.hardware.guard is not None), origin=origin)
+
+
+@torch.no_grad()
+def run_many(env: CartPoleEnv, policy: Policy) -> list[Episode]:
+    """Return one episode of each cart of any plant, all from one reset, on tensors."""
     current = env.reset()
     origins = env.plant.origins()
     frames, actions = [current], []
@@ -96,19 +148,21 @@ def _note_endings(
     """Fill in the reason for each cart whose first episode ends in this step."""
     for row in outcome["done"].squeeze(-1).nonzero().squeeze(-1).tolist():
         if endings[row] is None:
-            endings[row] = _ending(env, int(action[row]), outcome[row])
+            last = outcome[row]
+            endings[row] = _ending(env, int(action[row]), last["truncated"].item(), last["state"][2].item())
 
 
-def _ending(env: CartPoleEnv, action: int, last: TensorDictBase) -> str:
+def _ending(env: CartPoleEnv, action: int, truncated: bool, theta: float) -> str:
+    """Return why an episode ended after `action`, at `theta` rad."""
     reported = env.plant.ended_by
     if reported:
         return str(Ending(reported))
     if action == NO_ACTION:
         return str(Ending.NON_FINITE)
-    if last["truncated"].item():
+    if truncated:
         return str(Ending.TIME)
     limit = env.hardware.task.angle_limit
-    fallen = limit is not None and abs(last["state"][2].item()) > limit
+    fallen = limit is not None and abs(theta) > limit
     return str(Ending.ANGLE if fallen else Ending.TRACK)
 
 

@@ -10,8 +10,6 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-import torch
-from tensordict import TensorDictBase
 
 from cartpole_rl.envs.guard import guard_side
 from cartpole_rl.envs.settings import TrackGuard
@@ -28,7 +26,7 @@ from cartpole_rl.identification.moves import (
 )
 from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 from cartpole_rl.physics.motor import LARGEST_MOTOR
-from cartpole_rl.plants.specs import Plant
+from cartpole_rl.plants.specs import OneFrame, Plant
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
 
@@ -140,13 +138,13 @@ def conduct(
     The cart stands, with the motor at 0, whenever a recording is yielded: nothing controls it while a file is
     written. The next experiment continues from there; after an ending by the plant it starts with a reset.
     """
-    task, present, ended = Task(period, np.random.default_rng(seed), BREAKAWAY), plant.reset(), False
+    task, present, ended = Task(period, np.random.default_rng(seed), BREAKAWAY), plant.reset_one(), False
     for number, experiment in enumerate(experiments):
         if number and not ended:
-            present = driven(plant, present, 0)  # a new frame: the last one is as old as the writing took
-            ended = bool(present["done"])
+            present = plant.step_one(0)  # a new frame: the last one is as old as the writing took
+            ended = present.terminated or present.truncated
         if ended:
-            present = plant.reset()
+            present = plant.reset_one()
         recorded, present, breakaway = run(plant, present, and_stop(experiment.moves(task), task))
         task = task._replace(breakaway=breakaway or task.breakaway)
         ended = recorded.ended_by != Ending.TIME
@@ -155,42 +153,30 @@ def conduct(
         yield experiment, recorded
 
 
-def driven(plant: Plant, present: TensorDictBase, motor: int) -> TensorDictBase:
-    """Return the frame at the end of a period under a motor value."""
-    return plant.step(present.set("motor", torch.tensor([[motor]])))["next"]
-
-
-def run(plant: Plant, present: TensorDictBase, moves: Moves) -> tuple[Episode, TensorDictBase, int | None]:
+def run(plant: Plant, present: OneFrame, moves: Moves) -> tuple[Episode, OneFrame, int | None]:
     """Make the moves from the frame `present` on; return the recording, the last frame, and their result.
 
     The motor is at 0 at the end, whatever the moves or the guard requested last.
     """
-    counts, gaps, motors, ended = [counts_of(present)], [float(present["dt"])], [], str(Ending.TIME)
+    counts, gaps, motors, ended = [present.counts], [present.dt], [], str(Ending.TIME)
     requested, breakaway = next(moves), None
     while True:
         now = observed(counts, gaps)
         motor = guarded(requested, now)
-        following = driven(plant, present, motor)
+        present = plant.step_one(motor)
         motors.append(motor)
-        counts.append(counts_of(following))
-        gaps.append(float(following["dt"]))
-        present = following
-        if following["terminated"] or following["truncated"]:
+        counts.append(present.counts)
+        gaps.append(present.dt)
+        if present.terminated or present.truncated:
             ended = str(plant.ended_by or Ending.TRACK)
             break
         try:
             requested = moves.send(observed(counts, gaps))
         except StopIteration as end:
             breakaway = end.value
-            present = driven(plant, present, 0) if motor else present
+            present = plant.step_one(0) if motor else present
             break
     return recording(np.array(counts), np.array(gaps[1:]), np.array(motors), ended), present, breakaway
-
-
-def counts_of(frame: TensorDictBase) -> tuple[int, int]:
-    """Return the encoder counts of cart and pole."""
-    cart, pole = frame["counts"][0].tolist()
-    return cart, pole
 
 
 def observed(counts: list[tuple[int, int]], gaps: list[float]) -> Observed:

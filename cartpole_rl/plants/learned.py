@@ -16,6 +16,7 @@ from cartpole_rl.physics.residual import UNDER_WAY, Residual, chosen_members
 from cartpole_rl.plants.learned_model import LearnedModel
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.plants.simulation import Carts, Inputs, Period, run_carts
+from cartpole_rl.plants.specs import OneFrame, Plant
 from cartpole_rl.randomization.draws import Draws
 from cartpole_rl.tasks.settings import StartSettings
 
@@ -81,6 +82,10 @@ class LearnedPlant(SimulatedPlant):
             drawn = torch.where(again, self._member[rows], drawn)
         self._member.index_copy_(0, rows, drawn)
         return super().restart(rows, again)
+
+    def step_one(self, motor: int) -> OneFrame:
+        """Drive the only cart for a period, on tensors: the residual's networks are products of matrices."""
+        return Plant.step_one(self, motor)
 
     def snapshot(self) -> dict[str, Any]:
         """Return everything on which the next step depends, for `restore`."""

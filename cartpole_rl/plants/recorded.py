@@ -5,15 +5,14 @@ have given, while the cart was driven.
 """
 
 import torch
-from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.plants.specs import Plant, Report, one_cart
+from cartpole_rl.plants.specs import TERMINATING, TRUNCATING, OneCartPlant, OneFrame
 from cartpole_rl.tasks.episode import Episode
 
 
-class RecordedPlant(Plant):
+class RecordedPlant(OneCartPlant):
     """One cart, [1]; each step returns the next recorded frame, the last of which ends the episode.
 
     `pole_length` in m is twice the distance from pivot to centre of mass of the recorded pole; None if it is
@@ -21,7 +20,7 @@ class RecordedPlant(Plant):
     """
 
     def __init__(self, episode: Episode, pole_length: float | None) -> None:
-        super().__init__(carts=1)
+        super().__init__()
         self.episode = episode
         self._pole_length = pole_length
         self._row = 0
@@ -41,17 +40,20 @@ class RecordedPlant(Plant):
     def _set_seed(self, seed: int | None) -> None:
         """Do nothing: a recording is not random."""
 
-    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDict:
+    def reset_one(self) -> OneFrame:
+        """Return to the first frame."""
         self._row = 0
-        return self.frame(self._report())
+        return self._frame()
 
-    def _step(self, tensordict: TensorDictBase) -> TensorDict:
+    def step_one(self, motor: int) -> OneFrame:
+        """Return the next frame, whatever the motor value."""
         self._row += 1
-        return self.step_frame(self._report())
+        return self._frame()
 
-    def _report(self) -> Report:
+    def _frame(self) -> OneFrame:
         episode, row = self.episode, self._row
-        last = row == episode.steps
-        since = episode.time[row] - episode.time[max(0, row - 1)]
+        cart, pole = episode.counts[row].tolist()
+        since = float(episode.time[row] - episode.time[max(0, row - 1)])
         motor = int(episode.motor[row - 1]) if row else 0
-        return one_cart(episode.counts[row].tolist(), since, motor, episode.ended_by if last else "")
+        ending = episode.ended_by if row == episode.steps else ""
+        return OneFrame((cart, pole), since, motor, ending in TERMINATING, ending in TRUNCATING)

@@ -3,10 +3,11 @@
 The true state stays inside; the frames hold what a cart reports over its serial port.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -16,8 +17,9 @@ from cartpole_rl.physics.dynamics import State
 from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.simulation import Carts, Inputs, Period, commands_under_way, encoder_counts, run_carts
-from cartpole_rl.plants.specs import Plant, Report
+from cartpole_rl.plants.specs import OneFrame, Plant, Report
 from cartpole_rl.randomization.draws import Draws
+from cartpole_rl.scalar import Scalar, plain
 from cartpole_rl.tasks.episode import Origin
 from cartpole_rl.tasks.settings import StartSettings
 from cartpole_rl.tasks.starts import draw_start
@@ -60,6 +62,8 @@ class SimulatedPlant(Plant):
         self.period, self.substeps = period, substeps
         run = partial(run_carts, models=models, period=period, substeps=substeps)
         self._run: Callable[[Carts, Inputs], Period] = Compiled(run) if compiled else run
+        self._plain_run = run
+        self._run_one: Scalar | None = None  # of a single cart
         self._generator = torch.Generator(device=self.device)
         self._noisy = any(randomizer.can_differ_from_zero(name) for name in NOISE_PARAMETERS)
         self._no_noise = torch.zeros(3, carts, device=self.device)
@@ -186,6 +190,16 @@ class SimulatedPlant(Plant):
         self._carts = Carts(self._carts.table, after.motion, after.drive)
         return self.step_frame(self._report(after.counts, after.motor_applied, after.off_track))
 
+    def step_one(self, motor: int) -> OneFrame:
+        """Drive the only cart for a period; the same physics as of many carts, as plain arithmetic."""
+        inputs = Inputs(torch.tensor([[motor]]), self._draw_noise(1))
+        if self._run_one is None:
+            self._run_one = Scalar(self._plain_run, self._carts, inputs)
+        after = self._run_one(*(tuple(map(plain, each)) for each in (self._carts, inputs)))
+        self._carts = Carts(self._carts.table, column(after.motion), column(after.drive))
+        (motor_applied,), (off_track,) = after.motor_applied, after.off_track
+        return OneFrame(after.counts, self.period, motor_applied, off_track, False)
+
     def _draw_noise(self, count: int) -> Tensor:
         """Return the noise of one period of `count` carts, [3, count]; 0 if no parameter is noisy."""
         if not self._noisy:
@@ -197,3 +211,8 @@ class SimulatedPlant(Plant):
         """Return the report of tensors that are transposed here."""
         dt = torch.full(off_track.shape, self.period, device=self.device)
         return Report(counts.T, dt.T, motor_applied.T, off_track.T, torch.zeros_like(off_track).T)
+
+
+def column(numbers: Sequence[float]) -> Tensor:
+    """Return numbers as a column [k, 1] float32."""
+    return torch.from_numpy(np.array(numbers, np.float32)).unsqueeze(1)

@@ -73,7 +73,7 @@ def finetune(config: FinetuneConfig, folder: Path) -> None:
     real_time = config.plant.kind == "serial" or config.emulator.clock == "real"
     with (
         TensorBoardLog(folder) as log,
-        Driver(make_env, partial(greedy_network, training), config.compile, real_time, confirm) as driver,
+        Driver(make_env, partial(greedy_network, training), real_time, confirm) as driver,
         yielding_to(driver) if real_time else nullcontext(),
     ):
         session = Session(files, DrivenCart(driver, files, log), load_agent(run), training, settings)

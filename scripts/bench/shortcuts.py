@@ -8,7 +8,7 @@ Each group does the same work; tests show that it gives the same numbers. Carts 
 - a step with resets: `CartPoleEnv.step_and_maybe_reset` beside that of TransformedEnv, over equal plants;
 - collecting 8 periods: `learning.collector.Collector` beside `torchrl.collectors.Collector`, both on a
   CartPoleEnv, with the same network and epsilon-greedy exploration;
-- the greedy action of one cart: `DrivingPolicy`, plain and compiled, beside the QValueActor;
+- the greedy action of one cart: `DrivingPolicy`, traced and compiled, beside the QValueActor;
 - a gradient of 512 transitions: `LossGradient`, plain and compiled, beside `backward` and clipping.
 
 A time is the processor time of the fastest of many calls, in which the rows take turns, with one thread.
@@ -91,7 +91,7 @@ def choices(agent: QAgent, size: int, compiled: bool) -> Pair:
     present = TensorDict({"observation": torch.randn(1, size)}, [1])
     ways = {
         "QValueActor": policy,
-        "DrivingPolicy, not compiled": DrivingPolicy(policy, compiled=False),
+        "DrivingPolicy, traced": DrivingPolicy(policy),
         "DrivingPolicy": DrivingPolicy(policy, compiled),
     }
     return {name: partial(torch.no_grad()(way), present) for name, way in ways.items()}

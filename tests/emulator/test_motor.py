@@ -30,6 +30,8 @@ def test_force_curve_dead_band_and_asymmetry():
 
 def test_force_lags_by_its_time_constant():
     motor = Motor(EmulatorSettings(**PLAIN_MOTOR | {"motor_time_constant": 0.01}))
-    assert motor.step(100, 0.01) == pytest.approx(2.0 * (1 - math.exp(-1)))
-    assert motor.step(0, 0.01) == pytest.approx(2.0 * (1 - math.exp(-1)) * math.exp(-1))
-    assert Motor(EmulatorSettings(**PLAIN_MOTOR)).step(100, 0.001) == pytest.approx(2.0)
+    decay = motor.decay(0.01)
+    assert motor.step(motor.static_force(100), decay) == pytest.approx(2.0 * (1 - math.exp(-1)))
+    assert motor.step(motor.static_force(0), decay) == pytest.approx(2.0 * (1 - math.exp(-1)) * math.exp(-1))
+    without_lag = Motor(EmulatorSettings(**PLAIN_MOTOR))
+    assert without_lag.step(without_lag.static_force(100), without_lag.decay(0.001)) == pytest.approx(2.0)

@@ -17,6 +17,7 @@ from cartpole_rl.errors import ConfigError
 from cartpole_rl.registration import ENVIRONMENTS, register
 
 STEPS = 520  # longer than an episode may be
+ONE_COUNT = 0.01  # of an encoder, in an observation: where float32 rounds it otherwise
 
 
 def test_importing_registers_once() -> None:
@@ -122,15 +123,16 @@ class TestVector:
     def test_a_cart_in_a_batch_equals_a_single_cart(self, name: str) -> None:
         alone, batch = gymnasium.make(name), vector(name, carts=1)
         first = alone.reset(seed=5)[0], batch.reset(seed=5)[0][0]
-        assert (first[0] == first[1]).all()
+        np.testing.assert_allclose(*first, rtol=1e-6)
         batch.action_space.seed(0)
         for _ in range(200):
             action = batch.action_space.sample()
             one, many = alone.step(action[0]), batch.step(action)
-            assert one[1:4] == tuple(part[0] for part in many[1:4])
+            np.testing.assert_allclose(one[1], many[1][0], atol=ONE_COUNT)
+            assert one[2:4] == tuple(part[0] for part in many[2:4])
             if one[2] or one[3]:
                 return
-            assert (one[0] == many[0][0]).all()
+            np.testing.assert_allclose(one[0], many[0][0], atol=ONE_COUNT)
 
 
 def test_randomization_is_by_name_or_by_lines() -> None:

@@ -72,7 +72,7 @@ def peer() -> Iterator[Faulty]:
 
 
 def driver(peer: CartPeer, confirm: Confirm, time_limit: int = LONG) -> Driver:
-    return Driver(partial(scripted_env, peer.port, time_limit), network, False, False, confirm)
+    return Driver(partial(scripted_env, peer.port, time_limit), network, False, confirm)
 
 
 def wait_for(condition: Callable[[], bool]) -> None:

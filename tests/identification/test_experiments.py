@@ -254,13 +254,13 @@ class TestChecks:
             check_recordings(frozen, PERIOD)
 
     def test_a_saturated_cart_encoder(self, recordings: dict[str, Episode]) -> None:
-        most = 8000
+        most = 9000
         saturated = changed(
             recordings["excite"],
             x=lambda x: x.clip(-most * CART_METRES_PER_COUNT, most * CART_METRES_PER_COUNT),
             cart=lambda counts: counts.clip(-most, most),
         )
-        with pytest.raises(RecordingError, match=r"stops dead at -?8000 counts"):
+        with pytest.raises(RecordingError, match=r"stops dead at -?9000 counts"):
             check_recordings([recordings["ramps"], saturated], PERIOD)
 
 

@@ -253,15 +253,19 @@ class SerialCart:
 
         If no newer state waits, no time has passed for the cart, as on a lockstep emulator.
         """
-        if not motor or not self._tracker.awaits_command or not self._connection.link.waiting():
+        if not motor or not self._tracker.awaits_command:
             return motor
         late = time.perf_counter() - self._tracker.newest_at
-        if late > min(self.settings.timeout, LONGEST_SUSPENSION):
+        stopped_after = WATCHDOG_PERIODS * self.information.period_us * 1e-6
+        lost_after = min(self.settings.timeout, LONGEST_SUSPENSION)
+        if late <= min(stopped_after, lost_after) or not self._connection.link.waiting():
+            return motor
+        if late > lost_after:
             raise LinkError(
                 f"this computer did not answer the cart on {self.port} for {late:.1f} s; end what keeps it "
                 "busy, and do not suspend a command that drives"
             )
-        return 0 if late > WATCHDOG_PERIODS * self.information.period_us * 1e-6 else motor
+        return 0 if late > stopped_after else motor
 
     def _is_homing(self) -> bool:
         self.poll_state()

@@ -194,8 +194,8 @@ class Connection:
         """The newest state that acknowledges the last frame; when that is overdue, the newest there is."""
         older: State | None = None
         while True:
-            while self.link.waiting():
-                self._read()
+            while waiting := self.link.waiting():
+                self._read(waiting)
             state = self._tracker.take_newest()
             if state is None:
                 self._read()
@@ -230,9 +230,9 @@ class Connection:
         if now - max(self.link.received_at, self.link.sent_at) > self._settings.nudge_after:
             self.link.send(Hello())
 
-    def _read(self) -> None:
-        """Take in what has arrived; wait a little for a first byte."""
-        for frame in self.link.receive():
+    def _read(self, waiting: int = 0) -> None:
+        """Take in the bytes that are `waiting`; if none are, wait a little for the first."""
+        for frame in self.link.receive(waiting):
             message = frame.message
             if isinstance(message, State):
                 if self._tracker.receive(message, Flags(frame.flags), self.link.received_at):

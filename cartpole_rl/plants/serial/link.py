@@ -54,10 +54,15 @@ class SerialLink:
         except OSError as error:
             raise self._broken("asked for bytes", error) from error
 
-    def receive(self) -> list[Frame]:
-        """Return the frames that have arrived; wait one read slice for a first byte. Raises LinkError."""
+    def receive(self, waiting: int) -> list[Frame]:
+        """Return the frames in the bytes that are `waiting`. Raises LinkError.
+
+        If none are, wait one read slice for a first byte, and take what has arrived with it.
+        """
         try:
-            data = self._port.read(self._port.in_waiting or 1)
+            data = self._port.read(waiting or 1)
+            if data and not waiting:
+                data += self._port.read(self._port.in_waiting)
         except OSError as error:
             raise self._broken("read", error) from error
         if not data:

@@ -21,7 +21,7 @@ from cartpole_rl.plants.serial.faults import Confirm, FaultClearing, nobody
 from cartpole_rl.plants.serial.information import check_scales
 from cartpole_rl.plants.serial.preparation import Preparation, StartPosition
 from cartpole_rl.plants.serial.settings import SerialSettings
-from cartpole_rl.plants.specs import Plant, Report, one_cart
+from cartpole_rl.plants.specs import TERMINATING, TRUNCATING, OneCartPlant, OneFrame, as_report
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.wire import Fault, Flags, State, seconds_between, ticks_between, went_back
 
@@ -37,7 +37,7 @@ class Owned(Protocol):
         """End it."""
 
 
-class SerialPlant(Plant):
+class SerialPlant(OneCartPlant):
     """One cart on a wire. It connects when it is made, and again in a reset after the link was lost.
 
     A reset prepares the cart (`Preparation`), arms it, and returns the first state. For a start `upright` it
@@ -66,7 +66,7 @@ class SerialPlant(Plant):
         owned: Owned | None = None,
         confirm: Confirm = nobody,
     ) -> None:
-        super().__init__(carts=1)
+        super().__init__()
         self.settings = settings
         self.cart = SerialCart(settings)
         self.ended_by = ""
@@ -115,7 +115,11 @@ class SerialPlant(Plant):
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDict:
         if tensordict is not None and "_reset" in tensordict and not tensordict["_reset"].any():
-            return self.frame(self._report(self._preparation.control_period))
+            return self.frame(as_report(self._frame(self._preparation.control_period)))
+        return super()._reset()
+
+    def reset_one(self) -> OneFrame:
+        """Prepare the cart, arm it, and return the first frame of an episode."""
         self._reach()
         self._preparation.prepare()
         self.cart.start()
@@ -124,23 +128,24 @@ class SerialPlant(Plant):
         self.ended_by = ""
         self.last_error = None
         self._driving = True
-        return self.frame(self._report(self._preparation.control_period))
+        return self._frame(self._preparation.control_period)
 
-    def _step(self, tensordict: TensorDictBase) -> TensorDict:
+    def step_one(self, motor: int) -> OneFrame:
+        """Send a motor value; return the frame at the end of the period."""
         if not self._driving:
-            return self.step_frame(self._report(self._preparation.control_period))
+            return self._frame(self._preparation.control_period)
         before = self._state
         try:
-            self.cart.set_motor(int(tensordict["motor"]))
+            self.cart.set_motor(motor)
             state = self.cart.get_state()
             if went_back(ticks_between(before.tick, state.tick)):
                 raise LinkError(RESTARTED)
             self._state = state
         except (LinkError, RefusedError, FaultError) as error:
             self._break_off(error)
-            return self.step_frame(self._report(self._preparation.control_period))
+            return self._frame(self._preparation.control_period)
         self._end_if_due()
-        return self.step_frame(self._report(seconds_between(before.time_us, self._state.time_us)))
+        return self._frame(seconds_between(before.time_us, self._state.time_us))
 
     def _end_if_due(self) -> None:
         """Set `ended_by` and stop the motor if the new state ends the episode."""
@@ -168,12 +173,17 @@ class SerialPlant(Plant):
             self.halt()
         self._state = replace(self._state, motor_applied=0, command_age_ms=0)
 
-    def _report(self, dt: float) -> Report:
-        """Return the report of the newest state; `dt` in s."""
-        state = self._state
-        counts = (state.cart_counts, state.pole_counts - self._turns)
-        halted = not self._driving and not self.ended_by
-        return one_cart(counts, dt, state.motor_applied, self.ended_by, halted)
+    def _frame(self, dt: float) -> OneFrame:
+        """Return the frame of the newest state; `dt` in s."""
+        state, ending = self._state, self.ended_by
+        halted = not self._driving and not ending
+        return OneFrame(
+            (state.cart_counts, state.pole_counts - self._turns),
+            dt,
+            state.motor_applied,
+            ending in TERMINATING,
+            halted or ending in TRUNCATING,
+        )
 
     def _whole_turns(self) -> int:
         """Return the pole counts of the whole turns between the start position and the newest state."""

@@ -1,0 +1,80 @@
+"""The hardware transform over a plant of one cart, on plain numbers: a tick takes microseconds.
+
+Perception is that of `perception.py`, and the plant is the one below the TorchRL environment, so both drive
+the same cart in the same way (tests/envs/test_one_cart.py). A percept holds k numbers in place of each tensor
+[k, N].
+"""
+
+from typing import Any
+
+import torch
+
+from cartpole_rl.envs.hardware import HardwareTransform
+from cartpole_rl.envs.perception import FirstPercept, Percept, PlantOutput, Previous
+from cartpole_rl.plants.specs import OneFrame, Plant
+from cartpole_rl.scalar import Scalar, plain
+from cartpole_rl.tasks.settings import NO_ACTION
+
+Numbers = tuple[Any, ...]  # the k numbers of a [k, 1] tensor
+
+
+class OneCart:
+    """One cart under the hardware transform. `reset` starts an episode and `step` drives a period.
+
+    Raises ConfigError for an observation that the plant cannot give.
+    """
+
+    def __init__(self, plant: Plant, hardware: HardwareTransform) -> None:
+        self.plant, self.hardware = plant, hardware
+        self._motors: list[int] = hardware.motors.tolist()
+        length, track_end = hardware.scaled_length(), hardware.track_end()
+        count, flag = torch.zeros(1, 1, dtype=torch.int64), torch.zeros(1, 1, dtype=torch.bool)
+        counts, number = count.repeat(2, 1), torch.zeros(1, 1)
+        state, past = number.repeat(4, 1), number.repeat(hardware.observation_settings.past_size, 1)
+        self._perceive_first = Scalar(
+            lambda first: hardware.first_perception(*first), (counts, length, track_end)
+        )
+        self._perceive = Scalar(
+            hardware.perception,
+            Previous(counts, state, past, count, count, length, track_end),
+            PlantOutput(counts, number, flag, flag),
+        )
+        self.frame: OneFrame  # the newest
+        self._percept: FirstPercept[Numbers] | Percept[Numbers]
+
+    def motor(self, action: int) -> int:
+        """Return the motor value of an action; 0 for NO_ACTION. Raises IndexError if it does not exist."""
+        if action == NO_ACTION:
+            return 0
+        if action < 0:
+            raise IndexError(f"action {action} does not exist")
+        return self._motors[action]
+
+    def sent_motor(self, action: int) -> int:
+        """Return the motor value to send: that of the action, or full motor inward under the track guard."""
+        motor, (side,) = self.motor(action), self._percept.guard
+        if side == 0 or action == NO_ACTION:
+            return motor
+        return max(0, *self._motors) if side > 0 else min(0, *self._motors)
+
+    def reset(self) -> FirstPercept[Numbers]:
+        """Start an episode. Raises the errors of the plant's reset."""
+        self.frame = self.plant.reset_one()
+        self._length, self._track_end = map(plain, (self.hardware.scaled_length(), self.hardware.track_end()))
+        first: FirstPercept[Numbers] = self._perceive_first(
+            (self.frame.counts, self._length, self._track_end)
+        )
+        self._percept = first
+        return first
+
+    def step(self, action: int) -> Percept[Numbers]:
+        """Drive one period."""
+        motor, before, earlier = self.sent_motor(action), self._percept, self.frame.counts
+        memory = before.state, before.past, before.step_count
+        previous = Previous(earlier, *memory, (motor,), self._length, self._track_end)
+        self.frame = frame = self.plant.step_one(motor)
+        truncated = frame.truncated or action == NO_ACTION
+        output = PlantOutput(frame.counts, (frame.dt,), (frame.terminated,), (truncated,))
+        now: Percept[Numbers] = self._perceive(previous, output)
+        self._percept = now
+        return now
