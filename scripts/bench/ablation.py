@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 from common import (
     RUNS,
+    add_seed_options,
+    chosen_seeds,
     min_median_max,
     option_parser,
     print_table,
@@ -24,7 +26,7 @@ from learning import seed_result
 
 from cartpole_rl.workflows.build import use_threads
 
-TRANSITIONS = 2_500_000
+TRANSITIONS = 2_000_000
 ARMS = {  # name: overrides of cartpole-train
     "default": [],
     "without mirror": ["agent.mirrored=false"],
@@ -33,13 +35,19 @@ ARMS = {  # name: overrides of cartpole-train
     "without averaged policy": ["agent.average_decay=null"],
     "single instead of double": ["agent.double=false"],
     "one-step returns": ["learning.n_step=1"],
-    "full five-step returns": ["learning.carry=true"],
+    "returns end with their chunk": ["learning.carry=false"],
     "no resting starts": ["task.start.resting_share=0"],
     "constant learning rate": ["optimizer.learning_rate_end=1"],
-    "prioritized replay": ["buffer=prioritized"],
+    "uniform replay": ["buffer=uniform"],
     "no retries": ["learning.retry_probability=0"],
     "rewards twice as large": ["reward.scale=0.1", "reward.track_penalty=10"],
     "without randomization": ["randomization=none"],
+    "no track guard": ["guard=none"],
+    "bold track guard": ["guard=bold"],
+    "careful track guard": ["guard=careful"],
+    "slow starts": ["task.start.speed_spread=0.2", "task.start.angular_speed_spread=1"],
+    "two layers of 128": ["agent.hidden=[128,128]"],
+    "two layers of 64": ["agent.hidden=[64,64]"],
 }
 
 
@@ -61,7 +69,7 @@ def main() -> None:
     """Train, judge, print a table and write the figures."""
     parser = option_parser(__doc__)
     parser.add_argument("--arms", nargs="+", choices=list(ARMS), default=list(ARMS), metavar="ARM")
-    parser.add_argument("--seeds", type=int, default=5, help="trainings of each arm (5)")
+    add_seed_options(parser, seeds=5)
     parser.add_argument("--jobs", type=int, default=1, help="trainings at the same time (1)")
     options = parser.parse_args()
     use_threads(1)
@@ -70,7 +78,7 @@ def main() -> None:
     for arm in options.arms:
         words = [f"learning.transitions={TRANSITIONS}", *ARMS[arm]]
         parent = RUNS / "ablation" / arm.replace(" ", "_")
-        folders = train_seeds("medium", options.seeds, options.jobs, words, parent)
+        folders = train_seeds("medium", chosen_seeds(options), options.jobs, words, parent)
         everything[arm] = [seed_result("medium", folder, references) for folder in folders]
         rows.append(row(arm, everything[arm]))
         print_table(rows)

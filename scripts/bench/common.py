@@ -17,6 +17,7 @@ from cartpole_rl.workflows.build import use_threads
 
 RUNS = Path("runs/bench")  # the parent of every run folder that a bench script makes
 REFERENCES = Path(__file__).with_name("references.json")  # written by reference.py
+FIRST_SEED = 10  # of reported trainings; settings were chosen on seeds 0 to 9
 LOST_SCORE = 500  # an episode with a lower score counts as lost
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -27,6 +28,23 @@ def option_parser(page: str | None) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=page, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write all figures to FILE")
     return parser
+
+
+def add_seed_options(parser: argparse.ArgumentParser, seeds: int) -> None:
+    """Add `--seeds` and `--first-seed`, from which `chosen_seeds` makes the seeds."""
+    parser.add_argument("--seeds", type=positive_int, default=seeds, help=f"trainings ({seeds})")
+    parser.add_argument(
+        "--first-seed",
+        type=int,
+        default=FIRST_SEED,
+        metavar="SEED",
+        help=f"of the trainings ({FIRST_SEED}; settings were chosen on seeds below)",
+    )
+
+
+def chosen_seeds(options: argparse.Namespace) -> range:
+    """Return the seeds of the options."""
+    return range(options.first_seed, options.first_seed + options.seeds)
 
 
 def positive_int(text: str) -> int:
@@ -61,14 +79,16 @@ def run_once(folder: Path, command: str, *words: str, result: str = "metrics.jso
     return folder
 
 
-def train_seeds(experiment: str, seeds: int, jobs: int, overrides: Sequence[str], parent: Path) -> list[Path]:
-    """Train `seeds` seeds of an experiment in `parent`/<seed>, `jobs` at a time; return the folders."""
+def train_seeds(
+    experiment: str, seeds: Sequence[int], jobs: int, overrides: Sequence[str], parent: Path
+) -> list[Path]:
+    """Train an experiment with each of `seeds` in `parent`/<seed>, `jobs` at a time; return the folders."""
 
     def train(seed: int) -> Path:
         words = (f"experiment={experiment}", f"seed={seed}", *overrides)
         return run_once(parent / str(seed), "train", *words)
 
-    return in_parallel(train, range(seeds), jobs)
+    return in_parallel(train, seeds, jobs)
 
 
 def in_parallel(work: Callable[[Job], Result], items: Iterable[Job], jobs: int) -> list[Result]:

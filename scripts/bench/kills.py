@@ -1,7 +1,7 @@
 #!/usr/bin/env python
 """Does a fine-tuning survive being killed? Kills one at random moments and resumes it each time.
 
-    scripts/bench/kills.py runs/bench/medium/0 --kills 5 --seed 0
+    scripts/bench/kills.py runs/bench/medium/10 --kills 5 --seed 0
 
 Starts `cartpole-finetune plant=emulated` with a small budget, sends it SIGKILL after a random time, and
 resumes it; after the last kill it runs to its end. Further words are passed to cartpole-finetune as

@@ -7,7 +7,7 @@ Trains `--seeds` agents of each experiment of conf/experiment and judges every l
 words are passed to cartpole-train as overrides. The runs are in runs/bench/<experiment>/<seed>, with
 `--device cuda` in runs/bench/<experiment>_cuda/<seed>; one that exists is not trained again.
 
-A fraction is the mean score over 20 starts on the nominal simulated cart, divided by the best score that
+A fraction is the mean score over 100 starts on the nominal simulated cart, divided by the best score that
 scripts/bench/reference.py found there (references.json). `drawn` is the mean score on a thousand carts of
 randomization=wide, each driven once; `failed` is the share of them with a score below 500. Seconds include
 compilation, collection, learning and evaluation.
@@ -22,6 +22,8 @@ import numpy as np
 from common import (
     LOST_SCORE,
     RUNS,
+    add_seed_options,
+    chosen_seeds,
     min_median_max,
     option_parser,
     print_table,
@@ -52,7 +54,7 @@ EXPERIMENTS = {  # the plants on which each experiment's agents are judged
     "recurrent": ("medium",),
 }
 REACHED, KEPT = 0.9, 0.85  # fractions: the first marks when learning succeeded, the second whether it lasted
-STARTS, DRAWN_CARTS = 20, 1000
+STARTS, DRAWN_CARTS = 100, 1000
 
 
 def judge(folder: Path, plant: str) -> dict[str, float]:
@@ -135,7 +137,7 @@ def parse_options() -> tuple[argparse.Namespace, list[str]]:
     """Return the command-line options and the overrides for cartpole-train."""
     parser = option_parser(__doc__)
     parser.add_argument("experiments", nargs="+", choices=list(EXPERIMENTS))
-    parser.add_argument("--seeds", type=int, default=10, help="trainings of each experiment (10)")
+    add_seed_options(parser, seeds=10)
     parser.add_argument(
         "--jobs", type=int, default=1, help="trainings at the same time (1); keep 1 to compare seconds"
     )
@@ -152,9 +154,9 @@ def main() -> None:
     for experiment in options.experiments:
         parent = RUNS / (experiment if device == "cpu" else f"{experiment}_{device}")
         words = [f"device={device}", *overrides]
-        folders = train_seeds(experiment, options.seeds, options.jobs, words, parent)
+        folders = train_seeds(experiment, chosen_seeds(options), options.jobs, words, parent)
         results = [seed_result(experiment, folder, references) for folder in folders]
-        everything[experiment] = dict(enumerate(results))
+        everything[experiment] = dict(zip(chosen_seeds(options), results, strict=True))
         rows += summary(experiment, results)
         print_table(rows)
     write_json(options.json, everything)

@@ -10,7 +10,7 @@ from common import REFERENCES
 
 
 def test_each_seed_is_judged_by_its_last_checkpoint(trained: Path) -> None:
-    seed = json.loads((trained / "learning.json").read_text())["medium"]["0"]
+    seed = json.loads((trained / "learning.json").read_text())["medium"]["10"]
     reference = json.loads(REFERENCES.read_text())["medium"]["score"]
     figures = seed["plants"]["medium"]
     assert figures["fraction"] == pytest.approx(figures["score"] / reference)
@@ -23,7 +23,7 @@ def test_a_trained_seed_is_not_trained_again(
     trained: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(learning, "DRAWN_CARTS", 10)
-    checkpoint = trained / "runs/bench/medium/0/checkpoints/last.pt"
+    checkpoint = trained / "runs/bench/medium/10/checkpoints/last.pt"
     before = checkpoint.stat().st_mtime_ns
     assert "fraction, medium" in run(learning, trained, "medium", "--seeds", "1")
     assert checkpoint.stat().st_mtime_ns == before

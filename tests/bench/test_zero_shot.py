@@ -13,7 +13,7 @@ from truths import COMPARED, REPORTED
 
 pytest.importorskip("mujoco", reason='pip install "cartpole_rl[emulator]"')
 
-WORDS = ("runs/bench/medium/0", "--truths", "1", "--starts", "2", "--json", "zero_shot.json")
+WORDS = ("runs/bench/medium/10", "--truths", "1", "--starts", "2", "--json", "zero_shot.json")
 DRAW = Draw(REPORTED, 0.0)
 
 
