@@ -23,6 +23,20 @@ def take_precedence() -> bool:
 
 
 @contextmanager
+def taking_precedence() -> Iterator[None]:
+    """Give this process real-time priority within the `with`, if the system allows it."""
+    if not hasattr(os, "SCHED_FIFO"):
+        yield
+        return
+    policy, param = os.sched_getscheduler(0), os.sched_getparam(0)
+    take_precedence()
+    try:
+        yield
+    finally:
+        os.sched_setscheduler(0, policy, param)
+
+
+@contextmanager
 def giving_precedence() -> Iterator[None]:
     """Give this process the lowest priority: `SCHED_IDLE`, or niceness 19 on other systems.
 

@@ -10,7 +10,7 @@ pytestmark = pytest.mark.skipif(not hasattr(os, "SCHED_FIFO"), reason="Linux onl
 
 
 def in_a_process(lines: str) -> str:
-    imports = "import os, resource\nfrom cartpole_rl.scheduling import giving_precedence, take_precedence"
+    imports = "import os, resource\nfrom cartpole_rl.scheduling import *"
     program = f"{imports}\n{lines}"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     return done.stdout.strip()
@@ -33,4 +33,11 @@ def test_it_goes_last() -> None:
     lines = "with giving_precedence():\n    print(os.sched_getscheduler(0))\nprint(os.sched_getscheduler(0))"
     within, after = map(int, in_a_process(lines).split())
     assert within == os.SCHED_IDLE
+    assert after == os.sched_getscheduler(0)
+
+
+def test_it_goes_first_for_a_while() -> None:
+    lines = "with taking_precedence():\n    print(os.sched_getscheduler(0))\nprint(os.sched_getscheduler(0))"
+    within, after = map(int, in_a_process(lines).split())
+    assert within in (os.SCHED_FIFO, os.SCHED_OTHER)  # where it is allowed; the usual one stays where not
     assert after == os.sched_getscheduler(0)

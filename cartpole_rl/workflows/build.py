@@ -15,6 +15,7 @@ from cartpole_rl.plants.cart_plant import cart_plant
 from cartpole_rl.plants.learned_model import load_model
 from cartpole_rl.plants.serial.faults import Confirm, nobody
 from cartpole_rl.plants.serial.preparation import StartPosition
+from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.plants.settings import EmulatedSettings, LearnedSettings, SimulatedSettings
 from cartpole_rl.randomization.poles import Pole, PoleSettings
 from cartpole_rl.settings import evaluation_seed
@@ -111,6 +112,12 @@ def evaluated_env(
     emulator = config.emulator.model_copy(update={"seed": config.emulator.seed + config.seed})
     plant = cart_plant(config.plant, emulator, settings.control_period, angle, prompt, confirm)
     return environment(settings, plant)
+
+
+def is_real_time(config: EvaluateConfig) -> bool:
+    """Return True for a cart with its own clock, which does not wait for this computer."""
+    emulated = isinstance(config.plant, EmulatedSettings)
+    return isinstance(config.plant, SerialSettings) or (emulated and config.emulator.clock == "real")
 
 
 def use_threads(threads: int | None) -> None:

@@ -31,7 +31,7 @@ from cartpole_rl.reporting.words import count_text
 from cartpole_rl.run_files import CHECKPOINTS, LAST, METRICS, RECORDINGS
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.agents import new_agent, trained_agent
-from cartpole_rl.workflows.build import evaluated_env, evaluated_settings, use_threads
+from cartpole_rl.workflows.build import evaluated_env, evaluated_settings, is_real_time, use_threads
 from cartpole_rl.workflows.checks import check_finetuning
 from cartpole_rl.workflows.config import EvaluateConfig, FinetuneConfig, TrainConfig
 from cartpole_rl.workflows.finetuning_cart import DrivenCart, yielding_to
@@ -70,7 +70,7 @@ def finetune(config: FinetuneConfig, folder: Path) -> None:
     if not checkpoint:
         files.save({}, 0)
     make_env = partial(evaluated_env, settings, evaluation, print)  # called with `confirm`
-    real_time = config.plant.kind == "serial" or config.emulator.clock == "real"
+    real_time = is_real_time(evaluation)
     with (
         TensorBoardLog(folder) as log,
         Driver(make_env, partial(greedy_network, training), real_time, confirm) as driver,
