@@ -50,16 +50,14 @@ def train(config: TrainConfig, folder: Path) -> None:
     config = with_fitted_guard(config)
     carts, start = config.learning.carts, config.task.start
     env = simulated_env(config, config.plant, carts, start, config.seed, config.compile, config.device)
-    note_unused_randomization(config, env.plant.randomizer)
-    note_guard(config.guard)
     agent = new_agent(config, config.device)
     if checkpoint:
-        restore_weights(
-            agent, checkpoint.state["agent"], f"resume={folder}"
-        )  # an error comes before any work
+        restore_weights(agent, checkpoint.state["agent"], f"resume={folder}")  # its error precedes any work
     policy = DrivingPolicy(agent.greedy_policy(), config.compile)
     evaluate = partial(judge, nominal_env(config), agent, policy, config.seed)
     write_config(folder, "train", config.model_dump(mode="json"), resumed=checkpoint is not None)
+    note_unused_randomization(config, env.plant.randomizer)
+    note_guard(config.guard)
     with TrainingMonitor(folder, config, checkpoint.step if checkpoint else None) as monitor:
         training = Training(
             config.learning,

@@ -18,7 +18,7 @@ def headings(path: Path) -> set[str]:
 def test_every_episode_of_an_agent_is_a_file(trained: Path, tmp_path: Path) -> None:
     done = in_process("record", f"run={trained}", "episodes=3", "hydra.run.dir=run", folder=tmp_path)
     assert done.code == 0, done.err
-    assert done.out.endswith("run/recordings/ holds 3 episodes\n")
+    assert "run/recordings/ holds 3 episodes, guarded " in done.out
     paths = sorted((tmp_path / "run/recordings").iterdir())
     assert [path.name for path in paths] == [f"episode_00{number}.csv" for number in range(3)]
     assert all(read_recording(path).steps > 1 for path in paths)
