@@ -154,7 +154,7 @@ def expression_of(
     """
     if name == "_to_copy":
         return CONVERSIONS[kind_of(dtype)], arguments
-    if name not in EXPRESSIONS or named or (name == "pow" and arguments[1] != 2):
+    if name not in EXPRESSIONS or named or (name == "pow" and not is_two(arguments[1])):
         return None
     if name == "clamp":
         value, low, high = (*arguments, None, None)[:3]
@@ -168,7 +168,14 @@ def expression_of(
         return "not {0}", arguments
     elif name == "div" and isinstance(arguments[1], int | float) and arguments[1]:
         return "{0} / {1}", arguments
+    if len(arguments) > MOST_OPERANDS.get(name, 2):
+        return None  # an option that is not known here, such as alpha
     return EXPRESSIONS[name], arguments
+
+
+def is_two(exponent: Any) -> bool:
+    """Return True for the number 2; an array of expressions is no number."""
+    return isinstance(exponent, int | float) and exponent == 2
 
 
 def kind_of(dtype: torch.dtype) -> type:
@@ -245,7 +252,7 @@ def placed(values: Any) -> Expressions:
 
 
 FUNCTIONS: dict[str, Any] = {
-    "__builtins__": {"abs": abs, "float": float, "int": int},
+    "__builtins__": {"abs": abs, "float": float},
     "nan": math.nan,
     "inf": math.inf,
     "clamped": clamped,
@@ -294,6 +301,7 @@ EXPRESSIONS = {
     "tanh": "tanh({0})",
     "where": "{1} if {0} else {2}",
 }
+MOST_OPERANDS = {"clamp": 3, "nan_to_num": 4, "where": 3}
 CONVERSIONS = {bool: "{0} != 0", float: "float({0})", int: "integer({0})"}
 FILLED = {"new_ones": 1, "new_zeros": 0, "ones_like": 1, "zeros_like": 0}
 SHAPES: dict[str, Callable[..., Any]] = {

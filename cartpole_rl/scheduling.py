@@ -24,8 +24,8 @@ def take_precedence() -> bool:
 
 @contextmanager
 def taking_precedence() -> Iterator[None]:
-    """Give this process real-time priority within the `with`, if the system allows it."""
-    if not hasattr(os, "SCHED_FIFO"):
+    """Give this process real-time priority within the `with`, if it has none and the system allows it."""
+    if not hasattr(os, "SCHED_FIFO") or os.sched_getscheduler(0) in (os.SCHED_FIFO, os.SCHED_RR):
         yield
         return
     policy, param = os.sched_getscheduler(0), os.sched_getparam(0)
@@ -33,7 +33,8 @@ def taking_precedence() -> Iterator[None]:
     try:
         yield
     finally:
-        os.sched_setscheduler(0, policy, param)
+        with suppress(PermissionError):
+            os.sched_setscheduler(0, policy, param)
 
 
 @contextmanager
@@ -58,8 +59,9 @@ def giving_precedence() -> Iterator[None]:
 
 @contextmanager
 def no_garbage_collection() -> Iterator[None]:
-    """Collect no garbage within the `with`: it would take longer than a tick allows."""
+    """Collect garbage now, and none within the `with`: it would take longer than a tick allows."""
     enabled = gc.isenabled()
+    gc.collect()
     gc.disable()
     try:
         yield

@@ -2,8 +2,9 @@
 
 Carts are drawn as in training and put into random states: a speed, an angle of the pole, and an energy of the
 pole up to somewhat more than upright. Each has full motor outward under way, keeps it for one more period,
-since the guard decides once a period, and then brakes with full motor inward. The way that a share `quantile`
-of them stays within, as a function of the measured speed, is bounded from above by the guard's
+since the guard decides once a period, and then brakes with full motor inward. Half of them run to the right,
+half to the left: carts may brake better in one direction. A share `quantile` of each half stays within some
+way, which depends on the measured speed. It is bounded from above by the guard's
 
     margin + delay v + v |v| / (2 deceleration),
 
@@ -32,10 +33,11 @@ SPEEDS = (0.0, 2.2)  # m/s, of the cart at the start; agents of the shipped expe
 BIN = 0.1  # m/s
 LEAST_SAMPLES = 500  # in a bin, for its quantile
 MOST_ENERGY = 1.3  # of the pole, as a multiple of that of the upright pole at rest, above hanging
-BRAKING = 60  # periods; the slowest carts of randomization=wide stop within 50
+BRAKING = 1.2  # s; the slowest carts of randomization=wide stop within 1
 SUBSTEPS = 4
 
 Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
 
 
 def fitted_guard(
@@ -46,32 +48,41 @@ def fitted_guard(
     `motors` are the motor values of the agent, `period` is the control period, s. Raises ConfigError if full
     motor does not brake the carts.
     """
-    speed, way = braking_distances(draws, max(motors), min(motors), models, period)
-    margin, delay, curvature = closest_bound(*quantiles(speed, way, quantile))
+    if not min(motors) < 0 < max(motors):
+        raise ConfigError(f"guard: actions.motors={list(motors)} brake in one direction; choose guard=none")
+    speed, way, rightward = braking_distances(draws, motors, models, period)
+    halves = [quantiles(speed[half], way[half], quantile) for half in (rightward, ~rightward)]
+    margin, delay, curvature = closest_bound(*map(np.concatenate, zip(*halves, strict=True)))
     if curvature <= 0:
         raise ConfigError("guard: full motor does not stop these carts; choose guard=none, or other actions")
     return TrackGuard(margin=round(margin, 4), delay=round(delay, 4), deceleration=round(0.5 / curvature, 3))
 
 
 def braking_distances(
-    draws: Draws, outward: int, inward: int, models: Models, period: float
-) -> tuple[Array, Array]:
-    """Return the measured speeds, m/s, and the ways that the carts run on to the right, m, [SAMPLES] each."""
+    draws: Draws, motors: Sequence[int], models: Models, period: float
+) -> tuple[Array, Array, Flags]:
+    """Return measured speeds, m/s, ways that carts run on, m, and which run to the right, [SAMPLES] each.
+
+    Speeds and ways are positive in the direction of motion.
+    """
     generator = torch.Generator().manual_seed(0)
     table = draws.draw(SAMPLES, generator)
     cart = CartParameters.from_table(table)
+    rightward = torch.arange(SAMPLES) % 2 == 0
+    side = torch.where(rightward, 1.0, -1.0)
     state = random_states(cart, generator)
+    state = state._replace(x_dot=side * state.x_dot)
     commands = 1 + max(1, math.ceil(draws.longest_delay() / period - 1e-9))
-    full = torch.full((SAMPLES,), float(outward))
-    drive = Drive(static_force(full, cart, models.actuator), [full] * commands)
+    right, left = float(max(motors)), float(min(motors))
+    outward, inward = torch.where(rightward, right, left), torch.where(rightward, left, right)
+    drive = Drive(static_force(outward, cart, models.actuator), [outward] * commands)
     before, (state, drive) = state, run_period(state, drive, cart.latency, cart, models, period, SUBSTEPS)
-    speed, start, farthest = (state.x - before.x) / period, state.x, torch.zeros(SAMPLES)
-    for step in range(BRAKING):
-        motor = full if step == 0 else torch.full_like(full, float(inward))
-        drive = Drive(drive.force, [motor, *drive.motors[:-1]])
+    speed, start, farthest = side * (state.x - before.x) / period, state.x, torch.zeros(SAMPLES)
+    for step in range(math.ceil(BRAKING / period)):
+        drive = Drive(drive.force, [inward if step else outward, *drive.motors[:-1]])
         state, drive = run_period(state, drive, cart.latency, cart, models, period, SUBSTEPS)
-        farthest = torch.maximum(farthest, state.x - start)
-    return speed.double().numpy(), farthest.double().numpy()
+        farthest = torch.maximum(farthest, side * (state.x - start))
+    return speed.double().numpy(), farthest.double().numpy(), rightward.numpy()
 
 
 def random_states(cart: CartParameters, generator: torch.Generator) -> State:
@@ -89,15 +100,15 @@ def random_states(cart: CartParameters, generator: torch.Generator) -> State:
 
 
 def quantiles(speed: Array, way: Array, quantile: float) -> tuple[Array, Array]:
-    """Return the upper ends of bins of `speed`, m/s, and the quantile of the `way` in each, m."""
+    """Return the middles of bins of `speed`, m/s, and the quantile of the `way` in each, m."""
     bins = np.floor(speed / BIN).astype(int)
-    ends, ways = [], []
+    middles, ways = [], []
     for number in np.unique(bins):
         inside = bins == number
         if inside.sum() >= LEAST_SAMPLES:
-            ends.append((number + 1) * BIN)
+            middles.append((number + 0.5) * BIN)
             ways.append(np.quantile(way[inside], quantile))
-    return np.array(ends), np.array(ways)
+    return np.array(middles), np.array(ways)
 
 
 def closest_bound(speed: Array, way: Array) -> tuple[float, float, float]:

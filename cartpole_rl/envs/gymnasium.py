@@ -11,6 +11,7 @@ Both wrap the same `CartPoleEnv` as everything else, with the nominal cart and t
 | balance | left, none, right, conf/actions/three       | (6.1), as in conf/reward/position  | track, 12 deg |
 
 An episode is truncated after 10 s. An action is an index of the motor values, from full left to full right.
+The track guard (envs/guard.py) replaces them near the end of the track.
 `info` has the step's scores (6.1) `score_upright` and (6.2) `score`. The observation is a Box of float32
 without bounds, as in conf/train.yaml:
 

@@ -55,7 +55,7 @@ class ObservationSettings(Settings):
 class TrackGuard(Settings):
     """The numbers of a track guard: see `envs/guard.py`."""
 
-    margin: NonNegative  # m
+    margin: Annotated[float, Field(ge=0, lt=0.3)]  # m
     delay: NonNegative  # s
     deceleration: Positive  # m/s^2
 

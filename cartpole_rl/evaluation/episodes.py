@@ -72,29 +72,30 @@ def choose(policy: Policy, current: TensorDictBase) -> Tensor:
 def run_batch(env: CartPoleEnv, policy: Policy) -> list[Episode]:
     """Return one episode of each cart, all from one reset."""
     if isinstance(env.plant, OneCartPlant):
-        return [run_one(env, prepared(env, policy))]
+        return [run_one(env, policy)]
     return run_many(env, policy)
 
 
 @torch.no_grad()
 def run_one(env: CartPoleEnv, policy: Policy) -> Episode:
     """Return an episode of a plant of one cart, on plain numbers."""
-    cart = env.one_cart
-    first = cart.reset()
-    (origin,) = env.plant.origins()
-    frames, steps, actions, motors = [cart.frame], [], [], []
-    observation, done = first.observation, False
+    cart, steps, actions, motors, done = env.one_cart, [], [], [], False
     with no_garbage_collection():
-        while not done:  # the cart waits for this loop; the rest is done afterwards
-            observed = torch.from_numpy(np.array([observation], np.float32))
-            action = int(choose(policy, tensordict_of({"observation": observed})))
-            motors.append(cart.sent_motor(action))
-            step = cart.step(action)
-            actions.append(action)
-            frames.append(cart.frame)
-            steps.append(step)
-            observation, (done,) = step.observation, step.done
-        env.plant.halt()  # a real cart would keep its last motor value
+        first = cart.reset()
+        (origin,) = env.plant.origins()
+        frames, observation = [cart.frame], first.observation
+        try:
+            while not done:  # the cart waits for this loop; the rest is done afterwards
+                observed = torch.from_numpy(np.array([observation], np.float32))
+                action = int(choose(policy, tensordict_of({"observation": observed})))
+                motors.append(cart.sent_motor(action))
+                step = cart.step(action)
+                actions.append(action)
+                frames.append(cart.frame)
+                steps.append(step)
+                observation, (done,) = step.observation, step.done
+        finally:
+            env.plant.halt()  # a real cart would keep its last motor value
     columns = {key: np.array([getattr(step, key) for step in steps])[:, 0] for key in _FROM_NEXT}
     columns["state"] = np.array([first.state, *(step.state for step in steps)])
     columns["counts"] = np.array([frame.counts for frame in frames])

@@ -27,6 +27,7 @@ from cartpole_rl.identification.moves import (
 from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 from cartpole_rl.physics.motor import LARGEST_MOTOR
 from cartpole_rl.plants.specs import OneFrame, Plant
+from cartpole_rl.scheduling import no_garbage_collection
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
 
@@ -140,12 +141,13 @@ def conduct(
     """
     task, present, ended = Task(period, np.random.default_rng(seed), BREAKAWAY), plant.reset_one(), False
     for number, experiment in enumerate(experiments):
-        if number and not ended:
-            present = plant.step_one(0)  # a new frame: the last one is as old as the writing took
-            ended = present.terminated or present.truncated
-        if ended:
-            present = plant.reset_one()
-        recorded, present, breakaway = run(plant, present, and_stop(experiment.moves(task), task))
+        with no_garbage_collection():
+            if number and not ended:
+                present = plant.step_one(0)  # a new frame: the last one is as old as the writing took
+                ended = present.terminated or present.truncated
+            if ended:
+                present = plant.reset_one()
+            recorded, present, breakaway = run(plant, present, and_stop(experiment.moves(task), task))
         task = task._replace(breakaway=breakaway or task.breakaway)
         ended = recorded.ended_by != Ending.TIME
         if number + 1 == len(experiments):

@@ -1,6 +1,7 @@
 """Builds the environment of an evaluation, from the settings of the agent's training and its own."""
 
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
 
 import torch
 
@@ -18,7 +19,8 @@ from cartpole_rl.plants.serial.preparation import StartPosition
 from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.plants.settings import EmulatedSettings, LearnedSettings, SimulatedSettings
 from cartpole_rl.randomization.poles import Pole, PoleSettings
-from cartpole_rl.settings import evaluation_seed
+from cartpole_rl.scheduling import taking_precedence
+from cartpole_rl.settings import Settings, evaluation_seed
 from cartpole_rl.tasks.settings import Start
 from cartpole_rl.workflows.checks import simulated_carts
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
@@ -114,10 +116,15 @@ def evaluated_env(
     return environment(settings, plant)
 
 
-def is_real_time(config: EvaluateConfig) -> bool:
+def is_real_time(plant: Settings, emulator: EmulatorSettings) -> bool:
     """Return True for a cart with its own clock, which does not wait for this computer."""
-    emulated = isinstance(config.plant, EmulatedSettings)
-    return isinstance(config.plant, SerialSettings) or (emulated and config.emulator.clock == "real")
+    emulated = isinstance(plant, EmulatedSettings)
+    return isinstance(plant, SerialSettings) or (emulated and emulator.clock == "real")
+
+
+def precedence(plant: Settings, emulator: EmulatorSettings) -> AbstractContextManager[None]:
+    """Return a context with real-time priority for a cart with its own clock."""
+    return taking_precedence() if is_real_time(plant, emulator) else nullcontext()
 
 
 def use_threads(threads: int | None) -> None:

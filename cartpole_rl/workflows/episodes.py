@@ -1,7 +1,6 @@
 """Whole episodes of an agent on any cart, as evaluations and recordings drive them."""
 
 from collections.abc import Iterator
-from contextlib import nullcontext
 from dataclasses import dataclass
 
 from tqdm import tqdm
@@ -12,10 +11,9 @@ from cartpole_rl.evaluation.episodes import Policy, run_batch, run_episodes
 from cartpole_rl.learning.randomness import seed_everything
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.reporting.words import guard_text
-from cartpole_rl.scheduling import taking_precedence
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.agents import evaluated_agent
-from cartpole_rl.workflows.build import evaluated_env, evaluated_settings, is_real_time, use_threads
+from cartpole_rl.workflows.build import evaluated_env, evaluated_settings, precedence, use_threads
 from cartpole_rl.workflows.config import EvaluateConfig
 from cartpole_rl.workflows.person import confirm
 from cartpole_rl.workflows.repeating import Repetition, repetition
@@ -36,7 +34,7 @@ class Evaluation:
         if self.repetition:
             yield from repeated(self.env, self.policy, self.repetition)
             return
-        with taking_precedence() if is_real_time(self.config) else nullcontext():
+        with precedence(self.config.plant, self.config.emulator):
             yield from with_progress(self.env, self.policy, self.config.episodes)
 
 

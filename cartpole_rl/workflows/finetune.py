@@ -70,7 +70,7 @@ def finetune(config: FinetuneConfig, folder: Path) -> None:
     if not checkpoint:
         files.save({}, 0)
     make_env = partial(evaluated_env, settings, evaluation, print)  # called with `confirm`
-    real_time = is_real_time(evaluation)
+    real_time = is_real_time(config.plant, config.emulator)
     with (
         TensorBoardLog(folder) as log,
         Driver(make_env, partial(greedy_network, training), real_time, confirm) as driver,

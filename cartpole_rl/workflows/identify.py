@@ -28,7 +28,7 @@ from cartpole_rl.reporting.identification import (
 )
 from cartpole_rl.run_files import CART, FIGURES, POLE, RANDOMIZATION, RECORDINGS
 from cartpole_rl.tasks.episode import Episode
-from cartpole_rl.workflows.build import use_threads
+from cartpole_rl.workflows.build import precedence, use_threads
 from cartpole_rl.workflows.config import IdentifyConfig
 from cartpole_rl.workflows.identified_files import report, write_choices
 from cartpole_rl.workflows.person import confirm, print_message
@@ -76,7 +76,11 @@ def identify_cart(config: IdentifyConfig, folder: Path) -> None:
 
 def record_experiments(config: IdentifyConfig, folder: Path) -> None:
     """Run every experiment on the cart, and write each one when it ends."""
-    with closing(make_plant(config)) as plant, tqdm(total=len(EXPERIMENTS), unit=" experiments") as progress:
+    with (
+        closing(make_plant(config)) as plant,
+        precedence(config.plant, config.emulator),
+        tqdm(total=len(EXPERIMENTS), unit=" experiments") as progress,
+    ):
         progress.set_postfix_str(EXPERIMENTS[0].name)
         for number, (experiment, episode) in enumerate(conduct(plant, config.control_period, config.seed)):
             header = {"experiment": experiment.name, "control_period_s": config.control_period}

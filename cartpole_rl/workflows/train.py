@@ -9,7 +9,7 @@ from cartpole_rl.envs.build import simulated_env, with_fitted_guard
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.settings import GuardSettings
 from cartpole_rl.evaluation.driving_policy import DrivingPolicy, as_weights
-from cartpole_rl.evaluation.episodes import run_batch
+from cartpole_rl.evaluation.episodes import Policy, run_batch
 from cartpole_rl.learning.checkpoints import forget_training, restore_weights
 from cartpole_rl.learning.randomness import seed_everything
 from cartpole_rl.learning.training import Training
@@ -54,7 +54,7 @@ def train(config: TrainConfig, folder: Path) -> None:
     if checkpoint:
         restore_weights(agent, checkpoint.state["agent"], f"resume={folder}")  # its error precedes any work
     policy = DrivingPolicy(agent.greedy_policy(), config.compile)
-    evaluate = partial(judge, nominal_env(config), agent, policy, config.seed)
+    evaluate = partial(judge_agent, nominal_env(config), agent, policy, config.seed)
     write_config(folder, "train", config.model_dump(mode="json"), resumed=checkpoint is not None)
     note_unused_randomization(config, env.plant.randomizer)
     note_guard(config.guard)
@@ -110,11 +110,16 @@ def nominal_env(config: TrainConfig) -> CartPoleEnv:
     return simulated_env(nominal, plant, carts, config.task.evaluation_start, 0, config.compile)
 
 
-def judge(env: CartPoleEnv, agent: QAgent, policy: DrivingPolicy, seed: int) -> list[Episode]:
-    """Return episodes of the greedy policy in a training with `seed`, from the same starts each time.
+def judge_agent(env: CartPoleEnv, agent: QAgent, policy: DrivingPolicy, seed: int) -> list[Episode]:
+    """Return `judge` of the agent's greedy policy.
 
     The carts are on the CPU, whatever the device of the training: `policy` acts with a copy of the weights.
     """
     policy.load(as_weights(agent.greedy_policy()))
+    return judge(env, policy, seed)
+
+
+def judge(env: CartPoleEnv, policy: Policy, seed: int) -> list[Episode]:
+    """Return episodes of a policy in a training with `seed`, from the same starts each time."""
     env.set_seed(evaluation_seed(seed))
     return run_batch(env, policy)

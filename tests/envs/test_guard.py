@@ -10,12 +10,13 @@ from torch import Tensor
 
 from cartpole_rl.choices import choice
 from cartpole_rl.emulator.settings import EmulatorSettings
-from cartpole_rl.envs.build import environment, shipped_settings, simulated_env, with_fitted_guard
+from cartpole_rl.envs.build import environment, randomizer, shipped_settings, simulated_env, with_fitted_guard
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
-from cartpole_rl.envs.guard import guard_side
-from cartpole_rl.envs.guard_fitting import closest_bound
+from cartpole_rl.envs.guard import guard_side, stopping_distance
+from cartpole_rl.envs.guard_fitting import braking_distances, closest_bound
 from cartpole_rl.envs.settings import TrackGuard
+from cartpole_rl.errors import ConfigError
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.physics.dynamics import State
 from cartpole_rl.plants.emulated import emulated_plant
@@ -105,6 +106,33 @@ def test_the_bound_is_the_least_one_above_all_quantiles() -> None:
     lower = way - 0.005 * np.sin(speed * 20) ** 2
     margin, delay, curvature = closest_bound(speed, lower)
     assert (margin + delay * speed + curvature * speed**2 >= lower - 1e-9).all()
+
+
+WEAK_TO_THE_LEFT = {"force_asymmetry": 0.12, "track_tilt": -0.008}
+
+
+@pytest.mark.parametrize("quantile", [0.6, 0.8, 0.99])
+@pytest.mark.parametrize("one_cart", [False, True])
+def test_the_share_of_brakings_within_the_bound(quantile: float, one_cart: bool) -> None:
+    """In both directions, also of a cart that brakes better in one of them."""
+    ends = {name: [value, value + 1e-4] for name, value in WEAK_TO_THE_LEFT.items()}
+    one = {name: {"distribution": "uniform", "absolute": each} for name, each in ends.items()}
+    randomization = one if one_cart else "wide"
+    overrides = {"guard": "fitted", "guard.quantile": quantile, "randomization": randomization}
+    settings = with_fitted_guard(shipped_settings(overrides))
+    models = settings.models(SimulatedSettings(**choice("plant/simulated")))
+    speed, way, rightward = braking_distances(
+        randomizer(settings), settings.actions.motors, models, settings.control_period
+    )
+    within = way <= stopping_distance(speed, settings.guard.active)
+    for half in (rightward, ~rightward):
+        assert within[half & (speed > 0) & (speed < 2.2)].mean() > quantile - 0.005
+
+
+def test_motor_values_of_one_sign_are_refused() -> None:
+    settings = shipped_settings({"actions": {"motors": [-255, -100, 0], "actuator": "force_curve"}})
+    with pytest.raises(ConfigError, match="brake in one direction; choose guard=none"):
+        with_fitted_guard(settings)
 
 
 # how many carts leave the track

@@ -20,7 +20,7 @@ from cartpole_rl.workflows.agents import new_agent
 from cartpole_rl.workflows.config import TrainConfig
 from cartpole_rl.workflows.finetuning_learner import NoCallbacks
 from cartpole_rl.workflows.loading import load_settings
-from cartpole_rl.workflows.train import judge, nominal_env, note_unused_randomization, train
+from cartpole_rl.workflows.train import judge_agent, nominal_env, note_unused_randomization, train
 
 SHORT = {
     "learning.transitions": 2048,
@@ -106,12 +106,14 @@ def test_a_training_is_evaluated_on_the_cpu() -> None:
     with separate_device():
         agent = new_agent(config, DEVICE)
         policy = DrivingPolicy(agent.greedy_policy(), compiled=False)
-        episodes = judge(nominal_env(config), agent, policy, seed=3)
+        episodes = judge_agent(nominal_env(config), agent, policy, seed=3)
         weights = moved(agent.state_dict(), "cpu")
     on_cpu = new_agent(config)
     on_cpu.load_state_dict(weights)
     policy = DrivingPolicy(on_cpu.greedy_policy(), compiled=False)
-    for episode, expected in zip(episodes, judge(nominal_env(config), on_cpu, policy, seed=3), strict=True):
+    for episode, expected in zip(
+        episodes, judge_agent(nominal_env(config), on_cpu, policy, seed=3), strict=True
+    ):
         assert (episode.counts == expected.counts).all()
         assert (episode.score == expected.score).all()
 

@@ -249,7 +249,7 @@ class SerialCart:
         self._stop_unanswered = False
 
     def _in_time(self, motor: int) -> int:
-        """The motor value, or 0 if it is too late for it; see `set_motor`.
+        """Return the motor value, or 0 if it is too late for it; see `set_motor`.
 
         If no newer state waits, no time has passed for the cart, as on a lockstep emulator.
         """
@@ -265,7 +265,7 @@ class SerialCart:
                 f"this computer did not answer the cart on {self.port} for {late:.1f} s; end what keeps it "
                 "busy, and do not suspend a command that drives"
             )
-        return 0 if late > stopped_after else motor
+        return 0
 
     def _is_homing(self) -> bool:
         self.poll_state()
