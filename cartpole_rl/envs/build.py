@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from functools import lru_cache
 from typing import Any, TypeVar
 
 import torch
@@ -44,11 +45,26 @@ def with_fitted_guard(config: Config) -> Config:
     guard = config.guard
     if not guard.enabled or guard.numbers:
         return config
+    shared = CartPoleSettings(**{name: getattr(config, name) for name in CartPoleSettings.model_fields})
+    if isinstance(config.randomization, IdentifiedSettings):
+        numbers = guard_numbers(shared)
+    else:
+        numbers = known_guard_numbers(shared.model_dump_json())
+    return config.model_copy(update={"guard": guard.model_copy(update={"numbers": numbers})})
+
+
+@lru_cache(maxsize=64)
+def known_guard_numbers(settings: str) -> TrackGuard:
+    """Return `guard_numbers` of settings as JSON: the fit takes half a second, and many carts share one."""
+    return guard_numbers(CartPoleSettings.model_validate_json(settings))
+
+
+def guard_numbers(config: CartPoleSettings) -> TrackGuard:
+    """Return the numbers of the track guard, fitted to the carts of `config`."""
     actuator = Actuator(config.actions.actuator)
     models = Models(config.cart_friction.model, config.pole_friction.model, actuator)
     motors, period = config.actions.motors, config.control_period
-    numbers = fitted_guard(guard.quantile, randomizer(config), motors, models, period)
-    return config.model_copy(update={"guard": guard.model_copy(update={"numbers": numbers})})
+    return fitted_guard(config.guard.quantile, randomizer(config), motors, models, period)
 
 
 def make_env(
@@ -65,7 +81,8 @@ def make_env(
 
 
 def environment(config: CartPoleSettings, plant: Plant) -> CartPoleEnv:
-    """Return the environment of `config` over `plant`."""
+    """Return the environment of `config` over `plant`, with the track guard of `with_fitted_guard`."""
+    config = with_fitted_guard(config)
     return make_env(
         plant, config.actions, config.task, config.observation, config.reward, config.guard.active
     )
