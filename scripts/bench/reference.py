@@ -59,6 +59,7 @@ from cartpole_rl.workflows.loading import load_settings
 STARTS = (-0.1, -0.05, 0.0, 0.05, 0.1)  # m: an evaluation places the cart within 0.1 m of the middle
 POLES = ("medium", "large")
 LENGTHS = tuple(tenths / 10 for tenths in range(2, 11))  # m, of the length experiment
+ALONE = {"randomization": "none", "guard": "none"}  # nothing is drawn, and full knowledge needs no guard
 FIRST_RUNG, RUNG = 1000, 3  # states of the first search, and the factor to the next
 WIDEST = 3000  # states, unless given
 LANDED = 4  # populations whose winners land
@@ -173,7 +174,7 @@ def truth_config(truth: Truth) -> TrainConfig:
     cart = {**simulated_cart(truth), "latency_jitter": 0.0}  # a search cannot foresee draws
     pole = {name: cart.pop(name) for name in Pole.model_fields}
     friction = {"cart_friction": "stribeck", "pole_friction": "bearing"}
-    choices = {"cart": cart, "pole": {"choices": {"truth": pole}}, "randomization": "none"}
+    choices = {"cart": cart, "pole": {"choices": {"truth": pole}}, **ALONE}
     return load_settings(TrainConfig, {**choices, **friction})
 
 
@@ -205,7 +206,7 @@ def composed(overrides: Sequence[str]) -> TrainConfig:
     """Return the settings of cartpole-train with `overrides`, on the nominal cart. Raises ConfigError."""
     pairs = (word.partition("=") for word in overrides)
     values = {name: yaml.safe_load(value) for name, _, value in pairs}
-    return load_settings(TrainConfig, {**values, "randomization": "none"})
+    return load_settings(TrainConfig, {**values, **ALONE})
 
 
 def with_rod(config: TrainConfig, length: float) -> TrainConfig:
