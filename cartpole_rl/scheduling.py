@@ -28,13 +28,9 @@ def taking_precedence() -> Iterator[None]:
     if not hasattr(os, "SCHED_FIFO") or os.sched_getscheduler(0) in (os.SCHED_FIFO, os.SCHED_RR):
         yield
         return
-    policy, param = os.sched_getscheduler(0), os.sched_getparam(0)
-    take_precedence()
-    try:
+    with _same_policy_afterwards():
+        take_precedence()
         yield
-    finally:
-        with suppress(PermissionError):
-            os.sched_setscheduler(0, policy, param)
 
 
 @contextmanager
@@ -48,8 +44,15 @@ def giving_precedence() -> Iterator[None]:
             os.nice(19)
         yield
         return
+    with _same_policy_afterwards():
+        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+        yield
+
+
+@contextmanager
+def _same_policy_afterwards() -> Iterator[None]:
+    """Restore the scheduling policy of this process at the end, if the system allows it."""
     policy, param = os.sched_getscheduler(0), os.sched_getparam(0)
-    os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
     try:
         yield
     finally:

@@ -26,6 +26,7 @@ from cartpole_rl.physics.actuator import static_force
 from cartpole_rl.physics.dynamics import Drive, State, run_period
 from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import GRAVITY, CartParameters
+from cartpole_rl.plants.simulation import commands_under_way
 from cartpole_rl.randomization.draws import Draws
 
 SAMPLES = 65536
@@ -72,7 +73,7 @@ def braking_distances(
     side = torch.where(rightward, 1.0, -1.0)
     state = random_states(cart, generator)
     state = state._replace(x_dot=side * state.x_dot)
-    commands = 1 + max(1, math.ceil(draws.longest_delay() / period - 1e-9))
+    commands = commands_under_way(draws.longest_delay(), period)
     right, left = float(max(motors)), float(min(motors))
     outward, inward = torch.where(rightward, right, left), torch.where(rightward, left, right)
     drive = Drive(static_force(outward, cart, models.actuator), [outward] * commands)

@@ -38,7 +38,7 @@ from numpy.typing import NDArray
 from tensordict import TensorDictBase
 
 from cartpole_rl.choices import choice
-from cartpole_rl.envs.build import shipped_settings, simulated_env, with_fitted_guard
+from cartpole_rl.envs.build import shipped_settings, simulated_env
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.plants.settings import SimulatedSettings
 
@@ -60,7 +60,6 @@ def simulated_environment(
     `randomization` is the name of a file in conf/randomization/, or its lines. Raises ConfigError.
     """
     settings = shipped_settings({**OF_TASK[task], "pole": "medium", "randomization": randomization})
-    settings = with_fitted_guard(settings)
     plant = SimulatedSettings(**choice("plant/simulated"))
     return simulated_env(settings, plant, carts, settings.task.start, seed=0, compiled=compiled)
 

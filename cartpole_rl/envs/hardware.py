@@ -72,7 +72,7 @@ class HardwareTransform(Transform):
         self.task, self.observation_settings, self.reward = task, observation, reward
         self.register_buffer("motors", torch.tensor(list(motors), dtype=torch.int64))
         inward = torch.tensor([0, max(0, *motors), min(0, *motors)])  # by the guard's direction: 0, 1, -1
-        self.register_buffer("_inward", inward)
+        self.register_buffer("inward", inward)
         self.guard = guard
         self.register_buffer("_by_action", torch.tensor([0, *motors], dtype=torch.int64))  # from NO_ACTION on
         self.first_perception = partial(perceive_first, settings=observation, guard=guard)
@@ -130,7 +130,7 @@ class HardwareTransform(Transform):
         motor = self.motor_values(action)
         if self.guard is None:
             return motor
-        inward = self._inward.index_select(0, guard.reshape(-1) % 3).reshape(guard.shape)
+        inward = self.inward.index_select(0, guard.reshape(-1) % 3).reshape(guard.shape)
         return torch.where((guard == 0) | (action == NO_ACTION), motor, inward)
 
     def guarded(self, action: Tensor, guard: Tensor) -> Tensor:

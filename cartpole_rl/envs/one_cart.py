@@ -27,6 +27,7 @@ class OneCart:
     def __init__(self, plant: Plant, hardware: HardwareTransform) -> None:
         self.plant, self.hardware = plant, hardware
         self._motors: list[int] = hardware.motors.tolist()
+        self._inward: list[int] = hardware.inward.tolist()
         length, track_end = hardware.scaled_length(), hardware.track_end()
         count, flag = torch.zeros(1, 1, dtype=torch.int64), torch.zeros(1, 1, dtype=torch.bool)
         counts, number = count.repeat(2, 1), torch.zeros(1, 1)
@@ -55,7 +56,7 @@ class OneCart:
         motor, (side,) = self.motor(action), self._percept.guard
         if side == 0 or action == NO_ACTION:
             return motor
-        return max(0, *self._motors) if side > 0 else min(0, *self._motors)
+        return self._inward[side]
 
     def reset(self) -> FirstPercept[Numbers]:
         """Start an episode. Raises the errors of the plant's reset."""

@@ -61,6 +61,17 @@ def share(text: str) -> float:
     return value
 
 
+def add_wider_option(parser: argparse.ArgumentParser) -> None:
+    """Add `--wider`."""
+    parser.add_argument(
+        "--wider",
+        type=share,
+        default=0.0,
+        metavar="SHARE",
+        help="extend each range on both sides by this share of its width, from 0 (default) to 1",
+    )
+
+
 def failure(command: str, *words: str) -> str | None:
     """Run cartpole-`command`; return None on success, else the last line of its error output."""
     program = Path(sys.executable).with_name(f"cartpole-{command}")

@@ -26,12 +26,12 @@ import yaml
 from common import (
     LOST_SCORE,
     RUNS,
+    add_wider_option,
     option_parser,
     positive_int,
     print_table,
     processes,
     read_json,
-    share,
     write_json,
 )
 from truth_references import Draw, known_references, note_missing
@@ -145,13 +145,7 @@ def parse_options() -> tuple[argparse.Namespace, dict[str, Any]]:
     parser.add_argument("agents", nargs="+", help="run folders; NAME=VALUE is an override")
     parser.add_argument("--truths", type=positive_int, default=20, help="number of carts (20)")
     parser.add_argument("--seed", type=int, default=TUNED, help=f"decides which carts are drawn ({TUNED})")
-    parser.add_argument(
-        "--wider",
-        type=share,
-        default=0.0,
-        metavar="SHARE",
-        help="widens their ranges, as in zero_shot.py (0)",
-    )
+    add_wider_option(parser)
     parser.add_argument("--episodes", type=positive_int, default=5, help="to learn from on each cart (5)")
     parser.add_argument("--starts", type=positive_int, default=5, help="episodes before and after (5)")
     parser.add_argument("--jobs", type=positive_int, default=1, help="fine-tunings at the same time (1)")

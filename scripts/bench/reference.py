@@ -42,7 +42,7 @@ import yaml
 from best_score.beam import held, landed, risk
 from best_score.cart import MOST, KnownCart, hanging, wrapped
 from best_score.swing_up import GENERATIONS, evolved, lacking, pushed
-from common import option_parser, positive_int, processes, read_json, share, write_json
+from common import add_wider_option, option_parser, positive_int, processes, read_json, write_json
 from truth_references import Draw, add_reference, known_references
 from truths import REPORTED, Truth, simulated_cart
 
@@ -250,13 +250,7 @@ def main() -> None:
     parser.add_argument("--all", action="store_true", help="both poles and rods of 0.2 to 1.0 m")
     parser.add_argument("--truths", type=positive_int, metavar="N", help="the first N drawn truths")
     parser.add_argument("--seed", type=int, default=REPORTED, help=f"of the truths ({REPORTED})")
-    parser.add_argument(
-        "--wider",
-        type=share,
-        default=0.0,
-        metavar="SHARE",
-        help="widens their ranges, as in zero_shot.py (0)",
-    )
+    add_wider_option(parser)
     parser.add_argument("--jobs", type=positive_int, default=1, help="truths searched at the same time (1)")
     options = parser.parse_args()
     torch.set_num_threads(1)

@@ -30,13 +30,13 @@ from typing import Any
 import numpy as np
 from common import (
     LOST_SCORE,
+    add_wider_option,
     min_median_max,
     option_parser,
     positive_int,
     print_table,
     processes,
     read_json,
-    share,
     write_json,
 )
 from truth_references import Draw, known_references, note_missing
@@ -223,13 +223,7 @@ def parse_options() -> argparse.Namespace:
         help=f"decides which carts are drawn: {REPORTED} (default) for reports; {COMPARED} gives the carts "
         "on which settings are compared",
     )
-    parser.add_argument(
-        "--wider",
-        type=share,
-        default=0.0,
-        metavar="SHARE",
-        help="extend each range on both sides by this share of its width, from 0 (default) to 1",
-    )
+    add_wider_option(parser)
     parser.add_argument("--jobs", type=positive_int, default=1, help="carts driven at the same time (1)")
     return parser.parse_args()
 
