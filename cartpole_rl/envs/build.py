@@ -96,19 +96,15 @@ def simulated_env(
     seed: int,
     compiled: bool = False,
     device: torch.device | str = "cpu",
-    near_share: float = 0.0,
 ) -> CartPoleEnv:
-    """Return an environment over `carts` simulated carts, `near_share` of them nearer to the nominal one.
-
-    Raises CheckpointError, ConfigError.
-    """
+    """Return an environment over `carts` simulated carts. Raises CheckpointError, ConfigError."""
     if isinstance(plant, LearnedSettings):
         return environment(config, learned_plant(config, plant, carts, start, seed, compiled, device))
     return environment(
         config,
         SimulatedPlant(
             carts,
-            randomizer(config, device, near_share),
+            randomizer(config, device),
             start,
             config.models(plant),
             config.control_period,
@@ -120,16 +116,11 @@ def simulated_env(
     )
 
 
-def randomizer(
-    config: CartPoleSettings, device: torch.device | str = "cpu", near_share: float = 0.0
-) -> Draws:
-    """Return the source of the carts that `config` describes. Raises ConfigError for impossible carts.
-
-    `near_share` is that of `Randomizer`; identified carts have none.
-    """
+def randomizer(config: CartPoleSettings, device: torch.device | str = "cpu") -> Draws:
+    """Return the source of the carts that `config` describes. Raises ConfigError for impossible carts."""
     if isinstance(config.randomization, IdentifiedSettings):
         return identified_carts(config.randomization, config.nominal_cart, config.pole, device)
-    return Randomizer(config.nominal_cart, config.pole, config.randomization, device, near_share)
+    return Randomizer(config.nominal_cart, config.pole, config.randomization, device)
 
 
 def learned_plant(

@@ -34,7 +34,6 @@ class LearningSettings(Settings):
     carts: Count  # simulated in parallel
     chunk: Count  # periods
     retry_probability: Fraction  # that a cart is kept for another episode after a failed one
-    near_share: Fraction = 0.0  # of the drawn carts, which are moved towards the nominal one
     updates: Count  # gradient steps per iteration
     batch_size: Count
     n_step: Annotated[int, Field(ge=1, le=20)]  # the longest return

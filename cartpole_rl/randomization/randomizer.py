@@ -21,9 +21,8 @@ POLE_FIELDS = tuple(Pole.model_fields)
 class Randomizer:
     """Draws carts about `cart` (every parameter but the pole's), with `poles` and `ranges` by parameter name.
 
-    `near_share` of the carts are moved towards the nominal cart with the same pole, to a point that is drawn
-    uniformly on the line between the two. Raises ConfigError when a name is unknown, a nominal value is
-    impossible, a range reaches an impossible value, or `cart` contains a parameter of the pole.
+    Raises ConfigError when a name is unknown, a nominal value is impossible, a range reaches an impossible
+    value, or `cart` contains a parameter of the pole.
     """
 
     def __init__(
@@ -32,9 +31,8 @@ class Randomizer:
         poles: PoleSettings,
         ranges: Mapping[str, Range],
         device: torch.device | str = "cpu",
-        near_share: float = 0.0,
     ) -> None:
-        self.poles, self.ranges, self.near_share = poles, dict(ranges), near_share
+        self.poles, self.ranges = poles, dict(ranges)
         check_carts(cart, poles, ranges)
         nominal = {**cart, **poles.nominal.model_dump()}
         self.nominal = torch.tensor([float(nominal[name]) for name in CartParameters.names()], device=device)
@@ -50,12 +48,7 @@ class Randomizer:
 
     def draw(self, count: int, generator: torch.Generator) -> Tensor:
         """Return parameters of `count` carts, [P, count]."""
-        poles, unit = self._draw_parts(count, generator)
-        table = self._table(poles, unit)
-        if not self.near_share:
-            return table
-        place = torch.rand(count, generator=generator, device=self.nominal.device) / self.near_share
-        return torch.lerp(poles, table, torch.where(place < 1, place, 1.0))
+        return self._table(*self._draw_parts(count, generator))
 
     def ends(self, name: str, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Return a draw with `name` at the low end of its range, and the same with it at the high end.

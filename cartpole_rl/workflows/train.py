@@ -48,7 +48,8 @@ def train(config: TrainConfig, folder: Path) -> None:
     use_threads(config.threads)
     seed_everything(config.seed)
     config = with_fitted_guard(config)
-    env = training_env(config)
+    carts, start = config.learning.carts, config.task.start
+    env = simulated_env(config, config.plant, carts, start, config.seed, config.compile, config.device)
     agent = new_agent(config, config.device)
     if checkpoint:
         restore_weights(agent, checkpoint.state["agent"], f"resume={folder}")  # its error precedes any work
@@ -97,20 +98,6 @@ def note_unused_randomization(config: TrainConfig, draws: Draws) -> None:
             f"actuator {config.actions.actuator} with motor values {list(config.actions.motors)}"
         )
         print_message("train", f"note: randomization of {', '.join(unused)} has no effect with {chosen}")
-
-
-def training_env(config: TrainConfig) -> CartPoleEnv:
-    """Return the environment that transitions are collected from."""
-    return simulated_env(
-        config,
-        config.plant,
-        config.learning.carts,
-        config.task.start,
-        config.seed,
-        config.compile,
-        config.device,
-        config.learning.near_share,
-    )
 
 
 def nominal_env(config: TrainConfig) -> CartPoleEnv:

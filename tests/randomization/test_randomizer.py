@@ -1,7 +1,6 @@
 """Drawn carts: inside their bounds, distributed as said, poles whole."""
 
 import math
-from types import MappingProxyType
 
 import pytest
 import torch
@@ -69,34 +68,6 @@ def test_lines_are_independent(ip02: dict[str, float], medium: PoleSettings) -> 
     values = torch.stack([getattr(carts, name) for name in lines])
     correlation = torch.corrcoef(values) - torch.eye(3)
     assert correlation.abs().max() < 0.03
-
-
-class TestNearShare:
-    """`near_share`: some carts are moved towards the nominal one."""
-
-    LINES = MappingProxyType(
-        {"cart_mass": Range(relative=(-0.2, 0.2)), "latency": Range(absolute=(0.0, 0.022))}
-    )
-
-    @pytest.mark.parametrize("share", [0.3, 1.0])
-    def test_that_share_is_moved_by_a_uniform_part_of_the_way(
-        self, ip02: dict[str, float], both_poles: PoleSettings, share: float
-    ) -> None:
-        plain = Randomizer(ip02, both_poles, self.LINES).draw(COUNT, torch.Generator().manual_seed(0))
-        near = Randomizer(ip02, both_poles, self.LINES, near_share=share)
-        moved = near.draw(COUNT, torch.Generator().manual_seed(0))
-        mass = CartParameters.names().index("cart_mass")
-        kept = (moved[mass] - ip02["cart_mass"]) / (plain[mass] - ip02["cart_mass"])
-        assert (kept == 1).double().mean() == pytest.approx(1 - share, abs=0.02)
-        assert farthest_from_uniform(kept[kept < 1]) < 0.03
-        row = CartParameters.names().index("latency")
-        expected = torch.lerp(torch.tensor(ip02["latency"]), plain[row], kept)
-        torch.testing.assert_close(moved[row], expected, rtol=0, atol=1e-4)
-
-    def test_the_pole_stays_the_drawn_one(self, ip02: dict[str, float], both_poles: PoleSettings) -> None:
-        carts = draw(Randomizer(ip02, both_poles, self.LINES, near_share=1.0))
-        expected = [pole.pole_mass for pole in (both_poles.choices or {}).values()]
-        assert sorted(set(carts.pole_mass.tolist())) == pytest.approx(sorted(expected))
 
 
 def test_the_generator_decides(ip02: dict[str, float], medium: PoleSettings) -> None:
