@@ -49,9 +49,11 @@ class Study(Settings):
     question: str
     thesis: str = ""  # the thesis's answer
     comment: str = ""  # why the results agree with the thesis or contradict it
+    verdict: Literal["", "fails", "contradicts", "agrees"] = ""  # of the comment; the page sorts by it
     measure: str = "score"  # score (6.2), score_upright (6.1) or another key of metrics.json
     ratio: bool = False  # also the second evaluation divided by the first, per agent
     axis: Axis | None = None
+    curves: tuple[Literal["score", "loss"], ...] = ("score",)  # of the trainings, drawn over transitions
     arms: Annotated[tuple[Variant, ...], Field(min_length=1)]
     evaluations: tuple[Variant, ...] = ()  # by cartpole-evaluate; none if the run itself holds the result
     command: Literal["train", "identify", "evaluate", "finetune", "model"] = "train"

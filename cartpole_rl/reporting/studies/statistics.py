@@ -7,7 +7,8 @@ One number per agent (the mean over its evaluation episodes) enters; agents are 
 - Intervals: the 2.5 and 97.5 percentiles of RESAMPLES bootstrap samples. A sample draws, within each stratum,
   as many values as it has, with replacement ("stratified bootstrap").
 - Performance profile: the share of agents above a score, for every score.
-- Probability of improvement: the share of pairs (x, y) with x > y, ties counted half (Mann and Whitney, 1947).
+- Probability of improvement: the share of pairs (x, y) with x > y, ties counted half (Mann and
+  Whitney, 1947).
 - Rank correlation: Spearman's rho, Pearson's correlation of the ranks, ties at their mean rank.
 """
 
@@ -35,7 +36,7 @@ class Estimate(NamedTuple):
     value: float
     low: float | None
     high: float | None
-    count: int
+    agents: int
 
 
 def interquartile_mean(values: ArrayLike) -> Array:
@@ -56,7 +57,7 @@ def estimate(*strata: ArrayLike) -> Estimate:
 
 
 def difference(values: ArrayLike, others: ArrayLike) -> Estimate:
-    """Return IQM(values) - IQM(others) for independent agents; the count is that of the smaller group."""
+    """Return IQM(values) - IQM(others) for independent agents; `agents` is that of the smaller group."""
     groups = [np.asarray(values, dtype=float), np.asarray(others, dtype=float)]
     return _estimate(
         lambda a, b: interquartile_mean(a) - interquartile_mean(b), groups, min(each.size for each in groups)

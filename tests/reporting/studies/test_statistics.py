@@ -34,7 +34,7 @@ def test_the_interval_is_that_of_the_percentile_bootstrap() -> None:
     assert found.value == pytest.approx(interquartile_mean(SCORES))
     assert found.low == pytest.approx(theirs.low, abs=60)
     assert found.high == pytest.approx(theirs.high, abs=60)
-    assert found.count == 10
+    assert found.agents == 10
 
 
 def test_an_interval_covers_the_true_value_about_as_often_as_it_says() -> None:

@@ -1,0 +1,235 @@
+"""The figures of a study as SVG with alt texts and captions."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cartpole_rl.reporting.figures import svg
+from cartpole_rl.reporting.figures.studies import (
+    MOST_LINES,
+    agreement,
+    curves_over_axis,
+    described,
+    dot_rows,
+    profiles,
+    training_curves,
+)
+from cartpole_rl.reporting.studies.answers import GOOD, estimate_text, measure_label
+from cartpole_rl.reporting.studies.results import OWN, StudyResults
+from cartpole_rl.reporting.studies.settings import Variant
+from cartpole_rl.reporting.studies.statistics import estimate, interquartile_mean
+
+MOST_ROWS = 40  # groups in a figure of dots
+FEWEST_PROFILED = 3  # agents
+CURVES = {"score": "score of an evaluation", "loss": "loss"}
+
+Array = NDArray[np.float64]
+Groups = Mapping[str, Mapping[str, Array]]
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """A figure for the page."""
+
+    svg: str
+    caption: str
+
+
+def drawings(results: StudyResults) -> Iterator[Drawing]:
+    """Yield the figures of a study that has agents."""
+    if not results.agents:
+        return
+    yield _over_axis(results) if _varied(results) else _dots(results)
+    if results.study.ratio:
+        yield from _ratios(results)
+    if not _varied(results):
+        yield from _profiles(results)
+    for name in results.study.curves:
+        yield from _training(results, name)
+    if len(results.evaluations) > 1 and not _varied(results):
+        yield from _agreement(results)
+
+
+def _varied(results: StudyResults) -> str:
+    """Return "evaluations" or "arms", whichever has values on the study's axis; empty if neither has two."""
+    if results.study.axis is None:
+        return ""
+    kinds: dict[str, Sequence[Variant]] = {"evaluations": results.evaluations, "arms": results.study.arms}
+    return next((kind for kind, each in kinds.items() if sum(one.value is not None for one in each) > 1), "")
+
+
+def _groups(results: StudyResults) -> dict[str, dict[str, Array]]:
+    """Return the values of each arm's evaluations by their labels."""
+    evaluations = results.evaluations
+    single = len(evaluations) == 1
+    return {
+        arm.label: {"" if single else each.label: results.values(arm.name, each.name) for each in evaluations}
+        for arm in results.study.arms
+    }
+
+
+def _dots(results: StudyResults) -> Drawing:
+    groups, note = _most(_groups(results))
+    label = measure_label(results.study.measure)
+    good = GOOD.get(results.study.measure)
+    figure = dot_rows(groups, label, {f"good: {good:g}": good} if good else None)
+    caption = f"Dots: agents. Diamond and line: interquartile mean and its 95 % interval.{note}"
+    return Drawing(svg(figure, described(groups, label)), caption)
+
+
+def _most(groups: Groups) -> tuple[Groups, str]:
+    """Return at most MOST_ROWS groups, the highest and the lowest, and a note if some are left out."""
+    if len(groups) <= MOST_ROWS:
+        return groups, ""
+    ranked = [*_ranked(groups)]
+    shown = [*ranked[: MOST_ROWS // 2], *ranked[-MOST_ROWS // 2 :]]
+    note = f" Of {len(groups)} groups the {MOST_ROWS // 2} highest and the {MOST_ROWS // 2} lowest are drawn."
+    return {label: groups[label] for label in shown}, note
+
+
+def _ranked(groups: Groups) -> list[str]:
+    """Return the labels, highest interquartile mean of the last series first."""
+
+    def height(label: str) -> float:
+        last = [*groups[label].values()][-1]
+        return float(interquartile_mean(last)) if last.size else float("-inf")
+
+    return sorted(groups, key=height, reverse=True)
+
+
+def _over_axis(results: StudyResults) -> Drawing:
+    axis = results.study.axis
+    assert axis
+    lines: dict[str, tuple[list[float], list[Array]]] = {}
+    over_evaluations = _varied(results) == "evaluations"
+    others: Sequence[Variant] = results.study.arms if over_evaluations else results.evaluations
+    places: Sequence[Variant] = results.evaluations if over_evaluations else results.study.arms
+    for other in others:
+        points = [
+            (place.value, values)
+            for place in places
+            if place.value is not None
+            and (
+                values := results.values(other.name, place.name)
+                if over_evaluations
+                else results.values(place.name, other.name)
+            ).size
+        ]
+        if points:
+            points.sort(key=lambda point: point[0])
+            lines[other.label] = ([value for value, _ in points], [values for _, values in points])
+    label = measure_label(results.study.measure)
+    unit = f", {axis.unit}" if axis.unit else ""
+    ends = "; ".join(
+        f"{name}: {estimate_text(estimate(values[0]))} at {at[0]:g} to {estimate_text(estimate(values[-1]))} "
+        f"at {at[-1]:g}"
+        for name, (at, values) in lines.items()
+    )
+    figure = curves_over_axis(lines, f"{axis.label}{unit}", label)
+    caption = "Dots: agents. Line and band: interquartile mean and its 95 % interval."
+    return Drawing(svg(figure, f"{label} over {axis.label}{unit}. {ends}."), caption)
+
+
+def _ratios(results: StudyResults) -> Iterator[Drawing]:
+    groups = {arm.label: {"": results.ratios(arm.name)} for arm in results.study.arms}
+    if not any(series[""].size for series in groups.values()):
+        return
+    first, second = results.evaluations[:2]
+    label = f"{second.label} / {first.label}"
+    shown, note = _most(groups)
+    figure = dot_rows(shown, label, {"1": 1.0})
+    yield Drawing(
+        svg(figure, described(shown, f"Ratio {label}")),
+        f"{second.label} divided by {first.label}, per agent.{note}",
+    )
+
+
+def _profiles(results: StudyResults) -> Iterator[Drawing]:
+    last = results.evaluations[-1]
+    groups = {arm.label: {"": results.values(arm.name, last.name)} for arm in results.study.arms}
+    ranked = [label for label in _ranked(groups) if groups[label][""].size >= FEWEST_PROFILED]
+    if not ranked:
+        return
+    chosen = {label: groups[label][""] for label in ranked[:MOST_LINES]}
+    label = measure_label(results.study.measure)
+    medians = "; ".join(
+        f"{name}: half of the agents above {np.median(each):.4g}" for name, each in chosen.items()
+    )
+    note = f" The highest {MOST_LINES} of {len(ranked)} are drawn." if len(ranked) > MOST_LINES else ""
+    place = "" if last is OWN else f", {last.label}"
+    yield Drawing(
+        svg(profiles(chosen, label), f"Performance profiles of {label}{place}. {medians}."),
+        f"Performance profile{place}: the share of agents above each value.{note}",
+    )
+
+
+def _training(results: StudyResults, name: str) -> Iterator[Drawing]:
+    groups = {
+        arm.label: [
+            agent.curves[name] for agent in results.agents if agent.arm == arm.name and name in agent.curves
+        ]
+        for arm in results.study.arms
+    }
+    drawn = [label for label, curves in groups.items() if curves][:MOST_LINES]
+    if not drawn:
+        return
+    ends = "; ".join(
+        f"{label}: median {np.median([curve[-1][1] for curve in groups[label]]):.3g} at the end"
+        for label in drawn
+    )
+    figure = training_curves({label: groups[label] for label in drawn}, CURVES[name])
+    left_out = sum(bool(curves) for curves in groups.values()) - len(drawn)
+    note = f" {left_out} more groups are not drawn." if left_out else ""
+    yield Drawing(
+        svg(figure, f"{CURVES[name]} over the transitions of training. {ends}."),
+        f"Training: {CURVES[name]}. Thin lines: agents. Thick line: their median.{note}",
+    )
+
+
+def _agreement(results: StudyResults) -> Iterator[Drawing]:
+    first, second = results.evaluations[:2]
+    pairs = {arm.label: _pairs(results, arm.name, first.name, second.name) for arm in results.study.arms}
+    present = {label: each for label, each in pairs.items() if each.size}
+    if sum(each.shape[1] for each in present.values()) < FEWEST_PROFILED:
+        return
+    label = measure_label(results.study.measure)
+    figure = agreement(present, f"{label}, {first.label}", f"{label}, {second.label}")
+    yield Drawing(
+        svg(figure, f"{label} of each agent: {second.label} over {first.label}."),
+        f"Each agent on both: a dot on the dashed line has the same {label} on both.",
+    )
+
+
+def _pairs(results: StudyResults, arm: str, first: str, second: str) -> Array:
+    """Return the pairs of values of an arm's agents [2, agents]."""
+    both = [
+        (agent.values[first], agent.values[second])
+        for agent in results.agents
+        if agent.arm == arm and {first, second} <= agent.values.keys()
+    ]
+    return np.array(both, dtype=float).reshape(-1, 2).T
+
+
+def rank_agreement(results: Sequence[StudyResults]) -> Drawing | None:
+    """Return the first two evaluations of all agents of all studies, if they are the same two in several."""
+    groups: dict[str, Array] = {}
+    labels = ("", "")
+    for each in results:
+        names = tuple(one.name for one in each.evaluations[:2])
+        if len(names) < 2 or each.study.agents_of or each.study.measure != "score" or _varied(each):
+            continue
+        if not groups:
+            labels, wanted = (each.evaluations[0].label, each.evaluations[1].label), names
+        pairs = each.pairs(*names)
+        if names == wanted and pairs.size:
+            groups[each.study.title] = pairs
+    if sum(pairs.shape[1] for pairs in groups.values()) < FEWEST_PROFILED:
+        return None
+    label = measure_label("score")
+    figure = agreement(groups, f"{label}, {labels[0]}", f"{label}, {labels[1]}")
+    return Drawing(
+        svg(figure, f"{label} of every agent of {len(groups)} studies: {labels[1]} over {labels[0]}."),
+        "Every agent of the studies with both evaluations.",
+    )
