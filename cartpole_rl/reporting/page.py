@@ -53,12 +53,12 @@ img {{ max-width: 100%; background: {style.PAPER}; border-radius: 4px; }}
 code {{ background: var(--faint); padding: .1rem .3rem; overflow-wrap: anywhere; }}
 @media (max-width: 40rem) {{
   body {{ margin: 1rem auto; }}
-  table, tbody, tr, td {{ display: block; }}
-  tr {{ border-bottom: 1px solid var(--muted); padding: .4rem 0; }}
-  tr:has(th) {{ display: none; }}
-  td {{ border: 0; padding: .1rem 0; }}
-  td::before {{ content: attr(data-label) ": "; color: var(--muted); }}
-  td[data-label=""]::before, td:empty::before {{ content: ""; }}
+  table {{ display: block; overflow-x: auto; }} th, td {{ padding-right: .8rem; }}
+  .cards, .cards tbody, .cards tr, .cards td {{ display: block; }}
+  .cards tr {{ border-bottom: 1px solid var(--muted); padding: .4rem 0; }}
+  .cards tr:has(th) {{ display: none; }}
+  .cards td {{ border: 0; padding: .1rem 0; }}
+  .cards td::before {{ content: attr(data-label) ": "; color: var(--muted); }}
 }}
 @media print {{
   :root {{ color-scheme: light; }}
@@ -88,8 +88,8 @@ def document(title: str, body: str, extra_style: str = "") -> str:
     )
 
 
-def table(rows: Sequence[Mapping[str, Any]]) -> Html:
-    """Return a table headed by the keys of the first row; on a phone each row is a list of its cells."""
+def table(rows: Sequence[Mapping[str, Any]], cards: bool = False) -> Html:
+    """Return a table headed by the keys of the first row; with `cards` a phone shows each row as a list."""
     head = "".join(f"<th>{html.escape(key)}</th>" for key in rows[0])
     body = "".join(
         "<tr>"
@@ -97,7 +97,8 @@ def table(rows: Sequence[Mapping[str, Any]]) -> Html:
         + "</tr>"
         for row in rows
     )
-    return Html(f"<table><tr>{head}</tr>{body}</table>")
+    opening = '<table class="cards">' if cards else "<table>"
+    return Html(f"{opening}<tr>{head}</tr>{body}</table>")
 
 
 def page(title: str, sections: Sequence[tuple[str, Any]]) -> str:

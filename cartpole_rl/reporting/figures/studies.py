@@ -3,7 +3,7 @@
 They are narrow, so that their text can be read on a phone; headings are those of the page.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -26,9 +26,16 @@ MOST_LINES = 8  # in a figure of curves
 PROFILE_POINTS = 101
 DOT, MEAN = 4.0, 7.0  # points
 JITTER = 0.16  # of a row
+HEIGHT = 2.9  # inch, of a panel of curves
+LONGEST_LABEL = 48  # characters
 
 Array = NDArray[np.float64]
 Curve = Sequence[tuple[float, float]]
+
+
+def cut(label: str) -> str:
+    """Return a label that fits into a figure; the page's tables have the whole one."""
+    return label if len(label) <= LONGEST_LABEL else label[: LONGEST_LABEL - 1].rstrip() + "…"
 
 
 def dot_rows(
@@ -41,7 +48,7 @@ def dot_rows(
     """
     series = list(dict.fromkeys(name for group in groups.values() for name in group))
     lines = len(groups) + sum(len(group) for group in groups.values())
-    figure = style.new_figure(height=LINE * (lines + 1) + 0.75, width=WIDTH)
+    figure = style.new_figure(height=LINE * (lines + 1) + 0.5 + _legend_height(series), width=WIDTH)
     axes = figure.subplots()
     style.dress(axes, grid="x")
     axes.spines["left"].set_visible(False)
@@ -50,7 +57,7 @@ def dot_rows(
         axes.text(
             0,
             height,
-            label,
+            cut(label),
             transform=axes.get_yaxis_transform(),
             fontsize=style.SMALL_SIZE,
             color=style.INK,
@@ -77,7 +84,7 @@ def curves_over_axis(
 
     `lines` maps a label to the places [S] on the axis and the values there, S arrays [agents].
     """
-    figure = style.new_figure(height=3.2, width=WIDTH)
+    figure = style.new_figure(height=HEIGHT + _legend_height(lines), width=WIDTH)
     axes = figure.subplots()
     style.dress(axes)
     for index, (places, values) in enumerate(lines.values()):
@@ -97,7 +104,7 @@ def curves_over_axis(
 
 def profiles(groups: Mapping[str, Array], measure: str) -> Figure:
     """Draw the share of each group's agents [agents] above every score, with its 95 % band."""
-    figure = style.new_figure(height=3.2, width=WIDTH)
+    figure = style.new_figure(height=HEIGHT + _legend_height(groups), width=WIDTH)
     axes = figure.subplots()
     style.dress(axes)
     everything = np.concatenate(list(groups.values()))
@@ -118,7 +125,7 @@ def profiles(groups: Mapping[str, Array], measure: str) -> Figure:
 
 def training_curves(groups: Mapping[str, Sequence[Curve]], name: str) -> Figure:
     """Draw a curve of each agent over its training as a thin line, and a group's median as a thick one."""
-    figure = style.new_figure(height=3.2, width=WIDTH)
+    figure = style.new_figure(height=HEIGHT + _legend_height(groups), width=WIDTH)
     axes = figure.subplots()
     style.dress(axes)
     for index, curves in enumerate(groups.values()):
@@ -139,11 +146,13 @@ def training_curves(groups: Mapping[str, Sequence[Curve]], name: str) -> Figure:
 
 def agreement(groups: Mapping[str, Array], x: str, y: str) -> Figure:
     """Draw one measure of each agent over another; `groups` maps a label to pairs [2, agents]."""
-    figure = style.new_figure(height=3.4, width=WIDTH)
+    figure = style.new_figure(height=HEIGHT + 0.2 + _legend_height(groups), width=WIDTH)
     axes = figure.subplots()
     style.dress(axes)
     for index, (first, second) in enumerate(groups.values()):
-        axes.plot(first, second, "o", color=style.series_colour(index), alpha=0.7, markersize=DOT, mew=0)
+        axes.plot(
+            first, second, "o", color=style.series_colour(index), alpha=0.7, markersize=DOT + 1.5, mew=0
+        )
     everything = np.concatenate(list(groups.values()), axis=1)
     ends = [min(0.0, float(everything.min())), float(everything.max())]
     axes.plot(ends, ends, color=style.MUTED, linewidth=1, linestyle=(0, (3, 3)), zorder=1)
@@ -152,8 +161,7 @@ def agreement(groups: Mapping[str, Array], x: str, y: str) -> Figure:
         text += "" if rho.low is None else f" ({rho.low:.2f} to {rho.high:.2f})"
         axes.set_title(text, loc="left", fontsize=style.SMALL_SIZE, color=style.INK)
     axes.xaxis.set_major_locator(MaxNLocator(nbins=6))
-    if len(groups) <= MOST_LINES:
-        _legend(axes, {name: style.series_colour(index) for index, name in enumerate(groups)})
+    _legend(axes, {name: style.series_colour(index) for index, name in enumerate(groups)})
     style.label(axes, x=x, y=y)
     return figure
 
@@ -196,14 +204,19 @@ def _vertical_guide(axes: Axes, value: float, text: str) -> None:
     )
 
 
+def _legend_height(names: Collection[str]) -> float:
+    """Return the height of a legend, inches."""
+    return 0.17 * len(names) if 1 < len(names) <= MOST_LINES else 0.0
+
+
 def _legend(axes: Axes, colours: Mapping[str, str]) -> None:
-    """Name the colours above the panel, one below the other; nothing for a single colour."""
-    if len(colours) < 2:
+    """Name the colours above the panel, one below the other; nothing for one colour or too many."""
+    if not _legend_height(colours):
         return
     handles = [axes.plot([], [], "s", color=colour, markersize=6)[0] for colour in colours.values()]
     axes.figure.legend(
         handles,
-        [*colours],
+        [*map(cut, colours)],
         loc="outside upper left",
         fontsize=style.SMALL_SIZE,
         frameon=False,

@@ -61,13 +61,25 @@ def status(results: StudyResults) -> Status:
         return Status.EMPTY
     if results.study.verdict in ("fails", "contradicts"):
         return VERDICTS[results.study.verdict]
-    good = GOOD.get(results.study.measure)
-    found = [each.value for each in estimates(results).values()]
-    if good is not None and not results.study.verdict and found and max(found) < good:
+    if not results.study.verdict and _all_below(results):
         return Status.FAILS
     if results.missing() or results.exclusions:
         return Status.INCOMPLETE
     return VERDICTS.get(results.study.verdict, Status.OPEN)
+
+
+def reason(results: StudyResults) -> str:
+    """Return why a study fails where no person wrote it: ": no arm reaches 2000"."""
+    if results.study.verdict or not _all_below(results):
+        return ""
+    return f": no interquartile mean reaches {GOOD[results.study.measure]:g}"
+
+
+def _all_below(results: StudyResults) -> bool:
+    """Return True if every arm is below GOOD in the last evaluation."""
+    good = GOOD.get(results.study.measure)
+    found = [each.value for each in estimates(results).values()]
+    return good is not None and bool(found) and max(found) < good
 
 
 def estimates(results: StudyResults) -> dict[str, Estimate]:

@@ -74,7 +74,9 @@ def _dots(results: StudyResults) -> Drawing:
     groups, note = _most(_groups(results))
     label = measure_label(results.study.measure)
     good = GOOD.get(results.study.measure)
-    figure = dot_rows(groups, label, {f"good: {good:g}": good} if good else None)
+    values = [value for agent in results.agents for value in agent.values.values()]
+    guided = good is not None and min(values) < good < max(values)
+    figure = dot_rows(groups, label, {f"good: {good:g}": good} if good and guided else None)
     caption = f"Dots: agents. Diamond and line: interquartile mean and its 95 % interval.{note}"
     return Drawing(svg(figure, described(groups, label)), caption)
 
@@ -152,7 +154,7 @@ def _profiles(results: StudyResults) -> Iterator[Drawing]:
     ranked = [label for label in _ranked(groups) if groups[label][""].size >= FEWEST_PROFILED]
     if not ranked:
         return
-    chosen = {label: groups[label][""] for label in ranked[:MOST_LINES]}
+    chosen = {label: series[""] for label, series in groups.items() if label in ranked[:MOST_LINES]}
     label = measure_label(results.study.measure)
     medians = "; ".join(
         f"{name}: half of the agents above {np.median(each):.4g}" for name, each in chosen.items()

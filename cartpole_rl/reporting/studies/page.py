@@ -18,6 +18,7 @@ from cartpole_rl.reporting.studies.answers import (
     estimate_text,
     measure_label,
     ratios,
+    reason,
     status,
 )
 from cartpole_rl.reporting.studies.comparison import Comparison
@@ -54,7 +55,7 @@ figure { margin: 0; } figcaption { color: var(--muted); font-size: .85rem; }
 pre { white-space: pre-wrap; background: var(--faint); padding: .5rem .7rem; border-radius: 4px; }
 pre code { padding: 0; }
 summary { cursor: pointer; color: var(--link); }
-.scroll { overflow-x: auto; }
+table { margin: 1rem 0; } h3 { font-size: 1rem; margin: 1.6rem 0 .5rem; } details { margin: .8rem 0; }
 @media print { details:not([open])::details-content { content-visibility: visible; display: block; } }
 """
 
@@ -76,7 +77,7 @@ def studies_page(results: Sequence[StudyResults], pictures: Mapping[str, Sequenc
     size = f", size {', '.join(sizes)}" if sizes else ""
     parts = [
         f"<h1>{TITLE}</h1>",
-        f"<p>{len(results)} studies{size}, {agents_text(agents)}.</p>",
+        f"<p>{len(results)} {'study' if len(results) == 1 else 'studies'}{size}, {agents_text(agents)}.</p>",
         _summary(results),
         _contents(results),
         *(_study_section(each, pictures.get(each.name, ())) for each in results),
@@ -115,23 +116,28 @@ def _summary(results: Sequence[StudyResults]) -> str:
             "study": _link(each),
             "the thesis": each.study.thesis or "–",
             "here": answer(each),
-            "verdict": _status(status(each)),
+            "verdict": _status(each),
         }
         for each in ranked
     ]
-    return f'<section id="summary"><h2>Summary: what fails comes first</h2>{table(rows)}</section>'
+    return (
+        f'<section id="summary"><h2>Summary: what fails comes first</h2>{table(rows, cards=True)}</section>'
+    )
 
 
 def _contents(results: Sequence[StudyResults]) -> str:
     """Return the thesis's own list with the studies of each row, then those beyond it."""
+    beyond = "".join(f"<li>{_link(each)}</li>" for each in results if each.study.order >= BEYOND)
+    further = f"<ul>{beyond}</ul>" if beyond else ""
+    if all(each.study.order >= BEYOND for each in results):
+        return f'<nav id="contents"><h2>Contents</h2>{further}</nav>'
     rows = []
     for number, what in THESIS_ROWS.items():
         own = [each for each in results if each.study.order // 10 == number]
         links = "".join(f"<li>{_link(each)}</li>" for each in own)
         missing = "" if own else ': <span class="alarm">no study</span>'
         rows.append(f"<li>{escaped(what)}{missing}<ul>{links}</ul></li>")
-    beyond = "".join(f"<li>{_link(each)}</li>" for each in results if each.study.order >= BEYOND)
-    further = f"<h3>Beyond the thesis</h3><ul>{beyond}</ul>" if beyond else ""
+    further = f"<h3>Beyond the thesis</h3>{further}" if beyond else ""
     return f'<nav id="contents"><h2>The list of the thesis</h2><ol>{"".join(rows)}</ol>{further}</nav>'
 
 
@@ -148,7 +154,7 @@ def _study_section(results: StudyResults, pictures: Sequence[Picture]) -> str:
     parts = [
         f'<section id="{_anchor(results.name)}">',
         f"<h2>{escaped(study.title)}{figure}</h2>",
-        f"<p>{_status(status(results))}</p><dl>{listed}</dl>",
+        f"<p>{_status(results)}</p><dl>{listed}</dl>",
         _doubts(results, [f"Missing: {each}." for each in results.missing()]),
         *_figures(results, pictures),
         _commands(results),
@@ -223,7 +229,7 @@ def _folded(rows: Sequence[Mapping[str, Any]], name: str) -> str:
     """Return a table, folded if it is long."""
     if not rows:
         return ""
-    whole = f'<div class="scroll">{table(rows)}</div>'
+    whole = table(rows)
     if len(rows) <= MOST_ROWS:
         return whole
     return f"<details><summary>{len(rows)} rows of {name}</summary>{whole}</details>"
@@ -288,8 +294,8 @@ def _runs(results: StudyResults) -> str:
         for agent in results.agents[:1000]
     ]
     versions = f"<p>{escaped(results.versions)}</p>" if results.versions else ""
-    shown = f'<div class="scroll">{table(rows)}</div>'
-    return f"<details><summary>The {len(results.agents)} runs behind it</summary>{versions}{shown}</details>"
+    heading = f"The {len(results.agents)} runs behind it"
+    return f"<details><summary>{heading}</summary>{versions}{table(rows)}</details>"
 
 
 def _named_values(results: StudyResults, values: Mapping[str, float], measure: str) -> dict[str, str]:
@@ -365,9 +371,10 @@ def _figure_name(figure: str) -> str:
     return f"Fig. {figure}" if figure[:1].isdigit() else figure
 
 
-def _status(found: Status) -> Html:
+def _status(results: StudyResults) -> Html:
+    found = status(results)
     calm = found in (Status.AGREES, Status.OPEN)
-    return Html(found) if calm else Html(f'<span class="alarm">{found}</span>')
+    return Html(found if calm else f'<span class="alarm">{found}</span>{escaped(reason(results))}')
 
 
 def _anchor(name: str) -> str:

@@ -10,9 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from cartpole_rl.errors import ConfigError
+from cartpole_rl.reporting.figures.studies import LONGEST_LABEL
 from cartpole_rl.reporting.studies.grouping import NULL, Columns, fewest, labels, setting_columns
-from cartpole_rl.reporting.studies.results import OWN, Agent, Exclusion, StudyResults
+from cartpole_rl.reporting.studies.results import OWN, Agent, Curve, Exclusion, StudyResults
 from cartpole_rl.reporting.studies.settings import Size, Study, Variant
+from cartpole_rl.reporting.studies.statistics import interquartile_mean
 from cartpole_rl.run_files import CHECKPOINTS
 from cartpole_rl.workflows.pages.runs import (
     Run,
@@ -26,6 +28,7 @@ from cartpole_rl.workflows.pages.runs import (
 )
 from cartpole_rl.workflows.run_folder import PREFIX
 
+MOST_UNSORTED = 12  # groups that are shown in the order of their runs
 AGENT = "agent"  # prefix of the settings of the agent that a run evaluates
 OVERRIDE = re.compile(r"\+{0,2}([a-z_][\w.]*)=")  # on a command line
 
@@ -116,38 +119,75 @@ def _chosen(run: Run) -> Iterator[str]:
 
 
 def results_of(sweep: Sweep, measure: str) -> StudyResults:
-    """Return a sweep as the results of a study whose arms are its groups."""
-    groups = {label: f"group_{number}" for number, label in enumerate(dict.fromkeys(sweep.labels))}
-    agents, repeated, taken = [], [], set()
-    for member, label in zip(sweep.members, sweep.labels, strict=True):
-        value, run = measured(member.run.results, measure), member.run
-        if (label, member.seed) in taken:
-            repeated.append(_exclusion(run, f"seed {member.seed} of {label} is there twice"))
-            continue
-        taken.add((label, member.seed))
-        assert value is not None
-        curve = tuple((each["transitions"], each["score"]) for each in history(run.folder))
-        curves = {"score": curve} if len(curve) > 1 else {}
-        agents.append(Agent(groups[label], member.seed, run.folder.as_posix(), {OWN.name: value}, curves))
-    arms = [Variant(name=name, label=label) for label, name in groups.items()]
-    study = Study(
-        title=sweep.name,
-        order=0,
-        question="",
-        measure=measure,
-        arms=tuple(arms) or (Variant(name="none", label="no run"),),
-        sizes={"any": Size(seeds=1)},
+    """Return a sweep as the results of a study whose arms are its groups, many of them highest first."""
+    kept, repeated = _without_repetitions(sweep)
+    groups: dict[str, list[Member]] = {}
+    for member, label in kept:
+        groups.setdefault(label, []).append(member)
+    means = {
+        label: float(interquartile_mean([_value(each, measure) for each in own]))
+        for label, own in groups.items()
+    }
+    ordered = (
+        sorted(groups, key=means.__getitem__, reverse=True) if len(groups) > MOST_UNSORTED else [*groups]
     )
+    arms = [Variant(name=f"group_{number}", label=label) for number, label in enumerate(ordered, start=1)]
+    if any(len(label) > LONGEST_LABEL for label in ordered):  # figures cut them: a number tells them apart
+        arms = [
+            arm.model_copy(update={"label": f"{number}: {arm.label}"})
+            for number, arm in enumerate(arms, start=1)
+        ]
+    agents = [
+        Agent(
+            arm.name,
+            member.seed,
+            member.run.folder.as_posix(),
+            {OWN.name: _value(member, measure)},
+            _curves(member),
+        )
+        for arm, label in zip(arms, ordered, strict=True)
+        for member in groups[label]
+    ]
     notes = [commits_note(member.run for member in sweep.members), *_unequal_seeds(sweep)]
-    versions = sweep.members[0].run.versions if sweep.members else ""
     return StudyResults(
         sweep.name,
-        study,
+        Study(
+            title=sweep.name,
+            order=0,
+            question="",
+            measure=measure,
+            arms=tuple(arms) or (Variant(name="none", label="no run"),),
+            sizes={"any": Size(seeds=1)},
+        ),
         tuple(agents),
         (*sweep.exclusions, *repeated),
         tuple(note for note in notes if note),
-        versions,
+        sweep.members[0].run.versions if sweep.members else "",
     )
+
+
+def _without_repetitions(sweep: Sweep) -> tuple[list[tuple[Member, str]], list[Exclusion]]:
+    """Return the members with their labels without second runs of the same seed, and those runs."""
+    kept: dict[tuple[str, int], tuple[Member, str]] = {}
+    repeated = []
+    for member, label in zip(sweep.members, sweep.labels, strict=True):
+        if (label, member.seed) in kept:
+            repeated.append(_exclusion(member.run, f"seed {member.seed} of {label} is there twice"))
+        else:
+            kept[label, member.seed] = member, label
+    return [*kept.values()], repeated
+
+
+def _value(member: Member, measure: str) -> float:
+    value = measured(member.run.results, measure)
+    assert value is not None  # `read_sweep` leaves such runs out
+    return value
+
+
+def _curves(member: Member) -> dict[str, Curve]:
+    """Return the learning curve of a training."""
+    curve = tuple((each["transitions"], each["score"]) for each in history(member.run.folder))
+    return {"score": curve} if len(curve) > 1 else {}
 
 
 def table(sweeps: Sequence[Sweep]) -> str:
