@@ -108,8 +108,9 @@ def profiles(groups: Mapping[str, Array], measure: str) -> Figure:
     axes = figure.subplots()
     style.dress(axes)
     everything = np.concatenate(list(groups.values()))
-    low, high = min(0.0, float(everything.min())), float(everything.max())
-    scores = np.linspace(low, high + 0.02 * (high - low or 1.0), PROFILE_POINTS)
+    low, high = float(everything.min()), float(everything.max())
+    margin = 0.05 * (high - low or 1.0)
+    scores = np.linspace(low - margin, high + margin, PROFILE_POINTS)
     for index, values in enumerate(groups.values()):
         share, lower, upper = performance_profile(values, scores)
         colour = style.series_colour(index)

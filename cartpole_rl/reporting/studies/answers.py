@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from enum import StrEnum
 
 from cartpole_rl.reporting.studies.results import StudyResults
+from cartpole_rl.reporting.studies.settings import Variant
 from cartpole_rl.reporting.studies.statistics import Estimate, estimate
 from cartpole_rl.reporting.table import interval_text
 
@@ -13,6 +14,7 @@ MEASURES = {  # key of metrics.json: label
     "score_upright": "score (6.1)",
     "steps": "steps",
     "upright_fraction": "share of time upright",
+    "upright_at_end": "share upright at the end",
     "time_to_upright_s": "time to upright, s",
 }
 THESIS_ROWS = {  # of the thesis's list: what must work
@@ -55,7 +57,7 @@ VERDICTS = {"fails": Status.FAILS, "contradicts": Status.CONTRADICTS, "agrees": 
 def status(results: StudyResults) -> Status:
     """Return how a study stands: by its results, then by the verdict that a person wrote.
 
-    Without a verdict a study fails if every arm's interquartile mean in the last evaluation is below GOOD.
+    Without a verdict a study fails if the interquartile mean of every arm is below GOOD.
     """
     if not results.agents:
         return Status.EMPTY
@@ -69,26 +71,23 @@ def status(results: StudyResults) -> Status:
 
 
 def reason(results: StudyResults) -> str:
-    """Return why a study fails where no person wrote it: ": no arm reaches 2000"."""
+    """Return why a study fails where no person wrote it: ": no interquartile mean reaches 2000"."""
     if results.study.verdict or not _all_below(results):
         return ""
     return f": no interquartile mean reaches {GOOD[results.study.measure]:g}"
 
 
 def _all_below(results: StudyResults) -> bool:
-    """Return True if every arm is below GOOD in the last evaluation."""
+    """Return True if every arm is below GOOD in the evaluation that counts; one of an axis may be hard."""
     good = GOOD.get(results.study.measure)
-    found = [each.value for each in estimates(results).values()]
-    return good is not None and bool(found) and max(found) < good
+    found = [each.value for each in estimates(results, results.judged).values()]
+    return good is not None and not results.varied and bool(found) and max(found) < good
 
 
-def estimates(results: StudyResults) -> dict[str, Estimate]:
-    """Return the interquartile mean of each arm (by label) in the last evaluation that has agents."""
-    for evaluation in reversed(results.evaluations):
-        found = {arm.label: results.estimate(arm.name, evaluation.name) for arm in results.study.arms}
-        if present := {label: each for label, each in found.items() if each}:
-            return present
-    return {}
+def estimates(results: StudyResults, evaluation: Variant) -> dict[str, Estimate]:
+    """Return the interquartile mean of each arm (by label) that has agents in an evaluation."""
+    found = {arm.label: results.estimate(arm.name, evaluation.name) for arm in results.study.arms}
+    return {label: each for label, each in found.items() if each}
 
 
 def ratios(results: StudyResults) -> dict[str, Estimate]:
@@ -99,22 +98,22 @@ def ratios(results: StudyResults) -> dict[str, Estimate]:
     return {label: estimate(values) for label, values in found.items() if values.size}
 
 
-def answer(results: StudyResults) -> str:
-    """Return our answer in one or two sentences, with intervals and the number of agents."""
-    found = estimates(results)
-    if not found:
-        return "No result yet."
-    last = next(
-        each
-        for each in reversed(results.evaluations)
-        if any(results.values(arm.name, each.name).size for arm in results.study.arms)
-    )
-    place = f" ({last.label})" if len(results.evaluations) > 1 else ""
-    sentences = [f"{measure_label(results.study.measure)}{place}: {_extremes(found)}."]
+def answer(results: StudyResults) -> list[str]:
+    """Return our answer in a few sentences, the main one first, with intervals and numbers of agents."""
+    if not results.agents:
+        return ["No result yet."]
+    several, shown = len(results.evaluations) > 1, [results.judged]
+    if results.varied and {*results.varied} <= {*results.evaluations}:
+        shown = [results.varied[0], results.varied[-1]]
+    sentences = [
+        f"{measure_label(results.study.measure)}{f' ({each.label})' if several else ''}: {_extremes(found)}."
+        for each in shown
+        if (found := estimates(results, each))
+    ]
     if shares := ratios(results):
         first, second = results.evaluations[:2]
         sentences.append(f"Ratio of {second.label} to {first.label}: {_extremes(shares)}.")
-    return " ".join(sentences)
+    return sentences
 
 
 def _extremes(found: Mapping[str, Estimate]) -> str:

@@ -1,5 +1,6 @@
 """The figures of a study as SVG with alt texts and captions."""
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -41,23 +42,15 @@ def drawings(results: StudyResults) -> Iterator[Drawing]:
     """Yield the figures of a study that has agents."""
     if not results.agents:
         return
-    yield _over_axis(results) if _varied(results) else _dots(results)
+    yield _over_axis(results) if results.varied else _dots(results)
     if results.study.ratio:
         yield from _ratios(results)
-    if not _varied(results):
+    if not results.varied:
         yield from _profiles(results)
     for name in results.study.curves:
         yield from _training(results, name)
-    if len(results.evaluations) > 1 and not _varied(results):
+    if len(results.evaluations) > 1 and not results.varied:
         yield from _agreement(results)
-
-
-def _varied(results: StudyResults) -> str:
-    """Return "evaluations" or "arms", whichever has values on the study's axis; empty if neither has two."""
-    if results.study.axis is None:
-        return ""
-    kinds: dict[str, Sequence[Variant]] = {"evaluations": results.evaluations, "arms": results.study.arms}
-    return next((kind for kind, each in kinds.items() if sum(one.value is not None for one in each) > 1), "")
 
 
 def _groups(results: StudyResults) -> dict[str, dict[str, Array]]:
@@ -104,34 +97,45 @@ def _ranked(groups: Groups) -> list[str]:
 def _over_axis(results: StudyResults) -> Drawing:
     axis = results.study.axis
     assert axis
-    lines: dict[str, tuple[list[float], list[Array]]] = {}
-    over_evaluations = _varied(results) == "evaluations"
-    others: Sequence[Variant] = results.study.arms if over_evaluations else results.evaluations
-    places: Sequence[Variant] = results.evaluations if over_evaluations else results.study.arms
-    for other in others:
-        points = [
-            (place.value, values)
-            for place in places
-            if place.value is not None
-            and (
-                values := results.values(other.name, place.name)
-                if over_evaluations
-                else results.values(place.name, other.name)
-            ).size
-        ]
-        if points:
-            points.sort(key=lambda point: point[0])
-            lines[other.label] = ([value for value, _ in points], [values for _, values in points])
+    lines = {
+        name: ([value for value, _ in points], [values for _, values in points])
+        for name, points in _lines(results).items()
+        if points
+    }
     label = measure_label(results.study.measure)
-    unit = f", {axis.unit}" if axis.unit else ""
+    quantity = f"{axis.label}, {axis.unit}" if axis.unit else axis.label
     ends = "; ".join(
-        f"{name}: {estimate_text(estimate(values[0]))} at {at[0]:g} to {estimate_text(estimate(values[-1]))} "
-        f"at {at[-1]:g}"
+        f"{name}: {estimate_text(estimate(values[0]))} at {at[0]:g}, "
+        f"{estimate_text(estimate(values[-1]))} at {at[-1]:g}"
         for name, (at, values) in lines.items()
     )
-    figure = curves_over_axis(lines, f"{axis.label}{unit}", label)
     caption = "Dots: agents. Line and band: interquartile mean and its 95 % interval."
-    return Drawing(svg(figure, f"{label} over {axis.label}{unit}. {ends}."), caption)
+    figure = curves_over_axis(lines, quantity, label)
+    return Drawing(svg(figure, f"{label} over {quantity}. {ends}."), caption)
+
+
+def _lines(results: StudyResults) -> dict[str, list[tuple[float, Array]]]:
+    """Return the places and the values of each line: of an arm, or of an evaluation and a family of arms."""
+    lines: dict[str, list[tuple[float, Array]]] = {}
+    places = {each.name for each in results.varied}
+    for arm in results.study.arms:
+        for evaluation in results.evaluations:
+            if evaluation.name in places:
+                name, value = arm.label, evaluation.value
+            elif arm.name in places:
+                several = len(results.evaluations) > 1
+                name, value = ", ".join((_family(arm), *([evaluation.label] if several else []))), arm.value
+            else:
+                continue
+            values = results.values(arm.name, evaluation.name)
+            if value is not None and values.size:
+                lines.setdefault(name.strip(", "), []).append((value, values))
+    return {name: sorted(points, key=lambda point: point[0]) for name, points in lines.items()}
+
+
+def _family(arm: Variant) -> str:
+    """Return the label without its last part, which is the value: "explicit" of "explicit, 20 ms"."""
+    return arm.label.rpartition(",")[0]
 
 
 def _ratios(results: StudyResults) -> Iterator[Drawing]:
@@ -149,7 +153,7 @@ def _ratios(results: StudyResults) -> Iterator[Drawing]:
 
 
 def _profiles(results: StudyResults) -> Iterator[Drawing]:
-    last = results.evaluations[-1]
+    last = results.judged
     groups = {arm.label: {"": results.values(arm.name, last.name)} for arm in results.study.arms}
     ranked = [label for label in _ranked(groups) if groups[label][""].size >= FEWEST_PROFILED]
     if not ranked:
@@ -192,7 +196,7 @@ def _training(results: StudyResults, name: str) -> Iterator[Drawing]:
 
 def _agreement(results: StudyResults) -> Iterator[Drawing]:
     first, second = results.evaluations[:2]
-    pairs = {arm.label: _pairs(results, arm.name, first.name, second.name) for arm in results.study.arms}
+    pairs = {arm.label: results.pairs(first.name, second.name, arm.name) for arm in results.study.arms}
     present = {label: each for label, each in pairs.items() if each.size}
     if sum(each.shape[1] for each in present.values()) < FEWEST_PROFILED:
         return
@@ -204,34 +208,37 @@ def _agreement(results: StudyResults) -> Iterator[Drawing]:
     )
 
 
-def _pairs(results: StudyResults, arm: str, first: str, second: str) -> Array:
-    """Return the pairs of values of an arm's agents [2, agents]."""
-    both = [
-        (agent.values[first], agent.values[second])
-        for agent in results.agents
-        if agent.arm == arm and {first, second} <= agent.values.keys()
-    ]
-    return np.array(both, dtype=float).reshape(-1, 2).T
-
-
 def rank_agreement(results: Sequence[StudyResults]) -> Drawing | None:
-    """Return the first two evaluations of all agents of all studies, if they are the same two in several."""
+    """Return the scores of all agents in the two evaluations that most studies compare; None for too few.
+
+    An agent that several studies evaluate is drawn once.
+    """
+    compared = [
+        each
+        for each in results
+        if len(each.evaluations) > 1 and each.study.measure == "score" and not each.varied
+    ]
+    names = Counter((each.evaluations[0].name, each.evaluations[1].name) for each in compared)
+    if not names:
+        return None
+    common, _ = names.most_common(1)[0]
+    drawn: set[tuple[float, ...]] = set()
     groups: dict[str, Array] = {}
     labels = ("", "")
-    for each in results:
-        names = tuple(one.name for one in each.evaluations[:2])
-        if len(names) < 2 or each.study.agents_of or each.study.measure != "score" or _varied(each):
-            continue
-        if not groups:
-            labels, wanted = (each.evaluations[0].label, each.evaluations[1].label), names
-        pairs = each.pairs(*names)
-        if names == wanted and pairs.size:
-            groups[each.study.title] = pairs
-    if sum(pairs.shape[1] for pairs in groups.values()) < FEWEST_PROFILED:
+    for each in compared:
+        first, second = each.evaluations[:2]
+        fresh = {tuple(pair) for pair in each.pairs(first.name, second.name).T.tolist()} - drawn
+        if (first.name, second.name) == common and fresh:
+            drawn |= fresh
+            groups[each.study.title] = np.array(sorted(fresh)).T
+            labels = first.label, second.label
+    if len(drawn) < FEWEST_PROFILED:
         return None
     label = measure_label("score")
     figure = agreement(groups, f"{label}, {labels[0]}", f"{label}, {labels[1]}")
     return Drawing(
-        svg(figure, f"{label} of every agent of {len(groups)} studies: {labels[1]} over {labels[0]}."),
-        "Every agent of the studies with both evaluations.",
+        svg(
+            figure, f"{label} of {len(drawn)} agents of {len(groups)} studies: {labels[1]} over {labels[0]}."
+        ),
+        f"{len(drawn)} agents of {len(groups)} studies. The dashed line: the same {label} on both.",
     )

@@ -1,11 +1,6 @@
 """The page of studies and that of a person's own runs, each one HTML file with everything in it."""
 
-import base64
-import html
-import shlex
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 from cartpole_rl.reporting.page import Html, document, escaped, table
 from cartpole_rl.reporting.studies.answers import (
@@ -16,20 +11,24 @@ from cartpole_rl.reporting.studies.answers import (
     agents_text,
     answer,
     estimate_text,
-    measure_label,
-    ratios,
     reason,
     status,
 )
 from cartpole_rl.reporting.studies.comparison import Comparison
-from cartpole_rl.reporting.studies.figures import Drawing, drawings, rank_agreement
-from cartpole_rl.reporting.studies.results import Exclusion, StudyResults
-from cartpole_rl.reporting.studies.settings import Variant
-from cartpole_rl.reporting.studies.statistics import estimate
-from cartpole_rl.reporting.table import number_text
+from cartpole_rl.reporting.studies.figures import rank_agreement
+from cartpole_rl.reporting.studies.results import StudyResults
+from cartpole_rl.reporting.studies.robustness import robustness
+from cartpole_rl.reporting.studies.sections import (
+    MOST_EXCLUSIONS,
+    Picture,
+    commands,
+    doubts,
+    drawn,
+    figure_parts,
+    folded,
+    run_list,
+)
 
-MOST_ROWS = 24  # of a table that is shown unfolded
-MOST_EXCLUSIONS = 40  # runs named one by one
 TITLE = "The thesis, carried out"
 METHOD = (
     "Each number of an agent is the mean over its evaluation episodes; the last checkpoint of every seed "
@@ -60,16 +59,6 @@ table { margin: 1rem 0; } h3 { font-size: 1rem; margin: 1.6rem 0 .5rem; } detail
 """
 
 
-@dataclass(frozen=True)
-class Picture:
-    """A picture or an animation for the page."""
-
-    data: bytes
-    kind: str  # "gif", "png" or "webp"
-    alt: str
-    caption: str
-
-
 def studies_page(results: Sequence[StudyResults], pictures: Mapping[str, Sequence[Picture]]) -> str:
     """Return the page of studies, in their order; `pictures` maps the name of a study to its pictures."""
     agents = sum(len(each.agents) for each in results)
@@ -82,6 +71,7 @@ def studies_page(results: Sequence[StudyResults], pictures: Mapping[str, Sequenc
         _contents(results),
         *(_study_section(each, pictures.get(each.name, ())) for each in results),
         _ranks(results),
+        _robustness(results),
         _method(),
     ]
     return document(TITLE, "\n".join(part for part in parts if part), STYLE)
@@ -115,7 +105,7 @@ def _summary(results: Sequence[StudyResults]) -> str:
         {
             "study": _link(each),
             "the thesis": each.study.thesis or "–",
-            "here": answer(each),
+            "here": f"{answer(each)[0]} {each.study.comment}" if _is_alarming(each) else answer(each)[0],
             "verdict": _status(each),
         }
         for each in ranked
@@ -147,7 +137,7 @@ def _study_section(results: StudyResults, pictures: Sequence[Picture]) -> str:
     facts = {
         "Question": study.question,
         "The thesis": study.thesis or "not in the thesis",
-        "Here": answer(results),
+        "Here": " ".join(answer(results)),
         "Why": study.comment,
     }
     listed = "".join(f"<dt>{name}</dt><dd>{escaped(text)}</dd>" for name, text in facts.items() if text)
@@ -155,10 +145,10 @@ def _study_section(results: StudyResults, pictures: Sequence[Picture]) -> str:
         f'<section id="{_anchor(results.name)}">',
         f"<h2>{escaped(study.title)}{figure}</h2>",
         f"<p>{_status(results)}</p><dl>{listed}</dl>",
-        _doubts(results, [f"Missing: {each}." for each in results.missing()]),
-        *_figures(results, pictures),
-        _commands(results),
-        _runs(results),
+        doubts(results, [f"Missing: {each}." for each in results.missing()]),
+        *figure_parts(results, pictures),
+        commands(results),
+        run_list(results),
         "</section>",
     ]
     return "\n".join(part for part in parts if part)
@@ -169,142 +159,13 @@ def _sweep_section(results: StudyResults, pictures: Sequence[Picture]) -> str:
     parts = [
         f'<section id="{_anchor(results.name)}">',
         f"<h2>{escaped(results.study.title)}</h2>",
-        f"<p>{agents_text(len(results.agents))} in {groups}. {escaped(answer(results))}</p>",
-        _doubts(results, []),
-        *_figures(results, pictures),
-        _runs(results),
+        f"<p>{agents_text(len(results.agents))} in {groups}. {escaped(' '.join(answer(results)))}</p>",
+        doubts(results, []),
+        *figure_parts(results, pictures),
+        run_list(results),
         "</section>",
     ]
     return "\n".join(part for part in parts if part)
-
-
-def _figures(results: StudyResults, pictures: Sequence[Picture]) -> Iterator[str]:
-    """Yield the table of values, the figures, and the animations and other pictures."""
-    if not results.agents:
-        return
-    yield _folded(_value_rows(results), "values")
-    if shares := ratios(results):
-        first, second = results.evaluations[:2]
-        name = f"{second.label} / {first.label}"
-        yield _folded(
-            [
-                {"arm": label, name: estimate_text(each), "agents": each.agents}
-                for label, each in shares.items()
-            ],
-            "ratios",
-        )
-    yield f'<div class="figures">{"".join(map(_drawing, drawings(results)))}</div>'
-    for kind, heading in (("gif", "The best, the median and the worst agent"), ("png", "Figures of a run")):
-        if shown := "".join(_picture(each) for each in pictures if (each.kind == "gif") == (kind == "gif")):
-            grid = "animations" if kind == "gif" else "figures"
-            yield f'<h3>{heading}</h3><div class="{grid}">{shown}</div>'
-
-
-def _value_rows(results: StudyResults) -> list[dict[str, Any]]:
-    """Return a row for each arm and evaluation that has agents."""
-    measure = results.study.measure
-    several = len(results.evaluations) > 1
-    rows = []
-    for arm in results.study.arms:
-        for evaluation in results.evaluations:
-            values = results.values(arm.name, evaluation.name)
-            if not values.size:
-                continue
-            row: dict[str, Any] = {"arm": arm.label}
-            if several:
-                row["evaluation"] = evaluation.label
-            row |= {
-                f"{measure_label(measure)}, 95 % interval": estimate_text(estimate(values)),
-                "lowest": number_text(float(values.min())),
-                "highest": number_text(float(values.max())),
-            }
-            if good := GOOD.get(measure):
-                row[f"above {good:g}"] = f"{(values > good).sum()} of {values.size}"
-            row["agents"] = values.size
-            rows.append(row)
-    return rows
-
-
-def _folded(rows: Sequence[Mapping[str, Any]], name: str) -> str:
-    """Return a table, folded if it is long."""
-    if not rows:
-        return ""
-    whole = table(rows)
-    if len(rows) <= MOST_ROWS:
-        return whole
-    return f"<details><summary>{len(rows)} rows of {name}</summary>{whole}</details>"
-
-
-def _doubts(results: StudyResults, missing: Sequence[str]) -> str:
-    """Return the box that names what is missing, what does not count and what is mixed; empty without any."""
-    shown = [f"{each.run} does not count: {each.reason}." for each in results.exclusions[:MOST_EXCLUSIONS]]
-    if (more := len(results.exclusions) - len(shown)) > 0:
-        shown.append(f"{more} more runs do not count, as: {_reasons(results.exclusions[MOST_EXCLUSIONS:])}.")
-    lines = [*missing, *shown, *results.notes]
-    if not lines:
-        return ""
-    listed = "".join(f"<li>{escaped(line)}</li>" for line in lines)
-    return f'<aside class="box" role="note" aria-label="Missing or mixed runs"><ul>{listed}</ul></aside>'
-
-
-def _reasons(exclusions: Sequence[Exclusion]) -> str:
-    return "; ".join(dict.fromkeys(each.reason for each in exclusions[:5]))
-
-
-def _commands(results: StudyResults) -> str:
-    """Return the command that repeats the study, and those of its first arm by hand."""
-    size = f" --size {results.label}" if results.label else ""
-    whole = f"scripts/reproduce {results.name}{size}"
-    by_hand = "\n".join(_by_hand(results))
-    return (
-        f"<h3>Command</h3><pre><code>{escaped(whole)}</code></pre>"
-        f"<details><summary>Arm by arm</summary><pre><code>{escaped(by_hand)}</code></pre></details>"
-    )
-
-
-def _by_hand(results: StudyResults) -> Iterator[str]:
-    """Yield a command for each arm, and one for each evaluation."""
-    study, size = results.study, results.size
-    overrides = size.overrides if size else ()
-    seeds = f"seed=range({size.seeds})" if size else "seed=0"
-    for arm in study.arms:
-        if not study.agents_of:
-            experiment = [f"experiment={study.experiment}"] if study.experiment else []
-            yield _command(study.command, ["-m", *experiment, *overrides, *arm.overrides, seeds])
-    for evaluation in study.evaluations:
-        if study.command != "evaluate":
-            more = size.evaluation_overrides if size else ()
-            yield _command("evaluate", ["run=<run>", *more, *evaluation.overrides])
-    if study.agents_of:
-        yield f"# agents: scripts/reproduce {study.agents_of}"
-
-
-def _command(name: str, words: Sequence[str]) -> str:
-    quoted = (word if word == "run=<run>" else shlex.quote(word) for word in words)
-    return f"cartpole-{name} {' '.join(quoted)}"
-
-
-def _runs(results: StudyResults) -> str:
-    """Return the folded list of the runs that count."""
-    if not results.agents:
-        return ""
-    measure = results.study.measure
-    rows = [
-        {"run": agent.run, "seed": agent.seed, **_named_values(results, agent.values, measure)}
-        for agent in results.agents[:1000]
-    ]
-    versions = f"<p>{escaped(results.versions)}</p>" if results.versions else ""
-    heading = f"The {len(results.agents)} runs behind it"
-    return f"<details><summary>{heading}</summary>{versions}{table(rows)}</details>"
-
-
-def _named_values(results: StudyResults, values: Mapping[str, float], measure: str) -> dict[str, str]:
-    evaluations: Sequence[Variant] = results.evaluations
-    if len(evaluations) == 1:
-        return {measure_label(measure): number_text(values[evaluations[0].name])}
-    return {
-        each.label: number_text(values[each.name]) if each.name in values else "–" for each in evaluations
-    }
 
 
 def _ranks(results: Sequence[StudyResults]) -> str:
@@ -313,8 +174,33 @@ def _ranks(results: Sequence[StudyResults]) -> str:
         return ""
     return (
         '<section id="ranks"><h2>Does the order in simulation predict that on the cart?</h2>'
-        f'<div class="figures">{_drawing(drawing)}</div></section>'
+        f'<div class="figures">{drawn(drawing)}</div></section>'
     )
+
+
+def _robustness(results: Sequence[StudyResults]) -> str:
+    """Return the section of the robustness score; empty without its studies."""
+    found = robustness(results)
+    if not found:
+        return ""
+    rows = [
+        {
+            "set-up": each.label,
+            **{name: _percent(score) for name, score in each.criteria.items()},
+            "overall": _percent(each.overall),
+        }
+        for each in found
+    ]
+    text = (
+        f"Share of cases, one agent at one value of a quantity, with a score (6.2) above {GOOD['score']:g}. "
+        f"Each quantity is a criterion of weight 1/{len(found[0].criteria)}, after the leaderboard of DFKI's "
+        "double pendulum (Wiebe et al., 2023)."
+    )
+    return f'<section id="robustness"><h2>Robustness score</h2><p>{text}</p>{table(rows)}</section>'
+
+
+def _percent(share: float | None) -> str:
+    return "–" if share is None else f"{share:.0%}"
 
 
 def _comparison(comparison: Comparison) -> str:
@@ -336,10 +222,10 @@ def _comparison(comparison: Comparison) -> str:
     lone = [f"{label} is only in {name}." for name, label in comparison.lone]
     parts = [
         '<section id="comparison"><h2>Comparison</h2>',
-        f"<p>Settings that differ:</p>{_folded(differs, 'settings')}"
+        f"<p>Settings that differ:</p>{folded(differs, 'settings')}"
         if differs
         else "<p>No setting differs.</p>",
-        _folded(rows, "groups") if rows else "<p>The two sets have no group in common.</p>",
+        folded(rows, "groups") if rows else "<p>The two sets have no group in common.</p>",
         "".join(f"<p>{escaped(line)}</p>" for line in lone[:MOST_EXCLUSIONS]),
         "</section>",
     ]
@@ -348,17 +234,6 @@ def _comparison(comparison: Comparison) -> str:
 
 def _method() -> str:
     return f'<section id="method"><h2>How numbers are made</h2><p>{METHOD}</p></section>'
-
-
-def _drawing(drawing: Drawing) -> str:
-    return f"<figure>{drawing.svg}<figcaption>{escaped(drawing.caption)}</figcaption></figure>"
-
-
-def _picture(picture: Picture) -> str:
-    data = base64.b64encode(picture.data).decode()
-    source = f"data:image/{picture.kind};base64,{data}"
-    image = f'<img src="{source}" alt="{html.escape(picture.alt)}">'
-    return f"<figure>{image}<figcaption>{escaped(picture.caption)}</figcaption></figure>"
 
 
 def _link(results: StudyResults) -> Html:
@@ -373,8 +248,13 @@ def _figure_name(figure: str) -> str:
 
 def _status(results: StudyResults) -> Html:
     found = status(results)
-    calm = found in (Status.AGREES, Status.OPEN)
-    return Html(found if calm else f'<span class="alarm">{found}</span>{escaped(reason(results))}')
+    if not _is_alarming(results):
+        return Html(found)
+    return Html(f'<span class="alarm">{found}</span>{escaped(reason(results))}')
+
+
+def _is_alarming(results: StudyResults) -> bool:
+    return status(results) not in (Status.AGREES, Status.OPEN)
 
 
 def _anchor(name: str) -> str:

@@ -1,7 +1,7 @@
 """The results of a study as plain numbers, read from run folders or from a small JSON file."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,6 +15,8 @@ FORMAT = 1  # of the JSON file
 DIGITS = 6  # significant, of the numbers in it
 OWN = Variant(name="own", label="its own evaluation")  # the result of a run without further evaluations
 STAGES = (Variant(name="before", label="before"), Variant(name="after", label="after fine-tuning"))
+
+CART = "emulated"  # evaluation on the cart that stands for the real one
 
 Array = NDArray[np.float64]
 Curve = tuple[tuple[float, float], ...]  # (transitions, value)
@@ -59,6 +61,23 @@ class StudyResults:
         return STAGES if self.study.command == "finetune" else (OWN,)
 
     @property
+    def judged(self) -> Variant:
+        """The evaluation that counts: CART if agents have it, else the last that some have."""
+        ranked = sorted(self.evaluations, key=lambda each: each.name == CART)
+        return next((each for each in reversed(ranked) if self._has(each)), ranked[-1])
+
+    @property
+    def varied(self) -> tuple[Variant, ...]:
+        """The evaluations or, if they have none, the arms with values on the axis; empty without an axis."""
+        if self.study.axis is None:
+            return ()
+        placed = (
+            tuple(each for each in kind if each.value is not None)
+            for kind in (self.evaluations, self.study.arms)
+        )
+        return next((each for each in placed if len(each) > 1), ())
+
+    @property
     def size(self) -> Size | None:
         """The size of these results."""
         name = self.study.size or (next(iter(self.study.sizes)) if len(self.study.sizes) == 1 else "")
@@ -79,18 +98,22 @@ class StudyResults:
             ]
         )
 
+    def _has(self, evaluation: Variant) -> bool:
+        return any(evaluation.name in agent.values for agent in self.agents)
+
     def ratios(self, arm: str) -> Array:
         """Return (second evaluation) / (first evaluation) of each agent [agents]; without a first of 0."""
-        first, second = (each.name for each in self.evaluations[:2])
-        pairs = [agent.values for agent in self.agents if agent.arm == arm]
-        return np.array(
-            [each[second] / each[first] for each in pairs if {first, second} <= each.keys() and each[first]]
-        )
+        first, second = self.pairs(self.evaluations[0].name, self.evaluations[1].name, arm)
+        return second[first != 0] / first[first != 0]
 
-    def pairs(self, evaluation: str, other: str) -> Array:
-        """Return the measures of the agents that have both evaluations [2, agents]."""
-        both = [agent.values for agent in self.agents if {evaluation, other} <= agent.values.keys()]
-        return np.array([[each[evaluation] for each in both], [each[other] for each in both]])
+    def pairs(self, evaluation: str, other: str, arm: str | None = None) -> Array:
+        """Return the measures of the agents (of `arm`) that have both evaluations [2, agents]."""
+        both = [
+            agent.values
+            for agent in self.agents
+            if {evaluation, other} <= agent.values.keys() and arm in (None, agent.arm)
+        ]
+        return np.array([[each[name] for each in both] for name in (evaluation, other)])
 
     def estimate(self, arm: str, evaluation: str) -> Estimate | None:
         """Return the interquartile mean of an arm; None without agents."""
@@ -166,8 +189,3 @@ def _rounded(value: float) -> float:
         return value
     rounded = round(value, DIGITS - 1 - math.floor(math.log10(abs(value))))
     return int(rounded) if rounded == int(rounded) else rounded
-
-
-def middle(ranked: Sequence[Agent]) -> Agent:
-    """Return the median agent of a ranking, the worse one of two."""
-    return ranked[len(ranked) // 2]

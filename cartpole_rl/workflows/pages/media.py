@@ -8,8 +8,8 @@ from PIL import Image
 
 from cartpole_rl.reporting.animation import smaller
 from cartpole_rl.reporting.studies.answers import measure_label
-from cartpole_rl.reporting.studies.page import Picture
 from cartpole_rl.reporting.studies.results import OWN, Agent, StudyResults
+from cartpole_rl.reporting.studies.sections import Picture
 from cartpole_rl.reporting.table import number_text
 from cartpole_rl.run_files import FIGURES
 from cartpole_rl.workflows.pages.studies import EVALUATIONS
@@ -59,10 +59,10 @@ class Gallery:
 def chosen(results: StudyResults) -> list[tuple[str, Agent, float, Path]]:
     """Return the best, the median and the worst agent with an animation, their values and animations.
 
-    They are those of the last evaluation of which there is one; the median of an even number is the worse of
-    the two in the middle.
+    They are those of the evaluation that counts, or of another one if it has no animation; the median of an
+    even number is the worse of the two in the middle.
     """
-    for evaluation in reversed(results.evaluations):
+    for evaluation in (results.judged, *reversed(results.evaluations)):
         filmed = [
             (agent, agent.values[evaluation.name], path)
             for agent in results.agents

@@ -5,8 +5,9 @@ from pathlib import Path
 from cartpole_rl.files import write_text
 from cartpole_rl.reporting.studies.answers import Status, agents_text, status
 from cartpole_rl.reporting.studies.comparison import compare
-from cartpole_rl.reporting.studies.page import Picture, runs_page, studies_page
+from cartpole_rl.reporting.studies.page import runs_page, studies_page
 from cartpole_rl.reporting.studies.results import StudyResults
+from cartpole_rl.reporting.studies.sections import Picture
 from cartpole_rl.run_files import PAGE
 from cartpole_rl.workflows.config import ReportConfig
 from cartpole_rl.workflows.pages.media import Gallery

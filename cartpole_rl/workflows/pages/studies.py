@@ -27,7 +27,8 @@ from cartpole_rl.reporting.studies.results import (
     StudyResults,
     from_json,
 )
-from cartpole_rl.reporting.studies.settings import Study
+from cartpole_rl.reporting.studies.settings import Study, Variant
+from cartpole_rl.run_files import CONFIG
 from cartpole_rl.workflows.pages.runs import (
     Run,
     commits_note,
@@ -40,7 +41,7 @@ from cartpole_rl.workflows.pages.runs import (
 )
 from cartpole_rl.workflows.run_folder import write_json
 
-STUDY, EVALUATIONS = "study.yaml", "evaluations"
+STUDY, EVALUATIONS, RUN = "study.yaml", "evaluations", "run="
 TEXTS = ("title", "order", "figure", "question", "thesis", "comment", "verdict")  # of today's conf/study/
 LOSS = "learning/loss"  # TensorBoard's curve
 CURVE_POINTS = 60
@@ -139,13 +140,27 @@ def _parts(folder: Path, study: Study) -> Iterator[Part]:
     for arm in study.arms:
         for place in _seeds(folder / arm.name):
             seed = int(place.name)
-            trained = folder.parent / study.agents_of / arm.name / place.name if study.agents_of else place
-            if (trained / "config.yaml").is_file() or not study.evaluations:
-                yield Part(arm.name, seed, OWN.name, read_run(trained))
+            own = next((each for each in (place, _origin(folder, study, arm, seed)) if _is_run(each)), place)
+            if _is_run(own) or not study.evaluations:
+                yield Part(arm.name, seed, OWN.name, read_run(own))
             for evaluation in study.evaluations:
                 inner = place / EVALUATIONS / evaluation.name
                 if inner.is_dir():
                     yield Part(arm.name, seed, evaluation.name, read_run(inner))
+
+
+def _origin(folder: Path, study: Study, arm: Variant, seed: int) -> Path:
+    """Return the run of another study whose agent an arm evaluates; the arm's own where it trains one."""
+    if study.agents_of:
+        return folder.parent / study.agents_of / arm.name / str(seed)
+    given = [word.removeprefix(RUN) for word in arm.overrides if word.startswith(RUN)]
+    if not given:
+        return folder / arm.name / str(seed)
+    return Path(given[-1].replace("{runs}", folder.parent.as_posix()).replace("{seed}", str(seed)))
+
+
+def _is_run(folder: Path) -> bool:
+    return (folder / CONFIG).is_file()
 
 
 def _seeds(arm: Path) -> list[Path]:
@@ -204,7 +219,9 @@ def _agents(folder: Path, study: Study, parts: Sequence[Part]) -> tuple[list[Age
         present = {name: value for name, value in values.items() if value is not None}
         if present:
             path = (folder / arm / str(seed)).as_posix()
-            agents.append(Agent(arm, seed, path, present, _curves(study, runs.get(OWN.name))))
+            variant = next(each for each in study.arms if each.name == arm)
+            curves = _curves(study, runs.get(OWN.name), _origin(folder, study, variant, seed))
+            agents.append(Agent(arm, seed, path, present, curves))
     order = [arm.name for arm in study.arms]
     return sorted(agents, key=lambda agent: (order.index(agent.arm), agent.seed)), exclusions
 
@@ -224,15 +241,15 @@ def _values(study: Study, runs: Mapping[str, Run]) -> dict[str, float | None]:
     return {OWN.name: measured(own, study.measure)}
 
 
-def _curves(study: Study, run: Run | None) -> dict[str, Curve]:
-    """Return the curves of a training that the study shows."""
-    if run is None or run.program != "train" or study.agents_of:
+def _curves(study: Study, run: Run | None, origin: Path) -> dict[str, Curve]:
+    """Return the curves of a training that the study shows; TensorBoard's are in its `origin`."""
+    if run is None or run.program != "train":
         return {}
     curves: dict[str, Sequence[tuple[float, float]]] = {}
     if "score" in study.curves:
         curves["score"] = [(each["transitions"], each["score"]) for each in history(run.folder)]
     if "loss" in study.curves:
-        curves["loss"] = scalars(run.folder, LOSS)
+        curves["loss"] = scalars(origin, LOSS)
     return {name: _thinned(curve) for name, curve in curves.items() if len(curve) > 1}
 
 
