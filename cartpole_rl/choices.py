@@ -31,6 +31,11 @@ def choice(name: str) -> dict[str, Any]:
     return yaml.safe_load(file.read_text(encoding="utf-8"))
 
 
+def group_choices(group: str) -> dict[str, dict[str, Any]]:
+    """Return the content of each choice of a group of conf/ by its name; empty for another name."""
+    return {file.stem: _load(group, file.stem) for file in sorted((conf_folder() / group).glob("*.yaml"))}
+
+
 def default_choices(command: str) -> dict[str, str]:
     """Return the default choice of each group that a command reads: {"cart": "ip02", ...}."""
     chosen: dict[str, str] = {}

@@ -4,11 +4,11 @@ All frames share a fixed palette of at most 32 colours, so that a frame stores o
 """
 
 import io
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, ImageDraw
+from PIL import Image, ImageDraw, ImageSequence
 
 from cartpole_rl.files import replacing
 from cartpole_rl.reporting.drawing import FINER, CartDrawing, palette
@@ -41,19 +41,9 @@ def gif(
 
     `pole_length` (pivot to tip) and `track_half_length` in m; one frame for each `every` control periods.
     """
-    first, *others = frames(episode, pole_length, track_half_length, title, every)
-    buffer = io.BytesIO()
-    first.save(
-        buffer,
-        "GIF",
-        save_all=True,
-        append_images=others,
-        duration=durations(episode, every),
-        loop=0,
-        optimize=False,
-        disposal=1,
+    return _encoded(
+        [*frames(episode, pole_length, track_half_length, title, every)], durations(episode, every)
     )
-    return buffer.getvalue()
 
 
 def frames(
@@ -78,3 +68,38 @@ def durations(episode: Episode, every: int = EVERY) -> list[int]:
     """Return the duration of each frame (ms): real time in the GIF's unit of 10 ms, rounded without drift."""
     hundredths = np.rint(100 * episode.time[rows(episode, every)]).astype(int)
     return [max(10 * int(wait), SHORTEST) for wait in np.diff(hundredths)] + [LAST_FRAME]
+
+
+def smaller(path: Path, width: int, every: int) -> bytes:
+    """Return the GIF at `path` scaled to `width` pixels with each `every`-th frame, in the same time.
+
+    Raises OSError for a file that is no picture.
+    """
+    chosen: list[Image.Image] = []
+    times: list[int] = []
+    with Image.open(path) as source:
+        size = (width, round(width * source.height / source.width))
+        for number, frame in enumerate(ImageSequence.Iterator(source)):
+            if number % every == 0:
+                scaled = frame.convert("RGB").resize(size, Image.Resampling.LANCZOS)
+                chosen.append(scaled.quantize(palette=palette(), dither=Image.Dither.NONE))
+                times.append(0)
+            times[-1] += frame.info.get("duration", SHORTEST)
+    return _encoded(chosen, times)
+
+
+def _encoded(pictures: Sequence[Image.Image], times: Sequence[int]) -> bytes:
+    """Return pictures in the fixed palette as an endless GIF, each shown for its time (ms)."""
+    first, *others = pictures
+    buffer = io.BytesIO()
+    first.save(
+        buffer,
+        "GIF",
+        save_all=True,
+        append_images=others,
+        duration=[*times],
+        loop=0,
+        optimize=False,
+        disposal=1,
+    )
+    return buffer.getvalue()

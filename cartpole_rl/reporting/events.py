@@ -1,7 +1,7 @@
-"""Truncation of TensorBoard's event files at the step from which a run is resumed.
+"""Reading TensorBoard's event files, and their truncation at the step from which a run is resumed.
 
-TensorBoard has a marker for this, torch's `purge_step`, but only one of its three readers obeys it: the
-default reader replaces points only where new ones exist, and that of `--load_fast=false` shows both
+TensorBoard has a marker for the truncation, torch's `purge_step`, but only one of its three readers obeys it:
+the default reader replaces points only where new ones exist, and that of `--load_fast=false` shows both
 (TensorBoard 2.21). Therefore the later points are removed from the files.
 
 An event file is a sequence of records: length u64 and its CRC u32, little-endian, the event, and its CRC u32.
@@ -33,6 +33,18 @@ def cut_back(folder: Path, first_step: int) -> None:
                 if _is_kept(event, first_step):
                     target.write(record)
         copy.replace(path)
+
+
+def scalars(folder: Path, tag: str) -> list[tuple[int, float]]:
+    """Return the points (step, value) of the curve `tag` in the event files in `folder`."""
+    points = []
+    for path in sorted(folder.glob("events.out.tfevents.*")):
+        with path.open("rb") as source:
+            for _, event in _records(source):
+                points += [
+                    (event.step, value.simple_value) for value in event.summary.value if value.tag == tag
+                ]
+    return points
 
 
 def _records(source: BinaryIO) -> Iterator[tuple[bytes, Event]]:

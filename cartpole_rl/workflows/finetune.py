@@ -28,7 +28,7 @@ from cartpole_rl.learning.randomness import seed_everything
 from cartpole_rl.reporting.scores import score_table
 from cartpole_rl.reporting.tensorboard import TensorBoardLog
 from cartpole_rl.reporting.words import count_text
-from cartpole_rl.run_files import CHECKPOINTS, LAST, METRICS, RECORDINGS
+from cartpole_rl.run_files import CHECKPOINTS, COMPARISON, LAST, METRICS, RECORDINGS
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.agents import new_agent, trained_agent
 from cartpole_rl.workflows.build import evaluated_env, evaluated_settings, is_real_time, use_threads
@@ -43,7 +43,6 @@ from cartpole_rl.workflows.report import report
 from cartpole_rl.workflows.resuming import resumed
 from cartpole_rl.workflows.run_folder import write_config, write_json
 
-COMPARISON = "comparison.json"
 SIMULATED_SCORE = "cart/score_in_simulation"  # TensorBoard's curve beside those of the cart
 
 

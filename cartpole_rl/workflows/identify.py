@@ -26,7 +26,7 @@ from cartpole_rl.reporting.identification import (
     identification_page,
     quantities_table,
 )
-from cartpole_rl.run_files import CART, FIGURES, POLE, RANDOMIZATION, RECORDINGS
+from cartpole_rl.run_files import CART, FIGURES, IDENTIFIED, PAGE, POLE, RANDOMIZATION, RECORDINGS
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.build import precedence, use_threads
 from cartpole_rl.workflows.config import IdentifyConfig
@@ -35,7 +35,6 @@ from cartpole_rl.workflows.person import confirm, print_message
 from cartpole_rl.workflows.recordings import experiments
 from cartpole_rl.workflows.run_folder import write_config, write_json
 
-PAGE, REPORT = "page.html", "identification.json"
 Episodes = dict[str, Episode]  # by the name of the experiment, or of the file
 
 
@@ -64,7 +63,7 @@ def identify_cart(config: IdentifyConfig, folder: Path) -> None:
     found = identify([*fitted.values()], [held_out], nominal, models, period, substeps, config.windows)
     carts = found.fit.draw(config.carts, np.random.default_rng(config.seed))
     write_choices(found, carts, folder)
-    write_json(folder / REPORT, report(found, carts))
+    write_json(folder / IDENTIFIED, report(found, carts))
     for name, figure in identification_figures(found, carts, fitted).items():
         save(figure, folder / FIGURES / f"{name}.png")
     identified = intervals(found.fit, carts)

@@ -15,6 +15,7 @@ from cartpole_rl.workflows.config import (
     PreflightConfig,
     RecordConfig,
     ReplayConfig,
+    ReportConfig,
     TrainConfig,
 )
 
@@ -27,6 +28,7 @@ COMMANDS: dict[type[Settings], str] = {
     ModelConfig: "model",
     FinetuneConfig: "finetune",
     PreflightConfig: "preflight",
+    ReportConfig: "report",
 }
 
 Config = TypeVar("Config", bound=Settings)

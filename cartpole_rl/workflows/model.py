@@ -26,7 +26,7 @@ from cartpole_rl.reporting.error_tables import REPORTED_TIMES, model_table, spre
 from cartpole_rl.reporting.figures import save
 from cartpole_rl.reporting.figures.learned_models import ensemble_figure
 from cartpole_rl.reporting.words import LEARNED, PHYSICS, count_text
-from cartpole_rl.run_files import FIGURES
+from cartpole_rl.run_files import FIGURES, MODELLED
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.build import use_threads
 from cartpole_rl.workflows.config import ModelConfig
@@ -34,7 +34,7 @@ from cartpole_rl.workflows.poles import chosen_pole
 from cartpole_rl.workflows.recordings import recordings
 from cartpole_rl.workflows.run_folder import write_config, write_json
 
-REPORT, FIGURE = "model.json", f"{FIGURES}/model.png"
+FIGURE = f"{FIGURES}/model.png"
 FRICTION_MODELS = (CartFriction.SIGMOID, CartFriction.STEP)  # candidates for the cart
 
 
@@ -64,14 +64,14 @@ def learn_model(config: ModelConfig, folder: Path) -> None:
     write_config(folder, "model", config.model_dump(mode="json", by_alias=True))
     save_model(folder / MODEL, model)
     data = {"pole": pole_name, "control_period_s": period, "recordings": [str(path) for path in paths]}
-    write_json(folder / REPORT, {**data, **results(model, ensemble, windows, errors)})
+    write_json(folder / MODELLED, {**data, **results(model, ensemble, windows, errors)})
     subtitle = f"{count_text(len(episodes))}, pole={pole_name}, {windows.number} held-out windows"
     save(ensemble_figure(physics, learned, ensemble, subtitle), folder / FIGURE)
     print(model_table(errors, f"errors on {windows.number} held-out windows, over the time predicted"))
     print(
         f"\n{spread_table(errors[LEARNED], CERTAIN, 'RMS errors and ensemble spreads on the same windows')}"
     )
-    print(f"{folder}/{MODEL}, {REPORT} and {FIGURE} are written")
+    print(f"{folder}/{MODEL}, {MODELLED} and {FIGURE} are written")
 
 
 def fit_and_learn(

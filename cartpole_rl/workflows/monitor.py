@@ -1,6 +1,5 @@
 """Progress bar, TensorBoard events, history and checkpoints of a training."""
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -10,7 +9,6 @@ import numpy as np
 from tqdm import tqdm
 
 from cartpole_rl.evaluation.metrics import episode_metrics
-from cartpole_rl.files import write_text
 from cartpole_rl.learning.checkpoints import AgentCheckpoint, TrainingCheckpoint, save_agent, save_training
 from cartpole_rl.learning.training import Scalars, Training
 from cartpole_rl.plants.simulated import SimulatedPlant
@@ -20,8 +18,8 @@ from cartpole_rl.reporting.tensorboard import TensorBoardLog
 from cartpole_rl.run_files import BEST, CHECKPOINTS, LAST
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.config import TrainConfig
+from cartpole_rl.workflows.history import read_history, write_history
 
-HISTORY = "history.jsonl"  # a line for each evaluation
 GUARDED = "guarded_fraction"  # None without a track guard
 COMPARED = (  # on the HPARAMS page
     "score",
@@ -128,14 +126,3 @@ class TrainingMonitor:
             "behaviour", behaviour(episode, f"After {transitions / 1e6:.1f} M transitions", half), transitions
         )
         self._log.animation("cart", gif(episode, length, half), transitions)
-
-
-def read_history(folder: Path) -> list[dict[str, float]]:
-    """Return the evaluations of a training so far, oldest first."""
-    path = folder / HISTORY
-    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
-
-
-def write_history(folder: Path, history: Sequence[dict[str, float]]) -> None:
-    """Write the evaluations for `read_history`, all or none."""
-    write_text(folder / HISTORY, "".join(json.dumps(record) + "\n" for record in history))

@@ -24,6 +24,7 @@ from cartpole_rl.run_files import (
     LAST,
     METRICS,
     MULTIRUN,
+    PAGE,
     POLE,
     PROVENANCE,
     RANDOMIZATION,
@@ -39,6 +40,7 @@ USES = {  # command: how its runs can be used
     "replay": f"its results are replay.json and {FIGURES}/; cartpole-replay from=... makes new ones",
     "identify": f"cartpole-train takes its files: cart={{0}}/{CART} pole={{0}}/{POLE} "
     f"randomization={{0}}/{RANDOMIZATION}",
+    "report": f"it is a page to read: {{0}}/{PAGE}",
     "model": "cartpole-train, cartpole-evaluate and cartpole-record take it as plant=learned plant.model={0}",
 }
 PACKAGES = ("cartpole_rl", "torch", "torchrl", "tensordict", "numpy", "hydra-core", "mujoco", "pyserial")

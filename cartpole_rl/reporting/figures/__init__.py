@@ -5,7 +5,7 @@ No function touches pyplot or a global setting, so that they may be called from 
 
 from cartpole_rl.reporting.figures.behaviours import behaviour
 from cartpole_rl.reporting.figures.comparisons import comparison
-from cartpole_rl.reporting.figures.files import png, save
+from cartpole_rl.reporting.figures.files import png, save, svg
 from cartpole_rl.reporting.figures.learning_curves import learning_curve
 
 __all__ = [
@@ -14,4 +14,5 @@ __all__ = [
     "learning_curve",
     "png",
     "save",
+    "svg",
 ]

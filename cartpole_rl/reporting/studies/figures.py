@@ -1,0 +1,244 @@
+"""The figures of a study as SVG with alt texts and captions."""
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cartpole_rl.reporting.figures import svg
+from cartpole_rl.reporting.figures.studies import (
+    MOST_LINES,
+    agreement,
+    curves_over_axis,
+    described,
+    dot_rows,
+    profiles,
+    training_curves,
+)
+from cartpole_rl.reporting.studies.answers import GOOD, estimate_text, measure_label
+from cartpole_rl.reporting.studies.results import OWN, StudyResults
+from cartpole_rl.reporting.studies.settings import Variant
+from cartpole_rl.reporting.studies.statistics import estimate, interquartile_mean
+
+MOST_ROWS = 40  # groups in a figure of dots
+FEWEST_PROFILED = 3  # agents
+CURVES = {"score": "score of an evaluation", "loss": "loss"}
+
+Array = NDArray[np.float64]
+Groups = Mapping[str, Mapping[str, Array]]
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """A figure for the page."""
+
+    svg: str
+    caption: str
+
+
+def drawings(results: StudyResults) -> Iterator[Drawing]:
+    """Yield the figures of a study that has agents."""
+    if not results.agents:
+        return
+    yield _over_axis(results) if results.varied else _dots(results)
+    if results.study.ratio:
+        yield from _ratios(results)
+    if not results.varied:
+        yield from _profiles(results)
+    for name in results.study.curves:
+        yield from _training(results, name)
+    if len(results.evaluations) > 1 and not results.varied:
+        yield from _agreement(results)
+
+
+def _groups(results: StudyResults) -> dict[str, dict[str, Array]]:
+    """Return the values of each arm's evaluations by their labels."""
+    evaluations = results.evaluations
+    single = len(evaluations) == 1
+    return {
+        arm.label: {"" if single else each.label: results.values(arm.name, each.name) for each in evaluations}
+        for arm in results.study.arms
+    }
+
+
+def _dots(results: StudyResults) -> Drawing:
+    groups, note = _most(_groups(results))
+    label = measure_label(results.study.measure)
+    good = GOOD.get(results.study.measure)
+    values = [value for agent in results.agents for value in agent.values.values()]
+    guided = good is not None and min(values) < good < max(values)
+    figure = dot_rows(groups, label, {f"good: {good:g}": good} if good and guided else None)
+    caption = f"Dots: agents. Diamond and line: interquartile mean and its 95 % interval.{note}"
+    return Drawing(svg(figure, described(groups, label)), caption)
+
+
+def _most(groups: Groups) -> tuple[Groups, str]:
+    """Return at most MOST_ROWS groups, the highest and the lowest, and a note if some are left out."""
+    if len(groups) <= MOST_ROWS:
+        return groups, ""
+    ranked = [*_ranked(groups)]
+    shown = [*ranked[: MOST_ROWS // 2], *ranked[-MOST_ROWS // 2 :]]
+    note = f" Of {len(groups)} groups the {MOST_ROWS // 2} highest and the {MOST_ROWS // 2} lowest are drawn."
+    return {label: groups[label] for label in shown}, note
+
+
+def _ranked(groups: Groups) -> list[str]:
+    """Return the labels, highest interquartile mean of the last series first."""
+
+    def height(label: str) -> float:
+        last = [*groups[label].values()][-1]
+        return float(interquartile_mean(last)) if last.size else float("-inf")
+
+    return sorted(groups, key=height, reverse=True)
+
+
+def _over_axis(results: StudyResults) -> Drawing:
+    axis = results.study.axis
+    assert axis
+    lines = {
+        name: ([value for value, _ in points], [values for _, values in points])
+        for name, points in _lines(results).items()
+        if points
+    }
+    label = measure_label(results.study.measure)
+    quantity = f"{axis.label}, {axis.unit}" if axis.unit else axis.label
+    ends = "; ".join(
+        f"{name}: {estimate_text(estimate(values[0]))} at {at[0]:g}, "
+        f"{estimate_text(estimate(values[-1]))} at {at[-1]:g}"
+        for name, (at, values) in lines.items()
+    )
+    caption = "Dots: agents. Line and band: interquartile mean and its 95 % interval."
+    figure = curves_over_axis(lines, quantity, label)
+    return Drawing(svg(figure, f"{label} over {quantity}. {ends}."), caption)
+
+
+def _lines(results: StudyResults) -> dict[str, list[tuple[float, Array]]]:
+    """Return the places and the values of each line: of an arm, or of an evaluation and a family of arms."""
+    lines: dict[str, list[tuple[float, Array]]] = {}
+    places = {each.name for each in results.varied}
+    for arm in results.study.arms:
+        for evaluation in results.evaluations:
+            if evaluation.name in places:
+                name, value = arm.label, evaluation.value
+            elif arm.name in places:
+                several = len(results.evaluations) > 1
+                name, value = ", ".join((_family(arm), *([evaluation.label] if several else []))), arm.value
+            else:
+                continue
+            values = results.values(arm.name, evaluation.name)
+            if value is not None and values.size:
+                lines.setdefault(name.strip(", "), []).append((value, values))
+    return {name: sorted(points, key=lambda point: point[0]) for name, points in lines.items()}
+
+
+def _family(arm: Variant) -> str:
+    """Return the label without its last part, which is the value: "explicit" of "explicit, 20 ms"."""
+    return arm.label.rpartition(",")[0]
+
+
+def _ratios(results: StudyResults) -> Iterator[Drawing]:
+    groups = {arm.label: {"": results.ratios(arm.name)} for arm in results.study.arms}
+    if not any(series[""].size for series in groups.values()):
+        return
+    first, second = results.evaluations[:2]
+    label = f"{second.label} / {first.label}"
+    shown, note = _most(groups)
+    figure = dot_rows(shown, label, {"1": 1.0})
+    yield Drawing(
+        svg(figure, described(shown, f"Ratio {label}")),
+        f"{second.label} divided by {first.label}, per agent.{note}",
+    )
+
+
+def _profiles(results: StudyResults) -> Iterator[Drawing]:
+    last = results.judged
+    groups = {arm.label: {"": results.values(arm.name, last.name)} for arm in results.study.arms}
+    ranked = [label for label in _ranked(groups) if groups[label][""].size >= FEWEST_PROFILED]
+    if not ranked:
+        return
+    chosen = {label: series[""] for label, series in groups.items() if label in ranked[:MOST_LINES]}
+    label = measure_label(results.study.measure)
+    medians = "; ".join(
+        f"{name}: half of the agents above {np.median(each):.4g}" for name, each in chosen.items()
+    )
+    note = f" The highest {MOST_LINES} of {len(ranked)} are drawn." if len(ranked) > MOST_LINES else ""
+    place = "" if last is OWN else f", {last.label}"
+    yield Drawing(
+        svg(profiles(chosen, label), f"Performance profiles of {label}{place}. {medians}."),
+        f"Performance profile{place}: the share of agents above each value.{note}",
+    )
+
+
+def _training(results: StudyResults, name: str) -> Iterator[Drawing]:
+    groups = {
+        arm.label: [
+            agent.curves[name] for agent in results.agents if agent.arm == arm.name and name in agent.curves
+        ]
+        for arm in results.study.arms
+    }
+    drawn = [label for label, curves in groups.items() if curves][:MOST_LINES]
+    if not drawn:
+        return
+    ends = "; ".join(
+        f"{label}: median {np.median([curve[-1][1] for curve in groups[label]]):.3g} at the end"
+        for label in drawn
+    )
+    figure = training_curves({label: groups[label] for label in drawn}, CURVES[name])
+    left_out = sum(bool(curves) for curves in groups.values()) - len(drawn)
+    note = f" {left_out} more groups are not drawn." if left_out else ""
+    yield Drawing(
+        svg(figure, f"{CURVES[name]} over the transitions of training. {ends}."),
+        f"Training: {CURVES[name]}. Thin lines: agents. Thick line: their median.{note}",
+    )
+
+
+def _agreement(results: StudyResults) -> Iterator[Drawing]:
+    first, second = results.evaluations[:2]
+    pairs = {arm.label: results.pairs(first.name, second.name, arm.name) for arm in results.study.arms}
+    present = {label: each for label, each in pairs.items() if each.size}
+    if sum(each.shape[1] for each in present.values()) < FEWEST_PROFILED:
+        return
+    label = measure_label(results.study.measure)
+    figure = agreement(present, f"{label}, {first.label}", f"{label}, {second.label}")
+    yield Drawing(
+        svg(figure, f"{label} of each agent: {second.label} over {first.label}."),
+        f"Each agent on both: a dot on the dashed line has the same {label} on both.",
+    )
+
+
+def rank_agreement(results: Sequence[StudyResults]) -> Drawing | None:
+    """Return the scores of all agents in the two evaluations that most studies compare; None for too few.
+
+    An agent that several studies evaluate is drawn once.
+    """
+    compared = [
+        each
+        for each in results
+        if len(each.evaluations) > 1 and each.study.measure == "score" and not each.varied
+    ]
+    names = Counter((each.evaluations[0].name, each.evaluations[1].name) for each in compared)
+    if not names:
+        return None
+    common, _ = names.most_common(1)[0]
+    drawn: set[tuple[float, ...]] = set()
+    groups: dict[str, Array] = {}
+    labels = ("", "")
+    for each in compared:
+        first, second = each.evaluations[:2]
+        fresh = {tuple(pair) for pair in each.pairs(first.name, second.name).T.tolist()} - drawn
+        if (first.name, second.name) == common and fresh:
+            drawn |= fresh
+            groups[each.study.title] = np.array(sorted(fresh)).T
+            labels = first.label, second.label
+    if len(drawn) < FEWEST_PROFILED:
+        return None
+    label = measure_label("score")
+    figure = agreement(groups, f"{label}, {labels[0]}", f"{label}, {labels[1]}")
+    return Drawing(
+        svg(
+            figure, f"{label} of {len(drawn)} agents of {len(groups)} studies: {labels[1]} over {labels[0]}."
+        ),
+        f"{len(drawn)} agents of {len(groups)} studies. The dashed line: the same {label} on both.",
+    )

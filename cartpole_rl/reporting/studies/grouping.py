@@ -1,0 +1,129 @@
+"""Groups of runs by the settings that differ, under short labels: "pole=large, learning.carts=512"."""
+
+import json
+from collections import Counter
+from collections.abc import Collection, Hashable, Mapping, Sequence
+from functools import cache
+from typing import Any
+
+from cartpole_rl.choices import group_choices
+
+MOST_NAMED = 8  # settings in a label
+DERIVED = ("guard.numbers", "agent.guard.numbers")  # fitted from other settings: the last to be named
+ALL = "all runs"  # label where no setting differs
+NULL, DEFAULT = "null", "default"  # a setting without a value; the label of a group that has only such
+
+Tree = Mapping[str, Any]
+Columns = dict[str, list[str]]  # setting: its value in every run
+
+
+def differing(settings: Sequence[Mapping[str, Hashable]]) -> list[str]:
+    """Return the dotted names whose values differ among runs, in the order of their first occurrence."""
+    names = dict.fromkeys(name for each in settings for name in each)
+    return [name for name in names if len({each.get(name) for each in settings}) > 1]
+
+
+def setting_columns(trees: Sequence[Tree], settings: Sequence[Mapping[str, Hashable]]) -> Columns:
+    """Return the settings that differ among runs, each with its value in every run.
+
+    `settings` are those of `trees` by dotted name. A group of conf/ is named by its choice if all runs have
+    one: "randomization" with values like "wide".
+    """
+    columns: Columns = {}
+    names = differing(settings)
+    for group in dict.fromkeys(map(_group, names)):
+        within = [name for name in names if _group(name) == group]
+        columns |= _columns_of(group, within, trees, settings)
+    return columns
+
+
+def fewest(columns: Columns, chosen: Collection[str]) -> Columns:
+    """Return the columns that tell the groups of runs apart, those that a person chose to set first.
+
+    A setting that nobody chose is left out if the others determine it.
+    """
+    first = [name for name in columns if name in chosen]
+    derived = [name for name in columns if name.startswith(DERIVED) and name not in first]
+    others = [name for name in columns if name not in (*first, *derived)]
+    kept = {name: columns[name] for name in (*first, *others, *derived)}
+    for name in (*derived, *reversed(others)):
+        rest = [values for other, values in kept.items() if other != name]
+        if rest and len({*zip(*rest, strict=True)}) == len({*zip(*kept.values(), strict=True)}):
+            del kept[name]
+    return kept
+
+
+def labels(columns: Columns, count: int) -> list[str]:
+    """Return the label of each of `count` runs; a setting is named by its last part if that is unique.
+
+    Above MOST_NAMED settings the others become a number: "variant 3".
+    """
+    lasts = Counter(name.rpartition(".")[2] for name in columns)
+    short = {name: last if lasts[last := name.rpartition(".")[2]] == 1 else name for name in columns}
+    named, others = [*columns][:MOST_NAMED], [*columns][MOST_NAMED:]
+    rests = [tuple(columns[name][row] for name in others) for row in range(count)]
+    numbers = {rest: number for number, rest in enumerate(dict.fromkeys(rests), start=1)}
+    parts = (
+        [
+            *(f"{short[name]}={columns[name][row]}" for name in named if columns[name][row] != NULL),
+            *([f"variant {numbers[rests[row]]}"] if others else []),
+        ]
+        for row in range(count)
+    )
+    return [", ".join(each) or (DEFAULT if columns else ALL) for each in parts]
+
+
+def _group(name: str) -> str:
+    """Return the group of conf/ that a setting belongs to; "agent.pole" for the agent of an evaluation."""
+    parts = name.split(".")
+    return ".".join(parts[:2] if parts[0] == "agent" and len(parts) > 2 else parts[:1])
+
+
+def _columns_of(
+    group: str, names: Sequence[str], trees: Sequence[Tree], settings: Sequence[Mapping[str, Hashable]]
+) -> dict[str, list[str]]:
+    """Return the columns of one group: its choices, or its settings."""
+    contents = [_subtree(tree, group) for tree in trees]
+    chosen = [_choice(group.rpartition(".")[2], content) for content in contents]
+    distinct = [json.dumps(content, sort_keys=True, default=str) for content in contents]
+    if all(chosen) and len({*zip(chosen, distinct, strict=True)}) == len({*chosen}):
+        return {group: [str(each) for each in chosen]}
+    return {name: [_text(each.get(name)) for each in settings] for name in names}
+
+
+def _subtree(tree: Tree, group: str) -> Any:
+    found: Any = tree
+    for part in group.split("."):
+        found = found.get(part) if isinstance(found, Mapping) else None
+    return found
+
+
+def _choice(group: str, content: Any) -> str | None:
+    """Return the choice of `group` that has this content, ignoring values that are None in the choice."""
+    if not isinstance(content, Mapping):
+        return None
+    return next((name for name, choice in _choices(group).items() if _is_choice(choice, content)), None)
+
+
+@cache
+def _choices(group: str) -> dict[str, dict[str, Any]]:
+    return group_choices(group) if group.isidentifier() else {}
+
+
+def _is_choice(choice: Any, content: Any) -> bool:
+    if isinstance(choice, Mapping) and isinstance(content, Mapping):
+        given = {name: value for name, value in choice.items() if value is not None}
+        others = {name for name, value in content.items() if value is not None} - {*choice}
+        same = all(_is_choice(value, content.get(name)) for name, value in given.items())
+        return (
+            same
+            and (bool(given) or not others)
+            and not any(isinstance(content[name], Mapping) for name in others)
+        )
+    return bool(choice == content)
+
+
+def _text(value: Hashable) -> str:
+    if value is None:
+        return NULL
+    return f"{value:g}" if isinstance(value, float) else str(value)

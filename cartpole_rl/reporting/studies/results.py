@@ -1,0 +1,191 @@
+"""The results of a study as plain numbers, read from run folders or from a small JSON file."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cartpole_rl.reporting.studies.settings import Size, Study, Variant
+from cartpole_rl.reporting.studies.statistics import Estimate, estimate
+
+FORMAT = 1  # of the JSON file
+DIGITS = 6  # significant, of the numbers in it
+OWN = Variant(name="own", label="its own evaluation")  # the result of a run without further evaluations
+STAGES = (Variant(name="before", label="before"), Variant(name="after", label="after fine-tuning"))
+
+CART = "emulated"  # evaluation on the cart that stands for the real one
+
+Array = NDArray[np.float64]
+Curve = tuple[tuple[float, float], ...]  # (transitions, value)
+
+
+@dataclass(frozen=True)
+class Agent:
+    """One run of an arm. `values` maps evaluations to the measure; `curves` are those of its training."""
+
+    arm: str
+    seed: int
+    run: str  # relative path
+    values: Mapping[str, float]
+    curves: Mapping[str, Curve] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Exclusion:
+    """A run that does not count, and the reason."""
+
+    run: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class StudyResults:
+    """The agents of a study that count, the runs that do not, and remarks on how they were made."""
+
+    name: str
+    study: Study
+    agents: tuple[Agent, ...] = ()
+    exclusions: tuple[Exclusion, ...] = ()
+    notes: tuple[str, ...] = ()
+    versions: str = ""  # of the packages that all agents share
+    folder: str = ""  # relative path of the runs
+
+    @property
+    def evaluations(self) -> tuple[Variant, ...]:
+        """The evaluations of the study; those of the runs themselves if it has none."""
+        if self.study.evaluations:
+            return self.study.evaluations
+        return STAGES if self.study.command == "finetune" else (OWN,)
+
+    @property
+    def judged(self) -> Variant:
+        """The evaluation that counts: CART if agents have it, else the last that some have."""
+        ranked = sorted(self.evaluations, key=lambda each: each.name == CART)
+        return next((each for each in reversed(ranked) if self._has(each)), ranked[-1])
+
+    @property
+    def varied(self) -> tuple[Variant, ...]:
+        """The evaluations or, if they have none, the arms with values on the axis; empty without an axis."""
+        if self.study.axis is None:
+            return ()
+        placed = (
+            tuple(each for each in kind if each.value is not None)
+            for kind in (self.evaluations, self.study.arms)
+        )
+        return next((each for each in placed if len(each) > 1), ())
+
+    @property
+    def size(self) -> Size | None:
+        """The size of these results."""
+        name = self.study.size or (next(iter(self.study.sizes)) if len(self.study.sizes) == 1 else "")
+        return self.study.sizes.get(name)
+
+    @property
+    def label(self) -> str:
+        """The name of the size, as on the command line."""
+        return next((name for name, size in self.study.sizes.items() if size is self.size), "")
+
+    def values(self, arm: str, evaluation: str) -> Array:
+        """Return the measure of each agent of an arm [agents]."""
+        return np.array(
+            [
+                agent.values[evaluation]
+                for agent in self.agents
+                if agent.arm == arm and evaluation in agent.values
+            ]
+        )
+
+    def _has(self, evaluation: Variant) -> bool:
+        return any(evaluation.name in agent.values for agent in self.agents)
+
+    def ratios(self, arm: str) -> Array:
+        """Return (second evaluation) / (first evaluation) of each agent [agents]; without a first of 0."""
+        first, second = self.pairs(self.evaluations[0].name, self.evaluations[1].name, arm)
+        return second[first != 0] / first[first != 0]
+
+    def pairs(self, evaluation: str, other: str, arm: str | None = None) -> Array:
+        """Return the measures of the agents (of `arm`) that have both evaluations [2, agents]."""
+        both = [
+            agent.values
+            for agent in self.agents
+            if {evaluation, other} <= agent.values.keys() and arm in (None, agent.arm)
+        ]
+        return np.array([[each[name] for each in both] for name in (evaluation, other)])
+
+    def estimate(self, arm: str, evaluation: str) -> Estimate | None:
+        """Return the interquartile mean of an arm; None without agents."""
+        values = self.values(arm, evaluation)
+        return estimate(values) if values.size else None
+
+    def missing(self) -> list[str]:
+        """Return a sentence for each arm and evaluation with fewer agents than the study asks for."""
+        if self.size is None:
+            return []
+        return [
+            f"{arm.label}, {evaluation.label}: {count} of {self.size.seeds} seeds"
+            for arm in self.study.arms
+            for evaluation in self.evaluations
+            if (count := self.values(arm.name, evaluation.name).size) < self.size.seeds
+        ]
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the results as plain data for `from_json`."""
+        agents = [
+            {
+                "arm": agent.arm,
+                "seed": agent.seed,
+                "run": agent.run,
+                "values": {name: _rounded(value) for name, value in agent.values.items()},
+                "curves": {
+                    name: [[_rounded(x), _rounded(y)] for x, y in curve]
+                    for name, curve in agent.curves.items()
+                },
+            }
+            for agent in self.agents
+        ]
+        return {
+            "format": FORMAT,
+            "name": self.name,
+            "study": self.study.model_dump(mode="json"),
+            "agents": agents,
+            "exclusions": [{"run": each.run, "reason": each.reason} for each in self.exclusions],
+            "notes": list(self.notes),
+            "versions": self.versions,
+            "folder": self.folder,
+        }
+
+
+def from_json(content: Mapping[str, Any], study: Study) -> StudyResults:
+    """Return the results of `study` in a JSON file. Raises KeyError, TypeError or ValueError."""
+    if content["format"] != FORMAT:
+        raise ValueError(f"format {content['format']}; this version reads format {FORMAT}")
+    agents = [
+        Agent(
+            each["arm"],
+            int(each["seed"]),
+            each["run"],
+            {name: float(value) for name, value in each["values"].items()},
+            {name: tuple((float(x), float(y)) for x, y in curve) for name, curve in each["curves"].items()},
+        )
+        for each in content["agents"]
+    ]
+    return StudyResults(
+        content["name"],
+        study,
+        tuple(agents),
+        tuple(Exclusion(**each) for each in content["exclusions"]),
+        tuple(content["notes"]),
+        content["versions"],
+        content["folder"],
+    )
+
+
+def _rounded(value: float) -> float:
+    """Return `value` with DIGITS significant digits, an integer where it is one."""
+    if value == 0 or not math.isfinite(value):
+        return value
+    rounded = round(value, DIGITS - 1 - math.floor(math.log10(abs(value))))
+    return int(rounded) if rounded == int(rounded) else rounded

@@ -1,0 +1,57 @@
+"""One robustness score, in the manner of the leaderboard of DFKI's double pendulum (Wiebe et al., 2023).
+
+Each study whose name starts with CRITERIA is one criterion: a quantity of the cart is set to several values.
+Its score is the share of successful cases, a case being one agent at one value and a success a score above
+GOOD. All criteria have the same weight.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from cartpole_rl.reporting.studies.answers import GOOD
+from cartpole_rl.reporting.studies.results import StudyResults
+
+CRITERIA = "robustness_"  # prefix of the names of studies
+
+
+@dataclass(frozen=True)
+class Robustness:
+    """The score of one set-up: by criterion, and their mean; None where a criterion has no agent."""
+
+    label: str
+    criteria: Mapping[str, float | None]
+
+    @property
+    def overall(self) -> float | None:
+        """The mean of the criteria; None if one is missing."""
+        present = [score for score in self.criteria.values() if score is not None]
+        return float(np.mean(present)) if len(present) == len(self.criteria) else None
+
+
+def robustness(results: Sequence[StudyResults]) -> list[Robustness]:
+    """Return the scores of the set-ups of all criteria, the most robust first; none without results."""
+    criteria = [
+        each
+        for each in results
+        if each.name.startswith(CRITERIA) and each.agents and each.varied and each.study.measure in GOOD
+    ]
+    labels = dict.fromkeys(arm.label for each in criteria for arm in each.study.arms)
+    found = [
+        Robustness(label, {_quantity(each): _share(each, label) for each in criteria}) for label in labels
+    ]
+    return sorted(found, key=lambda each: -1.0 if each.overall is None else each.overall, reverse=True)
+
+
+def _share(results: StudyResults, label: str) -> float | None:
+    """Return the share of successful cases of a set-up, each value of the quantity with the same weight."""
+    arm = next((arm.name for arm in results.study.arms if arm.label == label), "")
+    values = [results.values(arm, evaluation.name) for evaluation in results.varied]
+    shares = [float((each > GOOD[results.study.measure]).mean()) for each in values if each.size]
+    return float(np.mean(shares)) if len(shares) == len(values) else None
+
+
+def _quantity(results: StudyResults) -> str:
+    assert results.study.axis
+    return results.study.axis.label

@@ -1,0 +1,110 @@
+"""Pictures for a page from run folders: animations of agents, made smaller, and figures."""
+
+import io
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from PIL import Image
+
+from cartpole_rl.reporting.animation import smaller
+from cartpole_rl.reporting.studies.answers import measure_label
+from cartpole_rl.reporting.studies.results import OWN, Agent, StudyResults
+from cartpole_rl.reporting.studies.sections import Picture
+from cartpole_rl.reporting.table import number_text
+from cartpole_rl.run_files import FIGURES
+from cartpole_rl.workflows.pages.studies import EVALUATIONS
+
+BUDGET = 12_000_000  # bytes of all pictures; a page takes a third more
+SIZES = ((320, 3), (240, 4), (200, 6))  # width in pixels, frames per kept one: the first that fits is taken
+TYPICAL = (110_000, 65_000, 40_000)  # bytes of an animation of 10 s in these sizes
+FIGURE_WIDTH, FIGURE_QUALITY = 900, 70
+MOST_FIGURES = 6  # of a run
+PICTURED = ("identify", "model", "replay")  # commands whose results are figures
+
+
+class Gallery:
+    """Collects pictures until BUDGET is spent. `left_out` counts the animations that had no room."""
+
+    def __init__(self, studies: Sequence[StudyResults]) -> None:
+        animations = 3 * sum(bool(each.agents) for each in studies)
+        fitting = (place for place, size in enumerate(TYPICAL) if animations * size <= BUDGET)
+        self.width, self.every = SIZES[next(fitting, len(SIZES) - 1)]
+        self.room = BUDGET
+        self.left_out = 0
+
+    def pictures(self, results: StudyResults) -> list[Picture]:
+        """Return the pictures of a study that its run folders hold and that there is room for."""
+        found = []
+        for picture in (*self._animations(results), *_figures(results)):
+            if len(picture.data) > self.room:
+                self.left_out += 1
+                continue
+            self.room -= len(picture.data)
+            found.append(picture)
+        return found
+
+    def _animations(self, results: StudyResults) -> Iterator[Picture]:
+        label = measure_label(results.study.measure)
+        arms = {arm.name: arm.label for arm in results.study.arms}
+        for name, agent, value, path in chosen(results):
+            text = f"{name}: {arms[agent.arm]}, seed {agent.seed}, {label} {number_text(value)}"
+            try:
+                data = smaller(path, self.width, self.every)
+            except (OSError, ValueError):  # damaged
+                continue
+            alt = f"Animation of one episode of the {name} agent ({arms[agent.arm]}, seed {agent.seed})"
+            yield Picture(data, "gif", alt, text)
+
+
+def chosen(results: StudyResults) -> list[tuple[str, Agent, float, Path]]:
+    """Return the best, the median and the worst agent with an animation, their values and animations.
+
+    They are those of the evaluation that counts, or of another one if it has no animation; the median of an
+    even number is the worse of the two in the middle.
+    """
+    for evaluation in (results.judged, *reversed(results.evaluations)):
+        filmed = [
+            (agent, agent.values[evaluation.name], path)
+            for agent in results.agents
+            if evaluation.name in agent.values and (path := _file(agent, evaluation.name, "episode.gif"))
+        ]
+        if filmed:
+            ranked = sorted(filmed, key=lambda each: each[1], reverse=True)
+            places = {len(ranked) // 2: "median", len(ranked) - 1: "worst", 0: "best"}
+            return [(places[place], *ranked[place]) for place in sorted(places)]
+    return []
+
+
+def _figures(results: StudyResults) -> Iterator[Picture]:
+    """Yield the behaviour of the median agent, or all figures of a command whose results are figures."""
+    if results.study.command in PICTURED:
+        for arm in results.study.arms:
+            first = next((agent for agent in results.agents if agent.arm == arm.name), None)
+            files = sorted(Path(first.run, FIGURES).glob("*.png"))[:MOST_FIGURES] if first else []
+            for file in files:
+                yield from _figure(file, f"{file.stem.replace('_', ' ')}, {arm.label}")
+        return
+    for name, agent, _, path in chosen(results)[:2][-1:]:  # the median; of fewer than three, the last
+        if (file := path.with_name("behaviour.png")).is_file():
+            yield from _figure(file, f"An episode of the {name} agent over time (seed {agent.seed})")
+
+
+def _figure(path: Path, caption: str) -> Iterator[Picture]:
+    """Yield a figure as WebP; nothing if it is damaged."""
+    try:
+        with Image.open(path) as source:
+            picture = source.convert("RGB")
+            picture.thumbnail((FIGURE_WIDTH, FIGURE_WIDTH))
+    except (OSError, ValueError):
+        return
+    buffer = io.BytesIO()
+    picture.save(buffer, "WEBP", quality=FIGURE_QUALITY)
+    yield Picture(buffer.getvalue(), "webp", caption, caption)
+
+
+def _file(agent: Agent, evaluation: str, name: str) -> Path | None:
+    """Return a file in figures/ of an evaluation of an agent, or of its own run, if it exists."""
+    run = Path(agent.run)
+    inner = run if evaluation == OWN.name else run / EVALUATIONS / evaluation
+    path = inner / FIGURES / name
+    return path if path.is_file() else None
