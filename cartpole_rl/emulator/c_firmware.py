@@ -8,7 +8,7 @@ from cartpole_rl.wire import Fault, Message, SetMotor
 from cartpole_rl.wire.frames import END, open_envelope
 from cartpole_rl.wire.messages import MESSAGES
 
-LONGEST_ANSWER = 128  # bytes; FAULT and STATE together take 45
+LONGEST_ANSWER = 64  # bytes: 2 * CART_FRAME_BYTES
 SNAPSHOT_NUMBERS = 48
 
 

@@ -16,6 +16,19 @@ void cart_delay_command(cart *self, uint64_t due_us)
         *newest_us = due_us;
 }
 
+size_t cart_runs(cart_splitter *splitter, const uint8_t *bytes, size_t count, uint8_t *runs)
+{
+    size_t written = 0, length;
+    for (size_t at = 0; at < count; at++) {
+        if (!cart_split(splitter, bytes[at], &length))
+            continue;
+        runs[written++] = (uint8_t)length;
+        memcpy(runs + written, splitter->run, length);
+        written += length;
+    }
+    return written;
+}
+
 typedef struct {
     int64_t *numbers;
     size_t count;
