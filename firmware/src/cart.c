@@ -51,7 +51,8 @@ static size_t send_info(cart *self, uint8_t *frame)
     return send(self, CART_INFO, flags(self), payload, cart_pack_info(&info, payload), frame);
 }
 
-static size_t send_state(cart *self, uint8_t all_flags, int32_t cart_count, int32_t pole_count, uint8_t *frame)
+static size_t send_state(cart *self, uint8_t all_flags, int32_t cart_count, int32_t pole_count,
+                         uint8_t *frame)
 {
     uint8_t payload[CART_LONGEST_PAYLOAD];
     uint64_t age_ms = self->commanded ? (self->ticked_us - self->command_us) / 1000u : NO_AGE;

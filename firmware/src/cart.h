@@ -9,11 +9,11 @@
      cart_tick      once at the end of each period of `period_us`, with the raw counts measured now; then put
                     cart_motor on the motor at once
 
-   All from one thread, never from an interrupt. No function blocks, allocates or recurses; each takes a bounded
-   time (cart_tick at most two passes over CART_WINDOW_COUNTS counts, while homing).
+   All from one thread, never from an interrupt. No function blocks, allocates or recurses. Each takes a
+   bounded time; the longest, cart_tick while homing, passes a few times over CART_WINDOW_COUNTS counts.
 
-   Units: us since boot, which never wrap (64 bits); raw counts, positive to the right, 0 where the cart stood at
-   boot, within 2^30; motor values -255 to 255, positive to the right. A `cart` needs about 2 kB. */
+   Units: us since boot, which never wrap (64 bits); raw counts, positive to the right, 0 where the cart stood
+   at boot, within 2^30; motor values -255 to 255, positive to the right. A `cart` needs about 2 kB. */
 #ifndef CART_H
 #define CART_H
 
@@ -65,8 +65,8 @@ bool cart_drive(cart *self, uint64_t until_us, uint64_t *due_us);
 /* The motor value in force. */
 int16_t cart_motor(const cart *self);
 
-/* End a period: apply the rules; write FAULT, if one was latched, and STATE, at most 2 * CART_FRAME_BYTES, and
-   return their length. */
+/* End a period: apply the rules; write FAULT, if one was latched, and STATE, at most 2 * CART_FRAME_BYTES,
+   and return their length. */
 size_t cart_tick(cart *self, uint64_t now_us, int32_t cart_count, int32_t pole_count, uint8_t *frames);
 
 #ifdef __cplusplus

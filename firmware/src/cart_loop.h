@@ -1,7 +1,7 @@
 /* The cart's main loop over a board's hardware.
 
-   A board provides the six functions below and calls cart_loop_boot once and cart_loop_poll again and again, at
-   least once a millisecond. No function may block. */
+   A board provides the six functions below and calls cart_loop_boot once and cart_loop_poll again and again,
+   at least once a millisecond. No function may block. */
 #ifndef CART_LOOP_H
 #define CART_LOOP_H
 
