@@ -16,6 +16,8 @@ class CartHead(ctypes.Structure):
     """The first fields of a `cart` in ``firmware/src/cart.h``."""
 
     _fields_ = (
+        ("policy", ctypes.c_void_p),
+        ("policy_memory", ctypes.c_void_p),
         ("pole_trim", ctypes.c_int32),
         ("period_us", ctypes.c_uint32),
         ("armed", ctypes.c_bool),

@@ -51,6 +51,16 @@ static size_t send_info(cart *self, uint8_t *frame)
     return send(self, CART_INFO, flags(self), payload, cart_pack_info(&info, payload), frame);
 }
 
+static int32_t reported_cart(const cart *self, int32_t cart_count)
+{
+    return cart_subtract(cart_count, cart_zeros_middle(&self->zeros));
+}
+
+static int32_t reported_pole(const cart *self, int32_t pole_count)
+{
+    return cart_subtract(pole_count, self->pole_zero);
+}
+
 static size_t send_state(cart *self, uint8_t all_flags, int32_t cart_count, int32_t pole_count,
                          uint8_t *frame)
 {
@@ -58,8 +68,8 @@ static size_t send_state(cart *self, uint8_t all_flags, int32_t cart_count, int3
     uint64_t age_ms = self->commanded ? (self->ticked_us - self->command_us) / 1000u : NO_AGE;
     cart_state state = {self->ticks,
                         (uint32_t)(self->ticked_us & UINT32_MAX),
-                        cart_subtract(cart_count, cart_zeros_middle(&self->zeros)),
-                        cart_subtract(pole_count, self->pole_zero),
+                        reported_cart(self, cart_count),
+                        reported_pole(self, pole_count),
                         cart_motor(self),
                         self->last_sequence,
                         self->fault,
@@ -122,6 +132,7 @@ static void arm(cart *self, uint64_t now_us)
     if (self->armed)
         return;
     self->armed = true;
+    self->hosted = self->observed = false;
     self->watchdog_us = now_us;
     cart_guards_reset(&self->guards);
 }
@@ -138,7 +149,7 @@ static void carry_out(cart *self, const cart_envelope *envelope, uint64_t now_us
 {
     switch (envelope->type) {
     case CART_SET_MOTOR:
-        self->commanded = true;
+        self->commanded = self->hosted = true;
         self->command_us = self->watchdog_us = now_us;
         cart_line_command(&self->line, now_us, cart_read_i16(envelope->payload));
         break;
@@ -249,6 +260,24 @@ static void step_homing(cart *self, const cart_reading *reading)
     }
 }
 
+/* True while a policy on the board chooses the motor values. */
+static bool drives_itself(const cart *self)
+{
+    return self->armed && self->policy != NULL && !self->hosted;
+}
+
+/* Let the policy on the board choose the motor value, as a host would after STATE. */
+static void ask_policy(cart *self, const cart_reading *reading)
+{
+    cart_observation observation = {reported_cart(self, reading->cart), reported_pole(self, reading->pole),
+                                    cart_zeros_half_span(&self->zeros) - SOFT_LIMIT, reading->period_us,
+                                    !self->observed};
+    int16_t motor = self->policy(self->policy_memory, &observation);
+    bool valid = motor <= CART_LARGEST_MOTOR && motor >= -CART_LARGEST_MOTOR;
+    self->observed = true;
+    cart_line_hold(&self->line, valid ? motor : 0);
+}
+
 static uint32_t length_of_period(const cart *self, uint64_t now_us)
 {
     uint64_t length_us = now_us - self->ticked_us;
@@ -265,7 +294,7 @@ size_t cart_tick(cart *self, uint64_t now_us, int32_t cart_count, int32_t pole_c
     self->ticked_us = now_us;
     /* checked once a period: the limit has to pass by the next check at the latest */
     uint64_t limit_us = (uint64_t)(CART_WATCHDOG_PERIODS - 1) * self->period_us;
-    bool expired = self->armed && now_us - self->watchdog_us > limit_us;
+    bool expired = self->armed && !drives_itself(self) && now_us - self->watchdog_us > limit_us;
     if (expired)
         cart_line_hold(&self->line, 0);
     if (self->armed || self->homing)
@@ -277,5 +306,8 @@ size_t cart_tick(cart *self, uint64_t now_us, int32_t cart_count, int32_t pole_c
     size_t length = 0;
     if (self->fault != faults_before)
         length = send_fault(self, all_flags, frames);
-    return length + send_state(self, all_flags, cart_count, pole_count, frames + length);
+    length += send_state(self, all_flags, cart_count, pole_count, frames + length);
+    if (drives_itself(self))
+        ask_policy(self, &reading);
+    return length;
 }

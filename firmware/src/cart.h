@@ -28,7 +28,25 @@
 extern "C" {
 #endif
 
+/* What a policy on the board observes at the end of a period. */
 typedef struct {
+    int32_t cart_counts; /* from the middle of the track */
+    int32_t pole_counts; /* from upright */
+    int32_t soft_limit;  /* counts from the middle */
+    uint32_t period_us;  /* since the counts before */
+    bool first;          /* the first observation since START */
+} cart_observation;
+
+/* A policy on the board: returns the motor value for an observation, in a bounded time. */
+typedef int16_t (*cart_policy)(void *memory, const cart_observation *observation);
+
+typedef struct {
+    /* Set these after cart_boot if the board has a policy. From START on, the policy chooses the motor value at
+       the end of each period, until the host sends a SET_MOTOR, which takes the motor over until the next START.
+       All rules apply, except for the watchdog while the policy drives. A value out of range counts as 0. */
+    cart_policy policy;
+    void *policy_memory;
+
     int32_t pole_trim; /* counts above half a turn that a hanging pole shows after homing; 0 at boot */
 
     /* Read these; only the core writes them. */
@@ -42,6 +60,8 @@ typedef struct {
     cart_guards guards;
     cart_zeros zeros;
     int32_t pole_zero;    /* raw count that is reported as 0 */
+    bool hosted;          /* a SET_MOTOR was accepted since START */
+    bool observed;        /* the policy was asked since START */
     bool commanded;       /* a SET_MOTOR was accepted since boot */
     uint64_t command_us;  /* arrival of the newest SET_MOTOR */
     uint64_t watchdog_us; /* time of START or of the newest SET_MOTOR */

@@ -17,6 +17,9 @@
    or the cart runs the wrong way, swap A and B of that encoder, or the two inputs of the H-bridge. */
 #include <Arduino.h>
 #include <cart_loop.h>
+#ifdef CART_ONBOARD_POLICY
+#include <onboard.h>
+#endif
 #include <driver/pulse_cnt.h>
 #include <esp_task_wdt.h>
 
@@ -127,6 +130,9 @@ void setup(void)
     pole_counter = start_counter(POLE_A, POLE_B);
     start_watchdog();
     cart_loop_boot(&loop_state);
+#ifdef CART_ONBOARD_POLICY
+    onboard_attach(&loop_state.core);
+#endif
 }
 
 void loop(void)

@@ -17,6 +17,9 @@
    5 V encoders need level shifters. The two resistors keep the motor off while the board resets. If a count
    or the cart runs the wrong way, swap A and B of that encoder, or the two inputs of the H-bridge. */
 #include "cart_loop.h"
+#ifdef CART_ONBOARD_POLICY
+#include "onboard.h"
+#endif
 
 #include <stdint.h>
 
@@ -237,6 +240,9 @@ int main(void)
     start_counter(TIM2);
     start_port();
     cart_loop_boot(&loop);
+#ifdef CART_ONBOARD_POLICY
+    onboard_attach(&loop.core);
+#endif
     start_watchdog();
     for (;;) {
         cart_loop_poll(&loop);

@@ -6,6 +6,9 @@
      'M', clock us u32, motor value i16    the motor value in force from now on
      'X' or 'P', clock us u32              asks for the count of the cart or of the pole; the answer is an i32 */
 #include "cart_loop.h"
+#ifdef CART_ONBOARD_POLICY
+#include "onboard.h"
+#endif
 
 #define REGISTER(address) (*(volatile uint32_t *)(address))
 #define UART0 0x40004000u
@@ -122,6 +125,9 @@ int main(void)
     SYSTICK(0x8u) = 0;
     SYSTICK(0x0u) = 7u;
     cart_loop_boot(&loop);
+#ifdef CART_ONBOARD_POLICY
+    onboard_attach(&loop.core);
+#endif
     for (;;) {
         cart_loop_poll(&loop);
         if (received_tail == received_head)
