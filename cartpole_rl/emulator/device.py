@@ -4,6 +4,7 @@ import math
 import random
 from typing import Literal
 
+from cartpole_rl.emulator.c_firmware import CFirmware
 from cartpole_rl.emulator.encoders import CART_METRES, POLE_RADIANS
 from cartpole_rl.emulator.firmware import BANNER, Firmware
 from cartpole_rl.emulator.journal import Journal
@@ -23,7 +24,10 @@ class CartDevice:
     """
 
     def __init__(self, settings: EmulatorSettings) -> None:
-        """Raises EmulatorError if MuJoCo is not installed, OSError if the journal cannot be created."""
+        """Raises EmulatorError if MuJoCo is not installed or the C firmware cannot be compiled.
+
+        Raises OSError if the journal cannot be created.
+        """
         self._settings = settings
         self.physics = CartPhysics(settings)
         self._journal = Journal(settings.journal) if settings.journal else None
@@ -92,7 +96,10 @@ class CartDevice:
         self._booted_us = self.now_us
         self._boot = (0, 0)
         self._boot = self._counts()
-        self.firmware = Firmware(self._latency_us, round(self._settings.angle_offset / POLE_RADIANS))
+        kind = CFirmware if self._settings.firmware == "c" else Firmware
+        self.firmware: Firmware | CFirmware = kind(
+            self._latency_us, round(self._settings.angle_offset / POLE_RADIANS)
+        )
 
     def _counts(self) -> tuple[int, int]:
         """Return the raw counts of cart and pole since boot."""

@@ -104,7 +104,7 @@ class Firmware:
 
     def tick(self, now_us: int, cart: int, pole: int) -> list[bytes]:
         """End a period with two raw counts: apply the rules and return the frames to send, STATE last."""
-        reading = Reading(cart, pole, (now_us - self._ticked_us) / 1e6)
+        reading = Reading(cart, pole, max(1, now_us - self._ticked_us))
         self._ticks, self._ticked_us = self._ticks + 1, now_us
         faults_before = self.fault
         # checked once a period: the limit has to pass by the next check at the latest
@@ -117,10 +117,8 @@ class Firmware:
             self._step_homing(self._homing, reading)
         self._line.blocked = self._beyond(SOFT_LIMIT, cart) if self.armed else 0
         flags = self._flags() | (Flags.WATCHDOG if expired and self.armed else Flags(0))
-        frames = [self._frame(self._state(cart, pole), flags)]
-        if self.fault != faults_before:
-            frames.insert(0, self._frame(FaultReport(self.fault, self._ticks & U32), flags))
-        return frames
+        report = [FaultReport(self.fault, self._ticks & U32)] if self.fault != faults_before else []
+        return [self._frame(message, flags) for message in (*report, self._state(cart, pole))]
 
     def _obey(self, envelope: Envelope, now_us: int) -> Message | Reason | None:
         """Carry out a frame and return the answer; None for SET_MOTOR, which the next STATE acknowledges."""
@@ -197,15 +195,15 @@ class Firmware:
     def _check_faults(self, reading: Reading) -> None:
         """Latch new faults. Homing may touch the stops and detects a stall itself."""
         motor = self._line.value
-        jumped = self._cart_jumps.jumped(reading.cart, reading.seconds)
-        if self._cart_freezes.frozen(reading.cart, motor, reading.seconds) or jumped:
+        jumped = self._cart_jumps.jumped(reading.cart, reading.us)
+        if self._cart_freezes.frozen(reading.cart, motor, reading.us) or jumped:
             self._latch(Fault.CART_ENCODER)
-        jumped = self._pole_jumps.jumped(reading.pole, reading.seconds)
-        if self._pole_freezes.frozen(reading.pole, reading.cart, reading.seconds) or jumped:
+        jumped = self._pole_jumps.jumped(reading.pole, reading.us)
+        if self._pole_freezes.frozen(reading.pole, reading.cart, reading.us) or jumped:
             self._latch(Fault.POLE_ENCODER)
         if self.armed and self._beyond(HARD_LIMIT, reading.cart):
             self._latch(Fault.HARD_LIMIT)
-        if self.armed and self._stalls.stalled(reading.cart, motor, reading.seconds):
+        if self.armed and self._stalls.stalled(reading.cart, motor, reading.us):
             self._latch(Fault.STALL)
 
     def _latch(self, fault: Fault) -> None:

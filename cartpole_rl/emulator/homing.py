@@ -1,6 +1,7 @@
 """Homing: touch both stops, check the span, centre the cart, wait until the pole hangs still.
 
-Homing works on raw encoder counts, one reading per tick, and needs only rough numbers of the cart. A
+Homing works on raw encoder counts, one reading per tick, and needs only rough numbers of the cart. Distances
+and times are whole numbers of counts, nanometres and microseconds; ``servo.py`` computes in SI units. A
 procedure is a generator: it receives a `Reading`, yields the motor value until the next one, and returns
 its result. The pole's zero is the middle of its last small swing. Waiting for a complete stop would not be
 more accurate: friction in the bearing holds a stopped pole up to a count off the vertical.
@@ -11,38 +12,45 @@ from collections import deque
 from collections.abc import Generator
 from dataclasses import dataclass
 
-from cartpole_rl.emulator.encoders import CART_METRES, POLE_COUNTS, POLE_RADIANS, SPAN
+from cartpole_rl.emulator.encoders import CART_METRES, CART_NANOMETRES, POLE_COUNTS, POLE_RADIANS, SPAN
 from cartpole_rl.emulator.servo import PUSH, SpeedServo, SwingBrake, rough_motor
 from cartpole_rl.errors import CartPoleError
 
 QUARTER_TURN = POLE_COUNTS // 4
-SPAN_TOLERANCE = 0.03  # of the span
+SPAN_NM = round(SPAN * 1e9)
+SPAN_TOLERANCE = SPAN_NM * 3 // 100  # nm
 
 SEARCH_SPEED = 0.08  # m/s, towards a stop
 TRAVEL_SPEED = 0.2  # m/s, far from a stop whose position is known
-TOUCH_ZONE = 0.06  # m, distance from such a stop at which the slow search begins
-AGAINST_STOP = 0.4  # s under full push without motion that mean a stop
-STANDS = 3e-4  # m, largest motion in that time
-LONGEST_SEARCH = 30.0  # s for one stop
-CENTRED = 0.001  # m
-LONGEST_CENTRING = 20.0  # s
+TOUCH_ZONE = 60_000_000  # nm, distance from such a stop at which the slow search begins
+AGAINST_STOP = 400_000  # us under full push without motion that mean a stop
+STANDS = 300_000 // CART_NANOMETRES  # counts, largest motion in that time: 0.3 mm
+LONGEST_SEARCH = 30_000_000  # us for one stop
+CENTRED = 1_000_000  # nm
+LONGEST_CENTRING = 20_000_000  # us
 
-WHOLE_SWING = 2.0  # s: one period of a rod of 1.5 m
+WHOLE_SWING = 2_000_000  # us: one period of a rod of 1.5 m
 STILL = round(0.7 / 360 * POLE_COUNTS)  # counts peak to peak: 0.7 degrees
 BRAKED = round(2.6 / 360 * POLE_COUNTS)  # counts peak to peak; the brake cannot improve a smaller swing
-LONGEST_BRAKING = 20.0  # s
-PATIENCE = 20.0  # s, after which NEARLY_STILL is sufficient, for a pole with hardly any friction
+LONGEST_BRAKING = 20_000_000  # us
+PATIENCE = 20_000_000  # us, after which NEARLY_STILL is sufficient, for a pole with hardly any friction
 NEARLY_STILL = round(3.5 / 360 * POLE_COUNTS)  # counts peak to peak
-LONGEST_WAIT = 60.0  # s
+LONGEST_WAIT = 60_000_000  # us
+LONGEST_WINDOW = WHOLE_SWING // 5_000 + 1  # counts at the shortest period, plus one
 
 
 @dataclass(frozen=True)
 class Reading:
-    """Raw counts at a tick, and the time since the last one."""
+    """Raw counts at a tick, and the microseconds since the last one."""
 
     cart: int
     pole: int
-    seconds: float
+    us: int
+
+    @property
+    def seconds(self) -> float:
+        """The time since the last tick, s."""
+        return self.us / 1e6
 
 
 @dataclass(frozen=True)
@@ -72,17 +80,17 @@ Procedure = Generator[int, Reading, Reading]
 
 
 class Window:
-    """The newest counts of one encoder, over a fixed time."""
+    """The newest counts of one encoder, over a fixed time of `length_us`."""
 
-    def __init__(self, seconds: float) -> None:
-        self._seconds = seconds
-        self._counts: deque[int] = deque()
+    def __init__(self, length_us: int) -> None:
+        self._length_us = length_us
+        self._counts: deque[int] = deque(maxlen=LONGEST_WINDOW)
         self._full = False
 
-    def add(self, count: int, seconds: float) -> None:
-        """Add a count, `seconds` after the last one."""
+    def add(self, count: int, us: int) -> None:
+        """Add a count, `us` after the last one."""
         self._counts.append(count)
-        length = math.ceil(self._seconds / seconds) + 1
+        length = min(LONGEST_WINDOW, -(-self._length_us // us) + 1)
         self._full = len(self._counts) >= length
         while len(self._counts) > length:
             self._counts.popleft()
@@ -108,9 +116,9 @@ def home(hanging: int | None) -> Generator[int, Reading, Zeros]:
     left = reading.cart
     reading = yield from touch_stop(+1, left + round(SPAN / CART_METRES), reading)
     right = reading.cart
-    span = (right - left) * CART_METRES
-    if abs(span / SPAN - 1) > SPAN_TOLERANCE:
-        raise HomingError(f"the stops are {span:.3f} m apart, not {SPAN} m")
+    span = (right - left) * CART_NANOMETRES
+    if abs(span - SPAN_NM) > SPAN_TOLERANCE:
+        raise HomingError(f"the stops are {span / 1e9:.3f} m apart, not {SPAN} m")
     middle = (left + right) // 2
     reading = yield from centre(middle, reading)
     reading = yield from brake_swing(middle, hanging, reading)
@@ -120,33 +128,34 @@ def home(hanging: int | None) -> Generator[int, Reading, Zeros]:
 
 def touch_stop(direction: int, expected: int | None, reading: Reading) -> Procedure:
     """Move until a stop holds the cart. `expected` is the raw count of the stop, or None if it is unknown."""
-    servo, window, elapsed, before = SpeedServo(), Window(AGAINST_STOP), 0.0, reading.cart
+    servo, window, elapsed, before = SpeedServo(), Window(AGAINST_STOP), 0, reading.cart
     while elapsed < LONGEST_SEARCH:
-        far = expected is not None and abs(expected - reading.cart) * CART_METRES > TOUCH_ZONE
+        far = expected is not None and abs(expected - reading.cart) * CART_NANOMETRES > TOUCH_ZONE
         speed = (reading.cart - before) * CART_METRES / reading.seconds
         before = reading.cart
-        window.add(reading.cart, reading.seconds)
+        window.add(reading.cart, reading.us)
         motor = servo.motor(direction * (TRAVEL_SPEED if far else SEARCH_SPEED), speed, reading.seconds)
-        if window.spread * CART_METRES < STANDS and motor == direction * abs(rough_motor(PUSH)):
+        if window.spread <= STANDS and motor == direction * abs(rough_motor(PUSH)):
             return reading
         reading = yield motor
-        elapsed += reading.seconds
-    raise HomingError(f"no {'right' if direction > 0 else 'left'} stop within {LONGEST_SEARCH:.0f} s")
+        elapsed += reading.us
+    raise HomingError(f"no {'right' if direction > 0 else 'left'} stop within {LONGEST_SEARCH / 1e6:.0f} s")
 
 
 def centre(middle: int, reading: Reading) -> Procedure:
     """Move gently to the middle and switch the motor off."""
-    servo, elapsed, before = SpeedServo(), 0.0, reading.cart
+    servo, elapsed, before = SpeedServo(), 0, reading.cart
     while elapsed < LONGEST_CENTRING:
-        away = (middle - reading.cart) * CART_METRES
-        if abs(away) < CENTRED:
+        away = middle - reading.cart
+        if abs(away) * CART_NANOMETRES < CENTRED:
             return reading
-        target = max(-TRAVEL_SPEED, min(TRAVEL_SPEED, away / 1.0))  # slows down over the last second
+        speed_here = away * CART_METRES  # m/s: it slows down over the last second
+        target = max(-TRAVEL_SPEED, min(TRAVEL_SPEED, speed_here))
         speed = (reading.cart - before) * CART_METRES / reading.seconds
         before = reading.cart
         reading = yield servo.motor(target, speed, reading.seconds)
-        elapsed += reading.seconds
-    raise HomingError(f"not in the middle after {LONGEST_CENTRING:.0f} s")
+        elapsed += reading.us
+    raise HomingError(f"not in the middle after {LONGEST_CENTRING / 1e6:.0f} s")
 
 
 def brake_swing(middle: int, hanging: int | None, reading: Reading) -> Procedure:
@@ -156,9 +165,9 @@ def brake_swing(middle: int, hanging: int | None, reading: Reading) -> Procedure
     """
     if hanging is None:
         hanging, reading = yield from find_hanging(reading)
-    brake, window, elapsed, before = SwingBrake(), Window(WHOLE_SWING), 0.0, reading
+    brake, window, elapsed, before = SwingBrake(), Window(WHOLE_SWING), 0, reading
     while elapsed < LONGEST_BRAKING:
-        window.add(reading.pole, reading.seconds)
+        window.add(reading.pole, reading.us)
         if window.spread <= BRAKED:
             return reading
         if window.spread < QUARTER_TURN:  # the middle of such a small swing is the hanging pole
@@ -171,18 +180,18 @@ def brake_swing(middle: int, hanging: int | None, reading: Reading) -> Procedure
         )
         before = reading
         reading = yield motor
-        elapsed += reading.seconds
+        elapsed += reading.us
     return reading
 
 
 def find_hanging(reading: Reading) -> Generator[int, Reading, tuple[int, Reading]]:
     """Watch the pole for a whole swing with the motor off; return the count at which it was fastest."""
-    hanging, fastest, elapsed = reading.pole, 0.0, 0.0
+    hanging, fastest, elapsed = reading.pole, 0, 0  # fastest in counts/s
     while elapsed < WHOLE_SWING:
         before = reading
         reading = yield 0
-        elapsed += reading.seconds
-        speed = abs(reading.pole - before.pole) / reading.seconds
+        elapsed += reading.us
+        speed = abs(reading.pole - before.pole) * 1_000_000 // reading.us
         if speed > fastest:
             hanging, fastest = (reading.pole + before.pole) // 2, speed
     return hanging, reading
@@ -190,11 +199,11 @@ def find_hanging(reading: Reading) -> Generator[int, Reading, tuple[int, Reading
 
 def wait_until_still(reading: Reading) -> Generator[int, Reading, int]:
     """Wait with the motor off until the pole's swing is small; return the count in its middle."""
-    window, elapsed = Window(WHOLE_SWING), 0.0
+    window, elapsed = Window(WHOLE_SWING), 0
     while elapsed < LONGEST_WAIT:
-        window.add(reading.pole, reading.seconds)
+        window.add(reading.pole, reading.us)
         if window.spread <= (STILL if elapsed < PATIENCE else NEARLY_STILL):
             return window.centre
         reading = yield 0
-        elapsed += reading.seconds
-    raise HomingError(f"the pole still swings by {window.spread} counts after {LONGEST_WAIT:.0f} s")
+        elapsed += reading.us
+    raise HomingError(f"the pole still swings by {window.spread} counts after {LONGEST_WAIT / 1e6:.0f} s")

@@ -5,6 +5,8 @@ Times are whole microseconds since boot.
 
 from collections import deque
 
+MOST_PENDING = 1024  # the line's memory is bounded, as a board's is
+
 
 class MotorLine:
     """The motor value in force and the pending ones. No command overtakes another."""
@@ -25,8 +27,13 @@ class MotorLine:
         return self._requested * self.blocked > 0
 
     def command(self, due_us: int, value: int) -> None:
-        """Bring a value into force at `due_us`, or together with an earlier command that is due later."""
+        """Bring a value into force at `due_us`, or together with an earlier command that is due later.
+
+        If no more commands can wait, the value replaces the newest one.
+        """
         newest = self._pending[-1][0] if self._pending else 0
+        if len(self._pending) == MOST_PENDING:
+            self._pending.pop()
         self._pending.append((max(due_us, newest), value))
 
     def stop(self, now_us: int) -> None:

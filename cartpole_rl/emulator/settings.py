@@ -24,6 +24,9 @@ class EmulatorSettings(Settings):
     """The settings ``emulator.*``. Raises pydantic's ValidationError for a wrong name or value."""
 
     clock: Literal["lockstep", "real"] = "lockstep"  # one period for each frame, or 50 Hz by the wall clock
+    firmware: Literal["python", "c"] = (
+        "python"  # the reference, or the portable C of a real cart, compiled on first use
+    )
     seed: Annotated[int, Field(ge=0)] = (
         0  # of latencies, disturbed frames, boot position and the hand's angle
     )

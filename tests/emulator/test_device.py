@@ -7,6 +7,7 @@ import pytest
 pytest.importorskip("mujoco", reason='pip install "cartpole_rl[emulator]"')
 
 from driven_cart import COARSE, OTHER_PHYSICS, Driven, check_homed
+from firmwares import truth
 
 from cartpole_rl.emulator.device import CartDevice
 from cartpole_rl.emulator.encoders import CART_METRES, POLE_RADIANS
@@ -23,6 +24,8 @@ from cartpole_rl.wire import (
     Stop,
     encode_frame,
 )
+
+pytestmark = pytest.mark.usefixtures("each_firmware")
 
 NOMINAL_LIMITS = (16704, 17539)  # counts, as docs/protocol.md has them
 
@@ -207,7 +210,7 @@ def test_a_hand_takes_the_pole_again_at_another_angle_and_releases_it_for_homing
 
 def trace(**settings: object) -> bytes:
     """Return all bytes that a cart sends for one series of commands after boot; `homed` is set by hand."""
-    cart = CartDevice(EmulatorSettings(**COARSE | settings))
+    cart = CartDevice(truth(**COARSE | settings))
     cart.firmware.homed = True
     sent = cart.receive(encode_frame(Start(), 0)[:-1], 0)
     for motor in (85, -85, 80, -80, 0, 150, -150, 200, -255, 0, 255, 255, 255) * 2:
@@ -250,13 +253,16 @@ def test_every_setting_is_tried_here_or_on_the_wire():
     order = {"frame_duplication", "frame_reordering"}  # test_emulator_disturbance.py
     faults = {"unplug_at", "stuck_encoder", "stuck_at"}  # test_emulator_faults.py
     cogging = {"cogging", "cogging_pitch"}  # test_emulator_physics.py
+    firmware = {"firmware"}  # this module runs with both; test_c_firmware.py
     journal = {"journal"}  # tests/plants/test_stops.py, tests/bench/test_soak.py
-    assert set(OTHER) | on_the_wire | order | faults | cogging | journal == set(EmulatorSettings.model_fields)
+    assert set(OTHER) | firmware | on_the_wire | order | faults | cogging | journal == set(
+        EmulatorSettings.model_fields
+    )
 
 
 def test_latency_delays_the_force_by_its_value():
     def moved(latency: float) -> float:
-        settings = EmulatorSettings(latency=latency, latency_jitter=0.0, motor_time_constant=0.0)
+        settings = truth(latency=latency, latency_jitter=0.0, motor_time_constant=0.0)
         cart = CartDevice(settings)
         cart.firmware.homed = True
         cart.receive(encode_frame(Start(), 0)[:-1], 0)

@@ -15,9 +15,9 @@ pytest.importorskip("mujoco", reason='pip install "cartpole_rl[emulator]"')
 
 from driven_cart import Driven, check_homed
 from emulator_host import SILENCE, EmulatorHost, emulator
+from firmwares import truth
 
 from cartpole_rl.emulator.firmware import BANNER
-from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import LinkError
 from cartpole_rl.plants.emulated_cart import EmulatedCart
 from cartpole_rl.plants.serial.cart import SerialCart
@@ -35,6 +35,8 @@ from cartpole_rl.wire import (
     decode_frame,
 )
 from cartpole_rl.wire.frames import LONGEST_FRAME
+
+pytestmark = pytest.mark.usefixtures("each_firmware")
 
 COARSE = {"physics_step": 1e-3}
 CLOCKS = pytest.mark.parametrize("clock", ["lockstep", "real"])
@@ -70,7 +72,7 @@ def test_a_pulled_cable_ends_the_line_and_the_process(clock):
 def test_a_pulled_cable_is_a_lost_link_to_the_host(clock):
     with (
         pytest.raises(LinkError, match="unplugged"),
-        EmulatedCart(EmulatorSettings(clock=clock, unplug_at=1.0)) as emulated,
+        EmulatedCart(truth(clock=clock, unplug_at=1.0)) as emulated,
         SerialCart(host_settings(emulated)) as cart,
     ):
         poll(cart)
@@ -113,8 +115,8 @@ def test_a_reset_while_driving_stops_the_motor_and_loses_the_zeros():
 
 
 def test_the_host_notices_a_reset():
-    truth = EmulatorSettings(reset_at=60.0, **COARSE)
-    with EmulatedCart(truth) as emulated, SerialCart(host_settings(emulated)) as cart:
+    settings = truth(reset_at=60.0, **COARSE)
+    with EmulatedCart(settings) as emulated, SerialCart(host_settings(emulated)) as cart:
         cart.home()
         cart.start()
         with pytest.raises(RefusedError, match="SET_MOTOR") as caught:
@@ -138,11 +140,11 @@ def test_a_booted_board_prints_text_and_the_host_is_in_step_after_it():
     assert BANNER.endswith(b"\n\x00")
     assert BANNER.count(0) == 1
     assert len(BANNER) > LONGEST_FRAME  # longer than a reader collects
-    with EmulatedCart(EmulatorSettings()) as emulated:
+    with EmulatedCart(truth()) as emulated:
         raw = serial.Serial(emulated.port, timeout=SILENCE)
         assert raw.read(len(BANNER)) == BANNER
         raw.close()
-    with EmulatedCart(EmulatorSettings()) as emulated:
+    with EmulatedCart(truth()) as emulated:
         for _ in range(2):  # the board prints once and keeps running
             with SerialCart(host_settings(emulated)) as cart:
                 ticks = [cart.poll_state().tick for _ in range(5)]
@@ -225,8 +227,8 @@ def test_random_driving_through_swing_ups_raises_no_false_alarm(settings):
 
 
 def test_a_session_over_a_line_that_doubles_frames_loses_nothing():
-    truth = EmulatorSettings(frame_duplication=0.3, **COARSE)
-    with EmulatedCart(truth) as emulated, SerialCart(host_settings(emulated)) as cart:
+    settings = truth(frame_duplication=0.3, **COARSE)
+    with EmulatedCart(settings) as emulated, SerialCart(host_settings(emulated)) as cart:
         cart.home()
         cart.start()
         cart.statistics.clear()

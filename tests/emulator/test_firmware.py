@@ -1,8 +1,8 @@
-"""The firmware's rules one by one, with artificial encoder counts and without physics."""
+"""The rules of both firmwares one by one, with artificial encoder counts and without physics."""
 
 import pytest
+from firmwares import make_firmware
 
-from cartpole_rl.emulator.firmware import Firmware
 from cartpole_rl.wire import (
     Ack,
     ClearFault,
@@ -28,6 +28,8 @@ from cartpole_rl.wire import (
 from cartpole_rl.wire.checksum import crc16
 from cartpole_rl.wire.frames import Frame
 
+pytestmark = pytest.mark.usefixtures("each_firmware")
+
 SOFT, HARD = 16704, 17539  # counts, of the nominal track
 HANGING = 0
 
@@ -36,8 +38,7 @@ class Bench:
     """A firmware whose encoder counts a test sets."""
 
     def __init__(self, latency_us: int = 0, homed: bool = True) -> None:
-        self.firmware = Firmware(lambda: latency_us)
-        self.firmware.homed = homed
+        self.firmware = make_firmware(lambda: latency_us, homed)
         self.now_us = 0
         self.sequence = 0
 
@@ -135,8 +136,7 @@ def test_a_command_comes_into_force_after_its_latency():
 def test_a_latency_of_more_than_a_period_keeps_the_order():
     latencies = iter([50_000, 10_000])
     bench = Bench()
-    bench.firmware = Firmware(lambda: next(latencies))
-    bench.firmware.homed = True
+    bench.firmware = make_firmware(lambda: next(latencies), homed=True)
     bench.send(Start())
     bench.send(SetMotor(100))
     bench.tick()
@@ -202,6 +202,7 @@ def test_hard_limit_latches_until_it_is_cleared(bench, side):
     bench.send(SetMotor(-side * 100))
     report, state = bench.frames(side * HARD)
     assert report.message == FaultReport(Fault.HARD_LIMIT, 2)
+    assert (report.sequence, state.sequence) == (2, 3)
     assert state.message.fault == Fault.HARD_LIMIT
     assert state.message.motor_applied == 0
     assert Flags(state.flags) == Flags.HOMED | Flags.FAULTED
@@ -309,7 +310,7 @@ def test_period_can_be_set_within_bounds():
 
 def answer_to(body: bytes) -> list[Message]:
     stuffed = cobs.encode(body + crc16(body).to_bytes(2, "little"))
-    return [decode_frame(frame[:-1]).message for frame in Firmware(lambda: 0).receive(stuffed, 0)]
+    return [decode_frame(frame[:-1]).message for frame in make_firmware(lambda: 0).receive(stuffed, 0)]
 
 
 def test_invalid_messages_are_refused_with_a_reason():

@@ -5,14 +5,18 @@ scripts/fuzz/wire.py is the long version.
 
 import contextlib
 
+import pytest
+from firmwares import make_firmware
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from cartpole_rl.emulator.firmware import BANNER, Firmware
+from cartpole_rl.emulator.firmware import BANNER
 from cartpole_rl.errors import FrameError
 from cartpole_rl.wire import FrameSplitter, Home, SetMotor, Start, State, decode_frame, encode_frame
 from cartpole_rl.wire.frames import LONGEST_FRAME, Envelope, open_envelope
 from cartpole_rl.wire.messages import MESSAGES, Message
+
+pytestmark = pytest.mark.usefixtures("each_firmware")
 
 FRAMES = [encode_frame(message, 3)[:-1] for message in (Start(), Home(), SetMotor(200), SetMotor(-1))]
 FRAMES.append(encode_frame(State(1169, 23380000, 43, 2051, -200, 4, 0, 20), 148, 3)[:-1])
@@ -58,8 +62,7 @@ def test_the_hosts_decoder_takes_any_bytes(stream):
 @example(b"".join(frame + b"\x00" for frame in FRAMES))
 @settings(max_examples=150, deadline=None)
 def test_a_disarmed_cart_stays_still_and_disarmed_under_any_bytes(stream):
-    firmware, splitter = Firmware(lambda: 0), FrameSplitter()
-    firmware.homed = True
+    firmware, splitter = make_firmware(lambda: 0, homed=True), FrameSplitter()
     for stuffed in splitter.feed(stream):
         opened = envelope(stuffed)
         if opened is not None and opened.kind in (Start.TYPE, Home.TYPE):
@@ -75,8 +78,7 @@ def test_a_disarmed_cart_stays_still_and_disarmed_under_any_bytes(stream):
 
 
 def test_no_start_with_one_wrong_byte_arms():
-    firmware = Firmware(lambda: 0)
-    firmware.homed = True
+    firmware = make_firmware(lambda: 0, homed=True)
     for sequence in (0, 1, 3, 128, 255):
         frame = encode_frame(Start(), sequence)[:-1]
         for at in range(len(frame)):
@@ -100,8 +102,7 @@ def any_number(letter: str) -> st.SearchStrategy[int]:
 @settings(max_examples=150, deadline=None)
 def test_the_motor_is_0_whenever_the_cart_is_neither_armed_nor_homing(events, homed):
     """Valid frames in any order, between periods that end at any count (an int)."""
-    firmware, now_us = Firmware(lambda: 3_000), 0
-    firmware.homed = homed
+    firmware, now_us = make_firmware(lambda: 3_000, homed), 0
     for event in events:
         if isinstance(event, Message):
             firmware.receive(encode_frame(event, 1)[:-1], now_us)

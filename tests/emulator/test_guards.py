@@ -4,26 +4,27 @@ import math
 
 import pytest
 
+from cartpole_rl.emulator.encoders import CART_NANOMETRES
 from cartpole_rl.emulator.guards import (
-    PUSH_SECONDS,
+    PUSH_US,
     SPEED_CHANGE,
     STALL_COUNTS,
     STALL_MOTOR,
-    STALL_SECONDS,
+    STALL_US,
     FrozenCartWatch,
     FrozenPoleWatch,
     JumpWatch,
     StallWatch,
 )
 
-PERIOD = 0.0625  # s; a power of two, so that sums are exact
+PERIOD = 62_500  # us
 
 
 @pytest.mark.parametrize("motor", [STALL_MOTOR, -255])
 def test_a_cart_that_does_not_move_under_a_long_push_stalls(motor: int) -> None:
     watch = StallWatch()
     answers = [watch.stalled(STALL_COUNTS - 1, motor, PERIOD) for _ in range(10)]
-    assert answers.index(True) == STALL_SECONDS / PERIOD
+    assert answers.index(True) == STALL_US / PERIOD
     assert all(answers[answers.index(True) :])
 
 
@@ -42,7 +43,7 @@ def test_no_stall(count, motor) -> None:
 
 
 def test_a_jump_is_a_change_faster_than_the_limit() -> None:
-    watch = JumpWatch(fastest=1000.0)
+    watch = JumpWatch(fastest=1000)
     assert not watch.jumped(10**6, PERIOD)  # the first count has no predecessor
     assert not watch.jumped(10**6 - 62, PERIOD)
     assert watch.jumped(10**6 - 62 + 63, PERIOD)
@@ -55,7 +56,7 @@ def cart_encoder_frozen(counts: list[int], motors: list[int]) -> list[bool]:
 
 
 def test_a_cart_count_is_frozen_after_a_long_push_each_way() -> None:
-    long = math.ceil(PUSH_SECONDS / PERIOD) + 1
+    long = math.ceil(PUSH_US / PERIOD) + 1
     motors = [255] * long + [-255] * long
     answers = cart_encoder_frozen([7] * len(motors), motors)
     assert answers == [False] * (2 * long - 1) + [True]
@@ -79,12 +80,12 @@ def pole_encoder_frozen(speeds: list[float], poles: list[int]) -> bool:
     watch, cart, answers = FrozenPoleWatch(), 0, [False]
     watch.frozen(poles[0], cart, PERIOD)
     for speed, pole in zip(speeds, poles, strict=True):
-        cart += math.ceil(speed * PERIOD)
+        cart += math.ceil(speed * PERIOD / CART_NANOMETRES / 1000)
         answers.append(watch.frozen(pole, cart, PERIOD))
     return answers[-1]
 
 
-FAST = 1.1 * SPEED_CHANGE
+FAST = round(1.1 * SPEED_CHANGE)  # um/s
 
 
 def test_a_pole_count_is_frozen_when_the_cart_speeds_up_and_slows_down() -> None:

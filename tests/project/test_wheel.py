@@ -1,4 +1,4 @@
-"""The wheel holds conf/ and the console scripts, and what it installs trains and evaluates by itself."""
+"""The wheel holds conf/, firmware/ and the console scripts; what it installs trains and evaluates alone."""
 
 import json
 import os
@@ -68,9 +68,13 @@ def test_it_holds_the_package_conf_and_the_scripts(wheel: Path) -> None:
     shipped = {
         f"cartpole_rl/conf/{path.relative_to(ROOT / 'conf')}" for path in (ROOT / "conf").rglob("*.yaml")
     }
+    firmware = {
+        f"cartpole_rl/{path.relative_to(ROOT)}" for path in (ROOT / "firmware").rglob("*") if path.is_file()
+    }
     modules = {str(path.relative_to(ROOT)) for path in (ROOT / "cartpole_rl").rglob("*.py")}
     assert shipped <= names
     assert modules <= names
+    assert firmware <= names
     assert {name.split("/")[0] for name in names if ".dist-info" not in name} == {"cartpole_rl"}
     for command in ("train", "evaluate", "emulate"):
         assert f"cartpole-{command} = cartpole_rl.commands.{command}:main" in scripts

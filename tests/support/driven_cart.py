@@ -3,10 +3,10 @@
 import math
 
 import pytest
+from firmwares import truth
 
 from cartpole_rl.emulator.device import CartDevice
 from cartpole_rl.emulator.homing import CART_METRES, POLE_RADIANS
-from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.wire import Flags, Hello, Home, Info, Message, State, decode_frame, encode_frame
 
 OTHER_PHYSICS = {
@@ -37,7 +37,7 @@ class Driven:
     """An emulated cart driven in lockstep, without a wire."""
 
     def __init__(self, **settings: object) -> None:
-        self.settings = EmulatorSettings(**COARSE | settings)
+        self.settings = truth(**COARSE | settings)
         self.cart = CartDevice(self.settings)
         self.flags = Flags(0)
 

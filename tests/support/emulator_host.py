@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Iterator
 
 import serial
+from firmwares import UnderTest
 
 from cartpole_rl.errors import FrameError
 from cartpole_rl.wire import Flags, Frame, FrameSplitter, Home, Message, State, decode_frame, encode_frame
@@ -81,7 +82,13 @@ class EmulatorHost:
 @contextlib.contextmanager
 def emulator(*options: str, **settings: object) -> Iterator[EmulatorHost]:
     """Run an emulator; terminate it at the end and check that its exit status is 0."""
-    command = [sys.executable, "-m", "cartpole_rl.emulator", json.dumps(settings), *options]
+    command = [
+        sys.executable,
+        "-m",
+        "cartpole_rl.emulator",
+        json.dumps({"firmware": UnderTest.kind} | settings),
+        *options,
+    ]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
         host = EmulatorHost(process)

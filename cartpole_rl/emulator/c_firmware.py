@@ -1,0 +1,106 @@
+"""The C firmware, ``firmware/src/``, with the methods of `Firmware`: either can run an emulated cart."""
+
+import ctypes
+from collections.abc import Callable
+
+from cartpole_rl.emulator.c_library import load_library
+from cartpole_rl.wire import Fault, Message, SetMotor
+from cartpole_rl.wire.frames import END, open_envelope
+from cartpole_rl.wire.messages import MESSAGES
+
+LONGEST_ANSWER = 64  # bytes: 2 * CART_FRAME_BYTES
+SNAPSHOT_NUMBERS = 48
+
+
+class CartHead(ctypes.Structure):
+    """The first fields of a `cart` in ``firmware/src/cart.h``."""
+
+    _fields_ = (
+        ("policy", ctypes.c_void_p),
+        ("policy_memory", ctypes.c_void_p),
+        ("pole_trim", ctypes.c_int32),
+        ("period_us", ctypes.c_uint32),
+        ("armed", ctypes.c_bool),
+        ("homed", ctypes.c_bool),
+        ("homing", ctypes.c_bool),
+        ("fault", ctypes.c_uint16),
+        ("carried_out", ctypes.c_uint8),
+    )
+
+
+class CFirmware:
+    """The C firmware of one cart, just booted: idle, not homed, motor 0. Times are us since boot."""
+
+    def __init__(self, delay_us: Callable[[], int], zero_error: int = 0) -> None:
+        """`delay_us` returns a command's latency; homing sets the pole's zero `zero_error` counts too low.
+
+        Raises EmulatorError if the C firmware cannot be compiled.
+        """
+        self._library = load_library()
+        self._memory = ctypes.create_string_buffer(self._library.cart_size())
+        self._head = CartHead.from_buffer(self._memory)
+        self._answer = ctypes.create_string_buffer(LONGEST_ANSWER)
+        self._library.cart_boot(self._memory)
+        self._head.pole_trim = zero_error
+        self._delay_us = delay_us
+        self.carried_out: Message | None = None  # the newest message; None if it was refused or damaged
+
+    @property
+    def period_us(self) -> int:
+        """The length of the next period."""
+        return self._head.period_us
+
+    @property
+    def armed(self) -> bool:
+        """True while the cart obeys SET_MOTOR."""
+        return self._head.armed
+
+    @property
+    def homed(self) -> bool:
+        """True if the zeros are set."""
+        return self._head.homed
+
+    @homed.setter
+    def homed(self, homed: bool) -> None:
+        self._head.homed = homed
+
+    @property
+    def homing(self) -> bool:
+        """True while the cart is homing."""
+        return self._head.homing
+
+    @property
+    def fault(self) -> Fault:
+        """The latched faults."""
+        return Fault(self._head.fault)
+
+    @property
+    def snapshot(self) -> list[int]:
+        """The whole state as numbers, in the order of ``firmware/host/library.c``."""
+        numbers = (ctypes.c_int64 * SNAPSHOT_NUMBERS)()
+        self._library.cart_snapshot(self._memory, numbers)
+        return list(numbers)
+
+    def receive(self, stuffed: bytes, now_us: int) -> list[bytes]:
+        """Handle one frame without its final 0x00; return the answer, at most one frame."""
+        length = self._library.cart_receive(self._memory, stuffed, len(stuffed), now_us, self._answer)
+        kind = self._head.carried_out
+        self.carried_out = MESSAGES[kind].unpack(open_envelope(stuffed).payload) if kind else None
+        if isinstance(self.carried_out, SetMotor):
+            self._library.cart_delay_command(self._memory, now_us + self._delay_us())
+        return self._frames(length)
+
+    def drive(self, start_us: int, end_us: int) -> list[tuple[int, int]]:
+        """Return the motor values in force during a period as (since, value)."""
+        values = [(start_us, self._library.cart_motor(self._memory))]
+        due_us = ctypes.c_uint64()
+        while self._library.cart_drive(self._memory, end_us, due_us):
+            values.append((max(due_us.value, start_us), self._library.cart_motor(self._memory)))
+        return values
+
+    def tick(self, now_us: int, cart: int, pole: int) -> list[bytes]:
+        """End a period with two raw counts: apply the rules and return the frames to send, STATE last."""
+        return self._frames(self._library.cart_tick(self._memory, now_us, cart, pole, self._answer))
+
+    def _frames(self, length: int) -> list[bytes]:
+        return [frame + END for frame in self._answer.raw[:length].split(END)[:-1]]

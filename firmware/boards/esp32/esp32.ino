@@ -1,0 +1,142 @@
+/* Not compiled with the ESP32's tool chain (only its syntax was checked), never run on a board.
+
+   ESP32 with the Arduino core 3.x (ESP-IDF 5). Pulse counters read the encoders, LEDC drives an H-bridge with
+   two PWM inputs, UART0 speaks to the host over the USB connector.
+
+   | pin    | to                                                                     |
+   |--------|------------------------------------------------------------------------|
+   | GPIO32 | cart encoder A, 3.3 V                                                  |
+   | GPIO33 | cart encoder B                                                         |
+   | GPIO25 | pole encoder A, 3.3 V                                                  |
+   | GPIO26 | pole encoder B                                                         |
+   | GPIO18 | H-bridge input that drives the cart right; 10 kohm to ground           |
+   | GPIO19 | H-bridge input that drives the cart left; 10 kohm to ground            |
+   | GND    | ground of both encoders and of the H-bridge                            |
+
+   5 V encoders need level shifters. The two resistors keep the motor off while the board resets. If a count
+   or the cart runs the wrong way, swap A and B of that encoder, or the two inputs of the H-bridge. */
+#include <Arduino.h>
+#include <cart_loop.h>
+#ifdef CART_ONBOARD_POLICY
+#include <onboard.h>
+#endif
+#include <driver/pulse_cnt.h>
+#include <esp_task_wdt.h>
+
+static const int CART_A = 32, CART_B = 33, POLE_A = 25, POLE_B = 26, RIGHT = 18, LEFT = 19;
+static const uint32_t BAUD = 921600, PWM_HZ = 20000, HANG_MS = 50;
+static const int PWM_BITS = 8, COUNTER_LIMIT = 32000, GLITCH_NS = 200;
+
+static pcnt_unit_handle_t cart_counter, pole_counter;
+static cart_loop loop_state;
+
+/* A channel counts the edges of one signal; the level of the other one gives the direction. */
+static void add_channel(pcnt_unit_handle_t unit, int edge, int level, pcnt_channel_edge_action_t rising,
+                        pcnt_channel_edge_action_t falling)
+{
+    pcnt_chan_config_t pins = {};
+    pcnt_channel_handle_t channel;
+    pins.edge_gpio_num = edge;
+    pins.level_gpio_num = level;
+    ESP_ERROR_CHECK(pcnt_new_channel(unit, &pins, &channel));
+    ESP_ERROR_CHECK(pcnt_channel_set_edge_action(channel, rising, falling));
+    ESP_ERROR_CHECK(pcnt_channel_set_level_action(channel, PCNT_CHANNEL_LEVEL_ACTION_KEEP,
+                                                  PCNT_CHANNEL_LEVEL_ACTION_INVERSE));
+}
+
+/* A quadrature counter of 4 counts per line; watch points at its limits extend it to 32 bits. */
+static pcnt_unit_handle_t start_counter(int a, int b)
+{
+    pcnt_unit_config_t limits = {};
+    pcnt_glitch_filter_config_t filter = {};
+    pcnt_unit_handle_t unit;
+    limits.low_limit = -COUNTER_LIMIT;
+    limits.high_limit = COUNTER_LIMIT;
+    limits.flags.accum_count = 1;
+    filter.max_glitch_ns = GLITCH_NS;
+    pinMode(a, INPUT_PULLUP);
+    pinMode(b, INPUT_PULLUP);
+    ESP_ERROR_CHECK(pcnt_new_unit(&limits, &unit));
+    ESP_ERROR_CHECK(pcnt_unit_set_glitch_filter(unit, &filter));
+    add_channel(unit, a, b, PCNT_CHANNEL_EDGE_ACTION_DECREASE, PCNT_CHANNEL_EDGE_ACTION_INCREASE);
+    add_channel(unit, b, a, PCNT_CHANNEL_EDGE_ACTION_INCREASE, PCNT_CHANNEL_EDGE_ACTION_DECREASE);
+    ESP_ERROR_CHECK(pcnt_unit_add_watch_point(unit, -COUNTER_LIMIT));
+    ESP_ERROR_CHECK(pcnt_unit_add_watch_point(unit, COUNTER_LIMIT));
+    ESP_ERROR_CHECK(pcnt_unit_enable(unit));
+    ESP_ERROR_CHECK(pcnt_unit_clear_count(unit));
+    ESP_ERROR_CHECK(pcnt_unit_start(unit));
+    return unit;
+}
+
+/* A main loop that hangs for HANG_MS resets the board, which switches the motor off. */
+static void start_watchdog(void)
+{
+    esp_task_wdt_config_t hang = {};
+    hang.timeout_ms = HANG_MS;
+    hang.trigger_panic = true;
+    if (esp_task_wdt_reconfigure(&hang) != ESP_OK)
+        ESP_ERROR_CHECK(esp_task_wdt_init(&hang));
+    ESP_ERROR_CHECK(esp_task_wdt_add(NULL));
+}
+
+uint32_t cart_hardware_clock_us(void)
+{
+    return (uint32_t)micros();
+}
+
+static int32_t count_of(pcnt_unit_handle_t unit)
+{
+    int count = 0;
+    ESP_ERROR_CHECK(pcnt_unit_get_count(unit, &count));
+    return count;
+}
+
+int32_t cart_hardware_cart_count(void)
+{
+    return count_of(cart_counter);
+}
+
+int32_t cart_hardware_pole_count(void)
+{
+    return count_of(pole_counter);
+}
+
+void cart_hardware_set_motor(int16_t value)
+{
+    ledcWrite(RIGHT, value > 0 ? value : 0);
+    ledcWrite(LEFT, value < 0 ? -value : 0);
+}
+
+int cart_hardware_read(void)
+{
+    return Serial.read();
+}
+
+void cart_hardware_write(const uint8_t *frame, size_t length)
+{
+    if ((size_t)Serial.availableForWrite() >= length)
+        Serial.write(frame, length);
+}
+
+void setup(void)
+{
+    ledcAttach(RIGHT, PWM_HZ, PWM_BITS);
+    ledcAttach(LEFT, PWM_HZ, PWM_BITS);
+    cart_hardware_set_motor(0);
+    Serial.setRxBufferSize(512);
+    Serial.setTxBufferSize(512);
+    Serial.begin(BAUD);
+    cart_counter = start_counter(CART_A, CART_B);
+    pole_counter = start_counter(POLE_A, POLE_B);
+    start_watchdog();
+    cart_loop_boot(&loop_state);
+#ifdef CART_ONBOARD_POLICY
+    onboard_attach(&loop_state.core);
+#endif
+}
+
+void loop(void)
+{
+    cart_loop_poll(&loop_state);
+    esp_task_wdt_reset();
+}

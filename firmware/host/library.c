@@ -1,0 +1,128 @@
+/* The core as a shared library for the emulated cart, and its whole state as numbers for comparisons. */
+#include "library.h"
+
+#include <string.h>
+
+size_t cart_size(void)
+{
+    return sizeof(cart);
+}
+
+void cart_delay_command(cart *self, uint64_t due_us)
+{
+    cart_motor_line *line = &self->line;
+    uint64_t *newest_us = &line->due_us[(line->first + line->pending - 1u) % CART_PENDING];
+    if (due_us > *newest_us)
+        *newest_us = due_us;
+}
+
+size_t cart_runs(cart_splitter *splitter, const uint8_t *bytes, size_t count, uint8_t *runs)
+{
+    size_t written = 0, length;
+    for (size_t at = 0; at < count; at++) {
+        if (!cart_split(splitter, bytes[at], &length))
+            continue;
+        runs[written++] = (uint8_t)length;
+        memcpy(runs + written, splitter->run, length);
+        written += length;
+    }
+    return written;
+}
+
+typedef struct {
+    int64_t *numbers;
+    size_t count;
+} list;
+
+static void add(list *all, int64_t number)
+{
+    all->numbers[all->count++] = number;
+}
+
+static int64_t bits(double number)
+{
+    int64_t same;
+    memcpy(&same, &number, sizeof same);
+    return same;
+}
+
+static void add_core(list *all, const cart *self)
+{
+    add(all, self->period_us);
+    add(all, self->armed);
+    add(all, self->homed);
+    add(all, self->homing);
+    add(all, self->fault);
+    add(all, self->last_sequence);
+    add(all, self->sequence);
+    add(all, self->ticks);
+    add(all, (int64_t)self->ticked_us);
+    add(all, self->commanded);
+    add(all, (int64_t)self->command_us);
+    add(all, (int64_t)self->watchdog_us);
+    add(all, self->zeros.left_stop);
+    add(all, self->zeros.right_stop);
+    add(all, self->zeros.hanging_known);
+    add(all, self->zeros.hanging);
+    add(all, self->pole_zero);
+    add(all, self->line.blocked);
+    add(all, self->line.requested);
+    add(all, self->line.pending);
+}
+
+static void add_guards(list *all, const cart_guards *guards)
+{
+    const cart_stall_watch *stalls = &guards->stalls;
+    const cart_frozen_cart_watch *cart_freezes = &guards->cart_freezes;
+    const cart_frozen_pole_watch *pole_freezes = &guards->pole_freezes;
+    add(all, stalls->direction);
+    add(all, stalls->direction ? stalls->anchor : 0);
+    add(all, stalls->pushed_us);
+    add(all, guards->cart_jumps.counted);
+    add(all, guards->cart_jumps.last);
+    add(all, guards->pole_jumps.counted);
+    add(all, guards->pole_jumps.last);
+    add(all, cart_freezes->counted);
+    add(all, cart_freezes->count);
+    add(all, cart_freezes->direction);
+    add(all, cart_freezes->pushed_us);
+    add(all, cart_freezes->right);
+    add(all, cart_freezes->left);
+    add(all, pole_freezes->moved);
+    add(all, pole_freezes->cart);
+    add(all, pole_freezes->counted);
+    add(all, pole_freezes->pole);
+    add(all, pole_freezes->lowest);
+    add(all, pole_freezes->highest);
+    add(all, pole_freezes->rise);
+    add(all, pole_freezes->fall);
+}
+
+/* Both ways to the middle count as one stage. */
+static int64_t stage_number(cart_homing_stage stage)
+{
+    return stage == CART_CENTRE_AGAIN ? CART_CENTRE : stage;
+}
+
+static void add_homing(list *all, const cart *self)
+{
+    const cart_homing *homing = &self->procedure;
+    bool under_way = self->homing && homing->entered;
+    bool full = under_way && homing->window.full;
+    bool searched = homing->stage == CART_FIND_HANGING || homing->stage == CART_BRAKE;
+    add(all, under_way ? stage_number(homing->stage) : 0);
+    add(all, under_way ? homing->elapsed_us : 0);
+    add(all, under_way ? bits(homing->servo.reference) : 0);
+    add(all, under_way ? bits(homing->servo.integral) : 0);
+    add(all, under_way ? homing->window.used : 0);
+    add(all, full ? cart_window_spread(&homing->window) : -1);
+    add(all, under_way && searched ? homing->zeros.hanging : 0);
+}
+
+void cart_snapshot(const cart *self, int64_t *numbers)
+{
+    list all = {numbers, 0};
+    add_core(&all, self);
+    add_guards(&all, &self->guards);
+    add_homing(&all, self);
+}

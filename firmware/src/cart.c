@@ -1,0 +1,313 @@
+#include "cart.h"
+
+#include "cart_numbers.h"
+
+#include <string.h>
+
+#define SOFT_LIMIT CART_COUNTS(CART_SOFT_LIMIT_UM)
+#define HARD_LIMIT CART_COUNTS(CART_HARD_LIMIT_UM)
+#define HALF_SPAN CART_COUNTS(CART_SPAN_UM / 2)
+#define LONGEST_TICK_US 1000000000u /* a longer period counts as this long */
+#define NO_AGE 65535u
+
+void cart_boot(cart *self)
+{
+    memset(self, 0, sizeof *self);
+    self->period_us = CART_PERIOD_US;
+    self->zeros.left_stop = -HALF_SPAN;
+    self->zeros.right_stop = HALF_SPAN;
+}
+
+int16_t cart_motor(const cart *self)
+{
+    return cart_line_value(&self->line);
+}
+
+bool cart_drive(cart *self, uint64_t until_us, uint64_t *due_us)
+{
+    return cart_line_next(&self->line, until_us, due_us);
+}
+
+/* ---- Frames to the host ---- */
+
+static uint8_t flags(const cart *self)
+{
+    return (uint8_t)((self->armed ? CART_ARMED : 0) | (self->homed ? CART_HOMED : 0) |
+                     (self->homing ? CART_HOMING : 0) | (self->fault ? CART_FAULTED : 0) |
+                     (cart_line_limited(&self->line) ? CART_SOFT_LIMIT : 0));
+}
+
+static size_t send(cart *self, uint8_t type, uint8_t all_flags, const uint8_t *payload, size_t length,
+                   uint8_t *frame)
+{
+    return cart_frame(type, self->sequence++, all_flags, payload, length, frame);
+}
+
+static size_t send_info(cart *self, uint8_t *frame)
+{
+    uint8_t payload[CART_LONGEST_PAYLOAD];
+    int32_t half_span = cart_zeros_half_span(&self->zeros);
+    cart_info info = {half_span - SOFT_LIMIT, half_span - HARD_LIMIT, self->period_us};
+    return send(self, CART_INFO, flags(self), payload, cart_pack_info(&info, payload), frame);
+}
+
+static int32_t reported_cart(const cart *self, int32_t cart_count)
+{
+    return cart_subtract(cart_count, cart_zeros_middle(&self->zeros));
+}
+
+static int32_t reported_pole(const cart *self, int32_t pole_count)
+{
+    return cart_subtract(pole_count, self->pole_zero);
+}
+
+static size_t send_state(cart *self, uint8_t all_flags, int32_t cart_count, int32_t pole_count,
+                         uint8_t *frame)
+{
+    uint8_t payload[CART_LONGEST_PAYLOAD];
+    uint64_t age_ms = self->commanded ? (self->ticked_us - self->command_us) / 1000u : NO_AGE;
+    cart_state state = {self->ticks,
+                        (uint32_t)(self->ticked_us & UINT32_MAX),
+                        reported_cart(self, cart_count),
+                        reported_pole(self, pole_count),
+                        cart_motor(self),
+                        self->last_sequence,
+                        self->fault,
+                        (uint16_t)(age_ms < NO_AGE ? age_ms : NO_AGE)};
+    return send(self, CART_STATE, all_flags, payload, cart_pack_state(&state, payload), frame);
+}
+
+static size_t send_fault(cart *self, uint8_t all_flags, uint8_t *frame)
+{
+    uint8_t payload[CART_LONGEST_PAYLOAD];
+    size_t length = cart_pack_fault(self->fault, self->ticks, payload);
+    return send(self, CART_FAULT, all_flags, payload, length, frame);
+}
+
+/* ---- Messages from the host ---- */
+
+static cart_reason objection_in_this_state(const cart *self, uint8_t type)
+{
+    bool sets = type == CART_SET_PERIOD;
+    bool homes = type == CART_HOME;
+    bool drives = type == CART_SET_MOTOR || type == CART_START;
+    if (self->homing && (sets || homes || drives))
+        return CART_BUSY;
+    if (self->armed && (sets || homes))
+        return CART_BUSY;
+    if (self->fault && (homes || drives))
+        return CART_FAULT_LATCHED;
+    if (type == CART_START && !self->homed)
+        return CART_NOT_HOMED;
+    if (type == CART_SET_MOTOR && !self->armed)
+        return CART_NOT_ARMED;
+    return CART_ACCEPTED;
+}
+
+/* The first reason, in the order of docs/protocol.md, for which a frame is refused. */
+static cart_reason objection(const cart *self, const cart_envelope *envelope)
+{
+    int expected = cart_host_payload(envelope->type);
+    if (envelope->version != CART_VERSION)
+        return CART_BAD_VERSION;
+    if (expected < 0)
+        return CART_UNKNOWN_TYPE;
+    if (envelope->payload_length != (size_t)expected)
+        return CART_BAD_LENGTH;
+    if (envelope->type == CART_SET_MOTOR) {
+        int16_t motor = cart_read_i16(envelope->payload);
+        if (motor > CART_LARGEST_MOTOR || motor < -CART_LARGEST_MOTOR)
+            return CART_OUT_OF_RANGE;
+    }
+    if (envelope->type == CART_SET_PERIOD) {
+        uint32_t period_us = cart_read_u32(envelope->payload);
+        if (period_us < CART_SHORTEST_US || period_us > CART_LONGEST_US)
+            return CART_OUT_OF_RANGE;
+    }
+    return objection_in_this_state(self, envelope->type);
+}
+
+static void arm(cart *self, uint64_t now_us)
+{
+    if (self->armed)
+        return;
+    self->armed = true;
+    self->hosted = self->observed = false;
+    self->watchdog_us = now_us;
+    cart_guards_reset(&self->guards);
+}
+
+static void begin_homing(cart *self)
+{
+    self->homed = false;
+    self->homing = true;
+    cart_homing_begin(&self->procedure, &self->zeros);
+    cart_guards_reset(&self->guards);
+}
+
+static void carry_out(cart *self, const cart_envelope *envelope, uint64_t now_us)
+{
+    switch (envelope->type) {
+    case CART_SET_MOTOR:
+        self->commanded = self->hosted = true;
+        self->command_us = self->watchdog_us = now_us;
+        cart_line_command(&self->line, now_us, cart_read_i16(envelope->payload));
+        break;
+    case CART_START:
+        arm(self, now_us);
+        break;
+    case CART_STOP:
+        self->armed = self->homing = false;
+        cart_line_stop(&self->line, now_us);
+        break;
+    case CART_HOME:
+        begin_homing(self);
+        break;
+    case CART_CLEAR_FAULT:
+        self->fault = 0;
+        break;
+    case CART_SET_PERIOD:
+        self->period_us = cart_read_u32(envelope->payload);
+        break;
+    default: /* HELLO */
+        break;
+    }
+}
+
+static size_t refuse(cart *self, const cart_envelope *envelope, cart_reason reason, uint8_t *answer)
+{
+    uint8_t payload[] = {envelope->sequence, envelope->type, (uint8_t)reason};
+    return send(self, CART_NACK, flags(self), payload, sizeof payload, answer);
+}
+
+size_t cart_receive(cart *self, const uint8_t *stuffed, size_t length, uint64_t now_us, uint8_t *answer)
+{
+    cart_envelope envelope;
+    self->carried_out = 0;
+    if (!cart_open(stuffed, length, &envelope))
+        return 0; /* nothing in a damaged frame can be trusted */
+    cart_reason reason = objection(self, &envelope);
+    if (reason != CART_ACCEPTED)
+        return refuse(self, &envelope, reason, answer);
+    carry_out(self, &envelope, now_us);
+    self->carried_out = envelope.type;
+    self->last_sequence = envelope.sequence;
+    if (envelope.type == CART_SET_MOTOR)
+        return 0; /* the next STATE acknowledges it */
+    if (envelope.type == CART_HELLO || envelope.type == CART_SET_PERIOD)
+        return send_info(self, answer);
+    uint8_t payload[] = {envelope.sequence, envelope.type};
+    return send(self, CART_ACK, flags(self), payload, sizeof payload, answer);
+}
+
+/* ---- The rules of a period ---- */
+
+/* Disarm, set motor 0 and latch the fault. An encoder fault makes the zeros invalid. */
+static void latch(cart *self, uint16_t fault)
+{
+    self->fault |= fault;
+    self->armed = self->homing = false;
+    cart_line_hold(&self->line, 0);
+    if (fault & (CART_FAULT_CART_ENCODER | CART_FAULT_POLE_ENCODER))
+        self->homed = false;
+}
+
+/* 1 or -1 if the cart is within `inside` counts of the right or left stop, else 0. */
+static int8_t beyond(const cart *self, int32_t inside, int32_t cart_count)
+{
+    int32_t middle = cart_zeros_middle(&self->zeros);
+    if (cart_distance(cart_count, middle) < (int64_t)cart_zeros_half_span(&self->zeros) - inside)
+        return 0;
+    return cart_count > middle ? 1 : -1;
+}
+
+/* Latch new faults. Homing may touch the stops and detects a stall itself. */
+static void check_faults(cart *self, const cart_reading *reading)
+{
+    cart_guards *guards = &self->guards;
+    uint32_t period_us = reading->period_us;
+    int16_t motor = cart_motor(self);
+    bool jumped = cart_cart_jumped(&guards->cart_jumps, reading->cart, period_us);
+    if (cart_cart_frozen(&guards->cart_freezes, reading->cart, motor, period_us) || jumped)
+        latch(self, CART_FAULT_CART_ENCODER);
+    jumped = cart_pole_jumped(&guards->pole_jumps, reading->pole, period_us);
+    if (cart_pole_frozen(&guards->pole_freezes, reading->pole, reading->cart, period_us) || jumped)
+        latch(self, CART_FAULT_POLE_ENCODER);
+    if (self->armed && beyond(self, HARD_LIMIT, reading->cart))
+        latch(self, CART_FAULT_HARD_LIMIT);
+    if (self->armed && cart_stalled(&guards->stalls, reading->cart, motor, period_us))
+        latch(self, CART_FAULT_STALL);
+}
+
+/* Let homing choose the motor value, or end it with its zeros or a fault. */
+static void step_homing(cart *self, const cart_reading *reading)
+{
+    int16_t motor = 0;
+    switch (cart_homing_step(&self->procedure, reading, &motor)) {
+    case CART_HOMING_GOES_ON:
+        cart_line_hold(&self->line, motor);
+        break;
+    case CART_HOMING_DONE:
+        self->zeros = self->procedure.zeros;
+        self->pole_zero = self->zeros.hanging - CART_POLE_COUNTS / 2 - self->pole_trim;
+        self->homed = true;
+        self->homing = false;
+        cart_line_hold(&self->line, 0);
+        break;
+    default: /* CART_HOMING_FAILED */
+        latch(self, CART_FAULT_HOMING);
+        break;
+    }
+}
+
+/* True while a policy on the board chooses the motor values. */
+static bool drives_itself(const cart *self)
+{
+    return self->armed && self->policy != NULL && !self->hosted;
+}
+
+/* Let the policy on the board choose the motor value, as a host would after STATE. */
+static void ask_policy(cart *self, const cart_reading *reading)
+{
+    cart_observation observation = {reported_cart(self, reading->cart), reported_pole(self, reading->pole),
+                                    cart_zeros_half_span(&self->zeros) - SOFT_LIMIT, reading->period_us,
+                                    !self->observed};
+    int16_t motor = self->policy(self->policy_memory, &observation);
+    bool valid = motor <= CART_LARGEST_MOTOR && motor >= -CART_LARGEST_MOTOR;
+    self->observed = true;
+    cart_line_hold(&self->line, valid ? motor : 0);
+}
+
+static uint32_t length_of_period(const cart *self, uint64_t now_us)
+{
+    uint64_t length_us = now_us - self->ticked_us;
+    if (length_us < 1)
+        return 1;
+    return (uint32_t)(length_us < LONGEST_TICK_US ? length_us : LONGEST_TICK_US);
+}
+
+size_t cart_tick(cart *self, uint64_t now_us, int32_t cart_count, int32_t pole_count, uint8_t *frames)
+{
+    cart_reading reading = {cart_count, pole_count, length_of_period(self, now_us)};
+    uint16_t faults_before = self->fault;
+    self->ticks++;
+    self->ticked_us = now_us;
+    /* checked once a period: the limit has to pass by the next check at the latest */
+    uint64_t limit_us = (uint64_t)(CART_WATCHDOG_PERIODS - 1) * self->period_us;
+    bool expired = self->armed && !drives_itself(self) && now_us - self->watchdog_us > limit_us;
+    if (expired)
+        cart_line_hold(&self->line, 0);
+    if (self->armed || self->homing)
+        check_faults(self, &reading);
+    if (self->homing)
+        step_homing(self, &reading);
+    self->line.blocked = self->armed ? beyond(self, SOFT_LIMIT, cart_count) : 0;
+    uint8_t all_flags = (uint8_t)(flags(self) | (expired && self->armed ? CART_WATCHDOG : 0));
+    size_t length = 0;
+    if (self->fault != faults_before)
+        length = send_fault(self, all_flags, frames);
+    length += send_state(self, all_flags, cart_count, pole_count, frames + length);
+    if (drives_itself(self))
+        ask_policy(self, &reading);
+    return length;
+}

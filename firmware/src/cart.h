@@ -1,0 +1,96 @@
+/* The cart's side of wire protocol version 1: docs/protocol.md as a state machine without I/O.
+
+   Who calls what, when (cart_loop.h does all of it for a board):
+
+     cart_boot      once, at power-on or reset
+     cart_receive   for each complete run of bytes from the host, on arrival
+     cart_drive     after cart_receive and before cart_tick, until it returns false: it brings motor values
+                    into force; then put cart_motor on the motor
+     cart_tick      once at the end of each period of `period_us`, with the raw counts measured now; then put
+                    cart_motor on the motor at once
+
+   All from one thread, never from an interrupt. No function blocks, allocates or recurses. Each takes a
+   bounded time; the longest, cart_tick while homing, passes a few times over CART_WINDOW_COUNTS counts.
+
+   Units: us since boot, which never wrap (64 bits); raw counts, positive to the right, 0 where the cart stood
+   at boot, within 2^30; motor values -255 to 255, positive to the right. A `cart` needs about 2 kB. */
+#ifndef CART_H
+#define CART_H
+
+#include "cart_config.h"
+#include "cart_frames.h"
+#include "cart_guards.h"
+#include "cart_homing.h"
+#include "cart_messages.h"
+#include "cart_motor_line.h"
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+/* What a policy on the board observes at the end of a period. */
+typedef struct {
+    int32_t cart_counts; /* from the middle of the track */
+    int32_t pole_counts; /* from upright */
+    int32_t soft_limit;  /* counts from the middle */
+    uint32_t period_us;  /* since the counts before */
+    bool first;          /* the first observation since START */
+} cart_observation;
+
+/* A policy on the board: returns the motor value for an observation, in a bounded time. */
+typedef int16_t (*cart_policy)(void *memory, const cart_observation *observation);
+
+typedef struct {
+    /* Set these after cart_boot if the board has a policy. From START on, the policy chooses the motor value at
+       the end of each period, until the host sends a SET_MOTOR, which takes the motor over until the next START.
+       All rules apply, except for the watchdog while the policy drives. A value out of range counts as 0. */
+    cart_policy policy;
+    void *policy_memory;
+
+    int32_t pole_trim; /* counts above half a turn that a hanging pole shows after homing; 0 at boot */
+
+    /* Read these; only the core writes them. */
+    uint32_t period_us; /* of the next period */
+    bool armed, homed, homing;
+    uint16_t fault;      /* latched faults */
+    uint8_t carried_out; /* type of the message that cart_receive carried out; 0: refused or damaged */
+
+    /* Private. */
+    cart_motor_line line;
+    cart_guards guards;
+    cart_zeros zeros;
+    int32_t pole_zero;    /* raw count that is reported as 0 */
+    bool hosted;          /* a SET_MOTOR was accepted since START */
+    bool observed;        /* the policy was asked since START */
+    bool commanded;       /* a SET_MOTOR was accepted since boot */
+    uint64_t command_us;  /* arrival of the newest SET_MOTOR */
+    uint64_t watchdog_us; /* time of START or of the newest SET_MOTOR */
+    uint64_t ticked_us;
+    uint32_t ticks;
+    uint8_t last_sequence; /* of the host */
+    uint8_t sequence;      /* of the next frame sent */
+    cart_homing procedure;
+} cart;
+
+/* Boot: idle, not homed, motor 0. */
+void cart_boot(cart *self);
+
+/* Handle a run of stuffed bytes without its 0x00; write the answer, at most CART_FRAME_BYTES, and return its
+   length, 0 for none. */
+size_t cart_receive(cart *self, const uint8_t *stuffed, size_t length, uint64_t now_us, uint8_t *answer);
+
+/* Bring the next motor value that is due before `until_us` into force; return false if there is none. */
+bool cart_drive(cart *self, uint64_t until_us, uint64_t *due_us);
+
+/* The motor value in force. */
+int16_t cart_motor(const cart *self);
+
+/* End a period: apply the rules; write FAULT, if one was latched, and STATE, at most 2 * CART_FRAME_BYTES,
+   and return their length. */
+size_t cart_tick(cart *self, uint64_t now_us, int32_t cart_count, int32_t pole_count, uint8_t *frames);
+
+#ifdef __cplusplus
+}
+#endif
+
+#endif

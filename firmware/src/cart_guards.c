@@ -1,0 +1,105 @@
+#include "cart_guards.h"
+
+#include "cart_numbers.h"
+
+#include <string.h>
+
+#define HARD_PUSH 200 /* smallest motor value that moves any healthy cart */
+#define STALL_US 500000u
+#define STALL_COUNTS CART_COUNTS(1000)
+#define PUSH_US 100000u        /* of a hard push one way, after which the count must have changed */
+#define SPEED_CHANGE 200000    /* um/s; 0.2 m/s turn any pole by several counts */
+#define FASTEST_CART (5000000000LL / CART_NANOMETRES) /* counts/s: 5 m/s */
+#define FASTEST_POLE (16LL * CART_POLE_COUNTS)        /* counts/s: 16 turns a second */
+#define SECOND_US 1000000LL
+
+static int8_t push(int16_t motor)
+{
+    if (motor >= HARD_PUSH)
+        return 1;
+    return motor <= -HARD_PUSH ? -1 : 0;
+}
+
+void cart_guards_reset(cart_guards *guards)
+{
+    memset(guards, 0, sizeof *guards);
+}
+
+bool cart_stalled(cart_stall_watch *watch, int32_t cart, int16_t motor, uint32_t period_us)
+{
+    int8_t direction = push(motor);
+    bool same = direction == watch->direction && cart_distance(cart, watch->anchor) < STALL_COUNTS;
+    if (direction == 0 || !same) {
+        watch->direction = direction;
+        watch->anchor = cart;
+        watch->pushed_us = 0;
+        return false;
+    }
+    watch->pushed_us += period_us;
+    return watch->pushed_us >= STALL_US;
+}
+
+static bool jumped(cart_jump_watch *watch, int32_t count, uint32_t period_us, int64_t fastest)
+{
+    bool first = !watch->counted;
+    int64_t moved = cart_distance(count, watch->last);
+    watch->counted = true;
+    watch->last = count;
+    return !first && moved * SECOND_US > fastest * (int64_t)period_us;
+}
+
+bool cart_cart_jumped(cart_jump_watch *watch, int32_t cart, uint32_t period_us)
+{
+    return jumped(watch, cart, period_us, FASTEST_CART);
+}
+
+bool cart_pole_jumped(cart_jump_watch *watch, int32_t pole, uint32_t period_us)
+{
+    return jumped(watch, pole, period_us, FASTEST_POLE);
+}
+
+bool cart_cart_frozen(cart_frozen_cart_watch *watch, int32_t cart, int16_t motor, uint32_t period_us)
+{
+    int8_t direction = push(motor);
+    uint32_t left_us = PUSH_US - watch->pushed_us;
+    if (direction == watch->direction)
+        watch->pushed_us += period_us < left_us ? period_us : left_us;
+    else
+        watch->pushed_us = 0;
+    watch->direction = direction;
+    if (!watch->counted || cart != watch->count) {
+        watch->counted = true;
+        watch->count = cart;
+        watch->pushed_us = 0;
+        watch->right = watch->left = false;
+    }
+    if (watch->pushed_us >= PUSH_US) {
+        watch->right = watch->right || direction > 0;
+        watch->left = watch->left || direction < 0;
+    }
+    return watch->right && watch->left;
+}
+
+bool cart_pole_frozen(cart_frozen_pole_watch *watch, int32_t pole, int32_t cart, uint32_t period_us)
+{
+    bool first = !watch->moved;
+    int64_t counts = (int64_t)cart - watch->cart;
+    watch->moved = true;
+    watch->cart = cart;
+    if (first)
+        return false;
+    int64_t speed = cart_floor_divide(counts * CART_NANOMETRES * 1000, (int64_t)period_us);
+    if (!watch->counted || pole != watch->pole) {
+        watch->counted = true;
+        watch->pole = pole;
+        watch->lowest = watch->highest = speed;
+        watch->rise = watch->fall = 0;
+    }
+    watch->lowest = speed < watch->lowest ? speed : watch->lowest;
+    watch->highest = speed > watch->highest ? speed : watch->highest;
+    if (speed - watch->lowest > watch->rise)
+        watch->rise = speed - watch->lowest;
+    if (watch->highest - speed > watch->fall)
+        watch->fall = watch->highest - speed;
+    return watch->rise >= SPEED_CHANGE && watch->fall >= SPEED_CHANGE;
+}

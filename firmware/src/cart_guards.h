@@ -1,0 +1,62 @@
+/* Fault detection while the motor may move: a stalled cart and implausible encoders.
+
+   Each function is called once a period with the counts at its end and its length in us. */
+#ifndef CART_GUARDS_H
+#define CART_GUARDS_H
+
+#include "cart_config.h"
+
+#include <stdbool.h>
+#include <stdint.h>
+
+typedef struct {
+    int8_t direction;   /* of the push that is watched: 1, -1, or 0 for none */
+    int32_t anchor;     /* cart count at its start */
+    uint32_t pushed_us; /* since then */
+} cart_stall_watch;
+
+typedef struct {
+    bool counted; /* `last` is a count */
+    int32_t last;
+} cart_jump_watch;
+
+typedef struct {
+    bool counted; /* `count` is a count */
+    int32_t count;
+    int8_t direction;   /* of the present push: 1, -1, or 0 for none */
+    uint32_t pushed_us; /* since it began, not beyond the length that is needed */
+    bool right, left;   /* long pushes since the count changed */
+} cart_frozen_cart_watch;
+
+typedef struct {
+    bool moved;   /* `cart` is a count */
+    bool counted; /* `pole` is a count, and the speeds below are set */
+    int32_t cart, pole;
+    int64_t lowest, highest; /* cart speed in um/s since the pole's count changed */
+    int64_t rise, fall;      /* largest increase and decrease of that speed */
+} cart_frozen_pole_watch;
+
+typedef struct {
+    cart_stall_watch stalls;
+    cart_jump_watch cart_jumps, pole_jumps;
+    cart_frozen_cart_watch cart_freezes;
+    cart_frozen_pole_watch pole_freezes;
+} cart_guards;
+
+/* Forget everything: a hand may have moved cart and pole while the motor was off. */
+void cart_guards_reset(cart_guards *guards);
+
+/* A push of at least 200 one way for 0.5 s that moves the cart by less than 1 mm. */
+bool cart_stalled(cart_stall_watch *watch, int32_t cart, int16_t motor, uint32_t period_us);
+
+/* A count that changes faster than cart or pole can move. */
+bool cart_cart_jumped(cart_jump_watch *watch, int32_t cart, uint32_t period_us);
+bool cart_pole_jumped(cart_jump_watch *watch, int32_t pole, uint32_t period_us);
+
+/* A cart count that does not change under a hard push one way and then the other. */
+bool cart_cart_frozen(cart_frozen_cart_watch *watch, int32_t cart, int16_t motor, uint32_t period_us);
+
+/* A pole count that does not change while the cart speeds up by 0.2 m/s and slows down again. */
+bool cart_pole_frozen(cart_frozen_pole_watch *watch, int32_t pole, int32_t cart, uint32_t period_us);
+
+#endif

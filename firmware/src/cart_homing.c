@@ -1,0 +1,213 @@
+#include "cart_homing.h"
+
+#include "cart_numbers.h"
+
+#define QUARTER_TURN (CART_POLE_COUNTS / 4)
+#define PI 3.14159265358979323846
+#define POLE_RADIANS (2 * PI / CART_POLE_COUNTS) /* a count */
+#define SPAN_NM ((int64_t)CART_SPAN_UM * 1000)
+#define SPAN_TOLERANCE_NM (SPAN_NM * 3 / 100)
+
+#define SEARCH_SPEED 0.08 /* m/s, towards a stop */
+#define TRAVEL_SPEED 0.2  /* m/s, far from a stop whose position is known */
+#define TOUCH_ZONE_NM 60000000 /* distance from such a stop at which the slow search begins */
+#define AGAINST_STOP_US 400000u /* under full push without motion that mean a stop */
+#define STANDS_COUNTS (300000 / CART_NANOMETRES) /* largest motion in that time: 0.3 mm */
+#define LONGEST_SEARCH_US 30000000u /* for one stop */
+#define CENTRED_NM 1000000
+#define LONGEST_CENTRING_US 20000000u
+
+#define WHOLE_SWING_US 2000000u /* one period of a rod of 1.5 m */
+#define SWING(centidegrees) (((int64_t)(centidegrees)*CART_POLE_COUNTS + 18000) / 36000) /* counts */
+#define STILL SWING(70)   /* peak to peak */
+#define BRAKED SWING(260) /* peak to peak; the brake cannot improve a smaller swing */
+#define LONGEST_BRAKING_US 20000000u
+#define PATIENCE_US 20000000u /* after which NEARLY_STILL suffices, for a pole with hardly any friction */
+#define NEARLY_STILL SWING(350) /* peak to peak */
+#define LONGEST_WAIT_US 60000000u
+
+typedef enum { YIELDS, ENDS, FAILS } outcome; /* a stage waits for the next reading, is done, or failed */
+
+int32_t cart_zeros_middle(const cart_zeros *zeros)
+{
+    return cart_middle(zeros->left_stop, zeros->right_stop);
+}
+
+int32_t cart_zeros_half_span(const cart_zeros *zeros)
+{
+    return (int32_t)cart_floor_divide((int64_t)zeros->right_stop - zeros->left_stop, 2);
+}
+
+static double seconds(const cart_reading *reading)
+{
+    return reading->period_us / 1e6;
+}
+
+static double metres(int32_t from, int32_t to)
+{
+    return (double)((int64_t)to - from) * CART_METRES;
+}
+
+static void enter(cart_homing *homing, cart_homing_stage stage)
+{
+    homing->stage = stage;
+    homing->entered = false;
+}
+
+void cart_homing_begin(cart_homing *homing, const cart_zeros *zeros)
+{
+    homing->zeros = *zeros;
+    enter(homing, CART_TOUCH_LEFT);
+}
+
+/* Count the time of a stage; return true for its first reading. */
+static bool first_reading(cart_homing *homing, const cart_reading *reading, uint32_t window_us)
+{
+    if (homing->entered) {
+        homing->elapsed_us += reading->period_us;
+        return false;
+    }
+    homing->entered = true;
+    homing->elapsed_us = 0;
+    homing->before = *reading;
+    cart_servo_reset(&homing->servo);
+    cart_window_reset(&homing->window, window_us);
+    return true;
+}
+
+static double cart_speed(const cart_homing *homing, const cart_reading *reading)
+{
+    return metres(homing->before.cart, reading->cart) / seconds(reading);
+}
+
+/* Move until a stop holds the cart. The right stop is expected one span from the left one. */
+static outcome touch_stop(cart_homing *homing, const cart_reading *reading, int direction, int16_t *motor)
+{
+    first_reading(homing, reading, AGAINST_STOP_US);
+    if (homing->elapsed_us >= LONGEST_SEARCH_US)
+        return FAILS;
+    int64_t expected = (int64_t)homing->zeros.left_stop + CART_COUNTS(CART_SPAN_UM);
+    int64_t away = expected > reading->cart ? expected - reading->cart : reading->cart - expected;
+    bool far = direction > 0 && away * CART_NANOMETRES > TOUCH_ZONE_NM;
+    double speed = cart_speed(homing, reading);
+    homing->before = *reading;
+    cart_window_add(&homing->window, reading->cart, reading->period_us);
+    *motor = cart_servo_motor(&homing->servo, direction * (far ? TRAVEL_SPEED : SEARCH_SPEED), speed,
+                              seconds(reading));
+    bool stands = cart_window_spread(&homing->window) <= STANDS_COUNTS;
+    return stands && *motor == direction * CART_FULL_PUSH ? ENDS : YIELDS;
+}
+
+static bool span_is_right(const cart_zeros *zeros)
+{
+    int64_t span_nm = ((int64_t)zeros->right_stop - zeros->left_stop) * CART_NANOMETRES;
+    return span_nm >= SPAN_NM - SPAN_TOLERANCE_NM && span_nm <= SPAN_NM + SPAN_TOLERANCE_NM;
+}
+
+/* Move gently to the middle and switch the motor off. */
+static outcome centre(cart_homing *homing, const cart_reading *reading, int16_t *motor)
+{
+    first_reading(homing, reading, 0);
+    if (homing->elapsed_us >= LONGEST_CENTRING_US)
+        return FAILS;
+    int32_t middle = cart_zeros_middle(&homing->zeros);
+    if (cart_distance(middle, reading->cart) * CART_NANOMETRES < CENTRED_NM)
+        return ENDS;
+    double target = cart_limit(metres(reading->cart, middle), TRAVEL_SPEED); /* slows down over a second */
+    double speed = cart_speed(homing, reading);
+    homing->before = *reading;
+    *motor = cart_servo_motor(&homing->servo, target, speed, seconds(reading));
+    return YIELDS;
+}
+
+/* Watch the pole for a whole swing with the motor off; it hangs where it is fastest. */
+static outcome find_hanging(cart_homing *homing, const cart_reading *reading, int16_t *motor)
+{
+    if (first_reading(homing, reading, 0)) {
+        homing->zeros.hanging = reading->pole;
+        homing->fastest = 0;
+    } else {
+        int64_t moved = cart_distance(reading->pole, homing->before.pole);
+        int64_t speed = moved * 1000000 / (int64_t)reading->period_us;
+        if (speed > homing->fastest) {
+            homing->zeros.hanging = cart_middle(reading->pole, homing->before.pole);
+            homing->fastest = speed;
+        }
+    }
+    homing->before = *reading;
+    *motor = 0;
+    return homing->elapsed_us >= WHOLE_SWING_US ? ENDS : YIELDS;
+}
+
+/* Brake the pole's swing by moving the cart about the middle. */
+static outcome brake_swing(cart_homing *homing, const cart_reading *reading, int16_t *motor)
+{
+    first_reading(homing, reading, WHOLE_SWING_US);
+    if (homing->elapsed_us >= LONGEST_BRAKING_US)
+        return ENDS;
+    cart_window_add(&homing->window, reading->pole, reading->period_us);
+    int64_t spread = cart_window_spread(&homing->window);
+    if (spread <= BRAKED)
+        return ENDS;
+    if (spread < QUARTER_TURN) /* the middle of such a small swing is the hanging pole */
+        homing->zeros.hanging = cart_window_centre(&homing->window);
+    int64_t swing = (int64_t)reading->pole - homing->zeros.hanging;
+    int64_t turned = (int64_t)reading->pole - homing->before.pole;
+    *motor = cart_brake_motor(metres(cart_zeros_middle(&homing->zeros), reading->cart),
+                              cart_speed(homing, reading), (double)swing * POLE_RADIANS,
+                              (double)turned * POLE_RADIANS / seconds(reading));
+    homing->before = *reading;
+    return YIELDS;
+}
+
+/* Wait with the motor off until the pole's swing is small; it hangs in the middle of the swing. */
+static outcome wait_until_still(cart_homing *homing, const cart_reading *reading, int16_t *motor)
+{
+    first_reading(homing, reading, WHOLE_SWING_US);
+    if (homing->elapsed_us >= LONGEST_WAIT_US)
+        return FAILS;
+    cart_window_add(&homing->window, reading->pole, reading->period_us);
+    int64_t enough = homing->elapsed_us < PATIENCE_US ? STILL : NEARLY_STILL;
+    *motor = 0;
+    if (cart_window_spread(&homing->window) > enough)
+        return YIELDS;
+    homing->zeros.hanging = cart_window_centre(&homing->window);
+    homing->zeros.hanging_known = true;
+    return ENDS;
+}
+
+static outcome handle(cart_homing *homing, const cart_reading *reading, int16_t *motor)
+{
+    outcome how;
+    switch (homing->stage) {
+    case CART_TOUCH_LEFT:
+        how = touch_stop(homing, reading, -1, motor);
+        homing->zeros.left_stop = reading->cart;
+        return how;
+    case CART_TOUCH_RIGHT:
+        how = touch_stop(homing, reading, 1, motor);
+        homing->zeros.right_stop = reading->cart;
+        return how == ENDS && !span_is_right(&homing->zeros) ? FAILS : how;
+    case CART_FIND_HANGING:
+        return homing->zeros.hanging_known ? ENDS : find_hanging(homing, reading, motor);
+    case CART_BRAKE:
+        return brake_swing(homing, reading, motor);
+    case CART_WAIT_UNTIL_STILL:
+        return wait_until_still(homing, reading, motor);
+    default: /* CART_CENTRE, CART_CENTRE_AGAIN */
+        return centre(homing, reading, motor);
+    }
+}
+
+cart_homing_status cart_homing_step(cart_homing *homing, const cart_reading *reading, int16_t *motor)
+{
+    while (homing->stage < CART_ALL_STAGES_DONE) {
+        outcome how = handle(homing, reading, motor);
+        if (how == YIELDS)
+            return CART_HOMING_GOES_ON;
+        if (how == FAILS)
+            return CART_HOMING_FAILED;
+        enter(homing, (cart_homing_stage)(homing->stage + 1));
+    }
+    return CART_HOMING_DONE;
+}

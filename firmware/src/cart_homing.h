@@ -1,0 +1,61 @@
+/* Homing: touch both stops, check the span, centre the cart, wait until the pole hangs still.
+
+   One step a period, on raw counts. It needs only rough numbers of the cart. The pole's zero is the middle of
+   its last small swing: friction in the bearing holds a stopped pole up to a count off the vertical. */
+#ifndef CART_HOMING_H
+#define CART_HOMING_H
+
+#include "cart_servo.h"
+#include "cart_window.h"
+
+#include <stdbool.h>
+#include <stdint.h>
+
+/* The result of homing, in raw counts. */
+typedef struct {
+    int32_t left_stop, right_stop;
+    int32_t hanging;
+    bool hanging_known;
+} cart_zeros;
+
+/* Raw counts at the end of a period, and its length. */
+typedef struct {
+    int32_t cart, pole;
+    uint32_t period_us;
+} cart_reading;
+
+typedef enum { CART_HOMING_GOES_ON, CART_HOMING_DONE, CART_HOMING_FAILED } cart_homing_status;
+
+typedef enum {
+    CART_TOUCH_LEFT,
+    CART_TOUCH_RIGHT,
+    CART_CENTRE,
+    CART_FIND_HANGING,
+    CART_BRAKE,
+    CART_CENTRE_AGAIN,
+    CART_WAIT_UNTIL_STILL,
+    CART_ALL_STAGES_DONE
+} cart_homing_stage;
+
+typedef struct {
+    cart_homing_stage stage;
+    bool entered;        /* the stage has handled a reading */
+    uint32_t elapsed_us; /* since the stage began */
+    cart_reading before; /* the reading before the present one */
+    cart_zeros zeros;    /* as far as they are found */
+    int64_t fastest;     /* counts/s of the pole, while the hanging count is searched */
+    cart_servo servo;
+    cart_window window;
+} cart_homing;
+
+/* Begin. `zeros` are those of the last homing; their hanging count may be known. */
+void cart_homing_begin(cart_homing *homing, const cart_zeros *zeros);
+
+/* Handle the reading of a period and choose the motor value for the next one. */
+cart_homing_status cart_homing_step(cart_homing *homing, const cart_reading *reading, int16_t *motor);
+
+/* Count in the middle of the track, and counts from there to a stop. */
+int32_t cart_zeros_middle(const cart_zeros *zeros);
+int32_t cart_zeros_half_span(const cart_zeros *zeros);
+
+#endif

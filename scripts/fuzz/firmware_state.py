@@ -1,0 +1,116 @@
+"""The whole state of the Python firmware as numbers, in the order of ``cart_snapshot`` of the C firmware."""
+
+import struct
+from types import GeneratorType
+from typing import Any
+
+from cartpole_rl.emulator.firmware import Firmware
+
+STAGES = {"find_hanging": 3, "brake_swing": 4, "wait_until_still": 6}  # of homing; see stage_of
+
+
+def state_of(firmware: Firmware) -> list[int]:
+    """Return the state of a firmware."""
+    return [*core(firmware), *guards(firmware), *homing(firmware)]
+
+
+def core(firmware: Any) -> list[int]:
+    """Return flags, counters, times and zeros."""
+    zeros, line = firmware._zeros, firmware._line
+    return [
+        firmware.period_us,
+        firmware.armed,
+        firmware.homed,
+        firmware.homing,
+        int(firmware.fault),
+        firmware._last_sequence,
+        firmware._sequence,
+        firmware._ticks,
+        firmware._ticked_us,
+        firmware._command_us is not None,
+        firmware._command_us or 0,
+        firmware._watchdog_us,
+        zeros.left_stop,
+        zeros.right_stop,
+        zeros.hanging is not None,
+        zeros.hanging or 0,
+        firmware._pole_zero,
+        line.blocked,
+        line._requested,
+        len(line._pending),
+    ]
+
+
+def guards(firmware: Any) -> list[int]:
+    """Return the state of each guard."""
+    stalls, carts, poles = firmware._stalls, firmware._cart_freezes, firmware._pole_freezes
+    anchor, right = stalls._anchor or (0, False)
+    pushed = stalls._anchor is not None
+    return [
+        (1 if right else -1) if pushed else 0,
+        anchor,
+        stalls._since_us if pushed else 0,
+        *jump(firmware._cart_jumps),
+        *jump(firmware._pole_jumps),
+        carts._count is not None,
+        carts._count or 0,
+        carts._direction,
+        carts._pushed_us,
+        1 in carts._pushed,
+        -1 in carts._pushed,
+        poles._cart is not None,
+        poles._cart or 0,
+        poles._pole is not None,
+        poles._pole or 0,
+        poles._lowest,
+        poles._highest,
+        poles._rise,
+        poles._fall,
+    ]
+
+
+def jump(watch: Any) -> list[int]:
+    """Return the state of a JumpWatch."""
+    return [watch._last is not None, watch._last or 0]
+
+
+def homing(firmware: Any) -> list[int]:
+    """Return stage, time, servo and window of a homing that has handled a reading; else zeros."""
+    stack = generators(firmware._homing)
+    if len(stack) < 2:
+        return [0, 0, 0, 0, 0, -1, 0]
+    stage, local = stage_of(stack), stack[-1].gi_frame.f_locals
+    servo, window = local.get("servo"), local.get("window")
+    return [
+        stage,
+        local["elapsed"],
+        bits(servo._reference) if servo else 0,
+        bits(servo._integral) if servo else 0,
+        len(window._counts) if window else 0,
+        int(window.spread) if window and window._full else -1,
+        local["hanging"] if stage in (3, 4) else 0,
+    ]
+
+
+def generators(outermost: GeneratorType | None) -> list[Any]:
+    """Return a generator and those that it waits for."""
+    stack = []
+    while outermost is not None:
+        stack.append(outermost)
+        outermost = outermost.gi_yieldfrom
+    return stack
+
+
+def stage_of(stack: list[Any]) -> int:
+    """Return the number of the stage of homing, as in ``firmware/src/cart_homing.h``."""
+    name, local = stack[-1].gi_code.co_name, stack[-1].gi_frame.f_locals
+    if name == "touch_stop":
+        return 0 if local["direction"] < 0 else 1
+    if name == "centre":
+        return 2
+    return STAGES[name]
+
+
+def bits(number: float) -> int:
+    """Return the 64 bits of a number as a signed integer."""
+    return struct.unpack("<q", struct.pack("<d", number))[0]

@@ -1,0 +1,73 @@
+"""A rough cart and pole: a firmware under test homes, drives and fails with it as with a real one."""
+
+import math
+import random
+
+METRES = 22749e-9  # a count
+TURN = 4096  # counts
+GRAVITY, LENGTH = 9.81, 0.24  # m/s^2 and m, of the pole as a pendulum
+STEP = 1e-3  # s, longest step
+
+
+class ToyCart:
+    """A cart on a track with stops, and a pendulum. Some tracks are too short or too long."""
+
+    def __init__(self, dice: random.Random) -> None:
+        self._dice = dice
+        self._half = 0.407 if dice.random() < 0.8 else dice.uniform(0.38, 0.43)  # m
+        self._x, self._v = dice.uniform(-0.3, 0.3), 0.0
+        self._swing, self._rate = dice.uniform(-0.6, 0.6), dice.uniform(-1.0, 1.0)  # rad from hanging
+        self._damping = dice.choice([0.05, 0.3, 3.0])  # 1/s
+        self._origin = self._counts()
+        self._frozen: dict[str, int] = {}
+        self._jammed = False
+
+    def advance(self, motor: int, us: int) -> None:
+        """Move for `us` under one motor value."""
+        steps = max(1, math.ceil(us / 1e6 / STEP))
+        step = us / 1e6 / steps
+        force = math.copysign(max(0.0, 0.02 * abs(motor) - 1.0), motor)
+        for _ in range(steps):
+            friction = 0.55 if abs(self._v) > 1e-3 or abs(force) > 0.55 else 0.0
+            pull = force - math.copysign(friction, self._v if abs(self._v) > 1e-3 else force)
+            acceleration = (pull - 0.6 * self._v) / 0.85 if friction else 0.0
+            self._v = self._v + acceleration * step if friction else 0.0
+            self._x += 0.0 if self._jammed else self._v * step
+            if abs(self._x) > self._half:
+                self._x, self._v = math.copysign(self._half, self._x), 0.0
+            torque = -GRAVITY * math.sin(self._swing) - acceleration * math.cos(self._swing)
+            self._rate += (torque / LENGTH - self._damping * self._rate) * step
+            self._swing += self._rate * step
+
+    def counts(self) -> tuple[int, int]:
+        """Return the raw counts of cart and pole since the start."""
+        cart, pole = (now - then for now, then in zip(self._counts(), self._origin, strict=True))
+        return self._frozen.get("cart", cart), self._frozen.get("pole", pole)
+
+    def maybe_fail(self, share: float) -> None:
+        """With a small chance, freeze an encoder, free it again, jam or throw the cart, or turn the pole."""
+        if self._dice.random() >= share:
+            return
+        cart, pole = self.counts()
+        match self._dice.randrange(6):
+            case 0:
+                self._frozen["cart"] = cart
+            case 1:
+                self._frozen["pole"] = pole
+            case 2:
+                self._frozen.clear()
+            case 3:
+                self._jammed = True
+            case 4:
+                self._x = self._dice.uniform(-self._half, self._half)
+            case _:
+                self._rate += self._dice.uniform(-30, 30)
+
+    def repair(self) -> None:
+        """Free the encoders and the cart, and put the cart near the middle."""
+        self._frozen.clear()
+        self._jammed = False
+        self._x, self._v = self._dice.uniform(-0.1, 0.1), 0.0
+
+    def _counts(self) -> tuple[int, int]:
+        return math.floor(self._x / METRES), math.floor(self._swing / math.tau * TURN)

@@ -1,0 +1,263 @@
+#!/usr/bin/env python
+"""Do the Python and the C firmware answer any traffic with the same bytes, and are they in the same state?
+
+    scripts/fuzz/two_firmwares.py --bytes 10000000 --frames 1000000 --seed 0
+
+Both receive the same input: random bytes; frames of any type, valid or damaged, between periods with any
+counts; and whole runs on a rough cart with homing, driving, latencies, other periods, silence and failing
+encoders. In the runs, one of the two moves the cart, in turn. After each frame and each period the answers,
+the motor values and the whole state of the two are compared. The C firmware is compiled with the address and
+undefined-behaviour sanitizers of the compiler (`--plain`: without them), which end the run at the first
+error. Prints counts. Exit status 1 at the first difference, which is printed.
+"""
+
+import argparse
+import ctypes
+import os
+import random
+import subprocess
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+
+from firmware_state import state_of
+from toy_cart import ToyCart
+from wire import FROM_HOST, damaged, frames_of, noise
+
+from cartpole_rl.emulator import c_library
+from cartpole_rl.emulator.c_firmware import CFirmware
+from cartpole_rl.emulator.firmware import Firmware
+from cartpole_rl.wire import (
+    ClearFault,
+    FrameSplitter,
+    Home,
+    Message,
+    SetMotor,
+    SetPeriod,
+    Start,
+    cobs,
+    encode_frame,
+)
+from cartpole_rl.wire.checksum import crc16
+from cartpole_rl.wire.frames import END
+
+SANITIZERS = ("-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+SPLITTER_BYTES = 256  # at least the size of a cart_splitter
+LONGEST_INPUT = 4096  # bytes at once
+LARGEST_COUNT = 2**30
+FRAMES_PER_PERIOD = 20
+PERIODS_PER_DRIVE = 3000
+KINDS = ("noise", "damaged", "any", "drive")
+
+
+class DifferenceError(Exception):
+    """The two firmwares differ."""
+
+
+class Pair:
+    """Both firmwares with their splitters, at the same time of the same cart."""
+
+    def __init__(self, seed: int, largest_delay_us: int, counts: Counter[str]) -> None:
+        self.counts = counts
+        self._dice = [random.Random(seed), random.Random(seed)]
+
+        def delay(number: int) -> int:
+            return self._dice[number].randint(0, largest_delay_us)
+
+        self.python = Firmware(lambda: delay(0))
+        self.c = CFirmware(lambda: delay(1))
+        self._splitter = FrameSplitter()
+        self._c_splitter = ctypes.create_string_buffer(SPLITTER_BYTES)
+        self._runs = ctypes.create_string_buffer(2 * LONGEST_INPUT + 65)
+        self._last = b""
+        self.now_us = 0
+
+    def feed(self, data: bytes) -> None:
+        """Let bytes arrive now."""
+        self.counts["bytes"] += len(data)
+        runs = list(self._splitter.feed(data))
+        size = c_library.load_library().cart_runs(self._c_splitter, data, len(data), self._runs)
+        self._same("runs", b"".join(bytes([len(run)]) + run for run in runs), self._runs.raw[:size])
+        for run in runs:
+            self._last = run
+            self.counts["frames"] += 1
+            answers = [firmware.receive(run, self.now_us) for firmware in (self.python, self.c)]
+            self._same("answers", *answers)
+            self._same("carried out", self.python.carried_out, self.c.carried_out)
+            self._same_state()
+            self.counts["answers"] += len(answers[0])
+
+    def send(self, message: Message) -> None:
+        """Let a valid frame arrive now."""
+        self.feed(encode_frame(message, self.counts["frames"]))
+
+    def drive(self, us: int, leader: int) -> list[tuple[int, int]]:
+        """Pass `us`; return the motor values of the firmware that moves the cart."""
+        values = [firmware.drive(self.now_us, self.now_us + us) for firmware in (self.python, self.c)]
+        self._same("motor values", *values)
+        self.now_us += us
+        return values[leader]
+
+    def tick(self, cart: int, pole: int) -> None:
+        """End the period with two counts."""
+        self.counts["periods"] += 1
+        frames = [firmware.tick(self.now_us, cart, pole) for firmware in (self.python, self.c)]
+        self._same("frames", *frames)
+        self._same_state()
+
+    def _same_state(self) -> None:
+        pairs = zip(state_of(self.python), self.c.snapshot, strict=True)
+        different = {number: pair for number, pair in enumerate(pairs) if pair[0] != pair[1]}
+        if different:
+            raise DifferenceError(f"state differs at {self.now_us} us: {different}")
+
+    def _same(self, name: str, python: object, c: object) -> None:
+        if python != c:
+            raise DifferenceError(
+                f"{name} differ at {self.now_us} us after {self._last.hex(' ')}:\npython {python}\nc      {c}"
+            )
+
+
+def any_frame(dice: random.Random) -> bytes:
+    """Return a frame with a right checksum: mostly of a known type and length, with any content."""
+    version = 1 if dice.random() < 0.95 else dice.randrange(256)
+    kind = dice.randrange(1, 8) if dice.random() < 0.9 else dice.randrange(256)
+    length = {4: 2, 7: 4}.get(kind, 0) if dice.random() < 0.9 else dice.randrange(48)
+    payload = dice.randbytes(length)
+    if kind == SetMotor.TYPE and length == 2:
+        payload = dice.randint(-300, 300).to_bytes(2, "little", signed=True)
+    if kind == SetPeriod.TYPE and length == 4:
+        payload = dice.choice([dice.randint(4_000, 110_000), 20_000, 5_000, 5_001]).to_bytes(4, "little")
+    body = bytes((version, kind, dice.randrange(256), dice.randrange(256))) + payload
+    return cobs.encode(body + crc16(body).to_bytes(2, "little")) + END
+
+
+def traffic(kind: str, pair: Pair, dice: random.Random, size: int) -> None:
+    """Feed random bytes, damaged frames or any frames, with a period now and then."""
+    streams = {
+        "noise": noise(size, dice),
+        "damaged": damaged(size, frames_of(FROM_HOST), dice),
+        "any": (any_frame(dice) for _ in range(size)),
+    }
+    pair.python.homed = pair.c.homed = dice.random() < 0.8
+    cart = pole = 0
+    for data in streams[kind]:
+        pair.feed(data)
+        if dice.random() < 1 / FRAMES_PER_PERIOD or len(data) > 64:
+            jump = dice.choice([3, 100, 1000, 10_000])
+            cart += dice.randint(-jump, jump)
+            pole += dice.randint(-jump, jump) if dice.random() < 0.7 else 0
+            if dice.random() < 0.01:
+                cart, pole = (dice.randint(-LARGEST_COUNT, LARGEST_COUNT) for _ in range(2))
+            pair.drive(dice.choice([pair.python.period_us, dice.randint(1, 200_000)]), 0)
+            pair.tick(cart, pole)
+
+
+def rough_drive(pair: Pair, dice: random.Random, leader: int) -> None:
+    """Home a rough cart and drive it with random motor values, pauses and failures."""
+    toy, jitter = ToyCart(dice), dice.choice([0, 0, 300])
+    pair.send(SetPeriod(dice.choice([20_000, 20_000, 10_000, 5_000, 33_333, 100_000])))
+    failing, strange = dice.choice([0.0, 0.0005, 0.01]), dice.choice([0.0, 0.0, 0.0003, 0.05])
+
+    def period() -> None:
+        length_us = max(1, pair.python.period_us + dice.randint(-jitter, jitter))
+        rest_us = dice.randint(0, length_us)
+        for us in (length_us - rest_us, rest_us):
+            start_us = pair.now_us
+            values = pair.drive(us, leader)
+            ends = [since for since, _ in values[1:]] + [start_us + us]
+            for (since, motor), end in zip(values, ends, strict=True):
+                toy.advance(motor, end - since)
+            if dice.random() < strange:
+                pair.feed(any_frame(dice))
+        toy.maybe_fail(failing)
+        pair.tick(*toy.counts())
+
+    motor, lasts = 0, 0
+    for _ in range(PERIODS_PER_DRIVE):
+        firmware = pair.python
+        if firmware.fault and dice.random() < 0.1:
+            toy.repair()
+            pair.send(ClearFault())
+        if not firmware.homed and not firmware.homing and dice.random() < 0.3:
+            pair.send(Home())
+        elif firmware.homed and not firmware.armed and dice.random() < 0.3:
+            pair.send(Start())
+        elif firmware.armed:
+            if lasts == 0:
+                lasts, motor = dice.randint(1, 40), dice.choice([dice.randint(-255, 255), 200, -200, 255, 0])
+            lasts -= 1
+            for _ in range(dice.choice([0, 1, 1, 1, 1, 2])):
+                pair.send(SetMotor(motor))
+        homed, fault = firmware.homed, firmware.fault
+        period()
+        pair.counts["homings"] += firmware.homed and not homed
+        for new in firmware.fault & ~fault:
+            pair.counts[str(new.name)] += 1
+
+
+def run(total_bytes: int, total_frames: int, seed: int) -> Counter[str]:
+    """Compare the two until so many random bytes and so many frames have arrived. Raises DifferenceError."""
+    counts: Counter[str] = Counter()
+    session = random_bytes = 0
+    while random_bytes < total_bytes or counts["frames"] < total_frames:
+        kind = KINDS[session % len(KINDS)]
+        if kind == "noise" and random_bytes >= total_bytes:
+            kind = "drive"
+        dice = random.Random(f"{session} {seed}")
+        pair = Pair(dice.randrange(2**31), dice.choice([0, 3_000, 60_000]), counts)
+        if kind == "drive":
+            rough_drive(pair, dice, leader=session // len(KINDS) % 2)
+        else:
+            size = min(total_bytes, 200_000) if kind == "noise" else min(2_000, 1 + total_frames // 10)
+            random_bytes += size if kind == "noise" else 0
+            traffic(kind, pair, dice, size)
+        counts[f"sessions of {kind}"] += 1
+        session += 1
+    counts["random bytes"] = random_bytes
+    return counts
+
+
+def restart_with_sanitizers() -> int:
+    """Run this script again with the address sanitizer loaded before Python; return its exit status."""
+    compiler = c_library.find_compiler()
+    found = subprocess.run([compiler, "-print-file-name=libasan.so"], capture_output=True, text=True)
+    if not Path(found.stdout.strip()).is_absolute():
+        sys.exit(f"{compiler} has no libasan.so, which the address sanitizer needs; add --plain")
+    environment = {
+        **os.environ,
+        "LD_PRELOAD": found.stdout.strip(),
+        "ASAN_OPTIONS": "detect_leaks=0",
+        "PYTHONMALLOC": "malloc",
+    }
+    return subprocess.run([sys.executable, *sys.argv], env=environment).returncode
+
+
+def main() -> int:
+    """Compare the two firmwares; return the exit status."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--bytes", type=int, default=10_000_000, help="random bytes (10^7)")
+    parser.add_argument("--frames", type=int, default=1_000_000, help="runs of bytes that end in 0x00 (10^6)")
+    parser.add_argument("--seed", type=int, default=0, help="of all input (0)")
+    parser.add_argument("--plain", action="store_true", help="compile without sanitizers")
+    options = parser.parse_args()
+    if not options.plain:
+        if "libasan" not in os.environ.get("LD_PRELOAD", ""):
+            return restart_with_sanitizers()
+        c_library.FLAGS = (*c_library.FLAGS, *SANITIZERS)
+    started = time.perf_counter()
+    try:
+        counts = run(options.bytes, options.frames, options.seed)
+    except DifferenceError as difference:
+        print(difference)
+        return 1
+    print(", ".join(f"{count} {name}" for name, count in counts.items()))
+    print(f"no difference; {time.perf_counter() - started:.0f} s")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,62 @@
+"""The firmware compiles without a warning for the processors of boards, to a small program."""
+
+import importlib.util
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from cartpole_rl.emulator.c_library import firmware_folder
+
+STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Wpedantic", "-Werror")
+ARM = "arm-none-eabi-gcc"
+LARGEST = {"text": 32_768, "bss": 4_096}  # bytes: a board of 32 kB RAM has plenty left for a policy
+
+needs_arm = pytest.mark.skipif(
+    not (shutil.which(ARM) and shutil.which("make")), reason=f"needs {ARM} and make: apt-get install"
+)
+needs_zig = pytest.mark.skipif(
+    importlib.util.find_spec("ziglang") is None,
+    reason="needs a C compiler for other processors: pip install ziglang",
+)
+
+
+@needs_arm
+@pytest.mark.parametrize("board", ["nucleo_f401re", "qemu_an386"])
+def test_a_board_of_cortex_m_compiles_and_is_small(board: str, tmp_path: Path) -> None:
+    make = ["make", "-C", str(firmware_folder()), f"BUILD={tmp_path}", board]
+    done = subprocess.run(make, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+    sizes = re.search(r"text\s+data\s+bss.*\n\s*(?P<text>\d+)\s+\d+\s+(?P<bss>\d+)", done.stdout)
+    assert sizes is not None
+    assert {name: int(sizes[name]) <= limit for name, limit in LARGEST.items()} == {"text": True, "bss": True}
+
+
+@needs_zig
+@pytest.mark.parametrize(
+    "target",
+    [
+        ("thumb-linux-musleabihf", "-mcpu=cortex_m4"),
+        ("thumb-linux-musleabi", "-mcpu=cortex_m0plus"),
+        ("riscv32-linux-musl", "-mcpu=generic_rv32+m+c"),
+    ],
+    ids=["Cortex-M4", "Cortex-M0+", "RISC-V 32 (ESP32-C3)"],
+)
+def test_the_core_compiles_for_a_processor(target: tuple[str, str], tmp_path: Path) -> None:
+    """Files are compiled, not linked; musl only provides string.h and math.h."""
+    folder = firmware_folder()
+    for file in sorted(folder.glob("src/*.c")):
+        command = [sys.executable, "-m", "ziglang", "cc", "-target", *target, *STRICT, "-Os", "-c", str(file)]
+        done = subprocess.run([*command, "-o", str(tmp_path / "object.o")], capture_output=True, text=True)
+        assert (done.returncode, done.stderr) == (0, ""), file.name
+
+
+@pytest.mark.parametrize(
+    "file", sorted(firmware_folder().glob("boards/*/*.[ci]*")), ids=lambda file: file.parent.name
+)
+def test_the_first_line_says_what_was_compiled_and_run(file: Path) -> None:
+    first = file.read_text(encoding="utf-8").splitlines()[0]
+    assert re.match(r"/\* (Compiled|Not compiled) with .* (never run on a board|run in QEMU)", first)

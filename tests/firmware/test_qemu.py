@@ -1,0 +1,57 @@
+"""The C firmware on a Cortex-M4 in QEMU, driven over its UART, with physics at its pins."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+
+import pytest
+import qemu_cart
+
+pytest.importorskip("mujoco", reason='pip install "cartpole_rl[emulator]"')
+pytestmark = pytest.mark.skipif(
+    bool(qemu_cart.missing_programs()),
+    reason=f"needs {', '.join(qemu_cart.PROGRAMS)}: apt-get install",
+)
+
+from cartpole_rl.plants.serial.cart import SerialCart  # noqa: E402
+from cartpole_rl.plants.serial.settings import SerialSettings  # noqa: E402
+from cartpole_rl.wire import Fault, Flags  # noqa: E402
+
+PUSH, FAR = 110, 400  # motor value, and counts from the middle: 9 mm
+SETTINGS = SerialSettings(port="later", timeout=20, answer_timeout=2, connect_timeout=20, home_timeout=200)
+
+
+@pytest.fixture(scope="module")
+def port() -> Iterator[str]:
+    """The port of a board that has just booted."""
+    command = [sys.executable, str(qemu_cart.__file__), json.dumps({"physics_step": 1e-3})]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    try:
+        yield json.loads(process.stdout.readline())["port"]
+    finally:
+        process.terminate()
+        process.wait()
+        process.stdout.close()
+    assert process.returncode == 0
+
+
+def test_it_homes_drives_and_stops_like_any_cart(port: str) -> None:
+    with SerialCart(SETTINGS.model_copy(update={"port": port})) as cart:
+        cart.home()
+        assert cart.flags & Flags.HOMED
+        before = cart.poll_state()
+        assert abs(before.cart_counts) < 100
+        assert abs(before.pole_counts - 2048) <= 8
+        cart.start()
+        pushed = []
+        while not pushed or pushed[-1].cart_counts < FAR:  # a busy computer may miss a period
+            cart.set_motor(PUSH)
+            pushed.append(cart.get_state())
+        assert PUSH in [state.motor_applied for state in pushed]
+        assert max(state.pole_counts for state in pushed) > before.pole_counts + 3
+        silent = [cart.poll_state() for _ in range(4)]
+        assert silent[-1].motor_applied == 0
+        assert cart.flags & Flags.WATCHDOG
+        assert silent[-1].fault == Fault.NONE
