@@ -210,6 +210,14 @@ class ModelConfig(RunSettings, CartSettings):
         return [source] if isinstance(source, str) else source
 
 
+class ExportConfig(Settings):
+    """cartpole-export."""
+
+    run: Path
+    format: Literal["weights", "onnx", "c", "web"]
+    label: str
+
+
 class PreflightConfig(OnCart):
     """cartpole-preflight."""
 

@@ -9,6 +9,7 @@ from cartpole_rl.errors import CheckpointError, ConfigError
 from cartpole_rl.settings import Settings
 from cartpole_rl.workflows.config import (
     EvaluateConfig,
+    ExportConfig,
     FinetuneConfig,
     IdentifyConfig,
     ModelConfig,
@@ -27,6 +28,7 @@ COMMANDS: dict[type[Settings], str] = {
     ModelConfig: "model",
     FinetuneConfig: "finetune",
     PreflightConfig: "preflight",
+    ExportConfig: "export",
 }
 
 Config = TypeVar("Config", bound=Settings)

@@ -40,6 +40,7 @@ USES = {  # command: how its runs can be used
     "identify": f"cartpole-train takes its files: cart={{0}}/{CART} pole={{0}}/{POLE} "
     f"randomization={{0}}/{RANDOMIZATION}",
     "model": "cartpole-train, cartpole-evaluate and cartpole-record take it as plant=learned plant.model={0}",
+    "export": "its files are for other programs; cartpole-export run=... makes new ones",
 }
 PACKAGES = ("cartpole_rl", "torch", "torchrl", "tensordict", "numpy", "hydra-core", "mujoco", "pyserial")
 
