@@ -1,17 +1,19 @@
 """Write a trained agent for other programs."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from cartpole_rl.agents.network import MirrorQNetwork, QNetwork
 from cartpole_rl.envs.build import with_fitted_guard
 from cartpole_rl.exporting.agent import ExportedAgent
+from cartpole_rl.exporting.c_code import c_files
 from cartpole_rl.exporting.description import Description, observed_numbers
 from cartpole_rl.exporting.layers import plain_layers
 from cartpole_rl.exporting.onnx_model import write_onnx
 from cartpole_rl.exporting.weights import write_agent
+from cartpole_rl.files import write_text
 from cartpole_rl.learning.checkpoint_files import find_agent, provenance_file
 from cartpole_rl.learning.checkpoints import load_agent
 from cartpole_rl.randomization.checks import possible_poles
@@ -28,18 +30,16 @@ def export(config: ExportConfig, folder: Path) -> None:
     exported, or for a folder that already holds a run.
     """
     trained = trained_agent(config.run)
-    agent = exported_agent(trained, config.run)
+    agent = exported_agent(trained, provenance(config.run))
     write_config(folder, "export", {**config.model_dump(mode="json"), "seed": None})
     names = WRITERS[config.format](folder, agent, trained)
     files = " and ".join(f"{folder}/{name}" for name in names)
     print(f"{files} {'are' if len(names) > 1 else 'is'} written; SHA-256 of the agent: {agent.checksum}")
 
 
-def exported_agent(trained: TrainedAgent, run: Path) -> ExportedAgent:
-    """Return the agent of `run` as plain numbers. Raises ConfigError."""
-    agent = ExportedAgent(description(trained.training, run), plain_layers(network_of(trained)))
-    agent.check(f"run={run}")
-    return agent
+def exported_agent(trained: TrainedAgent, origin: Mapping[str, Any]) -> ExportedAgent:
+    """Return an agent as plain numbers; `origin` is its `provenance`. Raises ConfigError."""
+    return ExportedAgent(description(trained.training, origin), plain_layers(network_of(trained)))
 
 
 def network_of(trained: TrainedAgent) -> QNetwork | MirrorQNetwork:
@@ -49,8 +49,8 @@ def network_of(trained: TrainedAgent) -> QNetwork | MirrorQNetwork:
     return network
 
 
-def description(training: TrainConfig, run: Path) -> Description:
-    """Return the description of the agent of `run`, which was trained with these settings."""
+def description(training: TrainConfig, origin: Mapping[str, Any]) -> Description:
+    """Return the description of an agent that was trained with these settings."""
     lengths = training.pole.lengths or [pole.length for pole in possible_poles(training.pole)]
     observation, motors, agent = training.observation, training.actions.motors, training.agent
     return Description(
@@ -66,7 +66,7 @@ def description(training: TrainConfig, run: Path) -> Description:
         track_half_length=training.nominal_cart["track_half_length"],
         control_period=training.control_period,
         pole_lengths=(min(lengths), max(lengths)),
-        provenance=provenance(run),
+        provenance=dict(origin),
     )
 
 
@@ -95,8 +95,17 @@ def write_model(folder: Path, agent: ExportedAgent, trained: TrainedAgent) -> tu
     return (ONNX,)
 
 
+def write_c(folder: Path, agent: ExportedAgent, trained: TrainedAgent) -> tuple[str, ...]:
+    """Write policy.h and policy.c."""
+    files = c_files(agent, trained.training)
+    for name, text in files.items():
+        write_text(folder / name, text)
+    return tuple(files)
+
+
 WEIGHTS, ONNX = "agent.npz", "agent.onnx"
 WRITERS: dict[str, Callable[[Path, ExportedAgent, TrainedAgent], tuple[str, ...]]] = {
     "weights": write_weights,
     "onnx": write_model,
+    "c": write_c,
 }

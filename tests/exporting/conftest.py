@@ -9,7 +9,7 @@ import torch
 from cartpole_rl.envs.build import simulated_env
 from cartpole_rl.exporting.agent import ExportedAgent, Floats
 from cartpole_rl.workflows.agents import TrainedAgent, trained_agent
-from cartpole_rl.workflows.export import exported_agent
+from cartpole_rl.workflows.export import exported_agent, provenance
 
 MEDIUM = Path("pretrained/medium")
 
@@ -21,7 +21,7 @@ def medium_agent() -> TrainedAgent:
 
 @pytest.fixture(scope="session")
 def exported(medium_agent: TrainedAgent) -> ExportedAgent:
-    return exported_agent(medium_agent, MEDIUM)
+    return exported_agent(medium_agent, provenance(MEDIUM))
 
 
 @pytest.fixture(scope="session")
@@ -36,4 +36,4 @@ def observed(medium_agent: TrainedAgent) -> tuple[Floats, Floats]:
             observations.append(current["observation"].numpy())
             values.append(chosen["action_value"].numpy())
             current = env.step(current.set("action", chosen["action"]))["next"].exclude("reward")
-    return np.concatenate(observations), np.concatenate(values)
+    return np.ascontiguousarray(np.concatenate(observations)), np.concatenate(values)
