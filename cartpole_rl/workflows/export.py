@@ -7,15 +7,18 @@ from typing import Any
 
 from cartpole_rl.agents.network import MirrorQNetwork, QNetwork
 from cartpole_rl.envs.build import with_fitted_guard
+from cartpole_rl.errors import ConfigError
 from cartpole_rl.exporting.agent import ExportedAgent
 from cartpole_rl.exporting.c_code import c_files
 from cartpole_rl.exporting.description import Description, observed_numbers
 from cartpole_rl.exporting.layers import plain_layers
 from cartpole_rl.exporting.onnx_model import write_onnx
+from cartpole_rl.exporting.web_page import web_page
 from cartpole_rl.exporting.weights import write_agent
 from cartpole_rl.files import write_text
 from cartpole_rl.learning.checkpoint_files import find_agent, provenance_file
 from cartpole_rl.learning.checkpoints import load_agent
+from cartpole_rl.plants.settings import SimulatedSettings
 from cartpole_rl.randomization.checks import possible_poles
 from cartpole_rl.workflows.agents import TrainedAgent, trained_agent
 from cartpole_rl.workflows.config import ExportConfig, TrainConfig
@@ -103,9 +106,19 @@ def write_c(folder: Path, agent: ExportedAgent, trained: TrainedAgent) -> tuple[
     return tuple(files)
 
 
-WEIGHTS, ONNX = "agent.npz", "agent.onnx"
+def write_page(folder: Path, agent: ExportedAgent, trained: TrainedAgent) -> tuple[str, ...]:
+    """Write cart.html. Raises ConfigError for an agent that was not trained in simulation."""
+    plant = trained.training.plant
+    if not isinstance(plant, SimulatedSettings):
+        raise ConfigError(f"format=web: the agent was trained with plant={plant.kind}, not plant=simulated")
+    write_text(folder / PAGE, web_page(agent, trained.training, plant))
+    return (PAGE,)
+
+
+WEIGHTS, PAGE, ONNX = "agent.npz", "cart.html", "agent.onnx"
 WRITERS: dict[str, Callable[[Path, ExportedAgent, TrainedAgent], tuple[str, ...]]] = {
     "weights": write_weights,
     "onnx": write_model,
     "c": write_c,
+    "web": write_page,
 }
