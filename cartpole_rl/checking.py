@@ -18,6 +18,7 @@ NEAR = 0.8  # similarity of two names, 0 to 1, from which one is suggested for t
 SAME_GROUP = 0.15  # added to the similarity within one group
 EXAMPLES = {  # of required settings
     "run": "run=runs/train/<run>",
+    "format": "format=weights, onnx, c or web",
     "from": "from=runs/record/<run>",
     "plant.port": "plant.port=/dev/ttyUSB0 (cartpole-find-port lists the ports) or plant.port=auto",
     "plant.model": "plant.model=runs/model/<run>",

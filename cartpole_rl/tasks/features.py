@@ -62,18 +62,23 @@ class Quantity(NamedTuple):
 
     formula: Callable[[Measured], "Tensor"]
     mirror_sign: int  # its factor when left and right are swapped
+    name: str = ""  # in an exported agent
+    unit: str = ""  # of formula * scale
+    scale: float = 1.0  # by which the formula divides
 
 
-X = Quantity(lambda state: state.x / POSITION_SCALE, -1)
-X_DOT = Quantity(lambda state: state.x_dot / SPEED_SCALE, -1)
-COSINE = Quantity(lambda state: state.theta.cos(), 1)
-SINE = Quantity(lambda state: state.theta.sin(), -1)
-THETA_DOT = Quantity(lambda state: state.theta_dot / ANGULAR_SPEED_SCALE, -1)
+X = Quantity(lambda state: state.x / POSITION_SCALE, -1, "x", "m", POSITION_SCALE)
+X_DOT = Quantity(lambda state: state.x_dot / SPEED_SCALE, -1, "x_dot", "m/s", SPEED_SCALE)
+COSINE = Quantity(lambda state: state.theta.cos(), 1, "cos_theta")
+SINE = Quantity(lambda state: state.theta.sin(), -1, "sin_theta")
+THETA_DOT = Quantity(
+    lambda state: state.theta_dot / ANGULAR_SPEED_SCALE, -1, "theta_dot", "rad/s", ANGULAR_SPEED_SCALE
+)
 UNSCALED = (
-    Quantity(lambda state: state.x, -1),
-    Quantity(lambda state: state.x_dot, -1),
-    Quantity(lambda state: state.theta, -1),
-    Quantity(lambda state: state.theta_dot, -1),
+    Quantity(lambda state: state.x, -1, "x", "m"),
+    Quantity(lambda state: state.x_dot, -1, "x_dot", "m/s"),
+    Quantity(lambda state: state.theta, -1, "theta", "rad"),
+    Quantity(lambda state: state.theta_dot, -1, "theta_dot", "rad/s"),
 )
 
 

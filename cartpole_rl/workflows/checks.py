@@ -21,6 +21,7 @@ from cartpole_rl.randomization.checks import check_carts, check_one_pole
 from cartpole_rl.run_files import CHECKPOINTS, LAST
 from cartpole_rl.workflows.config import (
     EvaluateConfig,
+    ExportConfig,
     FinetuneConfig,
     IdentifyConfig,
     ModelConfig,
@@ -65,6 +66,13 @@ def check_finetuning(config: FinetuneConfig) -> Path:
         check_compiler()
     check_agent(config.run)
     return config.run
+
+
+def check_export(config: ExportConfig) -> None:
+    """Raise CartPoleError if there is no agent, or what writes the format is not installed."""
+    check_agent(config.run)
+    if config.format == "onnx" and (find_spec("onnx") is None or find_spec("onnxscript") is None):
+        raise ConfigError('format=onnx needs onnx and onnxscript: pip install "cartpole_rl[export]"')
 
 
 def check_replay(config: ReplayConfig) -> None:

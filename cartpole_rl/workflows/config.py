@@ -210,6 +210,7 @@ class ModelConfig(RunSettings, CartSettings):
         return [source] if isinstance(source, str) else source
 
 
+<<<<<<< HEAD
 class ReportConfig(Settings):
     """cartpole-report."""
 
@@ -237,6 +238,15 @@ class ReportConfig(Settings):
             raise ValueError("compare and measure belong to runs=...; each study names its own measure")
         return self
 
+=======
+class ExportConfig(Settings):
+    """cartpole-export."""
+
+    run: Path
+    format: Literal["weights", "onnx", "c", "web"]
+    label: str
+
+>>>>>>> export
 
 class PreflightConfig(OnCart):
     """cartpole-preflight."""

@@ -9,6 +9,7 @@ from cartpole_rl.errors import CheckpointError, ConfigError
 from cartpole_rl.settings import Settings
 from cartpole_rl.workflows.config import (
     EvaluateConfig,
+    ExportConfig,
     FinetuneConfig,
     IdentifyConfig,
     ModelConfig,
@@ -29,6 +30,7 @@ COMMANDS: dict[type[Settings], str] = {
     FinetuneConfig: "finetune",
     PreflightConfig: "preflight",
     ReportConfig: "report",
+    ExportConfig: "export",
 }
 
 Config = TypeVar("Config", bound=Settings)

@@ -42,6 +42,7 @@ USES = {  # command: how its runs can be used
     f"randomization={{0}}/{RANDOMIZATION}",
     "report": f"it is a page to read: {{0}}/{PAGE}",
     "model": "cartpole-train, cartpole-evaluate and cartpole-record take it as plant=learned plant.model={0}",
+    "export": "its files are for other programs; cartpole-export run=... makes new ones",
 }
 PACKAGES = ("cartpole_rl", "torch", "torchrl", "tensordict", "numpy", "hydra-core", "mujoco", "pyserial")
 

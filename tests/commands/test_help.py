@@ -20,6 +20,7 @@ SHOWN = {
 SCHEMAS: dict[str, type[Settings]] = {
     "emulate": config.EmulateConfig,
     "evaluate": config.EvaluateConfig,
+    "export": config.ExportConfig,
     "find_port": FindPortConfig,
     "finetune": config.FinetuneConfig,
     "identify": config.IdentifyConfig,

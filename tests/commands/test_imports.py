@@ -25,6 +25,12 @@ COMPLAINS = {  # command: words, exit code, part of the line on stderr
         ("run=lqr parameters={latencyy:1}", 2, "did you mean 'latency'?"),
         ("run=lqr plant=learned plant.model=nowhere", 1, "plant.model=nowhere: there is no such file"),
     ],
+    "export": [
+        ("run=nowhere format=c", 1, "run=nowhere: there is no such file or folder"),
+        ("run=pretrained/small format=c", 1, "there are pretrained/"),
+        ("run=pretrained/medium", 2, "format is missing; give format=weights, onnx, c or web"),
+        ("run=pretrained/medium format=java", 2, "'weights', 'onnx', 'c' or 'web'"),
+    ],
     "find_port": [("timeout=0", 2, "give more than 0")],
     "finetune": [
         ("run=nowhere", 1, "run=nowhere: there is no such file or folder"),

@@ -18,6 +18,7 @@ WHAT_TO_DO = {  # with a folder, by what made it
     "replay": "cartpole-replay from=... makes new ones",
     "identify": "cartpole-train takes its files: cart={0}/cart.yaml",
     "model": "plant=learned plant.model={0}",
+    "export": "its files are for other programs",
     "unfinished": "cartpole-train resume={0} continues it",
     "multirun": "give that of one of its jobs",
 }
@@ -29,6 +30,7 @@ SETTINGS = {  # words, with the folder at {0} and an agent at {1}: what is taken
     "finetune resume={0}": (set(), {"finetune": ENDED}),
     "evaluate run={0}": (AGENTS, {}),
     "record run={0}": (AGENTS, {}),
+    "export format=weights run={0}": (AGENTS, {}),
     "replay from={0}": (RECORDINGS, {}),
     "model from={0}": (RECORDINGS, {}),
     "identify from={0}": (RECORDINGS, {}),
@@ -62,6 +64,7 @@ def runs(
         ("record", "-m", "run=train", "episodes=1", "seed=0,1", "hydra.sweep.dir=multirun"),
         ("replay", "from=record", "hydra.run.dir=replay"),
         ("model", "from=record", *model, "hydra.run.dir=model"),
+        ("export", "run=train", "format=weights", "hydra.run.dir=export"),
     )
     for command, *words in made:
         done = in_process(command, *words, folder=folder)

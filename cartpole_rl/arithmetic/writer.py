@@ -1,0 +1,196 @@
+"""Writes the graph of a pure function of tensors as lines of plain arithmetic, in any language.
+
+The graph is evaluated once on arrays of expressions instead of numbers: operations on shapes move expressions
+about, and each arithmetic operation on each number writes a line. NaN, infinities, division by zero and
+conversions behave as in PyTorch.
+
+To support another operation of PyTorch, add it to `SHAPES` or `FILLED` by its name in ATen, or to the
+expressions of each language (`python.py`, `javascript.py`, `c.py`).
+"""
+
+import math
+import operator
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch._ops import OpOverload
+from torch.fx import GraphModule, Node
+
+from cartpole_rl.arithmetic import python
+
+Expressions = NDArray[np.object_]  # numbers, and names of variables
+LARGEST_FLOAT = torch.finfo(torch.float32).max
+CONVERSIONS = {bool: "to_bool", float: "to_float", int: "to_int"}
+FILLED = {"new_ones": 1, "new_zeros": 0, "ones_like": 1, "zeros_like": 0}
+MOST_OPERANDS = {"clamp": 3, "nan_to_num": 4, "where": 3}
+VARIABLE = re.compile(r"\bv\d+\b")
+
+
+class Operand(NamedTuple):
+    """An operand of an expression: a number, or the name of a variable, of Python's type `kind`."""
+
+    value: Any
+    kind: type
+
+
+class Line(NamedTuple):
+    """A variable and the expression that it holds."""
+
+    name: str
+    kind: type  # bool, int or float
+    expression: str
+
+
+# the expression of an operation, in a language: its name, its operands, and the type of the result;
+# KeyError for an operation that the language does not have
+Language = Callable[[str, Sequence[Operand], type], str]
+
+
+class Writer:
+    """The lines of a function that is being written in `language`."""
+
+    def __init__(self, language: Language) -> None:
+        self._language = language
+        self._lines: dict[str, Line] = {}  # by expression
+        self._kinds: dict[str, type] = {}  # of variables
+
+    def variables(self, names: Iterable[str], example: torch.Tensor) -> Expressions:
+        """Return an input of the shape and type of `example`: variables with these names."""
+        array = np.array([*names], dtype=object).reshape(tuple(example.shape))
+        self._kinds |= dict.fromkeys(array.reshape(-1), kind_of(example.dtype))
+        return array
+
+    def write(self, graph: GraphModule, inputs: Sequence[Expressions]) -> list[Expressions]:
+        """Return the outputs of `graph`, after writing the lines that compute them."""
+        values: dict[Node, Any] = {}
+        unread = iter(inputs)
+        for node in graph.graph.nodes:
+            if node.op == "placeholder":
+                values[node] = next(unread)
+            elif node.op == "get_attr":
+                values[node] = np.asarray(getattr(graph, node.target).numpy(), dtype=object)
+            elif node.op == "output":
+                return [values[each] for each in node.args[0]]
+            else:
+                values[node] = self._evaluate(node, values)
+        raise AssertionError("a graph has an output")
+
+    def lines(self, outputs: Iterable[Expressions]) -> list[Line]:
+        """Return the lines that `outputs` need, in order."""
+        needed = {each for output in outputs for each in output.reshape(-1) if isinstance(each, str)}
+        kept = []
+        for line in reversed(self._lines.values()):
+            if line.name in needed:
+                needed.update(VARIABLE.findall(line.expression))
+                kept.append(line)
+        return kept[::-1]
+
+    def kind(self, value: Any) -> type:
+        """Return the type of a number, or of the variable of this name."""
+        return self._kinds[value] if isinstance(value, str) else type(value)
+
+    def _evaluate(self, node: Node, values: dict[Node, Any]) -> Any:
+        """Return the result of a node, after writing the lines that compute it."""
+        arguments: Any = torch.fx.map_arg(node.args, values.__getitem__)
+        named: Any = torch.fx.map_arg(node.kwargs, values.__getitem__)
+        if node.target is operator.getitem:
+            return arguments[0][arguments[1]]
+        assert isinstance(node.target, OpOverload)
+        name = node.target._schema.name.removeprefix("aten::")
+        if name in SHAPES:
+            return SHAPES[name](*arguments, **named)
+        example = node.meta["val"]
+        kind = kind_of(example.dtype)
+        if name in FILLED:
+            return np.full(tuple(example.shape), kind(FILLED[name]), dtype=object)
+        try:
+            return self._each(*operation_of(name, arguments, named, kind), kind)
+        except KeyError:
+            raise NotImplementedError(
+                f"{node.target} cannot be written as plain arithmetic; add it to cartpole_rl/arithmetic/"
+            ) from None
+
+    def _each(self, operation: str, operands: Sequence[Any], kind: type) -> Expressions:
+        """Write an operation on each of the broadcast `operands`; return what holds the results."""
+        operands = [np.asarray(each, dtype=object) for each in operands]
+        results = np.empty(np.broadcast_shapes(*(each.shape for each in operands)), dtype=object)
+        for place, parts in zip(np.ndindex(results.shape), np.broadcast(*operands), strict=True):
+            results[place] = self._write(operation, parts, kind)
+        return results
+
+    def _write(self, operation: str, parts: Sequence[Any], kind: type) -> Any:
+        """Write a line unless it is known; return its variable, or the number if all `parts` are numbers."""
+        operands = [Operand(part, self.kind(part)) for part in parts]
+        if not any(isinstance(part, str) for part in parts):
+            return python.evaluate(operation, operands, kind)
+        expression = self._language(operation, operands, kind)
+        if expression not in self._lines:
+            name = f"v{len(self._lines) + 1}"
+            self._lines[expression] = Line(name, kind, expression)
+            self._kinds[name] = kind
+        return self._lines[expression].name
+
+
+def operation_of(
+    name: str, arguments: Sequence[Any], named: Mapping[str, Any], kind: type
+) -> tuple[str, Sequence[Any]]:
+    """Return the name of an arithmetic operation and its operands, for a result of type `kind`.
+
+    Raises KeyError if it has an option that is not known here, such as alpha.
+    """
+    if name == "_to_copy":
+        return CONVERSIONS[kind], arguments
+    if named or (name == "pow" and not is_two(arguments[1])):
+        raise KeyError(name)
+    if name == "clamp":
+        value, low, high = (*arguments, None, None)[:3]
+        arguments = value, -math.inf if low is None else low, math.inf if high is None else high
+    elif name == "nan_to_num":
+        value, of_nan, of_inf, of_minus_inf = (*arguments, None, None, None)[:4]
+        defaults = (0.0, LARGEST_FLOAT, -LARGEST_FLOAT)
+        given = (of_nan, of_inf, of_minus_inf)
+        arguments = value, *(b if a is None else a for a, b in zip(given, defaults, strict=True))
+    elif name == "bitwise_not" and kind is bool:
+        return "logical_not", arguments
+    elif name == "div" and isinstance(arguments[1], int | float) and arguments[1]:
+        return "div_by_number", arguments
+    elif name == "pow":
+        return "square", arguments[:1]
+    if len(arguments) > MOST_OPERANDS.get(name, 2):
+        raise KeyError(name)
+    return name, arguments
+
+
+def is_two(exponent: Any) -> bool:
+    """Return True for the number 2; an array of expressions is no number."""
+    return isinstance(exponent, int | float) and exponent == 2
+
+
+def kind_of(dtype: torch.dtype) -> type:
+    """Return Python's type of the numbers of a tensor."""
+    if dtype.is_floating_point:
+        return float
+    return bool if dtype is torch.bool else int
+
+
+def placed(values: Any) -> Expressions:
+    """Return an array of expressions; NumPy returns a single one without an array."""
+    return np.asarray(values, dtype=object)
+
+
+SHAPES: dict[str, Callable[..., Any]] = {
+    "cat": lambda parts, dim=0: np.concatenate(parts, dim),
+    "clone": placed,
+    "select": lambda values, dim, place: placed(np.take(values, place, dim)),
+    "slice": lambda values, dim=0, start=None, end=None: np.take(
+        values, range(*slice(start, end).indices(values.shape[dim])), dim
+    ),
+    "split_with_sizes": lambda values, sizes, dim=0: np.split(values, np.cumsum(sizes)[:-1], dim),
+    "stack": lambda parts, dim=0: np.stack(parts, dim),
+    "unbind": lambda values, dim=0: [placed(np.take(values, each, dim)) for each in range(values.shape[dim])],
+    "unsqueeze": np.expand_dims,
+}

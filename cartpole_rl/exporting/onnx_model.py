@@ -1,0 +1,48 @@
+"""An agent as an ONNX model.
+
+Input: `observation` [N, K] float32. Outputs: `action_value` [N, A] float32 and `action` [N] int64, the index
+of a motor value. The entry `cartpole_rl` in metadata_props is agent.json of the weights file.
+"""
+
+import logging
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from cartpole_rl.exporting.agent import ExportedAgent
+from cartpole_rl.files import replacing
+
+METADATA = "cartpole_rl"
+
+
+class GreedyPolicy(nn.Module):
+    """A Q-network and its greedy action."""
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the action values and the greedy actions."""
+        values = self.network(observation)
+        return values, values.argmax(-1)
+
+
+def write_onnx(path: Path, agent: ExportedAgent, network: nn.Module) -> None:
+    """Write `network`, the network of `agent`, as an ONNX model."""
+    example = torch.zeros(2, agent.description.sizes[0])
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it warns that torchvision is not installed
+    program = torch.onnx.export(
+        GreedyPolicy(network).eval(),
+        (example,),
+        input_names=["observation"],
+        output_names=["action_value", "action"],
+        dynamic_shapes=({0: torch.export.Dim("carts")},),
+        dynamo=True,
+        verbose=False,
+    )
+    assert program is not None
+    program.model.metadata_props[METADATA] = agent.json
+    with replacing(path) as beside:
+        program.save(str(beside), external_data=False)

@@ -1,0 +1,232 @@
+const HANGING = { x: 0, x_dot: 0, theta: Math.PI, theta_dot: 0 };
+const UPRIGHT = (5 / 180) * Math.PI; // rad
+const STIFFNESS = 60; // N/m, of the reader's spring on the cart
+const STRONGEST = 12; // N
+const HISTORY = 10; // s
+const PAUSE = 1.6; // s, after a failure
+const element = (id) => document.getElementById(id);
+const cart = new Cart();
+let before = cart.motion; // one period ago: the picture is drawn between the two
+let pull = null; // the reader's: where it acts, "cart" or "pole", and the pointer in m
+let keys = 0; // N, of the arrow keys
+let time = 0, upright = 0, failedAt = null, wasUpright = false;
+let history = [];
+
+function wrapped(angle) {
+  return Math.atan2(Math.sin(angle), Math.cos(angle));
+}
+
+/** The force on the cart, N, and the angular acceleration of the pole, rad/s^2, that the reader exerts. */
+function pushed() {
+  let force = keys, turn = 0;
+  if (pull) {
+    const [x, , theta] = cart.motion;
+    if (pull.on === "cart") force += STIFFNESS * (pull.x - x);
+    else turn = 40 * Math.sin(Math.atan2(pull.x - x, pull.y) - theta);
+  }
+  return [Math.max(-STRONGEST, Math.min(STRONGEST, force)), turn];
+}
+
+function period() {
+  if (failedAt !== null) {
+    if (time - failedAt > PAUSE) restart();
+    return;
+  }
+  before = cart.motion;
+  cart.step(agentDrives() ? cart.chosen() : 0, ...pushed());
+  const angle = wrapped(cart.motion[2]);
+  upright = Math.abs(angle) < UPRIGHT ? upright + DATA.period : 0;
+  wasUpright = wasUpright || upright > 1;
+  if (cart.offTrack) failedAt = time;
+  history.push({ time, angle });
+  while (history.length && history[0].time < time - HISTORY) history.shift();
+}
+
+function restart() {
+  cart.reset({ ...HANGING, theta: Math.PI + 0.02 * (Math.random() - 0.5), x: 0.1 * (Math.random() - 0.5) });
+  before = cart.motion;
+  failedAt = null;
+  upright = 0;
+  wasUpright = false;
+  pull = null;
+}
+
+function agentDrives() {
+  return element("agent").getAttribute("aria-pressed") === "true";
+}
+
+function verdict() {
+  if (failedAt !== null) return ["Failed: the cart left its track.", "--bad"];
+  if (!agentDrives()) return ["The motor is off.", "--soft"];
+  if (upright > 0.5) return [`Upright for ${upright.toFixed(1)} s`, "--good"];
+  return wasUpright ? ["Recovering …", "--pole"] : ["Swinging up …", "--soft"];
+}
+
+// pictures
+
+function prepared(canvas) {
+  const ratio = window.devicePixelRatio || 1, { clientWidth: width, clientHeight: height } = canvas;
+  if (canvas.width !== Math.round(width * ratio) || canvas.height !== Math.round(height * ratio)) {
+    canvas.width = Math.round(width * ratio);
+    canvas.height = Math.round(height * ratio);
+  }
+  const context = canvas.getContext("2d");
+  context.setTransform(ratio, 0, 0, ratio, 0, 0);
+  context.clearRect(0, 0, width, height);
+  return { context, width, height };
+}
+
+/** Pixels per metre, and where the middle of the track is. */
+function view(width, height) {
+  const half = cart.parameters.track_half_length + 0.12, length = 2 * cart.parameters.pole_com;
+  const scale = Math.min(width / (2 * half), height / (2 * length + 0.2));
+  return { scale, middle: width / 2, rail: height / 2 };
+}
+
+function colour(name) {
+  return getComputedStyle(document.documentElement).getPropertyValue(name);
+}
+
+function line(context, style, width, ...points) {
+  context.strokeStyle = style;
+  context.lineWidth = width;
+  context.lineCap = "round";
+  context.beginPath();
+  points.forEach(([x, y]) => context.lineTo(x, y));
+  context.stroke();
+}
+
+function drawScene(share) {
+  const { context, width, height } = prepared(element("scene"));
+  const { scale, middle, rail } = view(width, height);
+  const [x, theta] = [0, 2].map((place) => before[place] + share * (cart.motion[place] - before[place]));
+  const end = cart.parameters.track_half_length, length = 2 * cart.parameters.pole_com;
+  const at = (metres) => middle + scale * metres;
+  line(context, colour("--line"), 4, [at(-end - 0.08), rail], [at(end + 0.08), rail]);
+  for (const side of [-1, 1]) {
+    line(context, colour(failedAt === null ? "--soft" : "--bad"), 3, [at(side * end), rail - 9], [at(side * end), rail + 9]);
+  }
+  context.fillStyle = colour("--cart");
+  context.beginPath();
+  context.roundRect(at(x) - 26, rail - 13, 52, 26, 6);
+  context.fill();
+  const tip = [at(x) + scale * length * Math.sin(theta), rail - scale * length * Math.cos(theta)];
+  line(context, colour("--pole"), 7, [at(x), rail], tip);
+  context.fillStyle = colour("--ink");
+  context.beginPath();
+  context.arc(at(x), rail, 3.5, 0, 2 * Math.PI);
+  context.fill();
+  const motor = failedAt === null ? cart.motor : 0;
+  line(context, colour("--cart"), 3, [at(x), rail + 24], [at(x) + motor * 0.25, rail + 24]);
+  if (pull) {
+    const from = pull.on === "cart" ? [at(x), rail] : tip;
+    const to = pull.on === "cart" ? [at(pull.x), rail] : [at(pull.x), rail - scale * pull.y];
+    line(context, colour("--push"), 3, from, to);
+  } else if (keys) {
+    line(context, colour("--push"), 4, [at(x), rail - 24], [at(x) + 8 * keys, rail - 24]);
+  }
+}
+
+function drawTrace() {
+  const { context, width, height } = prepared(element("trace"));
+  const level = (angle) => height / 2 - (angle / Math.PI) * (height / 2 - 8);
+  const place = (point) => width * (1 - (time - point.time) / HISTORY);
+  context.fillStyle = colour("--soft");
+  context.font = "11px system-ui, sans-serif";
+  line(context, colour("--line"), 1, [0, level(0)], [width, level(0)]);
+  context.fillText("upright", 6, level(0) - 5);
+  context.fillText("hanging", 6, height - 6);
+  let points = [];
+  history.forEach((point, number) => {
+    if (number && Math.abs(point.angle - history[number - 1].angle) > Math.PI) {
+      line(context, colour("--pole"), 2, ...points);
+      points = [];
+    }
+    points.push([place(point), level(point.angle)]);
+  });
+  if (points.length) line(context, colour("--pole"), 2, ...points);
+}
+
+function drawStatus() {
+  const [text, tone] = verdict();
+  if (element("verdict").textContent !== text) element("verdict").textContent = text;
+  element("verdict").style.color = `var(${tone})`;
+  element("angle").textContent = `angle ${((wrapped(cart.motion[2]) * 180) / Math.PI).toFixed(0)}°`;
+  element("motor").textContent = `motor value ${cart.motor}`;
+}
+
+let last = null, due = 0;
+function frame(now) {
+  const passed = last === null ? 0 : Math.min(0.1, (now - last) / 1000); // after a pause of the page, go on
+  last = now;
+  due += passed;
+  while (due >= DATA.period) {
+    due -= DATA.period;
+    time += DATA.period;
+    period();
+  }
+  drawScene(due / DATA.period);
+  drawTrace();
+  drawStatus();
+  requestAnimationFrame(frame);
+}
+
+// the reader
+
+function pointer(event) {
+  const canvas = element("scene"), box = canvas.getBoundingClientRect();
+  const { scale, middle, rail } = view(canvas.clientWidth, canvas.clientHeight);
+  return { x: (event.clientX - box.left - middle) / scale, y: (rail - (event.clientY - box.top)) / scale };
+}
+
+element("scene").addEventListener("pointerdown", (event) => {
+  const { x, y } = pointer(event), [cartX, , theta] = cart.motion, length = 2 * cart.parameters.pole_com;
+  const toTip = Math.hypot(x - cartX - length * Math.sin(theta), y - length * Math.cos(theta));
+  pull = { on: toTip < 0.4 * length ? "pole" : "cart", x, y };
+  element("scene").setPointerCapture(event.pointerId);
+});
+element("scene").addEventListener("pointermove", (event) => {
+  if (pull) Object.assign(pull, pointer(event));
+});
+for (const end of ["pointerup", "pointercancel", "lostpointercapture"]) {
+  element("scene").addEventListener(end, () => (pull = null));
+}
+const ARROWS = { ArrowLeft: -8, ArrowRight: 8 };
+window.addEventListener("keydown", (event) => {
+  if (event.key in ARROWS && event.target.type !== "range") {
+    keys = ARROWS[event.key];
+    event.preventDefault();
+  }
+});
+window.addEventListener("keyup", (event) => {
+  if (event.key in ARROWS) keys = 0;
+});
+
+function apply() {
+  const friction = Number(element("friction").value), pole = DATA.poles[element("pole").value];
+  for (const name of ["cart_coulomb", "cart_viscous"]) cart.parameters[name] = friction * DATA.cart[name];
+  cart.parameters.latency = element("latency").value / 1000;
+  Object.assign(cart.parameters, pole);
+  element("friction-value").textContent = `${friction.toFixed(1)} times the nominal`;
+  element("latency-value").textContent = `${element("latency").value} ms`;
+  element("pole-value").textContent = `${(200 * pole.pole_com).toFixed(0)} cm`;
+}
+
+function nominal() {
+  element("friction").value = 1;
+  element("latency").value = 1000 * DATA.cart.latency;
+  element("pole").value = DATA.trained;
+  apply();
+}
+
+element("latency").max = 1000 * DATA.longestLatency;
+element("pole").max = DATA.poles.length - 1;
+for (const id of ["friction", "latency", "pole"]) element(id).addEventListener("input", apply);
+element("nominal").addEventListener("click", nominal);
+element("restart").addEventListener("click", restart);
+element("agent").addEventListener("click", () => {
+  element("agent").setAttribute("aria-pressed", String(!agentDrives()));
+});
+nominal();
+restart();
+requestAnimationFrame(frame);

@@ -1,0 +1,79 @@
+/* See policy.h. */
+#include "policy.h"
+
+#include <math.h>
+
+static const int16_t MOTORS[POLICY_ACTIONS] = {@@motors@@};
+static const int16_t INWARD_FROM_LEFT = @@rightmost@@;
+static const int16_t INWARD_FROM_RIGHT = @@leftmost@@;
+
+@@tables@@
+
+@@helpers@@/* The measured state, the observation and the direction of the track guard, from the first counts of an episode. */
+static int64_t perceive_first(policy_t *policy, const int32_t counts[2], float observation[POLICY_INPUTS])
+{
+@@first@@
+}
+
+/* The same from later counts. */
+static int64_t perceive(policy_t *policy, const int32_t counts[2], float dt, float observation[POLICY_INPUTS])
+{
+@@later@@
+}
+
+static bool all_finite(const float *numbers, int count)
+{
+    for (int i = 0; i < count; i++) {
+        if (!isfinite(numbers[i])) {
+            return false;
+        }
+    }
+    return true;
+}
+
+@@layers@@
+int policy_action(const float observation[POLICY_INPUTS])
+{
+@@network@@
+    if (!all_finite(observation, POLICY_INPUTS) || !all_finite(values, POLICY_ACTIONS)) {
+        return POLICY_NO_ACTION;
+    }
+    int best = 0;
+    for (int action = 1; action < POLICY_ACTIONS; action++) {
+        best = values[action] > values[best] ? action : best;
+    }
+    return best;
+}
+
+void policy_start(policy_t *policy, float track_end, float pole_length)
+{
+    *policy = (policy_t){.track_end = track_end, .pole_length = pole_length, .failed = !(track_end > 0.0f)};
+}
+
+int16_t policy_motor(policy_t *policy, int32_t cart_counts, int32_t pole_counts, float dt)
+{
+    const int32_t counts[2] = {cart_counts, pole_counts};
+    float observation[POLICY_INPUTS];
+    int64_t side = 0;
+    int action = POLICY_NO_ACTION;
+
+    if (!policy->failed && !policy->started) {
+        side = perceive_first(policy, counts, observation);
+        action = policy_action(observation);
+    } else if (!policy->failed && dt > 0.0f) {
+        side = perceive(policy, counts, dt, observation);
+        action = policy_action(observation);
+    }
+    policy->counts[0] = cart_counts;
+    policy->counts[1] = pole_counts;
+    policy->started = true;
+    policy->failed = action == POLICY_NO_ACTION;
+    if (policy->failed) {
+        policy->motor = 0;
+    } else if (side == 0) {
+        policy->motor = MOTORS[action];
+    } else {
+        policy->motor = side > 0 ? INWARD_FROM_LEFT : INWARD_FROM_RIGHT;
+    }
+    return policy->motor;
+}

@@ -1,0 +1,166 @@
+"""An agent as a web page: it drives a simulated cart that the reader pushes.
+
+The page is one file. Its physics, observation and track guard are written from the functions of the
+simulation (`plants/simulation.py`, `envs/perception.py`). It computes in float64.
+"""
+
+import base64
+import json
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from cartpole_rl.arithmetic import javascript
+from cartpole_rl.arithmetic.writer import Writer
+from cartpole_rl.compilation import Trace, trace
+from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
+from cartpole_rl.errors import ConfigError
+from cartpole_rl.exporting.agent import ExportedAgent
+from cartpole_rl.exporting.filling import filled
+from cartpole_rl.exporting.perceiving import NUMBER, perceiving
+from cartpole_rl.physics.dynamics import Addition, Drive, State
+from cartpole_rl.physics.parameters import CartParameters
+from cartpole_rl.plants.settings import SimulatedSettings
+from cartpole_rl.plants.simulation import Carts, Inputs, Period, commands_under_way, encoder_counts, run_carts
+from cartpole_rl.randomization.poles import Pole
+
+LONGEST_LATENCY = 0.04  # s, that the reader can choose
+RODS = [length / 100 for length in range(20, 101, 4)]  # m, poles that the reader can choose
+
+
+class TrueState(NamedTuple):
+    """The inputs of the encoders."""
+
+    table: Tensor  # [P, 1], one row per parameter
+    motion: Tensor  # [4, 1]
+    noise: Tensor  # [3, 1]
+
+
+class Counts(NamedTuple):
+    """The outputs of the encoders."""
+
+    counts: Tensor  # [2, 1] int64
+
+
+class Push(NamedTuple):
+    """What the reader does to the cart in a period."""
+
+    force: Tensor  # [1, 1] N on the cart
+    angular_acceleration: Tensor  # [1, 1] rad/s^2 of the pole
+
+
+def web_page(agent: ExportedAgent, settings: CartPoleSettings, plant: SimulatedSettings) -> str:
+    """Return the page of an agent that was trained with `settings` on `plant`.
+
+    Raises ConfigError for an observation that cannot be written in JavaScript.
+    """
+    about = agent.description
+    graphs = perceiving(settings, about.guard)
+    try:
+        functions = [
+            function("perceiveFirst", graphs.first, graphs.first_inputs._asdict()),
+            function("perceive", graphs.later, graphs.later_inputs._asdict()),
+            encoders(),
+            physics(settings, plant),
+        ]
+    except NotImplementedError as error:
+        raise ConfigError(f"format=web: the agent has an operation that is not known: {error}") from None
+    code = "\n".join((javascript.HELPERS, *functions, filled("cart.js", {"data": data(agent, settings)})))
+    return filled("cart.html", {"code": code, "page": filled("page.js", {}), **words(agent)})
+
+
+@torch.no_grad()
+def encoders() -> str:
+    """Return the function of the encoders."""
+
+    def counted(true: TrueState) -> Counts:
+        cart = CartParameters.from_table(true.table)
+        return Counts(encoder_counts(State(*true.motion.unbind(0)), cart, true.noise))
+
+    true = TrueState(torch.ones(len(CartParameters.names()), 1), torch.zeros(4, 1), torch.zeros(3, 1))
+    return function("encoderCounts", trace(counted, (true,)), true._asdict())
+
+
+@torch.no_grad()
+def physics(settings: CartPoleSettings, plant: SimulatedSettings) -> str:
+    """Return the function of one control period of the simulated cart."""
+    models = settings.models(plant)
+    drive = torch.zeros(1 + commands_under_way(LONGEST_LATENCY, settings.control_period), 1)
+    carts = Carts(torch.ones(len(CartParameters.names()), 1), torch.zeros(4, 1), drive)
+    inputs = Inputs(torch.zeros(1, 1, dtype=torch.int64), torch.zeros(3, 1))
+
+    def run(carts: Carts, inputs: Inputs, push: Push) -> Period:
+        def pushed(state: State, drive: Drive) -> Addition:
+            return Addition(push.force[0], torch.zeros_like, push.angular_acceleration[0])
+
+        return run_carts(
+            carts,
+            inputs,
+            models=models,
+            period=settings.control_period,
+            substeps=plant.substeps,
+            addition=pushed,
+        )
+
+    push = Push(NUMBER, NUMBER)
+    names = {**carts._asdict(), **inputs._asdict(), **push._asdict()}
+    return function("runPeriod", trace(run, (carts, inputs, push)), names)
+
+
+def function(name: str, traced: Trace, inputs: dict[str, Tensor]) -> str:
+    """Return a graph as a function of arrays of numbers, in the order of `inputs`, that returns arrays."""
+    writer = Writer(javascript.expression)
+    variables = [
+        writer.variables((f"{argument}[{place}]" for place in range(example.numel())), example)
+        for argument, example in inputs.items()
+    ]
+    results = writer.write(traced.graph, variables)
+    parts = [
+        f"{key}: [{', '.join(javascript.spelled(each) for each in values.reshape(-1))}]"
+        for key, values in traced.result(results)._asdict().items()
+    ]
+    lines = (*javascript.declared(writer.lines(results)), f"return {{ {', '.join(parts)} }};")
+    body = "\n".join(f"  {line}" for line in lines)
+    return f"function {name}({', '.join(inputs)}) {{\n{body}\n}}\n"
+
+
+def data(agent: ExportedAgent, settings: CartPoleSettings) -> str:
+    """Return the numbers of the agent and of the nominal cart as JSON."""
+    about, pole = agent.description, settings.pole.nominal
+    rods = [Pole.rod(length) for length in RODS if not pole.is_about(length)]
+    poles = sorted([pole, *rods], key=lambda each: each.length)
+    content: dict[str, Any] = {
+        "layers": [
+            {name: None if values is None else encoded(values) for name, values in layer._asdict().items()}
+            for layer in agent.layers
+        ],
+        "groups": about.norm_groups,
+        "epsilon": about.norm_epsilon,
+        "motors": about.motors,
+        "inward": [0, max(0, *about.motors), min(0, *about.motors)],
+        "period": about.control_period,
+        "pastSize": about.observation.past_size,
+        "names": CartParameters.names(),
+        "cart": settings.nominal_with(pole),
+        "poles": [each.model_dump() for each in poles],
+        "trained": poles.index(pole),
+        "commands": commands_under_way(LONGEST_LATENCY, about.control_period),
+        "longestLatency": LONGEST_LATENCY,
+    }
+    return json.dumps(content)
+
+
+def encoded(values: Any) -> str:
+    """Return float32 numbers in base64, little-endian."""
+    return base64.b64encode(np.ascontiguousarray(values, "<f4").tobytes()).decode()
+
+
+def words(agent: ExportedAgent) -> dict[str, str]:
+    """Return the texts of the page."""
+    about = agent.description
+    origin = " ".join(about.provenance.get("command", [])) or "an unknown training"
+    low, high = about.pole_lengths
+    lengths = f"{low:.2f} m" if low == high else f"{low:.2f} to {high:.2f} m"
+    return {"origin": origin, "checksum": agent.checksum, "lengths": lengths}

@@ -1,0 +1,124 @@
+"""Write a trained agent for other programs."""
+
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from cartpole_rl.agents.network import MirrorQNetwork, QNetwork
+from cartpole_rl.envs.build import with_fitted_guard
+from cartpole_rl.errors import ConfigError
+from cartpole_rl.exporting.agent import ExportedAgent
+from cartpole_rl.exporting.c_code import c_files
+from cartpole_rl.exporting.description import Description, observed_numbers
+from cartpole_rl.exporting.layers import plain_layers
+from cartpole_rl.exporting.onnx_model import write_onnx
+from cartpole_rl.exporting.web_page import web_page
+from cartpole_rl.exporting.weights import write_agent
+from cartpole_rl.files import write_text
+from cartpole_rl.learning.checkpoint_files import find_agent, provenance_file
+from cartpole_rl.learning.checkpoints import load_agent
+from cartpole_rl.plants.settings import SimulatedSettings
+from cartpole_rl.randomization.checks import possible_poles
+from cartpole_rl.workflows.agents import TrainedAgent, trained_agent
+from cartpole_rl.workflows.config import ExportConfig, TrainConfig
+from cartpole_rl.workflows.run_folder import write_config
+
+
+def export(config: ExportConfig, folder: Path) -> None:
+    """Write the agent of `config.run` as `config.format`.
+
+    Writes into `folder` config.yaml, provenance.json and agent.npz, agent.onnx, policy.h and policy.c, or
+    cart.html. Raises CheckpointError for a missing or damaged agent, ConfigError for one that cannot be
+    exported, or for a folder that already holds a run.
+    """
+    trained = trained_agent(config.run)
+    agent = exported_agent(trained, provenance(config.run))
+    write_config(folder, "export", {**config.model_dump(mode="json"), "seed": None})
+    names = WRITERS[config.format](folder, agent, trained)
+    files = " and ".join(f"{folder}/{name}" for name in names)
+    print(f"{files} {'are' if len(names) > 1 else 'is'} written; SHA-256 of the agent: {agent.checksum}")
+
+
+def exported_agent(trained: TrainedAgent, origin: Mapping[str, Any]) -> ExportedAgent:
+    """Return an agent as plain numbers; `origin` is its `provenance`. Raises ConfigError."""
+    return ExportedAgent(description(trained.training, origin), plain_layers(network_of(trained)))
+
+
+def network_of(trained: TrainedAgent) -> QNetwork | MirrorQNetwork:
+    """Return the network of the greedy policy, from observations to action values."""
+    network = trained.policy.module[0].module  # type: ignore[attr-defined]
+    assert isinstance(network, QNetwork | MirrorQNetwork)
+    return network
+
+
+def description(training: TrainConfig, origin: Mapping[str, Any]) -> Description:
+    """Return the description of an agent that was trained with these settings."""
+    lengths = training.pole.lengths or [pole.length for pole in possible_poles(training.pole)]
+    observation, motors, agent = training.observation, training.actions.motors, training.agent
+    return Description(
+        task=training.task.name,
+        observation=observation,
+        numbers=observed_numbers(observation),
+        sizes=(observation.size, *agent.hidden, len(motors)),
+        layer_norm=agent.layer_norm,
+        norm_groups=2 if agent.mirrored else 1,
+        mirrored=agent.mirrored,
+        motors=motors,
+        guard=with_fitted_guard(training).guard.active,
+        track_half_length=training.nominal_cart["track_half_length"],
+        control_period=training.control_period,
+        pole_lengths=(min(lengths), max(lengths)),
+        provenance=dict(origin),
+    )
+
+
+def provenance(run: Path) -> dict[str, Any]:
+    """Return the origin of the agent of `run`: its command, versions, commit, transitions and score."""
+    checkpoint, path = load_agent(run), provenance_file(find_agent(run))
+    recorded = {} if path is None else json.loads(path.read_text())
+    command = recorded.get("command", [])
+    return {
+        **recorded,
+        "command": [Path(command[0]).name, *command[1:]] if command else [],
+        "transitions": checkpoint.transitions,
+        "score": checkpoint.score,
+    }
+
+
+def write_weights(folder: Path, agent: ExportedAgent, trained: TrainedAgent) -> tuple[str, ...]:
+    """Write agent.npz."""
+    write_agent(folder / WEIGHTS, agent)
+    return (WEIGHTS,)
+
+
+def write_model(folder: Path, agent: ExportedAgent, trained: TrainedAgent) -> tuple[str, ...]:
+    """Write agent.onnx."""
+    write_onnx(folder / ONNX, agent, network_of(trained))
+    return (ONNX,)
+
+
+def write_c(folder: Path, agent: ExportedAgent, trained: TrainedAgent) -> tuple[str, ...]:
+    """Write policy.h and policy.c."""
+    files = c_files(agent, trained.training)
+    for name, text in files.items():
+        write_text(folder / name, text)
+    return tuple(files)
+
+
+def write_page(folder: Path, agent: ExportedAgent, trained: TrainedAgent) -> tuple[str, ...]:
+    """Write cart.html. Raises ConfigError for an agent that was not trained in simulation."""
+    plant = trained.training.plant
+    if not isinstance(plant, SimulatedSettings):
+        raise ConfigError(f"format=web: the agent was trained with plant={plant.kind}, not plant=simulated")
+    write_text(folder / PAGE, web_page(agent, trained.training, plant))
+    return (PAGE,)
+
+
+WEIGHTS, PAGE, ONNX = "agent.npz", "cart.html", "agent.onnx"
+WRITERS: dict[str, Callable[[Path, ExportedAgent, TrainedAgent], tuple[str, ...]]] = {
+    "weights": write_weights,
+    "onnx": write_model,
+    "c": write_c,
+    "web": write_page,
+}

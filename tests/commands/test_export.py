@@ -1,0 +1,41 @@
+"""cartpole-export writes the files of each format, and says which."""
+
+import json
+from pathlib import Path
+
+import pytest
+from command_line import ONCE, TINY, in_process
+
+from cartpole_rl.exporting.weights import read_agent
+
+FILES = {"weights": {"agent.npz"}}
+
+
+@pytest.mark.parametrize("form", FILES)
+def test_it_writes_the_files_of_the_format(form: str, tmp_path: Path) -> None:
+    words = ("run=pretrained/medium", f"format={form}", "hydra.run.dir=run")
+    done = in_process("export", *words, folder=tmp_path)
+    assert done.code == 0, done.err
+    assert done.err == ""
+    written = {path.name for path in (tmp_path / "run").iterdir()}
+    assert written == FILES[form] | {"config.yaml", "provenance.json"}
+    assert all(f"run/{name}" in done.out for name in FILES[form])
+    assert json.loads((tmp_path / "run/provenance.json").read_text())["program"] == "cartpole-export"
+
+
+def test_an_agent_of_ones_own_is_exported_with_its_provenance(trained: Path, tmp_path: Path) -> None:
+    run = trained / "checkpoints/best.pt"
+    done = in_process("export", f"run={run}", "format=weights", "hydra.run.dir=run", folder=tmp_path)
+    assert done.code == 0, done.err
+    about = read_agent(tmp_path / "run/agent.npz").description
+    assert len(about.motors) == 2
+    assert about.provenance["command"][0] == "cartpole-train"
+
+
+def test_a_recurrent_agent_is_refused(tmp_path: Path) -> None:
+    recurrent = ("experiment=recurrent", *TINY, ONCE, "hydra.run.dir=train")
+    assert in_process("train", *recurrent, folder=tmp_path).code == 0
+    done = in_process("export", "run=train", "format=weights", "hydra.run.dir=run", folder=tmp_path)
+    assert done.code == 2
+    assert "a recurrent agent (agent.recurrent) cannot be exported" in done.complaint
+    assert not (tmp_path / "run").exists()

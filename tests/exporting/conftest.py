@@ -1,0 +1,39 @@
+"""The pretrained agent of the medium pole, exported, and observations from its episodes on random carts."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from cartpole_rl.envs.build import simulated_env
+from cartpole_rl.exporting.agent import ExportedAgent, Floats
+from cartpole_rl.workflows.agents import TrainedAgent, trained_agent
+from cartpole_rl.workflows.export import exported_agent, provenance
+
+MEDIUM = Path("pretrained/medium")
+
+
+@pytest.fixture(scope="session")
+def medium_agent() -> TrainedAgent:
+    return trained_agent(MEDIUM)
+
+
+@pytest.fixture(scope="session")
+def exported(medium_agent: TrainedAgent) -> ExportedAgent:
+    return exported_agent(medium_agent, provenance(MEDIUM))
+
+
+@pytest.fixture(scope="session")
+def observed(medium_agent: TrainedAgent) -> tuple[Floats, Floats]:
+    """Observations [M, K] of whole episodes on randomized carts, and their action values [M, A]."""
+    training = medium_agent.training
+    env = simulated_env(training, training.plant, 50, training.task.evaluation_start, seed=7)
+    observations, values, current = [], [], env.reset()
+    with torch.no_grad():
+        for _ in range(400):
+            chosen = medium_agent.policy(current.select("observation"))
+            observations.append(current["observation"].numpy())
+            values.append(chosen["action_value"].numpy())
+            current = env.step(current.set("action", chosen["action"]))["next"].exclude("reward")
+    return np.ascontiguousarray(np.concatenate(observations)), np.concatenate(values)

@@ -1,0 +1,159 @@
+"""The exported C compiles without a warning and chooses the motor values of the host."""
+
+import ctypes
+import math
+import re
+import shutil
+import subprocess
+from collections.abc import Mapping
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from parity import assert_same_actions
+
+from cartpole_rl.envs.build import simulated_env
+from cartpole_rl.evaluation.episodes import Policy, choose
+from cartpole_rl.exporting.agent import ExportedAgent, Floats
+from cartpole_rl.exporting.c_code import c_files
+from cartpole_rl.plants.specs import tensordict_of
+from cartpole_rl.workflows.agents import TrainedAgent, new_agent
+from cartpole_rl.workflows.config import TrainConfig
+from cartpole_rl.workflows.export import exported_agent
+from cartpole_rl.workflows.loading import load_settings
+
+FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Wconversion", "-Wpedantic", "-Wdouble-promotion", "-Werror")
+SIZE = '#include "policy.h"\n#include <stddef.h>\nsize_t policy_size(void);\n'
+SIZE += "size_t policy_size(void)\n{\n    return sizeof(policy_t);\n}\n"
+AGENTS: dict[str, dict[str, Any]] = {
+    "raw": {"observation": "raw", "agent.hidden": [], "agent.mirrored": False, "guard": "none"},
+    "positions": {"observation": "positions", "agent.hidden": [8], "agent.mirrored": True},
+    "length": {"observation": "history_length", "pole": "range", "agent.hidden": [8, 6, 4]},
+    "plain": {"agent.hidden": [8, 6], "agent.layer_norm": False, "actions": "two"},
+}
+
+pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="gcc is missing: install a C compiler")
+
+
+class Compiled:
+    """The library of an exported agent, with one cart."""
+
+    def __init__(self, files: Mapping[str, str], folder: Path) -> None:
+        for name, text in {**files, "size.c": SIZE}.items():
+            (folder / name).write_text(text)
+        words = ["gcc", *FLAGS, "-shared", "-fPIC", "-o", "policy.so", "policy.c", "size.c", "-lm"]
+        done = subprocess.run(words, cwd=folder, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        self.library = ctypes.CDLL(str(folder / "policy.so"))
+        self.library.policy_size.restype = ctypes.c_size_t
+        self.library.policy_motor.restype = ctypes.c_int16
+        self.memory = ctypes.create_string_buffer(self.library.policy_size())
+
+    def action(self, observation: Floats) -> int:
+        return self.library.policy_action(observation.ctypes.data_as(ctypes.c_void_p))
+
+    def start(self, track_end: float, pole_length: float) -> None:
+        self.library.policy_start(self.memory, ctypes.c_float(track_end), ctypes.c_float(pole_length))
+
+    def motor(self, counts: tuple[int, int], dt: float) -> int:
+        return self.library.policy_motor(self.memory, *map(ctypes.c_int32, counts), ctypes.c_float(dt))
+
+
+@pytest.fixture(scope="module")
+def compiled(
+    exported: ExportedAgent, medium_agent: TrainedAgent, tmp_path_factory: pytest.TempPathFactory
+) -> Compiled:
+    return Compiled(c_files(exported, medium_agent.training), tmp_path_factory.mktemp("c"))
+
+
+def test_actions_are_those_of_the_host(compiled: Compiled, observed: tuple[Floats, Floats]) -> None:
+    observations, values = observed
+    assert_same_actions(np.array([compiled.action(each) for each in observations]), values)
+
+
+def check_motors(training: TrainConfig, policy: Policy, compiled: Compiled, periods: int) -> None:
+    """Drive a random cart by the host; check that the C code returns the motor values that are sent."""
+    env = simulated_env(training, training.plant, 1, training.task.start, seed=3)
+    cart, sent = env.one_cart, set()
+    for _ in range(3):
+        observation = cart.reset().observation
+        compiled.start(float(env.plant.track_half_length), float(env.plant.pole_length))
+        for _ in range(periods):
+            present = tensordict_of({"observation": torch.from_numpy(np.array([observation], np.float32))})
+            action = int(choose(policy, present))
+            motor, found = cart.sent_motor(action), compiled.motor(cart.frame.counts, cart.frame.dt)
+            if found != motor:  # either is right, and the two remember different motor values
+                values = policy(present)["action_value"].numpy()
+                assert_same_actions(np.array([training.actions.motors.index(found)]), values)
+                break
+            sent.add(motor)
+            step = cart.step(action)
+            observation = step.observation
+            if step.done[0]:
+                break
+    assert len(sent) > 1
+
+
+@torch.no_grad()
+def test_motor_values_are_those_of_the_host(compiled: Compiled, medium_agent: TrainedAgent) -> None:
+    check_motors(medium_agent.training, medium_agent.policy, compiled, 300)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("name", AGENTS)
+def test_so_they_are_for_every_observation_and_network(name: str, tmp_path: Path) -> None:
+    training = load_settings(TrainConfig, {**AGENTS[name], "compile": False})
+    agent = new_agent(training)
+    torch.manual_seed(1)
+    for weight in agent.parameters():
+        weight.add_(0.3 * torch.randn_like(weight))
+    trained = TrainedAgent(training, agent.greedy_policy())
+    exported = exported_agent(trained, {})
+    compiled = Compiled(c_files(exported, training), tmp_path)
+    check_motors(training, trained.policy, compiled, 200)
+    assert_figures(exported, tmp_path, compiled)
+
+
+def test_the_figures_in_the_comment_are_right(
+    exported: ExportedAgent, medium_agent: TrainedAgent, compiled: Compiled, tmp_path: Path
+) -> None:
+    for name, text in c_files(exported, medium_agent.training).items():
+        (tmp_path / name).write_text(text)
+    assert_figures(exported, tmp_path, compiled)
+
+
+def assert_figures(exported: ExportedAgent, folder: Path, compiled: Compiled) -> None:
+    comment = (folder / "policy.h").read_text().split("*/")[0]
+    assert f"{len(compiled.memory)} bytes for each cart" in comment
+    tables = re.findall(r"static const float \w+\[(\d+)\]", (folder / "policy.c").read_text())
+    motors = 2 * (len(exported.description.motors) + 2)
+    assert f"{4 * sum(map(int, tables)) + motors} bytes of tables" in comment
+    sizes = exported.description.sizes
+    products = sum(inputs * outputs for inputs, outputs in pairwise(sizes))
+    assert f"{products} multiply-adds" in comment
+    assert exported.checksum in comment
+
+
+def test_after_a_bad_number_the_motor_stays_at_0(compiled: Compiled) -> None:
+    for dt in (0.0, -0.02, math.nan):
+        compiled.start(0.38, 0.36)
+        assert compiled.motor((0, 2048), 0.0) != 0  # the first period reads no dt
+        assert compiled.motor((2000, 2048), dt) == 0
+        assert compiled.motor((2000, 2048), 0.02) == 0
+    for end in (math.nan, 0.0):
+        compiled.start(end, 0.36)
+        assert compiled.motor((0, 2048), 0.0) == 0
+    assert compiled.action(np.array([math.inf] * 10, np.float32)) == -1
+    assert compiled.action(np.array([math.nan] * 10, np.float32)) == -1
+    compiled.start(0.38, 0.36)
+    assert compiled.motor((0, 2048), 0.0) != 0
+
+
+def test_the_guard_brakes_a_fast_cart(compiled: Compiled) -> None:
+    for side in (1, -1):
+        compiled.start(0.38, 0.36)
+        compiled.motor((side * 13_000, 2048), 0.0)
+        assert compiled.motor((side * 14_000, 2048), 0.02) == -side * 250  # 1.1 m/s outward at 0.32 m
