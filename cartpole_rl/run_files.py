@@ -2,6 +2,9 @@
 
 CONFIG, PROVENANCE, MULTIRUN = "config.yaml", "provenance.json", "multirun.yaml"
 METRICS = "metrics.json"  # of an evaluation
+HISTORY = "history.jsonl"  # of a training: a line for each evaluation
+COMPARISON = "comparison.json"  # of a fine-tuning: metrics before and after
+IDENTIFIED, MODELLED = "identification.json", "model.json"  # results of these commands
 FIGURES, RECORDINGS = "figures", "recordings"
 CHECKPOINTS, LAST, BEST, RESUME = "checkpoints", "last.pt", "best.pt", "resume.pt"  # of an agent
 CART, POLE, RANDOMIZATION, POSTERIOR = "cart.yaml", "pole.yaml", "randomization.yaml", "posterior.npz"

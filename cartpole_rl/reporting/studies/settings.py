@@ -1,0 +1,86 @@
+"""The settings of a study: one row or figure of the thesis, or one beyond it (`conf/study/`).
+
+The copy of a study in its folder of results, study.yaml, also names its size.
+"""
+
+from collections.abc import Sequence
+from typing import Annotated, Literal
+
+from pydantic import Field, StringConstraints, model_validator
+
+from cartpole_rl.settings import Count, Finite, Settings
+
+FolderName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.+-]*$")]
+Overrides = tuple[str, ...]
+
+
+class Axis(Settings):
+    """The quantity whose values the arms or the evaluations of a study take."""
+
+    label: str
+    unit: str = ""
+
+
+class Variant(Settings):
+    """An arm or an evaluation: a folder's name, its label on the page, and the overrides of the command."""
+
+    name: FolderName
+    label: str
+    value: Finite | None = None  # on the axis of the study
+    overrides: Overrides = ()
+
+
+class Size(Settings):
+    """The number of agents per arm, and overrides for all arms and all evaluations."""
+
+    seeds: Count
+    overrides: Overrides = ()
+    evaluation_overrides: Overrides = ()
+
+
+class Study(Settings):
+    """A question, its arms and its evaluations. Every arm has one run of `command` per seed."""
+
+    title: str
+    order: (
+        int  # place on the page: 10 times the row of the thesis's list; 200 and above lie beyond the thesis
+    )
+    figure: str = ""  # figure, table or section of the thesis; empty beyond it
+    question: str
+    thesis: str = ""  # the thesis's answer
+    comment: str = ""  # why the results agree with the thesis or contradict it
+    verdict: Literal["", "fails", "contradicts", "agrees"] = ""  # of the comment; the page sorts by it
+    measure: str = "score"  # score (6.2), score_upright (6.1) or another key of metrics.json
+    ratio: bool = False  # also the second evaluation divided by the first, per agent
+    axis: Axis | None = None
+    curves: tuple[Literal["score", "loss"], ...] = ("score",)  # of the trainings, drawn over transitions
+    arms: Annotated[tuple[Variant, ...], Field(min_length=1)]
+    evaluations: tuple[Variant, ...] = ()  # by cartpole-evaluate; none if the run itself holds the result
+    command: Literal["train", "identify", "evaluate", "finetune", "model"] = "train"
+    experiment: str = ""  # file of conf/experiment/; empty for commands without experiments
+    agents_of: str = ""  # name of the study whose agents are evaluated instead of new ones
+    sizes: Annotated[dict[str, Size], Field(min_length=1)]
+    size: str = ""  # of the results in the same folder, one of `sizes`; empty in conf/study/
+
+    @model_validator(mode="after")
+    def _names_are_unique(self) -> "Study":
+        for kind, variants in (("arms", self.arms), ("evaluations", self.evaluations)):
+            if repeated := _repeated([variant.name for variant in variants]):
+                raise ValueError(f"{kind}: {', '.join(repeated)} is there more than once; give unique names")
+        return self
+
+    @model_validator(mode="after")
+    def _size_is_known(self) -> "Study":
+        if self.size and self.size not in self.sizes:
+            raise ValueError(f"size: {self.size} is not in sizes; give one of {', '.join(self.sizes)}")
+        return self
+
+    @model_validator(mode="after")
+    def _ratio_has_two_evaluations(self) -> "Study":
+        if self.ratio and len(self.evaluations) < 2:
+            raise ValueError("ratio=true needs two evaluations: the second is divided by the first")
+        return self
+
+
+def _repeated(names: Sequence[str]) -> list[str]:
+    return sorted({name for name in names if names.count(name) > 1})
