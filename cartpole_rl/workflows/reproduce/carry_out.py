@@ -2,8 +2,11 @@
 
 import shutil
 import sys
+import threading
 from pathlib import Path
 from typing import Any
+
+from tqdm import tqdm
 
 from cartpole_rl.learning.checkpoints import forget_training
 from cartpole_rl.run_files import CONFIG, HISTORY, METRICS, PROVENANCE
@@ -33,6 +36,7 @@ WORKFLOWS: dict[str, tuple[type, Any]] = {
     "identify": (IdentifyConfig, identify_cart),
     "model": (ModelConfig, learn_model),
 }
+tqdm.set_lock(threading.RLock())  # its own is a semaphore of the system, which a killed process would leave
 
 
 def carry_out(task: Task, resumed: bool = False) -> None:
