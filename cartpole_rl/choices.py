@@ -56,9 +56,7 @@ def compose(command: str, overrides: Mapping[str, Any] | None = None) -> dict[st
     """
     defaults = default_choices(command)
     given = {name: value for name, value in (overrides or {}).items() if name in defaults}
-    experiment = _load("experiment", given.pop("experiment", None))
-    lines: list[dict[str, str]] = experiment.pop("defaults", [])
-    replaced = {group.removeprefix("override /"): name for line in lines for group, name in line.items()}
+    replaced, experiment = _experiment(given.pop("experiment", None))
     chosen = {**defaults, **replaced, **given}
     values = {group: _load(group, name) for group, name in chosen.items() if name is not None}
     values = _merged(_merged(values, _own(command)), experiment)
@@ -66,6 +64,20 @@ def compose(command: str, overrides: Mapping[str, Any] | None = None) -> dict[st
         if name not in defaults:
             values = _merged(values, _nested(name, value))
     return _resolved(values)
+
+
+def _experiment(chosen: Choice) -> tuple[dict[str, str], dict[str, Any]]:
+    """Return the choices of an experiment by group, and its values, with those that it extends."""
+    values = _load("experiment", chosen)
+    choices: dict[str, str] = {}
+    extended: dict[str, Any] = {}
+    for line in values.pop("defaults", []):
+        if isinstance(line, str):  # another experiment
+            others, more = _experiment(line)
+            choices, extended = {**choices, **others}, _merged(extended, more)
+        else:
+            choices |= {group.removeprefix("override /"): name for group, name in line.items()}
+    return choices, _merged(extended, values)
 
 
 def _own(command: str) -> dict[str, Any]:

@@ -14,6 +14,8 @@ from cartpole_rl.emulator.settings import EmulatorSettings
 BOOT_HANGING = 0.3  # largest distance from the middle with boot=hanging, share of the half length
 BOOT_ANYWHERE = 0.99  # the same with boot=anywhere
 FASTEST_BOOT = 8.0  # rad/s, of the pole with boot=anywhere
+STANDS_WITHIN = math.radians(5)  # of upright, the pole stands
+STANDS_US = 2_000_000  # that it has to stand before a hand knocks it
 HAND_ERROR = 0.03  # rad, largest error of a hand that holds the pole upright
 
 
@@ -34,6 +36,9 @@ class CartDevice:
         self._latencies = random.Random(f"latency {settings.seed}")
         self._people = random.Random(f"people {settings.seed}")
         self._held: float | None = None  # rad, the angle at which the hand holds the pole
+        self._standing_us = 0  # for how long the pole has stood since START
+        self._knocked = False  # since START
+        self._knock = settings.knock  # rad/s of the next knock; to the right and left in turn
         self.now_us = 0
         self._place_cart()
         self._reset_us = microseconds(settings.reset_at)
@@ -81,6 +86,7 @@ class CartDevice:
         self.now_us = end_us
         frames = self.firmware.tick(end, *self._counts())
         self._move_hand()
+        self._maybe_knock(end - start)
         return banner + frames
 
     def _place_cart(self) -> None:
@@ -128,6 +134,18 @@ class CartDevice:
     def _latency_us(self) -> int:
         jitter = self._settings.latency_jitter
         return round(max(0.0, self._settings.latency + self._latencies.uniform(-jitter, jitter)) * 1e6)
+
+    def _maybe_knock(self, period_us: int) -> None:
+        """Knock a pole that has stood long enough, once after each START."""
+        if not self._knock or not self.firmware.armed:
+            self._standing_us, self._knocked = 0, False
+            return
+        physics = self.physics
+        stands = abs(math.remainder(physics.angle, math.tau)) < STANDS_WITHIN
+        self._standing_us = self._standing_us + period_us if stands else 0
+        if self._standing_us >= STANDS_US and not self._knocked:
+            physics.place_pole(physics.angle, physics.angle_dot + self._knock)
+            self._knock, self._knocked = -self._knock, True
 
     def _move_hand(self) -> None:
         """With start=upright: hold the pole up while the cart is homed and disarmed, else let go."""

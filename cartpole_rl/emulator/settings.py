@@ -77,6 +77,7 @@ class EmulatorSettings(Settings):
         "hanging"  # near the middle with a hanging pole, or anywhere with a turning pole
     )
     start: Literal["hanging", "upright"] = "hanging"  # upright: a hand holds the pole up before START
+    knock: NonNegative = 0.0  # rad/s that a hand adds once to a pole that has stood for 2 s, after each START
     journal: Path | None = None  # new file for commands carried out and motor values in force
     physics_step: Annotated[float, Field(ge=1e-5, le=1e-3)] = 5e-4  # s, the longest step of the physics
 

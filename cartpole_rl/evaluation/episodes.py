@@ -16,6 +16,7 @@ from torchrl.modules import QValueActor
 
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.evaluation.driving_policy import DrivingPolicy
+from cartpole_rl.evaluation.knocks import Knocks
 from cartpole_rl.plants.specs import OneCartPlant, tensordict_of
 from cartpole_rl.scheduling import no_garbage_collection
 from cartpole_rl.tasks.endings import Ending
@@ -27,12 +28,14 @@ Policy = Callable[[TensorDictBase], TensorDictBase]
 _FROM_NEXT = ("score", "score_upright", "reward", "done")
 
 
-def run_episodes(env: CartPoleEnv, policy: Policy, episodes: int) -> Iterator[Episode]:
-    """Yield `episodes` episodes. Raises the errors of the plant's reset."""
+def run_episodes(
+    env: CartPoleEnv, policy: Policy, episodes: int, knocks: Knocks | None = None
+) -> Iterator[Episode]:
+    """Yield `episodes` episodes, on simulated carts with `knocks`. Raises the errors of the plant's reset."""
     policy = prepared(env, policy)
     warm_up(env, policy)
     for _ in range(math.ceil(episodes / env.plant.carts)):
-        batch = run_batch(env, policy)
+        batch = run_batch(env, policy, knocks)
         yield from batch[:episodes]
         episodes -= len(batch)
 
@@ -69,11 +72,11 @@ def choose(policy: Policy, current: TensorDictBase) -> Tensor:
     return chosen.get("action").where(finite, NO_ACTION)
 
 
-def run_batch(env: CartPoleEnv, policy: Policy) -> list[Episode]:
+def run_batch(env: CartPoleEnv, policy: Policy, knocks: Knocks | None = None) -> list[Episode]:
     """Return one episode of each cart, all from one reset."""
-    if isinstance(env.plant, OneCartPlant):
+    if isinstance(env.plant, OneCartPlant) and knocks is None:
         return [run_one(env, policy)]
-    return run_many(env, policy)
+    return run_many(env, policy, knocks)
 
 
 @torch.no_grad()
@@ -108,14 +111,18 @@ def run_one(env: CartPoleEnv, policy: Policy) -> Episode:
 
 
 @torch.no_grad()
-def run_many(env: CartPoleEnv, policy: Policy) -> list[Episode]:
+def run_many(env: CartPoleEnv, policy: Policy, knocks: Knocks | None = None) -> list[Episode]:
     """Return one episode of each cart of any plant, all from one reset, on tensors."""
     current = env.reset()
+    if knocks:
+        knocks.reset()
     origins = env.plant.origins()
     frames, actions = [current], []
     endings: list[str | None] = [None] * env.plant.carts
     while None in endings:  # the cart waits for this loop; the rest is done afterwards
         action = choose(policy, current)
+        if knocks:
+            knocks()
         outcome = env.step(current.set("action", action)).get("next")
         actions.append(action)
         frames.append(outcome)

@@ -11,7 +11,7 @@ from scipy import stats
 
 from cartpole_rl.intervals import CONFIDENCE, student_interval
 from cartpole_rl.tasks.episode import Episode
-from cartpole_rl.tasks.upright import is_upright, upright_since, wrap
+from cartpole_rl.tasks.upright import is_upright, upright_at_end, upright_since, wrap
 
 RESAMPLES = 5000
 
@@ -23,7 +23,8 @@ def episode_metrics(episode: Episode, track_half_length: float) -> dict[str, Any
     the pole stays within 5 degrees for 1 s; `upright_fraction` the share of periods within 5 degrees, over
     which the RMS of angle and position are taken; `rms_motor_change` that of the step from one motor value to
     the next; `guarded_fraction` the share of periods in which the track guard replaced the agent's motor
-    value; `min_track_margin_m` the smallest distance from `track_half_length`, negative beyond it.
+    value; `upright_at_end` whether the pole is within 5 degrees for the last second, as 1 or 0, which
+    tells whether it came up again after a knock; `min_track_margin_m` the smallest distance from `track_half_length`, negative beyond it.
     """
     upright = is_upright(episode.theta[1:])
     change = np.diff(episode.motor)
@@ -35,6 +36,7 @@ def episode_metrics(episode: Episode, track_half_length: float) -> dict[str, Any
         "ended_by": episode.ended_by,
         "time_to_upright_s": upright_since(episode.time, episode.theta),
         "upright_fraction": float(upright.mean()),
+        "upright_at_end": float(upright_at_end(episode.time, episode.theta)),
         "rms_angle_rad": _rms(wrap(episode.theta[1:])[upright]),
         "rms_position_m": _rms(episode.x[1:][upright]),
         "rms_motor_change": _rms(change),

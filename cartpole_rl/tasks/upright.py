@@ -20,6 +20,15 @@ def is_upright(theta: NDArray[np.float64]) -> NDArray[np.bool_]:
     return np.abs(wrap(theta)) < UPRIGHT_ANGLE
 
 
+def upright_at_end(time: NDArray[np.float64], theta: NDArray[np.float64]) -> bool:
+    """Return True if the pole is upright during the whole last second (`HOLD`).
+
+    `time` [T] in s, ascending; `theta` [T] in rad.
+    """
+    last = time >= time[-1] - HOLD
+    return bool(time[-1] - time[0] >= HOLD and is_upright(theta[last]).all())
+
+
 def upright_since(time: NDArray[np.float64], theta: NDArray[np.float64]) -> float | None:
     """Return the first time (s) from which the pole stays upright for one second; None if it never does.
 

@@ -44,7 +44,8 @@ def evaluated_agent(config: EvaluateConfig) -> TrainedAgent:
     """Return the agent of config.run, or the baseline controller. Raises CheckpointError, ConfigError."""
     if config.run != BASELINE:
         return trained_agent(config.run)
-    return baseline_agent(config, load_settings(TrainConfig, OF_BASELINE))
+    training = load_settings(TrainConfig, OF_BASELINE)
+    return baseline_agent(config, training.model_copy(update={"actions": config.actions or training.actions}))
 
 
 def baseline_agent(config: EvaluateConfig, training: TrainConfig) -> TrainedAgent:

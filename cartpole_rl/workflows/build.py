@@ -21,7 +21,7 @@ from cartpole_rl.plants.settings import EmulatedSettings, LearnedSettings, Simul
 from cartpole_rl.randomization.poles import Pole, PoleSettings
 from cartpole_rl.scheduling import taking_precedence
 from cartpole_rl.settings import Settings, evaluation_seed
-from cartpole_rl.tasks.settings import Start
+from cartpole_rl.tasks.settings import ActionSettings, Start
 from cartpole_rl.workflows.checks import simulated_carts
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
 
@@ -32,6 +32,7 @@ REPLACEABLE = (
     "pole",
     "reward",
     "guard",
+    "actions",
 )  # by an evaluation; and the task
 
 
@@ -58,8 +59,17 @@ def replaced_settings(training: TrainConfig, config: EvaluateConfig) -> CartPole
     if isinstance(config.plant, LearnedSettings):
         found = load_model(config.plant.model).parameters
         given["pole"] = one_pole(Pole(**{name: found[name] for name in Pole.model_fields}))
+    if config.actions is not None:
+        check_as_many(config.actions, training.actions)
     settings = checked(CartPoleSettings, {**own, **given, "randomization": config.randomization})
     return with_parameters(settings, config.parameters or {})
+
+
+def check_as_many(actions: ActionSettings, trained: ActionSettings) -> None:
+    """Raise ConfigError unless there are as many actions as those that the agent was trained with."""
+    given, known = len(actions.motors), len(trained.motors)
+    if given != known:
+        raise ConfigError(f"actions: {given} motor values, but the agent chooses from {known}; give {known}")
 
 
 def emulated_pole(truth: EmulatorSettings) -> PoleSettings:

@@ -32,10 +32,10 @@ from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.plants.settings import EmulatedSettings, LearnedSettings, SimulatedSettings
 from cartpole_rl.randomization.checks import check_one_pole
 from cartpole_rl.randomization.poles import PoleSettings
-from cartpole_rl.settings import Count, Finite, Seed, Settings
-from cartpole_rl.tasks.settings import RewardSettings
+from cartpole_rl.settings import Count, Finite, NonNegative, Seed, Settings
+from cartpole_rl.tasks.settings import ActionSettings, RewardSettings
 
-OF_SIMULATION = ("parameters", "randomization", "cart", "cart_friction", "pole_friction")
+OF_SIMULATION = ("parameters", "randomization", "cart", "cart_friction", "pole_friction", "knock")
 
 
 class RunSettings(Settings):
@@ -131,6 +131,8 @@ class EvaluateConfig(RunSettings):
     task: dict[str, Any] | None = None  # TaskSettings, whose x_max may be missing: it is then the agent's
     reward: RewardSettings | None = None
     guard: GuardSettings | None = None
+    actions: ActionSettings | None = None
+    knock: NonNegative = 0.0  # rad/s, see `evaluation/knocks.py`
     repeat: RepeatSettings = RepeatSettings()
 
     @model_validator(mode="after")
@@ -181,6 +183,7 @@ class IdentifyConfig(RunSettings, CartSettings, OnCart):
     """cartpole-identify."""
 
     source: Annotated[Path | None, Field(alias="from")]
+    method: Literal["matching", "one_step"] = "matching"
     pole: PoleSettings
     control_period: ControlPeriod
     windows: Annotated[int, Field(ge=20, le=5000)]
@@ -210,7 +213,6 @@ class ModelConfig(RunSettings, CartSettings):
         return [source] if isinstance(source, str) else source
 
 
-<<<<<<< HEAD
 class ReportConfig(Settings):
     """cartpole-report."""
 
@@ -238,7 +240,7 @@ class ReportConfig(Settings):
             raise ValueError("compare and measure belong to runs=...; each study names its own measure")
         return self
 
-=======
+
 class ExportConfig(Settings):
     """cartpole-export."""
 
@@ -246,7 +248,6 @@ class ExportConfig(Settings):
     format: Literal["weights", "onnx", "c", "web"]
     label: str
 
->>>>>>> export
 
 class PreflightConfig(OnCart):
     """cartpole-preflight."""

@@ -8,6 +8,7 @@ from tqdm import tqdm
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
 from cartpole_rl.evaluation.episodes import Policy, run_batch, run_episodes
+from cartpole_rl.evaluation.knocks import Knocks
 from cartpole_rl.learning.randomness import seed_everything
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.reporting.words import guard_text
@@ -32,10 +33,16 @@ class Evaluation:
     def episodes(self) -> Iterator[Episode]:
         """Drive the repeated episode, or new ones, and yield each as it ends."""
         if self.repetition:
-            yield from repeated(self.env, self.policy, self.repetition)
+            yield from repeated(self.env, self.policy, self.repetition, self.knocks)
             return
         with precedence(self.config.plant, self.config.emulator):
-            yield from with_progress(self.env, self.policy, self.config.episodes)
+            yield from with_progress(self.env, self.policy, self.config.episodes, self.knocks)
+
+    @property
+    def knocks(self) -> Knocks | None:
+        """The knocks of the simulated poles; None for none."""
+        plant, speed = self.env.plant, self.config.knock
+        return Knocks(plant, speed) if speed and isinstance(plant, SimulatedPlant) else None
 
 
 def prepared(config: EvaluateConfig) -> Evaluation:
@@ -51,17 +58,19 @@ def prepared(config: EvaluateConfig) -> Evaluation:
     return Evaluation(config, settings, env, agent.policy, again)
 
 
-def repeated(env: CartPoleEnv, policy: Policy, again: Repetition) -> Iterator[Episode]:
+def repeated(env: CartPoleEnv, policy: Policy, again: Repetition, knocks: Knocks | None) -> Iterator[Episode]:
     """Drive the same simulated cart from the same start."""
     assert isinstance(env.plant, SimulatedPlant)
     env.plant.start_from(again.origin.state)
-    yield run_batch(env, policy)[again.row]
+    yield run_batch(env, policy, knocks)[again.row]
 
 
-def with_progress(env: CartPoleEnv, policy: Policy, episodes: int) -> Iterator[Episode]:
+def with_progress(
+    env: CartPoleEnv, policy: Policy, episodes: int, knocks: Knocks | None
+) -> Iterator[Episode]:
     """Drive episodes behind a progress bar that shows the score of each."""
     with tqdm(total=episodes, unit=" episodes") as progress:
-        for episode in run_episodes(env, policy, episodes):
+        for episode in run_episodes(env, policy, episodes, knocks):
             progress.set_postfix_str(f"score {episode.score.sum():.0f}{guard_text(episode)}", refresh=False)
             progress.update()
             yield episode

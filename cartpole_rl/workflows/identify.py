@@ -3,18 +3,22 @@
 Each experiment is on disk before the next one starts, and the cart is identified from the files.
 """
 
+import math
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 from tqdm import tqdm
 
+from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import RecordingError
 from cartpole_rl.evaluation.recordings import read_recording, write_recording
 from cartpole_rl.files import write_text
 from cartpole_rl.identification.checks import check_recordings
 from cartpole_rl.identification.experiments import EXPERIMENTS, HELD_OUT, conduct
 from cartpole_rl.identification.identify import Identification, identify
+from cartpole_rl.identification.one_step import one_step_estimates
 from cartpole_rl.identification.quantities import intervals
 from cartpole_rl.physics.models import Actuator, CartFriction, Models
 from cartpole_rl.plants.cart_plant import cart_plant
@@ -26,10 +30,12 @@ from cartpole_rl.reporting.identification import (
     identification_page,
     quantities_table,
 )
+from cartpole_rl.reporting.table import table
 from cartpole_rl.run_files import CART, FIGURES, IDENTIFIED, PAGE, POLE, RANDOMIZATION, RECORDINGS
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.build import precedence, use_threads
 from cartpole_rl.workflows.config import IdentifyConfig
+from cartpole_rl.workflows.identified_errors import errors, known_truth
 from cartpole_rl.workflows.identified_files import report, write_choices
 from cartpole_rl.workflows.person import confirm, print_message
 from cartpole_rl.workflows.recordings import experiments
@@ -42,8 +48,8 @@ def identify_cart(config: IdentifyConfig, folder: Path) -> None:
     """Identify the cart of `config.plant`, or that of the recordings in `config.source`.
 
     Writes into `folder` config.yaml, provenance.json, recordings/ of experiments, cart.yaml, pole.yaml,
-    randomization.yaml and posterior.npz (to train on), identification.json, page.html and figures/. Prints
-    the identified values. Raises RecordingError for missing, too few or implausible recordings, ConfigError
+    randomization.yaml and posterior.npz (to train on), identification.json, page.html and figures/. With method=one_step
+    only config.yaml, provenance.json, recordings/ and identification.json. Prints the identified values. Raises RecordingError for missing, too few or implausible recordings, ConfigError
     for several poles or a folder that already holds a run, PlantError and LinkError for a cart that fails.
     """
     use_threads(config.threads)
@@ -59,11 +65,15 @@ def identify_cart(config: IdentifyConfig, folder: Path) -> None:
     seconds = sum(each.steps for each in fitted.values()) * config.control_period
     print_message("identify", f"fitting {seconds:.0f} s of recordings")
     models = Models(CartFriction.STEP, config.pole_friction.model, Actuator.FORCE_CURVE)
+    truth = known_truth(config)
     period, substeps = config.control_period, config.substeps
+    if config.method == "one_step":
+        regress([*fitted.values(), held_out], nominal, models, period, truth, folder)
+        return
     found = identify([*fitted.values()], [held_out], nominal, models, period, substeps, config.windows)
     carts = found.fit.draw(config.carts, np.random.default_rng(config.seed))
     write_choices(found, carts, folder)
-    write_json(folder / IDENTIFIED, report(found, carts))
+    write_json(folder / IDENTIFIED, report(found, carts) | errors(found.fit.parameters, truth))
     for name, figure in identification_figures(found, carts, fitted).items():
         save(figure, folder / FIGURES / f"{name}.png")
     identified = intervals(found.fit, carts)
@@ -71,6 +81,28 @@ def identify_cart(config: IdentifyConfig, folder: Path) -> None:
     write_text(folder / PAGE, page)
     print(quantities_table(identified))
     print_verdict(found, folder)
+
+
+def regress(
+    episodes: Sequence[Episode],
+    nominal: Mapping[str, float],
+    models: Models,
+    period: float,
+    truth: EmulatorSettings | None,
+    folder: Path,
+) -> None:
+    """Estimate parameters from single transitions; write identification.json and print them."""
+    estimates = one_step_estimates(episodes, nominal, models, period)
+    found = {**nominal, **{name: each.value for name, each in estimates.items()}}
+    standard_errors = {name: each.error for name, each in estimates.items() if math.isfinite(each.error)}
+    content = {"method": "one_step", "parameters": found, "standard_errors": standard_errors}
+    write_json(folder / IDENTIFIED, content | errors(found, truth))
+    rows = [
+        {"parameter": name, "estimate": f"{each.value:.4g} ± {each.error:.1g}", "prior": f"{nominal[name]:g}"}
+        for name, each in estimates.items()
+    ]
+    print(table(rows, ["parameter", "estimate", "prior"]))
+    print(f"{folder}/{IDENTIFIED} is written; these values are for comparison, not to train on")
 
 
 def record_experiments(config: IdentifyConfig, folder: Path) -> None:

@@ -14,7 +14,7 @@ from cartpole_rl.evaluation.recordings import read_recording
 from cartpole_rl.identification.ensemble import Ensemble
 from cartpole_rl.identification.fit import Fit, best_fit
 from cartpole_rl.identification.held_out import held_out_windows, split
-from cartpole_rl.identification.prediction import CERTAIN, errors_at, predict
+from cartpole_rl.identification.prediction import CERTAIN, REPORTED, errors_at, predict
 from cartpole_rl.identification.rollout import Dynamics
 from cartpole_rl.identification.windows import Windows, cut_windows, recorded_period
 from cartpole_rl.physics.models import CartFriction, Models
@@ -126,5 +126,8 @@ def results(
         "cart_friction": str(model.models.cart_friction),
         "parameters": model.parameters,
         "errors": errors,
+        "network_over_physics": {
+            name: errors[LEARNED][-1][f"rms_{name}"] / errors[PHYSICS][-1][f"rms_{name}"] for name in REPORTED
+        },
         "left_out_loss": ensemble.history,
     }

@@ -1,0 +1,1 @@
+"""Reproduction of studies: every run of a study in its folder, resumable, several at a time."""

@@ -1,0 +1,141 @@
+"""The plan of a reproduction: which run of which command goes to which folder, and what it needs first.
+
+In the overrides of a study `{runs}` stands for the folder of all studies and `{seed}` for the seed of the
+agent, as in `run={runs}/todays_agents/medium/{seed}`. An arm of a training with `run=` trains no agent: that
+agent, or the baseline of run=lqr, is evaluated.
+"""
+
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from cartpole_rl.errors import ConfigError
+from cartpole_rl.reporting.studies.settings import Size, Study, Variant
+from cartpole_rl.workflows.reproduce.studies import load_study, unknown
+
+FIRST_SEED = 10  # settings were chosen on seeds 0 to 9
+EVALUATIONS = "evaluations"  # folder in that of an agent
+BASELINE = "lqr"
+SHARE = "share"  # in place of a command: take over the results of an agent of another study
+
+
+@dataclass(frozen=True)
+class Task:
+    """One run: its command, folder and overrides, and the folders of the runs that it needs."""
+
+    study: str
+    command: str
+    folder: Path
+    words: tuple[str, ...]
+    needs: tuple[Path, ...] = ()
+    agent: Path | None = None  # whose results are taken over
+
+
+def plan(names: Sequence[str], size: str, root: Path) -> list[Task]:
+    """Return the runs of the studies `names` and the runs of others that they need, in order.
+
+    Raises ConfigError for an unknown study or size.
+    """
+    tasks = {task.folder: task for name in names for task in study_tasks(name, size, root)}
+    missing = needed(tasks.values()) - tasks.keys()
+    while missing:
+        others = {folder.relative_to(root).parts[0] for folder in missing}
+        found = {task.folder: task for name in sorted(others) for task in study_tasks(name, size, root)}
+        if lost := sorted(missing - found.keys()):
+            raise ConfigError(f"{lost[0]}: a study needs this run, but no study of size {size} has it")
+        tasks = {**{folder: found[folder] for folder in sorted(missing)}, **tasks}
+        missing = needed(tasks.values()) - tasks.keys()
+    return list(tasks.values())
+
+
+def needed(tasks: Iterable[Task]) -> set[Path]:
+    """Return the folders of the runs that `tasks` need."""
+    return {folder for task in tasks for folder in task.needs}
+
+
+def study_tasks(name: str, size: str, root: Path) -> list[Task]:
+    """Return all runs of a study, each agent before its evaluations. Raises ConfigError."""
+    study = load_study(name)
+    chosen = size_of(name, study, size)
+    return [
+        task
+        for arm in study.arms
+        for seed in range(FIRST_SEED, FIRST_SEED + chosen.seeds)
+        for task in Agent(name, study, chosen, arm, seed, root).tasks()
+    ]
+
+
+def size_of(name: str, study: Study, size: str) -> Size:
+    """Return a size of a study. Raises ConfigError if it has no such size."""
+    if size not in study.sizes:
+        raise ConfigError(f"study {name}: {unknown('size', size, [*study.sizes])}")
+    return study.sizes[size]
+
+
+@dataclass(frozen=True)
+class Agent:
+    """One agent of a study, or one run of another command: an arm and a seed."""
+
+    name: str
+    study: Study
+    size: Size
+    arm: Variant
+    seed: int
+    root: Path
+
+    @property
+    def folder(self) -> Path:
+        """The run folder."""
+        return self.root / self.name / self.arm.name / str(self.seed)
+
+    def tasks(self) -> Iterator[Task]:
+        """Yield the run itself, then its evaluations."""
+        yield self.own_task()
+        agent = self.shared if self.shared == BASELINE else str(self.folder)
+        if self.study.command == "train" and self.shared not in (None, BASELINE):
+            agent = str(self.shared)
+        for evaluation in self.study.evaluations:
+            words = self.words(f"run={agent}", *evaluation.overrides, *self.size.evaluation_overrides)
+            needs = (self.folder, *self.runs_in(words))
+            yield Task(self.name, "evaluate", self.folder / EVALUATIONS / evaluation.name, words, needs)
+
+    def own_task(self) -> Task:
+        """Return the run itself: of the study's command, or the results of the agent that the arm names."""
+        study, size = self.study, self.size
+        experiment = [f"experiment={study.experiment}"] if study.experiment else []
+        words = self.words(*experiment, *self.arm.overrides, *size.overrides)
+        if study.command == "train" and self.shared == BASELINE:
+            words = self.words(*self.arm.overrides, *size.evaluation_overrides)
+            return Task(self.name, "evaluate", self.folder, words)
+        if study.command == "train" and self.shared is not None:
+            agent = Path(self.shared)
+            return Task(self.name, SHARE, self.folder, (), (agent,), agent)
+        return Task(self.name, study.command, self.folder, words, tuple(self.runs_in(words)))
+
+    @property
+    def shared(self) -> str | None:
+        """The run that this arm evaluates instead of training an agent; None for an agent of its own."""
+        given = [word.removeprefix("run=") for word in self.arm.overrides if word.startswith("run=")]
+        if given:
+            return self.filled(given[-1])
+        if self.study.agents_of:
+            return str(self.root / self.study.agents_of / self.arm.name / str(self.seed))
+        return None
+
+    def words(self, *overrides: str) -> tuple[str, ...]:
+        """Return overrides with their placeholders filled in, and the seed; of one setting the last."""
+        every = [*map(self.filled, overrides), f"seed={self.seed}"]
+        last = {word.lstrip("+").partition("=")[0]: word for word in every}
+        return tuple(last.values())
+
+    def filled(self, text: str) -> str:
+        """Return `text` with `{runs}` and `{seed}` filled in."""
+        return text.replace("{runs}", str(self.root)).replace("{seed}", str(self.seed))
+
+    def runs_in(self, words: Iterable[str]) -> Iterator[Path]:
+        """Yield the run folders of studies that `words` name."""
+        for word in words:
+            for found in re.findall(rf"{re.escape(str(self.root))}/([^/,\]]+/[^/,\]]+/\d+)", word):
+                if self.root / found != self.folder:
+                    yield self.root / found

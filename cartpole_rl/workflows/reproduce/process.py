@@ -1,0 +1,73 @@
+"""A run of a study as a process of its own, its results and its log. Imports nothing that takes long."""
+
+import json
+import os
+import shutil
+import signal
+import sys
+import traceback
+
+import yaml
+
+from cartpole_rl.errors import CartPoleError
+from cartpole_rl.run_files import CHECKPOINTS, CONFIG, IDENTIFIED, METRICS, MODELLED, PROVENANCE, RESUME
+from cartpole_rl.signals import RaiseOnce, end_with_parent, ending_signals
+from cartpole_rl.workflows.reproduce.plan import SHARE, Task
+
+LOG = "log.txt"
+RESULTS = {"identify": IDENTIFIED, "model": MODELLED}  # of the other commands METRICS
+RESUMABLE = ("train", "finetune")
+SIGNALLED = 128  # added to the number of a signal, as a shell does
+
+
+def is_complete(task: Task) -> bool:
+    """Return True for a run with all of its results; an interrupted evaluation has only some episodes."""
+    result = task.folder / RESULTS.get(task.command, METRICS)
+    if task.command != "evaluate":
+        return result.is_file()
+    try:
+        episodes = json.loads(result.read_text())["episodes"]
+        return len(episodes) == yaml.safe_load((task.folder / CONFIG).read_text())["episodes"]
+    except (OSError, ValueError, LookupError, TypeError, yaml.YAMLError):
+        return False
+
+
+def made_otherwise(task: Task) -> str:
+    """Return why a complete run does not belong to its study any more; empty if it does."""
+    if task.command == SHARE:
+        return ""
+    given = json.loads((task.folder / PROVENANCE).read_text())["command"][1:]
+    return "" if given == [*task.words] else "it was made with other settings; delete its folder to repeat it"
+
+
+def in_own_process(task: Task) -> None:
+    """Do what is left of a run, with everything that it prints in its log. Exits with 1 if it fails."""
+    end_with_parent(os.getppid())
+    RaiseOnce(lambda number: KeyboardInterrupt()).handle(signal.SIGINT, *ending_signals())
+    resumed = prepare(task)
+    task.folder.mkdir(parents=True, exist_ok=True)
+    with (task.folder / LOG).open("a") as log:
+        os.dup2(log.fileno(), sys.stdout.fileno())
+        os.dup2(log.fileno(), sys.stderr.fileno())
+        try:
+            from cartpole_rl.workflows.reproduce.carry_out import carry_out
+
+            carry_out(task, resumed)
+        except (CartPoleError, OSError) as error:
+            print(f"\n{' '.join(str(error).split())}", flush=True)
+            sys.exit(CartPoleError.exit_code)
+        except KeyboardInterrupt:
+            print("\ninterrupted", flush=True)
+            sys.exit(SIGNALLED + signal.SIGINT)
+        except Exception:
+            traceback.print_exc()
+            sys.exit(CartPoleError.exit_code)
+        print(f"{sum(os.times()[:4]):.1f} s of computing time", flush=True)
+
+
+def prepare(task: Task) -> bool:
+    """Remove an incomplete run that cannot be resumed; return True for one that can."""
+    if task.command in RESUMABLE and (task.folder / CHECKPOINTS / RESUME).is_file():
+        return True
+    shutil.rmtree(task.folder, ignore_errors=True)
+    return False

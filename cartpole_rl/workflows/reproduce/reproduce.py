@@ -1,0 +1,170 @@
+"""Reproduce studies: all their runs, several at a time, each in a process of its own.
+
+The processes are forked from one that has imported everything, where the system can: importing takes as long
+as a short evaluation. A run that fails does not end the others. Complete runs are skipped, so the same call
+continues after an interruption.
+"""
+
+import multiprocessing
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from multiprocessing.connection import wait
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+
+import yaml
+
+from cartpole_rl.files import write_text
+from cartpole_rl.workflows.reproduce.plan import Task, plan, size_of
+from cartpole_rl.workflows.reproduce.process import LOG, in_own_process, is_complete, made_otherwise
+from cartpole_rl.workflows.reproduce.progress import Progress, duration
+from cartpole_rl.workflows.reproduce.studies import load_study
+
+STUDY_FILE = "study.yaml"
+WORKER = "cartpole_rl.workflows.reproduce.carry_out"  # imports all workflows
+GRACE = 10.0  # s from SIGTERM to SIGKILL: an emulated cart is stopped, a cart's motor set to 0
+
+
+def reproduce(
+    names: Sequence[str],
+    size: str,
+    root: Path,
+    jobs: int,
+    show: Callable[[str], None] = print,
+) -> dict[str, str]:
+    """Run everything that is left of the studies `names` in `root`; return the failed runs and their reasons.
+
+    Raises ConfigError for an unknown study or size.
+    """
+    tasks = plan(names, size, root)
+    for name in names:
+        write_study(name, size, root)
+    schedule = Schedule(tasks, root)
+    todo = len(schedule.waiting)
+    show(f"{len(tasks)} runs, {len(tasks) - todo} of them done; {jobs} at a time, in {root}")
+    started = time.monotonic()
+    progress = Progress(todo, jobs, show)
+    with Workers(jobs) as workers:
+        while schedule.waiting or workers.running:
+            for task in schedule.ready(workers.free):
+                workers.start(task)
+            for task, seconds, failure in workers.finished() if workers.running else ():
+                schedule.finish(task, failure)
+                left = [*schedule.waiting, *workers.tasks]
+                progress.finished(task, schedule.label(task), seconds, left, failure)
+    show(f"{progress.done} runs in {duration(time.monotonic() - started)}")
+    return schedule.failures
+
+
+def write_study(name: str, size: str, root: Path) -> None:
+    """Write the study with its size beside its runs."""
+    study = load_study(name)
+    size_of(name, study, size)
+    content = study.model_copy(update={"size": size}).model_dump(mode="json")
+    write_text(root / name / STUDY_FILE, yaml.safe_dump(content, sort_keys=False, allow_unicode=True))
+
+
+class Schedule:
+    """The runs that are not done, in order, and the failures so far."""
+
+    def __init__(self, tasks: Sequence[Task], root: Path) -> None:
+        self._root = root
+        self.failures: dict[str, str] = {}
+        self._complete: set[Path] = set()
+        self._failed: set[Path] = set()
+        self.waiting: list[Task] = []
+        for task in tasks:
+            if not is_complete(task):
+                self.waiting.append(task)
+            elif other := made_otherwise(task):
+                self.finish(task, other)
+            else:
+                self._complete.add(task.folder)
+
+    def label(self, task: Task) -> str:
+        """Return the folder of a run below that of all studies."""
+        return str(task.folder.relative_to(self._root))
+
+    def ready(self, count: int) -> list[Task]:
+        """Take up to `count` runs whose needs are complete; runs whose needs failed fail too."""
+        for task in self.waiting:
+            if lost := self._failed.intersection(task.needs):
+                self.finish(task, f"it needs {min(map(str, lost))}, which failed")
+        self.waiting = [task for task in self.waiting if task.folder not in self._failed]
+        chosen = [task for task in self.waiting if self._complete.issuperset(task.needs)][:count]
+        self.waiting = [task for task in self.waiting if task not in chosen]
+        return chosen
+
+    def finish(self, task: Task, failure: str) -> None:
+        """Note the outcome of a run."""
+        if failure:
+            self.failures[self.label(task)] = failure
+            self._failed.add(task.folder)
+        else:
+            self._complete.add(task.folder)
+
+
+@dataclass
+class Workers:
+    """The processes of runs, at most `jobs` at a time; at the end of a `with` all are stopped."""
+
+    jobs: int
+    running: dict[Task, tuple[BaseProcess, float]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        forks = "forkserver" in multiprocessing.get_all_start_methods()
+        self._context = multiprocessing.get_context("forkserver" if forks else "spawn")
+        if forks:
+            self._context.set_forkserver_preload([WORKER])
+
+    def __enter__(self) -> "Workers":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        processes = [process for process, _ in self.running.values()]
+        for process in processes:
+            process.terminate()
+        deadline = time.monotonic() + GRACE
+        for process in processes:
+            process.join(max(0.0, deadline - time.monotonic()))
+            process.kill()
+
+    @property
+    def free(self) -> int:
+        """How many more runs may start."""
+        return self.jobs - len(self.running)
+
+    @property
+    def tasks(self) -> list[Task]:
+        """The runs under way."""
+        return [*self.running]
+
+    def start(self, task: Task) -> None:
+        """Start a run."""
+        process = self._context.Process(target=in_own_process, args=(task,))
+        process.start()
+        self.running[task] = process, time.monotonic()
+
+    def finished(self) -> list[tuple[Task, float, str]]:
+        """Wait for the next end of a run; return those that ended, their seconds and why they failed."""
+        wait([process.sentinel for process, _ in self.running.values()])
+        ended = [task for task, (process, _) in self.running.items() if process.exitcode is not None]
+        outcomes = []
+        for task in ended:
+            process, since = self.running.pop(task)
+            outcomes.append((task, time.monotonic() - since, failure_of(task, process.exitcode or 0)))
+        return outcomes
+
+
+def failure_of(task: Task, exit_code: int) -> str:
+    """Return why a run failed, the last line of its log; empty if it did not."""
+    if exit_code < 0:
+        return f"signal {-exit_code} ended its process"
+    if exit_code == 0 and is_complete(task):
+        return ""
+    try:
+        lines = (task.folder / LOG).read_text(errors="replace").strip().splitlines()
+    except OSError:
+        lines = []
+    return lines[-1] if lines else f"exit status {exit_code}"

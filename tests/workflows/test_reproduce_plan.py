@@ -1,0 +1,113 @@
+"""Studies: each file is valid, each run of each size has settings that its command takes, as Hydra reads them."""
+
+from collections import Counter
+from functools import cache
+from pathlib import Path
+
+import hydra
+import pytest
+from command_line import TINY
+
+from cartpole_rl.checking import checked
+from cartpole_rl.choices import compose, conf_folder
+from cartpole_rl.commands.hydra_application.composition import as_mapping
+from cartpole_rl.errors import ConfigError
+from cartpole_rl.settings import Settings
+from cartpole_rl.workflows.config import (
+    EvaluateConfig,
+    FinetuneConfig,
+    IdentifyConfig,
+    ModelConfig,
+    TrainConfig,
+)
+from cartpole_rl.workflows.reproduce.plan import FIRST_SEED, SHARE, Task, plan, study_tasks
+from cartpole_rl.workflows.reproduce.studies import load_study, overrides_of, study_names
+
+pytestmark = pytest.mark.usefixtures("hydra_reads_conf")
+
+ROOT = Path("runs/reproduce/quick")
+STUDIES = sorted(path.stem for path in (conf_folder() / "study").glob("*.yaml"))
+CONFIGS: dict[str, type[Settings]] = {
+    "train": TrainConfig,
+    "evaluate": EvaluateConfig,
+    "finetune": FinetuneConfig,
+    "identify": IdentifyConfig,
+    "model": ModelConfig,
+}
+ROWS = 18  # of the thesis's list
+FILES = ("cart=", "pole=", "randomization=")  # of runs that do not exist here
+
+
+@cache
+def without_hydra(command: str, words: tuple[str, ...]) -> Settings:
+    return checked(CONFIGS[command], compose(command, overrides_of(words)))
+
+
+def of_conf(words: tuple[str, ...]) -> tuple[str, ...]:
+    """The overrides without the files of other runs."""
+    return tuple(word for word in words if not (word.startswith(FILES) and word.endswith(".yaml")))
+
+
+def one_of_each(tasks: list[Task]) -> list[Task]:
+    """The runs of the first seed."""
+    return [task for task in tasks if str(FIRST_SEED) in task.folder.parts and task.command != SHARE]
+
+
+@pytest.mark.parametrize("size", ["quick", "full"])
+@pytest.mark.parametrize("study", STUDIES)
+def test_every_run_of_a_study_has_valid_settings(study: str, size: str) -> None:
+    for task in one_of_each(study_tasks(study, size, ROOT)):
+        assert without_hydra(task.command, of_conf(task.words))
+
+
+@pytest.mark.parametrize("study", STUDIES)
+def test_hydra_reads_the_overrides_alike(study: str) -> None:
+    for task in one_of_each(study_tasks(study, "quick", ROOT)):
+        words = of_conf(task.words)
+        with_hydra = checked(CONFIGS[task.command], as_mapping(hydra.compose(task.command, list(words))))
+        assert with_hydra == without_hydra(task.command, words), task.folder
+
+
+def test_every_row_of_the_list_has_a_study() -> None:
+    orders = {load_study(name).order for name in study_names()}
+    assert {10 * row for row in range(1, ROWS + 1)} <= {order // 10 * 10 for order in orders}
+
+
+def test_the_figures_with_ten_agents_have_them() -> None:
+    for name in ("friction_models", "perturbations"):
+        agents = [task for task in study_tasks(name, "full", ROOT) if task.folder.parent.parent.name == name]
+        assert {*Counter(task.folder.parent.name for task in agents).values()} == {10}
+
+
+def test_every_run_that_is_needed_is_planned_before() -> None:
+    done: set[Path] = set()
+    waiting = plan(study_names(), "full", ROOT)
+    while ready := [task for task in waiting if done.issuperset(task.needs)]:
+        done |= {task.folder for task in ready}
+        waiting = [task for task in waiting if task.folder not in done]
+    assert not waiting
+
+
+def test_a_study_brings_the_agents_that_it_needs() -> None:
+    folders = {task.folder.relative_to(ROOT).parts[:2] for task in plan(["recovery"], "quick", ROOT)}
+    assert {("swingup", "thesis"), ("todays_agents", "medium")} <= folders
+
+
+def test_a_wrong_name_gets_the_nearest_one() -> None:
+    with pytest.raises(
+        ConfigError, match="^friction_model: there is no such study; did you mean friction_models"
+    ):
+        plan(["friction_model"], "quick", ROOT)
+    with pytest.raises(ConfigError, match="fulll: there is no such size; did you mean full"):
+        plan(["baseline"], "fulll", ROOT)
+
+
+EXPERIMENTS = sorted(path.stem for path in (conf_folder() / "experiment").glob("*.yaml"))
+
+
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
+def test_an_experiment_composes_alike_with_and_without_hydra(experiment: str) -> None:
+    words = (f"experiment={experiment}", *TINY)
+    assert checked(TrainConfig, as_mapping(hydra.compose("train", list(words)))) == without_hydra(
+        "train", words
+    )
