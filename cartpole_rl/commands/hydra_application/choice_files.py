@@ -24,8 +24,10 @@ def with_choice_files(words: Sequence[str]) -> Iterator[list[str]]:
     """Yield the overrides with files replaced by choices. Raises ConfigError for a wrong file or null."""
     with TemporaryDirectory(prefix="cartpole_rl-") as folder:
         replaced = [_with_choices(word, Path(folder)) for word in words]
-        found = any(Path(folder).iterdir())
-        yield [*replaced, f"hydra.searchpath=[file://{folder}]"] if found else list(words)
+        if any(Path(folder).iterdir()):  # beside the first file: Hydra takes no override after an option
+            first = next(i for i, (word, new) in enumerate(zip(words, replaced, strict=True)) if word != new)
+            replaced.insert(first, f"hydra.searchpath=[file://{folder}]")
+        yield replaced
 
 
 def _with_choices(word: str, folder: Path) -> str:

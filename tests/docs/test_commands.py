@@ -1,0 +1,49 @@
+"""Every command of the pages in docs/ is one that the package takes: names, groups, keys and options exist.
+
+The README's commands are run by tests/readme; those of docs/extending.md by test_extending.py.
+"""
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+from command_line import in_process
+
+ROOT = Path(__file__).parents[2]
+PAGES = sorted([*ROOT.glob("docs/**/*.md"), ROOT / "runs/README.md", ROOT / "CONTRIBUTING.md"])
+CHOICE_FILES = {
+    "cart": "conf/cart/ip02.yaml",
+    "pole": "conf/pole/medium.yaml",
+    "randomization": "conf/randomization/wide.yaml",
+}
+
+
+def commands(start: str) -> list[tuple[str, str]]:
+    """The commands in indented blocks that begin with `start`, each with its page."""
+    found = []
+    for page in PAGES:
+        text = re.sub(r" *\\\n +", " ", page.read_text())
+        for line in re.findall(rf"^    ({start}.*?)(?:\s+#.*)?$", text, re.M):
+            found.append((page.relative_to(ROOT).as_posix(), line))
+    return found
+
+
+@pytest.mark.parametrize(("page", "command"), commands("cartpole-"))
+def test_the_command_composes(page: str, command: str, tmp_path: Path) -> None:
+    name, *words = shlex.split(re.sub("<.*?>", "run", command))
+    for group, file in CHOICE_FILES.items():
+        words = [re.sub(rf"^{group}=runs/.*\.yaml$", f"{group}={ROOT / file}", word) for word in words]
+    verb = name.removeprefix("cartpole-").replace("-", "_")
+    done = in_process(verb, *words, "--cfg", "job", folder=tmp_path)
+    assert done.code == 0, f"{page}: {command}\n{done.err}"
+
+
+@pytest.mark.parametrize(("page", "command"), commands("(?:\\./)?scripts/"))
+def test_the_script_and_its_options_exist(page: str, command: str) -> None:
+    name, *words = shlex.split(re.sub("<.*?>", "run", command))
+    script = ROOT / name
+    assert script.stat().st_mode & 0o100, f"{page}: {name} cannot be run"
+    code = "".join(file.read_text() for file in {script, *script.parent.glob("*.py")})
+    options = [word for word in words if word.startswith("--")]
+    assert [option for option in options if option not in code] == [], f"{page}: {command}"
