@@ -18,6 +18,7 @@ WHAT_TO_DO = {  # with a folder, by what made it
     "replay": "cartpole-replay from=... makes new ones",
     "identify": "cartpole-train takes its files: cart={0}/cart.yaml",
     "model": "plant=learned plant.model={0}",
+    "report": "it is a page to read: {0}/page.html",
     "unfinished": "cartpole-train resume={0} continues it",
     "multirun": "give that of one of its jobs",
 }
@@ -62,6 +63,7 @@ def runs(
         ("record", "-m", "run=train", "episodes=1", "seed=0,1", "hydra.sweep.dir=multirun"),
         ("replay", "from=record", "hydra.run.dir=replay"),
         ("model", "from=record", *model, "hydra.run.dir=model"),
+        ("report", "runs=evaluate", "animations=false", "hydra.run.dir=report"),
     )
     for command, *words in made:
         done = in_process(command, *words, folder=folder)

@@ -1,5 +1,6 @@
 """The page of studies and that of a person's own runs, each one HTML file with everything in it."""
 
+import re
 from collections.abc import Mapping, Sequence
 
 from cartpole_rl.reporting.page import Html, document, escaped, table
@@ -242,8 +243,10 @@ def _link(results: StudyResults) -> Html:
 
 
 def _figure_name(figure: str) -> str:
-    """Return "Fig. 6.8" for "6.8", and any other text as it is written."""
-    return f"Fig. {figure}" if figure[:1].isdigit() else figure
+    """Return "Fig. 6.8" for "6.8", "Section 3.1.3" for other numbers, and any other text as it is written."""
+    if re.match(r"\d+\.\d+[a-z]?(,|$)", figure):
+        return f"Fig. {figure}"
+    return f"Section {figure}" if figure[:1].isdigit() else figure
 
 
 def _status(results: StudyResults) -> Html:
