@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from cartpole_rl.reporting.studies.page import METHOD
 from cartpole_rl.reporting.studies.statistics import (
     difference,
     estimate,
@@ -13,6 +12,7 @@ from cartpole_rl.reporting.studies.statistics import (
     probability_of_improvement,
     rank_correlation,
 )
+from cartpole_rl.reporting.studies.texts import METHOD
 
 SCORES = np.random.default_rng(3).normal(3000, 900, 10)
 OTHERS = np.random.default_rng(4).normal(2500, 900, 10)

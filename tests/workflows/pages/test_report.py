@@ -13,9 +13,12 @@ from typing import Any
 import pytest
 from command_line import Outcome, in_process
 
+from cartpole_rl.choices import conf_folder
+
 Edit = Callable[[Path, Callable[[Any], object]], None]
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 BROWSER = next(filter(None, map(shutil.which, BROWSERS)), None)
+FOLDER = "hydra.run.dir="
 LIMIT = 20_000_000  # bytes of a page
 PROBE = """<script>
 const broken = [];
@@ -52,8 +55,10 @@ class Sources(HTMLParser):
 
 def report(*words: str) -> tuple[Outcome, str]:
     """Make a report in the working directory; return the outcome and the page."""
-    done = in_process("report", *words, "hydra.run.dir=report", folder=Path.cwd())
-    page = Path("report/page.html")
+    folder = next((word.removeprefix(FOLDER) for word in words if word.startswith(FOLDER)), "report")
+    chosen = dict.fromkeys((*words, f"{FOLDER}{folder}"))
+    done = in_process("report", *chosen, folder=Path.cwd())
+    page = Path(folder, "page.html")
     return done, page.read_text() if page.is_file() else ""
 
 
@@ -161,6 +166,18 @@ def test_what_fails_comes_first(study: Path, edit: Edit) -> None:
     contents = page[page.index('id="contents"') : page.index("</nav>")]
     assert contents.index("#study-agrees") < contents.index("#study-friction")
     assert contents.count("no study") == 16
+
+
+def test_the_page_says_what_stands_for_the_real_cart(study: Path, edit: Edit) -> None:
+    _, without = report("studies=quick", "animations=false")
+    words = ["plant=emulated", "emulator=large"]
+    edit(study / "study.yaml", lambda content: content["evaluations"][1].update(overrides=words))
+    _, page = report("studies=quick", "animations=false", "hydra.run.dir=again")
+    text = (conf_folder() / "emulator/large.yaml").read_text()
+    assert "is an emulator, not a real cart" in page
+    assert html.escape(text) in page
+    assert "is an emulator" not in without
+    assert "At most 3 agents per set-up" in page
 
 
 def test_a_page_from_the_small_files_alone(study: Path) -> None:
