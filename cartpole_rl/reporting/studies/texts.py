@@ -12,8 +12,8 @@ METHOD = (
 EMULATED = (
     "The emulated cart is an emulator, not a real cart: a separate program with the physics of MuJoCo that "
     "speaks the cart's serial protocol and shares no equation with the simulator. The settings below say how "
-    "it differs from the nominal cart. It lacks wear, backlash, a bending track "
-    "and more. With a real cart, plant=serial takes the place of plant=emulated in the same commands."
+    "it differs from the nominal cart. It lacks wear, backlash, a bending track and more. With a real cart, "
+    "plant=serial takes the place of plant=emulated in the same commands."
 )
 ENOUGH = 10  # agents per set-up
 STYLE = """
