@@ -28,6 +28,7 @@ SCHEMAS: dict[str, type[Settings]] = {
     "preflight": config.PreflightConfig,
     "record": config.RecordConfig,
     "replay": config.ReplayConfig,
+    "report": config.ReportConfig,
     "train": config.TrainConfig,
 }
 WITHOUT_A_SETTING = {"train": {"experiment"}}  # groups that set other groups

@@ -47,6 +47,11 @@ COMPLAINS = {  # command: words, exit code, part of the line on stderr
     ],
     "preflight": [("plant.port=nowhere plant.home_timeout=0", 2, "give more than 0")],
     "record": [("run=nowhere", 1, "run=nowhere: there is no such file or folder")],
+    "report": [
+        ("studies=nowhere", 2, "studies=nowhere: there is no such folder"),
+        ("seed=1", 2, "seed: there is no such setting"),
+        ("animations=maybe studies=nowhere", 2, "give true or false"),
+    ],
     "replay": [("from=nowhere", 1, "from=nowhere: there is no such file or folder")],
     "train": [
         ("resume=nowhere", 1, "resume=nowhere: there is no such folder"),

@@ -14,7 +14,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra_configs import shipped_choices
 from omegaconf import DictConfig
 
-COMMANDS = ("evaluate", "finetune", "identify", "model", "record", "replay", "train")
+COMMANDS = ("evaluate", "finetune", "identify", "model", "record", "replay", "report", "train")
 
 
 class StoppedClock(datetime):

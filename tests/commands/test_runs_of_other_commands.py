@@ -19,6 +19,7 @@ WHAT_TO_DO = {  # with a folder, by what made it
     "identify": "cartpole-train takes its files: cart={0}/cart.yaml",
     "model": "plant=learned plant.model={0}",
     "export": "its files are for other programs",
+    "report": "it is a page to read: {0}/page.html",
     "unfinished": "cartpole-train resume={0} continues it",
     "multirun": "give that of one of its jobs",
 }
@@ -65,6 +66,7 @@ def runs(
         ("replay", "from=record", "hydra.run.dir=replay"),
         ("model", "from=record", *model, "hydra.run.dir=model"),
         ("export", "run=train", "format=weights", "hydra.run.dir=export"),
+        ("report", "runs=evaluate", "animations=false", "hydra.run.dir=report"),
     )
     for command, *words in made:
         done = in_process(command, *words, folder=folder)

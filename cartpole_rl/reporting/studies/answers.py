@@ -17,6 +17,7 @@ MEASURES = {  # key of metrics.json: label
     "upright_at_end": "share upright at the end",
     "time_to_upright_s": "time to upright, s",
 }
+LOW_IS_GOOD = ("errors", "rms_", "time_to_", "network_over_")  # starts of measures
 THESIS_ROWS = {  # of the thesis's list: what must work
     1: "Physics, both integrators, substeps",
     2: "Balance with reward (5.1), three actions",
@@ -136,6 +137,11 @@ def estimate_text(found: Estimate) -> str:
 def agents_text(count: int) -> str:
     """Return "1 agent" or "10 agents"."""
     return f"{count} agent{'' if count == 1 else 's'}"
+
+
+def low_is_good(measure: str) -> bool:
+    """Return True for a measure of which less is better."""
+    return measure.startswith(LOW_IS_GOOD)
 
 
 def measure_label(measure: str) -> str:

@@ -230,7 +230,10 @@ def rank_agreement(results: Sequence[StudyResults]) -> Drawing | None:
         fresh = {tuple(pair) for pair in each.pairs(first.name, second.name).T.tolist()} - drawn
         if (first.name, second.name) == common and fresh:
             drawn |= fresh
-            groups[each.study.title] = np.array(sorted(fresh)).T
+            title = (
+                each.study.title if each.study.title not in groups else f"{each.study.title} ({each.name})"
+            )
+            groups[title] = np.array(sorted(fresh)).T
             labels = first.label, second.label
     if len(drawn) < FEWEST_PROFILED:
         return None

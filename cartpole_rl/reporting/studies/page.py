@@ -1,5 +1,6 @@
 """The page of studies and that of a person's own runs, each one HTML file with everything in it."""
 
+import re
 from collections.abc import Mapping, Sequence
 
 from cartpole_rl.reporting.page import Html, document, escaped, table
@@ -28,50 +29,32 @@ from cartpole_rl.reporting.studies.sections import (
     folded,
     run_list,
 )
-
-TITLE = "The thesis, carried out"
-METHOD = (
-    "Each number of an agent is the mean over its evaluation episodes; the last checkpoint of every seed "
-    "counts and no agent is picked. Values are interquartile means over agents (the mean without the lowest "
-    "and the highest quarter) with the 95 % interval of a stratified bootstrap over agents, after Agarwal et "
-    "al. (2021). Runs that are unfinished, damaged, or of other versions or settings than the rest are named "
-    "and do not count."
-)
-STYLE = """
-svg * { stroke-linejoin: round; stroke-linecap: butt; }
-svg { width: 100%; height: auto; font-family: inherit; }
-nav ol { padding-left: 1.8rem; } nav ul { padding-left: 1rem; list-style: none; margin: 0; }
-section { margin-top: 2.5rem; border-top: 1px solid var(--faint); }
-dt { color: var(--muted); } dd { margin: 0 0 .6rem 0; }
-.figures { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 24rem), 1fr));
-  gap: 1.2rem; }
-.animations { display: grid; grid-template-columns: repeat(3, 1fr); gap: .6rem; }
-figure { margin: 0; } figcaption { color: var(--muted); font-size: .85rem; }
-.box { border: 1px solid var(--alarm); border-left-width: 6px; border-radius: 4px;
-  padding: .2rem .9rem; margin: 1rem 0; }
-.box ul { padding-left: 1.2rem; margin: .3rem 0; }
-.alarm { color: var(--alarm); font-weight: 600; }
-pre { white-space: pre-wrap; background: var(--faint); padding: .5rem .7rem; border-radius: 4px; }
-pre code { padding: 0; }
-summary { cursor: pointer; color: var(--link); }
-table { margin: 1rem 0; } h3 { font-size: 1rem; margin: 1.6rem 0 .5rem; } details { margin: .8rem 0; }
-@media print { details:not([open])::details-content { content-visibility: visible; display: block; } }
-"""
+from cartpole_rl.reporting.studies.texts import EMULATED, ENOUGH, METHOD, STYLE, TITLE
 
 
-def studies_page(results: Sequence[StudyResults], pictures: Mapping[str, Sequence[Picture]]) -> str:
-    """Return the page of studies, in their order; `pictures` maps the name of a study to its pictures."""
+def studies_page(
+    results: Sequence[StudyResults],
+    pictures: Mapping[str, Sequence[Picture]],
+    emulators: Mapping[str, str] | None = None,
+) -> str:
+    """Return the page of studies, in their order.
+
+    `pictures` maps the name of a study to its pictures, `emulators` the name of each emulated cart to its
+    settings with their comments.
+    """
     agents = sum(len(each.agents) for each in results)
     sizes = sorted({each.label for each in results if each.agents and each.label})
     size = f", size {', '.join(sizes)}" if sizes else ""
     parts = [
         f"<h1>{TITLE}</h1>",
         f"<p>{len(results)} {'study' if len(results) == 1 else 'studies'}{size}, {agents_text(agents)}.</p>",
+        _tendency(results),
         _summary(results),
         _contents(results),
         *(_study_section(each, pictures.get(each.name, ())) for each in results),
         _ranks(results),
         _robustness(results),
+        _emulators(emulators or {}),
         _method(),
     ]
     return document(TITLE, "\n".join(part for part in parts if part), STYLE)
@@ -95,6 +78,26 @@ def runs_page(
         _method(),
     ]
     return document(title, "\n".join(part for part in parts if part), STYLE)
+
+
+def _tendency(results: Sequence[StudyResults]) -> str:
+    """Return a warning if no study has ENOUGH agents per set-up; empty otherwise."""
+    most = max((each.size.seeds for each in results if each.agents and each.size), default=ENOUGH)
+    if most >= ENOUGH:
+        return ""
+    return f'<p class="alarm">At most {agents_text(most)} per set-up: these results show tendencies only.</p>'
+
+
+def _emulators(emulators: Mapping[str, str]) -> str:
+    """Return what stands for the real cart, and in what it differs from the simulated one."""
+    if not emulators:
+        return ""
+    files = "".join(
+        f"<h3>emulator={escaped(name)}</h3><pre><code>{escaped(text)}</code></pre>"
+        for name, text in emulators.items()
+    )
+    heading = "The cart that stands for the real one"
+    return f'<section id="emulated"><h2>{heading}</h2><p>{EMULATED}</p>{files}</section>'
 
 
 def _summary(results: Sequence[StudyResults]) -> str:
@@ -242,8 +245,10 @@ def _link(results: StudyResults) -> Html:
 
 
 def _figure_name(figure: str) -> str:
-    """Return "Fig. 6.8" for "6.8", and any other text as it is written."""
-    return f"Fig. {figure}" if figure[:1].isdigit() else figure
+    """Return "Fig. 6.8" for "6.8", "Section 3.1.3" for other numbers, and any other text as it is written."""
+    if re.match(r"\d+\.\d+[a-z]?(,|$)", figure):
+        return f"Fig. {figure}"
+    return f"Section {figure}" if figure[:1].isdigit() else figure
 
 
 def _status(results: StudyResults) -> Html:

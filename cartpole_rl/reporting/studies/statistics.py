@@ -13,6 +13,7 @@ One number per agent (the mean over its evaluation episodes) enters; agents are 
 """
 
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +22,7 @@ from scipy import stats
 
 from cartpole_rl.intervals import CONFIDENCE
 
-RESAMPLES = 2000
+RESAMPLES = 5000
 TRIMMED = 0.25  # share of the values cut off at each end
 EDGES = (50 * (1 - CONFIDENCE), 50 * (1 + CONFIDENCE))  # percent
 FEWEST_RANKED = 4  # agents from which a rank correlation has an interval
@@ -51,11 +52,16 @@ def estimate(*strata: ArrayLike) -> Estimate:
 
     Raises ValueError if there is no value.
     """
-    groups = [np.asarray(each, dtype=float) for each in strata]
-    pooled = np.concatenate(groups)
-    if not pooled.size:
+    return _pooled_estimate(tuple(tuple(np.asarray(each, dtype=float).tolist()) for each in strata))
+
+
+@lru_cache(maxsize=4096)  # a page shows the same agents in its text, its tables and its figures
+def _pooled_estimate(strata: tuple[tuple[float, ...], ...]) -> Estimate:
+    groups = [np.array(each) for each in strata]
+    count = sum(each.size for each in groups)
+    if not count:
         raise ValueError("an estimate needs at least one value")
-    return _estimate(lambda *parts: interquartile_mean(np.concatenate(parts, axis=-1)), groups, pooled.size)
+    return _estimate(lambda *parts: interquartile_mean(np.concatenate(parts, axis=-1)), groups, count)
 
 
 def difference(values: ArrayLike, others: ArrayLike) -> Estimate:

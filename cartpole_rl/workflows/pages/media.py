@@ -7,7 +7,7 @@ from pathlib import Path
 from PIL import Image
 
 from cartpole_rl.reporting.animation import smaller
-from cartpole_rl.reporting.studies.answers import measure_label
+from cartpole_rl.reporting.studies.answers import low_is_good, measure_label
 from cartpole_rl.reporting.studies.results import OWN, Agent, StudyResults
 from cartpole_rl.reporting.studies.sections import Picture
 from cartpole_rl.reporting.table import number_text
@@ -69,7 +69,8 @@ def chosen(results: StudyResults) -> list[tuple[str, Agent, float, Path]]:
             if evaluation.name in agent.values and (path := _file(agent, evaluation.name, "episode.gif"))
         ]
         if filmed:
-            ranked = sorted(filmed, key=lambda each: each[1], reverse=True)
+            descending = not low_is_good(results.study.measure)
+            ranked = sorted(filmed, key=lambda each: each[1], reverse=descending)
             places = {len(ranked) // 2: "median", len(ranked) - 1: "worst", 0: "best"}
             return [(places[place], *ranked[place]) for place in sorted(places)]
     return []

@@ -11,7 +11,7 @@ from cartpole_rl.reporting.studies.sections import Picture
 from cartpole_rl.run_files import PAGE
 from cartpole_rl.workflows.config import ReportConfig
 from cartpole_rl.workflows.pages.media import Gallery
-from cartpole_rl.workflows.pages.studies import read_studies, write_data
+from cartpole_rl.workflows.pages.studies import emulators, read_studies, write_data
 from cartpole_rl.workflows.pages.sweeps import Sweep, grouped, read_sweep, results_of, table
 from cartpole_rl.workflows.person import print_message
 from cartpole_rl.workflows.run_folder import write_config
@@ -39,7 +39,7 @@ def _report_studies(config: ReportConfig, source: Path, folder: Path) -> None:
         write_data(results, config.data)
         print(f"{config.data}/ holds the numbers of {sum(bool(each.agents) for each in results)} studies")
     pictures = _pictures(config, results)
-    write_text(folder / PAGE, studies_page(results, pictures))
+    write_text(folder / PAGE, studies_page(results, pictures, emulators(results)))
     for kind in (Status.FAILS, Status.CONTRADICTS, Status.EMPTY, Status.INCOMPLETE):
         if names := [each.name for each in results if status(each) is kind]:
             print(f"{kind}: {', '.join(names)}")

@@ -42,6 +42,7 @@ from cartpole_rl.workflows.pages.runs import (
 from cartpole_rl.workflows.run_folder import write_json
 
 STUDY, EVALUATIONS, RUN = "study.yaml", "evaluations", "run="
+EMULATOR = "emulator="
 TEXTS = ("title", "order", "figure", "question", "thesis", "comment", "verdict")  # of today's conf/study/
 LOSS = "learning/loss"  # TensorBoard's curve
 CURVE_POINTS = 60
@@ -78,6 +79,19 @@ def read_studies(folder: Path) -> list[StudyResults]:
         raise ConfigError(f"studies={folder}: it holds no study; give a folder that scripts/reproduce wrote")
     found = [read_study(place) for place in places] or [read_data(file) for file in files]
     return sorted(_with_shipped(found), key=lambda each: (each.study.order, each.name))
+
+
+def emulators(results: Sequence[StudyResults]) -> dict[str, str]:
+    """Return the files of conf/emulator/ that the studies choose by emulator=<name>, by that name."""
+    words = {
+        word
+        for each in results
+        for variant in (*each.study.arms, *each.study.evaluations)
+        for word in variant.overrides
+    }
+    names = sorted(word.removeprefix(EMULATOR) for word in words if word.startswith(EMULATOR))
+    files = {name: conf_folder() / "emulator" / f"{name}.yaml" for name in names}
+    return {name: file.read_text(encoding="utf-8") for name, file in files.items() if file.is_file()}
 
 
 def write_data(results: Sequence[StudyResults], folder: Path) -> None:
