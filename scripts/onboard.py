@@ -2,8 +2,11 @@
 """Does a cart with a policy on the board swing its pole up by itself?
 
     cartpole-export run=RUN format=c hydra.run.dir=FOLDER
-    scripts/qemu/cart.py --policy FOLDER --fast     # or a real board, compiled with the same files
-    scripts/qemu/onboard.py /dev/pts/5 --episodes 3
+    cartpole-emulate emulator.firmware=c emulator.policy=FOLDER     # prints its port
+    scripts/onboard.py /dev/pts/5 --episodes 3
+
+Any cart with the agent on its board will do: an emulated one as here, a processor in QEMU
+(scripts/qemu/cart.py --policy FOLDER --fast), or a real one.
 
 Homes the cart, sends START, and then only listens, for the time of one episode; no motor value leaves this
 computer. Prints one line for each episode: the score (6.2), the share of the time upright, and faults. A
