@@ -139,8 +139,8 @@ def test_an_emulated_cart_drives_by_the_c_code_of_a_policy():
     driven.ask(Start())
     states = [driven.ask(Hello()) for _ in range(200)]
     assert {state.motor_applied for state in states} == {110, -110}
-    assert min(state.cart_counts for state in states) < -200
-    assert max(state.cart_counts for state in states) > 200
+    assert min(state.cart_counts for state in states) < -50
+    assert max(state.cart_counts for state in states) > 50
     assert driven.flags == Flags.ARMED | Flags.HOMED
 
 
