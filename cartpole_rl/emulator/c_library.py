@@ -59,30 +59,50 @@ def compile_c(output: Path, files: list[Path], *flags: str) -> None:
         raise EmulatorError(f"the C firmware was not compiled: {done.stderr.strip() or done.returncode}")
 
 
-def build_library() -> Path:
-    """Return the shared library, built unless these sources were built before. Raises EmulatorError."""
+def policy_sources(policy: Path | None) -> list[Path]:
+    """Return the C file of an exported agent, none without one. Raises EmulatorError if it is missing."""
+    if policy is None:
+        return []
+    missing = [name for name in ("policy.h", "policy.c") if not (policy / name).is_file()]
+    if missing:
+        raise EmulatorError(
+            f"emulator.policy={policy}: there is no {missing[0]}; give a folder of cartpole-export format=c"
+        )
+    return [policy.resolve() / "policy.c"]
+
+
+def build_library(policy: Path | None = None) -> Path:
+    """Return the shared library, built unless these sources were built before.
+
+    `policy` is a folder with policy.h and policy.c, of an agent that drives on the board. Raises
+    EmulatorError.
+    """
+    files = [*sources(), *policy_sources(policy)]
     folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "cartpole_rl"
     content = hashlib.sha256(" ".join((platform.platform(), find_compiler(), *FLAGS, *CART)).encode())
-    for path in sorted([*firmware_folder().glob("src/*"), *firmware_folder().glob("host/*")]):
+    read = [*firmware_folder().glob("src/*"), *firmware_folder().glob("host/*")]
+    for path in (*sorted(read), *(sorted(policy.glob("policy.[ch]")) if policy else ())):
         content.update(path.read_bytes())
     library = folder / f"firmware-{content.hexdigest()[:16]}.so"
     if not library.is_file():
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder) as beside:
             built = Path(beside, library.name)
-            compile_c(built, sources(), "-shared", "-fPIC")
+            flags = ("-DCART_ONBOARD_POLICY", f"-I{policy.resolve()}") if policy else ()
+            compile_c(built, files, "-shared", "-fPIC", *flags)
             built.replace(library)
     return library
 
 
 @functools.cache
-def load_library() -> ctypes.CDLL:
+def load_library(policy: Path | None = None) -> ctypes.CDLL:
     """Return the C firmware with the types of its functions. Raises EmulatorError."""
-    library = ctypes.CDLL(str(build_library()))
+    library = ctypes.CDLL(str(build_library(policy)))
     pointer, size, us = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_uint64
     signatures = {
         "cart_size": (size, []),
         "cart_boot": (None, [pointer]),
+        "cart_attach_policy": (None, [pointer]),
         "cart_receive": (size, [pointer, ctypes.c_char_p, size, us, ctypes.c_char_p]),
         "cart_delay_command": (None, [pointer, us]),
         "cart_drive": (ctypes.c_bool, [pointer, us, ctypes.POINTER(us)]),

@@ -102,10 +102,14 @@ class CartDevice:
         self._booted_us = self.now_us
         self._boot = (0, 0)
         self._boot = self._counts()
-        kind = CFirmware if self._settings.firmware == "c" else Firmware
-        self.firmware: Firmware | CFirmware = kind(
-            self._latency_us, round(self._settings.angle_offset / POLE_RADIANS)
-        )
+        self.firmware = self._new_firmware()
+
+    def _new_firmware(self) -> Firmware | CFirmware:
+        """Return the firmware that the settings choose, just booted."""
+        zero_error = round(self._settings.angle_offset / POLE_RADIANS)
+        if self._settings.firmware == "c":
+            return CFirmware(self._latency_us, zero_error, self._settings.policy)
+        return Firmware(self._latency_us, zero_error)
 
     def _counts(self) -> tuple[int, int]:
         """Return the raw counts of cart and pole since boot."""

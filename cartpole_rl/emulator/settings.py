@@ -27,6 +27,7 @@ class EmulatorSettings(Settings):
     firmware: Literal["python", "c"] = (
         "python"  # the reference, or the portable C of a real cart, compiled on first use
     )
+    policy: Path | None = None  # folder of an agent in C that drives on the board; needs firmware=c
     seed: Annotated[int, Field(ge=0)] = (
         0  # of latencies, disturbed frames, boot position and the hand's angle
     )
@@ -80,6 +81,12 @@ class EmulatorSettings(Settings):
     knock: NonNegative = 0.0  # rad/s that a hand adds once to a pole that has stood for 2 s, after each START
     journal: Path | None = None  # new file for commands carried out and motor values in force
     physics_step: Annotated[float, Field(ge=1e-5, le=1e-3)] = 5e-4  # s, the longest step of the physics
+
+    @model_validator(mode="after")
+    def _policy_needs_the_c_firmware(self) -> Self:
+        if self.policy is not None and self.firmware != "c":
+            raise ValueError("policy is C code, which the Python firmware cannot run: set firmware=c")
+        return self
 
     @model_validator(mode="after")
     def _stuck_at_needs_an_encoder(self) -> Self:

@@ -3,6 +3,19 @@
 
 #include <string.h>
 
+#ifdef CART_ONBOARD_POLICY
+#include "onboard.h"
+#endif
+
+void cart_attach_policy(cart *self)
+{
+#ifdef CART_ONBOARD_POLICY
+    onboard_attach(self);
+#else
+    (void)self;
+#endif
+}
+
 size_t cart_size(void)
 {
     return sizeof(cart);

@@ -6,6 +6,9 @@
 
 #define CART_SNAPSHOT_NUMBERS 48
 
+/* Give a cart that has just booted the policy with which the library was compiled, if any. */
+void cart_attach_policy(cart *self);
+
 /* The size of a `cart` in bytes. */
 size_t cart_size(void);
 

@@ -4,12 +4,15 @@
     scripts/qemu/cart.py                           # prints {"port": "/dev/pts/5", ...} and runs until Ctrl-C
     scripts/qemu/cart.py '{"cart_viscous": 1.0}'   # true parameters of the cart, see docs/emulator.md
     cartpole-evaluate run=... plant=serial plant.port=/dev/pts/5
+    scripts/qemu/cart.py --policy FOLDER --fast    # with an agent on the board; see scripts/onboard.py
 
 Needs the Debian packages qemu-system-arm, gcc-arm-none-eabi, libnewlib-arm-none-eabi and make. It compiles
 firmware/ for the board qemu_an386. UART 0 of the board is a pseudo-terminal, which a host opens like any
 serial port. UART 1 carries motor values and encoder counts (firmware/boards/qemu_an386/board.c has the
-format). The clock of the board follows the wall clock, and the physics follows the clock of the board.
-Settings of the clock, the link and faults have no effect.
+format). The clock of the board follows the wall clock, and the physics follows the clock of the board. With
+--fast the clock counts instructions, 16 ns each: the board runs as fast as this computer can, and is late
+for no period if the computer is busy, but does not wait for a host. Settings of the clock, the link and
+faults have no effect.
 """
 
 import argparse
@@ -81,9 +84,10 @@ class Pins:
         return math.floor(self._physics.x / CART_METRES), pole
 
 
-def build(folder: Path) -> Path:
-    """Compile the firmware into a folder; return the program."""
+def build(folder: Path, policy: Path | None) -> Path:
+    """Compile the firmware, with a policy if there is one, into a folder; return the program."""
     make = ["make", "-C", str(FIRMWARE), f"BUILD={folder}", "qemu_an386"]
+    make += [f"POLICY={policy.resolve()}"] if policy else []
     done = subprocess.run(make, capture_output=True, text=True)
     if done.returncode:
         sys.exit(f"the firmware was not compiled: {done.stderr.strip()}")
@@ -91,11 +95,12 @@ def build(folder: Path) -> Path:
 
 
 @contextmanager
-def board(program: Path, pins: Path) -> Iterator[str]:
+def board(program: Path, pins: Path, fast: bool) -> Iterator[str]:
     """Run a program in QEMU; its UART 1 connects to the socket `pins`. Yield the port of its UART 0."""
     command = ["qemu-system-arm", "-machine", "mps2-an386", "-nographic", "-monitor", "none"]
     command += ["-chardev", "pty,id=host", "-chardev", f"socket,id=pins,path={pins}"]
     command += ["-serial", "chardev:host", "-serial", "chardev:pins", "-kernel", str(program)]
+    command += ["-icount", "shift=4,sleep=off"] if fast else []
     with tempfile.TemporaryFile("w+") as log:
         process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
         try:
@@ -129,6 +134,8 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("settings", nargs="?", default="{}", help="settings of the cart as JSON")
+    parser.add_argument("--policy", type=Path, help="folder of cartpole-export format=c: the board drives")
+    parser.add_argument("--fast", action="store_true", help="do not follow the wall clock")
     options = parser.parse_args()
     if missing := missing_programs():
         sys.exit(f"not installed: {', '.join(missing)}")
@@ -140,7 +147,7 @@ def main() -> int:
         listening.listen(1)
         listening.settimeout(PATIENCE)
         try:
-            with board(build(Path(folder)), path) as port:
+            with board(build(Path(folder), options.policy), path, options.fast) as port:
                 line, _ = listening.accept()
                 print(json.dumps({"port": port}), flush=True)
                 with line:

@@ -2,10 +2,13 @@
 
 import ctypes
 import json
+import os
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
+from command_line import in_process
 from firmwares import needs_compiler
 
 from cartpole_rl.emulator import c_library
@@ -115,6 +118,28 @@ def test_a_file_compiles_without_a_warning_and_with_the_numbers_of_a_board(file,
 
 def test_the_library_compiles_without_a_warning(tmp_path):
     compile_c(tmp_path / "library.so", c_library.sources(), "-shared", "-fPIC", *STRICT[1:])
+
+
+def test_an_evaluation_sends_and_receives_the_same_with_both(tmp_path):
+    pytest.importorskip("mujoco", reason='pip install "cartpole_rl[emulator]"')
+    for kind in ("python", "c"):
+        emulator = (f"emulator.firmware={kind}", f"emulator.journal={kind}.jsonl", "emulator.latency=0.012")
+        words = ("run=lqr", "plant=emulated", "episodes=2", *emulator, f"hydra.run.dir={kind}")
+        done = in_process("evaluate", *words, folder=tmp_path)
+        assert done.code == 0, done.err
+    for name in ("{}/metrics.json", "{}.jsonl"):
+        python, c = (tmp_path.joinpath(name.format(kind)).read_text() for kind in ("python", "c"))
+        assert len(python) > 1000
+        assert c == python
+
+
+def test_a_cart_without_a_compiler_ends_with_one_line():
+    command = [sys.executable, "-m", "cartpole_rl.emulator", '{"firmware": "c"}']
+    environment = {name: value for name, value in os.environ.items() if name != "CC"} | {"PATH": ""}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
+    (line,) = done.stderr.splitlines()
+    assert done.returncode == 1
+    assert line.startswith("emulator.firmware=c needs a C compiler")
 
 
 def test_without_a_compiler_one_line_says_what_to_do(monkeypatch):

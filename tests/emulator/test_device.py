@@ -253,7 +253,7 @@ def test_every_setting_is_tried_here_or_on_the_wire():
     order = {"frame_duplication", "frame_reordering"}  # test_emulator_disturbance.py
     faults = {"unplug_at", "stuck_encoder", "stuck_at"}  # test_emulator_faults.py
     cogging = {"cogging", "cogging_pitch"}  # test_emulator_physics.py
-    firmware = {"firmware"}  # this module runs with both; test_c_firmware.py
+    firmware = {"firmware", "policy"}  # this module runs with both; test_onboard_policy.py
     journal = {"journal"}  # tests/plants/test_stops.py, tests/bench/test_soak.py
     assert set(OTHER) | firmware | on_the_wire | order | faults | cogging | journal == set(
         EmulatorSettings.model_fields

@@ -2,12 +2,17 @@
 
 import ctypes
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
+from driven_cart import Driven
 from firmwares import needs_compiler
 
 from cartpole_rl.emulator.c_firmware import CFirmware
-from cartpole_rl.wire import Fault, Flags, SetMotor, Start, State, Stop, decode_frame, encode_frame
+from cartpole_rl.emulator.c_library import build_library
+from cartpole_rl.emulator.settings import EmulatorSettings
+from cartpole_rl.errors import EmulatorError
+from cartpole_rl.wire import Fault, Flags, Hello, SetMotor, Start, State, Stop, decode_frame, encode_frame
 from cartpole_rl.wire.messages import Message
 
 pytestmark = needs_compiler
@@ -26,6 +31,7 @@ class Observation(ctypes.Structure):
     )
 
 
+SHUTTLE = Path(__file__).parents[1] / "support" / "shuttle"
 PolicyInC = ctypes.CFUNCTYPE(ctypes.c_int16, ctypes.c_void_p, ctypes.POINTER(Observation))
 
 
@@ -123,3 +129,26 @@ def test_a_fault_ends_it():
 @pytest.mark.parametrize("value", [256, -256, 32767, -32768])
 def test_a_value_out_of_range_is_0(value):
     assert Board(lambda seen: value).tick()[2] == 0
+
+
+def test_an_emulated_cart_drives_by_the_c_code_of_a_policy():
+    """The cart shuttles about the middle without a motor value from the host."""
+    pytest.importorskip("mujoco", reason='pip install "cartpole_rl[emulator]"')
+    driven = Driven(firmware="c", policy=SHUTTLE)
+    driven.home()
+    driven.ask(Start())
+    states = [driven.ask(Hello()) for _ in range(200)]
+    assert {state.motor_applied for state in states} == {110, -110}
+    assert min(state.cart_counts for state in states) < -50
+    assert max(state.cart_counts for state in states) > 50
+    assert driven.flags == Flags.ARMED | Flags.HOMED
+
+
+def test_a_policy_needs_the_c_firmware():
+    with pytest.raises(ValueError, match="set firmware=c"):
+        EmulatorSettings(policy=SHUTTLE)
+
+
+def test_a_folder_without_a_policy_is_named(tmp_path):
+    with pytest.raises(EmulatorError, match=r"emulator.policy=.*: there is no policy.h; give a folder"):
+        build_library(tmp_path)

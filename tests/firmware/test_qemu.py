@@ -4,6 +4,8 @@ import json
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 
 import pytest
 import qemu_cart
@@ -19,13 +21,14 @@ from cartpole_rl.plants.serial.settings import SerialSettings  # noqa: E402
 from cartpole_rl.wire import Fault, Flags  # noqa: E402
 
 PUSH, FAR = 110, 400  # motor value, and counts from the middle: 9 mm
-SETTINGS = SerialSettings(port="later", timeout=20, answer_timeout=2, connect_timeout=20, home_timeout=200)
+SHUTTLE = Path(__file__).parents[1] / "support" / "shuttle"
+SETTINGS = SerialSettings(port="later", timeout=20, answer_timeout=2, connect_timeout=20, home_timeout=600)
 
 
-@pytest.fixture(scope="module")
-def port() -> Iterator[str]:
-    """The port of a board that has just booted."""
-    command = [sys.executable, str(qemu_cart.__file__), json.dumps({"physics_step": 1e-3})]
+@contextmanager
+def board(*options: str) -> Iterator[str]:
+    """Run a board that has just booted; yield its port."""
+    command = [sys.executable, str(qemu_cart.__file__), json.dumps({"physics_step": 1e-3}), *options]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     try:
@@ -37,8 +40,8 @@ def port() -> Iterator[str]:
     assert process.returncode == 0
 
 
-def test_it_homes_drives_and_stops_like_any_cart(port: str) -> None:
-    with SerialCart(SETTINGS.model_copy(update={"port": port})) as cart:
+def test_it_homes_drives_and_stops_like_any_cart() -> None:
+    with board("--fast") as port, SerialCart(SETTINGS.model_copy(update={"port": port})) as cart:
         cart.home()
         assert cart.flags & Flags.HOMED
         before = cart.poll_state()
@@ -46,12 +49,22 @@ def test_it_homes_drives_and_stops_like_any_cart(port: str) -> None:
         assert abs(before.pole_counts - 2048) <= 8
         cart.start()
         pushed = []
-        while not pushed or pushed[-1].cart_counts < FAR:  # a busy computer may miss a period
+        while not pushed or pushed[-1].cart_counts < FAR:  # the board does not wait for the host
             cart.set_motor(PUSH)
             pushed.append(cart.get_state())
-        assert PUSH in [state.motor_applied for state in pushed]
         assert max(state.pole_counts for state in pushed) > before.pole_counts + 3
         silent = [cart.poll_state() for _ in range(4)]
         assert silent[-1].motor_applied == 0
         assert cart.flags & Flags.WATCHDOG
         assert silent[-1].fault == Fault.NONE
+
+
+def test_a_policy_on_the_board_drives_without_a_host() -> None:
+    options = ("--policy", str(SHUTTLE), "--fast")
+    with board(*options) as port, SerialCart(SETTINGS.model_copy(update={"port": port})) as cart:
+        cart.home()
+        cart.start()
+        states = [cart.poll_state() for _ in range(100)]
+        assert {110, -110} <= {state.motor_applied for state in states}
+        assert states[-1].fault == Fault.NONE
+        assert cart.flags & Flags.ARMED

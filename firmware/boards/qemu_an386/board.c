@@ -31,6 +31,7 @@
 
 static volatile uint8_t received[RECEIVE_BYTES];
 static volatile uint32_t received_head, received_tail;
+static uint32_t clock_us; /* read last: the main loop counts a measurement as of this moment */
 
 static void put(uint32_t uart, uint8_t byte)
 {
@@ -49,7 +50,7 @@ static int32_t ask(uint8_t encoder)
 {
     uint32_t count = 0;
     put(UART1, encoder);
-    put_number(COUNTER, 4);
+    put_number(clock_us, 4);
     for (int at = 0; at < 4; at++) {
         while (!(REGISTER(UART1 + STATE) & RECEIVE_FULL))
             continue;
@@ -75,7 +76,8 @@ void systick_interrupt(void)
 
 uint32_t cart_hardware_clock_us(void)
 {
-    return COUNTER;
+    clock_us = COUNTER;
+    return clock_us;
 }
 
 int32_t cart_hardware_cart_count(void)
@@ -95,7 +97,7 @@ void cart_hardware_set_motor(int16_t value)
         return;
     in_force = value;
     put(UART1, 'M');
-    put_number(COUNTER, 4);
+    put_number(cart_hardware_clock_us(), 4);
     put_number((uint16_t)value, 2);
 }
 

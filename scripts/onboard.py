@@ -1,0 +1,78 @@
+#!/usr/bin/env python
+"""Does a cart with a policy on the board swing its pole up by itself?
+
+    cartpole-export run=RUN format=c hydra.run.dir=FOLDER
+    cartpole-emulate emulator.firmware=c emulator.policy=FOLDER     # prints its port
+    scripts/onboard.py /dev/pts/5 --episodes 3
+
+Any cart with the agent on its board will do: an emulated one as here, a processor in QEMU
+(scripts/qemu/cart.py --policy FOLDER --fast), or a real one.
+
+Homes the cart, sends START, and then only listens, for the time of one episode; no motor value leaves this
+computer. Prints one line for each episode: the score (6.2), the share of the time upright, and faults. A
+period whose state was not read counts as the next one that was. Exit status 1 if a fault was latched.
+"""
+
+import argparse
+import sys
+
+import torch
+
+from cartpole_rl.choices import choice
+from cartpole_rl.plants.serial.cart import SerialCart
+from cartpole_rl.plants.serial.settings import SerialSettings
+from cartpole_rl.tasks.features import Measured, measured_position
+from cartpole_rl.tasks.rewards import SCORE
+from cartpole_rl.wire import Fault, State
+
+UPRIGHT = 0.0873  # rad: 5 degrees
+PERIOD_US = 20_000
+
+
+def episode(cart: SerialCart, periods: int) -> list[State]:
+    """Home the cart, arm it and listen; return the states from START on, fewer if a fault ends it."""
+    cart.home()
+    cart.set_period(PERIOD_US)
+    cart.start()
+    states = [cart.poll_state()]
+    while states[-1].tick < states[0].tick + periods and not states[-1].fault:
+        states.append(cart.poll_state())
+    cart.stop()
+    return states
+
+
+def line(states: list[State], track_half_length: float) -> str:
+    """Return the result of an episode in words."""
+    counts = torch.tensor([(state.cart_counts, state.pole_counts) for state in states]).T
+    x, theta = measured_position(counts)
+    zero = torch.zeros_like(x)
+    periods = torch.tensor([states[0].tick, *(state.tick for state in states)]).diff()
+    score = (SCORE.formula(Measured(x, zero, theta, zero), track_half_length) * periods).sum()
+    upright = ((theta.abs() < UPRIGHT) * periods).sum() / periods.sum()
+    fault = Fault(states[-1].fault)
+    return (
+        f"{periods.sum()} periods, {len(states)} states read, score {score:.0f}, upright "
+        f"{100 * upright:.0f} % of the time, fault {fault.name if fault else 'none'}"
+    )
+
+
+def main() -> int:
+    """Listen to episodes; return the exit status."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("port", help="serial port of the cart")
+    parser.add_argument("--episodes", type=int, default=1, help="number of episodes (1)")
+    options = parser.parse_args()
+    periods, track = choice("task/swingup")["time_limit"], choice("cart/ip02")["track_half_length"]
+    faults = 0
+    with SerialCart(SerialSettings(port=options.port)) as cart:
+        for _ in range(options.episodes):
+            states = episode(cart, periods)
+            print(line(states, track), flush=True)
+            faults |= states[-1].fault
+    return 1 if faults else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,52 @@
+#!/usr/bin/env python
+"""What does a cart report? For the first power-on of a new board: it moves nothing unless it is asked to.
+
+    scripts/watch.py /dev/ttyUSB0             # prints its counts twice a second until Ctrl-C
+    scripts/watch.py /dev/ttyUSB0 --home      # homes it first: the motor moves by itself
+
+At its start and at its end it sends STOP. If homing fails, it prints the fault and ends with exit status 1.
+"""
+
+import argparse
+import contextlib
+import sys
+
+from cartpole_rl.errors import PlantError
+from cartpole_rl.plants.serial.cart import SerialCart
+from cartpole_rl.plants.serial.settings import SerialSettings
+from cartpole_rl.wire import Fault, Flags, State
+
+PERIODS_PER_LINE = 25
+
+
+def line(state: State, flags: Flags) -> str:
+    """Return a state in words."""
+    fault = Fault(state.fault)
+    return (
+        f"tick {state.tick:8}  cart {state.cart_counts:8}  pole {state.pole_counts:8}  motor "
+        f"{state.motor_applied:4}  {flags.name or 'idle, not homed'}  fault {fault.name if fault else 'none'}"
+    )
+
+
+def main() -> None:
+    """Print what a cart reports until Ctrl-C."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("port", help="serial port of the cart")
+    parser.add_argument("--home", action="store_true", help="home the cart first")
+    options = parser.parse_args()
+    try:
+        with SerialCart(SerialSettings(port=options.port)) as cart, contextlib.suppress(KeyboardInterrupt):
+            print(cart.information)
+            if options.home:
+                print(line(cart.home(), cart.flags), flush=True)
+            while True:
+                states = [cart.poll_state() for _ in range(PERIODS_PER_LINE)]
+                print(line(states[-1], cart.flags), flush=True)
+    except PlantError as error:
+        sys.exit(str(error))
+
+
+if __name__ == "__main__":
+    main()
