@@ -64,7 +64,7 @@ def page(exported: ExportedAgent, medium_agent: TrainedAgent) -> str:
 class ExactPlant(OneCartPlant):
     """The nominal cart with some parameters replaced, simulated in float64 as the page is.
 
-    `SimulatedPlant` keeps its state in float32. Near upright, two episodes that differ by a rounding of float32
+    `SimulatedPlant` keeps its state in float32. Near upright, two episodes that differ by such a rounding
     differ by more than 1e-4 after a second.
     """
 
