@@ -3,9 +3,9 @@
 
 scripts/bench/export_parity.py pretrained/medium --observations 100000
 
-drives randomized simulated carts by the agent and records its observations. For each format it prints how many
-actions differ, the largest action value that such an action costs, and the processor time of an action.
-Needs gcc. PyTorch itself, on single observations, is the last row.
+drives randomized simulated carts by the agent and records its observations. For each format it prints how
+many actions differ, the largest action value that such an action costs, and the processor time of an action.
+The last row is PyTorch itself on single observations. Needs gcc.
 """
 
 import ctypes

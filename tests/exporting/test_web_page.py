@@ -1,12 +1,9 @@
 """The page's cart moves as the simulated one, in a headless browser."""
 
 import copy
-import html
 import json
 import math
 import re
-import shutil
-import subprocess
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from browser import BROWSER, BROWSERS, in_browser
 
 from cartpole_rl.envs.build import environment
 from cartpole_rl.exporting.agent import ExportedAgent
@@ -28,8 +26,6 @@ from cartpole_rl.workflows.agents import TrainedAgent
 from cartpole_rl.workflows.config import TrainConfig
 from cartpole_rl.workflows.export import network_of
 
-BROWSERS = ("chromium", "chromium-browser", "google-chrome")
-BROWSER = next(filter(None, map(shutil.which, BROWSERS)), None)
 PERIODS = 100  # 2 s
 HANGING = {"x": 0.05, "x_dot": 0.0, "theta": math.pi, "theta_dot": 0.0}
 EPISODES: list[dict[str, Any]] = [  # parameters that differ from the nominal cart, and the initial true state
@@ -119,19 +115,6 @@ def simulated(trained: TrainedAgent, episode: dict[str, Any]) -> np.ndarray:
         step = cart.step(action)
         rows.append([*plant.motion, motor])
     return np.array(rows)
-
-
-def in_browser(page: str, script: str, folder: Path) -> Any:
-    """Return the JSON that `script`, at the end of the page, writes into its body."""
-    assert BROWSER is not None
-    file = folder / "page.html"
-    file.write_text(page.replace("</body>", f"<script>{script}</script></body>"))
-    words = ["--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={folder / 'profile'}"]
-    done = subprocess.run(
-        [BROWSER, *words, "--dump-dom", file.as_uri()], capture_output=True, text=True, timeout=300
-    )
-    (body,) = re.findall(r"<body>(.*)</body>", done.stdout, re.S)
-    return json.loads(html.unescape(body))
 
 
 def test_the_page_needs_no_other_file(page: str) -> None:
