@@ -10,6 +10,7 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from operations import AWKWARD, OPERATIONS
 from torch import Tensor
 
 from cartpole_rl.choices import choice
@@ -25,7 +26,6 @@ from cartpole_rl.tasks.features import ObservationKind
 from cartpole_rl.tasks.rewards import Reward
 from cartpole_rl.tasks.settings import RewardSettings, TaskSettings
 
-AWKWARD = (0.0, -0.0, 0.5, -0.5, 1.5, 2.5, 1.0, -1.0, math.nan, math.inf, -math.inf, 1e300, -1e300, 710.0)
 numbers = st.sampled_from(AWKWARD) | st.floats(-10, 10)
 GUARD = TrackGuard(margin=0.01, delay=0.05, deceleration=3.0)
 TASK = TaskSettings(**choice("task/swingup") | {"x_max": 0.38})
@@ -51,36 +51,6 @@ def check(function: Callable[..., Any], scalar: Scalar, *arguments: tuple[Tensor
         kind = {torch.bool: bool, torch.int64: int}.get(right.dtype, float)
         for number, exact in zip(value, plain(right), strict=True):
             assert kind(number) == pytest.approx(exact, rel=1e-9, abs=1e-9, nan_ok=True)
-
-
-OPERATIONS: tuple[Callable[[Tensor, Tensor], Tensor], ...] = (
-    lambda a, b: a + 2 * b - 1,
-    lambda a, b: 1 - a * b,
-    lambda a, b: a / b,
-    lambda a, b: 1 / a,
-    lambda a, b: a / 3,
-    lambda a, b: a % b,
-    lambda a, b: -a.abs(),
-    lambda a, b: a.sign(),
-    lambda a, b: torch.copysign(a, b),
-    lambda a, b: a.round(),
-    lambda a, b: a.clamp(0, 1),
-    lambda a, b: a.clamp(min=0.0),
-    lambda a, b: a.clamp(max=2),
-    lambda a, b: a.clamp(-b, b),
-    lambda a, b: a.nan_to_num(0.0).clamp(-(2**30), 2**30).long(),
-    lambda a, b: a.sin() + b.cos(),
-    lambda a, b: a.exp(),
-    lambda a, b: a.sigmoid() - b.tanh(),
-    lambda a, b: a.clamp(-1e9, 1e9) ** 2,
-    lambda a, b: torch.where((a > b) | (a == 0), a, b),
-    lambda a, b: ~(a <= b) & (b != 0),
-    lambda a, b: (a < 1.5) * b,
-    lambda a, b: 1 * (a >= b) - 1 * (a < b),
-    lambda a, b: (a > 0).to(a.dtype) + b.bool(),
-    lambda a, b: (a.nan_to_num(0.0).clamp(-5000, 5000).long() + 2048) & 4095,
-    lambda a, b: (a.nan_to_num(0.0).clamp(-5000, 5000).long() + 100) % 7,
-)
 
 
 @pytest.mark.parametrize("number", range(len(OPERATIONS)))

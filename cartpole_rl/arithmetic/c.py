@@ -40,8 +40,10 @@ HELPERS = {  # defined where a line calls them
     "clamped(": """\
 static float clamped(float value, float low, float high)
 {
-    const float raised = value < low ? low : value; /* NaN stays NaN */
-    return raised > high ? high : raised;
+    if (isnan(value) || isnan(low) || isnan(high)) {
+        return NAN;
+    }
+    return value > low ? (value < high ? value : high) : (low < high ? low : high);
 }
 """,
     "sign(": """\

@@ -57,7 +57,8 @@ function finite(value, ofNan, ofInfinity, ofMinusInfinity) {
   return Number.isNaN(value) ? ofNan : value > 0 ? ofInfinity : ofMinusInfinity;
 }
 function remainder(value, by) {
-  return value - by * Math.floor(value / by);
+  const rest = value % by;
+  return rest !== 0 && rest < 0 !== by < 0 ? rest + by : rest;
 }
 function rounded(value) {
   const below = Math.floor(value), rest = value - below;

@@ -102,7 +102,7 @@ def header(agent: ExportedAgent, later: str) -> str:
         "period_ms": f"{1e3 * about.control_period:g}",
         "period_us": round(1e6 * about.control_period),
         "guard": about.guard or "none",
-        "origin": " ".join(about.provenance.get("command", [])) or "of unknown origin",
+        "origin": about.origin.replace("*/", "* /"),
         "checksum": agent.checksum,
         "inputs": about.sizes[0],
         "actions": len(about.motors),

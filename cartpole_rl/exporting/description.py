@@ -57,6 +57,11 @@ class Description(Settings):
     provenance: dict[str, Any]  # of the training: command, versions, commit, seed, score
 
     @property
+    def origin(self) -> str:
+        """The command of the training."""
+        return " ".join(map(str, self.provenance.get("command", []))) or "unknown"
+
+    @property
     def is_consistent(self) -> bool:
         """True if the parts that repeat each other agree."""
         ends = len(self.numbers), len(self.motors)

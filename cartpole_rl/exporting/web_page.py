@@ -5,6 +5,7 @@ simulation (`plants/simulation.py`, `envs/perception.py`). It computes in float6
 """
 
 import base64
+import html
 import json
 from typing import Any, NamedTuple
 
@@ -160,7 +161,6 @@ def encoded(values: Any) -> str:
 def words(agent: ExportedAgent) -> dict[str, str]:
     """Return the texts of the page."""
     about = agent.description
-    origin = " ".join(about.provenance.get("command", [])) or "an unknown training"
     low, high = about.pole_lengths
     lengths = f"{low:.2f} m" if low == high else f"{low:.2f} to {high:.2f} m"
-    return {"origin": origin, "checksum": agent.checksum, "lengths": lengths}
+    return {"origin": html.escape(about.origin), "checksum": agent.checksum, "lengths": lengths}

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from cartpole_rl.errors import CheckpointError
-from cartpole_rl.run_files import CHECKPOINTS, LAST, PROVENANCE, RESUME
+from cartpole_rl.run_files import CHECKPOINTS, LAST, RESUME
 
 PRETRAINED = "pretrained"  # run=pretrained/medium is an agent in this package
 PRETRAINED_AGENT = "agent.pt"
@@ -37,13 +37,6 @@ def find_pretrained(run: Path) -> Path:
         choices = ", ".join(f"{PRETRAINED}/{name}" for name in names)
         raise CheckpointError(f"run={run}: there is no such pretrained agent; there are {choices}")
     return path
-
-
-def provenance_file(agent: Path) -> Path | None:
-    """Return the provenance.json of the run that wrote the checkpoint `agent`; None if there is none."""
-    folder = agent.parent.parent if agent.parent.name == CHECKPOINTS else agent.parent
-    path = folder / PROVENANCE
-    return path if path.is_file() else None
 
 
 def find_training(run: Path) -> Path:

@@ -16,10 +16,11 @@ from cartpole_rl.exporting.onnx_model import write_onnx
 from cartpole_rl.exporting.web_page import web_page
 from cartpole_rl.exporting.weights import write_agent
 from cartpole_rl.files import write_text
-from cartpole_rl.learning.checkpoint_files import find_agent, provenance_file
+from cartpole_rl.learning.checkpoint_files import find_agent
 from cartpole_rl.learning.checkpoints import load_agent
 from cartpole_rl.plants.settings import SimulatedSettings
 from cartpole_rl.randomization.checks import possible_poles
+from cartpole_rl.run_files import CHECKPOINTS, PROVENANCE
 from cartpole_rl.workflows.agents import TrainedAgent, trained_agent
 from cartpole_rl.workflows.config import ExportConfig, TrainConfig
 from cartpole_rl.workflows.run_folder import write_config
@@ -75,8 +76,7 @@ def description(training: TrainConfig, origin: Mapping[str, Any]) -> Description
 
 def provenance(run: Path) -> dict[str, Any]:
     """Return the origin of the agent of `run`: its command, versions, commit, transitions and score."""
-    checkpoint, path = load_agent(run), provenance_file(find_agent(run))
-    recorded = {} if path is None else json.loads(path.read_text())
+    checkpoint, recorded = load_agent(run), recorded_provenance(find_agent(run))
     command = recorded.get("command", [])
     return {
         **recorded,
@@ -84,6 +84,16 @@ def provenance(run: Path) -> dict[str, Any]:
         "transitions": checkpoint.transitions,
         "score": checkpoint.score,
     }
+
+
+def recorded_provenance(agent: Path) -> dict[str, Any]:
+    """Return the provenance.json of the run that wrote the checkpoint `agent`; empty if there is none."""
+    folder = agent.parent.parent if agent.parent.name == CHECKPOINTS else agent.parent
+    try:
+        recorded = json.loads((folder / PROVENANCE).read_text())
+    except (OSError, ValueError):
+        return {}
+    return recorded if isinstance(recorded, dict) else {}
 
 
 def write_weights(folder: Path, agent: ExportedAgent, trained: TrainedAgent) -> tuple[str, ...]:

@@ -4,11 +4,11 @@ import json
 from pathlib import Path
 
 import pytest
-from command_line import ONCE, TINY, in_process
+from command_line import in_process
 
 from cartpole_rl.exporting.weights import read_agent
 
-FILES = {"weights": {"agent.npz"}}
+FILES = {"weights": {"agent.npz"}, "c": {"policy.h", "policy.c"}, "web": {"cart.html"}}
 
 
 @pytest.mark.parametrize("form", FILES)
@@ -30,12 +30,3 @@ def test_an_agent_of_ones_own_is_exported_with_its_provenance(trained: Path, tmp
     about = read_agent(tmp_path / "run/agent.npz").description
     assert len(about.motors) == 2
     assert about.provenance["command"][0] == "cartpole-train"
-
-
-def test_a_recurrent_agent_is_refused(tmp_path: Path) -> None:
-    recurrent = ("experiment=recurrent", *TINY, ONCE, "hydra.run.dir=train")
-    assert in_process("train", *recurrent, folder=tmp_path).code == 0
-    done = in_process("export", "run=train", "format=weights", "hydra.run.dir=run", folder=tmp_path)
-    assert done.code == 2
-    assert "a recurrent agent (agent.recurrent) cannot be exported" in done.complaint
-    assert not (tmp_path / "run").exists()

@@ -1,29 +1,31 @@
 """The page's cart moves as the simulated one, in a headless browser."""
 
-import html
+import copy
 import json
 import math
 import re
-import shutil
-import subprocess
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from browser import BROWSER, BROWSERS, in_browser
 
-from cartpole_rl.envs.build import simulated_env
-from cartpole_rl.evaluation.episodes import choose
+from cartpole_rl.envs.build import environment
 from cartpole_rl.exporting.agent import ExportedAgent
-from cartpole_rl.exporting.web_page import web_page
-from cartpole_rl.physics.dynamics import State
-from cartpole_rl.plants.specs import tensordict_of
+from cartpole_rl.exporting.web_page import LONGEST_LATENCY, web_page
+from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
+from cartpole_rl.physics.parameters import CartParameters
+from cartpole_rl.plants.settings import SimulatedSettings
+from cartpole_rl.plants.simulation import Carts, Inputs, commands_under_way, run_carts
+from cartpole_rl.plants.specs import OneCartPlant, OneFrame
+from cartpole_rl.scalar import Scalar
 from cartpole_rl.workflows.agents import TrainedAgent
-from cartpole_rl.workflows.build import with_parameters
+from cartpole_rl.workflows.config import TrainConfig
+from cartpole_rl.workflows.export import network_of
 
-BROWSERS = ("chromium", "chromium-browser", "google-chrome")
-BROWSER = next(filter(None, map(shutil.which, BROWSERS)), None)
 PERIODS = 100  # 2 s
 HANGING = {"x": 0.05, "x_dot": 0.0, "theta": math.pi, "theta_dot": 0.0}
 EPISODES: list[dict[str, Any]] = [  # parameters that differ from the nominal cart, and the initial true state
@@ -55,38 +57,64 @@ def page(exported: ExportedAgent, medium_agent: TrainedAgent) -> str:
     return web_page(exported, training, training.plant)
 
 
+class ExactPlant(OneCartPlant):
+    """The nominal cart with some parameters replaced, simulated in float64 as the page is.
+
+    `SimulatedPlant` keeps its state in float32. Near upright, two episodes that differ by such a rounding
+    differ by more than 1e-4 after a second.
+    """
+
+    def __init__(self, training: TrainConfig, parameters: dict[str, float], start: dict[str, float]) -> None:
+        super().__init__()
+        values = {**training.nominal_with(training.pole.nominal), **parameters}
+        self.track_end, self.length = values["track_half_length"], 2 * values["pole_com"]
+        self.period, self.start = training.control_period, tuple(start.values())
+        self.table = tuple(values[name] for name in CartParameters.names())
+        self.commands = commands_under_way(LONGEST_LATENCY, self.period)
+        assert isinstance(training.plant, SimulatedSettings)
+        plant = training.plant
+        run = partial(run_carts, models=training.models(plant), period=self.period, substeps=plant.substeps)
+        column = torch.zeros(4, 1)
+        drive = torch.zeros(1 + self.commands, 1)
+        example = Carts(torch.ones(len(self.table), 1), column, drive)
+        self.run = Scalar(run, example, Inputs(torch.zeros(1, 1, dtype=torch.int64), column[:3]))
+
+    @property
+    def pole_length(self) -> torch.Tensor:
+        return torch.tensor([self.length])
+
+    @property
+    def track_half_length(self) -> torch.Tensor:
+        return torch.tensor([self.track_end])
+
+    def _set_seed(self, seed: int | None) -> None:
+        """Nothing is random."""
+
+    def reset_one(self) -> OneFrame:
+        self.motion, self.drive = self.start, (0.0,) * (1 + self.commands)
+        x, _, theta, _ = self.start
+        counts = round(x / CART_METRES_PER_COUNT), round(theta / POLE_RADIANS_PER_COUNT)
+        return OneFrame(counts, self.period, 0, False, False)
+
+    def step_one(self, motor: int) -> OneFrame:
+        after = self.run((self.table, self.motion, self.drive), ((motor,), (0.0, 0.0, 0.0)))
+        self.motion, self.drive = after.motion, after.drive
+        return OneFrame(after.counts, self.period, motor, after.off_track[0], False)
+
+
 @torch.no_grad()
 def simulated(trained: TrainedAgent, episode: dict[str, Any]) -> np.ndarray:
     """True states and motor values of an episode in the simulation, [PERIODS, 5]."""
-    training = trained.training
-    settings = with_parameters(training.model_copy(update={"randomization": {}}), episode["parameters"])
-    settings = settings.model_copy(update={"guard": training.guard})
-    env = simulated_env(settings, training.plant, 1, training.task.evaluation_start, seed=0)
-    env.plant.start_from(episode["start"])
-    cart, rows = env.one_cart, []
+    plant = ExactPlant(trained.training, episode["parameters"], episode["start"])
+    network = copy.deepcopy(network_of(trained)).double()
+    cart, rows = environment(trained.training, plant).one_cart, []
     step: Any = cart.reset()
     for _ in range(PERIODS):
-        observed = torch.from_numpy(np.array([step.observation], np.float32))
-        action = int(choose(trained.policy, tensordict_of({"observation": observed})))
+        action = int(network(torch.tensor(step.observation, dtype=torch.float64)).argmax())
         motor = cart.sent_motor(action)
         step = cart.step(action)
-        rows.append([*(each.item() for each in State(*env.plant.true_state)), motor])
-        if cart.frame.terminated:
-            break
+        rows.append([*plant.motion, motor])
     return np.array(rows)
-
-
-def in_browser(page: str, script: str, folder: Path) -> Any:
-    """Return the JSON that `script`, at the end of the page, writes into its body."""
-    assert BROWSER is not None
-    file = folder / "page.html"
-    file.write_text(page.replace("</body>", f"<script>{script}</script></body>"))
-    words = ["--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={folder / 'profile'}"]
-    done = subprocess.run(
-        [BROWSER, *words, "--dump-dom", file.as_uri()], capture_output=True, text=True, timeout=300
-    )
-    (body,) = re.findall(r"<body>(.*)</body>", done.stdout, re.S)
-    return json.loads(html.unescape(body))
 
 
 def test_the_page_needs_no_other_file(page: str) -> None:

@@ -79,7 +79,7 @@ function prepared(canvas) {
 /** Pixels per metre, and where the middle of the track is. */
 function view(width, height) {
   const half = cart.parameters.track_half_length + 0.12, length = 2 * cart.parameters.pole_com;
-  const scale = Math.min(width / (2 * half), height / (2 * length + 0.2));
+  const scale = Math.min(width / (2 * half), height / (2 * length + 0.12));
   return { scale, middle: width / 2, rail: height / 2 };
 }
 
@@ -207,7 +207,7 @@ function apply() {
   for (const name of ["cart_coulomb", "cart_viscous"]) cart.parameters[name] = friction * DATA.cart[name];
   cart.parameters.latency = element("latency").value / 1000;
   Object.assign(cart.parameters, pole);
-  element("friction-value").textContent = `${friction.toFixed(1)} times the nominal`;
+  element("friction-value").textContent = `${friction.toFixed(1)} × nominal`;
   element("latency-value").textContent = `${element("latency").value} ms`;
   element("pole-value").textContent = `${(200 * pole.pole_com).toFixed(0)} cm`;
 }

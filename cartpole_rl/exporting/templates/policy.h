@@ -4,7 +4,7 @@
  *     RAM         @@ram@@ bytes for each cart (policy_t), @@stack@@ bytes of buffers on the stack
  *     operations  @@operations@@ multiply-adds, @@roots@@ square roots and @@trigonometry@@ calls of sinf, cosf a period
  *
- * No heap, no static variables, fixed buffers. It needs a float unit or a soft-float library, and <math.h>.
+ * No heap, no writable static variables, fixed buffers. It needs a float unit or a soft-float library, and <math.h>.
  *
  * In each control period of @@period_ms@@ ms, read both encoders, call policy_motor() and set the returned motor value
  * at once. Call policy_start() before the first period of an episode, with the cart homed. Counts and motor
@@ -12,7 +12,7 @@
  * limits, the watchdog and the faults of the firmware must stay in force: this code only chooses motor values. The track guard
  * of the training: @@guard@@
  *
- * Agent: @@origin@@
+ * Training: @@origin@@
  * SHA-256: @@checksum@@
  */
 #ifndef POLICY_H
