@@ -100,8 +100,12 @@ def as_mapping(composed: DictConfig) -> dict[str, Any]:
     return without_missing(OmegaConf.to_container(composed, resolve=True))
 
 
-# Hydra 1.4 deprecates what Hydra 1.3 needs
-warnings.filterwarnings("ignore", r"register_new_resolver\(\) is deprecated|The version_base parameter is")
+DEPRECATED_IN_1_4 = (  # and needed in Hydra 1.3
+    r"register_new_resolver\(\) is deprecated",
+    "The version_base parameter is deprecated",
+    r"hydra\.utils\.instantiate\(\) resolved _target_=",
+)
+warnings.filterwarnings("ignore", "|".join(DEPRECATED_IN_1_4))
 OmegaConf.register_new_resolver("run_folder", run_folder, use_cache=True)
 OmegaConf.register_new_resolver("sweep_folder", sweep_folder, use_cache=True)
 OmegaConf.register_new_resolver("constant_settings", constant_settings, use_cache=True)

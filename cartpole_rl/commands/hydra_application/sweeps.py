@@ -4,6 +4,7 @@ Each job keeps error.txt in its run folder until it succeeds. So the report is t
 and it includes jobs that were killed.
 """
 
+import logging
 import os
 import re
 import sys
@@ -39,7 +40,7 @@ class SweepStart(Callback):
 
 
 def as_multirun(words: Sequence[str]) -> list[str]:
-    """Return the words of a command line, with -m if one of them is sweep=...: choices cannot set the mode."""
+    """Return the words of a command line, with -m beside sweep=...: a choice cannot set the mode."""
     chosen = any(word.startswith("sweep=") for word in words)
     return [*words, "--multirun"] if chosen and not {"-m", "--multirun"} & {*words} else [*words]
 
@@ -71,6 +72,7 @@ def failures_reported(name: str) -> Iterator[None]:
 
     The launcher itself fails if the process of a job is killed. What it raises is named too.
     """
+    logging.getLogger("hydra_plugins").setLevel(logging.ERROR)  # failed jobs are named here
     SweepStart.folder = None
     try:
         yield
