@@ -30,13 +30,14 @@ NOT_ENDED = "it was killed or interrupted, or is still running"
 
 
 class SweepStart(Callback):
-    """Hydra's callback that notes the folder of the sweep."""
+    """Hydra's callback that notes the folder of the sweep, and what jobs in other processes cannot know."""
 
     folder: ClassVar[Path | None] = None
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
-        """Note the folder, before the first job."""
+        """Resolve folder and constant settings here; Hydra hands the values to the jobs."""
         SweepStart.folder = Path(config.hydra.sweep.dir)
+        _ = config.hydra.job.config.override_dirname.exclude_keys
 
 
 def as_multirun(words: Sequence[str]) -> list[str]:
