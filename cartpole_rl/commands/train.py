@@ -14,15 +14,15 @@ from cartpole_rl.workflows.config import TrainConfig
 
 
 @application("train", TrainConfig)
-def main(config: TrainConfig, folder: Path) -> None:
-    """Check, then train."""
+def main(config: TrainConfig, folder: Path) -> float:
+    """Check, then train; return the score, for Optuna."""
     if config.resume is None:
         check_training(config)
     else:
         check_resumption("train", config.resume, folder)
     from cartpole_rl.workflows.train import train
 
-    train(config, folder)
+    return train(config, folder)
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ from cartpole_rl.devices import moved
 from cartpole_rl.errors import CheckpointError
 from cartpole_rl.files import replacing
 from cartpole_rl.learning.checkpoint_files import find_agent, find_training
-from cartpole_rl.run_files import CHECKPOINTS, RESUME
+from cartpole_rl.run_files import CHECKPOINTS, ERROR, RESUME
 
 AGENT_FORMAT = "cartpole_rl agent 1"
 TRAINING_FORMAT = "cartpole_rl training 4"
@@ -91,8 +91,9 @@ def save_training(run: Path, training: TrainingCheckpoint, file_format: str = TR
 
 
 def forget_training(run: Path) -> None:
-    """Remove the file of `save_training`: the training has ended, and the buffer in it is large."""
+    """Remove the files of an unfinished training: that of `save_training` and the error of a sweep's job."""
     (run / CHECKPOINTS / RESUME).unlink(missing_ok=True)
+    (run / ERROR).unlink(missing_ok=True)
 
 
 def load_training(run: Path, file_format: str = TRAINING_FORMAT) -> TrainingCheckpoint:

@@ -79,7 +79,7 @@ def program_of(folder: Path) -> str | None:
 def check_program(setting: str, folder: Path, *taken: str) -> None:
     """Raise ConfigError if `folder` is a run of a command that is not among `taken`."""
     if (folder / MULTIRUN).is_file():
-        jobs = sorted(path for path in folder.iterdir() if path.is_dir())
+        jobs = sorted(path for path in folder.iterdir() if path.is_dir() and path.name[0] != ".")
         example = f": {setting}={jobs[0]}" if jobs else ""
         raise ConfigError(
             f"{setting}={folder} is a folder of a multirun; give that of one of its jobs{example}"

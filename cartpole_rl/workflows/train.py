@@ -31,8 +31,8 @@ from cartpole_rl.workflows.resuming import resumed
 from cartpole_rl.workflows.run_folder import write_config
 
 
-def train(config: TrainConfig, folder: Path) -> None:
-    """Train an agent on randomized simulated carts, or resume the training in `folder`.
+def train(config: TrainConfig, folder: Path) -> float:
+    """Train an agent on randomized simulated carts, or resume the training in `folder`; return its score.
 
     Writes config.yaml, provenance.json, TensorBoard events, history.jsonl (evaluations), checkpoints/last.pt
     and best.pt, metrics.json and figures/; until the end also checkpoints/resume.pt. Raises ConfigError for
@@ -81,6 +81,8 @@ def train(config: TrainConfig, folder: Path) -> None:
         monitor.finished(metrics)
     forget_training(folder)
     print(f"trained for {training.seconds:.0f} s; {folder}/{METRICS}, {FIGURES}/, {CHECKPOINTS}/ are written")
+    score: float = metrics["score"]["mean"]
+    return score
 
 
 def note_guard(guard: GuardSettings) -> None:

@@ -295,11 +295,16 @@ def test_without_a_compiler_the_remedy_is_stated(tmp_path: Path, monkeypatch: py
 
 def test_in_a_multirun_the_other_jobs_run(tmp_path: Path) -> None:
     done = in_process("train", "-m", *TINY, ONCE, "agent.gamma=1.5,0.9", folder=tmp_path)
-    assert done.code == 2
+    assert done.code == 1
     assert "agent.gamma=1.5: give less than 1" in done.err.splitlines()[0]
     assert "Traceback" not in done.err
     finished = list(tmp_path.glob("runs/train/*_multirun/*/metrics.json"))
     assert [path.parent.name for path in finished] == ["1_agent.gamma-0.9"]
+    assert not (finished[0].parent / "error.txt").exists()
+    assert done.err.splitlines()[-2:] == [
+        f"cartpole-train: 1 of 2 jobs failed in {finished[0].parents[1].relative_to(tmp_path)}:",
+        "cartpole-train: 0_agent.gamma-1.5: agent.gamma=1.5: give less than 1",
+    ]
 
 
 def test_through_a_real_process(tmp_path: Path) -> None:

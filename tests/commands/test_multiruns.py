@@ -78,7 +78,9 @@ def test_every_command_gives_each_multirun_its_own(
     multiruns = [hydra.compose(command, given.get(command, []), return_hydra_config=True) for _ in range(3)]
     folders = [multirun.hydra.sweep.dir for multirun in multiruns]
     assert len(set(folders)) == 3
-    assert all(Path(folder).is_dir() and Path(folder).parts[:2] == ("runs", command) for folder in folders)
+    assert all(
+        Path(folder).is_dir() and Path(folder).parent == Path.cwd() / "runs" / command for folder in folders
+    )
     for multirun, folder in zip(multiruns, folders, strict=True):
         assert folder_of_a_job(multirun, "label=first") == folder
         assert folder_of_a_job(multirun, "label=second") == folder

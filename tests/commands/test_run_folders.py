@@ -14,7 +14,7 @@ import yaml
 from command_line import TINY, console_script, in_process, outcome, prints_only_progress
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from cartpole_rl.commands.hydra_application.composition import job_name, run_folder
+from cartpole_rl.commands.hydra_application.composition import constant_settings, job_name, run_folder
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.errors import LinkError
 from cartpole_rl.evaluation.episodes import Policy, run_episodes
@@ -187,8 +187,8 @@ def test_names_of_jobs_show_what_differs(monkeypatch: pytest.MonkeyPatch) -> Non
     words = ["-m", "compile=false", "agent.hidden=[64,64],[8]", "run=runs/a,runs/b", "seed=range(0,2)"]
     monkeypatch.setattr(sys, "argv", ["cartpole-train", *words])
     job = ["compile=False", "agent.hidden=[64,64]", "run=runs/a", "seed=0"]
-    assert job_name(7, job) == "7_agent.hidden-64-64_run-runs-a_seed-0"
-    assert job_name(0, ["compile=False"]) == "0"
+    assert job_name(7, job, constant_settings()) == "7_agent.hidden-64-64_run-runs-a_seed-0"
+    assert job_name(0, ["compile=False"], constant_settings()) == "0"
 
 
 def test_runs_that_start_in_the_same_second_do_not_share_a_folder(

@@ -7,6 +7,7 @@ from typing import Any
 import hydra
 import pytest
 import yaml
+from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from cartpole_rl.checking import checked
 from cartpole_rl.choices import conf_folder, default_choices
@@ -21,7 +22,12 @@ pytestmark = pytest.mark.usefixtures("hydra_reads_conf")
 CONF = conf_folder()
 GROUPS = sorted(path.name for path in CONF.iterdir() if path.is_dir() and path.name != "hydra")
 CHOICES = [f"{group}={path.stem}" for group in GROUPS for path in sorted((CONF / group).glob("*.yaml"))]
-NOT_OF_TRAINING = ("emulator", "plant", "finetuning")  # groups with choices that training does not take
+NOT_OF_TRAINING = (
+    "emulator",
+    "plant",
+    "finetuning",
+    "sweep",
+)  # groups with choices that are not settings of it
 NEEDED = {"agent=recurrent": ["observation=positions"]}  # beside a choice
 REPLACEABLE = ("task", "pole", "cart_friction", "pole_friction", "reward", "randomization", "cart")
 
@@ -124,6 +130,22 @@ def test_an_experiment_holds_only_differences(experiment: str) -> None:
         assert not chosen.items() & default_choices("train").items()
     before = dict(leaves(composed("train", *(f"{group}={name}" for group, name in chosen.items()))))
     assert not [name for name, value in leaves(content) if before[name] == value]
+
+
+@pytest.mark.parametrize("sweep", sorted(path.stem for path in (CONF / "sweep").glob("*.yaml")))
+def test_training_takes_every_value_of_a_sweep(sweep: str) -> None:
+    params = yaml.safe_load((CONF / f"sweep/{sweep}.yaml").read_text())["hydra"]["sweeper"]["params"]
+    for parsed in OverridesParser.create().parse_overrides(
+        [f"{key}={value}" for key, value in params.items()]
+    ):
+        interval = parsed.value() if parsed.is_interval_sweep() else None
+        values = [interval.start, interval.end] if interval else [*parsed.sweep_string_iterator()]
+        assert len({*values}) > 1
+        for value in values:
+            config = checked(TrainConfig, composed("train", f"{parsed.get_key_element()}={value}"))
+            group, _, name = parsed.get_key_element().partition(".")
+            if name:
+                assert getattr(getattr(config, group), name) == float(value)
 
 
 def test_every_file_starts_with_a_description() -> None:

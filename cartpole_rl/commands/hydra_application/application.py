@@ -12,13 +12,12 @@ from typing import TypeVar
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from cartpole_rl.checking import checked
 from cartpole_rl.choices import conf_folder
 from cartpole_rl.commands.hydra_application.choice_files import with_choice_files
-from cartpole_rl.commands.hydra_application.complaints import dashed_setting, in_one_line
+from cartpole_rl.commands.hydra_application.complaints import dashed_setting
 from cartpole_rl.commands.hydra_application.composition import as_mapping, choices_of
 from cartpole_rl.commands.hydra_application.exits import (
     EXPECTED,
@@ -27,34 +26,35 @@ from cartpole_rl.commands.hydra_application.exits import (
     exit_after_signal,
     exit_with_message,
 )
+from cartpole_rl.commands.hydra_application.sweeps import as_multirun, failures_reported, is_job, run_as_job
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.settings import Settings
-from cartpole_rl.workflows.person import print_message
 
 Config = TypeVar("Config", bound=Settings)
-Body = Callable[[Config, Path], None]
+Body = Callable[[Config, Path], float | None]
 
 
 def application(name: str, schema: type[Config]) -> Callable[[Body[Config]], Callable[[], None]]:
     """Return a decorator that makes the command cartpole-<name>, with conf/<name>.yaml checked by `schema`.
 
-    The function gets the checked config and the run folder, which is removed at the end if it is empty. In a
-    multirun the other jobs run even if one fails.
+    The function gets the checked config and the run folder, which is removed at the end if it is empty. It
+    may return a score, which a sweep by Optuna maximizes.
     """
 
     def decorate(body: Body[Config]) -> Callable[[], None]:
         given: list[str] = []
 
-        def task(composed: DictConfig) -> None:
+        def task(composed: DictConfig) -> float | None:
             sys.argv[1:] = given  # as typed, for provenance.json
             quieten()  # here, since a launcher may run the job in another process
             folder = Path(HydraConfig.get().runtime.output_dir)
+
+            def work() -> float | None:
+                return body(checked(schema, as_mapping(composed)), folder)
+
             try:
-                body(checked(schema, as_mapping(composed)), folder)
+                return run_as_job(name, folder, work) if is_job() else work()
             except EXPECTED as error:
-                if HydraConfig.get().mode is RunMode.MULTIRUN:
-                    print_message(name, in_one_line(error, name))
-                    raise  # Hydra keeps it until all jobs have ended
                 exit_with_message(name, error)
             finally:
                 remove_if_empty(folder, name)
@@ -67,7 +67,7 @@ def application(name: str, schema: type[Config]) -> Callable[[Body[Config]], Cal
             try:
                 if dashed := dashed_setting(sys.argv[1:]):
                     raise ConfigError(dashed)
-                with with_choice_files(given) as words:
+                with with_choice_files(as_multirun(given)) as words, failures_reported(name):
                     sys.argv[1:] = words
                     hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=name)(task)()
             except EXPECTED as error:

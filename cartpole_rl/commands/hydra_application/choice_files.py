@@ -22,7 +22,9 @@ RUN_FILES = (CONFIG, CART, POLE, RANDOMIZATION)
 @contextmanager
 def with_choice_files(words: Sequence[str]) -> Iterator[list[str]]:
     """Yield the overrides with files replaced by choices. Raises ConfigError for a wrong file or null."""
-    with TemporaryDirectory(prefix="cartpole_rl-") as folder:
+    several = not {"-m", "--multirun"}.isdisjoint(words)
+    above = Path.cwd() if several else None  # the machines of a cluster may share it
+    with TemporaryDirectory(prefix="cartpole_rl-", dir=above) as folder:
         replaced = [_with_choices(word, Path(folder)) for word in words]
         if any(Path(folder).iterdir()):  # beside the first file: Hydra takes no override after an option
             first = next(i for i, (word, new) in enumerate(zip(words, replaced, strict=True)) if word != new)

@@ -25,6 +25,13 @@ HYDRA_OPTIONS = (
     "config",
     "info",
 )
+EXTRAS = {  # of the package, that bring launchers and a sweeper
+    "hydra/launcher/joblib": "joblib",
+    "hydra/launcher/submitit_local": "submitit",
+    "hydra/launcher/submitit_slurm": "submitit",
+    "hydra/launcher/ray": "ray",
+    "hydra/sweeper/optuna": "optuna",
+}
 NEAR_CHOICE = 0.6  # similarity from which a choice is suggested
 
 
@@ -51,6 +58,8 @@ def hydra_complaint(text: str, command: str) -> str:
         return no_such_setting(unknown[1], known_settings(command))
     if choice := re.search(r"Could not find '([^']+)' Available options in '([^']+)': (.*)", text):
         wrong = choice[1].removeprefix(f"{choice[2]}/")
+        if extra := EXTRAS.get(choice[1]):
+            return f'{choice[2]}={wrong} needs the extra {extra}: pip install "cartpole_rl[{extra}]"'
         remedy = nearest_choice(wrong, choice[3].split(" Config search")[0].split())
         return f"{choice[2]}={wrong}: there is no such choice; {remedy}"
     if several := re.match(r"Ambiguous value for argument '([^']+)'", text):

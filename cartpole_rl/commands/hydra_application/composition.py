@@ -2,7 +2,8 @@
 
 import re
 import sys
-from collections.abc import Sequence
+import warnings
+from collections.abc import Collection, Sequence
 from contextlib import suppress
 from datetime import datetime
 from itertools import count
@@ -38,9 +39,10 @@ def sweep_folder(command: str) -> str:
     """Return the folder of a multirun: a new one named by date and time, made here as that of a run.
 
     Hydra composes the config of each job anew with the cached values of its resolvers, in other processes
-    too, so all jobs of a multirun share the folder.
+    too, so all jobs of a multirun share the folder. The path is absolute, since such a process may have
+    another working directory.
     """
-    return new_folder(command, "multirun")
+    return str(Path(new_folder(command, "multirun")).absolute())
 
 
 def new_folder(command: str, label: str) -> str:
@@ -62,14 +64,18 @@ def _make(folder: Path) -> None:
         folder.mkdir(parents=True)
 
 
-def job_name(number: int, overrides: Sequence[str]) -> str:
+def constant_settings() -> list[str]:
+    """Return the settings on the command line that are the same in all jobs of a multirun."""
+    words = [word for word in sys.argv[1:] if "=" in word and not word.startswith("-")]
+    parsed = OverridesParser.create().parse_overrides(words)
+    return [each.get_key_element() for each in parsed if not each.is_sweep_override()]
+
+
+def job_name(number: int, overrides: Sequence[str], constant: Collection[str]) -> str:
     """Return the folder of one job of a multirun, by its swept settings: "0_randomization-friction_3_seed-0".
 
     Characters that a shell or Hydra would interpret become "-".
     """
-    words = [word for word in sys.argv[1:] if "=" in word and not word.startswith("-")]
-    parsed = OverridesParser.create().parse_overrides(words)
-    constant = {each.get_key_element() for each in parsed if not each.is_sweep_override()}
     swept = (word for word in overrides if "=" in word and word.split("=")[0] not in constant)
     plain = (re.sub(r"[^\w.+-]+", "-", word).strip("-") for word in swept)
     return "_".join((str(number), *plain))[:LONGEST_NAME]
@@ -94,8 +100,15 @@ def as_mapping(composed: DictConfig) -> dict[str, Any]:
     return without_missing(OmegaConf.to_container(composed, resolve=True))
 
 
+DEPRECATED_IN_1_4 = (  # and needed in Hydra 1.3
+    r"register_new_resolver\(\) is deprecated",
+    "The version_base parameter is deprecated",
+    r"hydra\.utils\.instantiate\(\) resolved _target_=",
+)
+warnings.filterwarnings("ignore", "|".join(DEPRECATED_IN_1_4))
 OmegaConf.register_new_resolver("run_folder", run_folder, use_cache=True)
 OmegaConf.register_new_resolver("sweep_folder", sweep_folder, use_cache=True)
+OmegaConf.register_new_resolver("constant_settings", constant_settings, use_cache=True)
 OmegaConf.register_new_resolver("job_name", job_name)
 # conf/emulator/ extends this choice; its numbers are the defaults of the settings class
 ConfigStore.instance().store(group="emulator", name="medium", node=EmulatorSettings().model_dump(mode="json"))

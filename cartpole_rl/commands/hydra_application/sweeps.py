@@ -1,0 +1,113 @@
+"""Sweeps: a failed job does not end one, and its end names every failed job with the reason.
+
+Each job keeps error.txt in its run folder until it succeeds. So the report is the same with every launcher,
+and it includes jobs that were killed.
+"""
+
+import logging
+import os
+import re
+import sys
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, ClassVar
+
+from hydra.core.hydra_config import HydraConfig
+from hydra.experimental.callback import Callback
+from hydra.types import RunMode
+from omegaconf import DictConfig
+
+from cartpole_rl.commands.hydra_application.complaints import in_one_line
+from cartpole_rl.commands.hydra_application.exits import EXPECTED
+from cartpole_rl.errors import CartPoleError
+from cartpole_rl.files import write_text
+from cartpole_rl.run_files import ERROR
+from cartpole_rl.workflows.person import print_message
+
+NOT_ENDED = "it was killed or interrupted, or is still running"
+
+
+class SweepStart(Callback):
+    """Hydra's callback that notes the folder of the sweep, and what jobs in other processes cannot know."""
+
+    folder: ClassVar[Path | None] = None
+
+    def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
+        """Resolve folder and constant settings here; Hydra hands the values to the jobs."""
+        SweepStart.folder = Path(config.hydra.sweep.dir)
+        _ = config.hydra.job.config.override_dirname.exclude_keys
+
+
+def as_multirun(words: Sequence[str]) -> list[str]:
+    """Return the words of a command line, with -m beside sweep=...: a choice cannot set the mode."""
+    chosen = any(word.startswith("sweep=") for word in words)
+    return [*words, "--multirun"] if chosen and not {"-m", "--multirun"} & {*words} else [*words]
+
+
+def is_job() -> bool:
+    """Return True in a job of a sweep."""
+    return HydraConfig.get().mode is RunMode.MULTIRUN
+
+
+def run_as_job(name: str, folder: Path, work: Callable[[], float | None]) -> float | None:
+    """Return the result of a job of a sweep; None if it failed, with the reason printed and in error.txt."""
+    if not HydraConfig.get().job.chdir:
+        os.chdir(HydraConfig.get().runtime.cwd)  # on a cluster, a worker may start in another folder
+    write_text(folder / ERROR, f"{NOT_ENDED}\n")
+    try:
+        result = work()
+    except Exception as error:
+        print_message(name, one_line := _one_line(error, name))
+        details = "" if isinstance(error, EXPECTED) else traceback.format_exc()
+        write_text(folder / ERROR, f"{one_line}\n{details}")
+        return None
+    (folder / ERROR).unlink(missing_ok=True)
+    return result
+
+
+@contextmanager
+def failures_reported(name: str) -> Iterator[None]:
+    """At the end of a sweep, name its failed jobs and exit with 1 if there are any.
+
+    The launcher itself fails if the process of a job is killed. What it raises is named too.
+    """
+    logging.getLogger("hydra_plugins").setLevel(logging.ERROR)  # failed jobs are named here
+    SweepStart.folder = None
+    try:
+        yield
+    except Exception as error:
+        if not _jobs():
+            raise
+        print_message(name, f"the sweep was stopped: {_one_line(error, name)}")
+        _report(name)
+        sys.exit(CartPoleError.exit_code)
+    if _report(name):
+        sys.exit(CartPoleError.exit_code)
+
+
+def _report(name: str) -> int:
+    """Print the failed jobs of the sweep, and return their number."""
+    jobs = _jobs()
+    failed = [job for job in jobs if (job / ERROR).exists()]
+    if failed:
+        print_message(name, f"{len(failed)} of {len(jobs)} jobs failed in {os.path.relpath(jobs[0].parent)}:")
+    for job in failed:
+        print_message(name, f"{job.name}: {(job / ERROR).read_text().splitlines()[0]}")
+    return len(failed)
+
+
+def _jobs() -> list[Path]:
+    """Return the run folders of the sweep, in the order of their numbers; none outside of a sweep."""
+    if SweepStart.folder is None:
+        return []
+    jobs = (path for path in SweepStart.folder.iterdir() if path.is_dir() and path.name[0] != ".")
+    return sorted(jobs, key=lambda job: [int(number) for number in re.findall(r"^\d+", job.name)])
+
+
+def _one_line(error: Exception, name: str) -> str:
+    """Return the message of `error`, with its class if it is not one of the expected errors."""
+    if isinstance(error, EXPECTED):
+        return in_one_line(error, name)
+    return ": ".join([type(error).__name__, *str(error).splitlines()[:1]])

@@ -1,0 +1,70 @@
+"""sweep= on the command line, and jobs that fail."""
+
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+from command_line import in_process
+
+from cartpole_rl.commands.hydra_application.complaints import EXTRAS
+from cartpole_rl.commands.hydra_application.sweeps import as_multirun
+
+FAILS = "agent.gamma=1.5"  # at once
+
+
+def test_a_sweep_needs_no_dash_m(tmp_path: Path) -> None:
+    done = in_process("train", "sweep=seeds", FAILS, folder=tmp_path)
+    assert done.code == 1
+    (folder,) = tmp_path.glob("runs/train/*_multirun")
+    report = done.err.splitlines()[-11:]
+    assert report[0] == f"cartpole-train: 10 of 10 jobs failed in {folder.relative_to(tmp_path)}:"
+    assert report[1:] == [
+        f"cartpole-train: {seed}_seed-{seed}: {FAILS}: give less than 1" for seed in range(10)
+    ]
+
+
+def test_the_command_line_replaces_values_of_a_sweep(tmp_path: Path) -> None:
+    done = in_process("train", "sweep=randomization_width", "seed=7", FAILS, folder=tmp_path)
+    assert done.code == 1
+    names = {job.name for job in tmp_path.glob("runs/train/*_multirun/*_*")}
+    assert names == {
+        "0_randomization-none",
+        "1_randomization-friction_6",
+        "2_randomization-half",
+        "3_randomization-wide",
+    }
+
+
+def test_a_defect_in_a_job_leaves_its_traceback(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("cartpole_rl.commands.train.check_training", lambda config: 1 / 0)
+    done = in_process("train", "-m", "seed=0,1", folder=tmp_path)
+    assert done.code == 1
+    assert done.err.splitlines()[-1] == "cartpole-train: 1_seed-1: ZeroDivisionError: division by zero"
+    (error,) = tmp_path.glob("runs/train/*_multirun/1_seed-1/error.txt")
+    assert "Traceback" in error.read_text()
+
+
+def test_an_unknown_setting_ends_a_sweep_before_its_first_job(tmp_path: Path) -> None:
+    done = in_process("train", "-m", "seeed=0,1", folder=tmp_path)
+    assert done.code == 2
+    assert "did you mean seed?" in done.complaint
+
+
+@pytest.mark.parametrize("choice", EXTRAS)
+def test_a_missing_extra_is_named(choice: str, tmp_path: Path) -> None:
+    group, _, name = choice.rpartition("/")
+    if find_spec("hydra_plugins") and any(
+        find_spec(f"hydra_plugins.hydra_{EXTRAS[choice]}_{kind}") for kind in ("launcher", "sweeper")
+    ):
+        pytest.skip(f"the extra {EXTRAS[choice]} is installed")
+    done = in_process("train", "-m", f"{group}={name}", "seed=0,1", folder=tmp_path)
+    assert done.code == 2
+    assert done.complaint.endswith(
+        f'needs the extra {EXTRAS[choice]}: pip install "cartpole_rl[{EXTRAS[choice]}]"'
+    )
+
+
+def test_dash_m_is_added_once() -> None:
+    assert as_multirun(["sweep=seeds"]) == ["sweep=seeds", "--multirun"]
+    assert as_multirun(["-m", "sweep=seeds"]) == ["-m", "sweep=seeds"]
+    assert as_multirun(["seed=1"]) == ["seed=1"]
