@@ -35,6 +35,7 @@ from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.settings import Count, Finite, Seed, Settings
 from cartpole_rl.tasks.settings import RewardSettings
 
+View = Literal["none", "live"]  # of the cart in the terminal, while it is driven
 OF_SIMULATION = ("parameters", "randomization", "cart", "cart_friction", "pole_friction")
 
 
@@ -132,6 +133,7 @@ class EvaluateConfig(RunSettings):
     reward: RewardSettings | None = None
     guard: GuardSettings | None = None
     repeat: RepeatSettings = RepeatSettings()
+    view: View = "none"
 
     @model_validator(mode="after")
     def _plant_reads_every_setting(self) -> "EvaluateConfig":
@@ -145,6 +147,8 @@ class EvaluateConfig(RunSettings):
             if kind == "emulated":
                 reason = "has its own cart; set emulator.* or emulator=large"
             raise ValueError(f"{', '.join(unread)}: plant={kind} {reason}")
+        if self.view == "live" and kind not in ("emulated", "serial"):
+            raise ValueError(f"view=live: it shows a cart on a port; plant={kind} has none")
         if kind != "emulated" and self.emulator != EmulatorSettings():
             raise ValueError(f"emulator: plant={kind} does not read it; give plant=emulated")
         return self
@@ -163,6 +167,7 @@ class FinetuneConfig(RunSettings, OnCart):
     finetuning: FinetuningSettings
     compile: bool
     resume: str | None
+    view: View = "none"
 
 
 class ReplayConfig(SimulatedCartSettings):
