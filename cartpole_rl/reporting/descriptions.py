@@ -1,9 +1,7 @@
 """Descriptions of all curves, histograms and pictures, shown by TensorBoard beside their names."""
 
 OF_EPISODES = {
-    "score": "Score (6.2) of an episode: the sum over its periods. The figure to judge a training by.",
-    "score_min": "Score (6.2) of the worst episode.",
-    "score_max": "Score (6.2) of the best episode.",
+    "score": "Score (6.2) of an episode: the sum over its periods.",
     "score_upright": "Score (6.1) of an episode: the sum over its periods; only an upright pole scores.",
     "steps": "Control periods of an episode. Fewer than the time limit: it ended early.",
     "upright_fraction": "Share of an episode in which the pole is within 5 degrees of upright.",
@@ -17,6 +15,9 @@ GROUPS = {
     "summary": "Mean over the episodes of the last evaluation.",
 }
 DESCRIPTIONS = {
+    "evaluation/score": "Mean score (6.2) of the greedy policy on nominal carts: judge a training by it.",
+    "evaluation/score_min": "Score (6.2) of the worst episode of an evaluation.",
+    "evaluation/score_max": "Score (6.2) of the best episode of an evaluation.",
     "evaluation/seconds": "Seconds of training until this evaluation.",
     "exploration/episode_length": "Mean control periods of the episodes that ended since the last point.",
     "learning/loss": "Mean loss of the updates of an iteration.",
@@ -53,9 +54,9 @@ PREFIXES = {
 
 def description(tag: str) -> str:
     """Return the description of a curve, a histogram or a picture; empty for an unknown one."""
+    if tag in DESCRIPTIONS:
+        return DESCRIPTIONS[tag]
     group, _, name = tag.partition("/")
     if group in GROUPS and name in OF_EPISODES:
         return f"{OF_EPISODES[name]} {GROUPS[group]}"
-    if tag in DESCRIPTIONS:
-        return DESCRIPTIONS[tag]
     return next((text for prefix, text in PREFIXES.items() if tag.startswith(prefix)), "")
