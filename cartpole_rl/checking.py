@@ -15,6 +15,7 @@ TAGS = re.compile(
     r"(?<=^plant\.)(simulated|emulated|serial|learned)\.|(?<=^randomization\.)(ranges|identified)\."
 )
 NEAR = 0.8  # similarity of two names, 0 to 1, from which one is suggested for the other
+NEAR_VALUE = 0.6  # similarity from which a value is suggested
 SAME_GROUP = 0.15  # added to the similarity within one group
 EXAMPLES = {  # of required settings
     "run": "run=runs/train/<run>",
@@ -72,9 +73,19 @@ def _complaint(detail: Mapping[str, Any], schema: type[Settings], values: Mappin
 def _reason(detail: Mapping[str, Any]) -> str:
     """Return the remedy for a wrong value, or what is wrong with it."""
     if remedy := REMEDIES.get(detail["type"]):
-        return remedy.format(**{name: _plain(limit) for name, limit in detail.get("ctx", {}).items()})
+        given = {name: _plain(limit) for name, limit in detail.get("ctx", {}).items()}
+        return _meant(detail) + remedy.format(**given)
     reason: str = detail["msg"].removeprefix("Value error, ")
     return reason[0].lower() + reason[1:] if detail["loc"] else reason
+
+
+def _meant(detail: Mapping[str, Any]) -> str:
+    """Return "did you mean ...? " for a text that is close to one of the expected ones."""
+    choices = re.findall(r"'([^']+)'", str(detail.get("ctx", {}).get("expected", "")))
+    if not choices or not isinstance(detail["input"], str):
+        return ""
+    near = most_similar(detail["input"], choices)
+    return f"did you mean {near}? " if similarity(detail["input"], near)[0] >= NEAR_VALUE else ""
 
 
 def _plain(limit: Any) -> Any:

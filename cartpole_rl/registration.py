@@ -13,6 +13,7 @@ from importlib.machinery import ModuleSpec
 from types import ModuleType
 
 ENVIRONMENTS = {"cartpole_rl/SwingUp-v0": "swingup", "cartpole_rl/Balance-v0": "balance"}  # id: task
+MAX_EPISODE_STEPS = 500  # `time_limit` in conf/task/, which takes too long to read here
 
 
 def register() -> None:
@@ -26,6 +27,7 @@ def register() -> None:
                 entry_point="cartpole_rl.envs.gymnasium:CartPoleGymnasium",
                 vector_entry_point="cartpole_rl.envs.gymnasium:CartPoleVector",
                 kwargs={"task": task},
+                max_episode_steps=MAX_EPISODE_STEPS,
             )
 
 

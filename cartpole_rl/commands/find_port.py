@@ -43,7 +43,7 @@ def listing(ports: list[UsbPort]) -> str:
     lines = [f"{port.device}  {described(port)}" for port in ports]
     carts = cart_like(ports)
     if len(carts) == 1:
-        lines.append(f"The cart is probably on it: plant.port={carts[0].device}, or plant.port=auto")
+        lines.append(f"The cart is probably on it. Next: cartpole-preflight plant.port={carts[0].device}")
     elif carts:
         lines.append("`cartpole-find-port watch=true` finds out which of them is the cart")
     else:
@@ -61,7 +61,8 @@ def watched(ports: PortList, timeout: float) -> str:
         if changed := [*vanished, *appeared]:
             what = "vanished" if vanished else "appeared"
             lines = [f"{port.device} {what}: plant.port={port.device}  {described(port)}" for port in changed]
-            return "\n".join([*lines, *(["Plug it in again before you use it."] if vanished else [])])
+            again = "Plug it in again before you use it. Next:" if vanished else "Next:"
+            return "\n".join([*lines, f"{again} cartpole-preflight plant.port={changed[0].device}"])
         time.sleep(LOOK_EVERY)
     raise PortError(f"no port appeared or vanished within {timeout:g} s: {REMEDY}")
 

@@ -23,6 +23,8 @@ def run(settings: EmulatorSettings) -> None:
     cart = CartDevice(settings)
     with until_stopped(), PtyLink() as link:
         print(json.dumps({"port": link.port, "pid": os.getpid()}), flush=True)
+        if sys.stderr.isatty():  # a person, not a program that reads the line
+            print(f"next, in another terminal: cartpole-preflight plant.port={link.port}", file=sys.stderr)
         clock = run_lockstep if settings.clock == "lockstep" else run_real
         clock(cart, Channel(link, settings))
         print(f"the cable was pulled after {settings.unplug_at:g} s (unplug_at)", file=sys.stderr)

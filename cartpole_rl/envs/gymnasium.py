@@ -1,31 +1,38 @@
 """The simulated environments for Gymnasium: one cart, or many at once.
 
-    gymnasium.make("cartpole_rl/SwingUp-v0")
+    gymnasium.make("cartpole_rl/SwingUp-v0", render_mode="human")
     gymnasium.make_vec("cartpole_rl/Balance-v0", num_envs=1024, vectorization_mode="vector_entry_point")
 
 Both wrap the same `CartPoleEnv` as everything else, with the nominal cart and the medium pole of conf/.
 
-| task    | actions                                     | reward                             | ends          |
-|---------|---------------------------------------------|------------------------------------|---------------|
-| swingup | nine motor values, conf/actions/nine_levels | (6.2), as in conf/reward/score     | track         |
-| balance | left, none, right, conf/actions/three       | (6.1), as in conf/reward/position  | track, 12 deg |
+| id         | actions                       | reward                            | ends          |
+|------------|-------------------------------|-----------------------------------|---------------|
+| SwingUp-v0 | 9, conf/actions/nine_levels   | (6.2), as in conf/reward/score    | track         |
+| Balance-v0 | left, none, right, as `three` | (6.1), as in conf/reward/position | track, 12 deg |
 
-An episode is truncated after 10 s. An action is an index of the motor values, from full left to full right.
-The track guard (envs/guard.py) replaces them near the end of the track.
-`info` has the step's scores (6.1) `score_upright` and (6.2) `score`. The observation is a Box of float32
-without bounds, as in conf/train.yaml:
+An action is an index of the motor values, from full left to full right. The track guard (envs/guard.py)
+replaces them near the end of the track. An episode is truncated after `max_episode_steps`, by default 500
+control periods of 20 ms. `info` has the step's scores (6.1) `score_upright` and (6.2) `score`.
 
-| index | observation                       | unit    |
-|-------|-----------------------------------|---------|
-| 0     | x, positive right                 | 0.38 m  |
-| 1     | x_dot                             | 1 m/s   |
-| 2, 3  | cos and sin of theta, 0 upright   | 1       |
-| 4     | theta_dot                         | 8 rad/s |
-| 5-7   | last motor values, newest first   | 255     |
-| 8, 9  | x_dot and theta_dot, a step ago   | as 1, 4 |
+The observation is a Box of float32. The space itself is unbounded, because a measured speed has no bound;
+the table gives the bounds of each number, or the usual range. Times the unit, a number is in SI units.
+
+| index | observation                               | unit    | range                       |
+|-------|-------------------------------------------|---------|-----------------------------|
+| 0     | x, positive right, 0 in the middle        | 0.38 m  | -1 to 1, the track          |
+| 1     | x_dot, mean of the last period            | 1 m/s   | unbounded, usually -1 to 1  |
+| 2     | cos(theta), 1 upright                     | 1       | -1 to 1                     |
+| 3     | sin(theta), positive right                | 1       | -1 to 1                     |
+| 4     | theta_dot, mean of the last period        | 8 rad/s | unbounded, usually -1 to 1  |
+| 5-7   | the last three motor values, newest first | 255     | -1 to 1                     |
+| 8     | x_dot a period ago                        | 1 m/s   | as 1                        |
+| 9     | theta_dot a period ago                    | 8 rad/s | as 4                        |
+
+`render_mode="rgb_array"` returns pictures of 320 by 480 pixels, one for each cart. `render_mode="human"`
+shows up to nine carts in a window of matplotlib, in real time (envs/rendering.py).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import gymnasium
@@ -38,28 +45,42 @@ from numpy.typing import NDArray
 from tensordict import TensorDictBase
 
 from cartpole_rl.choices import choice
-from cartpole_rl.envs.build import shipped_settings, simulated_env
+from cartpole_rl.envs.build import shipped_settings, simulated_env, with_fitted_guard
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
+from cartpole_rl.envs.rendering import RENDER_MODES, Picture, Renderer
 from cartpole_rl.plants.settings import SimulatedSettings
+from cartpole_rl.registration import MAX_EPISODE_STEPS
 
 OF_TASK = {
     "swingup": {"task": "swingup", "actions": "nine_levels", "reward": "score"},
     "balance": {"task": "balance", "actions": "three", "reward": "position"},
 }
 SCORES = ("score", "score_upright")
+PERIOD = 0.02  # s, the control period of conf/train.yaml
+UNLIMITED = 2**62  # control periods, where Gymnasium's TimeLimit ends the episode
+METADATA = {"render_modes": list(RENDER_MODES), "render_fps": round(1 / PERIOD)}
 
 Array = NDArray[Any]
 Randomization = str | Mapping[str, Mapping[str, Any]]
 
 
 def simulated_environment(
-    task: str, carts: int, randomization: Randomization = "none", compiled: bool = False
+    task: str,
+    carts: int,
+    randomization: Randomization = "none",
+    compiled: bool = False,
+    time_limit: int | None = None,
 ) -> CartPoleEnv:
     """Return the environment of `task`, "swingup" or "balance", with the other choices of conf/train.yaml.
 
-    `randomization` is the name of a file in conf/randomization/, or its lines. Raises ConfigError.
+    `randomization` is the name of a file in conf/randomization/, or its lines. `time_limit` in control
+    periods; None is that of the task. Raises ConfigError.
     """
     settings = shipped_settings({**OF_TASK[task], "pole": "medium", "randomization": randomization})
+    if time_limit is not None:
+        fitted = with_fitted_guard(settings)  # before the change, so that environments share the fit
+        limited = fitted.task.model_copy(update={"time_limit": time_limit})
+        settings = fitted.model_copy(update={"task": limited})
     plant = SimulatedSettings(**choice("plant/simulated"))
     return simulated_env(settings, plant, carts, settings.task.start, seed=0, compiled=compiled)
 
@@ -74,15 +95,24 @@ def action_space(env: CartPoleEnv) -> spaces.Discrete:
     return spaces.Discrete(len(env.hardware.motors))
 
 
+def renderer(mode: str | None, env: CartPoleEnv, task: str, steps: int | None) -> Renderer | None:
+    """Return the renderer of a mode, or None without one; `steps` is the length of an episode."""
+    if mode is None:
+        return None
+    return Renderer(mode, env.plant, f"cartpole_rl {task}", PERIOD, steps or MAX_EPISODE_STEPS)
+
+
 class CartPoleGymnasium(gymnasium.Env[Array, np.int64]):
-    """One simulated cart."""
+    """One simulated cart. It has no time limit; `gymnasium.make` adds that of the registration."""
 
-    metadata = {"render_modes": []}  # noqa: RUF012 - Gymnasium declares it so
+    metadata = METADATA
 
-    def __init__(self, task: str, randomization: Randomization = "none", render_mode: None = None) -> None:
-        self.env = simulated_environment(task, 1, randomization)
+    def __init__(
+        self, task: str, randomization: Randomization = "none", render_mode: str | None = None
+    ) -> None:
+        self.env = simulated_environment(task, 1, randomization, time_limit=UNLIMITED)
         self.observation_space, self.action_space = observation_space(self.env), action_space(self.env)
-        self.render_mode = render_mode
+        self.render_mode, self.renderer = render_mode, renderer(render_mode, self.env, task, None)
         self.seeded = False  # the plant, from `np_random`
 
     def reset(
@@ -91,14 +121,35 @@ class CartPoleGymnasium(gymnasium.Env[Array, np.int64]):
         """Start an episode."""
         super().reset(seed=seed)
         seed_plant(self, seed)
-        return float32(self.env.one_cart.reset().observation), {}
+        first = self.env.one_cart.reset()
+        if self.renderer is not None:
+            x, _, theta, _ = first.state
+            self.renderer.start(0, x, theta)
+            self.renderer.show()
+        return float32(first.observation), {}
 
     def step(self, action: np.int64) -> tuple[Array, float, bool, bool, dict[str, Any]]:
         """One control period."""
+        motor = self.env.one_cart.sent_motor(int(action))
         now = self.env.one_cart.step(int(action))
         (reward,), (terminated,), (truncated,) = now.reward, now.terminated, now.truncated
         scores = {"score": now.score[0], "score_upright": now.score_upright[0]}
+        if self.renderer is not None:
+            x, _, theta, _ = now.state
+            self.renderer.advance(0, x, theta, motor, now.score[0])
+            self.renderer.show()
         return float32(now.observation), reward, terminated, truncated, scores
+
+    def render(self) -> Picture | None:
+        """Return the newest picture, uint8 [320, 480, 3]; None if it is shown in a window."""
+        if self.renderer is None or self.render_mode == "human":
+            return None
+        return self.renderer.pictures()[0]
+
+    def close(self) -> None:
+        """Close the window."""
+        if self.renderer is not None:
+            self.renderer.close()
 
 
 class CartPoleVector(VectorEnv[Array, Array, Array]):
@@ -107,7 +158,7 @@ class CartPoleVector(VectorEnv[Array, Array, Array]):
     `info` then holds the last observation under `final_obs`, as in Gymnasium's own vector environments.
     """
 
-    metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
+    metadata = METADATA | {"autoreset_mode": AutoresetMode.SAME_STEP}
 
     def __init__(
         self,
@@ -115,10 +166,15 @@ class CartPoleVector(VectorEnv[Array, Array, Array]):
         num_envs: int = 1,
         randomization: Randomization = "none",
         compiled: bool = False,
-        render_mode: None = None,
+        render_mode: str | None = None,
+        max_episode_steps: int | None = None,
     ) -> None:
-        self.env = simulated_environment(task, num_envs, randomization, compiled)
-        self.num_envs, self.render_mode = num_envs, render_mode
+        self.env = simulated_environment(task, num_envs, randomization, compiled, max_episode_steps)
+        self.num_envs = num_envs
+        self.render_mode, self.renderer = (
+            render_mode,
+            renderer(render_mode, self.env, task, max_episode_steps),
+        )
         self.single_observation_space = observation_space(self.env)
         self.single_action_space = action_space(self.env)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -133,12 +189,17 @@ class CartPoleVector(VectorEnv[Array, Array, Array]):
         super().reset(seed=seed)
         seed_plant(self, seed)
         self._present = self.env.reset()
+        if self.renderer is not None:
+            start_all(self.renderer, self._present, range(self.num_envs))
+            self.renderer.show()
         return self._present["observation"].numpy().copy(), {}
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
         """One control period of every cart."""
         self._present.set("action", torch.as_tensor(np.asarray(actions, dtype=np.int64)))
         transition, self._present = self.env.step_and_maybe_reset(self._present)
+        if self.renderer is not None:
+            self._draw(self.renderer, transition)
         last = {key: value.numpy() for key, value in transition["next"].items()}
         return (
             self._present["observation"].numpy().copy(),
@@ -147,6 +208,35 @@ class CartPoleVector(VectorEnv[Array, Array, Array]):
             last["truncated"][:, 0],
             vector_info(last),
         )
+
+    def render(self) -> tuple[Picture, ...] | None:
+        """Return the newest picture of each cart, uint8 [320, 480, 3]; None if they are shown in a window."""
+        if self.renderer is None or self.render_mode == "human":
+            return None
+        return self.renderer.pictures()
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Close the window."""
+        if self.renderer is not None:
+            self.renderer.close()
+
+    def _draw(self, renderer: Renderer, transition: TensorDictBase) -> None:
+        """Show the carts after a step; those whose episode ended show the start of the next."""
+        motors = self.env.hardware.command(transition)["motor"]
+        last = transition["next"]
+        rows = torch.cat((last["state"], motors, last["score"]), dim=1).tolist()
+        for cart, (x, _, theta, _, motor, score) in enumerate(rows):
+            renderer.advance(cart, x, theta, int(motor), score)
+        start_all(renderer, self._present, last["done"][:, 0].nonzero()[:, 0].tolist())
+        renderer.show()
+
+
+def start_all(renderer: Renderer, present: TensorDictBase, carts: Iterable[int]) -> None:
+    """Start an episode of each of `carts` at its state in `present`."""
+    states = present["state"].tolist()
+    for cart in carts:
+        x, _, theta, _ = states[cart]
+        renderer.start(cart, x, theta)
 
 
 def vector_info(last: Mapping[str, Array]) -> dict[str, Any]:

@@ -41,7 +41,7 @@ class OneCart:
             PlantOutput(counts, number, flag, flag),
         )
         self.frame: OneFrame  # the newest
-        self._percept: FirstPercept[Numbers] | Percept[Numbers]
+        self.percept: FirstPercept[Numbers] | Percept[Numbers]  # of the newest frame
 
     def motor(self, action: int) -> int:
         """Return the motor value of an action; 0 for NO_ACTION. Raises IndexError if it does not exist."""
@@ -53,7 +53,7 @@ class OneCart:
 
     def sent_motor(self, action: int) -> int:
         """Return the motor value to send: that of the action, or full motor inward under the track guard."""
-        motor, (side,) = self.motor(action), self._percept.guard
+        motor, (side,) = self.motor(action), self.percept.guard
         if side == 0 or action == NO_ACTION:
             return motor
         return self._inward[side]
@@ -65,17 +65,17 @@ class OneCart:
         first: FirstPercept[Numbers] = self._perceive_first(
             (self.frame.counts, self._length, self._track_end)
         )
-        self._percept = first
+        self.percept = first
         return first
 
     def step(self, action: int) -> Percept[Numbers]:
         """Drive one period."""
-        motor, before, earlier = self.sent_motor(action), self._percept, self.frame.counts
+        motor, before, earlier = self.sent_motor(action), self.percept, self.frame.counts
         memory = before.state, before.past, before.step_count
         previous = Previous(earlier, *memory, (motor,), self._length, self._track_end)
         self.frame = frame = self.plant.step_one(motor)
         truncated = frame.truncated or action == NO_ACTION
         output = PlantOutput(frame.counts, (frame.dt,), (frame.terminated,), (truncated,))
         now: Percept[Numbers] = self._perceive(previous, output)
-        self._percept = now
+        self.percept = now
         return now

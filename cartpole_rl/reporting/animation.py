@@ -10,8 +10,10 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw, ImageSequence
 
+from cartpole_rl.drawing.cart import FINER, CartDrawing, palette
 from cartpole_rl.files import replacing
-from cartpole_rl.reporting.drawing import FINER, CartDrawing, palette
+from cartpole_rl.reporting.words import ending_text
+from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
 
 EVERY = 2  # control periods between frames: 25 frames a second at 50 Hz
@@ -50,7 +52,8 @@ def frames(
     episode: Episode, pole_length: float, track_half_length: float, title: str = "", every: int = EVERY
 ) -> Iterator[Image.Image]:
     """Yield pictures of 480 by 320 pixels in the fixed palette; arguments as for `gif`."""
-    drawing = CartDrawing.of(episode, pole_length, track_half_length)
+    ending = "" if episode.ended_by == Ending.TIME else ending_text(episode)
+    drawing = CartDrawing.of(episode, pole_length, track_half_length, ending=ending)
     background = drawing.background(title)
     for row in rows(episode, every):
         canvas = background.copy()

@@ -17,7 +17,7 @@ from tensorboard.compat.proto.event_pb2 import Event
 HEADER = struct.Struct("<QI")
 FOOTER_BYTES = 4
 HPARAMS = "_hparams_/"  # prefix of the tags of TensorBoard's hparams plugin
-FINAL = "Final/"  # prefix of final metrics; capitals sort first, and HPARAMS shows the first few
+FINAL = "summary/"  # prefix of final metrics, one point each; TensorBoard shows them last
 
 
 def cut_back(folder: Path, first_step: int) -> None:

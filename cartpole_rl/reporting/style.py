@@ -1,32 +1,31 @@
 """Colours, sizes and the style of all figures.
 
-The colours are those of Okabe and Ito (2008), "Color Universal Design", which stay distinct for colour-blind
-readers, with a brown in place of their yellow. A colour means the same in figures and animations. Figures are
-built with matplotlib's object API, so that nothing here touches pyplot or global settings.
+The colours are those of `drawing/colours.py`. Figures are built with matplotlib's object API, so nothing here
+touches pyplot or global settings.
 """
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-BLUE = "#0072B2"
-VERMILLION = "#D55E00"
-GREEN = "#009E73"
-PURPLE = "#CC79A7"
-ORANGE = "#E69F00"
-SKY = "#56B4E9"
-BROWN = "#8C5109"  # darker than Okabe and Ito's yellow, which vanishes on white
-BLACK = "#000000"
-
-INK = "#222222"  # text
-MUTED = "#6B6B6B"  # secondary text, guide lines
-FAINT = "#E3E3E3"  # grid
-PAPER = "#FFFFFF"
-
-POLE = BLUE  # the angle
-CART = PURPLE  # the position
-MOTOR = ORANGE  # the action
-UPRIGHT = GREEN  # |theta| below the upright angle
-LIMIT = VERMILLION  # the ends of the track
+from cartpole_rl.drawing.colours import (  # noqa: F401 - figures read all of them as style.POLE, ...
+    BLACK,
+    BLUE,
+    BROWN,
+    CART,
+    FAINT,
+    GREEN,
+    INK,
+    LIMIT,
+    MOTOR,
+    MUTED,
+    ORANGE,
+    PAPER,
+    POLE,
+    PURPLE,
+    SKY,
+    UPRIGHT,
+    VERMILLION,
+)
 
 SERIES = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY, BROWN, BLACK)
 """Colours of unrelated series, in order of use."""

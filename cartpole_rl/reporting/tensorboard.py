@@ -19,13 +19,20 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 from PIL import Image
-from tensorboard.compat.proto.summary_pb2 import Summary
+from tensorboard.compat.proto.summary_pb2 import (
+    DATA_CLASS_BLOB_SEQUENCE,
+    DATA_CLASS_SCALAR,
+    DATA_CLASS_TENSOR,
+    Summary,
+)
 from torch.utils.tensorboard import FileWriter, summary
 
+from cartpole_rl.reporting.descriptions import description
 from cartpole_rl.reporting.events import FINAL, cut_back
 from cartpole_rl.reporting.figures import png
 
 BINS = 40
+PLUGINS = {DATA_CLASS_SCALAR: "scalars", DATA_CLASS_TENSOR: "histograms", DATA_CLASS_BLOB_SEQUENCE: "images"}
 FLUSH_SECONDS = 10  # largest age of what a running TensorBoard shows
 FIGURE_DPI = 110  # sharp on a page, and a third of the bytes of a saved figure
 
@@ -62,14 +69,16 @@ class TensorBoardLog:
         """Log one point of each curve at `step`; None is skipped."""
         for name, value in values.items():
             if value is not None:
-                self._writer.add_summary(summary.scalar(name, float(value)), step)
+                point = summary.scalar(name, float(value))
+                self._writer.add_summary(described(point, DATA_CLASS_SCALAR), step)
 
     def histogram(self, name: str, values: ArrayLike, step: int) -> None:
         """Log the distribution of the finite `values`, of any shape."""
         flat = np.asarray(values, dtype=np.float64).ravel()
         flat = flat[np.isfinite(flat)]
         if flat.size:
-            self._writer.add_summary(summary.histogram(name, flat, bins=BINS), step)
+            histogram = summary.histogram(name, flat, bins=BINS)
+            self._writer.add_summary(described(histogram, DATA_CLASS_TENSOR), step)
 
     def figure(self, name: str, figure: Figure, step: int) -> None:
         """Log a figure as a picture."""
@@ -83,7 +92,7 @@ class TensorBoardLog:
         """Log the run's line on the HPARAMS page, once at the end of a run.
 
         `config` may be nested: `{"agent": {"gamma": 0.99}}` becomes `agent.gamma`, a list its text. The final
-        `metrics` become points of curves named `Final/...` at `step`; those that are None or not finite are
+        `metrics` become points of curves named `summary/...` at `step`; those that are None or not finite are
         skipped.
         """
         final = {
@@ -101,7 +110,20 @@ class TensorBoardLog:
         with Image.open(io.BytesIO(encoded)) as picture:
             width, height = picture.size
         image = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=encoded)
-        self._writer.add_summary(Summary(value=[Summary.Value(tag=name, image=image)]), step)
+        value = Summary(value=[Summary.Value(tag=name, image=image)])
+        self._writer.add_summary(described(value, DATA_CLASS_BLOB_SEQUENCE), step)
+
+
+def described(points: Summary, data_class: int) -> Summary:
+    """Return `points` with the descriptions that TensorBoard shows beside their names.
+
+    With a description alone, its fast reader would not know the class of the data and drop them.
+    """
+    for value in points.value:
+        value.metadata.summary_description = description(value.tag)
+        value.metadata.data_class = data_class
+        value.metadata.plugin_data.plugin_name = PLUGINS[data_class]
+    return points
 
 
 def flatten(config: Mapping[str, Any], prefix: str = "") -> dict[str, float | str]:

@@ -35,6 +35,7 @@ from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.settings import Count, Finite, NonNegative, Seed, Settings
 from cartpole_rl.tasks.settings import ActionSettings, RewardSettings
 
+View = Literal["none", "live"]  # of the cart in the terminal, while it is driven
 OF_SIMULATION = ("parameters", "randomization", "cart", "cart_friction", "pole_friction", "knock")
 
 
@@ -134,6 +135,7 @@ class EvaluateConfig(RunSettings):
     actions: ActionSettings | None = None
     knock: NonNegative = 0.0  # rad/s, see `evaluation/knocks.py`
     repeat: RepeatSettings = RepeatSettings()
+    view: View = "none"
 
     @model_validator(mode="after")
     def _plant_reads_every_setting(self) -> "EvaluateConfig":
@@ -147,6 +149,8 @@ class EvaluateConfig(RunSettings):
             if kind == "emulated":
                 reason = "has its own cart; set emulator.* or emulator=large"
             raise ValueError(f"{', '.join(unread)}: plant={kind} {reason}")
+        if self.view == "live" and kind not in ("emulated", "serial"):
+            raise ValueError(f"view=live: it shows a cart on a port; plant={kind} has none")
         if kind != "emulated" and self.emulator != EmulatorSettings():
             raise ValueError(f"emulator: plant={kind} does not read it; give plant=emulated")
         return self
@@ -165,6 +169,7 @@ class FinetuneConfig(RunSettings, OnCart):
     finetuning: FinetuningSettings
     compile: bool
     resume: str | None
+    view: View = "none"
 
 
 class ReplayConfig(SimulatedCartSettings):

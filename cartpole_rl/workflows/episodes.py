@@ -9,6 +9,7 @@ from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
 from cartpole_rl.evaluation.episodes import Policy, run_batch, run_episodes
 from cartpole_rl.evaluation.knocks import Knocks
+from cartpole_rl.evaluation.publishing import followed
 from cartpole_rl.learning.randomness import seed_everything
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.reporting.words import guard_text
@@ -16,7 +17,9 @@ from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.agents import evaluated_agent
 from cartpole_rl.workflows.build import evaluated_env, evaluated_settings, precedence, use_threads
 from cartpole_rl.workflows.config import EvaluateConfig
+from cartpole_rl.workflows.live import LiveView, view_title
 from cartpole_rl.workflows.person import confirm
+from cartpole_rl.workflows.progress import progress_bar
 from cartpole_rl.workflows.repeating import Repetition, repetition
 
 
@@ -35,8 +38,11 @@ class Evaluation:
         if self.repetition:
             yield from repeated(self.env, self.policy, self.repetition, self.knocks)
             return
-        with precedence(self.config.plant, self.config.emulator):
-            yield from with_progress(self.env, self.policy, self.config.episodes, self.knocks)
+        config = self.config
+        with LiveView(view_title(config.plant), config.view) as live:
+            followed(self.env, live.memory)
+            with precedence(config.plant, config.emulator):
+                yield from with_progress(self.env, self.policy, config.episodes, self.knocks)
 
     @property
     def knocks(self) -> Knocks | None:
@@ -69,7 +75,7 @@ def with_progress(
     env: CartPoleEnv, policy: Policy, episodes: int, knocks: Knocks | None
 ) -> Iterator[Episode]:
     """Drive episodes behind a progress bar that shows the score of each."""
-    with tqdm(total=episodes, unit=" episodes") as progress:
+    with progress_bar(episodes, "episodes") as progress:
         for episode in run_episodes(env, policy, episodes, knocks):
             progress.set_postfix_str(f"score {episode.score.sum():.0f}{guard_text(episode)}", refresh=False)
             progress.update()

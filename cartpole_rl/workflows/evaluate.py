@@ -7,16 +7,20 @@ from typing import Any
 
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.plants.serial.plant import SerialPlant
+from cartpole_rl.plants.serial.settings import SerialSettings
+from cartpole_rl.plants.settings import EmulatedSettings
 from cartpole_rl.plants.simulated import NOISE_PARAMETERS
 from cartpole_rl.reporting.scores import score_table
 from cartpole_rl.reporting.words import count_text
 from cartpole_rl.run_files import FIGURES, METRICS
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.workflows.checks import BASELINE
 from cartpole_rl.workflows.config import EvaluateConfig
 from cartpole_rl.workflows.episodes import Evaluation, prepared
 from cartpole_rl.workflows.repeating import Repetition
 from cartpole_rl.workflows.report import report
+from cartpole_rl.workflows.results import plant_words, print_results, shown
 from cartpole_rl.workflows.run_folder import write_config
 
 
@@ -56,7 +60,16 @@ def report_evaluation(evaluation: Evaluation, episodes: Sequence[Episode], folde
         print(compared(evaluation.repetition, episodes[0]))
     if link.get("latency_override"):
         print(f"latency as measured, for cartpole-train: '{link['latency_override']}'")
-    print(f"{folder}/{METRICS} and {FIGURES}/ are written")
+    print_results(folder, f"{METRICS} and {FIGURES}/", next_command(evaluation.config))
+
+
+def next_command(config: EvaluateConfig) -> str:
+    """Return the command that brings the agent nearer to a real cart; the baseline leads to an agent."""
+    if config.run == BASELINE:
+        return "cartpole-train experiment=medium"
+    if isinstance(config.plant, SerialSettings | EmulatedSettings):
+        return f"cartpole-finetune run={shown(config.run)} {plant_words(config.plant)}"
+    return f"cartpole-evaluate run={shown(config.run)} plant=emulated"
 
 
 def cut_off(episodes: Sequence[Episode]) -> Iterator[str]:

@@ -14,10 +14,13 @@ from torch import nn
 
 from cartpole_rl.agents.dqn import QAgent
 from cartpole_rl.checking import checked
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
 from cartpole_rl.evaluation.driver import Driver
 from cartpole_rl.evaluation.driving_policy import as_weights
 from cartpole_rl.evaluation.metrics import episode_metrics, summarize
+from cartpole_rl.evaluation.publishing import followed
+from cartpole_rl.evaluation.snapshots import Memory
 from cartpole_rl.learning.checkpoints import (
     AgentCheckpoint,
     TrainingCheckpoint,
@@ -25,6 +28,7 @@ from cartpole_rl.learning.checkpoints import (
     load_agent,
 )
 from cartpole_rl.learning.randomness import seed_everything
+from cartpole_rl.plants.serial.faults import Confirm
 from cartpole_rl.reporting.scores import score_table
 from cartpole_rl.reporting.tensorboard import TensorBoardLog
 from cartpole_rl.reporting.words import count_text
@@ -37,9 +41,11 @@ from cartpole_rl.workflows.config import EvaluateConfig, FinetuneConfig, TrainCo
 from cartpole_rl.workflows.finetuning_cart import DrivenCart, yielding_to
 from cartpole_rl.workflows.finetuning_files import FinetuningFiles, Stage
 from cartpole_rl.workflows.finetuning_learner import CartLearner
+from cartpole_rl.workflows.live import LiveView, view_title
 from cartpole_rl.workflows.loading import recorded_settings
 from cartpole_rl.workflows.person import confirm
 from cartpole_rl.workflows.report import report
+from cartpole_rl.workflows.results import plant_words, print_results, shown
 from cartpole_rl.workflows.resuming import resumed
 from cartpole_rl.workflows.run_folder import write_config, write_json
 
@@ -68,9 +74,11 @@ def finetune(config: FinetuneConfig, folder: Path) -> None:
     write_config(folder, "finetune", config.model_dump(mode="json"), resumed=checkpoint is not None)
     if not checkpoint:
         files.save({}, 0)
-    make_env = partial(evaluated_env, settings, evaluation, print)  # called with `confirm`
+    live = LiveView(view_title(config.plant), config.view)
+    make_env = partial(driven_env, settings, evaluation, live.memory)  # called with `confirm`
     real_time = is_real_time(config.plant, config.emulator)
     with (
+        live,
         TensorBoardLog(folder) as log,
         Driver(make_env, partial(greedy_network, training), real_time, confirm) as driver,
         yielding_to(driver) if real_time else nullcontext(),
@@ -79,6 +87,13 @@ def finetune(config: FinetuneConfig, folder: Path) -> None:
         if checkpoint and checkpoint.state:
             session.restore(checkpoint)
         session.run()
+
+
+def driven_env(
+    settings: CartPoleSettings, evaluation: EvaluateConfig, memory: Memory | None, confirm: Confirm
+) -> CartPoleEnv:
+    """Return the environment over the cart, in the process that drives it."""
+    return followed(evaluated_env(settings, evaluation, print, confirm), memory)
 
 
 def evaluation_config(config: FinetuneConfig) -> EvaluateConfig:
@@ -177,7 +192,10 @@ class Session:
         if link.get("latency_override"):
             print(f"latency as measured, for cartpole-train: '{link['latency_override']}'")
         print(f"kept: the policy {kept} fine-tuning")
-        print(f"{folder}/{METRICS}, {COMPARISON}, {CHECKPOINTS}/{LAST} and {RECORDINGS}/ are written")
+        files = f"{METRICS}, {COMPARISON}, {CHECKPOINTS}/{LAST} and {RECORDINGS}/"
+        print_results(
+            folder, files, f"cartpole-evaluate run={shown(folder)} {plant_words(self.config.plant)}"
+        )
 
     def summarize(self, episodes: list[Episode]) -> dict[str, Any]:
         """Return the summary of the metrics of `episodes`."""

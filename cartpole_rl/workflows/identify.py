@@ -38,7 +38,9 @@ from cartpole_rl.workflows.config import IdentifyConfig
 from cartpole_rl.workflows.identified_errors import errors, known_truth
 from cartpole_rl.workflows.identified_files import report, write_choices
 from cartpole_rl.workflows.person import confirm, print_message
+from cartpole_rl.workflows.progress import progress_bar
 from cartpole_rl.workflows.recordings import experiments
+from cartpole_rl.workflows.results import print_results, shown
 from cartpole_rl.workflows.run_folder import write_config, write_json
 
 Episodes = dict[str, Episode]  # by the name of the experiment, or of the file
@@ -110,7 +112,7 @@ def record_experiments(config: IdentifyConfig, folder: Path) -> None:
     with (
         closing(make_plant(config)) as plant,
         precedence(config.plant, config.emulator),
-        tqdm(total=len(EXPERIMENTS), unit=" experiments") as progress,
+        progress_bar(len(EXPERIMENTS), "experiments") as progress,
     ):
         progress.set_postfix_str(EXPERIMENTS[0].name)
         for number, (experiment, episode) in enumerate(conduct(plant, config.control_period, config.seed)):
@@ -143,8 +145,9 @@ def split(recordings: Episodes, source: Path) -> tuple[Episodes, Episode]:
 
 def next_command(found: Identification, folder: Path) -> str:
     """Return the command that trains on carts like the identified one."""
+    run = shown(folder)
     return (
-        f"cartpole-train cart={folder}/{CART} pole={folder}/{POLE} randomization={folder}/{RANDOMIZATION} "
+        f"cartpole-train cart={run}/{CART} pole={run}/{POLE} randomization={run}/{RANDOMIZATION} "
         f"cart_friction={found.models.cart_friction} pole_friction={found.models.pole_friction}"
     )
 
@@ -157,5 +160,5 @@ def print_verdict(found: Identification, folder: Path) -> None:
     )
     for warning in found.warnings:
         print(f"warning: {warning}")
-    print(f"{folder}/{PAGE}, {CART}, {POLE}, {RANDOMIZATION} and {FIGURES}/ are written; next:")
-    print(next_command(found, folder))
+    files = f"{PAGE}, {CART}, {POLE}, {RANDOMIZATION} and {FIGURES}/"
+    print_results(folder, files, next_command(found, folder))

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from cartpole_rl.evaluation.recordings import read_recording
 from cartpole_rl.identification.ensemble import Ensemble
@@ -31,7 +30,9 @@ from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.build import use_threads
 from cartpole_rl.workflows.config import ModelConfig
 from cartpole_rl.workflows.poles import chosen_pole
+from cartpole_rl.workflows.progress import progress_bar
 from cartpole_rl.workflows.recordings import recordings
+from cartpole_rl.workflows.results import print_results, shown
 from cartpole_rl.workflows.run_folder import write_config, write_json
 
 FIGURE = f"{FIGURES}/model.png"
@@ -71,7 +72,8 @@ def learn_model(config: ModelConfig, folder: Path) -> None:
     print(
         f"\n{spread_table(errors[LEARNED], CERTAIN, 'RMS errors and ensemble spreads on the same windows')}"
     )
-    print(f"{folder}/{MODEL}, {MODELLED} and {FIGURE} are written")
+    following = f"cartpole-train plant=learned plant.model={shown(folder)}"
+    print_results(folder, f"{MODEL}, {MODELLED} and {FIGURE}", following)
 
 
 def fit_and_learn(
@@ -82,7 +84,7 @@ def fit_and_learn(
     dynamics = Dynamics.of(fit.parameters, models, period, LearnedSettings.substeps)
     windows = cut_windows(episodes, period, most=config.windows)
     ensemble = Ensemble(windows, dynamics, fit.rms, config.ensemble, config.seed)
-    with tqdm(total=config.ensemble.updates, unit=" updates") as progress:
+    with progress_bar(config.ensemble.updates, "updates") as progress:
 
         def show_progress(update: int, losses: list[float]) -> None:
             progress.set_postfix_str(f"validation loss {np.mean(losses):.2f}")

@@ -6,7 +6,6 @@ from types import TracebackType
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from cartpole_rl.evaluation.metrics import episode_metrics
 from cartpole_rl.learning.checkpoints import AgentCheckpoint, TrainingCheckpoint, save_agent, save_training
@@ -19,6 +18,8 @@ from cartpole_rl.run_files import BEST, CHECKPOINTS, LAST
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.config import TrainConfig
 from cartpole_rl.workflows.history import read_history, write_history
+from cartpole_rl.workflows.person import print_message
+from cartpole_rl.workflows.progress import progress_bar
 
 GUARDED = "guarded_fraction"  # None without a track guard
 COMPARED = (  # on the HPARAMS page
@@ -29,6 +30,7 @@ COMPARED = (  # on the HPARAMS page
     "upright_fraction",
     GUARDED,
 )
+TAGS = {GUARDED: "track_guard_fraction"}  # in TensorBoard, which sorts names: the score comes first
 AVERAGED = ("score", "score_upright", "steps", "upright_fraction")  # over the episodes of an evaluation
 PICTURES = 4  # behaviour figures and animations in TensorBoard, over the whole training
 
@@ -44,13 +46,8 @@ class TrainingMonitor:
         self._settings = config.model_dump(mode="json")
         self._logged = resumed_at or 0
         self._log = TensorBoardLog(folder, purge_step=None if resumed_at is None else resumed_at + 1)
-        self._bar = tqdm(
-            total=config.learning.collected_transitions,
-            initial=self._logged,
-            unit=" transitions",
-            unit_scale=True,
-            mininterval=1.0,
-        )
+        total = config.learning.collected_transitions
+        self._bar = progress_bar(total, "transitions", initial=self._logged, unit_scale=True, mininterval=1.0)
         self.history = [record for record in read_history(folder) if record["transitions"] <= self._logged]
         write_history(folder, self.history)
 
@@ -73,9 +70,8 @@ class TrainingMonitor:
         transitions, record = training.transitions, self._record(training, episodes)
         self.history.append(record)
         write_history(self.folder, self.history)
-        self._log.scalars(
-            {f"evaluation/{key}": record[key] for key in record if key != "transitions"}, transitions
-        )
+        curves = {TAGS.get(key, key): value for key, value in record.items() if key != "transitions"}
+        self._log.scalars({f"evaluation/{key}": value for key, value in curves.items()}, transitions)
         if len(self.history) % max(1, self.config.learning.evaluations // PICTURES) == 0:
             self._log_pictures(episodes[0], transitions)
         agent = AgentCheckpoint(self._settings, training.agent.state_dict(), transitions, record["score"])
@@ -83,6 +79,9 @@ class TrainingMonitor:
             save_agent(self.folder / CHECKPOINTS / name, agent)
         self._bar.set_postfix_str(f"score {record['score']:.0f}")
         self._advance(transitions)
+        if self._bar.disable:
+            done, total = transitions / 1e6, self.config.learning.collected_transitions / 1e6
+            print_message("train", f"{done:.2f} of {total:.2f} M transitions, score {record['score']:.0f}")
 
     def on_checkpoint(self, training: Training) -> None:
         """Write the state to resume from."""
@@ -123,6 +122,8 @@ class TrainingMonitor:
         half = self.config.task.x_max
         length = self.config.pole.nominal.length
         self._log.figure(
-            "behaviour", behaviour(episode, f"After {transitions / 1e6:.1f} M transitions", half), transitions
+            "pictures/behaviour",
+            behaviour(episode, f"After {transitions / 1e6:.1f} M transitions", half),
+            transitions,
         )
-        self._log.animation("cart", gif(episode, length, half), transitions)
+        self._log.animation("pictures/cart", gif(episode, length, half), transitions)

@@ -12,6 +12,7 @@ from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.plants.settings import EmulatedSettings
 from cartpole_rl.workflows.config import PreflightConfig
 from cartpole_rl.workflows.person import confirm
+from cartpole_rl.workflows.results import plant_words
 
 
 def check_cart(config: PreflightConfig) -> None:
@@ -27,7 +28,8 @@ def check_cart(config: PreflightConfig) -> None:
         raise PlantError(
             f"the cart is not ready: {finding.check if finding else 'nothing was checked'} failed"
         )
-    print("The cart is ready.")
+    print("The cart is ready. Next:")
+    print(f"cartpole-identify {plant_words(config.plant)}")
 
 
 def fault_clearing(plant: EmulatedSettings | SerialSettings) -> FaultClearing:

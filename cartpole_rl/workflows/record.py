@@ -17,6 +17,7 @@ from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.config import EvaluateConfig, RecordConfig
 from cartpole_rl.workflows.episodes import prepared
 from cartpole_rl.workflows.origins import stored_origin
+from cartpole_rl.workflows.results import shown
 from cartpole_rl.workflows.run_folder import write_config
 
 
@@ -40,7 +41,9 @@ def record(config: RecordConfig, folder: Path) -> None:
                 episodes.append(episode)
     finally:
         if episodes:
-            print(f"{folder}/{RECORDINGS}/ holds {count_text(len(episodes))}{guard_text(*episodes)}")
+            held = f"{count_text(len(episodes))}{guard_text(*episodes)}"
+            print(f"{shown(folder)}/{RECORDINGS}/ holds {held}; next:")
+            print(f"cartpole-replay from={shown(folder)}")
 
 
 def heading(config: EvaluateConfig, settings: CartPoleSettings, episode: Episode) -> dict[str, Any]:

@@ -21,6 +21,7 @@ from cartpole_rl.run_files import FIGURES
 from cartpole_rl.workflows.config import ReplayConfig
 from cartpole_rl.workflows.poles import chosen_pole
 from cartpole_rl.workflows.recordings import recordings
+from cartpole_rl.workflows.results import print_results, shown
 from cartpole_rl.workflows.run_folder import write_config, write_json
 
 REPLAY, FIGURE = "replay.json", f"{FIGURES}/replay.png"
@@ -49,7 +50,7 @@ def replay_recordings(config: ReplayConfig, folder: Path) -> None:
     subtitle = f"above: {paths[0].name},  below: {count},  pole={name}"
     save(replay_figure(replays, period, REPORTED_TIMES, "Measured and simulated", subtitle), folder / FIGURE)
     print(replay_table(errors, f"errors of {count}, pole={name}, over the time since a reset"))
-    print(f"{folder}/{REPLAY} and {FIGURE} are written")
+    print_results(folder, f"{REPLAY} and {FIGURE}", f"cartpole-model from={shown(config.source)}")
 
 
 def simulated_parameters(config: ReplayConfig, pole: Pole) -> dict[str, float]:

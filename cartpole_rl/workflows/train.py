@@ -27,6 +27,7 @@ from cartpole_rl.workflows.loading import recorded_settings
 from cartpole_rl.workflows.monitor import TrainingMonitor
 from cartpole_rl.workflows.person import print_message
 from cartpole_rl.workflows.report import report
+from cartpole_rl.workflows.results import print_results, shown
 from cartpole_rl.workflows.resuming import resumed
 from cartpole_rl.workflows.run_folder import write_config
 
@@ -80,7 +81,9 @@ def train(config: TrainConfig, folder: Path) -> float:
         )
         monitor.finished(metrics)
     forget_training(folder)
-    print(f"trained for {training.seconds:.0f} s; {folder}/{METRICS}, {FIGURES}/, {CHECKPOINTS}/ are written")
+    print(f"trained for {training.seconds:.0f} s")
+    files = f"{METRICS}, {FIGURES}/ and {CHECKPOINTS}/"
+    print_results(folder, files, f"cartpole-evaluate run={shown(folder)} plant=emulated")
     score: float = metrics["score"]["mean"]
     return score
 

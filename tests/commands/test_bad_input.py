@@ -21,6 +21,7 @@ WRONG_TRAINING = [
     ("seed=abc", "seed=abc", "give an integer"),
     ("agent.gamma=1.5", "agent.gamma=1.5", "give less than 1"),
     ("agent.loss=l1", "agent.loss=l1", "'l2' or 'smooth_l1'"),
+    ("agent.loss=smoth_l1", "agent.loss=smoth_l1", "did you mean smooth_l1? give 'l2' or 'smooth_l1'"),
     ("control_period=1", "control_period=1", "give at most 0.1"),
     ("pole=tiny", "pole=tiny", "both, large, medium, range"),
     ("pole=null", "pole=null", "leave pole=null out"),

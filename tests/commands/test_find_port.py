@@ -46,7 +46,7 @@ def test_help_has_examples(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("ports", "last"),
     [
-        ([CH340, MODEM], "The cart is probably on it: plant.port=/dev/ttyUSB0, or plant.port=auto"),
+        ([CH340, MODEM], "The cart is probably on it. Next: cartpole-preflight plant.port=/dev/ttyUSB0"),
         ([CH340, FTDI], "`cartpole-find-port watch=true` finds out which of them is the cart"),
         ([MODEM], "None of them has a chip used on carts (CP210x, CH340, FTDI, Espressif)"),
     ],

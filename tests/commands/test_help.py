@@ -1,14 +1,19 @@
 """Help of every command, and a user's own choices."""
 
 import re
+import shlex
 from pathlib import Path
 
+import hydra
 import pytest
 import yaml
 from command_line import in_process
+from hydra_configs import shipped_choices
 
+from cartpole_rl.checking import checked
 from cartpole_rl.choices import conf_folder
 from cartpole_rl.commands.find_port import FindPortConfig
+from cartpole_rl.commands.hydra_application.composition import as_mapping
 from cartpole_rl.settings import Settings
 from cartpole_rl.workflows import config
 
@@ -54,6 +59,28 @@ def test_help_shows_the_groups_that_the_command_reads_and_no_other(command: str,
     assert shown & groups == groups & SCHEMAS[command].model_fields.keys() | WITHOUT_A_SETTING.get(
         command, set()
     )
+
+
+def examples(text: str) -> list[list[str]]:
+    """The words of each example on a page of --help, without what it explains."""
+    _, _, below = text.partition("Examples\n")
+    lines = [line.strip() for line in below.partition("\n\n")[0].splitlines()]
+    return [shlex.split(re.split(r" {3,}", line)[0]) for line in lines if line.startswith("cartpole-")]
+
+
+@pytest.mark.parametrize("command", SCHEMAS)
+def test_help_says_what_the_command_does_and_its_three_examples_compose(command: str, tmp_path: Path) -> None:
+    name = f"cartpole-{command.replace('_', '-')}"
+    page = in_process(command, "--help", folder=tmp_path).out
+    assert page.startswith(f"{name} ")
+    found = examples(page)
+    assert len(found) == 3
+    with shipped_choices():
+        for program, *words in found:
+            assert program == name
+            one_job = "-m" in words
+            words = [word.partition(",")[0] if one_job else word for word in words if word != "-m"]
+            checked(SCHEMAS[command], as_mapping(hydra.compose(command, words)))
 
 
 @pytest.mark.parametrize(

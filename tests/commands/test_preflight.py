@@ -13,10 +13,11 @@ def test_the_emulated_cart_is_ready(tmp_path: Path) -> None:
     words = ("plant=emulated", "emulator=large", "emulator.cart_coulomb_right=0.8")
     done = in_process("preflight", *words, folder=tmp_path)
     assert (done.code, done.err) == (0, ""), done
-    *checks, last = done.out.splitlines()
+    *checks, last, following = done.out.splitlines()
     assert len(checks) == 8
     assert all(line.startswith("OK   ") for line in checks)
-    assert last == "The cart is ready."
+    assert last == "The cart is ready. Next:"
+    assert following == "cartpole-identify plant=emulated"
     assert not list(tmp_path.iterdir())
 
 

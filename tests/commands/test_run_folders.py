@@ -81,7 +81,15 @@ def test_the_last_evaluation_is_that_of_the_metrics(trained: Path) -> None:
     for key in ("score", "score_upright", "steps", "upright_fraction"):
         assert last[key] == pytest.approx(metrics[key]["mean"])
     assert last["score"] == pytest.approx(curves(trained)["evaluation/score"][-1][1])
-    assert curves(trained)["Final/score"][0][1] == pytest.approx(last["score"])
+    assert curves(trained)["summary/score"][0][1] == pytest.approx(last["score"])
+
+
+def test_tensorboard_shows_the_score_first_and_describes_everything(trained: Path) -> None:
+    events = EventAccumulator(str(trained)).Reload()
+    tags = [tag for kind in ("scalars", "images", "histograms") for tag in events.Tags()[kind]]
+    assert min(tags) == "evaluation/score"
+    assert max(events.Tags()["scalars"]).startswith("summary/")  # a point each
+    assert [tag for tag in tags if not events.SummaryMetadata(tag).summary_description] == []
 
 
 @pytest.mark.parametrize("plant", ["simulated", "emulated"])
@@ -166,7 +174,7 @@ def test_a_sweep_makes_a_folder_a_job(sweep: list[Path]) -> None:
         assert len(history(job)) == 2
         assert (job / "checkpoints/last.pt").exists()
         assert {path.name for path in (job / "figures").iterdir()} >= {"learning_curve.png", "behaviour.png"}
-        assert "Final/score" in curves(job)
+        assert "summary/score" in curves(job)
 
 
 def test_equal_seeds_give_equal_runs_and_another_seed_another(trained: Path, sweep: list[Path]) -> None:

@@ -12,9 +12,10 @@ import torch
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, VectorEnv
 
-from cartpole_rl.envs.gymnasium import simulated_environment
+from cartpole_rl.choices import choice
+from cartpole_rl.envs.gymnasium import PERIOD, simulated_environment
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.registration import ENVIRONMENTS, register
+from cartpole_rl.registration import ENVIRONMENTS, MAX_EPISODE_STEPS, register
 
 STEPS = 520  # longer than an episode may be
 ONE_COUNT = 0.01  # of an encoder, in an observation: where float32 rounds it otherwise
@@ -60,10 +61,10 @@ def course(env: VectorEnv, seed: int) -> Iterator[tuple]:
 
 @pytest.mark.parametrize("name", ENVIRONMENTS)
 def test_passes_gymnasiums_checker(name: str) -> None:
+    """Its render modes are checked in test_rendering.py, on a display."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warnings.filterwarnings("ignore", message=".*infinity.*")  # a measured state has no bounds
-        warnings.filterwarnings("ignore", message=".*render.*")
         check_env(gymnasium.make(name).unwrapped, skip_render_check=True)
 
 
@@ -74,6 +75,22 @@ def test_the_tasks_are_those_of_conf(name: str, actions: int, limit: float | Non
     assert env.env.hardware.task.angle_limit == pytest.approx(limit)
     assert env.env.plant.parameters.pole_com.item() == pytest.approx(0.1778)
     assert env.env.hardware.task.x_max == pytest.approx(env.env.plant.parameters.track_half_length.item())
+
+
+def test_the_constants_are_those_of_conf() -> None:
+    assert choice("train")["control_period"] == PERIOD
+    assert {choice(f"task/{task}")["time_limit"] for task in ENVIRONMENTS.values()} == {MAX_EPISODE_STEPS}
+    assert {gymnasium.spec(name).max_episode_steps for name in ENVIRONMENTS} == {MAX_EPISODE_STEPS}
+
+
+@pytest.mark.parametrize("steps", [20, 510])
+def test_max_episode_steps_sets_the_length_of_an_episode(steps: int) -> None:
+    single = gymnasium.make("cartpole_rl/SwingUp-v0", max_episode_steps=steps)
+    many = vector("cartpole_rl/SwingUp-v0", carts=2, max_episode_steps=steps)
+    for env, action in ((single, 4), (many, np.full(2, 4))):  # the middle action: no motor
+        env.reset(seed=0)
+        ends = [np.all(env.step(action)[3]) for _ in range(steps)]
+        assert ends == [False] * (steps - 1) + [True]
 
 
 def test_an_episode_is_truncated_after_ten_seconds() -> None:

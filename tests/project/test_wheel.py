@@ -73,7 +73,7 @@ def test_it_holds_the_package_conf_and_the_scripts(wheel: Path) -> None:
     }
     modules = {str(path.relative_to(ROOT)) for path in (ROOT / "cartpole_rl").rglob("*.py")}
     assert shipped <= names
-    assert modules <= names
+    assert modules | {"cartpole_rl/py.typed"} <= names
     assert firmware <= names
     assert {name.split("/")[0] for name in names if ".dist-info" not in name} == {"cartpole_rl"}
     for command in ("train", "evaluate", "emulate"):

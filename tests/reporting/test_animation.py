@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from PIL import Image, ImageChops, ImageColor
 
+from cartpole_rl.drawing.cart import CART_WIDTH, PIVOT_HEIGHT, SIZE
 from cartpole_rl.reporting import style
 from cartpole_rl.reporting.animation import LAST_FRAME, durations, frames, gif, rows, write_gif
-from cartpole_rl.reporting.drawing import CART_WIDTH, PIVOT_HEIGHT, SIZE
 from cartpole_rl.tasks.episode import Episode
 
 POLE, TRACK = 0.3365, 0.407  # m

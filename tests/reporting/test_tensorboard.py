@@ -84,8 +84,8 @@ def test_hparams_list_three_runs_with_settings_and_final_metrics(tmp_path: Path)
         assert start.hparams["seed"].number_value == seed
         assert start.hparams["agent.gamma"].number_value == 0.99
         assert metadata.SESSION_END_INFO_TAG in content
-        assert [event.value for event in runs.Scalars(f"run{seed}", "Final/score")] == [4000.0 + seed]
-        assert "Final/never" not in runs.Runs()[f"run{seed}"]["scalars"]
+        assert [event.value for event in runs.Scalars(f"run{seed}", "summary/score")] == [4000.0 + seed]
+        assert "summary/never" not in runs.Runs()[f"run{seed}"]["scalars"]
 
 
 def test_flatten_gives_dotted_names_and_plain_values() -> None:
@@ -134,7 +134,7 @@ class TestResume:
             log.scalars({"a": 2.0}, 20)
             log.hparams({"frames": 20}, {"score": 2.0}, 20)
         assert points(tmp_path, "a") == {10: 1.0, 20: 2.0}
-        assert points(tmp_path, "Final/score") == {20: 2.0}
+        assert points(tmp_path, "summary/score") == {20: 2.0}
         content = read(tmp_path).PluginTagToContent(metadata.PLUGIN_NAME)[metadata.SESSION_START_INFO_TAG]
         assert metadata.parse_session_start_info_plugin_data(content).hparams["frames"].number_value == 20
 

@@ -9,7 +9,7 @@ import hydra
 from hydra.errors import HydraException, OverrideParseException
 from omegaconf import OmegaConf
 
-from cartpole_rl.checking import most_similar, no_such_setting, setting_names, similarity
+from cartpole_rl.checking import NEAR_VALUE, most_similar, no_such_setting, setting_names, similarity
 from cartpole_rl.choices import conf_folder, default_choices
 
 # Hydra's, each up to its first hyphen; without --run, which has no effect: a user means run=
@@ -32,7 +32,6 @@ EXTRAS = {  # of the package, that bring launchers and a sweeper
     "hydra/launcher/ray": "ray",
     "hydra/sweeper/optuna": "optuna",
 }
-NEAR_CHOICE = 0.6  # similarity from which a choice is suggested
 
 
 def in_one_line(error: Exception, command: str) -> str:
@@ -70,7 +69,7 @@ def hydra_complaint(text: str, command: str) -> str:
 def nearest_choice(wrong: str, choices: Sequence[str]) -> str:
     """Return a hint: the choice that was probably meant, and all choices."""
     near = most_similar(wrong, choices)
-    hint = f"did you mean {near}? " if similarity(wrong, near)[0] >= NEAR_CHOICE else ""
+    hint = f"did you mean {near}? " if similarity(wrong, near)[0] >= NEAR_VALUE else ""
     return f"{hint}there are {', '.join(choices)}"
 
 

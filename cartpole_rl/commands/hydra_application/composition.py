@@ -1,7 +1,9 @@
 """Extends Hydra: names of run folders, the choices in --help, the defaults of the emulated cart."""
 
 import re
+import shutil
 import sys
+import textwrap
 import warnings
 from collections.abc import Collection, Sequence
 from contextlib import suppress
@@ -89,10 +91,18 @@ def choices_of(command: str, schema: type[Settings]) -> str:
     loader = GlobalHydra.instance().config_loader()
     refused = {"plant": {*kinds(EvaluateConfig, "plant")} - {*kinds(schema, "plant")}}
     lines = [
-        f"  {group}: {', '.join(sorted({*loader.get_group_options(group)} - refused.get(group, set())))}\n"
+        f"  {group}: {', '.join(sorted({*loader.get_group_options(group)} - refused.get(group, set())))}"
         for group in sorted(default_choices(command))
     ]
-    return "".join(("Choices (group=choice)\n", *lines, "\n")) if lines else ""
+    return "\n".join(("Choices (group=choice)", *map(wrapped, lines), "\n")) if lines else ""
+
+
+def wrapped(line: str) -> str:
+    """Return a line of choices, wrapped where standard output is a narrow terminal."""
+    if not sys.stdout.isatty():
+        return line
+    width = max(40, shutil.get_terminal_size().columns - 1)
+    return textwrap.fill(line, width, subsequent_indent="    ", break_on_hyphens=False)
 
 
 def as_mapping(composed: DictConfig) -> dict[str, Any]:

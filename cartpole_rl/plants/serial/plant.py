@@ -71,6 +71,7 @@ class SerialPlant(OneCartPlant):
         self.cart = SerialCart(settings)
         self.ended_by = ""
         self.last_error: PlantError | None = None
+        self.on_command: Callable[[int], None] | None = None  # called with each motor value once it is sent
         faults = FaultClearing(settings.clear_faults, confirm)
         self._preparation = Preparation(self.cart, start, control_period, faults, prompt)
         self._driving = False  # an episode is under way
@@ -137,6 +138,8 @@ class SerialPlant(OneCartPlant):
         before = self._state
         try:
             self.cart.set_motor(motor)
+            if self.on_command is not None:  # in the time until the next state
+                self.on_command(motor)
             state = self.cart.get_state()
             if went_back(ticks_between(before.tick, state.tick)):
                 raise LinkError(RESTARTED)

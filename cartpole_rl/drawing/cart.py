@@ -10,17 +10,15 @@ from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
+from typing import Protocol
 
 import matplotlib
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageColor, ImageDraw, ImageFont
 
+from cartpole_rl.drawing import colours
 from cartpole_rl.physics.motor import LARGEST_MOTOR
-from cartpole_rl.reporting import style
-from cartpole_rl.reporting.words import ending_text
-from cartpole_rl.tasks.endings import Ending
-from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.tasks.upright import is_upright
 
 SIZE = (480, 320)  # pixels
@@ -38,32 +36,68 @@ TRAIL = 0.4  # s for which the path of the pole's tip stays visible
 FAINTEST = 0.15  # share of its colour at the far end
 
 TINTS = {  # shares of each colour over white, for smooth edges; with white at most 32 colours
-    style.INK: (1.0, 0.8, 0.6, 0.42, 0.27, 0.13),
-    style.POLE: (1.0, 0.75, 0.5, 0.3, 0.15),
-    style.UPRIGHT: (1.0, 0.75, 0.5, 0.3, 0.15),
-    style.CART: (1.0, 0.8, 0.6, 0.4, 0.2),
-    style.MOTOR: (1.0, 0.75, 0.5, 0.25),
-    style.LIMIT: (1.0, 0.75, 0.5, 0.25),
+    colours.INK: (1.0, 0.8, 0.6, 0.42, 0.27, 0.13),
+    colours.POLE: (1.0, 0.75, 0.5, 0.3, 0.15),
+    colours.UPRIGHT: (1.0, 0.75, 0.5, 0.3, 0.15),
+    colours.CART: (1.0, 0.8, 0.6, 0.4, 0.2),
+    colours.MOTOR: (1.0, 0.75, 0.5, 0.25),
+    colours.LIMIT: (1.0, 0.75, 0.5, 0.25),
 }
 
 Colour = tuple[int, int, int]
 Draw = ImageDraw.ImageDraw
 
 
+class Course(Protocol):
+    """The part of an episode of T control periods that is drawn; a `tasks.episode.Episode` is one."""
+
+    @property
+    def time(self) -> NDArray[np.float64]:
+        """[T+1] s."""
+
+    @property
+    def x(self) -> NDArray[np.float64]:
+        """[T+1] m."""
+
+    @property
+    def theta(self) -> NDArray[np.float64]:
+        """[T+1] rad."""
+
+    @property
+    def motor(self) -> NDArray[np.int64]:
+        """[T] or [T+1] motor value drawn at each row; 0 at the last row if it is missing."""
+
+    @property
+    def score(self) -> NDArray[np.float64]:
+        """[T] equation (6.2) of each step."""
+
+
 @dataclass(frozen=True)
 class CartDrawing:
     """One episode, ready to be drawn row by row."""
 
-    episode: Episode
+    episode: Course
     pole: float  # fine pixels
     track: float  # fine pixels, half length
     scale: float  # fine pixels per metre
     upright: NDArray[np.bool_]  # [T+1]
     score: NDArray[np.float64]  # [T+1] sum of equation (6.2) so far
+    duration: float  # s, of the whole time bar
+    ending: str  # written on the last row
 
     @classmethod
-    def of(cls, episode: Episode, pole_length: float, track_half_length: float) -> "CartDrawing":
-        """Scale the drawing so that track and pole (lengths in m) just fit."""
+    def of(
+        cls,
+        episode: Course,
+        pole_length: float,
+        track_half_length: float,
+        duration: float | None = None,
+        ending: str = "",
+    ) -> "CartDrawing":
+        """Scale the drawing so that track and pole (lengths in m) just fit.
+
+        The time bar spans `duration` s, or the episode.
+        """
         width = SIZE[0] - 2 * MARGIN
         scale = FINER * min(REACH / pole_length, (width - 1.3 * CART_WIDTH) / (2 * track_half_length))
         return cls(
@@ -73,15 +107,17 @@ class CartDrawing:
             scale=scale,
             upright=is_upright(episode.theta),
             score=np.concatenate(([0.0], np.cumsum(episode.score))),
+            duration=duration or float(episode.time[-1] - episode.time[0]) or 1.0,
+            ending=ending,
         )
 
     def background(self, title: str) -> Image.Image:
         """Draw what never changes: title, track, stops and middle, the empty time bar, and the legend."""
-        canvas = Image.new("RGB", (FINER * SIZE[0], FINER * SIZE[1]), style.PAPER)
+        canvas = Image.new("RGB", (FINER * SIZE[0], FINER * SIZE[1]), colours.PAPER)
         draw = ImageDraw.Draw(canvas)
         self._draw_title(draw, title)
         self._draw_track(draw)
-        draw.rectangle(_bar(0.0, 1.0), fill=tint(style.INK, 0.13))
+        draw.rectangle(_bar(0.0, 1.0), fill=tint(colours.INK, 0.13))
         _draw_legend(draw)
         return canvas
 
@@ -105,7 +141,7 @@ class CartDrawing:
 
     def _colour(self, row: int) -> str:
         """Return the pole's colour: green while it is upright."""
-        return style.UPRIGHT if self.upright[row] else style.POLE
+        return colours.UPRIGHT if self.upright[row] else colours.POLE
 
     def _draw_title(self, draw: Draw, title: str) -> None:
         """Draw the title, cut to TITLE_WIDTH."""
@@ -113,18 +149,18 @@ class CartDrawing:
         while font.getlength(title) > FINER * TITLE_WIDTH:
             whole = whole[:-1].rstrip()
             title = whole + "…"
-        draw.text((FINER * MARGIN, FINER * 24), title, fill=style.INK, font=font, anchor="lm")
+        draw.text((FINER * MARGIN, FINER * 24), title, fill=colours.INK, font=font, anchor="lm")
 
     def _draw_track(self, draw: Draw) -> None:
         """Draw the rail, its middle, and the stops that the cart touches at the track's ends."""
-        middle, height, grey = FINER * SIZE[0] / 2, FINER * PIVOT_HEIGHT, tint(style.INK, 0.42)
+        middle, height, grey = FINER * SIZE[0] / 2, FINER * PIVOT_HEIGHT, tint(colours.INK, 0.42)
         end = self.track + FINER * CART_WIDTH / 2
         rail = height + FINER * (CART_HEIGHT / 2 + WHEEL)
         draw.rectangle((middle - end, rail, middle + end, rail + FINER * 3), fill=grey)
         for side in (-1, 1):
             inner, outer = middle + side * end, middle + side * (end + FINER * 5)
             box = (min(inner, outer), height - FINER * 12, max(inner, outer), rail + FINER * 3)
-            draw.rectangle(box, fill=style.LIMIT)
+            draw.rectangle(box, fill=colours.LIMIT)
         draw.line((middle, rail + FINER * 5, middle, rail + FINER * 11), fill=grey, width=FINER * 2)
 
     def _draw_trail(self, draw: Draw, row: int) -> None:
@@ -137,7 +173,7 @@ class CartDrawing:
 
     def _draw_arrow(self, draw: Draw, row: int) -> None:
         """Draw the motor value as an arrow on the side towards which it pushes."""
-        motor = int(self.episode.motor[row]) if row < self.episode.steps else 0
+        motor = int(self.episode.motor[row]) if row < len(self.episode.motor) else 0
         if motor == 0:
             return
         x, y = self._cart(row)
@@ -145,9 +181,9 @@ class CartDrawing:
         head = FINER * 9.0
         start = x + side * FINER * (CART_WIDTH / 2 + 4)
         end = start + side * (FINER * LONGEST_ARROW * abs(motor) / LARGEST_MOTOR + head)
-        draw.line((start, y, end - side * head, y), fill=style.MOTOR, width=FINER * 6)
+        draw.line((start, y, end - side * head, y), fill=colours.MOTOR, width=FINER * 6)
         draw.polygon(
-            [(end, y), (end - side * head, y - head), (end - side * head, y + head)], fill=style.MOTOR
+            [(end, y), (end - side * head, y - head), (end - side * head, y + head)], fill=colours.MOTOR
         )
 
     def _draw_cart(self, draw: Draw, row: int) -> None:
@@ -155,38 +191,32 @@ class CartDrawing:
         x, y = self._cart(row)
         half_width, half_height = FINER * CART_WIDTH / 2, FINER * CART_HEIGHT / 2
         for side in (-0.55, 0.55):
-            _disc(draw, x + side * half_width, y + half_height, FINER * WHEEL, style.INK)
+            _disc(draw, x + side * half_width, y + half_height, FINER * WHEEL, colours.INK)
         box = (x - half_width, y - half_height, x + half_width, y + half_height)
-        draw.rounded_rectangle(box, FINER * 4, fill=style.CART)
+        draw.rounded_rectangle(box, FINER * 4, fill=colours.CART)
         draw.line((x, y, *self._tip(row)), fill=self._colour(row), width=FINER * 7)
         _disc(draw, *self._tip(row), FINER * 3.4, self._colour(row))
-        _disc(draw, x, y, FINER * 6.0, style.INK)
-        _disc(draw, x, y, FINER * 2.5, style.PAPER)
+        _disc(draw, x, y, FINER * 6.0, colours.INK)
+        _disc(draw, x, y, FINER * 2.5, colours.PAPER)
 
     def _draw_progress(self, draw: Draw, row: int) -> None:
         """Fill the bar up to now, green where the pole was upright."""
-        time = self.episode.time
-        span = time[-1] - time[0] or 1.0
+        shares = (self.episode.time - self.episode.time[0]) / self.duration
         edges = [0, *(np.flatnonzero(np.diff(self.upright[: row + 1])) + 1), row]
         for start, stop in pairwise(edges):
-            colour = style.UPRIGHT if self.upright[start] else tint(style.POLE, 0.5)
-            draw.rectangle(_bar((time[start] - time[0]) / span, (time[stop] - time[0]) / span), fill=colour)
+            colour = colours.UPRIGHT if self.upright[start] else tint(colours.POLE, 0.5)
+            draw.rectangle(_bar(shares[start], shares[stop]), fill=colour)
 
     def _draw_numbers(self, draw: Draw, row: int) -> None:
-        """Write the time, the score so far and, on the last frame, an ending other than the time limit."""
+        """Write the time, the score so far and, on the last row, the ending."""
         right, font = FINER * (SIZE[0] - MARGIN), _font(15)
         clock = f"{self.episode.time[row] - self.episode.time[0]:.2f} s"
-        draw.text((right, FINER * 24), clock, fill=style.INK, font=font, anchor="rm")
+        draw.text((right, FINER * 24), clock, fill=colours.INK, font=font, anchor="rm")
         score = f"score {self.score[row]:.0f}"
-        draw.text((right - FINER * 75, FINER * 24), score, fill=style.INK, font=font, anchor="rm")
-        if row == self.episode.steps and self.episode.ended_by != Ending.TIME:
-            draw.text(
-                (FINER * MARGIN, FINER * 46),
-                ending_text(self.episode),
-                fill=style.LIMIT,
-                font=font,
-                anchor="lm",
-            )
+        draw.text((right - FINER * 75, FINER * 24), score, fill=colours.INK, font=font, anchor="rm")
+        if self.ending and row == len(self.upright) - 1:
+            place = (FINER * MARGIN, FINER * 46)
+            draw.text(place, self.ending, fill=colours.LIMIT, font=font, anchor="lm")
 
 
 def tint(colour: str, part: float) -> Colour:
@@ -198,11 +228,11 @@ def tint(colour: str, part: float) -> Colour:
 @cache
 def palette() -> Image.Image:
     """Return a picture whose palette has the fixed colours, as Pillow's `quantize` takes it."""
-    colours = [tint(style.INK, 0.0)] + [
+    tints = [tint(colours.INK, 0.0)] + [
         tint(colour, part) for colour, parts in TINTS.items() for part in parts
     ]
     holder = Image.new("P", (1, 1))
-    holder.putpalette([level for colour in colours for level in colour])
+    holder.putpalette([level for each in tints for level in each])
     return holder
 
 
@@ -221,14 +251,16 @@ def _bar(start: float, stop: float) -> tuple[float, float, float, float]:
 
 def _draw_legend(draw: Draw) -> None:
     """Explain the bar's green and the arrow, below the bar."""
-    font, height, grey = _font(10), FINER * LEGEND, tint(style.INK, 0.6)
+    font, height, grey = _font(10), FINER * LEGEND, tint(colours.INK, 0.6)
     left, right = FINER * MARGIN, FINER * (SIZE[0] - MARGIN)
     draw.text((left, height), "time, green while the pole is upright", fill=grey, font=font, anchor="lm")
     words = "motor"
     draw.text((right, height), words, fill=grey, font=font, anchor="rm")
     tip, head = right - font.getlength(words) - FINER * 5, FINER * 4
-    draw.line((tip - FINER * 16, height, tip - head, height), fill=style.MOTOR, width=FINER * 3)
-    draw.polygon([(tip, height), (tip - head, height - head), (tip - head, height + head)], fill=style.MOTOR)
+    draw.line((tip - FINER * 16, height, tip - head, height), fill=colours.MOTOR, width=FINER * 3)
+    draw.polygon(
+        [(tip, height), (tip - head, height - head), (tip - head, height + head)], fill=colours.MOTOR
+    )
 
 
 def _disc(draw: Draw, x: float, y: float, radius: float, colour: str) -> None:

@@ -1,0 +1,57 @@
+"""Snapshots of a driven cart in memory shared with another process, which shows them.
+
+The driving process writes one snapshot a period, right after it has sent a motor value: it then waits for the
+cart in any case. Nothing is locked. A counter that is odd during a write lets the reader discard torn data.
+"""
+
+import multiprocessing
+import struct
+from ctypes import Array, c_char
+from typing import NamedTuple
+
+COUNTER = struct.Struct("<Q")
+FIELDS = struct.Struct("<2I 2i 2I 6d")
+SIZE = COUNTER.size + FIELDS.size
+ATTEMPTS = 10  # to read while the writer writes
+
+Memory = Array[c_char]
+
+
+class Snapshot(NamedTuple):
+    """A cart at one moment of an episode."""
+
+    episode: int  # from 1
+    step: int  # control periods of the episode
+    motor: int  # motor value sent, -255 to 255
+    guard: int  # direction of the track guard's motor value, 0 if the agent's was sent
+    late_ticks: int  # of all episodes
+    lost_frames: int
+    x: float  # m
+    x_dot: float  # m/s
+    theta: float  # rad, 0 upright
+    theta_dot: float  # rad/s
+    score: float  # sum of equation (6.2) so far
+    track_half_length: float  # m
+
+
+def new_memory() -> Memory:
+    """Return memory for a snapshot, which a new process of `multiprocessing` can be given."""
+    return multiprocessing.RawArray(c_char, SIZE)
+
+
+def write(memory: Memory, number: int, snapshot: Snapshot) -> None:
+    """Write the snapshot `number`, which counts up from 1."""
+    COUNTER.pack_into(memory, 0, 2 * number - 1)
+    FIELDS.pack_into(memory, COUNTER.size, *snapshot)
+    COUNTER.pack_into(memory, 0, 2 * number)
+
+
+def read(memory: Memory) -> tuple[int, Snapshot] | None:
+    """Return the number and the content of the newest snapshot; None before the first one."""
+    for _ in range(ATTEMPTS):
+        (before,) = COUNTER.unpack_from(memory, 0)
+        snapshot = Snapshot(*FIELDS.unpack_from(memory, COUNTER.size))
+        (after,) = COUNTER.unpack_from(memory, 0)
+        if before == after and before % 2 == 0:
+            return (before // 2, snapshot) if before else None
+    return None

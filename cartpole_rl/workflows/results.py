@@ -1,0 +1,25 @@
+"""The last lines of a command: where its results are, and the next command to run."""
+
+from contextlib import suppress
+from pathlib import Path
+
+from cartpole_rl.plants.serial.settings import SerialSettings
+from cartpole_rl.plants.settings import EmulatedSettings
+
+
+def print_results(folder: Path, files: str, following: str) -> None:
+    """Print that `files` are in `folder`, and the command `following`."""
+    print(f"{shown(folder)}/{files} are written; next:")
+    print(following)
+
+
+def shown(path: Path) -> Path:
+    """Return `path` relative to the working directory if it is below it."""
+    with suppress(ValueError):
+        return path.resolve().relative_to(Path.cwd())
+    return path
+
+
+def plant_words(plant: EmulatedSettings | SerialSettings) -> str:
+    """Return the words that choose a cart on the command line."""
+    return f"plant=serial plant.port={plant.port}" if isinstance(plant, SerialSettings) else "plant=emulated"

@@ -1,0 +1,80 @@
+"""Snapshots of a driven cart: written by one process, read whole by another."""
+
+import multiprocessing
+from contextlib import closing
+
+import pytest
+import torch
+from tensordict import TensorDictBase
+
+from cartpole_rl.emulator.settings import EmulatorSettings
+from cartpole_rl.envs.build import environment, shipped_settings
+from cartpole_rl.evaluation.episodes import run_episodes
+from cartpole_rl.evaluation.publishing import followed
+from cartpole_rl.evaluation.snapshots import COUNTER, Memory, Snapshot, new_memory, read, write
+from cartpole_rl.plants.emulated import emulated_plant
+
+WRITES = 20_000
+
+
+def numbered(number: int) -> Snapshot:
+    """A snapshot whose fields all say which one it is."""
+    return Snapshot(*[number] * 6, *[float(number)] * 6)
+
+
+def full_left(current: TensorDictBase) -> TensorDictBase:
+    return current.set("action", torch.zeros(1, dtype=torch.int64))
+
+
+def write_many(memory: Memory) -> None:
+    for number in range(1, WRITES + 1):
+        write(memory, number, numbered(number))
+
+
+def test_nothing_is_read_before_the_first_snapshot() -> None:
+    assert read(new_memory()) is None
+
+
+def test_the_newest_snapshot_is_read() -> None:
+    memory = new_memory()
+    for number in (1, 2):
+        write(memory, number, numbered(number))
+    assert read(memory) == (2, numbered(2))
+
+
+def test_a_snapshot_that_is_being_written_is_not_read() -> None:
+    memory = new_memory()
+    write(memory, 1, numbered(1))
+    COUNTER.pack_into(memory, 0, 3)
+    assert read(memory) is None
+
+
+def test_another_process_never_reads_parts_of_two_snapshots() -> None:
+    memory = new_memory()
+    process = multiprocessing.get_context("spawn").Process(target=write_many, args=(memory,))
+    process.start()
+    seen = set()
+    while process.is_alive():
+        if (found := read(memory)) is not None:
+            assert found == (found[0], numbered(found[0]))
+            seen.add(found[0])
+    process.join()
+    assert read(memory) == (WRITES, numbered(WRITES))
+    assert len(seen) > 1
+
+
+def test_a_driven_cart_publishes_what_the_episode_holds() -> None:
+    settings = shipped_settings({"task.time_limit": 40})
+    plant = emulated_plant(EmulatorSettings(physics_step=1e-3), settings.control_period)
+    with closing(environment(settings, plant)) as env:
+        memory = new_memory()
+        followed(env, memory)
+        *_, episode = run_episodes(env, full_left, 2)
+        number, snapshot = read(memory)
+    assert number == 2 * 40  # one for each period
+    assert (snapshot.episode, snapshot.step) == (2, 39)
+    assert snapshot.motor == episode.motor[-1]
+    assert (snapshot.x, snapshot.theta) == pytest.approx((episode.x[-2], episode.theta[-2]), abs=1e-6)
+    assert snapshot.score == pytest.approx(episode.score[:-1].sum(), rel=1e-5)
+    assert snapshot.late_ticks == plant.cart.statistics.late_ticks
+    assert snapshot.track_half_length == pytest.approx(0.38, abs=0.01)
