@@ -58,9 +58,7 @@ def prepared(config: EvaluateConfig) -> Evaluation:
     return Evaluation(config, settings, env, agent.policy, again)
 
 
-def repeated(
-    env: CartPoleEnv, policy: Policy, again: Repetition, knocks: Knocks | None
-) -> Iterator[Episode]:
+def repeated(env: CartPoleEnv, policy: Policy, again: Repetition, knocks: Knocks | None) -> Iterator[Episode]:
     """Drive the same simulated cart from the same start."""
     assert isinstance(env.plant, SimulatedPlant)
     env.plant.start_from(again.origin.state)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.reporting.studies.settings import Size, Study, Variant
-from cartpole_rl.workflows.reproduce.studies import load_study, unknown
+from cartpole_rl.workflows.reproduce.studies import STUDIES, load_study, unknown
 
 FIRST_SEED = 10  # settings were chosen on seeds 0 to 9
 EVALUATIONS = "evaluations"  # folder in that of an agent
@@ -32,16 +32,18 @@ class Task:
     agent: Path | None = None  # whose results are taken over
 
 
-def plan(names: Sequence[str], size: str, root: Path) -> list[Task]:
+def plan(names: Sequence[str], size: str, root: Path, source: Path = STUDIES) -> list[Task]:
     """Return the runs of the studies `names` and the runs of others that they need, in order.
 
     Raises ConfigError for an unknown study or size.
     """
-    tasks = {task.folder: task for name in names for task in study_tasks(name, size, root)}
+    tasks = {task.folder: task for name in names for task in study_tasks(name, size, root, source)}
     missing = needed(tasks.values()) - tasks.keys()
     while missing:
         others = {folder.relative_to(root).parts[0] for folder in missing}
-        found = {task.folder: task for name in sorted(others) for task in study_tasks(name, size, root)}
+        found = {
+            task.folder: task for name in sorted(others) for task in study_tasks(name, size, root, source)
+        }
         if lost := sorted(missing - found.keys()):
             raise ConfigError(f"{lost[0]}: a study needs this run, but no study of size {size} has it")
         tasks = {**{folder: found[folder] for folder in sorted(missing)}, **tasks}
@@ -54,9 +56,9 @@ def needed(tasks: Iterable[Task]) -> set[Path]:
     return {folder for task in tasks for folder in task.needs}
 
 
-def study_tasks(name: str, size: str, root: Path) -> list[Task]:
+def study_tasks(name: str, size: str, root: Path, source: Path = STUDIES) -> list[Task]:
     """Return all runs of a study, each agent before its evaluations. Raises ConfigError."""
-    study = load_study(name)
+    study = load_study(name, source)
     chosen = size_of(name, study, size)
     return [
         task

@@ -33,10 +33,13 @@ def is_complete(task: Task) -> bool:
 
 
 def made_otherwise(task: Task) -> str:
-    """Return why a complete run does not belong to its study any more; empty if it does."""
+    """Return why a run does not belong to its study any more; empty if it does."""
     if task.command == SHARE:
         return ""
-    given = json.loads((task.folder / PROVENANCE).read_text())["command"][1:]
+    try:
+        given = json.loads((task.folder / PROVENANCE).read_text())["command"][1:]
+    except (OSError, ValueError, LookupError, TypeError):
+        given = None
     return "" if given == [*task.words] else "it was made with other settings; delete its folder to repeat it"
 
 
@@ -67,7 +70,8 @@ def in_own_process(task: Task) -> None:
 
 def prepare(task: Task) -> bool:
     """Remove an incomplete run that cannot be resumed; return True for one that can."""
-    if task.command in RESUMABLE and (task.folder / CHECKPOINTS / RESUME).is_file():
+    can_resume = task.command in RESUMABLE and (task.folder / CHECKPOINTS / RESUME).is_file()
+    if can_resume and not made_otherwise(task):
         return True
     shutil.rmtree(task.folder, ignore_errors=True)
     return False

@@ -25,7 +25,9 @@ class Progress:
         remaining = self.remaining(left)
         rest = "" if remaining is None else f", about {duration(remaining)} left"
         outcome = f"FAILED: {failure}" if failure else duration(seconds)
-        self.show(f"[{self.done:{len(str(self.total))}}/{self.total}] {task.command:8} {label}: {outcome}{rest}")
+        self.show(
+            f"[{self.done:{len(str(self.total))}}/{self.total}] {task.command:8} {label}: {outcome}{rest}"
+        )
 
     def remaining(self, left: Iterable[Task]) -> float | None:
         """Return the seconds that runs still take, by the mean of those like them; None before the first."""
@@ -40,7 +42,12 @@ class Progress:
 
 def kinds(task: Task) -> tuple[tuple[str, ...], ...]:
     """Return what runs like this one share, the most similar first."""
-    return (task.study, task.command, *task.folder.parts[-1:]), (task.study, task.command), (task.command,), ()
+    return (
+        (task.study, task.command, *task.folder.parts[-1:]),
+        (task.study, task.command),
+        (task.command,),
+        (),
+    )
 
 
 def duration(seconds: float) -> str:
