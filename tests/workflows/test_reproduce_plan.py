@@ -19,7 +19,7 @@ from cartpole_rl.workflows.config import (
     ModelConfig,
     TrainConfig,
 )
-from cartpole_rl.workflows.reproduce.plan import FIRST_SEED, SHARE, Task, plan, study_tasks
+from cartpole_rl.workflows.reproduce.plan import FIRST_SEED, Task, plan, study_tasks
 from cartpole_rl.workflows.reproduce.studies import load_study, overrides_of, study_names
 
 pytestmark = pytest.mark.usefixtures("hydra_reads_conf")
@@ -51,7 +51,7 @@ def words_of(task: Task) -> tuple[str, ...]:
 def settings_of(study: str, size: str) -> set[tuple[str, tuple[str, ...]]]:
     """The commands with their overrides of the first seed."""
     tasks = [task for task in study_tasks(study, size, ROOT) if str(FIRST_SEED) in task.folder.parts]
-    return {(task.command, words_of(task)) for task in tasks if task.command != SHARE}
+    return {(task.command, words_of(task)) for task in tasks}
 
 
 @pytest.mark.parametrize("study", STUDIES)
@@ -62,7 +62,7 @@ def test_every_run_of_a_study_has_valid_settings(study: str) -> None:
 
 @pytest.mark.parametrize("study", STUDIES)
 def test_hydra_reads_the_overrides_of_the_last_arm_and_evaluation_alike(study: str) -> None:
-    *_, own, last = [task for task in study_tasks(study, "full", ROOT) if task.command != SHARE]
+    *_, own, last = study_tasks(study, "full", ROOT)
     for task in {own.command: own, last.command: last}.values():
         words = words_of(task)
         with_hydra = checked(CONFIGS[task.command], as_mapping(hydra.compose(task.command, list(words))))

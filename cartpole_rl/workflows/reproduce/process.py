@@ -12,7 +12,7 @@ import yaml
 from cartpole_rl.errors import CartPoleError
 from cartpole_rl.run_files import CHECKPOINTS, CONFIG, IDENTIFIED, METRICS, MODELLED, PROVENANCE, RESUME
 from cartpole_rl.signals import RaiseOnce, end_with_parent, ending_signals
-from cartpole_rl.workflows.reproduce.plan import SHARE, Task
+from cartpole_rl.workflows.reproduce.plan import Task
 
 LOG = "log.txt"
 RESULTS = {"identify": IDENTIFIED, "model": MODELLED}  # of the other commands METRICS
@@ -34,8 +34,6 @@ def is_complete(task: Task) -> bool:
 
 def made_otherwise(task: Task) -> str:
     """Return why a run does not belong to its study any more; empty if it does."""
-    if task.command == SHARE:
-        return ""
     try:
         given = json.loads((task.folder / PROVENANCE).read_text())["command"][1:]
     except (OSError, ValueError, LookupError, TypeError):
