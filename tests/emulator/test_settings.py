@@ -19,7 +19,7 @@ TRUTH = {
 }
 NAMES = sorted(name for names in TRUTH.values() for name in names)
 FAULTS = ["unplug_at", "reset_at", "stuck_encoder", "stuck_at"]
-OURS = ["boot", "clock", "journal", "physics_step", "seed", "start", *FAULTS]
+OURS = ["boot", "clock", "journal", "knock", "physics_step", "seed", "start", *FAULTS]
 
 
 def test_the_names_are_the_public_ones():
