@@ -7,14 +7,15 @@ import signal
 import sys
 import traceback
 
-import yaml
-
+from cartpole_rl.choices import choice
 from cartpole_rl.errors import CartPoleError
-from cartpole_rl.run_files import CHECKPOINTS, CONFIG, IDENTIFIED, METRICS, MODELLED, PROVENANCE, RESUME
+from cartpole_rl.run_files import CHECKPOINTS, IDENTIFIED, METRICS, MODELLED, PROVENANCE, RESUME
 from cartpole_rl.signals import RaiseOnce, end_with_parent, ending_signals
 from cartpole_rl.workflows.reproduce.plan import Task
+from cartpole_rl.workflows.reproduce.studies import overrides_of
 
 LOG = "log.txt"
+DEFAULT_EPISODES = choice("evaluate")["episodes"]
 RESULTS = {"identify": IDENTIFIED, "model": MODELLED}  # of the other commands METRICS
 RESUMABLE = ("train", "finetune")
 SIGNALLED = 128  # added to the number of a signal, as a shell does
@@ -25,10 +26,10 @@ def is_complete(task: Task) -> bool:
     result = task.folder / RESULTS.get(task.command, METRICS)
     if task.command != "evaluate":
         return result.is_file()
+    asked = overrides_of(task.words).get("episodes", DEFAULT_EPISODES)
     try:
-        episodes = json.loads(result.read_text())["episodes"]
-        return len(episodes) == yaml.safe_load((task.folder / CONFIG).read_text())["episodes"]
-    except (OSError, ValueError, LookupError, TypeError, yaml.YAMLError):
+        return len(json.loads(result.read_text())["episodes"]) == asked
+    except (OSError, ValueError, LookupError, TypeError):
         return False
 
 
