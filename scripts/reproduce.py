@@ -13,11 +13,14 @@ import argparse
 import os
 import signal
 import sys
+from functools import partial
 from pathlib import Path
 
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.signals import RaiseOnce, ending_signals
-from cartpole_rl.workflows.reproduce.studies import load_study, study_names
+from cartpole_rl.workflows.reproduce.process import SIGNALLED
+from cartpole_rl.workflows.reproduce.reproduce import reproduce
+from cartpole_rl.workflows.reproduce.studies import STUDIES, load_study, study_names
 
 
 def parse_options() -> argparse.Namespace:
@@ -29,42 +32,49 @@ def parse_options() -> argparse.Namespace:
     parser.add_argument("--size", default="quick", help="quick (default) or full")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="runs at a time (one per core)")
     parser.add_argument("--folder", type=Path, default=Path("runs/reproduce"), help="of the results")
+    parser.add_argument("--studies", type=Path, default=STUDIES, help="folder of the studies (conf/study)")
     parser.add_argument("--list", action="store_true", help="name all studies and end")
     return parser.parse_args()
 
 
-def list_studies() -> None:
+def list_studies(source: Path) -> None:
     """Print the name, the figure and the question of each study."""
-    for name in study_names():
-        study = load_study(name)
+    for name in study_names(source):
+        study = load_study(name, source)
         print(f"{name:28} {study.figure:18} {study.question}")
 
 
-def main() -> int:
-    """Reproduce; return the exit code."""
-    options = parse_options()
-    if options.list:
-        list_studies()
-        return 0
-    from cartpole_rl.workflows.reproduce.reproduce import reproduce
+def interrupted(number: int) -> KeyboardInterrupt:
+    """Return the exception that a signal raises."""
+    return KeyboardInterrupt(number)
 
-    root = options.folder / options.size
-    RaiseOnce(lambda number: KeyboardInterrupt()).handle(signal.SIGINT, *ending_signals())
+
+def run(options: argparse.Namespace) -> int:
+    """Reproduce the chosen studies; return the exit code. Raises ConfigError."""
+    root, source = options.folder / options.size, options.studies
+    names = options.names or study_names(source)
+    failures = reproduce(names, options.size, root, max(1, options.jobs), source, partial(print, flush=True))
+    for label, reason in failures.items():
+        print(f"scripts/reproduce: {label} failed: {reason}", file=sys.stderr)
+    print(f"the page: cartpole-report studies={root}")
+    return 1 if failures else 0
+
+
+def main() -> int:
+    """List the studies or reproduce them; return the exit code."""
+    options = parse_options()
+    RaiseOnce(interrupted).handle(signal.SIGINT, *ending_signals())
     try:
-        names = options.names or study_names()
-        failures = reproduce(
-            names, options.size, root, max(1, options.jobs), lambda line: print(line, flush=True)
-        )
+        if options.list:
+            list_studies(options.studies)
+            return 0
+        return run(options)
     except ConfigError as error:
         print(f"scripts/reproduce: {error}", file=sys.stderr)
         return error.exit_code
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as signalled:
         print("scripts/reproduce: interrupted; the same command continues", file=sys.stderr)
-        return 130
-    for label, reason in failures.items():
-        print(f"scripts/reproduce: {label} failed: {reason}", file=sys.stderr)
-    print(f"results: cartpole-report studies={root}")
-    return 1 if failures else 0
+        return SIGNALLED + (signalled.args or (signal.SIGINT,))[0]
 
 
 if __name__ == "__main__":

@@ -23,8 +23,8 @@ def episode_metrics(episode: Episode, track_half_length: float) -> dict[str, Any
     the pole stays within 5 degrees for 1 s; `upright_fraction` the share of periods within 5 degrees, over
     which the RMS of angle and position are taken; `rms_motor_change` that of the step from one motor value to
     the next; `guarded_fraction` the share of periods in which the track guard replaced the agent's motor
-    value; `upright_at_end` whether the pole is within 5 degrees for the last second, as 1 or 0, which
-    tells whether it came up again after a knock; `min_track_margin_m` the smallest distance from `track_half_length`, negative beyond it.
+    value; `upright_at_end` is 1 if the pole is within 5 degrees during the last second, else 0;
+    `min_track_margin_m` the smallest distance from `track_half_length`, negative beyond it.
     """
     upright = is_upright(episode.theta[1:])
     change = np.diff(episode.motor)

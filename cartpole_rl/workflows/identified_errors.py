@@ -30,7 +30,7 @@ def known_truth(config: IdentifyConfig) -> EmulatorSettings | None:
 
 
 def errors(found: Mapping[str, float], truth: EmulatorSettings | None) -> dict[str, Any]:
-    """Return `errors` for identification.json: relative errors by name, and their median; {} without a truth."""
+    """Return `errors` for identification.json: relative errors and their median; {} without a truth."""
     if truth is None:
         return {}
     true = true_values(truth)

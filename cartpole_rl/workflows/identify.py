@@ -50,9 +50,10 @@ def identify_cart(config: IdentifyConfig, folder: Path) -> None:
     """Identify the cart of `config.plant`, or that of the recordings in `config.source`.
 
     Writes into `folder` config.yaml, provenance.json, recordings/ of experiments, cart.yaml, pole.yaml,
-    randomization.yaml and posterior.npz (to train on), identification.json, page.html and figures/. With method=one_step
-    only config.yaml, provenance.json, recordings/ and identification.json. Prints the identified values. Raises RecordingError for missing, too few or implausible recordings, ConfigError
-    for several poles or a folder that already holds a run, PlantError and LinkError for a cart that fails.
+    randomization.yaml and posterior.npz (to train on), identification.json, page.html and figures/; with
+    method=one_step only the first three and identification.json. Prints the identified values. Raises
+    RecordingError for missing, too few or implausible recordings, ConfigError for several poles or a folder
+    that already holds a run, PlantError and LinkError for a cart that fails.
     """
     use_threads(config.threads)
     nominal = config.nominal  # or ConfigError, before the cart moves

@@ -20,7 +20,7 @@ from cartpole_rl.workflows import config
 COMMANDS = ("train", "evaluate", "emulate")
 SHOWN = {
     "train": "pole: both, large, medium, range",
-    **dict.fromkeys(COMMANDS[1:], "emulator: large, medium"),
+    **dict.fromkeys(COMMANDS[1:], "emulator: large, medium, stand_in, stand_in_large"),
 }
 SCHEMAS: dict[str, type[Settings]] = {
     "emulate": config.EmulateConfig,

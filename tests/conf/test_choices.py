@@ -10,7 +10,7 @@ import yaml
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from cartpole_rl.checking import checked
-from cartpole_rl.choices import conf_folder, default_choices
+from cartpole_rl.choices import conf_folder
 from cartpole_rl.commands.hydra_application.composition import as_mapping
 from cartpole_rl.envs.build import randomizer
 from cartpole_rl.tasks.rewards import Reward
@@ -20,7 +20,7 @@ from cartpole_rl.workflows.config import EmulateConfig, EvaluateConfig, Finetune
 pytestmark = pytest.mark.usefixtures("hydra_reads_conf")
 
 CONF = conf_folder()
-GROUPS = sorted(path.name for path in CONF.iterdir() if path.is_dir() and path.name != "hydra")
+GROUPS = sorted(path.name for path in CONF.iterdir() if path.is_dir() and path.name not in ("hydra", "study"))
 CHOICES = [f"{group}={path.stem}" for group in GROUPS for path in sorted((CONF / group).glob("*.yaml"))]
 NOT_OF_TRAINING = (
     "emulator",
@@ -122,14 +122,21 @@ def test_training_takes_an_experiment(experiment: str) -> None:
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_an_experiment_holds_only_differences(experiment: str) -> None:
-    """From the defaults of cartpole-train. Those of the thesis name every group, each with its source."""
+    """From the experiment that it extends, or the defaults of cartpole-train.
+
+    Those of the thesis name every group, each with its source.
+    """
     content = yaml.safe_load((CONF / f"experiment/{experiment}.yaml").read_text()) or {}
-    groups = dict(next(iter(line.items())) for line in content.pop("defaults", []))
+    lines = content.pop("defaults", [])
+    extended = [f"experiment={line}" for line in lines if isinstance(line, str)]
+    groups = dict(next(iter(line.items())) for line in lines if isinstance(line, dict))
     chosen = {name.removeprefix("override /"): choice for name, choice in groups.items()}
     if not experiment.startswith("thesis"):
-        assert not chosen.items() & default_choices("train").items()
-    before = dict(leaves(composed("train", *(f"{group}={name}" for group, name in chosen.items()))))
-    assert not [name for name, value in leaves(content) if before[name] == value]
+        cases = {group: composed("train", *extended, f"{group}={choice}") for group, choice in chosen.items()}
+        assert not [group for group, case in cases.items() if case == composed("train", *extended)]
+    words = (f"{group}={name}" for group, name in chosen.items())
+    before = dict(leaves(composed("train", *extended, *words)))
+    assert not [name for name, value in leaves(content) if name in before and before[name] == value]
 
 
 @pytest.mark.parametrize("sweep", sorted(path.stem for path in (CONF / "sweep").glob("*.yaml")))

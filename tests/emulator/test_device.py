@@ -254,10 +254,30 @@ def test_every_setting_is_tried_here_or_on_the_wire():
     faults = {"unplug_at", "stuck_encoder", "stuck_at"}  # test_emulator_faults.py
     cogging = {"cogging", "cogging_pitch"}  # test_emulator_physics.py
     firmware = {"firmware", "policy"}  # this module runs with both; test_onboard_policy.py
-    journal = {"journal"}  # tests/plants/test_stops.py, tests/bench/test_soak.py
-    assert set(OTHER) | firmware | on_the_wire | order | faults | cogging | journal == set(
+    others = {"journal", "knock"}  # tests/plants/test_stops.py, tests/bench/test_soak.py; below
+    assert set(OTHER) | firmware | on_the_wire | order | faults | cogging | others == set(
         EmulatorSettings.model_fields
     )
+
+
+def test_a_standing_pole_is_knocked_once_after_each_start_to_either_side():
+    cart = CartDevice(EmulatorSettings(knock=4.0))
+    cart.firmware.homed = True
+
+    def knocks() -> list[tuple[int, float]]:
+        cart.receive(encode_frame(Start(), 0)[:-1], cart.now_us)
+        found = []
+        for period in range(1, 251):
+            cart.physics.place_pole(0.0)
+            cart.pass_period(cart.period_end_us)
+            if abs(cart.physics.angle_dot) > 1:
+                found.append((period, round(cart.physics.angle_dot, 1)))
+        cart.receive(encode_frame(Stop(), 0)[:-1], cart.now_us)
+        cart.pass_period(cart.period_end_us)
+        return found
+
+    assert knocks() == [(100, 4.0)]
+    assert knocks() == [(100, -4.0)]
 
 
 def test_latency_delays_the_force_by_its_value():

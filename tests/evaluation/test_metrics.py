@@ -116,3 +116,16 @@ def test_the_summary_counts_endings_and_skips_missing_metrics() -> None:
     assert summary["time_to_upright_s"] == {"mean": PERIOD, "low": None, "high": None, "count": 1}
     alone = summarize([episode_metrics(hanging, 0.4)])
     assert alone["time_to_upright_s"] is None
+
+
+@pytest.mark.parametrize(
+    ("last", "stands"), [([0.0] * 51, 1), ([6.0] + [0.0] * 49, 0), ([0.0] * 50 + [6.0], 0)]
+)
+def test_the_pole_is_upright_at_the_end_if_it_was_during_the_last_second(
+    last: list[float], stands: int
+) -> None:
+    assert episode_metrics(episode([90.0] * 20 + last), 0.4)["upright_at_end"] == stands
+
+
+def test_an_episode_of_less_than_a_second_does_not_end_upright() -> None:
+    assert episode_metrics(episode([0.0] * 50), 0.4)["upright_at_end"] == 0

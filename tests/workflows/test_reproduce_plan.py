@@ -1,4 +1,4 @@
-"""Studies: each file is valid, each run of each size has settings that its command takes, as Hydra reads them."""
+"""Studies: each file is valid, and each run of each size has settings that its command takes."""
 
 from collections import Counter
 from functools import cache
@@ -6,7 +6,6 @@ from pathlib import Path
 
 import hydra
 import pytest
-from command_line import TINY
 
 from cartpole_rl.checking import checked
 from cartpole_rl.choices import compose, conf_folder
@@ -20,7 +19,7 @@ from cartpole_rl.workflows.config import (
     ModelConfig,
     TrainConfig,
 )
-from cartpole_rl.workflows.reproduce.plan import FIRST_SEED, SHARE, Task, plan, study_tasks
+from cartpole_rl.workflows.reproduce.plan import FIRST_SEED, Task, plan, study_tasks
 from cartpole_rl.workflows.reproduce.studies import load_study, overrides_of, study_names
 
 pytestmark = pytest.mark.usefixtures("hydra_reads_conf")
@@ -43,27 +42,29 @@ def without_hydra(command: str, words: tuple[str, ...]) -> Settings:
     return checked(CONFIGS[command], compose(command, overrides_of(words)))
 
 
-def of_conf(words: tuple[str, ...]) -> tuple[str, ...]:
-    """The overrides without the files of other runs."""
-    return tuple(word for word in words if not (word.startswith(FILES) and word.endswith(".yaml")))
+def words_of(task: Task) -> tuple[str, ...]:
+    """The overrides, with one agent for all and without the files of other runs, which do not exist here."""
+    kept = (word for word in task.words if not (word.startswith(FILES) and word.endswith(".yaml")))
+    return tuple("run=somewhere" if word.startswith("run=") else word for word in kept)
 
 
-def one_of_each(tasks: list[Task]) -> list[Task]:
-    """The runs of the first seed."""
-    return [task for task in tasks if str(FIRST_SEED) in task.folder.parts and task.command != SHARE]
-
-
-@pytest.mark.parametrize("size", ["quick", "full"])
-@pytest.mark.parametrize("study", STUDIES)
-def test_every_run_of_a_study_has_valid_settings(study: str, size: str) -> None:
-    for task in one_of_each(study_tasks(study, size, ROOT)):
-        assert without_hydra(task.command, of_conf(task.words))
+def settings_of(study: str, size: str) -> set[tuple[str, tuple[str, ...]]]:
+    """The commands with their overrides of the first seed."""
+    tasks = [task for task in study_tasks(study, size, ROOT) if str(FIRST_SEED) in task.folder.parts]
+    return {(task.command, words_of(task)) for task in tasks}
 
 
 @pytest.mark.parametrize("study", STUDIES)
-def test_hydra_reads_the_overrides_alike(study: str) -> None:
-    for task in one_of_each(study_tasks(study, "quick", ROOT)):
-        words = of_conf(task.words)
+def test_every_run_of_a_study_has_valid_settings(study: str) -> None:
+    for command, words in settings_of(study, "quick") | settings_of(study, "full"):
+        assert without_hydra(command, words)
+
+
+@pytest.mark.parametrize("study", STUDIES)
+def test_hydra_reads_the_overrides_of_the_last_arm_and_evaluation_alike(study: str) -> None:
+    *_, own, last = study_tasks(study, "full", ROOT)
+    for task in {own.command: own, last.command: last}.values():
+        words = words_of(task)
         with_hydra = checked(CONFIGS[task.command], as_mapping(hydra.compose(task.command, list(words))))
         assert with_hydra == without_hydra(task.command, words), task.folder
 
@@ -93,21 +94,30 @@ def test_a_study_brings_the_agents_that_it_needs() -> None:
     assert {("swingup", "thesis"), ("todays_agents", "medium")} <= folders
 
 
-def test_a_wrong_name_gets_the_nearest_one() -> None:
-    with pytest.raises(
-        ConfigError, match="^friction_model: there is no such study; did you mean friction_models"
-    ):
-        plan(["friction_model"], "quick", ROOT)
-    with pytest.raises(ConfigError, match="fulll: there is no such size; did you mean full"):
-        plan(["baseline"], "fulll", ROOT)
+@pytest.mark.parametrize(
+    ("name", "size", "complaint"),
+    [
+        ("friction_model", "quick", "friction_model: there is no such study; did you mean friction_models?"),
+        ("baseline", "fulll", "study baseline: fulll: there is no such size; did you mean full?"),
+        ("x", "quick", "x: there is no such study; --list names them"),
+    ],
+)
+def test_a_wrong_name_gets_the_nearest_one(name: str, size: str, complaint: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        plan([name], size, ROOT)
+    assert str(caught.value) == complaint
 
 
-EXPERIMENTS = sorted(path.stem for path in (conf_folder() / "experiment").glob("*.yaml"))
+EXTENDING = [
+    path.stem
+    for path in sorted((conf_folder() / "experiment").glob("*.yaml"))
+    if "\n  - thesis" in path.read_text()
+]
 
 
-@pytest.mark.parametrize("experiment", EXPERIMENTS)
-def test_an_experiment_composes_alike_with_and_without_hydra(experiment: str) -> None:
-    words = (f"experiment={experiment}", *TINY)
+@pytest.mark.parametrize("experiment", [*EXTENDING, "friction_models_fig_6_8", "perturbations_fig_6_14"])
+def test_an_experiment_that_extends_another_composes_alike_with_and_without_hydra(experiment: str) -> None:
+    words = (f"experiment={experiment}",)
     assert checked(TrainConfig, as_mapping(hydra.compose("train", list(words)))) == without_hydra(
         "train", words
     )

@@ -1,15 +1,12 @@
 """Carries out a run of a study with the workflow of its command."""
 
-import shutil
 import sys
 import threading
-from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
 from cartpole_rl.learning.checkpoints import forget_training
-from cartpole_rl.run_files import CONFIG, HISTORY, METRICS, PROVENANCE
 from cartpole_rl.workflows.config import (
     EvaluateConfig,
     FinetuneConfig,
@@ -22,13 +19,12 @@ from cartpole_rl.workflows.finetune import finetune
 from cartpole_rl.workflows.identify import identify_cart
 from cartpole_rl.workflows.loading import load_settings
 from cartpole_rl.workflows.model import learn_model
-from cartpole_rl.workflows.reproduce.plan import SHARE, Task
+from cartpole_rl.workflows.reproduce.plan import Task
 from cartpole_rl.workflows.reproduce.process import RESUMABLE
 from cartpole_rl.workflows.reproduce.studies import overrides_of
 from cartpole_rl.workflows.run_folder import PREFIX
 from cartpole_rl.workflows.train import train
 
-SHARED_FILES = (CONFIG, PROVENANCE, HISTORY, METRICS)  # METRICS last: it makes a run complete
 WORKFLOWS: dict[str, tuple[type, Any]] = {
     "train": (TrainConfig, train),
     "evaluate": (EvaluateConfig, evaluate),
@@ -41,10 +37,6 @@ tqdm.set_lock(threading.RLock())  # its own is a semaphore of the system, which 
 
 def carry_out(task: Task, resumed: bool = False) -> None:
     """Run the command of a task in its folder, or resume it. Raises CartPoleError."""
-    if task.command == SHARE:
-        assert task.agent is not None
-        share(task.agent, task.folder)
-        return
     sys.argv = [f"{PREFIX}{task.command}", *task.words]  # for provenance.json
     schema, workflow = WORKFLOWS[task.command]
     overrides = overrides_of(task.words)
@@ -53,10 +45,3 @@ def carry_out(task: Task, resumed: bool = False) -> None:
     workflow(load_settings(schema, overrides), task.folder)
     if task.command in RESUMABLE:
         forget_training(task.folder)
-
-
-def share(agent: Path, folder: Path) -> None:
-    """Copy the results of an agent of another study, without its checkpoints and figures."""
-    for name in SHARED_FILES:
-        if (agent / name).is_file():
-            shutil.copy(agent / name, folder / name)

@@ -12,12 +12,11 @@ from pathlib import Path
 
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.reporting.studies.settings import Size, Study, Variant
-from cartpole_rl.workflows.reproduce.studies import load_study, unknown
+from cartpole_rl.workflows.reproduce.studies import STUDIES, load_study, unknown
 
 FIRST_SEED = 10  # settings were chosen on seeds 0 to 9
 EVALUATIONS = "evaluations"  # folder in that of an agent
 BASELINE = "lqr"
-SHARE = "share"  # in place of a command: take over the results of an agent of another study
 
 
 @dataclass(frozen=True)
@@ -29,19 +28,20 @@ class Task:
     folder: Path
     words: tuple[str, ...]
     needs: tuple[Path, ...] = ()
-    agent: Path | None = None  # whose results are taken over
 
 
-def plan(names: Sequence[str], size: str, root: Path) -> list[Task]:
+def plan(names: Sequence[str], size: str, root: Path, source: Path = STUDIES) -> list[Task]:
     """Return the runs of the studies `names` and the runs of others that they need, in order.
 
     Raises ConfigError for an unknown study or size.
     """
-    tasks = {task.folder: task for name in names for task in study_tasks(name, size, root)}
+    tasks = {task.folder: task for name in names for task in study_tasks(name, size, root, source)}
     missing = needed(tasks.values()) - tasks.keys()
     while missing:
         others = {folder.relative_to(root).parts[0] for folder in missing}
-        found = {task.folder: task for name in sorted(others) for task in study_tasks(name, size, root)}
+        found = {
+            task.folder: task for name in sorted(others) for task in study_tasks(name, size, root, source)
+        }
         if lost := sorted(missing - found.keys()):
             raise ConfigError(f"{lost[0]}: a study needs this run, but no study of size {size} has it")
         tasks = {**{folder: found[folder] for folder in sorted(missing)}, **tasks}
@@ -54,9 +54,9 @@ def needed(tasks: Iterable[Task]) -> set[Path]:
     return {folder for task in tasks for folder in task.needs}
 
 
-def study_tasks(name: str, size: str, root: Path) -> list[Task]:
+def study_tasks(name: str, size: str, root: Path, source: Path = STUDIES) -> list[Task]:
     """Return all runs of a study, each agent before its evaluations. Raises ConfigError."""
-    study = load_study(name)
+    study = load_study(name, source)
     chosen = size_of(name, study, size)
     return [
         task
@@ -90,28 +90,26 @@ class Agent:
         return self.root / self.name / self.arm.name / str(self.seed)
 
     def tasks(self) -> Iterator[Task]:
-        """Yield the run itself, then its evaluations."""
-        yield self.own_task()
-        agent = self.shared if self.shared == BASELINE else str(self.folder)
-        if self.study.command == "train" and self.shared not in (None, BASELINE):
-            agent = str(self.shared)
+        """Yield the run itself, unless it evaluates an agent of another study, then its evaluations."""
+        agent = str(self.folder)
+        if self.study.command != "train" or self.shared is None:
+            yield self.own_task()
+        else:
+            agent = self.shared
+        if agent == BASELINE:
+            words = self.words(f"run={BASELINE}", *self.size.evaluation_overrides)
+            yield Task(self.name, "evaluate", self.folder, words)
         for evaluation in self.study.evaluations:
             words = self.words(f"run={agent}", *evaluation.overrides, *self.size.evaluation_overrides)
-            needs = (self.folder, *self.runs_in(words))
+            needs = tuple(self.runs_in(words))
             yield Task(self.name, "evaluate", self.folder / EVALUATIONS / evaluation.name, words, needs)
 
     def own_task(self) -> Task:
-        """Return the run itself: of the study's command, or the results of the agent that the arm names."""
-        study, size = self.study, self.size
+        """Return the run of the study's command."""
+        study = self.study
         experiment = [f"experiment={study.experiment}"] if study.experiment else []
-        words = self.words(*experiment, *self.arm.overrides, *size.overrides)
-        if study.command == "train" and self.shared == BASELINE:
-            words = self.words(*self.arm.overrides, *size.evaluation_overrides)
-            return Task(self.name, "evaluate", self.folder, words)
-        if study.command == "train" and self.shared is not None:
-            agent = Path(self.shared)
-            return Task(self.name, SHARE, self.folder, (), (agent,), agent)
-        return Task(self.name, study.command, self.folder, words, tuple(self.runs_in(words)))
+        words = self.words(*experiment, *self.arm.overrides, *self.size.overrides)
+        return Task(self.name, study.command, self.folder, words, tuple(self.runs_in(words, own=False)))
 
     @property
     def shared(self) -> str | None:
@@ -133,9 +131,9 @@ class Agent:
         """Return `text` with `{runs}` and `{seed}` filled in."""
         return text.replace("{runs}", str(self.root)).replace("{seed}", str(self.seed))
 
-    def runs_in(self, words: Iterable[str]) -> Iterator[Path]:
-        """Yield the run folders of studies that `words` name."""
+    def runs_in(self, words: Iterable[str], own: bool = True) -> Iterator[Path]:
+        """Yield the run folders of studies that `words` name, the `own` one too."""
         for word in words:
             for found in re.findall(rf"{re.escape(str(self.root))}/([^/,\]]+/[^/,\]]+/\d+)", word):
-                if self.root / found != self.folder:
+                if own or self.root / found != self.folder:
                     yield self.root / found

@@ -7,14 +7,15 @@ import signal
 import sys
 import traceback
 
-import yaml
-
+from cartpole_rl.choices import choice
 from cartpole_rl.errors import CartPoleError
-from cartpole_rl.run_files import CHECKPOINTS, CONFIG, IDENTIFIED, METRICS, MODELLED, PROVENANCE, RESUME
+from cartpole_rl.run_files import CHECKPOINTS, IDENTIFIED, METRICS, MODELLED, PROVENANCE, RESUME
 from cartpole_rl.signals import RaiseOnce, end_with_parent, ending_signals
-from cartpole_rl.workflows.reproduce.plan import SHARE, Task
+from cartpole_rl.workflows.reproduce.plan import Task
+from cartpole_rl.workflows.reproduce.studies import overrides_of
 
 LOG = "log.txt"
+DEFAULT_EPISODES = choice("evaluate")["episodes"]
 RESULTS = {"identify": IDENTIFIED, "model": MODELLED}  # of the other commands METRICS
 RESUMABLE = ("train", "finetune")
 SIGNALLED = 128  # added to the number of a signal, as a shell does
@@ -25,18 +26,19 @@ def is_complete(task: Task) -> bool:
     result = task.folder / RESULTS.get(task.command, METRICS)
     if task.command != "evaluate":
         return result.is_file()
+    asked = overrides_of(task.words).get("episodes", DEFAULT_EPISODES)
     try:
-        episodes = json.loads(result.read_text())["episodes"]
-        return len(episodes) == yaml.safe_load((task.folder / CONFIG).read_text())["episodes"]
-    except (OSError, ValueError, LookupError, TypeError, yaml.YAMLError):
+        return len(json.loads(result.read_text())["episodes"]) == asked
+    except (OSError, ValueError, LookupError, TypeError):
         return False
 
 
 def made_otherwise(task: Task) -> str:
-    """Return why a complete run does not belong to its study any more; empty if it does."""
-    if task.command == SHARE:
-        return ""
-    given = json.loads((task.folder / PROVENANCE).read_text())["command"][1:]
+    """Return why a run does not belong to its study any more; empty if it does."""
+    try:
+        given = json.loads((task.folder / PROVENANCE).read_text())["command"][1:]
+    except (OSError, ValueError, LookupError, TypeError):
+        given = None
     return "" if given == [*task.words] else "it was made with other settings; delete its folder to repeat it"
 
 
@@ -67,7 +69,8 @@ def in_own_process(task: Task) -> None:
 
 def prepare(task: Task) -> bool:
     """Remove an incomplete run that cannot be resumed; return True for one that can."""
-    if task.command in RESUMABLE and (task.folder / CHECKPOINTS / RESUME).is_file():
+    can_resume = task.command in RESUMABLE and (task.folder / CHECKPOINTS / RESUME).is_file()
+    if can_resume and not made_otherwise(task):
         return True
     shutil.rmtree(task.folder, ignore_errors=True)
     return False

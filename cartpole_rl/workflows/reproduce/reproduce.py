@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
+from typing import Any
 
 import yaml
 
@@ -19,10 +20,11 @@ from cartpole_rl.files import write_text
 from cartpole_rl.workflows.reproduce.plan import Task, plan, size_of
 from cartpole_rl.workflows.reproduce.process import LOG, in_own_process, is_complete, made_otherwise
 from cartpole_rl.workflows.reproduce.progress import Progress, duration
-from cartpole_rl.workflows.reproduce.studies import load_study
+from cartpole_rl.workflows.reproduce.studies import STUDIES, load_study
 
 STUDY_FILE = "study.yaml"
 WORKER = "cartpole_rl.workflows.reproduce.carry_out"  # imports all workflows
+Outcome = tuple[Task, float, str]  # of a run: its seconds and why it failed, empty for success
 GRACE = 10.0  # s from SIGTERM to SIGKILL: an emulated cart is stopped, a cart's motor set to 0
 
 
@@ -31,15 +33,16 @@ def reproduce(
     size: str,
     root: Path,
     jobs: int,
+    source: Path = STUDIES,
     show: Callable[[str], None] = print,
 ) -> dict[str, str]:
-    """Run everything that is left of the studies `names` in `root`; return the failed runs and their reasons.
+    """Run everything that is left of the studies `names` of `source`, in `root`; return the failures by run.
 
     Raises ConfigError for an unknown study or size.
     """
-    tasks = plan(names, size, root)
+    tasks = plan(names, size, root, source)
     for name in names:
-        write_study(name, size, root)
+        write_study(name, size, root, source)
     schedule = Schedule(tasks, root)
     todo = len(schedule.waiting)
     show(f"{len(tasks)} runs, {len(tasks) - todo} of them done; {jobs} at a time, in {root}")
@@ -47,9 +50,12 @@ def reproduce(
     progress = Progress(todo, jobs, show)
     with Workers(jobs) as workers:
         while schedule.waiting or workers.running:
+            ended = schedule.lost()
             for task in schedule.ready(workers.free):
                 workers.start(task)
-            for task, seconds, failure in workers.finished() if workers.running else ():
+            if workers.running and not ended:
+                ended = workers.finished()
+            for task, seconds, failure in ended:
                 schedule.finish(task, failure)
                 left = [*schedule.waiting, *workers.tasks]
                 progress.finished(task, schedule.label(task), seconds, left, failure)
@@ -57,9 +63,9 @@ def reproduce(
     return schedule.failures
 
 
-def write_study(name: str, size: str, root: Path) -> None:
+def write_study(name: str, size: str, root: Path, source: Path = STUDIES) -> None:
     """Write the study with its size beside its runs."""
-    study = load_study(name)
+    study = load_study(name, source)
     size_of(name, study, size)
     content = study.model_copy(update={"size": size}).model_dump(mode="json")
     write_text(root / name / STUDY_FILE, yaml.safe_dump(content, sort_keys=False, allow_unicode=True))
@@ -86,15 +92,24 @@ class Schedule:
         """Return the folder of a run below that of all studies."""
         return str(task.folder.relative_to(self._root))
 
+    def lost(self) -> list[Outcome]:
+        """Take the runs that need a failed one."""
+        taken = [
+            (task, 0.0, f"it needs {min(map(str, failed))}, which failed")
+            for task in self.waiting
+            if (failed := self._failed.intersection(task.needs))
+        ]
+        self._take([task for task, _, _ in taken])
+        return taken
+
     def ready(self, count: int) -> list[Task]:
-        """Take up to `count` runs whose needs are complete; runs whose needs failed fail too."""
-        for task in self.waiting:
-            if lost := self._failed.intersection(task.needs):
-                self.finish(task, f"it needs {min(map(str, lost))}, which failed")
-        self.waiting = [task for task in self.waiting if task.folder not in self._failed]
+        """Take up to `count` runs whose needs are complete."""
         chosen = [task for task in self.waiting if self._complete.issuperset(task.needs)][:count]
-        self.waiting = [task for task in self.waiting if task not in chosen]
+        self._take(chosen)
         return chosen
+
+    def _take(self, tasks: Sequence[Task]) -> None:
+        self.waiting = [task for task in self.waiting if task not in tasks]
 
     def finish(self, task: Task, failure: str) -> None:
         """Note the outcome of a run."""
@@ -113,9 +128,9 @@ class Workers:
     running: dict[Task, tuple[BaseProcess, float]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        forks = "forkserver" in multiprocessing.get_all_start_methods()
-        self._context = multiprocessing.get_context("forkserver" if forks else "spawn")
-        if forks:
+        self._context: Any = multiprocessing.get_context("spawn")
+        if "forkserver" in multiprocessing.get_all_start_methods():
+            self._context = multiprocessing.get_context("forkserver")
             self._context.set_forkserver_preload([WORKER])
 
     def __enter__(self) -> "Workers":
@@ -146,8 +161,8 @@ class Workers:
         process.start()
         self.running[task] = process, time.monotonic()
 
-    def finished(self) -> list[tuple[Task, float, str]]:
-        """Wait for the next end of a run; return those that ended, their seconds and why they failed."""
+    def finished(self) -> list[Outcome]:
+        """Wait for the next end of a run; return those that ended."""
         wait([process.sentinel for process, _ in self.running.values()])
         ended = [task for task, (process, _) in self.running.items() if process.exitcode is not None]
         outcomes = []

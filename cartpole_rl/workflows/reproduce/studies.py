@@ -1,41 +1,42 @@
-"""The studies in conf/study/, by name."""
+"""Studies by name: those of conf/study/, or of a folder of a user's own."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import Any
 
 import yaml
 
 from cartpole_rl.checking import checked, most_similar, similarity
-from cartpole_rl.choices import choice, conf_folder
+from cartpole_rl.choices import conf_folder
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.reporting.studies.settings import Study
 
-GROUP = "study"
+STUDIES = conf_folder() / "study"
 NEAR = 0.5  # similarity of two names, from which one is suggested for the other
 
 
-def study_names() -> list[str]:
-    """Return the names of all studies, in the order of the page."""
-    names = [path.stem for path in (conf_folder() / GROUP).glob("*.yaml")]
-    return sorted(names, key=lambda name: (load_study(name).order, name))
+def study_names(source: Path = STUDIES) -> list[str]:
+    """Return the names of all studies in `source`, in the order of the page. Raises ConfigError."""
+    names = [path.stem for path in source.glob("*.yaml")]
+    return sorted(names, key=lambda name: (load_study(name, source).order, name))
 
 
-def load_study(name: str) -> Study:
+def load_study(name: str, source: Path = STUDIES) -> Study:
     """Return a study. Raises ConfigError that names the nearest study, or what is wrong in its file."""
-    if not (conf_folder() / GROUP / f"{name}.yaml").is_file():
-        raise ConfigError(
-            unknown("study", name, [path.stem for path in (conf_folder() / GROUP).glob("*.yaml")])
-        )
+    path = source / f"{name}.yaml"
+    if not path.is_file():
+        raise ConfigError(unknown("study", name, (other.stem for other in source.glob("*.yaml"))))
     try:
-        return checked(Study, choice(f"{GROUP}/{name}"))
+        return checked(Study, yaml.safe_load(path.read_text(encoding="utf-8")))
     except (ConfigError, yaml.YAMLError) as error:
-        raise ConfigError(f"conf/{GROUP}/{name}.yaml: {error}") from None
+        raise ConfigError(f"{path}: {' '.join(str(error).split())}") from None
 
 
-def unknown(kind: str, name: str, names: Sequence[str]) -> str:
+def unknown(kind: str, name: str, names: Iterable[str]) -> str:
     """Return the message for a name that is none of `names`."""
-    near = most_similar(name, names)
-    hint = f"did you mean {near}?" if similarity(name, near)[0] > NEAR else "--list names them"
+    known = [*names]
+    near = most_similar(name, known) if known else ""
+    hint = f"did you mean {near}?" if near and similarity(name, near)[0] > NEAR else "--list names them"
     return f"{name}: there is no such {kind}; {hint}"
 
 

@@ -1,0 +1,156 @@
+"""A study at toy size: it runs, is killed, resumes; a failed run does not end the others."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import yaml
+from command_line import TINY, Outcome, outcome
+
+from cartpole_rl.reporting.studies.settings import Study
+from cartpole_rl.workflows.reproduce.plan import plan
+from cartpole_rl.workflows.reproduce.process import is_complete, made_otherwise
+from cartpole_rl.workflows.reproduce.progress import Progress, duration
+from cartpole_rl.workflows.reproduce.reproduce import Schedule
+
+SCRIPT = Path(__file__).parents[2] / "scripts/reproduce.py"
+ARMS = [
+    {"name": "trained", "label": "trained"},
+    {"name": "impossible", "label": "impossible", "overrides": ["cart.cart_mass=-1"]},
+    {"name": "lqr", "label": "energy and LQR", "overrides": ["run=lqr"]},
+]
+STUDY = {
+    "title": "Toy",
+    "order": 1,
+    "question": "Does it run?",
+    "experiment": "balance",
+    "arms": ARMS,
+    "evaluations": [{"name": "own", "label": "own"}],
+    "sizes": {
+        "quick": {
+            "seeds": 1,  # forty evaluations: there is time to interrupt it after the first
+            "overrides": [*TINY, "learning.transitions=20480", "learning.evaluations=40"],
+            "evaluation_overrides": ["episodes=2"],
+        }
+    },
+}
+SHARED = [{"name": "shared", "label": "shared", "overrides": ["run={runs}/toy/trained/{seed}"]}]
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with two studies."""
+    folder = tmp_path_factory.mktemp("study")
+    for name, content in {"toy": STUDY, "sharing": {**STUDY, "arms": SHARED}}.items():
+        (folder / f"{name}.yaml").write_text(yaml.safe_dump(content))
+    return folder
+
+
+def start(source: Path, folder: Path, *words: str) -> "subprocess.Popen[str]":
+    """scripts/reproduce, just started."""
+    command = [sys.executable, SCRIPT, *words, "--studies", source, "--folder", folder, "--jobs", "2"]
+    return subprocess.Popen(
+        list(map(str, command)), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+
+
+@pytest.fixture(scope="module")
+def results(source: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Outcome, Outcome]:
+    """The folder of a study that was interrupted and continued, and both outcomes."""
+    folder = tmp_path_factory.mktemp("runs")
+    process = start(source, folder, "toy")
+    checkpoint = folder / "quick/toy/trained/10/checkpoints/resume.pt"
+    while not checkpoint.exists() and process.poll() is None:
+        time.sleep(0.01)
+    process.send_signal(signal.SIGINT)
+    stopped = outcome(process)
+    return folder / "quick", stopped, outcome(start(source, folder, "toy"))
+
+
+def test_an_interruption_says_how_to_go_on(results: tuple[Path, Outcome, Outcome]) -> None:
+    assert results[1].code == 130
+    assert results[1].err.splitlines()[-1] == "scripts/reproduce: interrupted; the same command continues"
+
+
+def test_the_same_command_resumes(results: tuple[Path, Outcome, Outcome]) -> None:
+    run = results[0] / "toy/trained/10"
+    assert "resumed" in json.loads((run / "provenance.json").read_text())
+    assert len(json.loads((run / "evaluations/own/metrics.json").read_text())["episodes"]) == 2
+    assert not (run / "checkpoints/resume.pt").exists()
+    assert sum(path.stat().st_size for path in run.rglob("*") if path.is_file()) < 5e6
+
+
+def test_a_failure_does_not_end_the_others(results: tuple[Path, Outcome, Outcome]) -> None:
+    root, _, done = results
+    assert done.code == 1
+    reasons = [line for line in done.err.splitlines() if line.startswith("scripts/reproduce: ")]
+    assert reasons == [
+        "scripts/reproduce: toy/impossible/10 failed: cart_mass is -1; it must be above 0",
+        "scripts/reproduce: toy/impossible/10/evaluations/own failed: "
+        f"it needs {root}/toy/impossible/10, which failed",
+    ]
+    assert (root / "toy/lqr/10/evaluations/own/metrics.json").exists()
+
+
+def test_a_line_for_each_run_counts_and_estimates(results: tuple[Path, Outcome, Outcome]) -> None:
+    lines = [line for line in results[2].out.splitlines() if line.startswith("[")]
+    assert [line.split("]")[0] for line in lines] == [f"[{n}/{len(lines)}" for n in range(1, len(lines) + 1)]
+    assert any(line.endswith("left") for line in lines)
+
+
+def test_the_study_is_written_with_its_size(results: tuple[Path, Outcome, Outcome]) -> None:
+    written = Study(**yaml.safe_load((results[0] / "toy/study.yaml").read_text()))
+    assert (written.size, written.title) == ("quick", "Toy")
+
+
+def test_an_agent_of_another_study_is_not_trained_again(
+    results: tuple[Path, Outcome, Outcome], source: Path
+) -> None:
+    root = results[0]
+    done = outcome(start(source, root.parent, "sharing"))
+    assert done.code == 0, done.err
+    assert done.out.startswith("2 runs, 1 of them done; 2 at a time")
+    evaluated = yaml.safe_load((root / "sharing/shared/10/evaluations/own/config.yaml").read_text())
+    assert evaluated["run"] == str(root / "toy/trained/10")
+
+
+def test_an_incomplete_or_another_run_is_not_taken_for_complete(
+    results: tuple[Path, Outcome, Outcome], source: Path
+) -> None:
+    root = results[0]
+    trained, evaluation = plan(["toy"], "quick", root, source)[:2]
+    assert is_complete(trained)
+    assert is_complete(evaluation)
+    assert not made_otherwise(evaluation)
+    assert made_otherwise(replace(evaluation, words=("episodes=7",))).startswith("it was made with other")
+    metrics = json.loads((evaluation.folder / "metrics.json").read_text())
+    del metrics["episodes"][-1]  # as after Ctrl-C
+    (evaluation.folder / "metrics.json").write_text(json.dumps(metrics))
+    assert not is_complete(evaluation)
+
+
+def test_a_wrong_name_is_one_line(source: Path, tmp_path: Path) -> None:
+    done = outcome(start(source, tmp_path, "toys"))
+    assert done.code == 2
+    assert done.complaint == "scripts/reproduce: toys: there is no such study; did you mean toy?"
+
+
+def test_runs_wait_for_those_that_they_need(source: Path, tmp_path: Path) -> None:
+    schedule = Schedule(plan(["sharing"], "quick", tmp_path, source), tmp_path)
+    (first,) = schedule.ready(5)
+    assert first.folder == tmp_path / "toy/trained/10"
+    schedule.finish(first, "")
+    evaluation = tmp_path / "sharing/shared/10/evaluations/own"
+    assert [task.folder for task in schedule.ready(5)] == [evaluation]
+
+
+def test_the_time_left_is_that_of_similar_runs(source: Path, tmp_path: Path) -> None:
+    tasks, lines = plan(["toy"], "quick", tmp_path, source), []
+    progress = Progress(len(tasks), 2, lines.append)
+    progress.finished(tasks[0], "first", 90.0, tasks[1:], "")
+    assert lines == [f"[1/{len(tasks)}] train    first: 2 min, about {duration(45 * len(tasks[1:]))} left"]
