@@ -42,6 +42,8 @@ VERBS = (
     "emulate",
     "find-port",
     "preflight",
+    "report",
+    "export",
 )
 COMMANDS = re.findall(
     r"^    ((?:cartpole-|tensorboard|\./scripts/|pip ).*?)(?:\s+#.*)?$",
@@ -192,6 +194,16 @@ def test_finetune(command: str, trained: Path, serial_port: Callable[[], str]) -
     result = run_here(command, *short, f"hydra.run.dir={folder}", cwd=trained)
     assert result.returncode == 0, result.stderr
     assert (trained / folder / "checkpoints/last.pt").exists()
+
+
+@pytest.mark.parametrize("command", [*listed("cartpole-report"), *listed("cartpole-export")])
+def test_pages(command: str, trained: Path) -> None:
+    verb = command.split()[0].removeprefix("cartpole-")
+    folder = f"runs/{verb}/first"
+    result = run_here(command.replace("<run>", "first"), f"hydra.run.dir={folder}", cwd=trained)
+    assert result.returncode == 0, result.stderr
+    (page,) = (trained / folder).glob("*.html")
+    assert "<html" in page.read_text(encoding="utf-8")
 
 
 def test_find_port_lists_the_ports(tmp_path: Path) -> None:
