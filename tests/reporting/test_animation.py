@@ -11,7 +11,7 @@ from PIL import Image, ImageChops, ImageColor
 
 from cartpole_rl.drawing.cart import CART_WIDTH, PIVOT_HEIGHT, SIZE
 from cartpole_rl.reporting import style
-from cartpole_rl.reporting.animation import LAST_FRAME, durations, frames, gif, rows, write_gif
+from cartpole_rl.reporting.animation import LAST_FRAME, durations, frames, gif, rows, smaller, write_gif
 from cartpole_rl.tasks.episode import Episode
 
 POLE, TRACK = 0.3365, 0.407  # m
@@ -158,3 +158,12 @@ def test_a_title_never_runs_into_the_numbers(balance: Episode) -> None:
 def test_write_gif_makes_folders(tmp_path, balance: Episode) -> None:
     path = write_gif(part(balance, 0, 10), tmp_path / "figures" / "episode.gif", POLE, TRACK)
     assert path.read_bytes().startswith(b"GIF89a")
+
+
+def test_a_smaller_animation_takes_as_long(tmp_path, balance: Episode) -> None:
+    path = write_gif(part(balance, 0, 41), tmp_path / "episode.gif", POLE, TRACK)
+    whole, small = [*shown(path.read_bytes())], [*shown(smaller(path, 160, 4))]
+    assert small[0][0].size == (160, 107)
+    assert len(small) == -(-len(whole) // 4)
+    assert sum(wait for _, wait in small) == sum(wait for _, wait in whole)
+    assert len(smaller(path, 160, 4)) < path.stat().st_size / 4

@@ -11,6 +11,7 @@ from tensorboard.backend.event_processing.event_multiplexer import EventMultiple
 from tensorboard.plugins.hparams import metadata
 
 from cartpole_rl.reporting.animation import gif
+from cartpole_rl.reporting.events import scalars
 from cartpole_rl.reporting.figures import behaviour
 from cartpole_rl.reporting.tensorboard import TensorBoardLog, flatten
 from cartpole_rl.tasks.episode import Episode
@@ -36,6 +37,8 @@ def test_scalars_round_trip(tmp_path: Path) -> None:
         log.scalars({"train/loss": 0.25, "evaluation/score": None}, 20)
     assert points(tmp_path, "train/loss") == {10: 0.5, 20: 0.25}
     assert points(tmp_path, "evaluation/score") == {10: 100}
+    assert scalars(tmp_path, "train/loss") == [(10, 0.5), (20, 0.25)]
+    assert scalars(tmp_path, "train/other") == []
 
 
 def test_a_histogram_counts_every_finite_value(tmp_path: Path) -> None:

@@ -65,8 +65,11 @@ class Study(Settings):
     @model_validator(mode="after")
     def _names_are_unique(self) -> "Study":
         for kind, variants in (("arms", self.arms), ("evaluations", self.evaluations)):
-            if repeated := _repeated([variant.name for variant in variants]):
-                raise ValueError(f"{kind}: {', '.join(repeated)} is there more than once; give unique names")
+            for names in ([each.name for each in variants], [each.label for each in variants]):
+                if repeated := _repeated(names):
+                    raise ValueError(
+                        f"{kind}: {', '.join(repeated)} is there more than once; give unique names and labels"
+                    )
         return self
 
     @model_validator(mode="after")

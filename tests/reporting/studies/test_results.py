@@ -140,6 +140,7 @@ def test_less_is_better_of_errors_and_times() -> None:
     [
         ({"ratio": True}, "ratio=true needs two evaluations"),
         ({"arms": [{"name": "a", "label": "a"}] * 2}, "arms: a is there more than once"),
+        ({"arms": [{"name": name, "label": "same"} for name in "ab"]}, "arms: same is there more than once"),
         ({"size": "huge"}, "size: huge is not in sizes"),
         ({"arms": [{"name": "../a", "label": "a"}]}, "arms.0.name"),
         ({"command": "swim"}, "command=swim: give 'train'"),
