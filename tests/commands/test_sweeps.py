@@ -44,6 +44,12 @@ def test_a_defect_in_a_job_leaves_its_traceback(tmp_path: Path, monkeypatch: pyt
     assert "Traceback" in error.read_text()
 
 
+def test_commands_without_a_run_folder_report_too(tmp_path: Path) -> None:
+    done = in_process("preflight", "-m", "plant.port=nowhere,nothing", folder=tmp_path)
+    assert done.code == 1
+    assert "2 of 2 jobs failed in multirun/" in done.err
+
+
 def test_an_unknown_setting_ends_a_sweep_before_its_first_job(tmp_path: Path) -> None:
     done = in_process("train", "-m", "seeed=0,1", folder=tmp_path)
     assert done.code == 2
