@@ -11,6 +11,7 @@ import shutil
 import signal
 import sys
 import time
+from contextlib import suppress
 from types import TracebackType
 
 from cartpole_rl.evaluation.snapshots import Memory, new_memory, read
@@ -51,7 +52,8 @@ class LiveView:
             return
         self._process.terminate()
         self._process.join()
-        put(f"{SAVE}{ALL_LINES}{RESTORE}")
+        with suppress(OSError):  # the terminal is closed
+            put(f"{SAVE}{ALL_LINES}{RESTORE}")
 
 
 def view_title(plant: Settings) -> str:
