@@ -23,8 +23,8 @@ def view(title: str, snapshot: Snapshot | None, fresh: bool, width: int, colour:
     if snapshot is None:
         waiting = [title, "waiting for the cart to start its first episode"]
         return [cut(line, width) for line in [*waiting, *[""] * (LINES - 3), rule]]
-    state = "" if fresh else ", between episodes"
-    heading = f"{title}: episode {snapshot.episode}{state}, step {snapshot.step}"
+    state = f"step {snapshot.step}" if fresh else f"ended at step {snapshot.step}"
+    heading = f"{title}: episode {snapshot.episode}, {state}"
     return [
         cut(heading, width),
         *(painted(cut(line, width), tint, colour) for line, tint in gauges(snapshot, width)),

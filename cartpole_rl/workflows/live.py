@@ -11,18 +11,20 @@ import shutil
 import signal
 import sys
 import time
+from contextlib import suppress
 from types import TracebackType
+from typing import NoReturn
 
 from cartpole_rl.evaluation.snapshots import Memory, new_memory, read
 from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.reporting.live_view import LINES, view
+from cartpole_rl.scheduling import giving_precedence
 from cartpole_rl.settings import Settings
 from cartpole_rl.signals import end_with_parent
 from cartpole_rl.workflows.config import View
 
 INTERVAL = 0.1  # s between two pictures
 FRESH = 0.5  # s after which a snapshot that does not change is of an episode that has ended
-NICENESS = 10
 SAVE, RESTORE, CLEAR_LINE, ALL_LINES = "\x1b7", "\x1b8", "\x1b[2K", "\x1b[r"
 
 
@@ -51,7 +53,8 @@ class LiveView:
             return
         self._process.terminate()
         self._process.join()
-        put(f"{SAVE}{ALL_LINES}{RESTORE}")
+        with suppress(OSError):  # the terminal is closed
+            put(f"{SAVE}{ALL_LINES}{RESTORE}")
 
 
 def view_title(plant: Settings) -> str:
@@ -65,12 +68,15 @@ def has_cursor() -> bool:
 
 
 def show(memory: Memory, title: str, parent: int) -> None:
-    """Draw the newest snapshot until the process is terminated or its parent ends."""
+    """Draw the newest snapshot at the lowest priority, until the process is ended or its parent ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process
     end_with_parent(parent)
-    if hasattr(os, "nice"):
-        os.nice(NICENESS)
-    colour = not os.environ.get("NO_COLOR")
+    with giving_precedence():
+        draw(memory, title, colour=not os.environ.get("NO_COLOR"))
+
+
+def draw(memory: Memory, title: str, colour: bool) -> NoReturn:
+    """Draw the newest snapshot again and again."""
     newest, changed, size = 0, time.monotonic(), (0, 0)
     while True:
         found = read(memory)

@@ -5,6 +5,7 @@ import os
 import pty
 import shlex
 import sys
+import termios
 from pathlib import Path
 
 import hydra
@@ -84,8 +85,11 @@ def test_a_progress_bar_is_drawn_on_a_terminal_and_nowhere_else(
     progress_bar(3, "episodes").update()
     assert capsys.readouterr().err == ""
     reader, writer = pty.openpty()
+    termios.tcsetwinsize(writer, (24, 80))
     with os.fdopen(writer, "w") as terminal:
         monkeypatch.setattr(sys, "stderr", terminal)
         with progress_bar(3, "episodes") as bar:
             bar.update()
-        assert "1/3" in os.read(reader, 65536).decode()
+        shown = ""
+        while "1/3" not in shown:  # the time limit of the test ends the wait otherwise
+            shown += os.read(reader, 65536).decode()

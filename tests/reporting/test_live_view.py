@@ -50,6 +50,6 @@ def test_colours_say_upright_guarded_and_late() -> None:
     assert painted == [False, False, False, False, True, True, False]
 
 
-def test_an_old_snapshot_is_called_one() -> None:
-    assert "between episodes" in view("", CALM, fresh=False, width=80, colour=False)[0]
+def test_an_old_snapshot_is_of_an_episode_that_has_ended() -> None:
+    assert "episode 2, ended at step 120" in view("", CALM, fresh=False, width=80, colour=False)[0]
     assert "waiting for the cart" in view("", None, fresh=False, width=80, colour=False)[1]
