@@ -24,7 +24,7 @@ def episode_metrics(episode: Episode, track_half_length: float) -> dict[str, Any
     the pole stays within 5 degrees for 1 s; `upright_fraction` the share of periods within 5 degrees, over
     which the RMS of angle and position are taken; `rms_motor_change` that of the step from one motor value to
     the next; `guarded_fraction` the share of periods in which the track guard replaced the agent's motor
-    value; `upright_at_end` is 1 if the time limit is reached with the pole within 5 degrees for a second, else 0;
+    value; `upright_at_end` is 1 if the pole is within 5 degrees for the last second of a full-length episode;
     `min_track_margin_m` the smallest distance from `track_half_length`, negative beyond it.
     """
     upright = is_upright(episode.theta[1:])
