@@ -10,6 +10,7 @@ import numpy as np
 from scipy import stats
 
 from cartpole_rl.intervals import CONFIDENCE, student_interval
+from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.tasks.upright import is_upright, upright_at_end, upright_since, wrap
 
@@ -23,7 +24,7 @@ def episode_metrics(episode: Episode, track_half_length: float) -> dict[str, Any
     the pole stays within 5 degrees for 1 s; `upright_fraction` the share of periods within 5 degrees, over
     which the RMS of angle and position are taken; `rms_motor_change` that of the step from one motor value to
     the next; `guarded_fraction` the share of periods in which the track guard replaced the agent's motor
-    value; `upright_at_end` is 1 if the pole is within 5 degrees during the last second, else 0;
+    value; `upright_at_end` is 1 if the pole is within 5 degrees for the last second of a full-length episode;
     `min_track_margin_m` the smallest distance from `track_half_length`, negative beyond it.
     """
     upright = is_upright(episode.theta[1:])
@@ -36,13 +37,18 @@ def episode_metrics(episode: Episode, track_half_length: float) -> dict[str, Any
         "ended_by": episode.ended_by,
         "time_to_upright_s": upright_since(episode.time, episode.theta),
         "upright_fraction": float(upright.mean()),
-        "upright_at_end": float(upright_at_end(episode.time, episode.theta)),
+        "upright_at_end": float(stands_at_end(episode)),
         "rms_angle_rad": _rms(wrap(episode.theta[1:])[upright]),
         "rms_position_m": _rms(episode.x[1:][upright]),
         "rms_motor_change": _rms(change),
         "guarded_fraction": None if episode.guarded is None else float(episode.guarded.mean()),
         "min_track_margin_m": float(track_half_length - np.abs(episode.x).max()),
     }
+
+
+def stands_at_end(episode: Episode) -> bool:
+    """Return True for a pole that is upright for the last second of an episode of full length."""
+    return episode.ended_by == Ending.TIME and upright_at_end(episode.time, episode.theta)
 
 
 def _rms(values: np.ndarray) -> float | None:

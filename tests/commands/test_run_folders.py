@@ -264,7 +264,7 @@ def test_episodes_before_a_broken_link_are_reported(
 ) -> None:
     """One episode ran when the cable was pulled out."""
 
-    def pulled(env: CartPoleEnv, policy: Policy, episodes: int) -> Iterator[Episode]:
+    def pulled(env: CartPoleEnv, policy: Policy, episodes: int, knocks: None) -> Iterator[Episode]:
         yield next(run_episodes(env, policy, episodes))
         raise LinkError("the cart was unplugged")
 

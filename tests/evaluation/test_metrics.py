@@ -1,6 +1,7 @@
 """Metrics of hand-made episodes, and the coverage of the intervals."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -129,3 +130,8 @@ def test_the_pole_is_upright_at_the_end_if_it_was_during_the_last_second(
 
 def test_an_episode_of_less_than_a_second_does_not_end_upright() -> None:
     assert episode_metrics(episode([0.0] * 50), 0.4)["upright_at_end"] == 0
+
+
+def test_an_upright_pole_on_a_cart_that_left_its_track_does_not_stand_at_the_end() -> None:
+    left = replace(episode([0.0] * 80), ended_by="track")
+    assert episode_metrics(left, 0.4)["upright_at_end"] == 0
