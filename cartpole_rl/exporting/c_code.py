@@ -18,7 +18,7 @@ from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.exporting.agent import ExportedAgent, Floats
 from cartpole_rl.exporting.filling import filled
-from cartpole_rl.exporting.perceiving import First, Later, perceiving
+from cartpole_rl.exporting.perception_graphs import First, Later, perception_graphs
 
 FLOAT_BYTES, MOTOR_BYTES = 4, 2
 MEMORY_BYTES = 36  # of policy_t without `past`
@@ -41,7 +41,7 @@ def c_files(agent: ExportedAgent, settings: CartPoleSettings) -> dict[str, str]:
 
     Raises ConfigError for an observation that cannot be written in C.
     """
-    graphs = perceiving(settings, agent.description.guard)
+    graphs = perception_graphs(settings, agent.description.guard)
     try:
         first, later = body(graphs.first, graphs.first_inputs), body(graphs.later, graphs.later_inputs)
     except NotImplementedError as error:
@@ -57,12 +57,12 @@ def body(traced: Trace, inputs: First | Later) -> str:
         for name, tensor in inputs._asdict().items()
     }
     results = writer.write(traced.graph, list(named.values()))
-    seen = traced.result(results)
+    percept = traced.result(results)
     statements = c.declared(writer.lines(results))
-    for name, values in (("policy->state", seen.state), ("policy->past", seen.past)):
+    for name, values in (("policy->state", percept.state), ("policy->past", percept.past)):
         statements += assigned(name, values, writer)
-    statements += assigned("observation", seen.observation, writer)
-    statements.append(f"return {in_c(seen.guard.item(), int, writer)};")
+    statements += assigned("observation", percept.observation, writer)
+    statements.append(f"return {in_c(percept.guard.item(), int, writer)};")
     text = "\n".join(statements)
     read = [
         f"const {c.TYPES[writer.kind(variable)]} {variable} = {PLACES[name].format(place)};"

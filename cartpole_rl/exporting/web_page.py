@@ -20,7 +20,7 @@ from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.exporting.agent import ExportedAgent
 from cartpole_rl.exporting.filling import filled
-from cartpole_rl.exporting.perceiving import NUMBER, perceiving
+from cartpole_rl.exporting.perception_graphs import NUMBER, perception_graphs
 from cartpole_rl.physics.dynamics import Addition, Drive, State
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.settings import SimulatedSettings
@@ -58,7 +58,7 @@ def web_page(agent: ExportedAgent, settings: CartPoleSettings, plant: SimulatedS
     Raises ConfigError for an observation that cannot be written in JavaScript.
     """
     about = agent.description
-    graphs = perceiving(settings, about.guard)
+    graphs = perception_graphs(settings, about.guard)
     try:
         functions = [
             function("perceiveFirst", graphs.first, graphs.first_inputs._asdict()),

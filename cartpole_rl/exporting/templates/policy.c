@@ -9,7 +9,8 @@ static const int16_t INWARD_FROM_RIGHT = @@leftmost@@;
 
 @@tables@@
 
-@@helpers@@/* The measured state, the observation and the direction of the track guard, from the first counts of an episode. */
+@@helpers@@/* Set the measured state and the observation from the first counts of an episode; return the direction of the
+ * track guard's motor value, 0 if it does not act. */
 static int64_t perceive_first(policy_t *policy, const int32_t counts[2], float observation[POLICY_INPUTS])
 {
 @@first@@

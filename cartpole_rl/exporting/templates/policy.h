@@ -2,15 +2,16 @@
  *
  *     flash       @@flash@@ bytes of tables, and the code
  *     RAM         @@ram@@ bytes for each cart (policy_t), @@stack@@ bytes of buffers on the stack
- *     operations  @@operations@@ multiply-adds, @@roots@@ square roots and @@trigonometry@@ calls of sinf, cosf a period
+ *     operations  @@operations@@ multiply-adds, @@roots@@ square roots and @@trigonometry@@ sines and cosines a period
  *
- * No heap, no writable static variables, fixed buffers. It needs a float unit or a soft-float library, and <math.h>.
+ * No heap, no writable static variables, fixed buffers. It needs a float unit or a soft-float library, and
+ * <math.h>.
  *
- * In each control period of @@period_ms@@ ms, read both encoders, call policy_motor() and set the returned motor value
- * at once. Call policy_start() before the first period of an episode, with the cart homed. Counts and motor
- * values are positive to the right; cart counts are 0 in the middle of the track, pole counts 0 at upright. The
- * limits, the watchdog and the faults of the firmware must stay in force: this code only chooses motor values. The track guard
- * of the training: @@guard@@
+ * In each control period of @@period_ms@@ ms, read both encoders, call policy_motor() and set the returned motor
+ * value at once. Call policy_start() before the first period of an episode, with the cart homed. Counts and
+ * motor values are positive to the right; cart counts are 0 in the middle of the track, pole counts 0 at
+ * upright. This code only chooses motor values: the limits, the watchdog and the faults of the firmware must
+ * stay in force. Track guard of the training: @@guard@@
  *
  * Training: @@origin@@
  * SHA-256: @@checksum@@
@@ -45,9 +46,9 @@ typedef struct {
     bool failed;         /* a number was not finite */
 } policy_t;
 
-/* Start an episode. track_end: m from the middle to the soft limit; the track guard keeps the cart within, and
- * without a positive number every motor value is 0.
- * pole_length: m, twice the distance from pivot to centre of mass; @@length_use@@. */
+/* Start an episode. track_end: m from the middle to the soft limit, which the track guard reads; without a positive
+ * number every motor value is 0. pole_length: m, twice the distance from pivot to centre of mass;
+ * @@length_use@@. */
 void policy_start(policy_t *policy, float track_end, float pole_length);
 
 /* Return the motor value, -255 to 255, for the newest counts. dt: s since the counts of the last call, by the

@@ -39,7 +39,7 @@ class Later(NamedTuple):
     track_end: Tensor  # [1, 1] m
 
 
-class Seen(NamedTuple):
+class DrivingPercept(NamedTuple):
     """The results of a period."""
 
     state: Tensor  # [4, 1]
@@ -48,7 +48,7 @@ class Seen(NamedTuple):
     guard: Tensor  # [1, 1] int64, direction of the track guard's motor value
 
 
-class Perceiving(NamedTuple):
+class PerceptionGraphs(NamedTuple):
     """Both graphs, and examples of their inputs."""
 
     first: Trace
@@ -58,29 +58,31 @@ class Perceiving(NamedTuple):
 
 
 @torch.no_grad()
-def perceiving(settings: CartPoleSettings, guard: TrackGuard | None) -> Perceiving:
+def perception_graphs(settings: CartPoleSettings, guard: TrackGuard | None) -> PerceptionGraphs:
     """Return the graphs of perception under `settings` with the track guard `guard`."""
     observation = settings.observation
-    look_first = partial(perceive_first, settings=observation, guard=guard)
-    look = partial(perceive, settings=observation, task=settings.task, rewards=settings.reward, guard=guard)
+    perceive_start = partial(perceive_first, settings=observation, guard=guard)
+    perceive_next = partial(
+        perceive, settings=observation, task=settings.task, rewards=settings.reward, guard=guard
+    )
 
     def scaled(length: Tensor) -> Tensor:
         return length[: int(observation.pole_length)] / LENGTH_SCALE
 
-    def start(first: First) -> Seen:
-        return seen(look_first(first.counts, scaled(first.pole_length), first.track_end))
+    def start(first: First) -> DrivingPercept:
+        return driving_percept(perceive_start(first.counts, scaled(first.pole_length), first.track_end))
 
-    def advance(later: Later) -> Seen:
+    def advance(later: Later) -> DrivingPercept:
         remembered = later.last_counts, later.state, later.past, COUNT, later.motor
         previous = Previous(*remembered, scaled(later.pole_length), later.track_end)
-        return seen(look(previous, PlantOutput(later.counts, later.dt, FLAG, FLAG)))
+        return driving_percept(perceive_next(previous, PlantOutput(later.counts, later.dt, FLAG, FLAG)))
 
     past = NUMBER.repeat(observation.past_size, 1)
     first = First(COUNTS, NUMBER, NUMBER)
     later = Later(COUNTS, NUMBER, COUNTS, NUMBER.repeat(4, 1), past, COUNT, NUMBER, NUMBER)
-    return Perceiving(trace(start, (first,)), first, trace(advance, (later,)), later)
+    return PerceptionGraphs(trace(start, (first,)), first, trace(advance, (later,)), later)
 
 
-def seen(percept: FirstPercept[Tensor] | Percept[Tensor]) -> Seen:
+def driving_percept(percept: FirstPercept[Tensor] | Percept[Tensor]) -> DrivingPercept:
     """Return the results that drive a cart."""
-    return Seen(percept.state, percept.past, percept.observation, percept.guard)
+    return DrivingPercept(percept.state, percept.past, percept.observation, percept.guard)
