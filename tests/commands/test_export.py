@@ -8,11 +8,18 @@ from command_line import in_process
 
 from cartpole_rl.exporting.weights import read_agent
 
-FILES = {"weights": {"agent.npz"}, "c": {"policy.h", "policy.c"}, "web": {"cart.html"}}
+FILES = {
+    "weights": {"agent.npz"},
+    "onnx": {"agent.onnx"},
+    "c": {"policy.h", "policy.c"},
+    "web": {"cart.html"},
+}
 
 
 @pytest.mark.parametrize("form", FILES)
 def test_it_writes_the_files_of_the_format(form: str, tmp_path: Path) -> None:
+    if form == "onnx":
+        pytest.importorskip("onnxscript", reason='onnxscript is missing: pip install "cartpole_rl[export]"')
     words = ("run=pretrained/medium", f"format={form}", "hydra.run.dir=run")
     done = in_process("export", *words, folder=tmp_path)
     assert done.code == 0, done.err
