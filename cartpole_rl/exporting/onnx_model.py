@@ -1,7 +1,8 @@
 """An agent as an ONNX model.
 
 Input: `observation` [N, K] float32. Outputs: `action_value` [N, A] float32 and `action` [N] int64, the index
-of a motor value. The entry `cartpole_rl` in metadata_props is agent.json of the weights file.
+of a motor value, or -1, which means motor 0, where an observation or action value is not finite. The track
+guard is not in the model. The entry `cartpole_rl` in metadata_props is agent.json of the weights file.
 """
 
 import logging
@@ -12,6 +13,7 @@ from torch import Tensor, nn
 
 from cartpole_rl.exporting.agent import ExportedAgent
 from cartpole_rl.files import replacing
+from cartpole_rl.tasks.settings import NO_ACTION
 
 METADATA = "cartpole_rl"
 
@@ -24,9 +26,10 @@ class GreedyPolicy(nn.Module):
         self.network = network
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the action values and the greedy actions."""
+        """Return the action values and the greedy actions; NO_ACTION where a number is not finite."""
         values = self.network(observation)
-        return values, values.argmax(-1)
+        finite = observation.isfinite().all(-1) & values.isfinite().all(-1)
+        return values, values.argmax(-1).where(finite, NO_ACTION)
 
 
 def write_onnx(path: Path, agent: ExportedAgent, network: nn.Module) -> None:

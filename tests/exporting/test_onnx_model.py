@@ -26,6 +26,10 @@ def test_it_acts_as_in_pytorch_and_is_described(
     values, actions = session.run(None, {"observation": observations})
     assert np.abs(values - expected).max() < 1e-4
     assert_same_actions(actions, expected)
+    for number in (np.nan, np.inf, -np.inf):
+        broken = observations[:2].copy()
+        broken[0, 4] = number
+        assert session.run(["action"], {"observation": broken})[0].tolist() == [-1, actions[1]]
     one = session.run(["action"], {"observation": observations[:1]})
     assert one[0].shape == (1,)
     about = json.loads(session.get_modelmeta().custom_metadata_map["cartpole_rl"])
