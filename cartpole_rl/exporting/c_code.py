@@ -102,7 +102,7 @@ def header(agent: ExportedAgent, later: str) -> str:
         "period_ms": f"{1e3 * about.control_period:g}",
         "period_us": round(1e6 * about.control_period),
         "guard": about.guard or "none",
-        "origin": about.origin.replace("*/", "* /"),
+        "origin": in_comment(about.origin),
         "checksum": agent.checksum,
         "inputs": about.sizes[0],
         "actions": len(about.motors),
@@ -113,6 +113,11 @@ def header(agent: ExportedAgent, later: str) -> str:
         "length_use": "observed" if about.observation.pole_length else "not read by this agent",
     }
     return filled("policy.h", values)
+
+
+def in_comment(text: str) -> str:
+    """Return text as one line within a comment; it neither ends the comment nor opens another."""
+    return " ".join(text.split()).replace("*/", "* /").replace("/*", "/ *")
 
 
 def source(agent: ExportedAgent, first: str, later: str) -> str:

@@ -139,6 +139,21 @@ def assert_figures(exported: ExportedAgent, folder: Path, compiled: Compiled) ->
     assert exported.checksum in comment
 
 
+@pytest.mark.parametrize("origin", ["*/ int x; /*", "/*/", "a\nb\\", "a ??/", "**//", "\\"])
+def test_no_origin_leaves_the_comment(
+    origin: str, exported: ExportedAgent, medium_agent: TrainedAgent, tmp_path: Path
+) -> None:
+    about = exported.description.model_copy(update={"provenance": {"command": [origin]}})
+    for name, text in c_files(replace(exported, description=about), medium_agent.training).items():
+        (tmp_path / name).write_text(text)
+    words = ["gcc", *FLAGS, "-fsyntax-only", "policy.c"]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    first, second = (tmp_path / "policy.h").read_text().split("*/")[0].splitlines()[-3:-1]
+    assert first.startswith(' * Training: "')
+    assert second.startswith(" * SHA-256: ")
+
+
 def test_after_a_bad_number_the_motor_stays_at_0(compiled: Compiled) -> None:
     for dt in (0.0, -0.02, math.nan, math.inf):
         compiled.start(0.38, 0.36)

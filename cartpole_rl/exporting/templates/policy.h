@@ -13,7 +13,7 @@
  * upright. This code only chooses motor values: the limits, the watchdog and the faults of the firmware must
  * stay in force. Track guard of the training: @@guard@@
  *
- * Training: @@origin@@
+ * Training: "@@origin@@"
  * SHA-256: @@checksum@@
  */
 #ifndef POLICY_H
