@@ -42,7 +42,9 @@ class Description(Settings):
     task: str
     observation: ObservationSettings
     numbers: tuple[ObservedNumber, ...]  # the observation, in order
-    sizes: tuple[Count, ...]  # of the observation, each hidden layer, and the action values
+    sizes: Annotated[
+        tuple[Count, ...], Field(min_length=2)
+    ]  # of the observation, each hidden layer, and the action values
     layer_norm: bool
     norm_groups: Literal[1, 2]  # parts of a hidden layer that are normalized separately
     norm_epsilon: Positive = NORM_EPSILON
@@ -63,9 +65,14 @@ class Description(Settings):
 
     @property
     def is_consistent(self) -> bool:
-        """True if the parts that repeat each other agree."""
+        """True if the parts that repeat each other agree, and the encoders are those of the cart."""
         ends = len(self.numbers), len(self.motors)
-        return ends == (self.sizes[0], self.sizes[-1]) and self.numbers == observed_numbers(self.observation)
+        scales = self.cart_metres_per_count, self.pole_counts_per_turn
+        return (
+            ends == (self.sizes[0], self.sizes[-1])
+            and self.numbers == observed_numbers(self.observation)
+            and scales == (CART_METRES_PER_COUNT, POLE_COUNTS_PER_TURN)
+        )
 
     def shapes(self) -> Iterator[tuple[str, tuple[int, ...]]]:
         """Yield the name and the shape of each array of weights."""

@@ -2,6 +2,7 @@
 
 import io
 import json
+import math
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -80,9 +81,9 @@ def rewritten(file: Path, change: Callable[[Members], object]) -> Path:
     return file
 
 
-def array(values: Any) -> bytes:
+def array(values: Any, kind: Any = np.float32) -> bytes:
     content = io.BytesIO()
-    np.save(content, np.asarray(values, np.float32))
+    np.save(content, np.asarray(values, kind))
     return content.getvalue()
 
 
@@ -119,6 +120,18 @@ DAMAGE: dict[str, tuple[Callable[[Members], object], str]] = {
     "other scales": (lambda members: change_json(members, numbers=[]), "contradicts itself"),
     "no description": (lambda members: members.pop("agent.json"), "is not a weights file"),
     "no JSON": (lambda members: members.update({"agent.json": b"{"}), "is not a weights file"),
+    "an infinite number": (
+        lambda members: change_json(members, provenance={"score": math.inf}),
+        "is not a weights file",
+    ),
+    "no sizes": (lambda members: change_json(members, sizes=[]), "sizes in agent.json"),
+    "one size": (lambda members: change_json(members, sizes=[10]), "sizes in agent.json"),
+    "text": (
+        lambda members: members.update({"layer0.bias.npy": array(["one"] * 128, str)}),
+        "is not a weights file",
+    ),
+    "bytes": (lambda members: members.update({"layer0.bias.npy": b"one"}), "is not a weights file"),
+    "a member more": (lambda members: members.update({"more.txt": b"one"}), "is not a weights file"),
     "a list": (lambda members: members.update({"agent.json": b"[]"}), "is not a weights file"),
     "a pickle": (
         lambda members: members.update({"layer0.bias.npy": pickled()}),
@@ -137,6 +150,20 @@ def pickled() -> bytes:
 def test_a_damaged_file_is_refused(damage: str, file: Path) -> None:
     change, expected = DAMAGE[damage]
     assert expected in complaint(rewritten(file, change))
+
+
+@pytest.mark.parametrize("kind", [np.float64, np.complex128, ">f4"])
+def test_numbers_of_another_kind_are_refused(kind: Any, exported: ExportedAgent, file: Path) -> None:
+    """Converted to float32, these are the weights of the file, and have its checksum."""
+    members = {"layer0.bias.npy": array(exported.layers[0].bias, kind)}
+    assert "is not a weights file" in complaint(rewritten(file, lambda found: found.update(members)))
+
+
+def test_encoders_of_another_cart_are_refused(exported: ExportedAgent, tmp_path: Path) -> None:
+    for changes in ({"cart_metres_per_count": 4.5e-5}, {"pole_counts_per_turn": 2048}):
+        about = exported.description.model_copy(update=changes)
+        with pytest.raises(CheckpointError, match="contradicts itself"):
+            write_agent(tmp_path / "agent.npz", ExportedAgent(about, exported.layers))
 
 
 def test_a_file_that_is_none_is_refused(file: Path, tmp_path: Path) -> None:
