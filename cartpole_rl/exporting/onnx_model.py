@@ -2,7 +2,8 @@
 
 Input: `observation` [N, K] float32. Outputs: `action_value` [N, A] float32 and `action` [N] int64, the index
 of a motor value, or -1, which means motor 0, where an observation or action value is not finite. The track
-guard is not in the model. The entry `cartpole_rl` in metadata_props is agent.json of the weights file.
+guard is not in the model. The entry `cartpole_rl` in metadata_props is agent.json of the weights file; its
+checksum identifies the agent, not the model.
 """
 
 import logging

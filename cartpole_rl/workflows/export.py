@@ -8,7 +8,7 @@ from typing import Any
 from cartpole_rl.agents.network import MirrorQNetwork, QNetwork
 from cartpole_rl.envs.build import with_fitted_guard
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.exporting.agent import ExportedAgent
+from cartpole_rl.exporting.agent import ExportedAgent, canonical_json
 from cartpole_rl.exporting.c_code import c_files
 from cartpole_rl.exporting.description import Description, observed_numbers
 from cartpole_rl.exporting.layers import plain_layers
@@ -42,8 +42,13 @@ def export(config: ExportConfig, folder: Path) -> None:
 
 
 def exported_agent(trained: TrainedAgent, origin: Mapping[str, Any]) -> ExportedAgent:
-    """Return an agent as plain numbers; `origin` is its `provenance`. Raises ConfigError."""
-    return ExportedAgent(description(trained.training, origin), plain_layers(network_of(trained)))
+    """Return an agent as plain numbers; `origin` is its `provenance`.
+
+    Raises ConfigError for an agent that cannot be exported, CheckpointError for one that is not finite.
+    """
+    agent = ExportedAgent(description(trained.training, origin), plain_layers(network_of(trained)))
+    agent.check("run")
+    return agent
 
 
 def network_of(trained: TrainedAgent) -> QNetwork | MirrorQNetwork:
@@ -77,20 +82,25 @@ def description(training: TrainConfig, origin: Mapping[str, Any]) -> Description
 def provenance(run: Path) -> dict[str, Any]:
     """Return the origin of the agent of `run`: its command, versions, commit, transitions and score."""
     checkpoint, recorded = load_agent(run), recorded_provenance(find_agent(run))
-    command = recorded.get("command", [])
+    match recorded.get("command"):
+        case [str(program), *arguments]:
+            command = [Path(program).name, *arguments]
+        case _:
+            command = []
     return {
         **recorded,
-        "command": [Path(command[0]).name, *command[1:]] if command else [],
+        "command": command,
         "transitions": checkpoint.transitions,
         "score": checkpoint.score,
     }
 
 
 def recorded_provenance(agent: Path) -> dict[str, Any]:
-    """Return the provenance.json of the run that wrote the checkpoint `agent`; empty if there is none."""
+    """Return the provenance.json of the run that wrote `agent`; empty if it is missing or damaged."""
     folder = agent.parent.parent if agent.parent.name == CHECKPOINTS else agent.parent
     try:
-        recorded = json.loads((folder / PROVENANCE).read_text())
+        recorded = json.loads((folder / PROVENANCE).read_text(encoding="utf-8"))
+        canonical_json(recorded)  # refuses infinite numbers
     except (OSError, ValueError):
         return {}
     return recorded if isinstance(recorded, dict) else {}
