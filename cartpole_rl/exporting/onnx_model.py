@@ -7,13 +7,11 @@ checksum identifies the agent, not the model.
 """
 
 import logging
-from pathlib import Path
 
 import torch
 from torch import Tensor, nn
 
 from cartpole_rl.exporting.agent import ExportedAgent
-from cartpole_rl.files import replacing
 from cartpole_rl.tasks.settings import NO_ACTION
 
 METADATA = "cartpole_rl"
@@ -33,8 +31,8 @@ class GreedyPolicy(nn.Module):
         return values, values.argmax(-1).where(finite, NO_ACTION)
 
 
-def write_onnx(path: Path, agent: ExportedAgent, network: nn.Module) -> None:
-    """Write `network`, the network of `agent`, as an ONNX model."""
+def onnx_model(agent: ExportedAgent, network: nn.Module) -> bytes:
+    """Return `network`, the network of `agent`, as an ONNX model."""
     example = torch.zeros(2, agent.description.sizes[0])
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it warns that torchvision is not installed
     program = torch.onnx.export(
@@ -48,5 +46,4 @@ def write_onnx(path: Path, agent: ExportedAgent, network: nn.Module) -> None:
     )
     assert program is not None
     program.model.metadata_props[METADATA] = agent.json
-    with replacing(path) as beside:
-        program.save(str(beside), external_data=False)
+    return program.model_proto.SerializeToString()

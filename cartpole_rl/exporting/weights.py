@@ -15,22 +15,22 @@ from pydantic import ValidationError
 from cartpole_rl.errors import CheckpointError
 from cartpole_rl.exporting.agent import ExportedAgent, Layer, canonical_json
 from cartpole_rl.exporting.description import FORMAT, Description
-from cartpole_rl.files import replacing
 
 DESCRIPTION = "agent.json"
 FLOATS = np.dtype("<f4")
 EPOCH = (1980, 1, 1, 0, 0, 0)  # of every member, so that equal agents make equal files
 
 
-def write_agent(path: Path, agent: ExportedAgent) -> None:
-    """Write a weights file. Raises CheckpointError if the agent is not finite or not consistent."""
-    agent.check(str(path))
-    with replacing(path) as beside, zipfile.ZipFile(beside, "w") as archive:
+def weights_file(agent: ExportedAgent) -> bytes:
+    """Return the content of a weights file."""
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as archive:
         archive.writestr(zipfile.ZipInfo(DESCRIPTION, EPOCH), agent.json + "\n")
         for name, values in agent.arrays():
             content = io.BytesIO()
             np.save(content, values.astype(FLOATS), allow_pickle=False)
             archive.writestr(zipfile.ZipInfo(f"{name}.npy", EPOCH), content.getvalue())
+    return file.getvalue()
 
 
 def read_agent(path: Path) -> ExportedAgent:

@@ -1,7 +1,7 @@
 """Write a trained agent for other programs."""
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +12,10 @@ from cartpole_rl.exporting.agent import ExportedAgent, canonical_json
 from cartpole_rl.exporting.c_code import c_files
 from cartpole_rl.exporting.description import Description, observed_numbers
 from cartpole_rl.exporting.layers import plain_layers
-from cartpole_rl.exporting.onnx_model import write_onnx
+from cartpole_rl.exporting.onnx_model import onnx_model
 from cartpole_rl.exporting.web_page import web_page
-from cartpole_rl.exporting.weights import write_agent
-from cartpole_rl.files import write_text
+from cartpole_rl.exporting.weights import weights_file
+from cartpole_rl.files import write_bytes
 from cartpole_rl.learning.checkpoint_files import find_agent
 from cartpole_rl.learning.checkpoints import load_agent
 from cartpole_rl.plants.settings import SimulatedSettings
@@ -35,10 +35,12 @@ def export(config: ExportConfig, folder: Path) -> None:
     """
     trained = trained_agent(config.run)
     agent = exported_agent(trained, provenance(config.run))
+    contents = files_of(config.format, agent, trained)
     write_config(folder, "export", {**config.model_dump(mode="json"), "seed": None})
-    names = WRITERS[config.format](folder, agent, trained)
-    files = " and ".join(f"{folder}/{name}" for name in names)
-    print(f"{files} {'are' if len(names) > 1 else 'is'} written; SHA-256 of the agent: {agent.checksum}")
+    for name, content in contents.items():
+        write_bytes(folder / name, content)
+    files = " and ".join(f"{folder}/{name}" for name in contents)
+    print(f"{files} {'are' if len(contents) > 1 else 'is'} written; SHA-256 of the agent: {agent.checksum}")
 
 
 def exported_agent(trained: TrainedAgent, origin: Mapping[str, Any]) -> ExportedAgent:
@@ -106,39 +108,22 @@ def recorded_provenance(agent: Path) -> dict[str, Any]:
     return recorded if isinstance(recorded, dict) else {}
 
 
-def write_weights(folder: Path, agent: ExportedAgent, trained: TrainedAgent) -> tuple[str, ...]:
-    """Write agent.npz."""
-    write_agent(folder / WEIGHTS, agent)
-    return (WEIGHTS,)
+def files_of(form: str, agent: ExportedAgent, trained: TrainedAgent) -> dict[str, bytes]:
+    """Return the contents of the files of a format, by name. Raises ConfigError."""
+    match form:
+        case "weights":
+            return {"agent.npz": weights_file(agent)}
+        case "onnx":
+            return {"agent.onnx": onnx_model(agent, network_of(trained))}
+        case "c":
+            return {name: text.encode() for name, text in c_files(agent, trained.training).items()}
+        case _:
+            return {"cart.html": page(agent, trained).encode()}
 
 
-def write_model(folder: Path, agent: ExportedAgent, trained: TrainedAgent) -> tuple[str, ...]:
-    """Write agent.onnx."""
-    write_onnx(folder / ONNX, agent, network_of(trained))
-    return (ONNX,)
-
-
-def write_c(folder: Path, agent: ExportedAgent, trained: TrainedAgent) -> tuple[str, ...]:
-    """Write policy.h and policy.c."""
-    files = c_files(agent, trained.training)
-    for name, text in files.items():
-        write_text(folder / name, text)
-    return tuple(files)
-
-
-def write_page(folder: Path, agent: ExportedAgent, trained: TrainedAgent) -> tuple[str, ...]:
-    """Write cart.html. Raises ConfigError for an agent that was not trained in simulation."""
+def page(agent: ExportedAgent, trained: TrainedAgent) -> str:
+    """Return cart.html. Raises ConfigError for an agent that was not trained in simulation."""
     plant = trained.training.plant
     if not isinstance(plant, SimulatedSettings):
         raise ConfigError(f"format=web: the agent was trained with plant={plant.kind}, not plant=simulated")
-    write_text(folder / PAGE, web_page(agent, trained.training, plant))
-    return (PAGE,)
-
-
-WEIGHTS, PAGE, ONNX = "agent.npz", "cart.html", "agent.onnx"
-WRITERS: dict[str, Callable[[Path, ExportedAgent, TrainedAgent], tuple[str, ...]]] = {
-    "weights": write_weights,
-    "onnx": write_model,
-    "c": write_c,
-    "web": write_page,
-}
+    return web_page(agent, trained.training, plant)

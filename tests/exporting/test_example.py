@@ -15,7 +15,7 @@ import pytest
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.exporting.agent import ExportedAgent
 from cartpole_rl.exporting.description import observed_numbers
-from cartpole_rl.exporting.weights import write_agent
+from cartpole_rl.exporting.weights import weights_file
 from cartpole_rl.plants.emulated_cart import EmulatedCart
 
 ROOT = Path(__file__).parents[2]
@@ -31,7 +31,7 @@ pytest.importorskip("mujoco", reason='mujoco is missing: pip install "cartpole_r
 
 @pytest.fixture
 def file(exported: ExportedAgent, tmp_path: Path) -> Path:
-    write_agent(tmp_path / "agent.npz", exported)
+    (tmp_path / "agent.npz").write_bytes(weights_file(exported))
     return tmp_path / "agent.npz"
 
 
@@ -117,7 +117,7 @@ def test_an_agent_that_observes_the_length_needs_it_before_the_port_opens(
     first = exported.layers[0]
     wider = first._replace(weight=np.pad(first.weight, ((0, 0), (0, 1))))
     agent = ExportedAgent(about.model_copy(update={**changes, "sizes": sizes}), (wider, *exported.layers[1:]))
-    write_agent(tmp_path / "agent.npz", agent)
+    (tmp_path / "agent.npz").write_bytes(weights_file(agent))
     for length in ((), ("0",), ("nan",), ("inf",)):
         code, _, err = ended(started(tmp_path / "agent.npz", tmp_path / "port", *length))
         assert code == 1

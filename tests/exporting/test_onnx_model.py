@@ -1,7 +1,6 @@
 """The ONNX model acts as the agent in PyTorch and carries its description."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,12 +15,11 @@ onnxruntime = pytest.importorskip("onnxruntime", reason="pip install onnxruntime
 
 
 def test_it_acts_as_in_pytorch_and_is_described(
-    exported: ExportedAgent, medium_agent: TrainedAgent, observed: tuple[Floats, Floats], tmp_path: Path
+    exported: ExportedAgent, medium_agent: TrainedAgent, observed: tuple[Floats, Floats]
 ) -> None:
-    from cartpole_rl.exporting.onnx_model import write_onnx
+    from cartpole_rl.exporting.onnx_model import onnx_model
 
-    write_onnx(tmp_path / "agent.onnx", exported, network_of(medium_agent))
-    session = onnxruntime.InferenceSession(tmp_path / "agent.onnx")
+    session = onnxruntime.InferenceSession(onnx_model(exported, network_of(medium_agent)))
     observations, expected = observed
     values, actions = session.run(None, {"observation": observations})
     assert np.abs(values - expected).max() < 1e-4
