@@ -87,6 +87,8 @@ def drive_armed(cart, agent, layers, pole_length, seconds):
         now = {"x": state.cart_counts * metre, "x_dot": cart_step * metre / dt, "theta": theta}
         now |= {"theta_dot": pole_step * 2 * math.pi / turn / dt}
         now |= {"cos_theta": math.cos(theta), "sin_theta": math.sin(theta), "pole_length": pole_length}
+        if agent.angle_limit is not None and abs(theta) > agent.angle_limit:
+            raise PlantError("the pole fell")
         history.appendleft(now)
         observation = [history[each.periods_ago][each.name] / each.scale for each in agent.numbers]
         values = action_values(agent, layers, np.array(observation, np.float32))
@@ -113,6 +115,8 @@ def main(file, port, pole_length="0"):
     """Read an agent, drive the cart on a port, and print how long the pole stood."""
     exported = read_agent(Path(file))  # checks the whole file
     agent = exported.description
+    if agent.start == "upright":
+        raise ConfigError("this agent needs an upright pole, and here it hangs; give an agent that swings up")
     length = length_of(pole_length, agent)
     with SerialCart(SerialSettings(port=port)) as cart:
         cart.home()

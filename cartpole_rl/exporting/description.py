@@ -8,7 +8,7 @@ from pydantic import Field
 from cartpole_rl.envs.settings import ObservationSettings, TrackGuard
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_COUNTS_PER_TURN
-from cartpole_rl.settings import Count, Positive, Settings
+from cartpole_rl.settings import Count, Finite, Positive, Settings
 from cartpole_rl.tasks.features import (
     LENGTH_SCALE,
     MOTOR_SCALE,
@@ -17,7 +17,7 @@ from cartpole_rl.tasks.features import (
     ObservationKind,
     Quantity,
 )
-from cartpole_rl.tasks.settings import MotorValue
+from cartpole_rl.tasks.settings import MotorValue, Start
 
 FORMAT: Literal["cartpole_rl weights 1"] = "cartpole_rl weights 1"
 NORM_EPSILON = 1e-5  # added to the variance; PyTorch's default
@@ -50,6 +50,8 @@ class Description(Settings):
     norm_epsilon: Positive = NORM_EPSILON
     mirrored: bool  # the action values have the mirror symmetry of left and right
     motors: tuple[MotorValue, ...]  # by action index
+    start: Start  # the initial angle of the pole
+    angle_limit: Finite | None  # rad from upright; beyond it the episode ends. None: no limit
     guard: TrackGuard | None  # its rule is in cartpole_rl/envs/guard.py
     track_half_length: Positive  # m, of the nominal cart; a real one reports its own
     control_period: Positive  # s

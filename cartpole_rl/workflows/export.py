@@ -73,6 +73,8 @@ def description(training: TrainConfig, origin: Mapping[str, Any]) -> Description
         norm_groups=2 if agent.mirrored else 1,
         mirrored=agent.mirrored,
         motors=motors,
+        start=training.task.evaluation_start.angle,
+        angle_limit=training.task.angle_limit,
         guard=with_fitted_guard(training).guard.active,
         track_half_length=training.nominal_cart["track_half_length"],
         control_period=training.control_period,

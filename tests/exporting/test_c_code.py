@@ -116,6 +116,8 @@ def test_so_they_are_for_every_observation_and_network(name: str, tmp_path: Path
     exported = exported_agent(trained, {})
     compiled = Compiled(c_files(exported, training), tmp_path)
     check_motors(training, trained.policy, compiled, 200)
+    observes = int(training.observation.pole_length)
+    assert f"#define POLICY_OBSERVES_LENGTH {observes}" in (tmp_path / "policy.h").read_text()
     assert_figures(exported, tmp_path, compiled)
 
 
@@ -167,6 +169,22 @@ def test_after_a_bad_number_the_motor_stays_at_0(compiled: Compiled) -> None:
     assert compiled.action(np.array([math.nan] * 10, np.float32)) == -1
     compiled.start(0.38, 0.36)
     assert compiled.motor((0, 2048), 0.0) != 0
+
+
+def test_the_motor_stays_at_0_once_the_pole_fell(tmp_path: Path) -> None:
+    training = load_settings(TrainConfig, {**AGENTS["plain"], "task": "balance", "compile": False})
+    exported = exported_agent(TrainedAgent(training, new_agent(training).greedy_policy()), {})
+    compiled = Compiled(c_files(exported, training), tmp_path)
+    for sign in (1, -1):  # 100 counts are 8.8 degrees, 140 are 12.3
+        compiled.start(0.38, 0.36)
+        assert compiled.motor((0, sign * 100), 0.0) != 0
+        assert compiled.motor((0, sign * 140), 0.02) == 0
+        assert compiled.motor((0, 0), 0.02) == 0
+    compiled.start(0.38, 0.36)
+    assert compiled.motor((0, 2048), 0.0) == 0
+    header = (tmp_path / "policy.h").read_text()
+    assert "#define POLICY_STARTS_UPRIGHT 1" in header
+    assert "#define POLICY_OBSERVES_LENGTH 0" in header
 
 
 def test_without_a_start_the_motor_stays_at_0(compiled: Compiled) -> None:

@@ -17,6 +17,7 @@ from cartpole_rl.exporting.agent import ExportedAgent
 from cartpole_rl.exporting.description import observed_numbers
 from cartpole_rl.exporting.weights import weights_file
 from cartpole_rl.plants.emulated_cart import EmulatedCart
+from cartpole_rl.tasks.settings import Start
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples/drive_without_torch.py"
@@ -122,3 +123,19 @@ def test_an_agent_that_observes_the_length_needs_it_before_the_port_opens(
         code, _, err = ended(started(tmp_path / "agent.npz", tmp_path / "port", *length))
         assert code == 1
         assert "this agent observes the pole's length" in err
+
+
+def test_an_agent_that_needs_an_upright_pole_is_refused(exported: ExportedAgent, tmp_path: Path) -> None:
+    about = exported.description.model_copy(update={"start": Start.UPRIGHT, "angle_limit": 0.2})
+    (tmp_path / "agent.npz").write_bytes(weights_file(ExportedAgent(about, exported.layers)))
+    code, _, err = ended(started(tmp_path / "agent.npz", tmp_path / "port"))
+    assert code == 1
+    assert "needs an upright pole" in err
+
+
+def test_a_fallen_pole_ends_the_drive(exported: ExportedAgent, tmp_path: Path) -> None:
+    about = exported.description.model_copy(update={"angle_limit": 0.2})
+    (tmp_path / "agent.npz").write_bytes(weights_file(ExportedAgent(about, exported.layers)))
+    code, _, err = driven(tmp_path / "agent.npz", tmp_path / "journal.jsonl")
+    assert (code, err) == (1, "the pole fell\n")
+    assert taken(tmp_path / "journal.jsonl")[-1] == "STOP"

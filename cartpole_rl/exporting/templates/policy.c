@@ -10,6 +10,7 @@
 static const int16_t MOTORS[POLICY_ACTIONS] = {@@motors@@};
 static const int16_t INWARD_FROM_LEFT = @@rightmost@@;
 static const int16_t INWARD_FROM_RIGHT = @@leftmost@@;
+static const float ANGLE_LIMIT = @@angle_limit@@; /* rad, of the pole from upright */
 
 @@tables@@
 
@@ -73,7 +74,7 @@ int16_t policy_motor(policy_t *policy, int32_t cart_counts, int32_t pole_counts,
     policy->counts[0] = cart_counts;
     policy->counts[1] = pole_counts;
     policy->started = true;
-    policy->ready = action != POLICY_NO_ACTION;
+    policy->ready = action != POLICY_NO_ACTION && fabsf(policy->state[2]) <= ANGLE_LIMIT;
     if (!policy->ready) {
         policy->motor = 0;
     } else if (side == 0) {

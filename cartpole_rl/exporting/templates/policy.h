@@ -33,6 +33,8 @@ extern "C" {
 #define POLICY_CART_NANOMETRES_PER_COUNT @@nanometres@@
 #define POLICY_POLE_COUNTS_PER_TURN @@counts_per_turn@@
 #define POLICY_TRACK_HALF_LENGTH @@track@@ /* m, of the nominal cart */
+#define POLICY_OBSERVES_LENGTH @@observes_length@@ /* 1 if the agent reads pole_length */
+#define POLICY_STARTS_UPRIGHT @@starts_upright@@ /* 1 if an episode must start with the pole upright */
 
 /* The memory of one cart. Its fields are private. */
 typedef struct {
@@ -52,8 +54,8 @@ typedef struct {
 void policy_start(policy_t *policy, float track_end, float pole_length);
 
 /* Return the motor value, -255 to 255, for the newest counts. dt: s since the counts of the last call, by the
- * clock of the encoders; not read in the first call of an episode. Before policy_start(), and once a number was
- * not finite or dt was not positive, it returns 0. */
+ * clock of the encoders; not read in the first call of an episode. Before policy_start(), once a number was not
+ * finite or dt was not positive, and once the pole was beyond the angle limit of the task, it returns 0. */
 int16_t policy_motor(policy_t *policy, int32_t cart_counts, int32_t pole_counts, float dt);
 
 /* Return the index of the best motor value for an observation, or POLICY_NO_ACTION if a number is not finite. */
