@@ -55,7 +55,7 @@ class ExportedAgent:
 
     @property
     def checksum(self) -> str:
-        """SHA-256, in hexadecimal, of the description and of each array.
+        """SHA-256, in hexadecimal, of the description and of each array: it identifies the agent, not a file.
 
         The description is JSON with sorted keys, without spaces, in ASCII. Each array is its name and shape
         as text, as in "layer0.bias [128]", and its float32 numbers, row by row, little-endian.

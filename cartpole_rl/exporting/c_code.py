@@ -4,6 +4,7 @@ State, observation and track guard are written from the functions that simulatio
 (`envs/perception.py`), so they are defined once.
 """
 
+import math
 import re
 import textwrap
 from collections.abc import Iterable, Sequence
@@ -19,6 +20,7 @@ from cartpole_rl.errors import ConfigError
 from cartpole_rl.exporting.agent import ExportedAgent, Floats
 from cartpole_rl.exporting.filling import filled
 from cartpole_rl.exporting.perception_graphs import First, Later, perception_graphs
+from cartpole_rl.tasks.settings import Start
 
 FLOAT_BYTES, MOTOR_BYTES = 4, 2
 MEMORY_BYTES = 36  # of policy_t without `past`
@@ -102,7 +104,7 @@ def header(agent: ExportedAgent, later: str) -> str:
         "period_ms": f"{1e3 * about.control_period:g}",
         "period_us": round(1e6 * about.control_period),
         "guard": about.guard or "none",
-        "origin": about.origin.replace("*/", "* /"),
+        "origin": in_comment(about.origin),
         "checksum": agent.checksum,
         "inputs": about.sizes[0],
         "actions": len(about.motors),
@@ -110,9 +112,16 @@ def header(agent: ExportedAgent, later: str) -> str:
         "counts_per_turn": about.pole_counts_per_turn,
         "track": c.literal(about.track_half_length),
         "past": past,
+        "observes_length": int(about.observation.pole_length),
+        "starts_upright": int(about.start == Start.UPRIGHT),
         "length_use": "observed" if about.observation.pole_length else "not read by this agent",
     }
     return filled("policy.h", values)
+
+
+def in_comment(text: str) -> str:
+    """Return text as one line within a comment; it neither ends the comment nor opens another."""
+    return " ".join(text.split()).replace("*/", "* /").replace("/*", "/ *")
 
 
 def source(agent: ExportedAgent, first: str, later: str) -> str:
@@ -123,6 +132,7 @@ def source(agent: ExportedAgent, first: str, later: str) -> str:
         "motors": ", ".join(map(str, about.motors)),
         "rightmost": max(0, *about.motors),
         "leftmost": min(0, *about.motors),
+        "angle_limit": c.literal(math.inf if about.angle_limit is None else about.angle_limit),
         "tables": "\n\n".join(table(name, values) for name, values in agent.arrays()),
         "helpers": "".join(f"{text}\n" for text in helpers),
         "first": first,

@@ -8,7 +8,7 @@ from pydantic import Field
 from cartpole_rl.envs.settings import ObservationSettings, TrackGuard
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_COUNTS_PER_TURN
-from cartpole_rl.settings import Count, Positive, Settings
+from cartpole_rl.settings import Count, Finite, Positive, Settings
 from cartpole_rl.tasks.features import (
     LENGTH_SCALE,
     MOTOR_SCALE,
@@ -17,7 +17,7 @@ from cartpole_rl.tasks.features import (
     ObservationKind,
     Quantity,
 )
-from cartpole_rl.tasks.settings import MotorValue
+from cartpole_rl.tasks.settings import MotorValue, Start
 
 FORMAT: Literal["cartpole_rl weights 1"] = "cartpole_rl weights 1"
 NORM_EPSILON = 1e-5  # added to the variance; PyTorch's default
@@ -42,12 +42,16 @@ class Description(Settings):
     task: str
     observation: ObservationSettings
     numbers: tuple[ObservedNumber, ...]  # the observation, in order
-    sizes: tuple[Count, ...]  # of the observation, each hidden layer, and the action values
+    sizes: Annotated[
+        tuple[Count, ...], Field(min_length=2)
+    ]  # of the observation, each hidden layer, and the action values
     layer_norm: bool
     norm_groups: Literal[1, 2]  # parts of a hidden layer that are normalized separately
     norm_epsilon: Positive = NORM_EPSILON
     mirrored: bool  # the action values have the mirror symmetry of left and right
     motors: tuple[MotorValue, ...]  # by action index
+    start: Start  # the initial angle of the pole
+    angle_limit: Finite | None  # rad from upright; beyond it the episode ends. None: no limit
     guard: TrackGuard | None  # its rule is in cartpole_rl/envs/guard.py
     track_half_length: Positive  # m, of the nominal cart; a real one reports its own
     control_period: Positive  # s
@@ -63,9 +67,14 @@ class Description(Settings):
 
     @property
     def is_consistent(self) -> bool:
-        """True if the parts that repeat each other agree."""
+        """True if the parts that repeat each other agree, and the encoders are those of the cart."""
         ends = len(self.numbers), len(self.motors)
-        return ends == (self.sizes[0], self.sizes[-1]) and self.numbers == observed_numbers(self.observation)
+        scales = self.cart_metres_per_count, self.pole_counts_per_turn
+        return (
+            ends == (self.sizes[0], self.sizes[-1])
+            and self.numbers == observed_numbers(self.observation)
+            and scales == (CART_METRES_PER_COUNT, POLE_COUNTS_PER_TURN)
+        )
 
     def shapes(self) -> Iterator[tuple[str, tuple[int, ...]]]:
         """Yield the name and the shape of each array of weights."""

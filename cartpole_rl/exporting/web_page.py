@@ -26,6 +26,7 @@ from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.settings import SimulatedSettings
 from cartpole_rl.plants.simulation import Carts, Inputs, Period, commands_under_way, encoder_counts, run_carts
 from cartpole_rl.randomization.poles import Pole
+from cartpole_rl.tasks.settings import Start
 
 LONGEST_LATENCY = 0.04  # s, that the reader can choose
 RODS = [length / 100 for length in range(20, 101, 4)]  # m, poles that the reader can choose
@@ -143,6 +144,8 @@ def data(agent: ExportedAgent, settings: CartPoleSettings) -> str:
         "inward": [0, max(0, *about.motors), min(0, *about.motors)],
         "period": about.control_period,
         "pastSize": about.observation.past_size,
+        "startsUpright": about.start == Start.UPRIGHT,
+        "angleLimit": about.angle_limit,
         "names": CartParameters.names(),
         "cart": settings.nominal_with(pole),
         "poles": [each.model_dump() for each in poles],

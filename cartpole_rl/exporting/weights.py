@@ -13,23 +13,24 @@ import numpy as np
 from pydantic import ValidationError
 
 from cartpole_rl.errors import CheckpointError
-from cartpole_rl.exporting.agent import ExportedAgent, Layer
+from cartpole_rl.exporting.agent import ExportedAgent, Layer, canonical_json
 from cartpole_rl.exporting.description import FORMAT, Description
-from cartpole_rl.files import replacing
 
 DESCRIPTION = "agent.json"
+FLOATS = np.dtype("<f4")
 EPOCH = (1980, 1, 1, 0, 0, 0)  # of every member, so that equal agents make equal files
 
 
-def write_agent(path: Path, agent: ExportedAgent) -> None:
-    """Write a weights file. Raises CheckpointError if the agent is not finite or not consistent."""
-    agent.check(str(path))
-    with replacing(path) as beside, zipfile.ZipFile(beside, "w") as archive:
+def weights_file(agent: ExportedAgent) -> bytes:
+    """Return the content of a weights file."""
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as archive:
         archive.writestr(zipfile.ZipInfo(DESCRIPTION, EPOCH), agent.json + "\n")
         for name, values in agent.arrays():
             content = io.BytesIO()
-            np.save(content, values.astype("<f4"), allow_pickle=False)
+            np.save(content, values.astype(FLOATS), allow_pickle=False)
             archive.writestr(zipfile.ZipInfo(f"{name}.npy", EPOCH), content.getvalue())
+    return file.getvalue()
 
 
 def read_agent(path: Path) -> ExportedAgent:
@@ -67,6 +68,9 @@ def read_archive(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
         values = json.loads(content.pop(DESCRIPTION))
         if not isinstance(values, dict):
             raise ValueError("it is no JSON object")
+        canonical_json(values)  # refuses infinite numbers
+        if any(not isinstance(each, np.ndarray) or each.dtype != FLOATS for each in content.values()):
+            raise ValueError("a member is not an array of float32")
     except Exception as error:  # a damaged zip file raises errors of many kinds
         raise CheckpointError(
             f"{path} is not a weights file, or is damaged ({type(error).__name__}); "

@@ -1,21 +1,21 @@
 """Write a trained agent for other programs."""
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from cartpole_rl.agents.network import MirrorQNetwork, QNetwork
 from cartpole_rl.envs.build import with_fitted_guard
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.exporting.agent import ExportedAgent
+from cartpole_rl.exporting.agent import ExportedAgent, canonical_json
 from cartpole_rl.exporting.c_code import c_files
 from cartpole_rl.exporting.description import Description, observed_numbers
 from cartpole_rl.exporting.layers import plain_layers
-from cartpole_rl.exporting.onnx_model import write_onnx
+from cartpole_rl.exporting.onnx_model import onnx_model
 from cartpole_rl.exporting.web_page import web_page
-from cartpole_rl.exporting.weights import write_agent
-from cartpole_rl.files import write_text
+from cartpole_rl.exporting.weights import weights_file
+from cartpole_rl.files import write_bytes
 from cartpole_rl.learning.checkpoint_files import find_agent
 from cartpole_rl.learning.checkpoints import load_agent
 from cartpole_rl.plants.settings import SimulatedSettings
@@ -35,15 +35,22 @@ def export(config: ExportConfig, folder: Path) -> None:
     """
     trained = trained_agent(config.run)
     agent = exported_agent(trained, provenance(config.run))
+    contents = files_of(config.format, agent, trained)
     write_config(folder, "export", {**config.model_dump(mode="json"), "seed": None})
-    names = WRITERS[config.format](folder, agent, trained)
-    files = " and ".join(f"{folder}/{name}" for name in names)
-    print(f"{files} {'are' if len(names) > 1 else 'is'} written; SHA-256 of the agent: {agent.checksum}")
+    for name, content in contents.items():
+        write_bytes(folder / name, content)
+    files = " and ".join(f"{folder}/{name}" for name in contents)
+    print(f"{files} {'are' if len(contents) > 1 else 'is'} written; SHA-256 of the agent: {agent.checksum}")
 
 
 def exported_agent(trained: TrainedAgent, origin: Mapping[str, Any]) -> ExportedAgent:
-    """Return an agent as plain numbers; `origin` is its `provenance`. Raises ConfigError."""
-    return ExportedAgent(description(trained.training, origin), plain_layers(network_of(trained)))
+    """Return an agent as plain numbers; `origin` is its `provenance`.
+
+    Raises ConfigError for an agent that cannot be exported, CheckpointError for one that is not finite.
+    """
+    agent = ExportedAgent(description(trained.training, origin), plain_layers(network_of(trained)))
+    agent.check("run")
+    return agent
 
 
 def network_of(trained: TrainedAgent) -> QNetwork | MirrorQNetwork:
@@ -66,6 +73,8 @@ def description(training: TrainConfig, origin: Mapping[str, Any]) -> Description
         norm_groups=2 if agent.mirrored else 1,
         mirrored=agent.mirrored,
         motors=motors,
+        start=training.task.evaluation_start.angle,
+        angle_limit=training.task.angle_limit,
         guard=with_fitted_guard(training).guard.active,
         track_half_length=training.nominal_cart["track_half_length"],
         control_period=training.control_period,
@@ -77,58 +86,46 @@ def description(training: TrainConfig, origin: Mapping[str, Any]) -> Description
 def provenance(run: Path) -> dict[str, Any]:
     """Return the origin of the agent of `run`: its command, versions, commit, transitions and score."""
     checkpoint, recorded = load_agent(run), recorded_provenance(find_agent(run))
-    command = recorded.get("command", [])
+    match recorded.get("command"):
+        case [str(program), *arguments]:
+            command = [Path(program).name, *arguments]
+        case _:
+            command = []
     return {
         **recorded,
-        "command": [Path(command[0]).name, *command[1:]] if command else [],
+        "command": command,
         "transitions": checkpoint.transitions,
         "score": checkpoint.score,
     }
 
 
 def recorded_provenance(agent: Path) -> dict[str, Any]:
-    """Return the provenance.json of the run that wrote the checkpoint `agent`; empty if there is none."""
+    """Return the provenance.json of the run that wrote `agent`; empty if it is missing or damaged."""
     folder = agent.parent.parent if agent.parent.name == CHECKPOINTS else agent.parent
     try:
-        recorded = json.loads((folder / PROVENANCE).read_text())
+        recorded = json.loads((folder / PROVENANCE).read_text(encoding="utf-8"))
+        canonical_json(recorded)  # refuses infinite numbers
     except (OSError, ValueError):
         return {}
     return recorded if isinstance(recorded, dict) else {}
 
 
-def write_weights(folder: Path, agent: ExportedAgent, trained: TrainedAgent) -> tuple[str, ...]:
-    """Write agent.npz."""
-    write_agent(folder / WEIGHTS, agent)
-    return (WEIGHTS,)
+def files_of(form: str, agent: ExportedAgent, trained: TrainedAgent) -> dict[str, bytes]:
+    """Return the contents of the files of a format, by name. Raises ConfigError."""
+    match form:
+        case "weights":
+            return {"agent.npz": weights_file(agent)}
+        case "onnx":
+            return {"agent.onnx": onnx_model(agent, network_of(trained))}
+        case "c":
+            return {name: text.encode() for name, text in c_files(agent, trained.training).items()}
+        case _:
+            return {"cart.html": page(agent, trained).encode()}
 
 
-def write_model(folder: Path, agent: ExportedAgent, trained: TrainedAgent) -> tuple[str, ...]:
-    """Write agent.onnx."""
-    write_onnx(folder / ONNX, agent, network_of(trained))
-    return (ONNX,)
-
-
-def write_c(folder: Path, agent: ExportedAgent, trained: TrainedAgent) -> tuple[str, ...]:
-    """Write policy.h and policy.c."""
-    files = c_files(agent, trained.training)
-    for name, text in files.items():
-        write_text(folder / name, text)
-    return tuple(files)
-
-
-def write_page(folder: Path, agent: ExportedAgent, trained: TrainedAgent) -> tuple[str, ...]:
-    """Write cart.html. Raises ConfigError for an agent that was not trained in simulation."""
+def page(agent: ExportedAgent, trained: TrainedAgent) -> str:
+    """Return cart.html. Raises ConfigError for an agent that was not trained in simulation."""
     plant = trained.training.plant
     if not isinstance(plant, SimulatedSettings):
         raise ConfigError(f"format=web: the agent was trained with plant={plant.kind}, not plant=simulated")
-    write_text(folder / PAGE, web_page(agent, trained.training, plant))
-    return (PAGE,)
-
-
-WEIGHTS, PAGE, ONNX = "agent.npz", "cart.html", "agent.onnx"
-WRITERS: dict[str, Callable[[Path, ExportedAgent, TrainedAgent], tuple[str, ...]]] = {
-    "weights": write_weights,
-    "onnx": write_model,
-    "c": write_c,
-    "web": write_page,
-}
+    return web_page(agent, trained.training, plant)

@@ -24,7 +24,7 @@ from common import option_parser, positive_int, print_table, write_json
 
 from cartpole_rl.envs.build import simulated_env
 from cartpole_rl.exporting.c_code import c_files
-from cartpole_rl.exporting.onnx_model import write_onnx
+from cartpole_rl.exporting.onnx_model import onnx_model
 from cartpole_rl.workflows.agents import TrainedAgent, trained_agent
 from cartpole_rl.workflows.export import exported_agent, network_of
 
@@ -61,7 +61,7 @@ def in_c(trained: TrainedAgent, folder: Path) -> Choose:
 def in_onnx(trained: TrainedAgent, folder: Path) -> Choose:
     """Return the ONNX model, run by onnxruntime on one thread."""
     path = folder / "agent.onnx"
-    write_onnx(path, exported_agent(trained, {}), network_of(trained))
+    path.write_bytes(onnx_model(exported_agent(trained, {}), network_of(trained)))
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     session = onnxruntime.InferenceSession(path, options)

@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 from collections.abc import Mapping
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -42,6 +43,7 @@ class Compiled:
     """The library of an exported agent, with one cart."""
 
     def __init__(self, files: Mapping[str, str], folder: Path) -> None:
+        self.folder = folder
         for name, text in {**files, "size.c": SIZE}.items():
             (folder / name).write_text(text)
         words = ["gcc", *FLAGS, "-shared", "-fPIC", "-o", "policy.so", "policy.c", "size.c", "-lm"]
@@ -114,6 +116,8 @@ def test_so_they_are_for_every_observation_and_network(name: str, tmp_path: Path
     exported = exported_agent(trained, {})
     compiled = Compiled(c_files(exported, training), tmp_path)
     check_motors(training, trained.policy, compiled, 200)
+    observes = int(training.observation.pole_length)
+    assert f"#define POLICY_OBSERVES_LENGTH {observes}" in (tmp_path / "policy.h").read_text()
     assert_figures(exported, tmp_path, compiled)
 
 
@@ -137,19 +141,74 @@ def assert_figures(exported: ExportedAgent, folder: Path, compiled: Compiled) ->
     assert exported.checksum in comment
 
 
+@pytest.mark.parametrize("origin", ["*/ int x; /*", "/*/", "a\nb\\", "a ??/", "**//", "\\"])
+def test_no_origin_leaves_the_comment(
+    origin: str, exported: ExportedAgent, medium_agent: TrainedAgent, tmp_path: Path
+) -> None:
+    about = exported.description.model_copy(update={"provenance": {"command": [origin]}})
+    for name, text in c_files(replace(exported, description=about), medium_agent.training).items():
+        (tmp_path / name).write_text(text)
+    words = ["gcc", *FLAGS, "-fsyntax-only", "policy.c"]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    first, second = (tmp_path / "policy.h").read_text().split("*/")[0].splitlines()[-3:-1]
+    assert first.startswith(' * Training: "')
+    assert second.startswith(" * SHA-256: ")
+
+
 def test_after_a_bad_number_the_motor_stays_at_0(compiled: Compiled) -> None:
-    for dt in (0.0, -0.02, math.nan):
+    for dt in (0.0, -0.02, math.nan, math.inf):
         compiled.start(0.38, 0.36)
         assert compiled.motor((0, 2048), 0.0) != 0  # the first period reads no dt
         assert compiled.motor((2000, 2048), dt) == 0
         assert compiled.motor((2000, 2048), 0.02) == 0
-    for end in (math.nan, 0.0):
+    for end in (math.nan, 0.0, math.inf):
         compiled.start(end, 0.36)
         assert compiled.motor((0, 2048), 0.0) == 0
     assert compiled.action(np.array([math.inf] * 10, np.float32)) == -1
     assert compiled.action(np.array([math.nan] * 10, np.float32)) == -1
     compiled.start(0.38, 0.36)
     assert compiled.motor((0, 2048), 0.0) != 0
+
+
+def test_the_motor_stays_at_0_once_the_pole_fell(tmp_path: Path) -> None:
+    training = load_settings(TrainConfig, {**AGENTS["plain"], "task": "balance", "compile": False})
+    exported = exported_agent(TrainedAgent(training, new_agent(training).greedy_policy()), {})
+    compiled = Compiled(c_files(exported, training), tmp_path)
+    for sign in (1, -1):  # 100 counts are 8.8 degrees, 140 are 12.3
+        compiled.start(0.38, 0.36)
+        assert compiled.motor((0, sign * 100), 0.0) != 0
+        assert compiled.motor((0, sign * 140), 0.02) == 0
+        assert compiled.motor((0, 0), 0.02) == 0
+    compiled.start(0.38, 0.36)
+    assert compiled.motor((0, 2048), 0.0) == 0
+    header = (tmp_path / "policy.h").read_text()
+    assert "#define POLICY_STARTS_UPRIGHT 1" in header
+    assert "#define POLICY_OBSERVES_LENGTH 0" in header
+
+
+def test_without_a_start_the_motor_stays_at_0(compiled: Compiled) -> None:
+    ctypes.memset(compiled.memory, 0, len(compiled.memory))
+    assert [compiled.motor((0, 2048), 0.02) for _ in range(3)] == [0, 0, 0]
+
+
+def test_a_unit_that_is_not_finite_reaches_the_action_values(tmp_path: Path) -> None:
+    training = load_settings(TrainConfig, {**AGENTS["plain"], "compile": False})
+    exported = exported_agent(TrainedAgent(training, new_agent(training).greedy_policy()), {})
+    first = exported.layers[0]
+    layer = first._replace(weight=np.full_like(first.weight, 3e38))
+    agent = replace(exported, layers=(layer, *exported.layers[1:]))
+    compiled = Compiled(c_files(agent, training), tmp_path)
+    numbers = np.array([2, -2] * 5, np.float32)  # infinity minus infinity
+    assert compiled.action(numbers) == -1
+
+
+def test_options_that_remove_the_checks_are_refused(compiled: Compiled) -> None:
+    for option in ("-Ofast", "-ffast-math", "-ffinite-math-only"):
+        words = ["gcc", option, "-fsyntax-only", str(compiled.folder / "policy.c")]
+        done = subprocess.run(words, capture_output=True, text=True)
+        assert done.returncode != 0
+        assert "they remove the checks for finite numbers" in done.stderr
 
 
 def test_the_guard_brakes_a_fast_cart(compiled: Compiled) -> None:

@@ -1,16 +1,23 @@
 """examples/drive_without_torch.py swings up the pole of an emulated cart, and PyTorch is never imported."""
 
+import json
 import os
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.exporting.agent import ExportedAgent
-from cartpole_rl.exporting.weights import write_agent
+from cartpole_rl.exporting.description import observed_numbers
+from cartpole_rl.exporting.weights import weights_file
 from cartpole_rl.plants.emulated_cart import EmulatedCart
+from cartpole_rl.tasks.settings import Start
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples/drive_without_torch.py"
@@ -23,16 +30,112 @@ assert not {{"torch", "tensordict", "torchrl"}} & {{*sys.modules}}
 pytest.importorskip("mujoco", reason='mujoco is missing: pip install "cartpole_rl[emulator]"')
 
 
-def test_the_example_swings_up_and_balances(exported: ExportedAgent, tmp_path: Path) -> None:
-    write_agent(tmp_path / "agent.npz", exported)
+@pytest.fixture
+def file(exported: ExportedAgent, tmp_path: Path) -> Path:
+    (tmp_path / "agent.npz").write_bytes(weights_file(exported))
+    return tmp_path / "agent.npz"
+
+
+def started(*arguments: str | Path) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-c", SCRIPT, *arguments],
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def ended(process: subprocess.Popen[str]) -> tuple[int, str, str]:
+    """The exit status, stdout and stderr; a traceback is an error."""
+    out, err = process.communicate()
+    assert "Traceback" not in err, err
+    return process.returncode, out, err
+
+
+def taken(journal: Path) -> list[str]:
+    """The commands that the emulated cart carried out."""
+    lines = [json.loads(line) for line in journal.read_text().splitlines() if line.endswith("}")]
+    return [line["took"] for line in lines if "took" in line]
+
+
+def driven(file: Path, journal: Path, **emulator: Any) -> tuple[int, str, str]:
+    with EmulatedCart(EmulatorSettings(physics_step=1e-3, journal=journal, **emulator)) as cart:
+        return ended(started(file, cart.port))
+
+
+def test_the_example_swings_up_and_balances(file: Path, tmp_path: Path) -> None:
+    journal = tmp_path / "journal.jsonl"
+    code, out, err = driven(file, journal)
+    assert code == 0, err
+    assert float(out.split()[-2]) > 7.0  # of 10 s
+    assert taken(journal)[-1] == "STOP"
+
+
+def test_a_cart_that_restarts_ends_it_with_an_error(file: Path, tmp_path: Path) -> None:
+    code, out, err = driven(file, tmp_path / "journal.jsonl", reset_at=26.0)  # it drives from 24 s to 34 s
+    assert (code, out) == (1, "")
+    assert "restarted" in err
+    assert taken(tmp_path / "journal.jsonl")[-1] == "STOP"
+
+
+def test_two_interrupts_stop_the_cart(file: Path, tmp_path: Path) -> None:
     journal = tmp_path / "journal.jsonl"
     with EmulatedCart(EmulatorSettings(physics_step=1e-3, journal=journal)) as cart:
-        done = subprocess.run(
-            [sys.executable, "-c", SCRIPT, tmp_path / "agent.npz", cart.port],
-            env={**os.environ, "PYTHONPATH": str(ROOT)},
-            capture_output=True,
-            text=True,
-        )
-    assert done.returncode == 0, done.stderr
-    assert float(done.stdout.split()[-2]) > 7.0  # of 10 s
-    assert '"took": "STOP"' in journal.read_text().splitlines()[-2] + journal.read_text().splitlines()[-1]
+        process = started(file, cart.port)
+        while "START" not in taken(journal):
+            assert process.poll() is None
+            time.sleep(0.02)
+        for _ in range(2):
+            process.send_signal(signal.SIGINT)
+        code, out, err = ended(process)
+    assert (code, out, err) == (128 + signal.SIGINT, "", "")
+    assert taken(journal)[-1] == "STOP"
+
+
+def test_wrong_arguments_are_named_in_one_line(file: Path, tmp_path: Path) -> None:
+    expected: dict[tuple[str | Path, ...], str] = {
+        (): "usage: drive_without_torch.py AGENT.npz PORT [POLE_LENGTH]",
+        (file,): "usage:",
+        (tmp_path / "nowhere.npz", "/dev/null"): "there is no such file",
+        (file, tmp_path / "port"): "port",
+        (file, tmp_path / "port", "long"): "POLE_LENGTH: 'long' is not a number",
+    }
+    for arguments, text in expected.items():
+        code, _, err = ended(started(*arguments))
+        assert code == 1
+        assert text in err
+        assert err.count("\n") == 1
+
+
+def test_an_agent_that_observes_the_length_needs_it_before_the_port_opens(
+    exported: ExportedAgent, tmp_path: Path
+) -> None:
+    about = exported.description
+    observation = about.observation.model_copy(update={"pole_length": True})
+    changes = {"observation": observation, "numbers": observed_numbers(observation)}
+    sizes = (about.sizes[0] + 1, *about.sizes[1:])
+    first = exported.layers[0]
+    wider = first._replace(weight=np.pad(first.weight, ((0, 0), (0, 1))))
+    agent = ExportedAgent(about.model_copy(update={**changes, "sizes": sizes}), (wider, *exported.layers[1:]))
+    (tmp_path / "agent.npz").write_bytes(weights_file(agent))
+    for length in ((), ("0",), ("nan",), ("inf",)):
+        code, _, err = ended(started(tmp_path / "agent.npz", tmp_path / "port", *length))
+        assert code == 1
+        assert "this agent observes the pole's length" in err
+
+
+def test_an_agent_that_needs_an_upright_pole_is_refused(exported: ExportedAgent, tmp_path: Path) -> None:
+    about = exported.description.model_copy(update={"start": Start.UPRIGHT, "angle_limit": 0.2})
+    (tmp_path / "agent.npz").write_bytes(weights_file(ExportedAgent(about, exported.layers)))
+    code, _, err = ended(started(tmp_path / "agent.npz", tmp_path / "port"))
+    assert code == 1
+    assert "needs an upright pole" in err
+
+
+def test_a_fallen_pole_ends_the_drive(exported: ExportedAgent, tmp_path: Path) -> None:
+    about = exported.description.model_copy(update={"angle_limit": 0.2})
+    (tmp_path / "agent.npz").write_bytes(weights_file(ExportedAgent(about, exported.layers)))
+    code, _, err = driven(tmp_path / "agent.npz", tmp_path / "journal.jsonl")
+    assert (code, err) == (1, "the pole fell\n")
+    assert taken(tmp_path / "journal.jsonl")[-1] == "STOP"

@@ -22,9 +22,10 @@ from cartpole_rl.plants.settings import SimulatedSettings
 from cartpole_rl.plants.simulation import Carts, Inputs, commands_under_way, run_carts
 from cartpole_rl.plants.specs import OneCartPlant, OneFrame
 from cartpole_rl.scalar import Scalar
-from cartpole_rl.workflows.agents import TrainedAgent
+from cartpole_rl.workflows.agents import TrainedAgent, new_agent
 from cartpole_rl.workflows.config import TrainConfig
-from cartpole_rl.workflows.export import network_of
+from cartpole_rl.workflows.export import exported_agent, network_of
+from cartpole_rl.workflows.loading import load_settings
 
 PERIODS = 100  # 2 s
 HANGING = {"x": 0.05, "x_dot": 0.0, "theta": math.pi, "theta_dot": 0.0}
@@ -123,7 +124,29 @@ def test_the_page_needs_no_other_file(page: str) -> None:
     assert len(page) < 150_000
 
 
-@pytest.mark.skipif(BROWSER is None, reason=f"none of {', '.join(BROWSERS)} is installed")
+NEEDS_BROWSER = pytest.mark.skipif(BROWSER is None, reason=f"none of {', '.join(BROWSERS)} is installed")
+
+
+@NEEDS_BROWSER
+def test_a_balancing_agent_starts_upright_and_fails_when_the_pole_falls(tmp_path: Path) -> None:
+    training = load_settings(TrainConfig, {"task": "balance", "agent.hidden": [8], "compile": False})
+    assert isinstance(training.plant, SimulatedSettings)
+    agent = exported_agent(TrainedAgent(training, new_agent(training).greedy_policy()), {})
+    script = """
+    const driven = new Cart(), start = driven.motion[2], angles = [];
+    driven.reset({ ...REST, theta: 0.1 });
+    while (!driven.fallen && angles.length < 200) {
+      driven.step(0);
+      angles.push(Math.abs(driven.percept.state[2]));
+    }
+    document.body.textContent = JSON.stringify([start, ...angles.slice(-2)]);
+    """
+    start, before, last = in_browser(web_page(agent, training, training.plant), script, tmp_path)
+    assert start == 0
+    assert before <= training.task.angle_limit < last
+
+
+@NEEDS_BROWSER
 def test_it_drives_as_the_simulation(page: str, medium_agent: TrainedAgent, tmp_path: Path) -> None:
     script = f"const EPISODES = {json.dumps(EPISODES)}, PERIODS = {PERIODS};{DRIVE}"
     for episode, rows in zip(EPISODES, in_browser(page, script, tmp_path), strict=True):

@@ -2,6 +2,7 @@
 
 import io
 import json
+import math
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -12,14 +13,14 @@ import pytest
 
 from cartpole_rl.errors import CheckpointError
 from cartpole_rl.exporting.agent import ExportedAgent
-from cartpole_rl.exporting.weights import read_agent, write_agent
+from cartpole_rl.exporting.weights import read_agent, weights_file
 
 Members = dict[str, bytes]
 
 
 @pytest.fixture
 def file(exported: ExportedAgent, tmp_path: Path) -> Path:
-    write_agent(tmp_path / "agent.npz", exported)
+    (tmp_path / "agent.npz").write_bytes(weights_file(exported))
     return tmp_path / "agent.npz"
 
 
@@ -41,9 +42,8 @@ def test_an_agent_comes_back(exported: ExportedAgent, file: Path) -> None:
         assert np.array_equal(values, expected)
 
 
-def test_equal_agents_make_equal_files(exported: ExportedAgent, file: Path, tmp_path: Path) -> None:
-    write_agent(tmp_path / "again.npz", exported)
-    assert (tmp_path / "again.npz").read_bytes() == file.read_bytes()
+def test_equal_agents_make_equal_files(exported: ExportedAgent, file: Path) -> None:
+    assert weights_file(exported) == file.read_bytes()
 
 
 def test_the_description_defines_the_observation(file: Path) -> None:
@@ -80,9 +80,9 @@ def rewritten(file: Path, change: Callable[[Members], object]) -> Path:
     return file
 
 
-def array(values: Any) -> bytes:
+def array(values: Any, kind: Any = np.float32) -> bytes:
     content = io.BytesIO()
-    np.save(content, np.asarray(values, np.float32))
+    np.save(content, np.asarray(values, kind))
     return content.getvalue()
 
 
@@ -119,6 +119,18 @@ DAMAGE: dict[str, tuple[Callable[[Members], object], str]] = {
     "other scales": (lambda members: change_json(members, numbers=[]), "contradicts itself"),
     "no description": (lambda members: members.pop("agent.json"), "is not a weights file"),
     "no JSON": (lambda members: members.update({"agent.json": b"{"}), "is not a weights file"),
+    "an infinite number": (
+        lambda members: change_json(members, provenance={"score": math.inf}),
+        "is not a weights file",
+    ),
+    "no sizes": (lambda members: change_json(members, sizes=[]), "sizes in agent.json"),
+    "one size": (lambda members: change_json(members, sizes=[10]), "sizes in agent.json"),
+    "text": (
+        lambda members: members.update({"layer0.bias.npy": array(["one"] * 128, str)}),
+        "is not a weights file",
+    ),
+    "bytes": (lambda members: members.update({"layer0.bias.npy": b"one"}), "is not a weights file"),
+    "a member more": (lambda members: members.update({"more.txt": b"one"}), "is not a weights file"),
     "a list": (lambda members: members.update({"agent.json": b"[]"}), "is not a weights file"),
     "a pickle": (
         lambda members: members.update({"layer0.bias.npy": pickled()}),
@@ -139,6 +151,20 @@ def test_a_damaged_file_is_refused(damage: str, file: Path) -> None:
     assert expected in complaint(rewritten(file, change))
 
 
+@pytest.mark.parametrize("kind", [np.float64, np.complex128, ">f4"])
+def test_numbers_of_another_kind_are_refused(kind: Any, exported: ExportedAgent, file: Path) -> None:
+    """Converted to float32, these are the weights of the file, and have its checksum."""
+    members = {"layer0.bias.npy": array(exported.layers[0].bias, kind)}
+    assert "is not a weights file" in complaint(rewritten(file, lambda found: found.update(members)))
+
+
+def test_encoders_of_another_cart_are_refused(exported: ExportedAgent, tmp_path: Path) -> None:
+    for changes in ({"cart_metres_per_count": 4.5e-5}, {"pole_counts_per_turn": 2048}):
+        about = exported.description.model_copy(update=changes)
+        (tmp_path / "agent.npz").write_bytes(weights_file(ExportedAgent(about, exported.layers)))
+        assert "contradicts itself" in complaint(tmp_path / "agent.npz")
+
+
 def test_a_file_that_is_none_is_refused(file: Path, tmp_path: Path) -> None:
     assert "there is no such file" in complaint(tmp_path / "nowhere.npz")
     file.write_bytes(file.read_bytes()[:1000])
@@ -147,11 +173,8 @@ def test_a_file_that_is_none_is_refused(file: Path, tmp_path: Path) -> None:
     assert "is not a weights file" in complaint(file)
 
 
-def test_an_agent_that_is_not_finite_is_not_written(exported: ExportedAgent, tmp_path: Path) -> None:
+def test_an_agent_that_is_not_finite_is_refused(exported: ExportedAgent) -> None:
     first = exported.layers[0]
     broken = first._replace(bias=np.full_like(first.bias, np.inf))
-    with pytest.raises(CheckpointError, match=r"layer0\.bias is not finite"):
-        write_agent(
-            tmp_path / "agent.npz", ExportedAgent(exported.description, (broken, *exported.layers[1:]))
-        )
-    assert not list(tmp_path.iterdir())
+    with pytest.raises(CheckpointError, match=r"run: layer0\.bias is not finite"):
+        ExportedAgent(exported.description, (broken, *exported.layers[1:])).check("run")

@@ -11,6 +11,8 @@ import pytest
 
 REMEDIES = {
     "mujoco": 'pip install "cartpole_rl[emulator]"',
+    "onnxruntime": 'pip install "cartpole_rl[dev]"',
+    "onnxscript": 'pip install "cartpole_rl[export]"',
     "psutil": 'pip install "cartpole_rl[dev]"',
     "g++": "install a C++ compiler",
     "Python.h": "install Python's headers",

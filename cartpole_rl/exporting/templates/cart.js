@@ -7,6 +7,7 @@ function decoded(text) {
 }
 
 const NO_NOISE = [0, 0, 0];
+const REST = { x: 0, x_dot: 0, theta: DATA.startsUpright ? 0 : Math.PI, theta_dot: 0 };
 const LAYERS = DATA.layers.map((layer) => {
   const decodedLayer = {};
   for (const [name, text] of Object.entries(layer)) decodedLayer[name] = decoded(text);
@@ -44,7 +45,7 @@ function actionValues(observation) {
 class Cart {
   constructor(parameters = {}) {
     this.parameters = { ...DATA.cart, ...parameters };
-    this.reset({ x: 0, x_dot: 0, theta: Math.PI, theta_dot: 0 });
+    this.reset(REST);
   }
 
   get table() {
@@ -67,6 +68,7 @@ class Cart {
     this.percept = perceiveFirst(this.counts, this.poleLength, this.trackEnd);
     this.motor = 0;
     this.offTrack = false;
+    this.fallen = false;
   }
 
   /** The motor value that the agent and its track guard choose; 0 where a number is not finite. */
@@ -86,5 +88,6 @@ class Cart {
     );
     Object.assign(this, { motion: after.motion, drive: after.drive, counts: after.counts, motor });
     this.offTrack = after.off_track[0];
+    this.fallen = DATA.angleLimit !== null && Math.abs(this.percept.state[2]) > DATA.angleLimit;
   }
 }

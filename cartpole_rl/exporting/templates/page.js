@@ -1,4 +1,3 @@
-const HANGING = { x: 0, x_dot: 0, theta: Math.PI, theta_dot: 0 };
 const UPRIGHT = (5 / 180) * Math.PI; // rad
 const STIFFNESS = 60; // N/m, of the reader's spring on the cart
 const STRONGEST = 12; // N
@@ -37,13 +36,13 @@ function period() {
   const angle = wrapped(cart.motion[2]);
   upright = Math.abs(angle) < UPRIGHT ? upright + DATA.period : 0;
   wasUpright = wasUpright || upright > 1;
-  if (cart.offTrack) failedAt = time;
+  if (cart.offTrack || cart.fallen) failedAt = time;
   history.push({ time, angle });
   while (history.length && history[0].time < time - HISTORY) history.shift();
 }
 
 function restart() {
-  cart.reset({ ...HANGING, theta: Math.PI + 0.02 * (Math.random() - 0.5), x: 0.1 * (Math.random() - 0.5) });
+  cart.reset({ ...REST, theta: REST.theta + 0.02 * (Math.random() - 0.5), x: 0.1 * (Math.random() - 0.5) });
   before = cart.motion;
   failedAt = null;
   upright = 0;
@@ -56,7 +55,7 @@ function agentDrives() {
 }
 
 function verdict() {
-  if (failedAt !== null) return ["Failed: the cart left its track.", "--bad"];
+  if (failedAt !== null) return [cart.fallen ? "Failed: the pole fell." : "Failed: the cart left its track.", "--bad"];
   if (!agentDrives()) return ["The motor is off.", "--soft"];
   if (upright > 0.5) return [`Upright for ${upright.toFixed(1)} s`, "--good"];
   return wasUpright ? ["Recovering …", "--pole"] : ["Swinging up …", "--soft"];

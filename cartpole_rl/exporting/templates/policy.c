@@ -3,9 +3,14 @@
 
 #include <math.h>
 
+#if defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__
+#error "compile without -Ofast, -ffast-math and -ffinite-math-only: they remove the checks for finite numbers"
+#endif
+
 static const int16_t MOTORS[POLICY_ACTIONS] = {@@motors@@};
 static const int16_t INWARD_FROM_LEFT = @@rightmost@@;
 static const int16_t INWARD_FROM_RIGHT = @@leftmost@@;
+static const float ANGLE_LIMIT = @@angle_limit@@; /* rad, of the pole from upright */
 
 @@tables@@
 
@@ -48,7 +53,8 @@ int policy_action(const float observation[POLICY_INPUTS])
 
 void policy_start(policy_t *policy, float track_end, float pole_length)
 {
-    *policy = (policy_t){.track_end = track_end, .pole_length = pole_length, .failed = !(track_end > 0.0f)};
+    const bool ready = isfinite(track_end) && track_end > 0.0f;
+    *policy = (policy_t){.track_end = track_end, .pole_length = pole_length, .ready = ready};
 }
 
 int16_t policy_motor(policy_t *policy, int32_t cart_counts, int32_t pole_counts, float dt)
@@ -58,18 +64,18 @@ int16_t policy_motor(policy_t *policy, int32_t cart_counts, int32_t pole_counts,
     int64_t side = 0;
     int action = POLICY_NO_ACTION;
 
-    if (!policy->failed && !policy->started) {
+    if (policy->ready && !policy->started) {
         side = perceive_first(policy, counts, observation);
         action = policy_action(observation);
-    } else if (!policy->failed && dt > 0.0f) {
+    } else if (policy->ready && isfinite(dt) && dt > 0.0f) {
         side = perceive(policy, counts, dt, observation);
         action = policy_action(observation);
     }
     policy->counts[0] = cart_counts;
     policy->counts[1] = pole_counts;
     policy->started = true;
-    policy->failed = action == POLICY_NO_ACTION;
-    if (policy->failed) {
+    policy->ready = action != POLICY_NO_ACTION && fabsf(policy->state[2]) <= ANGLE_LIMIT;
+    if (!policy->ready) {
         policy->motor = 0;
     } else if (side == 0) {
         policy->motor = MOTORS[action];

@@ -5,7 +5,7 @@
  *     operations  @@operations@@ multiply-adds, @@roots@@ square roots and @@trigonometry@@ sines and cosines a period
  *
  * No heap, no writable static variables, fixed buffers. It needs a float unit or a soft-float library, and
- * <math.h>.
+ * <math.h>. -Ofast and -ffast-math are refused: they remove the checks for finite numbers.
  *
  * In each control period of @@period_ms@@ ms, read both encoders, call policy_motor() and set the returned motor
  * value at once. Call policy_start() before the first period of an episode, with the cart homed. Counts and
@@ -13,7 +13,7 @@
  * upright. This code only chooses motor values: the limits, the watchdog and the faults of the firmware must
  * stay in force. Track guard of the training: @@guard@@
  *
- * Training: @@origin@@
+ * Training: "@@origin@@"
  * SHA-256: @@checksum@@
  */
 #ifndef POLICY_H
@@ -33,6 +33,8 @@ extern "C" {
 #define POLICY_CART_NANOMETRES_PER_COUNT @@nanometres@@
 #define POLICY_POLE_COUNTS_PER_TURN @@counts_per_turn@@
 #define POLICY_TRACK_HALF_LENGTH @@track@@ /* m, of the nominal cart */
+#define POLICY_OBSERVES_LENGTH @@observes_length@@ /* 1 if the agent reads pole_length */
+#define POLICY_STARTS_UPRIGHT @@starts_upright@@ /* 1 if an episode must start with the pole upright */
 
 /* The memory of one cart. Its fields are private. */
 typedef struct {
@@ -43,17 +45,17 @@ typedef struct {
     int32_t counts[2];   /* of cart and pole, one period ago */
     int16_t motor;       /* returned last */
     bool started;        /* counts are known */
-    bool failed;         /* a number was not finite */
+    bool ready;          /* policy_start() succeeded, and every number since was finite */
 } policy_t;
 
-/* Start an episode. track_end: m from the middle to the soft limit, which the track guard reads; without a positive
- * number every motor value is 0. pole_length: m, twice the distance from pivot to centre of mass;
+/* Start an episode. track_end: m from the middle to the soft limit, which the track guard reads; without a positive,
+ * finite number every motor value is 0. pole_length: m, twice the distance from pivot to centre of mass;
  * @@length_use@@. */
 void policy_start(policy_t *policy, float track_end, float pole_length);
 
 /* Return the motor value, -255 to 255, for the newest counts. dt: s since the counts of the last call, by the
- * clock of the encoders; not read in the first call of an episode. Once a number was not finite or dt was not
- * positive, it returns 0 until policy_start(). */
+ * clock of the encoders; not read in the first call of an episode. Before policy_start(), once a number was not
+ * finite or dt was not positive, and once the pole was beyond the angle limit of the task, it returns 0. */
 int16_t policy_motor(policy_t *policy, int32_t cart_counts, int32_t pole_counts, float dt);
 
 /* Return the index of the best motor value for an observation, or POLICY_NO_ACTION if a number is not finite. */
