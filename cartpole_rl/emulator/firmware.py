@@ -39,6 +39,7 @@ from cartpole_rl.wire.messages import (
     SetMotor,
     SetPeriod,
     Start,
+    StartPolicy,
     State,
     Stop,
 )
@@ -53,6 +54,7 @@ HARD_LIMIT = round(0.008 / CART_METRES)  # counts inside a stop
 WATCHDOG_PERIODS = 3
 NO_AGE = 65535
 U32 = 0xFFFFFFFF
+UNDERSTOOD = {kind for kind in MESSAGES if not kind & FROM_CART} - {StartPolicy.TYPE}  # it has no policy
 NOMINAL_HALF_SPAN = round(SPAN / 2 / CART_METRES)
 
 
@@ -124,7 +126,7 @@ class Firmware:
         """Carry out a frame and return the answer; None for SET_MOTOR, which the next STATE acknowledges."""
         if envelope.version != VERSION:
             return Reason.BAD_VERSION
-        if envelope.kind not in MESSAGES or envelope.kind & FROM_CART:
+        if envelope.kind not in UNDERSTOOD:
             return Reason.UNKNOWN_TYPE
         try:
             message = MESSAGES[envelope.kind].unpack(envelope.payload)

@@ -1,6 +1,6 @@
 """The messages of protocol version 1. Numbers are little-endian; `LAYOUT` is a payload in `struct` notation.
 
-Host to cart: HELLO, START, STOP, SET_MOTOR, HOME, CLEAR_FAULT, SET_PERIOD.
+Host to cart: HELLO, START, STOP, SET_MOTOR, HOME, CLEAR_FAULT, SET_PERIOD, START_POLICY.
 Cart to host: INFO, STATE (each period), ACK, NACK, FAULT.
 
 To add a message, add its type and its class; docs/extending.md shows all steps.
@@ -26,6 +26,7 @@ class MessageType(IntEnum):
     HOME = 0x05
     CLEAR_FAULT = 0x06
     SET_PERIOD = 0x07
+    START_POLICY = 0x08
     INFO = 0x81
     STATE = 0x82
     ACK = 0x83
@@ -151,6 +152,13 @@ class SetPeriod(Message):
     TYPE = MessageType.SET_PERIOD
     LAYOUT = "I"
     period_us: int
+
+
+@dataclass(frozen=True)
+class StartPolicy(Message):
+    """Arms the motor and lets the policy on the board drive. Unknown to a cart without one."""
+
+    TYPE = MessageType.START_POLICY
 
 
 @dataclass(frozen=True)

@@ -90,14 +90,17 @@ static cart_reason objection_in_this_state(const cart *self, uint8_t type)
 {
     bool sets = type == CART_SET_PERIOD;
     bool homes = type == CART_HOME;
-    bool drives = type == CART_SET_MOTOR || type == CART_START;
+    bool starts = type == CART_START || type == CART_START_POLICY;
+    bool drives = type == CART_SET_MOTOR || starts;
     if (self->homing && (sets || homes || drives))
         return CART_BUSY;
     if (self->armed && (sets || homes))
         return CART_BUSY;
+    if (self->armed && type == CART_START_POLICY && !self->self_driven)
+        return CART_BUSY;
     if (self->fault && (homes || drives))
         return CART_FAULT_LATCHED;
-    if (type == CART_START && !self->homed)
+    if (starts && !self->homed)
         return CART_NOT_HOMED;
     if (type == CART_SET_MOTOR && !self->armed)
         return CART_NOT_ARMED;
@@ -110,7 +113,7 @@ static cart_reason objection(const cart *self, const cart_envelope *envelope)
     int expected = cart_host_payload(envelope->type);
     if (envelope->version != CART_VERSION)
         return CART_BAD_VERSION;
-    if (expected < 0)
+    if (expected < 0 || (envelope->type == CART_START_POLICY && self->policy == NULL))
         return CART_UNKNOWN_TYPE;
     if (envelope->payload_length != (size_t)expected)
         return CART_BAD_LENGTH;
@@ -132,9 +135,17 @@ static void arm(cart *self, uint64_t now_us)
     if (self->armed)
         return;
     self->armed = true;
-    self->hosted = self->observed = false;
+    self->observed = false;
     self->watchdog_us = now_us;
     cart_guards_reset(&self->guards);
+}
+
+/* Give the motor to the host. The policy's last value does not outlive it. */
+static void take_over(cart *self, uint64_t now_us)
+{
+    if (self->self_driven)
+        cart_line_stop(&self->line, now_us);
+    self->self_driven = false;
 }
 
 static void begin_homing(cart *self)
@@ -149,15 +160,21 @@ static void carry_out(cart *self, const cart_envelope *envelope, uint64_t now_us
 {
     switch (envelope->type) {
     case CART_SET_MOTOR:
-        self->commanded = self->hosted = true;
+        take_over(self, now_us);
+        self->commanded = true;
         self->command_us = self->watchdog_us = now_us;
         cart_line_command(&self->line, now_us, cart_read_i16(envelope->payload));
         break;
     case CART_START:
+        take_over(self, now_us);
         arm(self, now_us);
         break;
+    case CART_START_POLICY:
+        arm(self, now_us);
+        self->self_driven = true;
+        break;
     case CART_STOP:
-        self->armed = self->homing = false;
+        self->armed = self->homing = self->self_driven = false;
         cart_line_stop(&self->line, now_us);
         break;
     case CART_HOME:
@@ -190,6 +207,8 @@ size_t cart_receive(cart *self, const uint8_t *stuffed, size_t length, uint64_t 
     if (reason != CART_ACCEPTED)
         return refuse(self, &envelope, reason, answer);
     carry_out(self, &envelope, now_us);
+    if (self->self_driven)
+        self->watchdog_us = now_us; /* any frame shows that the host is there */
     self->carried_out = envelope.type;
     self->last_sequence = envelope.sequence;
     if (envelope.type == CART_SET_MOTOR)
@@ -206,7 +225,7 @@ size_t cart_receive(cart *self, const uint8_t *stuffed, size_t length, uint64_t 
 static void latch(cart *self, uint16_t fault)
 {
     self->fault |= fault;
-    self->armed = self->homing = false;
+    self->armed = self->homing = self->self_driven = false;
     cart_line_hold(&self->line, 0);
     if (fault & (CART_FAULT_CART_ENCODER | CART_FAULT_POLE_ENCODER))
         self->homed = false;
@@ -260,12 +279,6 @@ static void step_homing(cart *self, const cart_reading *reading)
     }
 }
 
-/* True while a policy on the board chooses the motor values. */
-static bool drives_itself(const cart *self)
-{
-    return self->armed && self->policy != NULL && !self->hosted;
-}
-
 /* Let the policy on the board choose the motor value, as a host would after STATE. */
 static void ask_policy(cart *self, const cart_reading *reading)
 {
@@ -294,20 +307,20 @@ size_t cart_tick(cart *self, uint64_t now_us, int32_t cart_count, int32_t pole_c
     self->ticked_us = now_us;
     /* checked once a period: the limit has to pass by the next check at the latest */
     uint64_t limit_us = (uint64_t)(CART_WATCHDOG_PERIODS - 1) * self->period_us;
-    bool expired = self->armed && !drives_itself(self) && now_us - self->watchdog_us > limit_us;
-    if (expired)
+    self->expired = self->armed && now_us - self->watchdog_us > limit_us;
+    if (self->expired)
         cart_line_hold(&self->line, 0);
     if (self->armed || self->homing)
         check_faults(self, &reading);
     if (self->homing)
         step_homing(self, &reading);
     self->line.blocked = self->armed ? beyond(self, SOFT_LIMIT, cart_count) : 0;
-    uint8_t all_flags = (uint8_t)(flags(self) | (expired && self->armed ? CART_WATCHDOG : 0));
+    uint8_t all_flags = (uint8_t)(flags(self) | (self->expired && self->armed ? CART_WATCHDOG : 0));
     size_t length = 0;
     if (self->fault != faults_before)
         length = send_fault(self, all_flags, frames);
     length += send_state(self, all_flags, cart_count, pole_count, frames + length);
-    if (drives_itself(self))
+    if (self->self_driven && !self->expired)
         ask_policy(self, &reading);
     return length;
 }

@@ -34,16 +34,16 @@ typedef struct {
     int32_t pole_counts; /* from upright */
     int32_t soft_limit;  /* counts from the middle */
     uint32_t period_us;  /* since the counts before */
-    bool first;          /* the first observation since START */
+    bool first;          /* the first observation since START_POLICY */
 } cart_observation;
 
 /* A policy on the board: returns the motor value for an observation, in a bounded time. */
 typedef int16_t (*cart_policy)(void *memory, const cart_observation *observation);
 
 typedef struct {
-    /* Set these after cart_boot if the board has a policy. From START on, the policy chooses the motor value at
-       the end of each period, until the host sends a SET_MOTOR, which takes the motor over until the next START.
-       All rules apply, except for the watchdog while the policy drives. A value out of range counts as 0. */
+    /* Set these after cart_boot if the board has a policy. From START_POLICY on, the policy chooses the motor
+       value at the end of each period, until the host sends START or SET_MOTOR. All rules apply. While the
+       policy drives, any frame that the cart accepts keeps the watchdog quiet. A value out of range counts as 0. */
     cart_policy policy;
     void *policy_memory;
 
@@ -60,11 +60,12 @@ typedef struct {
     cart_guards guards;
     cart_zeros zeros;
     int32_t pole_zero;    /* raw count that is reported as 0 */
-    bool hosted;          /* a SET_MOTOR was accepted since START */
-    bool observed;        /* the policy was asked since START */
+    bool self_driven;     /* the policy chooses the motor values */
+    bool observed;        /* the policy was asked since START_POLICY */
+    bool expired;         /* the watchdog holds the motor at 0 since the newest period */
     bool commanded;       /* a SET_MOTOR was accepted since boot */
     uint64_t command_us;  /* arrival of the newest SET_MOTOR */
-    uint64_t watchdog_us; /* time of START or of the newest SET_MOTOR */
+    uint64_t watchdog_us; /* time of the newest frame that the watchdog counts */
     uint64_t ticked_us;
     uint32_t ticks;
     uint8_t last_sequence; /* of the host */
