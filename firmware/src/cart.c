@@ -130,6 +130,15 @@ static cart_reason objection(const cart *self, const cart_envelope *envelope)
     return objection_in_this_state(self, envelope->type);
 }
 
+/* 1 or -1 if the cart is within `inside` counts of the right or left stop, else 0. */
+static int8_t beyond(const cart *self, int32_t inside, int32_t cart_count)
+{
+    int32_t middle = cart_zeros_middle(&self->zeros);
+    if (cart_distance(cart_count, middle) < (int64_t)cart_zeros_half_span(&self->zeros) - inside)
+        return 0;
+    return cart_count > middle ? 1 : -1;
+}
+
 static void arm(cart *self, uint64_t now_us)
 {
     if (self->armed)
@@ -137,6 +146,7 @@ static void arm(cart *self, uint64_t now_us)
     self->armed = true;
     self->observed = false;
     self->watchdog_us = now_us;
+    self->line.blocked = beyond(self, SOFT_LIMIT, self->reading.cart);
     cart_guards_reset(&self->guards);
 }
 
@@ -231,15 +241,6 @@ static void latch(cart *self, uint16_t fault)
         self->homed = false;
 }
 
-/* 1 or -1 if the cart is within `inside` counts of the right or left stop, else 0. */
-static int8_t beyond(const cart *self, int32_t inside, int32_t cart_count)
-{
-    int32_t middle = cart_zeros_middle(&self->zeros);
-    if (cart_distance(cart_count, middle) < (int64_t)cart_zeros_half_span(&self->zeros) - inside)
-        return 0;
-    return cart_count > middle ? 1 : -1;
-}
-
 /* Latch new faults. Homing may touch the stops and detects a stall itself. */
 static void check_faults(cart *self, const cart_reading *reading)
 {
@@ -279,18 +280,6 @@ static void step_homing(cart *self, const cart_reading *reading)
     }
 }
 
-/* Let the policy on the board choose the motor value, as a host would after STATE. */
-static void ask_policy(cart *self, const cart_reading *reading)
-{
-    cart_observation observation = {reported_cart(self, reading->cart), reported_pole(self, reading->pole),
-                                    cart_zeros_half_span(&self->zeros) - SOFT_LIMIT, reading->period_us,
-                                    !self->observed};
-    int16_t motor = self->policy(self->policy_memory, &observation);
-    bool valid = motor <= CART_LARGEST_MOTOR && motor >= -CART_LARGEST_MOTOR;
-    self->observed = true;
-    cart_line_hold(&self->line, valid ? motor : 0);
-}
-
 static uint32_t length_of_period(const cart *self, uint64_t now_us)
 {
     uint64_t length_us = now_us - self->ticked_us;
@@ -303,6 +292,7 @@ size_t cart_tick(cart *self, uint64_t now_us, int32_t cart_count, int32_t pole_c
 {
     cart_reading reading = {cart_count, pole_count, length_of_period(self, now_us)};
     uint16_t faults_before = self->fault;
+    self->reading = reading;
     self->ticks++;
     self->ticked_us = now_us;
     /* checked once a period: the limit has to pass by the next check at the latest */
@@ -320,7 +310,19 @@ size_t cart_tick(cart *self, uint64_t now_us, int32_t cart_count, int32_t pole_c
     if (self->fault != faults_before)
         length = send_fault(self, all_flags, frames);
     length += send_state(self, all_flags, cart_count, pole_count, frames + length);
-    if (self->self_driven && !self->expired)
-        ask_policy(self, &reading);
     return length;
+}
+
+void cart_ask_policy(cart *self)
+{
+    if (!self->self_driven || self->expired)
+        return;
+    const cart_reading *reading = &self->reading;
+    cart_observation observation = {reported_cart(self, reading->cart), reported_pole(self, reading->pole),
+                                    cart_zeros_half_span(&self->zeros) - SOFT_LIMIT, reading->period_us,
+                                    self->period_us, !self->observed};
+    int16_t motor = self->policy(self->policy_memory, &observation);
+    bool valid = motor <= CART_LARGEST_MOTOR && motor >= -CART_LARGEST_MOTOR;
+    self->observed = true;
+    cart_line_hold(&self->line, valid ? motor : 0);
 }

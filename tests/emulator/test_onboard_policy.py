@@ -43,6 +43,7 @@ class Observation(ctypes.Structure):
         ("pole_counts", ctypes.c_int32),
         ("soft_limit", ctypes.c_int32),
         ("period_us", ctypes.c_uint32),
+        ("set_period_us", ctypes.c_uint32),
         ("first", ctypes.c_bool),
     )
 
@@ -55,7 +56,7 @@ class Board:
     """A homed cart whose policy is a Python function and drives, unless `start` is another message."""
 
     def __init__(self, choose: Callable[[Observation], int], start: Message = StartPolicy()) -> None:
-        self.observed: list[tuple[int, int, int, int, bool]] = []
+        self.observed: list[tuple[int, int, int, int, int, bool]] = []
 
         def called(memory: int, pointer: "ctypes._Pointer[Observation]") -> int:
             seen = pointer.contents
@@ -95,9 +96,9 @@ def test_it_observes_each_period_and_chooses_after_state():
     assert [motor for *_, motor in ticks] == [50, -90, 30]
     assert [state.motor_applied for state, *_ in ticks] == [0, 50, -90]
     assert board.observed == [
-        (500, 7, SOFT, 20_000, True),
-        (-900, 8, SOFT, 20_000, False),
-        (300, -5, SOFT, 20_000, False),
+        (500, 7, SOFT, 20_000, 20_000, True),
+        (-900, 8, SOFT, 20_000, 20_000, False),
+        (300, -5, SOFT, 20_000, 20_000, False),
     ]
 
 
@@ -206,6 +207,27 @@ def test_an_emulated_cart_drives_by_the_c_code_of_a_policy():
     assert min(state.cart_counts for state in states) < -50
     assert max(state.cart_counts for state in states) > 50
     assert driven.flags == Flags.ARMED | Flags.HOMED
+
+
+def test_the_c_code_of_a_policy_gives_0_at_another_period():
+    firmware = CFirmware(lambda: 0, policy=SHUTTLE)
+    firmware.homed = True
+    motors = []
+    for number, period_us in enumerate((10_000, 20_000), start=1):
+        for message in (Stop(), SetPeriod(period_us), StartPolicy()):
+            firmware.receive(encode_frame(message, 1)[:-1], number * 100_000)
+        firmware.tick(number * 100_000 + period_us, 0, 2048)
+        motors.append(firmware.drive(number * 100_000 + period_us, number * 100_000 + period_us + 1)[-1][1])
+    assert motors[0] == 0 != motors[1]
+
+
+@pytest.mark.parametrize("name", ["POLICY_CART_NANOMETRES_PER_COUNT", "POLICY_POLE_COUNTS_PER_TURN"])
+def test_a_policy_for_other_encoders_does_not_compile(name, tmp_path):
+    for file in ("policy.h", "policy.c"):
+        text = (SHUTTLE / file).read_text(encoding="utf-8")
+        tmp_path.joinpath(file).write_text(text.replace(f"{name} ", f"{name} 1"), encoding="utf-8")
+    with pytest.raises(EmulatorError, match="policy.h is for other encoders"):
+        build_library(tmp_path)
 
 
 def test_a_policy_needs_the_c_firmware():
