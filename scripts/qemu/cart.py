@@ -91,7 +91,7 @@ def build(folder: Path, policy: Path | None) -> Path:
     done = subprocess.run(make, capture_output=True, text=True)
     if done.returncode:
         sys.exit(f"the firmware was not compiled: {done.stderr.strip()}")
-    return folder / "qemu_an386.elf"
+    return folder / ("qemu_an386-policy.elf" if policy else "qemu_an386.elf")
 
 
 @contextmanager
