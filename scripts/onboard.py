@@ -8,9 +8,10 @@
 Any cart with the agent on its board will do: an emulated one as here, a processor in QEMU
 (scripts/qemu/cart.py --policy FOLDER --fast), or a real one.
 
-Homes the cart, sends START_POLICY, and then asks for the state in each period of one episode. That keeps
-the cart's watchdog quiet; no motor value leaves this computer. Prints one line for each episode: the score (6.2), the share of the time upright, and faults. A
-period whose state was not read counts as the next one that was. Exit status 1 if a fault was latched.
+Homes the cart, sends START_POLICY, and then asks for the state in each period of one episode, which keeps
+the cart's watchdog quiet; no motor value leaves this computer. Prints one line for each episode: the score
+(6.2), the share of the time upright, and faults. A period whose state was not read counts as the next one
+that was. Exit status 1 if a fault was latched.
 """
 
 import argparse

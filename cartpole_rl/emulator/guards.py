@@ -43,7 +43,10 @@ class JumpWatch:
         self._last: int | None = None
 
     def jumped(self, count: int, us: int) -> bool:
-        """Return whether this count is impossible `us` after the last one; one count may come from rounding."""
+        """Return whether this count is impossible `us` after the last one.
+
+        One count may come from rounding.
+        """
         last, self._last = self._last, count
         return last is not None and (abs(count - last) - 1) * 1_000_000 > self._fastest * us
 

@@ -201,7 +201,7 @@ def test_the_soft_limit_holds_from_the_first_command_on(side):
     bench.tick(side * SOFT)
     bench.send(Start())
     bench.send(SetMotor(side * 255))
-    state, flags = bench.tick(side * SOFT)
+    _, flags = bench.tick(side * SOFT)
     assert {motor for _, motor in bench.motors} == {0}
     assert flags & Flags.SOFT_LIMIT
     bench.send(SetMotor(-side * 255))
@@ -309,7 +309,10 @@ def test_a_cart_that_cannot_move_fails_to_home():
 
 @pytest.mark.parametrize("way", [1, -1])
 def test_homing_ends_when_the_cart_moves_the_wrong_way(way):
-    """A motor or an encoder is reversed: motor values to the left increase the count. It may roll at first."""
+    """A motor or an encoder is reversed: motor values to the left increase the count.
+
+    A healthy cart may roll the wrong way at first.
+    """
     bench, counts, speed = Bench(homed=False), 0.0, 500.0 if way < 0 else 0.0
     bench.send(Home())
     motor = 0

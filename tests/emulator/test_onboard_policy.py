@@ -33,6 +33,7 @@ from cartpole_rl.wire.messages import Message
 
 pytestmark = needs_compiler
 SOFT = 16704  # counts, of the nominal track
+START_POLICY = StartPolicy()
 
 
 class Observation(ctypes.Structure):
@@ -55,7 +56,7 @@ PolicyInC = ctypes.CFUNCTYPE(ctypes.c_int16, ctypes.c_void_p, ctypes.POINTER(Obs
 class Board:
     """A homed cart whose policy is a Python function and drives, unless `start` is another message."""
 
-    def __init__(self, choose: Callable[[Observation], int], start: Message = StartPolicy()) -> None:
+    def __init__(self, choose: Callable[[Observation], int], start: Message = START_POLICY) -> None:
         self.observed: list[tuple[int, int, int, int, int, bool]] = []
 
         def called(memory: int, pointer: "ctypes._Pointer[Observation]") -> int:
@@ -226,7 +227,7 @@ def test_a_policy_for_other_encoders_does_not_compile(name, tmp_path):
     for file in ("policy.h", "policy.c"):
         text = (SHUTTLE / file).read_text(encoding="utf-8")
         tmp_path.joinpath(file).write_text(text.replace(f"{name} ", f"{name} 1"), encoding="utf-8")
-    with pytest.raises(EmulatorError, match="policy.h is for other encoders"):
+    with pytest.raises(EmulatorError, match="for other encoders"):
         build_library(tmp_path)
 
 
