@@ -53,7 +53,7 @@ class Fault(IntFlag):
     STALL = 0x0002
     CART_ENCODER = 0x0004
     POLE_ENCODER = 0x0008
-    HOMING = 0x0010  # a stop was not found, the span was wrong by over 3 %, or the pole did not come to rest
+    HOMING = 0x0010  # the cart moved the wrong way, no stop was found, the span was wrong, or the pole swings
 
 
 class Reason(IntEnum):

@@ -44,8 +44,8 @@ typedef int16_t (*cart_policy)(void *memory, const cart_observation *observation
 
 typedef struct {
     /* Set these after cart_boot if the board has a policy. From START_POLICY on, the policy chooses the motor
-       value after each period, until the host sends START or SET_MOTOR. All rules apply. While the
-       policy drives, any frame that the cart accepts keeps the watchdog quiet. A value out of range counts as 0. */
+       value after each period, until the host sends START or SET_MOTOR. All rules apply. While the policy
+       drives, any frame that the cart accepts keeps the watchdog quiet. A value out of range counts as 0. */
     cart_policy policy;
     void *policy_memory;
 

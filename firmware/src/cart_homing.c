@@ -82,7 +82,7 @@ static double cart_speed(const cart_homing *homing, const cart_reading *reading)
     return metres(homing->before.cart, reading->cart) / seconds(reading);
 }
 
-/* True if the cart moves the wrong way, faster than at the beginning of the stage, when it may have rolled. */
+/* True if the cart moves the wrong way, faster than at the start of the stage, when it may have rolled. */
 static bool goes_astray(cart_homing *homing, const cart_reading *reading, int direction, double speed)
 {
     double wrong = -direction * speed;
@@ -127,7 +127,8 @@ static outcome centre(cart_homing *homing, const cart_reading *reading, int16_t 
     int32_t middle = cart_zeros_middle(&homing->zeros);
     if (cart_distance(middle, reading->cart) * CART_NANOMETRES < CENTRED_NM)
         return ENDS;
-    if ((cart_distance(middle, reading->cart) - cart_distance(middle, homing->start)) * CART_NANOMETRES > ASTRAY_NM)
+    int64_t added = cart_distance(middle, reading->cart) - cart_distance(middle, homing->start);
+    if (added * CART_NANOMETRES > ASTRAY_NM)
         return FAILS;
     double target = cart_limit(metres(reading->cart, middle), TRAVEL_SPEED); /* slows down over a second */
     double speed = cart_speed(homing, reading);

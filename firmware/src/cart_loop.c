@@ -48,7 +48,7 @@ static void receive(cart_loop *loop)
     }
 }
 
-/* Deadlines do not drift. After a late period, the next one is skipped if less than half of it would be left: a very
+/* Deadlines do not drift. After a late period, the next one is skipped if at most half of it is left: a very
    short period would make speeds out of single counts. */
 static void end_period(cart_loop *loop)
 {

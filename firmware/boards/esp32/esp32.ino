@@ -86,8 +86,8 @@ extern "C" void IRAM_ATTR esp_task_wdt_isr_user_handler(void)
     cut_motor();
 }
 
-/* If no period ends for HANG_MS, the board cuts the motor and restarts. The restart alone would not: it resets neither
-   LEDC nor the pins, so after any other panic the last motor value stays until setup(). */
+/* If no period ends for HANG_MS, the board cuts the motor and restarts. The restart alone does not cut it: it
+   resets neither LEDC nor the pins. So after any other panic the last motor value stays until setup(). */
 static void start_watchdog(void)
 {
     esp_task_wdt_config_t hang = {};

@@ -76,7 +76,7 @@
 
 #define CORE_MHZ 83u
 #define APB1_HZ 41500000u
-#define BAUD 921600u       /* APB1_HZ / 45 is 0.07 % more; the oscillator adds up to 1 % at room temperature */
+#define BAUD 921600u       /* APB1_HZ / 45 is 0.07 % more; the oscillator's own error adds to it */
 #define PWM_STEPS 255u     /* motor value 255 is always on */
 #define PWM_PRESCALER 16u  /* 83 MHz / 16 / 255 = 20.3 kHz */
 #define RECEIVE_BYTES 512u /* powers of two */
@@ -85,7 +85,7 @@
 static volatile uint8_t received[RECEIVE_BYTES], to_send[SEND_BYTES];
 static volatile uint32_t received_head, received_tail, send_head, send_tail;
 
-/* 83 MHz from the internal oscillator: 16 MHz / 16 * 332 / 4; peripherals of APB1 at half of it, their timers not. */
+/* 83 MHz from the internal oscillator: 16 MHz / 16 * 332 / 4; APB1 has half of it, its timers all of it. */
 static void start_clock(void)
 {
     FLASH_ACR = (1u << 9) | (1u << 8) | 2u; /* instruction cache, prefetch, two wait states */
@@ -176,8 +176,8 @@ static void start_port(void)
     NVIC_ISER1 = 1u << (USART2_INTERRUPT - 32u);
 }
 
-/* A board on which no period ends resets, which switches the motor off: after about 190 ms, between 130 and 350 ms
-   as its oscillator has 47 to 17 kHz. The longest period is 100 ms. */
+/* A board on which no period ends resets, which switches the motor off: after about 190 ms, or 130 to 350 ms
+   with an oscillator of 47 to 17 kHz. The longest period is 100 ms. */
 static void start_watchdog(void)
 {
     IWDG(0x0u) = 0xCCCCu;
@@ -227,7 +227,7 @@ int32_t cart_hardware_pole_count(void)
 
 void cart_hardware_set_motor(int16_t value)
 {
-    REGISTER(TIM3 + CR1) |= 2u; /* both change at the same end of a PWM cycle, so that they are never on together */
+    REGISTER(TIM3 + CR1) |= 2u; /* both change at the end of the same PWM cycle: never on together */
     REGISTER(TIM3 + CCR1) = value > 0 ? (uint32_t)value : 0u;
     REGISTER(TIM3 + CCR2) = value < 0 ? (uint32_t)-value : 0u;
     REGISTER(TIM3 + CR1) &= ~2u;
