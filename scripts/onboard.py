@@ -6,7 +6,8 @@
     scripts/onboard.py /dev/pts/5 --episodes 3
 
 Any cart with the agent on its board will do: an emulated one as here, a processor in QEMU
-(scripts/qemu/cart.py --policy FOLDER --fast), or a real one.
+(scripts/qemu/cart.py --policy FOLDER), or a real one. With --fast the board outruns this computer, and its
+watchdog interrupts the policy.
 
 Homes the cart, sends START_POLICY, and then asks for the state in each period of one episode, which keeps
 the cart's watchdog quiet; no motor value leaves this computer. Prints one line for each episode: the score
