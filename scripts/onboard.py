@@ -6,11 +6,13 @@
     scripts/onboard.py /dev/pts/5 --episodes 3
 
 Any cart with the agent on its board will do: an emulated one as here, a processor in QEMU
-(scripts/qemu/cart.py --policy FOLDER --fast), or a real one.
+(scripts/qemu/cart.py --policy FOLDER), or a real one. With --fast the board outruns this computer, and its
+watchdog interrupts the policy.
 
-Homes the cart, sends START, and then only listens, for the time of one episode; no motor value leaves this
-computer. Prints one line for each episode: the score (6.2), the share of the time upright, and faults. A
-period whose state was not read counts as the next one that was. Exit status 1 if a fault was latched.
+Homes the cart, sends START_POLICY, and then asks for the state in each period of one episode, which keeps
+the cart's watchdog quiet; no motor value leaves this computer. Prints one line for each episode: the score
+(6.2), the share of the time upright, and faults. A period whose state was not read counts as the next one
+that was. Exit status 1 if a fault was latched.
 """
 
 import argparse
@@ -30,10 +32,10 @@ PERIOD_US = 20_000
 
 
 def episode(cart: SerialCart, periods: int) -> list[State]:
-    """Home the cart, arm it and listen; return the states from START on, fewer if a fault ends it."""
+    """Home the cart, let its policy drive; return the states from then on, fewer if a fault ends it."""
     cart.home()
     cart.set_period(PERIOD_US)
-    cart.start()
+    cart.start_policy()
     states = [cart.poll_state()]
     while states[-1].tick < states[0].tick + periods and not states[-1].fault:
         states.append(cart.poll_state())

@@ -10,7 +10,7 @@ from cartpole_rl.wire.frames import END, open_envelope
 from cartpole_rl.wire.messages import MESSAGES
 
 LONGEST_ANSWER = 64  # bytes: 2 * CART_FRAME_BYTES
-SNAPSHOT_NUMBERS = 48
+SNAPSHOT_NUMBERS = 47
 
 
 class CartHead(ctypes.Structure):
@@ -103,7 +103,9 @@ class CFirmware:
 
     def tick(self, now_us: int, cart: int, pole: int) -> list[bytes]:
         """End a period with two raw counts: apply the rules and return the frames to send, STATE last."""
-        return self._frames(self._library.cart_tick(self._memory, now_us, cart, pole, self._answer))
+        length = self._library.cart_tick(self._memory, now_us, cart, pole, self._answer)
+        self._library.cart_ask_policy(self._memory)
+        return self._frames(length)
 
     def _frames(self, length: int) -> list[bytes]:
         return [frame + END for frame in self._answer.raw[:length].split(END)[:-1]]

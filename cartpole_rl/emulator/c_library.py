@@ -108,6 +108,7 @@ def load_library(policy: Path | None = None) -> ctypes.CDLL:
         "cart_drive": (ctypes.c_bool, [pointer, us, ctypes.POINTER(us)]),
         "cart_motor": (ctypes.c_int16, [pointer]),
         "cart_tick": (size, [pointer, us, ctypes.c_int32, ctypes.c_int32, ctypes.c_char_p]),
+        "cart_ask_policy": (None, [pointer]),
         "cart_runs": (size, [pointer, ctypes.c_char_p, size, ctypes.c_char_p]),
         "cart_snapshot": (None, [pointer, ctypes.POINTER(ctypes.c_int64)]),
     }

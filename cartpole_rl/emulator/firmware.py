@@ -39,6 +39,7 @@ from cartpole_rl.wire.messages import (
     SetMotor,
     SetPeriod,
     Start,
+    StartPolicy,
     State,
     Stop,
 )
@@ -53,6 +54,7 @@ HARD_LIMIT = round(0.008 / CART_METRES)  # counts inside a stop
 WATCHDOG_PERIODS = 3
 NO_AGE = 65535
 U32 = 0xFFFFFFFF
+UNDERSTOOD = {kind for kind in MESSAGES if not kind & FROM_CART} - {StartPolicy.TYPE}  # it has no policy
 NOMINAL_HALF_SPAN = round(SPAN / 2 / CART_METRES)
 
 
@@ -78,6 +80,7 @@ class Firmware:
         self._sequence = 0  # of the next frame sent
         self._ticks = 0
         self._ticked_us = 0
+        self._cart = 0  # raw count of the newest period
         self._reset_watches()
 
     @property
@@ -105,7 +108,7 @@ class Firmware:
     def tick(self, now_us: int, cart: int, pole: int) -> list[bytes]:
         """End a period with two raw counts: apply the rules and return the frames to send, STATE last."""
         reading = Reading(cart, pole, max(1, now_us - self._ticked_us))
-        self._ticks, self._ticked_us = self._ticks + 1, now_us
+        self._ticks, self._ticked_us, self._cart = self._ticks + 1, now_us, cart
         faults_before = self.fault
         # checked once a period: the limit has to pass by the next check at the latest
         expired = self.armed and now_us - self._watchdog_us > (WATCHDOG_PERIODS - 1) * self.period_us
@@ -124,7 +127,7 @@ class Firmware:
         """Carry out a frame and return the answer; None for SET_MOTOR, which the next STATE acknowledges."""
         if envelope.version != VERSION:
             return Reason.BAD_VERSION
-        if envelope.kind not in MESSAGES or envelope.kind & FROM_CART:
+        if envelope.kind not in UNDERSTOOD:
             return Reason.UNKNOWN_TYPE
         try:
             message = MESSAGES[envelope.kind].unpack(envelope.payload)
@@ -167,6 +170,7 @@ class Firmware:
                 self._line.command(now_us + self._delay_us(), motor)
             case Start() if not self.armed:
                 self.armed, self._watchdog_us = True, now_us
+                self._line.blocked = self._beyond(SOFT_LIMIT, self._cart)
                 self._reset_watches()
             case Stop():
                 self.armed, self._homing = False, None

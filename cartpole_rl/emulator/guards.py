@@ -8,7 +8,7 @@ from cartpole_rl.emulator.encoders import CART_METRES, CART_NANOMETRES, POLE_COU
 STALL_MOTOR = 200  # smallest motor value that moves any healthy cart
 STALL_US = 500_000
 STALL_COUNTS = round(0.001 / CART_METRES)
-PUSH_US = 100_000  # of such a push one way, after which the count must have changed
+PUSH_US = 100_000  # of such pushes one way, after which the count must have changed
 SPEED_CHANGE = 200_000  # um/s; 0.2 m/s turn any pole by several counts
 FASTEST_CART = 5_000_000_000 // CART_NANOMETRES  # counts/s; 5 m/s: over twice what the motor can reach here
 FASTEST_POLE = 16 * POLE_COUNTS  # counts/s; 16 turns a second is five times a fast swing
@@ -43,34 +43,36 @@ class JumpWatch:
         self._last: int | None = None
 
     def jumped(self, count: int, us: int) -> bool:
-        """Return whether this count is impossible `us` after the last one."""
+        """Return whether this count is impossible `us` after the last one.
+
+        One count may come from rounding.
+        """
         last, self._last = self._last, count
-        return last is not None and abs(count - last) * 1_000_000 > self._fastest * us
+        return last is not None and (abs(count - last) - 1) * 1_000_000 > self._fastest * us
 
 
 class FrozenCartWatch:
-    """Detects a cart count that does not change under a hard push one way and then the other.
+    """Detects a cart count that does not change under hard pushes in both directions.
 
     Under a push one way only, the cart itself may be held by a stop or an obstacle, which is a stall. An
-    obstacle on one side lets the cart move the other way, by at least one count.
+    obstacle on one side lets the cart move the other way, by at least one count. The period in which a push
+    begins does not count: pushes that change their direction in each period may move nothing.
     """
 
     def __init__(self) -> None:
         self._count: int | None = None
         self._direction = 0  # of the present push: 1, -1, or 0 for none
-        self._pushed_us = 0  # since it began, at most PUSH_US
-        self._pushed: set[int] = set()  # directions of long pushes since the count changed
+        self._pushed_us = {1: 0, -1: 0}  # in each direction since the count changed, at most PUSH_US
 
     def frozen(self, cart: int, motor: int, us: int) -> bool:
         """Return whether the encoder is frozen, after `us` under `motor` that ended at count `cart`."""
         direction = 0 if abs(motor) < STALL_MOTOR else 1 if motor > 0 else -1
-        self._pushed_us = min(PUSH_US, self._pushed_us + us) if direction == self._direction else 0
-        self._direction = direction
+        lasted, self._direction = direction != 0 and direction == self._direction, direction
         if cart != self._count:
-            self._count, self._pushed_us, self._pushed = cart, 0, set()
-        if direction and self._pushed_us >= PUSH_US:
-            self._pushed.add(direction)
-        return len(self._pushed) == 2
+            self._count, self._pushed_us = cart, {1: 0, -1: 0}
+        elif lasted:
+            self._pushed_us[direction] = min(PUSH_US, self._pushed_us[direction] + us)
+        return min(self._pushed_us.values()) >= PUSH_US
 
 
 class FrozenPoleWatch:

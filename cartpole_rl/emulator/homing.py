@@ -23,6 +23,7 @@ SPAN_TOLERANCE = SPAN_NM * 3 // 100  # nm
 SEARCH_SPEED = 0.08  # m/s, towards a stop
 TRAVEL_SPEED = 0.2  # m/s, far from a stop whose position is known
 TOUCH_ZONE = 60_000_000  # nm, distance from such a stop at which the slow search begins
+ASTRAY = 20_000_000  # nm, a motion the wrong way that means a reversed motor or encoder
 AGAINST_STOP = 400_000  # us under full push without motion that mean a stop
 STANDS = 300_000 // CART_NANOMETRES  # counts, largest motion in that time: 0.3 mm
 LONGEST_SEARCH = 30_000_000  # us for one stop
@@ -80,17 +81,22 @@ Procedure = Generator[int, Reading, Reading]
 
 
 class Window:
-    """The newest counts of one encoder, over a fixed time of `length_us`."""
+    """The newest counts of one encoder, over a time of at least `length_us`.
+
+    It holds as many counts as that time has of the shortest period so far.
+    """
 
     def __init__(self, length_us: int) -> None:
         self._length_us = length_us
+        self._shortest_us: int | None = None  # period so far
         self._counts: deque[int] = deque(maxlen=LONGEST_WINDOW)
         self._full = False
 
     def add(self, count: int, us: int) -> None:
         """Add a count, `us` after the last one."""
         self._counts.append(count)
-        length = min(LONGEST_WINDOW, -(-self._length_us // us) + 1)
+        self._shortest_us = us if self._shortest_us is None else min(us, self._shortest_us)
+        length = min(LONGEST_WINDOW, -(-self._length_us // self._shortest_us) + 1)
         self._full = len(self._counts) >= length
         while len(self._counts) > length:
             self._counts.popleft()
@@ -127,11 +133,19 @@ def home(hanging: int | None) -> Generator[int, Reading, Zeros]:
 
 
 def touch_stop(direction: int, expected: int | None, reading: Reading) -> Procedure:
-    """Move until a stop holds the cart. `expected` is the raw count of the stop, or None if it is unknown."""
+    """Move until a stop holds the cart. `expected` is the raw count of the stop, or None if it is unknown.
+
+    Raises HomingError if the cart moves the wrong way, faster than at the beginning, when it may have rolled.
+    """
     servo, window, elapsed, before = SpeedServo(), Window(AGAINST_STOP), 0, reading.cart
+    start, rolled = reading.cart, 0.0
     while elapsed < LONGEST_SEARCH:
         far = expected is not None and abs(expected - reading.cart) * CART_NANOMETRES > TOUCH_ZONE
         speed = (reading.cart - before) * CART_METRES / reading.seconds
+        if elapsed <= reading.us:  # the first two readings give the first speed
+            rolled = -direction * speed
+        if (start - reading.cart) * direction * CART_NANOMETRES > ASTRAY and -direction * speed > rolled:
+            raise HomingError("the cart moves the wrong way: its motor or its encoder is reversed")
         before = reading.cart
         window.add(reading.cart, reading.us)
         motor = servo.motor(direction * (TRAVEL_SPEED if far else SEARCH_SPEED), speed, reading.seconds)
@@ -144,11 +158,13 @@ def touch_stop(direction: int, expected: int | None, reading: Reading) -> Proced
 
 def centre(middle: int, reading: Reading) -> Procedure:
     """Move gently to the middle and switch the motor off."""
-    servo, elapsed, before = SpeedServo(), 0, reading.cart
+    servo, elapsed, before, start = SpeedServo(), 0, reading.cart, reading.cart
     while elapsed < LONGEST_CENTRING:
         away = middle - reading.cart
         if abs(away) * CART_NANOMETRES < CENTRED:
             return reading
+        if (abs(away) - abs(middle - start)) * CART_NANOMETRES > ASTRAY:
+            raise HomingError("the cart moves away from the middle")
         speed_here = away * CART_METRES  # m/s: it slows down over the last second
         target = max(-TRAVEL_SPEED, min(TRAVEL_SPEED, speed_here))
         speed = (reading.cart - before) * CART_METRES / reading.seconds

@@ -27,7 +27,7 @@ class EmulatorSettings(Settings):
     firmware: Literal["python", "c"] = (
         "python"  # the reference, or the portable C of a real cart, compiled on first use
     )
-    policy: Path | None = None  # folder of an agent in C that drives on the board; needs firmware=c
+    policy: Path | None = None  # folder of an agent in C that drives after START_POLICY; needs firmware=c
     seed: Annotated[int, Field(ge=0)] = (
         0  # of latencies, disturbed frames, boot position and the hand's angle
     )

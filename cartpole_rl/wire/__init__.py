@@ -18,6 +18,7 @@ from cartpole_rl.wire.messages import (
     SetMotor,
     SetPeriod,
     Start,
+    StartPolicy,
     State,
     Stop,
 )
@@ -40,6 +41,7 @@ __all__ = [
     "SetMotor",
     "SetPeriod",
     "Start",
+    "StartPolicy",
     "State",
     "Stop",
     "decode_frame",

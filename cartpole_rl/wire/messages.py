@@ -1,6 +1,6 @@
 """The messages of protocol version 1. Numbers are little-endian; `LAYOUT` is a payload in `struct` notation.
 
-Host to cart: HELLO, START, STOP, SET_MOTOR, HOME, CLEAR_FAULT, SET_PERIOD.
+Host to cart: HELLO, START, STOP, SET_MOTOR, HOME, CLEAR_FAULT, SET_PERIOD, START_POLICY.
 Cart to host: INFO, STATE (each period), ACK, NACK, FAULT.
 
 To add a message, add its type and its class; docs/extending.md shows all steps.
@@ -26,6 +26,7 @@ class MessageType(IntEnum):
     HOME = 0x05
     CLEAR_FAULT = 0x06
     SET_PERIOD = 0x07
+    START_POLICY = 0x08
     INFO = 0x81
     STATE = 0x82
     ACK = 0x83
@@ -52,7 +53,7 @@ class Fault(IntFlag):
     STALL = 0x0002
     CART_ENCODER = 0x0004
     POLE_ENCODER = 0x0008
-    HOMING = 0x0010  # a stop was not found, the span was wrong by over 3 %, or the pole did not come to rest
+    HOMING = 0x0010  # the cart moved the wrong way, no stop was found, the span was wrong, or the pole swings
 
 
 class Reason(IntEnum):
@@ -151,6 +152,13 @@ class SetPeriod(Message):
     TYPE = MessageType.SET_PERIOD
     LAYOUT = "I"
     period_us: int
+
+
+@dataclass(frozen=True)
+class StartPolicy(Message):
+    """Arms the motor and lets the policy on the board drive. Unknown to a cart without one."""
+
+    TYPE = MessageType.START_POLICY
 
 
 @dataclass(frozen=True)

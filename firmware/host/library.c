@@ -98,9 +98,8 @@ static void add_guards(list *all, const cart_guards *guards)
     add(all, cart_freezes->counted);
     add(all, cart_freezes->count);
     add(all, cart_freezes->direction);
-    add(all, cart_freezes->pushed_us);
-    add(all, cart_freezes->right);
-    add(all, cart_freezes->left);
+    add(all, cart_freezes->right_us);
+    add(all, cart_freezes->left_us);
     add(all, pole_freezes->moved);
     add(all, pole_freezes->cart);
     add(all, pole_freezes->counted);

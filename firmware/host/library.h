@@ -4,7 +4,7 @@
 
 #include "cart.h"
 
-#define CART_SNAPSHOT_NUMBERS 48
+#define CART_SNAPSHOT_NUMBERS 47
 
 /* Give a cart that has just booted the policy with which the library was compiled, if any. */
 void cart_attach_policy(cart *self);

@@ -90,14 +90,17 @@ static cart_reason objection_in_this_state(const cart *self, uint8_t type)
 {
     bool sets = type == CART_SET_PERIOD;
     bool homes = type == CART_HOME;
-    bool drives = type == CART_SET_MOTOR || type == CART_START;
+    bool starts = type == CART_START || type == CART_START_POLICY;
+    bool drives = type == CART_SET_MOTOR || starts;
     if (self->homing && (sets || homes || drives))
         return CART_BUSY;
     if (self->armed && (sets || homes))
         return CART_BUSY;
+    if (self->armed && type == CART_START_POLICY && !self->self_driven)
+        return CART_BUSY;
     if (self->fault && (homes || drives))
         return CART_FAULT_LATCHED;
-    if (type == CART_START && !self->homed)
+    if (starts && !self->homed)
         return CART_NOT_HOMED;
     if (type == CART_SET_MOTOR && !self->armed)
         return CART_NOT_ARMED;
@@ -110,7 +113,7 @@ static cart_reason objection(const cart *self, const cart_envelope *envelope)
     int expected = cart_host_payload(envelope->type);
     if (envelope->version != CART_VERSION)
         return CART_BAD_VERSION;
-    if (expected < 0)
+    if (expected < 0 || (envelope->type == CART_START_POLICY && self->policy == NULL))
         return CART_UNKNOWN_TYPE;
     if (envelope->payload_length != (size_t)expected)
         return CART_BAD_LENGTH;
@@ -127,14 +130,32 @@ static cart_reason objection(const cart *self, const cart_envelope *envelope)
     return objection_in_this_state(self, envelope->type);
 }
 
+/* 1 or -1 if the cart is within `inside` counts of the right or left stop, else 0. */
+static int8_t beyond(const cart *self, int32_t inside, int32_t cart_count)
+{
+    int32_t middle = cart_zeros_middle(&self->zeros);
+    if (cart_distance(cart_count, middle) < (int64_t)cart_zeros_half_span(&self->zeros) - inside)
+        return 0;
+    return cart_count > middle ? 1 : -1;
+}
+
 static void arm(cart *self, uint64_t now_us)
 {
     if (self->armed)
         return;
     self->armed = true;
-    self->hosted = self->observed = false;
+    self->observed = false;
     self->watchdog_us = now_us;
+    self->line.blocked = beyond(self, SOFT_LIMIT, self->reading.cart);
     cart_guards_reset(&self->guards);
+}
+
+/* Give the motor to the host. The policy's last value does not outlive it. */
+static void take_over(cart *self, uint64_t now_us)
+{
+    if (self->self_driven)
+        cart_line_stop(&self->line, now_us);
+    self->self_driven = false;
 }
 
 static void begin_homing(cart *self)
@@ -149,15 +170,21 @@ static void carry_out(cart *self, const cart_envelope *envelope, uint64_t now_us
 {
     switch (envelope->type) {
     case CART_SET_MOTOR:
-        self->commanded = self->hosted = true;
+        take_over(self, now_us);
+        self->commanded = true;
         self->command_us = self->watchdog_us = now_us;
         cart_line_command(&self->line, now_us, cart_read_i16(envelope->payload));
         break;
     case CART_START:
+        take_over(self, now_us);
         arm(self, now_us);
         break;
+    case CART_START_POLICY:
+        arm(self, now_us);
+        self->self_driven = true;
+        break;
     case CART_STOP:
-        self->armed = self->homing = false;
+        self->armed = self->homing = self->self_driven = false;
         cart_line_stop(&self->line, now_us);
         break;
     case CART_HOME:
@@ -190,6 +217,8 @@ size_t cart_receive(cart *self, const uint8_t *stuffed, size_t length, uint64_t 
     if (reason != CART_ACCEPTED)
         return refuse(self, &envelope, reason, answer);
     carry_out(self, &envelope, now_us);
+    if (self->self_driven)
+        self->watchdog_us = now_us; /* any frame shows that the host is there */
     self->carried_out = envelope.type;
     self->last_sequence = envelope.sequence;
     if (envelope.type == CART_SET_MOTOR)
@@ -206,19 +235,10 @@ size_t cart_receive(cart *self, const uint8_t *stuffed, size_t length, uint64_t 
 static void latch(cart *self, uint16_t fault)
 {
     self->fault |= fault;
-    self->armed = self->homing = false;
+    self->armed = self->homing = self->self_driven = false;
     cart_line_hold(&self->line, 0);
     if (fault & (CART_FAULT_CART_ENCODER | CART_FAULT_POLE_ENCODER))
         self->homed = false;
-}
-
-/* 1 or -1 if the cart is within `inside` counts of the right or left stop, else 0. */
-static int8_t beyond(const cart *self, int32_t inside, int32_t cart_count)
-{
-    int32_t middle = cart_zeros_middle(&self->zeros);
-    if (cart_distance(cart_count, middle) < (int64_t)cart_zeros_half_span(&self->zeros) - inside)
-        return 0;
-    return cart_count > middle ? 1 : -1;
 }
 
 /* Latch new faults. Homing may touch the stops and detects a stall itself. */
@@ -260,24 +280,6 @@ static void step_homing(cart *self, const cart_reading *reading)
     }
 }
 
-/* True while a policy on the board chooses the motor values. */
-static bool drives_itself(const cart *self)
-{
-    return self->armed && self->policy != NULL && !self->hosted;
-}
-
-/* Let the policy on the board choose the motor value, as a host would after STATE. */
-static void ask_policy(cart *self, const cart_reading *reading)
-{
-    cart_observation observation = {reported_cart(self, reading->cart), reported_pole(self, reading->pole),
-                                    cart_zeros_half_span(&self->zeros) - SOFT_LIMIT, reading->period_us,
-                                    !self->observed};
-    int16_t motor = self->policy(self->policy_memory, &observation);
-    bool valid = motor <= CART_LARGEST_MOTOR && motor >= -CART_LARGEST_MOTOR;
-    self->observed = true;
-    cart_line_hold(&self->line, valid ? motor : 0);
-}
-
 static uint32_t length_of_period(const cart *self, uint64_t now_us)
 {
     uint64_t length_us = now_us - self->ticked_us;
@@ -290,24 +292,37 @@ size_t cart_tick(cart *self, uint64_t now_us, int32_t cart_count, int32_t pole_c
 {
     cart_reading reading = {cart_count, pole_count, length_of_period(self, now_us)};
     uint16_t faults_before = self->fault;
+    self->reading = reading;
     self->ticks++;
     self->ticked_us = now_us;
     /* checked once a period: the limit has to pass by the next check at the latest */
     uint64_t limit_us = (uint64_t)(CART_WATCHDOG_PERIODS - 1) * self->period_us;
-    bool expired = self->armed && !drives_itself(self) && now_us - self->watchdog_us > limit_us;
-    if (expired)
+    self->expired = self->armed && now_us - self->watchdog_us > limit_us;
+    if (self->expired)
         cart_line_hold(&self->line, 0);
     if (self->armed || self->homing)
         check_faults(self, &reading);
     if (self->homing)
         step_homing(self, &reading);
     self->line.blocked = self->armed ? beyond(self, SOFT_LIMIT, cart_count) : 0;
-    uint8_t all_flags = (uint8_t)(flags(self) | (expired && self->armed ? CART_WATCHDOG : 0));
+    uint8_t all_flags = (uint8_t)(flags(self) | (self->expired && self->armed ? CART_WATCHDOG : 0));
     size_t length = 0;
     if (self->fault != faults_before)
         length = send_fault(self, all_flags, frames);
     length += send_state(self, all_flags, cart_count, pole_count, frames + length);
-    if (drives_itself(self))
-        ask_policy(self, &reading);
     return length;
+}
+
+void cart_ask_policy(cart *self)
+{
+    if (!self->self_driven || self->expired)
+        return;
+    const cart_reading *reading = &self->reading;
+    cart_observation observation = {reported_cart(self, reading->cart), reported_pole(self, reading->pole),
+                                    cart_zeros_half_span(&self->zeros) - SOFT_LIMIT, reading->period_us,
+                                    self->period_us, !self->observed};
+    int16_t motor = self->policy(self->policy_memory, &observation);
+    bool valid = motor <= CART_LARGEST_MOTOR && motor >= -CART_LARGEST_MOTOR;
+    self->observed = true;
+    cart_line_hold(&self->line, valid ? motor : 0);
 }

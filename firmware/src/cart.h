@@ -7,7 +7,8 @@
      cart_drive     after cart_receive and before cart_tick, until it returns false: it brings motor values
                     into force; then put cart_motor on the motor
      cart_tick      once at the end of each period of `period_us`, with the raw counts measured now; then put
-                    cart_motor on the motor at once
+                    cart_motor on the motor at once and send the frames
+     cart_ask_policy  after cart_tick and the sending of its frames; then put cart_motor on the motor
 
    All from one thread, never from an interrupt. No function blocks, allocates or recurses. Each takes a
    bounded time; the longest, cart_tick while homing, passes a few times over CART_WINDOW_COUNTS counts.
@@ -34,16 +35,17 @@ typedef struct {
     int32_t pole_counts; /* from upright */
     int32_t soft_limit;  /* counts from the middle */
     uint32_t period_us;  /* since the counts before */
-    bool first;          /* the first observation since START */
+    uint32_t set_period_us;
+    bool first; /* the first observation since START_POLICY */
 } cart_observation;
 
 /* A policy on the board: returns the motor value for an observation, in a bounded time. */
 typedef int16_t (*cart_policy)(void *memory, const cart_observation *observation);
 
 typedef struct {
-    /* Set these after cart_boot if the board has a policy. From START on, the policy chooses the motor value at
-       the end of each period, until the host sends a SET_MOTOR, which takes the motor over until the next START.
-       All rules apply, except for the watchdog while the policy drives. A value out of range counts as 0. */
+    /* Set these after cart_boot if the board has a policy. From START_POLICY on, the policy chooses the motor
+       value after each period, until the host sends START or SET_MOTOR. All rules apply. While the policy
+       drives, any frame that the cart accepts keeps the watchdog quiet. A value out of range counts as 0. */
     cart_policy policy;
     void *policy_memory;
 
@@ -60,12 +62,14 @@ typedef struct {
     cart_guards guards;
     cart_zeros zeros;
     int32_t pole_zero;    /* raw count that is reported as 0 */
-    bool hosted;          /* a SET_MOTOR was accepted since START */
-    bool observed;        /* the policy was asked since START */
+    bool self_driven;     /* the policy chooses the motor values */
+    bool observed;        /* the policy was asked since START_POLICY */
+    bool expired;         /* the watchdog holds the motor at 0 since the newest period */
     bool commanded;       /* a SET_MOTOR was accepted since boot */
     uint64_t command_us;  /* arrival of the newest SET_MOTOR */
-    uint64_t watchdog_us; /* time of START or of the newest SET_MOTOR */
+    uint64_t watchdog_us; /* time of the newest frame that the watchdog counts */
     uint64_t ticked_us;
+    cart_reading reading; /* of the newest period */
     uint32_t ticks;
     uint8_t last_sequence; /* of the host */
     uint8_t sequence;      /* of the next frame sent */
@@ -88,6 +92,9 @@ int16_t cart_motor(const cart *self);
 /* End a period: apply the rules; write FAULT, if one was latched, and STATE, at most 2 * CART_FRAME_BYTES,
    and return their length. */
 size_t cart_tick(cart *self, uint64_t now_us, int32_t cart_count, int32_t pole_count, uint8_t *frames);
+
+/* Let the policy choose the motor value if it drives. */
+void cart_ask_policy(cart *self);
 
 #ifdef __cplusplus
 }

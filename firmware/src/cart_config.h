@@ -1,4 +1,5 @@
-/* The numbers of one cart. A build for other hardware overrides them with -D or edits this file. */
+/* The numbers of one cart. A build for other hardware overrides them with -D or edits this file. No count is
+   converted: the host needs the same numbers (docs/extending.md). */
 #ifndef CART_CONFIG_H
 #define CART_CONFIG_H
 

@@ -7,7 +7,7 @@
 #define HARD_PUSH 200 /* smallest motor value that moves any healthy cart */
 #define STALL_US 500000u
 #define STALL_COUNTS CART_COUNTS(1000)
-#define PUSH_US 100000u        /* of a hard push one way, after which the count must have changed */
+#define PUSH_US 100000u        /* of hard pushes one way, after which the count must have changed */
 #define SPEED_CHANGE 200000    /* um/s; 0.2 m/s turn any pole by several counts */
 #define FASTEST_CART (5000000000LL / CART_NANOMETRES) /* counts/s: 5 m/s */
 #define FASTEST_POLE (16LL * CART_POLE_COUNTS)        /* counts/s: 16 turns a second */
@@ -39,13 +39,14 @@ bool cart_stalled(cart_stall_watch *watch, int32_t cart, int16_t motor, uint32_t
     return watch->pushed_us >= STALL_US;
 }
 
+/* One count may come from rounding. */
 static bool jumped(cart_jump_watch *watch, int32_t count, uint32_t period_us, int64_t fastest)
 {
     bool first = !watch->counted;
     int64_t moved = cart_distance(count, watch->last);
     watch->counted = true;
     watch->last = count;
-    return !first && moved * SECOND_US > fastest * (int64_t)period_us;
+    return !first && (moved - 1) * SECOND_US > fastest * (int64_t)period_us;
 }
 
 bool cart_cart_jumped(cart_jump_watch *watch, int32_t cart, uint32_t period_us)
@@ -61,23 +62,18 @@ bool cart_pole_jumped(cart_jump_watch *watch, int32_t pole, uint32_t period_us)
 bool cart_cart_frozen(cart_frozen_cart_watch *watch, int32_t cart, int16_t motor, uint32_t period_us)
 {
     int8_t direction = push(motor);
-    uint32_t left_us = PUSH_US - watch->pushed_us;
-    if (direction == watch->direction)
-        watch->pushed_us += period_us < left_us ? period_us : left_us;
-    else
-        watch->pushed_us = 0;
+    bool lasted = direction != 0 && direction == watch->direction; /* the push began before this period */
     watch->direction = direction;
     if (!watch->counted || cart != watch->count) {
         watch->counted = true;
         watch->count = cart;
-        watch->pushed_us = 0;
-        watch->right = watch->left = false;
+        watch->right_us = watch->left_us = 0;
+    } else if (lasted) {
+        uint32_t *pushed_us = direction > 0 ? &watch->right_us : &watch->left_us;
+        uint32_t left_us = PUSH_US - *pushed_us;
+        *pushed_us += period_us < left_us ? period_us : left_us;
     }
-    if (watch->pushed_us >= PUSH_US) {
-        watch->right = watch->right || direction > 0;
-        watch->left = watch->left || direction < 0;
-    }
-    return watch->right && watch->left;
+    return watch->right_us >= PUSH_US && watch->left_us >= PUSH_US;
 }
 
 bool cart_pole_frozen(cart_frozen_pole_watch *watch, int32_t pole, int32_t cart, uint32_t period_us)

@@ -23,9 +23,8 @@ typedef struct {
 typedef struct {
     bool counted; /* `count` is a count */
     int32_t count;
-    int8_t direction;   /* of the present push: 1, -1, or 0 for none */
-    uint32_t pushed_us; /* since it began, not beyond the length that is needed */
-    bool right, left;   /* long pushes since the count changed */
+    int8_t direction;           /* of the present push: 1, -1, or 0 for none */
+    uint32_t right_us, left_us; /* of pushes since the count changed, not beyond the time that is needed */
 } cart_frozen_cart_watch;
 
 typedef struct {

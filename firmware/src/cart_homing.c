@@ -11,6 +11,7 @@
 #define SEARCH_SPEED 0.08 /* m/s, towards a stop */
 #define TRAVEL_SPEED 0.2  /* m/s, far from a stop whose position is known */
 #define TOUCH_ZONE_NM 60000000 /* distance from such a stop at which the slow search begins */
+#define ASTRAY_NM 20000000 /* a motion the wrong way that means a reversed motor or encoder */
 #define AGAINST_STOP_US 400000u /* under full push without motion that mean a stop */
 #define STANDS_COUNTS (300000 / CART_NANOMETRES) /* largest motion in that time: 0.3 mm */
 #define LONGEST_SEARCH_US 30000000u /* for one stop */
@@ -68,6 +69,7 @@ static bool first_reading(cart_homing *homing, const cart_reading *reading, uint
         return false;
     }
     homing->entered = true;
+    homing->start = reading->cart;
     homing->elapsed_us = 0;
     homing->before = *reading;
     cart_servo_reset(&homing->servo);
@@ -80,6 +82,16 @@ static double cart_speed(const cart_homing *homing, const cart_reading *reading)
     return metres(homing->before.cart, reading->cart) / seconds(reading);
 }
 
+/* True if the cart moves the wrong way, faster than at the start of the stage, when it may have rolled. */
+static bool goes_astray(cart_homing *homing, const cart_reading *reading, int direction, double speed)
+{
+    double wrong = -direction * speed;
+    int64_t moved = ((int64_t)homing->start - reading->cart) * direction;
+    if (homing->elapsed_us <= reading->period_us)
+        homing->rolled = wrong; /* the first two readings give the first speed */
+    return moved * CART_NANOMETRES > ASTRAY_NM && wrong > homing->rolled;
+}
+
 /* Move until a stop holds the cart. The right stop is expected one span from the left one. */
 static outcome touch_stop(cart_homing *homing, const cart_reading *reading, int direction, int16_t *motor)
 {
@@ -90,6 +102,8 @@ static outcome touch_stop(cart_homing *homing, const cart_reading *reading, int 
     int64_t away = expected > reading->cart ? expected - reading->cart : reading->cart - expected;
     bool far = direction > 0 && away * CART_NANOMETRES > TOUCH_ZONE_NM;
     double speed = cart_speed(homing, reading);
+    if (goes_astray(homing, reading, direction, speed))
+        return FAILS;
     homing->before = *reading;
     cart_window_add(&homing->window, reading->cart, reading->period_us);
     *motor = cart_servo_motor(&homing->servo, direction * (far ? TRAVEL_SPEED : SEARCH_SPEED), speed,
@@ -113,6 +127,9 @@ static outcome centre(cart_homing *homing, const cart_reading *reading, int16_t 
     int32_t middle = cart_zeros_middle(&homing->zeros);
     if (cart_distance(middle, reading->cart) * CART_NANOMETRES < CENTRED_NM)
         return ENDS;
+    int64_t added = cart_distance(middle, reading->cart) - cart_distance(middle, homing->start);
+    if (added * CART_NANOMETRES > ASTRAY_NM)
+        return FAILS;
     double target = cart_limit(metres(reading->cart, middle), TRAVEL_SPEED); /* slows down over a second */
     double speed = cart_speed(homing, reading);
     homing->before = *reading;

@@ -48,7 +48,8 @@ static void receive(cart_loop *loop)
     }
 }
 
-/* Deadlines do not drift. A period that was missed altogether is skipped. */
+/* Deadlines do not drift. After a late period, the next one is skipped if at most half of it is left: a very
+   short period would make speeds out of single counts. */
 static void end_period(cart_loop *loop)
 {
     uint8_t frames[2 * CART_FRAME_BYTES];
@@ -58,8 +59,10 @@ static void end_period(cart_loop *loop)
     size_t length = cart_tick(&loop->core, loop->now_us, cart_count, pole_count, frames);
     apply_motor(loop);
     cart_hardware_write(frames, length);
+    cart_ask_policy(&loop->core);
+    apply_motor(loop);
     loop->end_us += loop->core.period_us;
-    if (loop->end_us <= loop->now_us)
+    if (loop->end_us <= loop->now_us + loop->core.period_us / 2)
         loop->end_us = loop->now_us + loop->core.period_us;
 }
 

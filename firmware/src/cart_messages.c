@@ -10,6 +10,7 @@ int cart_host_payload(uint8_t type)
     case CART_STOP:
     case CART_HOME:
     case CART_CLEAR_FAULT:
+    case CART_START_POLICY:
         return 0;
     case CART_SET_MOTOR:
         return 2;

@@ -13,6 +13,7 @@ enum {
     CART_HOME = 0x05,
     CART_CLEAR_FAULT = 0x06,
     CART_SET_PERIOD = 0x07,
+    CART_START_POLICY = 0x08,
     CART_INFO = 0x81,
     CART_STATE = 0x82,
     CART_ACK = 0x83,

@@ -5,6 +5,7 @@
 void cart_window_reset(cart_window *window, uint32_t length_us)
 {
     window->length_us = length_us;
+    window->shortest_us = UINT32_MAX;
     window->first = window->used = 0;
     window->full = false;
 }
@@ -16,7 +17,10 @@ static int32_t count_at(const cart_window *window, uint32_t number)
 
 void cart_window_add(cart_window *window, int32_t count, uint32_t period_us)
 {
-    uint32_t length = (window->length_us + period_us - 1) / period_us + 1;
+    if (period_us < window->shortest_us)
+        window->shortest_us = period_us;
+    /* so many of the shortest periods, and so any periods, last at least `length_us` */
+    uint32_t length = (window->length_us + window->shortest_us - 1) / window->shortest_us + 1;
     if (length > CART_WINDOW_COUNTS)
         length = CART_WINDOW_COUNTS;
     if (window->used == CART_WINDOW_COUNTS) {

@@ -12,6 +12,7 @@
 
 typedef struct {
     uint32_t length_us;
+    uint32_t shortest_us; /* period so far */
     uint16_t first; /* index of the oldest count */
     uint16_t used;
     bool full; /* the counts cover `length_us` */

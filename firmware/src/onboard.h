@@ -5,6 +5,10 @@
 #include "cart.h"
 #include "policy.h"
 
+#if POLICY_CART_NANOMETRES_PER_COUNT != CART_NANOMETRES || POLICY_POLE_COUNTS_PER_TURN != CART_POLE_COUNTS
+#error "policy.h is for other encoders than cart_config.h: export the agent for this cart"
+#endif
+
 #ifndef CART_POLE_LENGTH
 #define CART_POLE_LENGTH 0.3556f /* m, twice the distance from pivot to centre of mass; few agents read it */
 #endif
@@ -12,6 +16,8 @@
 static inline int16_t onboard_motor(void *memory, const cart_observation *observation)
 {
     policy_t *policy = (policy_t *)memory;
+    if (observation->set_period_us != POLICY_PERIOD_US)
+        return 0; /* it was trained for another period */
     if (observation->first)
         policy_start(policy, (float)(observation->soft_limit * CART_METRES), CART_POLE_LENGTH);
     return policy_motor(policy, observation->cart_counts, observation->pole_counts,

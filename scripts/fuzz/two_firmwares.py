@@ -122,7 +122,7 @@ class Pair:
 def any_frame(dice: random.Random) -> bytes:
     """Return a frame with a right checksum: mostly of a known type and length, with any content."""
     version = 1 if dice.random() < 0.95 else dice.randrange(256)
-    kind = dice.randrange(1, 8) if dice.random() < 0.9 else dice.randrange(256)
+    kind = dice.randrange(1, 9) if dice.random() < 0.9 else dice.randrange(256)
     length = {4: 2, 7: 4}.get(kind, 0) if dice.random() < 0.9 else dice.randrange(48)
     payload = dice.randbytes(length)
     if kind == SetMotor.TYPE and length == 2:

@@ -39,6 +39,7 @@ from cartpole_rl.wire import (
     SetMotor,
     SetPeriod,
     Start,
+    StartPolicy,
     State,
     Stop,
     cobs,
@@ -49,7 +50,16 @@ from cartpole_rl.wire.frames import END, LONGEST_FRAME, Envelope, open_envelope
 
 CHUNK = 4096  # bytes, as one read of a port returns
 TICK_EVERY = 64  # runs of bytes between two periods of the firmware
-FROM_HOST: list[Message] = [Hello(), Start(), Stop(), SetMotor(-200), Home(), ClearFault(), SetPeriod(20_000)]
+FROM_HOST: list[Message] = [
+    Hello(),
+    Start(),
+    Stop(),
+    SetMotor(-200),
+    Home(),
+    ClearFault(),
+    SetPeriod(20_000),
+    StartPolicy(),
+]
 FROM_CART: list[Message] = [
     Info(1, 0, 0, 4096, 22749, 255, 16704, 17539, 20_000),
     State(1169, 23_380_000, 43, 2051, -200, 4, 0, 20),

@@ -4,7 +4,7 @@
     scripts/qemu/cart.py                           # prints {"port": "/dev/pts/5", ...} and runs until Ctrl-C
     scripts/qemu/cart.py '{"cart_viscous": 1.0}'   # true parameters of the cart, see docs/emulator.md
     cartpole-evaluate run=... plant=serial plant.port=/dev/pts/5
-    scripts/qemu/cart.py --policy FOLDER --fast    # with an agent on the board; see scripts/onboard.py
+    scripts/qemu/cart.py --policy FOLDER           # with an agent on the board; see scripts/onboard.py
 
 Needs the Debian packages qemu-system-arm, gcc-arm-none-eabi, libnewlib-arm-none-eabi and make. It compiles
 firmware/ for the board qemu_an386. UART 0 of the board is a pseudo-terminal, which a host opens like any
@@ -91,7 +91,7 @@ def build(folder: Path, policy: Path | None) -> Path:
     done = subprocess.run(make, capture_output=True, text=True)
     if done.returncode:
         sys.exit(f"the firmware was not compiled: {done.stderr.strip()}")
-    return folder / "qemu_an386.elf"
+    return folder / ("qemu_an386-policy.elf" if policy else "qemu_an386.elf")
 
 
 @contextmanager

@@ -196,6 +196,19 @@ def test_soft_limit_lets_the_cart_in_and_not_out(bench, side):
 
 
 @pytest.mark.parametrize("side", [1, -1])
+def test_the_soft_limit_holds_from_the_first_command_on(side):
+    bench = Bench()
+    bench.tick(side * SOFT)
+    bench.send(Start())
+    bench.send(SetMotor(side * 255))
+    _, flags = bench.tick(side * SOFT)
+    assert {motor for _, motor in bench.motors} == {0}
+    assert flags & Flags.SOFT_LIMIT
+    bench.send(SetMotor(-side * 255))
+    assert bench.tick(side * SOFT)[0].motor_applied == -side * 255
+
+
+@pytest.mark.parametrize("side", [1, -1])
 def test_hard_limit_latches_until_it_is_cleared(bench, side):
     bench.send(SetMotor(100))
     bench.tick(side * (HARD - 1))
@@ -292,6 +305,31 @@ def test_a_cart_that_cannot_move_fails_to_home():
     assert faults[0] == 0
     assert faults[-1] == Fault.HOMING
     assert bench.refusal(Home()) == Reason.FAULT_LATCHED
+
+
+@pytest.mark.parametrize("way", [1, -1])
+def test_homing_ends_when_the_cart_moves_the_wrong_way(way):
+    """A motor or an encoder is reversed: motor values to the left increase the count.
+
+    A healthy cart may roll the wrong way at first.
+    """
+    bench, counts, speed = Bench(homed=False), 0.0, 500.0 if way < 0 else 0.0
+    bench.send(Home())
+    motor = 0
+    for _ in range(150):
+        speed += -way * motor * 0.7 if abs(motor) > 50 else -0.1 * speed  # counts a period; 200: 3.5 m/s^2
+        counts += speed
+        state, _ = bench.tick(round(counts))
+        motor = state.motor_applied
+        if state.fault:
+            break
+    if way > 0:
+        assert state.fault == Fault.HOMING
+        assert counts < 0.06 / 22.749e-6
+        assert motor == 0
+    else:
+        assert state.fault == 0
+        assert counts > 0.02 / 22.749e-6 or speed < 0
 
 
 def test_an_armed_cart_is_not_homed_or_retimed(bench):

@@ -1,4 +1,4 @@
-"""A policy on the board drives from START on, under all rules, until the host takes over."""
+"""A policy on the board drives from START_POLICY on, under all rules, until the host takes over."""
 
 import ctypes
 from collections.abc import Callable
@@ -12,11 +12,28 @@ from cartpole_rl.emulator.c_firmware import CFirmware
 from cartpole_rl.emulator.c_library import build_library
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import EmulatorError
-from cartpole_rl.wire import Fault, Flags, Hello, SetMotor, Start, State, Stop, decode_frame, encode_frame
+from cartpole_rl.wire import (
+    Ack,
+    Fault,
+    Flags,
+    Hello,
+    MessageType,
+    Nack,
+    Reason,
+    SetMotor,
+    SetPeriod,
+    Start,
+    StartPolicy,
+    State,
+    Stop,
+    decode_frame,
+    encode_frame,
+)
 from cartpole_rl.wire.messages import Message
 
 pytestmark = needs_compiler
 SOFT = 16704  # counts, of the nominal track
+START_POLICY = StartPolicy()
 
 
 class Observation(ctypes.Structure):
@@ -27,6 +44,7 @@ class Observation(ctypes.Structure):
         ("pole_counts", ctypes.c_int32),
         ("soft_limit", ctypes.c_int32),
         ("period_us", ctypes.c_uint32),
+        ("set_period_us", ctypes.c_uint32),
         ("first", ctypes.c_bool),
     )
 
@@ -36,10 +54,10 @@ PolicyInC = ctypes.CFUNCTYPE(ctypes.c_int16, ctypes.c_void_p, ctypes.POINTER(Obs
 
 
 class Board:
-    """A homed and armed cart whose policy is a Python function."""
+    """A homed cart whose policy is a Python function and drives, unless `start` is another message."""
 
-    def __init__(self, choose: Callable[[Observation], int]) -> None:
-        self.observed: list[tuple[int, int, int, int, bool]] = []
+    def __init__(self, choose: Callable[[Observation], int], start: Message = START_POLICY) -> None:
+        self.observed: list[tuple[int, int, int, int, int, bool]] = []
 
         def called(memory: int, pointer: "ctypes._Pointer[Observation]") -> int:
             seen = pointer.contents
@@ -51,10 +69,17 @@ class Board:
         self.firmware._head.policy = ctypes.cast(self._called, ctypes.c_void_p)
         self.firmware.homed = True
         self.now_us = 0
-        self.send(Start())
+        self.send(start)
 
-    def send(self, message: Message) -> None:
-        self.firmware.receive(encode_frame(message, 1)[:-1], self.now_us)
+    def send(self, message: Message) -> Message | None:
+        """Send a message; return the answer, if any."""
+        answers = self.firmware.receive(encode_frame(message, 1)[:-1], self.now_us)
+        return decode_frame(answers[0][:-1]).message if answers else None
+
+    def heard(self, cart: int = 0, pole: int = 0) -> tuple[State, Flags, int]:
+        """Pass a period in which the host sends HELLO."""
+        self.send(Hello())
+        return self.tick(cart, pole)
 
     def tick(self, cart: int = 0, pole: int = 0) -> tuple[State, Flags, int]:
         """Pass a period; return STATE, its flags, and the motor value in force after it."""
@@ -68,24 +93,65 @@ class Board:
 
 def test_it_observes_each_period_and_chooses_after_state():
     board = Board(lambda seen: seen.cart_counts // 10)
-    ticks = [board.tick(cart, pole) for cart, pole in ((500, 7), (-900, 8), (300, -5))]
+    ticks = [board.heard(cart, pole) for cart, pole in ((500, 7), (-900, 8), (300, -5))]
     assert [motor for *_, motor in ticks] == [50, -90, 30]
     assert [state.motor_applied for state, *_ in ticks] == [0, 50, -90]
     assert board.observed == [
-        (500, 7, SOFT, 20_000, True),
-        (-900, 8, SOFT, 20_000, False),
-        (300, -5, SOFT, 20_000, False),
+        (500, 7, SOFT, 20_000, 20_000, True),
+        (-900, 8, SOFT, 20_000, 20_000, False),
+        (300, -5, SOFT, 20_000, 20_000, False),
     ]
 
 
-def test_it_needs_no_host_and_no_watchdog_stops_it():
+def test_any_accepted_frame_keeps_the_watchdog_quiet():
     board = Board(lambda seen: 100)
     for period in range(100):
+        if period % 2:
+            board.send(Hello())
         _, flags, motor = board.tick(10 * period)
         assert (flags, motor) == (Flags.ARMED | Flags.HOMED, 100)
 
 
-def test_a_motor_value_of_the_host_takes_over_until_the_next_start():
+def test_the_watchdog_stops_it_and_a_frame_revives_it():
+    board = Board(lambda seen: 100)
+    ticks = [board.tick() for _ in range(6)]
+    assert [motor for *_, motor in ticks] == [100, 100, 0, 0, 0, 0]
+    assert [bool(flags & Flags.WATCHDOG) for _, flags, _ in ticks] == [False, False, True, True, True, True]
+    assert len(board.observed) == 2
+    assert isinstance(board.send(SetPeriod(10_000)), Nack)  # a refused frame revives nothing
+    assert board.tick()[2] == 0
+    assert board.heard()[2] == 100
+
+
+def test_start_never_asks_it():
+    board = Board(lambda seen: 100, start=Start())
+    assert [board.tick()[2] for _ in range(5)] == [0] * 5
+    board.send(SetMotor(30))
+    assert [board.tick()[2] for _ in range(4)] == [30, 30, 0, 0]
+    assert board.observed == []
+
+
+def test_start_takes_the_motor_over_with_motor_0():
+    board = Board(lambda seen: 100)
+    assert board.tick()[2] == 100
+    assert board.send(Start()) == Ack(1, MessageType.START)
+    state, flags, motor = board.tick()
+    assert (state.motor_applied, motor) == (0, 0)
+    assert flags & Flags.ARMED
+
+
+def test_it_is_refused_where_start_is_and_on_a_cart_that_the_host_drives():
+    board = Board(lambda seen: 100, start=Start())
+    assert board.send(StartPolicy()) == Nack(1, MessageType.START_POLICY, Reason.BUSY)
+    board.send(Stop())
+    assert board.send(StartPolicy()) == board.send(StartPolicy()) == Ack(1, MessageType.START_POLICY)
+    board.send(Stop())
+    board.firmware.homed = False
+    assert board.send(StartPolicy()) == Nack(1, MessageType.START_POLICY, Reason.NOT_HOMED)
+    assert board.send(Start()) == Nack(1, MessageType.START, Reason.NOT_HOMED)
+
+
+def test_a_motor_value_of_the_host_takes_over_until_the_next_start_policy():
     board = Board(lambda seen: 100)
     board.tick()
     board.send(SetMotor(-30))
@@ -93,7 +159,7 @@ def test_a_motor_value_of_the_host_takes_over_until_the_next_start():
     assert board.tick()[1] & Flags.WATCHDOG
     board.send(Stop())
     assert board.tick()[2] == 0
-    board.send(Start())
+    board.send(StartPolicy())
     assert board.tick()[2] == 100
     assert board.observed[-1][-1]  # first
 
@@ -109,16 +175,16 @@ def test_stop_ends_it_and_a_disarmed_board_asks_nothing():
 @pytest.mark.parametrize("side", [1, -1])
 def test_the_soft_limit_holds_for_it(side):
     board = Board(lambda seen: side * 100)
-    board.tick(side * (SOFT - 200))
-    state, flags, motor = board.tick(side * SOFT)
+    board.heard(side * (SOFT - 200))
+    state, flags, motor = board.heard(side * SOFT)
     assert (state.motor_applied, motor) == (0, 0)
     assert flags & Flags.SOFT_LIMIT
-    assert board.tick(side * (SOFT - 100))[2] == side * 100
+    assert board.heard(side * (SOFT - 100))[2] == side * 100
 
 
 def test_a_fault_ends_it():
     board = Board(lambda seen: 255)
-    states = [board.tick(5) for _ in range(30)]
+    states = [board.heard(5) for _ in range(30)]
     assert states[-1][0].fault == Fault.STALL
     assert states[-1][2] == 0
     asked = len(board.observed)
@@ -136,12 +202,33 @@ def test_an_emulated_cart_drives_by_the_c_code_of_a_policy():
     pytest.importorskip("mujoco", reason='pip install "cartpole_rl[emulator]"')
     driven = Driven(firmware="c", policy=SHUTTLE)
     driven.home()
-    driven.ask(Start())
+    driven.ask(StartPolicy())
     states = [driven.ask(Hello()) for _ in range(200)]
     assert {state.motor_applied for state in states} == {110, -110}
     assert min(state.cart_counts for state in states) < -50
     assert max(state.cart_counts for state in states) > 50
     assert driven.flags == Flags.ARMED | Flags.HOMED
+
+
+def test_the_c_code_of_a_policy_gives_0_at_another_period():
+    firmware = CFirmware(lambda: 0, policy=SHUTTLE)
+    firmware.homed = True
+    motors = []
+    for number, period_us in enumerate((10_000, 20_000), start=1):
+        for message in (Stop(), SetPeriod(period_us), StartPolicy()):
+            firmware.receive(encode_frame(message, 1)[:-1], number * 100_000)
+        firmware.tick(number * 100_000 + period_us, 0, 2048)
+        motors.append(firmware.drive(number * 100_000 + period_us, number * 100_000 + period_us + 1)[-1][1])
+    assert motors[0] == 0 != motors[1]
+
+
+@pytest.mark.parametrize("name", ["POLICY_CART_NANOMETRES_PER_COUNT", "POLICY_POLE_COUNTS_PER_TURN"])
+def test_a_policy_for_other_encoders_does_not_compile(name, tmp_path):
+    for file in ("policy.h", "policy.c"):
+        text = (SHUTTLE / file).read_text(encoding="utf-8")
+        tmp_path.joinpath(file).write_text(text.replace(f"{name} ", f"{name} 1"), encoding="utf-8")
+    with pytest.raises(EmulatorError, match="for other encoders"):
+        build_library(tmp_path)
 
 
 def test_a_policy_needs_the_c_firmware():

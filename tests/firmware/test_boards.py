@@ -1,6 +1,7 @@
 """The firmware compiles without a warning for the processors of boards, to a small program."""
 
 import importlib.util
+import os
 import re
 import shutil
 import subprocess
@@ -13,6 +14,7 @@ from cartpole_rl.emulator.c_library import firmware_folder
 
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Wpedantic", "-Werror")
 ARM = "arm-none-eabi-gcc"
+SHUTTLE = Path(__file__).parents[1] / "support" / "shuttle"
 LARGEST = {"text": 32_768, "bss": 4_096}  # bytes: a board of 32 kB RAM has plenty left for a policy
 
 needs_arm = pytest.mark.skipif(
@@ -33,6 +35,25 @@ def test_a_board_of_cortex_m_compiles_and_is_small(board: str, tmp_path: Path) -
     sizes = re.search(r"text\s+data\s+bss.*\n\s*(?P<text>\d+)\s+\d+\s+(?P<bss>\d+)", done.stdout)
     assert sizes is not None
     assert {name: int(sizes[name]) <= limit for name, limit in LARGEST.items()} == {"text": True, "bss": True}
+
+
+@needs_arm
+def test_a_program_with_a_policy_does_not_take_the_place_of_the_one_without(tmp_path: Path) -> None:
+    """A new policy.h is compiled; the plain program stays as it was and is not the one with the policy."""
+    policy = shutil.copytree(SHUTTLE, tmp_path / "policy")
+    build = tmp_path / "build"
+
+    def make(*words: str) -> str:
+        command = ["make", "-C", str(firmware_folder()), f"BUILD={build}", "nucleo_f401re", *words]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+
+    make(f"POLICY={policy}")
+    assert ARM in make()
+    programs = [build / "nucleo_f401re-policy.elf", build / "nucleo_f401re.elf"]
+    assert programs[0].read_bytes() != programs[1].read_bytes()
+    assert ARM not in make(f"POLICY={policy}")
+    os.utime(policy / "policy.h", (2**31, 2**31))
+    assert ARM in make(f"POLICY={policy}")
 
 
 @needs_zig

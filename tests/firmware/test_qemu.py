@@ -59,11 +59,11 @@ def test_it_homes_drives_and_stops_like_any_cart() -> None:
         assert silent[-1].fault == Fault.NONE
 
 
-def test_a_policy_on_the_board_drives_without_a_host() -> None:
+def test_a_policy_on_the_board_drives_while_the_host_listens() -> None:
     options = ("--policy", str(SHUTTLE), "--fast")
     with board(*options) as port, SerialCart(SETTINGS.model_copy(update={"port": port})) as cart:
         cart.home()
-        cart.start()
+        cart.start_policy()
         states = [cart.poll_state() for _ in range(100)]
         assert {110, -110} <= {state.motor_applied for state in states}
         assert states[-1].fault == Fault.NONE

@@ -21,6 +21,7 @@ from cartpole_rl.wire import (
     SetMotor,
     SetPeriod,
     Start,
+    StartPolicy,
     State,
     Stop,
     encode_frame,
@@ -42,6 +43,7 @@ EXAMPLES: dict[str, tuple[Message, int, int]] = {
     "NACK": (Nack(6, MessageType.SET_MOTOR, Reason.NOT_ARMED), 150, HOMED),
     "FAULT": (FaultReport(Fault.HARD_LIMIT, 1200), 160, HOMED | Flags.FAULTED),
     "CLEAR_FAULT": (ClearFault(), 7, 0),
+    "START_POLICY": (StartPolicy(), 8, 0),
 }
 ROWS = dict(re.findall(r"^\| ([A-Z_]+)\b.*\| `((?:[0-9a-f]{2} )+00)` \|$", PAGE, re.MULTILINE))
 

@@ -32,6 +32,7 @@ from cartpole_rl.wire.messages import (
     SetMotor,
     SetPeriod,
     Start,
+    StartPolicy,
     State,
     Stop,
 )
@@ -149,14 +150,19 @@ class SerialCart:
         return self._note(self._connection.request(Hello(), Info))
 
     def start(self) -> None:
-        """Arm the motor. Every way to drive a cart goes through here.
+        """Arm the motor. Every way to drive a cart from this computer goes through here.
 
         Raises NotReadyError if INFO describes another kind of cart than the one that is driven here,
         RefusedError if the cart is not homed, FaultError if a fault is latched.
         """
-        check_scales(self.information)
-        check_limits(self.information)
-        self._connection.request(Start(), Ack)
+        self._arm(Start())
+
+    def start_policy(self) -> None:
+        """Arm the motor and let the policy on the board drive, while `poll_state` keeps it from stopping.
+
+        Raises what `start` raises, and RefusedError if the board has no policy.
+        """
+        self._arm(StartPolicy())
 
     def stop(self) -> None:
         """Set the motor to 0 and disarm; ends a homing. The bytes go out before anything that can block."""
@@ -241,6 +247,11 @@ class SerialCart:
             yield
         finally:
             self._tracker.measuring = True
+
+    def _arm(self, message: Start | StartPolicy) -> None:
+        check_scales(self.information)
+        check_limits(self.information)
+        self._connection.request(message, Ack)
 
     def _stop(self, within: float) -> None:
         """Set the motor to 0 and disarm; wait `within` s at most for the answer."""

@@ -36,8 +36,9 @@ FAULTS: dict[Fault, str] = {
     Fault.STALL: "the motor was driven but the cart did not move (free the cart, check the motor's cable)",
     Fault.CART_ENCODER: "the cart's encoder does not answer (check its cable)",
     Fault.POLE_ENCODER: "the pole's encoder does not answer (check its cable)",
-    Fault.HOMING: "homing failed: a stop was not found, the span was off by over 3 %, or the pole did not "
-    "come to rest (clear the track, let the pole hang, check the cart encoder's cable)",
+    Fault.HOMING: "homing failed: the cart moved the wrong way, a stop was not found, the span was off by "
+    "over 3 %, or the pole did not come to rest (clear the track, let the pole hang, check the motor's "
+    "direction and the cart encoder's cable)",
 }
 
 

@@ -20,11 +20,14 @@
 #ifdef CART_ONBOARD_POLICY
 #include <onboard.h>
 #endif
+#include <driver/gpio.h>
 #include <driver/pulse_cnt.h>
+#include <esp_rom_gpio.h>
 #include <esp_task_wdt.h>
+#include <soc/gpio_sig_map.h>
 
 static const int CART_A = 32, CART_B = 33, POLE_A = 25, POLE_B = 26, RIGHT = 18, LEFT = 19;
-static const uint32_t BAUD = 921600, PWM_HZ = 20000, HANG_MS = 50;
+static const uint32_t BAUD = 921600, PWM_HZ = 20000, HANG_MS = 150; /* longer than a period */
 static const int PWM_BITS = 8, COUNTER_LIMIT = 32000, GLITCH_NS = 200;
 
 static pcnt_unit_handle_t cart_counter, pole_counter;
@@ -68,7 +71,23 @@ static pcnt_unit_handle_t start_counter(int a, int b)
     return unit;
 }
 
-/* A main loop that hangs for HANG_MS resets the board, which switches the motor off. */
+/* Take both H-bridge inputs from the PWM and hold them low. */
+static void IRAM_ATTR cut_motor(void)
+{
+    esp_rom_gpio_connect_out_signal(RIGHT, SIG_GPIO_OUT_IDX, false, false);
+    esp_rom_gpio_connect_out_signal(LEFT, SIG_GPIO_OUT_IDX, false, false);
+    gpio_set_level((gpio_num_t)RIGHT, 0);
+    gpio_set_level((gpio_num_t)LEFT, 0);
+}
+
+/* ESP-IDF calls this when the task watchdog expires, before the panic that restarts the board. */
+extern "C" void IRAM_ATTR esp_task_wdt_isr_user_handler(void)
+{
+    cut_motor();
+}
+
+/* If no period ends for HANG_MS, the board cuts the motor and restarts. The restart alone does not cut it: it
+   resets neither LEDC nor the pins. So after any other panic the last motor value stays until setup(). */
 static void start_watchdog(void)
 {
     esp_task_wdt_config_t hang = {};
@@ -103,8 +122,9 @@ int32_t cart_hardware_pole_count(void)
 
 void cart_hardware_set_motor(int16_t value)
 {
-    ledcWrite(RIGHT, value > 0 ? value : 0);
-    ledcWrite(LEFT, value < 0 ? -value : 0);
+    int on = value > 0 ? RIGHT : LEFT, off = value > 0 ? LEFT : RIGHT;
+    ledcWrite(off, 0); /* first, so that both are never on */
+    ledcWrite(on, value > 0 ? value : -value);
 }
 
 int cart_hardware_read(void)
@@ -120,6 +140,9 @@ void cart_hardware_write(const uint8_t *frame, size_t length)
 
 void setup(void)
 {
+    pinMode(RIGHT, OUTPUT);
+    pinMode(LEFT, OUTPUT);
+    cut_motor();
     ledcAttach(RIGHT, PWM_HZ, PWM_BITS);
     ledcAttach(LEFT, PWM_HZ, PWM_BITS);
     cart_hardware_set_motor(0);
@@ -137,6 +160,6 @@ void setup(void)
 
 void loop(void)
 {
-    cart_loop_poll(&loop_state);
-    esp_task_wdt_reset();
+    if (cart_loop_poll(&loop_state))
+        esp_task_wdt_reset();
 }

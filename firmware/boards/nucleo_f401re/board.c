@@ -1,8 +1,8 @@
 /* Compiled with arm-none-eabi-gcc 12.2, never run on a board; see docs/firmware.md.
 
-   STMicroelectronics NUCLEO-F401RE (STM32F401RE, Cortex-M4 at 84 MHz), without vendor code. The ST-LINK's
+   STMicroelectronics NUCLEO-F401RE (STM32F401RE, Cortex-M4 at 83 MHz), without vendor code. The ST-LINK's
    virtual serial port is the host's port. Timers 5 and 2 read the encoders with 32 bits, timer 3 drives an
-   H-bridge with two PWM inputs.
+   H-bridge with two PWM inputs, timer 4 is the clock.
 
    | pin  | connector  | to                                                                          |
    |------|------------|-----------------------------------------------------------------------------|
@@ -31,6 +31,11 @@
 #define RCC_CFGR RCC(0x08u)
 #define RCC_AHB1ENR RCC(0x30u)
 #define RCC_APB1ENR RCC(0x40u)
+#define PWR_CR REGISTER(0x40007000u)
+#define EXTI_IMR REGISTER(0x40013C00u)
+#define EXTI_RTSR REGISTER(0x40013C08u)
+#define SUPPLY_LINE 16u /* of EXTI: the supply detector */
+#define SUPPLY_INTERRUPT 1u
 #define FLASH_ACR REGISTER(0x40023C00u)
 
 #define GPIOA(offset) REGISTER(0x40020000u + (offset))
@@ -42,6 +47,7 @@
 
 #define TIM2 0x40000000u
 #define TIM3 0x40000400u
+#define TIM4 0x40000800u
 #define TIM5 0x40000C00u
 #define CR1 0x00u
 #define SMCR 0x08u
@@ -65,36 +71,47 @@
 #define USART2_INTERRUPT 38u
 
 #define IWDG(offset) REGISTER(0x40003000u + (offset))
+#define NVIC_ISER0 REGISTER(0xE000E100u)
 #define NVIC_ISER1 REGISTER(0xE000E104u)
-#define DEMCR REGISTER(0xE000EDFCu)
-#define DWT_CTRL REGISTER(0xE0001000u)
-#define DWT_CYCCNT REGISTER(0xE0001004u)
 
-#define CORE_MHZ 84u
-#define APB1_HZ 42000000u
-#define BAUD 921600u
+#define CORE_MHZ 83u
+#define APB1_HZ 41500000u
+#define BAUD 921600u       /* APB1_HZ / 45 is 0.07 % more; the oscillator's own error adds to it */
 #define PWM_STEPS 255u     /* motor value 255 is always on */
-#define PWM_PRESCALER 16u  /* 84 MHz / 16 / 255 = 20.6 kHz */
+#define PWM_PRESCALER 16u  /* 83 MHz / 16 / 255 = 20.3 kHz */
 #define RECEIVE_BYTES 512u /* powers of two */
 #define SEND_BYTES 512u
 
 static volatile uint8_t received[RECEIVE_BYTES], to_send[SEND_BYTES];
 static volatile uint32_t received_head, received_tail, send_head, send_tail;
 
-/* 84 MHz from the internal oscillator: 16 MHz / 16 * 336 / 4; peripherals of APB1 at half of it. */
+/* 83 MHz from the internal oscillator: 16 MHz / 16 * 332 / 4; APB1 has half of it, its timers all of it. */
 static void start_clock(void)
 {
     FLASH_ACR = (1u << 9) | (1u << 8) | 2u; /* instruction cache, prefetch, two wait states */
-    RCC_PLLCFGR = 16u | (336u << 6) | (1u << 16) | (7u << 24);
+    RCC_PLLCFGR = 16u | (332u << 6) | (1u << 16) | (7u << 24);
     RCC_CR |= 1u << 24;
     while (!(RCC_CR & (1u << 25)))
         continue;
     RCC_CFGR = (4u << 10) | 2u;
     while ((RCC_CFGR & (3u << 2)) != (2u << 2))
         continue;
-    DEMCR |= 1u << 24;
-    DWT_CYCCNT = 0;
-    DWT_CTRL |= 1u;
+    RCC_APB1ENR |= 1u << 2; /* TIM4 */
+    (void)RCC_APB1ENR;
+    REGISTER(TIM4 + PSC) = CORE_MHZ - 1u; /* 1 MHz */
+    REGISTER(TIM4 + EGR) = 1u;
+    REGISTER(TIM4 + CR1) = 1u;
+}
+
+/* A supply below about 2.9 V resets the board, which switches the motor off, before the processor fails. */
+static void watch_supply(void)
+{
+    RCC_APB1ENR |= 1u << 28; /* PWR */
+    (void)RCC_APB1ENR;
+    PWR_CR |= (7u << 5) | (1u << 4);
+    EXTI_RTSR |= 1u << SUPPLY_LINE;
+    EXTI_IMR |= 1u << SUPPLY_LINE;
+    NVIC_ISER0 = 1u << SUPPLY_INTERRUPT; /* unexpected() of startup.c */
 }
 
 /* Give a pin of port A or B to a peripheral. */
@@ -159,13 +176,14 @@ static void start_port(void)
     NVIC_ISER1 = 1u << (USART2_INTERRUPT - 32u);
 }
 
-/* A main loop that hangs for about 50 ms resets the board, which switches the motor off. */
+/* A board on which no period ends resets, which switches the motor off: after about 190 ms, or 130 to 350 ms
+   with an oscillator of 47 to 17 kHz. The longest period is 100 ms. */
 static void start_watchdog(void)
 {
     IWDG(0x0u) = 0xCCCCu;
     IWDG(0x0u) = 0x5555u;
-    IWDG(0x4u) = 0;    /* 32 kHz / 4 */
-    IWDG(0x8u) = 400u; /* about 50 ms */
+    IWDG(0x4u) = 0; /* 32 kHz / 4 */
+    IWDG(0x8u) = 1500u;
     while (IWDG(0xCu))
         continue;
     IWDG(0x0u) = 0xAAAAu;
@@ -189,11 +207,11 @@ void usart2_interrupt(void)
 
 uint32_t cart_hardware_clock_us(void)
 {
-    static uint32_t cycles, rest, clock_us;
-    uint32_t now = DWT_CYCCNT, passed = now - cycles + rest;
-    cycles = now;
-    clock_us += passed / CORE_MHZ;
-    rest = passed % CORE_MHZ;
+    static uint16_t last;
+    static uint32_t clock_us;
+    uint16_t now = (uint16_t)REGISTER(TIM4 + CNT); /* wraps after 65 ms; the main loop is much faster */
+    clock_us += (uint16_t)(now - last);
+    last = now;
     return clock_us;
 }
 
@@ -209,8 +227,10 @@ int32_t cart_hardware_pole_count(void)
 
 void cart_hardware_set_motor(int16_t value)
 {
+    REGISTER(TIM3 + CR1) |= 2u; /* both change at the end of the same PWM cycle: never on together */
     REGISTER(TIM3 + CCR1) = value > 0 ? (uint32_t)value : 0u;
     REGISTER(TIM3 + CCR2) = value < 0 ? (uint32_t)-value : 0u;
+    REGISTER(TIM3 + CR1) &= ~2u;
 }
 
 int cart_hardware_read(void)
@@ -234,6 +254,7 @@ int main(void)
 {
     static cart_loop loop;
     start_clock();
+    watch_supply();
     start_pins();
     start_motor();
     start_counter(TIM5);
@@ -245,7 +266,7 @@ int main(void)
 #endif
     start_watchdog();
     for (;;) {
-        cart_loop_poll(&loop);
-        IWDG(0x0u) = 0xAAAAu;
+        if (cart_loop_poll(&loop))
+            IWDG(0x0u) = 0xAAAAu;
     }
 }

@@ -4,6 +4,10 @@
 
 #include <stdint.h>
 
+#define POLICY_PERIOD_US 20000
+#define POLICY_CART_NANOMETRES_PER_COUNT 22749
+#define POLICY_POLE_COUNTS_PER_TURN 4096
+
 typedef struct {
     float track_end; /* m from the middle to the soft limit */
 } policy_t;
