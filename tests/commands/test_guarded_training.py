@@ -21,7 +21,7 @@ def test_every_command_shows_how_often_the_guard_acts(tmp_path: Path) -> None:
     done = in_process("train", *TINY, "guard=careful", wide, f"hydra.run.dir={run}", folder=tmp_path)
     assert done.code == 0, done.err
     assert "track guard: margin 0.0" in done.err
-    assert {f"exploration/{FRACTION}", f"evaluation/{FRACTION}"} <= tags(run)
+    assert {f"exploration/{FRACTION}", "evaluation/track_guard_fraction"} <= tags(run)
     history = [json.loads(line) for line in (run / "history.jsonl").read_text().splitlines()]
     metrics = json.loads((run / "metrics.json").read_text())
     assert history[-1][FRACTION] == metrics[FRACTION]["mean"]

@@ -36,7 +36,7 @@ SCHEMAS: dict[str, type[Settings]] = {
     "report": config.ReportConfig,
     "train": config.TrainConfig,
 }
-WITHOUT_A_SETTING = {"train": {"experiment"}}  # groups that set other groups
+WITHOUT_A_SETTING = {"train": {"experiment", "sweep"}}  # groups that set other groups, or what is swept
 
 
 @pytest.mark.parametrize("command", COMMANDS)

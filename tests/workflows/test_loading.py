@@ -22,6 +22,8 @@ REQUIRED = {
     "record": {"run": "lqr"},
     "replay": {"from": "."},
     "model": {"from": "."},
+    "report": {"runs": "."},
+    "export": {"run": "pretrained/medium", "format": "web"},
 }
 EXPERIMENTS = sorted(path.stem for path in (conf_folder() / "experiment").glob("*.yaml"))
 

@@ -26,9 +26,9 @@ def with_choice_files(words: Sequence[str]) -> Iterator[list[str]]:
     above = Path.cwd() if several else None  # the machines of a cluster may share it
     with TemporaryDirectory(prefix="cartpole_rl-", dir=above) as folder:
         replaced = [_with_choices(word, Path(folder)) for word in words]
-        if any(Path(folder).iterdir()):  # beside the first file: Hydra takes no override after an option
-            first = next(i for i, (word, new) in enumerate(zip(words, replaced, strict=True)) if word != new)
-            replaced.insert(first, f"hydra.searchpath=[file://{folder}]")
+        if any(Path(folder).iterdir()):  # beside a file: Hydra takes no override after an option
+            files = [number for number, word in enumerate(words) if word != replaced[number]]
+            replaced.insert(files[-1] + 1, f"hydra.searchpath=[file://{folder}]")
         yield replaced
 
 

@@ -26,6 +26,7 @@ from cartpole_rl.files import write_text
 from cartpole_rl.run_files import ERROR
 from cartpole_rl.workflows.person import print_message
 
+MODES = {"-m", "--multirun", "-r", "--run", "-c", "--cfg", "-i", "--info", "-sc", "--shell-completion"}
 NOT_ENDED = "it was killed or interrupted, or is still running"
 
 
@@ -41,9 +42,13 @@ class SweepStart(Callback):
 
 
 def as_multirun(words: Sequence[str]) -> list[str]:
-    """Return the words of a command line, with -m beside sweep=...: a choice cannot set the mode."""
+    """Return the words of a command line, with -m beside sweep=...: a choice cannot set the mode.
+
+    Hydra takes one mode, so `--cfg job` and the like stay alone.
+    """
     chosen = any(word.startswith("sweep=") for word in words)
-    return [*words, "--multirun"] if chosen and not {"-m", "--multirun"} & {*words} else [*words]
+    has_mode = any(word.partition("=")[0] in MODES for word in words)
+    return [*words, "--multirun"] if chosen and not has_mode else [*words]
 
 
 def is_job() -> bool:
