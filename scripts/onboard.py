@@ -17,17 +17,18 @@ that was. Exit status 1 if a fault was latched.
 
 import argparse
 import sys
+from itertools import pairwise
 
 import torch
 
 from cartpole_rl.choices import choice
 from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.settings import SerialSettings
-from cartpole_rl.tasks.features import Measured, measured_position
-from cartpole_rl.tasks.rewards import SCORE
+from cartpole_rl.tasks.features import Measured, measured_position, measured_velocity
+from cartpole_rl.tasks.rewards import SCORE, UPRIGHT_ANGLE
 from cartpole_rl.wire import Fault, State
+from cartpole_rl.wire.clock import seconds_between, ticks_between
 
-UPRIGHT = 0.0873  # rad: 5 degrees
 PERIOD_US = 20_000
 
 
@@ -37,7 +38,7 @@ def episode(cart: SerialCart, periods: int) -> list[State]:
     cart.set_period(PERIOD_US)
     cart.start_policy()
     states = [cart.poll_state()]
-    while states[-1].tick < states[0].tick + periods and not states[-1].fault:
+    while ticks_between(states[0].tick, states[-1].tick) < periods and not states[-1].fault:
         states.append(cart.poll_state())
     cart.stop()
     return states
@@ -46,11 +47,13 @@ def episode(cart: SerialCart, periods: int) -> list[State]:
 def line(states: list[State], track_half_length: float) -> str:
     """Return the result of an episode in words."""
     counts = torch.tensor([(state.cart_counts, state.pole_counts) for state in states]).T
-    x, theta = measured_position(counts)
-    zero = torch.zeros_like(x)
-    periods = torch.tensor([states[0].tick, *(state.tick for state in states)]).diff()
-    score = (SCORE.formula(Measured(x, zero, theta, zero), track_half_length) * periods).sum()
-    upright = ((theta.abs() < UPRIGHT) * periods).sum() / periods.sum()
+    pairs = list(pairwise(states))
+    seconds = torch.tensor([seconds_between(before.time_us, after.time_us) for before, after in pairs])
+    periods = torch.tensor([ticks_between(before.tick, after.tick) for before, after in pairs])
+    x, theta = measured_position(counts[:, 1:])
+    x_dot, theta_dot = measured_velocity(counts[:, 1:], counts[:, :-1], seconds)
+    score = (SCORE.formula(Measured(x, x_dot, theta, theta_dot), track_half_length) * periods).sum()
+    upright = ((theta.abs() < UPRIGHT_ANGLE) * periods).sum() / periods.sum()
     fault = Fault(states[-1].fault)
     return (
         f"{periods.sum()} periods, {len(states)} states read, score {score:.0f}, upright "
