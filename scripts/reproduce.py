@@ -20,7 +20,7 @@ from cartpole_rl.errors import ConfigError
 from cartpole_rl.signals import RaiseOnce, ending_signals
 from cartpole_rl.workflows.reproduce.process import SIGNALLED
 from cartpole_rl.workflows.reproduce.reproduce import reproduce
-from cartpole_rl.workflows.reproduce.studies import STUDIES, load_study, study_names
+from cartpole_rl.workflows.studies import STUDIES, load_study, study_names
 
 
 def parse_options() -> argparse.Namespace:

@@ -20,7 +20,7 @@ from cartpole_rl.workflows.config import (
     TrainConfig,
 )
 from cartpole_rl.workflows.reproduce.plan import FIRST_SEED, Task, plan, study_tasks
-from cartpole_rl.workflows.reproduce.studies import load_study, overrides_of, study_names
+from cartpole_rl.workflows.studies import load_study, overrides_of, study_names
 
 pytestmark = pytest.mark.usefixtures("hydra_reads_conf")
 

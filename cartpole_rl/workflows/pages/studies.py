@@ -12,8 +12,6 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from cartpole_rl.checking import checked
 from cartpole_rl.choices import conf_folder
 from cartpole_rl.errors import ConfigError
@@ -40,6 +38,7 @@ from cartpole_rl.workflows.pages.runs import (
     split_by_majority,
 )
 from cartpole_rl.workflows.run_folder import write_json
+from cartpole_rl.workflows.studies import STUDIES, read_study_file
 
 STUDY, EVALUATIONS, RUN = "study.yaml", "evaluations", "run="
 EMULATOR = "emulator="
@@ -111,23 +110,9 @@ def read_data(file: Path) -> StudyResults:
         raise ConfigError(f"studies={file} is not a file of results: {error}") from None
 
 
-def load_study(file: Path) -> Study:
-    """Return the study in a YAML file. Raises ConfigError."""
-    try:
-        values = yaml.safe_load(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError, yaml.YAMLError) as error:
-        raise ConfigError(f"{file} cannot be read: {' '.join(str(error).split())}") from None
-    if not isinstance(values, Mapping):
-        raise ConfigError(f"{file} holds no study")
-    try:
-        return checked(Study, values)
-    except ConfigError as error:
-        raise ConfigError(f"{file}: {error}") from None
-
-
 def read_study(folder: Path) -> StudyResults:
     """Return the results in the folder of one study."""
-    study = load_study(folder / STUDY)
+    study = read_study_file(folder / STUDY)
     if not study.size and folder.parent.name in study.sizes:
         study = study.model_copy(update={"size": folder.parent.name})
     parts, exclusions = [*_parts(folder, study)], []
@@ -285,10 +270,10 @@ def _unlisted(folder: Path, study: Study) -> list[str]:
 
 def _with_texts(results: StudyResults) -> StudyResults:
     """Return the results with the texts of today's conf/study/, which are written after the runs."""
-    file = conf_folder() / "study" / f"{results.name}.yaml"
+    file = STUDIES / f"{results.name}.yaml"
     if not file.is_file():
         return results
-    today = load_study(file)
+    today = read_study_file(file)
     texts = {name: getattr(today, name) for name in TEXTS}
     made = ("measure", "arms", "evaluations", "command", "experiment")
     changed = [name for name in made if getattr(today, name) != getattr(results.study, name)]
@@ -298,11 +283,13 @@ def _with_texts(results: StudyResults) -> StudyResults:
 
 def _with_shipped(found: Sequence[StudyResults]) -> list[StudyResults]:
     """Return `found` with the other studies of conf/study/, if it holds one of them."""
-    shipped = {file.stem: file for file in sorted((conf_folder() / "study").glob("*.yaml"))}
+    shipped = {file.stem: file for file in sorted(STUDIES.glob("*.yaml"))}
     names = {each.name for each in found}
     if not names & {*shipped}:
         return [*found]
-    lacking = [StudyResults(name, load_study(file)) for name, file in shipped.items() if name not in names]
+    lacking = [
+        StudyResults(name, read_study_file(file)) for name, file in shipped.items() if name not in names
+    ]
     return [*found, *lacking]
 
 

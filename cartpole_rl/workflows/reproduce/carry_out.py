@@ -21,8 +21,8 @@ from cartpole_rl.workflows.loading import load_settings
 from cartpole_rl.workflows.model import learn_model
 from cartpole_rl.workflows.reproduce.plan import Task
 from cartpole_rl.workflows.reproduce.process import RESUMABLE
-from cartpole_rl.workflows.reproduce.studies import overrides_of
 from cartpole_rl.workflows.run_folder import PREFIX
+from cartpole_rl.workflows.studies import overrides_of
 from cartpole_rl.workflows.train import train
 
 WORKFLOWS: dict[str, tuple[type, Any]] = {

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.reporting.studies.settings import Size, Study, Variant
-from cartpole_rl.workflows.reproduce.studies import STUDIES, load_study, unknown
+from cartpole_rl.workflows.studies import STUDIES, load_study, unknown
 
 FIRST_SEED = 10  # settings were chosen on seeds 0 to 9
 EVALUATIONS = "evaluations"  # folder in that of an agent

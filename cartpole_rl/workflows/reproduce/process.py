@@ -12,7 +12,7 @@ from cartpole_rl.errors import CartPoleError
 from cartpole_rl.run_files import CHECKPOINTS, IDENTIFIED, METRICS, MODELLED, PROVENANCE, RESUME
 from cartpole_rl.signals import RaiseOnce, end_with_parent, ending_signals
 from cartpole_rl.workflows.reproduce.plan import Task
-from cartpole_rl.workflows.reproduce.studies import overrides_of
+from cartpole_rl.workflows.studies import overrides_of
 
 LOG = "log.txt"
 DEFAULT_EPISODES = choice("evaluate")["episodes"]

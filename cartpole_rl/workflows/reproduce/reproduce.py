@@ -20,7 +20,7 @@ from cartpole_rl.files import write_text
 from cartpole_rl.workflows.reproduce.plan import Task, plan, size_of
 from cartpole_rl.workflows.reproduce.process import LOG, in_own_process, is_complete, made_otherwise
 from cartpole_rl.workflows.reproduce.progress import Progress, duration
-from cartpole_rl.workflows.reproduce.studies import STUDIES, load_study
+from cartpole_rl.workflows.studies import STUDIES, load_study
 
 STUDY_FILE = "study.yaml"
 WORKER = "cartpole_rl.workflows.reproduce.carry_out"  # imports all workflows

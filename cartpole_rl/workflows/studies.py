@@ -1,6 +1,6 @@
 """Studies by name: those of conf/study/, or of a folder of a user's own."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,14 +22,22 @@ def study_names(source: Path = STUDIES) -> list[str]:
 
 
 def load_study(name: str, source: Path = STUDIES) -> Study:
-    """Return a study. Raises ConfigError that names the nearest study, or what is wrong in its file."""
+    """Return a study of `source`. ConfigError names the nearest study or the mistake."""
     path = source / f"{name}.yaml"
     if not path.is_file():
         raise ConfigError(unknown("study", name, (other.stem for other in source.glob("*.yaml"))))
+    return read_study_file(path)
+
+
+def read_study_file(file: Path) -> Study:
+    """Return the study in a YAML file. Raises ConfigError."""
     try:
-        return checked(Study, yaml.safe_load(path.read_text(encoding="utf-8")))
-    except (ConfigError, yaml.YAMLError) as error:
-        raise ConfigError(f"{path}: {' '.join(str(error).split())}") from None
+        values = yaml.safe_load(file.read_text(encoding="utf-8"))
+        if not isinstance(values, Mapping):
+            raise ConfigError("it holds no study")
+        return checked(Study, values)
+    except (ConfigError, OSError, ValueError, yaml.YAMLError) as error:
+        raise ConfigError(f"{file}: {' '.join(str(error).split())}") from None
 
 
 def unknown(kind: str, name: str, names: Iterable[str]) -> str:
