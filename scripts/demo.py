@@ -1,4 +1,4 @@
-"""The demo after its installation: train, evaluate on both plants, compare. See scripts/demo."""
+"""The demo after its installation: train, evaluate, fine-tune, compare. See scripts/demo."""
 
 import json
 import subprocess
@@ -13,24 +13,36 @@ from cartpole_rl.reporting.figures import comparison, save
 from cartpole_rl.reporting.scores import SCORES
 from cartpole_rl.reporting.table import interval_text, table
 
-EPISODES = 10
+EPISODES = 10  # without exploration
+TUNING_EPISODES = 5  # to learn from
 BIN = Path(sys.executable).parent
 SHOWN = ("score", "score_upright", "time_to_upright_s", "upright_fraction", "min_track_margin_m")
 
 
 def main() -> None:
-    """Train, evaluate, and print a comparison."""
+    """Train, evaluate in simulation, fine-tune on the emulated cart, and print a comparison."""
     started = time.perf_counter()
+    training, tuning = overrides(sys.argv[1:])
     folder = Path("runs/demo") / datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
+    agent = f"run={folder}/train"
     step("1/3: train an agent in simulation")
-    run("train", f"hydra.run.dir={folder}/train", "experiment=medium", *sys.argv[1:])
+    run("train", f"hydra.run.dir={folder}/train", "experiment=medium", *training)
     step("2/3: evaluate it in simulation")
-    simulated = evaluate(folder, "simulated")
-    step("3/3: evaluate it on an emulated cart, over a serial port")
-    emulated = evaluate(folder, "emulated")
-    report(folder, {"simulated": simulated, "emulated": emulated})
+    run("evaluate", f"hydra.run.dir={folder}/simulated", agent, "plant=simulated", f"episodes={EPISODES}")
+    step("3/3: drive an emulated cart over its serial port, fine-tune the agent there, and drive again")
+    episodes = (f"episodes={TUNING_EPISODES}", f"evaluation_episodes={EPISODES}")
+    run("finetune", f"hydra.run.dir={folder}/finetune", agent, "plant=emulated", *episodes, *tuning)
+    report(folder)
     print(f"The demo took {time.perf_counter() - started:.0f} s. Its results are in {folder}.")
-    print(f"Next, fine-tune the agent: .venv/bin/cartpole-finetune run={folder}/train plant=emulated")
+    print(
+        f"Next, watch the agent: .venv/bin/cartpole-evaluate run={folder}/finetune plant=emulated view=live"
+    )
+
+
+def overrides(words: list[str]) -> tuple[list[str], list[str]]:
+    """Return the overrides of cartpole-train, and those after `--`, of cartpole-finetune."""
+    end = words.index("--") if "--" in words else len(words)
+    return words[:end], words[end + 1 :]
 
 
 def step(title: str) -> None:
@@ -46,28 +58,29 @@ def run(name: str, *arguments: str) -> None:
         sys.exit(status)
 
 
-def evaluate(folder: Path, plant: str) -> dict:
-    """Return the metrics of the last checkpoint on `plant`."""
-    output = folder / plant
-    run(
-        "evaluate", f"hydra.run.dir={output}", f"run={folder}/train", f"plant={plant}", f"episodes={EPISODES}"
-    )
-    return json.loads((output / "metrics.json").read_text())
-
-
-def report(folder: Path, results: dict[str, dict]) -> None:
-    """Print the results by plant, save the comparison figure and list all figures."""
-    print(f"\nThe last checkpoint on both carts: mean and 95 % interval of {EPISODES} episodes")
+def report(folder: Path) -> None:
+    """Print the results on each cart, save the comparison figure and list all figures."""
+    tuned = json.loads((folder / "finetune/comparison.json").read_text())
+    results = {
+        "simulated": json.loads((folder / "simulated/metrics.json").read_text()),
+        "emulated": tuned["before"],
+        "emulated, fine-tuned": tuned["after"],
+    }
+    print(f"\nThe last checkpoint on each cart: mean and 95 % interval of {EPISODES} episodes")
     rows = [
-        {"figure": SCORES[key]} | {plant: mean_text(result[key]) for plant, result in results.items()}
+        {"figure": SCORES[key]} | {cart: mean_text(result[key]) for cart, result in results.items()}
         for key in SHOWN
     ]
-    print(table(rows, {"figure": "", "simulated": "simulated", "emulated": "emulated"}))
-    ratio = results["emulated"]["score"]["mean"] / results["simulated"]["score"]["mean"]
-    print(f"ratio of the scores, emulated / simulated: {ratio:.2f}\n")
+    means = {name: result["score"] for name, result in results.items()}
+    print(table(rows, {"figure": ""} | {cart: cart for cart in results}))
+    simulated, before, after = (mean["mean"] for mean in means.values())
+    print(
+        f"ratio of the scores, emulated / simulated: {before / simulated:.2f}, "
+        f"after fine-tuning {after / simulated:.2f}; kept: the policy {tuned['kept']} fine-tuning\n"
+    )
     scores = {name: np.array([e["score"] for e in result["episodes"]]) for name, result in results.items()}
-    intervals = {name: (result["score"]["low"], result["score"]["high"]) for name, result in results.items()}
-    save(comparison(scores, "The same agent on two carts", intervals), folder / "comparison.png")
+    intervals = {name: (mean["low"], mean["high"]) for name, mean in means.items() if mean["count"] > 1}
+    save(comparison(scores, "The same agent on each cart", intervals), folder / "comparison.png")
     print(f"scores:          {folder}/comparison.png")
     print(f"learning curve:  {folder}/train/figures/learning_curve.png")
     print(f"TensorBoard:     .venv/bin/tensorboard --logdir {folder}")

@@ -198,8 +198,9 @@ class Session:
         )
 
     def summarize(self, episodes: list[Episode]) -> dict[str, Any]:
-        """Return the summary of the metrics of `episodes`."""
-        return summarize([episode_metrics(episode, self.settings.task.x_max) for episode in episodes])
+        """Return the metrics of `episodes` and their summary."""
+        metrics = [episode_metrics(episode, self.settings.task.x_max) for episode in episodes]
+        return {**summarize(metrics), "episodes": metrics}
 
     def save(self) -> None:
         """Write the checkpoint to resume from."""
