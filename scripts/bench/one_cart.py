@@ -10,7 +10,8 @@ Three measurements, with one thread:
 - seconds per episode of 500 steps on an emulated lockstep cart, which includes its re-centring; the cart
   stands still, while a network of the default size computes its actions;
 - the host's part of a tick, from the arrival of a state to the end of writing its command: median, 99.9th
-  percentile and longest, alone and beside a process that multiplies matrices at a learner's priority.
+  percentile and longest, alone and beside a process that multiplies matrices at a learner's priority. The
+  host has real-time priority, as it has for a cart with its own clock, if the system allows it.
 """
 
 import time
@@ -32,7 +33,7 @@ from cartpole_rl.envs.build import environment, shipped_settings
 from cartpole_rl.evaluation.driving_policy import DrivingPolicy
 from cartpole_rl.evaluation.episodes import run_episodes
 from cartpole_rl.plants.emulated import emulated_plant
-from cartpole_rl.scheduling import giving_precedence
+from cartpole_rl.scheduling import giving_precedence, taking_precedence
 
 PEER = "CartPole-v1"
 OURS = ("cartpole_rl/SwingUp-v0", "cartpole_rl/Balance-v0")
@@ -91,6 +92,7 @@ def lockstep(episodes: int, beside: bool) -> dict[str, Any]:
     settings = shipped_settings({"pole": "medium"})
     with (
         busy_process() if beside else nullcontext(),
+        taking_precedence(),
         closing(environment(settings, emulated_plant(EmulatorSettings()))) as env,
     ):
         policy = StandingStill(settings.observation.mirror_signs, list(settings.actions.motors))
