@@ -91,7 +91,7 @@ def train(config: TrainConfig, folder: Path) -> float:
 def note_guard(guard: GuardSettings) -> None:
     """Print the numbers of the track guard, if there is one."""
     if guard.active:
-        print_message("train", f"track guard: {guard.active} (guard.quantile={guard.quantile:g})")
+        print_message("train", f"track guard: {guard.active}")
 
 
 def note_unused_randomization(config: TrainConfig, draws: Draws) -> None:
