@@ -17,8 +17,8 @@ from cartpole_rl.reporting.figures.studies import (
     profiles,
     training_curves,
 )
-from cartpole_rl.reporting.studies.answers import GOOD, estimate_text, measure_label
-from cartpole_rl.reporting.studies.results import OWN, StudyResults
+from cartpole_rl.reporting.studies.answers import GOOD, agents_text, estimate_text, measure_label
+from cartpole_rl.reporting.studies.results import OWN, SMALLEST, StudyResults
 from cartpole_rl.reporting.studies.settings import Variant
 from cartpole_rl.reporting.studies.statistics import estimate, interquartile_mean
 
@@ -145,6 +145,11 @@ def _ratios(results: StudyResults) -> Iterator[Drawing]:
     first, second = results.evaluations[:2]
     label = f"{second.label} / {first.label}"
     shown, note = _most(groups)
+    counted = sum(series[""].size for series in groups.values())
+    if failed := results.pairs(first.name, second.name).shape[1] - counted:
+        note += (
+            f" {agents_text(failed)} without ratio: under {SMALLEST:.0%} of the highest on the {first.label}."
+        )
     figure = dot_rows(shown, label, {"1": 1.0})
     yield Drawing(
         svg(figure, described(shown, f"Ratio {label}")),

@@ -17,6 +17,7 @@ OWN = Variant(name="own", label="its own evaluation")  # the result of a run wit
 STAGES = (Variant(name="before", label="before"), Variant(name="after", label="after fine-tuning"))
 
 CART = "emulated"  # evaluation on the cart that stands for the real one
+SMALLEST = 0.1  # share of the study's highest value, below which an agent has no ratio
 
 Array = NDArray[np.float64]
 Curve = tuple[tuple[float, float], ...]  # (transitions, value)
@@ -102,9 +103,15 @@ class StudyResults:
         return any(evaluation.name in agent.values for agent in self.agents)
 
     def ratios(self, arm: str) -> Array:
-        """Return (second evaluation) / (first evaluation) of each agent [agents]; without a first of 0."""
-        first, second = self.pairs(self.evaluations[0].name, self.evaluations[1].name, arm)
-        return second[first != 0] / first[first != 0]
+        """Return (second evaluation) / (first evaluation) of each agent [agents].
+
+        Agents whose first value is under SMALLEST of the study's highest are left out: the ratio of two
+        failures means nothing.
+        """
+        names = self.evaluations[0].name, self.evaluations[1].name
+        every, (first, second) = self.pairs(*names)[0], self.pairs(*names, arm)
+        counts = (first > 0) & (first >= SMALLEST * max(every, default=0.0))
+        return second[counts] / first[counts]
 
     def pairs(self, evaluation: str, other: str, arm: str | None = None) -> Array:
         """Return the measures of the agents (of `arm`) that have both evaluations [2, agents]."""

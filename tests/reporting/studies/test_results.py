@@ -105,8 +105,8 @@ def test_the_answer_over_an_axis_is_that_at_its_ends() -> None:
     assert found[1].startswith("score (6.2) (4 rad/s): highest 1750")
 
 
-def test_ratios_leave_out_a_score_of_nothing() -> None:
-    values = {"wide": on_carts((100, 50), (0, 50)), "none": on_carts((10, 20), (10, 10))}
+def test_ratios_leave_out_agents_that_fail_on_the_first_cart() -> None:
+    values = {"wide": on_carts((100, 50), (9, 50), (0, 50)), "none": on_carts((10, 20), (10, 10))}
     found = results("one", values, evaluations=CARTS, ratio=True)
     np.testing.assert_allclose(found.ratios("wide"), [0.5])
     np.testing.assert_allclose(found.ratios("none"), [2.0, 1.0])
