@@ -53,6 +53,8 @@ def check_evaluation(config: EvaluateConfig) -> None:
     """Raise CartPoleError if the agent or the cart does not exist."""
     if config.run != BASELINE:
         check_agent(config.run)
+    elif config.drives_on_board:
+        raise ConfigError(f"run={BASELINE}: only a trained agent can drive on the board; give its run folder")
     if isinstance(config.plant, LearnedSettings):
         check_model(config.plant)
     check_parameters(config.parameters or {})

@@ -211,7 +211,7 @@ def test_an_emulated_cart_drives_by_the_c_code_of_a_policy():
 
 
 def test_the_c_code_of_a_policy_gives_0_at_another_period():
-    firmware = CFirmware(lambda: 0, policy=SHUTTLE)
+    firmware = CFirmware(lambda: 0, policy=SHUTTLE, pole_length=0.3556)
     firmware.homed = True
     motors = []
     for number, period_us in enumerate((10_000, 20_000), start=1):
