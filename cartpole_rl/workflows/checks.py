@@ -129,7 +129,7 @@ def check_agent(run: Path) -> None:
 
 def check_has_agent(run: Path) -> None:
     """Raise ConfigError if `run` is a run folder without an agent."""
-    check_program("run", run, "train", "finetune")
+    check_program("run", run, "train", "finetune", "distill")
     if (program := program_of(run)) and not (run / CHECKPOINTS / LAST).exists():
         raise ConfigError(
             f"run={run}: this run of {PREFIX}{program} has no agent yet; {use_of(run, program)}"

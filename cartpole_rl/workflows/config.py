@@ -22,6 +22,7 @@ from cartpole_rl.envs.settings import GuardSettings
 from cartpole_rl.identification.settings import EnsembleSettings
 from cartpole_rl.learning.settings import (
     BufferSettings,
+    DistillationSettings,
     FinetuningSettings,
     LearningSettings,
     OptimizerSettings,
@@ -284,6 +285,14 @@ class ExportConfig(Settings):
     run: Path
     format: Literal["weights", "onnx", "c", "web"]
     label: str
+
+
+class DistillConfig(RunSettings):
+    """cartpole-distill."""
+
+    run: Path
+    hidden: Annotated[tuple[Count, ...], Field(min_length=1)]
+    distillation: DistillationSettings
 
 
 class PreflightConfig(OnCart):
