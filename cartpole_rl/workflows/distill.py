@@ -59,5 +59,6 @@ def distill(config: DistillConfig, folder: Path) -> float:
 def student_settings(training: TrainConfig, config: DistillConfig) -> TrainConfig:
     """Return the settings of the teacher's training with the student's network. Raises ConfigError."""
     agent = training.agent.model_dump() | {"hidden": config.hidden, "recurrent": None}
-    values = {**training.model_dump(mode="json"), "agent": agent, "seed": config.seed}
+    own = {"agent": agent, "seed": config.seed, "compile": False, "device": "cpu"}
+    values = {**training.model_dump(mode="json"), **own}
     return with_fitted_guard(checked(TrainConfig, values))

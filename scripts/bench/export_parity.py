@@ -50,6 +50,7 @@ from cartpole_rl.workflows.loading import load_settings
 CARTS = 200  # simulated at once
 SEED = 1
 NANOSECONDS = 16  # of an instruction in QEMU, -icount shift=4
+ROUNDINGS = 4  # of float32, by which equal action values may differ
 TIMED = 1000  # choices that firmware/boards/qemu_policy times
 MEMORY = 0x21000000  # where it finds the observations
 LONGEST = 100_000  # observations that fit there
@@ -188,12 +189,16 @@ def on_processor(folder: Path, observations: Array) -> tuple[Array, float]:
 
 
 def row(name: str, actions: Array, values: Array) -> dict[str, Any]:
-    """Return how many actions differ from the best ones by `values`, and the largest cost of one."""
+    """Return how many actions differ from the best ones by `values`, and the largest cost of one.
+
+    Another order of the sums changes a value by a few roundings, and decides between equally good actions.
+    """
     cost = values.max(1) - np.take_along_axis(values, actions[:, None].astype(np.int64), 1)[:, 0]
     return {
         "of": name,
         "observations": len(values),
         "differ": int((actions != values.argmax(1)).sum()),
+        "beyond rounding": int((cost > ROUNDINGS * np.spacing(values.max(1))).sum()),
         "largest cost": f"{cost.max():.1e}",
     }
 

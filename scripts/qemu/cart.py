@@ -4,7 +4,7 @@
     scripts/qemu/cart.py                           # prints {"port": "/dev/pts/5", ...} and runs until Ctrl-C
     scripts/qemu/cart.py '{"cart_viscous": 1.0}'   # true parameters of the cart, see docs/emulator.md
     cartpole-evaluate run=... plant=serial plant.port=/dev/pts/5
-    scripts/qemu/cart.py --policy FOLDER           # with an agent on the board; see scripts/onboard.py
+    scripts/qemu/cart.py --policy FOLDER           # with an agent on the board: plant.policy=onboard
 
 Needs the Debian packages qemu-system-arm, gcc-arm-none-eabi, libnewlib-arm-none-eabi and make. It compiles
 firmware/ for the board qemu_an386. UART 0 of the board is a pseudo-terminal, which a host opens like any
