@@ -19,6 +19,7 @@ from cartpole_rl.errors import LearningError
 from cartpole_rl.learning.schedules import half_cosine
 from cartpole_rl.learning.settings import DistillationSettings
 
+LAST_RATE = 0.03  # share of the learning rate at the end
 Driver = Callable[[TensorDictBase], TensorDictBase]  # from `observation` to `action` and `action_value`
 
 
@@ -43,8 +44,8 @@ class Distillation:
         self._by_student = torch.arange(env.plant.carts) % 2 == 0
         self._observations: list[Tensor] = []  # [N, K] for each period
         self._values: list[Tensor] = []  # [N, A], the teacher's
-        self._weights = [weight for weight in student.actor.parameters() if weight.requires_grad]
-        self._optimizer = torch.optim.Adam(self._weights, lr=settings.learning_rate, fused=True)
+        weights = [weight for weight in student.actor.parameters() if weight.requires_grad]
+        self._optimizer = torch.optim.Adam(weights, lr=settings.learning_rate, fused=True)
 
     @property
     def transitions(self) -> int:
@@ -82,7 +83,9 @@ class Distillation:
         for update in range(settings.updates):
             progress = (number + update / settings.updates) / settings.rounds
             for group in self._optimizer.param_groups:
-                group["lr"] = half_cosine(settings.learning_rate, 0.03 * settings.learning_rate, progress)
+                group["lr"] = half_cosine(
+                    settings.learning_rate, LAST_RATE * settings.learning_rate, progress
+                )
             rows = torch.randint(len(observations), (settings.batch_size,), generator=self._random)
             losses.append(self._update(observations[rows], values[rows]))
         return sum(losses) / len(losses)
