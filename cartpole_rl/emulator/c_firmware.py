@@ -32,18 +32,24 @@ class CartHead(ctypes.Structure):
 class CFirmware:
     """The C firmware of one cart, just booted: idle, not homed, motor 0. Times are us since boot."""
 
-    def __init__(self, delay_us: Callable[[], int], zero_error: int = 0, policy: Path | None = None) -> None:
+    def __init__(
+        self,
+        delay_us: Callable[[], int],
+        zero_error: int = 0,
+        policy: Path | None = None,
+        pole_length: float = 0.0,
+    ) -> None:
         """`delay_us` returns a command's latency; homing sets the pole's zero `zero_error` counts too low.
 
-        `policy` is a folder with policy.h and policy.c, of an agent that drives on the board. Raises
-        EmulatorError if the C firmware cannot be compiled.
+        `policy` is a folder with policy.h and policy.c, of an agent that drives on the board; it may observe
+        `pole_length` in m. Raises EmulatorError if the C firmware cannot be compiled.
         """
         self._library = load_library(policy)
         self._memory = ctypes.create_string_buffer(self._library.cart_size())
         self._head = CartHead.from_buffer(self._memory)
         self._answer = ctypes.create_string_buffer(LONGEST_ANSWER)
         self._library.cart_boot(self._memory)
-        self._library.cart_attach_policy(self._memory)
+        self._library.cart_attach_policy(self._memory, pole_length)
         self._head.pole_trim = zero_error
         self._delay_us = delay_us
         self.carried_out: Message | None = None  # the newest message; None if it was refused or damaged

@@ -102,7 +102,7 @@ def load_library(policy: Path | None = None) -> ctypes.CDLL:
     signatures = {
         "cart_size": (size, []),
         "cart_boot": (None, [pointer]),
-        "cart_attach_policy": (None, [pointer]),
+        "cart_attach_policy": (None, [pointer, ctypes.c_float]),
         "cart_receive": (size, [pointer, ctypes.c_char_p, size, us, ctypes.c_char_p]),
         "cart_delay_command": (None, [pointer, us]),
         "cart_drive": (ctypes.c_bool, [pointer, us, ctypes.POINTER(us)]),

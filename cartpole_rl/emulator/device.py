@@ -108,7 +108,8 @@ class CartDevice:
         """Return the firmware that the settings choose, just booted."""
         zero_error = round(self._settings.angle_offset / POLE_RADIANS)
         if self._settings.firmware == "c":
-            return CFirmware(self._latency_us, zero_error, self._settings.policy)
+            length = 2 * self._settings.pole_com
+            return CFirmware(self._latency_us, zero_error, self._settings.policy, length)
         return Firmware(self._latency_us, zero_error)
 
     def _counts(self) -> tuple[int, int]:

@@ -44,9 +44,11 @@ from cartpole_rl.wire.messages import (
     Stop,
 )
 
-FIRMWARE = (1, 0, 0)
-BANNER = b"ets Jul 29 2019 12:21:46\r\n\r\nrst:0x1 (POWERON_RESET),boot:0x13\r\ncart 1.0.0\r\n\x00"
+FIRMWARE = (1, 1, 0)  # 1.1.0 knows START_POLICY, 1.0.0 does not
 # the text of an ESP32, and one 0x00 that separates it from the first frame
+BANNER = (
+    b"ets Jul 29 2019 12:21:46\r\n\r\nrst:0x1 (POWERON_RESET),boot:0x13\r\ncart %d.%d.%d\r\n\x00" % FIRMWARE
+)
 PERIOD_US = 20_000
 SHORTEST_US, LONGEST_US = 5_000, 100_000
 SOFT_LIMIT = round(0.027 / CART_METRES)  # counts inside a stop

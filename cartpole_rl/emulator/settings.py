@@ -16,6 +16,7 @@ Share = Annotated[
     float, Field(allow_inf_nan=False, ge=0, le=0.9)
 ]  # of frames; above 0.9 hardly any frame would arrive
 LARGEST_MOTOR = 255
+ONBOARD = Path("onboard")  # as `policy`: the agent that is evaluated
 MotorValue = Annotated[float, Field(ge=0, le=LARGEST_MOTOR)]
 Coefficient = Annotated[float, Field(allow_inf_nan=False)]
 
@@ -27,7 +28,8 @@ class EmulatorSettings(Settings):
     firmware: Literal["python", "c"] = (
         "python"  # the reference, or the portable C of a real cart, compiled on first use
     )
-    policy: Path | None = None  # folder of an agent in C that drives after START_POLICY; needs firmware=c
+    # folder of an agent in C that drives after START_POLICY; in cartpole-evaluate onboard: the agent of run=
+    policy: Path | None = None
     seed: Annotated[int, Field(ge=0)] = (
         0  # of latencies, disturbed frames, boot position and the hand's angle
     )

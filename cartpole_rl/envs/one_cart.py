@@ -53,7 +53,11 @@ class OneCart:
 
     def sent_motor(self, action: int) -> int:
         """Return the motor value to send: that of the action, or full motor inward under the track guard."""
-        motor, (side,) = self.motor(action), self.percept.guard
+        return self.guarded_motor(action, self.percept)
+
+    def guarded_motor(self, action: int, percept: FirstPercept[Numbers] | Percept[Numbers]) -> int:
+        """Return the motor value that would be sent for an action on a percept."""
+        motor, (side,) = self.motor(action), percept.guard
         if side == 0 or action == NO_ACTION:
             return motor
         return self._inward[side]
@@ -70,12 +74,16 @@ class OneCart:
 
     def step(self, action: int) -> Percept[Numbers]:
         """Drive one period."""
-        motor, before, earlier = self.sent_motor(action), self.percept, self.frame.counts
+        motor = self.sent_motor(action)
+        frame = self.plant.step_one(motor)
+        return self.advance(motor, frame._replace(truncated=frame.truncated or action == NO_ACTION))
+
+    def advance(self, motor: int, frame: OneFrame) -> Percept[Numbers]:
+        """Perceive the frame at the end of a period under a motor value."""
+        before, earlier, self.frame = self.percept, self.frame.counts, frame
         memory = before.state, before.past, before.step_count
         previous = Previous(earlier, *memory, (motor,), self._length, self._track_end)
-        self.frame = frame = self.plant.step_one(motor)
-        truncated = frame.truncated or action == NO_ACTION
-        output = PlantOutput(frame.counts, (frame.dt,), (frame.terminated,), (truncated,))
+        output = PlantOutput(frame.counts, (frame.dt,), (frame.terminated,), (frame.truncated,))
         now: Percept[Numbers] = self._perceive(previous, output)
         self.percept = now
         return now

@@ -5,7 +5,7 @@ over-represented.
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,9 +15,11 @@ from torch import Tensor
 from torchrl.modules import QValueActor
 
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
+from cartpole_rl.envs.one_cart import Numbers
+from cartpole_rl.envs.perception import FirstPercept, Percept
 from cartpole_rl.evaluation.driving_policy import DrivingPolicy
 from cartpole_rl.evaluation.knocks import Knocks
-from cartpole_rl.plants.specs import OneCartPlant, tensordict_of
+from cartpole_rl.plants.specs import OneCartPlant, OneFrame, tensordict_of
 from cartpole_rl.scheduling import no_garbage_collection
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
@@ -89,8 +91,7 @@ def run_one(env: CartPoleEnv, policy: Policy) -> Episode:
         frames, observation = [cart.frame], first.observation
         try:
             while not done:  # the cart waits for this loop; the rest is done afterwards
-                observed = torch.from_numpy(np.array([observation], np.float32))
-                action = int(choose(policy, tensordict_of({"observation": observed})))
+                action = chosen_action(policy, observation)
                 motors.append(cart.sent_motor(action))
                 step = cart.step(action)
                 actions.append(action)
@@ -99,15 +100,34 @@ def run_one(env: CartPoleEnv, policy: Policy) -> Episode:
                 observation, (done,) = step.observation, step.done
         finally:
             env.plant.halt()  # a real cart would keep its last motor value
+    motor = np.array(motors)
+    guarded = motor != np.array([cart.motor(action) for action in actions])
+    ending = ending_of(env, action, steps[-1].truncated[0], steps[-1].state[2])
+    return replace(one_episode(env, first, steps, frames, motor, guarded, ending), origin=origin)
+
+
+def chosen_action(policy: Policy, observation: Sequence[float]) -> int:
+    """Return the policy's action on the observation of one cart."""
+    observed = torch.from_numpy(np.array([observation], np.float32))
+    return int(choose(policy, tensordict_of({"observation": observed})))
+
+
+def one_episode(
+    env: CartPoleEnv,
+    first: FirstPercept[Numbers],
+    steps: Sequence[Percept[Numbers]],
+    frames: Sequence[OneFrame],
+    motor: np.ndarray,
+    guarded: np.ndarray,
+    ending: str,
+) -> Episode:
+    """Return the episode of one cart from its percepts, its frames, and its motor values, guarded or not."""
     columns = {key: np.array([getattr(step, key) for step in steps])[:, 0] for key in _FROM_NEXT}
     columns["state"] = np.array([first.state, *(step.state for step in steps)])
     columns["counts"] = np.array([frame.counts for frame in frames])
     columns["time"] = np.cumsum([0.0, *(frame.dt for frame in frames[1:])])
-    columns["motor"] = np.array(motors)
-    columns["guarded"] = columns["motor"] != np.array([cart.motor(action) for action in actions])
-    (truncated,), theta = step.truncated, step.state[2]
-    ending = _ending(env, action, truncated, theta)
-    return replace(_episode(columns, ending, env.hardware.guard is not None), origin=origin)
+    columns |= {"motor": motor, "guarded": guarded}
+    return _episode(columns, ending, env.hardware.guard is not None)
 
 
 @torch.no_grad()
@@ -157,10 +177,10 @@ def _note_endings(
     for row in outcome["done"].squeeze(-1).nonzero().squeeze(-1).tolist():
         if endings[row] is None:
             last = outcome[row]
-            endings[row] = _ending(env, int(action[row]), last["truncated"].item(), last["state"][2].item())
+            endings[row] = ending_of(env, int(action[row]), last["truncated"].item(), last["state"][2].item())
 
 
-def _ending(env: CartPoleEnv, action: int, truncated: bool, theta: float) -> str:
+def ending_of(env: CartPoleEnv, action: int, truncated: bool, theta: float) -> str:
     """Return why an episode ended after `action`, at `theta` rad."""
     reported = env.plant.ended_by
     if reported:

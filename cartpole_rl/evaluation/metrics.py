@@ -25,7 +25,9 @@ def episode_metrics(episode: Episode, track_half_length: float) -> dict[str, Any
     which the RMS of angle and position are taken; `rms_motor_change` that of the step from one motor value to
     the next; `guarded_fraction` the share of periods in which the track guard replaced the agent's motor
     value; `upright_at_end` is 1 if the pole is within 5 degrees for the last second of a full-length episode;
-    `min_track_margin_m` the smallest distance from `track_half_length`, negative beyond it.
+    `min_track_margin_m` the smallest distance from `track_half_length`, negative beyond it. Only an episode
+    that the cart's board drove has `same_as_host_fraction`, the share of periods with the motor value that
+    this computer would have sent.
     """
     upright = is_upright(episode.theta[1:])
     change = np.diff(episode.motor)
@@ -43,12 +45,19 @@ def episode_metrics(episode: Episode, track_half_length: float) -> dict[str, Any
         "rms_motor_change": _rms(change),
         "guarded_fraction": None if episode.guarded is None else float(episode.guarded.mean()),
         "min_track_margin_m": float(track_half_length - np.abs(episode.x).max()),
+        **_same_as_host(episode),
     }
 
 
 def stands_at_end(episode: Episode) -> bool:
     """Return True for a pole that is upright for the last second of an episode of full length."""
     return episode.ended_by == Ending.TIME and upright_at_end(episode.time, episode.theta)
+
+
+def _same_as_host(episode: Episode) -> dict[str, float]:
+    if episode.expected is None:
+        return {}
+    return {"same_as_host_fraction": float((episode.motor == episode.expected).mean())}
 
 
 def _rms(values: np.ndarray) -> float | None:

@@ -67,6 +67,19 @@ class LearningSettings(Settings):
         return self.iterations * self.carts * self.chunk
 
 
+class DistillationSettings(Settings):
+    """Distillation of an agent into a smaller network."""
+
+    carts: Count  # simulated in parallel
+    rounds: Count  # of driving, then learning
+    periods: Count  # that each cart is driven in a round
+    updates: Count  # gradient steps in a round
+    batch_size: Count
+    learning_rate: Positive  # at the start; it falls along half a cosine
+    epsilon: Fraction  # share of random actions
+    value_weight: NonNegative  # of the error of the mean action value, beside that of the advantages
+
+
 class FinetuningSettings(Settings):
     """Fine-tuning of a trained agent on one cart."""
 

@@ -19,9 +19,19 @@ SCORES = {  # key in metrics.json: label
 
 def score_table(summary: Mapping[str, Any], heading: str) -> str:
     """Return a table of the means in a summary of episodes (`evaluation.metrics.summarize`)."""
+    return score_columns({"mean": summary}, heading)
+
+
+def score_columns(summaries: Mapping[str, Mapping[str, Any]], heading: str) -> str:
+    """Return a table with a column of means for each summary, by its name."""
     rows = [
-        {"figure": label, "mean": interval_text(value["mean"], value["low"], value["high"])}
+        {"figure": label, **{name: mean_text(summary[key]) for name, summary in summaries.items()}}
         for key, label in SCORES.items()
-        if (value := summary[key]) is not None
+        if any(summary[key] is not None for summary in summaries.values())
     ]
-    return table(rows, {"figure": heading, "mean": "mean"})
+    return table(rows, {"figure": heading, **{name: name for name in summaries}})
+
+
+def mean_text(value: Mapping[str, Any] | None) -> str | None:
+    """Return a mean with its interval; None without one."""
+    return None if value is None else interval_text(value["mean"], value["low"], value["high"])

@@ -30,7 +30,7 @@ class Episode:
     theta: Array  # [T+1] rad, 0 upright, positive to the right, not wrapped
     theta_dot: Array  # [T+1] rad/s
     counts: NDArray[np.int64]  # [T+1, 2] encoder counts of cart and pole, as the cart sent them
-    motor: NDArray[np.int64]  # [T] motor value sent, -255 to 255
+    motor: NDArray[np.int64]  # [T] motor value sent, -255 to 255; reported, where the cart's board drove
     score: Array  # [T] equation (6.2) of each step, at state t+1
     score_upright: Array  # [T] equation (6.1) of each step, at state t+1
     reward: Array  # [T]
@@ -38,6 +38,10 @@ class Episode:
     origin: Origin | None = None  # None on a real cart
     guarded: NDArray[np.bool_] | None = (
         None  # [T] the track guard replaced the agent's motor value; None without one
+    )
+
+    expected: NDArray[np.int64] | None = (
+        None  # [T] motor value that this computer would have sent, where a policy on the cart's board drove
     )
 
     @property

@@ -53,6 +53,8 @@ def check_evaluation(config: EvaluateConfig) -> None:
     """Raise CartPoleError if the agent or the cart does not exist."""
     if config.run != BASELINE:
         check_agent(config.run)
+    elif config.drives_on_board:
+        raise ConfigError(f"run={BASELINE}: only a trained agent can drive on the board; give its run folder")
     if isinstance(config.plant, LearnedSettings):
         check_model(config.plant)
     check_parameters(config.parameters or {})
@@ -127,7 +129,7 @@ def check_agent(run: Path) -> None:
 
 def check_has_agent(run: Path) -> None:
     """Raise ConfigError if `run` is a run folder without an agent."""
-    check_program("run", run, "train", "finetune")
+    check_program("run", run, "train", "finetune", "distill")
     if (program := program_of(run)) and not (run / CHECKPOINTS / LAST).exists():
         raise ConfigError(
             f"run={run}: this run of {PREFIX}{program} has no agent yet; {use_of(run, program)}"

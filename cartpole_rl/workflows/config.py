@@ -2,13 +2,13 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
 from cartpole_rl.agents.settings import AgentSettings
 from cartpole_rl.checking import kinds
-from cartpole_rl.emulator.settings import EmulatorSettings
+from cartpole_rl.emulator.settings import ONBOARD, EmulatorSettings
 from cartpole_rl.envs.cart_pole_settings import (
     CartFrictionSettings,
     CartPoleSettings,
@@ -22,6 +22,7 @@ from cartpole_rl.envs.settings import GuardSettings
 from cartpole_rl.identification.settings import EnsembleSettings
 from cartpole_rl.learning.settings import (
     BufferSettings,
+    DistillationSettings,
     FinetuningSettings,
     LearningSettings,
     OptimizerSettings,
@@ -47,11 +48,26 @@ class RunSettings(Settings):
     threads: Count | None
 
 
+def policy_key(plant: Settings, emulator: EmulatorSettings) -> str:
+    """Return the setting that gives the cart's board a policy to drive by; empty if there is none."""
+    if isinstance(plant, EmulatedSettings) and emulator.policy is not None:
+        return f"emulator.policy={emulator.policy}"
+    if isinstance(plant, SerialSettings) and plant.policy is not None:
+        return f"plant.policy={plant.policy}"
+    return ""
+
+
 class OnCart(Settings):
     """The cart on a port: `plant`, which is a real one or one with the settings `emulator`."""
 
     plant: Annotated[EmulatedSettings | SerialSettings, Field(discriminator="kind")]
     emulator: EmulatorSettings
+
+    @model_validator(mode="after")
+    def _this_computer_drives(self) -> Self:
+        if key := policy_key(self.plant, self.emulator):
+            raise ValueError(f"{key}: only cartpole-evaluate lets the cart's board drive; leave it out")
+        return self
 
 
 class TrainConfig(RunSettings, CartPoleSettings):
@@ -153,11 +169,28 @@ class EvaluateConfig(RunSettings):
             raise ValueError(f"view=live: it shows a cart on a port; plant={kind} has none")
         if kind != "emulated" and self.emulator != EmulatorSettings():
             raise ValueError(f"emulator: plant={kind} does not read it; give plant=emulated")
+        if self.emulator.policy not in (None, ONBOARD):
+            raise ValueError(
+                f"emulator.policy={self.emulator.policy}: this command exports the agent of run= itself; "
+                "give emulator.policy=onboard"
+            )
         return self
+
+    @property
+    def drives_on_board(self) -> bool:
+        """True if episodes are also driven by the agent on the cart's board."""
+        return bool(policy_key(self.plant, self.emulator))
 
 
 class RecordConfig(EvaluateConfig):
     """cartpole-record. It has the settings of an evaluation."""
+
+    @model_validator(mode="after")
+    def _this_computer_drives(self) -> Self:
+        if self.drives_on_board:
+            key = policy_key(self.plant, self.emulator)
+            raise ValueError(f"{key}: only cartpole-evaluate lets the cart's board drive; leave it out")
+        return self
 
 
 class FinetuneConfig(RunSettings, OnCart):
@@ -252,6 +285,14 @@ class ExportConfig(Settings):
     run: Path
     format: Literal["weights", "onnx", "c", "web"]
     label: str
+
+
+class DistillConfig(RunSettings):
+    """cartpole-distill."""
+
+    run: Path
+    hidden: Annotated[tuple[Count, ...], Field(min_length=1)]
+    distillation: DistillationSettings
 
 
 class PreflightConfig(OnCart):

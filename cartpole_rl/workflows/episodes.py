@@ -9,6 +9,7 @@ from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
 from cartpole_rl.evaluation.episodes import Policy, run_batch, run_episodes
 from cartpole_rl.evaluation.knocks import Knocks
+from cartpole_rl.evaluation.onboard import run_onboard_episodes
 from cartpole_rl.evaluation.publishing import followed
 from cartpole_rl.learning.randomness import seed_everything
 from cartpole_rl.plants.simulated import SimulatedPlant
@@ -17,6 +18,7 @@ from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.agents import evaluated_agent
 from cartpole_rl.workflows.build import evaluated_env, evaluated_settings, precedence, use_threads
 from cartpole_rl.workflows.config import EvaluateConfig
+from cartpole_rl.workflows.export import on_the_board
 from cartpole_rl.workflows.live import LiveView, view_title
 from cartpole_rl.workflows.person import confirm
 from cartpole_rl.workflows.progress import progress_bar
@@ -38,11 +40,21 @@ class Evaluation:
         if self.repetition:
             yield from repeated(self.env, self.policy, self.repetition, self.knocks)
             return
+        count = self.config.episodes
+        yield from self._shown(run_episodes(self.env, self.policy, count, self.knocks), "episodes")
+
+    def onboard_episodes(self) -> Iterator[Episode]:
+        """Let the policy on the cart's board drive, and yield each episode as it ends."""
+        driven = run_onboard_episodes(self.env, self.policy, self.config.episodes)
+        yield from self._shown(driven, "episodes on the board")
+
+    def _shown(self, episodes: Iterator[Episode], name: str) -> Iterator[Episode]:
+        """Drive episodes behind a progress bar and the live view."""
         config = self.config
         with LiveView(view_title(config.plant), config.view) as live:
             followed(self.env, live.memory)
             with precedence(config.plant, config.emulator):
-                yield from with_progress(self.env, self.policy, config.episodes, self.knocks)
+                yield from with_progress(episodes, config.episodes, name)
 
     @property
     def knocks(self) -> Knocks | None:
@@ -60,7 +72,8 @@ def prepared(config: EvaluateConfig) -> Evaluation:
     seed_everything(config.seed)
     agent = evaluated_agent(config)
     settings = evaluated_settings(agent.training, config)
-    env = evaluated_env(settings, config, prompt=tqdm.write, confirm=confirm)
+    with on_the_board(config, agent, settings) as equipped:
+        env = evaluated_env(settings, equipped, prompt=tqdm.write, confirm=confirm)
     return Evaluation(config, settings, env, agent.policy, again)
 
 
@@ -71,12 +84,10 @@ def repeated(env: CartPoleEnv, policy: Policy, again: Repetition, knocks: Knocks
     yield run_batch(env, policy, knocks)[again.row]
 
 
-def with_progress(
-    env: CartPoleEnv, policy: Policy, episodes: int, knocks: Knocks | None
-) -> Iterator[Episode]:
-    """Drive episodes behind a progress bar that shows the score of each."""
-    with progress_bar(episodes, "episodes") as progress:
-        for episode in run_episodes(env, policy, episodes, knocks):
+def with_progress(episodes: Iterator[Episode], count: int, name: str) -> Iterator[Episode]:
+    """Drive `count` episodes behind a progress bar that shows the score of each."""
+    with progress_bar(count, name) as progress:
+        for episode in episodes:
             progress.set_postfix_str(f"score {episode.score.sum():.0f}{guard_text(episode)}", refresh=False)
             progress.update()
             yield episode

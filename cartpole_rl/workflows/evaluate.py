@@ -10,7 +10,7 @@ from cartpole_rl.plants.serial.plant import SerialPlant
 from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.plants.settings import EmulatedSettings
 from cartpole_rl.plants.simulated import NOISE_PARAMETERS
-from cartpole_rl.reporting.scores import score_table
+from cartpole_rl.reporting.scores import score_columns, score_table
 from cartpole_rl.reporting.words import count_text
 from cartpole_rl.run_files import FIGURES, METRICS
 from cartpole_rl.tasks.endings import Ending
@@ -33,6 +33,7 @@ def evaluate(config: EvaluateConfig, folder: Path) -> None:
     """
     evaluation = prepared(config)
     episodes: list[Episode] = []
+    onboard: list[Episode] = []
     try:
         with closing(evaluation.env):
             settings = evaluation.settings.model_dump(mode="json")
@@ -41,26 +42,43 @@ def evaluate(config: EvaluateConfig, folder: Path) -> None:
             )
             for episode in evaluation.episodes():
                 episodes.append(episode)
+            if config.drives_on_board:
+                for episode in evaluation.onboard_episodes():
+                    onboard.append(episode)
     finally:  # after a broken link or Ctrl-C, the episodes until then are reported
         if episodes:
-            report_evaluation(evaluation, episodes, folder)
+            report_evaluation(evaluation, episodes, onboard, folder)
 
 
-def report_evaluation(evaluation: Evaluation, episodes: Sequence[Episode], folder: Path) -> None:
-    """Write metrics.json and figures/, and print the scores."""
+def report_evaluation(
+    evaluation: Evaluation, episodes: Sequence[Episode], onboard: Sequence[Episode], folder: Path
+) -> None:
+    """Write metrics.json and figures/, and print the scores; `onboard` are those that the board drove."""
     plant, settings = evaluation.config.plant.kind, evaluation.settings
     link = link_figures(evaluation.env)
-    summary = report(folder, episodes, plant, settings.pole, settings.task.x_max, link)
-    print(score_table(summary, f"plant={plant}, {count_text(len(episodes))}"))
+    summary = report(folder, episodes, plant, settings.pole, settings.task.x_max, link, onboard=onboard)
+    heading = f"plant={plant}, {count_text(len(episodes))}"
+    if onboard:
+        print(score_columns({"this computer": summary, "on the board": summary["onboard"]}, heading))
+        print(same_motors(onboard))
+    else:
+        print(score_table(summary, heading))
     if settings.guard.active:
         print(f"track guard: {settings.guard.active}")
-    for line in cut_off(episodes):
+    for line in cut_off([*episodes, *onboard]):
         print(line)
     if evaluation.repetition:
         print(compared(evaluation.repetition, episodes[0]))
     if link.get("latency_override"):
         print(f"latency as measured, for cartpole-train: '{link['latency_override']}'")
     print_results(folder, f"{METRICS} and {FIGURES}/", next_command(evaluation.config))
+
+
+def same_motors(onboard: Sequence[Episode]) -> str:
+    """Return a line that compares the motor values of the board with those of the agent here."""
+    same = sum(int((episode.motor == episode.expected).sum()) for episode in onboard)
+    steps = sum(episode.steps for episode in onboard)
+    return f"on the board: {same} of {steps} motor values are those that this computer would have sent"
 
 
 def next_command(config: EvaluateConfig) -> str:

@@ -1,12 +1,17 @@
 """Write a trained agent for other programs."""
 
 import json
-from collections.abc import Mapping
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from cartpole_rl.agents.network import MirrorQNetwork, QNetwork
+from cartpole_rl.emulator.settings import ONBOARD
 from cartpole_rl.envs.build import with_fitted_guard
+from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.exporting.agent import ExportedAgent, canonical_json
 from cartpole_rl.exporting.c_code import c_files
@@ -22,7 +27,7 @@ from cartpole_rl.plants.settings import SimulatedSettings
 from cartpole_rl.randomization.checks import possible_poles
 from cartpole_rl.run_files import CHECKPOINTS, PROVENANCE
 from cartpole_rl.workflows.agents import TrainedAgent, trained_agent
-from cartpole_rl.workflows.config import ExportConfig, TrainConfig
+from cartpole_rl.workflows.config import EvaluateConfig, ExportConfig, TrainConfig
 from cartpole_rl.workflows.run_folder import write_config
 
 
@@ -41,6 +46,28 @@ def export(config: ExportConfig, folder: Path) -> None:
         write_bytes(folder / name, content)
     files = " and ".join(f"{folder}/{name}" for name in contents)
     print(f"{files} {'are' if len(contents) > 1 else 'is'} written; SHA-256 of the agent: {agent.checksum}")
+
+
+@contextmanager
+def on_the_board(
+    config: EvaluateConfig, trained: TrainedAgent, settings: CartPoleSettings
+) -> Iterator[EvaluateConfig]:
+    """Yield `config`; with emulator.policy=onboard its emulated cart has the agent on its board.
+
+    The agent has the actions, guard and task of `settings`, as on this computer. Its files are needed
+    until the cart has started. Raises ConfigError for an agent that cannot be exported.
+    """
+    if config.emulator.policy != ONBOARD:
+        yield config
+        return
+    shared = {name: getattr(settings, name) for name in CartPoleSettings.model_fields}
+    evaluated = replace(trained, training=trained.training.model_copy(update=shared))
+    contents = files_of("c", exported_agent(evaluated, provenance(config.run)), evaluated)
+    with tempfile.TemporaryDirectory() as folder:
+        for name, content in contents.items():
+            Path(folder, name).write_bytes(content)
+        emulator = config.emulator.model_copy(update={"policy": Path(folder)})
+        yield config.model_copy(update={"emulator": emulator})
 
 
 def exported_agent(trained: TrainedAgent, origin: Mapping[str, Any]) -> ExportedAgent:

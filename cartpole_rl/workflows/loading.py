@@ -8,6 +8,7 @@ from cartpole_rl.choices import compose
 from cartpole_rl.errors import CheckpointError, ConfigError
 from cartpole_rl.settings import Settings
 from cartpole_rl.workflows.config import (
+    DistillConfig,
     EvaluateConfig,
     ExportConfig,
     FinetuneConfig,
@@ -31,6 +32,7 @@ COMMANDS: dict[type[Settings], str] = {
     PreflightConfig: "preflight",
     ReportConfig: "report",
     ExportConfig: "export",
+    DistillConfig: "distill",
 }
 
 Config = TypeVar("Config", bound=Settings)

@@ -22,20 +22,37 @@ def report(
     x_max: float,
     link: Mapping[str, int] | None = None,
     history: Sequence[Mapping[str, float]] = (),
+    onboard: Sequence[Episode] = (),
 ) -> dict[str, Any]:
     """Write metrics.json and figures/ into `folder`, and return the summary of the episodes (`summarize`).
 
-    The behaviour figure and the animation show the first episode; `history` adds the learning curve.
+    Behaviour figure and animation show the first episode. `history` adds the learning curve, `onboard` the
+    episodes that the cart's board drove, under that key of metrics.json and of the summary.
     """
-    metrics = [episode_metrics(episode, x_max) for episode in episodes]
-    summary = summarize(metrics)
+    summary, listed = summarized(episodes, x_max)
     header = {"plant": plant, "pole": pole.name, **(link or {})}
     cart, origins = stored_origins(episodes)
-    listed = [{**each, **origin} for each, origin in zip(metrics, origins, strict=True)]
-    write_json(folder / METRICS, {**header, **summary, **cart, "episodes": listed})
+    listed = [{**each, **origin} for each, origin in zip(listed, origins, strict=True)]
+    content = {**header, **summary, **cart, "episodes": listed}
     figures = folder / FIGURES
-    save(behaviour(episodes[0], f"First episode, plant={plant}", x_max), figures / "behaviour.png")
-    write_gif(episodes[0], figures / "episode.gif", pole.nominal.length, x_max, f"plant={plant}")
+    if onboard:
+        summary["onboard"], listed = summarized(onboard, x_max)
+        content["onboard"] = {**summary["onboard"], "episodes": listed}
+        draw(onboard[0], figures, "onboard_", f"plant={plant}, on the board", pole, x_max)
+    write_json(folder / METRICS, content)
+    draw(episodes[0], figures, "", f"plant={plant}", pole, x_max)
     if history:
         save(learning_curve([("score", list(history))]), figures / "learning_curve.png")
     return summary
+
+
+def summarized(episodes: Sequence[Episode], x_max: float) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """Return the summary of episodes, and the metrics of each."""
+    metrics = [episode_metrics(episode, x_max) for episode in episodes]
+    return summarize(metrics), metrics
+
+
+def draw(episode: Episode, folder: Path, prefix: str, title: str, pole: PoleSettings, x_max: float) -> None:
+    """Write the behaviour figure and the animation of the first episode."""
+    save(behaviour(episode, f"First episode, {title}", x_max), folder / f"{prefix}behaviour.png")
+    write_gif(episode, folder / f"{prefix}episode.gif", pole.nominal.length, x_max, title)

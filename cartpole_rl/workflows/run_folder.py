@@ -35,6 +35,7 @@ PREFIX = "cartpole-"
 USES = {  # command: how its runs can be used
     "train": "cartpole-evaluate, cartpole-record and cartpole-finetune take it as run={0}",
     "finetune": "cartpole-evaluate, cartpole-record and cartpole-finetune take it as run={0}",
+    "distill": "cartpole-evaluate, cartpole-record and cartpole-finetune take it as run={0}",
     "evaluate": "cartpole-evaluate drives one of its episodes again: repeat.run={0}",
     "record": "cartpole-replay, cartpole-identify and cartpole-model take it as from={0}",
     "replay": f"its results are replay.json and {FIGURES}/; cartpole-replay from=... makes new ones",

@@ -4,15 +4,19 @@
 #include <string.h>
 
 #ifdef CART_ONBOARD_POLICY
+static float pole_length; /* m */
+#define CART_POLE_LENGTH pole_length
 #include "onboard.h"
 #endif
 
-void cart_attach_policy(cart *self)
+void cart_attach_policy(cart *self, float length)
 {
 #ifdef CART_ONBOARD_POLICY
+    pole_length = length;
     onboard_attach(self);
 #else
     (void)self;
+    (void)length;
 #endif
 }
 

@@ -6,8 +6,9 @@
 
 #define CART_SNAPSHOT_NUMBERS 47
 
-/* Give a cart that has just booted the policy with which the library was compiled, if any. */
-void cart_attach_policy(cart *self);
+/* Give a cart that has just booted the policy with which the library was compiled, if any. The pole's length in m
+   is twice the distance from pivot to centre of mass. */
+void cart_attach_policy(cart *self, float length);
 
 /* The size of a `cart` in bytes. */
 size_t cart_size(void);

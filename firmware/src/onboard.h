@@ -10,7 +10,10 @@
 #endif
 
 #ifndef CART_POLE_LENGTH
-#define CART_POLE_LENGTH 0.3556f /* m, twice the distance from pivot to centre of mass; few agents read it */
+#if POLICY_OBSERVES_LENGTH
+#error "this agent observes the length of the pole: compile with -DCART_POLE_LENGTH=0.3556f (make: POLE_LENGTH=0.3556): m, twice the distance from pivot to centre of mass"
+#endif
+#define CART_POLE_LENGTH 0.0f /* not read */
 #endif
 
 static inline int16_t onboard_motor(void *memory, const cart_observation *observation)

@@ -4,7 +4,7 @@
     scripts/qemu/cart.py                           # prints {"port": "/dev/pts/5", ...} and runs until Ctrl-C
     scripts/qemu/cart.py '{"cart_viscous": 1.0}'   # true parameters of the cart, see docs/emulator.md
     cartpole-evaluate run=... plant=serial plant.port=/dev/pts/5
-    scripts/qemu/cart.py --policy FOLDER           # with an agent on the board; see scripts/onboard.py
+    scripts/qemu/cart.py --policy FOLDER           # with an agent on the board: plant.policy=onboard
 
 Needs the Debian packages qemu-system-arm, gcc-arm-none-eabi, libnewlib-arm-none-eabi and make. It compiles
 firmware/ for the board qemu_an386. UART 0 of the board is a pseudo-terminal, which a host opens like any
@@ -84,10 +84,13 @@ class Pins:
         return math.floor(self._physics.x / CART_METRES), pole
 
 
-def build(folder: Path, policy: Path | None) -> Path:
-    """Compile the firmware, with a policy if there is one, into a folder; return the program."""
+def build(folder: Path, policy: Path | None, pole_length: float) -> Path:
+    """Compile the firmware, with a policy if there is one, into a folder; return the program.
+
+    The policy may observe `pole_length`, in m.
+    """
     make = ["make", "-C", str(FIRMWARE), f"BUILD={folder}", "qemu_an386"]
-    make += [f"POLICY={policy.resolve()}"] if policy else []
+    make += [f"POLICY={policy.resolve()}", f"POLE_LENGTH={pole_length}"] if policy else []
     done = subprocess.run(make, capture_output=True, text=True)
     if done.returncode:
         sys.exit(f"the firmware was not compiled: {done.stderr.strip()}")
@@ -140,14 +143,16 @@ def main() -> int:
     if missing := missing_programs():
         sys.exit(f"not installed: {', '.join(missing)}")
     signal.signal(signal.SIGTERM, interrupt)
-    pins = Pins(EmulatorSettings.model_validate_json(options.settings))
+    settings = EmulatorSettings.model_validate_json(options.settings)
+    pins = Pins(settings)
     with tempfile.TemporaryDirectory() as folder, socket.socket(socket.AF_UNIX) as listening:
         path = Path(folder, "pins")
         listening.bind(str(path))
         listening.listen(1)
         listening.settimeout(PATIENCE)
         try:
-            with board(build(Path(folder), options.policy), path, options.fast) as port:
+            program = build(Path(folder), options.policy, 2 * settings.pole_com)
+            with board(program, path, options.fast) as port:
                 line, _ = listening.accept()
                 print(json.dumps({"port": port}), flush=True)
                 with line:

@@ -23,6 +23,7 @@ SHOWN = {
     **dict.fromkeys(COMMANDS[1:], "emulator: large, medium, stand_in, stand_in_large"),
 }
 SCHEMAS: dict[str, type[Settings]] = {
+    "distill": config.DistillConfig,
     "emulate": config.EmulateConfig,
     "evaluate": config.EvaluateConfig,
     "export": config.ExportConfig,

@@ -31,6 +31,10 @@ COMPLAINS = {  # command: words, exit code, part of the line on stderr
         ("run=pretrained/medium", 2, "format is missing; give format=weights, onnx, c or web"),
         ("run=pretrained/medium format=java", 2, "'weights', 'onnx', 'c' or 'web'"),
     ],
+    "distill": [
+        ("run=nowhere", 1, "run=nowhere: there is no such file or folder"),
+        ("run=pretrained/medium distillation.rounds=0", 2, "give at least 1"),
+    ],
     "find_port": [("timeout=0", 2, "give more than 0")],
     "finetune": [
         ("run=nowhere", 1, "run=nowhere: there is no such file or folder"),

@@ -13,6 +13,7 @@ MADE_BY = (*USES, "unfinished", "multirun")
 WHAT_TO_DO = {  # with a folder, by what made it
     "train": "cartpole-evaluate, cartpole-record and cartpole-finetune take it as run={0}",
     "finetune": "cartpole-evaluate, cartpole-record and cartpole-finetune take it as run={0}",
+    "distill": "cartpole-evaluate, cartpole-record and cartpole-finetune take it as run={0}",
     "evaluate": "cartpole-evaluate drives one of its episodes again: repeat.run={0}",
     "record": "cartpole-replay, cartpole-identify and cartpole-model take it as from={0}",
     "replay": "cartpole-replay from=... makes new ones",
@@ -24,7 +25,7 @@ WHAT_TO_DO = {  # with a folder, by what made it
     "multirun": "give that of one of its jobs",
 }
 ENDED = "has ended; cartpole-evaluate run={0} drives its agent"
-AGENTS, RECORDINGS = {"train", "finetune", "unfinished"}, {"record", "identify", "finetune"}
+AGENTS, RECORDINGS = {"train", "finetune", "distill", "unfinished"}, {"record", "identify", "finetune"}
 SETTINGS = {  # words, with the folder at {0} and an agent at {1}: what is taken, what is said of others
     "train resume={0}": ({"unfinished"}, {"train": ENDED}),
     "finetune run={0} plant=emulated": (AGENTS, {}),
@@ -32,6 +33,7 @@ SETTINGS = {  # words, with the folder at {0} and an agent at {1}: what is taken
     "evaluate run={0}": (AGENTS, {}),
     "record run={0}": (AGENTS, {}),
     "export format=weights run={0}": (AGENTS, {}),
+    "distill run={0}": (AGENTS, {}),
     "replay from={0}": (RECORDINGS, {}),
     "model from={0}": (RECORDINGS, {}),
     "identify from={0}": (RECORDINGS, {}),
@@ -59,12 +61,14 @@ def runs(
     shutil.copytree(identified[0], folder / "identify")
     shutil.copytree(tuned[0], folder / "finetune")
     model = ("windows=20", "ensemble.members=1", "ensemble.hidden=4", "ensemble.updates=2")
+    small = [f"distillation.{name}=2" for name in ("carts", "rounds", "periods", "updates", "batch_size")]
     made = (
         ("evaluate", "run=train", "episodes=1", "hydra.run.dir=evaluate"),
         ("record", "run=lqr", "episodes=3", "hydra.run.dir=record"),
         ("record", "-m", "run=train", "episodes=1", "seed=0,1", "hydra.sweep.dir=multirun"),
         ("replay", "from=record", "hydra.run.dir=replay"),
         ("model", "from=record", *model, "hydra.run.dir=model"),
+        ("distill", "run=train", *small, "hydra.run.dir=distill"),
         ("export", "run=train", "format=weights", "hydra.run.dir=export"),
         ("report", "runs=evaluate", "animations=false", "hydra.run.dir=report"),
     )

@@ -9,7 +9,7 @@ from driven_cart import Driven
 from firmwares import needs_compiler
 
 from cartpole_rl.emulator.c_firmware import CFirmware
-from cartpole_rl.emulator.c_library import build_library
+from cartpole_rl.emulator.c_library import build_library, compile_c
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import EmulatorError
 from cartpole_rl.wire import (
@@ -211,7 +211,7 @@ def test_an_emulated_cart_drives_by_the_c_code_of_a_policy():
 
 
 def test_the_c_code_of_a_policy_gives_0_at_another_period():
-    firmware = CFirmware(lambda: 0, policy=SHUTTLE)
+    firmware = CFirmware(lambda: 0, policy=SHUTTLE, pole_length=0.3556)
     firmware.homed = True
     motors = []
     for number, period_us in enumerate((10_000, 20_000), start=1):
@@ -229,6 +229,43 @@ def test_a_policy_for_other_encoders_does_not_compile(name, tmp_path):
         tmp_path.joinpath(file).write_text(text.replace(f"{name} ", f"{name} 1"), encoding="utf-8")
     with pytest.raises(EmulatorError, match="for other encoders"):
         build_library(tmp_path)
+
+
+@pytest.mark.parametrize("flags", [[], ["-DCART_POLE_LENGTH=0.3556f"]])
+def test_an_agent_that_observes_the_length_compiles_only_with_one(flags, tmp_path):
+    header = (SHUTTLE / "policy.h").read_text(encoding="utf-8")
+    tmp_path.joinpath("policy.h").write_text(
+        header.replace("POLICY_OBSERVES_LENGTH 0", "POLICY_OBSERVES_LENGTH 1"), encoding="utf-8"
+    )
+    board = tmp_path / "board.c"
+    board.write_text(
+        '#include "onboard.h"\nvoid boot(cart *self);\nvoid boot(cart *self) { onboard_attach(self); }\n'
+    )
+    words = ("-fsyntax-only", f"-I{tmp_path}", *flags)
+    if flags:
+        compile_c(tmp_path / "none", [board], *words)
+    else:
+        with pytest.raises(EmulatorError, match="compile with -DCART_POLE_LENGTH="):
+            compile_c(tmp_path / "none", [board], *words)
+
+
+def test_the_c_code_of_a_policy_observes_the_length_of_the_emulated_pole(tmp_path):
+    """A policy that returns its pole's length in mm as the motor value."""
+    for name in ("policy.h", "policy.c"):
+        tmp_path.joinpath(name).write_text((SHUTTLE / name).read_text(encoding="utf-8"), encoding="utf-8")
+    tmp_path.joinpath("policy.c").write_text(
+        '#include "policy.h"\n'
+        "void policy_start(policy_t *policy, float track_end, float pole_length)\n"
+        "{\n    policy->track_end = pole_length;\n}\n"
+        "int16_t policy_motor(policy_t *policy, int32_t cart_counts, int32_t pole_counts, float dt)\n"
+        "{\n    (void)cart_counts, (void)pole_counts, (void)dt;\n"
+        "    return (int16_t)(1000 * policy->track_end);\n}\n"
+    )
+    firmware = CFirmware(lambda: 0, policy=tmp_path, pole_length=0.25)
+    firmware.homed = True
+    firmware.receive(encode_frame(StartPolicy(), 1)[:-1], 0)
+    firmware.tick(20_000, 0, 2048)
+    assert firmware.drive(20_000, 20_001)[-1][1] == 250
 
 
 def test_a_policy_needs_the_c_firmware():

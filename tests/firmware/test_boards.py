@@ -52,6 +52,9 @@ def test_a_program_with_a_policy_does_not_take_the_place_of_the_one_without(tmp_
     programs = [build / "nucleo_f401re-policy.elf", build / "nucleo_f401re.elf"]
     assert programs[0].read_bytes() != programs[1].read_bytes()
     assert ARM not in make(f"POLICY={policy}")
+    other = f"POLICY={shutil.copytree(policy, tmp_path / 'other')}"
+    assert ARM in make(other)
+    assert ARM in make(other, "POLE_LENGTH=0.3")
     os.utime(policy / "policy.h", (2**31, 2**31))
     assert ARM in make(f"POLICY={policy}")
 

@@ -163,6 +163,7 @@ class SerialCart:
         Raises what `start` raises, and RefusedError if the board has no policy.
         """
         self._arm(StartPolicy())
+        self._tracker.follow_policy()
 
     def stop(self) -> None:
         """Set the motor to 0 and disarm; ends a homing. The bytes go out before anything that can block."""

@@ -46,7 +46,10 @@ def refusal(nack: Nack) -> PlantError:
     """Return the error for a NACK: FaultError if a fault is latched, otherwise RefusedError."""
     known = nack.type in MessageType.__members__.values()
     what = MessageType(nack.type).name if known else f"message {nack.type:#04x}"
-    text = f"the cart refused {what}: {REASONS.get(nack.reason, f'reason {nack.reason}, unknown here')}"
+    why = REASONS.get(nack.reason, f"reason {nack.reason}, unknown here")
+    if (nack.type, nack.reason) == (MessageType.START_POLICY, Reason.UNKNOWN_TYPE):
+        why = "its board has no policy: compile its firmware with one (docs/firmware.md)"
+    text = f"the cart refused {what}: {why}"
     if nack.reason == Reason.FAULT_LATCHED:
         return FaultError(text)
     return RefusedError(text, Reason(nack.reason) if nack.reason in REASONS else nack.reason)

@@ -43,7 +43,8 @@ class SerialPlant(OneCartPlant):
     A reset prepares the cart (`Preparation`), arms it, and returns the first state. For a start `upright` it
     asks a person by `prompt` to hold the pole up. Faults are cleared when a person agrees by `confirm`, and
     `settings.clear_faults` times without asking. `control_period` in s is set on the cart before an episode,
-    if it has another one.
+    if it has another one. With `on_board` the policy on the cart's board drives from the reset on, and
+    `listen_one` takes the place of `step_one`.
 
     `terminated`: the cart is beyond its soft limit, or latched a fault. `truncated`: the link was lost, or
     the cart restarted; the counts are then the last ones received. `ended_by` is the last ending, "track",
@@ -72,6 +73,7 @@ class SerialPlant(OneCartPlant):
         self.ended_by = ""
         self.last_error: PlantError | None = None
         self.on_command: Callable[[int], None] | None = None  # called with each motor value once it is sent
+        self.on_board = False  # resets start the policy on the cart's board; `listen_one` passes periods
         faults = FaultClearing(settings.clear_faults, confirm)
         self._preparation = Preparation(self.cart, start, control_period, faults, prompt)
         self._driving = False  # an episode is under way
@@ -123,7 +125,10 @@ class SerialPlant(OneCartPlant):
         """Prepare the cart, arm it, and return the first frame of an episode."""
         self._reach()
         self._preparation.prepare()
-        self.cart.start()
+        if self.on_board:
+            self.cart.start_policy()
+        else:
+            self.cart.start()
         self._state = self.cart.get_state()
         self._turns = self._whole_turns()
         self.ended_by = ""
@@ -133,14 +138,32 @@ class SerialPlant(OneCartPlant):
 
     def step_one(self, motor: int) -> OneFrame:
         """Send a motor value; return the frame at the end of the period."""
+
+        def answer() -> State:
+            self.cart.set_motor(motor)
+            if self.on_command is not None:  # in the time until the next state
+                self.on_command(motor)
+            return self.cart.get_state()
+
+        return self._pass_period(answer)
+
+    def listen_one(self) -> OneFrame:
+        """Let the policy on the board drive; return the frame at the end of the period."""
+
+        def listen() -> State:
+            if self.on_command is not None:
+                self.on_command(self._state.motor_applied)
+            return self.cart.poll_state()
+
+        return self._pass_period(listen)
+
+    def _pass_period(self, next_state: Callable[[], State]) -> OneFrame:
+        """Return the frame of the next state, or the last one after an ending."""
         if not self._driving:
             return self._frame(self._preparation.control_period)
         before = self._state
         try:
-            self.cart.set_motor(motor)
-            if self.on_command is not None:  # in the time until the next state
-                self.on_command(motor)
-            state = self.cart.get_state()
+            state = next_state()
             if went_back(ticks_between(before.tick, state.tick)):
                 raise LinkError(RESTARTED)
             self._state = state

@@ -28,6 +28,8 @@ class SerialSettings(Settings):
     # others; without a terminal the command ends and says what to check.
     clear_faults: Annotated[int, Field(ge=0)] = 0
     rehome: Rehome = "once"
+    # onboard: cartpole-evaluate also lets the policy on the board drive, which is the agent of run=.
+    policy: Literal["onboard"] | None = None
 
     # Without a state for so long, the link is lost. So it is when this computer does not answer a state for
     # so long, or for 1 s if the timeout is larger.

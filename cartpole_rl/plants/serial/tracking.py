@@ -4,9 +4,10 @@ Only a state with a newer tick becomes the newest. A tick at or a little below t
 state that was repeated, or overtaken by a newer one: it is dropped. A tick far below it means that the cart
 has restarted.
 
-Late ticks are counted while the host answers states with motor values: each state that was passed over, and
-each state whose command was sent more than a period after the state had arrived. The second is counted only
-if the cart's tick advanced meanwhile: a lockstep emulator waits for the host, so nothing is late there.
+Late ticks are counted while the host answers states with motor values, or watches a policy on the board: each
+state that was passed over, and each state whose command was sent more than a period after the state had
+arrived. The second is counted only if the cart's tick advanced meanwhile: a lockstep emulator waits for the
+host, so nothing is late there.
 
 There is no I/O and no clock here: the caller passes the times, in s of `time.perf_counter`.
 """
@@ -38,7 +39,7 @@ class StateTracker:
         self.last: State | None = None  # the newest that arrived, handed out or not
         self._missing: set[int] = set()  # ticks that were counted as lost, and may still arrive
         self._catching_up = False  # the operating system dropped states while the host was busy
-        self._driving = False  # states are answered with motor values
+        self._driving = False  # states are answered with motor values, or a policy on the board is watched
         self._handed_out: State | None = None
         self._overdue: State | None = None  # its command was sent more than a period after it arrived
         self._commanded: tuple[int, State] | None = None  # sequence of a motor value, and the state before it
@@ -107,6 +108,10 @@ class StateTracker:
         """Note that a question is sent, not a motor value: waiting for its answer is not a delay."""
         self._driving = self.awaits_command = False
         self._overdue = self._commanded = None
+
+    def follow_policy(self) -> None:
+        """Note that a policy on the board drives: each state should be read."""
+        self._driving = True
 
     def catch_up(self) -> None:
         """Note that states were dropped while the host was busy: until the next `hand_out` none are lost."""

@@ -20,11 +20,11 @@
 #ifdef CART_ONBOARD_POLICY
 #include <onboard.h>
 #endif
-#include <driver/gpio.h>
 #include <driver/pulse_cnt.h>
 #include <esp_rom_gpio.h>
 #include <esp_task_wdt.h>
 #include <soc/gpio_sig_map.h>
+#include <soc/gpio_struct.h>
 
 static const int CART_A = 32, CART_B = 33, POLE_A = 25, POLE_B = 26, RIGHT = 18, LEFT = 19;
 static const uint32_t BAUD = 921600, PWM_HZ = 20000, HANG_MS = 150; /* longer than a period */
@@ -71,13 +71,13 @@ static pcnt_unit_handle_t start_counter(int a, int b)
     return unit;
 }
 
-/* Take both H-bridge inputs from the PWM and hold them low. */
+/* Take both H-bridge inputs from the PWM and hold them low. It is called in a panic: no code in flash. */
 static void IRAM_ATTR cut_motor(void)
 {
+    static_assert(RIGHT < 32 && LEFT < 32, "the pins of the other register");
+    GPIO.out_w1tc = (1u << RIGHT) | (1u << LEFT);
     esp_rom_gpio_connect_out_signal(RIGHT, SIG_GPIO_OUT_IDX, false, false);
     esp_rom_gpio_connect_out_signal(LEFT, SIG_GPIO_OUT_IDX, false, false);
-    gpio_set_level((gpio_num_t)RIGHT, 0);
-    gpio_set_level((gpio_num_t)LEFT, 0);
 }
 
 /* ESP-IDF calls this when the task watchdog expires, before the panic that restarts the board. */
@@ -86,10 +86,21 @@ extern "C" void IRAM_ATTR esp_task_wdt_isr_user_handler(void)
     cut_motor();
 }
 
+/* The Arduino core calls this at the start of a panic, before the report that takes up to a second. It needs the
+   core's own linker flag --wrap=esp_panic_handler, which PlatformIO leaves out, and no -flto. */
+static void IRAM_ATTR panicked(arduino_panic_info_t *information, void *argument)
+{
+    (void)information;
+    (void)argument;
+    cut_motor();
+}
+
 /* If no period ends for HANG_MS, the board cuts the motor and restarts. The restart alone does not cut it: it
-   resets neither LEDC nor the pins. So after any other panic the last motor value stays until setup(). */
+   resets neither LEDC nor the pins. In a panic with the flash switched off, `panicked` is not reached, and the last
+   motor value stays until setup(). */
 static void start_watchdog(void)
 {
+    set_arduino_panic_handler(panicked, NULL);
     esp_task_wdt_config_t hang = {};
     hang.timeout_ms = HANG_MS;
     hang.trigger_panic = true;

@@ -7,6 +7,7 @@
 #define POLICY_PERIOD_US 20000
 #define POLICY_CART_NANOMETRES_PER_COUNT 22749
 #define POLICY_POLE_COUNTS_PER_TURN 4096
+#define POLICY_OBSERVES_LENGTH 0
 
 typedef struct {
     float track_end; /* m from the middle to the soft limit */

@@ -1,0 +1,66 @@
+"""Episodes that the policy on a cart's board drives, while this computer only listens.
+
+In each period this computer sends HELLO, which keeps the cart's watchdog quiet, and reads the state.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
+from cartpole_rl.envs.one_cart import Numbers
+from cartpole_rl.envs.perception import FirstPercept, Percept
+from cartpole_rl.evaluation.episodes import Policy, chosen_action, ending_of, one_episode, prepared
+from cartpole_rl.plants.serial.plant import SerialPlant
+from cartpole_rl.scheduling import no_garbage_collection
+from cartpole_rl.tasks.episode import Episode
+
+
+def run_onboard_episodes(env: CartPoleEnv, policy: Policy, episodes: int) -> Iterator[Episode]:
+    """Yield episodes of the cart's board, with the motor values that `policy` would have chosen here.
+
+    Raises RefusedError if the board has no policy, and the errors of the plant's reset.
+    """
+    policy = prepared(env, policy)
+    for _ in range(episodes):
+        yield run_onboard(env, policy)
+
+
+@torch.no_grad()
+def run_onboard(env: CartPoleEnv, policy: Policy) -> Episode:
+    """Return an episode of the cart's board. `motor` is what the cart reports at the end of each period."""
+    plant, cart, steps, done = env.plant, env.one_cart, [], False
+    assert isinstance(plant, SerialPlant)
+    with no_garbage_collection(), on_board(plant):
+        first = cart.reset()
+        frames = [cart.frame]
+        try:
+            while not done:
+                frame = plant.listen_one()
+                step = cart.advance(frame.motor_applied, frame)
+                frames.append(frame)
+                steps.append(step)
+                (done,) = step.done
+        finally:
+            plant.halt()
+    percepts: list[FirstPercept[Numbers] | Percept[Numbers]] = [first, *steps[:-1]]
+    actions = [chosen_action(policy, percept.observation) for percept in percepts]
+    chosen = np.array([cart.motor(action) for action in actions])
+    expected = np.array([cart.guarded_motor(*pair) for pair in zip(actions, percepts, strict=True)])
+    motor = np.array([frame.motor_applied for frame in frames[1:]])
+    ending = ending_of(env, 0, steps[-1].truncated[0], steps[-1].state[2])
+    episode = one_episode(env, first, steps, frames, motor, expected != chosen, ending)
+    return replace(episode, expected=expected[: episode.steps])
+
+
+@contextmanager
+def on_board(plant: SerialPlant) -> Iterator[None]:
+    """Let the policy on the board drive within the `with`."""
+    plant.on_board = True
+    try:
+        yield
+    finally:
+        plant.on_board = False

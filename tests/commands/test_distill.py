@@ -1,0 +1,47 @@
+"""cartpole-distill makes an agent that the other commands take."""
+
+import json
+from pathlib import Path
+
+from command_line import in_process
+
+SMALL = tuple(
+    f"distillation.{name}={value}"
+    for name, value in {"carts": 8, "rounds": 2, "periods": 5, "updates": 3, "batch_size": 16}.items()
+)
+
+
+def test_the_student_is_an_agent_like_any_other(trained: Path, tmp_path: Path) -> None:
+    words = (f"run={trained}", "hidden=[8,6]", *SMALL, "hydra.run.dir=student")
+    done = in_process("distill", *words, folder=tmp_path)
+    assert done.code == 0, done.err
+    assert done.out.splitlines()[-1] == "cartpole-export run=student format=c"
+    student = tmp_path / "student"
+    assert {path.name for path in student.iterdir()} == {
+        "checkpoints",
+        "config.yaml",
+        "figures",
+        "metrics.json",
+        "provenance.json",
+    }
+    assert json.loads((student / "provenance.json").read_text())["program"] == "cartpole-distill"
+    done = in_process("export", "run=student", "format=c", "hydra.run.dir=c", folder=tmp_path)
+    assert done.code == 0, done.err
+    header = (tmp_path / "c/policy.h").read_text()
+    assert "cartpole-distill run=" in header
+    done = in_process("evaluate", "run=student", "episodes=1", "hydra.run.dir=e", folder=tmp_path)
+    assert done.code == 0, done.err
+
+
+def test_bad_input_is_answered_with_one_line(trained: Path, tmp_path: Path) -> None:
+    for words, remedy in {
+        "run=nowhere": "run=nowhere: there is no such file or folder",
+        f"run={trained} hidden=[]": "hidden",
+        f"run={trained} hidden=[7]": "even numbers of units",
+        f"run={trained} distillation.rounds=0": "give at least 1",
+        "run=lqr": "run=lqr: there is no such file or folder",
+    }.items():
+        done = in_process("distill", *words.split(), "hydra.run.dir=run", folder=tmp_path)
+        assert done.code in (1, 2)
+        assert remedy in done.complaint
+        assert not (tmp_path / "run/config.yaml").exists()

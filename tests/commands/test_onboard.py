@@ -1,0 +1,65 @@
+"""cartpole-evaluate with the agent on the cart's board, beside this computer."""
+
+import json
+from pathlib import Path
+
+import pytest
+from command_line import COARSE, in_process
+from firmwares import needs_compiler
+
+BOARD = ("plant=emulated", "emulator.firmware=c", "emulator.policy=onboard")
+
+
+@needs_compiler
+def test_the_scores_stand_side_by_side(trained: Path, tmp_path: Path) -> None:
+    pytest.importorskip("mujoco", reason='pip install "cartpole_rl[emulator]"')
+    words = (f"run={trained}", *BOARD, COARSE, "episodes=1", "hydra.run.dir=run")
+    done = in_process("evaluate", *words, folder=tmp_path)
+    assert done.code == 0, done.err
+    metrics = json.loads((tmp_path / "run/metrics.json").read_text())
+    (episode,) = metrics["onboard"]["episodes"]
+    assert episode["same_as_host_fraction"] == metrics["onboard"]["same_as_host_fraction"]["mean"] > 0.9
+    assert "same_as_host_fraction" not in metrics["episodes"][0]
+    heading = done.out.splitlines()[0]
+    assert "this computer" in heading
+    assert "on the board" in heading
+    assert "motor values are those that this computer would have sent" in done.out
+    for name in ("behaviour.png", "episode.gif"):
+        assert (tmp_path / "run/figures" / name).is_file()
+        assert (tmp_path / "run/figures" / f"onboard_{name}").is_file()
+    assert "emulator:" in (tmp_path / "run/config.yaml").read_text()
+    assert "policy: onboard" in (tmp_path / "run/config.yaml").read_text()
+
+
+@pytest.mark.parametrize(
+    ("command", "words", "named", "remedy"),
+    [
+        ("evaluate", (*BOARD, "run=lqr"), "run=lqr", "give its run folder"),
+        ("evaluate", ("plant=emulated", "emulator.policy=onboard"), "emulator", "set firmware=c"),
+        (
+            "evaluate",
+            (*BOARD[:2], "emulator.policy=out"),
+            "emulator.policy=out",
+            "give emulator.policy=onboard",
+        ),
+        ("record", BOARD, "emulator.policy=onboard", "leave it out"),
+        ("finetune", BOARD, "emulator.policy=onboard", "leave it out"),
+        ("preflight", BOARD, "emulator.policy=onboard", "leave it out"),
+        (
+            "preflight",
+            ("plant=serial", "plant.port=x", "plant.policy=onboard"),
+            "plant.policy",
+            "leave it out",
+        ),
+        ("emulate", BOARD[1:], "emulator.policy=onboard", "give a folder of cartpole-export format=c"),
+    ],
+)
+def test_bad_input_is_answered_with_one_line(
+    command: str, words: tuple[str, ...], named: str, remedy: str, trained: Path, tmp_path: Path
+) -> None:
+    run = () if command in ("preflight", "emulate") or "run=lqr" in words else (f"run={trained}",)
+    done = in_process(command, *run, *words, folder=tmp_path)
+    assert done.code in (1, 2)
+    assert named in done.complaint
+    assert remedy in done.complaint
+    assert not (tmp_path / "runs").exists()

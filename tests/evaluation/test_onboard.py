@@ -1,0 +1,83 @@
+"""The policy on the board of an emulated cart drives as this computer does."""
+
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from firmwares import needs_compiler
+
+from cartpole_rl.emulator.settings import ONBOARD
+from cartpole_rl.errors import ConfigError
+from cartpole_rl.evaluation.episodes import run_episodes
+from cartpole_rl.evaluation.onboard import run_onboard_episodes
+from cartpole_rl.plants.serial.errors import RefusedError
+from cartpole_rl.tasks.endings import Ending
+from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.workflows.agents import TrainedAgent, new_agent, trained_agent
+from cartpole_rl.workflows.build import evaluated_env, evaluated_settings
+from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
+from cartpole_rl.workflows.export import on_the_board
+from cartpole_rl.workflows.loading import load_settings
+
+pytestmark = needs_compiler
+AGENT = "pretrained/medium"
+WORDS = {
+    "run": AGENT,
+    "plant": "emulated",
+    "task": "swingup",
+    "task.time_limit": 150,
+    "emulator.firmware": "c",
+    "emulator.physics_step": 1e-3,
+}
+
+
+@contextmanager
+def driven(policy: Path | None, onboard: bool, **emulator: float) -> Iterator[Iterator[Episode]]:
+    """Yield an episode of a new cart, driven by its board or by this computer."""
+    pytest.importorskip("mujoco", reason='pip install "cartpole_rl[emulator]"')
+    config = load_settings(EvaluateConfig, WORDS)
+    truth = config.emulator.model_copy(update={"policy": policy, **emulator})
+    config = config.model_copy(update={"emulator": truth})
+    agent = trained_agent(Path(AGENT))
+    settings = evaluated_settings(agent.training, config)
+    with on_the_board(config, agent, settings) as equipped:
+        env = evaluated_env(settings, equipped, prompt=print)
+    with closing(env):
+        run = run_onboard_episodes if onboard else run_episodes
+        yield run(env, agent.policy, 1)
+
+
+def test_without_latency_both_drive_the_same_cart_to_the_same_bytes() -> None:
+    """The board chooses at the end of a period, and so does this computer if its commands take no time."""
+    episodes = []
+    for onboard in (False, True):
+        with driven(ONBOARD, onboard, latency=0.0, latency_jitter=0.0) as driving:
+            episodes += driving
+    host, board = episodes
+    assert (board.counts == host.counts).all()
+    assert (board.motor == host.motor).all()
+    assert np.abs(board.theta).min() < 0.5  # it swings up
+    assert (board.time == host.time).all()
+    assert board.score.sum() == host.score.sum()
+    assert (board.expected == board.motor).all()
+    assert host.expected is None
+    assert board.ended_by == host.ended_by == Ending.TIME
+
+
+def test_a_board_without_a_policy_refuses() -> None:
+    with (
+        driven(None, onboard=True) as driving,
+        pytest.raises(RefusedError, match="refused START_POLICY: its board has no policy"),
+    ):
+        next(driving)
+
+
+def test_a_recurrent_agent_is_refused() -> None:
+    training = load_settings(TrainConfig, {"agent": "recurrent", "observation": "positions"})
+    agent = TrainedAgent(training, new_agent(training).greedy_policy())
+    config = load_settings(EvaluateConfig, {**WORDS, "emulator.policy": "onboard"})
+    settings = evaluated_settings(training, config)
+    with pytest.raises(ConfigError, match="a recurrent agent"), on_the_board(config, agent, settings):
+        pass
