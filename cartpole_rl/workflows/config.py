@@ -55,7 +55,7 @@ class OnCart(Settings):
 
 
 class TrainConfig(RunSettings, CartPoleSettings):
-    """cartpole-train."""
+    """The settings of cartpole-train."""
 
     plant: Annotated[SimulatedSettings | LearnedSettings, Field(discriminator="kind")]
     agent: AgentSettings
@@ -115,7 +115,7 @@ class RepeatSettings(Settings):
 
 
 class EvaluateConfig(RunSettings):
-    """cartpole-evaluate. Groups that are None are those of the agent's training."""
+    """The settings of cartpole-evaluate. Groups that are None are those of the agent's training."""
 
     run: Path
     episodes: Annotated[int, Field(ge=1, le=100_000)]
@@ -157,11 +157,11 @@ class EvaluateConfig(RunSettings):
 
 
 class RecordConfig(EvaluateConfig):
-    """cartpole-record. It has the settings of an evaluation."""
+    """The settings of cartpole-record, which are those of an evaluation."""
 
 
 class FinetuneConfig(RunSettings, OnCart):
-    """cartpole-finetune."""
+    """The settings of cartpole-finetune."""
 
     run: Path | None
     episodes: Annotated[int, Field(ge=1, le=1000)]
@@ -173,7 +173,7 @@ class FinetuneConfig(RunSettings, OnCart):
 
 
 class ReplayConfig(SimulatedCartSettings):
-    """cartpole-replay."""
+    """The settings of cartpole-replay."""
 
     source: Annotated[Path, Field(alias="from")]
     pole: PoleSettings | None = None
@@ -185,7 +185,7 @@ class ReplayConfig(SimulatedCartSettings):
 
 
 class IdentifyConfig(RunSettings, CartSettings, OnCart):
-    """cartpole-identify."""
+    """The settings of cartpole-identify."""
 
     source: Annotated[Path | None, Field(alias="from")]
     method: Literal["matching", "one_step"] = "matching"
@@ -204,7 +204,7 @@ class IdentifyConfig(RunSettings, CartSettings, OnCart):
 
 
 class ModelConfig(RunSettings, CartSettings):
-    """cartpole-model."""
+    """The settings of cartpole-model."""
 
     source: Annotated[tuple[Path, ...], Field(alias="from", min_length=1)]
     pole: PoleSettings | None = None
@@ -219,7 +219,7 @@ class ModelConfig(RunSettings, CartSettings):
 
 
 class ReportConfig(Settings):
-    """cartpole-report."""
+    """The settings of cartpole-report."""
 
     studies: Path | None
     runs: tuple[str, ...]
@@ -247,7 +247,7 @@ class ReportConfig(Settings):
 
 
 class ExportConfig(Settings):
-    """cartpole-export."""
+    """The settings of cartpole-export."""
 
     run: Path
     format: Literal["weights", "onnx", "c", "web"]
@@ -255,10 +255,10 @@ class ExportConfig(Settings):
 
 
 class PreflightConfig(OnCart):
-    """cartpole-preflight."""
+    """The settings of cartpole-preflight."""
 
 
 class EmulateConfig(Settings):
-    """cartpole-emulate."""
+    """The settings of cartpole-emulate."""
 
     emulator: EmulatorSettings

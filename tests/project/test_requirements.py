@@ -14,6 +14,7 @@ REMEDIES = {
     "onnxruntime": 'pip install "cartpole_rl[dev]"',
     "onnxscript": 'pip install "cartpole_rl[export]"',
     "psutil": 'pip install "cartpole_rl[dev]"',
+    "sphinx": 'pip install "cartpole_rl[docs]"',
     "g++": "install a C++ compiler",
     "Python.h": "install Python's headers",
 }
