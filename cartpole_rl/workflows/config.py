@@ -114,6 +114,13 @@ class RepeatSettings(Settings):
     episode: Annotated[int, Field(ge=0)] | None = None  # from 0, in the order of metrics.json
 
 
+class AnimationSettings(Settings):
+    """The animations of an evaluation, in addition to that of its first episode as a GIF."""
+
+    simulation: bool = False  # beside the first episode, the one that simulation predicts from its start
+    mp4: bool = False  # each animation also as an MP4, which needs the extra `video`
+
+
 class EvaluateConfig(RunSettings):
     """The settings of cartpole-evaluate. Groups that are None are those of the agent's training."""
 
@@ -136,6 +143,7 @@ class EvaluateConfig(RunSettings):
     knock: NonNegative = 0.0  # rad/s, see `evaluation/knocks.py`
     repeat: RepeatSettings = RepeatSettings()
     view: View = "none"
+    animation: AnimationSettings = AnimationSettings()
 
     @model_validator(mode="after")
     def _plant_reads_every_setting(self) -> "EvaluateConfig":
@@ -151,13 +159,21 @@ class EvaluateConfig(RunSettings):
             raise ValueError(f"{', '.join(unread)}: plant={kind} {reason}")
         if self.view == "live" and kind not in ("emulated", "serial"):
             raise ValueError(f"view=live: it shows a cart on a port; plant={kind} has none")
+        if self.animation.simulation and kind not in ("emulated", "serial"):
+            raise ValueError(f"animation.simulation=true: plant={kind} is simulated itself; omit it")
         if kind != "emulated" and self.emulator != EmulatorSettings():
             raise ValueError(f"emulator: plant={kind} does not read it; give plant=emulated")
         return self
 
 
 class RecordConfig(EvaluateConfig):
-    """The settings of cartpole-record, which are those of an evaluation."""
+    """The settings of cartpole-record, which are those of an evaluation without figures."""
+
+    @model_validator(mode="after")
+    def _no_figures(self) -> "RecordConfig":
+        if self.animation != AnimationSettings():
+            raise ValueError("animation: cartpole-record draws nothing; use cartpole-evaluate")
+        return self
 
 
 class FinetuneConfig(RunSettings, OnCart):

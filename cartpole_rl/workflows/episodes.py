@@ -16,7 +16,7 @@ from cartpole_rl.reporting.words import guard_text
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.agents import evaluated_agent
 from cartpole_rl.workflows.build import evaluated_env, evaluated_settings, precedence, use_threads
-from cartpole_rl.workflows.config import EvaluateConfig
+from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
 from cartpole_rl.workflows.live import LiveView, view_title
 from cartpole_rl.workflows.person import confirm
 from cartpole_rl.workflows.progress import progress_bar
@@ -32,6 +32,7 @@ class Evaluation:
     env: CartPoleEnv
     policy: Policy
     repetition: Repetition | None
+    training: TrainConfig
 
     def episodes(self) -> Iterator[Episode]:
         """Drive the repeated episode, or new ones, and yield each as it ends."""
@@ -61,7 +62,7 @@ def prepared(config: EvaluateConfig) -> Evaluation:
     agent = evaluated_agent(config)
     settings = evaluated_settings(agent.training, config)
     env = evaluated_env(settings, config, prompt=tqdm.write, confirm=confirm)
-    return Evaluation(config, settings, env, agent.policy, again)
+    return Evaluation(config, settings, env, agent.policy, again, agent.training)
 
 
 def repeated(env: CartPoleEnv, policy: Policy, again: Repetition, knocks: Knocks | None) -> Iterator[Episode]:

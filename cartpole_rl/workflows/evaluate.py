@@ -12,12 +12,13 @@ from cartpole_rl.plants.settings import EmulatedSettings
 from cartpole_rl.plants.simulated import NOISE_PARAMETERS
 from cartpole_rl.reporting.scores import score_table
 from cartpole_rl.reporting.words import count_text
-from cartpole_rl.run_files import FIGURES, METRICS
+from cartpole_rl.run_files import BESIDE_SIMULATION, FIGURES, METRICS
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.checks import BASELINE
 from cartpole_rl.workflows.config import EvaluateConfig
 from cartpole_rl.workflows.episodes import Evaluation, prepared
+from cartpole_rl.workflows.prediction import draw_beside_simulation
 from cartpole_rl.workflows.repeating import Repetition
 from cartpole_rl.workflows.report import report
 from cartpole_rl.workflows.results import plant_words, print_results, shown
@@ -50,12 +51,15 @@ def report_evaluation(evaluation: Evaluation, episodes: Sequence[Episode], folde
     """Write metrics.json and figures/, and print the scores."""
     plant, settings = evaluation.config.plant.kind, evaluation.settings
     link = link_figures(evaluation.env)
-    summary = report(folder, episodes, plant, settings.pole, settings.task.x_max, link)
+    mp4 = evaluation.config.animation.mp4
+    summary = report(folder, episodes, plant, settings.pole, settings.task.x_max, link, mp4=mp4)
     print(score_table(summary, f"plant={plant}, {count_text(len(episodes))}"))
     if settings.guard.active:
         print(f"track guard: {settings.guard.active}")
     for line in cut_off(episodes):
         print(line)
+    if evaluation.config.animation.simulation:
+        print(draw_beside_simulation(evaluation, episodes[0], folder / FIGURES / BESIDE_SIMULATION))
     if evaluation.repetition:
         print(compared(evaluation.repetition, episodes[0]))
     if link.get("latency_override"):

@@ -76,7 +76,7 @@ def read_evaluation(run: Path) -> tuple[dict[str, Any], dict[str, Any]]:
 def same_evaluation(config: EvaluateConfig, recorded: Mapping[str, Any], origin: Origin) -> EvaluateConfig:
     """Return the recorded evaluation with the agent of `config`, on that cart only. Raises ConfigError."""
     former = {name: recorded[name] for name in EvaluateConfig.model_fields if name in recorded}
-    own = {name: getattr(config, name) for name in ("run", "label", "repeat")}
+    own = {name: getattr(config, name) for name in ("run", "label", "repeat", "animation")}
     pole = {name: origin.parameters[name] for name in Pole.model_fields}
     of_cart = {name: value for name, value in origin.parameters.items() if name not in pole}
     one_cart = {

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 REMEDIES = {
+    "av": 'pip install "cartpole_rl[video]"',
     "mujoco": 'pip install "cartpole_rl[emulator]"',
     "onnxruntime": 'pip install "cartpole_rl[dev]"',
     "onnxscript": 'pip install "cartpole_rl[export]"',
