@@ -16,6 +16,7 @@ Share = Annotated[
     float, Field(allow_inf_nan=False, ge=0, le=0.9)
 ]  # of frames; above 0.9 hardly any frame would arrive
 LARGEST_MOTOR = 255
+Port = Literal["auto", "pty", "tcp"]
 MotorValue = Annotated[float, Field(ge=0, le=LARGEST_MOTOR)]
 Coefficient = Annotated[float, Field(allow_inf_nan=False)]
 
@@ -28,6 +29,7 @@ class EmulatorSettings(Settings):
         "python"  # the reference, or the portable C of a real cart, compiled on first use
     )
     policy: Path | None = None  # folder of an agent in C that drives after START_POLICY; needs firmware=c
+    port: Port = "auto"  # a pseudo-terminal or a local TCP port; auto: pty where the system has it
     seed: Annotated[int, Field(ge=0)] = (
         0  # of latencies, disturbed frames, boot position and the hand's angle
     )
