@@ -58,8 +58,8 @@ def read_evaluation(run: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the config and the metrics of an evaluation in simulation. Raises ConfigError."""
     check_program("repeat.run", run, "evaluate")
     try:
-        recorded = yaml.safe_load((run / CONFIG).read_text())
-        metrics = json.loads((run / METRICS).read_text())
+        recorded = yaml.safe_load((run / CONFIG).read_text(encoding="utf-8"))
+        metrics = json.loads((run / METRICS).read_text(encoding="utf-8"))
         plant, _ = metrics["plant"], recorded["evaluated"]
     except (OSError, ValueError, LookupError, TypeError, yaml.YAMLError):
         raise ConfigError(
