@@ -20,7 +20,7 @@ from torch.utils.tensorboard import SummaryWriter
 
 for name in ("fcntl", "termios", "pty", "tty", "resource", "pwd", "grp", "readline", "curses"):
     sys.modules[name] = None
-posix = "sched_", "SCHED_", "fork", "openpty", "nice", "getuid", "geteuid", "setsid", "killpg", "O_NO", "ttyname"
+posix = "sched_", "SCHED_", "fork", "openpty", "nice", "getuid", "geteuid", "setsid", "killpg", "O_NO"
 for name in [name for name in dir(os) if name.startswith(posix)]:
     delattr(os, name)
 for name in ("HUP", "KILL", "QUIT", "ALRM", "USR1", "USR2", "PIPE", "WINCH"):
