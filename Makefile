@@ -1,7 +1,7 @@
 # One target for each check; `make check` runs them all and is what CI runs.
 BIN := .venv/bin
 
-.PHONY: check lint types floors test format
+.PHONY: check lint types floors test docs format
 
 check: lint types floors test
 
@@ -17,6 +17,10 @@ floors:
 
 test:
 	$(BIN)/pytest -n 2 --dist worksteal
+
+# the site, into build/site; a broken link, a missing page or an unresolved reference is an error
+docs:
+	$(BIN)/sphinx-build -c docs -b html --fail-on-warning --keep-going --quiet . build/site
 
 format:
 	$(BIN)/ruff format .

@@ -8,5 +8,6 @@ COMPARISON = "comparison.json"  # of a fine-tuning: metrics before and after
 PAGE = "page.html"  # of an identification and of a report
 IDENTIFIED, MODELLED = "identification.json", "model.json"  # results of these commands
 FIGURES, RECORDINGS = "figures", "recordings"
+ANIMATION, BESIDE_SIMULATION = "episode.gif", "beside_simulation.gif"  # of the first episode
 CHECKPOINTS, LAST, BEST, RESUME = "checkpoints", "last.pt", "best.pt", "resume.pt"  # of an agent
 CART, POLE, RANDOMIZATION, POSTERIOR = "cart.yaml", "pole.yaml", "randomization.yaml", "posterior.npz"

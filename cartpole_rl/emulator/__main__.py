@@ -21,7 +21,7 @@ def main(arguments: list[str] | None = None) -> int:
     parent = os.getppid()
     parser = argparse.ArgumentParser(
         prog="python -m cartpole_rl.emulator",
-        description="Emulate a cart on a pseudo-terminal. Prints its port as one JSON line.",
+        description="Emulate a cart on a pseudo-terminal or a TCP port. Prints its port as one JSON line.",
     )
     parser.add_argument(
         "settings",

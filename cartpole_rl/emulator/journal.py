@@ -15,7 +15,7 @@ class Journal:
     """Writes events to a new file at once. Raises FileExistsError: it overwrites no file."""
 
     def __init__(self, path: Path) -> None:
-        self._file = path.open("x", buffering=1)
+        self._file = path.open("x", buffering=1, encoding="utf-8")
         self._motor = 0
 
     def took(self, us: int, message: Message) -> None:

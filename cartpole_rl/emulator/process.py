@@ -10,7 +10,7 @@ from types import FrameType
 
 from cartpole_rl.emulator.clocks import run_lockstep, run_real
 from cartpole_rl.emulator.device import CartDevice
-from cartpole_rl.emulator.link import Channel, PtyLink
+from cartpole_rl.emulator.link import Channel, open_link
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.signals import ending_signals
 
@@ -18,10 +18,10 @@ from cartpole_rl.signals import ending_signals
 def run(settings: EmulatorSettings) -> None:
     """Print one JSON line with `port` and `pid`, and emulate until SIGINT, SIGTERM, SIGHUP or `unplug_at`.
 
-    Main thread only. Raises EmulatorError if MuJoCo or pseudo-terminals are missing.
+    Main thread only. Raises EmulatorError if MuJoCo is missing, or pseudo-terminals for `port` pty.
     """
     cart = CartDevice(settings)
-    with until_stopped(), PtyLink() as link:
+    with until_stopped(), open_link(settings.port) as link:
         print(json.dumps({"port": link.port, "pid": os.getpid()}), flush=True)
         if sys.stderr.isatty():  # a person, not a program that reads the line
             print(f"next, in another terminal: cartpole-preflight plant.port={link.port}", file=sys.stderr)

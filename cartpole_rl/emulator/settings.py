@@ -17,6 +17,7 @@ Share = Annotated[
 ]  # of frames; above 0.9 hardly any frame would arrive
 LARGEST_MOTOR = 255
 ONBOARD = Path("onboard")  # as `policy`: the agent that is evaluated
+Port = Literal["auto", "pty", "tcp"]
 MotorValue = Annotated[float, Field(ge=0, le=LARGEST_MOTOR)]
 Coefficient = Annotated[float, Field(allow_inf_nan=False)]
 
@@ -30,6 +31,7 @@ class EmulatorSettings(Settings):
     )
     # folder of an agent in C that drives after START_POLICY; in cartpole-evaluate onboard: the agent of run=
     policy: Path | None = None
+    port: Port = "auto"  # a pseudo-terminal or a local TCP port; auto: pty where the system has it
     seed: Annotated[int, Field(ge=0)] = (
         0  # of latencies, disturbed frames, boot position and the hand's angle
     )

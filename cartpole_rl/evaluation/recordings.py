@@ -34,7 +34,7 @@ COLUMNS = (*STATE, *COUNTS, "motor", *STEP)  # that every recording has
 
 def write_recording(path: Path, episode: Episode, facts: Mapping[str, Any] | None = None) -> None:
     """Write one episode atomically; `facts` are added to the heading."""
-    with replacing(path) as beside, beside.open("w", newline="") as file:
+    with replacing(path) as beside, beside.open("w", newline="", encoding="utf-8") as file:
         for key, value in {"format": FORMAT, "ended_by": episode.ended_by, **(facts or {})}.items():
             file.write(f"# {key}: {value}\n")
         lines = csv.writer(file)
@@ -54,7 +54,7 @@ def read_recording(path: Path) -> Episode:
     """Read the episode in a file. Raises RecordingError if it is damaged or not a recording."""
     facts, text = {}, []
     try:
-        for line in path.read_text().splitlines():
+        for line in path.read_text(encoding="utf-8").splitlines():
             if line.startswith("#"):
                 key, _, value = line[1:].partition(":")
                 facts[key.strip()] = value.strip()

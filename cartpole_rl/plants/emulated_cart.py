@@ -2,11 +2,11 @@
 
 import json
 import os
-import select
 import subprocess
 import sys
 import tempfile
-import time
+from queue import Empty, SimpleQueue
+from threading import Thread
 from types import TracebackType
 from typing import Self
 
@@ -36,6 +36,7 @@ class EmulatedCart:
             stdout=subprocess.PIPE,
             stderr=self._stderr,
             start_new_session=True,
+            creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),  # the same on Windows
         )
         try:
             self.port = self._read_port()
@@ -106,17 +107,16 @@ class EmulatedCart:
     def _read_port(self) -> str:
         """Return the port in the JSON line that the process prints when it is ready."""
         assert self._process.stdout is not None  # a pipe was asked for
-        output = self._process.stdout.fileno()
-        deadline = time.monotonic() + READY_TIMEOUT
-        line = b""
-        while not line.endswith(b"\n"):
-            if not select.select([output], [], [], max(0.0, deadline - time.monotonic()))[0]:
-                raise EmulatorError(f"the emulated cart was not ready after {READY_TIMEOUT:g} s")
-            data = os.read(output, 4096)
-            if not data:
-                self._process.wait(GRACE)
-                raise EmulatorError(self.died)
-            line += data
+        lines: SimpleQueue[bytes] = SimpleQueue()  # Windows cannot wait for a pipe with a timeout
+        output = self._process.stdout
+        Thread(target=lambda: lines.put(output.readline()), daemon=True).start()
+        try:
+            line = lines.get(timeout=READY_TIMEOUT)
+        except Empty:
+            raise EmulatorError(f"the emulated cart was not ready after {READY_TIMEOUT:g} s") from None
+        if not line:
+            self._process.wait(GRACE)
+            raise EmulatorError(self.died)
         try:
             return str(json.loads(line)["port"])
         except (ValueError, KeyError, TypeError) as error:

@@ -1,10 +1,12 @@
-"""One episode as an animated GIF in real time, small enough for a page, a pull request or TensorBoard.
+"""Episodes as animated GIFs in real time, small enough for a page or TensorBoard; also as MP4.
 
 All frames share a fixed palette of at most 32 colours, so that a frame stores only the pixels that changed.
 """
 
 import io
 from collections.abc import Iterator, Sequence
+from fractions import Fraction
+from itertools import accumulate
 from pathlib import Path
 
 import numpy as np
@@ -19,21 +21,19 @@ from cartpole_rl.tasks.episode import Episode
 EVERY = 2  # control periods between frames: 25 frames a second at 50 Hz
 LAST_FRAME = 1000  # ms, of the last frame before the animation repeats
 SHORTEST = 20  # ms; browsers slow down a frame that claims less
+MILLISECOND = Fraction(1, 1000)  # s
 
 
-def write_gif(
-    episode: Episode,
-    path: Path | str,
-    pole_length: float,
-    track_half_length: float,
-    title: str = "",
-    every: int = EVERY,
-) -> Path:
-    """Write the animation of `gif` to `path`, and create its folder."""
-    path = Path(path)
+def write_animation(path: Path, pictures: Sequence[Image.Image], times: Sequence[int], mp4: bool) -> None:
+    """Write pictures, each shown for its time (ms), as the GIF `path` and, if `mp4`, as an MP4 beside it.
+
+    Creates the folder. An MP4 needs PyAV.
+    """
     with replacing(path) as beside:
-        beside.write_bytes(gif(episode, pole_length, track_half_length, title, every))
-    return path
+        beside.write_bytes(encoded_gif(pictures, times))
+    if mp4:
+        with replacing(path.with_suffix(".mp4")) as beside:
+            beside.write_bytes(encoded_mp4(pictures, times))
 
 
 def gif(
@@ -43,7 +43,7 @@ def gif(
 
     `pole_length` (pivot to tip) and `track_half_length` in m; one frame for each `every` control periods.
     """
-    return _encoded(
+    return encoded_gif(
         [*frames(episode, pole_length, track_half_length, title, every)], durations(episode, every)
     )
 
@@ -52,13 +52,25 @@ def frames(
     episode: Episode, pole_length: float, track_half_length: float, title: str = "", every: int = EVERY
 ) -> Iterator[Image.Image]:
     """Yield pictures of 480 by 320 pixels in the fixed palette; arguments as for `gif`."""
-    ending = "" if episode.ended_by == Ending.TIME else ending_text(episode)
-    drawing = CartDrawing.of(episode, pole_length, track_half_length, ending=ending)
+    drawing = drawn(episode, pole_length, track_half_length)
     background = drawing.background(title)
     for row in rows(episode, every):
-        canvas = background.copy()
-        drawing.draw(ImageDraw.Draw(canvas), row)
-        yield canvas.reduce(FINER).quantize(palette=palette(), dither=Image.Dither.NONE)
+        yield picture(drawing, background, row)
+
+
+def drawn(
+    episode: Episode, pole_length: float, track_half_length: float, duration: float | None = None
+) -> CartDrawing:
+    """Return the drawing of an episode; its time bar spans `duration` s, or the episode."""
+    ending = "" if episode.ended_by == Ending.TIME else ending_text(episode)
+    return CartDrawing.of(episode, pole_length, track_half_length, duration, ending)
+
+
+def picture(drawing: CartDrawing, background: Image.Image, row: int) -> Image.Image:
+    """Return the picture of one row of the state, in the fixed palette."""
+    canvas = background.copy()
+    drawing.draw(ImageDraw.Draw(canvas), row)
+    return canvas.reduce(FINER).quantize(palette=palette(), dither=Image.Dither.NONE)
 
 
 def rows(episode: Episode, every: int = EVERY) -> list[int]:
@@ -88,10 +100,10 @@ def smaller(path: Path, width: int, every: int) -> bytes:
                 chosen.append(scaled.quantize(palette=palette(), dither=Image.Dither.NONE))
                 times.append(0)
             times[-1] += frame.info.get("duration", SHORTEST)
-    return _encoded(chosen, times)
+    return encoded_gif(chosen, times)
 
 
-def _encoded(pictures: Sequence[Image.Image], times: Sequence[int]) -> bytes:
+def encoded_gif(pictures: Sequence[Image.Image], times: Sequence[int]) -> bytes:
     """Return pictures in the fixed palette as an endless GIF, each shown for its time (ms)."""
     first, *others = pictures
     buffer = io.BytesIO()
@@ -105,4 +117,22 @@ def _encoded(pictures: Sequence[Image.Image], times: Sequence[int]) -> bytes:
         optimize=False,
         disposal=1,
     )
+    return buffer.getvalue()
+
+
+def encoded_mp4(pictures: Sequence[Image.Image], times: Sequence[int]) -> bytes:
+    """Return pictures as an MP4 (H.264), each shown for its time (ms)."""
+    import av  # an extra
+
+    buffer = io.BytesIO()
+    with av.open(buffer, "w", format="mp4") as container:
+        stream = container.add_stream("libx264", options={"crf": "18"})
+        stream.width, stream.height = pictures[0].size
+        stream.pix_fmt, stream.codec_context.time_base = "yuv420p", MILLISECOND
+        starts = accumulate(times, initial=0)
+        for picture, start in zip([*pictures, pictures[-1]], starts, strict=True):  # the last one ends then
+            frame = av.VideoFrame.from_image(picture.convert("RGB"))
+            frame.pts, frame.time_base = start, MILLISECOND
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
     return buffer.getvalue()

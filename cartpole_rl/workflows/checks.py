@@ -58,6 +58,8 @@ def check_evaluation(config: EvaluateConfig) -> None:
     if isinstance(config.plant, LearnedSettings):
         check_model(config.plant)
     check_parameters(config.parameters or {})
+    if config.animation.mp4 and find_spec("av") is None:
+        raise ConfigError('animation.mp4=true needs PyAV: pip install "cartpole_rl[video]"')
 
 
 def check_finetuning(config: FinetuneConfig) -> Path:

@@ -71,7 +71,7 @@ class OnCart(Settings):
 
 
 class TrainConfig(RunSettings, CartPoleSettings):
-    """cartpole-train."""
+    """The settings of cartpole-train."""
 
     plant: Annotated[SimulatedSettings | LearnedSettings, Field(discriminator="kind")]
     agent: AgentSettings
@@ -130,8 +130,15 @@ class RepeatSettings(Settings):
     episode: Annotated[int, Field(ge=0)] | None = None  # from 0, in the order of metrics.json
 
 
+class AnimationSettings(Settings):
+    """The animations of an evaluation, in addition to that of its first episode as a GIF."""
+
+    simulation: bool = False  # beside the first episode, the one that simulation predicts from its start
+    mp4: bool = False  # each animation also as an MP4, which needs the extra `video`
+
+
 class EvaluateConfig(RunSettings):
-    """cartpole-evaluate. Groups that are None are those of the agent's training."""
+    """The settings of cartpole-evaluate. Groups that are None are those of the agent's training."""
 
     run: Path
     episodes: Annotated[int, Field(ge=1, le=100_000)]
@@ -152,6 +159,7 @@ class EvaluateConfig(RunSettings):
     knock: NonNegative = 0.0  # rad/s, see `evaluation/knocks.py`
     repeat: RepeatSettings = RepeatSettings()
     view: View = "none"
+    animation: AnimationSettings = AnimationSettings()
 
     @model_validator(mode="after")
     def _plant_reads_every_setting(self) -> "EvaluateConfig":
@@ -167,6 +175,8 @@ class EvaluateConfig(RunSettings):
             raise ValueError(f"{', '.join(unread)}: plant={kind} {reason}")
         if self.view == "live" and kind not in ("emulated", "serial"):
             raise ValueError(f"view=live: it shows a cart on a port; plant={kind} has none")
+        if self.animation.simulation and kind not in ("emulated", "serial"):
+            raise ValueError(f"animation.simulation=true: plant={kind} is simulated itself; omit it")
         if kind != "emulated" and self.emulator != EmulatorSettings():
             raise ValueError(f"emulator: plant={kind} does not read it; give plant=emulated")
         if self.emulator.policy not in (None, ONBOARD):
@@ -183,7 +193,13 @@ class EvaluateConfig(RunSettings):
 
 
 class RecordConfig(EvaluateConfig):
-    """cartpole-record. It has the settings of an evaluation."""
+    """The settings of cartpole-record, which are those of an evaluation without figures."""
+
+    @model_validator(mode="after")
+    def _no_figures(self) -> "RecordConfig":
+        if self.animation != AnimationSettings():
+            raise ValueError("animation: cartpole-record draws nothing; use cartpole-evaluate")
+        return self
 
     @model_validator(mode="after")
     def _this_computer_drives(self) -> Self:
@@ -194,7 +210,7 @@ class RecordConfig(EvaluateConfig):
 
 
 class FinetuneConfig(RunSettings, OnCart):
-    """cartpole-finetune."""
+    """The settings of cartpole-finetune."""
 
     run: Path | None
     episodes: Annotated[int, Field(ge=1, le=1000)]
@@ -206,7 +222,7 @@ class FinetuneConfig(RunSettings, OnCart):
 
 
 class ReplayConfig(SimulatedCartSettings):
-    """cartpole-replay."""
+    """The settings of cartpole-replay."""
 
     source: Annotated[Path, Field(alias="from")]
     pole: PoleSettings | None = None
@@ -218,7 +234,7 @@ class ReplayConfig(SimulatedCartSettings):
 
 
 class IdentifyConfig(RunSettings, CartSettings, OnCart):
-    """cartpole-identify."""
+    """The settings of cartpole-identify."""
 
     source: Annotated[Path | None, Field(alias="from")]
     method: Literal["matching", "one_step"] = "matching"
@@ -237,7 +253,7 @@ class IdentifyConfig(RunSettings, CartSettings, OnCart):
 
 
 class ModelConfig(RunSettings, CartSettings):
-    """cartpole-model."""
+    """The settings of cartpole-model."""
 
     source: Annotated[tuple[Path, ...], Field(alias="from", min_length=1)]
     pole: PoleSettings | None = None
@@ -252,7 +268,7 @@ class ModelConfig(RunSettings, CartSettings):
 
 
 class ReportConfig(Settings):
-    """cartpole-report."""
+    """The settings of cartpole-report."""
 
     studies: Path | None
     runs: tuple[str, ...]
@@ -280,7 +296,7 @@ class ReportConfig(Settings):
 
 
 class ExportConfig(Settings):
-    """cartpole-export."""
+    """The settings of cartpole-export."""
 
     run: Path
     format: Literal["weights", "onnx", "c", "web"]
@@ -296,10 +312,10 @@ class DistillConfig(RunSettings):
 
 
 class PreflightConfig(OnCart):
-    """cartpole-preflight."""
+    """The settings of cartpole-preflight."""
 
 
 class EmulateConfig(Settings):
-    """cartpole-emulate."""
+    """The settings of cartpole-emulate."""
 
     emulator: EmulatorSettings

@@ -17,7 +17,7 @@ from cartpole_rl.reporting.words import guard_text
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.agents import evaluated_agent
 from cartpole_rl.workflows.build import evaluated_env, evaluated_settings, precedence, use_threads
-from cartpole_rl.workflows.config import EvaluateConfig
+from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
 from cartpole_rl.workflows.export import on_the_board
 from cartpole_rl.workflows.live import LiveView, view_title
 from cartpole_rl.workflows.person import confirm
@@ -34,6 +34,7 @@ class Evaluation:
     env: CartPoleEnv
     policy: Policy
     repetition: Repetition | None
+    training: TrainConfig
 
     def episodes(self) -> Iterator[Episode]:
         """Drive the repeated episode, or new ones, and yield each as it ends."""
@@ -74,7 +75,7 @@ def prepared(config: EvaluateConfig) -> Evaluation:
     settings = evaluated_settings(agent.training, config)
     with on_the_board(config, agent, settings) as equipped:
         env = evaluated_env(settings, equipped, prompt=tqdm.write, confirm=confirm)
-    return Evaluation(config, settings, env, agent.policy, again)
+    return Evaluation(config, settings, env, agent.policy, again, agent.training)
 
 
 def repeated(env: CartPoleEnv, policy: Policy, again: Repetition, knocks: Knocks | None) -> Iterator[Episode]:

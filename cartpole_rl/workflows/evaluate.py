@@ -12,12 +12,13 @@ from cartpole_rl.plants.settings import EmulatedSettings
 from cartpole_rl.plants.simulated import NOISE_PARAMETERS
 from cartpole_rl.reporting.scores import score_columns, score_table
 from cartpole_rl.reporting.words import count_text
-from cartpole_rl.run_files import FIGURES, METRICS
+from cartpole_rl.run_files import BESIDE_SIMULATION, FIGURES, METRICS
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.checks import BASELINE
 from cartpole_rl.workflows.config import EvaluateConfig
 from cartpole_rl.workflows.episodes import Evaluation, prepared
+from cartpole_rl.workflows.prediction import draw_beside_simulation
 from cartpole_rl.workflows.repeating import Repetition
 from cartpole_rl.workflows.report import report
 from cartpole_rl.workflows.results import plant_words, print_results, shown
@@ -56,7 +57,8 @@ def report_evaluation(
     """Write metrics.json and figures/, and print the scores; `onboard` are those that the board drove."""
     plant, settings = evaluation.config.plant.kind, evaluation.settings
     link = link_figures(evaluation.env)
-    summary = report(folder, episodes, plant, settings.pole, settings.task.x_max, link, onboard=onboard)
+    mp4, x_max = evaluation.config.animation.mp4, settings.task.x_max
+    summary = report(folder, episodes, plant, settings.pole, x_max, link, onboard=onboard, mp4=mp4)
     heading = f"plant={plant}, {count_text(len(episodes))}"
     if onboard:
         print(score_columns({"this computer": summary, "on the board": summary["onboard"]}, heading))
@@ -67,6 +69,8 @@ def report_evaluation(
         print(f"track guard: {settings.guard.active}")
     for line in cut_off([*episodes, *onboard]):
         print(line)
+    if evaluation.config.animation.simulation:
+        print(draw_beside_simulation(evaluation, episodes[0], folder / FIGURES / BESIDE_SIMULATION))
     if evaluation.repetition:
         print(compared(evaluation.repetition, episodes[0]))
     if link.get("latency_override"):

@@ -11,7 +11,9 @@ from cartpole_rl.run_files import HISTORY
 def read_history(folder: Path) -> list[dict[str, float]]:
     """Return the evaluations of a training so far, oldest first."""
     path = folder / HISTORY
-    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+    return (
+        [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.exists() else []
+    )
 
 
 def write_history(folder: Path, history: Sequence[dict[str, float]]) -> None:

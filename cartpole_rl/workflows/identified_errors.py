@@ -22,7 +22,7 @@ def known_truth(config: IdentifyConfig) -> EmulatorSettings | None:
     if config.source is None:
         return config.emulator if isinstance(config.plant, EmulatedSettings) else None
     try:
-        recorded = yaml.safe_load((config.source / CONFIG).read_text())
+        recorded = yaml.safe_load((config.source / CONFIG).read_text(encoding="utf-8"))
         of_emulator = recorded["plant"]["kind"] == "emulated"
         return checked(EmulatorSettings, recorded["emulator"]) if of_emulator else None
     except (OSError, yaml.YAMLError, LookupError, TypeError, ConfigError):  # recordings of another origin

@@ -43,7 +43,7 @@ def recorded_pole(paths: Sequence[Path]) -> tuple[str, Pole]:
 
 def recorded_length(path: Path) -> float | None:
     """Return the pole's length (m) in a recording's header; None where it has none. Raises RecordingError."""
-    with path.open() as file:
+    with path.open(encoding="utf-8") as file:
         pairs = (line[1:].partition(":") for line in file if line.startswith("#"))
         text = {key.strip(): value.strip() for key, _, value in pairs}.get(LENGTH)
     try:

@@ -58,8 +58,8 @@ def read_evaluation(run: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the config and the metrics of an evaluation in simulation. Raises ConfigError."""
     check_program("repeat.run", run, "evaluate")
     try:
-        recorded = yaml.safe_load((run / CONFIG).read_text())
-        metrics = json.loads((run / METRICS).read_text())
+        recorded = yaml.safe_load((run / CONFIG).read_text(encoding="utf-8"))
+        metrics = json.loads((run / METRICS).read_text(encoding="utf-8"))
         plant, _ = metrics["plant"], recorded["evaluated"]
     except (OSError, ValueError, LookupError, TypeError, yaml.YAMLError):
         raise ConfigError(
@@ -76,7 +76,7 @@ def read_evaluation(run: Path) -> tuple[dict[str, Any], dict[str, Any]]:
 def same_evaluation(config: EvaluateConfig, recorded: Mapping[str, Any], origin: Origin) -> EvaluateConfig:
     """Return the recorded evaluation with the agent of `config`, on that cart only. Raises ConfigError."""
     former = {name: recorded[name] for name in EvaluateConfig.model_fields if name in recorded}
-    own = {name: getattr(config, name) for name in ("run", "label", "repeat")}
+    own = {name: getattr(config, name) for name in ("run", "label", "repeat", "animation")}
     pole = {name: origin.parameters[name] for name in Pole.model_fields}
     of_cart = {name: value for name, value in origin.parameters.items() if name not in pole}
     one_cart = {

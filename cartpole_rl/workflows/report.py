@@ -6,9 +6,9 @@ from typing import Any
 
 from cartpole_rl.evaluation.metrics import episode_metrics, summarize
 from cartpole_rl.randomization.poles import PoleSettings
-from cartpole_rl.reporting.animation import write_gif
+from cartpole_rl.reporting.animation import durations, frames, write_animation
 from cartpole_rl.reporting.figures import behaviour, learning_curve, save
-from cartpole_rl.run_files import FIGURES, METRICS
+from cartpole_rl.run_files import ANIMATION, FIGURES, METRICS
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.origins import stored_origins
 from cartpole_rl.workflows.run_folder import write_json
@@ -23,11 +23,13 @@ def report(
     link: Mapping[str, int] | None = None,
     history: Sequence[Mapping[str, float]] = (),
     onboard: Sequence[Episode] = (),
+    mp4: bool = False,
 ) -> dict[str, Any]:
     """Write metrics.json and figures/ into `folder`, and return the summary of the episodes (`summarize`).
 
-    Behaviour figure and animation show the first episode. `history` adds the learning curve, `onboard` the
-    episodes that the cart's board drove, under that key of metrics.json and of the summary.
+    Behaviour figure and animation show the first episode; `mp4` adds the animation as an MP4. `history` adds
+    the learning curve, `onboard` the episodes that the cart's board drove, under that key of metrics.json and
+    of the summary.
     """
     summary, listed = summarized(episodes, x_max)
     header = {"plant": plant, "pole": pole.name, **(link or {})}
@@ -38,9 +40,9 @@ def report(
     if onboard:
         summary["onboard"], listed = summarized(onboard, x_max)
         content["onboard"] = {**summary["onboard"], "episodes": listed}
-        draw(onboard[0], figures, "onboard_", f"plant={plant}, on the board", pole, x_max)
+        draw(onboard[0], figures, "onboard_", f"plant={plant}, on the board", pole, x_max, mp4)
     write_json(folder / METRICS, content)
-    draw(episodes[0], figures, "", f"plant={plant}", pole, x_max)
+    draw(episodes[0], figures, "", f"plant={plant}", pole, x_max, mp4)
     if history:
         save(learning_curve([("score", list(history))]), figures / "learning_curve.png")
     return summary
@@ -52,7 +54,10 @@ def summarized(episodes: Sequence[Episode], x_max: float) -> tuple[dict[str, Any
     return summarize(metrics), metrics
 
 
-def draw(episode: Episode, folder: Path, prefix: str, title: str, pole: PoleSettings, x_max: float) -> None:
+def draw(
+    episode: Episode, folder: Path, prefix: str, title: str, pole: PoleSettings, x_max: float, mp4: bool
+) -> None:
     """Write the behaviour figure and the animation of the first episode."""
     save(behaviour(episode, f"First episode, {title}", x_max), folder / f"{prefix}behaviour.png")
-    write_gif(episode, folder / f"{prefix}episode.gif", pole.nominal.length, x_max, title)
+    pictures = [*frames(episode, pole.nominal.length, x_max, title)]
+    write_animation(folder / f"{prefix}{ANIMATION}", pictures, durations(episode), mp4)

@@ -55,7 +55,7 @@ def write_config(folder: Path, program: str, config: Mapping[str, Any], resumed:
     overwrite another one.
     """
     if resumed:
-        first = json.loads((folder / PROVENANCE).read_text())
+        first = json.loads((folder / PROVENANCE).read_text(encoding="utf-8"))
         resumptions = [*first.get("resumed", []), provenance()]
         write_json(folder / PROVENANCE, {**first, "resumed": resumptions})
         return
@@ -70,7 +70,7 @@ def write_config(folder: Path, program: str, config: Mapping[str, Any], resumed:
 def program_of(folder: Path) -> str | None:
     """Return the command that wrote the run in `folder`, as a key of USES; None for any other folder."""
     try:
-        program = json.loads((folder / PROVENANCE).read_text())["program"]
+        program = json.loads((folder / PROVENANCE).read_text(encoding="utf-8"))["program"]
     except (OSError, ValueError, LookupError, TypeError):
         return None
     name = str(program).removeprefix(PREFIX)

@@ -1,4 +1,4 @@
-"""An episode of an evaluation is found again by its cart and its start, and driven again."""
+"""Repeated episodes: same cart, same start, same score. Predicted ones: nominal cart, start of the cart."""
 
 import json
 from pathlib import Path
@@ -8,10 +8,16 @@ import numpy as np
 import pytest
 import yaml
 from command_line import in_process
+from PIL import Image
 
 from cartpole_rl.evaluation.recordings import read_recording
 from cartpole_rl.physics.parameters import CartParameters
+from cartpole_rl.workflows import checks
+from cartpole_rl.workflows.config import EvaluateConfig
+from cartpole_rl.workflows.episodes import prepared
+from cartpole_rl.workflows.loading import load_settings
 from cartpole_rl.workflows.origins import as_stored, read_origin
+from cartpole_rl.workflows.prediction import predicted_episode
 
 SAME = ("score", "score_upright", "reward", "steps", "ended_by", "min_track_margin_m", "rms_motor_change")
 
@@ -28,11 +34,12 @@ def evaluated(trained: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name, words in {
         "wide": ("randomization=wide", "pole=both", "task=swingup", "seed=5"),
         "noisy": (noisy, "task=swingup"),
-        "emulated": ("plant=emulated", "episodes=1"),
+        "emulated": ("plant=emulated", "episodes=1", "animation.simulation=true"),
     }.items():
         given = words if name == "emulated" else ("episodes=7", *words)
         done = in_process("evaluate", f"run={trained}", *given, f"hydra.run.dir={name}", folder=folder)
         assert done.code == 0, done.err
+        (folder / name / "printed.txt").write_text(done.out)
     return folder
 
 
@@ -141,3 +148,58 @@ def test_bad_input_is_told_in_a_line(
     assert named in done.complaint
     assert remedy in done.complaint
     assert not list(evaluated.glob("runs/evaluate/*"))
+
+
+def test_the_first_episode_is_drawn_beside_its_prediction(evaluated: Path) -> None:
+    with Image.open(evaluated / "emulated/figures/beside_simulation.gif") as animation:
+        assert animation.size == (960, 320)
+        assert animation.n_frames > 2
+    score = read(evaluated / "emulated")["episodes"][0]["score"]
+    line = f"first episode: score {score:.0f}, predicted by simulation "
+    assert line in (evaluated / "emulated/printed.txt").read_text()
+
+
+def test_the_prediction_starts_where_the_cart_did_and_drives_the_nominal_cart(trained: Path) -> None:
+    words = {"run": trained, "randomization": "wide", "task": "swingup", "episodes": 1}
+    evaluation = prepared(load_settings(EvaluateConfig, words))
+    (episode,) = evaluation.episodes()
+    predicted = predicted_episode(evaluation, episode)
+    for name in ("x", "theta"):  # the encoders round
+        assert getattr(predicted, name)[0] == pytest.approx(getattr(episode, name)[0], abs=0.002)
+    assert episode.origin is not None
+    assert predicted.origin is not None
+    nominal = evaluation.training.nominal_with(evaluation.training.pole.nominal)
+    drawn = [name for name, value in nominal.items() if episode.origin.parameters[name] != as_f32(value)]
+    assert len(drawn) > 5
+    assert predicted.origin.parameters == {
+        **predicted.origin.parameters,
+        **{name: as_f32(value) for name, value in nominal.items()},
+    }
+
+
+def as_f32(value: float) -> float:
+    return float(np.float32(value))
+
+
+@pytest.mark.parametrize(
+    ("command", "words", "remedy"),
+    [
+        ("evaluate", "animation.simulation=true", "plant=simulated is simulated itself"),
+        ("record", "plant=emulated animation.simulation=true", "use cartpole-evaluate"),
+    ],
+)
+def test_an_animation_that_cannot_be_drawn_is_refused(
+    command: str, words: str, remedy: str, trained: Path, tmp_path: Path
+) -> None:
+    done = in_process(command, f"run={trained}", *words.split(), folder=tmp_path)
+    assert done.code == 2
+    assert remedy in done.complaint
+
+
+def test_an_mp4_without_the_library_names_the_extra(
+    trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(checks, "find_spec", lambda name: None)
+    done = in_process("evaluate", f"run={trained}", "animation.mp4=true", folder=tmp_path)
+    assert done.code == 2
+    assert 'pip install "cartpole_rl[video]"' in done.complaint

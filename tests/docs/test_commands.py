@@ -1,15 +1,21 @@
 """Every command of the pages in docs/ is one that the package takes: names, groups, keys and options exist.
 
-The README's commands are run by tests/readme; those of docs/extending.md by test_extending.py.
+Running them all would take days: they are composed, and scripts are asked for their options. The README's
+commands, which are the same ones, are run by tests/readme; those of docs/extending.md by test_extending.py,
+the Python blocks by workflows/test_python_api.py and envs/test_torchrl_example.py. No block is left out.
 """
 
 import re
 import shlex
+import subprocess
+import tomllib
 from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 from command_line import in_process
+
+from cartpole_rl.emulator.__main__ import read_settings
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted([*ROOT.glob("docs/**/*.md"), ROOT / "runs/README.md", ROOT / "CONTRIBUTING.md"])
@@ -18,6 +24,25 @@ CHOICE_FILES = {
     "pole": "conf/pole/medium.yaml",
     "randomization": "conf/randomization/wide.yaml",
 }
+OTHER_PAGES = [*(page for page in PAGES if page.name != "extending.md"), ROOT / "README.md"]
+CHECKED = (
+    "cartpole-",
+    "scripts/",
+    "./scripts/",
+    "pip ",
+    "make ",
+    "tensorboard ",
+    "python -m cartpole_rl.emulator ",
+)
+NEED_HARDWARE = {"docs/firmware.md": ("arduino-cli ", "openocd ", "ln -s ", "make -C firmware nucleo")}
+NOT_COMMANDS = {  # drawings, formulas, files and what a command prints
+    "docs/protocol.md": ("COBS(", "time ", "cart ", "line ", "host ", "motor ", "power, reset"),
+    "docs/house.md": ("conf/ ──>",),
+    "docs/first-hour.md": ("OK  ",),
+    "docs/safety.md": ("x + margin",),
+    "docs/randomization.md": ("cart_mass:", "cart_coulomb:", "pole_viscous:"),
+}
+BLOCKS = re.compile(r"(?:(?<=\n\n)|\A)(?:    .*\n(?:\n(?=    ))?)+")
 
 
 def commands(start: str) -> list[tuple[str, str]]:
@@ -58,3 +83,40 @@ def test_the_script_and_its_options_exist(page: str, command: str) -> None:
     code = "".join(file.read_text() for file in {script, *script.parent.glob("*.py")})
     options = [word for word in words if word.startswith("--")]
     assert [option for option in options if option not in code] == [], f"{page}: {command}"
+
+
+def test_blocks_are_found() -> None:
+    pages = [page for page in OTHER_PAGES if BLOCKS.search(page.read_text())]
+    assert len(pages) > 15
+
+
+@pytest.mark.parametrize("page", OTHER_PAGES, ids=lambda page: page.name)
+def test_every_line_of_a_block_is_checked_here_or_needs_hardware(page: Path) -> None:
+    name = page.relative_to(ROOT).as_posix()
+    known = (*CHECKED, *NEED_HARDWARE.get(name, ()), *NOT_COMMANDS.get(name, ()))
+    text = re.sub(r" *\\\n +", " ", re.sub(r"^```python\n.*?^```", "", page.read_text(), flags=re.M | re.S))
+    assert "```" not in text, "a fenced block that is not Python"
+    lines = [line[4:] for block in BLOCKS.findall(text) for line in block.splitlines() if line.strip()]
+    assert [line for line in lines if not line.startswith((" ", *known))] == []
+
+
+@pytest.mark.parametrize(("page", "command"), commands("pip "))
+def test_the_extras_that_are_installed_exist(page: str, command: str) -> None:
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    words = shlex.split(command)
+    assert words[:5] == ["pip", "install", "-c", "constraints.txt", "-e"], f"{page}: {command}"
+    assert set(words[5].removeprefix(".[").removesuffix("]").split(",")) <= set(extras)
+
+
+@pytest.mark.parametrize(("page", "command"), [*commands("make "), *commands("tensorboard ")])
+def test_the_target_exists_and_the_folder_is_that_of_runs(page: str, command: str) -> None:
+    words = shlex.split(command)
+    if words[0] == "tensorboard":
+        assert words[1:] == ["--logdir", "runs"], f"{page}: {command}"
+    elif "-C" not in words:
+        assert subprocess.run([*words, "--dry-run"], cwd=ROOT, capture_output=True).returncode == 0
+
+
+@pytest.mark.parametrize(("page", "command"), commands("python -m cartpole_rl.emulator "))
+def test_the_settings_of_an_emulator_exist(page: str, command: str) -> None:
+    assert read_settings(shlex.split(command)[-1]), page

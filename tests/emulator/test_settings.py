@@ -19,7 +19,19 @@ TRUTH = {
 }
 NAMES = sorted(name for names in TRUTH.values() for name in names)
 FAULTS = ["unplug_at", "reset_at", "stuck_encoder", "stuck_at"]
-OURS = ["boot", "clock", "firmware", "journal", "knock", "physics_step", "policy", "seed", "start", *FAULTS]
+OURS = [
+    "boot",
+    "clock",
+    "firmware",
+    "journal",
+    "knock",
+    "physics_step",
+    "policy",
+    "port",
+    "seed",
+    "start",
+    *FAULTS,
+]
 
 
 def test_the_names_are_the_public_ones():

@@ -10,10 +10,12 @@ from pathlib import Path
 import pytest
 
 REMEDIES = {
+    "av": 'pip install "cartpole_rl[video]"',
     "mujoco": 'pip install "cartpole_rl[emulator]"',
     "onnxruntime": 'pip install "cartpole_rl[dev]"',
     "onnxscript": 'pip install "cartpole_rl[export]"',
     "psutil": 'pip install "cartpole_rl[dev]"',
+    "sphinx": 'pip install "cartpole_rl[docs]"',
     "g++": "install a C++ compiler",
     "Python.h": "install Python's headers",
 }

@@ -4,6 +4,7 @@ import dataclasses
 import io
 from collections.abc import Iterator
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +12,8 @@ from PIL import Image, ImageChops, ImageColor
 
 from cartpole_rl.drawing.cart import CART_WIDTH, PIVOT_HEIGHT, SIZE
 from cartpole_rl.reporting import style
-from cartpole_rl.reporting.animation import LAST_FRAME, durations, frames, gif, rows, smaller, write_gif
+from cartpole_rl.reporting.animation import LAST_FRAME, durations, frames, gif, rows, smaller, write_animation
+from cartpole_rl.reporting.side_by_side import nearest_rows, side_by_side
 from cartpole_rl.tasks.episode import Episode
 
 POLE, TRACK = 0.3365, 0.407  # m
@@ -155,15 +157,55 @@ def test_a_title_never_runs_into_the_numbers(balance: Episode) -> None:
     assert right <= 295
 
 
-def test_write_gif_makes_folders(tmp_path, balance: Episode) -> None:
-    path = write_gif(part(balance, 0, 10), tmp_path / "figures" / "episode.gif", POLE, TRACK)
+def written(episode: Episode, path: Path, mp4: bool = False) -> Path:
+    """Write the animation of an episode."""
+    write_animation(path, [*frames(episode, POLE, TRACK)], durations(episode), mp4)
+    return path
+
+
+def test_writing_makes_folders(tmp_path, balance: Episode) -> None:
+    path = written(part(balance, 0, 10), tmp_path / "figures" / "episode.gif")
     assert path.read_bytes().startswith(b"GIF89a")
+    assert list(path.parent.iterdir()) == [path]
+
+
+def test_the_mp4_shows_the_same_pictures_for_as_long(tmp_path, swing_up: Episode) -> None:
+    av = pytest.importorskip("av")
+    path = written(part(swing_up, 0, 40), tmp_path / "episode.gif", mp4=True)
+    with av.open(path.with_suffix(".mp4")) as video:
+        filmed = list(video.decode(video=0))
+    drawn = list(shown(path.read_bytes()))
+    starts = np.cumsum([0, *(wait for _, wait in drawn)]) / 1000
+    assert [frame.time for frame in filmed] == pytest.approx(list(starts))  # the last picture ends there
+    for frame, (picture, _) in zip(filmed, drawn, strict=False):
+        difference = np.asarray(frame.to_image()).astype(int) - np.asarray(picture)
+        assert np.abs(difference).mean() < 3
 
 
 def test_a_smaller_animation_takes_as_long(tmp_path, balance: Episode) -> None:
-    path = write_gif(part(balance, 0, 41), tmp_path / "episode.gif", POLE, TRACK)
+    path = written(part(balance, 0, 41), tmp_path / "episode.gif")
     whole, small = [*shown(path.read_bytes())], [*shown(smaller(path, 160, 4))]
     assert small[0][0].size == (160, 107)
     assert len(small) == -(-len(whole) // 4)
     assert sum(wait for _, wait in small) == sum(wait for _, wait in whole)
     assert len(smaller(path, 160, 4)) < path.stat().st_size / 4
+
+
+def test_side_by_side_both_run_in_real_time_until_the_longer_one_ends(swing_up: Episode) -> None:
+    short, long = part(swing_up, 0, 10), part(swing_up, 0, 40)
+    left, right = list(frames(short, POLE, TRACK)), list(frames(long, POLE, TRACK))
+    pictures, times = side_by_side((short, long), ("", ""), POLE, TRACK)
+    assert times == durations(long)
+    bar = 290  # the left time bar is as long as that of the longer episode
+    for number, both in enumerate(pictures):
+        halves = both.convert("RGB").crop((0, 0, 475, bar)), both.convert("RGB").crop((485, 0, 960, bar))
+        for half, alone, place in zip(halves, (left, right), (0, 5), strict=True):
+            expected = alone[min(number, len(alone) - 1)].convert("RGB").crop((place, 0, 475 + place, bar))
+            assert ImageChops.difference(half, expected).getbbox() is None
+
+
+def test_side_by_side_a_late_cart_stays_beside_the_same_time(swing_up: Episode) -> None:
+    late = dataclasses.replace(swing_up, time=swing_up.time * 1.25)
+    chosen = list(nearest_rows(swing_up, late))
+    assert chosen[:40] == pytest.approx(1.25 * np.array(rows(late)[:40]), abs=0.51)
+    assert chosen[-1] == swing_up.steps

@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
+from io import TextIOWrapper
 from pathlib import Path
 from typing import TypeVar
 
@@ -61,6 +62,7 @@ def application(name: str, schema: type[Config]) -> Callable[[Body[Config]], Cal
 
         def main() -> None:
             given[:] = sys.argv[1:]
+            accept_all_characters()
             catch_signals()
             OmegaConf.register_new_resolver("choices_of", partial(choices_of, name, schema), replace=True)
             os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra raises its errors instead of printing them
@@ -78,6 +80,13 @@ def application(name: str, schema: type[Config]) -> Callable[[Body[Config]], Cal
         return main
 
     return decorate
+
+
+def accept_all_characters() -> None:
+    """Let the output replace characters that its encoding lacks, as that of a pipe on Windows does."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="replace")
 
 
 def quieten() -> None:

@@ -99,7 +99,7 @@ def _report(name: str) -> int:
     if failed:
         print_message(name, f"{len(failed)} of {len(jobs)} jobs failed in {os.path.relpath(jobs[0].parent)}:")
     for job in failed:
-        print_message(name, f"{job.name}: {(job / ERROR).read_text().splitlines()[0]}")
+        print_message(name, f"{job.name}: {(job / ERROR).read_text('utf-8').splitlines()[0]}")
     return len(failed)
 
 

@@ -13,6 +13,7 @@ from serial.tools import list_ports
 
 from cartpole_rl.errors import PortError
 from cartpole_rl.plants.serial.ports import UsbPort, cart_like, described, usb_ports
+from cartpole_rl.plants.serial.tcp import TcpPort
 
 READ_SLICE = 0.01  # s that one read blocks at most; callers look at their own clocks in between
 AUTO = "auto"
@@ -24,14 +25,9 @@ def open_port(port: str, baud: int, write_timeout: float) -> serial.SerialBase:
     Raises PortError if it does not exist, is busy, may not be opened, or is not a serial port.
     """
     try:
-        line = serial.serial_for_url(
-            port,
-            do_not_open=True,
-            baudrate=baud,
-            timeout=READ_SLICE,
-            write_timeout=write_timeout,
-            exclusive=True,
-        )
+        line = TcpPort() if port.startswith("socket://") else serial.serial_for_url(port, do_not_open=True)
+        line.port, line.baudrate = port, baud
+        line.timeout, line.write_timeout, line.exclusive = READ_SLICE, write_timeout, True
         line.dtr = False
         line.rts = False
         line.open()

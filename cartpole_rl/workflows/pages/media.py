@@ -11,7 +11,7 @@ from cartpole_rl.reporting.studies.answers import low_is_good, measure_label
 from cartpole_rl.reporting.studies.results import OWN, Agent, StudyResults
 from cartpole_rl.reporting.studies.sections import Picture
 from cartpole_rl.reporting.table import number_text
-from cartpole_rl.run_files import FIGURES
+from cartpole_rl.run_files import ANIMATION, FIGURES
 from cartpole_rl.workflows.pages.studies import EVALUATIONS
 
 BUDGET = 12_000_000  # bytes of all pictures; a page takes a third more
@@ -66,7 +66,7 @@ def chosen(results: StudyResults) -> list[tuple[str, Agent, float, Path]]:
         filmed = [
             (agent, agent.values[evaluation.name], path)
             for agent in results.agents
-            if evaluation.name in agent.values and (path := _file(agent, evaluation.name, "episode.gif"))
+            if evaluation.name in agent.values and (path := _file(agent, evaluation.name, ANIMATION))
         ]
         if filmed:
             descending = not low_is_good(results.study.measure)

@@ -28,7 +28,7 @@ def is_complete(task: Task) -> bool:
         return result.is_file()
     asked = overrides_of(task.words).get("episodes", DEFAULT_EPISODES)
     try:
-        return len(json.loads(result.read_text())["episodes"]) == asked
+        return len(json.loads(result.read_text(encoding="utf-8"))["episodes"]) == asked
     except (OSError, ValueError, LookupError, TypeError):
         return False
 
@@ -36,7 +36,7 @@ def is_complete(task: Task) -> bool:
 def made_otherwise(task: Task) -> str:
     """Return why a run does not belong to its study any more; empty if it does."""
     try:
-        given = json.loads((task.folder / PROVENANCE).read_text())["command"][1:]
+        given = json.loads((task.folder / PROVENANCE).read_text(encoding="utf-8"))["command"][1:]
     except (OSError, ValueError, LookupError, TypeError):
         given = None
     return "" if given == [*task.words] else "it was made with other settings; delete its folder to repeat it"
@@ -48,7 +48,7 @@ def in_own_process(task: Task) -> None:
     RaiseOnce(lambda number: KeyboardInterrupt()).handle(signal.SIGINT, *ending_signals())
     resumed = prepare(task)
     task.folder.mkdir(parents=True, exist_ok=True)
-    with (task.folder / LOG).open("a") as log:
+    with (task.folder / LOG).open("a", encoding="utf-8") as log:
         os.dup2(log.fileno(), sys.stdout.fileno())
         os.dup2(log.fileno(), sys.stderr.fileno())
         try:

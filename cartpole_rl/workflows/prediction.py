@@ -1,0 +1,38 @@
+"""An episode on a cart, beside the one that simulation predicts from the same start."""
+
+from pathlib import Path
+
+from cartpole_rl.envs.build import simulated_env
+from cartpole_rl.evaluation.episodes import run_batch
+from cartpole_rl.plants.simulated import SimulatedPlant
+from cartpole_rl.reporting.animation import write_animation
+from cartpole_rl.reporting.side_by_side import side_by_side
+from cartpole_rl.settings import evaluation_seed
+from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.workflows.episodes import Evaluation
+
+
+def draw_beside_simulation(evaluation: Evaluation, episode: Episode, path: Path) -> str:
+    """Draw `episode` and its prediction into `path`, and return a line that compares their scores."""
+    predicted = predicted_episode(evaluation, episode)
+    titles = f"plant={evaluation.config.plant.kind}", "predicted by simulation"
+    pole, track = evaluation.settings.pole.nominal.length, evaluation.settings.task.x_max
+    pictures, times = side_by_side((episode, predicted), titles, pole, track)
+    write_animation(path, pictures, times, evaluation.config.animation.mp4)
+    scores = f"score {episode.score.sum():.0f}, predicted by simulation {predicted.score.sum():.0f}"
+    return f"first episode: {scores}; {path.name} shows both"
+
+
+def predicted_episode(evaluation: Evaluation, episode: Episode) -> Episode:
+    """Return an episode of the same agent on the nominal cart of its training, from the start of `episode`.
+
+    The start is the measured one.
+    """
+    settings = evaluation.settings.model_copy(update={"randomization": {}})
+    start, seed = settings.task.evaluation_start, evaluation_seed(evaluation.config.seed)
+    env = simulated_env(settings, evaluation.training.plant, 1, start, seed)
+    assert isinstance(env.plant, SimulatedPlant)
+    names = ("x", "x_dot", "theta", "theta_dot")
+    env.plant.start_from({name: float(getattr(episode, name)[0]) for name in names})
+    (predicted,) = run_batch(env, evaluation.policy)
+    return predicted

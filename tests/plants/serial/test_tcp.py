@@ -1,0 +1,159 @@
+"""A cart behind a TCP port of this computer is driven, watched and lost like one behind a pseudo-terminal."""
+
+import socket
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+
+pytest.importorskip("mujoco", reason='pip install "cartpole_rl[emulator]"')
+
+from cartpole_rl.emulator.link import PtyLink, TcpLink, open_link
+from cartpole_rl.emulator.settings import EmulatorSettings
+from cartpole_rl.errors import EmulatorError, LinkError, PortError
+from cartpole_rl.plants.emulated_cart import EmulatedCart
+from cartpole_rl.plants.serial.cart import SerialCart
+from cartpole_rl.plants.serial.port import open_port
+from cartpole_rl.wire import Flags, FrameSplitter, SetMotor, State, decode_frame, encode_frame
+
+
+def truth(**settings: object) -> EmulatorSettings:
+    return EmulatorSettings.model_validate({"port": "tcp", "physics_step": 1e-3} | settings)
+
+
+@contextmanager
+def connected(**settings: object) -> Iterator[SerialCart]:
+    with EmulatedCart(truth(**settings)) as emulated, SerialCart(emulated.settings) as cart:
+        yield cart
+
+
+def test_a_host_is_noticed_and_what_it_writes_arrives() -> None:
+    with TcpLink() as line:
+        assert line.port.startswith("socket://127.0.0.1:")
+        assert line.read(0) == b""
+        assert not line.opened
+        with open_port(line.port, 921600, 1.0) as host:
+            assert line.read(5) == b""
+            assert line.opened
+            host.write(bytes(range(256)))
+            assert line.read(5) == bytes(range(256))
+            line.write(bytes(1000))
+            until(lambda: host.in_waiting == 1000)
+            assert host.read(1000) == bytes(1000)
+            assert host.in_waiting == 0
+        assert line.read(5) == b""  # closed
+        line.write(b"nobody reads this")
+        with open_port(line.port, 921600, 1.0) as host:
+            assert line.read(5) == b""
+            line.write(b"the next host")
+            until(lambda: host.in_waiting == 13)
+
+
+def until(happens) -> None:
+    deadline = time.monotonic() + 20
+    while not happens():
+        assert time.monotonic() < deadline
+        time.sleep(0.001)
+
+
+def test_a_host_that_does_not_read_loses_whole_frames_and_never_half_of_one() -> None:
+    with TcpLink() as line, open_port(line.port, 921600, 1.0) as host:
+        line.read(5)
+        padding = bytes(200_000)  # fills the buffers soon
+        line.offer(padding * 50)
+        for number in range(1000):
+            line.offer(encode_frame(SetMotor(number), number))
+        splitter, came = FrameSplitter(), []
+        while not came:
+            data = host.read(host.in_waiting or 1)
+            frames = [stuffed for stuffed in splitter.feed(data.lstrip(b"\0")) if stuffed]
+            came += [decode_frame(stuffed).message for stuffed in frames]
+            line.offer(encode_frame(SetMotor(2000), 0))
+        assert came[0] == SetMotor(2000)
+
+
+def test_a_port_that_is_closed_is_an_error_and_so_is_one_that_nobody_listens_to() -> None:
+    with TcpLink() as line:
+        host = open_port(line.port, 921600, 1.0)
+        line.read(5)
+    with pytest.raises(OSError, match="disconnected"):
+        host.read(1)
+    with pytest.raises(PortError, match="refused"):
+        open_port(line.port, 921600, 1.0)
+
+
+def test_it_listens_to_this_computer_alone() -> None:
+    with TcpLink() as line:
+        number = int(line.port.rpartition(":")[2])
+        with pytest.raises(ConnectionRefusedError), socket.create_connection(("127.0.0.2", number), 5):
+            pass
+
+
+def states(port: str) -> list[State]:
+    """The states of a cart that is homed, driven and stopped in lockstep."""
+    with connected(port=port) as cart:
+        cart.home()
+        cart.start()
+        came = []
+        for tick in range(60):
+            cart.set_motor(200 if tick // 10 % 2 else -200)
+            came.append(cart.get_state())
+        return came
+
+
+def test_lockstep_is_the_same_as_over_a_pseudo_terminal() -> None:
+    assert states("tcp") == states("pty")
+
+
+def test_an_error_leaves_the_cart_with_motor_0_and_a_second_host_finds_it_so() -> None:
+    with EmulatedCart(truth()) as emulated:
+        with pytest.raises(ZeroDivisionError), SerialCart(emulated.settings) as cart:
+            drive_and_fail(cart)
+        with SerialCart(emulated.settings) as cart:
+            state = cart.get_state()
+            assert state.motor_applied == 0
+            assert not cart.flags & Flags.ARMED
+            assert cart.flags & Flags.HOMED
+
+
+def test_the_firmware_runs_on_without_a_host() -> None:
+    """So its watchdog stops a cart whose host was killed."""
+    with EmulatedCart(truth(clock="real")) as emulated:
+        with SerialCart(emulated.settings) as cart:
+            before = cart.get_state()
+        time.sleep(0.3)
+        with SerialCart(emulated.settings) as cart:
+            after = cart.get_state()
+    assert after.tick - before.tick > 15
+    assert after.time_us - before.time_us == 20_000 * (after.tick - before.tick)
+
+
+def drive_and_fail(cart: SerialCart) -> None:
+    cart.home()
+    cart.start()
+    cart.set_motor(200)
+    assert cart.get_state().motor_applied == 200
+    raise ZeroDivisionError
+
+
+@pytest.mark.parametrize("clock", ["lockstep", "real"])
+def test_a_pulled_cable_is_a_lost_link(clock: str) -> None:
+    with pytest.raises(LinkError, match="unplugged"), connected(clock=clock, unplug_at=0.5) as cart:
+        drain(cart)
+
+
+def drain(cart: SerialCart) -> None:
+    while True:
+        cart.poll_state()
+
+
+def test_a_system_without_pseudo_terminals_gets_a_tcp_port(monkeypatch: pytest.MonkeyPatch) -> None:
+    with open_link("auto") as line:
+        assert isinstance(line, PtyLink)
+    monkeypatch.setitem(sys.modules, "termios", None)
+    with open_link("auto") as line:
+        assert isinstance(line, TcpLink)
+    with pytest.raises(EmulatorError, match="use tcp"):
+        open_link("pty")
