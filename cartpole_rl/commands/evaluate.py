@@ -5,6 +5,7 @@ run=lqr is energy and LQR, a controller without learning, as a baseline.
 cartpole-evaluate run=runs/train/2026-11-21_12-00-00 episodes=20
 cartpole-evaluate run=runs/train/2026-11-21_12-00-00 plant=emulated emulator.latency=0.02
 cartpole-evaluate run=runs/train/2026-11-21_12-00-00 plant=serial plant.port=/dev/ttyUSB0
+cartpole-evaluate run=pretrained/medium plant=emulated emulator.firmware=c emulator.policy=onboard
 cartpole-evaluate run=lqr plant=emulated
 cartpole-evaluate run=runs/train/<run> repeat.run=runs/evaluate/<run> repeat.episode=17
 
