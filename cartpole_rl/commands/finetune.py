@@ -12,7 +12,7 @@ the next one starts, so Ctrl-C, a power cut or a pulled cable loses at most the 
 from pathlib import Path
 
 from cartpole_rl.commands.hydra_application.application import application
-from cartpole_rl.commands.hydra_application.overrides import check_resumption
+from cartpole_rl.commands.hydra_application.overrides import check_resumption, is_given
 from cartpole_rl.workflows.checks import check_finetuning
 from cartpole_rl.workflows.config import FinetuneConfig
 
@@ -23,10 +23,10 @@ def main(config: FinetuneConfig, folder: Path) -> None:
     if config.resume is None:
         check_finetuning(config)
     else:
-        check_resumption("finetune", config.resume, folder)
+        check_resumption("finetune", config.resume, folder, ("learner",))
     from cartpole_rl.workflows.finetune import finetune
 
-    finetune(config, folder)
+    finetune(config, folder, new_learner=is_given("learner"))
 
 
 if __name__ == "__main__":
