@@ -4,6 +4,7 @@ import ctypes
 import os
 import platform
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -63,7 +64,7 @@ def _end_with_parent() -> None:
 
 
 def fact_finder() -> Callable[[], dict[str, Any]]:
-    """Return a function that returns versions and clock (s) of the machine that calls it.
+    """Return a function that returns versions, clock (s) and own address of the machine that calls it.
 
     Ray sends a nested function by value, so that machine need not have this package.
     """
@@ -75,7 +76,11 @@ def fact_finder() -> Callable[[], dict[str, Any]]:
                 found[name] = version(name)
             except PackageNotFoundError:
                 found[name] = None
-        return {"versions": found, "clock": time.time()}
+        try:
+            resolved = socket.gethostbyname(socket.gethostname())
+        except OSError:  # TorchRL takes the same address then
+            resolved = "127.0.0.1"
+        return {"versions": found, "clock": time.time(), "resolved": resolved}
 
     return facts
 
@@ -94,9 +99,10 @@ def difference(here: Mapping[str, str | None], there: Mapping[str, str | None]) 
 def check_learners(nodes: Iterable[Mapping[str, Any]], ask: Callable[[str], Mapping[str, Any]]) -> list[str]:
     """Check the machines that offer LEARNER; return warnings about their clocks.
 
-    `nodes` are Ray's; `ask` returns the facts of one by its id. Raises LearnerError if there is none, or one
-    has other versions.
+    `nodes` are Ray's; `ask` returns the facts of one by its id. Raises LearnerError if there is none, if one
+    has other versions, or if TorchRL would give an address to the other machine that it cannot reach.
     """
+    here = fact_finder()()
     offering = [node for node in nodes if node["Alive"] and LEARNER in node["Resources"]]
     if not offering:
         raise LearnerError(
@@ -108,12 +114,28 @@ def check_learners(nodes: Iterable[Mapping[str, Any]], ask: Callable[[str], Mapp
         asked = time.time()
         there = ask(node["NodeID"])
         middle = (asked + time.time()) / 2
-        if text := difference(fact_finder()()["versions"], there["versions"]):
+        if text := difference(here["versions"], there["versions"]):
             raise LearnerError(text)
+        if not is_local(address := node["NodeManagerAddress"]):
+            check_host_name("the learner's", there["resolved"])
+            check_host_name("the cart's", here["resolved"])
         behind = middle - there["clock"]
         if abs(behind) > CLOCKS:
             warnings.append(
-                f"the clock of {node['NodeManagerAddress']} differs by {abs(behind):.0f} s from this one; "
-                "set both by NTP"
+                f"the clock of {address} differs by {abs(behind):.0f} s from this one; set both by NTP"
             )
     return warnings
+
+
+def is_local(address: str) -> bool:
+    """Return True for an address that other machines cannot reach."""
+    return address.startswith("127.")
+
+
+def check_host_name(whose: str, resolved: str) -> None:
+    """Raise LearnerError if a machine's name stands for the machine itself, as Debian sets it up."""
+    if is_local(resolved):
+        raise LearnerError(
+            f"the host name of {whose} machine resolves to {resolved} there, and TorchRL tells the other "
+            "machine that address: in /etc/hosts, give the name its address in the network"
+        )

@@ -1,5 +1,6 @@
 """The checks of the machines that offer a learner."""
 
+import socket
 import time
 from typing import Any
 
@@ -15,10 +16,19 @@ NODES = [
 ]
 
 
-def facts(clock: float = 0.0, **versions: str | None) -> dict[str, Any]:
-    """The facts of this machine with a clock that is `clock` s ahead, and other `versions`."""
+@pytest.fixture(autouse=True)
+def _this_machine_has_an_address(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(socket, "gethostbyname", lambda _: "10.0.0.2")
+
+
+def facts(clock: float = 0.0, resolved: str = "10.0.0.3", **versions: str | None) -> dict[str, Any]:
+    """The facts of a machine like this one, with a clock that is `clock` s ahead, and other `versions`."""
     own = fact_finder()()
-    return {"versions": {**own["versions"], **versions}, "clock": time.time() + clock}
+    return {
+        "versions": {**own["versions"], **versions},
+        "clock": time.time() + clock,
+        "resolved": resolved,
+    }
 
 
 def test_the_same_versions_and_clocks_are_accepted() -> None:
@@ -45,3 +55,15 @@ def test_clocks_that_differ_are_reported(ahead: float, warnings: int) -> None:
 def test_a_cluster_without_a_learner_is_refused() -> None:
     with pytest.raises(LearnerError, match=r"no Ray node offers the resource learner: .* ray start --head"):
         check_learners(NODES[:2], lambda _: facts())
+
+
+def test_a_host_name_that_means_localhost_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(
+        LearnerError, match=r"name of the learner's machine resolves to 127.0.1.1 .*/etc/hosts"
+    ):
+        check_learners(NODES, lambda _: facts(resolved="127.0.1.1"))
+    monkeypatch.setattr(socket, "gethostbyname", lambda _: "127.0.1.1")
+    with pytest.raises(LearnerError, match=r"name of the cart's machine resolves to 127.0.1.1"):
+        check_learners(NODES, lambda _: facts())
+    on_one_machine = [{**node, "NodeManagerAddress": "127.0.0.1"} for node in NODES]
+    assert check_learners(on_one_machine, lambda _: facts(resolved="127.0.1.1")) == []
