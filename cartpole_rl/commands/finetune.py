@@ -5,8 +5,9 @@ cartpole-finetune run=runs/train/2026-11-21_12-00-00 plant=emulated emulator.car
 cartpole-finetune resume=runs/finetune/2026-11-21_12-30-00
 
 Three stages: episodes without exploration (before), episodes to learn from (tune), episodes without
-exploration (after). One process drives the cart while this one learns. Each episode is written to disk before
-the next one starts, so Ctrl-C, a power cut or a pulled cable loses at most the current episode.
+exploration (after). One process drives the cart while this one learns, or another machine (learner=ray). Each
+episode is written to disk before the next one starts, so Ctrl-C, a power cut or a pulled cable loses at most
+the current episode.
 """
 
 from pathlib import Path

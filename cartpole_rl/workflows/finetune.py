@@ -70,7 +70,7 @@ def finetune(config: FinetuneConfig, folder: Path, new_learner: bool = False) ->
         TensorBoardLog(folder) as log,
         learner_link(files, tuned, evaluation) as link,
         Driver(make_env, partial(greedy_network, training), real_time, confirm) as driver,
-        yielding_to(driver) if real_time else nullcontext(),
+        yielding_to(driver, link is None) if real_time else nullcontext(),
     ):
         cart = DrivenCart(driver, files, log)
         if link is None:

@@ -26,6 +26,7 @@ NOT_OF_TRAINING = (
     "emulator",
     "plant",
     "finetuning",
+    "learner",
     "sweep",
 )  # groups with choices that are not settings of it
 NEEDED = {"agent=recurrent": ["observation=positions"]}  # beside a choice

@@ -7,6 +7,7 @@ interrupted run, and reports its progress. `LearnerLink` starts it again after i
 import multiprocessing
 import os
 import signal
+import subprocess
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -65,6 +66,8 @@ class LearnerLink:
         self.address, self.timeout = address, timeout
         self.make_task, self.show = make_task, show
         self.is_lost = True
+        self._reason: str | None = None  # of the loss that was shown last
+        self._was_connected = False
         self.curves: list[tuple[int, dict[str, float]]] = []  # that `take_curves` has not returned yet
         self._started = 0.0
         show(f"connecting to the learner at {address}")
@@ -126,6 +129,8 @@ class LearnerLink:
 
     def _take(self, event: Any) -> None:
         match event:
+            case LearnerError() if self._was_connected:  # another one may take its place
+                self._lose(str(event))
             case CartPoleError():
                 raise event
             case str():
@@ -135,15 +140,15 @@ class LearnerLink:
             case Report():
                 if self.is_lost:
                     self.show("connected to the learner")
-                self.is_lost = False
+                self.is_lost, self._was_connected, self._reason = False, True, None
                 for message in event.messages:
                     self.show(f"learner: {message}")
                 self.curves += event.curves
 
     def _lose(self, reason: str) -> None:
-        if not self.is_lost:
+        if self._was_connected and reason != self._reason:
             self.show(f"the learner is lost: {reason}")
-        self.is_lost = True
+        self.is_lost, self._reason = True, reason
 
     def _start(self) -> None:
         context = multiprocessing.get_context("spawn")
@@ -172,25 +177,29 @@ def _serve(pipe: Connection, address: str, timeout: float, task: LearnerTask, pa
             os.dup2(log.fileno(), standard)
     with suppress(EOFError, ConnectionError):
         try:
-            with cart_node(address, task.cart):
-                _connect(address)
+            with cart_node(address, task.cart) as node:
+                _connect(address, node)
                 _report(pipe, timeout, _learner(pipe, task))
         except CartPoleError as error:
             pipe.send(error)
         except Exception as error:  # Ray's are of many kinds
             pipe.send(Lost(_first_line(error)))
+    os._exit(0)  # Ray's own way out waits for a cluster that may not answer
 
 
-def _connect(address: str) -> None:
-    """Connect to the cluster through the node of this machine, as soon as that has joined."""
+def _connect(address: str, node: "subprocess.Popen[bytes]") -> None:
+    """Connect to the cluster through the node of this machine, as soon as that has joined.
+
+    Raises ConnectionError if the node has ended.
+    """
     import ray
 
-    while True:
-        try:
+    while not ray.is_initialized():
+        if node.poll() is not None:
+            raise ConnectionError(f"no Ray cluster answers at {address}")
+        with suppress(ConnectionError, ValueError, LookupError):
             ray.init(address=address, namespace=NAMESPACE, log_to_driver=False, logging_level="ERROR")
-            return
-        except (ConnectionError, ValueError, LookupError):
-            time.sleep(PERIOD)
+        time.sleep(PERIOD)
 
 
 def _learner(pipe: Connection, task: LearnerTask) -> Any:

@@ -31,10 +31,11 @@ START_RAY = "ray start --head --port={port} --resources='{{\"learner\": 1}}'"
 
 
 @contextmanager
-def cart_node(address: str, resource: str) -> Iterator[None]:
+def cart_node(address: str, resource: str) -> "Iterator[subprocess.Popen[bytes]]":
     """Run a Ray node on this machine that joins the cluster at `address` and offers `resource`.
 
-    It runs nothing but what asks for that resource. It ends with this process, even if that is killed.
+    It runs nothing but what asks for that resource. It ends with this process, even if that is killed. The
+    yielded process ends early if the cluster cannot be reached.
     """
     command = [sys.executable, "-m", "ray.scripts.scripts", "start", f"--address={address}", "--block"]
     limits = ["--num-cpus=0", "--num-gpus=0", f"--object-store-memory={STORE}"]
@@ -46,7 +47,7 @@ def cart_node(address: str, resource: str) -> Iterator[None]:
         preexec_fn=_end_with_parent,
     )
     try:
-        yield
+        yield process
     finally:
         process.terminate()
         try:
