@@ -1,7 +1,7 @@
 #!/usr/bin/env python
 """What does a learner on another machine cost the cart, and what happens when the connection fails?
 
-    sudo scripts/bench/two_machines.py pretrained/medium local up slow brief cut killed --episodes 8
+    scripts/bench/two_machines.py pretrained/medium local up slow brief cut killed --episodes 8
 
 Runs `cartpole-finetune` on an emulated cart with the clock of a real one, on two network namespaces of this
 computer: Ray's head with the learner on one, the cart on the other (`network.py`). Needs root on Linux, and
@@ -25,7 +25,7 @@ import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -67,6 +67,13 @@ class Bench:
         self.learner, self.cart, self.cable = machines
         self.options = options
         self.env = {**os.environ, **SETTINGS}
+        self.processes: list[subprocess.Popen[bytes]] = []
+
+    def close(self) -> None:
+        """End what still runs."""
+        for process in self.processes:
+            process.terminate()
+            process.wait()
 
     def run(self, scenario: str) -> Row:
         """Fine-tune in one scenario."""
@@ -107,7 +114,9 @@ class Bench:
         command = self.cart.command(sys.executable, "-m", "cartpole_rl.commands.finetune", *words)
         folder.parent.mkdir(parents=True, exist_ok=True)
         with folder.with_suffix(".log").open("ab") as log:
-            return subprocess.Popen(command, env=self.env, stdout=log, stderr=log)
+            process = subprocess.Popen(command, env=self.env, stdout=log, stderr=log)
+        self.processes.append(process)
+        return process
 
     @contextmanager
     def ray_head(self) -> Iterator["subprocess.Popen[bytes]"]:
@@ -124,7 +133,7 @@ class Bench:
             try:
                 yield head
             finally:
-                head.terminate()
+                head.kill()  # its processes end with it
                 head.wait()
 
     def cut(self, folder: Path, process: "subprocess.Popen[bytes]", seconds: float) -> None:
@@ -217,8 +226,7 @@ def main() -> None:
     options.folder = options.folder.absolute()
     options.folder.mkdir(parents=True, exist_ok=True)
     rows = []
-    with two_machines("cartpole") as machines:
-        bench = Bench(machines, options)
+    with two_machines("cartpole") as machines, closing(Bench(machines, options)) as bench:
         for scenario in options.scenarios:
             rows.append(bench.run(scenario))
             write_json(options.json, [vars(row) for row in rows])

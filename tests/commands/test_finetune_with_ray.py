@@ -12,8 +12,14 @@ from pathlib import Path
 
 import pytest
 import torch
-from command_line import FINETUNING, Outcome, in_process
+from command_line import FINETUNING, Outcome, in_process, interrupt
 
+from cartpole_rl.learning.checkpoints import (
+    FINETUNING_FORMAT,
+    TrainingCheckpoint,
+    load_training,
+    save_training,
+)
 from cartpole_rl.workflows.ray_learner.node import SETTINGS
 
 needs_ray = pytest.mark.skipif(find_spec("ray") is None, reason='needs Ray: pip install "cartpole_rl[ray]"')
@@ -61,16 +67,34 @@ def test_it_equals_one_on_a_single_machine_to_the_bit(
 
 
 @needs_ray
-def test_a_cluster_without_learner_is_refused_before_the_cart_moves(
-    trained: Path, head: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("cartpole_rl.workflows.ray_learner.link.FIRST_CONNECTION", 1.0)
-    nowhere = head.rpartition(":")[0] + ":1"
-    words = (*FINETUNING, "learner=ray", f"learner.address={nowhere}", "hydra.run.dir=run")
+def test_an_address_without_a_cluster_is_refused_before_the_cart_moves(trained: Path, tmp_path: Path) -> None:
+    words = (*FINETUNING, "learner=ray", "learner.address=127.0.0.1:1", "hydra.run.dir=run")
     done = in_process("finetune", f"run={trained}", *words, folder=tmp_path)
     assert done.code == 1
-    assert f"the learner at learner.address={nowhere} does not answer; start Ray" in done.err
+    assert "the learner at learner.address=127.0.0.1:1 does not answer (no Ray cluster answers" in done.err
     assert not (tmp_path / "run/recordings").exists()
+
+
+def test_a_run_that_lost_its_learner_continues_on_one_machine(trained: Path, tmp_path: Path) -> None:
+    """Its checkpoint holds the newest weights alone."""
+    run = tmp_path / "run"
+    interrupt(tmp_path, "tune_001.csv", signal.SIGINT)
+    words = (*FINETUNING, "episodes=3", "hydra.run.dir=run")
+    assert in_process("finetune", f"run={trained}", *words, folder=tmp_path).code == 130
+    saved = load_training(run, FINETUNING_FORMAT)
+    assert saved.step >= 1
+    elsewhere = {"kind": "ray", "address": "gone:6379", "episodes_ahead": 5, "timeout": 10.0}
+    weights = {"agent": saved.state["agent"], "learner": "name"}
+    left = TrainingCheckpoint({**saved.config, "learner": elsewhere}, weights, saved.step)
+    save_training(run, left, FINETUNING_FORMAT)
+
+    done = in_process("finetune", f"resume={run}", "learner=local", "seed=1", folder=tmp_path)
+    assert done.code == 2
+    assert done.complaint.endswith("resume uses that run's own config; leave out seed=1")
+    done = in_process("finetune", f"resume={run}", "learner=local", folder=tmp_path)
+    assert done.code == 0, done.err
+    assert len(list((run / "recordings").glob("tune_*.csv"))) == 3
+    assert (run / "metrics.json").exists()
 
 
 @pytest.mark.skipif(find_spec("ray") is not None, reason="Ray is installed")

@@ -29,7 +29,7 @@ from cartpole_rl.workflows.ray_learner.node import (
 from cartpole_rl.workflows.ray_learner.task import LearnerTask, Report
 
 NAMESPACE = "cartpole_rl"  # of Ray, for the names of learners
-FIRST_CONNECTION = 300.0  # s; Ray, its workers and PyTorch need half a minute, and more beside other work
+FIRST_CONNECTION = 600.0  # s; half a minute is usual, ten times as much beside other work
 PAUSE = 5.0  # s before the link is started again
 PERIOD = 1.0  # s between two reports
 GIVE_UP = 45.0  # s without an answer, after which the link starts anew: Ray may have given up this node
@@ -119,11 +119,12 @@ class LearnerLink:
         end = time.monotonic() + FIRST_CONNECTION
         while self.is_lost:
             self.poll()
-            if time.monotonic() > end:
-                port = self.address.rpartition(":")[2]
+            if self._reason is not None or time.monotonic() > end:
+                port, reason = self.address.rpartition(":")[2], f" ({self._reason})" if self._reason else ""
                 raise LearnerError(
-                    f"the learner at learner.address={self.address} does not answer; start Ray on its "
-                    f"machine with {START_RAY.format(port=port)}, or give learner=local"
+                    f"the learner at learner.address={self.address} does not answer{reason}; start Ray on "
+                    f"its machine with {START_RAY.format(port=port)}, or give learner=local; {LOG} in the "
+                    "run folder has Ray's output"
                 )
             time.sleep(0.1)
 
@@ -179,7 +180,7 @@ def _serve(pipe: Connection, address: str, timeout: float, task: LearnerTask, pa
         try:
             with cart_node(address, task.cart) as node:
                 _connect(address, node)
-                _report(pipe, timeout, _learner(pipe, task))
+                _report(pipe, timeout, _learner(pipe, task), node)
         except CartPoleError as error:
             pipe.send(error)
         except Exception as error:  # Ray's are of many kinds
@@ -245,14 +246,19 @@ def _is_busy(name: str) -> bool:
     return ray.available_resources().get(LEARNER, 0) < 1
 
 
-def _report(pipe: Connection, timeout: float, learner: Any) -> None:
-    """Send reports of the learner, until it does not answer any more, has failed, or is to end."""
+def _report(pipe: Connection, timeout: float, learner: Any, node: "subprocess.Popen[bytes]") -> None:
+    """Send reports of the learner, until it does not answer any more, has failed, or is to end.
+
+    Raises ConnectionError if the Ray node of this machine has ended.
+    """
     import ray
 
     curves = messages = 0
     ray.get(learner.report.remote(), timeout=FIRST_CONNECTION)
     answered = time.monotonic()
     while True:
+        if node.poll() is not None:
+            raise ConnectionError("the Ray node of this machine ended")
         try:
             report = ray.get(learner.report.remote(curves, messages), timeout=timeout)
         except ray.exceptions.GetTimeoutError:

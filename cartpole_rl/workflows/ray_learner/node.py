@@ -20,11 +20,10 @@ PACKAGES = ("cartpole_rl", "torch", "torchrl", "tensordict", "ray")
 CLOCKS = 5.0  # s of difference between two clocks, from which it is reported
 STORE = 100_000_000  # bytes of Ray's object store on the cart's machine; an episode takes 50 kB
 STOP = 10.0  # s from SIGTERM to SIGKILL
-NICENESS = 5  # of Ray on the cart's machine: a driving process without real-time priority comes first
 SETTINGS = {  # of Ray
     "RAY_USAGE_STATS_ENABLED": "0",
-    "RAY_raylet_start_wait_time_s": "120",
-    "RAY_worker_niceness": "0",  # added to NICENESS
+    "RAY_raylet_start_wait_time_s": "300",  # the default is too little beside other work
+    "RAY_worker_niceness": "0",
     "OMP_NUM_THREADS": "1",
 }
 START_RAY = "ray start --head --port={port} --resources='{{\"learner\": 1}}'"
@@ -59,7 +58,6 @@ def cart_node(address: str, resource: str) -> "Iterator[subprocess.Popen[bytes]]
 
 def _end_with_parent() -> None:
     """Let Linux end this process with its parent (PR_SET_PDEATHSIG)."""
-    os.nice(NICENESS)
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(1, signal.SIGTERM)
 
