@@ -4,6 +4,7 @@ It outlives a lost connection: it waits for the next episode, and ends when no c
 """
 
 import os
+import secrets
 import threading
 import time
 from functools import partial
@@ -31,8 +32,7 @@ class Learner:
     """Learns in a thread from its construction on. Ray calls `report` at the same time."""
 
     def __init__(self, task: LearnerTask) -> None:
-        self.task = task
-        self.learned = task.learned
+        self.task, self.name = task, secrets.token_hex(8)
         self.failure: str | None = None
         self.curves: list[tuple[int, Scalars]] = []
         self.messages: list[str] = []
@@ -40,10 +40,11 @@ class Learner:
         for run in (self._learn, self._end_when_abandoned):
             threading.Thread(target=run, daemon=True).start()
 
-    def report(self, curves: int = 0, messages: int = 0) -> Report:
-        """Return the progress, without the first `curves` and `messages`, which the caller has."""
+    def report(self, first: tuple[int, int] = (0, 0)) -> Report:
+        """Return the progress from number `first` of the curves and of the messages on."""
         self._asked = time.monotonic()
-        return Report(self.learned, self.curves[curves:], self.messages[messages:], self.failure)
+        curves, messages = first
+        return Report(self.name, first, self.curves[curves:], self.messages[messages:], self.failure)
 
     def _learn(self) -> None:
         try:
@@ -109,8 +110,7 @@ class DistantCart:
         self.actor.curves.append((learned, scalars))
 
     def save(self, learned: int) -> None:
-        """Count the episodes; the cart saves the weights that it gets."""
-        self.actor.learned = learned
+        """Do nothing: the cart saves the weights that it gets, and the episodes are on its disk."""
 
     def _episode(self, number: int) -> Episode:
         return from_tensordict(self.connection.episode(number))

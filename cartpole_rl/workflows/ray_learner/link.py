@@ -68,6 +68,7 @@ class LearnerLink:
         self.is_lost = True
         self._reason: str | None = None  # of the loss that was shown last
         self._was_connected = False
+        self._known_learner, self._known = "", (0, 0)  # numbers of its curves and messages
         self.curves: list[tuple[int, dict[str, float]]] = []  # that `take_curves` has not returned yet
         self._started = 0.0
         show(f"connecting to the learner at {address}")
@@ -142,9 +143,17 @@ class LearnerLink:
                 if self.is_lost:
                     self.show("connected to the learner")
                 self.is_lost, self._was_connected, self._reason = False, True, None
-                for message in event.messages:
-                    self.show(f"learner: {message}")
-                self.curves += event.curves
+                self._take_news(event)
+
+    def _take_news(self, report: Report) -> None:
+        """Take curves and messages, except those that an earlier process of the link has reported."""
+        known = self._known if report.learner == self._known_learner else (0, 0)
+        curves, messages = (max(0, count - first) for count, first in zip(known, report.first, strict=True))
+        self.curves += report.curves[curves:]
+        for message in report.messages[messages:]:
+            self.show(f"learner: {message}")
+        self._known_learner = report.learner
+        self._known = max(known[0], report.next[0]), max(known[1], report.next[1])
 
     def _lose(self, reason: str) -> None:
         if self._was_connected and reason != self._reason:
@@ -253,21 +262,21 @@ def _report(pipe: Connection, timeout: float, learner: Any, node: "subprocess.Po
     """
     import ray
 
-    curves = messages = 0
+    first = 0, 0
     ray.get(learner.report.remote(), timeout=FIRST_CONNECTION)
     answered = time.monotonic()
     while True:
         if node.poll() is not None:
             raise ConnectionError("the Ray node of this machine ended")
         try:
-            report = ray.get(learner.report.remote(curves, messages), timeout=timeout)
+            report = ray.get(learner.report.remote(first), timeout=timeout)
         except ray.exceptions.GetTimeoutError:
             pipe.send(Lost(f"no answer for {timeout:g} s"))
             if time.monotonic() - answered > GIVE_UP:
                 return
             continue
         answered = time.monotonic()
-        curves, messages = curves + len(report.curves), messages + len(report.messages)
+        first = report.next
         pipe.send(report)
         if report.failure is not None:
             ray.kill(learner)

@@ -29,9 +29,15 @@ class LearnerTask:
 
 @dataclass
 class Report:
-    """The progress of a learner since the last report."""
+    """The progress of the learner with the name `learner`, from entry `first` of each list on."""
 
-    learned: int = 0  # episodes
+    learner: str
+    first: tuple[int, int] = (0, 0)  # of the curves and of the messages
     curves: list[tuple[int, Scalars]] = field(default_factory=list)  # each after that many episodes
     messages: list[str] = field(default_factory=list)
     failure: str | None = None  # the error that ended learning
+
+    @property
+    def next(self) -> tuple[int, int]:
+        """The numbers of curves and messages so far."""
+        return self.first[0] + len(self.curves), self.first[1] + len(self.messages)

@@ -31,7 +31,7 @@ class PipedLink(LearnerLink):
         self._started = time.monotonic()
         self.ends = [*getattr(self, "ends", []), end]
         if len(self.ends) == 1:
-            end.send(Report())
+            end.send(Report("first"))
 
 
 @pytest.fixture
@@ -46,7 +46,13 @@ def link(shown: list[str]) -> PipedLink:
 
 
 def test_a_loss_is_shown_once_with_its_reason(link: PipedLink, shown: list[str]) -> None:
-    for event in (Lost("no answer"), Lost("no answer"), Lost("no Ray cluster"), Report(), Lost("no answer")):
+    for event in (
+        Lost("no answer"),
+        Lost("no answer"),
+        Lost("no Ray cluster"),
+        Report("first"),
+        Lost("no answer"),
+    ):
         link.ends[0].send(event)
         link.poll()
     assert link.is_lost
@@ -70,17 +76,26 @@ def test_a_process_that_ended_is_started_again_after_a_pause(
     monkeypatch.setattr(module, "PAUSE", 0.0)
     link.poll()
     assert len(link.ends) == 2
-    link.ends[1].send(Report())
+    link.ends[1].send(Report("first"))
     link.poll()
     assert not link.is_lost
 
 
 def test_curves_are_taken_once(link: PipedLink, shown: list[str]) -> None:
-    link.ends[0].send(Report(curves=[(1, {"loss": 2.0})], messages=["fitted"]))
-    link.poll()
-    assert link.take_curves() == [(1, {"loss": 2.0})]
+    """A new process of the link reports from the beginning, a new learner has other curves."""
+    curves = [(number, {"loss": 2.0}) for number in range(3)]
+    for report, taken in (
+        (Report("first", (0, 0), curves[:1], ["fitted"]), curves[:1]),
+        (Report("first", (1, 1), curves[1:2]), curves[1:2]),
+        (Report("first", (0, 0), curves[:2], ["fitted"]), []),
+        (Report("first", (2, 1), curves[2:]), curves[2:]),
+        (Report("second", (0, 0), curves[:1], ["fitted anew"]), curves[:1]),
+    ):
+        link.ends[0].send(report)
+        link.poll()
+        assert link.take_curves() == taken
     assert link.take_curves() == []
-    assert shown[-1] == "learner: fitted"
+    assert shown[-2:] == ["learner: fitted", "learner: fitted anew"]
 
 
 def test_a_learning_that_failed_ends_the_session(link: PipedLink) -> None:
