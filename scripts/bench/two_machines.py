@@ -81,9 +81,7 @@ class Bench:
         self.cable.set(delay=DELAY if scenario == "slow" else 0.0)
         started, loads = time.monotonic(), [os.getloadavg()[0]]
         with self.ray_head() if scenario != "local" else _nothing() as head:
-            learner = (
-                [] if head is None else ["learner=ray", f"learner.address={self.learner.address}:{PORT}"]
-            )
+            learner = [] if head is None else self.learner_words()
             process = self.finetune(folder, f"run={self.options.run}", *self.words(folder), *learner)
             if scenario in CUT:
                 self.cut(folder, process, CUT[scenario])
@@ -95,6 +93,11 @@ class Bench:
                 sys.exit(f"{scenario}: see {folder}.log")
         loads.append(os.getloadavg()[0])
         return self.row(scenario, folder, sum(loads) / len(loads), (time.monotonic() - started) / 60)
+
+    def learner_words(self) -> list[str]:
+        """Return the overrides of a learner on the other machine."""
+        address = f"learner.address={self.learner.address}:{PORT}"
+        return ["learner=ray", address, f"learner.episodes_ahead={self.options.ahead}"]
 
     def words(self, folder: Path) -> list[str]:
         """Return the overrides of every run."""
@@ -219,6 +222,7 @@ def main() -> None:
     parser.add_argument("--episodes", type=positive_int, default=8, help="to learn from (8)")
     parser.add_argument("--evaluation-episodes", type=positive_int, default=2, help="before and after (2)")
     parser.add_argument("--iterations", type=positive_int, default=60, help="of learning per episode (60)")
+    parser.add_argument("--ahead", type=int, default=2, help="episodes with earlier weights (2)")
     parser.add_argument("--folder", type=Path, default=Path("runs/bench/two_machines"), help="of the runs")
     parser.add_argument("--overrides", nargs="*", default=[], help="more, for cartpole-finetune")
     options = parser.parse_args()

@@ -22,6 +22,7 @@ from cartpole_rl.workflows.ray_learner.offers import OfferFile, pack, unpack
 from cartpole_rl.workflows.ray_learner.task import LearnerTask
 
 POLL = 0.1  # s between two looks for weights
+LAST_CURVES = 10.0  # s to wait for the learner's last curves; they are not needed
 NAME = "learner"  # in a checkpoint: the learner's name in the Ray cluster
 
 show = partial(print_message, "finetune")
@@ -77,6 +78,7 @@ class RaySession(Session):
         self.link, self.offers = link, OfferFile(files.folder)
         assert isinstance(self.config.learner, RayLearnerSettings)
         self.ahead = self.config.learner.episodes_ahead
+        self.logged = 0  # episodes that the newest curves were learned from
 
     def tune(self) -> None:
         """Drive the episodes that are not on disk, each with the weights for it, and wait for the last ones.
@@ -88,6 +90,7 @@ class RaySession(Session):
             self.cart.start(self.tuned.weights, self.config.finetuning.epsilon, self.config.seed + number)
             self.cart.finish(Stage.TUNE, number)
         self.wait_for_weights(self.config.episodes, 0)
+        self.wait_for_last_curves()
         self.link.finish()
         self.offers.remove()
 
@@ -132,3 +135,12 @@ class RaySession(Session):
         """Write the learner's curves beside those of the cart."""
         for learned, scalars in self.link.take_curves():
             self.cart.log.scalars(scalars, self.cart.step(Stage.TUNE, learned))
+            self.logged = learned
+
+    def wait_for_last_curves(self) -> None:
+        """Wait for the curves after the last episode, which arrive by another way than the weights."""
+        end = time.monotonic() + LAST_CURVES
+        while self.logged < self.config.episodes and time.monotonic() < end:
+            self.link.poll()
+            self.log_curves()
+            time.sleep(POLL)

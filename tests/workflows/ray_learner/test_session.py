@@ -67,6 +67,7 @@ def state_of(version: float, network: dict[str, Any] | None = None) -> dict[str,
 def session(files: FinetuningFiles, short_episode: Episode, monkeypatch: pytest.MonkeyPatch) -> RaySession:
     """A session with the weights 0."""
     monkeypatch.setattr("cartpole_rl.workflows.ray_learner.session.POLL", 0.0)
+    monkeypatch.setattr("cartpole_rl.workflows.ray_learner.session.LAST_CURVES", 0.0)
     start = AgentCheckpoint(TRAINING.model_dump(mode="json"), state_of(0), 0, None)
     tuned = TunedAgent(TRAINING, start, None)
     tuned.state[NAME] = "run"
