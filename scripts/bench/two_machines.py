@@ -12,8 +12,7 @@ the extra `ray`. Both share the processors of this computer, so compare with `lo
     slow     each packet takes 50 ms, so a question and its answer take 100 ms
     brief    the cable is cut for 15 s after the second episode to learn from
     cut      the same for 90 s: Ray gives up the cart's node, which joins again
-    killed   Ray is killed on the learner's machine; once the cart waits, the run is interrupted, and resumed
-             with learner=local
+    killed   Ray is killed on the learner's machine, and started again once the cart waits
 """
 
 import argparse
@@ -25,7 +24,7 @@ import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -80,17 +79,17 @@ class Bench:
         folder = self.options.folder / scenario
         self.cable.set(delay=DELAY if scenario == "slow" else 0.0)
         started, loads = time.monotonic(), [os.getloadavg()[0]]
-        with self.ray_head() if scenario != "local" else _nothing() as head:
+        with self.ray_head() if scenario != "local" else nullcontext() as head:
             learner = [] if head is None else self.learner_words()
             process = self.finetune(folder, f"run={self.options.run}", *self.words(folder), *learner)
             if scenario in CUT:
                 self.cut(folder, process, CUT[scenario])
-            if scenario == "killed":
+            if head is not None and scenario == "killed":
                 self.kill(folder, process, head)
-                process = self.finetune(folder, f"resume={folder}", "learner=local")
-            loads.append(os.getloadavg()[0])
-            if process.wait() != 0:
-                sys.exit(f"{scenario}: see {folder}.log")
+            with self.ray_head() if scenario == "killed" else nullcontext():
+                loads.append(os.getloadavg()[0])
+                if process.wait() != 0:
+                    sys.exit(f"{scenario}: see {folder}.log")
         loads.append(os.getloadavg()[0])
         return self.row(scenario, folder, sum(loads) / len(loads), (time.monotonic() - started) / 60)
 
@@ -148,18 +147,13 @@ class Bench:
         self.cable.set()
         self.note(folder, "the cable is restored")
 
-    def kill(
-        self, folder: Path, process: "subprocess.Popen[bytes]", head: "subprocess.Popen[bytes] | None"
-    ) -> None:
-        """Kill Ray on the learner's machine after CUT_AFTER; interrupt the run once the cart waits."""
-        assert head is not None
+    def kill(self, folder: Path, process: "subprocess.Popen[bytes]", head: "subprocess.Popen[bytes]") -> None:
+        """Kill Ray on the learner's machine after CUT_AFTER; return once the cart waits."""
         self.wait_for(folder, process, lambda: (folder / "recordings" / CUT_AFTER).exists())
         self.note(folder, "Ray is killed on the learner's machine")
         head.kill()
         self.wait_for(folder, process, lambda: WAITING in folder.with_suffix(".log").read_text())
-        self.note(folder, "the run is interrupted")
-        process.send_signal(signal.SIGINT)
-        process.wait()
+        self.note(folder, "Ray is started again")
 
     def wait_for(self, folder: Path, process: "subprocess.Popen[bytes]", condition: object) -> None:
         """Wait until `condition()` is true. Raises SystemExit if the run ends before."""
@@ -189,11 +183,6 @@ class Bench:
             total(curves["link/late_ticks"]),
             max(curves["link/latency_p999_ms"]),
         )
-
-
-@contextmanager
-def _nothing() -> Iterator[None]:
-    yield None
 
 
 def read_curves(run: Path) -> dict[str, list[float]]:

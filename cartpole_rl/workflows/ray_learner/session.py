@@ -9,11 +9,13 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
-from typing import Any
 
+from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
 from cartpole_rl.errors import CheckpointError
 from cartpole_rl.learning.settings import RayLearnerSettings
+from cartpole_rl.reporting.words import count_text
 from cartpole_rl.workflows.config import EvaluateConfig
+from cartpole_rl.workflows.finetuning_cart import DrivenCart
 from cartpole_rl.workflows.finetuning_files import FinetuningFiles, Stage
 from cartpole_rl.workflows.finetuning_session import Session, TunedAgent
 from cartpole_rl.workflows.person import print_message
@@ -69,9 +71,9 @@ class RaySession(Session):
     def __init__(
         self,
         files: FinetuningFiles,
-        cart: Any,
+        cart: DrivenCart,
         tuned: TunedAgent,
-        settings: Any,
+        settings: CartPoleSettings,
         link: LearnerLink,
     ) -> None:
         super().__init__(files, cart, tuned, settings)
@@ -109,7 +111,7 @@ class RaySession(Session):
                 return
             if self.link.is_lost:
                 if lacking <= ahead:
-                    show(f"tune {version + 1} is driven with weights from {self.tuned.learned} episodes")
+                    show(f"tune {version + 1} is driven with weights from {count_text(self.tuned.learned)}")
                     return
                 if not waited:
                     show("the cart waits for the learner; Ctrl-C stops, resume= continues")
