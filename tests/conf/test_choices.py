@@ -72,6 +72,12 @@ def test_fine_tuning_takes_it(chosen: str) -> None:
     assert checked(FinetuneConfig, composed("finetune", "run=somewhere", chosen)).finetuning.iterations > 0
 
 
+@pytest.mark.parametrize("learner", ["local", "ray learner.address=server:6379"])
+def test_fine_tuning_takes_each_learner(learner: str) -> None:
+    config = checked(FinetuneConfig, composed("finetune", "run=somewhere", *f"learner={learner}".split()))
+    assert config.learner.kind == learner.split()[0]
+
+
 @pytest.mark.parametrize("task", ["balance", "swingup"])
 def test_any_reward_goes_with_any_task(task: str) -> None:
     for reward in Reward:
