@@ -9,6 +9,7 @@ import os
 import signal
 import subprocess
 import time
+import traceback
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -192,8 +193,11 @@ def _serve(pipe: Connection, address: str, timeout: float, task: LearnerTask, pa
                 _report(pipe, timeout, _learner(pipe, task), node)
         except CartPoleError as error:
             pipe.send(error)
-        except Exception as error:  # Ray's are of many kinds
-            pipe.send(Lost(_first_line(error)))
+        except ConnectionError as error:
+            pipe.send(Lost(str(error)))
+        except Exception as error:  # Ray's are of many kinds, and many lines long
+            traceback.print_exc()
+            pipe.send(Lost(f"{type(error).__name__}, see {LOG}"))
     os._exit(0)  # Ray's own way out waits for a cluster that may not answer
 
 
@@ -224,7 +228,7 @@ def _learner(pipe: Connection, task: LearnerTask) -> Any:
         remote = ray.remote(fact_finder()).options(num_cpus=0, scheduling_strategy=strategy)
         return ray.get(remote.remote())
 
-    for warning in check_learners(ray.nodes(), ask):
+    for warning in check_learners(ray.nodes(), ask, ray.util.get_node_ip_address()):
         pipe.send(warning)
     if _is_busy(task.name):
         pipe.send(
@@ -286,7 +290,3 @@ def _report(pipe: Connection, timeout: float, learner: Any, node: "subprocess.Po
             pipe.recv()  # Finish
             ray.kill(learner)
             return
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0]

@@ -95,11 +95,14 @@ def difference(here: Mapping[str, str | None], there: Mapping[str, str | None]) 
     return f"the cart's and the learner's machine have other versions: {text}; install the same ones on both"
 
 
-def check_learners(nodes: Iterable[Mapping[str, Any]], ask: Callable[[str], Mapping[str, Any]]) -> list[str]:
+def check_learners(
+    nodes: Iterable[Mapping[str, Any]], ask: Callable[[str], Mapping[str, Any]], own_address: str
+) -> list[str]:
     """Check the machines that offer LEARNER; return warnings about their clocks.
 
-    `nodes` are Ray's; `ask` returns the facts of one by its id. Raises LearnerError if there is none, if one
-    has other versions, or if TorchRL would give an address to the other machine that it cannot reach.
+    `nodes` are Ray's; `ask` returns the facts of one by its id; `own_address` is that of this machine. Raises
+    LearnerError if there is none, if one has other versions, or if TorchRL would give the other machine an
+    address that it cannot reach.
     """
     here = fact_finder()()
     offering = [node for node in nodes if node["Alive"] and LEARNER in node["Resources"]]
@@ -115,7 +118,7 @@ def check_learners(nodes: Iterable[Mapping[str, Any]], ask: Callable[[str], Mapp
         middle = (asked + time.time()) / 2
         if text := difference(here["versions"], there["versions"]):
             raise LearnerError(text)
-        if not is_local(address := node["NodeManagerAddress"]):
+        if (address := node["NodeManagerAddress"]) != own_address:
             check_host_name("the learner's", there["resolved"])
             check_host_name("the cart's", here["resolved"])
         behind = middle - there["clock"]
@@ -126,14 +129,9 @@ def check_learners(nodes: Iterable[Mapping[str, Any]], ask: Callable[[str], Mapp
     return warnings
 
 
-def is_local(address: str) -> bool:
-    """Return True for an address that other machines cannot reach."""
-    return address.startswith("127.")
-
-
 def check_host_name(whose: str, resolved: str) -> None:
     """Raise LearnerError if a machine's name stands for the machine itself, as Debian sets it up."""
-    if is_local(resolved):
+    if resolved.startswith("127."):
         raise LearnerError(
             f"the host name of {whose} machine resolves to {resolved} there, and TorchRL tells the other "
             "machine that address: in /etc/hosts, give the name its address in the network"
