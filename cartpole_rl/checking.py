@@ -12,7 +12,7 @@ from cartpole_rl.settings import Settings
 
 # the tags of unions, which pydantic adds to a key
 TAGS = re.compile(
-    r"(?<=^plant\.)(simulated|emulated|serial|learned)\.|(?<=^randomization\.)(ranges|identified)\."
+    r"(?<=^plant\.)(simulated|emulated|serial|learned)\.|(?<=^learner\.)(local|ray)\.|(?<=^randomization\.)(ranges|identified)\."
 )
 NEAR = 0.8  # similarity of two names, 0 to 1, from which one is suggested for the other
 NEAR_VALUE = 0.6  # similarity from which a value is suggested
@@ -23,6 +23,7 @@ EXAMPLES = {  # of required settings
     "from": "from=runs/record/<run>",
     "plant.port": "plant.port=/dev/ttyUSB0 (cartpole-find-port lists the ports) or plant.port=auto",
     "plant.model": "plant.model=runs/model/<run>",
+    "learner.address": "learner.address=<host>:6379, the address of the Ray head",
 }
 REMEDIES = {  # by pydantic's type of error; the others keep pydantic's text
     **dict.fromkeys(("int_type", "int_parsing", "int_from_float"), "give an integer"),

@@ -29,6 +29,10 @@ class LearningError(CartPoleError):
     """A training cannot continue."""
 
 
+class LearnerError(CartPoleError):
+    """The learner on another machine cannot be reached or used."""
+
+
 class CheckpointError(CartPoleError):
     """A checkpoint is missing, damaged, or not of this package."""
 

@@ -80,6 +80,21 @@ class DistillationSettings(Settings):
     value_weight: NonNegative  # of the error of the mean action value, beside that of the advantages
 
 
+class LocalLearnerSettings(Settings):
+    """learner=local: the learner of a fine-tuning is a process on the computer of the cart."""
+
+    kind: Literal["local"] = "local"
+
+
+class RayLearnerSettings(Settings):
+    """learner=ray: the learner of a fine-tuning is on another machine, in a Ray cluster."""
+
+    kind: Literal["ray"]
+    address: Annotated[str, Field(pattern=r"^[^/\s:]+:\d+$")]  # of the Ray head, as host:port
+    episodes_ahead: Annotated[int, Field(ge=0)]  # driven with earlier weights while the learner is lost
+    timeout: Annotated[float, Field(gt=0, le=600)]  # s without an answer: the learner counts as lost
+
+
 class FinetuningSettings(Settings):
     """Fine-tuning of a trained agent on one cart."""
 

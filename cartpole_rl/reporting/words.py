@@ -16,7 +16,7 @@ PHYSICS, LEARNED = "physics alone", "physics + network"  # models that are compa
 
 def count_text(episodes: int) -> str:
     """Return "1 episode" or "20 episodes"."""
-    return f"{episodes} episode{'s' if episodes > 1 else ''}"
+    return f"{episodes} episode{'' if episodes == 1 else 's'}"
 
 
 def guard_text(*episodes: Episode) -> str:

@@ -69,7 +69,14 @@ def check_finetuning(config: FinetuneConfig) -> Path:
     if config.compile:
         check_compiler()
     check_agent(config.run)
+    check_ray(config)
     return config.run
+
+
+def check_ray(config: FinetuneConfig) -> None:
+    """Raise ConfigError if the settings need Ray, and it is not installed."""
+    if config.learner.kind == "ray" and find_spec("ray") is None:
+        raise ConfigError('learner=ray needs Ray: pip install "cartpole_rl[ray]", on both machines')
 
 
 def check_export(config: ExportConfig) -> None:

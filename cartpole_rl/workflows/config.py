@@ -25,7 +25,9 @@ from cartpole_rl.learning.settings import (
     DistillationSettings,
     FinetuningSettings,
     LearningSettings,
+    LocalLearnerSettings,
     OptimizerSettings,
+    RayLearnerSettings,
 )
 from cartpole_rl.physics.bounds import check_values
 from cartpole_rl.physics.models import Actuator
@@ -216,6 +218,9 @@ class FinetuneConfig(RunSettings, OnCart):
     episodes: Annotated[int, Field(ge=1, le=1000)]
     evaluation_episodes: Annotated[int, Field(ge=1, le=1000)]
     finetuning: FinetuningSettings
+    learner: Annotated[LocalLearnerSettings | RayLearnerSettings, Field(discriminator="kind")] = (
+        LocalLearnerSettings()
+    )  # missing in runs of earlier versions
     compile: bool
     resume: str | None
     view: View = "none"

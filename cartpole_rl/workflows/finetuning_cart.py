@@ -1,7 +1,7 @@
 """The cart of a fine-tuning, driven by its own process; each finished episode is written and logged."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import Any
 
 from tqdm import tqdm
@@ -78,11 +78,14 @@ class DrivenCart:
 
 
 @contextmanager
-def yielding_to(driver: Driver) -> Iterator[None]:
-    """Lower this process's priority, but not that of the driver or of an emulated cart: they have started."""
+def yielding_to(driver: Driver, learns_here: bool) -> Iterator[None]:
+    """Lower this process's priority, but not that of the driver or of an emulated cart: they have started.
+
+    A process that does not learn keeps its priority: it waits while the cart is driven.
+    """
     if not driver.has_priority:
         print_message(
             "finetune", "other processes may delay the cart: no real-time priority (see `ulimit -r`)"
         )
-    with giving_precedence():
+    with giving_precedence() if learns_here else nullcontext():
         yield

@@ -1,7 +1,8 @@
 """Learning of a fine-tuning: from one cart's recordings, and from simulations that are fitted to them."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,7 @@ from cartpole_rl.workflows.config import FinetuneConfig, TrainConfig
 from cartpole_rl.workflows.finetuning_files import pole_length
 from cartpole_rl.workflows.person import print_message
 
+PRINT = partial(print_message, "finetune")
 SAMPLES = 4096  # carts drawn from each fit
 EVALUATED_CARTS = 10  # of the score in simulation
 
@@ -50,13 +52,19 @@ class CartLearner:
     """An agent that learns from the recordings of a cart and from simulations of it.
 
     `training` are the settings that the agent was trained with, `settings` those of the cart that it drives.
-    `start` or `restore` must be called before the agent can learn.
+    `show` prints a message. `start` or `restore` must be called before the agent can learn.
     """
 
     def __init__(
-        self, config: FinetuneConfig, training: TrainConfig, settings: CartPoleSettings, agent: QAgent
+        self,
+        config: FinetuneConfig,
+        training: TrainConfig,
+        settings: CartPoleSettings,
+        agent: QAgent,
+        show: Callable[[str], None] = PRINT,
     ) -> None:
         self.config, self.training, self.settings, self.agent = config, training, settings, agent
+        self.show = show
         models = training.models(training.plant)
         self.candidates = [models]  # physics models to fit
         if models.cart_friction is CartFriction.SIGMOID:
@@ -64,11 +72,15 @@ class CartLearner:
         self.loop: Finetuning | None = None
         self.carts: torch.Tensor  # [P, SAMPLES], drawn from the newest fit
 
-    def start(self, recorded: Sequence[Episode]) -> None:
-        """Fit the simulator to the `recorded` episodes and prepare learning."""
+    def start(self, recorded: Sequence[Episode], rounds: int = 0) -> None:
+        """Fit the simulator to the `recorded` episodes and prepare learning.
+
+        The agent has made `rounds` rounds already: the schedules continue there.
+        """
         fit, models = self.fit_simulator(recorded)
         self.carts = self.draw_carts(fit)
         self.prepare(recorded, models)
+        self.started.iteration = rounds * self.config.finetuning.iterations
         self.started.fill()
 
     def restore(self, recorded: Sequence[Episode], snapshot: Mapping[str, Any]) -> None:
@@ -143,8 +155,7 @@ class CartLearner:
         windows = cut_windows(recorded, period)
         nominal = self.training.nominal_with(self.training.pole.nominal)
         fit, models = best_fit(windows, nominal, self.candidates, period)
-        print_message(
-            "finetune",
+        self.show(
             f"simulator fitted to {windows.number} windows of {windows.periods * period:g} s: RMS error "
             f"{1e3 * CART_METRES_PER_COUNT * fit.rms[0]:.2f} mm and "
             f"{math.degrees(POLE_RADIANS_PER_COUNT) * fit.rms[1]:.2f} deg",

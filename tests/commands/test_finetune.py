@@ -3,13 +3,12 @@
 import json
 import os
 import signal
-import threading
 import time
 from collections import defaultdict
 from pathlib import Path
 
 import torch
-from command_line import FINETUNING, ONCE, TINY, Outcome, console_script, in_process, outcome
+from command_line import FINETUNING, ONCE, TINY, Outcome, console_script, in_process, interrupt, outcome
 from tensorboard.backend.event_processing.event_file_loader import EventFileLoader
 
 from cartpole_rl.evaluation.recordings import read_recording
@@ -90,17 +89,6 @@ def test_a_tuned_agent_is_evaluated_like_any_other(tuned: tuple[Path, Outcome], 
         "evaluate", f"run={run}", "episodes=2", f"hydra.run.dir={tmp_path}/evaluated", folder=tmp_path
     )
     assert done.code == 0, done.err
-
-
-def interrupt(folder: Path, recording: str, stop: signal.Signals) -> None:
-    """Send `stop` to this process once an episode is on disk."""
-
-    def send() -> None:
-        while not (folder / "run/recordings" / recording).exists():
-            time.sleep(0.01)
-        os.kill(os.getpid(), stop)
-
-    threading.Thread(target=send, daemon=True).start()
 
 
 def contents(run: Path) -> dict[str, bytes]:

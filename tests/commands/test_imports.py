@@ -40,6 +40,7 @@ COMPLAINS = {  # command: words, exit code, part of the line on stderr
         ("run=nowhere", 1, "run=nowhere: there is no such file or folder"),
         ("resume=nowhere", 1, "resume=nowhere: there is no such folder"),
         ("finetuning.epsilon=0.5", 2, "give at most 0.2"),
+        ("learner=ray", 2, "learner.address is missing; give learner.address=<host>:6379"),
     ],
     "identify": [
         ("from=nowhere", 1, "from=nowhere: there is no such file or folder"),

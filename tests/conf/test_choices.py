@@ -26,6 +26,7 @@ NOT_OF_TRAINING = (
     "emulator",
     "plant",
     "finetuning",
+    "learner",
     "sweep",
 )  # groups with choices that are not settings of it
 NEEDED = {"agent=recurrent": ["observation=positions"]}  # beside a choice
@@ -69,6 +70,12 @@ def test_an_evaluation_can_replace_the_agents_choice(chosen: str, trained: Train
 @pytest.mark.parametrize("chosen", [case for case in CHOICES if group_of(case) == "finetuning"])
 def test_fine_tuning_takes_it(chosen: str) -> None:
     assert checked(FinetuneConfig, composed("finetune", "run=somewhere", chosen)).finetuning.iterations > 0
+
+
+@pytest.mark.parametrize("learner", ["local", "ray learner.address=server:6379"])
+def test_fine_tuning_takes_each_learner(learner: str) -> None:
+    config = checked(FinetuneConfig, composed("finetune", "run=somewhere", *f"learner={learner}".split()))
+    assert config.learner.kind == learner.split()[0]
 
 
 @pytest.mark.parametrize("task", ["balance", "swingup"])

@@ -97,6 +97,17 @@ def interrupt_after(file: Path) -> None:
     threading.Thread(target=interrupt, daemon=True).start()
 
 
+def interrupt(folder: Path, recording: str, stop: signal.Signals) -> None:
+    """Send `stop` to this process once an episode of the run in `folder`/run is on disk."""
+
+    def send() -> None:
+        while not (folder / "run/recordings" / recording).exists():
+            time.sleep(0.01)
+        os.kill(os.getpid(), stop)
+
+    threading.Thread(target=send, daemon=True).start()
+
+
 def modified(file: Path) -> int | None:
     """Return when a file was written, ns; None if there is none."""
     return file.stat().st_mtime_ns if file.exists() else None

@@ -92,3 +92,15 @@ def test_a_resumed_fine_tuning_equals_one_that_was_not_stopped(recorded: list[Ep
     assert resumed.started.iteration == 9
     expected = weights(whole)
     assert all(torch.equal(expected[name], weight) for name, weight in weights(resumed).items())
+
+
+def test_a_learner_that_starts_later_continues_the_schedules(recorded: list[Episode]) -> None:
+    """Without the state of the earlier one: it was on a machine that is gone."""
+    whole = learner()
+    whole.start(recorded[:1])
+    for _ in range(2):
+        whole.round()
+    late = learner()
+    late.start(recorded, rounds=2)
+    assert late.started.iteration == whole.started.iteration == 6
+    assert late.started.epsilon() == whole.started.epsilon() < late.started.settings.epsilon[0]

@@ -12,10 +12,15 @@ from cartpole_rl.workflows.config import EvaluateConfig
 TAKEN_BY_REPEAT = ("run", "repeat.run", "repeat.episode", "label")
 
 
-def check_resumption(program: str, resume: str, folder: Path) -> None:
-    """Raise CartPoleError where other settings are given, or the run cannot be resumed."""
-    refuse_others(("resume",), "resume uses that run's own config")
+def check_resumption(program: str, resume: str, folder: Path, replaceable: Collection[str] = ()) -> None:
+    """Raise CartPoleError where other than `replaceable` settings are given, or the run cannot continue."""
+    refuse_others(("resume", *replaceable), "resume uses that run's own config")
     check_resumable(program, resume, folder)
+
+
+def is_given(group: str) -> bool:
+    """Return True if the command line sets something in `group`."""
+    return any(_key(word).split(".")[0] == group for word in HydraConfig.get().overrides.task)
 
 
 def check_repetition(config: EvaluateConfig) -> None:
@@ -32,5 +37,9 @@ def check_repetition(config: EvaluateConfig) -> None:
 def refuse_others(allowed: Collection[str], reason: str) -> None:
     """Raise ConfigError that names the settings given on the command line beside those `allowed`."""
     overrides = HydraConfig.get().overrides.task
-    if others := [word for word in overrides if word.lstrip("+").split("=")[0] not in allowed]:
+    if others := [word for word in overrides if {_key(word), _key(word).split(".")[0]}.isdisjoint(allowed)]:
         raise ConfigError(f"{reason}; leave out {', '.join(others)}")
+
+
+def _key(word: str) -> str:
+    return word.lstrip("+").split("=")[0]

@@ -1,0 +1,69 @@
+"""The checks of the machines that offer a learner."""
+
+import socket
+import time
+from typing import Any
+
+import pytest
+
+from cartpole_rl.errors import LearnerError
+from cartpole_rl.workflows.ray_learner.node import check_learners, fact_finder
+
+NODES = [
+    {"NodeID": "gone", "Alive": False, "Resources": {"learner": 1}, "NodeManagerAddress": "10.0.0.1"},
+    {"NodeID": "cart", "Alive": True, "Resources": {"cart_1": 1}, "NodeManagerAddress": "10.0.0.2"},
+    {"NodeID": "server", "Alive": True, "Resources": {"learner": 1}, "NodeManagerAddress": "10.0.0.3"},
+]
+OWN = "10.0.0.2"
+
+
+@pytest.fixture(autouse=True)
+def _this_machine_has_an_address(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(socket, "gethostbyname", lambda _: OWN)
+
+
+def facts(clock: float = 0.0, resolved: str = "10.0.0.3", **versions: str | None) -> dict[str, Any]:
+    """The facts of a machine like this one, with a clock that is `clock` s ahead, and other `versions`."""
+    own = fact_finder()()
+    return {
+        "versions": {**own["versions"], **versions},
+        "clock": time.time() + clock,
+        "resolved": resolved,
+    }
+
+
+def test_the_same_versions_and_clocks_are_accepted() -> None:
+    asked = []
+    assert check_learners(NODES, lambda node: asked.append(node) or facts(), OWN) == []
+    assert asked == ["server"]
+
+
+def test_another_version_is_refused() -> None:
+    text = (
+        "other versions: torch .* here and 1.0 there, tensordict .* here and missing there; install the same"
+    )
+    with pytest.raises(LearnerError, match=text):
+        check_learners(NODES, lambda _: facts(torch="1.0", tensordict=None), OWN)
+
+
+@pytest.mark.parametrize(("ahead", "warnings"), [(-60.0, 1), (-2.0, 0), (2.0, 0), (60.0, 1)])
+def test_clocks_that_differ_are_reported(ahead: float, warnings: int) -> None:
+    found = check_learners(NODES, lambda _: facts(ahead), OWN)
+    assert len(found) == warnings
+    assert all("10.0.0.3 differs by 60 s" in text for text in found)
+
+
+def test_a_cluster_without_a_learner_is_refused() -> None:
+    with pytest.raises(LearnerError, match=r"no Ray node offers the resource learner: .* ray start --head"):
+        check_learners(NODES[:2], lambda _: facts(), OWN)
+
+
+def test_a_host_name_that_means_localhost_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(
+        LearnerError, match=r"name of the learner's machine resolves to 127.0.1.1 .*/etc/hosts"
+    ):
+        check_learners(NODES, lambda _: facts(resolved="127.0.1.1"), OWN)
+    monkeypatch.setattr(socket, "gethostbyname", lambda _: "127.0.1.1")
+    with pytest.raises(LearnerError, match=r"name of the cart's machine resolves to 127.0.1.1"):
+        check_learners(NODES, lambda _: facts(), OWN)
+    assert check_learners(NODES, lambda _: facts(resolved="127.0.1.1"), "10.0.0.3") == []  # one machine
