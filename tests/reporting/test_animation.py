@@ -37,7 +37,7 @@ def part(episode: Episode, start: int, steps: int, **other: object) -> Episode:
     values = {
         field.name: getattr(episode, field.name)[start : start + steps + (field.name in long)]
         for field in dataclasses.fields(episode)
-        if field.name not in ("ended_by", "origin", "guarded")
+        if field.name not in ("ended_by", "origin", "guarded", "expected")
     }
     return Episode(**{**values, "ended_by": episode.ended_by, **other})  # type: ignore[arg-type]
 
