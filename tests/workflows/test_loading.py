@@ -21,6 +21,7 @@ REQUIRED = {
     "evaluate": {"run": "lqr"},
     "record": {"run": "lqr"},
     "replay": {"from": "."},
+    "distill": {"run": "."},
     "model": {"from": "."},
     "report": {"runs": "."},
     "export": {"run": "pretrained/medium", "format": "web"},
