@@ -83,11 +83,7 @@ def test_an_episode_of_one_period_can_be_drawn(swing_up: Episode) -> None:
     short = {
         name: each[: 2 if len(each) == 501 else 1]
         for name, each in short.items()
-<<<<<<< HEAD
         if isinstance(each, np.ndarray)
-=======
-        if name not in ("ended_by", "origin", "guarded", "expected")
->>>>>>> fw
     }
     assert png(behaviour(Episode(**short, ended_by="link")))
 
