@@ -34,7 +34,10 @@ CHECKED = (
     "tensorboard ",
     "python -m cartpole_rl.emulator ",
 )
-NEED_HARDWARE = {"docs/firmware.md": ("arduino-cli ", "openocd ", "ln -s ", "make -C firmware nucleo")}
+NEED_HARDWARE = {
+    "docs/firmware.md": ("arduino-cli ", "openocd ", "ln -s ", "make -C firmware nucleo"),
+    "docs/two-machines.md": ("ray start ",),  # another machine; scripts/bench/two_machines.py runs it
+}
 NOT_COMMANDS = {  # drawings, formulas, files and what a command prints
     "docs/protocol.md": ("COBS(", "time ", "cart ", "line ", "host ", "motor ", "power, reset"),
     "docs/house.md": ("conf/ ──>",),
