@@ -255,7 +255,8 @@ def test_every_setting_is_tried_here_or_on_the_wire():
     cogging = {"cogging", "cogging_pitch"}  # test_emulator_physics.py
     firmware = {"firmware", "policy"}  # this module runs with both; test_onboard_policy.py
     others = {"journal", "knock"}  # tests/plants/test_stops.py, tests/bench/test_soak.py; below
-    assert set(OTHER) | firmware | on_the_wire | order | faults | cogging | others == set(
+    port = {"port"}  # tests/plants/serial/test_tcp.py
+    assert set(OTHER) | firmware | on_the_wire | order | faults | cogging | others | port == set(
         EmulatorSettings.model_fields
     )
 

@@ -1,5 +1,6 @@
 """A small network learns what an agent does, from the states that both visit."""
 
+from copy import deepcopy
 from pathlib import Path
 
 import torch
@@ -20,9 +21,9 @@ SMALL = DistillationSettings(
     carts=32,
     rounds=4,
     periods=60,
-    updates=60,
+    updates=200,
     batch_size=128,
-    learning_rate=3e-3,
+    learning_rate=1e-2,
     epsilon=0.02,
     value_weight=0.02,
 )
@@ -39,15 +40,22 @@ def small_distillation() -> tuple[Distillation, QAgent, CartPoleEnv]:
     return Distillation(SMALL, drivers[0], student, drivers[1], env, seed=0), student, env
 
 
-def test_the_student_comes_to_choose_as_the_teacher_does() -> None:
-    distillation, student, _ = small_distillation()
-    losses = list(distillation.run())
-    assert losses[-1] < losses[0] / 3
+def agreement(student: QAgent, distillation: Distillation) -> float:
+    """Return the share of the visited states in which the student chooses the teacher's action."""
     observations, values = torch.cat(distillation._observations), torch.cat(distillation._values)
-    assert distillation.transitions == len(observations) == SMALL.carts * SMALL.rounds * SMALL.periods
     with torch.no_grad():
         chosen = student.greedy_policy().module[0].module(observations).argmax(-1)
-    assert (chosen == values.argmax(-1)).float().mean() > 0.5
+    return float((chosen == values.argmax(-1)).float().mean())
+
+
+def test_the_student_comes_to_choose_as_the_teacher_does() -> None:
+    distillation, student, _ = small_distillation()
+    untrained = deepcopy(student)
+    losses = list(distillation.run())
+    assert len(losses) == SMALL.rounds
+    assert losses[-1] < losses[0] / 2
+    assert distillation.transitions == SMALL.carts * SMALL.rounds * SMALL.periods
+    assert agreement(student, distillation) > agreement(untrained, distillation) + 0.2
     assert torch.isfinite(torch.cat([weight.flatten() for weight in student.parameters()])).all()
 
 

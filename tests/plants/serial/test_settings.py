@@ -51,12 +51,15 @@ def test_timeouts_reach_the_port_and_the_calls_that_wait(
     peer: CartPeer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     opened, real = [], serial.serial_for_url
-    monkeypatch.setattr(
-        serial, "serial_for_url", lambda url, **kwargs: opened.append(kwargs) or real(url, **kwargs)
-    )
+
+    def noted(url: str, **kwargs: object) -> serial.SerialBase:
+        opened.append(real(url, **kwargs))
+        return opened[-1]
+
+    monkeypatch.setattr(serial, "serial_for_url", noted)
     config = evaluation(port=peer.port, baud=115200, retries=0, **TIMEOUTS)
     with closing(environment(config)) as env:
-        assert (opened[0]["baudrate"], opened[0]["write_timeout"]) == (115200, 0.07)
+        assert (opened[0].baudrate, opened[0].write_timeout) == (115200, 0.07)
         peer.flags = Flags.HOMING
         carry_out, peer.carry_out = peer.carry_out, lambda message: None
         with pytest.raises(PlantError, match=r"homing was not done after 0\.11 s"):
