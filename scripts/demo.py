@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from cartpole_rl.reporting.figures import comparison, save
-from cartpole_rl.reporting.scores import SCORES
-from cartpole_rl.reporting.table import interval_text, table
+from cartpole_rl.reporting.scores import SCORES, mean_text
+from cartpole_rl.reporting.table import table
 
 EPISODES = 10  # without exploration
 TUNING_EPISODES = 5  # to learn from
@@ -68,7 +68,8 @@ def report(folder: Path) -> None:
     }
     print(f"\nThe last checkpoint on each cart: mean and 95 % interval of {EPISODES} episodes")
     rows = [
-        {"figure": SCORES[key]} | {cart: mean_text(result[key]) for cart, result in results.items()}
+        {"figure": SCORES[key]}
+        | {cart: mean_text(result[key]) or "never" for cart, result in results.items()}
         for key in SHOWN
     ]
     means = {name: result["score"] for name, result in results.items()}
@@ -84,11 +85,6 @@ def report(folder: Path) -> None:
     print(f"scores:          {folder}/comparison.png")
     print(f"learning curve:  {folder}/train/figures/learning_curve.png")
     print(f"TensorBoard:     .venv/bin/tensorboard --logdir {folder}")
-
-
-def mean_text(figure: dict | None) -> str:
-    """Return a mean with its interval; "never" if no episode has the figure."""
-    return "never" if figure is None else interval_text(figure["mean"], figure["low"], figure["high"])
 
 
 if __name__ == "__main__":

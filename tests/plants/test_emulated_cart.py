@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from functools import partial
 
 import pytest
+from emulator_host import drive_and_fail
 
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import EmulatorError, LinkError
@@ -156,14 +157,6 @@ def test_an_error_inside_with_leaves_a_cart_with_motor_0() -> None:
             assert state.motor_applied == 0
             assert not cart.flags & Flags.ARMED
             assert cart.flags & Flags.HOMED
-
-
-def drive_and_fail(cart: SerialCart) -> None:
-    cart.home()
-    cart.start()
-    cart.set_motor(200)
-    assert cart.get_state().motor_applied == 200
-    raise ZeroDivisionError
 
 
 def test_a_bad_cable_only_loses_frames() -> None:

@@ -11,6 +11,7 @@ import serial
 from firmwares import UnderTest
 
 from cartpole_rl.errors import FrameError
+from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.wire import Flags, Frame, FrameSplitter, Home, Message, State, decode_frame, encode_frame
 
 SILENCE = 200.0  # s, timeout of a test
@@ -101,3 +102,12 @@ def emulator(*options: str, **settings: object) -> Iterator[EmulatorHost]:
         process.wait()
         if process.stdout:
             process.stdout.close()
+
+
+def drive_and_fail(cart: SerialCart) -> None:
+    """Drive a cart, and raise ZeroDivisionError under way."""
+    cart.home()
+    cart.start()
+    cart.set_motor(200)
+    assert cart.get_state().motor_applied == 200
+    raise ZeroDivisionError

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import pytest
+from emulator_host import drive_and_fail
 
 pytest.importorskip("mujoco", reason='pip install "cartpole_rl[emulator]"')
 
@@ -128,14 +129,6 @@ def test_the_firmware_runs_on_without_a_host() -> None:
             after = cart.get_state()
     assert after.tick - before.tick > 15
     assert after.time_us - before.time_us == 20_000 * (after.tick - before.tick)
-
-
-def drive_and_fail(cart: SerialCart) -> None:
-    cart.home()
-    cart.start()
-    cart.set_motor(200)
-    assert cart.get_state().motor_applied == 200
-    raise ZeroDivisionError
 
 
 @pytest.mark.parametrize("clock", ["lockstep", "real"])
