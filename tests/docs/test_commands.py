@@ -1,8 +1,9 @@
 """Every command of the pages in docs/ is one that the package takes: names, groups, keys and options exist.
 
-Running them all would take days: they are composed, and scripts are asked for their options. The README's
-commands, which are the same ones, are run by tests/readme; those of docs/extending.md by test_extending.py,
-the Python blocks by workflows/test_python_api.py and envs/test_torchrl_example.py. No block is left out.
+The README's commands are run by test_readme.py, those of the guides by test_guides.py, those of
+docs/extending.md by test_extending.py, the Python blocks by workflows/test_python_api.py and
+envs/test_torchrl_example.py. Here are those that need an extra, whose settings are composed, and scripts that
+take hours: their options exist. No block is left out.
 """
 
 import re
@@ -13,17 +14,10 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
-from command_line import in_process
+from page_commands import NEED_EXTRAS, PAGES, ROOT, guide_commands, run_here
 
 from cartpole_rl.emulator.__main__ import read_settings
 
-ROOT = Path(__file__).parents[2]
-PAGES = sorted([*ROOT.glob("docs/**/*.md"), ROOT / "runs/README.md", ROOT / "CONTRIBUTING.md"])
-CHOICE_FILES = {
-    "cart": "conf/cart/ip02.yaml",
-    "pole": "conf/pole/medium.yaml",
-    "randomization": "conf/randomization/wide.yaml",
-}
 OTHER_PAGES = [*(page for page in PAGES if page.name != "extending.md"), ROOT / "README.md"]
 CHECKED = (
     "cartpole-",
@@ -48,37 +42,22 @@ NOT_COMMANDS = {  # drawings, formulas, files and what a command prints
 BLOCKS = re.compile(r"(?:(?<=\n\n)|\A)(?:    .*\n(?:\n(?=    ))?)+")
 
 
-def commands(start: str) -> list[tuple[str, str]]:
-    """The commands in indented blocks that begin with `start`, each with its page."""
-    found = []
-    for page in PAGES:
-        text = re.sub(r" *\\\n +", " ", page.read_text())
-        for line in re.findall(rf"^    ({start}.*?)(?:\s+#.*)?$", text, re.M):
-            found.append((page.relative_to(ROOT).as_posix(), line))
-    return found
-
-
-def needs_extra(words: list[str]) -> bool:
-    """Return True for a launcher or a sweeper that is not part of Hydra."""
-    starts = "sweep=optuna", "hydra/launcher=", "hydra/sweeper="
-    return any(word.startswith(starts) for word in words) and find_spec("hydra_plugins") is None
-
-
-@pytest.mark.parametrize(("page", "command"), commands("cartpole-"))
-def test_the_command_composes(page: str, command: str, tmp_path: Path) -> None:
-    name, *words = shlex.split(re.sub("<.*?>", "run", command))
-    for group, file in CHOICE_FILES.items():
-        words = [re.sub(rf"^{group}=runs/.*\.yaml$", f"{group}={ROOT / file}", word) for word in words]
-    if needs_extra(words):
+@pytest.mark.parametrize(
+    ("page", "command"),
+    [
+        (page, line)
+        for page, line in guide_commands("cartpole-")
+        if any(extra in line for extra in NEED_EXTRAS)
+    ],
+)
+def test_the_command_that_needs_an_extra_composes(page: str, command: str, tmp_path: Path) -> None:
+    if "sweep=optuna" in command and find_spec("hydra_plugins") is None:
         pytest.skip("its launcher or sweeper is an extra: scripts/sweeps runs it")
-    if "-m" in words:  # Hydra does not compose a sweep as a whole: its first job
-        words = [re.sub(r"=range\(.*\)$", "=0", word).partition(",")[0] for word in words if word != "-m"]
-    verb = name.removeprefix("cartpole-").replace("-", "_")
-    done = in_process(verb, *words, "--cfg", "job", folder=tmp_path)
-    assert done.code == 0, f"{page}: {command}\n{done.err}"
+    done = run_here(command, "--cfg", "job", cwd=tmp_path)
+    assert done.returncode == 0, f"{page}: {command}\n{done.stderr}"
 
 
-@pytest.mark.parametrize(("page", "command"), commands("(?:\\./)?scripts/"))
+@pytest.mark.parametrize(("page", "command"), guide_commands("(?:\\./)?scripts/"))
 def test_the_script_and_its_options_exist(page: str, command: str) -> None:
     name, *words = shlex.split(re.sub("<.*?>", "run", command))
     script = ROOT / name
@@ -103,7 +82,7 @@ def test_every_line_of_a_block_is_checked_here_or_needs_hardware(page: Path) -> 
     assert [line for line in lines if not line.startswith((" ", *known))] == []
 
 
-@pytest.mark.parametrize(("page", "command"), commands("pip "))
+@pytest.mark.parametrize(("page", "command"), guide_commands("pip "))
 def test_the_extras_that_are_installed_exist(page: str, command: str) -> None:
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     words = shlex.split(command)
@@ -111,7 +90,7 @@ def test_the_extras_that_are_installed_exist(page: str, command: str) -> None:
     assert set(words[5].removeprefix(".[").removesuffix("]").split(",")) <= set(extras)
 
 
-@pytest.mark.parametrize(("page", "command"), [*commands("make "), *commands("tensorboard ")])
+@pytest.mark.parametrize(("page", "command"), [*guide_commands("make "), *guide_commands("tensorboard ")])
 def test_the_target_exists_and_the_folder_is_that_of_runs(page: str, command: str) -> None:
     words = shlex.split(command)
     if words[0] == "tensorboard":
@@ -120,6 +99,6 @@ def test_the_target_exists_and_the_folder_is_that_of_runs(page: str, command: st
         assert subprocess.run([*words, "--dry-run"], cwd=ROOT, capture_output=True).returncode == 0
 
 
-@pytest.mark.parametrize(("page", "command"), commands("python -m cartpole_rl.emulator "))
+@pytest.mark.parametrize(("page", "command"), guide_commands("python -m cartpole_rl.emulator "))
 def test_the_settings_of_an_emulator_exist(page: str, command: str) -> None:
     assert read_settings(shlex.split(command)[-1]), page

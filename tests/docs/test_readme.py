@@ -13,25 +13,21 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from command_line import in_process, interrupt_after
+from command_line import interrupt_after
+from page_commands import (
+    BIN,
+    BUDGET,
+    COARSE,
+    IDENTIFYING,
+    MODELLING,
+    README,
+    ROOT,
+    TUNING,
+    block_lines,
+    run_here,
+    within,
+)
 
-ROOT = Path(__file__).parents[2]
-BIN = Path(sys.executable).parent
-BUDGET = [
-    "compile=false",
-    "learning.transitions=1024",
-    "learning.carts=16",
-    "learning.chunk=8",
-    "learning.updates=1",
-    "learning.batch_size=16",
-    "learning.warmup_transitions=64",
-    "learning.evaluations=1",
-    "learning.evaluation_episodes=2",
-    "buffer.size=2000",
-    "task.time_limit=100",
-]
-TUNING = ["compile=false", "finetuning.iterations=1", "episodes=1", "evaluation_episodes=1"]
-COARSE = "emulator.physics_step=1e-3"
 VERBS = (
     "train",
     "evaluate",
@@ -46,34 +42,7 @@ VERBS = (
     "report",
     "export",
 )
-COMMANDS = re.findall(
-    r"^    ((?:cartpole-|tensorboard|\./scripts/|pip ).*?)(?:\s+#.*)?$",
-    re.sub(r" \\\n +", " ", (ROOT / "README.md").read_text()),
-    re.M,
-)
-
-
-def run(command: str, *more: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    """Run the installed command in a separate process."""
-    name, *words = command.split()
-    return subprocess.run([BIN / name, *words, *more], cwd=cwd, capture_output=True, text=True)
-
-
-def run_here(command: str, *more: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    """The same command, in this process."""
-    name, *words = command.split()
-    verb = name.removeprefix("cartpole-").replace("-", "_")
-    done = in_process(verb, *words, *more, folder=cwd)
-    return subprocess.CompletedProcess(command, done.code, done.out, done.err)
-
-
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder in which `cartpole-train` has made runs/train/<run>."""
-    folder = tmp_path_factory.mktemp("user")
-    result = run("cartpole-train experiment=medium hydra.run.dir=runs/train/first", *BUDGET, cwd=folder)
-    assert result.returncode == 0, result.stderr
-    return folder
+COMMANDS = block_lines(README, r"cartpole-|tensorboard|\./scripts/|pip ")
 
 
 def listed(start: str) -> list[str]:
@@ -94,7 +63,7 @@ def test_every_command_is_one_that_a_test_here_runs() -> None:
 
 @pytest.mark.parametrize("command", [c for c in listed("cartpole-train") if "<run>" not in c])
 def test_train(command: str, tmp_path: Path) -> None:
-    budget = [word for word in BUDGET if word.split("=")[0] not in command]
+    budget = within(BUDGET, command)
     if "learning.transitions=" in command:
         command = re.sub(r"learning.transitions=\d+", "learning.transitions=1024", command)
     result = run_here(command, *budget, cwd=tmp_path)
@@ -139,34 +108,16 @@ def test_evaluate(command: str, trained: Path, serial_port: Callable[[], str]) -
     assert len(metrics["episodes"]) == (20 if "episodes=20" in command else 1)
 
 
-@pytest.fixture
-def serial_port() -> Callable[[], str]:
-    """Start `cartpole-emulate` when called, return its port, and interrupt it after the test."""
-    running: list[subprocess.Popen[str]] = []
-
-    def start() -> str:
-        process = subprocess.Popen([BIN / "cartpole-emulate", COARSE], stdout=subprocess.PIPE, text=True)
-        running.append(process)
-        assert process.stdout is not None
-        return json.loads(process.stdout.readline())["port"]
-
-    yield start
-    for process in running:
-        process.send_signal(signal.SIGINT)
-        assert process.wait(timeout=100) in (0, 130)
-
-
 def test_identify_train_on_it_and_model_it(trained: Path, serial_port: Callable[[], str]) -> None:
     (identify,) = listed("cartpole-identify")
     identify = identify.replace("/dev/ttyUSB0", serial_port())
-    short = ["windows=20", "substeps=2", "carts=100"]
-    identified = run_here(identify, *short, "hydra.run.dir=runs/identify/first", cwd=trained)
+    identified = run_here(identify, *IDENTIFYING, "hydra.run.dir=runs/identify/first", cwd=trained)
     assert identified.returncode == 0, identified.stderr
     (train,) = [command for command in listed("cartpole-train") if "identify" in command]
     result = run_here(train.replace("<run>", "first"), *BUDGET, cwd=trained)
     assert result.returncode == 0, result.stderr
     (model,) = listed("cartpole-model")
-    short = ["ensemble.updates=2", "ensemble.members=1", "windows=20", "hydra.run.dir=runs/model/first"]
+    short = [*MODELLING, "hydra.run.dir=runs/model/first"]
     modelled = run_here(model.replace("<run>", "first"), *short, cwd=trained)
     assert modelled.returncode == 0, modelled.stderr
     assert (trained / "runs/model/first/model.pt").exists()
@@ -190,9 +141,8 @@ def test_finetune(command: str, trained: Path, serial_port: Callable[[], str]) -
         command = command.replace("/dev/ttyUSB0", serial_port())
     else:
         command = f"{command} {COARSE}"
-    short = ["episodes=1", "evaluation_episodes=1", "finetuning.iterations=1", "compile=false"]
     folder = f"runs/finetune/{abs(hash(command))}"
-    result = run_here(command, *short, f"hydra.run.dir={folder}", cwd=trained)
+    result = run_here(command, *TUNING, f"hydra.run.dir={folder}", cwd=trained)
     assert result.returncode == 0, result.stderr
     assert (trained / folder / "checkpoints/last.pt").exists()
 

@@ -1,0 +1,162 @@
+"""Every command of the guides that the README does not have runs to its end, with budgets that take seconds.
+
+Those that need a launcher, Optuna or Ray are run by scripts/sweeps and scripts/bench/two_machines.py.
+"""
+
+import re
+import shlex
+import shutil
+import signal
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from command_line import interrupt_after
+from page_commands import (
+    BIN,
+    BUDGET,
+    COARSE,
+    IDENTIFYING,
+    MODELLING,
+    NEED_EXTRAS,
+    README,
+    TUNING,
+    block_lines,
+    guide_commands,
+    run_here,
+    within,
+)
+from small_study import make_study
+
+DISTILLING = [
+    f"distillation.{name}={value}"
+    for name, value in {"carts": 8, "rounds": 2, "periods": 5, "updates": 3, "batch_size": 16}.items()
+]
+BUDGETS = {  # of each command; what the page gives stays, except where it takes minutes
+    "train": [*BUDGET, "seed=0", "agent.action_gap=0.7"],  # the last two narrow the sweeps
+    "evaluate": ["episodes=1"],
+    "finetune": TUNING,
+    "identify": IDENTIFYING,
+    "model": MODELLING,
+    "distill": DISTILLING,
+    "report": ["animations=false"],
+    "export": [],
+}
+LONG = (
+    "learning.transitions=",
+    "episodes=40",
+    "episodes=20",
+    "finetuning.iterations=",
+    "seed=range",
+    "emulator.clock=real",
+)
+MAKERS = {  # the command that makes the first run of each kind
+    "identify": "cartpole-identify plant=emulated",
+    "model": "cartpole-model from=runs/identify/first",
+    "distill": "cartpole-distill run=runs/train/first hidden=[8,8]",
+    "finetune": "cartpole-finetune run=runs/train/first episodes=3",  # interrupted, as a page resumes it
+    "evaluate": "cartpole-evaluate run=runs/train/first episodes=18",  # a page repeats episode 17
+}
+
+
+def without_numbers(command: str) -> str:
+    """Return `command` without the number of its episodes."""
+    return re.sub(r" episodes=\d+", "", command)
+
+
+def commands() -> dict[str, str]:
+    """The page of each command; those of the README and those that need an extra are left out."""
+    known = {without_numbers(line) for line in block_lines(README, "cartpole-")}
+    found: dict[str, str] = {}
+    for page, line in guide_commands("cartpole-(?!emulate)"):
+        if without_numbers(line) not in known and not any(extra in line for extra in NEED_EXTRAS):
+            found.setdefault(line, page)
+            known.add(without_numbers(line))
+    return found
+
+
+COMMANDS = commands()
+
+
+@pytest.fixture
+def made(trained: Path) -> Callable[[str], None]:
+    """Make runs/<kind>/first unless it is there, and what it is made from."""
+
+    def make(kind: str) -> None:
+        if (trained / f"runs/{kind}/first").exists():
+            return
+        command = MAKERS[kind]
+        need(command, make)
+        more = [*within(BUDGETS[kind], command), *coarse(command), f"hydra.run.dir=runs/{kind}/first"]
+        if kind == "finetune":
+            interrupt_after(trained / "runs/finetune/first/recordings/tune_000.csv")
+        done = run_here(command, *more, cwd=trained)
+        assert done.returncode == (130 if kind == "finetune" else 0), done.stderr
+
+    return make
+
+
+def need(command: str, make: Callable[[str], None]) -> None:
+    """Make the runs that `command` reads."""
+    for kind in re.findall(r"runs/(\w+)/first", command):
+        make(kind)
+
+
+def coarse(command: str) -> list[str]:
+    """Return the setting for a fast emulated cart where `command` drives one."""
+    drives_one = "plant=emulated" in command or command.startswith("cartpole-finetune run")
+    return [COARSE] if drives_one and "plant=serial" not in command else []
+
+
+def lay_out_reports(folder: Path) -> None:
+    """Make the sweeps and studies that the pages name: copies of one run and of one small study."""
+    for name in ("2026-11-21_12-00-00_multirun", "a", "b", "first_multirun", "second_multirun"):
+        target = folder / "runs/train" / name / ("0_seed-0" if name.endswith("multirun") else ".")
+        if not target.exists():
+            shutil.copytree(folder / "runs/train/first", target)
+    for size in ("quick", "full"):
+        if not (folder / "runs/reproduce" / size).exists():
+            make_study(folder / "runs/reproduce" / size / "friction_models", size)
+
+
+def test_the_guides_have_commands_of_their_own() -> None:
+    assert len(COMMANDS) > 30
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_the_command_runs(
+    command: str, trained: Path, made: Callable[[str], None], serial_port: Callable[..., str]
+) -> None:
+    verb = command.split()[0].removeprefix("cartpole-")
+    words = [word for word in shlex.split(command) if not word.startswith(LONG)]
+    line = shlex.join(words).replace("<run>", "first").replace("RUN", "runs/train/first")
+    line = re.sub(r"runs/reproduce/full/\S*/10", "runs/train/first", line)
+    need(line, made)
+    if verb == "report":
+        lay_out_reports(trained)
+        if "studies=docs" in line:
+            run_here("cartpole-report studies=runs/reproduce/full data=docs/results/thesis", cwd=trained)
+    if "plant=serial" in line:
+        board = []
+        if "plant.policy=onboard" in line:
+            run_here("cartpole-export run=runs/train/first format=c hydra.run.dir=onboard", cwd=trained)
+            board = ["emulator.firmware=c", f"emulator.policy={trained / 'onboard'}"]
+        line = re.sub(r"/dev/\S+", serial_port(*board), line)
+    folder = f"runs/guides/{abs(hash(command))}"
+    where = [f"hydra.{'sweep' if ' -m ' in line or 'sweep=' in line else 'run'}.dir={folder}"]
+    where *= "resume=" not in line and "hydra.run.dir" not in line
+    budget = [] if "resume=" in line or "repeat." in line else within(BUDGETS[verb], line)
+    done = run_here(line, *budget, *coarse(line), *where, cwd=trained)
+    assert done.returncode == 0, f"{COMMANDS[command]}: {command}\n{done.stderr}"
+    assert done.stdout
+
+
+@pytest.mark.parametrize(("page", "command"), guide_commands("cartpole-emulate"))
+def test_the_emulated_cart_starts(page: str, command: str, tmp_path: Path) -> None:
+    name, *words = shlex.split(command)
+    with subprocess.Popen([BIN / name, *words], cwd=tmp_path, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert '"port"' in process.stdout.readline(), page
+        process.send_signal(signal.SIGINT)
+        assert process.wait(timeout=100) in (0, 130)
