@@ -35,10 +35,11 @@ class OneCart:
         self._perceive_first = Scalar(
             lambda first: hardware.first_perception(*first), (counts, length, track_end)
         )
-        self._perceive = Scalar(
-            hardware.perception,
-            Previous(counts, state, past, count, count, length, track_end),
-            PlantOutput(counts, number, flag, flag),
+        previous = Previous(counts, state, past, count, count, length, track_end)
+        output = PlantOutput(counts, number, flag, flag)
+        self._perceive = Scalar(hardware.perception, previous, output)
+        self._any_period = tuple(
+            tuple(plain(torch.ones_like(each)) for each in part) for part in (previous, output)
         )
         self.frame: OneFrame  # the newest
         self.percept: FirstPercept[Numbers] | Percept[Numbers]  # of the newest frame
@@ -71,6 +72,11 @@ class OneCart:
         )
         self.percept = first
         return first
+
+    def rehearse(self) -> Percept[Numbers]:
+        """Perceive a period of ones, which changes nothing."""
+        now: Percept[Numbers] = self._perceive(*self._any_period)
+        return now
 
     def step(self, action: int) -> Percept[Numbers]:
         """Drive one period."""

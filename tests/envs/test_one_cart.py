@@ -135,6 +135,16 @@ def test_a_recorded_cart(
     assert compare(*pair, [2] * 500) == episode.steps
 
 
+def test_a_rehearsal_changes_nothing(
+    make_plant: Callable[..., SimulatedPlant], make_environment: Callable[..., CartPoleEnv]
+) -> None:
+    cart = make_environment(make_plant(1), MOTORS).one_cart
+    cart.reset()
+    before = cart.frame, cart.percept
+    assert all(map(math.isfinite, cart.rehearse().observation))
+    assert (cart.frame, cart.percept) == before
+
+
 def test_an_emulated_cart(make_environment: Callable[..., CartPoleEnv]) -> None:
     """Two lockstep carts with the same seed, to the end of the track."""
     plants = [emulated_plant(EmulatorSettings(seed=1)) for _ in range(2)]

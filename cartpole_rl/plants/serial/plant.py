@@ -72,6 +72,7 @@ class SerialPlant(OneCartPlant):
         self.cart = SerialCart(settings)
         self.ended_by = ""
         self.last_error: PlantError | None = None
+        self.before_start: Callable[[], None] | None = None  # called before START, the cart being ready
         self.on_command: Callable[[int], None] | None = None  # called with each motor value once it is sent
         self.on_board = False  # resets start the policy on the cart's board; `listen_one` passes periods
         faults = FaultClearing(settings.clear_faults, confirm)
@@ -125,6 +126,8 @@ class SerialPlant(OneCartPlant):
         """Prepare the cart, arm it, and return the first frame of an episode."""
         self._reach()
         self._preparation.prepare()
+        if self.before_start is not None:
+            self.before_start()
         if self.on_board:
             self.cart.start_policy()
         else:

@@ -47,6 +47,16 @@ def test_a_reset_homes_and_arms(peer: CartPeer, plant: SerialPlant) -> None:
     ]
 
 
+def test_the_call_before_the_start_finds_the_cart_ready_and_disarmed(
+    peer: CartPeer, plant: SerialPlant
+) -> None:
+    found = []
+    plant.before_start = lambda: found.append(peer.flags & (Flags.HOMED | Flags.ARMED))
+    plant.reset()
+    assert found == [Flags.HOMED]
+    assert peer.flags & Flags.ARMED
+
+
 def test_a_step_carries_the_carts_own_numbers(peer: CartPeer, plant: SerialPlant) -> None:
     plant.reset()
     peer.state = replace(peer.state, cart_counts=-123, pole_counts=-5000)
