@@ -1,6 +1,7 @@
 """Distill a trained agent into a smaller network, for a small processor."""
 
 from pathlib import Path
+from statistics import mean
 
 from torch import nn
 
@@ -14,6 +15,7 @@ from cartpole_rl.run_files import CHECKPOINTS, FIGURES, LAST, METRICS
 from cartpole_rl.workflows.agents import new_agent, trained_agent
 from cartpole_rl.workflows.build import use_threads
 from cartpole_rl.workflows.config import DistillConfig, TrainConfig
+from cartpole_rl.workflows.export import provenance
 from cartpole_rl.workflows.progress import progress_bar
 from cartpole_rl.workflows.report import report
 from cartpole_rl.workflows.results import print_results, shown
@@ -24,9 +26,10 @@ from cartpole_rl.workflows.train import judge, nominal_env
 def distill(config: DistillConfig, folder: Path) -> float:
     """Train a network of `config.hidden` to drive as the agent of `config.run` does; return its score.
 
-    The carts are those of the agent's training. Writes into `folder` config.yaml, provenance.json,
-    checkpoints/last.pt, metrics.json and figures/. Raises CheckpointError for a missing or damaged agent,
-    ConfigError for impossible settings or a folder that already holds a run, LearningError if it diverges.
+    The carts are those of the agent's training. Writes into `folder` config.yaml, which has the provenance
+    of the teacher as well, provenance.json, checkpoints/last.pt, metrics.json and figures/. Raises
+    CheckpointError for a missing or damaged agent, ConfigError for impossible settings or a folder that
+    already holds a run, LearningError if it diverges.
     """
     use_threads(config.threads)
     seed_everything(config.seed)
@@ -35,7 +38,8 @@ def distill(config: DistillConfig, folder: Path) -> float:
     student = new_agent(training)
     carts, start = config.distillation.carts, training.task.start
     env = simulated_env(training, training.plant, carts, start, config.seed)
-    content = {**config.model_dump(mode="json"), "student": training.model_dump(mode="json")}
+    settings, origin = training.model_dump(mode="json"), provenance(config.run)
+    content = {**config.model_dump(mode="json"), "student": settings, "teacher": origin}
     write_config(folder, "distill", content)
     assert isinstance(teacher.policy, nn.Module)
     taught, driver = DrivingPolicy(teacher.policy), DrivingPolicy(student.greedy_policy())
@@ -45,11 +49,10 @@ def distill(config: DistillConfig, folder: Path) -> float:
             progress.set_postfix_str(f"loss {loss:.3f}", refresh=False)
             progress.update()
     episodes = judge(nominal_env(training), student.greedy_policy(), config.seed)
-    metrics = report(folder, episodes, training.plant.kind, training.pole, training.task.x_max)
-    score: float = metrics["score"]["mean"]
-    settings = training.model_dump(mode="json")
+    score = mean([float(episode.score.sum()) for episode in episodes])
     agent = AgentCheckpoint(settings, student.state_dict(), distillation.transitions, score)
     save_agent(folder / CHECKPOINTS / LAST, agent)
+    report(folder, episodes, training.plant.kind, training.pole, training.task.x_max)
     print(f"a network of {list(config.hidden)} hidden units scores {score:.0f}")
     files = f"{METRICS}, {FIGURES}/ and {CHECKPOINTS}/"
     print_results(folder, files, f"cartpole-export run={shown(folder)} format=c")

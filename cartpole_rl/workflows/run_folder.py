@@ -100,6 +100,8 @@ def use_of(folder: Path, program: str) -> str:
         if (folder / CHECKPOINTS / RESUME).exists():
             return f"{PREFIX}{program} resume={folder} continues it"
         return f"it was stopped before its first checkpoint; start {PREFIX}{program} again"
+    if program == "distill" and not (folder / CHECKPOINTS / LAST).exists():
+        return f"it was stopped before its end; start {PREFIX}{program} again"
     return USES[program].format(folder)
 
 

@@ -3,7 +3,8 @@
 import json
 from pathlib import Path
 
-from command_line import in_process
+import yaml
+from command_line import in_process, interrupt_after
 
 SMALL = tuple(
     f"distillation.{name}={value}"
@@ -25,6 +26,9 @@ def test_the_student_is_an_agent_like_any_other(trained: Path, tmp_path: Path) -
         "provenance.json",
     }
     assert json.loads((student / "provenance.json").read_text())["program"] == "cartpole-distill"
+    teacher = yaml.safe_load((student / "config.yaml").read_text())["teacher"]
+    assert teacher["program"] == "cartpole-train"
+    assert teacher["transitions"] > 0
     done = in_process("export", "run=student", "format=c", "hydra.run.dir=c", folder=tmp_path)
     assert done.code == 0, done.err
     header = (tmp_path / "c/policy.h").read_text()
@@ -45,3 +49,15 @@ def test_bad_input_is_answered_with_one_line(trained: Path, tmp_path: Path) -> N
         assert done.code in (1, 2)
         assert remedy in done.complaint
         assert not (tmp_path / "run/config.yaml").exists()
+
+
+def test_an_interrupted_one_says_what_to_do(trained: Path, tmp_path: Path) -> None:
+    interrupt_after(tmp_path / "half/provenance.json")
+    words = (f"run={trained}", "distillation.rounds=100000", "hydra.run.dir=half")
+    done = in_process("distill", *words, folder=tmp_path)
+    assert done.code == 130, done.err
+    done = in_process("evaluate", "run=half", folder=tmp_path)
+    assert done.complaint == (
+        "cartpole-evaluate: run=half: this run of cartpole-distill has no agent yet; "
+        "it was stopped before its end; start cartpole-distill again"
+    )
