@@ -111,7 +111,7 @@ class KnownCart:
             return run_carts(carts, inputs, models=self.models, period=period, substeps=substeps)
         rows = torch.arange(size).clamp(max=count - 1)
         padded = (type(each)(*(value[:, rows] for value in each)) for each in (carts, inputs))
-        after = compiled_run(self.models, period, substeps, size)(*padded)
+        after = compiled_run(self.models, period, substeps, (len(carts.drive), size))(*padded)
         return Period(*(value[:, :count] for value in after))
 
     def run(self, nodes: Nodes, actions: Sequence[int]) -> Nodes:
@@ -124,8 +124,11 @@ class KnownCart:
 
 
 @cache
-def compiled_run(models: Models, period: float, substeps: int, size: int) -> Compiled[Period]:
-    """Return `run_carts` for `size` carts, compiled; the same for every cart with these models."""
+def compiled_run(models: Models, period: float, substeps: int, drive: tuple[int, int]) -> Compiled[Period]:
+    """Return `run_carts` for a `drive` of that shape, compiled.
+
+    It serves every cart with these models whose latency spans as many periods.
+    """
     return Compiled(partial(run_carts, models=models, period=period, substeps=substeps))
 
 
