@@ -25,7 +25,7 @@ def register() -> None:
             gymnasium.register(
                 name,
                 entry_point="cartpole_rl.envs.gymnasium:CartPoleGymnasium",
-                vector_entry_point="cartpole_rl.envs.gymnasium:CartPoleVector",
+                vector_entry_point="cartpole_rl.envs.gymnasium_vector:CartPoleVector",
                 kwargs={"task": task},
                 max_episode_steps=MAX_EPISODE_STEPS,
             )

@@ -32,17 +32,13 @@ the table gives the bounds of each number, or the usual range. Times the unit, a
 shows up to nine carts in a window of matplotlib, in real time (envs/rendering.py).
 """
 
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol
 
 import gymnasium
 import numpy as np
-import torch
 from gymnasium import spaces
-from gymnasium.vector import AutoresetMode, VectorEnv
-from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
-from tensordict import TensorDictBase
 
 from cartpole_rl.choices import choice
 from cartpole_rl.envs.build import shipped_settings, simulated_env, with_fitted_guard
@@ -152,114 +148,23 @@ class CartPoleGymnasium(gymnasium.Env[Array, np.int64]):
             self.renderer.close()
 
 
-class CartPoleVector(VectorEnv[Array, Array, Array]):
-    """Many simulated carts at once; a cart whose episode ends starts the next in the same step.
-
-    `info` then holds the last observation under `final_obs`, as in Gymnasium's own vector environments.
-    """
-
-    metadata = METADATA | {"autoreset_mode": AutoresetMode.SAME_STEP}
-
-    def __init__(
-        self,
-        task: str,
-        num_envs: int = 1,
-        randomization: Randomization = "none",
-        compiled: bool = False,
-        render_mode: str | None = None,
-        max_episode_steps: int | None = None,
-    ) -> None:
-        self.env = simulated_environment(task, num_envs, randomization, compiled, max_episode_steps)
-        self.num_envs = num_envs
-        self.render_mode, self.renderer = (
-            render_mode,
-            renderer(render_mode, self.env, task, max_episode_steps),
-        )
-        self.single_observation_space = observation_space(self.env)
-        self.single_action_space = action_space(self.env)
-        self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self.action_space = batch_space(self.single_action_space, num_envs)
-        self.seeded = False  # the plant, from `np_random`
-        self._present: TensorDictBase
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Array, dict[str, Any]]:
-        """Start an episode on each cart; one seed serves all."""
-        super().reset(seed=seed)
-        seed_plant(self, seed)
-        self._present = self.env.reset()
-        if self.renderer is not None:
-            start_all(self.renderer, self._present, range(self.num_envs))
-            self.renderer.show()
-        return self._present["observation"].numpy().copy(), {}
-
-    def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
-        """One control period of every cart."""
-        self._present.set("action", torch.as_tensor(np.asarray(actions, dtype=np.int64)))
-        transition, self._present = self.env.step_and_maybe_reset(self._present)
-        if self.renderer is not None:
-            self._draw(self.renderer, transition)
-        last = {key: value.numpy() for key, value in transition["next"].items()}
-        return (
-            self._present["observation"].numpy().copy(),
-            last["reward"][:, 0],
-            last["terminated"][:, 0],
-            last["truncated"][:, 0],
-            vector_info(last),
-        )
-
-    def render(self) -> tuple[Picture, ...] | None:
-        """Return the newest picture of each cart, uint8 [320, 480, 3]; None if they are shown in a window."""
-        if self.renderer is None or self.render_mode == "human":
-            return None
-        return self.renderer.pictures()
-
-    def close_extras(self, **kwargs: Any) -> None:
-        """Close the window."""
-        if self.renderer is not None:
-            self.renderer.close()
-
-    def _draw(self, renderer: Renderer, transition: TensorDictBase) -> None:
-        """Show the carts after a step; those whose episode ended show the start of the next."""
-        motors = self.env.hardware.command(transition)["motor"]
-        last = transition["next"]
-        rows = torch.cat((last["state"], motors, last["score"]), dim=1).tolist()
-        for cart, (x, _, theta, _, motor, score) in enumerate(rows):
-            renderer.advance(cart, x, theta, int(motor), score)
-        start_all(renderer, self._present, last["done"][:, 0].nonzero()[:, 0].tolist())
-        renderer.show()
-
-
-def start_all(renderer: Renderer, present: TensorDictBase, carts: Iterable[int]) -> None:
-    """Start an episode of each of `carts` at its state in `present`."""
-    states = present["state"].tolist()
-    for cart in carts:
-        x, _, theta, _ = states[cart]
-        renderer.start(cart, x, theta)
-
-
-def vector_info(last: Mapping[str, Array]) -> dict[str, Any]:
-    """Return the scores of all carts and the final observations of those that ended, each with its mask."""
-    ended = last["done"][:, 0]
-    everyone = np.ones_like(ended)
-    scores = {key: last[key][:, 0] for key in SCORES}
-    info: dict[str, Any] = {**scores, **{f"_{key}": everyone for key in SCORES}}
-    if ended.any():
-        final = np.full(len(ended), None, dtype=object)
-        for row in np.flatnonzero(ended):
-            final[row] = last["observation"][row]
-        info |= {"final_obs": final, "_final_obs": ended}
-        info |= {"final_info": {**scores, **{f"_{key}": ended for key in SCORES}}, "_final_info": ended}
-    return info
-
-
 def float32(numbers: Sequence[float]) -> Array:
     """Return numbers as an array of float32."""
     return np.array(numbers, np.float32)
 
 
-def seed_plant(wrapper: CartPoleGymnasium | CartPoleVector, seed: int | None) -> None:
+class Seeded(Protocol):
+    """An environment of Gymnasium over `env`, whose plant may be seeded already."""
+
+    env: CartPoleEnv
+    seeded: bool
+
+    @property
+    def np_random(self) -> np.random.Generator:
+        """Gymnasium's generator."""
+
+
+def seed_plant(wrapper: Seeded, seed: int | None) -> None:
     """Before the first episodes and those after a new `seed`, seed the plant's generator from Gymnasium's."""
     if seed is not None or not wrapper.seeded:
         wrapper.env.set_seed(int(wrapper.np_random.integers(2**31)))
