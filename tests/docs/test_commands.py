@@ -30,7 +30,13 @@ CHECKED = (
 )
 ACTIVATE = "source .venv/bin/activate"
 NEED_HARDWARE = {
-    "docs/firmware.md": ("arduino-cli ", "mkdir -p ~/Arduino", "openocd ", "ln -s ", "make -C firmware nucleo"),
+    "docs/firmware.md": (
+        "arduino-cli ",
+        "mkdir -p ~/Arduino",
+        "openocd ",
+        "ln -s ",
+        "make -C firmware nucleo",
+    ),
     "docs/two-machines.md": ("ray start ",),  # another machine; scripts/bench/two_machines.py runs it
 }
 NOT_COMMANDS = {  # drawings, formulas, files, what a command prints, and a builtin of the shell
