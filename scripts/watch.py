@@ -3,6 +3,7 @@
 
     scripts/watch.py /dev/ttyUSB0             # prints its counts twice a second until Ctrl-C
     scripts/watch.py /dev/ttyUSB0 --home      # homes it first: the motor moves by itself
+    scripts/watch.py /dev/ttyUSB0 --baud 115200
 
 At its start and at its end it sends STOP. If homing fails, it prints the fault and ends with exit status 1.
 """
@@ -17,6 +18,7 @@ from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.wire import Fault, Flags, State
 
 PERIODS_PER_LINE = 25
+BAUD_RATES = 921600, 115200  # of the protocol; the first is the default
 
 
 def line(state: State, flags: Flags) -> str:
@@ -35,10 +37,12 @@ def main() -> None:
     )
     parser.add_argument("port", help="serial port of the cart")
     parser.add_argument("--home", action="store_true", help="home the cart first")
+    parser.add_argument("--baud", type=int, choices=BAUD_RATES, default=BAUD_RATES[0], help="line speed")
     options = parser.parse_args()
+    settings = SerialSettings(port=options.port, baud=options.baud)
     try:
-        with SerialCart(SerialSettings(port=options.port)) as cart, contextlib.suppress(KeyboardInterrupt):
-            print(cart.information)
+        with SerialCart(settings) as cart, contextlib.suppress(KeyboardInterrupt):
+            print(cart.information, flush=True)
             if options.home:
                 print(line(cart.home(), cart.flags), flush=True)
             while True:

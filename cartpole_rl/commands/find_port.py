@@ -47,7 +47,7 @@ def listing(ports: list[UsbPort]) -> str:
     elif carts:
         lines.append("`cartpole-find-port watch=true` finds out which of them is the cart")
     else:
-        lines.append("None of them has a chip used on carts (CP210x, CH340, FTDI, Espressif)")
+        lines.append("None of them has a chip used on carts (CP210x, CH340, FTDI, Espressif, ST-LINK)")
     return "\n".join(lines)
 
 

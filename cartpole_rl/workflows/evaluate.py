@@ -21,7 +21,7 @@ from cartpole_rl.workflows.episodes import Evaluation, prepared
 from cartpole_rl.workflows.prediction import draw_beside_simulation
 from cartpole_rl.workflows.repeating import Repetition
 from cartpole_rl.workflows.report import report
-from cartpole_rl.workflows.results import plant_words, print_results, shown
+from cartpole_rl.workflows.results import plant_words, print_loop_time, print_results, shown
 from cartpole_rl.workflows.run_folder import write_config
 
 
@@ -73,8 +73,7 @@ def report_evaluation(
         print(draw_beside_simulation(evaluation, episodes[0], folder / FIGURES / BESIDE_SIMULATION))
     if evaluation.repetition:
         print(compared(evaluation.repetition, episodes[0]))
-    if link.get("latency_override"):
-        print(f"latency as measured, for cartpole-train: '{link['latency_override']}'")
+    print_loop_time(link.get("latency_override"))
     print_results(folder, f"{METRICS} and {FIGURES}/", next_command(evaluation.config))
 
 

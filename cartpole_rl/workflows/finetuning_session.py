@@ -18,7 +18,7 @@ from cartpole_rl.workflows.finetuning_cart import DrivenCart
 from cartpole_rl.workflows.finetuning_files import FinetuningFiles, Stage
 from cartpole_rl.workflows.finetuning_learner import CartLearner
 from cartpole_rl.workflows.report import report
-from cartpole_rl.workflows.results import plant_words, print_results, shown
+from cartpole_rl.workflows.results import plant_words, print_loop_time, print_results, shown
 from cartpole_rl.workflows.run_folder import write_json
 from cartpole_rl.workflows.tuning import tune
 
@@ -85,8 +85,7 @@ class Session:
         write_json(folder / COMPARISON, {**summaries, "kept": kept})
         print(score_table(summaries[Stage.BEFORE], f"before, {count_text(len(episodes[Stage.BEFORE]))}"))
         print(score_table(summaries[Stage.AFTER], f"after, {count_text(len(episodes[Stage.AFTER]))}"))
-        if link.get("latency_override"):
-            print(f"latency as measured, for cartpole-train: '{link['latency_override']}'")
+        print_loop_time(link.get("latency_override"))
         print(f"kept: the policy {kept} fine-tuning")
         files = f"{METRICS}, {COMPARISON}, {CHECKPOINTS}/{LAST} and {RECORDINGS}/"
         print_results(

@@ -13,6 +13,15 @@ def print_results(folder: Path, files: str, following: str) -> None:
     print(following)
 
 
+def print_loop_time(override: str | None) -> None:
+    """Print the measured loop time of `LinkStatistics.latency_override`, if there is one."""
+    if override is not None:
+        print(
+            "measured loop time as an override of cartpole-train; add the latency that cartpole-preflight "
+            f"prints to both numbers: '{override}'"
+        )
+
+
 def shown(path: Path) -> Path:
     """Return `path` relative to the working directory if it is below it."""
     with suppress(ValueError):

@@ -48,7 +48,7 @@ def test_help_has_examples(tmp_path: Path) -> None:
     [
         ([CH340, MODEM], "The cart is probably on it. Next: cartpole-preflight plant.port=/dev/ttyUSB0"),
         ([CH340, FTDI], "`cartpole-find-port watch=true` finds out which of them is the cart"),
-        ([MODEM], "None of them has a chip used on carts (CP210x, CH340, FTDI, Espressif)"),
+        ([MODEM], "None of them has a chip used on carts (CP210x, CH340, FTDI, Espressif, ST-LINK)"),
     ],
 )
 def test_a_listing_ends_in_what_to_do(ports: list[UsbPort], last: str) -> None:

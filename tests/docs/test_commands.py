@@ -28,14 +28,22 @@ CHECKED = (
     "tensorboard ",
     "python -m cartpole_rl.emulator ",
 )
+ACTIVATE = "source .venv/bin/activate"
 NEED_HARDWARE = {
-    "docs/firmware.md": ("arduino-cli ", "openocd ", "ln -s ", "make -C firmware nucleo"),
+    "docs/firmware.md": (
+        "arduino-cli ",
+        "mkdir -p ~/Arduino",
+        "openocd ",
+        "ln -s ",
+        "make -C firmware nucleo",
+    ),
     "docs/two-machines.md": ("ray start ",),  # another machine; scripts/bench/two_machines.py runs it
 }
-NOT_COMMANDS = {  # drawings, formulas, files and what a command prints
+NOT_COMMANDS = {  # drawings, formulas, files, what a command prints, and a builtin of the shell
+    "README.md": (ACTIVATE,),
     "docs/protocol.md": ("COBS(", "time ", "cart ", "line ", "host ", "motor ", "power, reset"),
     "docs/house.md": ("conf/ ──>",),
-    "docs/first-hour.md": ("OK  ",),
+    "docs/first-hour.md": ("OK  ", ACTIVATE),
     "docs/safety.md": ("x + margin",),
     "docs/randomization.md": ("cart_mass:", "cart_coulomb:", "pole_viscous:"),
 }

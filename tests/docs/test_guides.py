@@ -138,7 +138,7 @@ def test_the_command_runs(
         if "studies=docs" in line:
             run_here("cartpole-report studies=runs/reproduce/full data=docs/results/thesis", cwd=trained)
     if "plant=serial" in line:
-        board = []
+        board = ["emulator.start=upright"] if "task=balance" in line else []  # a hand holds the pole
         if "plant.policy=onboard" in line:
             run_here("cartpole-export run=runs/train/first format=c hydra.run.dir=onboard", cwd=trained)
             board = ["emulator.firmware=c", f"emulator.policy={trained / 'onboard'}"]

@@ -42,7 +42,7 @@ VERBS = (
     "report",
     "export",
 )
-COMMANDS = block_lines(README, r"cartpole-|tensorboard|\./scripts/|pip ")
+COMMANDS = block_lines(README, r"cartpole-|tensorboard|\./scripts/")
 
 
 def listed(start: str) -> list[str]:
@@ -51,12 +51,17 @@ def listed(start: str) -> list[str]:
 
 def test_the_readme_opens_with_the_two_commands() -> None:
     assert COMMANDS[:2] == ["./scripts/demo", "./scripts/test"]
-    for command in COMMANDS[:2]:
-        assert (ROOT / command).stat().st_mode & 0o100
+    for command in COMMANDS[:3]:
+        assert (ROOT / command.split()[0]).stat().st_mode & 0o100
+
+
+def test_the_installation_is_that_of_the_demo() -> None:
+    (install,) = listed("./scripts/install")
+    assert install.removeprefix("./") in (ROOT / "scripts/demo").read_text().splitlines()
 
 
 def test_every_command_is_one_that_a_test_here_runs() -> None:
-    known = {"./scripts/demo", "./scripts/test", "pip", "tensorboard"}
+    known = {"./scripts/demo", "./scripts/test", "./scripts/install", "tensorboard"}
     known |= {f"cartpole-{verb}" for verb in VERBS}
     assert {command.split()[0] for command in COMMANDS} == known
 

@@ -9,11 +9,12 @@ from dataclasses import dataclass
 
 from serial.tools.list_ports_common import ListPortInfo
 
-BOARDS = {  # vendor ids of chips on ESP32 and Arduino boards
+BOARDS = {  # vendor ids of chips on ESP32, Arduino and Nucleo boards
     0x10C4: "Silicon Labs CP210x",
     0x1A86: "WCH CH340",
     0x0403: "FTDI",
     0x303A: "Espressif native USB",
+    0x0483: "STMicroelectronics ST-LINK",
 }
 
 

@@ -35,7 +35,14 @@ def test_a_computers_own_lines_are_left_out() -> None:
 
 @pytest.mark.parametrize(
     ("vendor", "words"),
-    [(0x10C4, "CP210x"), (0x1A86, "CH340"), (0x0403, "FTDI"), (0x303A, "Espressif"), (0x2C7C, "no chip")],
+    [
+        (0x10C4, "CP210x"),
+        (0x1A86, "CH340"),
+        (0x0403, "FTDI"),
+        (0x303A, "Espressif"),
+        (0x0483, "ST-LINK"),
+        (0x2C7C, "no chip"),
+    ],
 )
 def test_a_board_is_told_by_its_chip(vendor: int, words: str) -> None:
     port = UsbPort("/dev/ttyUSB0", vendor, 1)

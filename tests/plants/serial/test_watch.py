@@ -1,0 +1,46 @@
+"""scripts/watch.py, started as its page says, prints what a scripted cart reports and moves nothing."""
+
+import select
+import signal
+import subprocess
+import sys
+import termios
+from pathlib import Path
+
+import pytest
+from serial_peer import CartPeer, wait_for
+
+from cartpole_rl.wire import Home, SetMotor, Start, Stop
+
+SCRIPT = Path(__file__).parents[3] / "scripts/watch.py"
+OUTPUT_SPEED = 5  # of termios.tcgetattr
+
+
+def test_it_can_be_started_by_its_name() -> None:
+    assert SCRIPT.stat().st_mode & 0o100
+
+
+@pytest.mark.parametrize(("words", "speed"), [((), termios.B921600), (("--baud", "115200"), termios.B115200)])
+def test_counts_are_printed_until_an_interrupt(words: tuple[str, ...], speed: int) -> None:
+    with CartPeer(paced=True) as peer:
+        command = [sys.executable, SCRIPT, peer.port, *words]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+            assert process.stdout is not None
+            assert "firmware_major=1" in process.stdout.readline()
+            while not select.select([process.stdout], [], [], 0.01)[0]:
+                peer.tick(cart_counts=123)
+            assert "cart      123" in process.stdout.readline()
+            assert termios.tcgetattr(peer.master)[OUTPUT_SPEED] == speed
+            process.send_signal(signal.SIGINT)
+            assert process.wait(timeout=60) == 0
+        wait_for(lambda: isinstance(peer.received[-1].message, Stop))
+        assert not peer.messages(Home) + peer.messages(Start)
+        assert all(message == SetMotor(0) for message in peer.messages(SetMotor))
+
+
+def test_another_line_speed_is_refused_in_words() -> None:
+    done = subprocess.run(
+        [sys.executable, SCRIPT, "nosuch", "--baud", "9600"], capture_output=True, text=True
+    )
+    assert done.returncode == 2
+    assert "invalid choice: 9600 (choose from 921600, 115200)" in done.stderr

@@ -1,0 +1,18 @@
+"""Lines that commands print at their end."""
+
+import pytest
+
+from cartpole_rl.plants.serial.statistics import LinkStatistics
+from cartpole_rl.workflows.results import print_loop_time
+
+
+def test_a_measured_loop_time_is_printed_with_what_it_lacks(capsys: pytest.CaptureFixture[str]) -> None:
+    statistics = LinkStatistics()
+    print_loop_time(statistics.latency_override())
+    assert capsys.readouterr().out == ""
+    statistics.loop_times.add(0.004)
+    print_loop_time(statistics.latency_override())
+    assert capsys.readouterr().out == (
+        "measured loop time as an override of cartpole-train; add the latency that cartpole-preflight prints "
+        "to both numbers: '++randomization.latency={distribution: uniform, absolute: [0.004, 0.004]}'\n"
+    )
