@@ -23,6 +23,8 @@ static inline int16_t onboard_motor(void *memory, const cart_observation *observ
         return 0; /* it was trained for another period */
     if (observation->first)
         policy_start(policy, (float)(observation->soft_limit * CART_METRES), CART_POLE_LENGTH);
+    else if (observation->resumed)
+        policy_resume(policy);
     return policy_motor(policy, observation->cart_counts, observation->pole_counts,
                         (float)observation->period_us / 1e6f);
 }
