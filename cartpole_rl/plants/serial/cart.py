@@ -253,7 +253,7 @@ class SerialCart:
 
     @property
     def longest_suspension(self) -> float:
-        """s without an answer of this computer, after which the link counts as lost."""
+        """The time in s without an answer of this computer after which the link counts as lost."""
         return min(self.settings.timeout, LONGEST_SUSPENSION)
 
     @contextmanager
@@ -295,8 +295,8 @@ class SerialCart:
         """Raise LinkError if this computer did not answer the cart for too long."""
         if seconds > self.longest_suspension:
             raise LinkError(
-                f"this computer did not answer the cart on {self.port} for {seconds:.1f} s; end what keeps it "
-                "busy, and do not suspend a command that drives"
+                f"this computer did not answer the cart on {self.port} for {seconds:.1f} s; end what keeps "
+                "it busy, and do not suspend a command that drives"
             )
 
     def _is_homing(self) -> bool:
