@@ -29,7 +29,7 @@ from cartpole_rl.wire import (
     decode_frame,
     encode_frame,
 )
-from cartpole_rl.wire.messages import Message
+from cartpole_rl.wire.messages import Message, PolicyQuestion
 
 pytestmark = needs_compiler
 SOFT = 16704  # counts, of the nominal track
@@ -153,6 +153,18 @@ def test_it_is_refused_where_start_is_and_on_a_cart_that_the_host_drives():
     board.firmware.homed = False
     assert board.send(StartPolicy()) == Nack(1, MessageType.START_POLICY, Reason.NOT_HOMED)
     assert board.send(Start()) == Nack(1, MessageType.START, Reason.NOT_HOMED)
+
+
+@pytest.mark.parametrize("state", [Stop(), Start(), START_POLICY], ids=["idle", "host", "policy"])
+def test_a_board_says_whether_it_has_a_policy_and_arms_nothing(state):
+    board = Board(lambda seen: 100)
+    for reason in (Reason.BAD_LENGTH, Reason.UNKNOWN_TYPE):
+        board.send(Stop())
+        board.send(state)
+        armed = board.firmware.armed
+        assert board.send(PolicyQuestion()) == Nack(1, MessageType.START_POLICY, reason)
+        assert board.firmware.armed == armed
+        board.firmware._head.policy = None
 
 
 def test_a_motor_value_of_the_host_takes_over_until_the_next_start_policy():

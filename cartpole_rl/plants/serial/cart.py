@@ -28,6 +28,7 @@ from cartpole_rl.wire.messages import (
     Hello,
     Home,
     Info,
+    PolicyQuestion,
     Reason,
     SetMotor,
     SetPeriod,
@@ -164,6 +165,17 @@ class SerialCart:
         """
         self._arm(StartPolicy())
         self._tracker.follow_policy()
+
+    def check_policy(self) -> None:
+        """Raise RefusedError if the board has no policy. The question arms no cart, homed or not."""
+        try:
+            self._connection.request(PolicyQuestion(), Ack)
+        except RefusedError as error:
+            if error.reason != Reason.BAD_LENGTH:
+                raise
+            return
+        self.stop()
+        raise PlantError("the cart accepted a START_POLICY of the wrong length: correct its firmware")
 
     def stop(self) -> None:
         """Set the motor to 0 and disarm; ends a homing. The bytes go out before anything that can block."""
