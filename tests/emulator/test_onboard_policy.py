@@ -278,11 +278,27 @@ def test_the_c_code_of_a_policy_observes_the_length_of_the_emulated_pole(tmp_pat
         "{\n    (void)cart_counts, (void)pole_counts, (void)dt;\n"
         "    return (int16_t)(1000 * policy->track_end);\n}\n"
     )
-    firmware = CFirmware(lambda: 0, policy=tmp_path, pole_length=0.25)
-    firmware.homed = True
-    firmware.receive(encode_frame(StartPolicy(), 1)[:-1], 0)
-    firmware.tick(20_000, 0, 2048)
-    assert firmware.drive(20_000, 20_001)[-1][1] == 250
+    carts = [CFirmware(lambda: 0, policy=tmp_path, pole_length=length) for length in (0.25, 0.125)]
+    for firmware in carts:
+        firmware.homed = True
+        firmware.receive(encode_frame(StartPolicy(), 1)[:-1], 0)
+    for firmware in carts:
+        firmware.tick(20_000, 0, 2048)
+    assert [firmware.drive(20_000, 20_001)[-1][1] for firmware in carts] == [250, 125]
+
+
+def test_a_policy_that_replaces_another_in_its_folder_is_compiled(tmp_path):
+    motors = []
+    for push in ("110", "90"):
+        for name in ("policy.h", "policy.c"):
+            text = (SHUTTLE / name).read_text(encoding="utf-8").replace("PUSH 110", f"PUSH {push}")
+            tmp_path.joinpath(name).write_text(text, encoding="utf-8")
+        firmware = CFirmware(lambda: 0, policy=tmp_path, pole_length=0.25)
+        firmware.homed = True
+        firmware.receive(encode_frame(StartPolicy(), 1)[:-1], 0)
+        firmware.tick(20_000, 0, 2048)
+        motors.append(firmware.drive(20_000, 20_001)[-1][1])
+    assert motors == [110, 90]
 
 
 def test_a_policy_needs_the_c_firmware():
