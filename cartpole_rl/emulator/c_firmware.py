@@ -46,10 +46,11 @@ class CFirmware:
         """
         self._library = load_library(policy)
         self._memory = ctypes.create_string_buffer(self._library.cart_size())
+        self._policy_memory = ctypes.create_string_buffer(max(1, self._library.cart_policy_size()))
         self._head = CartHead.from_buffer(self._memory)
         self._answer = ctypes.create_string_buffer(LONGEST_ANSWER)
         self._library.cart_boot(self._memory)
-        self._library.cart_attach_policy(self._memory, pole_length)
+        self._library.cart_attach_policy(self._memory, self._policy_memory, pole_length)
         self._head.pole_trim = zero_error
         self._delay_us = delay_us
         self.carried_out: Message | None = None  # the newest message; None if it was refused or damaged

@@ -94,15 +94,20 @@ def build_library(policy: Path | None = None) -> Path:
     return library
 
 
-@functools.cache
 def load_library(policy: Path | None = None) -> ctypes.CDLL:
     """Return the C firmware with the types of its functions. Raises EmulatorError."""
-    library = ctypes.CDLL(str(build_library(policy)))
+    return _loaded(build_library(policy))
+
+
+@functools.cache
+def _loaded(path: Path) -> ctypes.CDLL:
+    library = ctypes.CDLL(str(path))
     pointer, size, us = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_uint64
     signatures = {
         "cart_size": (size, []),
         "cart_boot": (None, [pointer]),
-        "cart_attach_policy": (None, [pointer, ctypes.c_float]),
+        "cart_policy_size": (size, []),
+        "cart_attach_policy": (None, [pointer, pointer, ctypes.c_float]),
         "cart_receive": (size, [pointer, ctypes.c_char_p, size, us, ctypes.c_char_p]),
         "cart_delay_command": (None, [pointer, us]),
         "cart_drive": (ctypes.c_bool, [pointer, us, ctypes.POINTER(us)]),

@@ -44,7 +44,7 @@ from cartpole_rl.wire.messages import (
     Stop,
 )
 
-FIRMWARE = (1, 1, 0)  # 1.1.0 knows START_POLICY, 1.0.0 does not
+FIRMWARE = (1, 1, 1)  # 1.1.0 knows START_POLICY, 1.0.0 does not
 # the text of an ESP32, and one 0x00 that separates it from the first frame
 BANNER = (
     b"ets Jul 29 2019 12:21:46\r\n\r\nrst:0x1 (POWERON_RESET),boot:0x13\r\ncart %d.%d.%d\r\n\x00" % FIRMWARE

@@ -26,8 +26,8 @@ def episode_metrics(episode: Episode, track_half_length: float) -> dict[str, Any
     the next; `guarded_fraction` the share of periods in which the track guard replaced the agent's motor
     value; `upright_at_end` is 1 if the pole is within 5 degrees for the last second of a full-length episode;
     `min_track_margin_m` the smallest distance from `track_half_length`, negative beyond it. Only an episode
-    that the cart's board drove has `same_as_host_fraction`, the share of periods with the motor value that
-    this computer would have sent.
+    that the cart's board drove has `same_as_host_fraction`, the share of the compared periods with the motor
+    value that this computer would have sent, and `not_compared_steps`, the number of the other periods.
     """
     upright = is_upright(episode.theta[1:])
     change = np.diff(episode.motor)
@@ -54,10 +54,22 @@ def stands_at_end(episode: Episode) -> bool:
     return episode.ended_by == Ending.TIME and upright_at_end(episode.time, episode.theta)
 
 
-def _same_as_host(episode: Episode) -> dict[str, float]:
+def same_as_host(episode: Episode) -> tuple[int, int]:
+    """Return how many motor values of the board are those of this computer, and how many were compared."""
+    assert episode.expected is not None
+    assert episode.compared is not None
+    same = (episode.motor == episode.expected) & episode.compared
+    return int(same.sum()), int(episode.compared.sum())
+
+
+def _same_as_host(episode: Episode) -> dict[str, Any]:
     if episode.expected is None:
         return {}
-    return {"same_as_host_fraction": float((episode.motor == episode.expected).mean())}
+    same, count = same_as_host(episode)
+    return {
+        "same_as_host_fraction": same / count if count else None,
+        "not_compared_steps": episode.steps - count,
+    }
 
 
 def _rms(values: np.ndarray) -> float | None:

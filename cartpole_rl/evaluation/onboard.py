@@ -3,20 +3,28 @@
 In each period this computer sends HELLO, which keeps the cart's watchdog quiet, and reads the state.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.one_cart import Numbers
 from cartpole_rl.envs.perception import FirstPercept, Percept
+from cartpole_rl.envs.settings import ObservationSettings
 from cartpole_rl.evaluation.episodes import Policy, chosen_action, ending_of, one_episode, prepared
 from cartpole_rl.plants.serial.plant import SerialPlant
+from cartpole_rl.plants.specs import OneFrame
 from cartpole_rl.scheduling import no_garbage_collection
+from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.wire import Flags
+
+LATE_PERIODS = 1.5
+STOPPING = (Ending.TRACK, Ending.FAULT, Ending.LINK)  # the motor is at 0 in the last state
 
 
 def run_onboard_episodes(env: CartPoleEnv, policy: Policy, episodes: int) -> Iterator[Episode]:
@@ -36,12 +44,13 @@ def run_onboard(env: CartPoleEnv, policy: Policy) -> Episode:
     assert isinstance(plant, SerialPlant)
     with no_garbage_collection(), on_board(plant):
         first = cart.reset()
-        frames = [cart.frame]
+        frames, stopped = [cart.frame], [False]
         try:
             while not done:
                 frame = plant.listen_one()
                 step = cart.advance(frame.motor_applied, frame)
                 frames.append(frame)
+                stopped.append(bool(plant.cart.flags & Flags.WATCHDOG))
                 steps.append(step)
                 (done,) = step.done
         finally:
@@ -53,7 +62,34 @@ def run_onboard(env: CartPoleEnv, policy: Policy) -> Episode:
     motor = np.array([frame.motor_applied for frame in frames[1:]])
     ending = ending_of(env, 0, steps[-1].truncated[0], steps[-1].state[2])
     episode = one_episode(env, first, steps, frames, motor, expected != chosen, ending)
-    return replace(episode, expected=expected[: episode.steps])
+    gaps = np.array(stopped) | late(frames, plant.cart.information.period_us * 1e-6)
+    compared = comparable(gaps[1:], memory(env.hardware.observation_settings), ending)
+    return replace(episode, expected=expected[: episode.steps], compared=compared[: episode.steps])
+
+
+def late(frames: Sequence[OneFrame], period: float) -> NDArray[np.bool_]:
+    """Return [T+1] which frames came more than 1.5 periods after the one before: states were missed."""
+    return np.array([frame.dt for frame in frames]) > LATE_PERIODS * period
+
+
+def memory(observation: ObservationSettings) -> int:
+    """Return how many past periods an agent observes."""
+    return max(observation.past_motors, observation.past_velocities, observation.past_positions)
+
+
+def comparable(gaps: NDArray[np.bool_], memory: int, ending: str) -> NDArray[np.bool_]:
+    """Return [T] in which periods board and computer chose from the same observation.
+
+    `gaps` [T]: before the state at the end of the period, a state was missed or the watchdog held the motor.
+    The board then observes other velocities, for `memory` periods more another past. The last state before an
+    ending that stops the motor does not report the policy's value.
+    """
+    compared = np.ones(len(gaps), bool)
+    for period in np.flatnonzero(gaps):
+        compared[period : period + memory + 3] = False
+    if ending in STOPPING:
+        compared[-1] = False
+    return compared
 
 
 @contextmanager

@@ -44,6 +44,10 @@ class Episode:
         None  # [T] motor value that this computer would have sent, where a policy on the cart's board drove
     )
 
+    compared: NDArray[np.bool_] | None = (
+        None  # [T] the motor value can be compared with `expected`; None unless the cart's board drove
+    )
+
     @property
     def measured_steps(self) -> int:
         """Number of control periods whose outcome was measured: all but the last one before a lost link."""

@@ -69,7 +69,7 @@ class Reason(IntEnum):
     BAD_VERSION = 8
 
 
-MESSAGES: dict[int, "type[Message]"] = {}  # by type byte; each message enters itself
+MESSAGES: dict[int, "type[Message]"] = {}  # by type byte; each valid message enters itself
 
 
 class Message:
@@ -78,8 +78,9 @@ class Message:
     TYPE: ClassVar[MessageType]
     LAYOUT: ClassVar[str] = ""
 
-    def __init_subclass__(cls) -> None:
-        MESSAGES[cls.TYPE] = cls
+    def __init_subclass__(cls, *, valid: bool = True) -> None:
+        if valid:
+            MESSAGES[cls.TYPE] = cls
 
     def pack(self) -> bytes:
         """Return the payload. Raises FrameError if a field does not fit its width."""
@@ -159,6 +160,15 @@ class StartPolicy(Message):
     """Arms the motor and lets the policy on the board drive. Unknown to a cart without one."""
 
     TYPE = MessageType.START_POLICY
+
+
+@dataclass(frozen=True)
+class PolicyQuestion(Message, valid=False):
+    """START_POLICY with a payload. A cart refuses it: as BAD_LENGTH with a policy, UNKNOWN_TYPE without."""
+
+    TYPE = MessageType.START_POLICY
+    LAYOUT = "B"
+    payload: int = 0
 
 
 @dataclass(frozen=True)

@@ -181,6 +181,9 @@ class EvaluateConfig(RunSettings):
             raise ValueError(f"animation.simulation=true: plant={kind} is simulated itself; omit it")
         if kind != "emulated" and self.emulator != EmulatorSettings():
             raise ValueError(f"emulator: plant={kind} does not read it; give plant=emulated")
+        if self.drives_on_board and self.repeat != RepeatSettings():
+            key = policy_key(self.plant, self.emulator)
+            raise ValueError(f"repeat: it repeats an episode in simulation; leave out repeat.*, or {key}")
         if self.emulator.policy not in (None, ONBOARD):
             raise ValueError(
                 f"emulator.policy={self.emulator.policy}: this command exports the agent of run= itself; "

@@ -12,6 +12,7 @@ from cartpole_rl.evaluation.knocks import Knocks
 from cartpole_rl.evaluation.onboard import run_onboard_episodes
 from cartpole_rl.evaluation.publishing import followed
 from cartpole_rl.learning.randomness import seed_everything
+from cartpole_rl.plants.serial.plant import SerialPlant
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.reporting.words import guard_text
 from cartpole_rl.tasks.episode import Episode
@@ -43,6 +44,12 @@ class Evaluation:
             return
         count = self.config.episodes
         yield from self._shown(run_episodes(self.env, self.policy, count, self.knocks), "episodes")
+
+    def check_board(self) -> None:
+        """Raise RefusedError if the cart's board shall drive and has no policy."""
+        if self.config.drives_on_board:
+            assert isinstance(self.env.plant, SerialPlant)
+            self.env.plant.cart.check_policy()
 
     def onboard_episodes(self) -> Iterator[Episode]:
         """Let the policy on the cart's board drive, and yield each episode as it ends."""

@@ -6,6 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
+from cartpole_rl.errors import PlantError
+from cartpole_rl.evaluation.metrics import same_as_host
 from cartpole_rl.plants.serial.plant import SerialPlant
 from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.plants.settings import EmulatedSettings
@@ -37,6 +39,7 @@ def evaluate(config: EvaluateConfig, folder: Path) -> None:
     onboard: list[Episode] = []
     try:
         with closing(evaluation.env):
+            evaluation.check_board()
             settings = evaluation.settings.model_dump(mode="json")
             write_config(
                 folder, "evaluate", {**evaluation.config.model_dump(mode="json"), "evaluated": settings}
@@ -46,6 +49,7 @@ def evaluate(config: EvaluateConfig, folder: Path) -> None:
             if config.drives_on_board:
                 for episode in evaluation.onboard_episodes():
                     onboard.append(episode)
+                    check_agent_on_board(config.run, onboard[0])
     finally:  # after a broken link or Ctrl-C, the episodes until then are reported
         if episodes:
             report_evaluation(evaluation, episodes, onboard, folder)
@@ -79,9 +83,20 @@ def report_evaluation(
 
 def same_motors(onboard: Sequence[Episode]) -> str:
     """Return a line that compares the motor values of the board with those of the agent here."""
-    same = sum(int((episode.motor == episode.expected).sum()) for episode in onboard)
+    same, count = (sum(column) for column in zip(*map(same_as_host, onboard), strict=True))
     steps = sum(episode.steps for episode in onboard)
-    return f"on the board: {same} of {steps} motor values are those that this computer would have sent"
+    line = f"on the board: {same} of {count} motor values are those that this computer would have sent"
+    return f"{line}; {steps - count} more were not compared (docs/firmware.md)" if count < steps else line
+
+
+def check_agent_on_board(run: Path, episode: Episode) -> None:
+    """Raise PlantError if most motor values of the board are not those of the agent of `run`."""
+    same, count = same_as_host(episode)
+    if 2 * same < count:
+        raise PlantError(
+            f"the board drives another agent than run={run}: {same} of {count} motor values are the same; "
+            "export this agent with cartpole-export format=c and compile the firmware with it"
+        )
 
 
 def next_command(config: EvaluateConfig) -> str:

@@ -23,6 +23,7 @@ from cartpole_rl.exporting.weights import weights_file
 from cartpole_rl.files import write_bytes
 from cartpole_rl.learning.checkpoint_files import find_agent
 from cartpole_rl.learning.checkpoints import load_agent
+from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.plants.settings import SimulatedSettings
 from cartpole_rl.randomization.checks import possible_poles
 from cartpole_rl.run_files import CHECKPOINTS, PROVENANCE
@@ -55,8 +56,11 @@ def on_the_board(
     """Yield `config`; with emulator.policy=onboard its emulated cart has the agent on its board.
 
     The agent has the actions, guard and task of `settings`, as on this computer. Its files are needed
-    until the cart has started. Raises ConfigError for an agent that cannot be exported.
+    until the cart has started. Raises ConfigError for an agent that cannot be exported, and if `settings`
+    are not those of the agent on the board of a real cart.
     """
+    if isinstance(config.plant, SerialSettings) and config.plant.policy is not None:
+        check_compiled_settings(trained.training, settings)
     if config.emulator.policy != ONBOARD:
         yield config
         return
@@ -68,6 +72,22 @@ def on_the_board(
             Path(folder, name).write_bytes(content)
         emulator = config.emulator.model_copy(update={"policy": Path(folder)})
         yield config.model_copy(update={"emulator": emulator})
+
+
+def check_compiled_settings(training: TrainConfig, settings: CartPoleSettings) -> None:
+    """Raise ConfigError if `settings` differ from those that an agent of `training` is exported with."""
+    trained = with_fitted_guard(training)
+    differs = {
+        "actions": settings.actions.motors != trained.actions.motors,
+        "guard": settings.guard.active != trained.guard.active,
+        "task": settings.task.angle_limit != trained.task.angle_limit,
+    }
+    if any(differs.values()):
+        names = ", ".join(name for name in differs if differs[name])
+        raise ConfigError(
+            f"{names}: with plant.policy=onboard the board has those of the agent's training; "
+            f"leave out {names}"
+        )
 
 
 def exported_agent(trained: TrainedAgent, origin: Mapping[str, Any]) -> ExportedAgent:

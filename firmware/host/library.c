@@ -4,18 +4,26 @@
 #include <string.h>
 
 #ifdef CART_ONBOARD_POLICY
-static float pole_length; /* m */
-#define CART_POLE_LENGTH pole_length
+#define CART_POLE_LENGTH 0.0f /* not read: cart_attach_policy gives it */
 #include "onboard.h"
 #endif
 
-void cart_attach_policy(cart *self, float length)
+size_t cart_policy_size(void)
 {
 #ifdef CART_ONBOARD_POLICY
-    pole_length = length;
-    onboard_attach(self);
+    return sizeof(onboard_memory);
+#else
+    return 0;
+#endif
+}
+
+void cart_attach_policy(cart *self, void *memory, float length)
+{
+#ifdef CART_ONBOARD_POLICY
+    onboard_attach_memory(self, (onboard_memory *)memory, length);
 #else
     (void)self;
+    (void)memory;
     (void)length;
 #endif
 }

@@ -6,9 +6,12 @@
 
 #define CART_SNAPSHOT_NUMBERS 47
 
-/* Give a cart that has just booted the policy with which the library was compiled, if any. The pole's length in m
-   is twice the distance from pivot to centre of mass. */
-void cart_attach_policy(cart *self, float length);
+/* The size in bytes of the memory of the policy with which the library was compiled; 0 without one. */
+size_t cart_policy_size(void);
+
+/* Give a cart that has just booted this policy, if any, and its memory, all zeros. The pole's length in m is twice
+   the distance from pivot to centre of mass. */
+void cart_attach_policy(cart *self, void *memory, float length);
 
 /* The size of a `cart` in bytes. */
 size_t cart_size(void);

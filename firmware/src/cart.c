@@ -144,7 +144,7 @@ static void arm(cart *self, uint64_t now_us)
     if (self->armed)
         return;
     self->armed = true;
-    self->observed = false;
+    self->observed = self->interrupted = false;
     self->watchdog_us = now_us;
     self->line.blocked = beyond(self, SOFT_LIMIT, self->reading.cart);
     cart_guards_reset(&self->guards);
@@ -315,14 +315,19 @@ size_t cart_tick(cart *self, uint64_t now_us, int32_t cart_count, int32_t pole_c
 
 void cart_ask_policy(cart *self)
 {
-    if (!self->self_driven || self->expired)
+    if (!self->self_driven)
         return;
+    if (self->expired) {
+        self->interrupted = true;
+        return;
+    }
     const cart_reading *reading = &self->reading;
     cart_observation observation = {reported_cart(self, reading->cart), reported_pole(self, reading->pole),
                                     cart_zeros_half_span(&self->zeros) - SOFT_LIMIT, reading->period_us,
-                                    self->period_us, !self->observed};
+                                    self->period_us, !self->observed, self->interrupted};
     int16_t motor = self->policy(self->policy_memory, &observation);
     bool valid = motor <= CART_LARGEST_MOTOR && motor >= -CART_LARGEST_MOTOR;
     self->observed = true;
+    self->interrupted = false;
     cart_line_hold(&self->line, valid ? motor : 0);
 }

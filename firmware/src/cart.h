@@ -34,9 +34,10 @@ typedef struct {
     int32_t cart_counts; /* from the middle of the track */
     int32_t pole_counts; /* from upright */
     int32_t soft_limit;  /* counts from the middle */
-    uint32_t period_us;  /* since the counts before */
+    uint32_t period_us;  /* since the counts of the period before */
     uint32_t set_period_us;
-    bool first; /* the first observation since START_POLICY */
+    bool first;   /* the first observation since START_POLICY */
+    bool resumed; /* the watchdog held the motor at 0 since the last observation, which is out of date */
 } cart_observation;
 
 /* A policy on the board: returns the motor value for an observation, in a bounded time. */
@@ -64,6 +65,7 @@ typedef struct {
     int32_t pole_zero;    /* raw count that is reported as 0 */
     bool self_driven;     /* the policy chooses the motor values */
     bool observed;        /* the policy was asked since START_POLICY */
+    bool interrupted;     /* the watchdog held the motor at 0 since then */
     bool expired;         /* the watchdog holds the motor at 0 since the newest period */
     bool commanded;       /* a SET_MOTOR was accepted since boot */
     uint64_t command_us;  /* arrival of the newest SET_MOTOR */

@@ -16,10 +16,10 @@
 #define CART_PENDING 1 /* motor values that can wait for their latency; a board applies them on arrival */
 #endif
 
-/* 1.1.0 knows START_POLICY, 1.0.0 does not. */
+/* 1.1.0 knows START_POLICY, 1.0.0 does not; in 1.1.1 a policy starts anew after the watchdog stopped it. */
 #define CART_FIRMWARE_MAJOR 1
 #define CART_FIRMWARE_MINOR 1
-#define CART_FIRMWARE_PATCH 0
+#define CART_FIRMWARE_PATCH 1
 
 #define CART_LARGEST_MOTOR 255
 #define CART_PERIOD_US 20000u /* at boot */

@@ -16,23 +16,39 @@
 #define CART_POLE_LENGTH 0.0f /* not read */
 #endif
 
+/* The memory of the agent on one cart. */
+typedef struct {
+    policy_t policy;
+    float pole_length; /* m */
+} onboard_memory;
+
 static inline int16_t onboard_motor(void *memory, const cart_observation *observation)
 {
-    policy_t *policy = (policy_t *)memory;
+    onboard_memory *agent = (onboard_memory *)memory;
+    policy_t *policy = &agent->policy;
     if (observation->set_period_us != POLICY_PERIOD_US)
         return 0; /* it was trained for another period */
     if (observation->first)
-        policy_start(policy, (float)(observation->soft_limit * CART_METRES), CART_POLE_LENGTH);
+        policy_start(policy, (float)(observation->soft_limit * CART_METRES), agent->pole_length);
+    else if (observation->resumed)
+        policy_resume(policy);
     return policy_motor(policy, observation->cart_counts, observation->pole_counts,
                         (float)observation->period_us / 1e6f);
 }
 
-/* Call after the boot of the cart. */
+/* Call after the boot of the cart. `agent` has to outlive it. */
+static inline void onboard_attach_memory(cart *self, onboard_memory *agent, float pole_length)
+{
+    agent->pole_length = pole_length;
+    self->policy = onboard_motor;
+    self->policy_memory = agent;
+}
+
+/* The same for the only cart of a program. */
 static inline void onboard_attach(cart *self)
 {
-    static policy_t policy;
-    self->policy = onboard_motor;
-    self->policy_memory = &policy;
+    static onboard_memory agent;
+    onboard_attach_memory(self, &agent, CART_POLE_LENGTH);
 }
 
 #endif

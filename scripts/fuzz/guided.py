@@ -187,7 +187,7 @@ class Wire:
                 kind, size = CART_TYPES[steps.number() % 5], steps.number() % 32
                 return valid_frame(1, kind, steps.number(), steps.number(), steps.take(size)) + END
             case 2:
-                info = bytes((1, 1, 0)) + (4096).to_bytes(2, "little") + (22749).to_bytes(4, "little")
+                info = bytes((1, 1, 1)) + (4096).to_bytes(2, "little") + (22749).to_bytes(4, "little")
                 return valid_frame(1, 0x81, 0, 0, info + steps.take(14)) + END
             case 3:
                 return valid_frame(1, 0x83, 0, 0, bytes((sequence, steps.number() % 8))) + END

@@ -68,6 +68,7 @@ class Pair:
         self.python = Firmware(lambda: delay(0))
         self.c = CFirmware(lambda: delay(1))
         self._splitter = FrameSplitter()
+        self._library = c_library.load_library()
         self._c_splitter = ctypes.create_string_buffer(SPLITTER_BYTES)
         self._runs = ctypes.create_string_buffer(2 * LONGEST_INPUT + 65)
         self._last = b""
@@ -77,7 +78,7 @@ class Pair:
         """Let bytes arrive now."""
         self.counts["bytes"] += len(data)
         runs = list(self._splitter.feed(data))
-        size = c_library.load_library().cart_runs(self._c_splitter, data, len(data), self._runs)
+        size = self._library.cart_runs(self._c_splitter, data, len(data), self._runs)
         self._same("runs", b"".join(bytes([len(run)]) + run for run in runs), self._runs.raw[:size])
         for run in runs:
             self._last = run

@@ -7,6 +7,11 @@ import pytest
 from command_line import COARSE, in_process
 from firmwares import needs_compiler
 
+from cartpole_rl.emulator.settings import EmulatorSettings
+from cartpole_rl.plants.emulated_cart import EmulatedCart
+
+SHUTTLE = Path(__file__).parents[1] / "support" / "shuttle"
+SERIAL = ("plant=serial", "plant.port=x", "plant.policy=onboard")
 BOARD = ("plant=emulated", "emulator.firmware=c", "emulator.policy=onboard")
 
 
@@ -31,6 +36,38 @@ def test_the_scores_stand_side_by_side(trained: Path, tmp_path: Path) -> None:
     assert "policy: onboard" in (tmp_path / "run/config.yaml").read_text()
 
 
+@needs_compiler
+@pytest.mark.parametrize(
+    ("policy", "complaint", "driven"),
+    [
+        (None, "its board has no policy: compile its firmware with one", False),
+        (SHUTTLE, "the board drives another agent than run=", True),
+    ],
+    ids=["no policy", "another agent"],
+)
+def test_a_board_without_the_agent_is_refused(
+    policy: Path | None, complaint: str, driven: bool, trained: Path, tmp_path: Path
+) -> None:
+    pytest.importorskip("mujoco", reason='pip install "cartpole_rl[emulator]"')
+    truth = EmulatorSettings(firmware="c", policy=policy, physics_step=1e-3)
+    with EmulatedCart(truth) as cart:
+        words = (
+            f"run={trained}",
+            SERIAL[0],
+            f"plant.port={cart.port}",
+            SERIAL[2],
+            "episodes=2",
+            "plant.clear_faults=9",
+        )
+        done = in_process("evaluate", *words, "hydra.run.dir=run", folder=tmp_path)
+    assert done.code == 1
+    assert complaint in done.complaint
+    metrics = tmp_path / "run/metrics.json"
+    assert metrics.is_file() == driven
+    if driven:
+        assert len(json.loads(metrics.read_text())["onboard"]["episodes"]) == 1
+
+
 @pytest.mark.parametrize(
     ("command", "words", "named", "remedy"),
     [
@@ -45,12 +82,16 @@ def test_the_scores_stand_side_by_side(trained: Path, tmp_path: Path) -> None:
         ("record", BOARD, "emulator.policy=onboard", "leave it out"),
         ("finetune", BOARD, "emulator.policy=onboard", "leave it out"),
         ("preflight", BOARD, "emulator.policy=onboard", "leave it out"),
+        ("preflight", SERIAL, "plant.policy", "leave it out"),
+        ("evaluate", (*BOARD, "repeat.run=x", "repeat.episode=0"), "repeat", "leave out repeat.*"),
+        ("evaluate", (*SERIAL, "guard=none"), "guard", "leave out guard"),
         (
-            "preflight",
-            ("plant=serial", "plant.port=x", "plant.policy=onboard"),
-            "plant.policy",
-            "leave it out",
+            "evaluate",
+            (*SERIAL, "++actions={motors: [-100, 100], actuator: force_curve}"),
+            "actions",
+            "leave out actions",
         ),
+        ("evaluate", (*SERIAL, "task=balance"), "task", "leave out task"),
         ("emulate", BOARD[1:], "emulator.policy=onboard", "give a folder of cartpole-export format=c"),
     ],
 )

@@ -84,7 +84,7 @@ def test_a_cart_boots_idle_with_the_motor_at_zero():
 
 
 def test_hello_is_answered_with_info():
-    assert Bench().send(Hello()) == Info(1, 1, 0, 4096, 22749, 255, SOFT, HARD, 20_000)
+    assert Bench().send(Hello()) == Info(1, 1, 1, 4096, 22749, 255, SOFT, HARD, 20_000)
 
 
 def test_start_needs_homing():

@@ -29,7 +29,7 @@ from cartpole_rl.wire import (
     decode_frame,
     encode_frame,
 )
-from cartpole_rl.wire.messages import Message
+from cartpole_rl.wire.messages import Message, PolicyQuestion
 
 pytestmark = needs_compiler
 SOFT = 16704  # counts, of the nominal track
@@ -46,6 +46,7 @@ class Observation(ctypes.Structure):
         ("period_us", ctypes.c_uint32),
         ("set_period_us", ctypes.c_uint32),
         ("first", ctypes.c_bool),
+        ("resumed", ctypes.c_bool),
     )
 
 
@@ -57,7 +58,7 @@ class Board:
     """A homed cart whose policy is a Python function and drives, unless `start` is another message."""
 
     def __init__(self, choose: Callable[[Observation], int], start: Message = START_POLICY) -> None:
-        self.observed: list[tuple[int, int, int, int, int, bool]] = []
+        self.observed: list[tuple[int, int, int, int, int, bool, bool]] = []
 
         def called(memory: int, pointer: "ctypes._Pointer[Observation]") -> int:
             seen = pointer.contents
@@ -97,9 +98,9 @@ def test_it_observes_each_period_and_chooses_after_state():
     assert [motor for *_, motor in ticks] == [50, -90, 30]
     assert [state.motor_applied for state, *_ in ticks] == [0, 50, -90]
     assert board.observed == [
-        (500, 7, SOFT, 20_000, 20_000, True),
-        (-900, 8, SOFT, 20_000, 20_000, False),
-        (300, -5, SOFT, 20_000, 20_000, False),
+        (500, 7, SOFT, 20_000, 20_000, True, False),
+        (-900, 8, SOFT, 20_000, 20_000, False, False),
+        (300, -5, SOFT, 20_000, 20_000, False, False),
     ]
 
 
@@ -112,7 +113,8 @@ def test_any_accepted_frame_keeps_the_watchdog_quiet():
         assert (flags, motor) == (Flags.ARMED | Flags.HOMED, 100)
 
 
-def test_the_watchdog_stops_it_and_a_frame_revives_it():
+@pytest.mark.parametrize("frame", [Hello(), START_POLICY], ids=["HELLO", "START_POLICY"])
+def test_the_watchdog_stops_it_and_a_frame_revives_it(frame):
     board = Board(lambda seen: 100)
     ticks = [board.tick() for _ in range(6)]
     assert [motor for *_, motor in ticks] == [100, 100, 0, 0, 0, 0]
@@ -120,7 +122,9 @@ def test_the_watchdog_stops_it_and_a_frame_revives_it():
     assert len(board.observed) == 2
     assert isinstance(board.send(SetPeriod(10_000)), Nack)  # a refused frame revives nothing
     assert board.tick()[2] == 0
-    assert board.heard()[2] == 100
+    board.send(frame)
+    assert board.tick()[2] == board.heard()[2] == 100
+    assert [seen[-2:] for seen in board.observed[1:]] == [(False, False), (False, True), (False, False)]
 
 
 def test_start_never_asks_it():
@@ -151,6 +155,18 @@ def test_it_is_refused_where_start_is_and_on_a_cart_that_the_host_drives():
     assert board.send(Start()) == Nack(1, MessageType.START, Reason.NOT_HOMED)
 
 
+@pytest.mark.parametrize("state", [Stop(), Start(), START_POLICY], ids=["idle", "host", "policy"])
+def test_a_board_says_whether_it_has_a_policy_and_arms_nothing(state):
+    board = Board(lambda seen: 100)
+    for reason in (Reason.BAD_LENGTH, Reason.UNKNOWN_TYPE):
+        board.send(Stop())
+        board.send(state)
+        armed = board.firmware.armed
+        assert board.send(PolicyQuestion()) == Nack(1, MessageType.START_POLICY, reason)
+        assert board.firmware.armed == armed
+        board.firmware._head.policy = None
+
+
 def test_a_motor_value_of_the_host_takes_over_until_the_next_start_policy():
     board = Board(lambda seen: 100)
     board.tick()
@@ -161,7 +177,7 @@ def test_a_motor_value_of_the_host_takes_over_until_the_next_start_policy():
     assert board.tick()[2] == 0
     board.send(StartPolicy())
     assert board.tick()[2] == 100
-    assert board.observed[-1][-1]  # first
+    assert board.observed[-1][-2:] == (True, False)  # first, resumed
 
 
 def test_stop_ends_it_and_a_disarmed_board_asks_nothing():
@@ -257,15 +273,32 @@ def test_the_c_code_of_a_policy_observes_the_length_of_the_emulated_pole(tmp_pat
         '#include "policy.h"\n'
         "void policy_start(policy_t *policy, float track_end, float pole_length)\n"
         "{\n    policy->track_end = pole_length;\n}\n"
+        "void policy_resume(policy_t *policy)\n{\n    (void)policy;\n}\n"
         "int16_t policy_motor(policy_t *policy, int32_t cart_counts, int32_t pole_counts, float dt)\n"
         "{\n    (void)cart_counts, (void)pole_counts, (void)dt;\n"
         "    return (int16_t)(1000 * policy->track_end);\n}\n"
     )
-    firmware = CFirmware(lambda: 0, policy=tmp_path, pole_length=0.25)
-    firmware.homed = True
-    firmware.receive(encode_frame(StartPolicy(), 1)[:-1], 0)
-    firmware.tick(20_000, 0, 2048)
-    assert firmware.drive(20_000, 20_001)[-1][1] == 250
+    carts = [CFirmware(lambda: 0, policy=tmp_path, pole_length=length) for length in (0.25, 0.125)]
+    for firmware in carts:
+        firmware.homed = True
+        firmware.receive(encode_frame(StartPolicy(), 1)[:-1], 0)
+    for firmware in carts:
+        firmware.tick(20_000, 0, 2048)
+    assert [firmware.drive(20_000, 20_001)[-1][1] for firmware in carts] == [250, 125]
+
+
+def test_a_policy_that_replaces_another_in_its_folder_is_compiled(tmp_path):
+    motors = []
+    for push in ("110", "90"):
+        for name in ("policy.h", "policy.c"):
+            text = (SHUTTLE / name).read_text(encoding="utf-8").replace("PUSH 110", f"PUSH {push}")
+            tmp_path.joinpath(name).write_text(text, encoding="utf-8")
+        firmware = CFirmware(lambda: 0, policy=tmp_path, pole_length=0.25)
+        firmware.homed = True
+        firmware.receive(encode_frame(StartPolicy(), 1)[:-1], 0)
+        firmware.tick(20_000, 0, 2048)
+        motors.append(firmware.drive(20_000, 20_001)[-1][1])
+    assert motors == [110, 90]
 
 
 def test_a_policy_needs_the_c_firmware():

@@ -11,7 +11,8 @@ from firmwares import needs_compiler
 from cartpole_rl.emulator.settings import ONBOARD
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.evaluation.episodes import run_episodes
-from cartpole_rl.evaluation.onboard import run_onboard_episodes
+from cartpole_rl.evaluation.metrics import same_as_host
+from cartpole_rl.evaluation.onboard import comparable, run_onboard_episodes
 from cartpole_rl.plants.serial.errors import RefusedError
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
@@ -62,8 +63,38 @@ def test_without_latency_both_drive_the_same_cart_to_the_same_bytes() -> None:
     assert (board.time == host.time).all()
     assert board.score.sum() == host.score.sum()
     assert (board.expected == board.motor).all()
+    assert same_as_host(board) == (150, 150)
     assert host.expected is None
     assert board.ended_by == host.ended_by == Ending.TIME
+
+
+def test_missed_states_are_not_compared() -> None:
+    """After a lost state, the computer observes other velocities than the board, and another past."""
+    with driven(ONBOARD, onboard=True, frame_loss=0.03) as driving:
+        (board,) = driving
+    missed = np.diff(board.time) > 0.03
+    same, count = same_as_host(board)
+    assert missed.any()
+    assert not board.compared[missed].any()
+    assert 0 < same == count < 150
+    assert (board.motor != board.expected).sum() > 0
+
+
+@pytest.mark.parametrize(
+    ("gaps", "memory", "ending", "left_out"),
+    [
+        ((), 3, Ending.TIME, ()),
+        ((4,), 0, Ending.TIME, (4, 5, 6)),
+        ((4,), 2, Ending.ANGLE, (4, 5, 6, 7, 8)),
+        ((), 2, Ending.TRACK, (9,)),
+        ((8,), 2, Ending.FAULT, (8, 9)),
+    ],
+)
+def test_periods_that_are_not_compared(
+    gaps: tuple[int, ...], memory: int, ending: str, left_out: tuple[int, ...]
+) -> None:
+    compared = comparable(np.isin(np.arange(10), gaps), memory, ending)
+    assert tuple(np.flatnonzero(~compared)) == left_out
 
 
 def test_a_board_without_a_policy_refuses() -> None:

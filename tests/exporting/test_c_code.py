@@ -60,6 +60,9 @@ class Compiled:
     def start(self, track_end: float, pole_length: float) -> None:
         self.library.policy_start(self.memory, ctypes.c_float(track_end), ctypes.c_float(pole_length))
 
+    def resume(self) -> None:
+        self.library.policy_resume(self.memory)
+
     def motor(self, counts: tuple[int, int], dt: float) -> int:
         return self.library.policy_motor(self.memory, *map(ctypes.c_int32, counts), ctypes.c_float(dt))
 
@@ -162,6 +165,8 @@ def test_after_a_bad_number_the_motor_stays_at_0(compiled: Compiled) -> None:
         assert compiled.motor((0, 2048), 0.0) != 0  # the first period reads no dt
         assert compiled.motor((2000, 2048), dt) == 0
         assert compiled.motor((2000, 2048), 0.02) == 0
+        compiled.resume()
+        assert compiled.motor((2000, 2048), 0.02) == 0
     for end in (math.nan, 0.0, math.inf):
         compiled.start(end, 0.36)
         assert compiled.motor((0, 2048), 0.0) == 0
@@ -180,11 +185,27 @@ def test_the_motor_stays_at_0_once_the_pole_fell(tmp_path: Path) -> None:
         assert compiled.motor((0, sign * 100), 0.0) != 0
         assert compiled.motor((0, sign * 140), 0.02) == 0
         assert compiled.motor((0, 0), 0.02) == 0
+        compiled.resume()
+        assert compiled.motor((0, 0), 0.02) == 0
     compiled.start(0.38, 0.36)
     assert compiled.motor((0, 2048), 0.0) == 0
     header = (tmp_path / "policy.h").read_text()
     assert "#define POLICY_STARTS_UPRIGHT 1" in header
     assert "#define POLICY_OBSERVES_LENGTH 0" in header
+
+
+def test_a_resumed_policy_forgets_what_it_observed(compiled: Compiled) -> None:
+    """After a gap the next counts are the first: no velocity is computed over it."""
+    memories = []
+    for resumed in (False, True):
+        compiled.start(0.38, 0.36)
+        if resumed:
+            for cart in (0, 500, 900):
+                compiled.motor((cart, 2048), 0.02)
+            compiled.resume()
+        compiled.motor((5000, 1000), 0.02)
+        memories.append(bytes(compiled.memory))
+    assert memories[0] == memories[1]
 
 
 def test_without_a_start_the_motor_stays_at_0(compiled: Compiled) -> None:
@@ -201,6 +222,20 @@ def test_a_unit_that_is_not_finite_reaches_the_action_values(tmp_path: Path) -> 
     compiled = Compiled(c_files(agent, training), tmp_path)
     numbers = np.array([2, -2] * 5, np.float32)  # infinity minus infinity
     assert compiled.action(numbers) == -1
+
+
+def test_files_of_two_exports_do_not_compile(
+    exported: ExportedAgent, medium_agent: TrainedAgent, tmp_path: Path
+) -> None:
+    files = c_files(exported, medium_agent.training)
+    about = exported.description.model_copy(update={"provenance": {}})
+    other = c_files(replace(exported, description=about), medium_agent.training)
+    (tmp_path / "policy.h").write_text(other["policy.h"])
+    (tmp_path / "policy.c").write_text(files["policy.c"])
+    words = ["gcc", *FLAGS, "-fsyntax-only", "policy.c"]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode != 0
+    assert "policy.h is of another export than policy.c" in done.stderr
 
 
 def test_options_that_remove_the_checks_are_refused(compiled: Compiled) -> None:

@@ -59,6 +59,25 @@ def test_a_program_with_a_policy_does_not_take_the_place_of_the_one_without(tmp_
     assert ARM in make(f"POLICY={policy}")
 
 
+@needs_arm
+@pytest.mark.parametrize("length", ["1", "0.36", ".3"])
+def test_any_notation_of_a_length_compiles(length: str, tmp_path: Path) -> None:
+    words = (f"BUILD={tmp_path}", "nucleo_f401re", f"POLICY={SHUTTLE}", f"POLE_LENGTH={length}")
+    done = subprocess.run(["make", "-C", str(firmware_folder()), *words], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@needs_arm
+def test_a_folder_without_a_policy_is_named(tmp_path: Path) -> None:
+    """make -C looks for a relative folder in firmware/."""
+    folder = shutil.copytree(SHUTTLE, tmp_path / "policy").name
+    words = (f"BUILD={tmp_path}", "nucleo_f401re", f"POLICY={folder}")
+    make = ["make", "-C", str(firmware_folder()), *words]
+    done = subprocess.run(make, capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode != 0
+    assert f"POLICY={folder}: there is no policy.c in it; give the absolute path" in done.stderr
+
+
 @needs_zig
 @pytest.mark.parametrize(
     "target",

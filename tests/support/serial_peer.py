@@ -25,6 +25,7 @@ from cartpole_rl.wire import (
     SetMotor,
     SetPeriod,
     Start,
+    StartPolicy,
     State,
     Stop,
     decode_frame,
@@ -137,7 +138,7 @@ class CartPeer(Peer):
     def carry_out(self, message: Message) -> None:
         if isinstance(message, Home):
             self.flags |= Flags.HOMED
-        elif isinstance(message, Start):
+        elif isinstance(message, Start | StartPolicy):
             self.flags |= Flags.ARMED
         elif isinstance(message, Stop):
             self.flags &= ~Flags.ARMED

@@ -32,7 +32,7 @@ PAGE = (Path(__file__).parents[2] / "docs" / "protocol.md").read_text(encoding="
 HOMED = Flags.HOMED
 EXAMPLES: dict[str, tuple[Message, int, int]] = {
     "HELLO": (Hello(), 0, 0),
-    "INFO": (Info(1, 1, 0, 4096, 22749, 255, 16704, 17539, 20000), 0, 0),
+    "INFO": (Info(1, 1, 1, 4096, 22749, 255, 16704, 17539, 20000), 0, 0),
     "SET_PERIOD": (SetPeriod(20000), 1, 0),
     "HOME": (Home(), 2, 0),
     "ACK": (Ack(2, MessageType.HOME), 5, Flags.HOMING),

@@ -1,6 +1,10 @@
 /* See policy.h. */
 #include "policy.h"
 
+#if POLICY_ID != 0x@@id@@u
+#error "policy.h is of another export than policy.c: copy both files of one export"
+#endif
+
 #include <math.h>
 
 #if defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__
@@ -55,6 +59,13 @@ void policy_start(policy_t *policy, float track_end, float pole_length)
 {
     const bool ready = isfinite(track_end) && track_end > 0.0f;
     *policy = (policy_t){.track_end = track_end, .pole_length = pole_length, .ready = ready};
+}
+
+void policy_resume(policy_t *policy)
+{
+    const bool ready = policy->ready;
+    policy_start(policy, policy->track_end, policy->pole_length);
+    policy->ready = ready;
 }
 
 int16_t policy_motor(policy_t *policy, int32_t cart_counts, int32_t pole_counts, float dt)

@@ -26,6 +26,7 @@
 extern "C" {
 #endif
 
+#define POLICY_ID 0x@@id@@u /* policy.c is of the same export */
 #define POLICY_INPUTS @@inputs@@
 #define POLICY_ACTIONS @@actions@@
 #define POLICY_NO_ACTION (-1)
@@ -52,6 +53,10 @@ typedef struct {
  * finite number every motor value is 0. pole_length: m, twice the distance from pivot to centre of mass;
  * @@length_use@@. */
 void policy_start(policy_t *policy, float track_end, float pole_length);
+
+/* Continue an episode after periods in which policy_motor() was not called: the next counts are then like the first
+ * of an episode, without velocities and past. Once policy_motor() returns 0 for the rest of an episode, it still does. */
+void policy_resume(policy_t *policy);
 
 /* Return the motor value, -255 to 255, for the newest counts. dt: s since the counts of the last call, by the
  * clock of the encoders; not read in the first call of an episode. Before policy_start(), once a number was not

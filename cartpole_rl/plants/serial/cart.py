@@ -28,6 +28,7 @@ from cartpole_rl.wire.messages import (
     Hello,
     Home,
     Info,
+    PolicyQuestion,
     Reason,
     SetMotor,
     SetPeriod,
@@ -158,12 +159,23 @@ class SerialCart:
         self._arm(Start())
 
     def start_policy(self) -> None:
-        """Arm the motor and let the policy on the board drive, while `poll_state` keeps it from stopping.
+        """Arm the motor and let the policy on the board drive, while `follow_policy` keeps it from stopping.
 
         Raises what `start` raises, and RefusedError if the board has no policy.
         """
         self._arm(StartPolicy())
         self._tracker.follow_policy()
+
+    def check_policy(self) -> None:
+        """Raise RefusedError if the board has no policy. The question arms no cart, homed or not."""
+        try:
+            self._connection.request(PolicyQuestion(), Ack)
+        except RefusedError as error:
+            if error.reason != Reason.BAD_LENGTH:
+                raise
+            return
+        self.stop()
+        raise PlantError("the cart accepted a START_POLICY of the wrong length: correct its firmware")
 
     def stop(self) -> None:
         """Set the motor to 0 and disarm; ends a homing. The bytes go out before anything that can block."""
@@ -216,12 +228,14 @@ class SerialCart:
         """Send a motor value; return the value sent.
 
         That is `value` within the cart's limits, or 0 if it answers a state so old that the cart's watchdog
-        has stopped the motor. Raises LinkError if that state is older than `settings.timeout` or
-        LONGEST_SUSPENSION, or if the operating system delayed the value for as long as the watchdog waits.
+        has stopped the motor. Raises LinkError if that state is older than `longest_suspension`, or if the
+        operating system delayed the value for as long as the watchdog waits.
         """
         connection = self._connection
         limit = max(0, self.information.motor_limit)  # 0 stays 0 for any limit in INFO
-        sent = self._in_time(max(-limit, min(limit, int(value))))
+        sent = max(-limit, min(limit, int(value)))
+        if sent and self._is_late():
+            sent = 0
         connection.send_motor(sent)
         return sent
 
@@ -239,6 +253,20 @@ class SerialCart:
         """Send HELLO and wait for a state. A lockstep cart advances only when it receives a frame."""
         self._connection.link.send(Hello())
         return self.get_state()
+
+    def follow_policy(self) -> State:
+        """Send HELLO, which lets the policy on the board drive on, and wait for a state.
+
+        Raises LinkError, before it sends anything, if a newer state waits and the last one is older than
+        `longest_suspension`.
+        """
+        self._is_late()
+        return self.poll_state()
+
+    @property
+    def longest_suspension(self) -> float:
+        """The time in s without an answer of this computer after which the link counts as lost."""
+        return min(self.settings.timeout, LONGEST_SUSPENSION)
 
     @contextmanager
     def unmeasured(self) -> Iterator[None]:
@@ -260,24 +288,28 @@ class SerialCart:
         self._connection.request(Stop(), Ack, before=(SetMotor(0),), within=within)
         self._stop_unanswered = False
 
-    def _in_time(self, motor: int) -> int:
-        """Return the motor value, or 0 if it is too late for it; see `set_motor`.
+    def _is_late(self) -> bool:
+        """Return True if the cart's watchdog has stopped the motor since the newest state.
 
-        If no newer state waits, no time has passed for the cart, as on a lockstep emulator.
+        If no newer state waits, no time has passed for the cart, as on a lockstep emulator. Raises LinkError
+        if the state is older than `longest_suspension`.
         """
-        if not motor or not self._tracker.awaits_command:
-            return motor
+        if not self._tracker.awaits_command:
+            return False
         late = time.perf_counter() - self._tracker.newest_at
         stopped_after = WATCHDOG_PERIODS * self.information.period_us * 1e-6
-        lost_after = min(self.settings.timeout, LONGEST_SUSPENSION)
-        if late <= min(stopped_after, lost_after) or not self._connection.link.waiting():
-            return motor
-        if late > lost_after:
+        if late <= min(stopped_after, self.longest_suspension) or not self._connection.link.waiting():
+            return False
+        self.check_suspension(late)
+        return True
+
+    def check_suspension(self, seconds: float) -> None:
+        """Raise LinkError if this computer did not answer the cart for too long."""
+        if seconds > self.longest_suspension:
             raise LinkError(
-                f"this computer did not answer the cart on {self.port} for {late:.1f} s; end what keeps it "
-                "busy, and do not suspend a command that drives"
+                f"this computer did not answer the cart on {self.port} for {seconds:.1f} s; end what keeps "
+                "it busy, and do not suspend a command that drives"
             )
-        return 0
 
     def _is_homing(self) -> bool:
         self.poll_state()

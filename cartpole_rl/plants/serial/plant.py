@@ -156,7 +156,7 @@ class SerialPlant(OneCartPlant):
         def listen() -> State:
             if self.on_command is not None:
                 self.on_command(self._state.motor_applied)
-            return self.cart.poll_state()
+            return self.cart.follow_policy()
 
         return self._pass_period(listen)
 
@@ -169,6 +169,7 @@ class SerialPlant(OneCartPlant):
             state = next_state()
             if went_back(ticks_between(before.tick, state.tick)):
                 raise LinkError(RESTARTED)
+            self.cart.check_suspension(seconds_between(before.time_us, state.time_us))
             self._state = state
         except (LinkError, RefusedError, FaultError) as error:
             self._break_off(error)

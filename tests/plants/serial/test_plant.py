@@ -1,6 +1,7 @@
 """The plant on a scripted cart: endings, clocks and faults. On the emulated cart: test_emulated_plant.py."""
 
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import replace
 
 import pytest
@@ -66,11 +67,32 @@ def test_a_step_carries_the_carts_own_numbers(peer: CartPeer, plant: SerialPlant
     assert not frame["done"]
 
 
-def test_dt_is_the_carts_clock_across_its_wrap(peer: CartPeer, plant: SerialPlant) -> None:
-    plant.reset()
-    peer.state = replace(peer.state, time_us=2**32 - 25_000)
-    step(plant, 0)
-    assert step(plant, 0)["dt"].item() == pytest.approx(0.02, abs=1e-6)
+def test_dt_is_the_carts_clock_across_its_wrap(peer: CartPeer) -> None:
+    peer.state = replace(peer.state, time_us=2**32 - 1_000_000)
+    with closing(SerialPlant(quick_settings(peer.port))) as plant:
+        plant.reset()
+        assert peer.state.time_us > 2**31
+        while peer.state.time_us > 2**31:
+            frame = step(plant, 0)
+            assert not frame["done"]
+            assert frame["dt"].item() == pytest.approx(0.02, abs=1e-6)
+
+
+@pytest.mark.parametrize("on_board", [False, True])
+def test_a_host_that_was_suspended_while_it_waited_is_a_lost_link(
+    peer: CartPeer, plant: SerialPlant, on_board: bool
+) -> None:
+    """A person may have moved the cart meanwhile: the motor stays at 0, and the cart is homed."""
+    plant.on_board = on_board
+    plant.reset_one()
+    assert not (plant.listen_one() if on_board else plant.step_one(50)).truncated
+    peer.state = replace(peer.state, time_us=peer.state.time_us + 500_000)
+    frame = plant.listen_one() if on_board else plant.step_one(50)
+    assert (frame.truncated, frame.motor_applied, plant.ended_by) == (True, 0, "link")
+    assert "did not answer" in str(plant.last_error)
+    assert_stopped(peer)
+    plant.reset_one()
+    assert len(peer.messages(Home)) == 2
 
 
 @pytest.mark.parametrize("side", [-1, 1])

@@ -236,6 +236,19 @@ def test_a_command_that_comes_too_late_is_0(host_clock: HostClock) -> None:
     assert [message.motor for message in peer.messages(SetMotor)] == [0, 0, 200, 0, 0]
 
 
+def test_a_suspended_host_does_not_let_the_policy_on_the_board_drive_on(host_clock: HostClock) -> None:
+    with CartPeer(paced=True) as peer, SerialCart(quick_settings(peer.port, timeout=10.0)) as cart:
+        peer.tick()
+        cart.get_state()
+        peer.tick()
+        wait_for(lambda: peer.unread() > 0)
+        greeted = len(peer.messages(Hello))
+        host_clock.ahead += 3.0
+        with pytest.raises(LinkError, match=r"did not answer the cart on .* for 3\.\d s"):
+            cart.follow_policy()
+    assert len(peer.messages(Hello)) == greeted
+
+
 def test_time_that_passes_for_the_host_alone_makes_no_command_late(host_clock: HostClock) -> None:
     with CartPeer() as peer, SerialCart(quick_settings(peer.port)) as cart:
         cart.get_state()

@@ -14,6 +14,7 @@ typedef struct {
 } policy_t;
 
 void policy_start(policy_t *policy, float track_end, float pole_length);
+void policy_resume(policy_t *policy);
 int16_t policy_motor(policy_t *policy, int32_t cart_counts, int32_t pole_counts, float dt);
 
 #endif
