@@ -53,13 +53,24 @@ def prepared(env: CartPoleEnv, policy: Policy) -> Policy:
 
 @torch.no_grad()
 def warm_up(env: CartPoleEnv, policy: Policy) -> None:
-    """Compute a step on zeros: compilation and lazy loading must not delay the first ticks."""
+    """Compute a period: compilation and lazy loading must not delay the first ticks.
+
+    A serial cart repeats it before each episode, before it is armed: what is not in the processor's caches
+    makes the first tick the slowest.
+    """
+    if isinstance(env.plant, OneCartPlant):
+        rehearse(env.one_cart, policy)
+        if isinstance(env.plant, SerialPlant):
+            env.plant.before_start = partial(rehearse, env.one_cart, policy)
+        return
     blank = env.fake_tensordict()
     choose(policy, blank)
-    if isinstance(env.plant, OneCartPlant):
-        _ = env.one_cart
-    else:
-        env.hardware.perceive(blank, env.hardware.command(blank), blank["next"])
+    env.hardware.perceive(blank, env.hardware.command(blank), blank["next"])
+
+
+def rehearse(cart: OneCart, policy: Policy) -> None:
+    """Perceive a period that changes nothing, and choose an action on it."""
+    chosen_action(policy, cart.rehearse().observation)
 
 
 def choose(policy: Policy, current: TensorDictBase) -> Tensor:
@@ -87,8 +98,6 @@ def run_batch(env: CartPoleEnv, policy: Policy, knocks: Knocks | None = None) ->
 def run_one(env: CartPoleEnv, policy: Policy) -> Episode:
     """Return an episode of a plant of one cart, on plain numbers."""
     cart, steps, actions, motors, done = env.one_cart, [], [], [], False
-    if isinstance(env.plant, SerialPlant):
-        env.plant.before_start = partial(rehearse, cart, policy)
     with no_garbage_collection():
         first = cart.reset()
         (origin,) = env.plant.origins()
@@ -108,11 +117,6 @@ def run_one(env: CartPoleEnv, policy: Policy) -> Episode:
     guarded = motor != np.array([cart.motor(action) for action in actions])
     ending = ending_of(env, action, steps[-1].truncated[0], steps[-1].state[2])
     return replace(one_episode(env, first, steps, frames, motor, guarded, ending), origin=origin)
-
-
-def rehearse(cart: OneCart, policy: Policy) -> None:
-    """Compute a period: what is not in the processor's caches makes the first tick the slowest."""
-    chosen_action(policy, cart.rehearse().observation)
 
 
 def chosen_action(policy: Policy, observation: Sequence[float]) -> int:
