@@ -269,7 +269,7 @@ def changed(episode: Episode, **changes: Callable[[np.ndarray], np.ndarray]) -> 
     values = {
         name: getattr(episode, name).copy()
         for name in episode.__dataclass_fields__
-        if name not in ("ended_by", "origin", "guarded", "expected")
+        if isinstance(getattr(episode, name), np.ndarray)
     }
     for name, change in changes.items():
         if name in ("cart", "pole"):

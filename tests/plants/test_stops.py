@@ -258,6 +258,9 @@ def test_an_experiment_of_the_identification(cart: TellingCart) -> None:
     experiments = tuple(Experiment(name, "nothing", push) for name in ("first", "second"))
     with closing(serial_plant(cart)) as plant:
         for _, episode in conduct(plant, PERIOD_MS / 1000, experiments=experiments):
+            if not episode.motor.any():  # a busy machine suspended the host for over a second after START
+                assert episode.ended_by == "link"
+                continue
             after, _ = cart.stopped()
             assert 0 < after <= WATCHDOG_MS
             commands = [line["motor"] for line in cart.told() if line.get("took") == "SET_MOTOR"]

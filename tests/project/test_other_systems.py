@@ -20,7 +20,8 @@ from torch.utils.tensorboard import SummaryWriter
 
 for name in ("fcntl", "termios", "pty", "tty", "resource", "pwd", "grp", "readline", "curses"):
     sys.modules[name] = None
-posix = "sched_", "SCHED_", "fork", "openpty", "nice", "getuid", "geteuid", "setsid", "killpg", "O_NO"
+# Python's own shutil needs O_NONBLOCK and O_NOFOLLOW where it found them
+posix = "sched_", "SCHED_", "fork", "openpty", "nice", "getuid", "geteuid", "setsid", "killpg", "O_NOCTTY"
 for name in [name for name in dir(os) if name.startswith(posix)]:
     delattr(os, name)
 for name in ("HUP", "KILL", "QUIT", "ALRM", "USR1", "USR2", "PIPE", "WINCH"):
