@@ -3,6 +3,7 @@
 A receiver that starts in the middle of a frame, or receives noise, is synchronized again at the next 0x00.
 """
 
+import os
 import time
 from contextlib import suppress
 
@@ -42,10 +43,26 @@ class SerialLink:
     def write(self, data: bytes) -> None:
         """Write raw bytes within the port's write timeout. Raises LinkError."""
         try:
-            self._port.write(data)
+            taken = self._taken_at_once(data)
+            if taken < len(data):
+                self._port.write(data[taken:])
         except OSError as error:
             raise self._broken("written to", error) from error
         self.sent_at = time.perf_counter()
+
+    def _taken_at_once(self, data: bytes) -> int:
+        """Return how many bytes the system takes without a wait; 0 for a port without a descriptor.
+
+        After its bytes were taken, pyserial 3.5 waits until the port would take more. That lasts until a
+        kernel thread has delivered what arrives meanwhile: up to 5 ms on a busy machine.
+        """
+        descriptor = getattr(self._port, "fd", None)
+        if descriptor is None:
+            return 0
+        try:
+            return os.write(descriptor, data)
+        except BlockingIOError:
+            return 0
 
     def waiting(self) -> int:
         """Return the number of bytes that have arrived and are not read yet. Raises LinkError."""
