@@ -61,7 +61,8 @@ BLOCKS = re.compile(r"(?:(?<=\n\n)|\A)(?:    .*\n(?:\n(?=    ))?)+")
 def test_the_command_that_needs_an_extra_composes(page: str, command: str, tmp_path: Path) -> None:
     if "sweep=optuna" in command and find_spec("hydra_plugins") is None:
         pytest.skip("its launcher or sweeper is an extra: scripts/sweeps runs it")
-    done = run_here(command, "--cfg", "job", cwd=tmp_path)
+    fixed = re.sub(r" '\S+=interval\(.*?\)'", "", command)  # Hydra composes one job, not a search
+    done = run_here(fixed, "--cfg", "job", cwd=tmp_path)
     assert done.returncode == 0, f"{page}: {command}\n{done.stderr}"
 
 
