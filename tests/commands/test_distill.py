@@ -4,16 +4,11 @@ import json
 from pathlib import Path
 
 import yaml
-from command_line import in_process, interrupt_after
-
-SMALL = tuple(
-    f"distillation.{name}={value}"
-    for name, value in {"carts": 8, "rounds": 2, "periods": 5, "updates": 3, "batch_size": 16}.items()
-)
+from command_line import DISTILLATION, in_process, interrupt_after
 
 
 def test_the_student_is_an_agent_like_any_other(trained: Path, tmp_path: Path) -> None:
-    words = (f"run={trained}", "hidden=[8,6]", *SMALL, "hydra.run.dir=student")
+    words = (f"run={trained}", "hidden=[8,6]", *DISTILLATION, "hydra.run.dir=student")
     done = in_process("distill", *words, folder=tmp_path)
     assert done.code == 0, done.err
     assert done.out.splitlines()[-1] == "cartpole-export run=student format=c"

@@ -7,7 +7,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from page_commands import BIN, BUDGET, COARSE
+from command_line import BIN, COARSE
+from page_commands import BUDGET
 
 
 @pytest.fixture(scope="session")

@@ -12,11 +12,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from command_line import interrupt_after
+from command_line import BIN, COARSE, DISTILLATION, interrupt_after
 from page_commands import (
-    BIN,
     BUDGET,
-    COARSE,
     IDENTIFYING,
     MODELLING,
     NEED_EXTRAS,
@@ -29,17 +27,13 @@ from page_commands import (
 )
 from small_study import make_study
 
-DISTILLING = [
-    f"distillation.{name}={value}"
-    for name, value in {"carts": 8, "rounds": 2, "periods": 5, "updates": 3, "batch_size": 16}.items()
-]
 BUDGETS = {  # of each command; what the page gives stays, except where it takes minutes
     "train": [*BUDGET, "seed=0", "agent.action_gap=0.7"],  # the last two narrow the sweeps
     "evaluate": ["episodes=1"],
     "finetune": TUNING,
     "identify": IDENTIFYING,
     "model": MODELLING,
-    "distill": DISTILLING,
+    "distill": [*DISTILLATION],
     "report": ["animations=false"],
     "export": [],
 }

@@ -13,11 +13,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from command_line import interrupt_after
+from command_line import BIN, COARSE, interrupt_after
 from page_commands import (
-    BIN,
     BUDGET,
-    COARSE,
     IDENTIFYING,
     MODELLING,
     README,

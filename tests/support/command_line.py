@@ -43,6 +43,10 @@ FINETUNING = (
 TRUTH = ("emulator.cart_viscous=1.1", "emulator.latency=0.012", "emulator.angle_offset=-0.01")
 QUICK = ("windows=80", "substeps=4", "carts=200")
 IDENTIFICATION = (*TRUTH, *QUICK)
+DISTILLATION = tuple(
+    f"distillation.{name}={value}"
+    for name, value in {"carts": 8, "rounds": 2, "periods": 5, "updates": 3, "batch_size": 16}.items()
+)
 HANDLED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # by a command; a test restores its own
 ONCE = "learning.evaluations=1"  # most of a tiny training's time goes into pictures of its evaluations
 

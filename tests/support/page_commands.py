@@ -3,17 +3,14 @@
 import re
 import shlex
 import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 from command_line import in_process
 
 ROOT = Path(__file__).parents[2]
-BIN = Path(sys.executable).parent
 README = ROOT / "README.md"
 PAGES = sorted([*ROOT.glob("docs/**/*.md"), ROOT / "runs/README.md", ROOT / "CONTRIBUTING.md"])
-COARSE = "emulator.physics_step=1e-3"  # s; the default is half of it
 BUDGET = [  # of a training
     "compile=false",
     "learning.transitions=1024",
