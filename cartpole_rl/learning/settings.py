@@ -90,7 +90,7 @@ class RayLearnerSettings(Settings):
     """learner=ray: the learner of a fine-tuning is on another machine, in a Ray cluster."""
 
     kind: Literal["ray"]
-    address: Annotated[str, Field(pattern=r"^[^/\s:]+:\d+$")]  # of the Ray head, as host:port
+    address: Annotated[str, Field(pattern=r"^[^/\s:]+:\d{1,5}$")]  # of the Ray head, as host:port
     episodes_ahead: Annotated[int, Field(ge=0)]  # driven with earlier weights while the learner is lost
     timeout: Annotated[float, Field(gt=0, le=600)]  # s without an answer: the learner counts as lost
 

@@ -85,7 +85,9 @@ def yielding_to(driver: Driver, learns_here: bool) -> Iterator[None]:
     """
     if not driver.has_priority:
         print_message(
-            "finetune", "other processes may delay the cart: no real-time priority (see `ulimit -r`)"
+            "finetune",
+            "other processes may delay the cart: no real-time priority (see `ulimit -r` and "
+            "docs/first-hour.md)",
         )
     with giving_precedence() if learns_here else nullcontext():
         yield

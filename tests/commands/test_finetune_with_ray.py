@@ -1,6 +1,7 @@
 """A fine-tuning whose learner is on another node of a Ray cluster equals one on a single machine."""
 
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -67,11 +68,23 @@ def test_it_equals_one_on_a_single_machine_to_the_bit(
 
 
 @needs_ray
-def test_an_address_without_a_cluster_is_refused_before_the_cart_moves(trained: Path, tmp_path: Path) -> None:
-    words = (*FINETUNING, "learner=ray", "learner.address=127.0.0.1:1", "hydra.run.dir=run")
+@pytest.mark.parametrize(
+    ("address", "reason"),
+    [
+        ("127.0.0.1:1", "Connection refused"),
+        ("no-such-host.invalid:6379", "Name or service not known|Temporary failure in name resolution"),
+    ],
+)
+def test_an_address_where_nothing_listens_is_refused_before_the_cart_moves(
+    address: str, reason: str, trained: Path, tmp_path: Path
+) -> None:
+    words = (*FINETUNING, "learner=ray", f"learner.address={address}", "hydra.run.dir=run")
     done = in_process("finetune", f"run={trained}", *words, folder=tmp_path)
     assert done.code == 1
-    assert "the learner at learner.address=127.0.0.1:1 does not answer (no Ray cluster answers" in done.err
+    refused = (
+        rf"the learner at learner\.address={re.escape(address)} does not answer \(.*({reason}).*\); start"
+    )
+    assert re.search(refused, done.err)
     assert not (tmp_path / "run/recordings").exists()
 
 
@@ -105,7 +118,7 @@ def test_without_ray_the_extra_is_named(trained: Path, tmp_path: Path) -> None:
     assert 'learner=ray needs Ray: pip install "cartpole_rl[ray]"' in done.complaint
 
 
-@pytest.mark.parametrize("address", ["server", "ray://server:10001", ""])
+@pytest.mark.parametrize("address", ["server", "ray://server:10001", "server:637900", ""])
 def test_an_address_has_a_host_and_a_port(address: str, trained: Path, tmp_path: Path) -> None:
     words = ("learner=ray", f"learner.address={address}", "hydra.run.dir=run")
     done = in_process("finetune", f"run={trained}", *words, folder=tmp_path)

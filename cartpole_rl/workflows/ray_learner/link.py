@@ -24,6 +24,7 @@ from cartpole_rl.workflows.ray_learner.node import (
     SETTINGS,
     START_RAY,
     cart_node,
+    check_address,
     check_learners,
     fact_finder,
 )
@@ -188,6 +189,7 @@ def _serve(pipe: Connection, address: str, timeout: float, task: LearnerTask, pa
             os.dup2(log.fileno(), standard)
     with suppress(EOFError, ConnectionError):
         try:
+            check_address(address)
             with cart_node(address, task.cart) as node:
                 _connect(address, node)
                 _report(pipe, timeout, _learner(pipe, task), node)

@@ -20,6 +20,7 @@ PACKAGES = ("cartpole_rl", "torch", "torchrl", "tensordict", "ray")
 CLOCKS = 5.0  # s of difference between two clocks, from which it is reported
 STORE = 100_000_000  # bytes of Ray's object store on the cart's machine; an episode takes 50 kB
 STOP = 10.0  # s from SIGTERM to SIGKILL
+ANSWER = 10.0  # s for a connection to the cluster's address
 SETTINGS = {  # of Ray
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_raylet_start_wait_time_s": "300",  # the default is too little beside other work
@@ -27,6 +28,15 @@ SETTINGS = {  # of Ray
     "OMP_NUM_THREADS": "1",
 }
 START_RAY = "ray start --head --port={port} --resources='{{\"learner\": 1}}'"
+
+
+def check_address(address: str) -> None:
+    """Raise ConnectionError if nothing listens at `address`; Ray itself takes two minutes to say so."""
+    host, _, port = address.rpartition(":")
+    try:
+        socket.create_connection((host, int(port)), ANSWER).close()
+    except OSError as error:
+        raise ConnectionError(error.strerror or str(error)) from error
 
 
 @contextmanager
