@@ -6,8 +6,11 @@ any child is started: exec sets a signal that has a handler back to its default.
 handler, as tests interrupt their own process too. The handler of the others does nothing, so that pytest
 itself still outlives them, as nohup is meant to. SIGPIPE is left alone: Python ignores it, and subprocess
 restores it in children.
+
+Torch takes one thread, here and in children: the work of a test is small, and threads would wait busily.
 """
 
+import os
 import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -33,6 +36,9 @@ from cartpole_rl.tasks.settings import ActionSettings, RewardSettings, Start, St
 
 CONF = Path(__file__).parents[1] / "conf"
 
+os.environ["OMP_NUM_THREADS"] = "1"  # of children
+torch.set_num_threads(1)
+
 
 def outlive(number: int, frame: FrameType | None) -> None:
     """Do nothing about a signal that was ignored."""
@@ -53,11 +59,6 @@ def hydra_reads_conf() -> Iterator[None]:
     """Let the tests of a module call `hydra.compose`."""
     with shipped_choices():
         yield
-
-
-@pytest.fixture(autouse=True, scope="session")
-def one_thread() -> None:
-    torch.set_num_threads(1)
 
 
 @pytest.fixture(scope="session")
