@@ -114,16 +114,16 @@ def test_evaluate(command: str, trained: Path, serial_port: Callable[[], str]) -
 def test_identify_train_on_it_and_model_it(trained: Path, serial_port: Callable[[], str]) -> None:
     (identify,) = listed("cartpole-identify")
     identify = identify.replace("/dev/ttyUSB0", serial_port())
-    identified = run_here(identify, *IDENTIFYING, "hydra.run.dir=runs/identify/first", cwd=trained)
+    identified = run_here(identify, *IDENTIFYING, "hydra.run.dir=runs/identify/mine", cwd=trained)
     assert identified.returncode == 0, identified.stderr
     (train,) = [command for command in listed("cartpole-train") if "identify" in command]
-    result = run_here(train.replace("<run>", "first"), *BUDGET, cwd=trained)
+    result = run_here(train.replace("<run>", "mine"), *BUDGET, cwd=trained)
     assert result.returncode == 0, result.stderr
     (model,) = listed("cartpole-model")
-    short = [*MODELLING, "hydra.run.dir=runs/model/first"]
-    modelled = run_here(model.replace("<run>", "first"), *short, cwd=trained)
+    short = [*MODELLING, "hydra.run.dir=runs/model/mine"]
+    modelled = run_here(model.replace("<run>", "mine"), *short, cwd=trained)
     assert modelled.returncode == 0, modelled.stderr
-    assert (trained / "runs/model/first/model.pt").exists()
+    assert (trained / "runs/model/mine/model.pt").exists()
 
 
 def test_record_and_replay(trained: Path) -> None:

@@ -14,7 +14,7 @@ from cartpole_rl.evaluation.publishing import followed
 from cartpole_rl.evaluation.snapshots import COUNTER, Memory, Snapshot, new_memory, read, write
 from cartpole_rl.plants.emulated import emulated_plant
 
-WRITES = 20_000
+WRITES = 5_000
 
 
 def numbered(number: int) -> Snapshot:

@@ -25,7 +25,7 @@ BUDGET = [  # of a training
     "task.time_limit=100",
 ]
 TUNING = ["compile=false", "finetuning.iterations=1", "episodes=1", "evaluation_episodes=1"]
-IDENTIFYING = ["windows=20", "substeps=2", "carts=100"]
+IDENTIFYING = ["windows=20", "substeps=1", "carts=100"]
 NEED_EXTRAS = ("sweep=optuna", "learner=ray")  # which scripts/sweeps and scripts/bench/two_machines.py run
 MODELLING = ["ensemble.updates=2", "ensemble.members=1", "windows=20"]
 
