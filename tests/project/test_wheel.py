@@ -8,21 +8,9 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from command_line import ONCE, TINY
 
 ROOT = Path(__file__).parents[2]
-BUDGET = [
-    "learning.transitions=512",
-    "learning.carts=16",
-    "learning.chunk=8",
-    "learning.updates=1",
-    "learning.batch_size=16",
-    "learning.warmup_transitions=64",
-    "learning.evaluations=1",
-    "learning.evaluation_episodes=1",
-    "buffer.size=1000",
-    "task.time_limit=60",
-    "compile=false",
-]
 
 
 def pip(*words: str | Path) -> None:
@@ -86,7 +74,7 @@ def test_what_it_installs_trains_and_evaluates_by_its_own_conf(installed: Path) 
     conf.write_text(conf.read_text().replace("\nseed: 0\n", "\nseed: 7\n"))
     home = run(
         installed,
-        ["train", *BUDGET, "hydra.run.dir=trained"],
+        ["train", *TINY, ONCE, "hydra.run.dir=trained"],
         ["evaluate", "run=trained", "plant=emulated", "episodes=1", "hydra.run.dir=evaluated"],
     )
     assert json.loads((home / "evaluated/metrics.json").read_text())["plant"] == "emulated"

@@ -6,24 +6,12 @@ import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
-from command_line import in_process
+from command_line import ONCE, TINY, in_process
 
 ROOT = Path(__file__).parents[2]
 README = ROOT / "README.md"
 PAGES = sorted([*ROOT.glob("docs/**/*.md"), ROOT / "runs/README.md", ROOT / "CONTRIBUTING.md"])
-BUDGET = [  # of a training
-    "compile=false",
-    "learning.transitions=1024",
-    "learning.carts=16",
-    "learning.chunk=8",
-    "learning.updates=1",
-    "learning.batch_size=16",
-    "learning.warmup_transitions=64",
-    "learning.evaluations=1",
-    "learning.evaluation_episodes=2",
-    "buffer.size=2000",
-    "task.time_limit=100",
-]
+BUDGET = [*TINY, ONCE]  # of a training
 TUNING = ["compile=false", "finetuning.iterations=1", "episodes=1", "evaluation_episodes=1"]
 IDENTIFYING = ["windows=20", "substeps=1", "carts=100"]
 NEED_EXTRAS = ("sweep=optuna", "learner=ray")  # which scripts/sweeps and scripts/bench/two_machines.py run
