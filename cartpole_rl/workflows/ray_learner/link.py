@@ -98,7 +98,7 @@ class LearnerLink:
             while self._pipe.poll():
                 self._take(self._pipe.recv())
         except (EOFError, ConnectionError):
-            self._lose("its process on this machine ended")
+            self._lose(self._reason or "its process on this machine ended")
             if time.monotonic() - self._started > PAUSE:
                 self._end()
                 self._start()
