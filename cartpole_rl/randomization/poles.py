@@ -64,6 +64,16 @@ class PoleSettings(Settings):
         """True if every cart carries the same pole."""
         return self.choices is not None and len(self.choices) == 1
 
+    def includes(self, pole: Pole) -> bool:
+        """Return True if `pole` is about one of these."""
+        if self.choices is not None:
+            return any(each.is_about(pole.length) for each in self.choices.values())
+        assert self.lengths is not None
+        low, high = map(Pole.rod, self.lengths)
+        return (
+            low.length < pole.length < high.length or low.is_about(pole.length) or high.is_about(pole.length)
+        )
+
     @property
     def each(self) -> "PoleSettings":
         """The poles that represent the choice: every choice, or rods from the shortest to the longest."""

@@ -13,15 +13,18 @@ from cartpole_rl.evaluation.onboard import run_onboard_episodes
 from cartpole_rl.evaluation.publishing import followed
 from cartpole_rl.learning.randomness import seed_everything
 from cartpole_rl.plants.serial.plant import SerialPlant
+from cartpole_rl.plants.settings import EmulatedSettings
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.reporting.words import guard_text
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.agents import evaluated_agent
 from cartpole_rl.workflows.build import evaluated_env, evaluated_settings, precedence, use_threads
+from cartpole_rl.workflows.checks import BASELINE
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
 from cartpole_rl.workflows.export import on_the_board
 from cartpole_rl.workflows.live import LiveView, view_title
-from cartpole_rl.workflows.person import confirm
+from cartpole_rl.workflows.person import confirm, print_message
+from cartpole_rl.workflows.poles import other_pole
 from cartpole_rl.workflows.progress import progress_bar
 from cartpole_rl.workflows.repeating import Repetition, repetition
 
@@ -44,6 +47,13 @@ class Evaluation:
             return
         count = self.config.episodes
         yield from self._shown(run_episodes(self.env, self.policy, count, self.knocks), "episodes")
+
+    def note_other_pole(self, command: str) -> None:
+        """Print a warning if the agent was trained with other poles; the baseline was not trained."""
+        emulated = isinstance(self.config.plant, EmulatedSettings)
+        line = other_pole(self.training.pole, self.settings.pole, emulated)
+        if line and self.config.run != BASELINE:
+            print_message(command, line)
 
     def check_board(self) -> None:
         """Raise RefusedError if the cart's board shall drive and has no policy."""

@@ -20,6 +20,7 @@ from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.checks import BASELINE
 from cartpole_rl.workflows.config import EvaluateConfig
 from cartpole_rl.workflows.episodes import Evaluation, prepared
+from cartpole_rl.workflows.poles import emulated_words, other_pole
 from cartpole_rl.workflows.prediction import draw_beside_simulation
 from cartpole_rl.workflows.repeating import Repetition
 from cartpole_rl.workflows.report import report
@@ -35,6 +36,7 @@ def evaluate(config: EvaluateConfig, folder: Path) -> None:
     cart that fails.
     """
     evaluation = prepared(config)
+    evaluation.note_other_pole("evaluate")
     episodes: list[Episode] = []
     onboard: list[Episode] = []
     try:
@@ -78,7 +80,7 @@ def report_evaluation(
     if evaluation.repetition:
         print(compared(evaluation.repetition, episodes[0]))
     print_loop_time(link.get("latency_override"))
-    print_results(folder, f"{METRICS} and {FIGURES}/", next_command(evaluation.config))
+    print_results(folder, f"{METRICS} and {FIGURES}/", next_command(evaluation))
 
 
 def same_motors(onboard: Sequence[Episode]) -> str:
@@ -99,13 +101,15 @@ def check_agent_on_board(run: Path, episode: Episode) -> None:
         )
 
 
-def next_command(config: EvaluateConfig) -> str:
+def next_command(evaluation: Evaluation) -> str:
     """Return the command that brings the agent nearer to a real cart; the baseline leads to an agent."""
+    config, trained, driven = evaluation.config, evaluation.training.pole, evaluation.settings.pole
     if config.run == BASELINE:
         return "cartpole-train experiment=medium"
     if isinstance(config.plant, SerialSettings | EmulatedSettings):
-        return f"cartpole-finetune run={shown(config.run)} {plant_words(config.plant)}"
-    return f"cartpole-evaluate run={shown(config.run)} plant=emulated"
+        poles = trained if other_pole(trained, driven, emulated=True) else driven
+        return f"cartpole-finetune run={shown(config.run)} {plant_words(config.plant, poles)}"
+    return f"cartpole-evaluate run={shown(config.run)} {emulated_words(trained)}"
 
 
 def cut_off(episodes: Sequence[Episode]) -> Iterator[str]:

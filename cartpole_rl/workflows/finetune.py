@@ -20,6 +20,7 @@ from cartpole_rl.evaluation.snapshots import Memory
 from cartpole_rl.learning.checkpoints import load_agent
 from cartpole_rl.learning.randomness import seed_everything
 from cartpole_rl.plants.serial.faults import Confirm
+from cartpole_rl.plants.settings import EmulatedSettings
 from cartpole_rl.reporting.tensorboard import TensorBoardLog
 from cartpole_rl.workflows.agents import new_agent, trained_agent
 from cartpole_rl.workflows.build import evaluated_env, evaluated_settings, is_real_time, use_threads
@@ -30,7 +31,8 @@ from cartpole_rl.workflows.finetuning_files import FinetuningFiles
 from cartpole_rl.workflows.finetuning_session import LocalSession, TunedAgent
 from cartpole_rl.workflows.live import LiveView, view_title
 from cartpole_rl.workflows.loading import recorded_settings
-from cartpole_rl.workflows.person import confirm
+from cartpole_rl.workflows.person import confirm, print_message
+from cartpole_rl.workflows.poles import other_pole
 from cartpole_rl.workflows.ray_learner.session import RaySession, learner_link
 from cartpole_rl.workflows.resuming import resumed
 from cartpole_rl.workflows.run_folder import write_config
@@ -57,6 +59,8 @@ def finetune(config: FinetuneConfig, folder: Path, new_learner: bool = False) ->
     training = trained_agent(run).training
     evaluation = evaluation_config(config)
     settings = evaluated_settings(training, evaluation)
+    if line := other_pole(training.pole, settings.pole, isinstance(config.plant, EmulatedSettings)):
+        print_message("finetune", line)
     files = FinetuningFiles(folder, config)
     write_config(folder, "finetune", config.model_dump(mode="json"), resumed=checkpoint is not None)
     if not checkpoint:

@@ -88,9 +88,8 @@ class Session:
         print_loop_time(link.get("latency_override"))
         print(f"kept: the policy {kept} fine-tuning")
         files = f"{METRICS}, {COMPARISON}, {CHECKPOINTS}/{LAST} and {RECORDINGS}/"
-        print_results(
-            folder, files, f"cartpole-evaluate run={shown(folder)} {plant_words(self.config.plant)}"
-        )
+        cart = plant_words(self.config.plant, self.settings.pole)
+        print_results(folder, files, f"cartpole-evaluate run={shown(folder)} {cart}")
 
     def summarize(self, episodes: list[Episode]) -> dict[str, Any]:
         """Return the metrics of `episodes` and their summary."""

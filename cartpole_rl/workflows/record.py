@@ -28,6 +28,7 @@ def record(config: RecordConfig, folder: Path) -> None:
     and CheckpointError for settings, PlantError and LinkError for a cart that fails.
     """
     evaluation = prepared(config)
+    evaluation.note_other_pole("record")
     episodes: list[Episode] = []
     try:
         with closing(evaluation.env):

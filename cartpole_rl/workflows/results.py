@@ -5,6 +5,8 @@ from pathlib import Path
 
 from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.plants.settings import EmulatedSettings
+from cartpole_rl.randomization.poles import PoleSettings
+from cartpole_rl.workflows.poles import emulated_words
 
 
 def print_results(folder: Path, files: str, following: str) -> None:
@@ -29,6 +31,8 @@ def shown(path: Path) -> Path:
     return path
 
 
-def plant_words(plant: EmulatedSettings | SerialSettings) -> str:
-    """Return the words that choose a cart on the command line."""
-    return f"plant=serial plant.port={plant.port}" if isinstance(plant, SerialSettings) else "plant=emulated"
+def plant_words(plant: EmulatedSettings | SerialSettings, poles: PoleSettings | None = None) -> str:
+    """Return the words that choose a cart on the command line, an emulated one with one of `poles`."""
+    if isinstance(plant, SerialSettings):
+        return f"plant=serial plant.port={plant.port}"
+    return emulated_words(poles) if poles else "plant=emulated"

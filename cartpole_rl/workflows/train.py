@@ -26,6 +26,7 @@ from cartpole_rl.workflows.config import TrainConfig
 from cartpole_rl.workflows.loading import recorded_settings
 from cartpole_rl.workflows.monitor import TrainingMonitor
 from cartpole_rl.workflows.person import print_message
+from cartpole_rl.workflows.poles import emulated_words
 from cartpole_rl.workflows.report import report
 from cartpole_rl.workflows.results import print_results, shown
 from cartpole_rl.workflows.resuming import resumed
@@ -83,7 +84,7 @@ def train(config: TrainConfig, folder: Path) -> float:
     forget_training(folder)
     print(f"trained for {training.seconds:.0f} s")
     files = f"{METRICS}, {FIGURES}/ and {CHECKPOINTS}/"
-    print_results(folder, files, f"cartpole-evaluate run={shown(folder)} plant=emulated")
+    print_results(folder, files, f"cartpole-evaluate run={shown(folder)} {emulated_words(config.pole)}")
     score: float = metrics["score"]["mean"]
     return score
 

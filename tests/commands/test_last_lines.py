@@ -41,6 +41,18 @@ def test_an_evaluation_leads_to_the_cart(words: tuple[str, ...], following: str,
     compose(last)
 
 
+def test_an_agent_on_another_pole_is_told_which_cart_has_its_own(tmp_path: Path) -> None:
+    words = ("plant=emulated", COARSE, "task=swingup", "task.time_limit=5", "episodes=1")
+    done = in_process("evaluate", "run=pretrained/large", *words, folder=tmp_path)
+    assert "trained with a pole of 0.66 m, the cart has one of 0.35 m; give emulator=large" in done.err
+    last = done.out.splitlines()[-1]
+    assert last == "cartpole-finetune run=pretrained/large plant=emulated emulator=large"
+    compose(last)
+    known = in_process("evaluate", "run=pretrained/large", "emulator=large", *words, folder=tmp_path)
+    assert "trained with" not in known.err
+    assert known.out.splitlines()[-1] == last
+
+
 def test_recordings_lead_to_a_replay_and_to_a_model(trained: Path) -> None:
     words = ("run=run", "episodes=2", "hydra.run.dir=last_record")
     *_, last = in_process("record", *words, folder=trained.parent).out.splitlines()

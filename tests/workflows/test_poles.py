@@ -1,0 +1,47 @@
+"""Which poles an agent knows, and which emulated cart has one of them."""
+
+import pytest
+
+from cartpole_rl.choices import group_choices
+from cartpole_rl.randomization.poles import Pole, PoleSettings
+from cartpole_rl.workflows.poles import emulated_words, other_pole
+
+POLES = group_choices("pole")
+MEDIUM, LARGE, BOTH = (PoleSettings(**POLES[name]) for name in ("medium", "large", "both"))
+RODS = PoleSettings(lengths=(0.2, 1.0))
+EMULATED = PoleSettings(choices={"0.35 m": Pole(pole_mass=0.13, pole_com=0.177, pole_inertia=1.2e-3)})
+
+
+@pytest.mark.parametrize(
+    ("trained", "words"),
+    [
+        (MEDIUM, "plant=emulated"),
+        (LARGE, "plant=emulated emulator=large"),
+        (BOTH, "plant=emulated"),
+        (RODS, "plant=emulated"),
+        (PoleSettings(lengths=(0.8, 1.0)), "plant=emulated"),
+    ],
+)
+def test_the_emulated_cart_has_a_pole_that_the_agent_knows(trained: PoleSettings, words: str) -> None:
+    assert emulated_words(trained) == words
+
+
+@pytest.mark.parametrize("trained", [MEDIUM, BOTH, RODS, PoleSettings(lengths=(0.2, 0.35))])
+def test_a_known_pole_gets_no_warning(trained: PoleSettings) -> None:
+    assert other_pole(trained, EMULATED, emulated=True) is None
+
+
+def test_another_pole_gets_a_warning_with_the_emulated_cart_to_choose() -> None:
+    line = "warning: the agent was trained with a pole of 0.66 m, the cart has one of 0.35 m"
+    assert other_pole(LARGE, EMULATED, emulated=True) == f"{line}; give emulator=large"
+    assert other_pole(LARGE, EMULATED, emulated=False) == line
+
+
+def test_each_pole_of_several_is_looked_at() -> None:
+    line = "warning: the agent was trained with a pole of 0.36 m, the cart has one of 0.36 m or 0.66 m"
+    assert other_pole(MEDIUM, BOTH, emulated=False) == line
+
+
+def test_rods_outside_the_trained_lengths_are_others() -> None:
+    line = "warning: the agent was trained with a pole of 0.2 to 0.3 m, the cart has one of 0.35 m"
+    assert other_pole(PoleSettings(lengths=(0.2, 0.3)), EMULATED, emulated=False) == line
