@@ -36,9 +36,9 @@ def group_choices(group: str) -> dict[str, dict[str, Any]]:
     return {file.stem: _load(group, file.stem) for file in sorted((conf_folder() / group).glob("*.yaml"))}
 
 
-def default_choices(command: str) -> dict[str, str]:
-    """Return the default choice of each group that a command reads: {"cart": "ip02", ...}."""
-    chosen: dict[str, str] = {}
+def default_choices(command: str) -> dict[str, str | None]:
+    """Return the default choice of each group that a command reads: {"cart": "ip02", "task": None, ...}."""
+    chosen: dict[str, str | None] = {}
     for line in choice(command)["defaults"]:
         if isinstance(line, dict):
             chosen |= line

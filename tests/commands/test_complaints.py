@@ -37,6 +37,14 @@ def test_a_missing_choice_is_named_with_the_nearest_one() -> None:
     )
 
 
+def test_a_setting_of_a_group_that_is_not_chosen_names_its_choices() -> None:
+    text = "Could not override 'task.time_limit'."
+    assert hydra_complaint(text, "evaluate") == (
+        "task.time_limit: task is not chosen, so it has no settings; give task= too: balance, swingup"
+    )
+    assert "no such setting" in hydra_complaint("Could not override 'task.time_limt'.", "train")
+
+
 def test_several_values_without_a_multirun_are_explained() -> None:
     assert hydra_complaint("Ambiguous value for argument 'seed=0,1': ...", "train").startswith("seed=0,1: -m")
 

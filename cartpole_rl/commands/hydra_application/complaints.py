@@ -10,7 +10,7 @@ from hydra.errors import HydraException, OverrideParseException
 from omegaconf import OmegaConf
 
 from cartpole_rl.checking import NEAR_VALUE, most_similar, no_such_setting, setting_names, similarity
-from cartpole_rl.choices import conf_folder, default_choices
+from cartpole_rl.choices import conf_folder, default_choices, group_choices
 
 # Hydra's, each up to its first hyphen; without --run, which has no effect: a user means run=
 HYDRA_OPTIONS = (
@@ -51,9 +51,12 @@ def in_one_line(error: Exception, command: str) -> str:
 def hydra_complaint(text: str, command: str) -> str:
     """Return Hydra's message, shorter where it is a frequent one."""
     if unknown := re.match(r"Could not override '([^']+)'", text):
-        group = unknown[1].partition(".")[0]
-        if group not in default_choices(command) and (conf_folder() / group).is_dir():
+        group, groups = unknown[1].partition(".")[0], default_choices(command)
+        if group not in groups and (conf_folder() / group).is_dir():
             return f"{unknown[1]}: cartpole-{command.replace('_', '-')} does not read this group"
+        if group in groups and groups[group] is None and not any(w.startswith(f"{group}=") for w in sys.argv):
+            known = ", ".join(group_choices(group))
+            return f"{unknown[1]}: {group} is not chosen, so it has no settings; give {group}= too: {known}"
         return no_such_setting(unknown[1], known_settings(command))
     if choice := re.search(r"Could not find '([^']+)' Available options in '([^']+)': (.*)", text):
         wrong = choice[1].removeprefix(f"{choice[2]}/")
