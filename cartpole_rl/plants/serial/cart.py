@@ -260,7 +260,7 @@ class SerialCart:
         Raises LinkError, before it sends anything, if a newer state waits and the last one is older than
         `longest_suspension`.
         """
-        self._is_late()
+        self.check_suspension(self._unanswered_for())
         return self.poll_state()
 
     @property
@@ -291,17 +291,20 @@ class SerialCart:
     def _is_late(self) -> bool:
         """Return True if the cart's watchdog has stopped the motor since the newest state.
 
-        If no newer state waits, no time has passed for the cart, as on a lockstep emulator. Raises LinkError
-        if the state is older than `longest_suspension`.
+        Raises LinkError if the state is older than `longest_suspension`.
         """
-        if not self._tracker.awaits_command:
-            return False
-        late = time.perf_counter() - self._tracker.newest_at
-        stopped_after = WATCHDOG_PERIODS * self.information.period_us * 1e-6
-        if late <= min(stopped_after, self.longest_suspension) or not self._connection.link.waiting():
-            return False
-        self.check_suspension(late)
-        return True
+        waited = self._unanswered_for()
+        self.check_suspension(waited)
+        return waited > WATCHDOG_PERIODS * self.information.period_us * 1e-6
+
+    def _unanswered_for(self) -> float:
+        """Return for how many seconds the newest state has waited for a motor value.
+
+        It is 0 if no newer state waits: no time has passed for the cart, as on a lockstep emulator.
+        """
+        if not self._tracker.awaits_command or not self._connection.link.waiting():
+            return 0.0
+        return time.perf_counter() - self._tracker.newest_at
 
     def check_suspension(self, seconds: float) -> None:
         """Raise LinkError if this computer did not answer the cart for too long."""
