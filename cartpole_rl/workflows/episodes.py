@@ -24,9 +24,9 @@ from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
 from cartpole_rl.workflows.export import on_the_board
 from cartpole_rl.workflows.live import LiveView, view_title
 from cartpole_rl.workflows.person import confirm, print_message
-from cartpole_rl.workflows.poles import other_pole
 from cartpole_rl.workflows.progress import progress_bar
 from cartpole_rl.workflows.repeating import Repetition, repetition
+from cartpole_rl.workflows.trained_poles import other_pole
 
 
 @dataclass(frozen=True)

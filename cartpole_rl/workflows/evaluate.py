@@ -20,12 +20,12 @@ from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.checks import BASELINE
 from cartpole_rl.workflows.config import EvaluateConfig
 from cartpole_rl.workflows.episodes import Evaluation, prepared
-from cartpole_rl.workflows.poles import emulated_words, other_pole
 from cartpole_rl.workflows.prediction import draw_beside_simulation
 from cartpole_rl.workflows.repeating import Repetition
 from cartpole_rl.workflows.report import report
 from cartpole_rl.workflows.results import plant_words, print_loop_time, print_results, shown
 from cartpole_rl.workflows.run_folder import write_config
+from cartpole_rl.workflows.trained_poles import emulated_words, other_pole
 
 
 def evaluate(config: EvaluateConfig, folder: Path) -> None:

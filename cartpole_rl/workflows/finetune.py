@@ -32,10 +32,10 @@ from cartpole_rl.workflows.finetuning_session import LocalSession, TunedAgent
 from cartpole_rl.workflows.live import LiveView, view_title
 from cartpole_rl.workflows.loading import recorded_settings
 from cartpole_rl.workflows.person import confirm, print_message
-from cartpole_rl.workflows.poles import other_pole
 from cartpole_rl.workflows.ray_learner.session import RaySession, learner_link
 from cartpole_rl.workflows.resuming import resumed
 from cartpole_rl.workflows.run_folder import write_config
+from cartpole_rl.workflows.trained_poles import other_pole
 
 
 def finetune(config: FinetuneConfig, folder: Path, new_learner: bool = False) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.plants.settings import EmulatedSettings
 from cartpole_rl.randomization.poles import PoleSettings
-from cartpole_rl.workflows.poles import emulated_words
+from cartpole_rl.workflows.trained_poles import emulated_words
 
 
 def print_results(folder: Path, files: str, following: str) -> None:

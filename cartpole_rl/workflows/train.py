@@ -26,11 +26,11 @@ from cartpole_rl.workflows.config import TrainConfig
 from cartpole_rl.workflows.loading import recorded_settings
 from cartpole_rl.workflows.monitor import TrainingMonitor
 from cartpole_rl.workflows.person import print_message
-from cartpole_rl.workflows.poles import emulated_words
 from cartpole_rl.workflows.report import report
 from cartpole_rl.workflows.results import print_results, shown
 from cartpole_rl.workflows.resuming import resumed
 from cartpole_rl.workflows.run_folder import write_config
+from cartpole_rl.workflows.trained_poles import emulated_words
 
 
 def train(config: TrainConfig, folder: Path) -> float:
