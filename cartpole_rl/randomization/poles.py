@@ -69,10 +69,8 @@ class PoleSettings(Settings):
         if self.choices is not None:
             return any(each.is_about(pole.length) for each in self.choices.values())
         assert self.lengths is not None
-        low, high = map(Pole.rod, self.lengths)
-        return (
-            low.length < pole.length < high.length or low.is_about(pole.length) or high.is_about(pole.length)
-        )
+        low, high = self.lengths
+        return low * (1 - SIMILAR) < pole.length < high * (1 + SIMILAR)
 
     @property
     def each(self) -> "PoleSettings":

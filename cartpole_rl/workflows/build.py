@@ -24,6 +24,7 @@ from cartpole_rl.settings import Settings, evaluation_seed
 from cartpole_rl.tasks.settings import ActionSettings, Start
 from cartpole_rl.workflows.checks import simulated_carts
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
+from cartpole_rl.workflows.trained_poles import emulated_pole
 
 REPLACEABLE = (
     "cart",
@@ -55,7 +56,7 @@ def replaced_settings(training: TrainConfig, config: EvaluateConfig) -> CartPole
     if config.task is not None:
         given["task"] = {**config.task, "x_max": config.task.get("x_max") or training.task.x_max}
     if isinstance(config.plant, EmulatedSettings):
-        given["pole"] = emulated_pole(config.emulator)
+        given["pole"] = one_pole(emulated_pole(config.emulator))
     if isinstance(config.plant, LearnedSettings):
         found = load_model(config.plant.model).parameters
         given["pole"] = one_pole(Pole(**{name: found[name] for name in Pole.model_fields}))
@@ -70,11 +71,6 @@ def check_as_many(actions: ActionSettings, trained: ActionSettings) -> None:
     given, known = len(actions.motors), len(trained.motors)
     if given != known:
         raise ConfigError(f"actions: {given} motor values, but the agent chooses from {known}; give {known}")
-
-
-def emulated_pole(truth: EmulatorSettings) -> PoleSettings:
-    """Return the pole of the emulated cart, named by its length."""
-    return one_pole(Pole(**truth.model_dump(include=set(Pole.model_fields))))
 
 
 def one_pole(pole: Pole) -> PoleSettings:

@@ -25,7 +25,7 @@ from cartpole_rl.workflows.repeating import Repetition
 from cartpole_rl.workflows.report import report
 from cartpole_rl.workflows.results import plant_words, print_loop_time, print_results, shown
 from cartpole_rl.workflows.run_folder import write_config
-from cartpole_rl.workflows.trained_poles import emulated_words, other_pole
+from cartpole_rl.workflows.trained_poles import emulated_words, knows
 
 
 def evaluate(config: EvaluateConfig, folder: Path) -> None:
@@ -107,7 +107,7 @@ def next_command(evaluation: Evaluation) -> str:
     if config.run == BASELINE:
         return "cartpole-train experiment=medium"
     if isinstance(config.plant, SerialSettings | EmulatedSettings):
-        poles = trained if other_pole(trained, driven, emulated=True) else driven
+        poles = driven if knows(trained, driven) else trained
         return f"cartpole-finetune run={shown(config.run)} {plant_words(config.plant, poles)}"
     return f"cartpole-evaluate run={shown(config.run)} {emulated_words(trained)}"
 

@@ -1,6 +1,6 @@
 """The poles that an agent was trained with, beside the one that it drives; needs no slow imports."""
 
-from cartpole_rl.choices import choice
+from cartpole_rl.choices import group_choices
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.randomization.poles import Pole, PoleSettings
 
@@ -9,12 +9,17 @@ POLES = ("medium", "large")  # in conf/pole/ and conf/emulator/; the first is th
 
 def other_pole(trained: PoleSettings, driven: PoleSettings, emulated: bool) -> str | None:
     """Return a warning if the agent was trained with other poles than those `driven`, None if not."""
-    if all(trained.includes(pole) for pole in (driven.each.choices or {}).values()):
+    if knows(trained, driven):
         return None
     known = emulator_for(trained) if emulated else None
     advice = f"; give emulator={known}" if known else ""
     length = f"a pole of {lengths(trained)}, the cart has one of {lengths(driven)}"
     return f"warning: the agent was trained with {length}{advice}"
+
+
+def knows(trained: PoleSettings, driven: PoleSettings) -> bool:
+    """Return True if each pole that represents `driven` is about one of `trained`."""
+    return all(trained.includes(pole) for pole in (driven.each.choices or {}).values())
 
 
 def lengths(poles: PoleSettings) -> str:
@@ -32,9 +37,13 @@ def emulated_words(poles: PoleSettings) -> str:
 
 def emulator_for(poles: PoleSettings) -> str | None:
     """Return the first of POLES whose emulated cart has one of `poles`."""
+    files = group_choices("emulator")  # without the first, which is in code
     for name in POLES:
-        values = {} if name == POLES[0] else choice(f"emulator/{name}")
-        truth = EmulatorSettings(**{field: values[field] for field in Pole.model_fields if field in values})
-        if poles.includes(Pole(**truth.model_dump(include=set(Pole.model_fields)))):
+        if poles.includes(emulated_pole(EmulatorSettings(**files.get(name, {})))):
             return name
     return None
+
+
+def emulated_pole(truth: EmulatorSettings) -> Pole:
+    """Return the pole of an emulated cart."""
+    return Pole(**truth.model_dump(include=set(Pole.model_fields)))
