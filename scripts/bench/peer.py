@@ -21,7 +21,15 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from common import option_parser, print_table, reference_scores, run_once, write_json
+from common import (
+    add_seed_options,
+    chosen_seeds,
+    option_parser,
+    print_table,
+    reference_scores,
+    run_once,
+    write_json,
+)
 from tensordict import TensorDict
 
 from cartpole_rl.envs.gymnasium import simulated_environment
@@ -187,7 +195,7 @@ def row(seed: int, own: float, peers: list[dict[str, float]], times: float, limi
 def main() -> None:
     """Train both, seed by seed, print a table and write the figures."""
     parser = option_parser(__doc__)
-    parser.add_argument("--seeds", type=int, default=3, help="trainings of each (3)")
+    add_seed_options(parser, seeds=3)
     parser.add_argument(
         "--times", type=float, default=10, help="stop the peer after this many times our seconds (10)"
     )
@@ -195,7 +203,7 @@ def main() -> None:
     options = parser.parse_args()
     use_threads(options.threads)
     everything, rows = {}, []
-    for seed in range(options.seeds):
+    for seed in chosen_seeds(options):
         history = ours(seed, options.threads)
         own = seconds_to_reached(history)
         limit = options.times * min(own, history[-1]["seconds"])  # our whole training if it never got there
