@@ -1,8 +1,9 @@
 """Settings of learning."""
 
+import re
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from cartpole_rl.settings import Count, Fraction, NonNegative, Positive, Settings
 
@@ -80,6 +81,18 @@ class DistillationSettings(Settings):
     value_weight: NonNegative  # of the error of the mean action value, beside that of the advantages
 
 
+def host_and_port(text: str) -> str:
+    """Return `text` if it is host:port. Raises ValueError."""
+    host, _, port = text.rpartition(":")
+    if (
+        not re.fullmatch(r"[^/\s:]+", host)
+        or not re.fullmatch("[0-9]{1,5}", port)
+        or not 0 < int(port) < 65536
+    ):
+        raise ValueError("give host:port, with a port from 1 to 65535")
+    return text
+
+
 class LocalLearnerSettings(Settings):
     """learner=local: the learner of a fine-tuning is a process on the computer of the cart."""
 
@@ -90,7 +103,7 @@ class RayLearnerSettings(Settings):
     """learner=ray: the learner of a fine-tuning is on another machine, in a Ray cluster."""
 
     kind: Literal["ray"]
-    address: Annotated[str, Field(pattern=r"^[^/\s:]+:\d{1,5}$")]  # of the Ray head, as host:port
+    address: Annotated[str, AfterValidator(host_and_port)]  # of the Ray head
     episodes_ahead: Annotated[int, Field(ge=0)]  # driven with earlier weights while the learner is lost
     timeout: Annotated[float, Field(gt=0, le=600)]  # s without an answer: the learner counts as lost
 

@@ -24,7 +24,7 @@ from cartpole_rl.settings import Settings, evaluation_seed
 from cartpole_rl.tasks.settings import ActionSettings, Start
 from cartpole_rl.workflows.checks import simulated_carts
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
-from cartpole_rl.workflows.trained_poles import emulated_pole
+from cartpole_rl.workflows.trained_poles import emulated_pole, one_pole, pole_of_length
 
 REPLACEABLE = (
     "cart",
@@ -57,6 +57,8 @@ def replaced_settings(training: TrainConfig, config: EvaluateConfig) -> CartPole
         given["task"] = {**config.task, "x_max": config.task.get("x_max") or training.task.x_max}
     if isinstance(config.plant, EmulatedSettings):
         given["pole"] = one_pole(emulated_pole(config.emulator))
+    if isinstance(config.plant, SerialSettings) and config.pole is None and config.plant.pole_length:
+        given["pole"] = pole_of_length(config.plant.pole_length, training.pole)
     if isinstance(config.plant, LearnedSettings):
         found = load_model(config.plant.model).parameters
         given["pole"] = one_pole(Pole(**{name: found[name] for name in Pole.model_fields}))
@@ -71,11 +73,6 @@ def check_as_many(actions: ActionSettings, trained: ActionSettings) -> None:
     given, known = len(actions.motors), len(trained.motors)
     if given != known:
         raise ConfigError(f"actions: {given} motor values, but the agent chooses from {known}; give {known}")
-
-
-def one_pole(pole: Pole) -> PoleSettings:
-    """Return the choice of this pole alone, named by its length."""
-    return PoleSettings(choices={f"{pole.length:.2f} m": pole})
 
 
 def with_parameters(settings: CartPoleSettings, parameters: Mapping[str, float]) -> CartPoleSettings:

@@ -15,6 +15,7 @@ from cartpole_rl.learning.randomness import seed_everything
 from cartpole_rl.plants.serial.plant import SerialPlant
 from cartpole_rl.plants.settings import EmulatedSettings
 from cartpole_rl.plants.simulated import SimulatedPlant
+from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.reporting.words import guard_text
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.agents import evaluated_agent
@@ -26,7 +27,7 @@ from cartpole_rl.workflows.live import LiveView, view_title
 from cartpole_rl.workflows.person import confirm, print_message
 from cartpole_rl.workflows.progress import progress_bar
 from cartpole_rl.workflows.repeating import Repetition, repetition
-from cartpole_rl.workflows.trained_poles import other_pole
+from cartpole_rl.workflows.trained_poles import known_poles, other_pole
 
 
 @dataclass(frozen=True)
@@ -48,10 +49,15 @@ class Evaluation:
         count = self.config.episodes
         yield from self._shown(run_episodes(self.env, self.policy, count, self.knocks), "episodes")
 
+    @property
+    def known_poles(self) -> list[PoleSettings]:
+        """The poles that the agent was trained with and fine-tuned on."""
+        return known_poles(self.config.run, self.training.pole)
+
     def note_other_pole(self, command: str) -> None:
         """Print a warning if the agent was trained with other poles; the baseline was not trained."""
         emulated = isinstance(self.config.plant, EmulatedSettings)
-        line = other_pole(self.training.pole, self.settings.pole, emulated)
+        line = other_pole(self.known_poles, self.settings.pole, emulated)
         if line and self.config.run != BASELINE:
             print_message(command, line)
 

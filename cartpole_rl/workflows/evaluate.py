@@ -36,11 +36,11 @@ def evaluate(config: EvaluateConfig, folder: Path) -> None:
     cart that fails.
     """
     evaluation = prepared(config)
-    evaluation.note_other_pole("evaluate")
     episodes: list[Episode] = []
     onboard: list[Episode] = []
     try:
         with closing(evaluation.env):
+            evaluation.note_other_pole("evaluate")
             evaluation.check_board()
             settings = evaluation.settings.model_dump(mode="json")
             write_config(
@@ -103,13 +103,13 @@ def check_agent_on_board(run: Path, episode: Episode) -> None:
 
 def next_command(evaluation: Evaluation) -> str:
     """Return the command that brings the agent nearer to a real cart; the baseline leads to an agent."""
-    config, trained, driven = evaluation.config, evaluation.training.pole, evaluation.settings.pole
+    config, known, driven = evaluation.config, evaluation.known_poles, evaluation.settings.pole
     if config.run == BASELINE:
         return "cartpole-train experiment=medium"
     if isinstance(config.plant, SerialSettings | EmulatedSettings):
-        poles = driven if knows(trained, driven) else trained
+        poles = driven if knows(known, driven) else known[-1]
         return f"cartpole-finetune run={shown(config.run)} {plant_words(config.plant, poles)}"
-    return f"cartpole-evaluate run={shown(config.run)} {emulated_words(trained)}"
+    return f"cartpole-evaluate run={shown(config.run)} {emulated_words(known[-1])}"
 
 
 def cut_off(episodes: Sequence[Episode]) -> Iterator[str]:

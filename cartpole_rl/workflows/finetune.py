@@ -35,7 +35,7 @@ from cartpole_rl.workflows.person import confirm, print_message
 from cartpole_rl.workflows.ray_learner.session import RaySession, learner_link
 from cartpole_rl.workflows.resuming import resumed
 from cartpole_rl.workflows.run_folder import write_config
-from cartpole_rl.workflows.trained_poles import other_pole
+from cartpole_rl.workflows.trained_poles import known_poles, other_pole
 
 
 def finetune(config: FinetuneConfig, folder: Path, new_learner: bool = False) -> None:
@@ -59,7 +59,8 @@ def finetune(config: FinetuneConfig, folder: Path, new_learner: bool = False) ->
     training = trained_agent(run).training
     evaluation = evaluation_config(config)
     settings = evaluated_settings(training, evaluation)
-    if line := other_pole(training.pole, settings.pole, isinstance(config.plant, EmulatedSettings)):
+    known = known_poles(run, training.pole)
+    if line := other_pole(known, settings.pole, isinstance(config.plant, EmulatedSettings)):
         print_message("finetune", line)
     files = FinetuningFiles(folder, config)
     write_config(folder, "finetune", config.model_dump(mode="json"), resumed=checkpoint is not None)

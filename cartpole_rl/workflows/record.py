@@ -28,10 +28,10 @@ def record(config: RecordConfig, folder: Path) -> None:
     and CheckpointError for settings, PlantError and LinkError for a cart that fails.
     """
     evaluation = prepared(config)
-    evaluation.note_other_pole("record")
     episodes: list[Episode] = []
     try:
         with closing(evaluation.env):
+            evaluation.note_other_pole("record")
             settings = evaluation.settings.model_dump(mode="json")
             write_config(
                 folder, "record", {**evaluation.config.model_dump(mode="json"), "recorded": settings}

@@ -34,5 +34,6 @@ def shown(path: Path) -> Path:
 def plant_words(plant: EmulatedSettings | SerialSettings, poles: PoleSettings | None = None) -> str:
     """Return the words that choose a cart on the command line, an emulated one with one of `poles`."""
     if isinstance(plant, SerialSettings):
-        return f"plant=serial plant.port={plant.port}"
+        length = f" plant.pole_length={plant.pole_length:g}" if plant.pole_length else ""
+        return f"plant=serial plant.port={plant.port}{length}"
     return emulated_words(poles) if poles else "plant=emulated"

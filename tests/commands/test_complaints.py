@@ -5,7 +5,9 @@ import errno
 import pytest
 from hydra.errors import HydraException, OverrideParseException
 
+from cartpole_rl.choices import default_choices
 from cartpole_rl.commands.hydra_application.complaints import (
+    WHOLE,
     dashed_setting,
     hydra_complaint,
     in_one_line,
@@ -43,6 +45,16 @@ def test_a_setting_of_a_group_that_is_not_chosen_names_its_choices() -> None:
         "task.time_limit: task is not chosen, so it has no settings; give task= too: balance, swingup"
     )
     assert "no such setting" in hydra_complaint("Could not override 'task.time_limt'.", "train")
+
+
+@pytest.mark.parametrize("command", ["train", "evaluate", "finetune", "identify", "export", "report"])
+def test_a_setting_of_each_group_without_a_choice_gets_one_line(command: str) -> None:
+    groups = [group for group, default in default_choices(command).items() if default is None]
+    for group in groups:
+        complaint = hydra_complaint(f"Could not override '{group}.seed'.", command)
+        expected = "no such setting" if group in WHOLE else "so it has no settings; give"
+        assert expected in complaint
+        assert "\n" not in complaint
 
 
 def test_several_values_without_a_multirun_are_explained() -> None:

@@ -2,7 +2,7 @@
 
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 
 import hydra
@@ -25,6 +25,7 @@ HYDRA_OPTIONS = (
     "config",
     "info",
 )
+WHOLE = ("experiment", "sweep")  # groups without settings of their own: they change those of others
 EXTRAS = {  # of the package, that bring launchers and a sweeper
     "hydra/launcher/joblib": "joblib",
     "hydra/launcher/submitit_local": "submitit",
@@ -54,7 +55,7 @@ def hydra_complaint(text: str, command: str) -> str:
         group, groups = unknown[1].partition(".")[0], default_choices(command)
         if group not in groups and (conf_folder() / group).is_dir():
             return f"{unknown[1]}: cartpole-{command.replace('_', '-')} does not read this group"
-        if group in groups and groups[group] is None and not any(w.startswith(f"{group}=") for w in sys.argv):
+        if group in without_choice(groups):
             known = ", ".join(group_choices(group))
             return f"{unknown[1]}: {group} is not chosen, so it has no settings; give {group}= too: {known}"
         return no_such_setting(unknown[1], known_settings(command))
@@ -67,6 +68,12 @@ def hydra_complaint(text: str, command: str) -> str:
     if several := re.match(r"Ambiguous value for argument '([^']+)'", text):
         return f"{several[1]}: -m runs each of several values; a list is one value if written [a,b]"
     return text
+
+
+def without_choice(groups: Mapping[str, str | None]) -> set[str]:
+    """Return those of `groups` that have settings of their own and are not chosen."""
+    given = {word.partition("=")[0] for word in sys.argv[1:]}
+    return {name for name, default in groups.items() if default is None} - given - {*WHOLE}
 
 
 def nearest_choice(wrong: str, choices: Sequence[str]) -> str:

@@ -44,6 +44,7 @@ class Lost:
     """The learner does not answer."""
 
     reason: str
+    ends_link: bool = False  # the link's process ends now
 
 
 @dataclass(frozen=True)
@@ -69,6 +70,7 @@ class LearnerLink:
         self.make_task, self.show = make_task, show
         self.is_lost = True
         self._reason: str | None = None  # of the loss that was shown last
+        self._ending: str | None = None  # why the link's process ends, from that process
         self._was_connected = False
         self._known_learner, self._known = "", (0, 0)  # numbers of its curves and messages
         self.curves: list[tuple[int, dict[str, float]]] = []  # that `take_curves` has not returned yet
@@ -98,7 +100,7 @@ class LearnerLink:
             while self._pipe.poll():
                 self._take(self._pipe.recv())
         except (EOFError, ConnectionError):
-            self._lose(self._reason or "its process on this machine ended")
+            self._lose(self._ending or "its process on this machine ended")
             if time.monotonic() - self._started > PAUSE:
                 self._end()
                 self._start()
@@ -134,12 +136,13 @@ class LearnerLink:
     def _take(self, event: Any) -> None:
         match event:
             case LearnerError() if self._was_connected:  # another one may take its place
-                self._lose(str(event))
+                self._take(Lost(str(event), ends_link=True))
             case CartPoleError():
                 raise event
             case str():
                 self.show(event)
             case Lost():
+                self._ending = event.reason if event.ends_link else None
                 self._lose(event.reason)
             case Report():
                 if self.is_lost:
@@ -170,7 +173,7 @@ class LearnerLink:
         )
         self._process.start()
         theirs.close()
-        self._started = time.monotonic()
+        self._started, self._ending = time.monotonic(), None
 
     def _end(self) -> None:
         self._pipe.close()  # the process ends when it notices
@@ -196,10 +199,10 @@ def _serve(pipe: Connection, address: str, timeout: float, task: LearnerTask, pa
         except CartPoleError as error:
             pipe.send(error)
         except ConnectionError as error:
-            pipe.send(Lost(str(error)))
+            pipe.send(Lost(str(error), ends_link=True))
         except Exception as error:  # Ray's are of many kinds, and many lines long
             traceback.print_exc()
-            pipe.send(Lost(f"{type(error).__name__}, see {LOG}"))
+            pipe.send(Lost(f"{type(error).__name__}, see {LOG}", ends_link=True))
     os._exit(0)  # Ray's own way out waits for a cluster that may not answer
 
 

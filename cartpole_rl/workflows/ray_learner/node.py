@@ -37,6 +37,8 @@ def check_address(address: str) -> None:
         socket.create_connection((host, int(port)), ANSWER).close()
     except OSError as error:
         raise ConnectionError(error.strerror or str(error)) from error
+    except UnicodeError as error:
+        raise ConnectionError("a host's name has labels of 1 to 63 characters") from error
 
 
 @contextmanager

@@ -28,7 +28,7 @@ class PipedLink(LearnerLink):
     def _start(self) -> None:
         self._pipe, end = Pipe()
         self._process: Any = Ended()
-        self._started = time.monotonic()
+        self._started, self._ending = time.monotonic(), None
         self.ends = [*getattr(self, "ends", []), end]
         if len(self.ends) == 1:
             end.send(Report("first"))
@@ -63,6 +63,26 @@ def test_a_loss_is_shown_once_with_its_reason(link: PipedLink, shown: list[str])
         "the learner is lost: no Ray cluster",
         "connected to the learner",
         "the learner is lost: no answer",
+    ]
+
+
+@pytest.mark.parametrize("last", [Lost("no Ray cluster", ends_link=True), LearnerError("no Ray cluster")])
+def test_the_reason_of_a_process_that_ends_is_kept(last: object, link: PipedLink, shown: list[str]) -> None:
+    link.ends[0].send(last)
+    link.ends[0].close()
+    for _ in range(3):
+        link.poll()
+    assert shown[2:] == ["the learner is lost: no Ray cluster"]
+
+
+def test_a_process_that_dies_while_the_learner_is_lost_is_shown(link: PipedLink, shown: list[str]) -> None:
+    link.ends[0].send(Lost("no answer"))
+    link.ends[0].close()
+    for _ in range(3):
+        link.poll()
+    assert shown[2:] == [
+        "the learner is lost: no answer",
+        "the learner is lost: its process on this machine ended",
     ]
 
 

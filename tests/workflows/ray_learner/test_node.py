@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from cartpole_rl.errors import LearnerError
-from cartpole_rl.workflows.ray_learner.node import check_learners, fact_finder
+from cartpole_rl.workflows.ray_learner.node import check_address, check_learners, fact_finder
 
 NODES = [
     {"NodeID": "gone", "Alive": False, "Resources": {"learner": 1}, "NodeManagerAddress": "10.0.0.1"},
@@ -67,3 +67,33 @@ def test_a_host_name_that_means_localhost_is_refused(monkeypatch: pytest.MonkeyP
     with pytest.raises(LearnerError, match=r"name of the cart's machine resolves to 127.0.1.1"):
         check_learners(NODES, lambda _: facts(), OWN)
     assert check_learners(NODES, lambda _: facts(resolved="127.0.1.1"), "10.0.0.3") == []  # one machine
+
+
+def test_an_address_where_something_listens_is_accepted() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        check_address(f"127.0.0.1:{server.getsockname()[1]}")
+
+
+@pytest.mark.parametrize(
+    ("error", "reason"),
+    [
+        (ConnectionRefusedError(111, "Connection refused"), "Connection refused"),
+        (socket.gaierror(-2, "Name or service not known"), "Name or service not known"),
+        (TimeoutError("timed out"), "timed out"),
+    ],
+)
+def test_an_address_that_cannot_be_reached_is_refused(
+    error: OSError, reason: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: Any) -> None:
+        raise error
+
+    monkeypatch.setattr(socket, "create_connection", fail)
+    with pytest.raises(ConnectionError, match=reason):
+        check_address("server:6379")
+
+
+@pytest.mark.parametrize("host", ["a..b", "a" * 64])
+def test_a_name_that_no_host_can_have_is_refused(host: str) -> None:
+    with pytest.raises(ConnectionError, match="labels of 1 to 63 characters"):
+        check_address(f"{host}:6379")

@@ -1,4 +1,4 @@
-"""An evaluation can give an agent other motor values, as many as it chooses from."""
+"""An evaluation can replace settings of the training: motor values, and the pole by its length."""
 
 import pytest
 
@@ -18,6 +18,28 @@ def test_another_number_of_them_is_refused() -> None:
     config = load_settings(EvaluateConfig, {"run": "somewhere", "actions": "three"})
     with pytest.raises(ConfigError, match=r"^actions: 3 motor values, but the agent chooses from 9; give 9$"):
         replaced_settings(load_settings(TrainConfig), config)
+
+
+@pytest.mark.parametrize(
+    ("length", "name"), [(0.36, "medium"), (0.66, "large"), (0.5, "0.50 m"), (None, None)]
+)
+def test_a_serial_cart_has_the_pole_of_the_stated_length(length: float | None, name: str | None) -> None:
+    plant = {"plant": "serial", "plant.port": "port", "plant.pole_length": length}
+    training = load_settings(TrainConfig, {"experiment": "both"})
+    settings = replaced_settings(training, load_settings(EvaluateConfig, {"run": "somewhere", **plant}))
+    assert settings.pole.name == (name or training.pole.name)
+
+
+def test_a_chosen_pole_is_kept() -> None:
+    words = {
+        "run": "somewhere",
+        "plant": "serial",
+        "plant.port": "port",
+        "plant.pole_length": 0.5,
+        "pole": "large",
+    }
+    settings = replaced_settings(load_settings(TrainConfig), load_settings(EvaluateConfig, words))
+    assert settings.pole.name == "large"
 
 
 def test_only_simulated_poles_are_knocked_by_an_evaluation() -> None:
