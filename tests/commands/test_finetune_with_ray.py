@@ -74,7 +74,7 @@ def test_an_address_without_a_cluster_is_refused_before_the_cart_moves(
 ) -> None:
     server = socket.create_server(("127.0.0.1", 0))
     address = f"127.0.0.1:{server.getsockname()[1]}"
-    reason = "no Ray cluster answers" if listens else "Connection refused"
+    reason = "timed out" if listens else "Connection refused"
     if not listens:
         server.close()
     words = (*FINETUNING, "learner=ray", f"learner.address={address}", "hydra.run.dir=run")

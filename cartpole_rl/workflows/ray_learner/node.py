@@ -20,7 +20,9 @@ PACKAGES = ("cartpole_rl", "torch", "torchrl", "tensordict", "ray")
 CLOCKS = 5.0  # s of difference between two clocks, from which it is reported
 STORE = 100_000_000  # bytes of Ray's object store on the cart's machine; an episode takes 50 kB
 STOP = 10.0  # s from SIGTERM to SIGKILL
-ANSWER = 10.0  # s for a connection to the cluster's address
+ANSWER = 10.0  # s for an answer from the cluster's address
+HTTP2_START = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes((0, 0, 0, 4, 0, 0, 0, 0, 0))  # RFC 9113, 3.4
+HTTP2_SETTINGS, HTTP2_HEADER = 4, 9  # the type of a server's first frame, bytes of its header
 SETTINGS = {  # of Ray
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_raylet_start_wait_time_s": "300",  # the default is too little beside other work
@@ -31,14 +33,22 @@ START_RAY = "ray start --head --port={port} --resources='{{\"learner\": 1}}'"
 
 
 def check_address(address: str) -> None:
-    """Raise ConnectionError if nothing listens at `address`; Ray itself takes two minutes to say so."""
+    """Raise ConnectionError if no gRPC server, as Ray's, answers at `address`; Ray itself takes minutes."""
     host, _, port = address.rpartition(":")
     try:
-        socket.create_connection((host, int(port)), ANSWER).close()
+        with (
+            socket.create_connection((host, int(port)), ANSWER) as connection,
+            connection.makefile("rb") as file,
+        ):
+            connection.sendall(HTTP2_START)
+            header = file.read(HTTP2_HEADER)
     except OSError as error:
         raise ConnectionError(error.strerror or str(error)) from error
     except UnicodeError as error:
         raise ConnectionError("a host's name has labels of 1 to 63 characters") from error
+    encrypted = os.environ.get("RAY_USE_TLS") == "1"
+    if not encrypted and (len(header) < HTTP2_HEADER or header[3] != HTTP2_SETTINGS):
+        raise ConnectionError("what listens there is not Ray")
 
 
 @contextmanager

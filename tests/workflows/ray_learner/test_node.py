@@ -2,6 +2,8 @@
 
 import socket
 import time
+from contextlib import nullcontext
+from threading import Thread
 from typing import Any
 
 import pytest
@@ -69,9 +71,32 @@ def test_a_host_name_that_means_localhost_is_refused(monkeypatch: pytest.MonkeyP
     assert check_learners(NODES, lambda _: facts(resolved="127.0.1.1"), "10.0.0.3") == []  # one machine
 
 
-def test_an_address_where_something_listens_is_accepted() -> None:
+@pytest.mark.parametrize(
+    ("answer", "tls", "reason"),
+    [
+        (bytes((0, 0, 0, 4, 0, 0, 0, 0, 0)), "", ""),
+        (b"-ERR unknown command 'PRI'\r\n", "", "what listens there is not Ray"),
+        (b"", "", "what listens there is not Ray"),
+        (b"\x15\x03\x01", "1", ""),
+    ],
+)
+def test_only_a_grpc_server_is_accepted(
+    answer: bytes, tls: str, reason: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """TLS hides what the server is."""
+    monkeypatch.setenv("RAY_USE_TLS", tls)
     with socket.create_server(("127.0.0.1", 0)) as server:
-        check_address(f"127.0.0.1:{server.getsockname()[1]}")
+        Thread(target=answer_once, args=(server, answer), daemon=True).start()
+        expected = pytest.raises(ConnectionError, match=reason) if reason else nullcontext()
+        with expected:
+            check_address(f"127.0.0.1:{server.getsockname()[1]}")
+
+
+def answer_once(server: socket.socket, answer: bytes) -> None:
+    connection, _ = server.accept()
+    with connection:
+        connection.recv(1000)
+        connection.sendall(answer)
 
 
 @pytest.mark.parametrize(
