@@ -283,6 +283,7 @@ class ReportConfig(Settings):
     compare: tuple[str, ...]
     measure: Annotated[str, Field(min_length=1)]
     animations: bool
+    figures: bool
     data: Path | None
     label: str
 

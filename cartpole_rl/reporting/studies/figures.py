@@ -5,6 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from cartpole_rl.reporting.figures import svg
@@ -32,10 +33,17 @@ Groups = Mapping[str, Mapping[str, Array]]
 
 @dataclass(frozen=True)
 class Drawing:
-    """A figure for the page."""
+    """A figure for the page; `alt` describes it for readers who cannot see it."""
 
-    svg: str
+    name: str
+    figure: Figure
+    alt: str
     caption: str
+
+    @property
+    def svg(self) -> str:
+        """The figure as an SVG element."""
+        return svg(self.figure, self.alt)
 
 
 def drawings(results: StudyResults) -> Iterator[Drawing]:
@@ -71,7 +79,7 @@ def _dots(results: StudyResults) -> Drawing:
     guided = good is not None and min(values) < good < max(values)
     figure = dot_rows(groups, label, {f"good: {good:g}": good} if good and guided else None)
     caption = f"Dots: agents. Diamond and line: interquartile mean and its 95 % interval.{note}"
-    return Drawing(svg(figure, described(groups, label)), caption)
+    return Drawing("agents", figure, described(groups, label), caption)
 
 
 def _most(groups: Groups) -> tuple[Groups, str]:
@@ -111,7 +119,7 @@ def _over_axis(results: StudyResults) -> Drawing:
     )
     caption = "Dots: agents. Line and band: interquartile mean and its 95 % interval."
     figure = curves_over_axis(lines, quantity, label)
-    return Drawing(svg(figure, f"{label} over {quantity}. {ends}."), caption)
+    return Drawing("agents", figure, f"{label} over {quantity}. {ends}.", caption)
 
 
 def _lines(results: StudyResults) -> dict[str, list[tuple[float, Array]]]:
@@ -152,7 +160,9 @@ def _ratios(results: StudyResults) -> Iterator[Drawing]:
         )
     figure = dot_rows(shown, label, {"1": 1.0})
     yield Drawing(
-        svg(figure, described(shown, f"Ratio {label}")),
+        "ratios",
+        figure,
+        described(shown, f"Ratio {label}"),
         f"{second.label} divided by {first.label}, per agent.{note}",
     )
 
@@ -171,7 +181,9 @@ def _profiles(results: StudyResults) -> Iterator[Drawing]:
     note = f" The highest {MOST_LINES} of {len(ranked)} are drawn." if len(ranked) > MOST_LINES else ""
     place = "" if last is OWN else f", {last.label}"
     yield Drawing(
-        svg(profiles(chosen, label), f"Performance profiles of {label}{place}. {medians}."),
+        "profiles",
+        profiles(chosen, label),
+        f"Performance profiles of {label}{place}. {medians}.",
         f"Performance profile{place}: the share of agents above each value.{note}",
     )
 
@@ -194,7 +206,9 @@ def _training(results: StudyResults, name: str) -> Iterator[Drawing]:
     left_out = sum(bool(curves) for curves in groups.values()) - len(drawn)
     note = f" {left_out} more groups are not drawn." if left_out else ""
     yield Drawing(
-        svg(figure, f"{CURVES[name]} over the transitions of training. {ends}."),
+        f"training_{name}",
+        figure,
+        f"{CURVES[name]} over the transitions of training. {ends}.",
         f"Training: {CURVES[name]}. Thin lines: agents. Thick line: their median.{note}",
     )
 
@@ -208,7 +222,9 @@ def _agreement(results: StudyResults) -> Iterator[Drawing]:
     label = measure_label(results.study.measure)
     figure = agreement(present, f"{label}, {first.label}", f"{label}, {second.label}")
     yield Drawing(
-        svg(figure, f"{label} of each agent: {second.label} over {first.label}."),
+        "agreement",
+        figure,
+        f"{label} of each agent: {second.label} over {first.label}.",
         f"Each agent on both: a dot on the dashed line has the same {label} on both.",
     )
 
@@ -245,8 +261,8 @@ def rank_agreement(results: Sequence[StudyResults]) -> Drawing | None:
     label = measure_label("score")
     figure = agreement(groups, f"{label}, {labels[0]}", f"{label}, {labels[1]}")
     return Drawing(
-        svg(
-            figure, f"{label} of {len(drawn)} agents of {len(groups)} studies: {labels[1]} over {labels[0]}."
-        ),
+        "rank_agreement",
+        figure,
+        f"{label} of {len(drawn)} agents of {len(groups)} studies: {labels[1]} over {labels[0]}.",
         f"{len(drawn)} agents of {len(groups)} studies. The dashed line: the same {label} on both.",
     )

@@ -3,12 +3,14 @@
 from pathlib import Path
 
 from cartpole_rl.files import write_text
+from cartpole_rl.reporting.figures import save
 from cartpole_rl.reporting.studies.answers import Status, agents_text, status
 from cartpole_rl.reporting.studies.comparison import compare
+from cartpole_rl.reporting.studies.figures import drawings
 from cartpole_rl.reporting.studies.page import runs_page, studies_page
 from cartpole_rl.reporting.studies.results import StudyResults
 from cartpole_rl.reporting.studies.sections import Picture
-from cartpole_rl.run_files import PAGE
+from cartpole_rl.run_files import FIGURES, PAGE
 from cartpole_rl.workflows.config import ReportConfig
 from cartpole_rl.workflows.pages.media import Gallery
 from cartpole_rl.workflows.pages.studies import emulators, read_studies, write_data
@@ -22,8 +24,9 @@ TABLE = "runs.csv"
 def make_report(config: ReportConfig, folder: Path) -> None:
     """Write the page of the studies in `config.studies`, or of the runs in `config.runs`.
 
-    Writes into `folder` config.yaml, provenance.json and page.html, and of a report on runs also runs.csv;
-    into `config.data` a small JSON file for each study. Prints how many runs count, and where the page is.
+    Writes into `folder` config.yaml, provenance.json and page.html, of a report on runs also runs.csv, with
+    `config.figures` also figures/; into `config.data` a small JSON file for each study. Prints how many runs
+    count, and where the page is.
     Raises ConfigError for folders without runs and for damaged studies.
     """
     if config.studies is not None:
@@ -40,6 +43,7 @@ def _report_studies(config: ReportConfig, source: Path, folder: Path) -> None:
         print(f"{config.data}/ holds the numbers of {sum(bool(each.agents) for each in results)} studies")
     pictures = _pictures(config, results)
     write_text(folder / PAGE, studies_page(results, pictures, emulators(results)))
+    _write_figures(config, results, folder)
     for kind in (Status.FAILS, Status.CONTRADICTS, Status.EMPTY, Status.INCOMPLETE):
         if names := [each.name for each in results if status(each) is kind]:
             print(f"{kind}: {', '.join(names)}")
@@ -58,7 +62,18 @@ def _report_runs(config: ReportConfig, folder: Path) -> None:
     title = " and ".join(_title(sweep) for sweep in sweeps)
     write_text(folder / PAGE, runs_page(title, results, _pictures(config, results), comparison))
     print(f"{folder}/{TABLE} holds all runs")
+    _write_figures(config, results, folder)
     _print_end(results, folder)
+
+
+def _write_figures(config: ReportConfig, results: list[StudyResults], folder: Path) -> None:
+    """Write the figures of the page as files, if `config` asks for them."""
+    if not config.figures:
+        return
+    for each in results:
+        for drawing in drawings(each):
+            save(drawing.figure, folder / FIGURES / f"{each.name}_{drawing.name}.svg")
+    print(f"{folder}/{FIGURES}/ holds the figures")
 
 
 def _pictures(config: ReportConfig, results: list[StudyResults]) -> dict[str, list[Picture]]:

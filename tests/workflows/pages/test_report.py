@@ -180,6 +180,14 @@ def test_the_page_says_what_stands_for_the_real_cart(study: Path, edit: Edit) ->
     assert "At most 3 agents per set-up" in page
 
 
+def test_each_figure_of_the_page_is_a_file_on_request(study: Path) -> None:
+    done, page = report("studies=quick", "animations=false", "figures=true")
+    assert "report/figures/ holds the figures" in done.out
+    files = sorted(Path("report/figures").glob("*.svg"))
+    assert len(files) == page.count("<svg") - page.count('id="ranks"')
+    assert all("<svg" in file.read_text(encoding="utf-8") for file in files)
+
+
 def test_a_page_from_the_small_files_alone(study: Path) -> None:
     _, whole = report("studies=quick", "data=data", "animations=false")
     shutil.rmtree("quick")
