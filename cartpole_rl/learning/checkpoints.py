@@ -4,7 +4,7 @@ Files are replaced atomically (`cartpole_rl.files`).
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +35,7 @@ class AgentCheckpoint:
     weights: dict[str, Any]
     transitions: int
     score: float | None  # mean score of the evaluation before the checkpoint
+    tuned_poles: list[dict[str, Any]] = field(default_factory=list)  # PoleSettings of carts it was tuned on
 
 
 @dataclass(frozen=True)

@@ -1,13 +1,16 @@
 """Agents: new ones, those in checkpoints, and the controller of run=lqr."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from cartpole_rl.agents.baseline import EnergyAndRegulator
 from cartpole_rl.agents.dqn import QAgent
+from cartpole_rl.checking import checked
 from cartpole_rl.evaluation.episodes import Policy
-from cartpole_rl.learning.checkpoints import load_agent, restore_weights
+from cartpole_rl.learning.checkpoints import AgentCheckpoint, load_agent, restore_weights
 from cartpole_rl.randomization.checks import check_one_pole
+from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.workflows.build import replaced_settings
 from cartpole_rl.workflows.checks import BASELINE, check_has_agent
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
@@ -24,10 +27,16 @@ def new_agent(config: TrainConfig, device: str = "cpu") -> QAgent:
 
 @dataclass(frozen=True)
 class TrainedAgent:
-    """A policy, and the settings that it was trained with."""
+    """A policy, the settings that it was trained with, and the poles of carts that it was fine-tuned on."""
 
     training: TrainConfig
     policy: Policy
+    tuned_poles: Sequence[PoleSettings] = ()
+
+    @property
+    def known_poles(self) -> list[PoleSettings]:
+        """The poles that the agent was trained with and fine-tuned on, the newest last."""
+        return [self.training.pole, *self.tuned_poles]
 
 
 def trained_agent(run: Path) -> TrainedAgent:
@@ -37,7 +46,12 @@ def trained_agent(run: Path) -> TrainedAgent:
     training = recorded_settings(TrainConfig, checkpoint.config, f"run={run}")
     agent = new_agent(training)
     restore_weights(agent, checkpoint.weights, f"run={run}")
-    return TrainedAgent(training, agent.greedy_policy())
+    return TrainedAgent(training, agent.greedy_policy(), tuned_poles(checkpoint))
+
+
+def tuned_poles(checkpoint: AgentCheckpoint) -> list[PoleSettings]:
+    """Return the poles of the carts that an agent was fine-tuned on. Raises ConfigError."""
+    return [checked(PoleSettings, poles) for poles in checkpoint.tuned_poles]
 
 
 def evaluated_agent(config: EvaluateConfig) -> TrainedAgent:

@@ -75,6 +75,14 @@ def check_as_many(actions: ActionSettings, trained: ActionSettings) -> None:
         raise ConfigError(f"actions: {given} motor values, but the agent chooses from {known}; give {known}")
 
 
+def predicting_env(
+    settings: CartPoleSettings, plant: SimulatedSettings | LearnedSettings, seed: int
+) -> CartPoleEnv:
+    """Return a simulated cart that predicts an episode on a real one. Raises ConfigError."""
+    nominal = settings.model_copy(update={"randomization": {}})
+    return simulated_env(nominal, plant, 1, settings.task.evaluation_start, evaluation_seed(seed))
+
+
 def with_parameters(settings: CartPoleSettings, parameters: Mapping[str, float]) -> CartPoleSettings:
     """Return `settings` with `parameters` of the cart and the pole replaced. Raises ConfigError."""
     check_names(parameters, "parameters")

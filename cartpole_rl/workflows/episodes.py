@@ -1,6 +1,6 @@
 """Whole episodes of an agent on any cart, as evaluations and recordings drive them."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from tqdm import tqdm
@@ -19,7 +19,13 @@ from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.reporting.words import guard_text
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.agents import evaluated_agent
-from cartpole_rl.workflows.build import evaluated_env, evaluated_settings, precedence, use_threads
+from cartpole_rl.workflows.build import (
+    evaluated_env,
+    evaluated_settings,
+    precedence,
+    predicting_env,
+    use_threads,
+)
 from cartpole_rl.workflows.checks import BASELINE
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
 from cartpole_rl.workflows.export import on_the_board
@@ -27,7 +33,7 @@ from cartpole_rl.workflows.live import LiveView, view_title
 from cartpole_rl.workflows.person import confirm, print_message
 from cartpole_rl.workflows.progress import progress_bar
 from cartpole_rl.workflows.repeating import Repetition, repetition
-from cartpole_rl.workflows.trained_poles import known_poles, other_pole
+from cartpole_rl.workflows.trained_poles import other_pole
 
 
 @dataclass(frozen=True)
@@ -40,6 +46,8 @@ class Evaluation:
     policy: Policy
     repetition: Repetition | None
     training: TrainConfig
+    known_poles: Sequence[PoleSettings]  # of the agent
+    simulation: CartPoleEnv | None  # that predicts the first episode
 
     def episodes(self) -> Iterator[Episode]:
         """Drive the repeated episode, or new ones, and yield each as it ends."""
@@ -48,11 +56,6 @@ class Evaluation:
             return
         count = self.config.episodes
         yield from self._shown(run_episodes(self.env, self.policy, count, self.knocks), "episodes")
-
-    @property
-    def known_poles(self) -> list[PoleSettings]:
-        """The poles that the agent was trained with and fine-tuned on."""
-        return known_poles(self.config.run, self.training.pole)
 
     def note_other_pole(self, command: str) -> None:
         """Print a warning if the agent was trained with other poles; the baseline was not trained."""
@@ -96,9 +99,14 @@ def prepared(config: EvaluateConfig) -> Evaluation:
     seed_everything(config.seed)
     agent = evaluated_agent(config)
     settings = evaluated_settings(agent.training, config)
+    simulation = (
+        predicting_env(settings, agent.training.plant, config.seed) if config.animation.simulation else None
+    )
     with on_the_board(config, agent, settings) as equipped:
         env = evaluated_env(settings, equipped, prompt=tqdm.write, confirm=confirm)
-    return Evaluation(config, settings, env, agent.policy, again, agent.training)
+    return Evaluation(
+        config, settings, env, agent.policy, again, agent.training, agent.known_poles, simulation
+    )
 
 
 def repeated(env: CartPoleEnv, policy: Policy, again: Repetition, knocks: Knocks | None) -> Iterator[Episode]:

@@ -107,9 +107,9 @@ def next_command(evaluation: Evaluation) -> str:
     if config.run == BASELINE:
         return "cartpole-train experiment=medium"
     if isinstance(config.plant, SerialSettings | EmulatedSettings):
-        poles = driven if knows(known, driven) else known[-1]
+        poles = [driven] if knows(known, driven) else known
         return f"cartpole-finetune run={shown(config.run)} {plant_words(config.plant, poles)}"
-    return f"cartpole-evaluate run={shown(config.run)} {emulated_words(known[-1])}"
+    return f"cartpole-evaluate run={shown(config.run)} {emulated_words(known)}"
 
 
 def cut_off(episodes: Sequence[Episode]) -> Iterator[str]:

@@ -35,7 +35,7 @@ from cartpole_rl.workflows.person import confirm, print_message
 from cartpole_rl.workflows.ray_learner.session import RaySession, learner_link
 from cartpole_rl.workflows.resuming import resumed
 from cartpole_rl.workflows.run_folder import write_config
-from cartpole_rl.workflows.trained_poles import known_poles, other_pole
+from cartpole_rl.workflows.trained_poles import other_pole
 
 
 def finetune(config: FinetuneConfig, folder: Path, new_learner: bool = False) -> None:
@@ -56,11 +56,11 @@ def finetune(config: FinetuneConfig, folder: Path, new_learner: bool = False) ->
     run = check_finetuning(config)
     use_threads(config.threads)
     seed_everything(config.seed)
-    training = trained_agent(run).training
+    agent = trained_agent(run)
+    training = agent.training
     evaluation = evaluation_config(config)
     settings = evaluated_settings(training, evaluation)
-    known = known_poles(run, training.pole)
-    if line := other_pole(known, settings.pole, isinstance(config.plant, EmulatedSettings)):
+    if line := other_pole(agent.known_poles, settings.pole, isinstance(config.plant, EmulatedSettings)):
         print_message("finetune", line)
     files = FinetuningFiles(folder, config)
     write_config(folder, "finetune", config.model_dump(mode="json"), resumed=checkpoint is not None)

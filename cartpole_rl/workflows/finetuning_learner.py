@@ -22,6 +22,7 @@ from cartpole_rl.learning.training import Scalars, Training
 from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 from cartpole_rl.physics.models import CartFriction, Models
 from cartpole_rl.plants.recorded import RecordedPlant
+from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.randomization.identified import IdentifiedCarts
 from cartpole_rl.settings import evaluation_seed
@@ -153,7 +154,9 @@ class CartLearner:
         """Return the fit with the lowest cost among the candidate models, and its models."""
         period = self.settings.control_period
         windows = cut_windows(recorded, period)
-        nominal = self.training.nominal_with(self.training.pole.nominal)
+        may_be_stated = isinstance(self.config.plant, SerialSettings)  # the length of its pole
+        poles = self.settings.pole if may_be_stated else self.training.pole
+        nominal = self.training.nominal_with(poles.nominal)
         fit, models = best_fit(windows, nominal, self.candidates, period)
         self.show(
             f"simulator fitted to {windows.number} windows of {windows.periods * period:g} s: RMS error "

@@ -1,5 +1,6 @@
 """The stages of a fine-tuning, and the session whose learner is this process."""
 
+from dataclasses import replace
 from typing import Any
 
 from cartpole_rl.agents.dqn import QAgent
@@ -8,11 +9,12 @@ from cartpole_rl.evaluation.driving_policy import Weights, as_weights
 from cartpole_rl.evaluation.metrics import episode_metrics, summarize
 from cartpole_rl.learning.checkpoints import AgentCheckpoint, TrainingCheckpoint, forget_training
 from cartpole_rl.learning.training import Scalars
+from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.reporting.scores import score_table
 from cartpole_rl.reporting.words import count_text
 from cartpole_rl.run_files import CHECKPOINTS, COMPARISON, LAST, METRICS, RECORDINGS
 from cartpole_rl.tasks.episode import Episode
-from cartpole_rl.workflows.agents import new_agent
+from cartpole_rl.workflows.agents import new_agent, tuned_poles
 from cartpole_rl.workflows.config import TrainConfig
 from cartpole_rl.workflows.finetuning_cart import DrivenCart
 from cartpole_rl.workflows.finetuning_files import FinetuningFiles, Stage
@@ -20,6 +22,7 @@ from cartpole_rl.workflows.finetuning_learner import CartLearner
 from cartpole_rl.workflows.report import report
 from cartpole_rl.workflows.results import plant_words, print_loop_time, print_results, shown
 from cartpole_rl.workflows.run_folder import write_json
+from cartpole_rl.workflows.trained_poles import knows
 from cartpole_rl.workflows.tuning import tune
 
 
@@ -46,6 +49,15 @@ class TunedAgent:
     def weights(self) -> Weights:
         """A copy of the present weights that drive."""
         return as_weights(self.agent.greedy_policy())
+
+    def checkpoint(self, kept: Stage, score: float, driven: PoleSettings) -> AgentCheckpoint:
+        """Return the agent before or after its fine-tuning on a cart with the pole `driven`."""
+        if kept is Stage.BEFORE:
+            return replace(self.start, score=score)
+        poles = self.start.tuned_poles
+        if not knows([self.training.pole, *tuned_poles(self.start)], driven):
+            poles = [*poles, driven.model_dump(mode="json")]
+        return replace(self.start, weights=self.agent.state_dict(), score=score, tuned_poles=poles)
 
 
 class Session:
@@ -76,9 +88,7 @@ class Session:
         summaries = {stage: self.summarize(each) for stage, each in episodes.items()}
         scores = {stage: each["score"]["mean"] for stage, each in summaries.items()}
         kept = Stage.AFTER if scores[Stage.AFTER] >= scores[Stage.BEFORE] else Stage.BEFORE
-        start = self.tuned.start
-        weights = self.tuned.agent.state_dict() if kept is Stage.AFTER else start.weights
-        self.files.save_agent(AgentCheckpoint(start.config, weights, start.transitions, scores[kept]))
+        self.files.save_agent(self.tuned.checkpoint(kept, scores[kept], self.settings.pole))
         folder, link = self.files.folder, self.cart.link_summary()
         x_max = self.settings.task.x_max
         report(folder, episodes[kept], self.config.plant.kind, self.settings.pole, x_max, link)
@@ -88,7 +98,7 @@ class Session:
         print_loop_time(link.get("latency_override"))
         print(f"kept: the policy {kept} fine-tuning")
         files = f"{METRICS}, {COMPARISON}, {CHECKPOINTS}/{LAST} and {RECORDINGS}/"
-        cart = plant_words(self.config.plant, self.settings.pole)
+        cart = plant_words(self.config.plant, [self.settings.pole])
         print_results(folder, files, f"cartpole-evaluate run={shown(folder)} {cart}")
 
     def summarize(self, episodes: list[Episode]) -> dict[str, Any]:

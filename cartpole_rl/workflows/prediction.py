@@ -2,12 +2,10 @@
 
 from pathlib import Path
 
-from cartpole_rl.envs.build import simulated_env
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.reporting.animation import write_animation
 from cartpole_rl.reporting.side_by_side import side_by_side
-from cartpole_rl.settings import evaluation_seed
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.episodes import Evaluation
 
@@ -28,9 +26,8 @@ def predicted_episode(evaluation: Evaluation, episode: Episode) -> Episode:
 
     The start is the measured one.
     """
-    settings = evaluation.settings.model_copy(update={"randomization": {}})
-    start, seed = settings.task.evaluation_start, evaluation_seed(evaluation.config.seed)
-    env = simulated_env(settings, evaluation.training.plant, 1, start, seed)
+    env = evaluation.simulation
+    assert env is not None
     assert isinstance(env.plant, SimulatedPlant)
     names = ("x", "x_dot", "theta", "theta_dot")
     env.plant.start_from({name: float(getattr(episode, name)[0]) for name in names})

@@ -11,6 +11,8 @@ from typing import Any
 
 from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
 from cartpole_rl.evaluation.recordings import LENGTH, write_recording
+from cartpole_rl.plants.serial.settings import SerialSettings
+from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.reporting.words import count_text, guard_text
 from cartpole_rl.run_files import RECORDINGS
 from cartpole_rl.tasks.episode import Episode
@@ -53,8 +55,15 @@ def heading(config: EvaluateConfig, settings: CartPoleSettings, episode: Episode
     return {
         "plant": config.plant.kind,
         "pole": settings.pole.name,
-        LENGTH: f"{settings.pole.nominal.length:.4f}" if settings.pole.is_single else "",
+        LENGTH: recorded_length(config, settings.pole),
         "control_period_s": settings.control_period,
         "run": config.run,
         **{name: json.dumps(values) for name, values in origin.items()},
     }
+
+
+def recorded_length(config: EvaluateConfig, poles: PoleSettings) -> str:
+    """Return the pole's length in m, as stated for a real cart or that of `poles`; empty for several."""
+    if isinstance(config.plant, SerialSettings) and config.plant.pole_length:
+        return f"{config.plant.pole_length:.4f}"
+    return f"{poles.nominal.length:.4f}" if poles.is_single else ""

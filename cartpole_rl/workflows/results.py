@@ -1,5 +1,6 @@
 """The last lines of a command: where its results are, and the next command to run."""
 
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -31,7 +32,7 @@ def shown(path: Path) -> Path:
     return path
 
 
-def plant_words(plant: EmulatedSettings | SerialSettings, poles: PoleSettings | None = None) -> str:
+def plant_words(plant: EmulatedSettings | SerialSettings, poles: Sequence[PoleSettings] = ()) -> str:
     """Return the words that choose a cart on the command line, an emulated one with one of `poles`."""
     if isinstance(plant, SerialSettings):
         length = f" plant.pole_length={plant.pole_length:g}" if plant.pole_length else ""

@@ -84,7 +84,7 @@ def train(config: TrainConfig, folder: Path) -> float:
     forget_training(folder)
     print(f"trained for {training.seconds:.0f} s")
     files = f"{METRICS}, {FIGURES}/ and {CHECKPOINTS}/"
-    print_results(folder, files, f"cartpole-evaluate run={shown(folder)} {emulated_words(config.pole)}")
+    print_results(folder, files, f"cartpole-evaluate run={shown(folder)} {emulated_words([config.pole])}")
     score: float = metrics["score"]["mean"]
     return score
 

@@ -72,13 +72,13 @@ def test_it_equals_one_on_a_single_machine_to_the_bit(
 def test_an_address_without_a_cluster_is_refused_before_the_cart_moves(
     listens: bool, trained: Path, tmp_path: Path
 ) -> None:
-    server = socket.create_server(("127.0.0.1", 0))
-    address = f"127.0.0.1:{server.getsockname()[1]}"
     reason = "timed out" if listens else "Connection refused"
-    if not listens:
-        server.close()
-    words = (*FINETUNING, "learner=ray", f"learner.address={address}", "hydra.run.dir=run")
-    done = in_process("finetune", f"run={trained}", *words, folder=tmp_path)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        address = f"127.0.0.1:{server.getsockname()[1]}"
+        if not listens:
+            server.close()
+        words = (*FINETUNING, "learner=ray", f"learner.address={address}", "hydra.run.dir=run")
+        done = in_process("finetune", f"run={trained}", *words, folder=tmp_path)
     assert done.code == 1
     refused = (
         rf"the learner at learner\.address={re.escape(address)} does not answer \(.*({reason}).*\); start"

@@ -6,7 +6,7 @@ from cartpole_rl.files import write_text
 from cartpole_rl.reporting.figures import save
 from cartpole_rl.reporting.studies.answers import Status, agents_text, status
 from cartpole_rl.reporting.studies.comparison import compare
-from cartpole_rl.reporting.studies.figures import drawings
+from cartpole_rl.reporting.studies.figures import Drawing, drawings, rank_agreement
 from cartpole_rl.reporting.studies.page import runs_page, studies_page
 from cartpole_rl.reporting.studies.results import StudyResults
 from cartpole_rl.reporting.studies.sections import Picture
@@ -43,7 +43,8 @@ def _report_studies(config: ReportConfig, source: Path, folder: Path) -> None:
         print(f"{config.data}/ holds the numbers of {sum(bool(each.agents) for each in results)} studies")
     pictures = _pictures(config, results)
     write_text(folder / PAGE, studies_page(results, pictures, emulators(results)))
-    _write_figures(config, results, folder)
+    if config.figures:
+        _write_figures(results, folder, rank_agreement(results))
     for kind in (Status.FAILS, Status.CONTRADICTS, Status.EMPTY, Status.INCOMPLETE):
         if names := [each.name for each in results if status(each) is kind]:
             print(f"{kind}: {', '.join(names)}")
@@ -62,18 +63,19 @@ def _report_runs(config: ReportConfig, folder: Path) -> None:
     title = " and ".join(_title(sweep) for sweep in sweeps)
     write_text(folder / PAGE, runs_page(title, results, _pictures(config, results), comparison))
     print(f"{folder}/{TABLE} holds all runs")
-    _write_figures(config, results, folder)
+    if config.figures:
+        _write_figures(results, folder)
     _print_end(results, folder)
 
 
-def _write_figures(config: ReportConfig, results: list[StudyResults], folder: Path) -> None:
-    """Write the figures of the page as files, if `config` asks for them."""
-    if not config.figures:
-        return
-    for each in results:
-        for drawing in drawings(each):
-            save(drawing.figure, folder / FIGURES / f"{each.name}_{drawing.name}.svg")
-    print(f"{folder}/{FIGURES}/ holds the figures")
+def _write_figures(results: list[StudyResults], folder: Path, ranks: Drawing | None = None) -> None:
+    """Write the figures of studies or runs as SVG files, and print where they are."""
+    figures = {f"{each.name}_{drawing.name}": drawing for each in results for drawing in drawings(each)}
+    if ranks:
+        figures[ranks.name] = ranks
+    for name, drawing in figures.items():
+        save(drawing.figure, folder / FIGURES / f"{name}.svg")
+    print(f"{folder}/{FIGURES}/ holds {len(figures)} figures" if figures else "there is no figure to write")
 
 
 def _pictures(config: ReportConfig, results: list[StudyResults]) -> dict[str, list[Picture]]:

@@ -280,8 +280,9 @@ def _report(pipe: Connection, timeout: float, learner: Any, node: "subprocess.Po
         try:
             report = ray.get(learner.report.remote(first), timeout=timeout)
         except ray.exceptions.GetTimeoutError:
-            pipe.send(Lost(f"no answer for {timeout:g} s"))
-            if time.monotonic() - answered > GIVE_UP:
+            gives_up = time.monotonic() - answered > GIVE_UP
+            pipe.send(Lost(f"no answer for {timeout:g} s", ends_link=gives_up))
+            if gives_up:
                 return
             continue
         answered = time.monotonic()

@@ -40,15 +40,21 @@ def check_address(address: str) -> None:
             socket.create_connection((host, int(port)), ANSWER) as connection,
             connection.makefile("rb") as file,
         ):
+            if encrypted():
+                return
             connection.sendall(HTTP2_START)
             header = file.read(HTTP2_HEADER)
     except OSError as error:
         raise ConnectionError(error.strerror or str(error)) from error
     except UnicodeError as error:
         raise ConnectionError("a host's name has labels of 1 to 63 characters") from error
-    encrypted = os.environ.get("RAY_USE_TLS") == "1"
-    if not encrypted and (len(header) < HTTP2_HEADER or header[3] != HTTP2_SETTINGS):
+    if len(header) < HTTP2_HEADER or header[3] != HTTP2_SETTINGS:
         raise ConnectionError("what listens there is not Ray")
+
+
+def encrypted() -> bool:
+    """Return True if Ray uses TLS, which hides what a server is."""
+    return os.environ.get("RAY_USE_TLS", "").lower() in ("1", "true")
 
 
 @contextmanager

@@ -182,10 +182,25 @@ def test_the_page_says_what_stands_for_the_real_cart(study: Path, edit: Edit) ->
 
 def test_each_figure_of_the_page_is_a_file_on_request(study: Path) -> None:
     done, page = report("studies=quick", "animations=false", "figures=true")
-    assert "report/figures/ holds the figures" in done.out
     files = sorted(Path("report/figures").glob("*.svg"))
-    assert len(files) == page.count("<svg") - page.count('id="ranks"')
+    assert f"report/figures/ holds {len(files)} figures" in done.out
+    assert len(files) == page.count("<svg")
     assert all("<svg" in file.read_text(encoding="utf-8") for file in files)
+
+
+def test_a_report_without_agents_has_no_figures(study: Path) -> None:
+    for arm in filter(Path.is_dir, [*study.iterdir()]):
+        shutil.rmtree(arm)
+    done, _ = report("studies=quick", "animations=false", "figures=true")
+    assert "there is no figure" in done.out
+    assert not Path("report/figures").exists()
+
+
+def test_the_figures_of_two_sets_of_runs_are_files(study: Path) -> None:
+    arms = [str(arm) for arm in sorted(study.iterdir()) if arm.is_dir()]
+    done, page = report(f"runs={arms[0]}", f"compare={arms[1]}", "animations=false", "figures=true")
+    assert done.code == 0, done.err
+    assert len(list(Path("report/figures").glob("*.svg"))) == page.count("<svg") > 0
 
 
 def test_a_page_from_the_small_files_alone(study: Path) -> None:

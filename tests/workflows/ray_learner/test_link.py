@@ -1,6 +1,8 @@
 """The link's process can die, hang or be refused; the session learns of it by `is_lost`."""
 
+import sys
 import time
+from contextlib import suppress
 from multiprocessing import Pipe
 from typing import Any
 
@@ -151,3 +153,41 @@ def test_an_address_without_a_cluster_is_given_up(shown: list[str], monkeypatch:
     monkeypatch.setattr(module, "FIRST_CONNECTION", 0.2)
     with pytest.raises(LearnerError, match=r"server:6379 does not answer.*; start Ray .* --port=6379"):
         PipedLink("server:6379", 10.0, lambda: pytest.fail("not needed"), shown.append)
+
+
+@pytest.mark.parametrize(("patience", "last"), [(-1.0, True), (1000.0, False)])
+def test_only_the_last_report_of_a_silent_learner_ends_the_link(
+    patience: float, last: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ray's own answers are made up here; scripts/bench/two_machines.py has a cluster."""
+    silent = SilentRay(answers=1)
+    monkeypatch.setitem(sys.modules, "ray", silent)
+    monkeypatch.setattr(module, "GIVE_UP", patience)
+    ours, theirs = Pipe()
+    with suppress(InterruptedError):
+        module._report(theirs, 10.0, silent, silent)
+    assert ours.recv() == Lost("no answer for 10 s", ends_link=last)
+
+
+class SilentRay:
+    """Ray, a learner in it and a node of it: the learner answers a few times, then never again."""
+
+    def __init__(self, answers: int) -> None:
+        self.answers, self.exceptions, self.report = answers, self, self
+
+    class GetTimeoutError(Exception):
+        pass
+
+    def remote(self, *_: object) -> None:
+        pass
+
+    def poll(self) -> None:
+        pass
+
+    def get(self, _: object, timeout: float) -> Report:
+        self.answers -= 1
+        if self.answers < -1:
+            raise InterruptedError  # enough for the test
+        if self.answers < 0:
+            raise self.GetTimeoutError
+        return Report("first")

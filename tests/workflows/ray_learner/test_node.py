@@ -78,6 +78,7 @@ def test_a_host_name_that_means_localhost_is_refused(monkeypatch: pytest.MonkeyP
         (b"-ERR unknown command 'PRI'\r\n", "", "what listens there is not Ray"),
         (b"", "", "what listens there is not Ray"),
         (b"\x15\x03\x01", "1", ""),
+        (b"\x15\x03\x01", "True", ""),
     ],
 )
 def test_only_a_grpc_server_is_accepted(

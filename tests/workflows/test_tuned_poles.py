@@ -1,0 +1,68 @@
+"""A fine-tuned agent knows the pole of its cart, in whatever file it is."""
+
+from pathlib import Path
+
+import pytest
+
+from cartpole_rl.choices import group_choices
+from cartpole_rl.learning.checkpoints import AgentCheckpoint, save_agent
+from cartpole_rl.randomization.poles import Pole, PoleSettings
+from cartpole_rl.workflows.agents import new_agent, trained_agent
+from cartpole_rl.workflows.config import TrainConfig
+from cartpole_rl.workflows.finetuning_files import Stage
+from cartpole_rl.workflows.finetuning_session import TunedAgent
+from cartpole_rl.workflows.loading import load_settings
+
+MEDIUM, LARGE = (PoleSettings(**group_choices("pole")[name]) for name in ("medium", "large"))
+ROD = PoleSettings(choices={"0.50 m": Pole.rod(0.5)})
+
+
+@pytest.fixture(scope="module")
+def training() -> TrainConfig:
+    return load_settings(TrainConfig, {"agent.hidden": [8]})
+
+
+@pytest.fixture
+def agent(training: TrainConfig) -> AgentCheckpoint:
+    """An agent of the medium pole."""
+    return AgentCheckpoint(training.model_dump(mode="json"), new_agent(training).state_dict(), 1000, 10.0)
+
+
+def saved(agent: AgentCheckpoint, path: Path) -> list[PoleSettings]:
+    """The poles that an agent knows after it is saved and loaded."""
+    save_agent(path, agent)
+    return trained_agent(path).known_poles
+
+
+@pytest.mark.parametrize(
+    ("kept", "driven", "known"),
+    [
+        (Stage.AFTER, LARGE, [MEDIUM, LARGE]),
+        (Stage.AFTER, MEDIUM, [MEDIUM]),
+        (Stage.BEFORE, LARGE, [MEDIUM]),
+    ],
+)
+def test_the_tuned_agent_knows_another_pole(
+    kept: Stage,
+    driven: PoleSettings,
+    known: list[PoleSettings],
+    training: TrainConfig,
+    agent: AgentCheckpoint,
+    tmp_path: Path,
+) -> None:
+    kept_agent = TunedAgent(training, agent, None).checkpoint(kept, 20.0, driven)
+    assert kept_agent.score == 20.0
+    assert saved(kept_agent, tmp_path / "last.pt") == known
+
+
+def test_a_second_fine_tuning_keeps_the_pole_of_the_first(
+    training: TrainConfig, agent: AgentCheckpoint, tmp_path: Path
+) -> None:
+    once = TunedAgent(training, agent, None).checkpoint(Stage.AFTER, 20.0, LARGE)
+    twice = TunedAgent(training, once, None).checkpoint(Stage.AFTER, 30.0, ROD)
+    assert saved(twice, tmp_path / "last.pt") == [MEDIUM, LARGE, ROD]
+
+
+def test_a_checkpoint_without_tuned_poles_is_read(agent: AgentCheckpoint, tmp_path: Path) -> None:
+    del vars(agent)["tuned_poles"]  # as before they were stored
+    assert saved(agent, tmp_path / "last.pt") == [MEDIUM]
