@@ -2,7 +2,8 @@
 
 from pathlib import Path
 
-from cartpole_rl.evaluation.episodes import run_batch
+from cartpole_rl.envs.cart_pole_env import CartPoleEnv
+from cartpole_rl.evaluation.episodes import Policy, run_batch
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.reporting.animation import write_animation
 from cartpole_rl.reporting.side_by_side import side_by_side
@@ -12,7 +13,8 @@ from cartpole_rl.workflows.episodes import Evaluation
 
 def draw_beside_simulation(evaluation: Evaluation, episode: Episode, path: Path) -> str:
     """Draw `episode` and its prediction into `path`, and return a line that compares their scores."""
-    predicted = predicted_episode(evaluation, episode)
+    assert evaluation.simulation is not None
+    predicted = predicted_episode(evaluation.simulation, evaluation.policy, episode)
     titles = f"plant={evaluation.config.plant.kind}", "predicted by simulation"
     pole, track = evaluation.settings.pole.nominal.length, evaluation.settings.task.x_max
     pictures, times = side_by_side((episode, predicted), titles, pole, track)
@@ -21,15 +23,10 @@ def draw_beside_simulation(evaluation: Evaluation, episode: Episode, path: Path)
     return f"first episode: {scores}; {path.name} shows both"
 
 
-def predicted_episode(evaluation: Evaluation, episode: Episode) -> Episode:
-    """Return an episode of the same agent on the nominal cart of its training, from the start of `episode`.
-
-    The start is the measured one.
-    """
-    env = evaluation.simulation
-    assert env is not None
+def predicted_episode(env: CartPoleEnv, policy: Policy, episode: Episode) -> Episode:
+    """Return an episode of `policy` on the simulated cart of `env`, from the measured start of `episode`."""
     assert isinstance(env.plant, SimulatedPlant)
     names = ("x", "x_dot", "theta", "theta_dot")
     env.plant.start_from({name: float(getattr(episode, name)[0]) for name in names})
-    (predicted,) = run_batch(env, evaluation.policy)
+    (predicted,) = run_batch(env, policy)
     return predicted

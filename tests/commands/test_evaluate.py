@@ -13,6 +13,7 @@ from PIL import Image
 from cartpole_rl.evaluation.recordings import read_recording
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.workflows import checks
+from cartpole_rl.workflows.build import predicting_env
 from cartpole_rl.workflows.config import EvaluateConfig
 from cartpole_rl.workflows.episodes import prepared
 from cartpole_rl.workflows.loading import load_settings
@@ -163,7 +164,8 @@ def test_the_prediction_starts_where_the_cart_did_and_drives_the_nominal_cart(tr
     words = {"run": trained, "randomization": "wide", "task": "swingup", "episodes": 1}
     evaluation = prepared(load_settings(EvaluateConfig, words))
     (episode,) = evaluation.episodes()
-    predicted = predicted_episode(evaluation, episode)
+    simulation = predicting_env(evaluation.settings, evaluation.training.plant, seed=0)
+    predicted = predicted_episode(simulation, evaluation.policy, episode)
     for name in ("x", "theta"):  # the encoders round
         assert getattr(predicted, name)[0] == pytest.approx(getattr(episode, name)[0], abs=0.002)
     assert episode.origin is not None
