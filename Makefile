@@ -16,7 +16,7 @@ floors:
 	$(BIN)/lint-imports
 
 test:
-	$(BIN)/pytest -n 2 --dist worksteal
+	$(BIN)/pytest -n 2 --dist worksteal --durations=20 --durations-min=5
 
 # the site, into build/site; a broken link, a missing page or an unresolved reference is an error
 docs:
