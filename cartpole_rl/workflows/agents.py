@@ -27,16 +27,11 @@ def new_agent(config: TrainConfig, device: str = "cpu") -> QAgent:
 
 @dataclass(frozen=True)
 class TrainedAgent:
-    """A policy, the settings that it was trained with, and the poles of carts that it was fine-tuned on."""
+    """A policy, the settings that it was trained with, and its `known_poles`, the newest last."""
 
     training: TrainConfig
     policy: Policy
-    tuned_poles: Sequence[PoleSettings] = ()
-
-    @property
-    def known_poles(self) -> list[PoleSettings]:
-        """The poles that the agent was trained with and fine-tuned on, the newest last."""
-        return [self.training.pole, *self.tuned_poles]
+    known_poles: Sequence[PoleSettings] = ()
 
 
 def trained_agent(run: Path) -> TrainedAgent:
@@ -46,12 +41,15 @@ def trained_agent(run: Path) -> TrainedAgent:
     training = recorded_settings(TrainConfig, checkpoint.config, f"run={run}")
     agent = new_agent(training)
     restore_weights(agent, checkpoint.weights, f"run={run}")
-    return TrainedAgent(training, agent.greedy_policy(), tuned_poles(checkpoint))
+    return TrainedAgent(training, agent.greedy_policy(), known_poles(training, checkpoint))
 
 
-def tuned_poles(checkpoint: AgentCheckpoint) -> list[PoleSettings]:
-    """Return the poles of the carts that an agent was fine-tuned on. Raises ConfigError."""
-    return [checked(PoleSettings, poles) for poles in checkpoint.tuned_poles]
+def known_poles(training: TrainConfig, checkpoint: AgentCheckpoint) -> list[PoleSettings]:
+    """Return the poles that an agent was trained with, and those that it was fine-tuned on.
+
+    Raises ConfigError for a damaged pole.
+    """
+    return [training.pole, *(checked(PoleSettings, poles) for poles in checkpoint.tuned_poles)]
 
 
 def evaluated_agent(config: EvaluateConfig) -> TrainedAgent:

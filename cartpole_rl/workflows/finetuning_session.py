@@ -14,7 +14,7 @@ from cartpole_rl.reporting.scores import score_table
 from cartpole_rl.reporting.words import count_text
 from cartpole_rl.run_files import CHECKPOINTS, COMPARISON, LAST, METRICS, RECORDINGS
 from cartpole_rl.tasks.episode import Episode
-from cartpole_rl.workflows.agents import new_agent, tuned_poles
+from cartpole_rl.workflows.agents import known_poles, new_agent
 from cartpole_rl.workflows.config import TrainConfig
 from cartpole_rl.workflows.finetuning_cart import DrivenCart
 from cartpole_rl.workflows.finetuning_files import FinetuningFiles, Stage
@@ -55,7 +55,7 @@ class TunedAgent:
         if kept is Stage.BEFORE:
             return replace(self.start, score=score)
         poles = self.start.tuned_poles
-        if not knows([self.training.pole, *tuned_poles(self.start)], driven):
+        if not knows(known_poles(self.training, self.start), driven):
             poles = [*poles, driven.model_dump(mode="json")]
         return replace(self.start, weights=self.agent.state_dict(), score=score, tuned_poles=poles)
 

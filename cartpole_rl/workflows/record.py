@@ -55,14 +55,14 @@ def heading(config: EvaluateConfig, settings: CartPoleSettings, episode: Episode
     return {
         "plant": config.plant.kind,
         "pole": settings.pole.name,
-        LENGTH: recorded_length(config, settings.pole),
+        LENGTH: length_to_record(config, settings.pole),
         "control_period_s": settings.control_period,
         "run": config.run,
         **{name: json.dumps(values) for name, values in origin.items()},
     }
 
 
-def recorded_length(config: EvaluateConfig, poles: PoleSettings) -> str:
+def length_to_record(config: EvaluateConfig, poles: PoleSettings) -> str:
     """Return the pole's length in m, as stated for a real cart or that of `poles`; empty for several."""
     if isinstance(config.plant, SerialSettings) and config.plant.pole_length:
         return f"{config.plant.pole_length:.4f}"

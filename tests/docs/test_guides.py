@@ -87,6 +87,7 @@ def made(trained: Path) -> Callable[[str], None]:
             interrupt_after(trained / "runs/finetune/first/recordings/tune_000.csv")
         done = run_here(command, *more, cwd=trained)
         assert done.returncode == (130 if kind == "finetune" else 0), done.stderr
+        assert done.stdout or kind == "finetune"
 
     return make
 

@@ -66,6 +66,9 @@ def test_another_process_never_reads_parts_of_two_snapshots() -> None:
             seen.add(found[0])
     enough.set()
     process.join()
+    newest, last = read(memory)
+    assert newest >= max(seen)
+    assert last == numbered(newest)
     assert len(seen) == ENOUGH
 
 
