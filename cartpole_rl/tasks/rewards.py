@@ -42,7 +42,17 @@ def linear_angle(state: Measured, x_max: float) -> "Tensor":
 
 def position(state: Measured, x_max: float) -> "Tensor":
     """(5.4) and (6.1): cos(theta / 2) (x_max - |x|) / x_max, from 0 to 1 per step."""
-    return cosine(state, x_max) * (1 - state.x.abs() / x_max).clamp(min=0)
+    return cosine(state, x_max) * centred(state, x_max)
+
+
+def linear_angle_position(state: Measured, x_max: float) -> "Tensor":
+    """(5.4) with (5.3) in place of its cosine (thesis 6.2, figure 6.7b), from 0 to 1 per step."""
+    return linear_angle(state, x_max) * centred(state, x_max)
+
+
+def centred(state: Measured, x_max: float) -> "Tensor":
+    """Return the factor of the position in (5.4), (x_max - |x|) / x_max; 0 beyond x_max."""
+    return (1 - state.x.abs() / x_max).clamp(min=0)
 
 
 def upright_bonus(state: Measured, x_max: float) -> "Tensor":
@@ -66,6 +76,7 @@ class Reward(StrEnum):
     COSINE = "cosine", cosine
     LINEAR_ANGLE = "linear_angle", linear_angle
     POSITION = "position", position
+    LINEAR_ANGLE_POSITION = "linear_angle_position", linear_angle_position
     UPRIGHT_BONUS = "upright_bonus", upright_bonus
     SCORE = "score", score
 

@@ -136,6 +136,11 @@ def check_agent(run: Path) -> None:
     find_agent(run)
 
 
+def agent_file(run: Path) -> Path | None:
+    """Return the checkpoint of an agent; None for the baseline. Raises CheckpointError."""
+    return None if run == BASELINE else find_agent(run)
+
+
 def check_has_agent(run: Path) -> None:
     """Raise ConfigError if `run` is a run folder without an agent."""
     check_program("run", run, "train", "finetune", "distill")

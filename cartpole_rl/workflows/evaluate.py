@@ -17,7 +17,7 @@ from cartpole_rl.reporting.words import count_text
 from cartpole_rl.run_files import BESIDE_SIMULATION, FIGURES, METRICS
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
-from cartpole_rl.workflows.checks import BASELINE
+from cartpole_rl.workflows.checks import BASELINE, agent_file
 from cartpole_rl.workflows.config import EvaluateConfig
 from cartpole_rl.workflows.episodes import Evaluation, prepared
 from cartpole_rl.workflows.prediction import draw_beside_simulation
@@ -43,9 +43,8 @@ def evaluate(config: EvaluateConfig, folder: Path) -> None:
             evaluation.note_other_pole("evaluate")
             evaluation.check_board()
             settings = evaluation.settings.model_dump(mode="json")
-            write_config(
-                folder, "evaluate", {**evaluation.config.model_dump(mode="json"), "evaluated": settings}
-            )
+            content = {**evaluation.config.model_dump(mode="json"), "evaluated": settings}
+            write_config(folder, "evaluate", content, agent=agent_file(config.run))
             for episode in evaluation.episodes():
                 episodes.append(episode)
             if config.drives_on_board:

@@ -24,7 +24,7 @@ from cartpole_rl.plants.settings import EmulatedSettings
 from cartpole_rl.reporting.tensorboard import TensorBoardLog
 from cartpole_rl.workflows.agents import new_agent, trained_agent
 from cartpole_rl.workflows.build import evaluated_env, evaluated_settings, is_real_time, use_threads
-from cartpole_rl.workflows.checks import check_finetuning
+from cartpole_rl.workflows.checks import agent_file, check_finetuning
 from cartpole_rl.workflows.config import EvaluateConfig, FinetuneConfig, TrainConfig
 from cartpole_rl.workflows.finetuning_cart import DrivenCart, yielding_to
 from cartpole_rl.workflows.finetuning_files import FinetuningFiles
@@ -63,7 +63,8 @@ def finetune(config: FinetuneConfig, folder: Path, new_learner: bool = False) ->
     if line := other_pole(agent.known_poles, settings.pole, isinstance(config.plant, EmulatedSettings)):
         print_message("finetune", line)
     files = FinetuningFiles(folder, config)
-    write_config(folder, "finetune", config.model_dump(mode="json"), resumed=checkpoint is not None)
+    content = config.model_dump(mode="json")
+    write_config(folder, "finetune", content, resumed=checkpoint is not None, agent=agent_file(run))
     if not checkpoint:
         files.save({}, 0)
     tuned = TunedAgent(training, load_agent(run), checkpoint)

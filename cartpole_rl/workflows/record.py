@@ -16,6 +16,7 @@ from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.reporting.words import count_text, guard_text
 from cartpole_rl.run_files import RECORDINGS
 from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.workflows.checks import agent_file
 from cartpole_rl.workflows.config import EvaluateConfig, RecordConfig
 from cartpole_rl.workflows.episodes import prepared
 from cartpole_rl.workflows.origins import stored_origin
@@ -35,9 +36,8 @@ def record(config: RecordConfig, folder: Path) -> None:
         with closing(evaluation.env):
             evaluation.note_other_pole("record")
             settings = evaluation.settings.model_dump(mode="json")
-            write_config(
-                folder, "record", {**evaluation.config.model_dump(mode="json"), "recorded": settings}
-            )
+            content = {**evaluation.config.model_dump(mode="json"), "recorded": settings}
+            write_config(folder, "record", content, agent=agent_file(evaluation.config.run))
             for episode in evaluation.episodes():
                 path = folder / RECORDINGS / f"episode_{len(episodes):03d}.csv"
                 write_recording(path, episode, heading(evaluation.config, evaluation.settings, episode))

@@ -3,6 +3,7 @@
 A command refuses the run folder of a command whose results it cannot use.
 """
 
+import hashlib
 import json
 import platform
 import subprocess
@@ -32,6 +33,7 @@ from cartpole_rl.run_files import (
 )
 
 PREFIX = "cartpole-"
+AGENT_HASH = "agent_sha256"  # in provenance.json: of the checkpoint that a run started from
 USES = {  # command: how its runs can be used
     "train": "cartpole-evaluate, cartpole-record and cartpole-finetune take it as run={0}",
     "finetune": "cartpole-evaluate, cartpole-record and cartpole-finetune take it as run={0}",
@@ -48,8 +50,14 @@ USES = {  # command: how its runs can be used
 PACKAGES = ("cartpole_rl", "torch", "torchrl", "tensordict", "numpy", "hydra-core", "mujoco", "pyserial")
 
 
-def write_config(folder: Path, program: str, config: Mapping[str, Any], resumed: bool = False) -> None:
-    """Write config.yaml and provenance.json of a run of cartpole-<program>.
+def write_config(
+    folder: Path,
+    program: str,
+    config: Mapping[str, Any],
+    resumed: bool = False,
+    agent: Path | None = None,
+) -> None:
+    """Write config.yaml and provenance.json of a run of cartpole-<program>, which starts from `agent`.
 
     A resumed run adds its provenance to that of the first start. Raises ConfigError if a new run would
     overwrite another one.
@@ -64,7 +72,14 @@ def write_config(folder: Path, program: str, config: Mapping[str, Any], resumed:
     folder.mkdir(parents=True, exist_ok=True)
     write_text(folder / CONFIG, yaml.safe_dump(dict(config), sort_keys=False))
     head = {"program": f"{PREFIX}{program}", "seed": config["seed"]}
+    if agent:
+        head[AGENT_HASH] = file_hash(agent)
     write_json(folder / PROVENANCE, {**head, **provenance()})
+
+
+def file_hash(file: Path) -> str:
+    """Return the SHA-256 of a file."""
+    return hashlib.sha256(file.read_bytes()).hexdigest()
 
 
 def program_of(folder: Path) -> str | None:

@@ -1,6 +1,7 @@
 """A study at toy size: it runs, is killed, resumes; a failed run does not end the others."""
 
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -14,9 +15,9 @@ from command_line import TINY, Outcome, outcome
 
 from cartpole_rl.reporting.studies.settings import Study
 from cartpole_rl.workflows.reproduce.plan import plan
-from cartpole_rl.workflows.reproduce.process import is_complete, made_otherwise
+from cartpole_rl.workflows.reproduce.process import is_complete, is_outdated, made_otherwise
 from cartpole_rl.workflows.reproduce.progress import Progress, duration
-from cartpole_rl.workflows.reproduce.reproduce import Schedule
+from cartpole_rl.workflows.reproduce.reproduce import Schedule, reproduce
 
 SCRIPT = Path(__file__).parents[2] / "scripts/reproduce.py"
 ARMS = [
@@ -119,6 +120,25 @@ def test_an_agent_of_another_study_is_not_trained_again(
     assert evaluated["run"] == str(root / "toy/trained/10")
 
 
+def test_an_evaluation_of_an_agent_that_was_trained_again_is_repeated(
+    results: tuple[Path, Outcome, Outcome], source: Path
+) -> None:
+    trained, evaluation = plan(["toy"], "quick", results[0], source)[:2]
+    checkpoint = trained.folder / "checkpoints/last.pt"
+    content = checkpoint.read_bytes()
+    assert not is_outdated(evaluation)
+    checkpoint.write_bytes(content + b"again")
+    assert is_outdated(evaluation)
+    checkpoint.rename(trained.folder / "away")
+    assert not is_outdated(evaluation)
+    (trained.folder / "metrics.json").rename(trained.folder / "no_metrics")
+    waiting = Schedule([trained, evaluation], results[0]).waiting
+    assert waiting == [trained, evaluation]  # the agent that will be trained is another one
+    (trained.folder / "no_metrics").rename(trained.folder / "metrics.json")
+    checkpoint.write_bytes(content)
+    assert Schedule([trained, evaluation], results[0]).waiting == []
+
+
 def test_an_incomplete_or_another_run_is_not_taken_for_complete(
     results: tuple[Path, Outcome, Outcome], source: Path
 ) -> None:
@@ -132,6 +152,23 @@ def test_an_incomplete_or_another_run_is_not_taken_for_complete(
     del metrics["episodes"][-1]  # as after Ctrl-C
     (evaluation.folder / "metrics.json").write_text(json.dumps(metrics))
     assert not is_complete(evaluation)
+
+
+def test_a_study_of_other_settings_keeps_its_file_and_gets_no_more_runs(
+    results: tuple[Path, Outcome, Outcome], tmp_path: Path
+) -> None:
+    root = tmp_path / "quick"
+    shutil.copytree(results[0] / "toy", root / "toy")
+    old = (root / "toy/study.yaml").read_text()
+    sizes = {"quick": {"seeds": 2, "overrides": TINY, "evaluation_overrides": ["episodes=2"]}}
+    (tmp_path / "toy.yaml").write_text(yaml.safe_dump({**STUDY, "arms": [ARMS[2]], "sizes": sizes}))
+    evaluation = root / "toy/lqr/10/evaluations/own"
+    record = json.loads((evaluation / "provenance.json").read_text())
+    (evaluation / "provenance.json").write_text(json.dumps({**record, "command": ["", "knock=8"]}))
+    failures = reproduce(["toy"], "quick", root, 1, tmp_path)
+    assert failures["toy/lqr/10/evaluations/own"].startswith("it was made with other settings")
+    assert failures["toy/lqr/11"] == "other runs of its study were made with other settings"
+    assert (root / "toy/study.yaml").read_text() == old
 
 
 def test_a_wrong_name_is_one_line(source: Path, tmp_path: Path) -> None:

@@ -146,14 +146,16 @@ def training_curves(groups: Mapping[str, Sequence[Curve]], name: str) -> Figure:
 
 
 def agreement(groups: Mapping[str, Array], x: str, y: str) -> Figure:
-    """Draw one measure of each agent over another; `groups` maps a label to pairs [2, agents]."""
+    """Draw one measure of each agent over another; `groups` maps a label to pairs [2, agents].
+
+    More than MOST_LINES groups have one colour and no legend.
+    """
     figure = style.new_figure(height=HEIGHT + 0.2 + _legend_height(groups), width=WIDTH)
     axes = figure.subplots()
     style.dress(axes)
     for index, (first, second) in enumerate(groups.values()):
-        axes.plot(
-            first, second, "o", color=style.series_colour(index), alpha=0.7, markersize=DOT + 1.5, mew=0
-        )
+        colour = style.series_colour(index if len(groups) <= MOST_LINES else 0)
+        axes.plot(first, second, "o", color=colour, alpha=0.7, markersize=DOT + 1.5, mew=0)
     everything = np.concatenate(list(groups.values()), axis=1)
     ends = [min(0.0, float(everything.min())), float(everything.max())]
     axes.plot(ends, ends, color=style.MUTED, linewidth=1, linestyle=(0, (3, 3)), zorder=1)

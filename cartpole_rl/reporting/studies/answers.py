@@ -56,33 +56,37 @@ VERDICTS = {"fails": Status.FAILS, "contradicts": Status.CONTRADICTS, "agrees": 
 
 
 def status(results: StudyResults) -> Status:
-    """Return how a study stands: by its results, then by the verdict that a person wrote.
+    """Return how a study stands: by the verdict that a person wrote about these results, else by themselves.
 
-    Without a verdict a study fails if the interquartile mean of every arm is below GOOD.
+    Without a verdict a study fails if, in an evaluation that counts, every interquartile mean is below GOOD.
     """
     if not results.agents:
         return Status.EMPTY
-    if results.study.verdict in ("fails", "contradicts"):
-        return VERDICTS[results.study.verdict]
-    if not results.study.verdict and _all_below(results):
+    if results.finding:
+        return VERDICTS[results.finding.verdict]
+    if _all_below(results):
         return Status.FAILS
-    if results.missing() or results.exclusions:
-        return Status.INCOMPLETE
-    return VERDICTS.get(results.study.verdict, Status.OPEN)
+    return Status.INCOMPLETE if results.missing() or results.exclusions else Status.OPEN
 
 
 def reason(results: StudyResults) -> str:
     """Return why a study fails where no person wrote it: ": no interquartile mean reaches 2000"."""
-    if results.study.verdict or not _all_below(results):
+    if results.finding or not (failed := _all_below(results)):
         return ""
-    return f": no interquartile mean reaches {GOOD[results.study.measure]:g}"
+    place = f" ({', '.join(each.label for each in failed)})" if len(results.evaluations) > 1 else ""
+    return f": no interquartile mean reaches {GOOD[results.study.measure]:g}{place}"
 
 
-def _all_below(results: StudyResults) -> bool:
-    """Return True if every arm is below GOOD in the evaluation that counts; one of an axis may be hard."""
+def _all_below(results: StudyResults) -> list[Variant]:
+    """Return the evaluations that count in which every arm is below GOOD; one of an axis may be hard."""
     good = GOOD.get(results.study.measure)
-    found = [each.value for each in estimates(results, results.judged).values()]
-    return good is not None and not results.varied and bool(found) and max(found) < good
+    if good is None or results.varied:
+        return []
+    highest = (
+        (each, max((found.value for found in estimates(results, each).values()), default=good))
+        for each in results.judged
+    )
+    return [each for each, value in highest if value < good]
 
 
 def estimates(results: StudyResults, evaluation: Variant) -> dict[str, Estimate]:
@@ -103,8 +107,8 @@ def answer(results: StudyResults) -> list[str]:
     """Return our answer in a few sentences, the main one first, with intervals and numbers of agents."""
     if not results.agents:
         return ["No result yet."]
-    several, shown = len(results.evaluations) > 1, [results.judged]
-    if results.varied and {*results.varied} <= {*results.evaluations}:
+    several, shown = len(results.evaluations) > 1, [*results.judged]
+    if results.varied and all(each in results.evaluations for each in results.varied):
         shown = [results.varied[0], results.varied[-1]]
     sentences = [
         f"{measure_label(results.study.measure)}{f' ({each.label})' if several else ''}: {_extremes(found)}."
@@ -118,11 +122,12 @@ def answer(results: StudyResults) -> list[str]:
 
 
 def _extremes(found: Mapping[str, Estimate]) -> str:
-    """Return the estimate of one arm, or of the highest and the lowest of several."""
+    """Return the estimate of one arm, or of the highest and the lowest of several that differ."""
     ranked = sorted(found, key=lambda label: found[label].value, reverse=True)
-    if len(ranked) == 1:
-        return f"{estimate_text(found[ranked[0]])}, {agents_text(found[ranked[0]].agents)}"
     high, low = ranked[0], ranked[-1]
+    if len({estimate_text(each) for each in found.values()}) == 1:
+        each = "" if len(ranked) == 1 else f"each of {len(ranked)} set-ups "
+        return f"{each}{estimate_text(found[high])}, {agents_text(found[high].agents)}"
     return (
         f"highest {estimate_text(found[high])} with {high} ({agents_text(found[high].agents)}), "
         f"lowest {estimate_text(found[low])} with {low} ({agents_text(found[low].agents)})"

@@ -25,7 +25,7 @@ from cartpole_rl.reporting.studies.statistics import estimate, interquartile_mea
 
 MOST_ROWS = 40  # groups in a figure of dots
 FEWEST_PROFILED = 3  # agents
-CURVES = {"score": "score of an evaluation", "loss": "loss"}
+LOSS = "loss"  # name of a curve; the others are named by the measure of an evaluation
 
 Array = NDArray[np.float64]
 Groups = Mapping[str, Mapping[str, Array]]
@@ -55,7 +55,7 @@ def drawings(results: StudyResults) -> Iterator[Drawing]:
         yield from _ratios(results)
     if not results.varied:
         yield from _profiles(results)
-    for name in results.study.curves:
+    for name in dict.fromkeys(name for agent in results.agents for name in agent.curves):
         yield from _training(results, name)
     if len(results.evaluations) > 1 and not results.varied:
         yield from _agreement(results)
@@ -168,24 +168,24 @@ def _ratios(results: StudyResults) -> Iterator[Drawing]:
 
 
 def _profiles(results: StudyResults) -> Iterator[Drawing]:
-    last = results.judged
-    groups = {arm.label: {"": results.values(arm.name, last.name)} for arm in results.study.arms}
-    ranked = [label for label in _ranked(groups) if groups[label][""].size >= FEWEST_PROFILED]
-    if not ranked:
-        return
-    chosen = {label: series[""] for label, series in groups.items() if label in ranked[:MOST_LINES]}
-    label = measure_label(results.study.measure)
-    medians = "; ".join(
-        f"{name}: half of the agents above {np.median(each):.4g}" for name, each in chosen.items()
-    )
-    note = f" The highest {MOST_LINES} of {len(ranked)} are drawn." if len(ranked) > MOST_LINES else ""
-    place = "" if last is OWN else f", {last.label}"
-    yield Drawing(
-        "profiles",
-        profiles(chosen, label),
-        f"Performance profiles of {label}{place}. {medians}.",
-        f"Performance profile{place}: the share of agents above each value.{note}",
-    )
+    for last in results.judged:
+        groups = {arm.label: {"": results.values(arm.name, last.name)} for arm in results.study.arms}
+        ranked = [label for label in _ranked(groups) if groups[label][""].size >= FEWEST_PROFILED]
+        if not ranked:
+            continue
+        chosen = {label: series[""] for label, series in groups.items() if label in ranked[:MOST_LINES]}
+        label = measure_label(results.study.measure)
+        medians = "; ".join(
+            f"{name}: half of the agents above {np.median(each):.4g}" for name, each in chosen.items()
+        )
+        note = f" The highest {MOST_LINES} of {len(ranked)} are drawn." if len(ranked) > MOST_LINES else ""
+        place = "" if last is OWN else f", {last.label}"
+        yield Drawing(
+            f"profiles_{last.name}" if len(results.judged) > 1 else "profiles",
+            profiles(chosen, label),
+            f"Performance profiles of {label}{place}. {medians}.",
+            f"Performance profile{place}: the share of agents above each value.{note}",
+        )
 
 
 def _training(results: StudyResults, name: str) -> Iterator[Drawing]:
@@ -202,14 +202,15 @@ def _training(results: StudyResults, name: str) -> Iterator[Drawing]:
         f"{label}: median {np.median([curve[-1][1] for curve in groups[label]]):.3g} at the end"
         for label in drawn
     )
-    figure = training_curves({label: groups[label] for label in drawn}, CURVES[name])
+    what = name if name == LOSS else f"{measure_label(name)} of an evaluation"
+    figure = training_curves({label: groups[label] for label in drawn}, what)
     left_out = sum(bool(curves) for curves in groups.values()) - len(drawn)
     note = f" {left_out} more groups are not drawn." if left_out else ""
     yield Drawing(
         f"training_{name}",
         figure,
-        f"{CURVES[name]} over the transitions of training. {ends}.",
-        f"Training: {CURVES[name]}. Thin lines: agents. Thick line: their median.{note}",
+        f"{what} over the transitions of training. {ends}.",
+        f"Training: {what}. Thin lines: agents. Thick line: their median.{note}",
     )
 
 
@@ -225,8 +226,13 @@ def _agreement(results: StudyResults) -> Iterator[Drawing]:
         "agreement",
         figure,
         f"{label} of each agent: {second.label} over {first.label}.",
-        f"Each agent on both: a dot on the dashed line has the same {label} on both.",
+        f"Each agent on both: a dot on the dashed line has the same {label} on both.{one_colour(present)}",
     )
+
+
+def one_colour(groups: Mapping[str, Array]) -> str:
+    """Return a note about groups that are too many to be told apart by colours."""
+    return f" All {len(groups)} groups have one colour." if len(groups) > MOST_LINES else ""
 
 
 def rank_agreement(results: Sequence[StudyResults]) -> Drawing | None:
@@ -264,5 +270,6 @@ def rank_agreement(results: Sequence[StudyResults]) -> Drawing | None:
         "rank_agreement",
         figure,
         f"{label} of {len(drawn)} agents of {len(groups)} studies: {labels[1]} over {labels[0]}.",
-        f"{len(drawn)} agents of {len(groups)} studies. The dashed line: the same {label} on both.",
+        f"{len(drawn)} agents of {len(groups)} studies. The dashed line: the same {label} on both."
+        f"{one_colour(groups)}",
     )

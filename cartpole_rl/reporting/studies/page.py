@@ -108,7 +108,7 @@ def _summary(results: Sequence[StudyResults]) -> str:
         {
             "study": _link(each),
             "the thesis": each.study.thesis or "–",
-            "here": f"{answer(each)[0]} {each.study.comment}" if _is_alarming(each) else answer(each)[0],
+            "here": " ".join([*answer(each)[: len(each.judged)], *_comment(each)]),
             "verdict": _status(each),
         }
         for each in ranked
@@ -141,7 +141,7 @@ def _study_section(results: StudyResults, pictures: Sequence[Picture]) -> str:
         "Question": study.question,
         "The thesis": study.thesis or "not in the thesis",
         "Here": " ".join(answer(results)),
-        "Why": study.comment,
+        "Why": " ".join(_comment(results)),
     }
     listed = "".join(f"<dt>{name}</dt><dd>{escaped(text)}</dd>" for name, text in facts.items() if text)
     parts = [
@@ -191,13 +191,14 @@ def _robustness(results: Sequence[StudyResults]) -> str:
             "set-up": each.label,
             **{name: _percent(score) for name, score in each.criteria.items()},
             "overall": _percent(each.overall),
+            "agents": each.agents,
         }
         for each in found
     ]
     text = (
         f"Share of cases, one agent at one value of a quantity, with a score (6.2) above {GOOD['score']:g}. "
         f"Each quantity is a criterion of weight 1/{len(found[0].criteria)}, after the leaderboard of DFKI's "
-        "double pendulum (Wiebe et al., 2023)."
+        "double pendulum (Wiebe et al., 2023). A set-up that lacks agents has no score."
     )
     return f'<section id="robustness"><h2>Robustness score</h2><p>{text}</p>{table(rows)}</section>'
 
@@ -256,6 +257,11 @@ def _status(results: StudyResults) -> Html:
     if not _is_alarming(results):
         return Html(found)
     return Html(f'<span class="alarm">{found}</span>{escaped(reason(results))}')
+
+
+def _comment(results: StudyResults) -> list[str]:
+    """Return what a person wrote about these results."""
+    return [results.finding.comment] if results.finding else []
 
 
 def _is_alarming(results: StudyResults) -> bool:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cartpole_rl.reporting.studies.settings import Size, Study, Variant
+from cartpole_rl.reporting.studies.settings import Finding, Size, Study, Variant
 from cartpole_rl.reporting.studies.statistics import Estimate, estimate
 
 FORMAT = 1  # of the JSON file
@@ -62,10 +62,22 @@ class StudyResults:
         return STAGES if self.study.command == "finetune" else (OWN,)
 
     @property
-    def judged(self) -> Variant:
-        """The evaluation that counts: CART if agents have it, else the last that some have."""
+    def judged(self) -> tuple[Variant, ...]:
+        """The evaluations that answer the question: those that the study names and agents have.
+
+        If it names none, it is CART if agents have it, else the last that some have.
+        """
+        if named := [each for each in self.evaluations if each.name in self.study.judged]:
+            return tuple(each for each in named if self._has(each)) or (named[0],)
         ranked = sorted(self.evaluations, key=lambda each: each.name == CART)
-        return next((each for each in reversed(ranked) if self._has(each)), ranked[-1])
+        return (next((each for each in reversed(ranked) if self._has(each)), ranked[-1]),)
+
+    @property
+    def finding(self) -> Finding | None:
+        """What a person found in these results; None if they are incomplete or of another size."""
+        found = self.study.finding
+        fits = found and found.size == self.label and not self.missing() and not self.exclusions
+        return found if fits else None
 
     @property
     def varied(self) -> tuple[Variant, ...]:

@@ -11,17 +11,21 @@ from dataclasses import dataclass
 import numpy as np
 
 from cartpole_rl.reporting.studies.answers import GOOD
-from cartpole_rl.reporting.studies.results import StudyResults
+from cartpole_rl.reporting.studies.results import Array, StudyResults
 
 CRITERIA = "robustness_"  # prefix of the names of studies
 
 
 @dataclass(frozen=True)
 class Robustness:
-    """The score of one set-up: by criterion, and their mean; None where a criterion has no agent."""
+    """The score of one set-up: by criterion, and their mean; None where a criterion lacks agents.
+
+    `agents` is the smallest number of agents of any case.
+    """
 
     label: str
     criteria: Mapping[str, float | None]
+    agents: int
 
     @property
     def overall(self) -> float | None:
@@ -39,17 +43,31 @@ def robustness(results: Sequence[StudyResults]) -> list[Robustness]:
     ]
     labels = dict.fromkeys(arm.label for each in criteria for arm in each.study.arms)
     found = [
-        Robustness(label, {_quantity(each): _share(each, label) for each in criteria}) for label in labels
+        Robustness(
+            label,
+            {_quantity(each): _share(each, label) for each in criteria},
+            min(values.size for each in criteria for values in _cases(each, label)),
+        )
+        for label in labels
     ]
     return sorted(found, key=lambda each: -1.0 if each.overall is None else each.overall, reverse=True)
 
 
 def _share(results: StudyResults, label: str) -> float | None:
-    """Return the share of successful cases of a set-up, each value of the quantity with the same weight."""
+    """Return the share of successful cases of a set-up, each value of the quantity with the same weight.
+
+    It is None if a value has fewer agents than the study asks for: agents must not be picked.
+    """
+    values, asked = _cases(results, label), results.size.seeds if results.size else 1
+    if any(each.size < max(asked, 1) for each in values):
+        return None
+    return float(np.mean([(each > GOOD[results.study.measure]).mean() for each in values]))
+
+
+def _cases(results: StudyResults, label: str) -> list[Array]:
+    """Return the measures of a set-up's agents [agents] at each value of the quantity."""
     arm = next((arm.name for arm in results.study.arms if arm.label == label), "")
-    values = [results.values(arm, evaluation.name) for evaluation in results.varied]
-    shares = [float((each > GOOD[results.study.measure]).mean()) for each in values if each.size]
-    return float(np.mean(shares)) if len(shares) == len(values) else None
+    return [results.values(arm, evaluation.name) for evaluation in results.varied]
 
 
 def _quantity(results: StudyResults) -> str:

@@ -134,8 +134,11 @@ def _by_hand(results: StudyResults) -> Iterator[str]:
         else:
             yield _command(study.command, [*experiment, *arm.overrides, *overrides, "seed={seed}"], results)
     for evaluation in study.evaluations:
-        more = size.evaluation_overrides if size else ()
-        yield _command("evaluate", ["run={run}", *evaluation.overrides, *more, "seed={seed}"], results)
+        common = size.evaluation_overrides if size else ()
+        for name in ("", *evaluation.of_arms):
+            if name:
+                yield f"# agents of {name}:"
+            yield _command("evaluate", ["run={run}", *evaluation.words(name, common), "seed={seed}"], results)
 
 
 def _command(name: str, words: Sequence[str], results: StudyResults) -> str:

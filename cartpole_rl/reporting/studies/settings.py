@@ -3,7 +3,7 @@
 The copy of a study in its folder of results, study.yaml, also names its size.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Literal
 
 from pydantic import Field, StringConstraints, model_validator
@@ -30,6 +30,26 @@ class Variant(Settings):
     overrides: Overrides = ()
 
 
+class Evaluation(Variant):
+    """An evaluation of each agent of a study."""
+
+    of_arms: Mapping[FolderName, Overrides] = {}  # more overrides for the agents of some arms
+
+    def words(self, arm: str, common: Overrides) -> Overrides:
+        """Return the overrides for the agents of `arm`, with those of `common` that they leave open."""
+        own = (*self.overrides, *self.of_arms.get(arm, ()))
+        chosen = {setting(word) for word in own}
+        return (*own, *(word for word in common if setting(word) not in chosen))
+
+
+class Finding(Settings):
+    """What a person found in the complete results of one size. It is shown with these results alone."""
+
+    size: str
+    verdict: Literal["fails", "contradicts", "agrees"]  # the page sorts by it
+    comment: str  # why the results agree with the thesis or contradict it
+
+
 class Size(Settings):
     """The number of agents per arm, and overrides for all arms and all evaluations."""
 
@@ -48,14 +68,16 @@ class Study(Settings):
     figure: str = ""  # figure, table or section of the thesis; empty beyond it
     question: str
     thesis: str = ""  # the thesis's answer
-    comment: str = ""  # why the results agree with the thesis or contradict it
-    verdict: Literal["", "fails", "contradicts", "agrees"] = ""  # of the comment; the page sorts by it
+    finding: Finding | None = None
     measure: str = "score"  # score (6.2), score_upright (6.1) or another key of metrics.json
     ratio: bool = False  # also the second evaluation divided by the first, per agent
     axis: Axis | None = None
-    curves: tuple[Literal["score", "loss"], ...] = ("score",)  # of the trainings, drawn over transitions
+    curves: tuple[Literal["score", "loss"], ...] = (
+        "score",
+    )  # of trainings; score: of the measure, if recorded
     arms: Annotated[tuple[Variant, ...], Field(min_length=1)]
-    evaluations: tuple[Variant, ...] = ()  # by cartpole-evaluate; none if the run itself holds the result
+    evaluations: tuple[Evaluation, ...] = ()  # by cartpole-evaluate; none if the run itself holds the result
+    judged: tuple[FolderName, ...] = ()  # evaluations that answer the question; empty: that on the cart
     command: Literal["train", "identify", "evaluate", "finetune", "model"] = "train"
     experiment: str = ""  # file of conf/experiment/; empty for commands without experiments
     agents_of: str = ""  # name of the study whose agents are evaluated instead of new ones
@@ -73,9 +95,20 @@ class Study(Settings):
         return self
 
     @model_validator(mode="after")
-    def _size_is_known(self) -> "Study":
-        if self.size and self.size not in self.sizes:
-            raise ValueError(f"size: {self.size} is not in sizes; give one of {', '.join(self.sizes)}")
+    def _sizes_are_known(self) -> "Study":
+        found = {"size": self.size, "finding.size": self.finding.size if self.finding else ""}
+        for name, size in found.items():
+            if size and size not in self.sizes:
+                raise ValueError(f"{name}: {size} is not in sizes; give one of {', '.join(self.sizes)}")
+        return self
+
+    @model_validator(mode="after")
+    def _evaluations_and_arms_are_known(self) -> "Study":
+        evaluations, arms = [each.name for each in self.evaluations], [each.name for each in self.arms]
+        of_arms = [name for each in self.evaluations for name in each.of_arms]
+        for kind, names, known in (("judged", self.judged, evaluations), ("of_arms", of_arms, arms)):
+            if unknown := [name for name in names if name not in known]:
+                raise ValueError(f"{kind}: {unknown[0]} is unknown; give some of {', '.join(known)}")
         return self
 
     @model_validator(mode="after")
@@ -83,6 +116,11 @@ class Study(Settings):
         if self.ratio and len(self.evaluations) < 2:
             raise ValueError("ratio=true needs two evaluations: the second is divided by the first")
         return self
+
+
+def setting(word: str) -> str:
+    """Return the name of the setting that an override changes."""
+    return word.lstrip("+").partition("=")[0]
 
 
 def _repeated(names: Sequence[str]) -> list[str]:

@@ -62,7 +62,7 @@ def chosen(results: StudyResults) -> list[tuple[str, Agent, float, Path]]:
     They are those of the evaluation that counts, or of another one if it has no animation; the median of an
     even number is the worse of the two in the middle.
     """
-    for evaluation in (results.judged, *reversed(results.evaluations)):
+    for evaluation in (*results.judged, *reversed(results.evaluations)):
         filmed = [
             (agent, agent.values[evaluation.name], path)
             for agent in results.agents

@@ -121,6 +121,13 @@ def history(folder: Path) -> list[dict[str, float]]:
         return []
 
 
+def learning_curve(folder: Path, measure: str) -> tuple[str, list[tuple[float, float]]]:
+    """Return the evaluations of a training: `measure`, or score if it has none, and (transitions, value)."""
+    records = history(folder)
+    name = measure if all(measure in each for each in records) else "score"
+    return name, [(each["transitions"], each[name]) for each in records]
+
+
 def shared_settings(tree: Mapping[str, Any]) -> dict[str, Hashable]:
     """Return the settings by dotted name without those that are FREE."""
     return {name: value for name, value in flattened(tree).items() if name.rpartition(".")[2] not in FREE}

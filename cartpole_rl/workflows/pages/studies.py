@@ -30,7 +30,7 @@ from cartpole_rl.run_files import CONFIG
 from cartpole_rl.workflows.pages.runs import (
     Run,
     commits_note,
-    history,
+    learning_curve,
     measured,
     read_run,
     settings_difference,
@@ -42,7 +42,7 @@ from cartpole_rl.workflows.studies import STUDIES, read_study_file
 
 STUDY, EVALUATIONS, RUN = "study.yaml", "evaluations", "run="
 EMULATOR = "emulator="
-TEXTS = ("title", "order", "figure", "question", "thesis", "comment", "verdict")  # of today's conf/study/
+TEXTS = ("title", "order", "figure", "question", "thesis", "finding", "judged")  # of today's conf/study/
 LOSS = "learning/loss"  # TensorBoard's curve
 CURVE_POINTS = 60
 
@@ -183,7 +183,7 @@ def _of_one_kind(parts: Sequence[Part]) -> tuple[list[Part], list[Exclusion]]:
         Exclusion(_name(part.run), f"other versions: {part.run.versions or 'unknown'} instead of {common}")
         for part, common in others
     ]
-    odd: set[tuple[str, int]] = set()
+    odd = {part.place for part, _ in others if part.evaluation == OWN.name}
 
     def kind(part: Part) -> tuple[str, str]:
         return part.arm, part.evaluation
@@ -197,6 +197,7 @@ def _of_one_kind(parts: Sequence[Part]) -> tuple[list[Part], list[Exclusion]]:
                 Exclusion(_name(part.run), f"other settings: {settings_difference(part.run, same[0].run)}")
             )
             odd |= {part.place} if part.evaluation == OWN.name else set()
+    # an agent whose own run is odd is left out whole
     return [part for part in kept if part.place not in odd], exclusions
 
 
@@ -246,7 +247,8 @@ def _curves(study: Study, run: Run | None, origin: Path) -> dict[str, Curve]:
         return {}
     curves: dict[str, Sequence[tuple[float, float]]] = {}
     if "score" in study.curves:
-        curves["score"] = [(each["transitions"], each["score"]) for each in history(run.folder)]
+        name, curve = learning_curve(run.folder, study.measure)
+        curves[name] = curve
     if "loss" in study.curves:
         curves["loss"] = scalars(origin, LOSS)
     return {name: _thinned(curve) for name, curve in curves.items() if len(curve) > 1}

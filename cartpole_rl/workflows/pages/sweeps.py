@@ -20,7 +20,7 @@ from cartpole_rl.workflows.pages.runs import (
     Run,
     commits_note,
     find_runs,
-    history,
+    learning_curve,
     measured,
     read_run,
     shared_settings,
@@ -143,7 +143,7 @@ def results_of(sweep: Sweep, measure: str) -> StudyResults:
             member.seed,
             member.run.folder.as_posix(),
             {OWN.name: _value(member, measure)},
-            _curves(member),
+            _curves(member, measure),
         )
         for arm, label in zip(arms, ordered, strict=True)
         for member in groups[label]
@@ -184,16 +184,17 @@ def _value(member: Member, measure: str) -> float:
     return value
 
 
-def _curves(member: Member) -> dict[str, Curve]:
+def _curves(member: Member, measure: str) -> dict[str, Curve]:
     """Return the learning curve of a training."""
-    curve = tuple((each["transitions"], each["score"]) for each in history(member.run.folder))
-    return {"score": curve} if len(curve) > 1 else {}
+    name, curve = learning_curve(member.run.folder, measure)
+    return {name: tuple(curve)} if len(curve) > 1 else {}
 
 
 def table(sweeps: Sequence[Sweep]) -> str:
     """Return all runs as CSV: their group, differing settings and mean metrics, or why one is left out."""
     rows: list[dict[str, Any]] = []
     for sweep in sweeps:
+        repeated = {each.run: each.reason for each in _without_repetitions(sweep)[1]}
         for number, (member, label) in enumerate(zip(sweep.members, sweep.labels, strict=True)):
             chosen = {f"setting:{name}": values[number] for name, values in sweep.columns.items()}
             head = {
@@ -202,7 +203,7 @@ def table(sweeps: Sequence[Sweep]) -> str:
                 "command": member.run.program,
                 "group": label,
                 "seed": member.seed,
-                "left_out": "",
+                "left_out": repeated.get(member.run.folder.as_posix(), ""),
             }
             rows.append({**head, **chosen, **_means(member.run.results)})
         rows += [{"set": sweep.name, "run": each.run, "left_out": each.reason} for each in sweep.exclusions]

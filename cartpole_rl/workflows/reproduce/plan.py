@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.reporting.studies.settings import Size, Study, Variant
+from cartpole_rl.reporting.studies.settings import Size, Study, Variant, setting
 from cartpole_rl.workflows.studies import STUDIES, load_study, unknown
 
 FIRST_SEED = 10  # settings were chosen on seeds 0 to 9
@@ -100,7 +100,8 @@ class Agent:
             words = self.words(f"run={BASELINE}", *self.size.evaluation_overrides)
             yield Task(self.name, "evaluate", self.folder, words)
         for evaluation in self.study.evaluations:
-            words = self.words(f"run={agent}", *evaluation.overrides, *self.size.evaluation_overrides)
+            own = evaluation.words(self.arm.name, self.size.evaluation_overrides)
+            words = self.words(f"run={agent}", *own)
             needs = tuple(self.runs_in(words))
             yield Task(self.name, "evaluate", self.folder / EVALUATIONS / evaluation.name, words, needs)
 
@@ -124,7 +125,7 @@ class Agent:
     def words(self, *overrides: str) -> tuple[str, ...]:
         """Return overrides with their placeholders filled in, and the seed; of one setting the last."""
         every = [*map(self.filled, overrides), f"seed={self.seed}"]
-        last = {word.lstrip("+").partition("=")[0]: word for word in every}
+        last = {setting(word): word for word in every}
         return tuple(last.values())
 
     def filled(self, text: str) -> str:

@@ -6,12 +6,15 @@ import shutil
 import signal
 import sys
 import traceback
+from pathlib import Path
+from typing import Any
 
 from cartpole_rl.choices import choice
 from cartpole_rl.errors import CartPoleError
-from cartpole_rl.run_files import CHECKPOINTS, IDENTIFIED, METRICS, MODELLED, PROVENANCE, RESUME
+from cartpole_rl.run_files import CHECKPOINTS, IDENTIFIED, LAST, METRICS, MODELLED, PROVENANCE, RESUME
 from cartpole_rl.signals import RaiseOnce, end_with_parent, ending_signals
 from cartpole_rl.workflows.reproduce.plan import Task
+from cartpole_rl.workflows.run_folder import AGENT_HASH, file_hash
 from cartpole_rl.workflows.studies import overrides_of
 
 LOG = "log.txt"
@@ -22,7 +25,15 @@ SIGNALLED = 128  # added to the number of a signal, as a shell does
 
 
 def is_complete(task: Task) -> bool:
-    """Return True for a run with all of its results; an interrupted evaluation has only some episodes."""
+    """Return True for a run with all of its results, of the agent that is there now.
+
+    An interrupted evaluation has only some episodes.
+    """
+    return has_results(task) and not is_outdated(task)
+
+
+def has_results(task: Task) -> bool:
+    """Return True for a run with all of its results."""
     result = task.folder / RESULTS.get(task.command, METRICS)
     if task.command != "evaluate":
         return result.is_file()
@@ -33,12 +44,25 @@ def is_complete(task: Task) -> bool:
         return False
 
 
+def is_outdated(task: Task) -> bool:
+    """Return True if the agent that a run started from was trained again since then."""
+    agent = Path(str(overrides_of(task.words).get("run"))) / CHECKPOINTS / LAST
+    recorded = recorded_provenance(task).get(AGENT_HASH)
+    return recorded is not None and agent.is_file() and file_hash(agent) != recorded
+
+
+def recorded_provenance(task: Task) -> dict[str, Any]:
+    """Return the provenance of a run; empty if it is missing or damaged."""
+    try:
+        found = json.loads((task.folder / PROVENANCE).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
 def made_otherwise(task: Task) -> str:
     """Return why a run does not belong to its study any more; empty if it does."""
-    try:
-        given = json.loads((task.folder / PROVENANCE).read_text(encoding="utf-8"))["command"][1:]
-    except (OSError, ValueError, LookupError, TypeError):
-        given = None
+    given = [*recorded_provenance(task).get("command", ())][1:]
     return "" if given == [*task.words] else "it was made with other settings; delete its folder to repeat it"
 
 

@@ -41,9 +41,11 @@ def reproduce(
     Raises ConfigError for an unknown study or size.
     """
     tasks = plan(names, size, root, source)
-    for name in names:
-        write_study(name, size, root, source)
     schedule = Schedule(tasks, root)
+    for name in names:
+        size_of(name, load_study(name, source), size)
+        if name not in schedule.mixed:  # else the study that its runs were made by stays
+            write_study(name, size, root, source)
     todo = len(schedule.waiting)
     show(f"{len(tasks)} runs, {len(tasks) - todo} of them done; {jobs} at a time, in {root}")
     started = time.monotonic()
@@ -66,13 +68,16 @@ def reproduce(
 def write_study(name: str, size: str, root: Path, source: Path = STUDIES) -> None:
     """Write the study with its size beside its runs."""
     study = load_study(name, source)
-    size_of(name, study, size)
     content = study.model_copy(update={"size": size}).model_dump(mode="json")
     write_text(root / name / STUDY_FILE, yaml.safe_dump(content, sort_keys=False, allow_unicode=True))
 
 
 class Schedule:
-    """The runs that are not done, in order, and the failures so far."""
+    """The runs that are not done, in order, and the failures so far.
+
+    A run is done if those that it needs are done, too. A study with runs of other settings is `mixed`, and
+    gets no more runs.
+    """
 
     def __init__(self, tasks: Sequence[Task], root: Path) -> None:
         self._root = root
@@ -80,13 +85,20 @@ class Schedule:
         self._complete: set[Path] = set()
         self._failed: set[Path] = set()
         self.waiting: list[Task] = []
+        self.mixed: set[str] = set()
+        done = completed(tasks)
         for task in tasks:
-            if not is_complete(task):
+            if task.folder not in done:
                 self.waiting.append(task)
             elif other := made_otherwise(task):
+                self.mixed.add(task.study)
                 self.finish(task, other)
             else:
                 self._complete.add(task.folder)
+        blocked = [task for task in self.waiting if task.study in self.mixed]
+        for task in blocked:
+            self.finish(task, "other runs of its study were made with other settings")
+        self._take(blocked)
 
     def label(self, task: Task) -> str:
         """Return the folder of a run below that of all studies."""
@@ -118,6 +130,15 @@ class Schedule:
             self._failed.add(task.folder)
         else:
             self._complete.add(task.folder)
+
+
+def completed(tasks: Sequence[Task]) -> set[Path]:
+    """Return the folders of the runs that are complete, as well as those that they need."""
+    found = {task.folder: task for task in tasks if is_complete(task)}
+    while lacking := [folder for folder, task in found.items() if not found.keys() >= {*task.needs}]:
+        for folder in lacking:
+            del found[folder]
+    return {*found}
 
 
 @dataclass

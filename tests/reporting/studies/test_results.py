@@ -88,13 +88,58 @@ def test_a_swing_up_below_2000_fails_unless_a_person_judged_it() -> None:
     low = {"wide": on_carts((4000, 1500), (4000, 1900)), "none": on_carts((4000, 100), (4000, 200))}
     failing = results("one", low, evaluations=CARTS)
     assert status(failing) is Status.FAILS
-    assert reason(failing) == ": no interquartile mean reaches 2000"
-    assert status(results("one", low, evaluations=CARTS, verdict="agrees")) is Status.AGREES
+    assert reason(failing) == ": no interquartile mean reaches 2000 (emulated cart)"
+    finding = {"size": "full", "verdict": "agrees", "comment": "A fall is what it asked for."}
+    assert status(results("one", low, evaluations=CARTS, finding=finding)) is Status.AGREES
     assert status(results("one", low, evaluations=CARTS, measure="score_upright")) is Status.OPEN
     high = {**low, "wide": on_carts((4000, 2500), (4000, 2900))}
     assert status(results("one", high, evaluations=CARTS)) is Status.OPEN
     assert status(results("one", {"wide": high["wide"]}, evaluations=CARTS)) is Status.INCOMPLETE
     assert status(results("one", {}, evaluations=CARTS)) is Status.EMPTY
+
+
+def test_a_finding_is_shown_with_complete_results_of_its_size_alone() -> None:
+    finding = {"size": "full", "verdict": "contradicts", "comment": "Drawing helps."}
+    high = {name: on_carts((4000, 2500), (4000, 2900)) for name in ("wide", "none")}
+    whole = results("one", high, evaluations=CARTS, finding=finding)
+    assert status(whole) is Status.CONTRADICTS
+    assert "Drawing helps." in studies_page([whole], {})
+    sizes = {**SIZES, "quick": {"seeds": 2}}
+    smaller = results("one", high, evaluations=CARTS, finding=finding, sizes=sizes, size="quick")
+    partial = results("one", {"wide": high["wide"]}, evaluations=CARTS, finding=finding)
+    for each, expected in ((smaller, Status.OPEN), (partial, Status.INCOMPLETE)):
+        assert status(each) is expected
+        assert "Drawing helps." not in studies_page([each], {})
+
+
+def test_each_evaluation_that_a_study_judges_counts() -> None:
+    carts = [*CARTS, {"name": "large", "label": "large cart"}]
+    agents = [{"simulated": 4000.0, "emulated": 4500.0, "large": 150.0}] * 2
+    found = results("one", {"wide": agents, "none": agents}, evaluations=carts, judged=["emulated", "large"])
+    assert answer(found) == [
+        "score (6.2) (emulated cart): each of 2 set-ups 4500 ± 0, 2 agents.",
+        "score (6.2) (large cart): each of 2 set-ups 150 ± 0, 2 agents.",
+    ]
+    assert status(found) is Status.FAILS
+    assert reason(found) == ": no interquartile mean reaches 2000 (large cart)"
+
+
+def test_a_set_up_that_lacks_agents_has_no_robustness_score() -> None:
+    values = {"wide": over_knocks((4000, 4000)), "none": over_knocks((4000, 0), (100, 0))}
+    (whole, picked) = robustness(
+        [results("robustness_knocks", values, evaluations=KNOCKS, axis={"label": "knock"})]
+    )
+    assert (whole.label, whole.overall, whole.agents) == ("not drawn", 0.25, 2)
+    assert (picked.label, picked.overall, picked.agents) == ("drawn", None, 1)
+
+
+def test_an_evaluation_has_its_own_episodes_and_those_of_an_arm() -> None:
+    common = ("episodes=10",)
+    words = {"overrides": ["randomization=wide", "episodes=100"], "of_arms": {"wide": ["plant.substeps=1"]}}
+    wide, plain = study(evaluations=[{**CARTS[0], **words}, CARTS[1]]).evaluations
+    assert wide.words("wide", common) == ("randomization=wide", "episodes=100", "plant.substeps=1")
+    assert wide.words("none", common) == ("randomization=wide", "episodes=100")
+    assert plain.words("wide", common) == common
 
 
 def test_the_answer_over_an_axis_is_that_at_its_ends() -> None:
@@ -112,15 +157,12 @@ def test_ratios_leave_out_agents_that_fail_on_the_first_cart() -> None:
     np.testing.assert_allclose(found.ratios("none"), [2.0, 1.0])
 
 
-def test_curves_of_loss_are_drawn_where_a_study_asks_for_them() -> None:
-    curves = {"score": ((1e5, 10.0), (2e5, 20.0)), "loss": ((1e5, 0.1), (2e5, 0.5))}
+def test_each_curve_of_the_trainings_is_drawn() -> None:
+    curves = {"score_upright": ((1e5, 10.0), (2e5, 20.0)), "loss": ((1e5, 0.1), (2e5, 0.5))}
     agents = tuple(Agent("wide", seed, "run", {"own": 20.0}, curves) for seed in (0, 1))
-    captions = [
-        drawing.caption for drawing in drawings(StudyResults("one", study(curves=["score", "loss"]), agents))
-    ]
-    assert [text for text in captions if text.startswith("Training: loss")]
     captions = [drawing.caption for drawing in drawings(StudyResults("one", study(), agents))]
-    assert not [text for text in captions if text.startswith("Training: loss")]
+    drawn = [text.split(".")[0] for text in captions if text.startswith("Training: ")]
+    assert drawn == ["Training: score (6", "Training: loss"]
 
 
 def test_a_study_without_results_is_on_the_page() -> None:
@@ -142,6 +184,15 @@ def test_less_is_better_of_errors_and_times() -> None:
         ({"arms": [{"name": "a", "label": "a"}] * 2}, "arms: a is there more than once"),
         ({"arms": [{"name": name, "label": "same"} for name in "ab"]}, "arms: same is there more than once"),
         ({"size": "huge"}, "size: huge is not in sizes"),
+        (
+            {"finding": {"size": "huge", "verdict": "agrees", "comment": "So."}},
+            "finding.size: huge is not in sizes",
+        ),
+        ({"judged": ["moon"], "evaluations": CARTS}, "judged: moon is unknown; give some of simulated,"),
+        (
+            {"evaluations": [{**CARTS[0], "of_arms": {"half": []}}]},
+            "of_arms: half is unknown; give some of wide, none",
+        ),
         ({"arms": [{"name": "../a", "label": "a"}]}, "arms.0.name"),
         ({"command": "swim"}, "command=swim: give 'train'"),
     ],

@@ -155,7 +155,9 @@ def test_what_fails_comes_first(study: Path, edit: Edit) -> None:
         edit(
             Path("quick", name, "study.yaml"),
             lambda content, name=name: content.update(
-                verdict=name, title=name, comment=f"why it {name}", order=10
+                finding={"size": "quick", "verdict": name, "comment": f"why it {name}"},
+                title=name,
+                order=10,
             ),
         )
     _, page = report("studies=quick", "animations=false")

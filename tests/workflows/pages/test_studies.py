@@ -112,6 +112,15 @@ def test_an_agent_whose_training_is_unfinished_does_not_count(study: Path) -> No
     assert results.values("much", "nominal").shape == (2,)
 
 
+def test_an_agent_whose_training_is_of_other_versions_does_not_count(study: Path, edit: Edit) -> None:
+    for name in ("config.yaml", "provenance.json", "metrics.json"):
+        shutil.copy(study / HEAVY / name, study / "much/1" / name)
+    edit(study / "much/1/provenance.json", lambda content: content["packages"].update(torch="1.0"))
+    results = read_study(study)
+    assert [each.run for each in results.exclusions] == ["quick/friction/much/1"]
+    assert results.values("much", "nominal").shape == (2,)
+
+
 def test_runs_of_several_commits_are_noted(study: Path, edit: Edit) -> None:
     edit(study / HEAVY / "provenance.json", lambda content: content.update(git_commit="abcdef0123456789"))
     (note,) = (note for note in read_study(study).notes if "commits" in note)
