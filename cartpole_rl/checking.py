@@ -2,7 +2,7 @@
 
 import difflib
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, TypeVar, get_args
 
 from pydantic import ValidationError
@@ -125,6 +125,14 @@ def no_such_setting(key: str, known: Iterable[str]) -> str:
     return f"{key}: there is no such setting; " + (
         f"did you mean {nearest}?" if near else "--cfg job shows the settings"
     )
+
+
+def of_another_choice(key: str, choices: Sequence[str]) -> str:
+    """Return the message for a setting that only other `choices` of its group have."""
+    group = key.partition(".")[0]
+    *others, last = choices
+    names = f"{', '.join(others)} or {last}" if others else last
+    return f"{key} belongs to {group}={names}: give {'one of them' if others else f'{group}={last}'}"
 
 
 def most_similar(wrong: str, names: Iterable[str]) -> str:

@@ -43,12 +43,17 @@ def listing(ports: list[UsbPort]) -> str:
     lines = [f"{port.device}  {described(port)}" for port in ports]
     carts = cart_like(ports)
     if len(carts) == 1:
-        lines.append(f"The cart is probably on it. Next: cartpole-preflight plant.port={carts[0].device}")
+        lines.append(f"The cart is probably on it. Next: {preflight_on(carts[0])}")
     elif carts:
         lines.append("`cartpole-find-port watch=true` finds out which of them is the cart")
     else:
         lines.append("None of them has a chip used on carts (CP210x, CH340, FTDI, Espressif, ST-LINK)")
     return "\n".join(lines)
+
+
+def preflight_on(port: UsbPort) -> str:
+    """Return the command that checks the cart on `port`."""
+    return f"cartpole-preflight plant=serial plant.port={port.device}"
 
 
 def watched(ports: PortList, timeout: float) -> str:
@@ -62,7 +67,7 @@ def watched(ports: PortList, timeout: float) -> str:
             what = "vanished" if vanished else "appeared"
             lines = [f"{port.device} {what}: plant.port={port.device}  {described(port)}" for port in changed]
             again = "Plug it in again before you use it. Next:" if vanished else "Next:"
-            return "\n".join([*lines, f"{again} cartpole-preflight plant.port={changed[0].device}"])
+            return "\n".join([*lines, f"{again} {preflight_on(changed[0])}"])
         time.sleep(LOOK_EVERY)
     raise PortError(f"no port appeared or vanished within {timeout:g} s: {REMEDY}")
 

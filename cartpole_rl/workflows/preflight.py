@@ -1,6 +1,7 @@
 """Check a cart by small moves before an agent drives it."""
 
-from collections.abc import Iterator
+import shlex
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 
 from cartpole_rl.errors import PlantError
@@ -10,14 +11,16 @@ from cartpole_rl.plants.serial.faults import FaultClearing, always
 from cartpole_rl.plants.serial.preflight import Finding, preflight
 from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.plants.settings import EmulatedSettings
+from cartpole_rl.randomization.poles import Pole
 from cartpole_rl.workflows.config import PreflightConfig
 from cartpole_rl.workflows.person import confirm
-from cartpole_rl.workflows.results import plant_words
+from cartpole_rl.workflows.trained_poles import POLES, emulated_pole, emulator_for, one_pole
 
 
-def check_cart(config: PreflightConfig) -> None:
+def check_cart(config: PreflightConfig, given: Sequence[str] = ()) -> None:
     """Check the cart of `config.plant` by small moves, and print a line for each check.
 
+    At the end prints the command that identifies the cart, with the words `given` for it, as plant.port=COM3.
     Writes no files. Raises PlantError after the first check that fails, LinkError if no cart answers.
     """
     with connected_cart(config) as cart:
@@ -28,8 +31,26 @@ def check_cart(config: PreflightConfig) -> None:
         raise PlantError(
             f"the cart is not ready: {finding.check if finding else 'nothing was checked'} failed"
         )
-    print("The cart is ready. Next:")
-    print(f"cartpole-identify {plant_words(config.plant)}")
+    print("The cart is ready. Next, with the mounted pole as pole= (medium, large or a file):")
+    print(next_command(config, given))
+
+
+def next_command(config: PreflightConfig, given: Sequence[str]) -> str:
+    """Return the command that identifies the cart of the words `given`, with its pole if it is known."""
+    chosen = any(word.startswith("plant=") for word in given)
+    plant = [*given] if chosen else [f"plant={config.plant.kind}", *given]
+    return f"cartpole-identify {shlex.join(plant)} pole={mounted_pole(config)}"
+
+
+def mounted_pole(config: PreflightConfig) -> str:
+    """Return the one of POLES that is about as long as the cart's; the default if there is none."""
+    if not isinstance(config.plant, SerialSettings):
+        pole = emulated_pole(config.emulator)
+    elif config.plant.pole_length is not None:
+        pole = Pole.rod(config.plant.pole_length)
+    else:
+        return POLES[0]
+    return emulator_for([one_pole(pole)]) or POLES[0]
 
 
 def fault_clearing(plant: EmulatedSettings | SerialSettings) -> FaultClearing:

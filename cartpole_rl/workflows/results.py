@@ -9,6 +9,8 @@ from cartpole_rl.plants.settings import EmulatedSettings
 from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.workflows.trained_poles import emulated_words
 
+DEFAULT_BAUD = SerialSettings.model_fields["baud"].default
+
 
 def print_results(folder: Path, files: str, following: str) -> None:
     """Print that `files` are in `folder`, and the command `following`."""
@@ -36,5 +38,6 @@ def plant_words(plant: EmulatedSettings | SerialSettings, poles: Sequence[PoleSe
     """Return the words that choose a cart on the command line, an emulated one with one of `poles`."""
     if isinstance(plant, SerialSettings):
         length = f" plant.pole_length={plant.pole_length:g}" if plant.pole_length else ""
-        return f"plant=serial plant.port={plant.port}{length}"
+        baud = f" plant.baud={plant.baud}" if plant.baud != DEFAULT_BAUD else ""
+        return f"plant=serial plant.port={plant.port}{baud}{length}"
     return emulated_words(poles) if poles else "plant=emulated"

@@ -125,6 +125,7 @@ WRONG_EVALUATION = [
     ("run=run plant=emulated emulator.latencyy=1", "emulator.latencyy", "did you mean emulator.latency?", 2),
     ("run=run plant=emulated task=swingup task.evaluation_start.angle=any", "angle=any", "hanging", 2),
     ("run=run emulator.latency=0.01", "emulator", "give plant=emulated", 2),
+    ("run=run plant.port=/dev/ttyUSB0", "plant.port belongs to plant=serial", "give plant=serial", 2),
     ("run=run plant=serial", "plant.port is missing", "give plant.port=/dev/ttyUSB0", 2),
     ("run=run plant=serial plant.prot=/dev/ttyUSB0", "plant.prot", "did you mean plant.port?", 2),
     ("run=run plant=serial plant.port=nowhere", "nowhere does not exist", "plug the cart in", 1),

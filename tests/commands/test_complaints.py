@@ -58,6 +58,29 @@ def test_a_setting_of_each_group_without_a_choice_gets_one_line(command: str) ->
         assert "\n" not in complaint
 
 
+@pytest.mark.parametrize(
+    ("command", "key", "complaint"),
+    [
+        ("evaluate", "plant.port", "plant.port belongs to plant=serial: give plant=serial"),
+        ("evaluate", "plant.baud", "plant.baud belongs to plant=serial: give plant=serial"),
+        ("identify", "plant.port", "plant.port belongs to plant=serial: give plant=serial"),
+        ("finetune", "learner.address", "learner.address belongs to learner=ray: give learner=ray"),
+        ("train", "pole.lengths", "pole.lengths belongs to pole=range: give pole=range"),
+        ("preflight", "plant.rehomes", "plant.rehomes: there is no such setting; did you mean plant.rehome?"),
+        (
+            "train",
+            "randomization.cart_mass.relative",
+            "randomization.cart_mass.relative belongs to randomization=half, wide or wider: give one of them",
+        ),
+    ],
+)
+def test_a_setting_of_another_choice_names_that_choice(
+    command: str, key: str, complaint: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.argv", [f"cartpole-{command}", f"{key}=1"])
+    assert hydra_complaint(f"Could not override '{key}'.", command) == complaint
+
+
 def test_several_values_without_a_multirun_are_explained() -> None:
     assert hydra_complaint("Ambiguous value for argument 'seed=0,1': ...", "train").startswith("seed=0,1: -m")
 

@@ -46,7 +46,10 @@ def test_help_has_examples(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("ports", "last"),
     [
-        ([CH340, MODEM], "The cart is probably on it. Next: cartpole-preflight plant.port=/dev/ttyUSB0"),
+        (
+            [CH340, MODEM],
+            "The cart is probably on it. Next: cartpole-preflight plant=serial plant.port=/dev/ttyUSB0",
+        ),
         ([CH340, FTDI], "`cartpole-find-port watch=true` finds out which of them is the cart"),
         ([MODEM], "None of them has a chip used on carts (CP210x, CH340, FTDI, Espressif, ST-LINK)"),
     ],
@@ -73,4 +76,6 @@ def test_the_port_that_changes_is_the_cart(lists: tuple[list[UsbPort], ...], wor
     following: Iterator[list[UsbPort]] = iter(lists)
     said = watched(lambda: next(following), timeout=10)
     assert said.startswith(words)
+    port = words.split("plant.port=")[1]
+    assert said.endswith(f" cartpole-preflight plant=serial plant.port={port}")
     assert ("Plug it in again" in said) == ("vanished" in words)

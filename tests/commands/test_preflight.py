@@ -2,23 +2,52 @@
 
 from pathlib import Path
 
+import hydra
+import pytest
 from command_line import in_process
+from hydra_configs import shipped_choices
 from serial_peer import Between
 
+from cartpole_rl.checking import checked
+from cartpole_rl.choices import compose
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.plants.emulated_cart import EmulatedCart
+from cartpole_rl.workflows.config import PreflightConfig
+from cartpole_rl.workflows.preflight import next_command
 
 
 def test_the_emulated_cart_is_ready(tmp_path: Path) -> None:
-    words = ("plant=emulated", "emulator=large", "emulator.cart_coulomb_right=0.8")
+    words = ("plant=emulated", "plant.rehome=always", "emulator=large", "emulator.cart_coulomb_right=0.8")
     done = in_process("preflight", *words, folder=tmp_path)
     assert (done.code, done.err) == (0, ""), done
     *checks, last, following = done.out.splitlines()
     assert len(checks) == 8
     assert all(line.startswith("OK   ") for line in checks)
-    assert last == "The cart is ready. Next:"
-    assert following == "cartpole-identify plant=emulated"
+    assert last == "The cart is ready. Next, with the mounted pole as pole= (medium, large or a file):"
+    assert following == f"cartpole-identify {' '.join(words)} pole=large"
+    with shipped_choices():
+        hydra.compose("identify", following.split()[1:])
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("given", "following"),
+    [
+        (("plant.port=COM3",), "plant=serial plant.port=COM3 pole=medium"),
+        (
+            ("plant=serial", "plant.port=auto", "plant.baud=115200", "plant.pole_length=0.65"),
+            "plant=serial plant.port=auto plant.baud=115200 plant.pole_length=0.65 pole=large",
+        ),
+        (
+            ("plant.port=x", "plant.pole_length=1"),
+            "plant=serial plant.port=x plant.pole_length=1 pole=medium",
+        ),
+    ],
+)
+def test_the_next_command_is_for_the_same_cart(given: tuple[str, ...], following: str) -> None:
+    settings = dict(word.split("=") for word in given)
+    config = checked(PreflightConfig, compose("preflight", settings))
+    assert next_command(config, given) == f"cartpole-identify {following}"
 
 
 def test_a_motor_the_wrong_way_round_is_refused(tmp_path: Path) -> None:
@@ -54,4 +83,7 @@ def test_a_simulated_cart_has_nothing_to_check(tmp_path: Path) -> None:
 
 
 def test_help_has_examples(tmp_path: Path) -> None:
-    assert "cartpole-preflight plant.port=auto" in in_process("preflight", "--help", folder=tmp_path).out
+    assert (
+        "cartpole-preflight plant=serial plant.port=auto"
+        in in_process("preflight", "--help", folder=tmp_path).out
+    )

@@ -9,7 +9,14 @@ import hydra
 from hydra.errors import HydraException, OverrideParseException
 from omegaconf import OmegaConf
 
-from cartpole_rl.checking import NEAR_VALUE, most_similar, no_such_setting, setting_names, similarity
+from cartpole_rl.checking import (
+    NEAR_VALUE,
+    most_similar,
+    no_such_setting,
+    of_another_choice,
+    setting_names,
+    similarity,
+)
 from cartpole_rl.choices import conf_folder, default_choices, group_choices
 
 # Hydra's, each up to its first hyphen; without --run, which has no effect: a user means run=
@@ -58,6 +65,8 @@ def hydra_complaint(text: str, command: str) -> str:
         if group in without_choice(groups):
             known = ", ".join(group_choices(group))
             return f"{unknown[1]}: {group} is not chosen, so it has no settings; give {group}= too: {known}"
+        if owners := choices_with(unknown[1], command):
+            return of_another_choice(unknown[1], owners)
         return no_such_setting(unknown[1], known_settings(command))
     if choice := re.search(r"Could not find '([^']+)' Available options in '([^']+)': (.*)", text):
         wrong = choice[1].removeprefix(f"{choice[2]}/")
@@ -83,16 +92,27 @@ def nearest_choice(wrong: str, choices: Sequence[str]) -> str:
     return f"{hint}there are {', '.join(choices)}"
 
 
+def choices_with(setting: str, command: str) -> list[str]:
+    """Return the choices of the setting's group with which a command has the setting."""
+    group, _, rest = setting.partition(".")
+    known = rest and group in default_choices(command) and group not in WHOLE
+    choices = group_choices(group) if known else ()
+    return [name for name in choices if setting in composed_settings(command, [f"{group}={name}"])]
+
+
 def known_settings(command: str) -> set[str]:
     """Return the settings of a command, composed with the choices on the command line if that is possible."""
     groups = [word for word in sys.argv[1:] if re.fullmatch(r"\w+=[\w.-]+", word)]
-    for overrides in (groups, []):
-        try:
-            with hydra.initialize_config_dir(version_base="1.3", config_dir=str(conf_folder())):
-                return setting_names(OmegaConf.to_container(hydra.compose(command, overrides), resolve=False))
-        except HydraException:
-            continue
-    return set()
+    return composed_settings(command, groups) or composed_settings(command, [])
+
+
+def composed_settings(command: str, overrides: list[str]) -> set[str]:
+    """Return the settings of a command, composed with `overrides`; none if Hydra refuses one of them."""
+    try:
+        with hydra.initialize_config_dir(version_base="1.3", config_dir=str(conf_folder())):
+            return setting_names(OmegaConf.to_container(hydra.compose(command, overrides), resolve=False))
+    except HydraException:
+        return set()
 
 
 def dashed_setting(words: Sequence[str]) -> str | None:

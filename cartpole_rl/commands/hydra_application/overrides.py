@@ -1,5 +1,6 @@
-"""Checks of resume= and repeat=, which take all other settings from an earlier run."""
+"""The words of the command line; checks of resume= and repeat=, which take all others from an earlier run."""
 
+import sys
 from collections.abc import Collection
 from pathlib import Path
 
@@ -21,6 +22,11 @@ def check_resumption(program: str, resume: str, folder: Path, replaceable: Colle
 def is_given(group: str) -> bool:
     """Return True if the command line sets something in `group`."""
     return any(_key(word).split(".")[0] == group for word in HydraConfig.get().overrides.task)
+
+
+def given_in(*groups: str) -> list[str]:
+    """Return the words of the command line, as typed, that choose one of `groups` or set something in it."""
+    return [word for word in sys.argv[1:] if _key(word).split(".")[0] in groups]
 
 
 def check_repetition(config: EvaluateConfig) -> None:

@@ -12,15 +12,21 @@ import math
 import statistics
 import time
 
+from cartpole_rl.errors import FaultError
 from cartpole_rl.physics.encoders import POLE_COUNTS_PER_TURN, cart_counts, pole_counts
 from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.centring import LEFT, RIGHT
 from cartpole_rl.plants.serial.errors import NotReadyError
 from cartpole_rl.plants.serial.faults import FaultClearing
-from cartpole_rl.plants.serial.information import NANOMETRES_PER_COUNT, check_limits, check_scales
+from cartpole_rl.plants.serial.information import (
+    NANOMETRES_PER_COUNT,
+    check_limits,
+    check_period,
+    check_scales,
+)
 from cartpole_rl.plants.serial.moves import GENTLE_MOTOR, metres
-from cartpole_rl.plants.serial.probe import MOVED, Probe
-from cartpole_rl.wire import Info, seconds_between, ticks_between
+from cartpole_rl.plants.serial.probe import MOVED, NO_MOTION, Probe
+from cartpole_rl.wire import Fault, Info, State, seconds_between, ticks_between
 
 QUESTIONS = 25  # asked over the link
 LOST_SHARE = 0.05  # of the frames; a good cable loses none
@@ -40,7 +46,7 @@ LONGEST_LATENCY_PERIODS = 2.0  # agents are trained on up to about one period
 
 def link(cart: SerialCart) -> str:
     """Check the period by the cart's own clock, the round trip, and that few frames get lost."""
-    cart.open()
+    check_period(cart.open())
     first, trips = cart.poll_state(), []
     for _ in range(QUESTIONS):
         asked = time.perf_counter()
@@ -55,7 +61,8 @@ def link(cart: SerialCart) -> str:
         raise NotReadyError(
             f"{counted.lost_frames} frames were lost and {counted.bad_frames} damaged of "
             f"{counted.frames_received}",
-            "use a short shielded cable, away from the motor's, or baud=115200",
+            "use a short shielded cable, away from the motor's; if that does not help, use 115200 baud: "
+            "set BAUD in the board's file, flash again, and give plant.baud=115200",
         )
     if abs(measured / period - 1) > PERIOD_TOLERANCE:
         raise NotReadyError(
@@ -90,8 +97,8 @@ def homing(cart: SerialCart, faults: FaultClearing) -> str:
     """Home; check that the cart is in the middle, the pole hangs, and the limits fit the track."""
     if fault := cart.poll_state().fault:
         faults.clear(cart, fault)
-    started_us = cart.get_state().time_us
-    state = cart.home()
+    before = cart.get_state()
+    state = _homed(cart, before)
     limits(cart.information)
     pole = (state.pole_counts - POLE_COUNTS_PER_TURN // 2) * 360 / POLE_COUNTS_PER_TURN
     if abs(metres(state.cart_counts)) > 0.01 or abs(pole) > 2:
@@ -100,9 +107,21 @@ def homing(cart: SerialCart, faults: FaultClearing) -> str:
             f"the pole {pole:+.1f} deg from hanging",
             "keep hands off during homing, check that no gear slips",
         )
-    seconds = seconds_between(started_us, state.time_us)
+    seconds = seconds_between(before.time_us, state.time_us)
     off = metres(state.cart_counts) * 1e3
     return f"{seconds:.0f} s; the cart {off:+.1f} mm from the middle, the pole {pole:+.1f} deg from hanging"
+
+
+def _homed(cart: SerialCart, before: State) -> State:
+    """Home; return the state after it. Raises NotReadyError if the cart has not moved since `before`."""
+    try:
+        return cart.home()
+    except FaultError:
+        state = cart.poll_state()
+        moved = abs(state.cart_counts - before.cart_counts) >= SURELY_MOVED
+        if moved or state.fault != Fault.HOMING:
+            raise
+        raise NotReadyError("homing failed: the cart's count does not change", NO_MOTION) from None
 
 
 def cart_direction(probe: Probe) -> str:

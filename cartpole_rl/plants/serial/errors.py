@@ -32,13 +32,16 @@ REASONS: dict[int, str] = {
 }
 
 FAULTS: dict[Fault, str] = {
-    Fault.HARD_LIMIT: "the cart ran into the end of the track (push it back towards the middle)",
-    Fault.STALL: "the motor was driven but the cart did not move (free the cart, check the motor's cable)",
-    Fault.CART_ENCODER: "the cart's encoder does not answer (check its cable)",
+    Fault.HARD_LIMIT: "the cart ran into the end of the track (switch the motor's supply off, push the cart "
+    "back towards the middle, switch the supply on)",
+    Fault.STALL: "the motor was driven but the cart did not move (check the motor's supply and cable, free "
+    "the cart)",
+    Fault.CART_ENCODER: "the cart's encoder does not answer (check its cable and the motor's supply)",
     Fault.POLE_ENCODER: "the pole's encoder does not answer (check its cable)",
-    Fault.HOMING: "homing failed: the cart moved the wrong way, a stop was not found, the span was off by "
-    "over 3 %, or the pole did not come to rest (clear the track, let the pole hang, check the motor's "
-    "direction and the cart encoder's cable)",
+    Fault.HOMING: "homing failed: the cart did not move, or moved the wrong way, an end stop was not found, "
+    "the distance of the end stops was off by over 3 %, or the pole did not come to rest (check the motor's "
+    "supply, its direction and the cables of the motor and of the cart's encoder; clear the track, let the "
+    "pole hang)",
 }
 
 

@@ -26,6 +26,11 @@ def check_scales(information: Info) -> None:
             raise NotReadyError(
                 f"INFO says {name} {reported}, not {expected}", "correct the firmware's settings"
             )
+    check_period(information)
+
+
+def check_period(information: Info) -> None:
+    """Raise NotReadyError if the cart's period is none that the protocol allows."""
     if not SHORTEST_PERIOD_US <= information.period_us <= LONGEST_PERIOD_US:
         raise NotReadyError(
             f"INFO says period {information.period_us} us, not {SHORTEST_PERIOD_US} to {LONGEST_PERIOD_US}",

@@ -14,6 +14,9 @@ RAMP_STEP = 1  # motor values per period
 SMALL_SWING = pole_counts(3.5)  # peak to peak; pushes the cart like three motor values
 SHORT_PATIENCE = 5.0  # s
 MOVED = cart_counts(0.09e-3)  # more than a pole that swings can press into the gears' play
+NO_MOTION = (  # the remedy for a cart whose count does not change
+    "switch the motor's supply on, check the cables of the motor and of the cart's encoder, free the cart"
+)
 
 
 class Probe(ArmedCart):
@@ -45,9 +48,7 @@ class Probe(ArmedCart):
             if abs(after.cart_counts - before.cart_counts) >= MOVED:
                 return size, before, after
         raise NotReadyError(
-            f"motor values up to {side * GENTLE_MOTOR:+d} do not move the cart's count",
-            "switch the motor's supply on, check the cables of the motor and of the cart's encoder, "
-            "free the cart",
+            f"motor values up to {side * GENTLE_MOTOR:+d} do not move the cart's count", NO_MOTION
         )
 
     def centre(self) -> None:

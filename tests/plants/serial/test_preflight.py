@@ -25,7 +25,7 @@ from cartpole_rl.plants.serial.errors import NotReadyError
 from cartpole_rl.plants.serial.preflight import Finding, preflight
 from cartpole_rl.plants.serial.probe import Probe
 from cartpole_rl.plants.serial.settings import SerialSettings
-from cartpole_rl.wire import Flags, Home, State
+from cartpole_rl.wire import Fault, Flags, Home, Message, State
 
 TRUTH: dict[str, Any] = {
     "deadband_right": 100.0,
@@ -202,15 +202,55 @@ def test_a_restart_is_a_finding_whatever_the_check_made_of_it() -> None:
     assert finding.words == "the cart has restarted; check its power"
 
 
-def test_a_fault_is_a_finding_with_its_remedy() -> None:
-    stuck = fast(stuck_encoder="cart", stuck_at=0.0)
-    with EmulatedCart(stuck) as emulated:
+@pytest.mark.parametrize(
+    "truth",
+    [
+        {"force_curve": (0.0, 0.0, 0.0)},  # a motor without power
+        {"cart_coulomb_left": 12.0, "cart_coulomb_right": 12.0},  # a blocked cart
+        {"stuck_encoder": "cart", "stuck_at": 0.0},
+    ],
+)
+def test_a_cart_that_does_not_move_is_a_finding_with_its_remedy(truth: dict[str, Any]) -> None:
+    with EmulatedCart(fast(**truth)) as emulated:
         cart = SerialCart(patient(emulated.port))
         *before, last = preflight(cart)
         cart.close()
     assert [finding.check for finding in before] == ["link", "limits"]
     assert (last.check, last.ready) == ("homing", False)
-    assert str(last).startswith("BAD  homing: the cart latched a fault: homing failed")
+    assert last.words == (
+        "homing failed: the cart's count does not change: switch the motor's supply on, check the cables of "
+        "the motor and of the cart's encoder, free the cart"
+    )
+
+
+class Failing(CartPeer):
+    """A cart that moves to the right by `moved` counts when it homes, and latches `fault`."""
+
+    def __init__(self, moved: int, fault: Fault) -> None:
+        super().__init__()
+        self.info, self.moved, self.fault = good_limits, moved, fault
+
+    def carry_out(self, message: Message) -> None:
+        if isinstance(message, Home):
+            self.state = replace(self.state, cart_counts=self.moved, fault=self.fault)
+
+
+@pytest.mark.parametrize(
+    ("moved", "fault", "words"),
+    [
+        (900, Fault.HOMING, "homing failed: the cart did not move, or moved the wrong way, an end stop"),
+        (0, Fault.POLE_ENCODER, "the pole's encoder does not answer (check its cable)"),
+    ],
+)
+def test_another_fault_while_homing_is_a_finding_with_its_remedy(
+    moved: int, fault: Fault, words: str
+) -> None:
+    with Failing(moved, fault) as peer:
+        cart = SerialCart(patient(peer.port))
+        *_, last = preflight(cart)
+        cart.close()
+    assert (last.check, last.ready) == ("homing", False)
+    assert last.words.startswith(f"the cart latched a fault: {words}")
 
 
 def test_a_bad_cable_is_told_before_anything_moves() -> None:
@@ -224,6 +264,7 @@ def test_a_bad_cable_is_told_before_anything_moves() -> None:
         cart.close()
     assert not finding.ready
     assert "use a short shielded cable" in finding.words
+    assert "set BAUD in the board's file, flash again, and give plant.baud=115200" in finding.words
 
 
 def test_a_port_that_does_not_exist() -> None:
@@ -247,6 +288,17 @@ def test_limits_that_are_not_this_carts(change: dict[str, int], words: str) -> N
     assert "soft 380 mm" in limits(good_limits)
     with pytest.raises(NotReadyError, match=words):
         limits(replace(good_limits, **change))
+
+
+@pytest.mark.parametrize("period_us", [0, 1, 4_999, 100_001])
+def test_a_period_that_the_protocol_does_not_allow(period_us: int) -> None:
+    with CartPeer() as peer:
+        peer.info = replace(good_limits, period_us=period_us)
+        cart = SerialCart(patient(peer.port))
+        (finding,) = preflight(cart)
+        cart.close()
+    assert (finding.check, finding.ready) == ("link", False)
+    assert finding.words.startswith(f"INFO says period {period_us} us, not 5000 to 100000: correct the firm")
 
 
 def test_the_check_ends_with_what_is_off_and_the_motor_is_off() -> None:
