@@ -10,7 +10,7 @@ from cartpole_rl.wire.frames import END, open_envelope
 from cartpole_rl.wire.messages import MESSAGES
 
 LONGEST_ANSWER = 64  # bytes: 2 * CART_FRAME_BYTES
-SNAPSHOT_NUMBERS = 47
+SNAPSHOT_NUMBERS = 46
 
 
 class CartHead(ctypes.Structure):

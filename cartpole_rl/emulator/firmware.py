@@ -74,7 +74,7 @@ class Firmware:
         self._zero_error = zero_error
         self._line = MotorLine()
         self._homing: Generator[int, Reading, Zeros] | None = None
-        self._zeros = Zeros(-NOMINAL_HALF_SPAN, NOMINAL_HALF_SPAN, hanging=None)
+        self._zeros = Zeros(-NOMINAL_HALF_SPAN, NOMINAL_HALF_SPAN, hanging=0)
         self._pole_zero = 0  # raw count that is reported as 0
         self._command_us: int | None = None  # when the newest SET_MOTOR arrived
         self._watchdog_us = 0  # time of START or of the newest SET_MOTOR
@@ -178,7 +178,7 @@ class Firmware:
                 self.armed, self._homing = False, None
                 self._line.stop(now_us)
             case Home():
-                self.homed, self._homing = False, home(self._zeros.hanging)
+                self.homed, self._homing = False, home()
                 next(self._homing)
                 self._reset_watches()
             case ClearFault():

@@ -60,7 +60,7 @@ class Zeros:
 
     left_stop: int
     right_stop: int
-    hanging: int | None  # None: not known yet
+    hanging: int
 
     @property
     def middle(self) -> int:
@@ -112,10 +112,10 @@ class Window:
         return round((max(self._counts) + min(self._counts)) / 2)
 
 
-def home(hanging: int | None) -> Generator[int, Reading, Zeros]:
-    """Perform the whole homing. `hanging` is the pole count at which the pole hung before, None after a boot.
+def home() -> Generator[int, Reading, Zeros]:
+    """Perform the whole homing. Raises HomingError.
 
-    Raises HomingError.
+    Nothing is taken from an earlier homing: its zeros may be why the cart is homed again.
     """
     reading = yield 0
     reading = yield from touch_stop(-1, None, reading)
@@ -127,6 +127,7 @@ def home(hanging: int | None) -> Generator[int, Reading, Zeros]:
         raise HomingError(f"the stops are {span / 1e9:.3f} m apart, not {SPAN} m")
     middle = (left + right) // 2
     reading = yield from centre(middle, reading)
+    hanging, reading = yield from find_hanging(reading)
     reading = yield from brake_swing(middle, hanging, reading)
     reading = yield from centre(middle, reading)
     return Zeros(left, right, (yield from wait_until_still(reading)))
@@ -174,13 +175,8 @@ def centre(middle: int, reading: Reading) -> Procedure:
     raise HomingError(f"not in the middle after {LONGEST_CENTRING / 1e6:.0f} s")
 
 
-def brake_swing(middle: int, hanging: int | None, reading: Reading) -> Procedure:
-    """Brake the pole's swing by moving the cart about the middle.
-
-    If the hanging count is unknown, it is the count at which the pole is fastest.
-    """
-    if hanging is None:
-        hanging, reading = yield from find_hanging(reading)
+def brake_swing(middle: int, hanging: int, reading: Reading) -> Procedure:
+    """Brake the pole's swing by moving the cart about the middle."""
     brake, window, elapsed, before = SwingBrake(), Window(WHOLE_SWING), 0, reading
     while elapsed < LONGEST_BRAKING:
         window.add(reading.pole, reading.us)

@@ -87,7 +87,6 @@ static void add_core(list *all, const cart *self)
     add(all, (int64_t)self->watchdog_us);
     add(all, self->zeros.left_stop);
     add(all, self->zeros.right_stop);
-    add(all, self->zeros.hanging_known);
     add(all, self->zeros.hanging);
     add(all, self->pole_zero);
     add(all, self->line.blocked);

@@ -162,7 +162,7 @@ static void begin_homing(cart *self)
 {
     self->homed = false;
     self->homing = true;
-    cart_homing_begin(&self->procedure, &self->zeros);
+    cart_homing_begin(&self->procedure);
     cart_guards_reset(&self->guards);
 }
 

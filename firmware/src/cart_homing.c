@@ -55,9 +55,8 @@ static void enter(cart_homing *homing, cart_homing_stage stage)
     homing->entered = false;
 }
 
-void cart_homing_begin(cart_homing *homing, const cart_zeros *zeros)
+void cart_homing_begin(cart_homing *homing)
 {
-    homing->zeros = *zeros;
     enter(homing, CART_TOUCH_LEFT);
 }
 
@@ -189,7 +188,6 @@ static outcome wait_until_still(cart_homing *homing, const cart_reading *reading
     if (cart_window_spread(&homing->window) > enough)
         return YIELDS;
     homing->zeros.hanging = cart_window_centre(&homing->window);
-    homing->zeros.hanging_known = true;
     return ENDS;
 }
 
@@ -206,7 +204,7 @@ static outcome handle(cart_homing *homing, const cart_reading *reading, int16_t 
         homing->zeros.right_stop = reading->cart;
         return how == ENDS && !span_is_right(&homing->zeros) ? FAILS : how;
     case CART_FIND_HANGING:
-        return homing->zeros.hanging_known ? ENDS : find_hanging(homing, reading, motor);
+        return find_hanging(homing, reading, motor);
     case CART_BRAKE:
         return brake_swing(homing, reading, motor);
     case CART_WAIT_UNTIL_STILL:

@@ -15,7 +15,6 @@
 typedef struct {
     int32_t left_stop, right_stop;
     int32_t hanging;
-    bool hanging_known;
 } cart_zeros;
 
 /* Raw counts at the end of a period, and its length. */
@@ -50,8 +49,8 @@ typedef struct {
     cart_window window;
 } cart_homing;
 
-/* Begin. `zeros` are those of the last homing; their hanging count may be known. */
-void cart_homing_begin(cart_homing *homing, const cart_zeros *zeros);
+/* Begin. Nothing is taken from an earlier homing: its zeros may be why the cart is homed again. */
+void cart_homing_begin(cart_homing *homing);
 
 /* Handle the reading of a period and choose the motor value for the next one. */
 cart_homing_status cart_homing_step(cart_homing *homing, const cart_reading *reading, int16_t *motor);

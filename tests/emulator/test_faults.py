@@ -17,6 +17,7 @@ from driven_cart import Driven, check_homed
 from emulator_host import SILENCE, EmulatorHost, emulator
 from firmwares import truth
 
+from cartpole_rl.emulator.device import CartDevice
 from cartpole_rl.emulator.firmware import BANNER
 from cartpole_rl.errors import LinkError
 from cartpole_rl.plants.emulated_cart import EmulatedCart
@@ -28,6 +29,7 @@ from cartpole_rl.wire import (
     Fault,
     Flags,
     Hello,
+    Home,
     Reason,
     SetMotor,
     Start,
@@ -188,6 +190,47 @@ def test_a_frozen_cart_count_under_a_push_one_way_is_a_stall():
     state, seconds = frozen("cart", [200])
     assert state.fault == Fault.STALL
     assert seconds < 0.7
+
+
+class Slipping(CartDevice):
+    """A pole encoder that stands still while its plug is loose, and then counts on: its zero is lost."""
+
+    def __init__(self, **settings: object) -> None:
+        self.lost, self.frozen = 0, None
+        super().__init__(truth(**COARSE | settings))
+
+    def _disc_counts(self) -> tuple[int, int]:
+        cart, pole = super()._disc_counts()
+        if self.frozen is not None:
+            self.lost = pole - self.frozen
+        return cart, pole - self.lost
+
+
+def test_homing_after_a_lost_zero_neither_pumps_the_pole_nor_strikes_the_stops():
+    driven = Driven()
+    driven.cart = cart = Slipping()
+    driven.home()
+    cart.physics.place_pole(0.02)
+    state = driven.ask(Start())
+    cart.frozen = cart._disc_counts()[1]
+    while not state.fault:
+        for motor in (*[250] * 8, *[-250] * 8):
+            state = driven.ask(SetMotor(motor))
+    assert state.fault == Fault.POLE_ENCODER
+    for _ in range(15):
+        driven.tick()
+    cart.frozen = None
+    for _ in range(235):
+        driven.tick()
+    assert abs(math.remainder(cart.lost * 2 * math.pi / 4096, 2 * math.pi)) > 1.5
+    driven.ask(ClearFault())
+    driven.ask(Home())
+    fastest = 0.0
+    while driven.flags & Flags.HOMING:
+        state = driven.tick()
+        fastest = max(fastest, abs(cart.physics.x_dot))
+    assert (state.fault, driven.flags) == (0, Flags.HOMED)
+    assert fastest < 0.4
 
 
 @pytest.mark.parametrize(("encoder", "fault"), [("cart", Fault.HOMING), ("pole", Fault.POLE_ENCODER)])

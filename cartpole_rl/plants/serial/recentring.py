@@ -28,6 +28,9 @@ STILL = pole_counts(1.0)  # peak to peak: worth waiting for, up to LONGEST_CALM
 NEARLY_STILL = pole_counts(2.1)  # peak to peak: good enough
 BRAKED = pole_counts(2.6)  # peak to peak; the cart's friction keeps it from braking smaller swings
 SLIPPED = pole_counts(1.5)  # a pole that rests this far off after homing lost its zero
+SMALL_SWING = pole_counts(90.0)  # peak to peak: its middle is the hanging pole, ...
+WRONG_ZERO = pole_counts(20.0)  # ... which is nearer to the zero than this, or the zero is wrong
+LARGE_SWING = pole_counts(180.0)  # peak to peak: no right brake leaves one after LONGEST_BRAKING
 
 FOLLOW = 0.9  # m/s^2 of the cart for 1 rad/s of the pole
 HARDEST_FOLLOW = 2.0  # m/s^2 in the middle, ...
@@ -97,16 +100,29 @@ def brake(moves: ArmedCart) -> None:
     """Take most of the swing out of the pole by moving the cart; stop trying after LONGEST_BRAKING.
 
     A cart that follows its hanging pole, and moves the other way while the pole is above it, takes energy
-    out of any swing, whole turns included.
+    out of any swing, whole turns included. By a wrong zero it would add energy: raises NotReadyError if the
+    zero is seen to be wrong, or if the pole swings far after all.
     """
+    turn = moves.cart.information.pole_counts_per_turn
     before = moves.drive(0)
     state, poles = moves.drive(0), [before.pole_counts]
     for _ in range(moves.periods(LONGEST_BRAKING)):
         poles.append(state.pole_counts)
         last = poles[-moves.periods(SWING_SECONDS) - 1 :]
-        if len(last) > moves.periods(SWING_SECONDS) and spread(last) <= BRAKED:
-            return
+        if len(last) > moves.periods(SWING_SECONDS):
+            if spread(last) <= BRAKED:
+                return
+            off = math.remainder((max(last) + min(last)) / 2 - turn / 2, turn)
+            if spread(last) < SMALL_SWING and abs(off) > WRONG_ZERO:
+                raise NotReadyError(
+                    f"the pole swings about a point {off * 360 / turn:+.0f} deg from its zero",
+                    "check the coupling of its encoder",
+                )
         before, state = state, moves.drive(braking_motor(before, state))
+    if spread(poles[-moves.periods(SWING_SECONDS) - 1 :]) > LARGE_SWING:
+        raise NotReadyError(
+            f"the pole still swings far after {LONGEST_BRAKING:g} s of braking", "check the pole's encoder"
+        )
 
 
 def braking_motor(before: State, state: State) -> int:

@@ -1,6 +1,7 @@
 """Between episodes the emulated cart is brought back to the middle, and homed where that will not do."""
 
 import contextlib
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
@@ -18,7 +19,7 @@ from cartpole_rl.plants.serial.errors import NotReadyError
 from cartpole_rl.plants.serial.plant import SerialPlant
 from cartpole_rl.plants.serial.recentring import recentre
 from cartpole_rl.plants.serial.settings import SerialSettings
-from cartpole_rl.wire import Fault, Flags
+from cartpole_rl.wire import Fault, Flags, Frame
 
 TURN = 4096
 MIDDLE = 100  # counts, 2.3 mm
@@ -188,6 +189,27 @@ class TestRefusals:
                 recentre(cart, HANGING)
             assert not peer.flags & Flags.ARMED
             recentre(cart, HANGING - 40)
+
+    @pytest.mark.parametrize(
+        ("middle", "swing", "reason"),
+        [
+            (HANGING + 1024, 100, r"swings about a point \+90 deg"),
+            (HANGING, 1200, "still swings far after 12"),
+        ],
+    )
+    def test_a_pole_that_cannot_be_braked(self, middle: int, swing: int, reason: str) -> None:
+        with CartPeer() as peer, SerialCart(quick(peer.port)) as cart:
+            answer = peer.answer
+
+            def swinging(frame: Frame) -> Iterator[bytes]:
+                phase = math.tau * peer.state.tick / 60
+                peer.state = replace(peer.state, pole_counts=round(middle + swing * math.sin(phase)))
+                yield from answer(frame)
+
+            peer.answer = swinging
+            with pytest.raises(NotReadyError, match=reason):
+                recentre(cart, HANGING)
+            assert not peer.flags & Flags.ARMED
 
     def test_a_fault_on_the_way_is_answered_by_homing(self, caplog: pytest.LogCaptureFixture) -> None:
         with CartPeer() as peer:
