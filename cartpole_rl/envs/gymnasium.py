@@ -126,13 +126,12 @@ class CartPoleGymnasium(gymnasium.Env[Array, np.int64]):
 
     def step(self, action: np.int64) -> tuple[Array, float, bool, bool, dict[str, Any]]:
         """One control period."""
-        motor = self.env.one_cart.sent_motor(int(action))
         now = self.env.one_cart.step(int(action))
         (reward,), (terminated,), (truncated,) = now.reward, now.terminated, now.truncated
         scores = {"score": now.score[0], "score_upright": now.score_upright[0]}
         if self.renderer is not None:
             x, _, theta, _ = now.state
-            self.renderer.advance(0, x, theta, motor, now.score[0])
+            self.renderer.advance(0, x, theta, self.env.one_cart.sent, now.score[0])
             self.renderer.show()
         return float32(now.observation), reward, terminated, truncated, scores
 

@@ -42,6 +42,7 @@ class OneCart:
             tuple(plain(torch.ones_like(each)) for each in part) for part in (previous, output)
         )
         self.frame: OneFrame  # the newest
+        self.sent = 0  # motor value of the newest period
         self.percept: FirstPercept[Numbers] | Percept[Numbers]  # of the newest frame
 
     def motor(self, action: int) -> int:
@@ -82,7 +83,8 @@ class OneCart:
         """Drive one period."""
         motor = self.sent_motor(action)
         frame = self.plant.step_one(motor)
-        return self.advance(motor, frame._replace(truncated=frame.truncated or action == NO_ACTION))
+        self.sent = motor if frame.sent is None else frame.sent
+        return self.advance(self.sent, frame._replace(truncated=frame.truncated or action == NO_ACTION))
 
     def advance(self, motor: int, frame: OneFrame) -> Percept[Numbers]:
         """Perceive the frame at the end of a period under a motor value."""

@@ -97,7 +97,7 @@ def run_batch(env: CartPoleEnv, policy: Policy, knocks: Knocks | None = None) ->
 @torch.no_grad()
 def run_one(env: CartPoleEnv, policy: Policy) -> Episode:
     """Return an episode of a plant of one cart, on plain numbers."""
-    cart, steps, actions, motors, done = env.one_cart, [], [], [], False
+    cart, steps, motors, guarded, done = env.one_cart, [], [], [], False
     with no_garbage_collection():
         first = cart.reset()
         (origin,) = env.plant.origins()
@@ -105,18 +105,17 @@ def run_one(env: CartPoleEnv, policy: Policy) -> Episode:
         try:
             while not done:  # the cart waits for this loop; the rest is done afterwards
                 action = chosen_action(policy, observation)
-                motors.append(cart.sent_motor(action))
+                guarded.append(cart.sent_motor(action) != cart.motor(action))
                 step = cart.step(action)
-                actions.append(action)
+                motors.append(cart.sent)
                 frames.append(cart.frame)
                 steps.append(step)
                 observation, (done,) = step.observation, step.done
         finally:
             env.plant.halt()  # a real cart would keep its last motor value
-    motor = np.array(motors)
-    guarded = motor != np.array([cart.motor(action) for action in actions])
     ending = ending_of(env, action, steps[-1].truncated[0], steps[-1].state[2])
-    return replace(one_episode(env, first, steps, frames, motor, guarded, ending), origin=origin)
+    episode = one_episode(env, first, steps, frames, np.array(motors), np.array(guarded), ending)
+    return replace(episode, origin=origin)
 
 
 def chosen_action(policy: Policy, observation: Sequence[float]) -> int:

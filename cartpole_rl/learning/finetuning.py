@@ -5,6 +5,7 @@ continues on both, with the same loop and the same loss.
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from itertools import takewhile
 from typing import Any
 
 import torch
@@ -30,12 +31,13 @@ def recorded_chunk(
     """Return the one-step transitions [1, T] of an episode in the environment that `make_env` builds.
 
     `pole_length` m is that of the cart, None if it is not known. The last step before a lost link is left
-    out, since its outcome was not measured. Return None if no other step is left.
+    out, since its outcome was not measured; so are those from a motor value on that no action has, as of a
+    late one. Return None if no other step is left.
     """
     env = make_env(RecordedPlant(episode, pole_length))
     index = {motor: action for action, motor in enumerate(motors)}
     current, taken = env.reset(), []
-    for motor in episode.motor[: episode.measured_steps].tolist():
+    for motor in takewhile(index.__contains__, episode.motor[: episode.measured_steps].tolist()):
         current["action"] = torch.tensor([index[motor]])
         transition, current = env.step_and_maybe_reset(current)
         taken.append(transition.select(*COLLECTED))

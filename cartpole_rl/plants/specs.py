@@ -34,12 +34,14 @@ class OneFrame(NamedTuple):
     motor_applied: int
     terminated: bool
     truncated: bool
+    sent: int | None = None  # the motor value that was sent, where the plant sent another than it was given
 
 
 class Plant(EnvBase):
     """A batch of N carts that take motor values and return encoder counts; simulated, or one cart on a wire.
 
-    In, each period: `motor` [N, 1] int64, -255 to 255, positive to the right.
+    In, each period: `motor` [N, 1] int64, -255 to 255, positive to the right. A plant that sends another
+    value, as 0 for a late one, writes it there.
     Out: `counts` [N, 2] int64 (cart from the middle of the track, pole from upright, both positive to the
     right, the pole not wrapped), `dt` [N, 1] float32 seconds since the previous frame by the plant's clock,
     `motor_applied` [N, 1] int64, `terminated` [N, 1] bool (left the track, or a device fault),
@@ -131,7 +133,7 @@ def tensordict_of(entries: dict[str, Any]) -> TensorDict:
 def one_frame(frame: TensorDictBase) -> OneFrame:
     """Return the frame of a plant of one cart as plain numbers."""
     cart, pole = frame["counts"][0].tolist()
-    dt, motor_applied, terminated, truncated = (frame[key].item() for key in OneFrame._fields[1:])
+    dt, motor_applied, terminated, truncated = (frame[key].item() for key in Report._fields[1:])
     return OneFrame((cart, pole), dt, motor_applied, terminated, truncated)
 
 
@@ -145,7 +147,10 @@ class OneCartPlant(Plant):
         return self.frame(as_report(self.reset_one()))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        return self.step_frame(as_report(self.step_one(int(tensordict["motor"]))))
+        frame = self.step_one(int(tensordict["motor"]))
+        if frame.sent is not None:
+            tensordict["motor"] = torch.tensor([[frame.sent]])
+        return self.step_frame(as_report(frame))
 
 
 def as_report(frame: OneFrame) -> Report:

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDictBase
@@ -130,8 +131,11 @@ def test_unmeasured_transitions_are_left_out(make_plant: Callable, make_environm
     assert chunk.shape[1] == lost.measured_steps == whole.shape[1] - 1
     torch.testing.assert_close(chunk["next", "observation"], whole["next", "observation"][:, :-1])
     assert not chunk["next", "done"].any()
-    only = replace(lost, **{name: getattr(lost, name)[:1] for name in ("motor", "score", "reward")})
+    late = replace(episode, motor=np.append(episode.motor[:-5], [7] * 5))  # 7 is no action's value
     env = make_environment
+    chunk = recorded_chunk(late, lambda plant: env(plant, MOTORS, time_limit=40), MOTORS, None)
+    assert chunk.shape[1] == whole.shape[1] - 5
+    only = replace(lost, **{name: getattr(lost, name)[:1] for name in ("motor", "score", "reward")})
     assert recorded_chunk(only, lambda plant: env(plant, MOTORS), MOTORS, None) is None
 
 

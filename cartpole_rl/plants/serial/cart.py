@@ -6,13 +6,13 @@ which states count as lost, repeated or late. The protocol is described in `docs
 """
 
 import logging
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from types import TracebackType
 from typing import Self
 
 from cartpole_rl.errors import LinkError, PlantError
+from cartpole_rl.plants.serial.clock import now
 from cartpole_rl.plants.serial.connection import WATCHDOG_PERIODS, Connection
 from cartpole_rl.plants.serial.errors import RefusedError, fault_error
 from cartpole_rl.plants.serial.information import check_limits, check_scales
@@ -207,7 +207,7 @@ class SerialCart:
             if error.reason != Reason.BUSY or not self._is_homing():
                 raise  # otherwise only the ACK was lost
         timeout, restarts = self.settings.home_timeout, self.restarts
-        deadline = time.perf_counter() + timeout
+        deadline = now() + timeout
         state = self._connection.state_since_question()
         while True:
             if state.fault:
@@ -217,7 +217,7 @@ class SerialCart:
             if self.flags & Flags.HOMED and not self.flags & Flags.HOMING:
                 self.info()  # the limits are now those of the span that was measured
                 return self.get_state()
-            if time.perf_counter() > deadline:
+            if now() > deadline:
                 self.stop()
                 raise PlantError(
                     f"homing was not done after {timeout:g} s: clear the track, let the pole hang"
@@ -304,7 +304,7 @@ class SerialCart:
         """
         if not self._tracker.awaits_command or not self._connection.link.waiting():
             return 0.0
-        return time.perf_counter() - self._tracker.newest_at
+        return now() - self._tracker.newest_at
 
     def check_suspension(self, seconds: float) -> None:
         """Raise LinkError if this computer did not answer the cart for too long."""

@@ -15,13 +15,13 @@ a state that is too old. The link then counts as broken.
 """
 
 import math
-import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import TypeVar
 
 from cartpole_rl.errors import LinkError
+from cartpole_rl.plants.serial.clock import now
 from cartpole_rl.plants.serial.errors import refusal
 from cartpole_rl.plants.serial.information import LONGEST_PERIOD_US
 from cartpole_rl.plants.serial.link import SerialLink
@@ -47,6 +47,7 @@ Answer = TypeVar("Answer", bound=Message)
 WATCHDOG_PERIODS = 3  # without a command, after which the cart sets its motor to 0
 BACKLOG_BYTES = 1000  # with more waiting, the system's buffer (4096) may have dropped newer bytes
 UNACKNOWLEDGED_PERIODS = 1.5  # after a frame: by then the next state has come, if the frame has arrived
+LONGEST_DEAFNESS = 1.0  # s; the cart's watchdog has stopped its motor long before
 KEPT_ANSWERS = 64
 
 
@@ -59,19 +60,22 @@ class Connection:
         self._tracker = tracker
         self._answers: deque[Message] = deque(maxlen=KEPT_ANSWERS)
         self._asked_sequence = 0  # of the newest question; older refusals of motor values are void
+        self._frames_asked = 0  # how many were sent up to the newest question, with it
+        self._heard: int | None = None  # the newest sequence that a state acknowledged, ...
+        self._unheard_since: float | None = None  # ... and when a newer one was sent
         self._refused: Nack | None = None  # of a motor value
         self._refused_sequence = -1  # of the newest frame that was refused; no state will acknowledge it
         self._state_since_refusal = True
 
     def shake_hands(self) -> Info:
         """Send HELLO until the cart answers. Whatever a booting board prints before is ignored."""
-        deadline = time.perf_counter() + self._settings.connect_timeout
+        deadline = now() + self._settings.connect_timeout
         pause = min(self._settings.answer_timeout, self._settings.connect_timeout)
-        while time.perf_counter() < deadline:
+        while now() < deadline:
             self._answers.clear()
             self.link.write(END)  # ends a partial frame that the cart may have read
             self.link.send(Hello())
-            until = min(deadline, time.perf_counter() + pause)
+            until = min(deadline, now() + pause)
             answer = self._await_answer(until, (), Info, lambda info: True)
             if answer is not None:
                 return answer
@@ -93,12 +97,12 @@ class Connection:
         self._refused_sequence = -1
         self._answers.clear()
         asked: list[int] = []
-        end, pause = time.perf_counter() + within, min(self._settings.answer_timeout, within / 2)
+        end, pause = now() + within, min(self._settings.answer_timeout, within / 2)
         for _ in range(1 + self._settings.retries):
             asked.append(self.link.send(*before, message))
             self.notice_backlog()
-            self._asked_sequence = asked[-1]
-            deadline = min(end, time.perf_counter() + pause)
+            self._asked_sequence, self._frames_asked = asked[-1], self.link.frames_sent
+            deadline = min(end, now() + pause)
             answer = self._await_answer(deadline, asked, kind, fits)
             if answer is not None:
                 self._refused = None  # of an earlier motor value, which has no meaning any more
@@ -113,7 +117,7 @@ class Connection:
     def send_motor(self, value: int) -> None:
         """Send a motor value once. Raises LinkError if it was delayed for as long as the watchdog waits."""
         self._refused_sequence = -1
-        before, started = self._tracker.last, time.perf_counter()
+        before, started = self._tracker.last, now()
         self.link.send(SetMotor(value))
         self._tracker.send_command(self.link.sequence, self.link.sent_at)
         period_us = min(self._tracker.period_us or LONGEST_PERIOD_US, LONGEST_PERIOD_US)
@@ -124,24 +128,38 @@ class Connection:
         """Wait for the newest state that was measured after the cart took the last frame.
 
         Raises RefusedError or FaultError if the cart refused the last motor value, LinkError if no state
-        arrives within `timeout` or the cart's clock stands still.
+        arrives within `timeout`, the cart's clock stands still, or the cart does not hear this computer.
         """
-        state = self._await_current(time.perf_counter() + self._settings.timeout)
+        state = self._await_current(now() + self._settings.timeout)
         self._raise_stopped_clock()
+        self._check_hearing(state)
         refused, self._refused = self._refused, None
         if refused is not None and not state.fault:
             raise refusal(refused)
         self._tracker.hand_out(state)
         return state
 
+    def _check_hearing(self, state: State) -> None:
+        """Raise LinkError if frames went out but, for LONGEST_DEAFNESS, no state has acknowledged one."""
+        newest, heard, self._heard = self.link.sequence, self._heard, state.last_sequence
+        if state.last_sequence == newest or newest == self._refused_sequence:
+            self._unheard_since = None
+        elif self._unheard_since is None or state.last_sequence != heard:
+            self._unheard_since = self.link.sent_at
+        elif now() - self._unheard_since > LONGEST_DEAFNESS:
+            raise LinkError(
+                f"the cart on {self.link.port} sends states but acknowledges nothing: check the wire from "
+                "this computer to the cart"
+            )
+
     def state_since_question(self) -> State:
         """Wait for a state that was measured after the cart took the newest question."""
-        deadline = time.perf_counter() + self._settings.timeout
+        deadline = now() + self._settings.timeout
         while True:
             state = self.current_state()
             if (state.last_sequence - self._asked_sequence) % 256 < 128:
                 return state
-            if time.perf_counter() > deadline:
+            if now() > deadline:
                 raise LinkError(
                     f"the states of the cart on {self.link.port} acknowledge no frame; correct its firmware"
                 )
@@ -158,7 +176,7 @@ class Connection:
 
         `before` is the newest state before the write. A lockstep emulator waits for the host.
         """
-        deadline = time.perf_counter() + self._settings.timeout
+        deadline = now() + self._settings.timeout
         while True:
             state = self._tracker.last
             if before is None or state is None or ticks_between(before.tick, state.tick) >= WATCHDOG_PERIODS:
@@ -185,7 +203,7 @@ class Connection:
                     raise refusal(answer)
                 if isinstance(answer, kind) and fits(answer):
                     return answer
-            if time.perf_counter() >= deadline:
+            if now() >= deadline:
                 return None
             self._answers.clear()
             self._read()
@@ -194,7 +212,7 @@ class Connection:
         """The newest state that acknowledges the last frame; when that is overdue, the newest there is."""
         older: State | None = None
         while True:
-            while waiting := self.link.waiting():
+            while (waiting := self.link.waiting()) and now() < deadline:  # a device may never pause
                 self._read(waiting)
             state = self._tracker.take_newest()
             if state is None:
@@ -215,19 +233,19 @@ class Connection:
             return True
         if link.sequence == self._refused_sequence and self._state_since_refusal:
             return True
-        waited = time.perf_counter() - link.sent_at
+        waited = now() - link.sent_at
         period_us = min(self._tracker.period_us or LONGEST_PERIOD_US, LONGEST_PERIOD_US)
         return waited > UNACKNOWLEDGED_PERIODS * period_us * 1e-6
 
     def _endure_silence(self, deadline: float) -> None:
         """Raise LinkError after the deadline; send HELLO after each `nudge_after` seconds without a byte."""
-        now = time.perf_counter()
-        if now > deadline:
+        time = now()
+        if time > deadline:
             raise LinkError(
                 f"no state came from {self.link.port} for {self._settings.timeout:g} s: "
                 "check the cart's cable and power"
             )
-        if now - max(self.link.received_at, self.link.sent_at) > self._settings.nudge_after:
+        if time - max(self.link.received_at, self.link.sent_at) > self._settings.nudge_after:
             self.link.send(Hello())
 
     def _read(self, waiting: int = 0) -> None:
@@ -247,7 +265,7 @@ class Connection:
         self._state_since_refusal = False
         if nack.type != MessageType.SET_MOTOR:
             self._answers.append(nack)
-        elif (nack.sequence - self._asked_sequence) % 256 < 128:
+        elif (self.link.sequence - nack.sequence) % 256 < self.link.frames_sent - self._frames_asked:
             self._refused = nack  # `current_state` raises it
 
     def _raise_stopped_clock(self) -> None:

@@ -4,25 +4,26 @@ A receiver that starts in the middle of a frame, or receives noise, is synchroni
 """
 
 import os
-import time
 from contextlib import suppress
 
 import serial
 
 from cartpole_rl.errors import FrameError, LinkError
+from cartpole_rl.plants.serial.clock import now
 from cartpole_rl.plants.serial.statistics import LinkStatistics
 from cartpole_rl.wire import Frame, FrameSplitter, Message, decode_frame, encode_frame
 
 
 class SerialLink:
-    """Both directions of one port. Times are those of `time.perf_counter`, in s."""
+    """Both directions of one port. Times are those of `clock.now`, in s."""
 
     def __init__(self, port: serial.SerialBase, statistics: LinkStatistics) -> None:
         self._port = port
         self._splitter = FrameSplitter()
         self.statistics = statistics
         self.sequence = 0  # of the newest frame sent
-        self.sent_at = self.received_at = time.perf_counter()
+        self.frames_sent = 0
+        self.sent_at = self.received_at = now()
         self.bytes_received = 0
         self.why_bad = ""  # what was wrong with the newest bad frame
 
@@ -36,6 +37,7 @@ class SerialLink:
         data = b""
         for message in messages:
             self.sequence = (self.sequence + 1) & 0xFF
+            self.frames_sent += 1
             data += encode_frame(message, self.sequence)
         self.write(data)
         return self.sequence
@@ -48,7 +50,7 @@ class SerialLink:
                 self._port.write(data[taken:])
         except OSError as error:
             raise self._broken("written to", error) from error
-        self.sent_at = time.perf_counter()
+        self.sent_at = now()
 
     def _taken_at_once(self, data: bytes) -> int:
         """Return how many bytes the system takes without a wait; 0 for a port without a descriptor.
@@ -84,7 +86,7 @@ class SerialLink:
             raise self._broken("read", error) from error
         if not data:
             return []
-        self.received_at = time.perf_counter()
+        self.received_at = now()
         self.bytes_received += len(data)
         overlong = self._splitter.overlong
         frames = [

@@ -141,14 +141,17 @@ class SerialPlant(OneCartPlant):
 
     def step_one(self, motor: int) -> OneFrame:
         """Send a motor value; return the frame at the end of the period."""
+        sent = motor
 
         def answer() -> State:
-            self.cart.set_motor(motor)
+            nonlocal sent
+            sent = self.cart.set_motor(motor)
             if self.on_command is not None:  # in the time until the next state
-                self.on_command(motor)
+                self.on_command(sent)
             return self.cart.get_state()
 
-        return self._pass_period(answer)
+        frame = self._pass_period(answer)
+        return frame if sent == motor else frame._replace(sent=sent)
 
     def listen_one(self) -> OneFrame:
         """Let the policy on the board drive; return the frame at the end of the period."""

@@ -6,7 +6,6 @@ a restart or a lost link the zeros may be wrong, and the cart is homed again.
 
 import logging
 import math
-import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ from typing import Literal
 
 from cartpole_rl.errors import LinkError, PlantError
 from cartpole_rl.plants.serial.cart import RESTARTED, SerialCart
+from cartpole_rl.plants.serial.clock import now
 from cartpole_rl.plants.serial.faults import FaultClearing
 from cartpole_rl.plants.serial.recentring import recentre
 from cartpole_rl.wire import Flags, State, microseconds_between
@@ -126,7 +126,7 @@ class Preparation:
         """Wait until the pole stays still in the position. Raises PlantError after `start_timeout`."""
         timeout = self._cart.settings.start_timeout
         window: deque[tuple[int, float]] = deque()  # (us, rad) of the last STILL_SECONDS
-        deadline = time.perf_counter() + timeout
+        deadline = now() + timeout
         while True:
             state = self._cart.poll_state()
             if not self._cart.flags & Flags.HOMED:
@@ -138,7 +138,7 @@ class Preparation:
                 window.clear()
             elif microseconds_between(window[0][0], state.time_us) >= STILL_SECONDS * 1e6:
                 return
-            if time.perf_counter() > deadline:
+            if now() > deadline:
                 raise PlantError(
                     f"waited {timeout:g} s for the pole to be still within "
                     f"{math.degrees(position.tolerance):.0f} deg of {self.start}; "

@@ -9,7 +9,7 @@ state that was passed over, and each state whose command was sent more than a pe
 arrived. The second is counted only if the cart's tick advanced meanwhile: a lockstep emulator waits for the
 host, so nothing is late there.
 
-There is no I/O and no clock here: the caller passes the times, in s of `time.perf_counter`.
+There is no I/O and no clock here: the caller passes the times, in s of `clock.now`.
 """
 
 from collections.abc import Iterator

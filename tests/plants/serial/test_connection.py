@@ -1,12 +1,14 @@
 """Questions and answers between the host and a scripted cart: repetitions, refusals, faults."""
 
 import re
+import threading
 from dataclasses import replace
 
 import pytest
 from serial_peer import CartPeer, Forgetful, Refusing, quick_settings
 
 from cartpole_rl.errors import FaultError, LinkError, PlantError
+from cartpole_rl.plants.serial import connection
 from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.errors import RefusedError
 from cartpole_rl.wire import Fault, Flags, Nack, Reason, SetMotor, Start, Stop
@@ -56,6 +58,63 @@ def test_a_refused_motor_value_is_raised_where_the_state_is_read() -> None:
         with pytest.raises(RefusedError, match=re.escape("not armed; has it restarted?")):
             cart.get_state()
         assert cart.get_state()
+
+
+@pytest.mark.parametrize("accepted", [10, 140, 300])
+def test_a_refusal_is_raised_at_once_however_many_values_were_accepted(accepted: int) -> None:
+    with CartPeer() as peer, SerialCart(quick_settings(peer.port)) as cart:
+        cart.start()
+        for _ in range(accepted):
+            cart.set_motor(50)
+            cart.get_state()
+        peer.answer = lambda frame: [
+            peer.encode(Nack(frame.sequence, SetMotor.TYPE, Reason.NOT_ARMED)),
+            peer.next_state(),
+        ]
+        cart.set_motor(50)
+        with pytest.raises(RefusedError, match="not armed"):
+            cart.get_state()
+        peer.answer = lambda frame: CartPeer.answer(peer, frame)
+
+
+def test_a_cart_that_hears_nothing_is_a_lost_link(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connection, "LONGEST_DEAFNESS", 0.2)
+    with CartPeer(paced=True) as peer, SerialCart(quick_settings(peer.port)) as cart:
+        peer.tick()
+        cart.start()
+        peer.tick()
+        cart.get_state()
+        peer.answer = lambda frame: ()  # the wire to the cart is broken, the one from it is not
+
+        def drive_on() -> None:
+            for _ in range(1000):
+                cart.set_motor(50)
+                peer.tick()
+                cart.get_state()
+
+        with pytest.raises(LinkError, match="sends states but acknowledges nothing: check the wire from"):
+            drive_on()
+        peer.answer = lambda frame: CartPeer.answer(peer, frame)
+
+
+def test_a_device_that_never_pauses_does_not_hold_up_the_host() -> None:
+    with CartPeer(paced=True) as peer, SerialCart(quick_settings(peer.port, timeout=0.3)) as cart:
+        stopped = threading.Event()
+
+        def flood() -> None:
+            while not stopped.is_set():
+                peer.send(b"noise " * 100)
+
+        flooding = threading.Thread(target=flood)
+        flooding.start()
+        try:
+            with pytest.raises(LinkError, match="no state came"):
+                cart.get_state()
+        finally:
+            stopped.set()
+            while flooding.is_alive():  # it may wait for room
+                peer.unread() and cart._connection.link.receive(peer.unread())
+            flooding.join()
 
 
 def test_a_refusal_of_what_was_sent_before_the_last_question_is_void() -> None:

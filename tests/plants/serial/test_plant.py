@@ -48,6 +48,23 @@ def test_a_reset_homes_and_arms(peer: CartPeer, plant: SerialPlant) -> None:
     ]
 
 
+def test_a_value_that_is_replaced_by_0_is_the_one_that_counts(
+    peer: CartPeer, plant: SerialPlant, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plant.reset()
+    commanded = []
+    plant.on_command = commanded.append
+    monkeypatch.setattr(plant.cart, "_is_late", lambda: True)
+    given = TensorDict({"motor": torch.tensor([[200]])}, [1])
+    plant._step(given)
+    assert plant.step_one(200).sent == 0
+    assert given["motor"].item() == 0
+    assert commanded == [0, 0]
+    monkeypatch.undo()
+    assert plant.step_one(200).sent is None
+    assert peer.messages(SetMotor)[-1] == SetMotor(200)
+
+
 def test_the_call_before_the_start_finds_the_cart_ready_and_disarmed(
     peer: CartPeer, plant: SerialPlant
 ) -> None:

@@ -9,6 +9,7 @@ from serial_peer import CartPeer, Forgetful, quick_settings, wait_for
 
 from cartpole_rl.errors import LinkError
 from cartpole_rl.plants.serial.cart import SerialCart
+from cartpole_rl.plants.serial.clock import now
 from cartpole_rl.wire import Frame, Hello, SetMotor
 
 
@@ -31,8 +32,9 @@ class HostClock:
 
 @pytest.fixture
 def host_clock(monkeypatch: pytest.MonkeyPatch) -> HostClock:
-    clock, real = HostClock(), time.perf_counter
-    monkeypatch.setattr(time, "perf_counter", lambda: real() + clock.ahead)
+    clock = HostClock()
+    for module in ("cart", "connection", "link"):
+        monkeypatch.setattr(f"cartpole_rl.plants.serial.{module}.now", lambda: now() + clock.ahead)
     return clock
 
 
