@@ -47,7 +47,7 @@ def studies_page(
     size = f", size {', '.join(sizes)}" if sizes else ""
     parts = [
         f"<h1>{TITLE}</h1>",
-        f"<p>{len(results)} {'study' if len(results) == 1 else 'studies'}{size}, {agents_text(agents)}.</p>",
+        f"<p>{_count(results)}{size}, {agents_text(agents)}.</p>",
         _tendency(results),
         _summary(results),
         _contents(results),
@@ -80,6 +80,13 @@ def runs_page(
     return document(title, "\n".join(part for part in parts if part), STYLE)
 
 
+def _count(results: Sequence[StudyResults]) -> str:
+    """Return "1 study", "38 studies", or "2 of 38 studies" where the others have no results."""
+    made = sum(bool(each.agents) for each in results)
+    part = f"{made} of " if made < len(results) else ""
+    return f"{part}{len(results)} {'study' if len(results) == 1 else 'studies'}"
+
+
 def _tendency(results: Sequence[StudyResults]) -> str:
     """Return a warning if no study has ENOUGH agents per set-up; empty otherwise."""
     most = max((each.size.seeds for each in results if each.agents and each.size), default=ENOUGH)
@@ -101,9 +108,10 @@ def _emulators(emulators: Mapping[str, str]) -> str:
 
 
 def _summary(results: Sequence[StudyResults]) -> str:
-    """Return the table of all studies, what fails or contradicts first."""
+    """Return the table of the studies with results, what fails or contradicts first, and name the others."""
     order = [*Status]
-    ranked = sorted(results, key=lambda each: order.index(status(each)))
+    carried_out = [each for each in results if each.agents]
+    ranked = sorted(carried_out, key=lambda each: order.index(status(each)))
     rows = [
         {
             "study": _link(each),
@@ -113,9 +121,10 @@ def _summary(results: Sequence[StudyResults]) -> str:
         }
         for each in ranked
     ]
-    return (
-        f'<section id="summary"><h2>Summary: what fails comes first</h2>{table(rows, cards=True)}</section>'
-    )
+    found = table(rows, cards=True) if rows else ""
+    others = ", ".join(_link(each) for each in results if not each.agents)
+    lacking = f"<p>No result yet: {others}.</p>" if others else ""
+    return f'<section id="summary"><h2>Summary: what fails comes first</h2>{found}{lacking}</section>'
 
 
 def _contents(results: Sequence[StudyResults]) -> str:
@@ -148,7 +157,7 @@ def _study_section(results: StudyResults, pictures: Sequence[Picture]) -> str:
         f'<section id="{_anchor(results.name)}">',
         f"<h2>{escaped(study.title)}{figure}</h2>",
         f"<p>{_status(results)}</p><dl>{listed}</dl>",
-        doubts(results, [f"Missing: {each}." for each in results.missing()]),
+        doubts(results, [f"Missing: {each}." for each in results.missing()] if results.agents else []),
         *figure_parts(results, pictures),
         commands(results),
         run_list(results),
@@ -265,7 +274,7 @@ def _comment(results: StudyResults) -> list[str]:
 
 
 def _is_alarming(results: StudyResults) -> bool:
-    return status(results) not in (Status.AGREES, Status.OPEN)
+    return status(results) not in (Status.AGREES, Status.OPEN, Status.EMPTY)
 
 
 def _anchor(name: str) -> str:
