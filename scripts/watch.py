@@ -6,13 +6,14 @@
     scripts/watch.py /dev/ttyUSB0 --baud 115200
 
 At its start and at its end it sends STOP. If homing fails, it prints the fault and ends with exit status 1.
+It clears no fault: a restart of the board does.
 """
 
 import argparse
 import contextlib
 import sys
 
-from cartpole_rl.errors import PlantError
+from cartpole_rl.errors import FaultError, PlantError
 from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.wire import Fault, Flags, State
@@ -48,6 +49,8 @@ def main() -> None:
             while True:
                 states = [cart.poll_state() for _ in range(PERIODS_PER_LINE)]
                 print(line(states[-1], cart.flags), flush=True)
+    except FaultError as error:
+        sys.exit(f"{error}; a restart of the board clears the fault, see First power-on in docs/firmware.md")
     except PlantError as error:
         sys.exit(str(error))
 

@@ -124,6 +124,9 @@ def test_identify_train_on_it_and_model_it(trained: Path, serial_port: Callable[
     modelled = run_here(model.replace("<run>", "mine"), *short, cwd=trained)
     assert modelled.returncode == 0, modelled.stderr
     assert (trained / "runs/model/mine/model.pt").exists()
+    (learned,) = [command for command in listed("cartpole-train") if "plant=learned" in command]
+    result = run_here(learned.replace("<run>", "mine"), *BUDGET, cwd=trained)
+    assert result.returncode == 0, result.stderr
 
 
 def test_record_and_replay(trained: Path) -> None:

@@ -139,7 +139,7 @@ def test_a_fault_that_stays_is_named_with_its_remedy() -> None:
     with CartPeer() as peer, SerialCart(quick_settings(peer.port)) as cart:
         cart.clear_fault()
         peer.state = replace(peer.state, fault=int(Fault.POLE_ENCODER | Fault.STALL) | 0x8000)
-        with pytest.raises(FaultError, match=r"motor's cable.*pole's encoder.*check its cable.*0x8000"):
+        with pytest.raises(FaultError, match=r"motor's supply.*pole's encoder.*check its cable.*0x8000"):
             cart.clear_fault()
 
 

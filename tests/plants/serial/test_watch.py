@@ -5,12 +5,13 @@ import signal
 import subprocess
 import sys
 import termios
+from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
 from serial_peer import CartPeer, wait_for
 
-from cartpole_rl.wire import Home, SetMotor, Start, Stop
+from cartpole_rl.wire import ClearFault, Fault, Frame, Home, Nack, Reason, SetMotor, Start, Stop
 
 SCRIPT = Path(__file__).parents[3] / "scripts/watch.py"
 OUTPUT_SPEED = 5  # of termios.tcgetattr
@@ -36,6 +37,26 @@ def test_counts_are_printed_until_an_interrupt(words: tuple[str, ...], speed: in
         wait_for(lambda: isinstance(peer.received[-1].message, Stop))
         assert not peer.messages(Home) + peer.messages(Start)
         assert all(message == SetMotor(0) for message in peer.messages(SetMotor))
+
+
+class Faulted(CartPeer):
+    """A cart that refuses HOME, since a fault is latched."""
+
+    def answer(self, frame: Frame) -> Iterable[bytes]:
+        if not isinstance(frame.message, Home):
+            yield from super().answer(frame)
+            return
+        yield self.encode(Nack(frame.sequence, Home.TYPE, Reason.FAULT_LATCHED))
+        yield self.next_state(last_sequence=frame.sequence, fault=Fault.HOMING)
+
+
+def test_a_latched_fault_is_printed_with_what_clears_it() -> None:
+    with Faulted() as peer:
+        done = subprocess.run([sys.executable, SCRIPT, peer.port, "--home"], capture_output=True, text=True)
+        assert not peer.messages(ClearFault)
+    assert done.returncode == 1
+    assert done.stderr.startswith("the cart refused HOME: a fault is latched")
+    assert "a restart of the board clears the fault" in done.stderr
 
 
 def test_another_line_speed_is_refused_in_words() -> None:
