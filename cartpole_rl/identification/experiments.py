@@ -11,10 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cartpole_rl.envs.guard import guard_side
 from cartpole_rl.envs.settings import TrackGuard
+from cartpole_rl.identification.guard import experiment_guard, guarded
 from cartpole_rl.identification.moves import (
-    SIDE,
     Moves,
     Observed,
     Task,
@@ -31,9 +30,6 @@ from cartpole_rl.scheduling import no_garbage_collection
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
 
-REACH = 0.27  # m from the middle; the shortest track ends at 0.3
-GUARD = TrackGuard(margin=0.0, delay=0.12, deceleration=1 / 0.24)  # of carts that are not known yet
-BRAKE = 220  # motor value of the guard
 BREAKAWAY = 90  # motor value that moves most carts, before it is known
 BROKEN_AWAY = 0.002  # m
 RIGHT, LEFT = 1, -1
@@ -80,7 +76,7 @@ def coast(task: Task) -> Moves:
     """Push the cart to each side, weakly and strongly, and let it coast."""
     for more in (20, 50, 90, 140):
         for side in (RIGHT, LEFT):
-            yield from go_to(-side * SIDE, task)
+            yield from go_to(-side * task.side, task)
             yield from push(side * task.moving(more), 0.9, task)
             yield from until_stopped(0, side, task)
     return None
@@ -90,7 +86,7 @@ def levels(task: Task) -> Moves:
     """Hold small motor values on a moving cart: the force near the dead-band is not observable at rest."""
     for size in (40, 50, 55, 60, 65, 70, 80, 95):
         for side in (RIGHT, LEFT):
-            yield from go_to(-side * SIDE, task)
+            yield from go_to(-side * task.side, task)
             yield from push(side * task.moving(110), 0.5, task)
             yield from until_stopped(side * size, side, task)
     return None
@@ -139,6 +135,7 @@ def conduct(
     The cart stands, with the motor at 0, whenever a recording is yielded: nothing controls it while a file is
     written. The next experiment continues from there; after an ending by the plant it starts with a reset.
     """
+    guard = experiment_guard(period)
     task, present, ended = Task(period, np.random.default_rng(seed), BREAKAWAY), plant.reset_one(), False
     for number, experiment in enumerate(experiments):
         with no_garbage_collection():
@@ -147,7 +144,7 @@ def conduct(
                 ended = present.terminated or present.truncated
             if ended:
                 present = plant.reset_one()
-            recorded, present, breakaway = run(plant, present, and_stop(experiment.moves(task), task))
+            recorded, present, breakaway = run(plant, present, and_stop(experiment.moves(task), task), guard)
         task = task._replace(breakaway=breakaway or task.breakaway)
         ended = recorded.ended_by != Ending.TIME
         if number + 1 == len(experiments):
@@ -155,16 +152,19 @@ def conduct(
         yield experiment, recorded
 
 
-def run(plant: Plant, present: OneFrame, moves: Moves) -> tuple[Episode, OneFrame, int | None]:
+def run(
+    plant: Plant, present: OneFrame, moves: Moves, guard: TrackGuard
+) -> tuple[Episode, OneFrame, int | None]:
     """Make the moves from the frame `present` on; return the recording, the last frame, and their result.
 
-    The motor is at 0 at the end, whatever the moves or the guard requested last.
+    `guard` brakes the cart where the moves do not. The motor is at 0 at the end, whatever the moves or the
+    guard requested last.
     """
     counts, gaps, motors, ended = [present.counts], [present.dt], [], str(Ending.TIME)
     requested, breakaway = next(moves), None
     while True:
         now = observed(counts, gaps)
-        motor = guarded(requested, now)
+        motor = guarded(requested, now.x, now.x_dot, guard)
         present = plant.step_one(motor)
         motors.append(motor)
         counts.append(present.counts)
@@ -190,14 +190,6 @@ def observed(counts: list[tuple[int, int]], gaps: list[float]) -> Observed:
         theta * POLE_RADIANS_PER_COUNT,
         (theta - theta_before) * POLE_RADIANS_PER_COUNT / gaps[-1],
     )
-
-
-def guarded(motor: float, now: Observed) -> int:
-    """Return the motor value, or one that brakes if the cart would get beyond REACH."""
-    side = guard_side(now.x, now.x_dot, REACH, GUARD)
-    if side and motor * side < BRAKE:
-        return int(side) * BRAKE
-    return int(np.clip(motor, -LARGEST_MOTOR, LARGEST_MOTOR))
 
 
 def recording(counts: np.ndarray, gaps: np.ndarray, motors: np.ndarray, ended_by: str) -> Episode:

@@ -8,9 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from cartpole_rl.identification.guard import reach
 from cartpole_rl.physics.motor import LARGEST_MOTOR
 
-SIDE = 0.2  # m, start of a run to the other side
+SIDE = 20 / 27  # share of the guard's reach where a run to the other side starts: 0.2 m at 20 ms
 CLOSE, SLOW = 0.02, 0.05  # m, m/s: at the target, and at rest
 LONGEST_MOVE = 4.0  # s
 STANDING, LONGEST_STOP = 0.005, 3.0  # m/s, s: at the end of an experiment
@@ -34,6 +35,11 @@ class Task(NamedTuple):
     period: float  # s, of control
     random: np.random.Generator
     breakaway: int  # motor value that moves the cart from rest
+
+    @property
+    def side(self) -> float:
+        """The distance from the middle where a run to the other side starts, m."""
+        return SIDE * reach(self.period)
 
     def periods(self, seconds: float) -> int:
         """Return the number of control periods in a time."""
@@ -65,7 +71,7 @@ def until_stopped(motor: int, side: int, task: Task) -> Moves:
     """Hold one motor value until the cart stops or gets near the end at `side`, then rest briefly."""
     now = yield motor
     for _ in range(task.periods(LONGEST_MOVE)):
-        if abs(now.x_dot) < SLOW / 5 or side * now.x > SIDE + 0.03:
+        if abs(now.x_dot) < SLOW / 5 or side * now.x > task.side + 0.03:
             break
         now = yield motor
     yield from hold(0, 0.2, task)

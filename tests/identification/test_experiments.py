@@ -1,6 +1,7 @@
 """Experiments on a simulated cart keep clear of the ends, and identify the cart."""
 
 from collections.abc import Callable
+from contextlib import closing
 from functools import partial
 from itertools import pairwise
 from typing import Any
@@ -9,27 +10,28 @@ import numpy as np
 import pytest
 from tensordict import TensorDict
 
+from cartpole_rl.emulator.settings import EmulatorSettings
+from cartpole_rl.envs.guard import stopping_distance
 from cartpole_rl.errors import RecordingError
 from cartpole_rl.identification.checks import check_recordings
 from cartpole_rl.identification.experiments import (
     EXPERIMENTS,
     HELD_OUT,
-    REACH,
     Experiment,
     Moves,
-    Observed,
     Task,
     conduct,
     excite,
     free_swing,
-    guarded,
     hold,
 )
+from cartpole_rl.identification.guard import TRACK_END, experiment_guard, guarded, reach
 from cartpole_rl.identification.identify import Identification, identify
 from cartpole_rl.identification.quantities import quantities
 from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_COUNTS_PER_TURN
 from cartpole_rl.physics.models import CartFriction, Models, PoleFriction
 from cartpole_rl.physics.parameters import CartParameters
+from cartpole_rl.plants.emulated import emulated_plant
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.tasks.episode import Episode
@@ -86,7 +88,7 @@ def test_every_experiment_is_made_to_its_end(recordings: dict[str, Episode]) -> 
 
 
 def test_the_cart_keeps_clear_of_the_ends(recordings: dict[str, Episode]) -> None:
-    assert max(np.abs(episode.x).max() for episode in recordings.values()) < REACH + 0.08
+    assert max(np.abs(episode.x).max() for episode in recordings.values()) < reach(PERIOD) + 0.08
 
 
 def test_the_swing_is_wide_and_free(recordings: dict[str, Episode]) -> None:
@@ -136,7 +138,35 @@ def test_recordings_follow_each_other_on_one_cart(recordings: dict[str, Episode]
     ],
 )
 def test_the_guard_brakes(x: float, x_dot: float, motor: int, given: int) -> None:
-    assert guarded(motor, Observed(x, x_dot, np.pi, 0.0)) == given
+    assert guarded(motor, x, x_dot, experiment_guard(PERIOD)) == given
+
+
+@pytest.mark.parametrize("period", [0.005, 0.02, 0.05, 0.1])
+@pytest.mark.parametrize("speed", [0.0, 0.5, 1.0])
+def test_the_guard_allows_for_a_period_in_which_it_does_not_act(period: float, speed: float) -> None:
+    """Where it lets a cart run, one that gains speed for a period more and is braked as hard stays within."""
+    guard, late = experiment_guard(period), period + 0.035  # s, period and response of the motor
+    at_rest = TRACK_END - stopping_distance(speed, guard)
+    true_speed = speed + guard.deceleration * period / 2  # the measured one is half a period old
+    ran_on = true_speed * late + guard.deceleration * late**2 / 2
+    braked = (true_speed + guard.deceleration * late) ** 2 / (2 * guard.deceleration)
+    assert at_rest + ran_on + braked <= TRACK_END + 1e-4
+    assert reach(0.02) == pytest.approx(0.27)
+
+
+LIGHT = {"cart_mass": 0.57}
+HEAVY = {"cart_mass": 1.1, "pole_mass": 0.23, "pole_com": 0.33, "pole_inertia": 7.88e-3}
+
+
+@pytest.mark.parametrize("period", [0.05, 0.1])
+@pytest.mark.parametrize("cart", [LIGHT, HEAVY], ids=["light", "heavy"])
+def test_an_emulated_cart_keeps_within_0_3_m_at_long_periods(cart: dict[str, float], period: float) -> None:
+    everything = tuple(each for each in EXPERIMENTS if each.name not in ("ramps", "swing"))
+    with closing(emulated_plant(EmulatorSettings(physics_step=1e-3, **cart), period)) as plant:
+        recorded = [episode for _, episode in conduct(plant, period, seed=1, experiments=everything)]
+    assert {episode.ended_by for episode in recorded} == {"time"}
+    assert max(np.abs(episode.x).max() for episode in recorded) < 0.3
+    assert sum(episode.steps for episode in recorded) * period < 240  # runs start within the guard's reach
 
 
 def test_the_cart_is_found(found: Identification, nominal: dict[str, float]) -> None:
