@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 
@@ -10,13 +10,22 @@ from pathlib import Path
 def replacing(path: Path) -> Iterator[Path]:
     """Yield a temporary path beside `path`; at the end, it replaces `path` atomically.
 
-    Content and new name are flushed to the disk, in this order, before this returns.
+    Content and new name are flushed to the disk, in this order, before this returns. After an error the
+    temporary file is removed, and `path` is as before. An OSError that names no file, as that of a full disk,
+    becomes one that names `path`.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     beside = path.with_name(f"{path.name}.partial")
-    yield beside
-    _flush(beside)
-    beside.replace(path)
+    try:
+        yield beside
+        _flush(beside)
+        beside.replace(path)
+    except BaseException as error:
+        with suppress(OSError):
+            beside.unlink(missing_ok=True)
+        if unnamed := _unnamed(error):
+            raise OSError(unnamed.errno, unnamed.strerror, str(path)) from error
+        raise
     if os.name == "posix":  # Windows cannot open a folder
         _flush(path.parent)
 
@@ -30,6 +39,12 @@ def write_bytes(path: Path, content: bytes) -> None:
     """Write `content` to `path` atomically."""
     with replacing(path) as beside:
         beside.write_bytes(content)
+
+
+def _unnamed(error: BaseException) -> OSError | None:
+    """Return the OSError without a file that `error` is, or that torch.save hides behind `error`."""
+    cause = error.__context__ if isinstance(error, RuntimeError) else error
+    return cause if isinstance(cause, OSError) and cause.errno and not cause.filename else None
 
 
 def _flush(path: Path) -> None:

@@ -106,8 +106,8 @@ def load_training(run: Path, file_format: str = TRAINING_FORMAT) -> TrainingChec
 
 
 def _save(path: Path, file_format: str, content: Mapping[str, Any]) -> None:
-    with replacing(path) as beside:
-        torch.save({"format": file_format, **moved(content, "cpu")}, beside)
+    with replacing(path) as beside, beside.open("wb") as file:  # with a path, torch hides why writing failed
+        torch.save({"format": file_format, **moved(content, "cpu")}, file)
 
 
 def _load(path: Path, expected: str) -> dict[str, Any]:

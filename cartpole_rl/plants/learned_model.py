@@ -41,8 +41,8 @@ def save_model(path: Path, model: LearnedModel) -> None:
         "substeps": model.substeps,
         "residual": {name: part.detach() for name, part in model.residual._asdict().items()},
     }
-    with replacing(path) as beside:
-        torch.save({"format": FORMAT, **content}, beside)
+    with replacing(path) as beside, beside.open("wb") as file:  # with a path, torch hides why writing failed
+        torch.save({"format": FORMAT, **content}, file)
 
 
 def load_model(source: Path) -> LearnedModel:

@@ -1,5 +1,6 @@
 """Response of every command to signals that end it."""
 
+import errno
 import os
 import signal
 import time
@@ -12,6 +13,7 @@ from hydra.core.global_hydra import GlobalHydra
 
 from cartpole_rl.commands.find_port import FindPortConfig
 from cartpole_rl.commands.hydra_application.application import application
+from cartpole_rl.commands.hydra_application.exits import exit_with_message
 from cartpole_rl.signals import UNWINDING, RaiseOnce, ending_signals
 
 
@@ -79,3 +81,26 @@ def test_a_hangup_that_nohup_ignores_stays_ignored() -> None:
     assert ending_signals() == [signal.SIGTERM]
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
     assert ending_signals() == [signal.SIGTERM, signal.SIGHUP]
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="the system has no device that is always full")
+def test_a_full_disk_ends_a_command_with_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    @application("find_port", FindPortConfig)
+    def main(config: FindPortConfig, run: Path) -> None:
+        Path("/dev/full").write_text("as a log that is appended to")
+
+    GlobalHydra.instance().clear()
+    monkeypatch.chdir(tmp_path)
+    with patch("sys.argv", ["cartpole-find-port"]), pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 1
+    assert capsys.readouterr().err.startswith(
+        "cartpole-find-port: a file was not written: No space left on dev"
+    )
+
+
+def test_an_error_of_the_system_that_concerns_no_file_is_raised() -> None:
+    with pytest.raises(OSError, match="Bad file descriptor"):
+        exit_with_message("train", OSError(errno.EBADF, "Bad file descriptor"))

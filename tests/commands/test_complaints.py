@@ -21,6 +21,14 @@ def test_a_file_error_names_the_file_and_the_reason() -> None:
     )
 
 
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT])
+def test_a_full_disk_gets_a_remedy(number: int) -> None:
+    remedy = "; make room, or give hydra.run.dir= a folder on another disk"
+    assert in_one_line(OSError(number, "is full", "last.pt"), "train") == f"last.pt: is full{remedy}"
+    unnamed = "a file was not written: is full"
+    assert in_one_line(OSError(number, "is full"), "train") == f"{unnamed}{remedy}"
+
+
 def test_a_word_that_is_no_setting_is_repeated() -> None:
     complaint = in_one_line(OverrideParseException("seed", "LexerNoViableAlt"), "train")
     assert complaint.startswith("seed: settings are given as key=value")

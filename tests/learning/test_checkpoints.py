@@ -1,12 +1,13 @@
 """Checkpoints are written whole or not at all, and a file that is none is named in one clear line."""
 
+import errno
 from pathlib import Path
 
 import pytest
 import torch
+from small_files import files_of_at_most
 
 from cartpole_rl.errors import CheckpointError
-from cartpole_rl.files import replacing
 from cartpole_rl.learning.checkpoints import (
     FINETUNING_FORMAT,
     TRAINING_FORMAT,
@@ -128,15 +129,20 @@ def test_a_file_that_would_run_code_is_refused(tmp_path: Path) -> None:
 def test_a_file_left_half_written_does_no_harm(tmp_path: Path) -> None:
     save_agent(tmp_path / LAST, AGENT)
 
-    def killed_while_writing() -> None:
-        with replacing(tmp_path / LAST) as beside:
-            beside.write_bytes(b"half a check")
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        killed_while_writing()
-    assert len(list((tmp_path / "checkpoints").iterdir())) == 2  # the half lies beside the whole
+    (tmp_path / "checkpoints/last.pt.partial").write_bytes(b"half a check")  # of a process that was killed
     assert load_agent(tmp_path).transitions == 10
     save_agent(tmp_path / LAST, AgentCheckpoint({}, {}, transitions=20, score=None))
     assert load_agent(tmp_path).transitions == 20
     assert [path.name for path in (tmp_path / "checkpoints").iterdir()] == ["last.pt"]
+
+
+@pytest.mark.parametrize("count", [2_000, 1_000_000])  # the weights are written at once, or in parts
+def test_a_checkpoint_that_cannot_be_written_leaves_the_earlier_one(count: int, tmp_path: Path) -> None:
+    save_training(tmp_path, TRAINING)
+    path = tmp_path / "checkpoints/resume.pt"
+    larger = TrainingCheckpoint({}, {"agent": {"w": torch.zeros(count)}}, step=20)
+    with files_of_at_most(4096), pytest.raises(OSError, match="File too large") as caught:
+        save_training(tmp_path, larger)
+    assert (caught.value.errno, caught.value.filename) == (errno.EFBIG, str(path))
+    assert [each.name for each in path.parent.iterdir()] == ["resume.pt"]
+    assert load_training(tmp_path) == TRAINING

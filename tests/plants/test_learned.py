@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from small_files import files_of_at_most
 from torchrl.envs.utils import check_env_specs
 
 from cartpole_rl.errors import CheckpointError
@@ -147,6 +148,13 @@ class TestFile:
             assert all(map(torch.equal, read.residual, model.residual))
         assert list(read.parameters) == list(parameters)
         assert set(read.parameters) == set(CartParameters.names())
+
+    def test_one_that_cannot_be_written_is_named(self, parameters: dict[str, float], tmp_path: Path) -> None:
+        path = tmp_path / "model.pt"
+        with files_of_at_most(1024), pytest.raises(OSError, match="File too large") as caught:
+            save_model(path, learned_model(parameters, 0.5))
+        assert caught.value.filename == str(path)
+        assert not list(tmp_path.iterdir())
 
     def test_what_is_no_model_is_named(self, parameters: dict[str, float], tmp_path: Path) -> None:
         def complaint(source: Path) -> str:

@@ -1,5 +1,6 @@
 """Rewrites errors of Hydra, OmegaConf and the operating system as one line with the remedy."""
 
+import errno
 import re
 import sys
 from collections.abc import Mapping, Sequence
@@ -33,6 +34,7 @@ HYDRA_OPTIONS = (
     "info",
 )
 WHOLE = ("experiment", "sweep")  # groups without settings of their own: they change those of others
+FULL = {errno.ENOSPC, errno.EDQUOT}  # the disk, or a user's share of it
 EXTRAS = {  # of the package, that bring launchers and a sweeper
     "hydra/launcher/joblib": "joblib",
     "hydra/launcher/submitit_local": "submitit",
@@ -52,8 +54,14 @@ def in_one_line(error: Exception, command: str) -> str:
     if isinstance(error, HydraException):
         return hydra_complaint(" ".join(str(error).split()), command)
     if isinstance(error, OSError):
-        return f"{error.filename}: {error.strerror}"
+        return file_complaint(error)
     return next(iter(str(error).splitlines()), type(error).__name__)
+
+
+def file_complaint(error: OSError) -> str:
+    """Return the file, what is wrong with it and, for a full disk, the remedy."""
+    remedy = "; make room, or give hydra.run.dir= a folder on another disk" if error.errno in FULL else ""
+    return f"{error.filename or 'a file was not written'}: {error.strerror}{remedy}"
 
 
 def hydra_complaint(text: str, command: str) -> str:

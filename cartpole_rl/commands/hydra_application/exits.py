@@ -4,6 +4,7 @@ Exit codes: 0; 1 where the work failed; 2 where the config is wrong; 130 after C
 after SIGHUP, which a closed terminal or a dropped ssh connection sends.
 """
 
+import errno
 import signal
 import sys
 from typing import NoReturn
@@ -11,13 +12,15 @@ from typing import NoReturn
 from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 
-from cartpole_rl.commands.hydra_application.complaints import in_one_line
+from cartpole_rl.commands.hydra_application.complaints import FULL, in_one_line
 from cartpole_rl.errors import CartPoleError, ConfigError
 from cartpole_rl.signals import RaiseOnce, ending_signals
 from cartpole_rl.workflows.person import print_message
 
 SIGNALLED = 128  # added to the number of a signal, as a shell does
 EXPECTED = (CartPoleError, HydraException, OmegaConfBaseException, OSError)  # printed without a traceback
+
+UNNAMED = {*FULL, errno.EFBIG, errno.EIO}  # of writing, which names no file
 
 
 class Terminated(BaseException):
@@ -29,13 +32,13 @@ class Terminated(BaseException):
 
 
 def exit_with_message(name: str, error: Exception) -> NoReturn:
-    """Print an error and exit. Raises an OSError that names no file: it is a defect of this package."""
+    """Print an error and exit. Raises an OSError that concerns no file: it is a defect of this package."""
     code = CartPoleError.exit_code
     if isinstance(error, CartPoleError):
         code = error.exit_code
     elif isinstance(error, HydraException | OmegaConfBaseException):  # some of which are OSErrors too
         code = ConfigError.exit_code
-    elif isinstance(error, OSError) and not error.filename:
+    elif isinstance(error, OSError) and not error.filename and error.errno not in UNNAMED:
         raise error
     print_message(name, in_one_line(error, name))
     sys.exit(code)
