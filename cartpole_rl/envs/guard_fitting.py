@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linprog
 from torch import Tensor
 
-from cartpole_rl.envs.settings import TrackGuard
+from cartpole_rl.envs.settings import LARGEST_MARGIN, TrackGuard
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.physics.actuator import static_force
 from cartpole_rl.physics.dynamics import Drive, State, run_period
@@ -47,15 +47,25 @@ def fitted_guard(
     """Return the guard that a share `quantile` of the carts of `draws` obeys in time.
 
     `motors` are the motor values of the agent, `period` is the control period, s. Raises ConfigError if full
-    motor does not brake the carts.
+    motor does not brake the carts, or so late that they need most of the track.
     """
     if not min(motors) < 0 < max(motors):
         raise ConfigError(f"guard: actions.motors={list(motors)} brake in one direction; choose guard=none")
     speed, way, rightward = braking_distances(draws, motors, models, period)
+    if not np.isfinite((speed, way)).all():
+        raise ConfigError(
+            "guard: simulated carts brake to numbers that are not finite; check cart.*, or guard=none"
+        )
     halves = [quantiles(speed[half], way[half], quantile) for half in (rightward, ~rightward)]
     margin, delay, curvature = closest_bound(*map(np.concatenate, zip(*halves, strict=True)))
     if curvature <= 0:
         raise ConfigError("guard: full motor does not stop these carts; choose guard=none, or other actions")
+    if round(margin, 4) >= LARGEST_MARGIN:
+        raise ConfigError(
+            f"guard: even from rest these carts run on by {margin:.3f} m before full motor stops them; this "
+            f"margin must be below {LARGEST_MARGIN:g} m: give a shorter control_period, less latency or "
+            "smaller motor values, or guard=none"
+        )
     return TrackGuard(margin=round(margin, 4), delay=round(delay, 4), deceleration=round(0.5 / curvature, 3))
 
 

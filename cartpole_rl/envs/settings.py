@@ -8,6 +8,7 @@ from cartpole_rl.settings import NonNegative, Positive, Settings
 from cartpole_rl.tasks.features import ObservationKind
 
 POSITIONS = ObservationKind.POSITIONS.mirror_signs
+LARGEST_MARGIN = 0.3  # m, of a track guard: most of half a track
 
 
 class ObservationSettings(Settings):
@@ -55,7 +56,7 @@ class ObservationSettings(Settings):
 class TrackGuard(Settings):
     """The numbers of a track guard: see `envs/guard.py`."""
 
-    margin: Annotated[float, Field(ge=0, lt=0.3)]  # m
+    margin: Annotated[float, Field(ge=0, lt=LARGEST_MARGIN)]  # m
     delay: NonNegative  # s
     deceleration: Positive  # m/s^2
 

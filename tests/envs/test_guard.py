@@ -135,6 +135,23 @@ def test_motor_values_of_one_sign_are_refused() -> None:
         with_fitted_guard(settings)
 
 
+LATE = {"control_period": 0.1, "cart.latency": 0.1, "cart.latency_jitter": 0.1, "guard": "careful"}
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (LATE, r"run on by 0\.30\d m before full motor stops them; .* below 0\.3 m: give a shorter"),
+        ({"cart.cart_viscous": 1e9}, "not finite; check cart"),
+    ],
+)
+def test_carts_that_no_guard_keeps_on_the_track_are_refused(
+    overrides: dict[str, object], message: str
+) -> None:
+    with pytest.raises(ConfigError, match=f"^guard: .*{message}"):
+        with_fitted_guard(shipped_settings({"randomization": "none", **overrides}))
+
+
 # how many carts leave the track
 
 
