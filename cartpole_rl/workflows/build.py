@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
+from typing import Any
 
 import torch
 
@@ -24,7 +25,7 @@ from cartpole_rl.settings import Settings, evaluation_seed
 from cartpole_rl.tasks.settings import ActionSettings, Start
 from cartpole_rl.workflows.checks import simulated_carts
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
-from cartpole_rl.workflows.trained_poles import emulated_pole, one_pole, pole_of_length
+from cartpole_rl.workflows.trained_poles import emulated_pole, knows, one_pole, pole_of_length
 
 REPLACEABLE = (
     "cart",
@@ -35,18 +36,51 @@ REPLACEABLE = (
     "guard",
     "actions",
 )  # by an evaluation; and the task
+OUTDATING = {"actions": "other full motor values", "pole": "another pole"}  # a guard's numbers, in words
 
 
 def evaluated_settings(training: TrainConfig, config: EvaluateConfig) -> CartPoleSettings:
     """Return the settings to evaluate with: `replaced_settings` with the numbers of the track guard.
 
     A new guard is fitted to the carts that `config` randomizes, or else to those of the training: an
-    evaluation without randomization may drive a real cart. Raises ConfigError.
+    evaluation without randomization may drive a real cart. The guard of the training is fitted anew to the
+    settings that make it `outdated`. Raises ConfigError.
     """
     settings = replaced_settings(training, config)
-    fitted_to = config.randomization or training.randomization
-    guard = with_fitted_guard(settings.model_copy(update={"randomization": fitted_to})).guard
-    return settings.model_copy(update={"guard": guard})
+    fitted_to = settings.model_copy(update={"randomization": config.randomization or training.randomization})
+    if changes := outdated(training, config):
+        guard = training.guard.model_copy(update={"numbers": None})
+        fitted_to = training.model_copy(update={**changes, "guard": guard})
+    return settings.model_copy(update={"guard": with_fitted_guard(fitted_to).guard})
+
+
+def outdated(training: TrainConfig, config: EvaluateConfig) -> dict[str, Any]:
+    """Return the replaced settings for which the numbers of the training's guard do not hold, by name.
+
+    They are what a person knows of a real cart: other full motor values, and a pole that was not in training.
+    Carts that simulation changes in other ways meet the guard that a real one of their kind would meet. The
+    guard of a policy on a real board cannot be changed. Raises ConfigError.
+    """
+    on_a_board = isinstance(config.plant, SerialSettings) and config.plant.policy is not None
+    if config.guard is not None or training.guard.active is None or on_a_board:
+        return {}
+    driven = replaced_settings(training, config.model_copy(update={"parameters": None}))
+    motors, trained = driven.actions.motors, training.actions
+    changes: dict[str, Any] = {}
+    if (min(motors), max(motors)) != (min(trained.motors), max(trained.motors)):
+        changes["actions"] = trained.model_copy(update={"motors": motors})
+    if not knows([training.pole], driven.pole):
+        changes["pole"] = driven.pole
+    return changes
+
+
+def guard_note(training: TrainConfig, config: EvaluateConfig, settings: CartPoleSettings) -> str | None:
+    """Return a line about the guard of `evaluated_settings` if it was fitted anew, None if not."""
+    changes = outdated(training, config)
+    if not changes:
+        return None
+    others = " and ".join(OUTDATING[name] for name in changes)
+    return f"note: the track guard of the training is for {others}; fitted anew: {settings.guard.active}"
 
 
 def replaced_settings(training: TrainConfig, config: EvaluateConfig) -> CartPoleSettings:

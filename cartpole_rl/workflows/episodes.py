@@ -22,6 +22,7 @@ from cartpole_rl.workflows.agents import evaluated_agent
 from cartpole_rl.workflows.build import (
     evaluated_env,
     evaluated_settings,
+    guard_note,
     precedence,
     predicting_env,
     use_threads,
@@ -62,6 +63,11 @@ class Evaluation:
         emulated = isinstance(self.config.plant, EmulatedSettings)
         line = other_pole(self.known_poles, self.settings.pole, emulated)
         if line and self.config.run != BASELINE:
+            print_message(command, line)
+
+    def note_refitted_guard(self, command: str) -> None:
+        """Print the numbers of the track guard if they are not those of the training, and were not chosen."""
+        if line := guard_note(self.training, self.config, self.settings):
             print_message(command, line)
 
     def check_board(self) -> None:

@@ -23,7 +23,13 @@ from cartpole_rl.plants.serial.faults import Confirm
 from cartpole_rl.plants.settings import EmulatedSettings
 from cartpole_rl.reporting.tensorboard import TensorBoardLog
 from cartpole_rl.workflows.agents import new_agent, trained_agent
-from cartpole_rl.workflows.build import evaluated_env, evaluated_settings, is_real_time, use_threads
+from cartpole_rl.workflows.build import (
+    evaluated_env,
+    evaluated_settings,
+    guard_note,
+    is_real_time,
+    use_threads,
+)
 from cartpole_rl.workflows.checks import agent_file, check_finetuning
 from cartpole_rl.workflows.config import EvaluateConfig, FinetuneConfig, TrainConfig
 from cartpole_rl.workflows.finetuning_cart import DrivenCart, yielding_to
@@ -61,6 +67,8 @@ def finetune(config: FinetuneConfig, folder: Path, new_learner: bool = False) ->
     evaluation = evaluation_config(config)
     settings = evaluated_settings(training, evaluation)
     if line := other_pole(agent.known_poles, settings.pole, isinstance(config.plant, EmulatedSettings)):
+        print_message("finetune", line)
+    if line := guard_note(training, evaluation, settings):
         print_message("finetune", line)
     files = FinetuningFiles(folder, config)
     content = config.model_dump(mode="json")

@@ -74,14 +74,19 @@ def read_evaluation(run: Path) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 def same_evaluation(config: EvaluateConfig, recorded: Mapping[str, Any], origin: Origin) -> EvaluateConfig:
-    """Return the recorded evaluation with the agent of `config`, on that cart only. Raises ConfigError."""
+    """Return the recorded evaluation with the agent of `config`, on that cart only. Raises ConfigError.
+
+    The guard is the one of then if it was chosen, or if the agent is the same; else it is the agent's own.
+    """
     former = {name: recorded[name] for name in EvaluateConfig.model_fields if name in recorded}
     own = {name: getattr(config, name) for name in ("run", "label", "repeat", "animation")}
     pole = {name: origin.parameters[name] for name in Pole.model_fields}
     of_cart = {name: value for name, value in origin.parameters.items() if name not in pole}
-    one_cart = {
+    one_cart: dict[str, Any] = {
         "parameters": of_cart,
         "pole": {"choices": {f"{2 * pole['pole_com']:.2f} m": pole}},
         "randomization": {},
     }
+    if former.get("guard") or Path(former["run"]) == config.run:  # its numbers may be of all the poles then
+        one_cart["guard"] = recorded["evaluated"]["guard"]
     return checked(EvaluateConfig, {**former, **own, **one_cart})

@@ -1,11 +1,13 @@
-"""A track guard that is chosen for an evaluation is fitted to carts that may differ from the nominal one."""
+"""The track guard of an evaluation: chosen, of the training, or fitted anew to motor values or a pole."""
 
 import pytest
 
 from cartpole_rl.envs.build import with_fitted_guard
-from cartpole_rl.workflows.build import evaluated_settings
+from cartpole_rl.workflows.build import evaluated_settings, guard_note
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
 from cartpole_rl.workflows.loading import load_settings
+
+GIVEN = {"margin": 0.05, "delay": 0.2, "deceleration": 2.0}
 
 
 def fitted(**overrides: object) -> TrainConfig:
@@ -29,7 +31,78 @@ def test_it_is_fitted_to_the_carts_of_the_evaluation() -> None:
 
 def test_the_guard_of_the_training_stays() -> None:
     training = fitted()
-    settings = evaluated_settings(
-        training, load_settings(EvaluateConfig, {"run": "any", "parameters": {"cart_mass": 0.8}})
+    evaluation = load_settings(
+        EvaluateConfig, {"run": "any", "parameters": {"cart_mass": 0.8}, "randomization": "half"}
     )
+    settings = evaluated_settings(training, evaluation)
     assert settings.guard == training.guard
+    assert guard_note(training, evaluation, settings) is None
+
+
+WEAK = (-150, -130, -110, -90, 0, 90, 110, 130, 150)
+SAME_ENDS = (-250, -188, -125, -63, 0, 63, 125, 188, 250)
+SERIAL = {"plant": "serial", "plant.port": "port"}
+
+
+def with_motors(motors: tuple[int, ...]) -> dict[str, object]:
+    return {"actions": {"motors": motors, "actuator": "force_curve"}}
+
+
+@pytest.mark.parametrize("plant", [{}, {"plant": "emulated"}, SERIAL])
+def test_it_is_fitted_anew_to_other_full_motor_values(plant: dict[str, object]) -> None:
+    training = fitted()
+    evaluation = load_settings(EvaluateConfig, {"run": "any", **plant, **with_motors(WEAK)})
+    settings = evaluated_settings(training, evaluation)
+    numbers = fitted(**with_motors(WEAK)).guard.active
+    assert numbers.deceleration < 0.8 * training.guard.active.deceleration
+    assert settings.guard.active == numbers
+    assert guard_note(training, evaluation, settings) == (
+        f"note: the track guard of the training is for other full motor values; fitted anew: {numbers}"
+    )
+
+
+def test_a_simulated_cart_does_not_tell_its_parameters_to_the_new_guard() -> None:
+    """It is that of the carts of the training, as on a real cart."""
+    unknown = {"parameters": {"cart_mass": 0.9}, "randomization": "half"}
+    evaluation = load_settings(EvaluateConfig, {"run": "any", **unknown, **with_motors(WEAK)})
+    settings = evaluated_settings(fitted(), evaluation)
+    assert settings.guard.active == fitted(**with_motors(WEAK)).guard.active
+
+
+def test_motor_values_with_the_same_ends_need_no_new_guard() -> None:
+    training = fitted()
+    evaluation = load_settings(EvaluateConfig, {"run": "any", **with_motors(SAME_ENDS)})
+    assert evaluated_settings(training, evaluation).guard == training.guard
+
+
+@pytest.mark.parametrize(
+    ("trained", "cart", "fitted_to"),
+    [
+        ("medium", {"plant": "emulated"}, "medium"),
+        ("both", {"pole": "medium"}, "both"),
+        ("medium", {"pole": "large"}, "large"),
+        ("medium", {**SERIAL, "pole": "large"}, "large"),
+    ],
+)
+def test_it_is_fitted_anew_to_a_pole_that_was_not_in_training(
+    trained: str, cart: dict[str, object], fitted_to: str
+) -> None:
+    evaluation = load_settings(EvaluateConfig, {"run": "any", **cart})
+    settings = evaluated_settings(fitted(pole=trained), evaluation)
+    assert settings.guard.active == fitted(pole=fitted_to).guard.active
+
+
+@pytest.mark.parametrize("chosen", [{"guard": "none"}, {"guard.numbers": GIVEN, "guard": "careful"}])
+def test_a_chosen_guard_is_not_replaced(chosen: dict[str, object]) -> None:
+    evaluation = load_settings(EvaluateConfig, {"run": "any", **chosen, **with_motors(WEAK)})
+    settings = evaluated_settings(fitted(), evaluation)
+    assert settings.guard == evaluation.guard
+    assert guard_note(fitted(), evaluation, settings) is None
+
+
+def test_the_guard_of_a_policy_on_a_real_board_stays() -> None:
+    """It was compiled with it."""
+    training = fitted()
+    cart = {**SERIAL, "plant.policy": "onboard", "plant.pole_length": 0.66}
+    evaluation = load_settings(EvaluateConfig, {"run": "any", **cart})
+    assert evaluated_settings(training, evaluation).guard == training.guard
