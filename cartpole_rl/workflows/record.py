@@ -31,7 +31,7 @@ def record(config: RecordConfig, folder: Path) -> None:
     and CheckpointError for settings, PlantError and LinkError for a cart that fails.
     """
     evaluation = prepared(config)
-    episodes: list[Episode] = []
+    episodes: dict[Path, Episode] = {}
     try:
         with closing(evaluation.env):
             evaluation.note_other_pole("record")
@@ -41,11 +41,11 @@ def record(config: RecordConfig, folder: Path) -> None:
             write_config(folder, "record", content, agent=agent_file(evaluation.config.run))
             for episode in evaluation.episodes():
                 path = folder / RECORDINGS / f"episode_{len(episodes):03d}.csv"
+                episodes[path] = episode
                 write_recording(path, episode, heading(evaluation.config, evaluation.settings, episode))
-                episodes.append(episode)
     finally:
-        if episodes:
-            held = f"{count_text(len(episodes))}{guard_text(*episodes)}"
+        if kept := [episode for path, episode in episodes.items() if path.exists()]:
+            held = f"{count_text(len(kept))}{guard_text(*kept)}"
             print(f"{shown(folder)}/{RECORDINGS}/ holds {held}; next:")
             print(f"cartpole-replay from={shown(folder)}")
 

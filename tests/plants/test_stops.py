@@ -41,7 +41,7 @@ from cartpole_rl.emulator.encoders import CART_METRES, SPAN
 from cartpole_rl.emulator.homing import Zeros
 from cartpole_rl.emulator.settings import EmulatorSettings
 
-def home_at_once(hanging):
+def home_at_once():
     reading = yield 0
     half = round(SPAN / 2 / CART_METRES)
     return Zeros(reading.cart - half, reading.cart + half, reading.pole)
