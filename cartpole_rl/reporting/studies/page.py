@@ -128,7 +128,7 @@ def _summary(results: Sequence[StudyResults]) -> str:
 
 
 def _contents(results: Sequence[StudyResults]) -> str:
-    """Return the thesis's own list with the studies of each row, then those beyond it; empty for one study."""
+    """Return the thesis's list with the studies of each row, then those beyond it; empty for one study."""
     if len(results) == 1:
         return ""
     beyond = "".join(f"<li>{_link(each)}</li>" for each in results if each.study.order >= BEYOND)
