@@ -69,9 +69,10 @@ def push(motor: int, speed: float, task: Task) -> Moves:
 
 def until_stopped(motor: int, side: int, task: Task) -> Moves:
     """Hold one motor value until the cart stops or gets near the end at `side`, then rest briefly."""
+    far = task.side + 0.03  # m
     now = yield motor
     for _ in range(task.periods(LONGEST_MOVE)):
-        if abs(now.x_dot) < SLOW / 5 or side * now.x > task.side + 0.03:
+        if abs(now.x_dot) < SLOW / 5 or side * now.x > far:
             break
         now = yield motor
     yield from hold(0, 0.2, task)

@@ -1,6 +1,5 @@
 """Write a trained agent for other programs."""
 
-import json
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -26,10 +25,10 @@ from cartpole_rl.learning.checkpoints import load_agent
 from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.plants.settings import SimulatedSettings
 from cartpole_rl.randomization.checks import possible_poles
-from cartpole_rl.run_files import CHECKPOINTS, PROVENANCE
+from cartpole_rl.run_files import CHECKPOINTS
 from cartpole_rl.workflows.agents import TrainedAgent, trained_agent
 from cartpole_rl.workflows.config import EvaluateConfig, ExportConfig, TrainConfig
-from cartpole_rl.workflows.run_folder import write_config
+from cartpole_rl.workflows.run_folder import recorded_provenance, write_config
 
 
 def export(config: ExportConfig, folder: Path) -> None:
@@ -132,7 +131,7 @@ def description(training: TrainConfig, origin: Mapping[str, Any]) -> Description
 
 def provenance(run: Path) -> dict[str, Any]:
     """Return the origin of the agent of `run`: its command, versions, commit, transitions and score."""
-    checkpoint, recorded = load_agent(run), recorded_provenance(find_agent(run))
+    checkpoint, recorded = load_agent(run), provenance_beside(find_agent(run))
     match recorded.get("command"):
         case [str(program), *arguments]:
             command = [Path(program).name, *arguments]
@@ -146,15 +145,15 @@ def provenance(run: Path) -> dict[str, Any]:
     }
 
 
-def recorded_provenance(agent: Path) -> dict[str, Any]:
+def provenance_beside(agent: Path) -> dict[str, Any]:
     """Return the provenance.json of the run that wrote `agent`; empty if it is missing or damaged."""
     folder = agent.parent.parent if agent.parent.name == CHECKPOINTS else agent.parent
+    recorded = recorded_provenance(folder)
     try:
-        recorded = json.loads((folder / PROVENANCE).read_text(encoding="utf-8"))
-        canonical_json(recorded)  # refuses infinite numbers
-    except (OSError, ValueError):
+        canonical_json(recorded)
+    except ValueError:  # an infinite number
         return {}
-    return recorded if isinstance(recorded, dict) else {}
+    return recorded
 
 
 def files_of(form: str, agent: ExportedAgent, trained: TrainedAgent) -> dict[str, bytes]:

@@ -84,12 +84,17 @@ def file_hash(file: Path) -> str:
 
 def program_of(folder: Path) -> str | None:
     """Return the command that wrote the run in `folder`, as a key of USES; None for any other folder."""
-    try:
-        program = json.loads((folder / PROVENANCE).read_text(encoding="utf-8"))["program"]
-    except (OSError, ValueError, LookupError, TypeError):
-        return None
-    name = str(program).removeprefix(PREFIX)
+    name = str(recorded_provenance(folder).get("program")).removeprefix(PREFIX)
     return name if name in USES else None
+
+
+def recorded_provenance(folder: Path) -> dict[str, Any]:
+    """Return the provenance.json of the run in `folder`; empty if it is missing or damaged."""
+    try:
+        recorded = json.loads((folder / PROVENANCE).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return recorded if isinstance(recorded, dict) else {}
 
 
 def check_program(setting: str, folder: Path, *taken: str) -> None:

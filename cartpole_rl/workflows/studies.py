@@ -9,7 +9,7 @@ import yaml
 from cartpole_rl.checking import checked, most_similar, similarity
 from cartpole_rl.choices import conf_folder
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.reporting.studies.settings import Study
+from cartpole_rl.reporting.studies.settings import Study, setting
 
 STUDIES = conf_folder() / "study"
 NEAR = 0.5  # similarity of two names, from which one is suggested for the other
@@ -50,5 +50,4 @@ def unknown(kind: str, name: str, names: Iterable[str]) -> str:
 
 def overrides_of(words: Sequence[str]) -> dict[str, Any]:
     """Return overrides as on a command line by name, their values as YAML reads them; the last one counts."""
-    pairs = (word.lstrip("+").partition("=") for word in words)
-    return {name: yaml.safe_load(value) for name, _, value in pairs}
+    return {setting(word): yaml.safe_load(word.partition("=")[2]) for word in words}

@@ -59,8 +59,8 @@ class Connection:
         self._settings = settings
         self._tracker = tracker
         self._answers: deque[Message] = deque(maxlen=KEPT_ANSWERS)
-        self._asked_sequence = 0  # of the newest question; older refusals of motor values are void
-        self._frames_asked = 0  # how many were sent up to the newest question, with it
+        self._asked_sequence = 0  # of the newest question
+        self._frames_asked = 0  # sent up to that question; refusals of motor values among them are void
         self._heard: int | None = None  # the newest sequence that a state acknowledged, ...
         self._unheard_since: float | None = None  # ... and when a newer one was sent
         self._refused: Nack | None = None  # of a motor value
@@ -239,13 +239,13 @@ class Connection:
 
     def _endure_silence(self, deadline: float) -> None:
         """Raise LinkError after the deadline; send HELLO after each `nudge_after` seconds without a byte."""
-        time = now()
-        if time > deadline:
+        moment = now()
+        if moment > deadline:
             raise LinkError(
                 f"no state came from {self.link.port} for {self._settings.timeout:g} s: "
                 "check the cart's cable and power"
             )
-        if time - max(self.link.received_at, self.link.sent_at) > self._settings.nudge_after:
+        if moment - max(self.link.received_at, self.link.sent_at) > self._settings.nudge_after:
             self.link.send(Hello())
 
     def _read(self, waiting: int = 0) -> None:

@@ -59,7 +59,7 @@ def _share(results: StudyResults, label: str) -> float | None:
     It is None if a value has fewer agents than the study asks for: agents must not be picked.
     """
     values, asked = _cases(results, label), results.size.seeds if results.size else 1
-    if any(each.size < max(asked, 1) for each in values):
+    if any(each.size < asked for each in values):
         return None
     return float(np.mean([(each > GOOD[results.study.measure]).mean() for each in values]))
 

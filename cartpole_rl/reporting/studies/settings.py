@@ -72,9 +72,7 @@ class Study(Settings):
     measure: str = "score"  # score (6.2), score_upright (6.1) or another key of metrics.json
     ratio: bool = False  # also the second evaluation divided by the first, per agent
     axis: Axis | None = None
-    curves: tuple[Literal["score", "loss"], ...] = (
-        "score",
-    )  # of trainings; score: of the measure, if recorded
+    curves: tuple[Literal["score", "loss"], ...] = ("score",)  # of trainings; score is that of `measure`
     arms: Annotated[tuple[Variant, ...], Field(min_length=1)]
     evaluations: tuple[Evaluation, ...] = ()  # by cartpole-evaluate; none if the run itself holds the result
     judged: tuple[FolderName, ...] = ()  # evaluations that answer the question; empty: that on the cart

@@ -7,14 +7,13 @@ import signal
 import sys
 import traceback
 from pathlib import Path
-from typing import Any
 
 from cartpole_rl.choices import choice
 from cartpole_rl.errors import CartPoleError
-from cartpole_rl.run_files import CHECKPOINTS, IDENTIFIED, LAST, METRICS, MODELLED, PROVENANCE, RESUME
+from cartpole_rl.run_files import CHECKPOINTS, IDENTIFIED, LAST, METRICS, MODELLED, RESUME
 from cartpole_rl.signals import RaiseOnce, end_with_parent, ending_signals
 from cartpole_rl.workflows.reproduce.plan import Task
-from cartpole_rl.workflows.run_folder import AGENT_HASH, file_hash
+from cartpole_rl.workflows.run_folder import AGENT_HASH, file_hash, recorded_provenance
 from cartpole_rl.workflows.studies import overrides_of
 
 LOG = "log.txt"
@@ -47,23 +46,16 @@ def has_results(task: Task) -> bool:
 def is_outdated(task: Task) -> bool:
     """Return True if the agent that a run started from was trained again since then."""
     agent = Path(str(overrides_of(task.words).get("run"))) / CHECKPOINTS / LAST
-    recorded = recorded_provenance(task).get(AGENT_HASH)
+    recorded = recorded_provenance(task.folder).get(AGENT_HASH)
     return recorded is not None and agent.is_file() and file_hash(agent) != recorded
-
-
-def recorded_provenance(task: Task) -> dict[str, Any]:
-    """Return the provenance of a run; empty if it is missing or damaged."""
-    try:
-        found = json.loads((task.folder / PROVENANCE).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return found if isinstance(found, dict) else {}
 
 
 def made_otherwise(task: Task) -> str:
     """Return why a run does not belong to its study any more; empty if it does."""
-    given = [*recorded_provenance(task).get("command", ())][1:]
-    return "" if given == [*task.words] else "it was made with other settings; delete its folder to repeat it"
+    match recorded_provenance(task.folder).get("command"):
+        case [_, *words] if words == [*task.words]:
+            return ""
+    return "it was made with other settings; delete its folder to repeat it"
 
 
 def in_own_process(task: Task) -> None:

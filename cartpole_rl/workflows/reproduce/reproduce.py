@@ -17,7 +17,7 @@ from typing import Any
 import yaml
 
 from cartpole_rl.files import write_text
-from cartpole_rl.workflows.reproduce.plan import Task, plan, size_of
+from cartpole_rl.workflows.reproduce.plan import Task, plan
 from cartpole_rl.workflows.reproduce.process import LOG, in_own_process, is_complete, made_otherwise
 from cartpole_rl.workflows.reproduce.progress import Progress, duration
 from cartpole_rl.workflows.studies import STUDIES, load_study
@@ -43,7 +43,6 @@ def reproduce(
     tasks = plan(names, size, root, source)
     schedule = Schedule(tasks, root)
     for name in names:
-        size_of(name, load_study(name, source), size)
         if name not in schedule.mixed:  # else the study that its runs were made by stays
             write_study(name, size, root, source)
     todo = len(schedule.waiting)
