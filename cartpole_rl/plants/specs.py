@@ -34,14 +34,16 @@ class OneFrame(NamedTuple):
     motor_applied: int
     terminated: bool
     truncated: bool
-    sent: int | None = None  # the motor value that was sent, where the plant sent another than it was given
+    sent: int | None = (
+        None  # the motor value that drove, where it is not the given one: that was late or lost
+    )
 
 
 class Plant(EnvBase):
     """A batch of N carts that take motor values and return encoder counts; simulated, or one cart on a wire.
 
-    In, each period: `motor` [N, 1] int64, -255 to 255, positive to the right. A plant that sends another
-    value, as 0 for a late one, writes it there.
+    In, each period: `motor` [N, 1] int64, -255 to 255, positive to the right. A plant that was driven by
+    another value, as 0 in place of a late one, writes it there.
     Out: `counts` [N, 2] int64 (cart from the middle of the track, pole from upright, both positive to the
     right, the pole not wrapped), `dt` [N, 1] float32 seconds since the previous frame by the plant's clock,
     `motor_applied` [N, 1] int64, `terminated` [N, 1] bool (left the track, or a device fault),

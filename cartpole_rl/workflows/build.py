@@ -25,7 +25,7 @@ from cartpole_rl.settings import Settings, evaluation_seed
 from cartpole_rl.tasks.settings import ActionSettings, Start
 from cartpole_rl.workflows.checks import simulated_carts
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
-from cartpole_rl.workflows.trained_poles import emulated_pole, knows, one_pole, pole_of_length
+from cartpole_rl.workflows.trained_poles import emulated_pole, knows, one_pole, pole_of_length, pole_text
 
 REPLACEABLE = (
     "cart",
@@ -49,9 +49,13 @@ def evaluated_settings(training: TrainConfig, config: EvaluateConfig) -> CartPol
     settings = replaced_settings(training, config)
     fitted_to = settings.model_copy(update={"randomization": config.randomization or training.randomization})
     if changes := outdated(training, config):
-        guard = training.guard.model_copy(update={"numbers": None})
-        fitted_to = training.model_copy(update={**changes, "guard": guard})
+        fitted_to = without_guard_numbers(training).model_copy(update=changes)
     return settings.model_copy(update={"guard": with_fitted_guard(fitted_to).guard})
+
+
+def without_guard_numbers(training: TrainConfig) -> TrainConfig:
+    """Return `training` with a track guard that is not fitted yet."""
+    return training.model_copy(update={"guard": training.guard.model_copy(update={"numbers": None})})
 
 
 def outdated(training: TrainConfig, config: EvaluateConfig) -> dict[str, Any]:
@@ -61,8 +65,7 @@ def outdated(training: TrainConfig, config: EvaluateConfig) -> dict[str, Any]:
     Carts that simulation changes in other ways meet the guard that a real one of their kind would meet. The
     guard of a policy on a real board cannot be changed. Raises ConfigError.
     """
-    on_a_board = isinstance(config.plant, SerialSettings) and config.plant.policy is not None
-    if config.guard is not None or training.guard.active is None or on_a_board:
+    if config.guard is not None or training.guard.active is None or config.has_compiled_agent:
         return {}
     driven = replaced_settings(training, config.model_copy(update={"parameters": None}))
     motors, trained = driven.actions.motors, training.actions
@@ -80,7 +83,10 @@ def guard_note(training: TrainConfig, config: EvaluateConfig, settings: CartPole
     if not changes:
         return None
     others = " and ".join(OUTDATING[name] for name in changes)
-    return f"note: the track guard of the training is for {others}; fitted anew: {settings.guard.active}"
+    pole = f" to {pole_text(settings.pole)}" if "pole" in changes else ""
+    return (
+        f"note: the track guard of the training is for {others}; fitted anew{pole}: {settings.guard.active}"
+    )
 
 
 def replaced_settings(training: TrainConfig, config: EvaluateConfig) -> CartPoleSettings:

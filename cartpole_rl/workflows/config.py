@@ -196,6 +196,11 @@ class EvaluateConfig(RunSettings):
         """True if episodes are also driven by the agent on the cart's board."""
         return bool(policy_key(self.plant, self.emulator))
 
+    @property
+    def has_compiled_agent(self) -> bool:
+        """True if the board of a real cart drives: what was compiled for it cannot be changed."""
+        return isinstance(self.plant, SerialSettings) and self.plant.policy is not None
+
 
 class RecordConfig(EvaluateConfig):
     """The settings of cartpole-record, which are those of an evaluation without figures."""

@@ -29,7 +29,7 @@ from cartpole_rl.workflows.build import (
 )
 from cartpole_rl.workflows.checks import BASELINE
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
-from cartpole_rl.workflows.export import on_the_board
+from cartpole_rl.workflows.export import compiled_training, on_the_board
 from cartpole_rl.workflows.live import LiveView, view_title
 from cartpole_rl.workflows.person import confirm, print_message
 from cartpole_rl.workflows.progress import progress_bar
@@ -104,7 +104,8 @@ def prepared(config: EvaluateConfig) -> Evaluation:
     use_threads(config.threads)
     seed_everything(config.seed)
     agent = evaluated_agent(config)
-    settings = evaluated_settings(agent.training, config)
+    training = compiled_training(agent) if config.has_compiled_agent else agent.training
+    settings = evaluated_settings(training, config)
     simulation = (
         predicting_env(settings, agent.training.plant, config.seed) if config.animation.simulation else None
     )

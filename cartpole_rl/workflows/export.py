@@ -3,7 +3,6 @@
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,13 +21,14 @@ from cartpole_rl.exporting.weights import weights_file
 from cartpole_rl.files import write_bytes
 from cartpole_rl.learning.checkpoint_files import find_agent
 from cartpole_rl.learning.checkpoints import load_agent
-from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.plants.settings import SimulatedSettings
 from cartpole_rl.randomization.checks import possible_poles
 from cartpole_rl.run_files import CHECKPOINTS
 from cartpole_rl.workflows.agents import TrainedAgent, trained_agent
+from cartpole_rl.workflows.build import without_guard_numbers
 from cartpole_rl.workflows.config import EvaluateConfig, ExportConfig, TrainConfig
 from cartpole_rl.workflows.run_folder import recorded_provenance, write_config
+from cartpole_rl.workflows.trained_poles import knows
 
 
 def export(config: ExportConfig, folder: Path) -> None:
@@ -58,13 +58,13 @@ def on_the_board(
     until the cart has started. Raises ConfigError for an agent that cannot be exported, and if `settings`
     are not those of the agent on the board of a real cart.
     """
-    if isinstance(config.plant, SerialSettings) and config.plant.policy is not None:
-        check_compiled_settings(trained.training, settings)
+    if config.has_compiled_agent:
+        check_compiled_settings(trained, settings)
     if config.emulator.policy != ONBOARD:
         yield config
         return
     shared = {name: getattr(settings, name) for name in CartPoleSettings.model_fields}
-    evaluated = replace(trained, training=trained.training.model_copy(update=shared))
+    evaluated = TrainedAgent(trained.training.model_copy(update=shared), trained.policy)
     contents = files_of("c", exported_agent(evaluated, provenance(config.run)), evaluated)
     with tempfile.TemporaryDirectory() as folder:
         for name, content in contents.items():
@@ -73,13 +73,25 @@ def on_the_board(
         yield config.model_copy(update={"emulator": emulator})
 
 
-def check_compiled_settings(training: TrainConfig, settings: CartPoleSettings) -> None:
-    """Raise ConfigError if `settings` differ from those that an agent of `training` is exported with."""
-    trained = with_fitted_guard(training)
+def compiled_training(trained: TrainedAgent) -> TrainConfig:
+    """Return the settings that an agent is exported with: of its training, with the guard of its newest pole.
+
+    An agent may have been fine-tuned on a pole that was not in its training.
+    """
+    training, newest = trained.training, (trained.known_poles or [trained.training.pole])[-1]
+    if not training.guard.enabled or knows([training.pole], newest):
+        return with_fitted_guard(training)
+    driven = without_guard_numbers(training).model_copy(update={"pole": newest})
+    return training.model_copy(update={"guard": with_fitted_guard(driven).guard})
+
+
+def check_compiled_settings(trained: TrainedAgent, settings: CartPoleSettings) -> None:
+    """Raise ConfigError if `settings` differ from those that the agent is exported with."""
+    compiled = compiled_training(trained)
     differs = {
-        "actions": settings.actions.motors != trained.actions.motors,
-        "guard": settings.guard.active != trained.guard.active,
-        "task": settings.task.angle_limit != trained.task.angle_limit,
+        "actions": settings.actions.motors != compiled.actions.motors,
+        "guard": settings.guard.active != compiled.guard.active,
+        "task": settings.task.angle_limit != compiled.task.angle_limit,
     }
     if any(differs.values()):
         names = ", ".join(name for name in differs if differs[name])
@@ -94,7 +106,7 @@ def exported_agent(trained: TrainedAgent, origin: Mapping[str, Any]) -> Exported
 
     Raises ConfigError for an agent that cannot be exported, CheckpointError for one that is not finite.
     """
-    agent = ExportedAgent(description(trained.training, origin), plain_layers(network_of(trained)))
+    agent = ExportedAgent(description(compiled_training(trained), origin), plain_layers(network_of(trained)))
     agent.check("run")
     return agent
 
@@ -107,7 +119,7 @@ def network_of(trained: TrainedAgent) -> QNetwork | MirrorQNetwork:
 
 
 def description(training: TrainConfig, origin: Mapping[str, Any]) -> Description:
-    """Return the description of an agent that was trained with these settings."""
+    """Return the description of an agent with these settings, those of `compiled_training`."""
     lengths = training.pole.lengths or [pole.length for pole in possible_poles(training.pole)]
     observation, motors, agent = training.observation, training.actions.motors, training.agent
     return Description(
@@ -121,7 +133,7 @@ def description(training: TrainConfig, origin: Mapping[str, Any]) -> Description
         motors=motors,
         start=training.task.evaluation_start.angle,
         angle_limit=training.task.angle_limit,
-        guard=with_fitted_guard(training).guard.active,
+        guard=training.guard.active,
         track_half_length=training.nominal_cart["track_half_length"],
         control_period=training.control_period,
         pole_lengths=(min(lengths), max(lengths)),

@@ -181,7 +181,16 @@ class CartLearner:
         def make_env(plant: RecordedPlant) -> CartPoleEnv:
             return environment(self.settings, plant)
 
-        return recorded_chunk(episode, make_env, self.settings.actions.motors, pole_length(self.config))
+        motors = self.settings.actions.motors
+        chunk = recorded_chunk(episode, make_env, motors, pole_length(self.config))
+        learned, measured = 0 if chunk is None else chunk.shape[1], episode.measured_steps
+        if learned < measured:
+            print_message(
+                "finetune",
+                f"an episode is learned from up to step {learned} of {measured}: there the motor value "
+                f"{episode.motor[learned]} drove, which is none of the agent's {list(motors)}",
+            )
+        return chunk
 
     def simulated_score(self) -> float:
         """Return the agent's mean score on carts of its training, the same ones at every call."""

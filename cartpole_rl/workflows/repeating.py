@@ -87,6 +87,7 @@ def same_evaluation(config: EvaluateConfig, recorded: Mapping[str, Any], origin:
         "pole": {"choices": {f"{2 * pole['pole_com']:.2f} m": pole}},
         "randomization": {},
     }
-    if former.get("guard") or Path(former["run"]) == config.run:  # its numbers may be of all the poles then
+    same_agent = Path(former["run"]).resolve() == config.run.resolve()
+    if former.get("guard") or same_agent:  # its numbers may be of all the poles then
         one_cart["guard"] = recorded["evaluated"]["guard"]
     return checked(EvaluateConfig, {**former, **own, **one_cart})

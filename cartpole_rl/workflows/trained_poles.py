@@ -26,8 +26,9 @@ def knows(known: Sequence[PoleSettings], driven: PoleSettings) -> bool:
 
 
 def pole_of_length(length: float, trained: PoleSettings) -> PoleSettings:
-    """Return the pole of `trained` with about that length (m), or else a uniform rod."""
-    alike = {name: pole for name, pole in (trained.choices or {}).items() if pole.is_about(length)}
+    """Return the pole of `trained` with about `length` m, else that of `pole=both`, else a uniform rod."""
+    known = trained if trained.includes(Pole.rod(length)) else PoleSettings(**group_choices("pole")["both"])
+    alike = {name: pole for name, pole in (known.choices or {}).items() if pole.is_about(length)}
     if not alike:
         return one_pole(Pole.rod(length))
     nearest = min(alike, key=lambda name: abs(alike[name].length - length))
@@ -37,6 +38,12 @@ def pole_of_length(length: float, trained: PoleSettings) -> PoleSettings:
 def one_pole(pole: Pole) -> PoleSettings:
     """Return the choice of this pole alone, named by its length."""
     return PoleSettings(choices={f"{pole.length:.2f} m": pole})
+
+
+def pole_text(poles: PoleSettings) -> str:
+    """Return the length and the mass of each pole for a message."""
+    each = (poles.choices or {}).values()
+    return " or ".join(f"{pole.length:.2f} m, {pole.pole_mass:.3g} kg" for pole in each) or poles.name
 
 
 def lengths(poles: PoleSettings) -> str:

@@ -33,6 +33,7 @@ from cartpole_rl.physics.models import CartFriction, Models, PoleFriction
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.emulated import emulated_plant
 from cartpole_rl.plants.simulated import SimulatedPlant
+from cartpole_rl.plants.specs import OneFrame
 from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.tasks.settings import Start, StartSettings
@@ -116,6 +117,25 @@ def test_the_cart_is_not_driven_after_the_last_experiment(make_plant: Callable) 
     endings = [episode.ended_by for _, episode in conduct(plant, PERIOD, experiments=experiments)]
     assert endings == ["track", "track"]
     assert len(resets) == 2
+
+
+def test_a_value_that_came_too_late_is_recorded_as_what_drove(make_plant: Callable) -> None:
+    class LatePlant(SimulatedPlant):
+        def step_one(self, motor: int) -> OneFrame:
+            late = len(given) == 2
+            given.append(motor)
+            frame = super().step_one(0 if late else motor)
+            return frame._replace(sent=0) if late else frame
+
+    def push(task: Task) -> Moves:
+        yield from hold(100, 5 * PERIOD, task)
+        return None
+
+    given: list[int] = []
+    plant = make_plant(1, kind=LatePlant)
+    ((_, recorded),) = conduct(plant, PERIOD, experiments=(Experiment("push", "nothing", push),))
+    assert recorded.motor.tolist()[:5] == [100, 100, 0, 100, 100]
+    assert given[:5] == [100] * 5
 
 
 def test_recordings_follow_each_other_on_one_cart(recordings: dict[str, Episode]) -> None:

@@ -82,14 +82,20 @@ def test_motor_values_with_the_same_ends_need_no_new_guard() -> None:
         ("both", {"pole": "medium"}, "both"),
         ("medium", {"pole": "large"}, "large"),
         ("medium", {**SERIAL, "pole": "large"}, "large"),
+        ("medium", {**SERIAL, "plant.pole_length": 0.66}, "large"),
     ],
 )
 def test_it_is_fitted_anew_to_a_pole_that_was_not_in_training(
     trained: str, cart: dict[str, object], fitted_to: str
 ) -> None:
-    evaluation = load_settings(EvaluateConfig, {"run": "any", **cart})
-    settings = evaluated_settings(fitted(pole=trained), evaluation)
-    assert settings.guard.active == fitted(pole=fitted_to).guard.active
+    training, evaluation = fitted(pole=trained), load_settings(EvaluateConfig, {"run": "any", **cart})
+    settings = evaluated_settings(training, evaluation)
+    numbers = fitted(pole=fitted_to).guard.active
+    assert settings.guard.active == numbers
+    line = "note: the track guard of the training is for another pole; fitted anew to 0.66 m, 0.23 kg: "
+    assert guard_note(training, evaluation, settings) == (
+        None if fitted_to == trained else f"{line}{numbers}"
+    )
 
 
 @pytest.mark.parametrize("chosen", [{"guard": "none"}, {"guard.numbers": GIVEN, "guard": "careful"}])

@@ -1,8 +1,10 @@
 """A fine-tuning that was stopped and resumed learns as if it had not stopped."""
 
 import io
+from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -104,3 +106,20 @@ def test_a_learner_that_starts_later_continues_the_schedules(recorded: list[Epis
     late.start(recorded, rounds=2)
     assert late.started.iteration == whole.started.iteration == 6
     assert late.started.epsilon() == whole.started.epsilon() < late.started.settings.epsilon[0]
+
+
+def test_what_is_not_learned_from_is_told(
+    recorded: list[Episode], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A late value was replaced by one that the agent cannot choose."""
+    odd = replace(recorded[0], motor=np.concatenate((recorded[0].motor[:10], [7], recorded[0].motor[11:])))
+    learned = learner()
+    assert learned.transitions(odd).shape[1] == 10
+    (line,) = capsys.readouterr().err.splitlines()
+    steps, motors = odd.measured_steps, list(TRAINING.actions.motors)
+    assert line == (
+        f"cartpole-finetune: an episode is learned from up to step 10 of {steps}: there the motor value 7 "
+        f"drove, which is none of the agent's {motors}"
+    )
+    assert learned.transitions(recorded[0]).shape[1] == steps
+    assert not capsys.readouterr().err

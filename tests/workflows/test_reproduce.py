@@ -147,6 +147,8 @@ def test_an_incomplete_or_another_run_is_not_taken_for_complete(
     assert is_complete(trained)
     assert is_complete(evaluation)
     assert not made_otherwise(evaluation)
+    elsewhere = plan(["toy"], "quick", root.resolve() / ".." / root.name, source)[1]
+    assert not made_otherwise(replace(elsewhere, folder=evaluation.folder))
     assert made_otherwise(replace(evaluation, words=("episodes=7",))).startswith("it was made with other")
     metrics = json.loads((evaluation.folder / "metrics.json").read_text())
     del metrics["episodes"][-1]  # as after Ctrl-C

@@ -55,10 +55,12 @@ def test_the_pole_of_a_fine_tuning_comes_first() -> None:
     assert other_pole([LARGE, ROD], EMULATED, emulated=True) == f"{line}; give emulator=large"
 
 
-def test_a_stated_length_is_that_of_a_trained_pole_or_of_a_rod() -> None:
+def test_a_stated_length_is_that_of_a_trained_pole_or_of_a_shipped_one_or_of_a_rod() -> None:
     assert pole_of_length(0.64, BOTH) == LARGE
-    assert pole_of_length(0.64, MEDIUM).nominal == Pole.rod(0.64)
+    assert pole_of_length(0.64, MEDIUM) == LARGE
+    assert pole_of_length(0.64, RODS).nominal == Pole.rod(0.64)
+    assert pole_of_length(0.5, MEDIUM).nominal == Pole.rod(0.5)
     similar = PoleSettings(choices={"0.60 m": Pole.rod(0.6), "0.64 m": Pole.rod(0.64)})
     assert pole_of_length(0.63, similar).name == "0.64 m"
-    line = "warning: the agent was trained with a pole of 0.36 m, the cart has one of 0.64 m"
-    assert other_pole([MEDIUM], pole_of_length(0.64, MEDIUM), emulated=False) == line
+    line = "warning: the agent was trained with a pole of 0.36 m, the cart has one of 0.50 m"
+    assert other_pole([MEDIUM], pole_of_length(0.5, MEDIUM), emulated=False) == line

@@ -1,14 +1,18 @@
-"""A fine-tuned agent knows the pole of its cart, in whatever file it is."""
+"""A fine-tuned agent knows the pole of its cart, in whatever file it is, and is exported for it."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from cartpole_rl.choices import group_choices
+from cartpole_rl.envs.build import with_fitted_guard
 from cartpole_rl.learning.checkpoints import AgentCheckpoint, save_agent
 from cartpole_rl.randomization.poles import Pole, PoleSettings
 from cartpole_rl.workflows.agents import new_agent, trained_agent
-from cartpole_rl.workflows.config import TrainConfig
+from cartpole_rl.workflows.build import evaluated_settings
+from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
+from cartpole_rl.workflows.export import compiled_training, exported_agent, on_the_board
 from cartpole_rl.workflows.finetuning_files import Stage
 from cartpole_rl.workflows.finetuning_session import TunedAgent
 from cartpole_rl.workflows.loading import load_settings
@@ -66,3 +70,25 @@ def test_a_second_fine_tuning_keeps_the_pole_of_the_first(
 def test_a_checkpoint_without_tuned_poles_is_read(agent: AgentCheckpoint, tmp_path: Path) -> None:
     del vars(agent)["tuned_poles"]  # as before they were stored
     assert saved(agent, tmp_path / "last.pt") == [MEDIUM]
+
+
+def test_it_is_exported_with_the_track_guard_of_the_pole_that_it_was_tuned_on(
+    training: TrainConfig, agent: AgentCheckpoint, tmp_path: Path
+) -> None:
+    """A board drives with what was compiled for it, and this computer compares with that."""
+    training = with_fitted_guard(training)
+    agent = replace(agent, config=training.model_dump(mode="json"))
+    numbers = {}
+    for name, driven in (("medium", MEDIUM), ("large", LARGE)):
+        save_agent(tmp_path / name, TunedAgent(training, agent, None).checkpoint(Stage.AFTER, 20.0, driven))
+        tuned = trained_agent(tmp_path / name)
+        numbers[name] = exported_agent(tuned, {}).description.guard
+        fitted = with_fitted_guard(load_settings(TrainConfig, {"pole": name}))
+        assert numbers[name] == fitted.guard.active
+        cart = {"plant": "serial", "plant.port": "port", "plant.policy": "onboard"}
+        config = load_settings(EvaluateConfig, {"run": tmp_path / name, **cart})
+        settings = evaluated_settings(compiled_training(tuned), config)
+        assert settings.guard.active == numbers[name]
+        with on_the_board(config, tuned, settings) as equipped:  # not refused
+            assert equipped == config
+    assert numbers["large"].delay > 1.2 * numbers["medium"].delay

@@ -6,7 +6,7 @@ which states count as lost, repeated or late. The protocol is described in `docs
 """
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from types import TracebackType
 from typing import Self
@@ -41,6 +41,7 @@ from cartpole_rl.wire.messages import (
 LOGGER = logging.getLogger(__name__)
 
 LONGEST_SUSPENSION = 1.0  # s without an answer of this computer, after which a person may have moved the cart
+LONGEST_WAKING = 0.25  # s after this computer slept, until the port has a state of a cart that ticks on
 LONGEST_STOP = 3.0  # s to wait for the answer to STOP, whatever the settings: signals.UNWINDING is longer
 LAST_STOP = 0.5  # s to wait for it in `close` if the STOP before was not answered
 RESTARTED = "the cart has restarted; check its power"
@@ -194,10 +195,11 @@ class SerialCart:
             self._connection.request(SetPeriod(period_us), Info, lambda info: info.period_us == period_us)
         )
 
-    def home(self) -> State:
+    def home(self, watch: Callable[[State], None] = lambda state: None) -> State:
         """Home, and wait until it is done: zeros set, the cart in the middle, the pole hanging still.
 
         Returns the state after it; `information` then has the limits that follow from the measured span.
+        `watch` is called with each state on the way.
         Raises FaultError if homing fails, PlantError if it takes longer than `settings.home_timeout`,
         LinkError if the cart restarts meanwhile.
         """
@@ -210,6 +212,7 @@ class SerialCart:
         deadline = now() + timeout
         state = self._connection.state_since_question()
         while True:
+            watch(state)
             if state.fault:
                 raise fault_error(state.fault)
             if self.restarts > restarts:
@@ -238,6 +241,10 @@ class SerialCart:
             sent = 0
         connection.send_motor(sent)
         return sent
+
+    def took_motor(self, state: State) -> bool:
+        """Return True if the newest motor value had arrived at the cart when it measured `state`."""
+        return self._connection.took_motor(state)
 
     def get_state(self) -> State:
         """Wait for the newest state that was measured after the cart took the last frame sent.
@@ -300,11 +307,13 @@ class SerialCart:
     def _unanswered_for(self) -> float:
         """Return for how many seconds the newest state has waited for a motor value.
 
-        It is 0 if no newer state waits: no time has passed for the cart, as on a lockstep emulator.
+        It is 0 if no newer state comes: no time has passed for the cart, as on a lockstep emulator.
         """
-        if not self._tracker.awaits_command or not self._connection.link.waiting():
+        if not self._tracker.awaits_command:
             return 0.0
-        return now() - self._tracker.newest_at
+        waited, link = now() - self._tracker.newest_at, self._connection.link
+        patience = LONGEST_WAKING if waited > self.longest_suspension else 0.0
+        return waited if link.await_byte(patience) else 0.0
 
     def check_suspension(self, seconds: float) -> None:
         """Raise LinkError if this computer did not answer the cart for too long."""

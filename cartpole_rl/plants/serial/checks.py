@@ -113,13 +113,17 @@ def homing(cart: SerialCart, faults: FaultClearing) -> str:
 
 
 def _homed(cart: SerialCart, before: State) -> State:
-    """Home; return the state after it. Raises NotReadyError if the cart has not moved since `before`."""
+    """Home; return the state after it. Raises NotReadyError if the cart never moved away from `before`."""
+    farthest = 0
+
+    def watch(state: State) -> None:
+        nonlocal farthest
+        farthest = max(farthest, abs(state.cart_counts - before.cart_counts))
+
     try:
-        return cart.home()
+        return cart.home(watch)
     except FaultError:
-        state = cart.poll_state()
-        moved = abs(state.cart_counts - before.cart_counts) >= SURELY_MOVED
-        if moved or state.fault != Fault.HOMING:
+        if farthest >= SURELY_MOVED or cart.poll_state().fault != Fault.HOMING:
             raise
         raise NotReadyError("homing failed: the cart's count does not change", NO_MOTION) from None
 

@@ -63,6 +63,7 @@ class Connection:
         self._frames_asked = 0  # sent up to that question; refusals of motor values among them are void
         self._heard: int | None = None  # the newest sequence that a state acknowledged, ...
         self._unheard_since: float | None = None  # ... and when a newer one was sent
+        self._motor_sequence = 0  # of the newest motor value
         self._refused: Nack | None = None  # of a motor value
         self._refused_sequence = -1  # of the newest frame that was refused; no state will acknowledge it
         self._state_since_refusal = True
@@ -118,7 +119,7 @@ class Connection:
         """Send a motor value once. Raises LinkError if it was delayed for as long as the watchdog waits."""
         self._refused_sequence = -1
         before, started = self._tracker.last, now()
-        self.link.send(SetMotor(value))
+        self._motor_sequence = self.link.send(SetMotor(value))
         self._tracker.send_command(self.link.sequence, self.link.sent_at)
         period_us = min(self._tracker.period_us or LONGEST_PERIOD_US, LONGEST_PERIOD_US)
         if self.link.sent_at - started > WATCHDOG_PERIODS * period_us * 1e-6:
@@ -157,12 +158,16 @@ class Connection:
         deadline = now() + self._settings.timeout
         while True:
             state = self.current_state()
-            if (state.last_sequence - self._asked_sequence) % 256 < 128:
+            if not_before(self._asked_sequence, state.last_sequence):
                 return state
             if now() > deadline:
                 raise LinkError(
                     f"the states of the cart on {self.link.port} acknowledge no frame; correct its firmware"
                 )
+
+    def took_motor(self, state: State) -> bool:
+        """Return True if the newest motor value had arrived at the cart when it measured `state`."""
+        return not_before(self._motor_sequence, state.last_sequence)
 
     def notice_backlog(self) -> bool:
         """Return True if so many bytes wait that newer states may have been dropped: they are not lost."""
@@ -286,3 +291,8 @@ class Connection:
         return (
             f"{link.bytes_received} bytes came, the last bad frame: {link.why_bad}; right port, right baud?"
         )
+
+
+def not_before(sequence: int, other: int) -> bool:
+    """Return True if the frame `other` is the frame `sequence` or a later one."""
+    return (other - sequence) % 256 < 128

@@ -4,6 +4,7 @@ A receiver that starts in the middle of a frame, or receives noise, is synchroni
 """
 
 import os
+import time
 from contextlib import suppress
 
 import serial
@@ -12,6 +13,8 @@ from cartpole_rl.errors import FrameError, LinkError
 from cartpole_rl.plants.serial.clock import now
 from cartpole_rl.plants.serial.statistics import LinkStatistics
 from cartpole_rl.wire import Frame, FrameSplitter, Message, decode_frame, encode_frame
+
+POLLING = 1e-3  # s
 
 
 class SerialLink:
@@ -72,6 +75,15 @@ class SerialLink:
             return self._port.in_waiting
         except OSError as error:
             raise self._broken("asked for bytes", error) from error
+
+    def await_byte(self, patience: float) -> bool:
+        """Return True as soon as a byte waits, False if none comes within `patience` s. Raises LinkError."""
+        deadline = now() + patience
+        while not self.waiting():
+            if now() >= deadline:
+                return False
+            time.sleep(POLLING)
+        return True
 
     def receive(self, waiting: int) -> list[Frame]:
         """Return the frames in the bytes that are `waiting`. Raises LinkError.

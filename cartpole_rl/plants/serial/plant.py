@@ -140,7 +140,10 @@ class SerialPlant(OneCartPlant):
         return self._frame(self._preparation.control_period)
 
     def step_one(self, motor: int) -> OneFrame:
-        """Send a motor value; return the frame at the end of the period."""
+        """Send a motor value; return the frame at the end of the period.
+
+        If the value was lost on its way, what drove is what the cart reports.
+        """
         sent = motor
 
         def answer() -> State:
@@ -148,7 +151,9 @@ class SerialPlant(OneCartPlant):
             sent = self.cart.set_motor(motor)
             if self.on_command is not None:  # in the time until the next state
                 self.on_command(sent)
-            return self.cart.get_state()
+            state = self.cart.get_state()
+            sent = sent if self.cart.took_motor(state) else state.motor_applied
+            return state
 
         frame = self._pass_period(answer)
         return frame if sent == motor else frame._replace(sent=sent)

@@ -26,8 +26,14 @@ class Task:
     study: str
     command: str
     folder: Path
+    root: Path  # folder of all studies, as `words` name it
     words: tuple[str, ...]
     needs: tuple[Path, ...] = ()
+
+    def was_made_by(self, words: Sequence[str]) -> bool:
+        """Return True for the words of this run, wherever the folder of all studies was then."""
+        own = [re.escape(word).replace(re.escape(f"{self.root}/"), ".*/") for word in self.words]
+        return len(words) == len(own) and all(map(re.fullmatch, own, words))
 
 
 def plan(names: Sequence[str], size: str, root: Path, source: Path = STUDIES) -> list[Task]:
@@ -98,19 +104,21 @@ class Agent:
             agent = self.shared
         if agent == BASELINE:
             words = self.words(f"run={BASELINE}", *self.size.evaluation_overrides)
-            yield Task(self.name, "evaluate", self.folder, words)
+            yield Task(self.name, "evaluate", self.folder, self.root, words)
         for evaluation in self.study.evaluations:
             own = evaluation.words(self.arm.name, self.size.evaluation_overrides)
             words = self.words(f"run={agent}", *own)
             needs = tuple(self.runs_in(words))
-            yield Task(self.name, "evaluate", self.folder / EVALUATIONS / evaluation.name, words, needs)
+            folder = self.folder / EVALUATIONS / evaluation.name
+            yield Task(self.name, "evaluate", folder, self.root, words, needs)
 
     def own_task(self) -> Task:
         """Return the run of the study's command."""
         study = self.study
         experiment = [f"experiment={study.experiment}"] if study.experiment else []
         words = self.words(*experiment, *self.arm.overrides, *self.size.overrides)
-        return Task(self.name, study.command, self.folder, words, tuple(self.runs_in(words, own=False)))
+        needs = tuple(self.runs_in(words, own=False))
+        return Task(self.name, study.command, self.folder, self.root, words, needs)
 
     @property
     def shared(self) -> str | None:

@@ -53,7 +53,7 @@ def is_outdated(task: Task) -> bool:
 def made_otherwise(task: Task) -> str:
     """Return why a run does not belong to its study any more; empty if it does."""
     match recorded_provenance(task.folder).get("command"):
-        case [_, *words] if words == [*task.words]:
+        case [_, *words] if task.was_made_by(words):
             return ""
     return "it was made with other settings; delete its folder to repeat it"
 
@@ -86,7 +86,7 @@ def in_own_process(task: Task) -> None:
 def prepare(task: Task) -> bool:
     """Remove an incomplete run that cannot be resumed; return True for one that can."""
     can_resume = task.command in RESUMABLE and (task.folder / CHECKPOINTS / RESUME).is_file()
-    if can_resume and not made_otherwise(task):
+    if can_resume and not made_otherwise(task) and not is_outdated(task):
         return True
     shutil.rmtree(task.folder, ignore_errors=True)
     return False

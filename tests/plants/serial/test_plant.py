@@ -65,6 +65,19 @@ def test_a_value_that_is_replaced_by_0_is_the_one_that_counts(
     assert peer.messages(SetMotor)[-1] == SetMotor(200)
 
 
+def test_a_value_that_was_lost_did_not_drive(peer: CartPeer, plant: SerialPlant) -> None:
+    """What drove is what the cart reports: the value before, until its watchdog sets the motor to 0."""
+    plant.reset()
+    assert plant.step_one(100).sent is None
+    answer = peer.answer
+    peer.answer = lambda frame: [peer.next_state()]  # hears nothing; its states go on
+    assert plant.step_one(200).sent == 100
+    peer.state = replace(peer.state, motor_applied=0)
+    assert plant.step_one(200).sent == 0
+    peer.answer = answer
+    assert plant.step_one(200).sent is None
+
+
 def test_the_call_before_the_start_finds_the_cart_ready_and_disarmed(
     peer: CartPeer, plant: SerialPlant
 ) -> None:

@@ -1,5 +1,6 @@
 """States that are lost, repeated, overtaken or answered late, between a host and a scripted cart."""
 
+import threading
 import time
 from collections.abc import Iterable
 from dataclasses import replace
@@ -256,6 +257,23 @@ def test_time_that_passes_for_the_host_alone_makes_no_command_late(host_clock: H
         cart.get_state()
         host_clock.ahead += 100.0
         assert cart.set_motor(200) == 200
+
+
+@pytest.mark.parametrize("on_board", [False, True])
+def test_a_computer_that_wakes_before_its_port_answers_no_state_from_before(
+    host_clock: HostClock, on_board: bool
+) -> None:
+    """Nothing waits yet, but the cart goes on: its next state comes a little later."""
+    with CartPeer(paced=True) as peer, SerialCart(quick_settings(peer.port, timeout=10.0)) as cart:
+        peer.tick()
+        cart.get_state()
+        host_clock.ahead += 600.0
+        later = threading.Timer(0.05, peer.tick)
+        later.start()
+        with pytest.raises(LinkError, match=r"did not answer the cart on .* for 600\.\d s"):
+            cart.follow_policy() if on_board else cart.set_motor(200)
+        later.join()
+    assert not any(message.motor for message in peer.messages(SetMotor))
 
 
 def test_a_state_overtaken_while_opening_is_not_counted_back() -> None:
