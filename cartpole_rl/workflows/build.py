@@ -25,7 +25,13 @@ from cartpole_rl.settings import Settings, evaluation_seed
 from cartpole_rl.tasks.settings import ActionSettings, Start
 from cartpole_rl.workflows.checks import simulated_carts
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
-from cartpole_rl.workflows.trained_poles import emulated_pole, knows, one_pole, pole_of_length, pole_text
+from cartpole_rl.workflows.trained_poles import (
+    emulated_pole,
+    guard_holds,
+    one_pole,
+    pole_of_length,
+    pole_text,
+)
 
 REPLACEABLE = (
     "cart",
@@ -61,7 +67,8 @@ def without_guard_numbers(training: TrainConfig) -> TrainConfig:
 def outdated(training: TrainConfig, config: EvaluateConfig) -> dict[str, Any]:
     """Return the replaced settings for which the numbers of the training's guard do not hold, by name.
 
-    They are what a person knows of a real cart: other full motor values, and a pole that was not in training.
+    They are what a person knows of a real cart: other full motor values, and a pole that is longer,
+    shorter or heavier than those in training.
     Carts that simulation changes in other ways meet the guard that a real one of their kind would meet. The
     guard of a policy on a real board cannot be changed. Raises ConfigError.
     """
@@ -72,7 +79,7 @@ def outdated(training: TrainConfig, config: EvaluateConfig) -> dict[str, Any]:
     changes: dict[str, Any] = {}
     if (min(motors), max(motors)) != (min(trained.motors), max(trained.motors)):
         changes["actions"] = trained.model_copy(update={"motors": motors})
-    if not knows([training.pole], driven.pole):
+    if not guard_holds(training.pole, driven.pole):
         changes["pole"] = driven.pole
     return changes
 

@@ -28,7 +28,7 @@ from cartpole_rl.workflows.agents import TrainedAgent, trained_agent
 from cartpole_rl.workflows.build import without_guard_numbers
 from cartpole_rl.workflows.config import EvaluateConfig, ExportConfig, TrainConfig
 from cartpole_rl.workflows.run_folder import recorded_provenance, write_config
-from cartpole_rl.workflows.trained_poles import knows
+from cartpole_rl.workflows.trained_poles import guard_holds
 
 
 def export(config: ExportConfig, folder: Path) -> None:
@@ -79,7 +79,7 @@ def compiled_training(trained: TrainedAgent) -> TrainConfig:
     An agent may have been fine-tuned on a pole that was not in its training.
     """
     training, newest = trained.training, (trained.known_poles or [trained.training.pole])[-1]
-    if not training.guard.enabled or knows([training.pole], newest):
+    if not training.guard.enabled or guard_holds(training.pole, newest):
         return with_fitted_guard(training)
     driven = without_guard_numbers(training).model_copy(update={"pole": newest})
     return training.model_copy(update={"guard": with_fitted_guard(driven).guard})

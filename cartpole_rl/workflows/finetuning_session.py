@@ -22,7 +22,7 @@ from cartpole_rl.workflows.finetuning_learner import CartLearner
 from cartpole_rl.workflows.report import report
 from cartpole_rl.workflows.results import plant_words, print_loop_time, print_results, shown
 from cartpole_rl.workflows.run_folder import write_json
-from cartpole_rl.workflows.trained_poles import knows
+from cartpole_rl.workflows.trained_poles import guard_holds
 from cartpole_rl.workflows.tuning import tune
 
 
@@ -55,7 +55,7 @@ class TunedAgent:
         if kept is Stage.BEFORE:
             return replace(self.start, score=score)
         poles = self.start.tuned_poles
-        if not knows(known_poles(self.training, self.start), driven):
+        if not any(guard_holds(each, driven) for each in known_poles(self.training, self.start)):
             poles = [*poles, driven.model_dump(mode="json")]
         return replace(self.start, weights=self.agent.state_dict(), score=score, tuned_poles=poles)
 

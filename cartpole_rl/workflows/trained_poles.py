@@ -6,6 +6,7 @@ from cartpole_rl.choices import group_choices
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.randomization.poles import Pole, PoleSettings
 
+HEAVIER = 1.2  # times the mass of a pole of the same length: full motor brakes it noticeably later
 POLES = ("medium", "large")  # in conf/pole/ and conf/emulator/; the first is the default
 
 
@@ -23,6 +24,18 @@ def knows(known: Sequence[PoleSettings], driven: PoleSettings) -> bool:
     """Return True if each pole that represents `driven` is about one of `known`."""
     each = (driven.each.choices or {}).values()
     return all(any(poles.includes(pole) for poles in known) for pole in each)
+
+
+def guard_holds(trained: PoleSettings, driven: PoleSettings) -> bool:
+    """Return True if a track guard that is fitted to `trained` is one for the poles of `driven`, too."""
+    each = (driven.each.choices or {}).values()
+    return knows([trained], driven) and all(pole.pole_mass < heaviest(trained, pole.length) for pole in each)
+
+
+def heaviest(trained: PoleSettings, length: float) -> float:
+    """Return the mass from which a pole of `length` m is another one than those of `trained`, kg."""
+    alike = [pole.pole_mass for pole in (trained.choices or {}).values() if pole.is_about(length)]
+    return HEAVIER * max(alike, default=Pole.rod(length).pole_mass)
 
 
 def pole_of_length(length: float, trained: PoleSettings) -> PoleSettings:

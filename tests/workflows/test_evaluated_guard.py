@@ -98,6 +98,24 @@ def test_it_is_fitted_anew_to_a_pole_that_was_not_in_training(
     )
 
 
+@pytest.mark.parametrize(
+    ("trained", "mass", "is_refitted"),
+    [("medium", 0.14, False), ("medium", 0.2, True), ("range", 0.2, False)],
+)
+def test_it_is_fitted_anew_to_a_heavier_pole_of_the_same_length(
+    trained: str, mass: float, is_refitted: bool
+) -> None:
+    """Rods of 0.36 m have 0.25 kg in training."""
+    pole = {"choices": {"mine": {"pole_mass": mass, "pole_com": 0.1778, "pole_inertia": 2e-3}}}
+    training = fitted(pole=trained, randomization="half")
+    evaluation = load_settings(EvaluateConfig, {"run": "any", **SERIAL, "pole": pole})
+    settings = evaluated_settings(training, evaluation)
+    assert (settings.guard != training.guard) == is_refitted
+    note = guard_note(training, evaluation, settings)
+    assert (note or "").startswith("note: " if is_refitted else "")
+    assert bool(note) == is_refitted
+
+
 @pytest.mark.parametrize("chosen", [{"guard": "none"}, {"guard.numbers": GIVEN, "guard": "careful"}])
 def test_a_chosen_guard_is_not_replaced(chosen: dict[str, object]) -> None:
     evaluation = load_settings(EvaluateConfig, {"run": "any", **chosen, **with_motors(WEAK)})
