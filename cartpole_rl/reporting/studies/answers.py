@@ -49,10 +49,16 @@ class Status(StrEnum):
     EMPTY = "no result"
     INCOMPLETE = "incomplete"
     OPEN = "not judged"
+    ANSWERED = "answered"
     AGREES = "agrees"
 
 
-VERDICTS = {"fails": Status.FAILS, "contradicts": Status.CONTRADICTS, "agrees": Status.AGREES}
+VERDICTS = {
+    "fails": Status.FAILS,
+    "contradicts": Status.CONTRADICTS,
+    "agrees": Status.AGREES,
+    "answered": Status.ANSWERED,
+}
 
 
 def status(results: StudyResults) -> Status:

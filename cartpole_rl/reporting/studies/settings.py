@@ -46,7 +46,7 @@ class Finding(Settings):
     """What a person found in the complete results of one size. It is shown with these results alone."""
 
     size: str
-    verdict: Literal["fails", "contradicts", "agrees"]  # the page sorts by it
+    verdict: Literal["fails", "contradicts", "agrees", "answered"]  # the last: beyond the thesis
     comment: str  # why the results agree with the thesis or contradict it
 
 
