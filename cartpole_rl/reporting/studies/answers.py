@@ -16,6 +16,8 @@ MEASURES = {  # key of metrics.json: label
     "upright_fraction": "share of time upright",
     "upright_at_end": "share upright at the end",
     "time_to_upright_s": "time to upright, s",
+    "errors.median": "median relative error of the parameters",
+    "network_over_physics.theta_deg": "error of the angle, with / without network",
 }
 LOW_IS_GOOD = ("errors", "rms_", "time_to_", "network_over_")  # starts of measures
 THESIS_ROWS = {  # of the thesis's list: what must work
@@ -117,7 +119,8 @@ def answer(results: StudyResults) -> list[str]:
     if results.varied and all(each in results.evaluations for each in results.varied):
         shown = [results.varied[0], results.varied[-1]]
     sentences = [
-        f"{measure_label(results.study.measure)}{f' ({each.label})' if several else ''}: {_extremes(found)}."
+        f"{measure_label(results.study.measure)}{f' ({each.label})' if several else ''}: "
+        f"{_extremes(found, results.study.unit)}."
         for each in shown
         if (found := estimates(results, each))
     ]
@@ -127,16 +130,16 @@ def answer(results: StudyResults) -> list[str]:
     return sentences
 
 
-def _extremes(found: Mapping[str, Estimate]) -> str:
+def _extremes(found: Mapping[str, Estimate], unit: str = "agent") -> str:
     """Return the estimate of one arm, or of the highest and the lowest of several that differ."""
     ranked = sorted(found, key=lambda label: found[label].value, reverse=True)
     high, low = ranked[0], ranked[-1]
     if len({estimate_text(each) for each in found.values()}) == 1:
         each = "" if len(ranked) == 1 else f"each of {len(ranked)} set-ups "
-        return f"{each}{estimate_text(found[high])}, {agents_text(found[high].agents)}"
+        return f"{each}{estimate_text(found[high])}, {counted_text(found[high].agents, unit)}"
     return (
-        f"highest {estimate_text(found[high])} with {high} ({agents_text(found[high].agents)}), "
-        f"lowest {estimate_text(found[low])} with {low} ({agents_text(found[low].agents)})"
+        f"highest {estimate_text(found[high])} with {high} ({counted_text(found[high].agents, unit)}), "
+        f"lowest {estimate_text(found[low])} with {low} ({counted_text(found[low].agents, unit)})"
     )
 
 
@@ -145,9 +148,9 @@ def estimate_text(found: Estimate) -> str:
     return interval_text(found.value, found.low, found.high)
 
 
-def agents_text(count: int) -> str:
+def counted_text(count: int, unit: str = "agent") -> str:
     """Return "1 agent" or "10 agents"."""
-    return f"{count} agent{'' if count == 1 else 's'}"
+    return f"{count} {unit}{'' if count == 1 else 's'}"
 
 
 def low_is_good(measure: str) -> bool:

@@ -18,7 +18,7 @@ from cartpole_rl.reporting.figures.studies import (
     profiles,
     training_curves,
 )
-from cartpole_rl.reporting.studies.answers import GOOD, agents_text, estimate_text, measure_label
+from cartpole_rl.reporting.studies.answers import GOOD, estimate_text, measure_label
 from cartpole_rl.reporting.studies.results import OWN, SMALLEST, StudyResults
 from cartpole_rl.reporting.studies.settings import Variant
 from cartpole_rl.reporting.studies.statistics import estimate, interquartile_mean
@@ -78,7 +78,9 @@ def _dots(results: StudyResults) -> Drawing:
     values = [value for agent in results.agents for value in agent.values.values()]
     guided = good is not None and min(values) < good < max(values)
     figure = dot_rows(groups, label, {f"good: {good:g}": good} if good and guided else None)
-    caption = f"Dots: agents. Diamond and line: interquartile mean and its 95 % interval.{note}"
+    caption = (
+        f"Dots: {results.study.unit}s. Diamond and line: interquartile mean and its 95 % interval.{note}"
+    )
     return Drawing("agents", figure, described(groups, label), caption)
 
 
@@ -117,7 +119,7 @@ def _over_axis(results: StudyResults) -> Drawing:
         f"{estimate_text(estimate(values[-1]))} at {at[-1]:g}"
         for name, (at, values) in lines.items()
     )
-    caption = "Dots: agents. Line and band: interquartile mean and its 95 % interval."
+    caption = f"Dots: {results.study.unit}s. Line and band: interquartile mean and its 95 % interval."
     figure = curves_over_axis(lines, quantity, label)
     return Drawing("agents", figure, f"{label} over {quantity}. {ends}.", caption)
 
@@ -155,9 +157,7 @@ def _ratios(results: StudyResults) -> Iterator[Drawing]:
     shown, note = _most(groups)
     counted = sum(series[""].size for series in groups.values())
     if failed := results.pairs(first.name, second.name).shape[1] - counted:
-        note += (
-            f" {agents_text(failed)} without ratio: under {SMALLEST:.0%} of the highest on the {first.label}."
-        )
+        note += f" {counted_text(failed)} without ratio: under {SMALLEST:.0%} of the highest on the {first.label}."
     figure = dot_rows(shown, label, {"1": 1.0})
     yield Drawing(
         "ratios",
@@ -176,7 +176,8 @@ def _profiles(results: StudyResults) -> Iterator[Drawing]:
         chosen = {label: series[""] for label, series in groups.items() if label in ranked[:MOST_LINES]}
         label = measure_label(results.study.measure)
         medians = "; ".join(
-            f"{name}: half of the agents above {np.median(each):.4g}" for name, each in chosen.items()
+            f"{name}: half of the {results.study.unit}s above {np.median(each):.4g}"
+            for name, each in chosen.items()
         )
         note = f" The highest {MOST_LINES} of {len(ranked)} are drawn." if len(ranked) > MOST_LINES else ""
         place = "" if last is OWN else f", {last.label}"
@@ -184,7 +185,7 @@ def _profiles(results: StudyResults) -> Iterator[Drawing]:
             f"profiles_{last.name}" if len(results.judged) > 1 else "profiles",
             profiles(chosen, label),
             f"Performance profiles of {label}{place}. {medians}.",
-            f"Performance profile{place}: the share of agents above each value.{note}",
+            f"Performance profile{place}: the share of {results.study.unit}s above each value.{note}",
         )
 
 

@@ -9,8 +9,8 @@ from cartpole_rl.reporting.studies.answers import (
     GOOD,
     THESIS_ROWS,
     Status,
-    agents_text,
     answer,
+    counted_text,
     estimate_text,
     reason,
     status,
@@ -47,7 +47,7 @@ def studies_page(
     size = f", size {', '.join(sizes)}" if sizes else ""
     parts = [
         f"<h1>{TITLE}</h1>",
-        f"<p>{_count(results)}{size}, {agents_text(agents)}.</p>",
+        f"<p>{_count(results)}{size}, {counted_text(agents, 'run')}.</p>",
         _tendency(results),
         _summary(results),
         _contents(results),
@@ -92,7 +92,9 @@ def _tendency(results: Sequence[StudyResults]) -> str:
     most = max((each.size.seeds for each in results if each.agents and each.size), default=ENOUGH)
     if most >= ENOUGH:
         return ""
-    return f'<p class="alarm">At most {agents_text(most)} per set-up: these results show tendencies only.</p>'
+    return (
+        f'<p class="alarm">At most {counted_text(most)} per set-up: these results show tendencies only.</p>'
+    )
 
 
 def _emulators(emulators: Mapping[str, str]) -> str:
@@ -173,7 +175,7 @@ def _sweep_section(results: StudyResults, pictures: Sequence[Picture]) -> str:
     parts = [
         f'<section id="{_anchor(results.name)}">',
         f"<h2>{escaped(results.study.title)}</h2>",
-        f"<p>{agents_text(len(results.agents))} in {groups}. {escaped(' '.join(answer(results)))}</p>",
+        f"<p>{counted_text(len(results.agents))} in {groups}. {escaped(' '.join(answer(results)))}</p>",
         doubts(results, []),
         *figure_parts(results, pictures),
         run_list(results),

@@ -77,7 +77,7 @@ def _value_rows(results: StudyResults) -> list[dict[str, Any]]:
             }
             if good := GOOD.get(measure):
                 row[f"above {good:g}"] = f"{(values > good).sum()} of {values.size}"
-            row["agents"] = values.size
+            row[f"{results.study.unit}s"] = values.size
             rows.append(row)
     return rows
 

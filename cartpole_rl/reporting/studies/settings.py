@@ -82,6 +82,11 @@ class Study(Settings):
     sizes: Annotated[dict[str, Size], Field(min_length=1)]
     size: str = ""  # of the results in the same folder, one of `sizes`; empty in conf/study/
 
+    @property
+    def unit(self) -> str:
+        """What a run of the command makes."""
+        return {"identify": "identification", "model": "model"}.get(self.command, "agent")
+
     @model_validator(mode="after")
     def _names_are_unique(self) -> "Study":
         for kind, variants in (("arms", self.arms), ("evaluations", self.evaluations)):

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from cartpole_rl.files import write_text
 from cartpole_rl.reporting.figures import save
-from cartpole_rl.reporting.studies.answers import Status, agents_text, status
+from cartpole_rl.reporting.studies.answers import Status, counted_text, status
 from cartpole_rl.reporting.studies.comparison import compare
 from cartpole_rl.reporting.studies.figures import Drawing, drawings, rank_agreement
 from cartpole_rl.reporting.studies.page import runs_page, studies_page
@@ -95,5 +95,5 @@ def _title(sweep: Sweep) -> str:
 
 def _print_end(results: list[StudyResults], folder: Path) -> None:
     left_out = sum(len(each.exclusions) for each in results)
-    print(f"{agents_text(sum(len(each.agents) for each in results))} count, {left_out} runs do not")
+    print(f"{counted_text(sum(len(each.agents) for each in results), 'run')} count, {left_out} do not")
     print(f"{folder}/{PAGE} is written")

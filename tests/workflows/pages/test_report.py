@@ -96,7 +96,7 @@ def test_a_browser_shows_the_page_of_studies_on_a_phone_and_in_the_dark(study: P
     (study / "much/1/evaluations/heavy/metrics.json").unlink()
     done, page = report("studies=quick", "data=data")
     assert done.code == 0, done.err
-    assert "\n6 agents count, 1 runs do not\n" in done.out
+    assert "\n6 runs count, 1 do not\n" in done.out
     assert done.out.endswith("report/page.html is written\n")
     assert all(source.startswith("data:image/") for source in Sources(page).found)
     assert len(page) < LIMIT
