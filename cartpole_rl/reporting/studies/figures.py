@@ -18,7 +18,7 @@ from cartpole_rl.reporting.figures.studies import (
     profiles,
     training_curves,
 )
-from cartpole_rl.reporting.studies.answers import GOOD, estimate_text, measure_label
+from cartpole_rl.reporting.studies.answers import GOOD, counted_text, estimate_text, measure_label
 from cartpole_rl.reporting.studies.results import OWN, SMALLEST, StudyResults
 from cartpole_rl.reporting.studies.settings import Variant
 from cartpole_rl.reporting.studies.statistics import estimate, interquartile_mean
@@ -157,7 +157,8 @@ def _ratios(results: StudyResults) -> Iterator[Drawing]:
     shown, note = _most(groups)
     counted = sum(series[""].size for series in groups.values())
     if failed := results.pairs(first.name, second.name).shape[1] - counted:
-        note += f" {counted_text(failed)} without ratio: under {SMALLEST:.0%} of the highest on the {first.label}."
+        least = f"{SMALLEST:.0%} of the highest on the {first.label}"
+        note += f" {counted_text(failed)} without ratio: under {least}."
     figure = dot_rows(shown, label, {"1": 1.0})
     yield Drawing(
         "ratios",
