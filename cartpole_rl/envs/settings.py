@@ -60,6 +60,14 @@ class TrackGuard(Settings):
     delay: NonNegative  # s
     deceleration: Positive  # m/s^2
 
+    def at_least(self, other: "TrackGuard") -> "TrackGuard":
+        """Return a guard that brakes as early as both."""
+        return TrackGuard(
+            margin=max(self.margin, other.margin),
+            delay=max(self.delay, other.delay),
+            deceleration=min(self.deceleration, other.deceleration),
+        )
+
     def __str__(self) -> str:
         """Return the numbers with their units."""
         return f"margin {self.margin:g} m, delay {self.delay:g} s, deceleration {self.deceleration:g} m/s^2"

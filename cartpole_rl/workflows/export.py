@@ -3,6 +3,7 @@
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ from cartpole_rl.agents.network import MirrorQNetwork, QNetwork
 from cartpole_rl.emulator.settings import ONBOARD
 from cartpole_rl.envs.build import with_fitted_guard
 from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
+from cartpole_rl.envs.settings import TrackGuard
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.exporting.agent import ExportedAgent, canonical_json
 from cartpole_rl.exporting.c_code import c_files
@@ -74,15 +76,19 @@ def on_the_board(
 
 
 def compiled_training(trained: TrainedAgent) -> TrainConfig:
-    """Return the settings that an agent is exported with: of its training, with the guard of its newest pole.
+    """Return the settings that an agent is exported with: its training's, with a guard for all `known_poles`.
 
-    An agent may have been fine-tuned on a pole that was not in its training.
+    An agent may have been fine-tuned on a pole that was not in its training, and nobody can tell the board
+    which one it drives.
     """
-    training, newest = trained.training, (trained.known_poles or [trained.training.pole])[-1]
-    if not training.guard.enabled or guard_holds(training.pole, newest):
-        return with_fitted_guard(training)
-    driven = without_guard_numbers(training).model_copy(update={"pole": newest})
-    return training.model_copy(update={"guard": with_fitted_guard(driven).guard})
+    training = with_fitted_guard(trained.training)
+    if training.guard.active is None:
+        return training
+    others = [pole for pole in trained.known_poles if not guard_holds(training.pole, pole)]
+    driven = [without_guard_numbers(training).model_copy(update={"pole": pole}) for pole in others]
+    guards = [each.guard.active for each in (training, *map(with_fitted_guard, driven)) if each.guard.active]
+    numbers = reduce(TrackGuard.at_least, guards)
+    return training.model_copy(update={"guard": training.guard.model_copy(update={"numbers": numbers})})
 
 
 def check_compiled_settings(trained: TrainedAgent, settings: CartPoleSettings) -> None:
@@ -96,7 +102,7 @@ def check_compiled_settings(trained: TrainedAgent, settings: CartPoleSettings) -
     if any(differs.values()):
         names = ", ".join(name for name in differs if differs[name])
         raise ConfigError(
-            f"{names}: with plant.policy=onboard the board has those of the agent's training; "
+            f"{names}: with plant.policy=onboard the board has those that the agent was exported with; "
             f"leave out {names}"
         )
 

@@ -185,10 +185,9 @@ class CartLearner:
         chunk = recorded_chunk(episode, make_env, motors, pole_length(self.config))
         learned, measured = 0 if chunk is None else chunk.shape[1], episode.measured_steps
         if learned < measured:
-            print_message(
-                "finetune",
+            self.show(
                 f"an episode is learned from up to step {learned} of {measured}: there the motor value "
-                f"{episode.motor[learned]} drove, which is none of the agent's {list(motors)}",
+                f"{episode.motor[learned]} drove, which is none of the agent's {list(motors)}"
             )
         return chunk
 

@@ -1,7 +1,7 @@
 """Errors of identified parameters where the truth is known: on the emulated cart."""
 
 import statistics
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import yaml
@@ -29,13 +29,22 @@ def known_truth(config: IdentifyConfig) -> EmulatorSettings | None:
         return None
 
 
-def errors(found: Mapping[str, float], truth: EmulatorSettings | None) -> dict[str, Any]:
-    """Return `errors` for identification.json: relative errors and their median; {} without a truth."""
+def errors(
+    found: Mapping[str, float], truth: EmulatorSettings | None, not_estimated: Collection[str] = ()
+) -> dict[str, Any]:
+    """Return `errors` for identification.json: relative errors and their median; {} without a truth.
+
+    Parameters that were `not_estimated` have no error.
+    """
     if truth is None:
         return {}
     true = true_values(truth)
     values = {**found, "force": force(found)}
-    relative = {name: abs(values[name] / value - 1) for name, value in true.items() if value}
+    relative = {
+        name: abs(values[name] / value - 1)
+        for name, value in true.items()
+        if value and name not in not_estimated
+    }
     return {"errors": {**relative, "median": statistics.median(relative.values())}}
 
 

@@ -99,7 +99,7 @@ def regress(
     found = {**nominal, **{name: each.value for name, each in estimates.items()}}
     standard_errors = {name: each.error for name, each in estimates.items() if math.isfinite(each.error)}
     content = {"method": "one_step", "parameters": found, "standard_errors": standard_errors}
-    write_json(folder / IDENTIFIED, content | errors(found, truth))
+    write_json(folder / IDENTIFIED, content | errors(found, truth, nominal.keys() - estimates.keys()))
     rows = [
         {"parameter": name, "estimate": f"{each.value:.4g} ± {each.error:.1g}", "prior": f"{nominal[name]:g}"}
         for name, each in estimates.items()

@@ -16,8 +16,8 @@ def other_pole(known: Sequence[PoleSettings], driven: PoleSettings, emulated: bo
         return None
     choice = emulator_for(known) if emulated else None
     advice = f"; give emulator={choice}" if choice else ""
-    length = f"a pole of {' or '.join(map(lengths, known))}, the cart has one of {lengths(driven)}"
-    return f"warning: the agent was trained with {length}{advice}"
+    trained, own = " or ".join(dict.fromkeys(map(lengths, known))), lengths(driven)
+    return f"warning: the agent was trained with a pole of {trained}, the cart has one of {own}{advice}"
 
 
 def knows(known: Sequence[PoleSettings], driven: PoleSettings) -> bool:

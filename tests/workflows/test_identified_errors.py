@@ -27,5 +27,11 @@ def test_an_error_is_relative_to_the_truth() -> None:
     assert found["median"] == 0
 
 
+def test_what_was_not_estimated_has_no_error() -> None:
+    found = errors({**EXACT, "cart_viscous": 0.0, "cart_mass": 2 * TRUTH.cart_mass}, TRUTH, {"cart_viscous"})
+    assert "cart_viscous" not in found["errors"]
+    assert found["errors"]["cart_mass"] == 1
+
+
 def test_without_a_truth_there_are_none() -> None:
     assert errors(EXACT, None) == {}

@@ -72,23 +72,38 @@ def test_a_checkpoint_without_tuned_poles_is_read(agent: AgentCheckpoint, tmp_pa
     assert saved(agent, tmp_path / "last.pt") == [MEDIUM]
 
 
-def test_it_is_exported_with_the_track_guard_of_the_pole_that_it_was_tuned_on(
+def test_it_is_exported_with_a_track_guard_for_all_poles_that_it_knows(
     training: TrainConfig, agent: AgentCheckpoint, tmp_path: Path
 ) -> None:
     """A board drives with what was compiled for it, and this computer compares with that."""
     training = with_fitted_guard(training)
     agent = replace(agent, config=training.model_dump(mode="json"))
+    of_pole = {
+        name: with_fitted_guard(load_settings(TrainConfig, {"pole": name})).guard.active
+        for name in ("medium", "large")
+    }
     numbers = {}
     for name, driven in (("medium", MEDIUM), ("large", LARGE)):
         save_agent(tmp_path / name, TunedAgent(training, agent, None).checkpoint(Stage.AFTER, 20.0, driven))
         tuned = trained_agent(tmp_path / name)
         numbers[name] = exported_agent(tuned, {}).description.guard
-        fitted = with_fitted_guard(load_settings(TrainConfig, {"pole": name}))
-        assert numbers[name] == fitted.guard.active
         cart = {"plant": "serial", "plant.port": "port", "plant.policy": "onboard"}
         config = load_settings(EvaluateConfig, {"run": tmp_path / name, **cart})
         settings = evaluated_settings(compiled_training(tuned), config)
         assert settings.guard.active == numbers[name]
         with on_the_board(config, tuned, settings) as equipped:  # not refused
             assert equipped == config
-    assert numbers["large"].delay > 1.2 * numbers["medium"].delay
+    assert numbers["medium"] == of_pole["medium"]
+    assert numbers["large"] == of_pole["medium"].at_least(of_pole["large"])
+    assert numbers["large"].delay == of_pole["large"].delay > 1.2 * of_pole["medium"].delay
+
+
+def test_an_agent_of_the_large_pole_that_was_tuned_on_a_shorter_one_keeps_its_guard(
+    agent: AgentCheckpoint, tmp_path: Path
+) -> None:
+    training = with_fitted_guard(load_settings(TrainConfig, {"agent.hidden": [8], "pole": "large"}))
+    agent = replace(agent, config=training.model_dump(mode="json"))
+    save_agent(tmp_path / "agent", TunedAgent(training, agent, None).checkpoint(Stage.AFTER, 20.0, MEDIUM))
+    compiled = compiled_training(trained_agent(tmp_path / "agent")).guard.active
+    assert compiled.delay == training.guard.active.delay
+    assert compiled.deceleration == training.guard.active.deceleration

@@ -243,7 +243,7 @@ class SerialCart:
         return sent
 
     def took_motor(self, state: State) -> bool:
-        """Return True if the newest motor value had arrived at the cart when it measured `state`."""
+        """Return True if the newest motor value was the last frame that the cart had taken before `state`."""
         return self._connection.took_motor(state)
 
     def get_state(self) -> State:

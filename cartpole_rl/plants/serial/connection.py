@@ -158,7 +158,7 @@ class Connection:
         deadline = now() + self._settings.timeout
         while True:
             state = self.current_state()
-            if not_before(self._asked_sequence, state.last_sequence):
+            if (state.last_sequence - self._asked_sequence) % 256 < 128:
                 return state
             if now() > deadline:
                 raise LinkError(
@@ -166,8 +166,8 @@ class Connection:
                 )
 
     def took_motor(self, state: State) -> bool:
-        """Return True if the newest motor value had arrived at the cart when it measured `state`."""
-        return not_before(self._motor_sequence, state.last_sequence)
+        """Return True if the newest motor value was the last frame that the cart had taken before `state`."""
+        return state.last_sequence == self._motor_sequence
 
     def notice_backlog(self) -> bool:
         """Return True if so many bytes wait that newer states may have been dropped: they are not lost."""
@@ -291,8 +291,3 @@ class Connection:
         return (
             f"{link.bytes_received} bytes came, the last bad frame: {link.why_bad}; right port, right baud?"
         )
-
-
-def not_before(sequence: int, other: int) -> bool:
-    """Return True if the frame `other` is the frame `sequence` or a later one."""
-    return (other - sequence) % 256 < 128

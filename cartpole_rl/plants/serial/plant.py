@@ -142,7 +142,7 @@ class SerialPlant(OneCartPlant):
     def step_one(self, motor: int) -> OneFrame:
         """Send a motor value; return the frame at the end of the period.
 
-        If the value was lost on its way, what drove is what the cart reports.
+        If the cart does not acknowledge the value, what drove is what it reports.
         """
         sent = motor
 

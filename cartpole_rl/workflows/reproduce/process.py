@@ -86,7 +86,9 @@ def in_own_process(task: Task) -> None:
 def prepare(task: Task) -> bool:
     """Remove an incomplete run that cannot be resumed; return True for one that can."""
     can_resume = task.command in RESUMABLE and (task.folder / CHECKPOINTS / RESUME).is_file()
-    if can_resume and not made_otherwise(task) and not is_outdated(task):
+    command = recorded_provenance(task.folder).get("command")
+    has_paths = isinstance(command, list) and command[1:] == [*task.words]  # it resumes with those of then
+    if can_resume and has_paths and not is_outdated(task):
         return True
     shutil.rmtree(task.folder, ignore_errors=True)
     return False

@@ -1,13 +1,13 @@
 """The checks of a cart, on the emulated one: a good one, wires the wrong way round, and other faults."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from typing import Any
 
 import pytest
-from serial_peer import INFO, Between, CartPeer, wait_for
+from serial_peer import INFO, Between, CartPeer
 
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import FaultError
@@ -25,7 +25,7 @@ from cartpole_rl.plants.serial.errors import NotReadyError
 from cartpole_rl.plants.serial.preflight import Finding, preflight
 from cartpole_rl.plants.serial.probe import Probe
 from cartpole_rl.plants.serial.settings import SerialSettings
-from cartpole_rl.wire import Fault, Flags, Frame, Home, Message, State
+from cartpole_rl.wire import Fault, Flags, Home, Message, State
 
 TRUTH: dict[str, Any] = {
     "deadband_right": 100.0,
@@ -224,21 +224,33 @@ def test_a_cart_that_does_not_move_is_a_finding_with_its_remedy(truth: dict[str,
 
 
 class Failing(CartPeer):
-    """A cart that moves to the right by `moved` counts when it homes, back again, and latches `fault`."""
+    """A cart that moves to the right by `moved` counts when it homes; `end_homing` latches `fault`."""
 
     def __init__(self, moved: int, fault: Fault) -> None:
         super().__init__()
         self.info, self.moved, self.fault = good_limits, moved, fault
 
-    def answer(self, frame: Frame) -> Iterable[bytes]:
-        yield from super().answer(frame)
-        if isinstance(frame.message, Home):
-            wait_for(lambda: self.unread() == 0)
-            yield self.next_state(cart_counts=0, fault=self.fault)
-
     def carry_out(self, message: Message) -> None:
         if isinstance(message, Home):
             self.state = replace(self.state, cart_counts=self.moved)
+
+    def end_homing(self) -> None:
+        """The cart is back in the middle."""
+        if not self.state.fault:
+            self.tick(cart_counts=0, fault=self.fault)
+
+
+class WatchedHoming(SerialCart):
+    """Ends the homing of `peer` once this computer has seen a state of it."""
+
+    peer: Failing
+
+    def home(self, watch: Callable[[State], None] = lambda state: None) -> State:
+        def seen(state: State) -> None:
+            watch(state)
+            self.peer.end_homing()
+
+        return super().home(seen)
 
 
 @pytest.mark.parametrize(
@@ -252,7 +264,8 @@ def test_another_fault_while_homing_is_a_finding_with_its_remedy(
     moved: int, fault: Fault, words: str
 ) -> None:
     with Failing(moved, fault) as peer:
-        cart = SerialCart(patient(peer.port))
+        cart = WatchedHoming(patient(peer.port))
+        cart.peer = peer
         *_, last = preflight(cart)
         cart.close()
     assert (last.check, last.ready) == ("homing", False)
