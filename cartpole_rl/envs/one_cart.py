@@ -83,7 +83,7 @@ class OneCart:
         """Drive one period."""
         motor = self.sent_motor(action)
         frame = self.plant.step_one(motor)
-        self.sent = motor if frame.sent is None else frame.sent
+        self.sent = frame.drove(motor)
         return self.advance(self.sent, frame._replace(truncated=frame.truncated or action == NO_ACTION))
 
     def advance(self, motor: int, frame: OneFrame) -> Percept[Numbers]:

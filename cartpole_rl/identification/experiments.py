@@ -166,7 +166,7 @@ def run(
         now = observed(counts, gaps)
         motor = guarded(requested, now.x, now.x_dot, guard)
         present = plant.step_one(motor)
-        motors.append(motor if present.sent is None else present.sent)
+        motors.append(present.drove(motor))
         counts.append(present.counts)
         gaps.append(present.dt)
         if present.terminated or present.truncated:

@@ -38,6 +38,10 @@ class OneFrame(NamedTuple):
         None  # the motor value that drove, where it is not the given one: that was late or lost
     )
 
+    def drove(self, given: int) -> int:
+        """Return the motor value that drove, where `given` was the one to send."""
+        return given if self.sent is None else self.sent
+
 
 class Plant(EnvBase):
     """A batch of N carts that take motor values and return encoder counts; simulated, or one cart on a wire.
