@@ -24,6 +24,7 @@ SEARCH_SPEED = 0.08  # m/s, towards a stop
 TRAVEL_SPEED = 0.2  # m/s, far from a stop whose position is known
 TOUCH_ZONE = 60_000_000  # nm, distance from such a stop at which the slow search begins
 ASTRAY = 20_000_000  # nm, a motion the wrong way that means a reversed motor or encoder
+FAST = POLE_COUNTS * 6 // 10  # counts/s of a pole that may move the cart against its motor: 3.8 rad/s
 AGAINST_STOP = 400_000  # us under full push without motion that mean a stop
 STANDS = 300_000 // CART_NANOMETRES  # counts, largest motion in that time: 0.3 mm
 LONGEST_SEARCH = 30_000_000  # us for one stop
@@ -136,18 +137,19 @@ def home() -> Generator[int, Reading, Zeros]:
 def touch_stop(direction: int, expected: int | None, reading: Reading) -> Procedure:
     """Move until a stop holds the cart. `expected` is the raw count of the stop, or None if it is unknown.
 
-    Raises HomingError if the cart moves the wrong way, faster than at the beginning, when it may have rolled.
+    Raises HomingError if the cart moves the wrong way, faster than at the beginning, when it may have rolled,
+    and faster than when a fast pole last pushed it.
     """
-    servo, window, elapsed, before = SpeedServo(), Window(AGAINST_STOP), 0, reading.cart
+    servo, window, elapsed, before = SpeedServo(), Window(AGAINST_STOP), 0, reading
     start, rolled = reading.cart, 0.0
     while elapsed < LONGEST_SEARCH:
         far = expected is not None and abs(expected - reading.cart) * CART_NANOMETRES > TOUCH_ZONE
-        speed = (reading.cart - before) * CART_METRES / reading.seconds
-        if elapsed <= reading.us:  # the first two readings give the first speed
-            rolled = -direction * speed
+        speed = (reading.cart - before.cart) * CART_METRES / reading.seconds
+        if elapsed <= reading.us or pole_speed(before, reading) > FAST:  # two readings give the first speed
+            start, rolled = reading.cart, -direction * speed
         if (start - reading.cart) * direction * CART_NANOMETRES > ASTRAY and -direction * speed > rolled:
             raise HomingError("the cart moves the wrong way: its motor or its encoder is reversed")
-        before = reading.cart
+        before = reading
         window.add(reading.cart, reading.us)
         motor = servo.motor(direction * (TRAVEL_SPEED if far else SEARCH_SPEED), speed, reading.seconds)
         if window.spread <= STANDS and motor == direction * abs(rough_motor(PUSH)):
@@ -159,17 +161,19 @@ def touch_stop(direction: int, expected: int | None, reading: Reading) -> Proced
 
 def centre(middle: int, reading: Reading) -> Procedure:
     """Move gently to the middle and switch the motor off."""
-    servo, elapsed, before, start = SpeedServo(), 0, reading.cart, reading.cart
+    servo, elapsed, before, start = SpeedServo(), 0, reading, reading.cart
     while elapsed < LONGEST_CENTRING:
         away = middle - reading.cart
         if abs(away) * CART_NANOMETRES < CENTRED:
             return reading
+        if pole_speed(before, reading) > FAST:
+            start = reading.cart
         if (abs(away) - abs(middle - start)) * CART_NANOMETRES > ASTRAY:
             raise HomingError("the cart moves away from the middle")
         speed_here = away * CART_METRES  # m/s: it slows down over the last second
         target = max(-TRAVEL_SPEED, min(TRAVEL_SPEED, speed_here))
-        speed = (reading.cart - before) * CART_METRES / reading.seconds
-        before = reading.cart
+        speed = (reading.cart - before.cart) * CART_METRES / reading.seconds
+        before = reading
         reading = yield servo.motor(target, speed, reading.seconds)
         elapsed += reading.us
     raise HomingError(f"not in the middle after {LONGEST_CENTRING / 1e6:.0f} s")
@@ -203,10 +207,15 @@ def find_hanging(reading: Reading) -> Generator[int, Reading, tuple[int, Reading
         before = reading
         reading = yield 0
         elapsed += reading.us
-        speed = abs(reading.pole - before.pole) * 1_000_000 // reading.us
+        speed = pole_speed(before, reading)
         if speed > fastest:
             hanging, fastest = (reading.pole + before.pole) // 2, speed
     return hanging, reading
+
+
+def pole_speed(before: Reading, reading: Reading) -> int:
+    """Return the pole's speed between two readings, in counts/s."""
+    return abs(reading.pole - before.pole) * 1_000_000 // reading.us
 
 
 def wait_until_still(reading: Reading) -> Generator[int, Reading, int]:

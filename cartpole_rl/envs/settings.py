@@ -61,7 +61,7 @@ class TrackGuard(Settings):
     deceleration: Positive  # m/s^2
 
     def at_least(self, other: "TrackGuard") -> "TrackGuard":
-        """Return a guard that brakes as early as both."""
+        """Return a guard that brakes a cart on its way outward as early as both, or earlier."""
         return TrackGuard(
             margin=max(self.margin, other.margin),
             delay=max(self.delay, other.delay),

@@ -176,7 +176,7 @@ def run(
             requested = moves.send(observed(counts, gaps))
         except StopIteration as end:
             breakaway = end.value
-            present = plant.step_one(0) if motor else present
+            present = plant.step_one(0) if motors[-1] else present
             break
     return recording(np.array(counts), np.array(gaps[1:]), np.array(motors), ended), present, breakaway
 

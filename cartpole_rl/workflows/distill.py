@@ -50,7 +50,8 @@ def distill(config: DistillConfig, folder: Path) -> float:
             progress.update()
     episodes = judge(nominal_env(training), student.greedy_policy(), config.seed)
     score = mean([float(episode.score.sum()) for episode in episodes])
-    agent = AgentCheckpoint(settings, student.state_dict(), distillation.transitions, score)
+    tuned_poles = [poles.model_dump(mode="json") for poles in teacher.known_poles[1:]]
+    agent = AgentCheckpoint(settings, student.state_dict(), distillation.transitions, score, tuned_poles)
     save_agent(folder / CHECKPOINTS / LAST, agent)
     report(folder, episodes, training.plant.kind, training.pole, training.task.x_max)
     print(f"a network of {list(config.hidden)} hidden units scores {score:.0f}")

@@ -12,6 +12,7 @@
 #define TRAVEL_SPEED 0.2  /* m/s, far from a stop whose position is known */
 #define TOUCH_ZONE_NM 60000000 /* distance from such a stop at which the slow search begins */
 #define ASTRAY_NM 20000000 /* a motion the wrong way that means a reversed motor or encoder */
+#define FAST_POLE (CART_POLE_COUNTS * 6 / 10) /* counts/s; it may move the cart against its motor: 3.8 rad/s */
 #define AGAINST_STOP_US 400000u /* under full push without motion that mean a stop */
 #define STANDS_COUNTS (300000 / CART_NANOMETRES) /* largest motion in that time: 0.3 mm */
 #define LONGEST_SEARCH_US 30000000u /* for one stop */
@@ -81,13 +82,22 @@ static double cart_speed(const cart_homing *homing, const cart_reading *reading)
     return metres(homing->before.cart, reading->cart) / seconds(reading);
 }
 
-/* True if the cart moves the wrong way, faster than at the start of the stage, when it may have rolled. */
+/* In counts/s, since the reading before. */
+static int64_t pole_speed(const cart_homing *homing, const cart_reading *reading)
+{
+    return cart_distance(reading->pole, homing->before.pole) * 1000000 / (int64_t)reading->period_us;
+}
+
+/* True if the cart moves the wrong way, faster than at the start of the stage, when it may have rolled, and
+   faster than when a fast pole last pushed it. */
 static bool goes_astray(cart_homing *homing, const cart_reading *reading, int direction, double speed)
 {
     double wrong = -direction * speed;
+    if (homing->elapsed_us <= reading->period_us || pole_speed(homing, reading) > FAST_POLE) {
+        homing->start = reading->cart; /* two readings give the first speed */
+        homing->rolled = wrong;
+    }
     int64_t moved = ((int64_t)homing->start - reading->cart) * direction;
-    if (homing->elapsed_us <= reading->period_us)
-        homing->rolled = wrong; /* the first two readings give the first speed */
     return moved * CART_NANOMETRES > ASTRAY_NM && wrong > homing->rolled;
 }
 
@@ -126,6 +136,8 @@ static outcome centre(cart_homing *homing, const cart_reading *reading, int16_t 
     int32_t middle = cart_zeros_middle(&homing->zeros);
     if (cart_distance(middle, reading->cart) * CART_NANOMETRES < CENTRED_NM)
         return ENDS;
+    if (pole_speed(homing, reading) > FAST_POLE)
+        homing->start = reading->cart;
     int64_t added = cart_distance(middle, reading->cart) - cart_distance(middle, homing->start);
     if (added * CART_NANOMETRES > ASTRAY_NM)
         return FAILS;
@@ -143,8 +155,7 @@ static outcome find_hanging(cart_homing *homing, const cart_reading *reading, in
         homing->zeros.hanging = reading->pole;
         homing->fastest = 0;
     } else {
-        int64_t moved = cart_distance(reading->pole, homing->before.pole);
-        int64_t speed = moved * 1000000 / (int64_t)reading->period_us;
+        int64_t speed = pole_speed(homing, reading);
         if (speed > homing->fastest) {
             homing->zeros.hanging = cart_middle(reading->pole, homing->before.pole);
             homing->fastest = speed;

@@ -41,8 +41,8 @@ typedef struct {
     bool entered;        /* the stage has handled a reading */
     uint32_t elapsed_us; /* since the stage began */
     cart_reading before; /* the reading before the present one */
-    int32_t start;       /* cart count when the stage began */
-    double rolled;       /* m/s the wrong way when the stage began */
+    int32_t start;       /* cart count when the stage began, or when the pole was last fast */
+    double rolled;       /* m/s the wrong way then */
     cart_zeros zeros;    /* as far as they are found */
     int64_t fastest;     /* counts/s of the pole, while the hanging count is searched */
     cart_servo servo;

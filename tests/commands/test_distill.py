@@ -1,14 +1,23 @@
 """cartpole-distill makes an agent that the other commands take."""
 
 import json
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import yaml
 from command_line import DISTILLATION, in_process, interrupt_after
 
+from cartpole_rl.choices import choice
+from cartpole_rl.learning.checkpoints import load_agent, save_agent
+from cartpole_rl.workflows.agents import trained_agent
+
 
 def test_the_student_is_an_agent_like_any_other(trained: Path, tmp_path: Path) -> None:
-    words = (f"run={trained}", "hidden=[8,6]", *DISTILLATION, "hydra.run.dir=student")
+    shutil.copytree(trained, tmp_path / "teacher")
+    checkpoint = tmp_path / "teacher/checkpoints/last.pt"
+    save_agent(checkpoint, replace(load_agent(checkpoint), tuned_poles=[choice("pole/large")]))
+    words = ("run=teacher", "hidden=[8,6]", *DISTILLATION, "hydra.run.dir=student")
     done = in_process("distill", *words, folder=tmp_path)
     assert done.code == 0, done.err
     assert done.out.splitlines()[-1] == "cartpole-export run=student format=c"
@@ -21,6 +30,7 @@ def test_the_student_is_an_agent_like_any_other(trained: Path, tmp_path: Path) -
         "provenance.json",
     }
     assert json.loads((student / "provenance.json").read_text())["program"] == "cartpole-distill"
+    assert trained_agent(student).known_poles == trained_agent(tmp_path / "teacher").known_poles
     teacher = yaml.safe_load((student / "config.yaml").read_text())["teacher"]
     assert teacher["program"] == "cartpole-train"
     assert teacher["transitions"] > 0

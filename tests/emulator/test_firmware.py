@@ -332,6 +332,19 @@ def test_homing_ends_when_the_cart_moves_the_wrong_way(way):
         assert counts > 0.02 / 22.749e-6 or speed < 0
 
 
+@pytest.mark.parametrize(("counts_a_second", "fault"), [(10_000, 0), (1_000, Fault.HOMING)])
+def test_homing_goes_on_while_a_fast_pole_pushes_the_cart_the_wrong_way(counts_a_second, fault):
+    """As after an episode whose pole turned over: such a pole is stronger than the motor."""
+    bench, counts, speed, state = Bench(homed=False), 0, 0, None
+    bench.send(Home())
+    for number in range(20):
+        speed += 15
+        counts += speed
+        state, _ = bench.tick(counts, number * counts_a_second // 50)
+    assert counts > 0.06 / 22.749e-6
+    assert state.fault == fault
+
+
 def test_an_armed_cart_is_not_homed_or_retimed(bench):
     assert bench.refusal(Home()) == Reason.BUSY
     assert bench.refusal(SetPeriod(10_000)) == Reason.BUSY

@@ -21,6 +21,7 @@ from contextlib import suppress
 from typing import TypeVar
 
 from cartpole_rl.errors import LinkError
+from cartpole_rl.physics.motor import LARGEST_MOTOR
 from cartpole_rl.plants.serial.clock import now
 from cartpole_rl.plants.serial.errors import refusal
 from cartpole_rl.plants.serial.information import LONGEST_PERIOD_US
@@ -129,16 +130,26 @@ class Connection:
         """Wait for the newest state that was measured after the cart took the last frame.
 
         Raises RefusedError or FaultError if the cart refused the last motor value, LinkError if no state
-        arrives within `timeout`, the cart's clock stands still, or the cart does not hear this computer.
+        arrives within `timeout`, the cart's clock stands still, its motor value is none, or the cart does
+        not hear this computer.
         """
         state = self._await_current(now() + self._settings.timeout)
         self._raise_stopped_clock()
+        self._check_motor(state)
         self._check_hearing(state)
         refused, self._refused = self._refused, None
         if refused is not None and not state.fault:
             raise refusal(refused)
         self._tracker.hand_out(state)
         return state
+
+    def _check_motor(self, state: State) -> None:
+        """Raise LinkError if the cart reports a motor value that no cart has: it would be learned from."""
+        if abs(state.motor_applied) > LARGEST_MOTOR:
+            raise LinkError(
+                f"STATE {state.tick} of the cart on {self.link.port} has motor value {state.motor_applied}, "
+                f"which is beyond {LARGEST_MOTOR}; correct its firmware"
+            )
 
     def _check_hearing(self, state: State) -> None:
         """Raise LinkError if frames went out but, for LONGEST_DEAFNESS, no state has acknowledged one."""

@@ -78,6 +78,7 @@ class SerialPlant(OneCartPlant):
         faults = FaultClearing(settings.clear_faults, confirm)
         self._preparation = Preparation(self.cart, start, control_period, faults, prompt)
         self._driving = False  # an episode is under way
+        self._drove = 0  # the motor value in the period before
         self._turns = 0  # pole counts of the whole turns that the pole had made before this episode
         self._owned = owned
         self._state = State(0, 0, 0, 0, 0, 0, 0, 0)
@@ -134,6 +135,7 @@ class SerialPlant(OneCartPlant):
             self.cart.start()
         self._state = self.cart.get_state()
         self._turns = self._whole_turns()
+        self._drove = 0
         self.ended_by = ""
         self.last_error = None
         self._driving = True
@@ -142,21 +144,26 @@ class SerialPlant(OneCartPlant):
     def step_one(self, motor: int) -> OneFrame:
         """Send a motor value; return the frame at the end of the period.
 
-        If the cart does not acknowledge the value, what drove is what it reports.
+        If the cart does not acknowledge the value, what drove is what it reports: the motor value in force.
+        If its watchdog or a fault has just set the motor to 0, that was the value of the period before.
         """
-        sent = motor
+        drove = motor
 
         def answer() -> State:
-            nonlocal sent
-            sent = self.cart.set_motor(motor)
+            nonlocal drove
+            before = self.cart.flags
+            drove = self.cart.set_motor(motor)
             if self.on_command is not None:  # in the time until the next state
-                self.on_command(sent)
+                self.on_command(drove)
             state = self.cart.get_state()
-            sent = sent if self.cart.took_motor(state) else state.motor_applied
+            if not self.cart.took_motor(state):
+                has_just_stopped = state.fault or self.cart.flags & ~before & Flags.WATCHDOG
+                drove = self._drove if has_just_stopped else state.motor_applied
             return state
 
         frame = self._pass_period(answer)
-        return frame if sent == motor else frame._replace(sent=sent)
+        self._drove = drove
+        return frame if drove == motor else frame._replace(sent=drove)
 
     def listen_one(self) -> OneFrame:
         """Let the policy on the board drive; return the frame at the end of the period."""

@@ -278,7 +278,7 @@ def _comment(results: StudyResults) -> list[str]:
 
 
 def _is_alarming(results: StudyResults) -> bool:
-    return status(results) not in (Status.AGREES, Status.OPEN, Status.EMPTY)
+    return status(results) not in (Status.AGREES, Status.ANSWERED, Status.OPEN, Status.EMPTY)
 
 
 def _anchor(name: str) -> str:

@@ -66,16 +66,38 @@ def test_a_value_that_is_replaced_by_0_is_the_one_that_counts(
 
 
 def test_a_value_that_was_lost_did_not_drive(peer: CartPeer, plant: SerialPlant) -> None:
-    """What drove is what the cart reports: the value before, until its watchdog sets the motor to 0."""
+    """What drove is the value before, also in the period at whose end the watchdog sets the motor to 0."""
     plant.reset()
     assert plant.step_one(100).sent is None
     answer = peer.answer
     peer.answer = lambda frame: [peer.next_state()]  # hears nothing; its states go on
     assert plant.step_one(200).sent == 100
-    peer.state = replace(peer.state, motor_applied=0)
+    peer.state, peer.flags = replace(peer.state, motor_applied=0), peer.flags | Flags.WATCHDOG
+    assert plant.step_one(200).sent == 100
     assert plant.step_one(200).sent == 0
-    peer.answer = answer
+    peer.answer, peer.flags = answer, peer.flags & ~Flags.WATCHDOG
     assert plant.step_one(200).sent is None
+
+
+def test_a_fault_ends_the_value_that_drove(peer: CartPeer, plant: SerialPlant) -> None:
+    plant.reset()
+    plant.step_one(100)
+    peer.state = replace(peer.state, motor_applied=0, fault=Fault.STALL)
+    peer.answer = lambda frame: [peer.next_state()]
+    assert plant.step_one(200).sent == 100
+
+
+@pytest.mark.parametrize("motor", [256, -30_000])
+def test_a_motor_value_that_no_cart_has_is_a_lost_link(
+    peer: CartPeer, plant: SerialPlant, motor: int
+) -> None:
+    """It would be observed and learned from."""
+    plant.reset()
+    peer.answer = lambda frame: [peer.next_state()]
+    peer.state = replace(peer.state, motor_applied=motor)
+    frame = plant.step_one(100)
+    assert (frame.truncated, frame.motor_applied) == (True, 0)
+    assert f"has motor value {motor}, which is beyond 255" in str(plant.last_error)
 
 
 def test_the_call_before_the_start_finds_the_cart_ready_and_disarmed(
