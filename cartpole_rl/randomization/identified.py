@@ -1,6 +1,7 @@
 """Draws carts from a table of carts: the posterior of an identification, correlations included."""
 
 from collections.abc import Collection, Mapping
+from typing import Any
 
 import numpy as np
 import torch
@@ -10,7 +11,7 @@ from cartpole_rl.errors import ConfigError
 from cartpole_rl.physics.bounds import BOUNDS
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.randomization.draws import Draws
-from cartpole_rl.randomization.poles import PoleSettings
+from cartpole_rl.randomization.poles import HEAVIER, Pole, PoleSettings
 from cartpole_rl.randomization.randomizer import Randomizer
 from cartpole_rl.randomization.settings import IdentifiedSettings
 
@@ -85,7 +86,10 @@ def identified_carts(
     poles: PoleSettings,
     device: torch.device | str = "cpu",
 ) -> IdentifiedCarts:
-    """Return the draws that `settings` describe. Raises ConfigError if the file is missing or damaged."""
+    """Return the draws that `settings` describe. Raises ConfigError if the file is missing or damaged.
+
+    With `poles` other than the identified one, the identified cart carries these.
+    """
     prior = Randomizer(cart, poles, settings.ranges, device)
     try:
         with np.load(settings.posterior) as stored:
@@ -93,6 +97,9 @@ def identified_carts(
             identified = [str(name) for name in stored["identified"]]
     except (OSError, ValueError, KeyError) as error:
         raise ConfigError(f"randomization.posterior={settings.posterior} cannot be read: {error}") from None
+    if not poles.is_single or not is_about(poles.nominal, posterior):
+        posterior = {name: values for name, values in posterior.items() if name not in Pole.model_fields}
+        identified = [name for name in identified if name in posterior]
     rows = []
     for name, nominal in zip(CartParameters.names(), prior.nominal.tolist(), strict=True):
         values = np.asarray(posterior.get(name, [nominal]), dtype=np.float64)
@@ -100,3 +107,9 @@ def identified_carts(
         rows.append(np.clip(values, BOUNDS[name].low, BOUNDS[name].high))
     table = torch.from_numpy(np.stack(np.broadcast_arrays(*rows))).float()
     return IdentifiedCarts(table, prior, settings.prior_share, float(table[LATENCY].max()), identified)
+
+
+def is_about(pole: Pole, posterior: Mapping[str, Any]) -> bool:
+    """Return True where `pole` may be the pole of a posterior: by its length and its mass."""
+    mass, com = (float(np.median(posterior.get(name, np.nan))) for name in ("pole_mass", "pole_com"))
+    return pole.is_about(2 * com) and 1 / HEAVIER < mass / pole.pole_mass < HEAVIER

@@ -6,6 +6,7 @@ from cartpole_rl.physics.rod import uniform_rod
 from cartpole_rl.settings import NonNegative, Positive, Settings
 
 SIMILAR = 0.1  # largest relative difference between two lengths of the same pole
+HEAVIER = 1.2  # times the mass of a pole of the same length: full motor brakes it noticeably later
 JUDGED_LENGTHS = 5  # rods on which an agent of a range of lengths is evaluated
 
 

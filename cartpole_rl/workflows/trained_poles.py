@@ -4,9 +4,8 @@ from collections.abc import Sequence
 
 from cartpole_rl.choices import group_choices
 from cartpole_rl.emulator.settings import EmulatorSettings
-from cartpole_rl.randomization.poles import Pole, PoleSettings
+from cartpole_rl.randomization.poles import HEAVIER, Pole, PoleSettings
 
-HEAVIER = 1.2  # times the mass of a pole of the same length: full motor brakes it noticeably later
 POLES = ("medium", "large")  # in conf/pole/ and conf/emulator/; the first is the default
 
 

@@ -1,22 +1,26 @@
 """Carts drawn from a table of carts keep the parameters of a cart together; some come from the prior."""
 
 from collections.abc import Callable
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
+from cartpole_rl.choices import group_choices
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.simulated import SimulatedPlant
-from cartpole_rl.randomization.identified import IdentifiedCarts
+from cartpole_rl.randomization.identified import IdentifiedCarts, identified_carts
 from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.randomization.randomizer import Randomizer
 from cartpole_rl.randomization.ranges import Range
+from cartpole_rl.randomization.settings import IdentifiedSettings
 
 MASS, VISCOUS = (CartParameters.names().index(name) for name in ("cart_mass", "cart_viscous"))
 
 
-def identified_carts(ip02: dict[str, float], medium: PoleSettings, prior_share: float) -> IdentifiedCarts:
+def heavy_carts(ip02: dict[str, float], medium: PoleSettings, prior_share: float) -> IdentifiedCarts:
     prior = Randomizer(ip02, medium, {"cart_mass": Range(absolute=(5.0, 6.0))})
     table = prior.nominal.unsqueeze(1).repeat(1, 100)
     table[MASS] = torch.linspace(0.5, 1.0, 100)
@@ -25,7 +29,7 @@ def identified_carts(ip02: dict[str, float], medium: PoleSettings, prior_share: 
 
 
 def test_rows_stay_together(ip02: dict[str, float], medium: PoleSettings) -> None:
-    drawn = identified_carts(ip02, medium, 0.0).draw(500, torch.Generator().manual_seed(0))
+    drawn = heavy_carts(ip02, medium, 0.0).draw(500, torch.Generator().manual_seed(0))
     assert torch.equal(drawn[VISCOUS], 2 * drawn[MASS])
     assert len(drawn[MASS].unique()) > 50
 
@@ -39,7 +43,7 @@ def test_a_number_that_is_not_finite_is_refused(ip02: dict[str, float], medium: 
 
 
 def test_the_share_of_the_prior(ip02: dict[str, float], medium: PoleSettings) -> None:
-    drawn = identified_carts(ip02, medium, 0.2).draw(5000, torch.Generator().manual_seed(0))
+    drawn = heavy_carts(ip02, medium, 0.2).draw(5000, torch.Generator().manual_seed(0))
     assert 0.17 < (drawn[MASS] >= 5).float().mean() < 0.23
 
 
@@ -47,7 +51,26 @@ def test_a_plant_goes_on_with_other_carts(
     ip02: dict[str, float], medium: PoleSettings, make_plant: Callable[..., SimulatedPlant]
 ) -> None:
     plant = make_plant(8)
-    plant.replace_randomizer(identified_carts(ip02, medium, 0.0))
+    plant.replace_randomizer(heavy_carts(ip02, medium, 0.0))
     plant.reset()
     assert torch.equal(plant.parameters.cart_viscous, 2 * plant.parameters.cart_mass)
-    assert identified_carts(ip02, medium, 0.0).longest_delay() == 0.03
+    assert heavy_carts(ip02, medium, 0.0).longest_delay() == 0.03
+
+
+@pytest.mark.parametrize(
+    ("pole", "masses"), [("medium", {0.12, 0.13}), ("large", {0.23}), ("both", {0.127, 0.23})]
+)
+def test_the_identified_cart_carries_the_given_pole(
+    pole: str, masses: set[float], ip02: dict[str, float], tmp_path: Path
+) -> None:
+    """The identified pole, if the given one is about the same, and else the given one."""
+    carts = {"cart_mass": [0.9, 1.0], "pole_mass": [0.12, 0.13], "pole_com": [0.18] * 2}
+    posterior = tmp_path / "posterior.npz"
+    names = list(carts)
+    np.savez(posterior, names=names, carts=np.array([carts[name] for name in names]), identified=names)
+    settings = IdentifiedSettings(posterior=posterior, widen=1.0, prior_share=0.0, ranges={})
+    poles = PoleSettings(**group_choices("pole")[pole])
+    drawn = identified_carts(settings, ip02, poles).draw(100, torch.Generator().manual_seed(0))
+    pole_mass = drawn[CartParameters.names().index("pole_mass")]
+    assert {round(mass, 3) for mass in pole_mass.tolist()} == masses
+    assert {round(mass, 3) for mass in drawn[MASS].tolist()} == {0.9, 1.0}

@@ -1,8 +1,12 @@
 """The track guard of an evaluation: chosen, of the training, or fitted anew to motor values or a pole."""
 
+from pathlib import Path
+
+import numpy as np
 import pytest
 
 from cartpole_rl.envs.build import with_fitted_guard
+from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.workflows.build import evaluated_settings, guard_note
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
 from cartpole_rl.workflows.loading import load_settings
@@ -96,6 +100,21 @@ def test_it_is_fitted_anew_to_a_pole_that_was_not_in_training(
     assert guard_note(training, evaluation, settings) == (
         None if fitted_to == trained else f"{line}{numbers}"
     )
+
+
+def test_identified_carts_carry_the_other_pole_when_it_is_fitted_anew(tmp_path: Path) -> None:
+    """The identified pole has no part in the guard for another one."""
+    training = load_settings(TrainConfig, {"guard": "careful"})
+    names = list(CartParameters.names())
+    nominal = training.nominal_with(training.pole.nominal)
+    carts = np.repeat([[nominal[name]] for name in names], 2, axis=1)
+    np.savez(tmp_path / "posterior.npz", names=names, carts=carts, identified=names)
+    of_one_cart = {"posterior": tmp_path / "posterior.npz", "widen": 1.0, "prior_share": 0.0, "ranges": {}}
+    training = fitted(randomization=of_one_cart)
+    evaluation = load_settings(EvaluateConfig, {"run": "any", **SERIAL, "plant.pole_length": 0.66})
+    numbers = evaluated_settings(training, evaluation).guard.active
+    assert numbers == fitted(randomization=of_one_cart, pole="large").guard.active
+    assert numbers.delay > 1.1 * training.guard.active.delay
 
 
 @pytest.mark.parametrize(
