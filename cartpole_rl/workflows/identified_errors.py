@@ -13,6 +13,7 @@ from cartpole_rl.plants.settings import EmulatedSettings
 from cartpole_rl.run_files import CONFIG
 from cartpole_rl.workflows.config import IdentifyConfig
 
+BY_HAND = ("pole_mass", "pole_com")  # `unknowns.WEIGHED` as parameters: measured with scales and a ruler
 MOTOR = 200  # motor value of the force that is compared; coefficients of a curve are not comparable
 SAME = ("cart_mass", "pole_mass", "pole_com", "cart_viscous", "pole_viscous")  # names on both sides
 

@@ -35,7 +35,7 @@ from cartpole_rl.run_files import CART, FIGURES, IDENTIFIED, PAGE, POLE, RANDOMI
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.build import precedence, use_threads
 from cartpole_rl.workflows.config import IdentifyConfig
-from cartpole_rl.workflows.identified_errors import errors, known_truth
+from cartpole_rl.workflows.identified_errors import BY_HAND, errors, known_truth
 from cartpole_rl.workflows.identified_files import report, write_choices
 from cartpole_rl.workflows.person import confirm, print_message
 from cartpole_rl.workflows.progress import progress_bar
@@ -76,7 +76,7 @@ def identify_cart(config: IdentifyConfig, folder: Path) -> None:
     found = identify([*fitted.values()], [held_out], nominal, models, period, substeps, config.windows)
     carts = found.fit.draw(config.carts, np.random.default_rng(config.seed))
     write_choices(found, carts, folder)
-    write_json(folder / IDENTIFIED, report(found, carts) | errors(found.fit.parameters, truth))
+    write_json(folder / IDENTIFIED, report(found, carts) | errors(found.fit.parameters, truth, BY_HAND))
     for name, figure in identification_figures(found, carts, fitted).items():
         save(figure, folder / FIGURES / f"{name}.png")
     identified = intervals(found.fit, carts)
