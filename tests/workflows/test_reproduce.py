@@ -14,10 +14,12 @@ import yaml
 from command_line import TINY, Outcome, outcome
 
 from cartpole_rl.reporting.studies.settings import Study
+from cartpole_rl.workflows.pages.runs import read_run
 from cartpole_rl.workflows.reproduce.plan import plan
-from cartpole_rl.workflows.reproduce.process import is_complete, is_outdated, made_otherwise
+from cartpole_rl.workflows.reproduce.process import is_complete, made_otherwise
 from cartpole_rl.workflows.reproduce.progress import Progress, duration
 from cartpole_rl.workflows.reproduce.reproduce import Schedule, reproduce
+from cartpole_rl.workflows.run_inputs import is_outdated
 
 SCRIPT = Path(__file__).parents[2] / "scripts/reproduce.py"
 ARMS = [
@@ -120,17 +122,19 @@ def test_an_agent_of_another_study_is_not_trained_again(
     assert evaluated["run"] == str(root / "toy/trained/10")
 
 
-def test_an_evaluation_of_an_agent_that_was_trained_again_is_repeated(
+def test_an_evaluation_of_an_agent_that_was_trained_again_is_repeated_and_does_not_count(
     results: tuple[Path, Outcome, Outcome], source: Path
 ) -> None:
     trained, evaluation = plan(["toy"], "quick", results[0], source)[:2]
     checkpoint = trained.folder / "checkpoints/last.pt"
     content = checkpoint.read_bytes()
-    assert not is_outdated(evaluation)
+    assert not is_outdated(evaluation.folder)
+    assert not read_run(evaluation.folder).problem
     checkpoint.write_bytes(content + b"again")
-    assert is_outdated(evaluation)
+    assert is_outdated(evaluation.folder)
+    assert read_run(evaluation.folder).problem.startswith("a run that it needs was made again")
     checkpoint.rename(trained.folder / "away")
-    assert not is_outdated(evaluation)
+    assert not is_outdated(evaluation.folder)
     (trained.folder / "metrics.json").rename(trained.folder / "no_metrics")
     waiting = Schedule([trained, evaluation], results[0]).waiting
     assert waiting == [trained, evaluation]  # the agent that will be trained is another one

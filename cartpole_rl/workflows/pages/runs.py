@@ -14,6 +14,7 @@ import yaml
 
 from cartpole_rl.run_files import COMPARISON, CONFIG, HISTORY, IDENTIFIED, METRICS, MODELLED, PROVENANCE
 from cartpole_rl.workflows.run_folder import PREFIX
+from cartpole_rl.workflows.run_inputs import is_outdated
 
 RESULTS = {"identify": (IDENTIFIED,), "model": (MODELLED,), "finetune": (METRICS, COMPARISON)}
 EPISODIC = ("evaluate", "record")  # commands that keep what they have after an interruption
@@ -80,7 +81,8 @@ def read_run(folder: Path) -> Run:
         return replace(run, problem=f"unfinished: it has no {Path(error.filename).name}")
     except (OSError, ValueError) as error:
         return replace(run, problem=f"damaged results: {_short(error)}")
-    return replace(run, results=results, problem=_interruption(program, config, results))
+    outdated = "a run that it needs was made again since, with another result" if is_outdated(folder) else ""
+    return replace(run, results=results, problem=_interruption(program, config, results) or outdated)
 
 
 def _results(folder: Path, program: str) -> dict[str, Any]:

@@ -6,14 +6,14 @@ import shutil
 import signal
 import sys
 import traceback
-from pathlib import Path
 
 from cartpole_rl.choices import choice
 from cartpole_rl.errors import CartPoleError
-from cartpole_rl.run_files import CHECKPOINTS, IDENTIFIED, LAST, METRICS, MODELLED, RESUME
+from cartpole_rl.run_files import CHECKPOINTS, IDENTIFIED, METRICS, MODELLED, RESUME
 from cartpole_rl.signals import RaiseOnce, end_with_parent, ending_signals
 from cartpole_rl.workflows.reproduce.plan import Task
-from cartpole_rl.workflows.run_folder import AGENT_HASH, file_hash, recorded_provenance
+from cartpole_rl.workflows.run_folder import recorded_provenance
+from cartpole_rl.workflows.run_inputs import is_outdated, write_inputs
 from cartpole_rl.workflows.studies import overrides_of
 
 LOG = "log.txt"
@@ -24,11 +24,11 @@ SIGNALLED = 128  # added to the number of a signal, as a shell does
 
 
 def is_complete(task: Task) -> bool:
-    """Return True for a run with all of its results, of the agent that is there now.
+    """Return True for a run with all of its results, of the agent and the cart that are there now.
 
     An interrupted evaluation has only some episodes.
     """
-    return has_results(task) and not is_outdated(task)
+    return has_results(task) and not is_outdated(task.folder)
 
 
 def has_results(task: Task) -> bool:
@@ -41,13 +41,6 @@ def has_results(task: Task) -> bool:
         return len(json.loads(result.read_text(encoding="utf-8"))["episodes"]) == asked
     except (OSError, ValueError, LookupError, TypeError):
         return False
-
-
-def is_outdated(task: Task) -> bool:
-    """Return True if the agent that a run started from was trained again since then."""
-    agent = Path(str(overrides_of(task.words).get("run"))) / CHECKPOINTS / LAST
-    recorded = recorded_provenance(task.folder).get(AGENT_HASH)
-    return recorded is not None and agent.is_file() and file_hash(agent) != recorded
 
 
 def made_otherwise(task: Task) -> str:
@@ -64,6 +57,8 @@ def in_own_process(task: Task) -> None:
     RaiseOnce(lambda number: KeyboardInterrupt()).handle(signal.SIGINT, *ending_signals())
     resumed = prepare(task)
     task.folder.mkdir(parents=True, exist_ok=True)
+    if not resumed:
+        write_inputs(task.folder, task.needs)
     with (task.folder / LOG).open("a", encoding="utf-8") as log:
         os.dup2(log.fileno(), sys.stdout.fileno())
         os.dup2(log.fileno(), sys.stderr.fileno())
@@ -88,7 +83,7 @@ def prepare(task: Task) -> bool:
     can_resume = task.command in RESUMABLE and (task.folder / CHECKPOINTS / RESUME).is_file()
     command = recorded_provenance(task.folder).get("command")
     has_paths = isinstance(command, list) and command[1:] == [*task.words]  # it resumes with those of then
-    if can_resume and has_paths and not is_outdated(task):
+    if can_resume and has_paths and not is_outdated(task.folder):
         return True
     shutil.rmtree(task.folder, ignore_errors=True)
     return False
