@@ -41,7 +41,9 @@ from cartpole_rl.wire.messages import (
 LOGGER = logging.getLogger(__name__)
 
 LONGEST_SUSPENSION = 1.0  # s without an answer of this computer, after which a person may have moved the cart
-LONGEST_WAKING = 0.25  # s after this computer slept, until the port has a state of a cart that ticks on
+LONGEST_SILENCE = (
+    0.25  # s until the port of a cart that ticks on has a newer state, also after this computer slept
+)
 LONGEST_STOP = 3.0  # s to wait for the answer to STOP, whatever the settings: signals.UNWINDING is longer
 LAST_STOP = 0.5  # s to wait for it in `close` if the STOP before was not answered
 RESTARTED = "the cart has restarted; check its power"
@@ -302,7 +304,7 @@ class SerialCart:
         """
         waited = self._unanswered_for()
         self.check_suspension(waited)
-        return waited > WATCHDOG_PERIODS * self.information.period_us * 1e-6
+        return waited > self._watchdog_time
 
     def _unanswered_for(self) -> float:
         """Return for how many seconds the newest state has waited for a motor value.
@@ -311,9 +313,15 @@ class SerialCart:
         """
         if not self._tracker.awaits_command:
             return 0.0
-        waited, link = now() - self._tracker.newest_at, self._connection.link
-        patience = LONGEST_WAKING if waited > self.longest_suspension else 0.0
-        return waited if link.await_byte(patience) else 0.0
+        waited = now() - self._tracker.newest_at
+        if waited <= self._watchdog_time:
+            return waited
+        return waited if self._connection.link.await_byte(LONGEST_SILENCE) else 0.0
+
+    @property
+    def _watchdog_time(self) -> float:
+        """The time in s without a motor value after which the cart's watchdog has stopped the motor."""
+        return WATCHDOG_PERIODS * self.information.period_us * 1e-6
 
     def check_suspension(self, seconds: float) -> None:
         """Raise LinkError if this computer did not answer the cart for too long."""

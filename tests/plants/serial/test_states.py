@@ -259,12 +259,27 @@ def test_time_that_passes_for_the_host_alone_makes_no_command_late(host_clock: H
         assert cart.set_motor(200) == 200
 
 
+def test_a_late_command_is_0_though_the_port_is_silent_at_first(
+    host_clock: HostClock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As with an adapter that delivers nothing for a moment."""
+    monkeypatch.setattr("cartpole_rl.plants.serial.cart.LONGEST_SILENCE", 60.0)
+    with CartPeer(paced=True) as peer, SerialCart(quick_settings(peer.port, timeout=10.0)) as cart:
+        peer.tick()
+        cart.get_state()
+        host_clock.ahead += 0.5
+        later = threading.Timer(0.05, peer.tick)
+        later.start()
+        assert cart.set_motor(200) == 0
+        later.join()
+
+
 @pytest.mark.parametrize("on_board", [False, True])
 def test_a_computer_that_wakes_before_its_port_answers_no_state_from_before(
     host_clock: HostClock, on_board: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Nothing waits yet, but the cart goes on: its next state comes a little later."""
-    monkeypatch.setattr("cartpole_rl.plants.serial.cart.LONGEST_WAKING", 60.0)
+    monkeypatch.setattr("cartpole_rl.plants.serial.cart.LONGEST_SILENCE", 60.0)
     with CartPeer(paced=True) as peer, SerialCart(quick_settings(peer.port, timeout=10.0)) as cart:
         peer.tick()
         cart.get_state()
