@@ -1,9 +1,16 @@
-"""Atomic writing of files: complete or absent, even after a kill or a power cut."""
+"""Atomic writing of files: complete or absent, even after a kill or a power cut. One writer in a folder."""
 
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+
+from cartpole_rl.errors import ConfigError
+
+try:
+    import fcntl
+except ImportError:  # Windows has no locks of folders
+    fcntl = None  # type: ignore[assignment]
 
 
 @contextmanager
@@ -28,6 +35,30 @@ def replacing(path: Path) -> Iterator[Path]:
         raise
     if os.name == "posix":  # Windows cannot open a folder
         _flush(path.parent)
+
+
+@contextmanager
+def claimed(folder: Path) -> Iterator[None]:
+    """Make `folder` and keep it for this process: two that write into it would damage its files.
+
+    Raises ConfigError if another process has it. The claim ends with the process, however that ends. Windows
+    and file systems without locks know no claims.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    if fcntl is None:
+        yield
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ConfigError(f"another process works in {folder}; wait for its end, or stop it") from None
+        except OSError:  # no locks
+            pass
+        yield
+    finally:
+        os.close(descriptor)
 
 
 def write_text(path: Path, text: str) -> None:

@@ -10,4 +10,5 @@ IDENTIFIED, MODELLED = "identification.json", "model.json"  # results of these c
 FIGURES, RECORDINGS = "figures", "recordings"
 ANIMATION, BESIDE_SIMULATION = "episode.gif", "beside_simulation.gif"  # of the first episode
 CHECKPOINTS, LAST, BEST, RESUME = "checkpoints", "last.pt", "best.pt", "resume.pt"  # of an agent
+START = "start.pt"  # in checkpoints/ of an unfinished fine-tuning: a copy of the agent that it started from
 CART, POLE, RANDOMIZATION, POSTERIOR = "cart.yaml", "pole.yaml", "randomization.yaml", "posterior.npz"

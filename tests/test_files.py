@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 from small_files import files_of_at_most
 
-from cartpole_rl.files import replacing, write_text
+from cartpole_rl.errors import ConfigError
+from cartpole_rl.files import claimed, replacing, write_text
 
 SCRIPT = r"""
 import sys
@@ -48,3 +49,14 @@ def test_other_errors_stay_and_leave_no_part(error: BaseException, tmp_path: Pat
         fail_in_the_middle()
     assert caught.value is error
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.skipif(os.name != "posix", reason="folders have no locks")
+def test_a_folder_is_claimed_once_and_until_the_end(tmp_path: Path) -> None:
+    with claimed(tmp_path / "run"):
+        with pytest.raises(ConfigError, match=r"another process works in .*run; wait for its end"):
+            claimed(tmp_path / "run").__enter__()
+        with claimed(tmp_path / "other"):
+            pass
+    with claimed(tmp_path / "run"):
+        assert not list((tmp_path / "run").iterdir())

@@ -124,3 +124,12 @@ class FinetuningSettings(Settings):
     warmup_transitions: Annotated[int, Field(ge=0)]  # random actions in simulation before the first update
     buffer_kind: Literal["prioritized", "uniform"]  # of the simulated transitions
     learning_rate: Positive  # at the start; it falls along half a cosine
+
+    @model_validator(mode="after")
+    def _recorded_transitions_have_no_priority(self) -> "FinetuningSettings":
+        if self.buffer_kind == "prioritized" and self.cart_share > 0:
+            raise ValueError(
+                "finetuning.buffer_kind=prioritized: recorded transitions have no priority; give "
+                "finetuning.buffer_kind=uniform, or finetuning.cart_share=0"
+            )
+        return self

@@ -1,5 +1,7 @@
 """Texts that several figures, tables and messages share."""
 
+from collections.abc import Iterator, Sequence
+
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
 
@@ -23,6 +25,13 @@ def guard_text(*episodes: Episode) -> str:
     """Return ", guarded 3.2 %", the mean share of periods under the track guard; empty without one."""
     shares = [episode.guarded.mean() for episode in episodes if episode.guarded is not None]
     return f", guarded {100 * sum(shares) / len(shares):.1f} %" if shares else ""
+
+
+def cut_off(episodes: Sequence[Episode]) -> Iterator[str]:
+    """Yield a warning for each fault that ended episodes early; their scores count in the means."""
+    for ending in (Ending.LINK, Ending.FAULT, Ending.NON_FINITE):
+        if count := sum(episode.ended_by == ending for episode in episodes):
+            yield f"warning: {count} of {count_text(len(episodes))} ended early by {ending} (docs/safety.md)"
 
 
 def ending_text(episode: Episode) -> str:

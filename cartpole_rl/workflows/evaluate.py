@@ -1,6 +1,6 @@
 """Drive whole episodes of a trained agent, in simulation or on a cart, and report their scores."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -13,9 +13,8 @@ from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.plants.settings import EmulatedSettings
 from cartpole_rl.plants.simulated import NOISE_PARAMETERS
 from cartpole_rl.reporting.scores import score_columns, score_table
-from cartpole_rl.reporting.words import count_text
+from cartpole_rl.reporting.words import count_text, cut_off
 from cartpole_rl.run_files import BESIDE_SIMULATION, FIGURES, METRICS
-from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.checks import BASELINE, agent_file
 from cartpole_rl.workflows.config import EvaluateConfig
@@ -110,13 +109,6 @@ def next_command(evaluation: Evaluation) -> str:
         poles = [driven] if knows(known, driven) else known
         return f"cartpole-finetune run={shown(config.run)} {plant_words(config.plant, poles)}"
     return f"cartpole-evaluate run={shown(config.run)} {emulated_words(known)}"
-
-
-def cut_off(episodes: Sequence[Episode]) -> Iterator[str]:
-    """Yield a warning for each fault that ended episodes early; their scores count in the means."""
-    for ending in (Ending.LINK, Ending.FAULT, Ending.NON_FINITE):
-        if count := sum(episode.ended_by == ending for episode in episodes):
-            yield f"warning: {count} of {count_text(len(episodes))} ended early by {ending} (docs/safety.md)"
 
 
 def compared(again: Repetition, episode: Episode) -> str:

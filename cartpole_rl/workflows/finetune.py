@@ -17,8 +17,11 @@ from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
 from cartpole_rl.evaluation.driver import Driver
 from cartpole_rl.evaluation.publishing import followed
 from cartpole_rl.evaluation.snapshots import Memory
+from cartpole_rl.files import claimed, write_bytes
+from cartpole_rl.learning.checkpoint_files import find_agent
 from cartpole_rl.learning.checkpoints import load_agent
 from cartpole_rl.learning.randomness import seed_everything
+from cartpole_rl.learning.settings import RayLearnerSettings
 from cartpole_rl.plants.serial.faults import Confirm
 from cartpole_rl.plants.settings import EmulatedSettings
 from cartpole_rl.reporting.tensorboard import TensorBoardLog
@@ -30,10 +33,11 @@ from cartpole_rl.workflows.build import (
     is_real_time,
     use_threads,
 )
-from cartpole_rl.workflows.checks import agent_file, check_finetuning
+from cartpole_rl.workflows.checks import check_finetuning
 from cartpole_rl.workflows.config import EvaluateConfig, FinetuneConfig, TrainConfig
 from cartpole_rl.workflows.finetuning_cart import DrivenCart, yielding_to
 from cartpole_rl.workflows.finetuning_files import FinetuningFiles
+from cartpole_rl.workflows.finetuning_learner import check_simulation
 from cartpole_rl.workflows.finetuning_session import LocalSession, TunedAgent
 from cartpole_rl.workflows.live import LiveView, view_title
 from cartpole_rl.workflows.loading import recorded_settings
@@ -47,19 +51,21 @@ from cartpole_rl.workflows.trained_poles import other_pole
 def finetune(config: FinetuneConfig, folder: Path, new_learner: bool = False) -> None:
     """Fine-tune the agent of `config.run` on the cart of `config.plant`, or resume the run in `folder`.
 
-    A resumed run uses its own settings; with `new_learner`, `config.learner` replaces its learner.
+    A resumed run uses its own settings and the agent that it started from; with `new_learner`,
+    `config.learner` replaces its learner.
 
     Writes config.yaml, provenance.json, recordings/, TensorBoard events, comparison.json (before and after),
     metrics.json, figures/ and checkpoints/last.pt with the better of both policies; until the end also
-    checkpoints/resume.pt. Prints both scores. Raises ConfigError and CheckpointError before the cart moves,
-    PlantError and LinkError for a cart that fails, LearningError if learning diverges.
+    checkpoints/start.pt and resume.pt. Prints both scores. Raises ConfigError and CheckpointError before the
+    cart moves, PlantError and LinkError for a cart that fails, LearningError if learning diverges.
     """
     checkpoint = resumed("finetune", config.resume, folder)
     if checkpoint:
         learner = {"learner": config.learner.model_dump()} if new_learner else {}
         values = {**checkpoint.config, "resume": config.resume, **learner}
         config = recorded_settings(FinetuneConfig, values, f"resume={config.resume}")
-    run = check_finetuning(config)
+    files = FinetuningFiles(folder, config)
+    run = files.start if checkpoint and files.start.exists() else check_finetuning(config)
     use_threads(config.threads)
     seed_everything(config.seed)
     agent = trained_agent(run)
@@ -70,27 +76,31 @@ def finetune(config: FinetuneConfig, folder: Path, new_learner: bool = False) ->
         print_message("finetune", line)
     if line := guard_note(training, evaluation, settings):
         print_message("finetune", line)
-    files = FinetuningFiles(folder, config)
-    content = config.model_dump(mode="json")
-    write_config(folder, "finetune", content, resumed=checkpoint is not None, agent=agent_file(run))
-    if not checkpoint:
-        files.save({}, 0)
-    tuned = TunedAgent(training, load_agent(run), checkpoint)
-    live = LiveView(view_title(config.plant), config.view)
-    make_env = partial(driven_env, settings, evaluation, live.memory)  # called with `confirm`
-    real_time = is_real_time(config.plant, config.emulator)
-    with (
-        live,
-        TensorBoardLog(folder) as log,
-        learner_link(files, tuned, evaluation) as link,
-        Driver(make_env, partial(greedy_network, training), real_time, confirm) as driver,
-        yielding_to(driver, link is None) if real_time else nullcontext(),
-    ):
-        cart = DrivenCart(driver, files, log)
-        if link is None:
-            LocalSession(files, cart, tuned, settings).run()
-        else:
-            RaySession(files, cart, tuned, settings, link).run()
+    if not isinstance(config.learner, RayLearnerSettings):  # whose machine has the files
+        check_simulation(training)
+    with claimed(folder):
+        start = find_agent(run)
+        content = config.model_dump(mode="json")
+        write_config(folder, "finetune", content, resumed=checkpoint is not None, agent=start)
+        if not checkpoint:
+            write_bytes(files.start, start.read_bytes())
+            files.save({}, 0)
+        tuned = TunedAgent(training, load_agent(start), checkpoint)
+        live = LiveView(view_title(config.plant), config.view)
+        make_env = partial(driven_env, settings, evaluation, live.memory)  # called with `confirm`
+        real_time = is_real_time(config.plant, config.emulator)
+        with (
+            live,
+            TensorBoardLog(folder) as log,
+            learner_link(files, tuned, evaluation) as link,
+            Driver(make_env, partial(greedy_network, training), real_time, confirm) as driver,
+            yielding_to(driver, link is None) if real_time else nullcontext(),
+        ):
+            cart = DrivenCart(driver, files, log)
+            if link is None:
+                LocalSession(files, cart, tuned, settings).run()
+            else:
+                RaySession(files, cart, tuned, settings, link).run()
 
 
 def driven_env(

@@ -6,17 +6,20 @@ from typing import Any
 
 from tqdm import tqdm
 
-from cartpole_rl.errors import LearningError
+from cartpole_rl.errors import LearningError, LinkError
 from cartpole_rl.evaluation.driver import Driver, DriveRequest
 from cartpole_rl.evaluation.driving_policy import Weights
 from cartpole_rl.plants.serial.statistics import LinkStatistics
 from cartpole_rl.reporting.tensorboard import TensorBoardLog
-from cartpole_rl.reporting.words import guard_text
+from cartpole_rl.reporting.words import ending_text, guard_text
 from cartpole_rl.scheduling import giving_precedence
 from cartpole_rl.tasks.endings import Ending
+from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.config import FinetuneConfig
 from cartpole_rl.workflows.finetuning_files import FinetuningFiles, Stage
 from cartpole_rl.workflows.person import print_message
+
+LARGEST_LOSSES = 3  # of the link in succession, in an evaluation
 
 
 class DrivenCart:
@@ -31,18 +34,36 @@ class DrivenCart:
         """The settings of the fine-tuning."""
         return self.files.config
 
-    def drive_missing(self, stage: Stage, count: int, weights: Weights) -> None:
-        """Drive the episodes of a stage that are not on disk, without exploration."""
-        for number in range(self.files.count(stage), count):
+    def evaluate(self, stage: Stage, weights: Weights) -> None:
+        """Drive the episodes of a stage that are not on disk, without exploration.
+
+        An episode that the link ended says nothing about the agent: it is driven again. Raises LinkError if
+        that happens LARGEST_LOSSES times in succession.
+        """
+        losses = 0
+        while (number := self.files.count(stage)) < self.config.evaluation_episodes:
             self.start(weights, 0.0, self.config.seed)
-            self.finish(stage, number)
+            episode = self.result(stage, number)
+            if episode.ended_by != Ending.LINK:
+                self.keep(stage, number, episode)
+                losses = 0
+                continue
+            losses += 1
+            lost = f"{stage} {number + 1}: {ending_text(episode)}"
+            if losses == LARGEST_LOSSES:
+                raise LinkError(f"{lost}, {losses} times in succession: check the cart's cable")
+            tqdm.write(f"{lost}; the episode does not count and is driven again")
 
     def start(self, weights: Weights, epsilon: float, seed: int) -> None:
         """Start an episode and return at once. Raises LinkError."""
         self.driver.start(DriveRequest(weights, epsilon, seed))
 
     def finish(self, stage: Stage, number: int) -> None:
-        """Wait for the started episode, write and log it.
+        """Wait for the started episode, write and log it. Raises the errors of `result`."""
+        self.keep(stage, number, self.result(stage, number))
+
+    def result(self, stage: Stage, number: int) -> Episode:
+        """Wait for the started episode.
 
         Raises LinkError, and LearningError if the network's numbers were not finite: the cart was stopped.
         """
@@ -54,11 +75,16 @@ class DrivenCart:
                 f"{stage} {number + 1}: an observation or an action value was not finite, so the cart was "
                 "stopped; nothing is learned from this episode"
             )
+        return episode
+
+    def keep(self, stage: Stage, number: int, episode: Episode) -> None:
+        """Write and log an episode."""
         self.files.write_episode(stage, number, episode)
         score, step = float(episode.score.sum()), self.step(stage, number + 1)
         share = None if episode.guarded is None else float(episode.guarded.mean())
         self.log.scalars({f"cart/score_{stage}": score, f"cart/guarded_{stage}": share}, step)
-        summary = vars(driven.link.summary())
+        assert self.link is not None
+        summary = vars(self.link.summary())
         self.log.scalars({f"link/{key}": float(value) for key, value in summary.items()}, step)
         self.log.flush()
         tqdm.write(

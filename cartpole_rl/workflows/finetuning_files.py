@@ -12,11 +12,12 @@ from cartpole_rl.learning.checkpoints import (
     FINETUNING_FORMAT,
     AgentCheckpoint,
     TrainingCheckpoint,
+    forget_training,
     save_agent,
     save_training,
 )
 from cartpole_rl.plants.serial.settings import SerialSettings
-from cartpole_rl.run_files import CHECKPOINTS, LAST, RECORDINGS
+from cartpole_rl.run_files import CHECKPOINTS, LAST, RECORDINGS, START
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.config import FinetuneConfig
 
@@ -34,6 +35,11 @@ class FinetuningFiles:
 
     def __init__(self, folder: Path, config: FinetuneConfig) -> None:
         self.folder, self.config = folder, config
+
+    @property
+    def start(self) -> Path:
+        """The copy of the agent that the fine-tuning started from; it exists until the end."""
+        return self.folder / CHECKPOINTS / START
 
     def path(self, stage: Stage, number: int) -> Path:
         """Return the path of an episode's recording."""
@@ -68,6 +74,11 @@ class FinetuningFiles:
     def save_agent(self, agent: AgentCheckpoint) -> None:
         """Write the run's last agent, the one that other commands read."""
         save_agent(self.folder / CHECKPOINTS / LAST, agent)
+
+    def forget_training(self) -> None:
+        """Remove what only an unfinished fine-tuning needs."""
+        forget_training(self.folder)
+        self.start.unlink(missing_ok=True)
 
 
 def pole_length(config: FinetuneConfig) -> float | None:

@@ -127,6 +127,7 @@ class CartLearner:
     def make_loop(self, models: Models) -> Finetuning:
         """Return the learning loop over simulated carts."""
         config, training, finetuning = self.config, self.training, self.config.finetuning
+        guarded = training.model_copy(update={"guard": self.settings.guard})  # as the cart
         plant = SimulatedPlant(
             training.learning.carts,
             self.randomizer(),
@@ -143,7 +144,7 @@ class CartLearner:
             training.buffer.model_copy(update={"kind": finetuning.buffer_kind}),
             training.optimizer.model_copy(update={"learning_rate": finetuning.learning_rate}),
             self.agent,
-            environment(training, plant),
+            environment(guarded, plant),
             lambda: [],
             NoCallbacks(),
             config.seed,
@@ -202,6 +203,11 @@ class CartLearner:
             evaluation_seed(self.config.seed),
         )
         return float(np.mean([each.score.sum() for each in run_batch(env, self.agent.greedy_policy())]))
+
+
+def check_simulation(training: TrainConfig) -> None:
+    """Raise CartPoleError if a file that the simulation of the training reads is missing or damaged."""
+    simulated_env(training, training.plant, 1, training.task.start, training.seed)
 
 
 def simulated_learning(

@@ -7,11 +7,11 @@ from cartpole_rl.agents.dqn import QAgent
 from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
 from cartpole_rl.evaluation.driving_policy import Weights, as_weights
 from cartpole_rl.evaluation.metrics import episode_metrics, summarize
-from cartpole_rl.learning.checkpoints import AgentCheckpoint, TrainingCheckpoint, forget_training
+from cartpole_rl.learning.checkpoints import AgentCheckpoint, TrainingCheckpoint
 from cartpole_rl.learning.training import Scalars
 from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.reporting.scores import score_table
-from cartpole_rl.reporting.words import count_text
+from cartpole_rl.reporting.words import count_text, cut_off
 from cartpole_rl.run_files import CHECKPOINTS, COMPARISON, LAST, METRICS, RECORDINGS
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.agents import known_poles, new_agent
@@ -71,12 +71,11 @@ class Session:
 
     def run(self) -> None:
         """Run all stages, as far as they are not on disk."""
-        count = self.config.evaluation_episodes
-        self.cart.drive_missing(Stage.BEFORE, count, self.tuned.first_weights)
+        self.cart.evaluate(Stage.BEFORE, self.tuned.first_weights)
         self.tune()
-        self.cart.drive_missing(Stage.AFTER, count, self.tuned.weights)
+        self.cart.evaluate(Stage.AFTER, self.tuned.weights)
         self.compare()
-        forget_training(self.files.folder)
+        self.files.forget_training()
 
     def tune(self) -> None:
         """Drive the episodes to learn from, and let the agent learn from them."""
@@ -95,6 +94,8 @@ class Session:
         write_json(folder / COMPARISON, {**summaries, "kept": kept})
         print(score_table(summaries[Stage.BEFORE], f"before, {count_text(len(episodes[Stage.BEFORE]))}"))
         print(score_table(summaries[Stage.AFTER], f"after, {count_text(len(episodes[Stage.AFTER]))}"))
+        for line in cut_off([*episodes[Stage.BEFORE], *episodes[Stage.AFTER]]):
+            print(line)
         print_loop_time(link.get("latency_override"))
         print(f"kept: the policy {kept} fine-tuning")
         files = f"{METRICS}, {COMPARISON}, {CHECKPOINTS}/{LAST} and {RECORDINGS}/"

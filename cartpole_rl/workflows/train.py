@@ -10,6 +10,7 @@ from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.settings import GuardSettings
 from cartpole_rl.evaluation.driving_policy import DrivingPolicy, as_weights
 from cartpole_rl.evaluation.episodes import Policy, run_batch
+from cartpole_rl.files import claimed
 from cartpole_rl.learning.checkpoints import forget_training, restore_weights
 from cartpole_rl.learning.randomness import seed_everything
 from cartpole_rl.learning.training import Training
@@ -57,31 +58,33 @@ def train(config: TrainConfig, folder: Path) -> float:
         restore_weights(agent, checkpoint.state["agent"], f"resume={folder}")  # its error precedes any work
     policy = DrivingPolicy(agent.greedy_policy(), config.compile)
     evaluate = partial(judge_agent, nominal_env(config), agent, policy, config.seed)
-    write_config(folder, "train", config.model_dump(mode="json"), resumed=checkpoint is not None)
-    note_unused_randomization(config, env.plant.randomizer)
-    note_guard(config.guard)
-    with TrainingMonitor(folder, config, checkpoint.step if checkpoint else None) as monitor:
-        training = Training(
-            config.learning,
-            config.buffer,
-            config.optimizer,
-            agent,
-            env,
-            evaluate,
-            monitor,
-            config.seed,
-            config.compile,
-        )
-        if checkpoint:
-            training.restore(checkpoint.state)
-        else:
-            monitor.randomization(env.plant)
-        training.run()
-        metrics = report(
-            folder, evaluate(), config.plant.kind, config.pole, config.task.x_max, history=monitor.history
-        )
-        monitor.finished(metrics)
-    forget_training(folder)
+    with claimed(folder):
+        write_config(folder, "train", config.model_dump(mode="json"), resumed=checkpoint is not None)
+        note_unused_randomization(config, env.plant.randomizer)
+        note_other_carts(config)
+        note_guard(config.guard)
+        with TrainingMonitor(folder, config, checkpoint.step if checkpoint else None) as monitor:
+            training = Training(
+                config.learning,
+                config.buffer,
+                config.optimizer,
+                agent,
+                env,
+                evaluate,
+                monitor,
+                config.seed,
+                config.compile,
+            )
+            if checkpoint:
+                training.restore(checkpoint.state)
+            else:
+                monitor.randomization(env.plant)
+            training.run()
+            metrics = report(
+                folder, evaluate(), config.plant.kind, config.pole, config.task.x_max, history=monitor.history
+            )
+            monitor.finished(metrics)
+        forget_training(folder)
     print(f"trained for {training.seconds:.0f} s")
     files = f"{METRICS}, {FIGURES}/ and {CHECKPOINTS}/"
     print_results(folder, files, f"cartpole-evaluate run={shown(folder)} {emulated_words([config.pole])}")
@@ -104,6 +107,21 @@ def note_unused_randomization(config: TrainConfig, draws: Draws) -> None:
             f"actuator {config.actions.actuator} with motor values {list(config.actions.motors)}"
         )
         print_message("train", f"note: randomization of {', '.join(unused)} has no effect with {chosen}")
+
+
+def note_other_carts(config: TrainConfig) -> None:
+    """Print the parameters of the nominal cart that lie outside their absolute ranges: no cart has them."""
+    nominal = config.nominal_cart
+    for name, line in config.ranges.items():
+        if line.absolute is None or name not in nominal:
+            continue
+        low, high = line.absolute
+        if not low <= nominal[name] <= high:
+            print_message(
+                "train",
+                f"note: the cart's {name} is {nominal[name]:g}, but randomization.{name} draws {low:g} to "
+                f"{high:g}: the agent is evaluated on a cart that it does not learn on",
+            )
 
 
 def nominal_env(config: TrainConfig) -> CartPoleEnv:

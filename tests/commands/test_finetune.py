@@ -2,9 +2,11 @@
 
 import json
 import os
+import shutil
 import signal
 import time
 from collections import defaultdict
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -12,6 +14,7 @@ from command_line import FINETUNING, ONCE, TINY, Outcome, console_script, in_pro
 from tensorboard.backend.event_processing.event_file_loader import EventFileLoader
 
 from cartpole_rl.evaluation.recordings import read_recording
+from cartpole_rl.learning.checkpoints import load_agent, save_agent
 from cartpole_rl.workflows.agents import trained_agent
 
 
@@ -97,9 +100,13 @@ def contents(run: Path) -> dict[str, bytes]:
 
 
 def test_a_run_continues_after_each_kind_of_interruption(trained: Path, tmp_path: Path) -> None:
-    """One run: killed, then interrupted, then terminated, each time after one more episode to learn from."""
+    """One run: killed, then interrupted, then terminated, each time after one more episode to learn from.
+
+    The agent that it started from has gone after the first time.
+    """
+    shutil.copytree(trained, tmp_path / "agent")
     words = (
-        f"run={trained}",
+        f"run={tmp_path}/agent",
         *FINETUNING,
         "finetuning.refit=2",
         "episodes=4",
@@ -112,6 +119,7 @@ def test_a_run_continues_after_each_kind_of_interruption(trained: Path, tmp_path
     os.kill(process.pid, signal.SIGKILL)
     assert outcome(process).code == -signal.SIGKILL
     kept = contents(tmp_path / "run")
+    shutil.rmtree(tmp_path / "agent")
     for recording, stop, code in (
         ("tune_001.csv", signal.SIGINT, 130),
         ("tune_002.csv", signal.SIGTERM, 143),
@@ -130,6 +138,17 @@ def test_a_run_continues_after_each_kind_of_interruption(trained: Path, tmp_path
         "before_000.csv",
         *(f"tune_00{number}.csv" for number in range(4)),
     ]
+
+
+def test_what_the_simulation_reads_is_missed_before_the_cart_moves(trained: Path, tmp_path: Path) -> None:
+    """An agent trained on an identified cart, whose files stayed on another computer."""
+    agent = load_agent(trained)
+    randomization = {"posterior": f"{tmp_path}/posterior.npz", "widen": 1.0, "prior_share": 0.0, "ranges": {}}
+    save_agent(tmp_path / "agent.pt", replace(agent, config={**agent.config, "randomization": randomization}))
+    done = finetune(tmp_path / "agent.pt", tmp_path)
+    assert f"randomization.posterior={tmp_path}/posterior.npz cannot be read" in done.complaint
+    assert done.code == 2
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_run_is_needed(tmp_path: Path) -> None:

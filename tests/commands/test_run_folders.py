@@ -18,6 +18,7 @@ from cartpole_rl.commands.hydra_application.composition import constant_settings
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.errors import LinkError
 from cartpole_rl.evaluation.episodes import Policy, run_episodes
+from cartpole_rl.files import claimed
 from cartpole_rl.tasks.episode import Episode
 
 
@@ -49,6 +50,15 @@ def timeless(value: Any) -> bool:
         told = [key for key in value if "second" in key or "date" in key or "wall" in key]
         return not told and all(timeless(each) for each in value.values())
     return not isinstance(value, list) or all(timeless(each) for each in value)
+
+
+def test_a_training_that_runs_is_not_resumed(stopped: Path) -> None:
+    before = (stopped / "provenance.json").read_bytes()
+    with claimed(stopped):
+        done = in_process("train", f"resume={stopped}", folder=stopped.parent)
+    remedy = f"another process works in {stopped}; wait for its end, or stop it"
+    assert (done.complaint, done.code) == (f"cartpole-train: {remedy}", 2)
+    assert (stopped / "provenance.json").read_bytes() == before
 
 
 def test_a_training_writes_the_files_of_runs_readme(trained: Path) -> None:

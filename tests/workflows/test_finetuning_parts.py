@@ -1,16 +1,22 @@
-"""Files of a fine-tuning, and the settings of its learning."""
+"""Files of a fine-tuning, its evaluations, and the settings of its learning."""
 
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from cartpole_rl.choices import choice
-from cartpole_rl.errors import CheckpointError
+from cartpole_rl.errors import CheckpointError, LinkError
+from cartpole_rl.evaluation.driver import Driven, DriveRequest
 from cartpole_rl.learning.checkpoints import FINETUNING_FORMAT, TrainingCheckpoint, load_training
 from cartpole_rl.learning.settings import FinetuningSettings, LearningSettings
+from cartpole_rl.plants.serial.statistics import LinkStatistics
+from cartpole_rl.reporting.tensorboard import TensorBoardLog
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.config import FinetuneConfig
+from cartpole_rl.workflows.finetuning_cart import DrivenCart
 from cartpole_rl.workflows.finetuning_files import FinetuningFiles, Stage
 from cartpole_rl.workflows.finetuning_learner import simulated_learning
 from cartpole_rl.workflows.loading import load_settings, recorded_settings
@@ -30,9 +36,25 @@ EPISODE = Episode(
 )
 
 
+class Script:
+    """A driver whose episodes end as `endings` say."""
+
+    def __init__(self, *endings: str) -> None:
+        self.endings = iter(endings)
+
+    def start(self, drive: DriveRequest) -> None:
+        """Do nothing."""
+
+    def result(self) -> Driven:
+        """Return the next episode."""
+        return Driven(replace(EPISODE, ended_by=next(self.endings)), LinkStatistics())
+
+
 @pytest.fixture
 def files(tmp_path: Path) -> FinetuningFiles:
-    return FinetuningFiles(tmp_path, load_settings(FinetuneConfig, {"run": "somewhere", "episodes": 3}))
+    return FinetuningFiles(
+        tmp_path, load_settings(FinetuneConfig, {"run": "somewhere", "evaluation_episodes": 3})
+    )
 
 
 def test_recorded_episodes_are_counted_by_stage(files: FinetuningFiles) -> None:
@@ -68,3 +90,36 @@ def test_learning_in_simulation_follows_the_settings() -> None:
     assert simulated.epsilon_transitions == simulated.transitions // 2
     assert simulated.warmup_transitions == 0
     assert simulated.batch_size == learning.batch_size
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Iterator[TensorBoardLog]:
+    with TensorBoardLog(tmp_path) as opened:
+        yield opened
+
+
+def test_an_episode_that_the_link_ended_is_driven_again(
+    files: FinetuningFiles, log: TensorBoardLog, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cart = DrivenCart(Script("time", "link", "link", "fault", "link", "time"), files, log)
+    cart.evaluate(Stage.BEFORE, {})
+    assert [each.ended_by for each in files.episodes(Stage.BEFORE)] == ["time", "fault", "time"]
+    told = "before 2: the link was lost after 0.0 s; the episode does not count and is driven again"
+    assert capsys.readouterr().out.splitlines()[1] == told
+
+
+def test_a_link_that_is_lost_again_and_again_ends_the_run(
+    files: FinetuningFiles, log: TensorBoardLog
+) -> None:
+    cart = DrivenCart(Script("time", "link", "link", "link"), files, log)
+    with pytest.raises(LinkError, match=r"before 2: the link was lost after 0\.0 s, 3 times in succession"):
+        cart.evaluate(Stage.BEFORE, {})
+    assert files.count(Stage.BEFORE) == 1
+
+
+def test_an_episode_to_learn_from_counts_until_the_link_ended_it(
+    files: FinetuningFiles, log: TensorBoardLog
+) -> None:
+    cart = DrivenCart(Script("link"), files, log)
+    cart.finish(Stage.TUNE, 0)
+    assert files.episode(Stage.TUNE, 0).ended_by == "link"

@@ -108,6 +108,18 @@ def test_a_learner_that_starts_later_continues_the_schedules(recorded: list[Epis
     assert late.started.epsilon() == whole.started.epsilon() < late.started.settings.epsilon[0]
 
 
+def test_simulation_brakes_as_the_cart_does(recorded: list[Episode]) -> None:
+    """The guard of a cart with another pole is not that of the training."""
+    learned = learner()
+    numbers = learned.settings.guard.active
+    assert numbers is not None
+    other = numbers.model_copy(update={"margin": 2 * numbers.margin})
+    guard = learned.settings.guard.model_copy(update={"numbers": other})
+    learned.settings = learned.settings.model_copy(update={"guard": guard})
+    learned.start(recorded[:1])
+    assert learned.started.env.hardware.guard == other
+
+
 def test_what_is_not_learned_from_is_told(
     recorded: list[Episode], capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -17,7 +17,7 @@ from cartpole_rl.workflows.agents import new_agent
 from cartpole_rl.workflows.build import evaluated_settings, use_threads
 from cartpole_rl.workflows.config import EvaluateConfig, FinetuneConfig, TrainConfig
 from cartpole_rl.workflows.finetuning_files import FinetuningFiles
-from cartpole_rl.workflows.finetuning_learner import CartLearner
+from cartpole_rl.workflows.finetuning_learner import CartLearner, check_simulation
 from cartpole_rl.workflows.loading import recorded_settings
 from cartpole_rl.workflows.ray_learner.cart_connection import CartConnection
 from cartpole_rl.workflows.ray_learner.episode_files import EpisodeFiles, from_tensordict
@@ -59,6 +59,7 @@ class Learner:
         config = recorded_settings(FinetuneConfig, task.config, "the run")
         training = recorded_settings(TrainConfig, task.start.config, "the agent")
         evaluation = recorded_settings(EvaluateConfig, task.evaluation, "the run")
+        check_simulation(training)
         use_threads(config.threads)
         seed_everything(config.seed)
         new_agent(training)  # `finetune` makes one more than it trains; random numbers agree with its own
