@@ -35,6 +35,7 @@ from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.plants.settings import EmulatedSettings, LearnedSettings, SimulatedSettings
 from cartpole_rl.randomization.checks import check_one_pole
 from cartpole_rl.randomization.poles import PoleSettings
+from cartpole_rl.randomization.settings import IdentifiedSettings
 from cartpole_rl.settings import Count, Finite, NonNegative, Seed, Settings
 from cartpole_rl.tasks.settings import ActionSettings, RewardSettings
 
@@ -59,11 +60,22 @@ def policy_key(plant: Settings, emulator: EmulatorSettings) -> str:
     return ""
 
 
+def check_emulator_is_read(kind: str, emulator: EmulatorSettings) -> None:
+    """Raise ValueError for settings of an emulated cart if plant=`kind` ignores them."""
+    if kind != "emulated" and emulator != EmulatorSettings():
+        raise ValueError(f"emulator: plant={kind} does not read it; give plant=emulated")
+
+
 class OnCart(Settings):
     """The cart on a port: `plant`, which is a real one or one with the settings `emulator`."""
 
     plant: Annotated[EmulatedSettings | SerialSettings, Field(discriminator="kind")]
     emulator: EmulatorSettings
+
+    @model_validator(mode="after")
+    def _plant_reads_the_emulator(self) -> Self:
+        check_emulator_is_read(self.plant.kind, self.emulator)
+        return self
 
     @model_validator(mode="after")
     def _this_computer_drives(self) -> Self:
@@ -179,8 +191,7 @@ class EvaluateConfig(RunSettings):
             raise ValueError(f"view=live: it shows a cart on a port; plant={kind} has none")
         if self.animation.simulation and kind not in ("emulated", "serial"):
             raise ValueError(f"animation.simulation=true: plant={kind} is simulated itself; omit it")
-        if kind != "emulated" and self.emulator != EmulatorSettings():
-            raise ValueError(f"emulator: plant={kind} does not read it; give plant=emulated")
+        check_emulator_is_read(kind, self.emulator)
         if self.drives_on_board and self.repeat != RepeatSettings():
             key = policy_key(self.plant, self.emulator)
             raise ValueError(f"repeat: it repeats an episode in simulation; leave out repeat.*, or {key}")
@@ -189,6 +200,23 @@ class EvaluateConfig(RunSettings):
                 f"emulator.policy={self.emulator.policy}: this command exports the agent of run= itself; "
                 "give emulator.policy=onboard"
             )
+        return self
+
+    @model_validator(mode="after")
+    def _randomization_leaves_the_parameters(self) -> "EvaluateConfig":
+        """Refuse parameters that each drawn cart would have another value of."""
+        drawn, given = self.randomization, self.parameters or {}
+        if isinstance(drawn, IdentifiedSettings):
+            if given:
+                raise ValueError("parameters: randomization draws identified carts; leave one of them out")
+            return self
+        for name in given.keys() & drawn.keys():
+            if bounds := drawn[name].absolute:
+                low, high = bounds
+                raise ValueError(
+                    f"parameters.{name}: randomization.{name} draws it from {low:g} to {high:g}; leave one "
+                    "of them out"
+                )
         return self
 
     @property

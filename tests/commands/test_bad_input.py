@@ -121,6 +121,12 @@ WRONG_EVALUATION = [
         "has its own cart; set emulator.*",
         2,
     ),
+    (
+        "run=run randomization=wide parameters={latency:0.05}",
+        "parameters.latency: randomization.latency draws it from 0 to 0.022",
+        "leave one of them out",
+        2,
+    ),
     ("run=run plant=emulated pole=large", "pole", "emulator=large", 2),
     ("run=run plant=emulated emulator.latencyy=1", "emulator.latencyy", "did you mean emulator.latency?", 2),
     ("run=run plant=emulated task=swingup task.evaluation_start.angle=any", "angle=any", "hanging", 2),
@@ -185,6 +191,19 @@ def test_a_port_that_may_not_be_opened(port: str, files: Path) -> None:
     done = in_process("evaluate", "run=run", "plant=serial", f"plant.port={port}", folder=files)
     assert "dialout" in done.complaint
     assert done.code == 1
+
+
+@pytest.mark.parametrize("command", ["finetune", "identify", "preflight"])
+def test_a_real_cart_does_not_read_the_emulator(command: str, tmp_path: Path) -> None:
+    done = in_process(command, "plant=serial", "plant.port=p", "emulator.cart_viscous=9", folder=tmp_path)
+    remedy = "emulator: plant=serial does not read it; give plant=emulated"
+    assert (done.complaint, done.code) == (f"cartpole-{command}: {remedy}", 2)
+
+
+def test_recorded_transitions_have_no_priority(tmp_path: Path) -> None:
+    done = in_process("finetune", "run=run", "finetuning.buffer_kind=prioritized", folder=tmp_path)
+    assert "give finetuning.buffer_kind=uniform, or finetuning.cart_share=0" in done.complaint
+    assert done.code == 2
 
 
 @pytest.mark.parametrize(

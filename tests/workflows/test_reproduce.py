@@ -13,10 +13,11 @@ import pytest
 import yaml
 from command_line import TINY, Outcome, outcome
 
+from cartpole_rl.files import claimed
 from cartpole_rl.reporting.studies.settings import Study
 from cartpole_rl.workflows.pages.runs import read_run
-from cartpole_rl.workflows.reproduce.plan import plan
-from cartpole_rl.workflows.reproduce.process import is_complete, made_otherwise
+from cartpole_rl.workflows.reproduce.plan import Task, plan
+from cartpole_rl.workflows.reproduce.process import is_complete, made_otherwise, prepare
 from cartpole_rl.workflows.reproduce.progress import Progress, duration
 from cartpole_rl.workflows.reproduce.reproduce import Schedule, reproduce
 from cartpole_rl.workflows.run_inputs import is_outdated
@@ -98,6 +99,39 @@ def test_a_failure_does_not_end_the_others(results: tuple[Path, Outcome, Outcome
         f"it needs {root}/toy/impossible/10, which failed",
     ]
     assert (root / "toy/lqr/10/evaluations/own/metrics.json").exists()
+
+
+def test_the_baseline_is_evaluated_again_without_its_other_evaluations(
+    results: tuple[Path, Outcome, Outcome], source: Path
+) -> None:
+    (baseline,) = (
+        task for task in plan(["toy"], "quick", results[0], source) if task.folder.parts[-2] == "lqr"
+    )
+    kept = baseline.folder / "evaluations/own/metrics.json"
+    content = kept.read_bytes()
+    assert not prepare(baseline)
+    assert [path.name for path in baseline.folder.iterdir()] == ["evaluations"]
+    assert kept.read_bytes() == content
+    assert reproduce(["toy"], "quick", results[0], 1, source, lambda line: None).keys() == {
+        "toy/impossible/10",
+        "toy/impossible/10/evaluations/own",
+    }
+    assert is_complete(baseline)
+
+
+def test_two_at_once_do_not_share_a_folder(results: tuple[Path, Outcome, Outcome], source: Path) -> None:
+    with claimed(results[0]):
+        done = outcome(start(source, results[0].parent, "toy"))
+    assert done.code == 2
+    assert "scripts/reproduce: another process works in" in done.err
+
+
+def test_a_fine_tuning_is_complete_with_its_comparison(tmp_path: Path) -> None:
+    task = Task("toy", "finetune", tmp_path, tmp_path, ())
+    (tmp_path / "metrics.json").write_text("{}")
+    assert not is_complete(task)
+    (tmp_path / "comparison.json").write_text("{}")
+    assert is_complete(task)
 
 
 def test_a_line_for_each_run_counts_and_estimates(results: tuple[Path, Outcome, Outcome]) -> None:

@@ -9,16 +9,16 @@ import traceback
 
 from cartpole_rl.choices import choice
 from cartpole_rl.errors import CartPoleError
-from cartpole_rl.run_files import CHECKPOINTS, IDENTIFIED, METRICS, MODELLED, RESUME
+from cartpole_rl.run_files import CHECKPOINTS, COMPARISON, IDENTIFIED, METRICS, MODELLED, RESUME
 from cartpole_rl.signals import RaiseOnce, end_with_parent, ending_signals
-from cartpole_rl.workflows.reproduce.plan import Task
+from cartpole_rl.workflows.reproduce.plan import EVALUATIONS, Task
 from cartpole_rl.workflows.run_folder import recorded_provenance
 from cartpole_rl.workflows.run_inputs import is_outdated, write_inputs
 from cartpole_rl.workflows.studies import overrides_of
 
 LOG = "log.txt"
 DEFAULT_EPISODES = choice("evaluate")["episodes"]
-RESULTS = {"identify": IDENTIFIED, "model": MODELLED}  # of the other commands METRICS
+RESULTS = {"identify": IDENTIFIED, "model": MODELLED, "finetune": COMPARISON}  # of the other commands METRICS
 RESUMABLE = ("train", "finetune")
 SIGNALLED = 128  # added to the number of a signal, as a shell does
 
@@ -79,11 +79,19 @@ def in_own_process(task: Task) -> None:
 
 
 def prepare(task: Task) -> bool:
-    """Remove an incomplete run that cannot be resumed; return True for one that can."""
+    """Remove an incomplete run that cannot be resumed; return True for one that can.
+
+    The evaluations below an evaluation, which is that of the baseline, are runs of their own and stay.
+    """
     can_resume = task.command in RESUMABLE and (task.folder / CHECKPOINTS / RESUME).is_file()
     command = recorded_provenance(task.folder).get("command")
     has_paths = isinstance(command, list) and command[1:] == [*task.words]  # it resumes with those of then
     if can_resume and has_paths and not is_outdated(task.folder):
         return True
-    shutil.rmtree(task.folder, ignore_errors=True)
+    stays = EVALUATIONS if task.command == "evaluate" else None
+    for path in task.folder.glob("*"):
+        if path.is_dir() and path.name != stays:
+            shutil.rmtree(path)
+        elif not path.is_dir():
+            path.unlink()
     return False

@@ -16,7 +16,7 @@ from typing import Any
 
 import yaml
 
-from cartpole_rl.files import write_text
+from cartpole_rl.files import claimed, write_text
 from cartpole_rl.workflows.reproduce.plan import Task, plan
 from cartpole_rl.workflows.reproduce.process import LOG, in_own_process, is_complete, made_otherwise
 from cartpole_rl.workflows.reproduce.progress import Progress, duration
@@ -38,29 +38,30 @@ def reproduce(
 ) -> dict[str, str]:
     """Run everything that is left of the studies `names` of `source`, in `root`; return the failures by run.
 
-    Raises ConfigError for an unknown study or size.
+    Raises ConfigError for an unknown study or size, or if another process works in `root`.
     """
     tasks = plan(names, size, root, source)
-    schedule = Schedule(tasks, root)
-    for name in names:
-        if name not in schedule.mixed:  # else the study that its runs were made by stays
-            write_study(name, size, root, source)
-    todo = len(schedule.waiting)
-    show(f"{len(tasks)} runs, {len(tasks) - todo} of them done; {jobs} at a time, in {root}")
-    started = time.monotonic()
-    progress = Progress(todo, jobs, show)
-    with Workers(jobs) as workers:
-        while schedule.waiting or workers.running:
-            ended = schedule.lost()
-            for task in schedule.ready(workers.free):
-                workers.start(task)
-            if workers.running and not ended:
-                ended = workers.finished()
-            for task, seconds, failure in ended:
-                schedule.finish(task, failure)
-                left = [*schedule.waiting, *workers.tasks]
-                progress.finished(task, schedule.label(task), seconds, left, failure)
-    show(f"{progress.done} runs in {duration(time.monotonic() - started)}")
+    with claimed(root):
+        schedule = Schedule(tasks, root)
+        for name in names:
+            if name not in schedule.mixed:  # else the study that its runs were made by stays
+                write_study(name, size, root, source)
+        todo = len(schedule.waiting)
+        show(f"{len(tasks)} runs, {len(tasks) - todo} of them done; {jobs} at a time, in {root}")
+        started = time.monotonic()
+        progress = Progress(todo, jobs, show)
+        with Workers(jobs) as workers:
+            while schedule.waiting or workers.running:
+                ended = schedule.lost()
+                for task in schedule.ready(workers.free):
+                    workers.start(task)
+                if workers.running and not ended:
+                    ended = workers.finished()
+                for task, seconds, failure in ended:
+                    schedule.finish(task, failure)
+                    left = [*schedule.waiting, *workers.tasks]
+                    progress.finished(task, schedule.label(task), seconds, left, failure)
+        show(f"{progress.done} runs in {duration(time.monotonic() - started)}")
     return schedule.failures
 
 
