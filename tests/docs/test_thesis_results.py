@@ -20,6 +20,10 @@ BEYOND_IT = re.compile(r"(\| [^|]+ ){2}\| `(?P<study>\w+)` \|")
 RESULTS = [each for each in read_studies(DATA) if each.agents]
 
 
+def test_every_study_has_results() -> None:
+    assert {each.name for each in RESULTS} == {*study_names()}
+
+
 @pytest.mark.parametrize("results", RESULTS, ids=lambda results: results.name)
 def test_the_data_are_complete_and_have_a_finding(results: StudyResults) -> None:
     assert results.label == "full"
