@@ -101,13 +101,13 @@ def drive_armed(cart, agent, layers, pole_length, seconds):
 
 
 def length_of(text, agent):
-    """Return the pole's length in m. Raises ConfigError if the agent observes it and it is not given."""
+    """Return the pole's length in m. Raises ConfigError if the agent observes it and it is not given in m."""
     try:
         length = float(text)
     except ValueError:
         raise ConfigError(f"POLE_LENGTH: {text!r} is not a number of metres") from None
-    if agent.observation.pole_length and not 0 < length < math.inf:
-        raise ConfigError(f"this agent observes the pole's length, give it in m; {USAGE}")
+    if agent.observation.pole_length and not 0 < length <= 3:
+        raise ConfigError(f"this agent observes the pole's length, give it in m, at most 3; {USAGE}")
     return length
 
 

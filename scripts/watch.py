@@ -16,6 +16,7 @@ import sys
 from cartpole_rl.errors import FaultError, PlantError
 from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.settings import SerialSettings
+from cartpole_rl.signals import RaiseOnce, ending_signals
 from cartpole_rl.wire import Fault, Flags, State
 
 PERIODS_PER_LINE = 25
@@ -32,7 +33,7 @@ def line(state: State, flags: Flags) -> str:
 
 
 def main() -> None:
-    """Print what a cart reports until Ctrl-C."""
+    """Print what a cart reports until Ctrl-C, SIGTERM or SIGHUP."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -41,6 +42,7 @@ def main() -> None:
     parser.add_argument("--baud", type=int, choices=BAUD_RATES, default=BAUD_RATES[0], help="line speed")
     options = parser.parse_args()
     settings = SerialSettings(port=options.port, baud=options.baud)
+    RaiseOnce(lambda number: SystemExit(128 + number)).handle(*ending_signals())
     try:
         with SerialCart(settings) as cart, contextlib.suppress(KeyboardInterrupt):
             print(cart.information, flush=True)

@@ -115,7 +115,9 @@ def header(agent: ExportedAgent, later: str) -> str:
         "past": past,
         "observes_length": int(about.observation.pole_length),
         "starts_upright": int(about.start == Start.UPRIGHT),
-        "length_use": "observed" if about.observation.pole_length else "not read by this agent",
+        "length_use": "above 0 and at most 3, or every motor value is 0."
+        if about.observation.pole_length
+        else "not read by this agent.",
     }
     return filled("policy.h", values)
 

@@ -213,6 +213,20 @@ def test_without_a_start_the_motor_stays_at_0(compiled: Compiled) -> None:
     assert [compiled.motor((0, 2048), 0.02) for _ in range(3)] == [0, 0, 0]
 
 
+@pytest.mark.parametrize("length", [0.0, -1.0, 355.6, math.nan, math.inf])
+def test_a_length_that_no_pole_has_keeps_the_motor_at_0(length: float, tmp_path: Path) -> None:
+    training = load_settings(TrainConfig, {"observation": "history_length", "compile": False})
+    exported = exported_agent(TrainedAgent(training, new_agent(training).greedy_policy()), {})
+    compiled = Compiled(c_files(exported, training), tmp_path)
+    compiled.start(0.38, length)
+    assert [compiled.motor((0, 2048), 0.02) for _ in range(3)] == [0, 0, 0]
+    compiled.resume()
+    assert compiled.motor((0, 2048), 0.02) == 0
+    compiled.start(0.38, 0.3556)
+    assert compiled.motor((0, 2048), 0.02) in training.actions.motors
+    assert "above 0 and at most 3" in (tmp_path / "policy.h").read_text()
+
+
 def test_a_unit_that_is_not_finite_reaches_the_action_values(tmp_path: Path) -> None:
     training = load_settings(TrainConfig, {**AGENTS["plain"], "compile": False})
     exported = exported_agent(TrainedAgent(training, new_agent(training).greedy_policy()), {})

@@ -119,7 +119,7 @@ def test_an_agent_that_observes_the_length_needs_it_before_the_port_opens(
     wider = first._replace(weight=np.pad(first.weight, ((0, 0), (0, 1))))
     agent = ExportedAgent(about.model_copy(update={**changes, "sizes": sizes}), (wider, *exported.layers[1:]))
     (tmp_path / "agent.npz").write_bytes(weights_file(agent))
-    for length in ((), ("0",), ("nan",), ("inf",)):
+    for length in ((), ("0",), ("nan",), ("inf",), ("355.6",)):
         code, _, err = ended(started(tmp_path / "agent.npz", tmp_path / "port", *length))
         assert code == 1
         assert "this agent observes the pole's length" in err

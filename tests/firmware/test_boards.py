@@ -67,6 +67,14 @@ def test_any_notation_of_a_length_compiles(length: str, tmp_path: Path) -> None:
     assert (done.returncode, done.stderr) == (0, "")
 
 
+@pytest.mark.parametrize("length", ["355.6", "0", "-1", "0,3556", "nan"])
+def test_a_length_that_no_pole_has_is_refused(length: str) -> None:
+    words = ("-n", "nucleo_f401re", f"POLICY={SHUTTLE}", f"POLE_LENGTH={length}")
+    done = subprocess.run(["make", "-C", str(firmware_folder()), *words], capture_output=True, text=True)
+    assert done.returncode != 0
+    assert f"POLE_LENGTH={length}: give twice the distance from pivot to centre of mass in m" in done.stderr
+
+
 @needs_arm
 def test_a_folder_without_a_policy_is_named(tmp_path: Path) -> None:
     """make -C looks for a relative folder in firmware/."""

@@ -4,7 +4,8 @@ import contextlib
 import io
 import json
 import re
-from collections.abc import Callable, Mapping
+import signal
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -87,11 +88,22 @@ def record_shaken_carts(folder: Path, make_plant: Callable, make_environment: Ca
 
 
 def test_the_page_has_a_block_for_each_function() -> None:
-    assert len(BLOCKS) == 11
+    assert len(BLOCKS) == 12
     for name in re.findall(r"`workflows\.([\w.]+)\.(\w+)\(", PAGE.read_text()):
         assert any(f"from cartpole_rl.workflows.{name[0]} import {name[1]}" in block for block in BLOCKS)
 
 
+@pytest.fixture
+def signal_handlers() -> Iterator[None]:
+    """Put the handlers of signals back afterwards."""
+    numbers = signal.SIGTERM, signal.SIGHUP
+    before = [signal.getsignal(number) for number in numbers]
+    yield
+    for number, handler in zip(numbers, before, strict=True):
+        signal.signal(number, handler)
+
+
+@pytest.mark.usefixtures("signal_handlers")
 def test_every_block_runs(notebook: Path, make_plant: Callable, make_environment: Callable) -> None:
     record_shaken_carts(notebook / "recordings", make_plant, make_environment)
     names: dict[str, Any] = {"__name__": "notebook"}
@@ -109,3 +121,5 @@ def test_every_block_runs(notebook: Path, make_plant: Callable, make_environment
     assert f"kept: {comparison['kept']}" in printed[6]
     assert "The cart is ready." in printed[8]
     assert "cos_theta" in printed[9]
+    with pytest.raises(SystemExit, match=str(128 + signal.SIGTERM)):
+        signal.raise_signal(signal.SIGTERM)

@@ -57,7 +57,8 @@ int policy_action(const float observation[POLICY_INPUTS])
 
 void policy_start(policy_t *policy, float track_end, float pole_length)
 {
-    const bool ready = isfinite(track_end) && track_end > 0.0f;
+    const bool length_fits = !POLICY_OBSERVES_LENGTH || (pole_length > 0.0f && pole_length <= POLICY_LONGEST_POLE);
+    const bool ready = isfinite(track_end) && track_end > 0.0f && length_fits;
     *policy = (policy_t){.track_end = track_end, .pole_length = pole_length, .ready = ready};
 }
 

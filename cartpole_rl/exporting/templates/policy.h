@@ -35,6 +35,7 @@ extern "C" {
 #define POLICY_POLE_COUNTS_PER_TURN @@counts_per_turn@@
 #define POLICY_TRACK_HALF_LENGTH @@track@@ /* m, of the nominal cart */
 #define POLICY_OBSERVES_LENGTH @@observes_length@@ /* 1 if the agent reads pole_length */
+#define POLICY_LONGEST_POLE 3.0f /* m */
 #define POLICY_STARTS_UPRIGHT @@starts_upright@@ /* 1 if an episode must start with the pole upright */
 
 /* The memory of one cart. Its fields are private. */
@@ -51,7 +52,7 @@ typedef struct {
 
 /* Start an episode. track_end: m from the middle to the soft limit, which the track guard reads; without a positive,
  * finite number every motor value is 0. pole_length: m, twice the distance from pivot to centre of mass;
- * @@length_use@@. */
+ * @@length_use@@ */
 void policy_start(policy_t *policy, float track_end, float pole_length);
 
 /* Continue an episode after periods in which policy_motor() was not called: the next counts are then like the first

@@ -59,8 +59,8 @@ class SerialCart:
                 print(cart.set_motor(100), cart.get_state())
 
     Counts and motor values are positive to the right. SIGTERM ends a Python process without leaving a `with`;
-    a program that wants the cart disarmed at once turns it into an exception. If it does not, the cart's own
-    watchdog sets the motor to 0 after three periods.
+    a program that drives a cart turns it into an exception (`cartpole_rl.signals.RaiseOnce`). If it does not,
+    the cart's own watchdog sets the motor to 0 after three periods, but a cart that homes goes on homing.
 
     Every method raises LinkError when the cart no longer answers.
     """

@@ -114,21 +114,28 @@ uint32_t cart_hardware_clock_us(void)
     return (uint32_t)micros();
 }
 
-static int32_t count_of(pcnt_unit_handle_t unit)
+/* Just after the counter has started again at its limit, the interrupt that adds the limit may still be pending, and
+   the count is off by COUNTER_LIMIT. No encoder turns that far in a period: such a count is read again. */
+static int32_t count_of(pcnt_unit_handle_t unit, int32_t *last)
 {
     int count = 0;
     ESP_ERROR_CHECK(pcnt_unit_get_count(unit, &count));
+    if (abs(count - *last) > COUNTER_LIMIT / 2)
+        ESP_ERROR_CHECK(pcnt_unit_get_count(unit, &count));
+    *last = count;
     return count;
 }
 
 int32_t cart_hardware_cart_count(void)
 {
-    return count_of(cart_counter);
+    static int32_t last;
+    return count_of(cart_counter, &last);
 }
 
 int32_t cart_hardware_pole_count(void)
 {
-    return count_of(pole_counter);
+    static int32_t last;
+    return count_of(pole_counter, &last);
 }
 
 void cart_hardware_set_motor(int16_t value)

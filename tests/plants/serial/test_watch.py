@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from serial_peer import CartPeer, wait_for
 
-from cartpole_rl.wire import ClearFault, Fault, Frame, Home, Nack, Reason, SetMotor, Start, Stop
+from cartpole_rl.wire import Ack, ClearFault, Fault, Frame, Home, Nack, Reason, SetMotor, Start, Stop
 
 SCRIPT = Path(__file__).parents[3] / "scripts/watch.py"
 OUTPUT_SPEED = 5  # of termios.tcgetattr
@@ -37,6 +37,27 @@ def test_counts_are_printed_until_an_interrupt(words: tuple[str, ...], speed: in
         wait_for(lambda: isinstance(peer.received[-1].message, Stop))
         assert not peer.messages(Home) + peer.messages(Start)
         assert all(message == SetMotor(0) for message in peer.messages(SetMotor))
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP], ids=lambda number: number.name)
+def test_a_signal_while_the_cart_homes_stops_it(number: signal.Signals) -> None:
+    with Homing() as peer:
+        command = [sys.executable, SCRIPT, peer.port, "--home"]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+            wait_for(lambda: bool(peer.messages(Home)))
+            process.send_signal(number)
+            assert process.wait(timeout=60) == 128 + number
+        wait_for(lambda: isinstance(peer.received[-1].message, Stop))
+
+
+class Homing(CartPeer):
+    """A cart that accepts HOME and never ends it."""
+
+    def answer(self, frame: Frame) -> Iterable[bytes]:
+        if not isinstance(frame.message, Home):
+            yield from super().answer(frame)
+            return
+        yield self.encode(Ack(frame.sequence, Home.TYPE))
 
 
 class Faulted(CartPeer):
