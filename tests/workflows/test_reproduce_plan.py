@@ -94,6 +94,18 @@ def test_a_study_brings_the_agents_that_it_needs() -> None:
     assert {("swingup", "thesis"), ("todays_agents", "medium")} <= folders
 
 
+def test_an_arm_that_names_its_agent_gives_its_other_overrides_to_every_evaluation() -> None:
+    tasks = [
+        task for task in study_tasks("robustness_mass", "full", ROOT) if "identified" in task.folder.parts
+    ]
+    assert {task.command for task in tasks} == {"evaluate"}
+    for task in tasks:
+        agent = ROOT / "identified_agents/identified" / task.folder.parts[-3]
+        assert task.words[0] == f"run={agent}"
+        assert task.needs == (agent,)
+        assert {"cart=ip02", "cart_friction=sigmoid"} < {*task.words}
+
+
 @pytest.mark.parametrize(
     ("name", "size", "complaint"),
     [

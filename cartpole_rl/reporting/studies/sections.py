@@ -12,7 +12,7 @@ from cartpole_rl.reporting.page import escaped, table
 from cartpole_rl.reporting.studies.answers import GOOD, estimate_text, measure_label, ratios
 from cartpole_rl.reporting.studies.figures import Drawing, drawings
 from cartpole_rl.reporting.studies.results import Exclusion, StudyResults
-from cartpole_rl.reporting.studies.settings import Variant
+from cartpole_rl.reporting.studies.settings import RUN, Variant
 from cartpole_rl.reporting.studies.statistics import estimate
 from cartpole_rl.reporting.table import number_text
 
@@ -127,10 +127,9 @@ def _by_hand(results: StudyResults) -> Iterator[str]:
     for arm in study.arms:
         if study.agents_of:
             yield f"# {arm.label}: agents of {study.agents_of}"
-        elif study.command == "train" and (
-            shared := [word for word in arm.overrides if word.startswith("run=")]
-        ):
-            yield f"# {arm.label}: {shared[-1]}"
+        elif named := study.agent_of(arm):
+            more = " ".join(study.evaluated_with(arm))
+            yield f"# {arm.label}: {RUN}{named}" + (f", each evaluation also with {more}" if more else "")
         else:
             yield _command(study.command, [*experiment, *arm.overrides, *overrides, "seed={seed}"], results)
     for evaluation in study.evaluations:

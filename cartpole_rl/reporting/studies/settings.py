@@ -12,6 +12,7 @@ from cartpole_rl.settings import Count, Finite, Settings
 
 FolderName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.+-]*$")]
 Overrides = tuple[str, ...]
+RUN = "run="  # the override that names an agent
 
 
 class Axis(Settings):
@@ -86,6 +87,17 @@ class Study(Settings):
     def unit(self) -> str:
         """What a run of the command makes."""
         return {"identify": "identification", "model": "model"}.get(self.command, "agent")
+
+    def agent_of(self, arm: Variant) -> str | None:
+        """Return the agent that an arm names by run= instead of training one; None if the arm has a run."""
+        named = [word.removeprefix(RUN) for word in arm.overrides if word.startswith(RUN)]
+        return named[-1] if named and self.command == "train" else None
+
+    def evaluated_with(self, arm: Variant) -> Overrides:
+        """Return the overrides for all evaluations of an arm that names its agent by run=."""
+        if self.agent_of(arm) is None:
+            return ()
+        return tuple(word for word in arm.overrides if not word.startswith(RUN))
 
     @model_validator(mode="after")
     def _names_are_unique(self) -> "Study":

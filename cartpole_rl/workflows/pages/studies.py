@@ -40,7 +40,7 @@ from cartpole_rl.workflows.pages.runs import (
 from cartpole_rl.workflows.run_folder import write_json
 from cartpole_rl.workflows.studies import STUDIES, read_study_file
 
-STUDY, EVALUATIONS, RUN = "study.yaml", "evaluations", "run="
+STUDY, EVALUATIONS = "study.yaml", "evaluations"
 EMULATOR = "emulator="
 TEXTS = ("title", "order", "figure", "question", "thesis", "finding", "judged")  # of today's conf/study/
 LOSS = "learning/loss"  # TensorBoard's curve
@@ -152,10 +152,10 @@ def _origin(folder: Path, study: Study, arm: Variant, seed: int) -> Path:
     """Return the run of another study whose agent an arm evaluates; the arm's own where it trains one."""
     if study.agents_of:
         return folder.parent / study.agents_of / arm.name / str(seed)
-    given = [word.removeprefix(RUN) for word in arm.overrides if word.startswith(RUN)]
-    if not given:
+    named = study.agent_of(arm)
+    if named is None:
         return folder / arm.name / str(seed)
-    return Path(given[-1].replace("{runs}", folder.parent.as_posix()).replace("{seed}", str(seed)))
+    return Path(named.replace("{runs}", folder.parent.as_posix()).replace("{seed}", str(seed)))
 
 
 def _is_run(folder: Path) -> bool:

@@ -2,7 +2,7 @@
 
 In the overrides of a study `{runs}` stands for the folder of all studies and `{seed}` for the seed of the
 agent, as in `run={runs}/todays_agents/medium/{seed}`. An arm of a training with `run=` trains no agent: that
-agent, or the baseline of run=lqr, is evaluated.
+agent, or the baseline of run=lqr, is evaluated, with the other overrides of the arm.
 """
 
 import re
@@ -107,7 +107,7 @@ class Agent:
             yield Task(self.name, "evaluate", self.folder, self.root, words)
         for evaluation in self.study.evaluations:
             own = evaluation.words(self.arm.name, self.size.evaluation_overrides)
-            words = self.words(f"run={agent}", *own)
+            words = self.words(f"run={agent}", *self.study.evaluated_with(self.arm), *own)
             needs = tuple(self.runs_in(words))
             folder = self.folder / EVALUATIONS / evaluation.name
             yield Task(self.name, "evaluate", folder, self.root, words, needs)
@@ -123,9 +123,8 @@ class Agent:
     @property
     def shared(self) -> str | None:
         """The run that this arm evaluates instead of training an agent; None for an agent of its own."""
-        given = [word.removeprefix("run=") for word in self.arm.overrides if word.startswith("run=")]
-        if given:
-            return self.filled(given[-1])
+        if named := self.study.agent_of(self.arm):
+            return self.filled(named)
         if self.study.agents_of:
             return str(self.root / self.study.agents_of / self.arm.name / str(self.seed))
         return None
