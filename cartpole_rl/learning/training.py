@@ -25,6 +25,7 @@ from cartpole_rl.learning.randomness import random_state, restore_random_state
 from cartpole_rl.learning.schedules import half_cosine, linear
 from cartpole_rl.learning.settings import BufferSettings, LearningSettings, OptimizerSettings
 from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.tasks.settings import Measure
 
 Scalars = dict[str, float]
 OPTIMIZERS = {"adam": torch.optim.Adam, "adamw": torch.optim.AdamW}
@@ -46,7 +47,7 @@ class Monitor(Protocol):
 class Training:
     """A DQN training of `agent` on `env`, both on one device, where all its tensors are.
 
-    `evaluate` runs the greedy policy on another plant, on any device.
+    `evaluate` runs the greedy policy on another plant, on any device; `measure` is the score that judges it.
     """
 
     def __init__(
@@ -60,8 +61,10 @@ class Training:
         monitor: Monitor,
         seed: int,
         compiled: bool = False,
+        measure: Measure = "score",
     ) -> None:
         self.settings, self.agent, self.env = settings, agent, env
+        self.measure = measure
         self.evaluate, self.monitor, self.seed = evaluate, monitor, seed
         self.collector = Collector(
             env, agent.actor, len(env.hardware.motors), seed, settings.retry_probability
@@ -166,7 +169,7 @@ class Training:
         """Evaluate the greedy policy and report the episodes to the monitor."""
         with self.timed():
             episodes = self.evaluate()
-        self.last_score = float(np.mean([episode.score.sum() for episode in episodes]))
+        self.last_score = float(np.mean([episode.total(self.measure) for episode in episodes]))
         is_best = self.last_score > self.best_score
         self.best_score = max(self.best_score, self.last_score)
         self.monitor.on_evaluation(self, episodes, is_best)

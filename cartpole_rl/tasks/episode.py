@@ -6,6 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from cartpole_rl.tasks.settings import Measure
+
 Array = NDArray[np.float64]
 
 
@@ -52,6 +54,10 @@ class Episode:
     def measured_steps(self) -> int:
         """Number of control periods whose outcome was measured: all but the last one before a lost link."""
         return self.steps - (self.ended_by == "link")
+
+    def total(self, measure: Measure) -> float:
+        """Return the sum of (6.2) or of (6.1) over the episode."""
+        return float(self.score.sum() if measure == "score" else self.score_upright.sum())
 
     @property
     def steps(self) -> int:

@@ -9,6 +9,7 @@ from cartpole_rl.physics.motor import LARGEST_MOTOR
 from cartpole_rl.settings import Count, Finite, Fraction, NonNegative, Positive, Settings
 from cartpole_rl.tasks.rewards import Reward
 
+Measure = Literal["score", "score_upright"]  # equations (6.2) and (6.1), as in metrics.json
 NO_ACTION = -1  # where an observation or action value is not finite: motor 0, and the episode ends
 
 MotorValue = Annotated[int, Field(ge=-LARGEST_MOTOR, le=LARGEST_MOTOR)]
@@ -64,3 +65,8 @@ class TaskSettings(Settings):
     time_limit: Count  # control periods
     angle_limit: Finite | None  # rad; None: the pole may hang
     x_max: Positive  # m, of (5.4), (6.1), (6.2)
+
+    @property
+    def measure(self) -> Measure:
+        """The score that judges an agent: (6.1) where the pole must not fall, (6.2) elsewhere (section 6)."""
+        return "score" if self.angle_limit is None else "score_upright"

@@ -49,11 +49,11 @@ def distill(config: DistillConfig, folder: Path) -> float:
             progress.set_postfix_str(f"loss {loss:.3f}", refresh=False)
             progress.update()
     episodes = judge(nominal_env(training), student.greedy_policy(), config.seed)
-    score = mean([float(episode.score.sum()) for episode in episodes])
+    score = mean([episode.total(training.task.measure) for episode in episodes])
     tuned_poles = [poles.model_dump(mode="json") for poles in teacher.known_poles[1:]]
     agent = AgentCheckpoint(settings, student.state_dict(), distillation.transitions, score, tuned_poles)
     save_agent(folder / CHECKPOINTS / LAST, agent)
-    report(folder, episodes, training.plant.kind, training.pole, training.task.x_max)
+    report(folder, episodes, training.plant.kind, training.pole, training.task)
     print(f"a network of {list(config.hidden)} hidden units scores {score:.0f}")
     files = f"{METRICS}, {FIGURES}/ and {CHECKPOINTS}/"
     print_results(folder, files, f"cartpole-export run={shown(folder)} format=c")

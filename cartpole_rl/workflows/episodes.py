@@ -18,6 +18,7 @@ from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.reporting.words import guard_text
 from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.tasks.settings import Measure
 from cartpole_rl.workflows.agents import evaluated_agent
 from cartpole_rl.workflows.build import (
     evaluated_env,
@@ -87,7 +88,7 @@ class Evaluation:
         with LiveView(view_title(config.plant), config.view) as live:
             followed(self.env, live.memory)
             with precedence(config.plant, config.emulator):
-                yield from with_progress(episodes, config.episodes, name)
+                yield from with_progress(episodes, config.episodes, name, self.settings.task.measure)
 
     @property
     def knocks(self) -> Knocks | None:
@@ -123,10 +124,12 @@ def repeated(env: CartPoleEnv, policy: Policy, again: Repetition, knocks: Knocks
     yield run_batch(env, policy, knocks)[again.row]
 
 
-def with_progress(episodes: Iterator[Episode], count: int, name: str) -> Iterator[Episode]:
-    """Drive `count` episodes behind a progress bar that shows the score of each."""
+def with_progress(episodes: Iterator[Episode], count: int, name: str, measure: Measure) -> Iterator[Episode]:
+    """Drive `count` episodes behind a progress bar that shows the score of each, its `measure`."""
     with progress_bar(count, name) as progress:
         for episode in episodes:
-            progress.set_postfix_str(f"score {episode.score.sum():.0f}{guard_text(episode)}", refresh=False)
+            progress.set_postfix_str(
+                f"{measure} {episode.total(measure):.0f}{guard_text(episode)}", refresh=False
+            )
             progress.update()
             yield episode

@@ -62,8 +62,8 @@ def report_evaluation(
     """Write metrics.json and figures/, and print the scores; `onboard` are those that the board drove."""
     plant, settings = evaluation.config.plant.kind, evaluation.settings
     link = link_figures(evaluation.env)
-    mp4, x_max = evaluation.config.animation.mp4, settings.task.x_max
-    summary = report(folder, episodes, plant, settings.pole, x_max, link, onboard=onboard, mp4=mp4)
+    mp4 = evaluation.config.animation.mp4
+    summary = report(folder, episodes, plant, settings.pole, settings.task, link, onboard=onboard, mp4=mp4)
     heading = f"plant={plant}, {count_text(len(episodes))}"
     if onboard:
         print(score_columns({"this computer": summary, "on the board": summary["onboard"]}, heading))

@@ -194,7 +194,7 @@ class CartLearner:
 
     def simulated_score(self) -> float:
         """Return the agent's mean score on carts of its training, the same ones at every call."""
-        training = self.training
+        training, measure = self.training, self.settings.task.measure
         env = simulated_env(
             training,
             training.plant,
@@ -202,7 +202,7 @@ class CartLearner:
             training.task.evaluation_start,
             evaluation_seed(self.config.seed),
         )
-        return float(np.mean([each.score.sum() for each in run_batch(env, self.agent.greedy_policy())]))
+        return float(np.mean([each.total(measure) for each in run_batch(env, self.agent.greedy_policy())]))
 
 
 def check_simulation(training: TrainConfig) -> None:

@@ -10,7 +10,7 @@ from cartpole_rl.evaluation.metrics import episode_metrics, summarize
 from cartpole_rl.learning.checkpoints import AgentCheckpoint, TrainingCheckpoint
 from cartpole_rl.learning.training import Scalars
 from cartpole_rl.randomization.poles import PoleSettings
-from cartpole_rl.reporting.scores import score_table
+from cartpole_rl.reporting.scores import SCORES, score_table
 from cartpole_rl.reporting.words import count_text, cut_off
 from cartpole_rl.run_files import CHECKPOINTS, COMPARISON, LAST, METRICS, RECORDINGS
 from cartpole_rl.tasks.episode import Episode
@@ -85,19 +85,19 @@ class Session:
         """Keep the better policy, and write and print the results."""
         episodes = {stage: self.files.episodes(stage) for stage in (Stage.BEFORE, Stage.AFTER)}
         summaries = {stage: self.summarize(each) for stage, each in episodes.items()}
-        scores = {stage: each["score"]["mean"] for stage, each in summaries.items()}
+        measure = self.settings.task.measure
+        scores = {stage: each[measure]["mean"] for stage, each in summaries.items()}
         kept = Stage.AFTER if scores[Stage.AFTER] >= scores[Stage.BEFORE] else Stage.BEFORE
         self.files.save_agent(self.tuned.checkpoint(kept, scores[kept], self.settings.pole))
         folder, link = self.files.folder, self.cart.link_summary()
-        x_max = self.settings.task.x_max
-        report(folder, episodes[kept], self.config.plant.kind, self.settings.pole, x_max, link)
+        report(folder, episodes[kept], self.config.plant.kind, self.settings.pole, self.settings.task, link)
         write_json(folder / COMPARISON, {**summaries, "kept": kept})
         print(score_table(summaries[Stage.BEFORE], f"before, {count_text(len(episodes[Stage.BEFORE]))}"))
         print(score_table(summaries[Stage.AFTER], f"after, {count_text(len(episodes[Stage.AFTER]))}"))
         for line in cut_off([*episodes[Stage.BEFORE], *episodes[Stage.AFTER]]):
             print(line)
         print_loop_time(link.get("latency_override"))
-        print(f"kept: the policy {kept} fine-tuning")
+        print(f"kept: the policy {kept} fine-tuning, by its {SCORES[measure]}")
         files = f"{METRICS}, {COMPARISON}, {CHECKPOINTS}/{LAST} and {RECORDINGS}/"
         cart = plant_words(self.config.plant, [self.settings.pole])
         print_results(folder, files, f"cartpole-evaluate run={shown(folder)} {cart}")

@@ -74,14 +74,16 @@ class TrainingMonitor:
         self._log.scalars({f"evaluation/{key}": value for key, value in curves.items()}, transitions)
         if len(self.history) % max(1, self.config.learning.evaluations // PICTURES) == 0:
             self._log_pictures(episodes[0], transitions)
-        agent = AgentCheckpoint(self._settings, training.agent.state_dict(), transitions, record["score"])
+        score = record[self.config.task.measure]
+        agent = AgentCheckpoint(self._settings, training.agent.state_dict(), transitions, score)
         for name in (LAST, BEST) if is_best else (LAST,):
             save_agent(self.folder / CHECKPOINTS / name, agent)
-        self._bar.set_postfix_str(f"score {record['score']:.0f}")
+        scored = f"{self.config.task.measure} {score:.0f}"
+        self._bar.set_postfix_str(scored)
         self._advance(transitions)
         if self._bar.disable:
             done, total = transitions / 1e6, self.config.learning.collected_transitions / 1e6
-            print_message("train", f"{done:.2f} of {total:.2f} M transitions, score {record['score']:.0f}")
+            print_message("train", f"{done:.2f} of {total:.2f} M transitions, {scored}")
 
     def on_checkpoint(self, training: Training) -> None:
         """Write the state to resume from."""
@@ -107,7 +109,7 @@ class TrainingMonitor:
     def _record(self, training: Training, episodes: Sequence[Episode]) -> dict[str, float]:
         """Return the evaluation's line in the history."""
         metrics = [episode_metrics(episode, self.config.task.x_max) for episode in episodes]
-        scores = [each["score"] for each in metrics]
+        scores = [each[self.config.task.measure] for each in metrics]
         averaged = AVERAGED if metrics[0][GUARDED] is None else (*AVERAGED, GUARDED)
         means = {key: float(np.mean([each[key] for each in metrics])) for key in averaged}
         return {

@@ -10,6 +10,7 @@ from cartpole_rl.reporting.animation import durations, frames, write_animation
 from cartpole_rl.reporting.figures import behaviour, learning_curve, save
 from cartpole_rl.run_files import ANIMATION, FIGURES, METRICS
 from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.tasks.settings import TaskSettings
 from cartpole_rl.workflows.origins import stored_origins
 from cartpole_rl.workflows.run_folder import write_json
 
@@ -19,7 +20,7 @@ def report(
     episodes: Sequence[Episode],
     plant: str,
     pole: PoleSettings,
-    x_max: float,
+    task: TaskSettings,
     link: Mapping[str, int] | None = None,
     history: Sequence[Mapping[str, float]] = (),
     onboard: Sequence[Episode] = (),
@@ -31,6 +32,7 @@ def report(
     the learning curve, `onboard` the episodes that the cart's board drove, under that key of metrics.json and
     of the summary.
     """
+    x_max = task.x_max
     summary, listed = summarized(episodes, x_max)
     header = {"plant": plant, "pole": pole.name, **(link or {})}
     cart, origins = stored_origins(episodes)
@@ -44,7 +46,8 @@ def report(
     write_json(folder / METRICS, content)
     draw(episodes[0], figures, "", f"plant={plant}", pole, x_max, mp4)
     if history:
-        save(learning_curve([("score", list(history))]), figures / "learning_curve.png")
+        curve = learning_curve([(task.measure, list(history))], measure=task.measure)
+        save(curve, figures / "learning_curve.png")
     return summary
 
 

@@ -37,6 +37,7 @@ from cartpole_rl.workflows.trained_poles import emulated_words
 def train(config: TrainConfig, folder: Path) -> float:
     """Train an agent on randomized simulated carts, or resume the training in `folder`; return its score.
 
+    The score is that of the task: (6.1) for a balance, (6.2) for a swing-up.
     Writes config.yaml, provenance.json, TensorBoard events, history.jsonl (evaluations), checkpoints/last.pt
     and best.pt, metrics.json and figures/; until the end also checkpoints/resume.pt. Raises ConfigError for
     settings that do not fit together or a folder that already holds a run, CheckpointError for a resumed run
@@ -74,6 +75,7 @@ def train(config: TrainConfig, folder: Path) -> float:
                 monitor,
                 config.seed,
                 config.compile,
+                config.task.measure,
             )
             if checkpoint:
                 training.restore(checkpoint.state)
@@ -81,14 +83,14 @@ def train(config: TrainConfig, folder: Path) -> float:
                 monitor.randomization(env.plant)
             training.run()
             metrics = report(
-                folder, evaluate(), config.plant.kind, config.pole, config.task.x_max, history=monitor.history
+                folder, evaluate(), config.plant.kind, config.pole, config.task, history=monitor.history
             )
             monitor.finished(metrics)
         forget_training(folder)
     print(f"trained for {training.seconds:.0f} s")
     files = f"{METRICS}, {FIGURES}/ and {CHECKPOINTS}/"
     print_results(folder, files, f"cartpole-evaluate run={shown(folder)} {emulated_words([config.pole])}")
-    score: float = metrics["score"]["mean"]
+    score: float = metrics[config.task.measure]["mean"]
     return score
 
 

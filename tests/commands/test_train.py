@@ -14,6 +14,7 @@ from cartpole_rl.agents.baseline import EnergyAndRegulator
 from cartpole_rl.choices import choice
 from cartpole_rl.evaluation.episodes import Policy, run_batch
 from cartpole_rl.evaluation.metrics import episode_metrics
+from cartpole_rl.learning.checkpoints import load_agent
 from cartpole_rl.physics.dynamics import State
 from cartpole_rl.physics.models import Models
 from cartpole_rl.randomization.poles import PoleSettings
@@ -42,21 +43,23 @@ SWING_UP = [  # on the nominal cart, with a smaller network: 5400 updates are en
 BALANCED = 0.5  # of the periods within 5 degrees; three seeds had 0.78 to 0.79, the best pump 0.07
 
 
-def train(folder: Path, *overrides: str) -> dict:
-    """metrics.json of a training with `overrides`."""
+def train(folder: Path, *overrides: str) -> tuple[dict, str]:
+    """metrics.json of a training with `overrides`, and what it printed."""
     done = in_process("train", *overrides, f"hydra.run.dir={folder}", folder=folder)
     assert done.code == 0, done.err
-    return json.loads((folder / "metrics.json").read_text())
+    return json.loads((folder / "metrics.json").read_text()), done.out + done.err
 
 
 def test_the_balance_is_learned(tmp_path: Path) -> None:
-    metrics = train(tmp_path, "experiment=balance", *SHORT)
+    metrics, printed = train(tmp_path, "experiment=balance", *SHORT)
     assert metrics["score_upright"]["mean"] > 450  # of 500; an untrained agent falls within 30 steps
     assert {episode["ended_by"] for episode in metrics["episodes"]} == {"time"}
+    assert f"score_upright {metrics['score_upright']['mean']:.0f}\n" in printed
+    assert load_agent(tmp_path).score == pytest.approx(metrics["score_upright"]["mean"])
 
 
 def test_the_swing_up_is_learned_and_ends_in_balance(tmp_path: Path) -> None:
-    metrics = train(tmp_path, "experiment=medium", *SWING_UP)
+    metrics, _ = train(tmp_path, "experiment=medium", *SWING_UP)
     assert metrics["upright_fraction"]["mean"] > BALANCED
 
 

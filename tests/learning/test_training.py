@@ -24,6 +24,7 @@ from cartpole_rl.learning.settings import (
 )
 from cartpole_rl.learning.training import Scalars, Training
 from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.tasks.settings import Measure
 
 LEARNING = {
     "transitions": 1024,
@@ -64,11 +65,11 @@ AGENT = {
 }
 
 
-def episode(score: float) -> Episode:
-    """Return an episode of one step with this score."""
+def episode(score: float, score_upright: float = 0.0) -> Episode:
+    """Return an episode of one step with these scores."""
     rest, step = np.zeros(2), np.zeros(1)
-    counts = np.zeros((2, 2), int)
-    return Episode(rest, rest, rest, rest, rest, counts, step.astype(int), step + score, step, step, "time")
+    counts, scores = np.zeros((2, 2), int), (step + score, step + score_upright)
+    return Episode(rest, rest, rest, rest, rest, counts, step.astype(int), *scores, step, "time")
 
 
 class Listener:
@@ -101,6 +102,7 @@ def make_training(make_plant: Callable, make_environment: Callable) -> Callable[
         evaluate: Callable[[], list[Episode]] = lambda: [episode(1.0)],
         seed: int = 0,
         kind: Callable[..., Training] = Training,
+        measure: Measure = "score",
         **environment: Any,
     ) -> Training:
         seed_everything(seed)
@@ -119,6 +121,7 @@ def make_training(make_plant: Callable, make_environment: Callable) -> Callable[
             evaluate,
             Listener(),
             seed,
+            measure=measure,
         )
 
     return build
@@ -149,6 +152,14 @@ def test_the_best_is_the_first_of_the_highest_scores(make_training: Callable[...
     training.run()
     assert [best for _, best in training.monitor.evaluations] == [True, True, False, False]
     assert (training.best_score, training.last_score) == (3.0, 3.0)
+
+
+def test_the_best_of_a_balance_has_the_highest_score_upright(make_training: Callable[..., Training]) -> None:
+    scores = iter([(9.0, 1.0), (1.0, 2.0), (5.0, 1.5), (2.0, 2.5)])
+    training = make_training(evaluate=lambda: [episode(*next(scores))], measure="score_upright")
+    training.run()
+    assert [best for _, best in training.monitor.evaluations] == [True, True, False, True]
+    assert (training.best_score, training.last_score) == (2.5, 2.5)
 
 
 def test_exploration_falls_from_all_to_the_last_share(make_training: Callable[..., Training]) -> None:

@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.reporting import style
 from cartpole_rl.reporting.figures.annotations import guide
+from cartpole_rl.reporting.scores import SCORES
+from cartpole_rl.tasks.settings import Measure
 
 MILLION = 1e6
 
@@ -28,11 +30,12 @@ def learning_curve(
     threshold: float | None = None,
     guides: Mapping[str, float] | None = None,
     title: str = "Learning curve",
+    measure: Measure = "score",
 ) -> Figure:
     """Draw the score of each evaluation over millions of transitions, one colour for each label.
 
     A history is a label and its records in order, one per evaluation: `transitions`, `seconds` of training,
-    and over the episodes of that evaluation `score` (mean), `score_min`, `score_max`.
+    and over the episodes of that evaluation the `measure` (mean), `score_min`, `score_max`.
     **Runs that share a label are seeds of one set-up**: each is a thin line, their median a thick one. A
     single run is a thick line. The band spans the worst to the best episode of all runs of that label.
     `threshold` is a target score; `guides` are other named scores.
@@ -45,13 +48,13 @@ def learning_curve(
     style.dress(axes)
     groups = _groups(histories)
     for index, (name, runs) in enumerate(groups.items()):
-        _draw_group(axes, name, runs, style.series_colour(index))
-    _draw_guides(axes, guides or {}, threshold, [run for _, run in histories])
+        _draw_group(axes, name, runs, style.series_colour(index), measure)
+    _draw_guides(axes, guides or {}, threshold, [run for _, run in histories], measure)
     axes.xaxis.set_major_locator(MaxNLocator(nbins=8, steps=(1, 2, 5, 10)))
     axes.set_xlim(left=0)
     axes.set_ylim(bottom=min(0.0, axes.dataLim.y0))
     axes.legend(loc="lower right", fontsize=style.SMALL_SIZE, frameon=True, framealpha=0.9, edgecolor="none")
-    style.label(axes, x="transitions (millions)", y="score of an episode")
+    style.label(axes, x="transitions (millions)", y=f"{SCORES[measure]} of an episode")
     lines = "thin lines: runs,  thick line: their median" if len(histories) > len(groups) else "line: mean"
     style.title(axes, title, f"{lines},  band: worst to best episode")
     return figure
@@ -82,7 +85,7 @@ def _on_common_transitions(runs: Sequence[Run], key: str) -> tuple[Array, Array]
     return shared, np.stack(values)
 
 
-def _draw_group(axes: Axes, name: str, runs: Sequence[Run], colour: str) -> None:
+def _draw_group(axes: Axes, name: str, runs: Sequence[Run], colour: str, measure: Measure) -> None:
     """Draw the band, the thin line of each seed and the thick line of a label."""
     transitions, lowest = _on_common_transitions(runs, "score_min")
     _, highest = _on_common_transitions(runs, "score_max")
@@ -93,13 +96,13 @@ def _draw_group(axes: Axes, name: str, runs: Sequence[Run], colour: str) -> None
         for run in runs:
             axes.plot(
                 _column(run, "transitions") / MILLION,
-                _column(run, "score"),
+                _column(run, measure),
                 color=colour,
                 alpha=0.55,
                 linewidth=0.9,
             )
         name = f"{name}: median of {len(runs)} runs"
-    transitions, scores = _on_common_transitions(runs, "score")
+    transitions, scores = _on_common_transitions(runs, measure)
     marker = "o" if len(transitions) == 1 else ""
     axes.plot(
         transitions / MILLION, np.median(scores, 0), marker=marker, color=colour, linewidth=2.2, label=name
@@ -107,23 +110,23 @@ def _draw_group(axes: Axes, name: str, runs: Sequence[Run], colour: str) -> None
 
 
 def _draw_guides(
-    axes: Axes, guides: Mapping[str, float], threshold: float | None, runs: Sequence[Run]
+    axes: Axes, guides: Mapping[str, float], threshold: float | None, runs: Sequence[Run], measure: Measure
 ) -> None:
     """Draw horizontal lines at named scores, and at the target, with when it was reached."""
     for name, score in guides.items():
         guide(axes, score, name)
     if threshold is not None:
-        guide(axes, threshold, f"target {threshold:g}\n{_outcome(runs, threshold)}", style.LIMIT)
+        guide(axes, threshold, f"target {threshold:g}\n{_outcome(runs, threshold, measure)}", style.LIMIT)
 
 
-def _reached(run: Run, threshold: float) -> Record | None:
+def _reached(run: Run, threshold: float, measure: Measure) -> Record | None:
     """Return the first record whose mean score is at least `threshold`."""
-    return next((record for record in run if record["score"] >= threshold), None)
+    return next((record for record in run if record[measure] >= threshold), None)
 
 
-def _outcome(runs: Sequence[Run], threshold: float) -> str:
+def _outcome(runs: Sequence[Run], threshold: float, measure: Measure) -> str:
     """Return how many runs reached the threshold, and their median time."""
-    hits = [record["seconds"] for run in runs if (record := _reached(run, threshold))]
+    hits = [record["seconds"] for run in runs if (record := _reached(run, threshold, measure))]
     if not hits:
         return "not reached"
     duration = _duration(float(np.median(hits)))

@@ -32,7 +32,7 @@ def test_one_run_is_a_line_over_millions_of_transitions_in_its_band() -> None:
     assert band[:, 1].min() == 0
     assert band[:, 1].max() == 4200
     assert axes.get_xlabel() == "transitions (millions)"
-    assert axes.get_ylabel() == "score of an episode"
+    assert axes.get_ylabel() == "score (6.2) of an episode"
 
 
 def test_runs_of_one_label_get_their_median() -> None:
