@@ -16,7 +16,7 @@ from cartpole_rl.workflows.studies import study_names
 
 DATA = ROOT / "docs/results/thesis"
 OF_THE_THESIS = re.compile(r"(\| [^|]+ ){3}\| (?P<verdict>[^|]+) \| `(?P<study>\w+)` \|")
-BEYOND_IT = re.compile(r"(\| [^|]+ ){2}\| `(?P<study>\w+)` \|")
+BEYOND_IT = re.compile(r"(\| [^|]+ ){2,}\| `(?P<study>\w+)` \|")
 RESULTS = [each for each in read_studies(DATA) if each.agents]
 
 

@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import get_args
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -22,6 +23,7 @@ from cartpole_rl.reporting.studies.answers import GOOD, counted_text, estimate_t
 from cartpole_rl.reporting.studies.results import OWN, SMALLEST, StudyResults
 from cartpole_rl.reporting.studies.settings import Variant
 from cartpole_rl.reporting.studies.statistics import estimate, interquartile_mean
+from cartpole_rl.tasks.settings import Measure
 
 MOST_ROWS = 40  # groups in a figure of dots
 FEWEST_PROFILED = 3  # agents
@@ -237,15 +239,21 @@ def one_colour(groups: Mapping[str, Array]) -> str:
     return f" All {len(groups)} groups have one colour." if len(groups) > MOST_LINES else ""
 
 
-def rank_agreement(results: Sequence[StudyResults]) -> Drawing | None:
-    """Return the scores of all agents in the two evaluations that most studies compare; None for too few.
+def rank_agreements(results: Sequence[StudyResults]) -> list[Drawing]:
+    """Return the agreement of the agents' order in simulation and on the cart, for each score."""
+    found = (_rank_agreement(results, measure) for measure in get_args(Measure))
+    return [each for each in found if each]
 
-    An agent that several studies evaluate is drawn once.
+
+def _rank_agreement(results: Sequence[StudyResults], measure: Measure) -> Drawing | None:
+    """Return the `measure` of all agents in the two evaluations that most studies compare; None for too few.
+
+    Only studies of this measure count. An agent that several studies evaluate is drawn once.
     """
     compared = [
         each
         for each in results
-        if len(each.evaluations) > 1 and each.study.measure == "score" and not each.varied
+        if len(each.evaluations) > 1 and each.study.measure == measure and not each.varied
     ]
     names = Counter((each.evaluations[0].name, each.evaluations[1].name) for each in compared)
     if not names:
@@ -266,12 +274,12 @@ def rank_agreement(results: Sequence[StudyResults]) -> Drawing | None:
             labels = first.label, second.label
     if len(drawn) < FEWEST_PROFILED:
         return None
-    label = measure_label("score")
+    label = measure_label(measure)
     figure = agreement(groups, f"{label}, {labels[0]}", f"{label}, {labels[1]}")
     return Drawing(
-        "rank_agreement",
+        f"rank_agreement_{measure}",
         figure,
         f"{label} of {len(drawn)} agents of {len(groups)} studies: {labels[1]} over {labels[0]}.",
-        f"{len(drawn)} agents of {len(groups)} studies. The dashed line: the same {label} on both."
-        f"{one_colour(groups)}",
+        f"{len(drawn)} agents of {len(groups)} studies. The dashed line: the same {label} on both. "
+        f"The simulated cart is the nominal one of each agent's training.{one_colour(groups)}",
     )

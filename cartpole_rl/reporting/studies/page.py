@@ -16,7 +16,7 @@ from cartpole_rl.reporting.studies.answers import (
     status,
 )
 from cartpole_rl.reporting.studies.comparison import Comparison
-from cartpole_rl.reporting.studies.figures import rank_agreement
+from cartpole_rl.reporting.studies.figures import rank_agreements
 from cartpole_rl.reporting.studies.results import StudyResults
 from cartpole_rl.reporting.studies.robustness import robustness
 from cartpole_rl.reporting.studies.sections import (
@@ -185,12 +185,12 @@ def _sweep_section(results: StudyResults, pictures: Sequence[Picture]) -> str:
 
 
 def _ranks(results: Sequence[StudyResults]) -> str:
-    drawing = rank_agreement(results)
-    if drawing is None:
+    figures = "".join(map(drawn, rank_agreements(results)))
+    if not figures:
         return ""
     return (
         '<section id="ranks"><h2>Does the order in simulation predict that on the cart?</h2>'
-        f'<div class="figures">{drawn(drawing)}</div></section>'
+        f'<div class="figures">{figures}</div></section>'
     )
 
 

@@ -47,7 +47,7 @@ class Finding(Settings):
     """What a person found in the complete results of one size. It is shown with these results alone."""
 
     size: str
-    verdict: Literal["fails", "contradicts", "agrees", "answered"]  # the last: the thesis gives no result
+    verdict: Literal["fails", "contradicts", "agrees", "answered"]  # the last: no result to compare with
     comment: str  # why the results agree with the thesis or contradict it
 
 

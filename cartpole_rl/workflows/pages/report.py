@@ -1,12 +1,13 @@
 """Make a report: one HTML page from run folders, of the studies of the thesis or of any runs."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from cartpole_rl.files import write_text
 from cartpole_rl.reporting.figures import save
 from cartpole_rl.reporting.studies.answers import Status, counted_text, status
 from cartpole_rl.reporting.studies.comparison import compare
-from cartpole_rl.reporting.studies.figures import Drawing, drawings, rank_agreement
+from cartpole_rl.reporting.studies.figures import Drawing, drawings, rank_agreements
 from cartpole_rl.reporting.studies.page import runs_page, studies_page
 from cartpole_rl.reporting.studies.results import StudyResults
 from cartpole_rl.reporting.studies.sections import Picture
@@ -44,7 +45,7 @@ def _report_studies(config: ReportConfig, source: Path, folder: Path) -> None:
     pictures = _pictures(config, results)
     write_text(folder / PAGE, studies_page(results, pictures, emulators(results)))
     if config.figures:
-        _write_figures(results, folder, rank_agreement(results))
+        _write_figures(results, folder, rank_agreements(results))
     for kind in (Status.FAILS, Status.CONTRADICTS, Status.EMPTY, Status.INCOMPLETE):
         if names := [each.name for each in results if status(each) is kind]:
             print(f"{kind}: {', '.join(names)}")
@@ -68,11 +69,10 @@ def _report_runs(config: ReportConfig, folder: Path) -> None:
     _print_end(results, folder)
 
 
-def _write_figures(results: list[StudyResults], folder: Path, ranks: Drawing | None = None) -> None:
+def _write_figures(results: list[StudyResults], folder: Path, ranks: Sequence[Drawing] = ()) -> None:
     """Write the figures of studies or runs as SVG files, and print where they are."""
     figures = {f"{each.name}_{drawing.name}": drawing for each in results for drawing in drawings(each)}
-    if ranks:
-        figures[ranks.name] = ranks
+    figures |= {each.name: each for each in ranks}
     for name, drawing in figures.items():
         save(drawing.figure, folder / FIGURES / f"{name}.svg")
     print(f"{folder}/{FIGURES}/ holds {len(figures)} figures" if figures else "there is no figure to write")

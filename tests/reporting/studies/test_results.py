@@ -8,7 +8,7 @@ import pytest
 from cartpole_rl.checking import checked
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.reporting.studies.answers import Status, answer, low_is_good, reason, status
-from cartpole_rl.reporting.studies.figures import drawings, rank_agreement
+from cartpole_rl.reporting.studies.figures import drawings, rank_agreements
 from cartpole_rl.reporting.studies.page import studies_page
 from cartpole_rl.reporting.studies.results import Agent, StudyResults
 from cartpole_rl.reporting.studies.robustness import robustness
@@ -78,10 +78,17 @@ def test_agents_that_several_studies_share_agree_once() -> None:
     own = on_carts((5, 5), (6, 9))
     one = results("one", {"wide": shared}, evaluations=CARTS)
     two = results("two", {"wide": shared, "none": own}, evaluations=CARTS)
-    drawing = rank_agreement([one, two])
-    assert drawing is not None
+    (drawing,) = rank_agreements([one, two])
     assert drawing.caption.startswith("6 agents of 2 studies")
-    assert rank_agreement([results("few", {"wide": shared[:2]}, evaluations=CARTS)]) is None
+    assert rank_agreements([results("few", {"wide": shared[:2]}, evaluations=CARTS)]) == []
+
+
+def test_agents_of_each_score_are_ranked_among_themselves() -> None:
+    swings = results("one", {"wide": on_carts((1, 2), (2, 3), (3, 1))}, evaluations=CARTS)
+    balances = results(
+        "two", {"wide": on_carts((5, 5), (6, 9), (7, 8), (8, 9))}, evaluations=CARTS, measure="score_upright"
+    )
+    assert [each.caption.partition(" ")[0] for each in rank_agreements([swings, balances])] == ["3", "4"]
 
 
 def test_a_swing_up_below_2000_fails_unless_a_person_judged_it() -> None:
