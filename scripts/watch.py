@@ -11,6 +11,7 @@ It clears no fault: a restart of the board does.
 
 import argparse
 import contextlib
+import signal
 import sys
 
 from cartpole_rl.errors import FaultError, PlantError
@@ -32,6 +33,11 @@ def line(state: State, flags: Flags) -> str:
     )
 
 
+def ending(number: int) -> BaseException:
+    """Return the exception of a signal. A second Ctrl-C must not leave a homing cart without STOP."""
+    return KeyboardInterrupt() if number == signal.SIGINT else SystemExit(128 + number)
+
+
 def main() -> None:
     """Print what a cart reports until Ctrl-C, SIGTERM or SIGHUP."""
     parser = argparse.ArgumentParser(
@@ -42,7 +48,7 @@ def main() -> None:
     parser.add_argument("--baud", type=int, choices=BAUD_RATES, default=BAUD_RATES[0], help="line speed")
     options = parser.parse_args()
     settings = SerialSettings(port=options.port, baud=options.baud)
-    RaiseOnce(lambda number: SystemExit(128 + number)).handle(*ending_signals())
+    RaiseOnce(ending).handle(signal.SIGINT, *ending_signals())
     try:
         with SerialCart(settings) as cart, contextlib.suppress(KeyboardInterrupt):
             print(cart.information, flush=True)

@@ -1,6 +1,6 @@
 """Builds the environment of an evaluation, from the settings of the agent's training and its own."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
@@ -110,16 +110,28 @@ def replaced_settings(training: TrainConfig, config: EvaluateConfig) -> CartPole
         found = load_model(config.plant.model).parameters
         given["pole"] = one_pole(Pole(**{name: found[name] for name in Pole.model_fields}))
     if config.actions is not None:
-        check_as_many(config.actions, training.actions)
+        check_same_meaning(config.actions, training.actions)
     settings = checked(CartPoleSettings, {**own, **given, "randomization": config.randomization})
     return with_parameters(settings, config.parameters or {})
 
 
-def check_as_many(actions: ActionSettings, trained: ActionSettings) -> None:
-    """Raise ConfigError unless there are as many actions as those that the agent was trained with."""
-    given, known = len(actions.motors), len(trained.motors)
-    if given != known:
-        raise ConfigError(f"actions: {given} motor values, but the agent chooses from {known}; give {known}")
+def check_same_meaning(actions: ActionSettings, trained: ActionSettings) -> None:
+    """Raise ConfigError unless the motor values have the number, signs and order of those in training."""
+    given, known = actions.motors, trained.motors
+    if len(given) != len(known):
+        raise ConfigError(
+            f"actions: {len(given)} motor values, but the agent chooses from {len(known)}; give {len(known)}"
+        )
+    if order_and_signs(given) != order_and_signs(known):
+        raise ConfigError(
+            f"actions.motors={[*given]}: the agent would push in other directions than in its training; give "
+            f"values with the signs and in the order of {[*known]}"
+        )
+
+
+def order_and_signs(motors: Sequence[int]) -> list[tuple[int, int]]:
+    """Return the rank and the sign of each motor value."""
+    return [(sorted(motors).index(motor), (motor > 0) - (motor < 0)) for motor in motors]
 
 
 def predicting_env(

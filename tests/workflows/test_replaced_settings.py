@@ -3,6 +3,7 @@
 import pytest
 
 from cartpole_rl.errors import ConfigError
+from cartpole_rl.tasks.settings import ActionSettings
 from cartpole_rl.workflows.build import replaced_settings
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
 from cartpole_rl.workflows.loading import load_settings
@@ -17,6 +18,21 @@ def test_motor_values_are_replaced() -> None:
 def test_another_number_of_them_is_refused() -> None:
     config = load_settings(EvaluateConfig, {"run": "somewhere", "actions": "three"})
     with pytest.raises(ConfigError, match=r"^actions: 3 motor values, but the agent chooses from 9; give 9$"):
+        replaced_settings(load_settings(TrainConfig), config)
+
+
+@pytest.mark.parametrize(
+    "motors",
+    [
+        [250, 200, 150, 100, 0, -100, -150, -200, -250],
+        [-250, -200, -150, 0, -100, 100, 150, 200, 250],
+        [-250, -200, -150, -100, 10, 100, 150, 200, 250],
+    ],
+)
+def test_values_that_push_in_other_directions_are_refused(motors: list[int]) -> None:
+    config = load_settings(EvaluateConfig, {"run": "somewhere", "actions": "nine_levels"})
+    config = config.model_copy(update={"actions": ActionSettings(motors=motors, actuator="force_curve")})
+    with pytest.raises(ConfigError, match="the agent would push in other directions than in its training"):
         replaced_settings(load_settings(TrainConfig), config)
 
 

@@ -94,16 +94,20 @@ def test_a_study_brings_the_agents_that_it_needs() -> None:
     assert {("swingup", "thesis"), ("todays_agents", "medium")} <= folders
 
 
-def test_an_arm_that_names_its_agent_gives_its_other_overrides_to_every_evaluation() -> None:
-    tasks = [
-        task for task in study_tasks("robustness_mass", "full", ROOT) if "identified" in task.folder.parts
-    ]
-    assert {task.command for task in tasks} == {"evaluate"}
-    for task in tasks:
-        agent = ROOT / "identified_agents/identified" / task.folder.parts[-3]
-        assert task.words[0] == f"run={agent}"
-        assert task.needs == (agent,)
-        assert {"cart=ip02", "cart_friction=sigmoid"} < {*task.words}
+def test_an_arm_that_names_its_agent_gives_its_other_overrides_to_every_evaluation(tmp_path: Path) -> None:
+    agent = "{runs}/todays_agents/medium/{seed}"
+    (tmp_path / "mine.yaml").write_text(f"""
+        title: Mine
+        order: 300
+        question: Does it work?
+        arms: [{{name: other, label: another cart, overrides: ["run={agent}", cart_friction=step]}}]
+        evaluations: [{{name: heavy, label: heavy, overrides: ["parameters={{cart_mass: 1.0}}"]}}]
+        sizes: {{quick: {{seeds: 1}}}}
+        """)
+    (task,) = study_tasks("mine", "quick", ROOT, tmp_path)
+    needed = ROOT / "todays_agents/medium/10"
+    assert task.words == (f"run={needed}", "cart_friction=step", "parameters={cart_mass: 1.0}", "seed=10")
+    assert task.needs == (needed,)
 
 
 @pytest.mark.parametrize(

@@ -309,12 +309,13 @@ class SerialCart:
     def _unanswered_for(self) -> float:
         """Return for how many seconds the newest state has waited for a motor value.
 
-        It is 0 if no newer state comes: no time has passed for the cart, as on a lockstep emulator.
+        It is 0 if no newer state comes, unless the cart is known to have its own clock: no time has passed
+        on a lockstep emulator.
         """
         if not self._tracker.awaits_command:
             return 0.0
         waited = now() - self._tracker.newest_at
-        if waited <= self._watchdog_time:
+        if waited <= self._watchdog_time or self._tracker.ticks_alone:
             return waited
         return waited if self._connection.link.await_byte(LONGEST_SILENCE) else 0.0
 

@@ -7,8 +7,9 @@ acknowledges it in its next STATE, which has the sequence of the last frame take
 so that a loop never mistakes an older state for the effect of its command. A frame that was lost is never
 acknowledged; one and a half periods after it was sent the newest state is returned anyway.
 
-If nothing arrives for `nudge_after` seconds, the host sends HELLO. That is harmless to a cart with its own
-clock. A lockstep emulator, which advances by one period per frame, continues after a lost frame.
+If nothing arrives for `nudge_after` seconds, the host sends HELLO: a lockstep emulator, which advances by one
+period per frame, continues after a lost frame. A cart that is known to have its own clock gets none: an
+accepted frame lets a policy on its board drive on, and the host would not see where to.
 
 A motor value that the operating system delayed for three periods or more, as behind a full buffer, answers
 a state that is too old. The link then counts as broken.
@@ -16,8 +17,9 @@ a state that is too old. The link then counts as broken.
 
 import math
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
+from itertools import count
 from typing import TypeVar
 
 from cartpole_rl.errors import LinkError
@@ -48,6 +50,7 @@ Answer = TypeVar("Answer", bound=Message)
 WATCHDOG_PERIODS = 3  # without a command, after which the cart sets its motor to 0
 BACKLOG_BYTES = 1000  # with more waiting, the system's buffer (4096) may have dropped newer bytes
 UNACKNOWLEDGED_PERIODS = 1.5  # after a frame: by then the next state has come, if the frame has arrived
+LONGEST_PAUSE = 0.5  # s between two questions that have to be answered within a given time
 LONGEST_DEAFNESS = 1.0  # s; the cart's watchdog has stopped its motor long before
 KEPT_ANSWERS = 64
 
@@ -70,13 +73,17 @@ class Connection:
         self._state_since_refusal = True
 
     def shake_hands(self) -> Info:
-        """Send HELLO until the cart answers. Whatever a booting board prints before is ignored."""
+        """Send STOP and HELLO until the cart answers. Whatever a booting board prints before is ignored.
+
+        STOP comes first: a host that died may have left the cart armed, with a policy on its board that any
+        accepted frame wakes.
+        """
         deadline = now() + self._settings.connect_timeout
         pause = min(self._settings.answer_timeout, self._settings.connect_timeout)
         while now() < deadline:
             self._answers.clear()
             self.link.write(END)  # ends a partial frame that the cart may have read
-            self.link.send(Hello())
+            self.link.send(Stop(), Hello())
             until = min(deadline, now() + pause)
             answer = self._await_answer(until, (), Info, lambda info: True)
             if answer is not None:
@@ -91,16 +98,20 @@ class Connection:
         before: tuple[Message, ...] = (),
         within: float = math.inf,
     ) -> Answer:
-        """Send `before` and `message` until the cart answers `message`, or `within` s; return the answer.
+        """Send `before` and `message` until the cart answers `message`; return the answer.
 
+        The question is repeated `settings.retries` times or, if `within` is given, for `within` s.
         Raises RefusedError or FaultError for a NACK, LinkError without an answer.
         """
         self._tracker.send_question()
         self._refused_sequence = -1
         self._answers.clear()
         asked: list[int] = []
-        end, pause = now() + within, min(self._settings.answer_timeout, within / 2)
-        for _ in range(1 + self._settings.retries):
+        end, pause = now() + within, self._settings.answer_timeout
+        attempts: Iterable[int] = range(1 + self._settings.retries)
+        if math.isfinite(within):
+            attempts, pause = count(), min(pause, within / 2, LONGEST_PAUSE)
+        for _ in attempts:
             asked.append(self.link.send(*before, message))
             self.notice_backlog()
             self._asked_sequence, self._frames_asked = asked[-1], self.link.frames_sent
@@ -117,9 +128,15 @@ class Connection:
         )
 
     def send_motor(self, value: int) -> None:
-        """Send a motor value once. Raises LinkError if it was delayed for as long as the watchdog waits."""
+        """Send a motor value once.
+
+        Raises LinkError if the system delayed it for as long as the watchdog waits, or if so long has passed
+        since the state that it answers: a value other than 0 is then too old.
+        """
         self._refused_sequence = -1
         before, started = self._tracker.last, now()
+        if value and self._tracker.awaits_command:
+            started = self._tracker.newest_at
         self._motor_sequence = self.link.send(SetMotor(value))
         self._tracker.send_command(self.link.sequence, self.link.sent_at)
         period_us = min(self._tracker.period_us or LONGEST_PERIOD_US, LONGEST_PERIOD_US)
@@ -233,6 +250,8 @@ class Connection:
             state = self._tracker.take_newest()
             if state is None:
                 self._read()
+                if self.link.waiting() and now() < deadline:
+                    continue  # this computer may have paused since it read: newer states wait
                 state = self._tracker.take_newest()
             if state is not None and older is not None:
                 self._tracker.count_passed_over()
@@ -261,7 +280,8 @@ class Connection:
                 f"no state came from {self.link.port} for {self._settings.timeout:g} s: "
                 "check the cart's cable and power"
             )
-        if moment - max(self.link.received_at, self.link.sent_at) > self._settings.nudge_after:
+        silent = moment - max(self.link.received_at, self.link.sent_at)
+        if silent > self._settings.nudge_after and not self._tracker.ticks_alone:
             self.link.send(Hello())
 
     def _read(self, waiting: int = 0) -> None:

@@ -129,17 +129,25 @@ class SerialPlant(OneCartPlant):
         self._preparation.prepare()
         if self.before_start is not None:
             self.before_start()
-        if self.on_board:
-            self.cart.start_policy()
-        else:
-            self.cart.start()
-        self._state = self.cart.get_state()
+        self._state = self._armed()
         self._turns = self._whole_turns()
         self._drove = 0
         self.ended_by = ""
         self.last_error = None
         self._driving = True
         return self._frame(self._preparation.control_period)
+
+    def _armed(self) -> State:
+        """Arm the cart and return the next state. After an error, a signal too, it is disarmed again."""
+        try:
+            if self.on_board:
+                self.cart.start_policy()
+            else:
+                self.cart.start()
+            return self.cart.get_state()
+        except BaseException:
+            self.halt()
+            raise
 
     def step_one(self, motor: int) -> OneFrame:
         """Send a motor value; return the frame at the end of the period.

@@ -20,6 +20,7 @@ from cartpole_rl.plants.serial.statistics import LinkStatistics
 from cartpole_rl.wire import Flags, State, microseconds_between, ticks_between, went_back
 
 HALF_MILLISECOND = 500  # us
+IDLE_TICKS = 6  # without a new frame of the host; a lockstep emulator passes one for each frame that is lost
 OVERTAKEN_TICKS = 16  # 0.3 s: no frame is delayed for longer, and no cart boots and is driven so soon
 
 
@@ -35,6 +36,8 @@ class StateTracker:
         self.awaits_command = False  # a state was handed out, and its command is not sent yet
         self.measuring = True  # latencies and late ticks are counted
         self.stopped_clock: tuple[State, State] | None = None  # two states between which no time passed
+        self.ticks_alone = False  # the cart is known to have a clock of its own
+        self._same_frame = 0  # ticks in succession that acknowledged the same frame of the host
         self._newest: State | None = None  # arrived, and not handed out yet
         self.last: State | None = None  # the newest that arrived, handed out or not
         self._missing: set[int] = set()  # ticks that were counted as lost, and may still arrive
@@ -57,6 +60,7 @@ class StateTracker:
     def disconnect(self) -> None:
         """Forget the states of this connection; the cart may restart before the next one."""
         self._newest = self.last = self.stopped_clock = self.period_us = None
+        self.ticks_alone, self._same_frame = False, 0
         self._missing.clear()
 
     def receive(self, state: State, flags: Flags, arrived_at: float) -> bool:
@@ -71,6 +75,7 @@ class StateTracker:
                 self.restarts += 1
             else:
                 self._check_clock(last, state, ticks)
+                self._note_own_clock(last, state, flags)
                 self._count_missing(state.tick, ticks - 1)
         if self._newest is not None:
             self.count_passed_over()
@@ -121,6 +126,12 @@ class StateTracker:
         """Count a state that was not answered, if motor values are being sent."""
         if self._driving:
             self.statistics.late_ticks += 1
+
+    def _note_own_clock(self, last: State, state: State, flags: Flags) -> None:
+        """Note it if the cart ticks without frames. While it homes, a lockstep emulator does that too."""
+        idle = state.last_sequence == last.last_sequence and not flags & Flags.HOMING
+        self._same_frame = self._same_frame + 1 if idle else 0
+        self.ticks_alone |= self._same_frame >= IDLE_TICKS
 
     def _check_clock(self, last: State, state: State, ticks: int) -> None:
         """Note it if the cart's clock did not advance between two states: no velocity can be computed.

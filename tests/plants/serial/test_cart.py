@@ -175,6 +175,7 @@ def test_a_motor_value_that_the_port_takes_late_breaks_the_link_if_the_cart_tick
         cart.get_state()
         cart.set_motor(100)
         cart.get_state()
+        stopped = len(peer.messages(Stop))
         writes = threading.Event()
 
         def wait() -> None:
@@ -191,7 +192,7 @@ def test_a_motor_value_that_the_port_takes_late_breaks_the_link_if_the_cart_tick
             return
         with pytest.raises(LinkError, match="took a motor value too slowly"):
             cart.set_motor(200)
-        wait_for(lambda: len(peer.messages(Stop)) == 2)
+        wait_for(lambda: len(peer.messages(Stop)) == stopped + 1)
         assert peer.messages(SetMotor)[-1].motor == 0
 
 
@@ -202,12 +203,25 @@ def test_the_end_waits_a_few_seconds_at_most_whatever_the_settings(caplog: pytes
         peer.answer = lambda frame: ()
         before = len(peer.messages(Stop))
         started = time.monotonic()
-        with pytest.raises(LinkError, match="did not answer STOP, asked 2 times"):
+        with pytest.raises(LinkError, match="did not answer STOP, asked 6 times"):
             cart.stop()
         cart.close()
         assert time.monotonic() - started < 30
         assert "then switch it off" in caplog.text
-        assert len(peer.messages(Stop)) - before == 4
+        assert len(peer.messages(Stop)) - before == 6 + 2  # every half a second for three, then for LAST_STOP
+
+
+@pytest.mark.parametrize("settings", [{"retries": 0}, {"retries": 1, "answer_timeout": 0.01}])
+def test_stop_is_repeated_through_noise_whatever_the_settings(settings: dict[str, float]) -> None:
+    with CartPeer() as peer, SerialCart(quick_settings(peer.port, **settings)) as cart:
+        first = len(peer.messages(Stop))
+
+        def deaf(frame: Frame) -> Iterable[bytes]:
+            return () if len(peer.messages(Stop)) <= first + 3 else CartPeer.answer(peer, frame)
+
+        peer.answer = deaf
+        cart.stop()
+        assert len(peer.messages(Stop)) == first + 4
 
 
 def test_a_signal_leaves_enough_time_for_the_end() -> None:

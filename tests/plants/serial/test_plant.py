@@ -1,6 +1,6 @@
 """The plant on a scripted cart: endings, clocks and faults. On the emulated cart: test_emulated_plant.py."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import closing
 from dataclasses import replace
 
@@ -13,7 +13,7 @@ from torchrl.envs.utils import check_env_specs
 from cartpole_rl.errors import FaultError, LinkError, PortError
 from cartpole_rl.plants.serial.errors import NotReadyError
 from cartpole_rl.plants.serial.plant import SerialPlant
-from cartpole_rl.wire import ClearFault, Fault, Flags, Home, SetMotor, Start, Stop
+from cartpole_rl.wire import ClearFault, Fault, Flags, Frame, Home, SetMotor, Start, Stop
 
 
 @pytest.fixture
@@ -46,6 +46,23 @@ def test_a_reset_homes_and_arms(peer: CartPeer, plant: SerialPlant) -> None:
         Home,
         Start,
     ]
+
+
+class SilentOnceArmed(CartPeer):
+    """A cart that accepts START or START_POLICY, and sends no state after it."""
+
+    def answer(self, frame: Frame) -> Iterable[bytes]:
+        answers = [*super().answer(frame)]
+        return answers[:1] if self.flags & Flags.ARMED else answers
+
+
+@pytest.mark.parametrize("on_board", [False, True])
+def test_a_reset_that_fails_after_start_disarms_the_cart(on_board: bool) -> None:
+    with SilentOnceArmed() as peer, closing(SerialPlant(quick_settings(peer.port))) as plant:
+        plant.on_board = on_board
+        with pytest.raises(LinkError, match="no state came"):
+            plant.reset()
+        assert not peer.flags & Flags.ARMED
 
 
 def test_a_value_that_is_replaced_by_0_is_the_one_that_counts(

@@ -50,14 +50,31 @@ def test_a_signal_while_the_cart_homes_stops_it(number: signal.Signals) -> None:
         wait_for(lambda: isinstance(peer.received[-1].message, Stop))
 
 
+def test_a_second_interrupt_does_not_leave_a_homing_cart_without_stop() -> None:
+    with Homing() as peer:
+        command = [sys.executable, SCRIPT, peer.port, "--home"]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+            wait_for(lambda: bool(peer.messages(Home)))
+            before, peer.lost_stops = len(peer.messages(Stop)), 1
+            process.send_signal(signal.SIGINT)
+            wait_for(lambda: len(peer.messages(Stop)) > before)
+            process.send_signal(signal.SIGINT)
+            assert process.wait(timeout=60) == 0
+        assert len(peer.messages(Stop)) == before + 2  # the first was lost, the second is answered
+
+
 class Homing(CartPeer):
-    """A cart that accepts HOME and never ends it."""
+    """A cart that accepts HOME and never ends it, and to which some STOPs are lost."""
+
+    lost_stops = 0
 
     def answer(self, frame: Frame) -> Iterable[bytes]:
-        if not isinstance(frame.message, Home):
+        if isinstance(frame.message, Stop) and self.lost_stops:
+            self.lost_stops -= 1
+        elif not isinstance(frame.message, Home):
             yield from super().answer(frame)
-            return
-        yield self.encode(Ack(frame.sequence, Home.TYPE))
+        else:
+            yield self.encode(Ack(frame.sequence, Home.TYPE))
 
 
 class Faulted(CartPeer):

@@ -1,0 +1,108 @@
+"""A motor value answers a state that is too old: each place where this computer can pause before it sends."""
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+from serial_peer import CartPeer, quick_settings, wait_for
+
+from cartpole_rl.errors import LinkError
+from cartpole_rl.plants.serial.cart import SerialCart
+from cartpole_rl.wire import Hello, SetMotor, Stop
+
+PERIODS = 15  # a pause; the watchdog waits for three
+
+
+@contextmanager
+def driven() -> Iterator[tuple[CartPeer, SerialCart]]:
+    """A cart that is armed and has been driven, and that is known to tick on its own."""
+    with CartPeer() as peer, SerialCart(quick_settings(peer.port)) as cart:
+        cart.start()
+        idle(peer, cart)
+        cart.set_motor(50)
+        cart.get_state()
+        yield peer, cart
+
+
+def idle(peer: CartPeer, cart: SerialCart) -> None:
+    """Let the cart tick without frames of the host, and read its states."""
+    for _ in range(10):
+        peer.tick()
+    wait_for(lambda: cart._connection.link.waiting() > 0)
+    cart.get_state()
+    assert cart._tracker.ticks_alone
+
+
+def after(function: Callable[..., Any], pause: Callable[[], None]) -> Callable[..., Any]:
+    """Return `function`, which pauses once before it returns."""
+    pending = [pause]
+
+    def paused(*args: object) -> object:
+        result = function(*args)
+        if pending and result:
+            pending.pop()()
+        return result
+
+    return paused
+
+
+def test_a_pause_between_the_check_and_the_write(monkeypatch: pytest.MonkeyPatch) -> None:
+    with driven() as (peer, cart):
+        stopped = len(peer.messages(Stop))
+
+        def send_late(value: int) -> None:
+            time.sleep(0.3)
+            for _ in range(PERIODS):
+                peer.tick()
+            send(value)
+
+        send = cart._connection.send_motor
+        monkeypatch.setattr(cart._connection, "send_motor", send_late)
+        with pytest.raises(LinkError, match="took a motor value too slowly"):
+            cart.set_motor(200)
+        wait_for(lambda: len(peer.messages(Stop)) > stopped)
+        assert peer.messages(SetMotor)[-1].motor == 0
+
+
+def test_a_pause_right_after_a_state_was_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The state that is handed out is the newest one, not the one that was read before the pause."""
+    with driven() as (peer, cart):
+        link = cart._connection.link
+
+        def pause() -> None:
+            for _ in range(PERIODS):
+                peer.tick()
+            wait_for(lambda: link.waiting() > 0)
+
+        monkeypatch.setattr(link, "receive", after(link.receive, pause))
+        cart.set_motor(0)
+        assert cart.get_state().tick == peer.state.tick
+
+
+def test_a_silent_port_after_a_pause_is_no_proof_that_no_time_has_passed() -> None:
+    with driven() as (peer, cart):
+        sent = len(peer.messages(SetMotor))
+        time.sleep(0.1)  # five periods, and the port has delivered none of them yet
+        assert cart.set_motor(200) == 0
+        wait_for(lambda: len(peer.messages(SetMotor)) > sent)
+        assert peer.messages(SetMotor)[-1].motor == 0
+
+
+def test_a_cart_that_ticks_on_its_own_gets_no_hello_in_silence() -> None:
+    """An accepted frame would let a policy on its board drive on."""
+    with driven() as (peer, cart):
+        peer.answer = lambda frame: ()
+        asked = len(peer.messages(Hello))
+        cart.set_motor(0)
+        with pytest.raises(LinkError, match="no state came"):
+            cart.get_state()
+        assert len(peer.messages(Hello)) == asked
+        peer.answer = lambda frame: CartPeer.answer(peer, frame)
+
+
+def test_a_host_that_opens_the_port_disarms_before_it_asks() -> None:
+    with CartPeer() as peer, SerialCart(quick_settings(peer.port)):
+        kinds = [type(frame.message) for frame in peer.received]
+        assert kinds[:2] == [Stop, Hello]
