@@ -146,22 +146,24 @@ def one_episode(
 def run_many(env: CartPoleEnv, policy: Policy, knocks: Knocks | None = None) -> list[Episode]:
     """Return one episode of each cart of any plant, all from one reset, on tensors."""
     current = env.reset()
-    if knocks:
-        knocks.reset()
-    origins = env.plant.origins()
     frames, actions = [current], []
     endings: list[str | None] = [None] * env.plant.carts
-    while None in endings:  # the cart waits for this loop; the rest is done afterwards
-        action = choose(policy, current)
+    try:
         if knocks:
-            knocks()
-        outcome = env.step(current.set("action", action)).get("next")
-        actions.append(action)
-        frames.append(outcome)
-        if outcome.get("done").any():
-            _note_endings(env, action, outcome, endings)
-        current = outcome.exclude("reward")
-    env.plant.halt()  # a real cart would keep its last motor value
+            knocks.reset()
+        origins = env.plant.origins()
+        while None in endings:  # the cart waits for this loop; the rest is done afterwards
+            action = choose(policy, current)
+            if knocks:
+                knocks()
+            outcome = env.step(current.set("action", action)).get("next")
+            actions.append(action)
+            frames.append(outcome)
+            if outcome.get("done").any():
+                _note_endings(env, action, outcome, endings)
+            current = outcome.exclude("reward")
+    finally:
+        env.plant.halt()  # a real cart would keep its last motor value
     first, steps = frames[0], frames[1:]
     columns = {key: torch.cat([step[key] for step in steps], 1) for key in _FROM_NEXT}
     columns |= {key: torch.stack([frame[key] for frame in frames], 1) for key in ("state", "counts")}

@@ -27,6 +27,7 @@ STATE = {  # column: field of Episode
 }
 STEP = {"score": "score", "score_upright": "score_upright", "reward": "reward"}
 COUNTS = ("cart_counts", "pole_counts")
+FEWEST_COUNTS, MOST_COUNTS = -(2**31), 2**31 - 1  # int32 on the wire
 LENGTH = "pole_length_m"  # in the heading: twice pivot to centre of mass, empty if not known
 GUARDED = "guarded"  # 1 where the track guard replaced the agent's motor value; empty without a guard
 COLUMNS = (*STATE, *COUNTS, "motor", *STEP)  # that every recording has
@@ -85,11 +86,13 @@ def read_recording(path: Path) -> Episode:
         guarded = np.array([int(mark or 0) != 0 for mark in marks]) if any(marks) else None
     except (ValueError, TypeError) as error:
         raise RecordingError(f"{path} is damaged: {error}") from None
-    _check_numbers(path, {**columns, **steps}, motor)
+    _check_numbers(path, {**columns, **steps}, motor, counts)
     return Episode(**columns, **steps, counts=counts, motor=motor, ended_by=ended_by, guarded=guarded)
 
 
-def _check_numbers(path: Path, columns: Mapping[str, np.ndarray], motor: np.ndarray) -> None:
+def _check_numbers(
+    path: Path, columns: Mapping[str, np.ndarray], motor: np.ndarray, counts: np.ndarray
+) -> None:
     """Raise RecordingError for the first impossible number."""
 
     def damaged(row: int, what: str) -> RecordingError:
@@ -100,5 +103,7 @@ def _check_numbers(path: Path, columns: Mapping[str, np.ndarray], motor: np.ndar
             raise damaged(int(np.flatnonzero(~np.isfinite(values))[0]), f"{name} is not finite")
     if not (steps := np.diff(columns["time"]) > 0).all():
         raise damaged(int(np.flatnonzero(~steps)[0]) + 1, "the time does not increase")
-    if (beyond := np.abs(motor) > LARGEST_MOTOR).any():
+    if (beyond := (motor < -LARGEST_MOTOR) | (motor > LARGEST_MOTOR)).any():
         raise damaged(int(np.flatnonzero(beyond)[0]), f"a motor value is beyond {LARGEST_MOTOR}")
+    if (beyond := (counts < FEWEST_COUNTS) | (counts > MOST_COUNTS)).any():
+        raise damaged(int(np.flatnonzero(beyond.any(axis=1))[0]), f"a count is beyond {MOST_COUNTS}")

@@ -10,7 +10,7 @@ from ctypes import Array, c_char
 from typing import NamedTuple
 
 COUNTER = struct.Struct("<Q")
-FIELDS = struct.Struct("<2I 2i 2I 6d")
+FIELDS = struct.Struct("<2I 2i 2Q 6d")  # a jump of the cart's tick can add 2^32 lost frames at once
 SIZE = COUNTER.size + FIELDS.size
 ATTEMPTS = 10  # to read while the writer writes
 

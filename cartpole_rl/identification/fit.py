@@ -13,7 +13,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cartpole_rl.identification.correlation import correlation
-from cartpole_rl.identification.matching import COARSE, FINEST, ROBUST, Match, Matching, first_guess
+from cartpole_rl.identification.matching import (
+    COARSE,
+    FINEST,
+    ROBUST,
+    Match,
+    Matching,
+    first_guess,
+    solvable,
+)
 from cartpole_rl.identification.rollout import rollout
 from cartpole_rl.identification.unknowns import POLE_LENGTH, Unknown, limits, parameters_at, unknowns_of
 from cartpole_rl.identification.windows import Windows
@@ -50,8 +58,9 @@ class Fit:
         table = parameters_at(self.point[:, None], self.unknowns, self.nominal)[:, 0]
         return dict(zip(CartParameters.names(), table.tolist(), strict=True))
 
+    @solvable()
     def draw(self, count: int, random: np.random.Generator, widen: float = 1.0) -> Array:
-        """Return carts [P, count] drawn from the posterior, correlations included."""
+        """Return carts [P, count] drawn from the posterior, correlations included. Raises RecordingError."""
         root = np.linalg.cholesky(self.covariance + 1e-12 * np.eye(len(self.point)))
         points = self.point[:, None] + widen * root @ random.standard_normal((len(self.point), count))
         return parameters_at(points, self.unknowns, self.nominal).numpy()
@@ -84,7 +93,8 @@ def fit_cart(
 
     The names `known`, of UNKNOWNS, keep their nominal values. Motion shows only ratios of forces and
     masses: unless WEIGHED are known, the prior sets the scale. `extra_latency` is that of `rollout`.
-    With `sharpened`, a second search weighs errors by the size that the first one left.
+    With `sharpened`, a second search weighs errors by the size that the first one left. Raises
+    RecordingError for windows in which no cart moves.
     """
     unknowns, nominal = unknowns_of(models, known), dict(nominal)
     positions, motors = torch.from_numpy(windows.positions), torch.from_numpy(windows.motors)

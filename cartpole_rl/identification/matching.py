@@ -5,13 +5,15 @@ states are eliminated from the normal equations (variable projection; Golub and 
 velocity is measured. Derivatives are differences of carts that are simulated side by side.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from cartpole_rl.errors import RecordingError
 from cartpole_rl.identification.rollout import Dynamics
 from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 from cartpole_rl.physics.residual import Residual
@@ -30,6 +32,18 @@ FIRST_DAMPING, LEAST_DAMPING = 1e-3, 1e-6
 ATTEMPTS = 6  # to lower the cost from one linearization, with ever more damping
 CONVERGED = 1e-4  # relative fall of the cost
 ROUNDS = 10  # steps from a first guess of the initial states
+
+
+@contextmanager
+def solvable() -> Iterator[None]:
+    """Raise RecordingError where equations have no solution: no cart causes errors of this size."""
+    try:
+        yield
+    except (np.linalg.LinAlgError, torch.linalg.LinAlgError):
+        raise RecordingError(
+            "no cart moves as the recordings say, their counts jump: check the encoders and their cables, "
+            "and record again, or leave these recordings out"
+        ) from None
 
 
 def huber(residuals: Tensor) -> Tensor:
@@ -74,16 +88,18 @@ class NormalEquations(NamedTuple):
         slopes = self.point_slopes - torch.einsum("wis,ws->wi", carried, self.state_slope)
         return matrix, slopes, inverse
 
+    @solvable()
     def solve(self, damping: Tensor) -> tuple[Tensor, Tensor]:
         """Return the steps of the point [U] and of the initial states [4, W].
 
-        `damping` is [1], or [W] for windows without a point.
+        `damping` is [1], or [W] for windows without a point. Raises RecordingError, as `covariance` does.
         """
         matrix, slopes, inverse = self.reduced(damping)
         step = -torch.linalg.solve(matrix, slopes.sum(0) + self.prior_slope)
         rest = self.state_slope + torch.einsum("wis,i->ws", self.point_state, step)
         return step, -torch.einsum("wst,wt->sw", inverse, rest)
 
+    @solvable()
     def covariance(self, episode: Tensor) -> Tensor:
         """Return that of the point, [U, U]: prior, and disagreement of windows and episodes (`episode` [W]).
 
@@ -231,6 +247,7 @@ class InitialStates(NamedTuple):
     form: Tensor  # [M, W, R, R]: residuals r cost r' form r where the initial states are the best for them
 
 
+@solvable()
 def match_initial_states(
     dynamics: Dynamics,
     positions: Tensor,
@@ -244,7 +261,7 @@ def match_initial_states(
 
     `motors` [H + T, W] are motor values; each member of `residual` has initial states of its own. The
     search is from `start` [4, M, W], or from the first guess. Components that the positions do not show, such
-    as the speed of a cart that sticks at once, stay near that guess.
+    as the speed of a cart that sticks at once, stay near that guess. Raises RecordingError.
     """
     members, windows = 1 if residual is None else residual.members, positions.shape[2]
     guess = first_guess(positions, dynamics.period).repeat(1, members)

@@ -3,12 +3,14 @@
 Files are replaced atomically (`cartpole_rl.files`).
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, get_type_hints
 
 import torch
+from pydantic import TypeAdapter, ValidationError
 from torch import nn
 
 from cartpole_rl.devices import moved
@@ -47,6 +49,9 @@ class TrainingCheckpoint:
     step: int  # on the axis of TensorBoard: transitions of a training, episodes of a fine-tuning
 
 
+Checkpoint = TypeVar("Checkpoint", AgentCheckpoint, TrainingCheckpoint)
+
+
 def save_agent(path: Path, agent: AgentCheckpoint) -> None:
     """Write a checkpoint for `load_agent`.
 
@@ -59,7 +64,7 @@ def save_agent(path: Path, agent: AgentCheckpoint) -> None:
 def load_agent(run: Path) -> AgentCheckpoint:
     """Read the agent of a run folder or a checkpoint file. Raises CheckpointError."""
     path = find_agent(run)
-    agent = AgentCheckpoint(**_load(path, AGENT_FORMAT))
+    agent = _load(path, AGENT_FORMAT, AgentCheckpoint)
     check_finite(agent.weights, f"{path} is refused")
     return agent
 
@@ -100,9 +105,23 @@ def forget_training(run: Path) -> None:
 def load_training(run: Path, file_format: str = TRAINING_FORMAT) -> TrainingCheckpoint:
     """Read the state to resume the training in the folder `run` from. Raises CheckpointError."""
     path = find_training(run)
-    training = TrainingCheckpoint(**_load(path, file_format))
-    check_finite(training.state.get("agent", {}), f"{path} is refused")
+    training = _load(path, file_format, TrainingCheckpoint)
+    weights = training.state.get("agent", {})
+    if not isinstance(weights, dict):
+        raise _damaged(path, "its agent is no dictionary")
+    check_finite(weights, f"{path} is refused")
     return training
+
+
+@contextmanager
+def whole_state(source: str) -> Iterator[None]:
+    """Raise CheckpointError that names `source` if the state which is restored lacks a part."""
+    try:
+        yield
+    except KeyError as error:
+        raise CheckpointError(
+            f"{source} is damaged, or of another version of this package: its state lacks {error}; start anew"
+        ) from None
 
 
 def _save(path: Path, file_format: str, content: Mapping[str, Any]) -> None:
@@ -110,7 +129,28 @@ def _save(path: Path, file_format: str, content: Mapping[str, Any]) -> None:
         torch.save({"format": file_format, **moved(content, "cpu")}, file)
 
 
-def _load(path: Path, expected: str) -> dict[str, Any]:
+def _load(path: Path, expected: str, kind: type[Checkpoint]) -> Checkpoint:
+    """Return the checkpoint in a file. Raises CheckpointError for another format, and for damaged parts."""
+    content = _content(path, expected)
+    try:
+        checkpoint = kind(**content)
+    except TypeError:  # a part is missing or unknown
+        raise _damaged(path, f"its parts are {', '.join(map(str, content))}") from None
+    for name, annotation in get_type_hints(kind).items():
+        try:
+            TypeAdapter(annotation).validate_python(getattr(checkpoint, name), strict=True)
+        except ValidationError as error:
+            raise _damaged(path, f"{name}: {error.errors()[0]['msg']}") from None
+    return checkpoint
+
+
+def _damaged(path: Path, why: str) -> CheckpointError:
+    return CheckpointError(
+        f"{path} is damaged, or of another version of this package: {why}; give another one"
+    )
+
+
+def _content(path: Path, expected: str) -> dict[str, Any]:
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch.load raises errors of many kinds for damaged files

@@ -50,8 +50,8 @@ class LearningSettings(Settings):
     def _long_enough(self) -> "LearningSettings":
         if self.transitions < self.carts * self.chunk * self.evaluations:
             raise ValueError(
-                f"transitions {self.transitions} is less than one iteration per evaluation; it must be at "
-                f"least carts * chunk * evaluations = {self.carts * self.chunk * self.evaluations}"
+                f"transitions={self.transitions} is too few; give at least "
+                f"{self.carts * self.chunk * self.evaluations}, or fewer evaluations"
             )
         if self.chunk < self.n_step:
             raise ValueError(f"chunk {self.chunk} must be at least n_step {self.n_step}")

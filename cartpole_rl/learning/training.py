@@ -211,6 +211,7 @@ class Training:
         return {
             "iteration": self.iteration,
             "seconds": self.seconds,
+            "measure": self.measure,
             "scores": [self.best_score, self.last_score],
             "agent": self.agent.state_dict(),
             "optimizer": self.optimizer.state_dict(),
@@ -222,10 +223,13 @@ class Training:
         }
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
-        """Restore the state in `snapshot`."""
+        """Restore the state in `snapshot`; scores in another measure than this training's are forgotten."""
         self.iteration = snapshot["iteration"]
         self.seconds = snapshot["seconds"]
-        self.best_score, self.last_score = snapshot["scores"]
+        if snapshot.get("measure", "score") == self.measure:  # missing in those of earlier versions: (6.2)
+            self.best_score, self.last_score = snapshot["scores"]
+        else:
+            self.best_score, self.last_score = -float("inf"), None
         self.agent.load_state_dict(snapshot["agent"])
         self.optimizer.load_state_dict(snapshot["optimizer"])
         restore_buffer(self.buffer, snapshot["replay"])

@@ -4,6 +4,7 @@ A page needs no other file, no network and no script. `reporting.figures.svg` dr
 """
 
 import html
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -49,6 +50,7 @@ a {{ color: var(--link); }}
 table {{ border-collapse: collapse; }} th, td {{ text-align: left; padding: .25rem 1.2rem .25rem 0; }}
 th {{ color: var(--muted); font-weight: normal; border-bottom: 1px solid var(--muted); }}
 td {{ border-bottom: 1px solid var(--faint); vertical-align: top; }}
+.number {{ white-space: nowrap; }}
 img {{ max-width: 100%; background: {style.PAPER}; border-radius: 4px; }}
 code {{ background: var(--faint); padding: .1rem .3rem; overflow-wrap: anywhere; }}
 @media (max-width: 40rem) {{
@@ -67,6 +69,7 @@ code {{ background: var(--faint); padding: .1rem .3rem; overflow-wrap: anywhere;
   figure, svg, tr, pre {{ break-inside: avoid; }} h2, h3 {{ break-after: avoid; }}
 }}
 """
+NUMBER = re.compile(r"-?\d[\w.,%±() –-]{0,28}$")  # "4104 (4062 to 4177)", "10 of 10"
 Section = Sequence[Mapping[str, str]] | Sequence[str] | str | Path
 
 
@@ -91,14 +94,16 @@ def document(title: str, body: str, extra_style: str = "") -> str:
 def table(rows: Sequence[Mapping[str, Any]], cards: bool = False) -> Html:
     """Return a table headed by the keys of the first row; with `cards` a phone shows each row as a list."""
     head = "".join(f"<th>{html.escape(key)}</th>" for key in rows[0])
-    body = "".join(
-        "<tr>"
-        + "".join(f'<td data-label="{html.escape(key)}">{escaped(cell)}</td>' for key, cell in row.items())
-        + "</tr>"
-        for row in rows
-    )
+    body = "".join(f"<tr>{''.join(_cell(key, cell) for key, cell in row.items())}</tr>" for row in rows)
     opening = '<table class="cards">' if cards else "<table>"
     return Html(f"{opening}<tr>{head}</tr>{body}</table>")
+
+
+def _cell(key: str, content: Any) -> str:
+    """Return a cell; one that starts with a number and is short stays on one line."""
+    text = escaped(content)
+    kind = ' class="number"' if NUMBER.match(text) else ""
+    return f'<td{kind} data-label="{html.escape(key)}">{text}</td>'
 
 
 def page(title: str, sections: Sequence[tuple[str, Any]]) -> str:

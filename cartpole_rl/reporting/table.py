@@ -25,26 +25,40 @@ def table(rows: Sequence[Mapping[str, Cell]], columns: Mapping[str, str] | Seque
     return "\n".join(GAP.join(line).rstrip() for line in zip(*cells, strict=True))
 
 
-def interval_text(mean: float, low: float | None, high: float | None) -> str:
+def interval_text(
+    mean: float,
+    low: float | None,
+    high: float | None,
+    ends: bool = False,
+    most_decimals: int = MOST_DECIMALS,
+) -> str:
     """Return a mean with the half width of its interval: "4210 ± 85".
 
     The half width has two significant digits, or fewer if the mean would have more than three. An asymmetric
-    interval is written by its ends, "4350 (4110 to 4420)". Without an interval (None or not finite) the mean
-    stands alone.
+    interval is written by its ends, "4350 (4110 to 4420)"; with `ends` every one. Without an interval (None
+    or not finite) the mean stands alone.
     """
     if low is None or high is None or not math.isfinite(high - low):
-        return number_text(mean)
+        return number_text(mean, most_decimals)
     below, above = mean - low, high - mean
-    finest = _decimals(mean or max(below, above), DIGITS)
+    finest = min(_decimals(mean or max(below, above), DIGITS), most_decimals)
     decimals = min(_decimals(max(below, above), digits=2) if above > 0 or below > 0 else finest, finest)
-    if abs(below - above) <= ASYMMETRY * max(below, above):
-        return f"{mean:.{decimals}f} ± {(below + above) / 2:.{decimals}f}"
-    return f"{mean:.{decimals}f} ({low:.{decimals}f} to {high:.{decimals}f})"
+    if not ends and abs(below - above) <= ASYMMETRY * max(below, above):
+        return f"{_fixed(mean, decimals)} ± {_fixed((below + above) / 2, decimals)}"
+    return f"{_fixed(mean, decimals)} ({_fixed(low, decimals)} to {_fixed(high, decimals)})"
 
 
-def number_text(value: float) -> str:
+def number_text(value: float, most_decimals: int = MOST_DECIMALS) -> str:
     """Return a number with at least three significant digits: "4210", "12.3", "0.00456"; a dash for NaN."""
-    return f"{value:.{_decimals(value, DIGITS)}f}" if math.isfinite(value) else MISSING
+    if not math.isfinite(value):
+        return MISSING
+    return _fixed(value, min(_decimals(value, DIGITS), most_decimals))
+
+
+def _fixed(value: float, decimals: int) -> str:
+    """Return a number with this many decimals; zero has no minus sign."""
+    text = f"{value:.{decimals}f}"
+    return text if float(text) else text.removeprefix("-")
 
 
 def _decimals(largest: float, digits: int) -> int:

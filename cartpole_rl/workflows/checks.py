@@ -18,7 +18,7 @@ from cartpole_rl.physics.bounds import check_names, check_value, check_values
 from cartpole_rl.plants.model_file import find_model
 from cartpole_rl.plants.settings import LearnedSettings
 from cartpole_rl.randomization.checks import check_carts, check_one_pole
-from cartpole_rl.run_files import CHECKPOINTS, LAST
+from cartpole_rl.run_files import CHECKPOINTS, LAST, METRICS, RESUME
 from cartpole_rl.workflows.config import (
     EvaluateConfig,
     ExportConfig,
@@ -132,6 +132,10 @@ def check_resumable(program: str, resume: str, folder: Path) -> None:
 
 def check_agent(run: Path) -> None:
     """Raise ConfigError or CheckpointError if `run` is not a run folder or file with an agent."""
+    if run == BASELINE:
+        raise ConfigError(
+            f"run={BASELINE}: the baseline has no network; give a training, such as run=pretrained/medium"
+        )
     check_has_agent(run)
     find_agent(run)
 
@@ -144,10 +148,16 @@ def agent_file(run: Path) -> Path | None:
 def check_has_agent(run: Path) -> None:
     """Raise ConfigError if `run` is a run folder without an agent."""
     check_program("run", run, "train", "finetune", "distill")
-    if (program := program_of(run)) and not (run / CHECKPOINTS / LAST).exists():
+    program = program_of(run)
+    if program is None or (run / CHECKPOINTS / LAST).exists():
+        return
+    if not (run / METRICS).exists():
         raise ConfigError(
             f"run={run}: this run of {PREFIX}{program} has no agent yet; {use_of(run, program)}"
         )
+    can_resume = (run / CHECKPOINTS / RESUME).exists()
+    again = f"{PREFIX}{program} resume={run} continues it" if can_resume else f"start {PREFIX}{program} again"
+    raise ConfigError(f"run={run}: it holds no {CHECKPOINTS}/{LAST}; the file was removed; {again}")
 
 
 def check_model(plant: LearnedSettings) -> None:

@@ -285,6 +285,21 @@ class IdentifyConfig(RunSettings, CartSettings, OnCart):
     substeps: Annotated[int, Field(ge=1, le=200)]
     carts: Count
 
+    @model_validator(mode="after")
+    def _recordings_need_no_cart(self) -> Self:
+        """Refuse settings of a cart where recordings are read."""
+        unused = {
+            "plant": self.plant != EmulatedSettings(kind="emulated"),
+            "emulator": self.emulator != EmulatorSettings(),
+        }
+        given = [name for name, changed in unused.items() if changed]
+        if self.source is not None and given:
+            raise ValueError(
+                f"{', '.join(given)}: from={self.source} reads recordings and drives no cart; leave one of "
+                "them out"
+            )
+        return self
+
     @property
     def nominal(self) -> dict[str, float]:
         """The prior values of the cart's and the pole's parameters. Raises ConfigError."""

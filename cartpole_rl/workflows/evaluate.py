@@ -24,7 +24,7 @@ from cartpole_rl.workflows.repeating import Repetition
 from cartpole_rl.workflows.report import report
 from cartpole_rl.workflows.results import plant_words, print_loop_time, print_results, shown
 from cartpole_rl.workflows.run_folder import write_config
-from cartpole_rl.workflows.trained_poles import emulated_words, knows
+from cartpole_rl.workflows.trained_poles import POLES, emulated_words, emulator_for, knows
 
 
 def evaluate(config: EvaluateConfig, folder: Path) -> None:
@@ -106,9 +106,13 @@ def next_command(evaluation: Evaluation) -> str:
     if config.run == BASELINE:
         return "cartpole-train experiment=medium"
     if isinstance(config.plant, SerialSettings | EmulatedSettings):
-        poles = [driven] if knows(known, driven) else known
+        chosen = (
+            knows(known, driven) or emulator_for([driven]) != POLES[0]
+        )  # not a default that it does not fit
+        poles = [driven] if chosen else known
         return f"cartpole-finetune run={shown(config.run)} {plant_words(config.plant, poles)}"
-    return f"cartpole-evaluate run={shown(config.run)} {emulated_words(known)}"
+    poles = known if config.pole is None else [driven]
+    return f"cartpole-evaluate run={shown(config.run)} {emulated_words(poles)}"
 
 
 def compared(again: Repetition, episode: Episode) -> str:

@@ -14,6 +14,7 @@ from torch import nn
 from cartpole_rl.checking import checked
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
+from cartpole_rl.errors import CheckpointError
 from cartpole_rl.evaluation.driver import Driver
 from cartpole_rl.evaluation.publishing import followed
 from cartpole_rl.evaluation.snapshots import Memory
@@ -25,6 +26,7 @@ from cartpole_rl.learning.settings import RayLearnerSettings
 from cartpole_rl.plants.serial.faults import Confirm
 from cartpole_rl.plants.settings import EmulatedSettings
 from cartpole_rl.reporting.tensorboard import TensorBoardLog
+from cartpole_rl.run_files import CHECKPOINTS, PROVENANCE, START
 from cartpole_rl.workflows.agents import new_agent, trained_agent
 from cartpole_rl.workflows.build import (
     evaluated_env,
@@ -44,7 +46,7 @@ from cartpole_rl.workflows.loading import recorded_settings
 from cartpole_rl.workflows.person import confirm, print_message
 from cartpole_rl.workflows.ray_learner.session import RaySession, learner_link
 from cartpole_rl.workflows.resuming import resumed
-from cartpole_rl.workflows.run_folder import write_config
+from cartpole_rl.workflows.run_folder import AGENT_HASH, file_hash, recorded_provenance, write_config
 from cartpole_rl.workflows.trained_poles import other_pole
 
 
@@ -65,7 +67,7 @@ def finetune(config: FinetuneConfig, folder: Path, new_learner: bool = False) ->
         values = {**checkpoint.config, "resume": config.resume, **learner}
         config = recorded_settings(FinetuneConfig, values, f"resume={config.resume}")
     files = FinetuningFiles(folder, config)
-    run = files.start if checkpoint and files.start.exists() else check_finetuning(config)
+    run = started_from(files) if checkpoint else check_finetuning(config)
     use_threads(config.threads)
     seed_everything(config.seed)
     agent = trained_agent(run)
@@ -82,8 +84,9 @@ def finetune(config: FinetuneConfig, folder: Path, new_learner: bool = False) ->
         start = find_agent(run)
         content = config.model_dump(mode="json")
         write_config(folder, "finetune", content, resumed=checkpoint is not None, agent=start)
-        if not checkpoint:
+        if run != files.start:
             write_bytes(files.start, start.read_bytes())
+        if not checkpoint:
             files.save({}, 0)
         tuned = TunedAgent(training, load_agent(start), checkpoint)
         live = LiveView(view_title(config.plant), config.view)
@@ -101,6 +104,22 @@ def finetune(config: FinetuneConfig, folder: Path, new_learner: bool = False) ->
                 LocalSession(files, cart, tuned, settings).run()
             else:
                 RaySession(files, cart, tuned, settings, link).run()
+
+
+def started_from(files: FinetuningFiles) -> Path:
+    """Return the agent that an interrupted fine-tuning started from: its copy, or that of `run` if unchanged.
+
+    Raises CheckpointError, ConfigError.
+    """
+    if files.start.exists():
+        return files.start
+    run = check_finetuning(files.config)
+    if file_hash(find_agent(run)) != recorded_provenance(files.folder).get(AGENT_HASH):
+        raise CheckpointError(
+            f"resume={files.folder}: it holds no {CHECKPOINTS}/{START}, and by {PROVENANCE} the agent of "
+            f"run={run} is not the one that it started from; cartpole-finetune run={run} starts anew"
+        )
+    return run
 
 
 def driven_env(

@@ -12,10 +12,12 @@ from cartpole_rl.agents.dqn import QAgent
 from cartpole_rl.envs.build import environment, randomizer, simulated_env
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
+from cartpole_rl.errors import RecordingError
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.identification.fit import Fit, best_fit
 from cartpole_rl.identification.unknowns import LONGEST_LATENCY
 from cartpole_rl.identification.windows import cut_windows
+from cartpole_rl.learning.checkpoints import whole_state
 from cartpole_rl.learning.finetuning import Finetuning, recorded_chunk
 from cartpole_rl.learning.settings import FinetuningSettings, LearningSettings
 from cartpole_rl.learning.training import Scalars, Training
@@ -76,7 +78,7 @@ class CartLearner:
     def start(self, recorded: Sequence[Episode], rounds: int = 0) -> None:
         """Fit the simulator to the `recorded` episodes and prepare learning.
 
-        The agent has made `rounds` rounds already: the schedules continue there.
+        The agent has made `rounds` rounds already: the schedules continue there. Raises RecordingError.
         """
         fit, models = self.fit_simulator(recorded)
         self.carts = self.draw_carts(fit)
@@ -86,10 +88,11 @@ class CartLearner:
 
     def restore(self, recorded: Sequence[Episode], snapshot: Mapping[str, Any]) -> None:
         """Continue from `snapshot`; `recorded` are the episodes that were learned from until then."""
-        self.carts = snapshot["carts"]
-        friction = CartFriction(snapshot["cart_friction"])
-        self.prepare(recorded, self.candidates[0]._replace(cart_friction=friction))
-        self.started.restore(snapshot)
+        with whole_state(f"resume={self.config.resume}"):
+            self.carts = snapshot["carts"]
+            friction = CartFriction(snapshot["cart_friction"])
+            self.prepare(recorded, self.candidates[0]._replace(cart_friction=friction))
+            self.started.restore(snapshot)
 
     def snapshot(self) -> dict[str, Any]:
         """Return the state from which `restore` continues, to be saved at once."""
@@ -119,9 +122,16 @@ class CartLearner:
         self.started.add(self.transitions(episode))
 
     def refit(self, recorded: Sequence[Episode]) -> None:
-        """Fit the simulator to the `recorded` episodes, and continue with carts drawn from that fit."""
-        fit, _ = self.fit_simulator(recorded)
-        self.carts = self.draw_carts(fit)
+        """Fit the simulator to the `recorded` episodes, and continue with carts drawn from that fit.
+
+        An episode that no cart drives, as with a loose encoder, leaves the earlier fit.
+        """
+        try:
+            fit, _ = self.fit_simulator(recorded)
+            self.carts = self.draw_carts(fit)
+        except RecordingError as error:
+            self.show(f"the simulator keeps its earlier fit: {error}")
+            return
         self.started.simulate(self.randomizer())
 
     def make_loop(self, models: Models) -> Finetuning:

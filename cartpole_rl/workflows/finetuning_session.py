@@ -7,7 +7,7 @@ from cartpole_rl.agents.dqn import QAgent
 from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
 from cartpole_rl.evaluation.driving_policy import Weights, as_weights
 from cartpole_rl.evaluation.metrics import episode_metrics, summarize
-from cartpole_rl.learning.checkpoints import AgentCheckpoint, TrainingCheckpoint
+from cartpole_rl.learning.checkpoints import AgentCheckpoint, TrainingCheckpoint, restore_weights
 from cartpole_rl.learning.training import Scalars
 from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.reporting.scores import SCORES, score_table
@@ -43,7 +43,7 @@ class TunedAgent:
         self.state: dict[str, Any] = {}
         if checkpoint and checkpoint.state:
             self.learned, self.state = checkpoint.step, checkpoint.state
-            self.agent.load_state_dict(self.state["agent"])
+            restore_weights(self.agent, self.state.get("agent", {}), "the state to resume from")
 
     @property
     def weights(self) -> Weights:

@@ -1,7 +1,10 @@
 """The person at the terminal."""
 
+import os
 import sys
 from contextlib import suppress
+
+READER_LEFT = 141  # exit code, as of a program that SIGPIPE ends
 
 
 def confirm(text: str) -> bool:
@@ -36,3 +39,12 @@ def print_message(name: str, message: str) -> None:
     """Print one line on stderr; do nothing if the terminal is closed."""
     with suppress(OSError):
         print(f"cartpole-{name.replace('_', '-')}: {message}", file=sys.stderr)
+
+
+def exit_if_nobody_reads() -> None:
+    """Exit with READER_LEFT if the reader of standard output, such as `head`, has left."""
+    try:
+        print(flush=True)  # a flush alone may find the text of the failed one gone
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for Python's last flush
+        sys.exit(READER_LEFT)

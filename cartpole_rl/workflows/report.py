@@ -26,7 +26,9 @@ def report(
     onboard: Sequence[Episode] = (),
     mp4: bool = False,
 ) -> dict[str, Any]:
-    """Write metrics.json and figures/ into `folder`, and return the summary of the episodes (`summarize`).
+    """Write figures/ and metrics.json into `folder`, and return the summary of the episodes (`summarize`).
+
+    metrics.json is written last: a run that has it is complete.
 
     Behaviour figure and animation show the first episode; `mp4` adds the animation as an MP4. `history` adds
     the learning curve, `onboard` the episodes that the cart's board drove, under that key of metrics.json and
@@ -43,11 +45,11 @@ def report(
         summary["onboard"], listed = summarized(onboard, x_max)
         content["onboard"] = {**summary["onboard"], "episodes": listed}
         draw(onboard[0], figures, "onboard_", f"plant={plant}, on the board", pole, x_max, mp4)
-    write_json(folder / METRICS, content)
     draw(episodes[0], figures, "", f"plant={plant}", pole, x_max, mp4)
     if history:
         curve = learning_curve([(task.measure, list(history))], measure=task.measure)
         save(curve, figures / "learning_curve.png")
+    write_json(folder / METRICS, content)
     return summary
 
 

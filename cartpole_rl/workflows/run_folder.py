@@ -59,11 +59,14 @@ def write_config(
 ) -> None:
     """Write config.yaml and provenance.json of a run of cartpole-<program>, which starts from `agent`.
 
-    A resumed run adds its provenance to that of the first start. Raises ConfigError if a new run would
-    overwrite another one.
+    A resumed run adds its provenance to that of the first start, which is begun anew if it is damaged. Raises
+    ConfigError if a new run would overwrite another one.
     """
+    head = {"program": f"{PREFIX}{program}", "seed": config["seed"]}
+    if agent:
+        head[AGENT_HASH] = file_hash(agent)
     if resumed:
-        first = json.loads((folder / PROVENANCE).read_text(encoding="utf-8"))
+        first = recorded_provenance(folder) or {**head, **provenance()}
         resumptions = [*first.get("resumed", []), provenance()]
         write_json(folder / PROVENANCE, {**first, "resumed": resumptions})
         return
@@ -71,9 +74,6 @@ def write_config(
         raise ConfigError(f"hydra.run.dir={folder}: it holds a run already; give another folder")
     folder.mkdir(parents=True, exist_ok=True)
     write_text(folder / CONFIG, yaml.safe_dump(dict(config), sort_keys=False))
-    head = {"program": f"{PREFIX}{program}", "seed": config["seed"]}
-    if agent:
-        head[AGENT_HASH] = file_hash(agent)
     write_json(folder / PROVENANCE, {**head, **provenance()})
 
 

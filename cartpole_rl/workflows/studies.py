@@ -1,5 +1,8 @@
 """Studies by name: those of conf/study/, or of a folder of a user's own."""
 
+import json
+import re
+import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,6 +21,8 @@ NEAR = 0.5  # similarity of two names, from which one is suggested for the other
 def study_names(source: Path = STUDIES) -> list[str]:
     """Return the names of all studies in `source`, in the order of the page. Raises ConfigError."""
     names = [path.stem for path in source.glob("*.yaml")]
+    if not names:
+        raise ConfigError(f"{source}: it holds no study")
     return sorted(names, key=lambda name: (load_study(name, source).order, name))
 
 
@@ -48,6 +53,25 @@ def unknown(kind: str, name: str, names: Iterable[str]) -> str:
     return f"{name}: there is no such {kind}; {hint}"
 
 
-def overrides_of(words: Sequence[str]) -> dict[str, Any]:
-    """Return overrides as on a command line by name, their values as YAML reads them; the last one counts."""
-    return {setting(word): yaml.safe_load(word.partition("=")[2]) for word in words}
+def overrides_of(words: Sequence[str], root: Path | None = None) -> dict[str, Any]:
+    """Return overrides as on a command line by name, their values as YAML reads them; the last one counts.
+
+    Paths below `root` are taken as they are: a folder's name may hold what means something else in YAML.
+    """
+    return {setting(word): yaml.safe_load(_quoted(word.partition("=")[2], root)) for word in words}
+
+
+def as_word(name: str, value: Path) -> str:
+    """Return an override for a command line, in quotes where Hydra and the shell need them."""
+    text = str(value)
+    if not re.fullmatch(r"[A-Za-z0-9_./:%+-]+", text):
+        text = '"' + re.sub(r'(\\*)"', r"\1\1\"", text) + '"'
+    return shlex.quote(f"{name}={text}")
+
+
+def _quoted(value: str, root: Path | None) -> str:
+    """Return a value with each path below `root` in quotes: a value of its own, or one of a list."""
+    if root is None:
+        return value
+    below = rf"(?<![^\[,\s]){re.escape(f'{root}/')}[^,\]]*[^,\]\s]"
+    return re.sub(below, lambda path: json.dumps(path[0], ensure_ascii=False), value)

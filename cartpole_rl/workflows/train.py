@@ -11,7 +11,7 @@ from cartpole_rl.envs.settings import GuardSettings
 from cartpole_rl.evaluation.driving_policy import DrivingPolicy, as_weights
 from cartpole_rl.evaluation.episodes import Policy, run_batch
 from cartpole_rl.files import claimed
-from cartpole_rl.learning.checkpoints import forget_training, restore_weights
+from cartpole_rl.learning.checkpoints import forget_training, restore_weights, whole_state
 from cartpole_rl.learning.randomness import seed_everything
 from cartpole_rl.learning.training import Training
 from cartpole_rl.plants.effects import without_effect
@@ -56,7 +56,9 @@ def train(config: TrainConfig, folder: Path) -> float:
     env = simulated_env(config, config.plant, carts, start, config.seed, config.compile, config.device)
     agent = new_agent(config, config.device)
     if checkpoint:
-        restore_weights(agent, checkpoint.state["agent"], f"resume={folder}")  # its error precedes any work
+        restore_weights(
+            agent, checkpoint.state.get("agent", {}), f"resume={folder}"
+        )  # its error precedes any work
     policy = DrivingPolicy(agent.greedy_policy(), config.compile)
     evaluate = partial(judge_agent, nominal_env(config), agent, policy, config.seed)
     with claimed(folder):
@@ -78,7 +80,8 @@ def train(config: TrainConfig, folder: Path) -> float:
                 config.task.measure,
             )
             if checkpoint:
-                training.restore(checkpoint.state)
+                with whole_state(f"resume={folder}"):
+                    training.restore(checkpoint.state)
             else:
                 monitor.randomization(env.plant)
             training.run()

@@ -3,17 +3,24 @@
 import errno
 import os
 import signal
+import subprocess
+import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from unittest.mock import patch
 
 import pytest
 from command_line import HANDLED
+from hydra._internal.core_plugins.basic_launcher import BasicLauncher
+from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.plugins import Plugins
+from hydra.core.utils import JobReturn
 
 from cartpole_rl.commands.find_port import FindPortConfig
 from cartpole_rl.commands.hydra_application.application import application
-from cartpole_rl.commands.hydra_application.exits import exit_with_message
+from cartpole_rl.commands.hydra_application.exits import Terminated, exit_with_message
 from cartpole_rl.signals import UNWINDING, RaiseOnce, ending_signals
 
 
@@ -104,3 +111,79 @@ def test_a_full_disk_ends_a_command_with_one_line(
 def test_an_error_of_the_system_that_concerns_no_file_is_raised() -> None:
     with pytest.raises(OSError, match="Bad file descriptor"):
         exit_with_message("train", OSError(errno.EBADF, "Bad file descriptor"))
+
+
+def test_a_pipe_without_a_reader_ends_a_command_quietly() -> None:
+    """As in `cartpole-train --cfg job | head -1`, once `head` has ended."""
+    program = (
+        "from cartpole_rl.commands.hydra_application.exits import exit_with_message\n"
+        "try:\n"
+        "    print('x' * 100_000)\n"
+        "except OSError as error:\n"
+        "    exit_with_message('train', error)\n"
+    )
+    reader, writer = os.pipe()
+    os.close(reader)
+    command = [sys.executable, "-c", program]
+    done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, check=False)
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (141, b"")
+
+
+def test_another_broken_pipe_is_raised() -> None:
+    with pytest.raises(BrokenPipeError):
+        exit_with_message("train", BrokenPipeError(errno.EPIPE, "Broken pipe"))
+
+
+class FreshLauncher(BasicLauncher):
+    """Starts jobs with the signals that a new process has, as joblib's workers do."""
+
+    def launch(self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int) -> Sequence[JobReturn]:
+        """Launch them."""
+        for number in HANDLED:
+            signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
+        return super().launch(job_overrides, initial_job_idx)
+
+
+@pytest.fixture
+def fresh_launcher() -> str:
+    Plugins.instance().register(FreshLauncher)
+    target = f"{FreshLauncher.__module__}.{FreshLauncher.__name__}"
+    ConfigStore.instance().store(group="hydra/launcher", name="fresh", node={"_target_": target})
+    return "hydra/launcher=fresh"
+
+
+def test_a_job_in_a_process_of_its_own_unwinds_after_a_signal(
+    fresh_launcher: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    happened: list[str] = []
+
+    @application("find_port", FindPortConfig)
+    def main(config: FindPortConfig, run: Path) -> None:
+        assert isinstance(signal.getsignal(signal.SIGTERM), RaiseOnce)  # or pytest would end here
+        with pytest.raises(Terminated):
+            signal.raise_signal(signal.SIGTERM)
+        happened.append("unwound")
+
+    GlobalHydra.instance().clear()
+    monkeypatch.chdir(tmp_path)
+    with patch("sys.argv", ["cartpole-find-port", "-m", fresh_launcher]):
+        main()
+    assert happened == ["unwound"]
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL  # as the launcher left it
+
+
+def test_a_job_that_a_signal_ended_ends_its_process_by_that_signal() -> None:
+    """So that the launcher reports it."""
+    program = (
+        "import os, signal, time\n"
+        "from cartpole_rl.commands.hydra_application.exits import job_signals\n"
+        "with job_signals():\n"
+        "    try:\n"
+        "        os.kill(os.getpid(), signal.SIGTERM)\n"
+        "        time.sleep(5)\n"
+        "    finally:\n"
+        "        print('unwound', flush=True)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert (done.stdout, done.returncode) == ("unwound\n", -signal.SIGTERM)

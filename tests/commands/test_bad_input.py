@@ -34,6 +34,8 @@ WRONG_TRAINING = [
     ("seed", "seed", "key=value"),
     ("--seed=1", "--seed=1", "without dashes: seed=1"),
     ("--seed 1", "--seed: ", "without dashes: seed=1"),
+    ("--hlep", "--hlep", "did you mean --help?"),
+    ("--cfg", "--cfg", "give --cfg job"),
     ("learning.epsilon=0.5", "learning.epsilon=0.5", "give a list, as [0.5,0.02]"),
     ("learning.epsilon=[0.5]", "learning.epsilon: ", "value 2 is missing"),
     ("learning.transitions=many", "learning.transitions=many", "give an integer"),
@@ -51,7 +53,7 @@ WRONG_TRAINING = [
     ("randomization.cart_mass.relative=[-1.5,0]", "cart_mass", "above 0"),
     ("randomization.cart_mass.relative=[0.2,-0.2]", "randomization.cart_mass", "wrong order"),
     ("randomization=none +randomization.track_tilt={relative:[-1,1]}", "track_tilt", "give absolute bounds"),
-    ("learning.transitions=100", "learning", "must be at least"),
+    ("learning.transitions=100", "learning: transitions=100 is too few", "or fewer evaluations"),
     ("agent.target_period=10", "agent", "either target_tau or target_period"),
     ("actions.motors=[100,100]", "actions", "two or more different values"),
     ("plant=emulated", "plant=emulated: ", "use cartpole-evaluate for plant=emulated"),
@@ -79,6 +81,34 @@ def test_a_choice_file_that_is_no_yaml(tmp_path: Path) -> None:
     problem = "expected ',' or ']', but got '<stream end>'"
     assert done.complaint == f"cartpole-train: pole=mine.yaml is not valid YAML, line 2: {problem}"
     assert done.code == 2
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("", "cart_mass is missing; give it, or take what is missing from a choice: defaults: [ip02]"),
+        ("mas: 1\n", "mas: there is no such setting; did you mean cart_mass?"),
+        ("defaults: [ip02]\nmas: 1\n", "mas: there is no such setting; did you mean cart_mass?"),
+    ],
+)
+def test_a_cart_file_names_what_is_wrong_with_it(text: str, complaint: str, tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_text(text)
+    done = in_process("train", "cart=mine.yaml", folder=tmp_path)
+    assert (done.complaint, done.code) == (f"cartpole-train: cart=mine.yaml: {complaint}", 2)
+
+
+def test_a_file_that_is_no_choice_file(tmp_path: Path) -> None:
+    (tmp_path / "mine.md").write_text("# My cart\n")
+    done = in_process("train", "cart=mine.md", folder=tmp_path)
+    assert done.complaint == "cartpole-train: cart=mine.md: a file of your own must end in .yaml"
+    assert done.code == 2
+
+
+@pytest.mark.parametrize("command", ["finetune", "distill"])
+def test_the_baseline_has_nothing_to_train_further(command: str, tmp_path: Path) -> None:
+    done = in_process(command, "run=lqr", folder=tmp_path)
+    remedy = "the baseline has no network; give a training, such as run=pretrained/medium"
+    assert (done.complaint, done.code) == (f"cartpole-{command}: run=lqr: {remedy}", 2)
 
 
 def test_a_plant_file_without_a_kind(tmp_path: Path) -> None:
@@ -241,6 +271,17 @@ def test_resuming_takes_no_other_setting(words: str, remedy: str, trained: Path)
     assert not (trained.parent / "other").exists()
 
 
+def test_a_run_whose_checkpoint_was_removed(trained: Path, tmp_path: Path) -> None:
+    shutil.copytree(trained, tmp_path / "mine")
+    (tmp_path / "mine/checkpoints/last.pt").unlink()
+    complaint = in_process("evaluate", "run=mine", folder=tmp_path).complaint
+    removed = "run=mine: it holds no checkpoints/last.pt; the file was removed"
+    assert complaint == f"cartpole-evaluate: {removed}; start cartpole-train again"
+    (tmp_path / "mine/checkpoints/resume.pt").write_text("")
+    complaint = in_process("evaluate", "run=mine", folder=tmp_path).complaint
+    assert complaint == f"cartpole-evaluate: {removed}; cartpole-train resume=mine continues it"
+
+
 def test_resuming_a_folder_without_a_training(files: Path) -> None:
     done = in_process("train", "resume=resume.pt", folder=files)
     assert "give the run folder of a training" in done.complaint
@@ -315,16 +356,16 @@ def test_without_a_compiler_the_remedy_is_stated(tmp_path: Path, monkeypatch: py
 
 
 def test_in_a_multirun_the_other_jobs_run(tmp_path: Path) -> None:
-    done = in_process("train", "-m", *TINY, ONCE, "agent.gamma=1.5,0.9", folder=tmp_path)
+    done = in_process("train", "-m", *TINY, ONCE, "cart.cart_mass=-1,0.9", folder=tmp_path)
     assert done.code == 1
-    assert "agent.gamma=1.5: give less than 1" in done.err.splitlines()[0]
+    assert "cart_mass is -1; it must be above 0" in done.err.splitlines()[0]
     assert "Traceback" not in done.err
     finished = list(tmp_path.glob("runs/train/*_multirun/*/metrics.json"))
-    assert [path.parent.name for path in finished] == ["1_agent.gamma-0.9"]
+    assert [path.parent.name for path in finished] == ["1_cart.cart_mass-0.9"]
     assert not (finished[0].parent / "error.txt").exists()
     assert done.err.splitlines()[-2:] == [
         f"cartpole-train: 1 of 2 jobs failed in {finished[0].parents[1].relative_to(tmp_path)}:",
-        "cartpole-train: 0_agent.gamma-1.5: agent.gamma=1.5: give less than 1",
+        "cartpole-train: 0_cart.cart_mass--1: cart_mass is -1; it must be above 0",
     ]
 
 

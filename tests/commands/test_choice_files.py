@@ -36,19 +36,21 @@ def test_a_file_becomes_a_choice_while_the_command_runs(tmp_path: Path) -> None:
 def test_files_of_equal_names_get_different_ones(tmp_path: Path) -> None:
     for number, name in enumerate(("first", "second")):
         (tmp_path / name).mkdir()
-        (tmp_path / name / "cart.yaml").write_text(f"cart_mass: {number}\n")
+        (tmp_path / name / "cart.yaml").write_text(f"defaults: [ip02]\ncart_mass: {number}\n")
     both = f"cart={tmp_path}/first/cart.yaml,{tmp_path}/second/cart.yaml"
     with with_choice_files([both]) as words:
         assert words[0] == "cart=cart,second_cart"
         folder = search_path(words) / "cart"
-        masses = [yaml.safe_load((folder / f"{name}.yaml").read_text()) for name in ("cart", "second_cart")]
-        assert masses == [{"cart_mass": 0}, {"cart_mass": 1}]
+        carts = [yaml.safe_load((folder / f"{name}.yaml").read_text()) for name in ("cart", "second_cart")]
+        assert [cart["cart_mass"] for cart in carts] == [0, 1]
 
 
 def test_choices_and_files_can_be_mixed(tmp_path: Path) -> None:
     (tmp_path / "mine.yaml").write_text("")
     with with_choice_files([f"pole=large,{tmp_path}/mine.yaml"]) as words:
         assert words[0] == "pole=large,mine"
+    with with_choice_files([f"pole={tmp_path}/mine.yaml,large"]) as words:
+        assert words[0] == "pole=mine,large"
 
 
 def refused(word: str) -> str:

@@ -8,10 +8,12 @@ from hydra.errors import HydraException, OverrideParseException
 from cartpole_rl.choices import default_choices
 from cartpole_rl.commands.hydra_application.complaints import (
     WHOLE,
+    composed_settings,
     dashed_setting,
     hydra_complaint,
     in_one_line,
     nearest_choice,
+    wrong_option,
 )
 
 
@@ -134,3 +136,26 @@ def test_no_hint_without_a_near_choice() -> None:
 )
 def test_a_setting_with_dashes_is_found(words: list[str], message: str | None) -> None:
     assert dashed_setting(words) == message
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["seed=1", "--hlep"], "--hlep: did you mean --help?"),
+        (["--verison"], "--verison: did you mean --version?"),
+        (["--cfg"], "--cfg: give --cfg job"),
+        (["-c", "seed=1"], "-c: give -c job"),
+        (["--cfg", "job", "--help"], None),
+        (["--resume=runs/train/first", "--run=lqr", "--seed", "1"], None),
+        (["--mult", "--config-dir=mine"], None),
+    ],
+)
+def test_a_misspelt_option_is_found(words: list[str], message: str | None) -> None:
+    assert wrong_option(words) == message
+
+
+@pytest.mark.parametrize("command", ["train", "evaluate", "finetune"])
+def test_no_setting_is_taken_for_an_option(command: str) -> None:
+    settings = {setting.partition(".")[0] for setting in composed_settings(command, [])}
+    assert len(settings) > 5
+    assert [setting for setting in settings if wrong_option([f"--{setting}"])] == []

@@ -48,7 +48,7 @@ def test_bad_input_is_answered_with_one_line(trained: Path, tmp_path: Path) -> N
         f"run={trained} hidden=[]": "hidden",
         f"run={trained} hidden=[7]": "even numbers of units",
         f"run={trained} distillation.rounds=0": "give at least 1",
-        "run=lqr": "run=lqr: there is no such file or folder",
+        "run=lqr": "run=lqr: the baseline has no network",
     }.items():
         done = in_process("distill", *words.split(), "hydra.run.dir=run", folder=tmp_path)
         assert done.code in (1, 2)

@@ -10,6 +10,7 @@ import yaml
 from command_line import in_process
 from hydra_configs import shipped_choices
 
+from cartpole_rl import __version__
 from cartpole_rl.checking import checked
 from cartpole_rl.choices import conf_folder
 from cartpole_rl.commands.find_port import FindPortConfig
@@ -82,6 +83,18 @@ def test_help_says_what_the_command_does_and_its_three_examples_compose(command:
             one_job = "-m" in words
             words = [word.partition(",")[0] if one_job else word for word in words if word != "-m"]
             checked(SCHEMAS[command], as_mapping(hydra.compose(command, words)))
+
+
+@pytest.mark.parametrize("command", SCHEMAS)
+def test_help_names_pages_that_exist(command: str, tmp_path: Path) -> None:
+    pages = re.findall(r"docs/[\w-]+\.md", in_process(command, "--help", folder=tmp_path).out)
+    assert pages
+    assert [page for page in pages if not Path(conf_folder().parent, page).is_file()] == []
+
+
+def test_version_is_that_of_the_package(tmp_path: Path) -> None:
+    done = in_process("train", "--version", folder=tmp_path)
+    assert (done.code, done.out) == (0, f"cartpole_rl {__version__}\n")
 
 
 @pytest.mark.parametrize(

@@ -107,6 +107,18 @@ class TestBadInput:
         assert done.code == 1
         assert "give two recordings or more" in done.err
 
+    @pytest.mark.parametrize(
+        ("words", "named"),
+        [
+            (("plant=serial", "plant.port=/dev/ttyUSB0"), "plant"),
+            (("plant.rehome=always", "emulator.latency=0.01"), "plant, emulator"),
+        ],
+    )
+    def test_a_cart_beside_recordings(self, words: tuple[str, ...], named: str, tmp_path: Path) -> None:
+        done = in_process("identify", "from=recorded", *words, folder=tmp_path)
+        remedy = "from=recorded reads recordings and drives no cart; leave one of them out"
+        assert (done.complaint, done.code) == (f"cartpole-identify: {named}: {remedy}", 2)
+
     def test_several_poles(self, tmp_path: Path) -> None:
         done = in_process("identify", "pole=both", folder=tmp_path)
         assert done.code == 2

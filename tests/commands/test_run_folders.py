@@ -1,6 +1,7 @@
 """Contents of run folders, equal seeds, sweeps, and trainings that were killed."""
 
 import json
+import shutil
 import subprocess
 import sys
 import time
@@ -59,6 +60,19 @@ def test_a_training_that_runs_is_not_resumed(stopped: Path) -> None:
     remedy = f"another process works in {stopped}; wait for its end, or stop it"
     assert (done.complaint, done.code) == (f"cartpole-train: {remedy}", 2)
     assert (stopped / "provenance.json").read_bytes() == before
+
+
+@pytest.mark.parametrize("part", ["agent", "optimizer", "collector"])
+def test_a_training_whose_state_lacks_a_part_is_not_resumed(part: str, stopped: Path, tmp_path: Path) -> None:
+    run = shutil.copytree(stopped, tmp_path / "run")
+    content = torch.load(run / "checkpoints/resume.pt", weights_only=True)
+    del content["state"][part]
+    torch.save(content, run / "checkpoints/resume.pt")
+    done = in_process("train", f"resume={run}", folder=tmp_path)
+    last = done.err.splitlines()[-1]
+    assert (f"lacks '{part}'; start anew" if part != "agent" else "other weights; train it again") in last
+    assert "Traceback" not in done.err
+    assert done.code == 1
 
 
 def test_a_training_writes_the_files_of_runs_readme(trained: Path) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from command_line import Outcome, in_process
 
-from cartpole_rl.workflows.run_folder import USES, program_of
+from cartpole_rl.workflows.run_folder import USES, program_of, write_config
 
 MADE_BY = (*USES, "unfinished", "multirun")
 WHAT_TO_DO = {  # with a folder, by what made it
@@ -108,3 +108,15 @@ def test_the_runs_of_other_commands_are_refused(words: str, runs: Path) -> None:
         assert done.out == ""
         assert contents(runs) == before
         assert not list(runs.glob("runs/*/*"))
+
+
+@pytest.mark.parametrize("damaged", ['{"program": "cartpole-tr', "[]", None])
+def test_a_run_whose_provenance_is_damaged_can_be_resumed(damaged: str | None, tmp_path: Path) -> None:
+    write_config(tmp_path, "train", {"seed": 4})
+    (tmp_path / "provenance.json").unlink()
+    if damaged is not None:
+        (tmp_path / "provenance.json").write_text(damaged)
+    write_config(tmp_path, "train", {"seed": 4}, resumed=True)
+    assert program_of(tmp_path) == "train"
+    again = json.loads((tmp_path / "provenance.json").read_text())
+    assert (again["seed"], len(again["resumed"])) == (4, 1)

@@ -9,7 +9,7 @@ from command_line import in_process
 from cartpole_rl.commands.hydra_application.complaints import EXTRAS
 from cartpole_rl.commands.hydra_application.sweeps import as_multirun
 
-FAILS = "agent.gamma=1.5"  # at once
+FAILS = "cart.cart_mass=-1"  # at once, by a check of the job: the type is right
 
 
 def test_a_sweep_needs_no_dash_m(tmp_path: Path) -> None:
@@ -19,8 +19,23 @@ def test_a_sweep_needs_no_dash_m(tmp_path: Path) -> None:
     report = done.err.splitlines()[-11:]
     assert report[0] == f"cartpole-train: 10 of 10 jobs failed in {folder.relative_to(tmp_path)}:"
     assert report[1:] == [
-        f"cartpole-train: {seed}_seed-{seed}: {FAILS}: give less than 1" for seed in range(10)
+        f"cartpole-train: {seed}_seed-{seed}: cart_mass is -1; it must be above 0" for seed in range(10)
     ]
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        ("-m seed=0,x", "seed=x: give an integer"),
+        ("sweep=seeds agent.gamma=1.5", "agent.gamma=1.5: give less than 1"),
+        ("-m learning.transitions=1000000,100", "learning: transitions=100 is too few"),
+    ],
+)
+def test_a_wrong_value_ends_a_sweep_before_its_first_job(words: str, complaint: str, tmp_path: Path) -> None:
+    done = in_process("train", *words.split(), folder=tmp_path)
+    assert done.complaint.startswith(f"cartpole-train: {complaint}")
+    assert done.code == 2
+    assert not list(tmp_path.iterdir())
 
 
 def test_the_command_line_replaces_values_of_a_sweep(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from command_line import BIN, COARSE, interrupt_after
+from command_line import BIN, COARSE, DISTILLATION, interrupt_after
 from page_commands import (
     BUDGET,
     IDENTIFYING,
@@ -34,6 +34,7 @@ VERBS = (
     "identify",
     "model",
     "finetune",
+    "distill",
     "emulate",
     "find-port",
     "preflight",
@@ -151,6 +152,14 @@ def test_finetune(command: str, trained: Path, serial_port: Callable[[], str]) -
     result = run_here(command, *TUNING, f"hydra.run.dir={folder}", cwd=trained)
     assert result.returncode == 0, result.stderr
     assert (trained / folder / "checkpoints/last.pt").exists()
+
+
+def test_distill(trained: Path) -> None:
+    (command,) = listed("cartpole-distill")
+    folder = "hydra.run.dir=runs/distill/first"
+    result = run_here(command.replace("<run>", "first"), *DISTILLATION, folder, cwd=trained)
+    assert result.returncode == 0, result.stderr
+    assert (trained / "runs/distill/first/checkpoints/last.pt").exists()
 
 
 @pytest.mark.parametrize("command", [*listed("cartpole-report"), *listed("cartpole-export")])

@@ -2,16 +2,21 @@
 
 import math
 from collections.abc import Callable
+from contextlib import closing
 
 import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
 
+from cartpole_rl.emulator.settings import EmulatorSettings
+from cartpole_rl.envs.build import environment, shipped_settings
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
-from cartpole_rl.evaluation.episodes import run_episodes
+from cartpole_rl.evaluation.episodes import run_episodes, run_many
+from cartpole_rl.plants.emulated import emulated_plant
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.tasks.settings import Start, StartSettings
+from cartpole_rl.wire import Flags
 
 RIGHT, NONE = 2, 1  # of the motor values -200, 0, 200
 
@@ -156,3 +161,20 @@ def test_the_same_seed_gives_the_same_episodes(make_plant: Callable, make_enviro
         runs.append(np.concatenate([episode.theta for episode in run_episodes(env, always(RIGHT), 8)]))
     assert np.array_equal(runs[0], runs[1])
     assert not np.array_equal(runs[0], runs[2])
+
+
+def test_an_error_on_the_way_leaves_no_cart_armed() -> None:
+    settings = shipped_settings({"task.time_limit": 40})
+    plant = emulated_plant(EmulatorSettings(physics_step=1e-3), settings.control_period)
+    chosen = iter(range(3))
+
+    def policy(seen: TensorDictBase) -> TensorDictBase:
+        next(chosen)
+        return always(0)(seen)
+
+    with closing(environment(settings, plant)) as env:
+        with pytest.raises(StopIteration):
+            run_many(env, policy)
+        state = plant.cart.poll_state()
+        assert state.motor_applied == 0
+        assert not plant.cart.flags & Flags.ARMED

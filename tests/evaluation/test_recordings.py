@@ -71,6 +71,9 @@ def test_any_reader_of_csv_sees_columns_with_units(tmp_path: Path, episode: Epis
         (lambda text: with_cell(text, 2, "theta_rad", "nan"), "theta is not finite in row 2"),
         (lambda text: with_cell(text, 2, "time_s", "0.0"), "time does not increase in row 2"),
         (lambda text: with_cell(text, 1, "motor", "999"), "beyond 255 in row 1; record it again"),
+        (lambda text: with_cell(text, 1, "motor", str(-(2**63))), "beyond 255 in row 1; record it again"),
+        (lambda text: with_cell(text, 3, "pole_counts", str(10**25)), "beyond 2147483647 in row 3; record"),
+        (lambda text: with_cell(text, 4, "cart_counts", str(-(2**63))), "beyond 2147483647 in row 4; record"),
         (lambda text: text[: len(text) // 2], "damaged"),
     ],
 )

@@ -46,6 +46,12 @@ def test_the_newest_snapshot_is_read() -> None:
     assert read(memory) == (2, numbered(2))
 
 
+def test_more_lost_frames_than_a_cart_can_count_are_published() -> None:
+    memory, many = new_memory(), numbered(1)._replace(lost_frames=2**32 + 5, late_ticks=2**33)
+    write(memory, 1, many)
+    assert read(memory) == (1, many)
+
+
 def test_a_snapshot_that_is_being_written_is_not_read() -> None:
     memory = new_memory()
     write(memory, 1, numbered(1))

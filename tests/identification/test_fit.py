@@ -1,5 +1,6 @@
 """Prediction is the simulator's, and a fit finds the cart that was simulated."""
 
+import dataclasses
 from collections.abc import Callable
 
 import numpy as np
@@ -102,6 +103,18 @@ def test_a_fit_finds_another_pole(
     recorded = run_batch(env, lambda present: present.set("action", torch.randint(5, (2,), generator=random)))
     found = fit_cart(cut_windows(recorded, PERIOD), nominal, STEP, PERIOD).parameters
     assert found["pole_com"] == pytest.approx(large.nominal.pole_com, rel=0.05)
+
+
+def test_counts_that_jump_are_no_carts(episodes: list[Episode], nominal: dict[str, float]) -> None:
+    """As with a loose encoder plug."""
+    random = np.random.default_rng(0)
+    jumping = [
+        dataclasses.replace(each, counts=each.counts + random.integers(-(10**6), 10**6, each.counts.shape))
+        for each in episodes
+    ]
+    with pytest.raises(RecordingError, match="their counts jump: check the encoders") as raised:
+        fit_cart(cut_windows(jumping, PERIOD, most=10), nominal, STEP, PERIOD).draw(5, random)
+    assert "\n" not in str(raised.value)
 
 
 def test_draws_are_physically_possible(episodes: list[Episode], nominal: dict[str, float]) -> None:

@@ -9,6 +9,7 @@ from small_files import files_of_at_most
 
 from cartpole_rl.errors import CheckpointError
 from cartpole_rl.learning.checkpoints import (
+    AGENT_FORMAT,
     FINETUNING_FORMAT,
     TRAINING_FORMAT,
     AgentCheckpoint,
@@ -114,6 +115,47 @@ def test_a_torch_file_of_another_kind_is_named(tmp_path: Path) -> None:
     assert "its format is None" in complaint(load_agent, tmp_path / "tensor.pt")
     save_training(tmp_path, TRAINING)
     assert "not an agent" in complaint(load_agent, tmp_path / "checkpoints/resume.pt")
+
+
+@pytest.mark.parametrize(
+    ("part", "value", "named"),
+    [
+        ("config", None, "config: Input should be a valid dictionary"),
+        ("config", {1: 2}, "config: Input should be a valid string"),
+        ("weights", [1.0], "weights: Input should be a valid dictionary"),
+        ("transitions", "10", "transitions: Input should be a valid integer"),
+        ("score", "high", "score: Input should be a valid number"),
+        ("tuned_poles", [5], "tuned_poles: Input should be a valid dictionary"),
+        ("speed", 1, "its parts are config, weights, transitions, score, tuned_poles, speed"),
+    ],
+)
+def test_an_agent_with_a_wrong_part_is_named(part: str, value: object, named: str, tmp_path: Path) -> None:
+    path = tmp_path / "agent.pt"
+    torch.save({"format": AGENT_FORMAT, **vars(AGENT), part: value}, path)
+    assert f"is damaged, or of another version of this package: {named}" in complaint(load_agent, path)
+
+
+@pytest.mark.parametrize("part", ["config", "weights", "transitions"])
+def test_an_agent_without_a_part_is_named(part: str, tmp_path: Path) -> None:
+    path, parts = tmp_path / "agent.pt", vars(AGENT).copy()
+    del parts[part]
+    torch.save({"format": AGENT_FORMAT, **parts}, path)
+    assert f"its parts are {', '.join(parts)}; give another one" in complaint(load_agent, path)
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"config": None}, "config: Input should be a valid dictionary"),
+        ({"step": 1.5}, "step: Input should be a valid integer"),
+        ({"state": {"agent": None}}, "its agent is no dictionary"),
+    ],
+)
+def test_a_training_with_a_wrong_part_is_named(change: dict, named: str, tmp_path: Path) -> None:
+    save_training(tmp_path, TRAINING)
+    content = {"format": TRAINING_FORMAT, **vars(TRAINING), **change}
+    torch.save(content, tmp_path / "checkpoints/resume.pt")
+    assert named in complaint(load_training, tmp_path)
 
 
 def test_a_file_that_would_run_code_is_refused(tmp_path: Path) -> None:

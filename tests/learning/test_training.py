@@ -162,6 +162,27 @@ def test_the_best_of_a_balance_has_the_highest_score_upright(make_training: Call
     assert (training.best_score, training.last_score) == (2.5, 2.5)
 
 
+@pytest.mark.parametrize("earlier", ["score", None])
+def test_the_best_score_in_another_measure_is_forgotten(
+    make_training: Callable[..., Training], earlier: Measure | None
+) -> None:
+    """Snapshots of earlier versions name no measure: it was the score."""
+    training = make_training(evaluate=lambda: [episode(9.0, 1.0)], measure="score")
+    training.run_evaluation()
+    snapshot = training.snapshot()
+    if earlier is None:
+        del snapshot["measure"]
+    resumed = make_training(evaluate=lambda: [episode(9.0, 1.0)], measure="score_upright")
+    resumed.restore(snapshot)
+    assert (resumed.best_score, resumed.last_score) == (-float("inf"), None)
+    resumed.run_evaluation()
+    assert (resumed.best_score, resumed.monitor.evaluations) == (1.0, [(0, True)])
+
+    same = make_training(measure="score")
+    same.restore(snapshot)
+    assert (same.best_score, same.last_score) == (9.0, 9.0)
+
+
 def test_exploration_falls_from_all_to_the_last_share(make_training: Callable[..., Training]) -> None:
     training = make_training()
     training.run()

@@ -55,6 +55,12 @@ def test_interval_text(mean: float, low: float, high: float, text: str) -> None:
     assert interval_text(mean, low, high) == text
 
 
+def test_interval_text_on_request_by_its_ends_and_with_fewer_decimals() -> None:
+    assert interval_text(4210.3, 4125.1, 4295.5, ends=True) == "4210 (4125 to 4296)"
+    assert interval_text(2.763, 2.71, 2.81, ends=True, most_decimals=1) == "2.8 (2.7 to 2.8)"
+    assert interval_text(-0.00002, -0.00004, 0.00001, most_decimals=1) == "0.0 (0.0 to 0.0)"
+
+
 @pytest.mark.parametrize(
     ("value", "text"),
     [(4210.4, "4210"), (12.345, "12.3"), (0.004561, "0.00456"), (0.0, "0"), (-7.0, "-7.00"), (math.nan, "–")],

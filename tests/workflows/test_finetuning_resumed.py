@@ -2,6 +2,7 @@
 
 import io
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,15 +11,20 @@ import torch
 from torch import Tensor
 
 from cartpole_rl.envs.build import simulated_env
+from cartpole_rl.errors import CheckpointError
 from cartpole_rl.evaluation.episodes import run_batch
+from cartpole_rl.files import write_bytes
+from cartpole_rl.learning.checkpoints import AgentCheckpoint, save_agent
 from cartpole_rl.learning.randomness import seed_everything
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.agents import new_agent
 from cartpole_rl.workflows.build import evaluated_settings
 from cartpole_rl.workflows.config import FinetuneConfig, TrainConfig
-from cartpole_rl.workflows.finetune import evaluation_config
+from cartpole_rl.workflows.finetune import evaluation_config, started_from
+from cartpole_rl.workflows.finetuning_files import FinetuningFiles
 from cartpole_rl.workflows.finetuning_learner import CartLearner
 from cartpole_rl.workflows.loading import load_settings
+from cartpole_rl.workflows.run_folder import write_config
 
 TRAINING = load_settings(
     TrainConfig,
@@ -94,6 +100,59 @@ def test_a_resumed_fine_tuning_equals_one_that_was_not_stopped(recorded: list[Ep
     assert resumed.started.iteration == 9
     expected = weights(whole)
     assert all(torch.equal(expected[name], weight) for name, weight in weights(resumed).items())
+
+
+def test_a_refit_that_fails_keeps_the_earlier_fit(
+    recorded: list[Episode], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """An encoder came loose in the last episode: learning goes on."""
+    first, *others = recorded
+    learned = learner()
+    learned.start([first])
+    carts, capacity = learned.carts.clone(), len(learned.started.buffer)
+    jumps = np.random.default_rng(0).integers(-(10**6), 10**6, first.counts.shape)
+    learned.refit([first, *(replace(each, counts=each.counts + jumps) for each in others)])
+    assert "the simulator keeps its earlier fit: no cart moves as" in capsys.readouterr().err.splitlines()[-1]
+    assert torch.equal(learned.carts, carts)
+    assert len(learned.started.buffer) == capacity
+    learned.round()
+    assert learned.started.iteration == CONFIG.finetuning.iterations
+
+
+@pytest.fixture
+def interrupted(tmp_path: Path) -> FinetuningFiles:
+    """An interrupted fine-tuning whose copy of the agent is missing."""
+    agent = tmp_path / "agent.pt"
+    save_agent(agent, AgentCheckpoint({}, {}, transitions=10, score=None))
+    config = CONFIG.model_copy(update={"run": agent})
+    write_config(tmp_path / "run", "finetune", config.model_dump(mode="json"), agent=agent)
+    return FinetuningFiles(tmp_path / "run", config)
+
+
+def test_without_its_copy_of_the_agent_it_takes_the_same_one(interrupted: FinetuningFiles) -> None:
+    assert started_from(interrupted) == interrupted.config.run
+    write_bytes(interrupted.start, b"a copy")
+    assert started_from(interrupted) == interrupted.start
+
+
+def test_without_its_copy_of_the_agent_another_one_is_refused(interrupted: FinetuningFiles) -> None:
+    run = interrupted.config.run
+    save_agent(run, AgentCheckpoint({}, {}, transitions=20, score=None))
+    with pytest.raises(CheckpointError) as raised:
+        started_from(interrupted)
+    assert str(raised.value) == (
+        f"resume={interrupted.folder}: it holds no checkpoints/start.pt, and by provenance.json the agent of "
+        f"run={run} is not the one that it started from; cartpole-finetune run={run} starts anew"
+    )
+
+
+def test_a_state_that_lacks_a_part_is_named(recorded: list[Episode]) -> None:
+    learned = learner()
+    learned.start(recorded[:1])
+    state = learned.snapshot()
+    for part in ("carts", "chooser", "optimizer"):
+        with pytest.raises(CheckpointError, match=rf"its state lacks '{part}'; start anew"):
+            learner().restore(recorded[:1], {name: value for name, value in state.items() if name != part})
 
 
 def test_a_learner_that_starts_later_continues_the_schedules(recorded: list[Episode]) -> None:

@@ -1,6 +1,7 @@
 """A study at toy size: it runs, is killed, resumes; a failed run does not end the others."""
 
 import json
+import re
 import shutil
 import signal
 import subprocess
@@ -18,7 +19,6 @@ from cartpole_rl.reporting.studies.settings import Study
 from cartpole_rl.workflows.pages.runs import read_run
 from cartpole_rl.workflows.reproduce.plan import Task, plan
 from cartpole_rl.workflows.reproduce.process import is_complete, made_otherwise, prepare
-from cartpole_rl.workflows.reproduce.progress import Progress, duration
 from cartpole_rl.workflows.reproduce.reproduce import Schedule, reproduce
 from cartpole_rl.workflows.run_inputs import is_outdated
 
@@ -61,6 +61,12 @@ def start(source: Path, folder: Path, *words: str) -> "subprocess.Popen[str]":
     return subprocess.Popen(
         list(map(str, command)), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
+
+
+def script(*words: str) -> Outcome:
+    """scripts/reproduce with `words`."""
+    command = [sys.executable, str(SCRIPT), *words]
+    return outcome(subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True))
 
 
 @pytest.fixture(scope="module")
@@ -205,7 +211,9 @@ def test_a_study_of_other_settings_keeps_its_file_and_gets_no_more_runs(
     evaluation = root / "toy/lqr/10/evaluations/own"
     record = json.loads((evaluation / "provenance.json").read_text())
     (evaluation / "provenance.json").write_text(json.dumps({**record, "command": ["", "knock=8"]}))
-    failures = reproduce(["toy"], "quick", root, 1, tmp_path)
+    lines: list[str] = []
+    failures = reproduce(["toy"], "quick", root, 1, tmp_path, lines.append)
+    assert lines[0] == f"4 runs, 1 of them done, 3 refused; 1 at a time, in {root}"
     assert failures["toy/lqr/10/evaluations/own"].startswith("it was made with other settings")
     assert failures["toy/lqr/11"] == "other runs of its study were made with other settings"
     assert (root / "toy/study.yaml").read_text() == old
@@ -217,6 +225,31 @@ def test_a_wrong_name_is_one_line(source: Path, tmp_path: Path) -> None:
     assert done.complaint == "scripts/reproduce: toys: there is no such study; did you mean toy?"
 
 
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (("--jobs", "0"), "--jobs 0: give at least 1"),
+        (("--jobs", "-2"), "--jobs -2: give at least 1"),
+        (("--size", "huge"), "--size huge: give quick"),
+    ],
+    ids=" ".join,
+)
+def test_a_wrong_option_is_one_line(words: tuple[str, ...], complaint: str, source: Path) -> None:
+    done = script(*words, "--studies", str(source))
+    assert (done.complaint, done.code) == (f"scripts/reproduce: {complaint}", 2)
+
+
+def test_a_folder_without_studies_is_one_line(tmp_path: Path) -> None:
+    done = script("--list", "--studies", str(tmp_path))
+    assert (done.complaint, done.code) == (f"scripts/reproduce: {tmp_path}: it holds no study", 2)
+
+
+def test_the_list_is_a_table_of_all_studies(source: Path) -> None:
+    lines = script("--list", "--studies", str(source)).out.splitlines()
+    assert re.split(r" {2,}", lines[0]) == ["study", "figure or section", "question"]
+    assert [line.split()[0] for line in lines[1:]] == ["sharing", "toy"]
+
+
 def test_runs_wait_for_those_that_they_need(source: Path, tmp_path: Path) -> None:
     schedule = Schedule(plan(["sharing"], "quick", tmp_path, source), tmp_path)
     (first,) = schedule.ready(5)
@@ -224,10 +257,3 @@ def test_runs_wait_for_those_that_they_need(source: Path, tmp_path: Path) -> Non
     schedule.finish(first, "")
     evaluation = tmp_path / "sharing/shared/10/evaluations/own"
     assert [task.folder for task in schedule.ready(5)] == [evaluation]
-
-
-def test_the_time_left_is_that_of_similar_runs(source: Path, tmp_path: Path) -> None:
-    tasks, lines = plan(["toy"], "quick", tmp_path, source), []
-    progress = Progress(len(tasks), 2, lines.append)
-    progress.finished(tasks[0], "first", 90.0, tasks[1:], "")
-    assert lines == [f"[1/{len(tasks)}] train    first: 2 min, about {duration(45 * len(tasks[1:]))} left"]

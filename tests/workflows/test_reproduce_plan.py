@@ -110,6 +110,15 @@ def test_an_arm_that_names_its_agent_gives_its_other_overrides_to_every_evaluati
     assert task.needs == (needed,)
 
 
+@pytest.mark.parametrize("folder", ["a #b", "a: b", "[x]", "a,b", "x]", "{seed}", "{runs}", "it's", "é"])
+def test_the_folder_of_all_studies_may_have_any_name(folder: str) -> None:
+    root = Path(folder, "quick")
+    agents = {root / "swingup/thesis/10", root / "todays_agents/medium/10"}
+    tasks = [task for task in study_tasks("recovery", "quick", root) if str(FIRST_SEED) in task.folder.parts]
+    assert agents <= {Path(task.overrides["run"]) for task in tasks}
+    assert agents <= {need for task in tasks for need in task.needs}
+
+
 @pytest.mark.parametrize(
     ("name", "size", "complaint"),
     [

@@ -15,10 +15,11 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
+from cartpole_rl import __version__
 from cartpole_rl.checking import checked
 from cartpole_rl.choices import conf_folder
 from cartpole_rl.commands.hydra_application.choice_files import with_choice_files
-from cartpole_rl.commands.hydra_application.complaints import dashed_setting
+from cartpole_rl.commands.hydra_application.complaints import dashed_setting, wrong_option
 from cartpole_rl.commands.hydra_application.composition import as_mapping, choices_of
 from cartpole_rl.commands.hydra_application.exits import (
     EXPECTED,
@@ -26,8 +27,9 @@ from cartpole_rl.commands.hydra_application.exits import (
     catch_signals,
     exit_after_signal,
     exit_with_message,
+    job_signals,
 )
-from cartpole_rl.commands.hydra_application.sweeps import as_multirun, failures_reported, is_job, run_as_job
+from cartpole_rl.commands.hydra_application.sweeps import as_multirun, is_job, run_as_job, sweep
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.settings import Settings
 
@@ -53,12 +55,13 @@ def application(name: str, schema: type[Config]) -> Callable[[Body[Config]], Cal
             def work() -> float | None:
                 return body(checked(schema, as_mapping(composed)), folder)
 
-            try:
-                return run_as_job(name, folder, work) if is_job() else work()
-            except EXPECTED as error:
-                exit_with_message(name, error)
-            finally:
-                remove_if_empty(folder, name)
+            with job_signals():
+                try:
+                    return run_as_job(name, folder, work) if is_job() else work()
+                except EXPECTED as error:
+                    exit_with_message(name, error)
+                finally:
+                    remove_if_empty(folder, name)
 
         def main() -> None:
             given[:] = sys.argv[1:]
@@ -67,9 +70,12 @@ def application(name: str, schema: type[Config]) -> Callable[[Body[Config]], Cal
             OmegaConf.register_new_resolver("choices_of", partial(choices_of, name, schema), replace=True)
             os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra raises its errors instead of printing them
             try:
-                if dashed := dashed_setting(sys.argv[1:]):
-                    raise ConfigError(dashed)
-                with with_choice_files(as_multirun(given)) as words, failures_reported(name):
+                if "--version" in given:
+                    print(f"cartpole_rl {__version__}")
+                    return
+                if wrong := wrong_option(given) or dashed_setting(given):
+                    raise ConfigError(wrong)
+                with with_choice_files(as_multirun(given)) as words, sweep(name, schema):
                     sys.argv[1:] = words
                     hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=name)(task)()
             except EXPECTED as error:

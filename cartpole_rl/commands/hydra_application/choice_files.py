@@ -5,17 +5,24 @@ is added to Hydra's search path. `${here}` in it stands for the file's folder, s
 """
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
+import yaml
+
+from cartpole_rl.checking import most_similar
 from cartpole_rl.choices import conf_folder, file_text
 from cartpole_rl.errors import ConfigError
+from cartpole_rl.physics.bounds import BOUNDS
+from cartpole_rl.randomization.poles import Pole
 from cartpole_rl.run_files import CART, CONFIG, POLE, RANDOMIZATION
 from cartpole_rl.workflows.run_folder import PREFIX, USES, check_program, program_of, use_of
 
 WORD = re.compile(r"^([a-z_]+)=(.+)$")
+SUFFIXES = (".yaml", ".yml")
 RUN_FILES = (CONFIG, CART, POLE, RANDOMIZATION)
 
 
@@ -40,10 +47,12 @@ def _with_choices(word: str, folder: Path) -> str:
         raise ConfigError(f"{word}: a group takes a choice; leave {word} out to take the default")
     for value in match[2].split(","):
         _check_run_folder(match[1], value)
-    if not match[2].endswith((".yaml", ".yml")):
+        if Path(value).suffix and not value.endswith(SUFFIXES) and Path(value).is_file():
+            raise ConfigError(f"{match[1]}={value}: a file of your own must end in .yaml")
+    if not any(value.endswith(SUFFIXES) for value in match[2].split(",")):
         return word
     names = (
-        _copied(value, folder / match[1]) if "/" in value or value.endswith("ml") else value
+        _copied(value, folder / match[1]) if "/" in value or value.endswith(SUFFIXES) else value
         for value in match[2].split(",")
     )
     return f"{match[1]}={','.join(names)}"
@@ -74,8 +83,23 @@ def _copied(value: str, group: Path) -> str:
     if not file.is_file():
         raise ConfigError(f"{group.name}={value}: there is no such file")
     group.mkdir(exist_ok=True)
+    text = file_text(group.name, file)
+    if group.name == "cart":
+        _check_cart(value, yaml.safe_load(text) or {})
     name = file.stem
     if (group / f"{name}.yaml").exists():
         name = f"{file.resolve().parent.name}_{name}"
-    (group / f"{name}.yaml").write_text(file_text(group.name, file), encoding="utf-8")
+    (group / f"{name}.yaml").write_text(text, encoding="utf-8")
     return name
+
+
+def _check_cart(file: str, values: Mapping[str, Any]) -> None:
+    """Raise ConfigError for an unknown parameter of a cart, or a missing one in a file that extends none."""
+    known = [name for name in BOUNDS if name not in Pole.model_fields]
+    for name in values.keys() - BOUNDS.keys() - {"defaults"}:
+        near = most_similar(name, known)
+        raise ConfigError(f"cart={file}: {name}: there is no such setting; did you mean {near}?")
+    missing = [name for name in known if name not in values]
+    if missing and "defaults" not in values:
+        remedy = "give it, or take what is missing from a choice: defaults: [ip02]"
+        raise ConfigError(f"cart={file}: {missing[0]} is missing; {remedy}")

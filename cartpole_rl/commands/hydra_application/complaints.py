@@ -20,19 +20,11 @@ from cartpole_rl.checking import (
 )
 from cartpole_rl.choices import conf_folder, default_choices, group_choices
 
+WHOLE_OPTIONS = ("help", "version", "cfg", "resolve", "package", "multirun", "info")
 # Hydra's, each up to its first hyphen; without --run, which has no effect: a user means run=
-HYDRA_OPTIONS = (
-    "help",
-    "hydra",
-    "version",
-    "cfg",
-    "resolve",
-    "package",
-    "multirun",
-    "shell",
-    "config",
-    "info",
-)
+HYDRA_OPTIONS = (*WHOLE_OPTIONS, "hydra", "shell", "config")
+NEAR_OPTION = 0.7  # similarity from which an option is suggested; that of resume and resolve is 0.62
+SHOWN = ("job", "hydra", "all")  # by --cfg
 WHOLE = ("experiment", "sweep")  # groups without settings of their own: they change those of others
 FULL = {errno.ENOSPC, errno.EDQUOT}  # the disk, or a user's share of it
 EXTRAS = {  # of the package, that bring launchers and a sweeper
@@ -121,6 +113,20 @@ def composed_settings(command: str, overrides: list[str]) -> set[str]:
             return setting_names(OmegaConf.to_container(hydra.compose(command, overrides), resolve=False))
     except HydraException:
         return set()
+
+
+def wrong_option(words: Sequence[str]) -> str | None:
+    """Return the message about a misspelt option of Hydra or --cfg without its value; None without one."""
+    for word, following in pairwise([*words, ""]):
+        if word in ("--cfg", "-c") and following not in SHOWN:
+            return f"{word}: give {word} job"
+        name = word.removeprefix("--")
+        if name == word or any(option.startswith(name) for option in HYDRA_OPTIONS):
+            continue
+        near = most_similar(name, WHOLE_OPTIONS)
+        if similarity(name, near)[0] >= NEAR_OPTION:
+            return f"{word}: did you mean --{near}?"
+    return None
 
 
 def dashed_setting(words: Sequence[str]) -> str | None:

@@ -1,12 +1,16 @@
 """Ends a command: after an expected error with one line and an exit code, after a signal with its code.
 
 Exit codes: 0; 1 where the work failed; 2 where the config is wrong; 130 after Ctrl-C; 143 after SIGTERM; 129
-after SIGHUP, which a closed terminal or a dropped ssh connection sends.
+after SIGHUP, which a closed terminal or a dropped ssh connection sends; 141 where the reader of a pipe has
+left.
 """
 
 import errno
 import signal
 import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import NoReturn
 
 from hydra.errors import HydraException
@@ -15,7 +19,7 @@ from omegaconf.errors import OmegaConfBaseException
 from cartpole_rl.commands.hydra_application.complaints import FULL, in_one_line
 from cartpole_rl.errors import CartPoleError, ConfigError
 from cartpole_rl.signals import RaiseOnce, ending_signals
-from cartpole_rl.workflows.person import print_message
+from cartpole_rl.workflows.person import exit_if_nobody_reads, print_message
 
 SIGNALLED = 128  # added to the number of a signal, as a shell does
 EXPECTED = (CartPoleError, HydraException, OmegaConfBaseException, OSError)  # printed without a traceback
@@ -33,6 +37,8 @@ class Terminated(BaseException):
 
 def exit_with_message(name: str, error: Exception) -> NoReturn:
     """Print an error and exit. Raises an OSError that concerns no file: it is a defect of this package."""
+    if isinstance(error, BrokenPipeError):
+        exit_if_nobody_reads()
     code = CartPoleError.exit_code
     if isinstance(error, CartPoleError):
         code = error.exit_code
@@ -57,6 +63,29 @@ def catch_signals() -> None:
     handler.handle(*ending_signals())
     if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
         handler.handle(signal.SIGINT)
+
+
+@contextmanager
+def job_signals() -> Iterator[None]:
+    """Let SIGTERM, SIGHUP and SIGINT unwind a job in a process that a launcher started.
+
+    The process then ends by that signal, which the launcher reports. Nothing changes in a thread, or where
+    SIGTERM has a handler: that of `catch_signals`, or the launcher's.
+    """
+    is_main = threading.current_thread() is threading.main_thread()
+    if not is_main or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
+        yield
+        return
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, *ending_signals())}
+    catch_signals()
+    try:
+        yield
+    except Terminated as signalled:
+        signal.signal(signalled.number, signal.SIG_DFL)
+        signal.raise_signal(signalled.number)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _exception_of(number: int) -> BaseException:

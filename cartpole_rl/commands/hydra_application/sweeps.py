@@ -1,5 +1,6 @@
-"""Sweeps: a failed job does not end one, and its end names every failed job with the reason.
+"""Sweeps: a wrong setting of any job ends one before it starts; a failed job does not end one.
 
+The end of a sweep names every failed job with the reason.
 Each job keeps error.txt in its run folder until it succeeds. So the report is the same with every launcher,
 and it includes jobs that were killed.
 """
@@ -10,20 +11,29 @@ import re
 import sys
 import traceback
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from itertools import chain
 from pathlib import Path
 from typing import Any, ClassVar
 
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
-from omegaconf import DictConfig
+from omegaconf import DictConfig, open_dict, read_write
+from omegaconf.errors import OmegaConfBaseException
 
+from cartpole_rl.checking import checked
 from cartpole_rl.commands.hydra_application.complaints import in_one_line
-from cartpole_rl.commands.hydra_application.exits import EXPECTED
-from cartpole_rl.errors import CartPoleError
+from cartpole_rl.commands.hydra_application.composition import as_mapping
+from cartpole_rl.commands.hydra_application.exits import EXPECTED, exit_with_message
+from cartpole_rl.errors import CartPoleError, ConfigError
 from cartpole_rl.files import write_text
 from cartpole_rl.run_files import ERROR
+from cartpole_rl.settings import Settings
 from cartpole_rl.workflows.person import print_message
 
 MODES = {"-m", "--multirun", "-r", "--run", "-c", "--cfg", "-i", "--info", "-sc", "--shell-completion"}
@@ -31,14 +41,39 @@ NOT_ENDED = "it was killed or interrupted, or is still running"
 
 
 class SweepStart(Callback):
-    """Hydra's callback that notes the folder of the sweep, and what jobs in other processes cannot know."""
+    """Hydra's callback that checks all jobs, notes the folder of the sweep and what jobs cannot know."""
 
+    command: ClassVar[str] = ""
+    schema: ClassVar[type[Settings]] = Settings
     folder: ClassVar[Path | None] = None
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
-        """Resolve folder and constant settings here; Hydra hands the values to the jobs."""
+        """Check the jobs; resolve folder and constant settings here: Hydra hands the values to the jobs.
+
+        It exits for a wrong setting, since Hydra swallows what a callback raises.
+        """
+        try:
+            with suppress(HydraException, OmegaConfBaseException):  # Hydra raises its own again
+                check_jobs(config, SweepStart.schema)
+        except ConfigError as error:
+            exit_with_message(SweepStart.command, error)
         SweepStart.folder = Path(config.hydra.sweep.dir)
         _ = config.hydra.job.config.override_dirname.exclude_keys
+
+
+def check_jobs(config: DictConfig, schema: type[Settings]) -> None:
+    """Raise for the first job of a sweep with a wrong setting, unless its sweeper chooses while it runs."""
+    sweeper = config.hydra.sweeper
+    if not sweeper._target_.endswith(BasicSweeper.__name__):
+        return
+    loader = GlobalHydra.instance().config_loader()
+    words = [f"{key}={value}" for key, value in (sweeper.params or {}).items()]
+    overrides = OverridesParser.create(loader).parse_overrides([*words, *config.hydra.overrides.task])
+    for job in chain.from_iterable(BasicSweeper.split_arguments(overrides, None)):
+        composed = loader.load_sweep_config(config, list(job))
+        with read_write(composed), open_dict(composed):
+            del composed["hydra"]
+        checked(schema, as_mapping(composed))
 
 
 def as_multirun(words: Sequence[str]) -> list[str]:
@@ -73,13 +108,13 @@ def run_as_job(name: str, folder: Path, work: Callable[[], float | None]) -> flo
 
 
 @contextmanager
-def failures_reported(name: str) -> Iterator[None]:
-    """At the end of a sweep, name its failed jobs and exit with 1 if there are any.
+def sweep(name: str, schema: type[Settings]) -> Iterator[None]:
+    """Check the jobs of a sweep by `schema`; at its end, name the failed ones and exit with 1 for any.
 
     The launcher itself fails if the process of a job is killed. What it raises is named too.
     """
     logging.getLogger("hydra_plugins").setLevel(logging.ERROR)  # failed jobs are named here
-    SweepStart.folder = None
+    SweepStart.command, SweepStart.schema, SweepStart.folder = name, schema, None
     try:
         yield
     except Exception as error:

@@ -53,6 +53,7 @@ def link(cart: SerialCart) -> str:
         information = cart.info()
         trips.append(time.perf_counter() - asked)
         last = cart.poll_state()
+    check_period(information)
     trip, period = statistics.median(trips), information.period_us * 1e-6
     measured = seconds_between(first.time_us, last.time_us) / max(1, ticks_between(first.tick, last.tick))
     counted = cart.statistics

@@ -6,6 +6,7 @@ Source: Espressif, "Boot Mode Selection", esptool documentation; pyserial 3.5.
 """
 
 import errno
+import re
 from collections.abc import Iterable
 
 import serial
@@ -17,6 +18,7 @@ from cartpole_rl.plants.serial.tcp import TcpPort
 
 READ_SLICE = 0.01  # s that one read blocks at most; callers look at their own clocks in between
 AUTO = "auto"
+WRONG_URL = (LookupError, re.error, NotImplementedError)  # of pyserial, for parts of a URL
 
 
 def open_port(port: str, baud: int, write_timeout: float) -> serial.SerialBase:
@@ -24,6 +26,11 @@ def open_port(port: str, baud: int, write_timeout: float) -> serial.SerialBase:
 
     Raises PortError if it does not exist, is busy, may not be opened, or is not a serial port.
     """
+    if port.lower().startswith("rfc2217://"):  # pyserial has no write_timeout for it
+        raise PortError(
+            f"{port}: rfc2217:// is not supported, as its writes have no time limit; let the bridge serve "
+            "the port as raw TCP, and give socket://HOST:PORT"
+        )
     try:
         line = TcpPort() if port.startswith("socket://") else serial.serial_for_url(port, do_not_open=True)
         line.port, line.baudrate = port, baud
@@ -33,6 +40,8 @@ def open_port(port: str, baud: int, write_timeout: float) -> serial.SerialBase:
         line.open()
     except (OSError, ValueError, OverflowError) as error:
         raise PortError(why_not_open(port, error)) from error
+    except WRONG_URL as error:
+        raise PortError(f"{port} is neither a device path nor a URL of pyserial: {error!r}") from error
     return line
 
 

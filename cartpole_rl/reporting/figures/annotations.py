@@ -1,10 +1,18 @@
 """Annotations inside and outside the panels of a figure."""
 
+import re
+
 from matplotlib.axes import Axes
 
 from cartpole_rl.reporting import style
 
+CONTROLS = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f]")  # no text of an SVG
 LATE = 0.85  # share of a time axis; the text of a later time stands to its left
+
+
+def plain(text: str) -> str:
+    """Return a text that a figure shows as it is: between two $ matplotlib expects a formula."""
+    return CONTROLS.sub("", text).replace("$", r"\$")
 
 
 def beside(axes: Axes, height: float, text: str, colour: str) -> None:

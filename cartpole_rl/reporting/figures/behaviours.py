@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from cartpole_rl.physics.motor import LARGEST_MOTOR
 from cartpole_rl.reporting import style
-from cartpole_rl.reporting.figures.annotations import at_time, beside
+from cartpole_rl.reporting.figures.annotations import at_time, beside, plain
 from cartpole_rl.reporting.words import ending_text, guard_text
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.tasks.rewards import UPRIGHT_ANGLE
@@ -35,7 +35,7 @@ def behaviour(episode: Episode, title: str = "One episode", track_half_length: f
     _draw_angle(angle, episode)
     _draw_position(position, episode, track_half_length)
     _draw_motor(motor, episode)
-    style.title(angle, title, _summary(episode))
+    style.title(angle, plain(title), _summary(episode))
     style.label(motor, x="time (s)")
     figure.align_ylabels()
     return figure

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.intervals import student_interval
 from cartpole_rl.reporting import style
-from cartpole_rl.reporting.figures.annotations import guide
+from cartpole_rl.reporting.figures.annotations import guide, plain
 from cartpole_rl.reporting.table import interval_text
 
 DOTS = -0.15  # offset of a column's dots, in columns
@@ -53,7 +53,7 @@ def comparison(
     low, high = min(0.0, axes.get_ylim()[0]), axes.get_ylim()[1]
     axes.set_ylim(low, high + 0.05 * (high - low))  # else dots that lie close together are cut at the top
     style.label(axes, y="score of an episode")
-    style.title(axes, title, "dots: episodes,  line and box: their mean and its 95 % interval")
+    style.title(axes, plain(title), "dots: episodes,  line and box: their mean and its 95 % interval")
     return figure
 
 
@@ -99,7 +99,7 @@ def _name_columns(axes: Axes, scores: Mapping[str, Array]) -> None:
     for column, (name, each) in enumerate(scores.items()):
         count = "1 episode" if each.size == 1 else f"{each.size} episodes"
         ratio = f"\n{each.mean() / first:.2f} × {next(iter(scores))}" if column and first else ""
-        names.append(f"{name}\n{count}{ratio}")
+        names.append(plain(f"{name}\n{count}{ratio}"))
     axes.set_xticks(range(len(names)), names, fontsize=style.LABEL_SIZE, color=style.INK)
     axes.tick_params(axis="x", length=0)
     axes.set_xlim(-0.5, len(names) - 0.3)

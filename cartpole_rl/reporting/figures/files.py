@@ -46,14 +46,15 @@ def png(figure: Figure, dpi: float = style.DPI) -> bytes:
     return buffer.getvalue()
 
 
-def svg(figure: Figure, alt: str) -> str:
+def svg(figure: Figure, alt: str, place: str = "") -> str:
     """Return `figure` as an SVG element for a page, with the text `alt` for readers who cannot see it.
 
+    Figures of a page with the same `alt` need a `place` each, so that their ids differ.
     Text stays text, the background is transparent, and the colours of `style` become the variables of the
     page's style sheet (`reporting.page`), so that the figure follows light and dark.
     """
     buffer = io.StringIO()
-    salt = hashlib.sha256(alt.encode()).hexdigest()  # of the ids, so that those of two figures differ
+    salt = hashlib.sha256(f"{place}\n{alt}".encode()).hexdigest()  # of the ids
     with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": salt}):
         figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
     text = buffer.getvalue()

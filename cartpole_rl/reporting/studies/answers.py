@@ -1,29 +1,25 @@
 """Our answer to a study in words, and how it stands: what fails or contradicts comes first on the page."""
 
+import re
 from collections.abc import Mapping
 from enum import StrEnum
 
+from cartpole_rl.reporting.studies.numbers import (
+    counted_text,
+    estimate_text,
+    low_is_good,
+    measure_label,
+    sentence_start,
+)
 from cartpole_rl.reporting.studies.results import StudyResults
 from cartpole_rl.reporting.studies.settings import Variant
 from cartpole_rl.reporting.studies.statistics import Estimate, estimate
-from cartpole_rl.reporting.table import interval_text
 
 GOOD = {"score": 2000.0}  # measure: value above which the thesis calls an agent good (section 6)
-MEASURES = {  # key of metrics.json: label
-    "score": "score (6.2)",
-    "score_upright": "score (6.1)",
-    "steps": "steps",
-    "upright_fraction": "share of time upright",
-    "upright_at_end": "share upright at the end",
-    "time_to_upright_s": "time to upright, s",
-    "errors.median": "median relative error of the parameters",
-    "network_over_physics.theta_deg": "error of the angle, with / without network",
-}
-LOW_IS_GOOD = ("errors", "rms_", "time_to_", "network_over_")  # starts of measures
 THESIS_ROWS = {  # of the thesis's list: what must work
     1: "Physics, both integrators, substeps",
     2: "Balance with reward (5.1), three actions",
-    3: "Balance with reward (6.1)",
+    3: "Balance with a reward for angle and position",
     4: "Swing-up in the stock simulation",
     5: "Nine actions, linear and measured spacing",
     6: "AdamW and Adam, reward (5.3), growth of the loss",
@@ -41,6 +37,11 @@ THESIS_ROWS = {  # of the thesis's list: what must work
     18: "Baselines: LQR, PID, energy swing-up",
 }
 BEYOND = 200  # order from which a study lies beyond the thesis
+CARTS = ("simulated cart", "emulated cart")  # starts of labels of evaluations
+MOST_TOLD = 4  # set-ups in a sentence; of more, the highest and the lowest
+PLAIN = re.compile(r"[A-Za-z' -]+")  # labels that need no quotation marks
+SENTENCES = re.compile(r"(?<=[a-z0-9)][.?!]) (?=[A-Z])")
+OPENING, SHORT = 200, 30  # characters of a text's first sentences: at most; fewer take another sentence
 
 
 class Status(StrEnum):
@@ -112,52 +113,67 @@ def ratios(results: StudyResults) -> dict[str, Estimate]:
 
 
 def answer(results: StudyResults) -> list[str]:
-    """Return our answer in a few sentences, the main one first, with intervals and numbers of agents."""
+    """Return our numbers in a few sentences, the main one first, with intervals and numbers of agents."""
     if not results.agents:
         return ["No result yet."]
-    several, shown = len(results.evaluations) > 1, [*results.judged]
+    study, shown = results.study, [*results.judged]
     if results.varied and all(each in results.evaluations for each in results.varied):
         shown = [results.varied[0], results.varied[-1]]
+    name = sentence_start(measure_label(study.measure))
     sentences = [
-        f"{measure_label(results.study.measure)}{f' ({each.label})' if several else ''}: "
-        f"{_extremes(found, results.study.unit)}."
+        f"{name}{_place(results, each)}{_ranked(found, study.unit, study.measure)}."
         for each in shown
         if (found := estimates(results, each))
     ]
     if shares := ratios(results):
         first, second = results.evaluations[:2]
-        sentences.append(f"Ratio of {second.label} to {first.label}: {_extremes(shares)}.")
+        sentences.append(f"Ratio of {second.label} to {first.label}{_ranked(shares)}.")
     return sentences
 
 
-def _extremes(found: Mapping[str, Estimate], unit: str = "agent") -> str:
-    """Return the estimate of one arm, or of the highest and the lowest of several that differ."""
-    ranked = sorted(found, key=lambda label: found[label].value, reverse=True)
-    high, low = ranked[0], ranked[-1]
-    if len({estimate_text(each) for each in found.values()}) == 1:
-        each = "" if len(ranked) == 1 else f"each of {len(ranked)} set-ups "
-        return f"{each}{estimate_text(found[high])}, {counted_text(found[high].agents, unit)}"
-    return (
-        f"highest {estimate_text(found[high])} with {high} ({counted_text(found[high].agents, unit)}), "
-        f"lowest {estimate_text(found[low])} with {low} ({counted_text(found[low].agents, unit)})"
-    )
+def _place(results: StudyResults, evaluation: Variant) -> str:
+    """Return where a number was measured: " on the emulated cart", ", latency 60 ms"; empty for one place."""
+    if len(results.evaluations) == 1:
+        return ""
+    if evaluation.value is not None and results.study.axis:
+        return f", {results.study.axis.label} {evaluation.label}"
+    if evaluation.label.startswith(CARTS):
+        return f" on the {evaluation.label}"
+    return f", {evaluation.label}"
 
 
-def estimate_text(found: Estimate) -> str:
-    """Return an estimate with its interval: "4210 ± 85"."""
-    return interval_text(found.value, found.low, found.high)
+def _ranked(found: Mapping[str, Estimate], unit: str = "agent", measure: str = "") -> str:
+    """Return ": " and the estimate of each arm, the best first; of many the highest and the lowest."""
+    less = low_is_good(measure)
+    note = " (lower is better)" if less else ""
+    labels = sorted(found, key=lambda label: found[label].value, reverse=not less)
+    best = found[labels[0]]
+    same_count = all(each.agents == best.agents for each in found.values())
+    if same_count and len({estimate_text(each, measure) for each in found.values()}) == 1:
+        each = "" if len(labels) == 1 else f"each of {len(labels)} set-ups "
+        return f"{note}: {each}{estimate_text(best, measure)}, {counted_text(best.agents, unit)}"
+
+    def told(label: str) -> str:
+        count = "" if same_count else f" of {counted_text(found[label].agents, unit)}"
+        return f"{_quoted(label)} {estimate_text(found[label], measure)}{count}"
+
+    end = f"; {counted_text(best.agents, unit)} each" if same_count else ""
+    first, last = ("lowest", "highest") if less else ("highest", "lowest")
+    if len(labels) <= MOST_TOLD:
+        return f"{note}: {', '.join(map(told, labels))}{end}"
+    return f"{note}, {len(labels)} set-ups: {first} {told(labels[0])}, {last} {told(labels[-1])}{end}"
 
 
-def counted_text(count: int, unit: str = "agent") -> str:
-    """Return "1 agent" or "10 agents"."""
-    return f"{count} {unit}{'' if count == 1 else 's'}"
+def _quoted(label: str) -> str:
+    """Return a label, in quotation marks where it would run into the number that follows it."""
+    return label if PLAIN.fullmatch(label) else f"“{label}”"
 
 
-def low_is_good(measure: str) -> bool:
-    """Return True for a measure of which less is better."""
-    return measure.startswith(LOW_IS_GOOD)
-
-
-def measure_label(measure: str) -> str:
-    """Return the name of a measure for axes and tables."""
-    return MEASURES.get(measure, measure.replace("_", " ").replace(".", " "))
+def opening(text: str) -> str:
+    """Return the first sentence of a text, and the next ones up to OPENING characters."""
+    first, *others = SENTENCES.split(text)
+    for sentence in others:
+        if len(first) >= SHORT and len(first) + len(sentence) > OPENING:
+            break
+        first += f" {sentence}"
+    return first

@@ -1,14 +1,14 @@
 """The figures of a study as SVG with alt texts and captions."""
 
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import get_args
+from functools import partial
 
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from cartpole_rl.reporting import style
 from cartpole_rl.reporting.figures import svg
 from cartpole_rl.reporting.figures.studies import (
     MOST_LINES,
@@ -16,14 +16,26 @@ from cartpole_rl.reporting.figures.studies import (
     curves_over_axis,
     described,
     dot_rows,
+    palette,
     profiles,
+    series_colours,
+    training_axis,
     training_curves,
 )
-from cartpole_rl.reporting.studies.answers import GOOD, counted_text, estimate_text, measure_label
+from cartpole_rl.reporting.studies.answers import GOOD
+from cartpole_rl.reporting.studies.numbers import (
+    counted_text,
+    estimate_text,
+    low_is_good,
+    measure_label,
+    percent,
+    sentence_start,
+    value_text,
+)
 from cartpole_rl.reporting.studies.results import OWN, SMALLEST, StudyResults
 from cartpole_rl.reporting.studies.settings import Variant
 from cartpole_rl.reporting.studies.statistics import estimate, interquartile_mean
-from cartpole_rl.tasks.settings import Measure
+from cartpole_rl.reporting.table import number_text
 
 MOST_ROWS = 40  # groups in a figure of dots
 FEWEST_PROFILED = 3  # agents
@@ -35,12 +47,13 @@ Groups = Mapping[str, Mapping[str, Array]]
 
 @dataclass(frozen=True)
 class Drawing:
-    """A figure for the page; `alt` describes it for readers who cannot see it."""
+    """A figure for the page; `alt` describes it for readers who cannot see it. `answer` stands above it."""
 
     name: str
     figure: Figure
     alt: str
     caption: str
+    answer: str = ""
 
     @property
     def svg(self) -> str:
@@ -55,7 +68,7 @@ def drawings(results: StudyResults) -> Iterator[Drawing]:
     yield _over_axis(results) if results.varied else _dots(results)
     if results.study.ratio:
         yield from _ratios(results)
-    if not results.varied:
+    if not results.varied and not low_is_good(results.study.measure):
         yield from _profiles(results)
     for name in dict.fromkeys(name for agent in results.agents for name in agent.curves):
         yield from _training(results, name)
@@ -80,10 +93,14 @@ def _dots(results: StudyResults) -> Drawing:
     values = [value for agent in results.agents for value in agent.values.values()]
     guided = good is not None and min(values) < good < max(values)
     figure = dot_rows(groups, label, {f"good: {good:g}": good} if good and guided else None)
-    caption = (
-        f"Dots: {results.study.unit}s. Diamond and line: interquartile mean and its 95 % interval.{note}"
-    )
-    return Drawing("agents", figure, described(groups, label), caption)
+    better = " Lower is better." if low_is_good(results.study.measure) else ""
+    alt = described(groups, label, partial(value_text, measure=results.study.measure), results.study.unit)
+    return Drawing("agents", figure, alt, f"{_key(results)}{better}{note}")
+
+
+def _key(results: StudyResults) -> str:
+    """Return what the marks of `dot_rows` are."""
+    return f"Dots: {results.study.unit}s. Diamond and line: interquartile mean and its 95 % interval."
 
 
 def _most(groups: Groups) -> tuple[Groups, str]:
@@ -117,13 +134,24 @@ def _over_axis(results: StudyResults) -> Drawing:
     label = measure_label(results.study.measure)
     quantity = f"{axis.label}, {axis.unit}" if axis.unit else axis.label
     ends = "; ".join(
-        f"{name}: {estimate_text(estimate(values[0]))} at {at[0]:g}, "
-        f"{estimate_text(estimate(values[-1]))} at {at[-1]:g}"
+        f"{name}: {estimate_text(estimate(values[0]), results.study.measure)} at {at[0]:g}, "
+        f"{estimate_text(estimate(values[-1]), results.study.measure)} at {at[-1]:g}"
         for name, (at, values) in lines.items()
     )
     caption = f"Dots: {results.study.unit}s. Line and band: interquartile mean and its 95 % interval."
-    figure = curves_over_axis(lines, quantity, label)
+    figure = curves_over_axis(lines, quantity, label, _line_colours(results, [*lines]))
     return Drawing("agents", figure, f"{label} over {quantity}. {ends}.", caption)
+
+
+def _line_colours(results: StudyResults, lines: Sequence[str]) -> dict[str, str]:
+    """Return the colours of lines over an axis: those of their arms or evaluations, if they are such."""
+    arms = _colours(results)
+    if {*lines} <= arms.keys() and len(arms) <= MOST_LINES:
+        return arms
+    evaluations = [each.label for each in results.evaluations]
+    if {*lines} <= {*evaluations}:
+        return series_colours(evaluations)
+    return {label: style.series_colour(index) for index, label in enumerate(lines)}
 
 
 def _lines(results: StudyResults) -> dict[str, list[tuple[float, Array]]]:
@@ -159,37 +187,51 @@ def _ratios(results: StudyResults) -> Iterator[Drawing]:
     shown, note = _most(groups)
     counted = sum(series[""].size for series in groups.values())
     if failed := results.pairs(first.name, second.name).shape[1] - counted:
-        least = f"{SMALLEST:.0%} of the highest on the {first.label}"
+        least = f"{percent(SMALLEST)} of the highest on the {first.label}"
         note += f" {counted_text(failed)} without ratio: under {least}."
     figure = dot_rows(shown, label, {"1": 1.0})
     yield Drawing(
         "ratios",
         figure,
-        described(shown, f"Ratio {label}"),
-        f"{second.label} divided by {first.label}, per agent.{note}",
+        described(shown, f"Ratio {label}", number_text, "agent"),
+        f"Ratio: {second.label} divided by {first.label}, per agent. {_key(results)}{note}",
     )
 
 
 def _profiles(results: StudyResults) -> Iterator[Drawing]:
+    colours, label = _colours(results), measure_label(results.study.measure)
     for last in results.judged:
         groups = {arm.label: {"": results.values(arm.name, last.name)} for arm in results.study.arms}
         ranked = [label for label in _ranked(groups) if groups[label][""].size >= FEWEST_PROFILED]
         if not ranked:
             continue
-        chosen = {label: series[""] for label, series in groups.items() if label in ranked[:MOST_LINES]}
-        label = measure_label(results.study.measure)
+        chosen = {name: series[""] for name, series in groups.items() if name in ranked}
         medians = "; ".join(
             f"{name}: half of the {results.study.unit}s above {np.median(each):.4g}"
             for name, each in chosen.items()
         )
-        note = f" The highest {MOST_LINES} of {len(ranked)} are drawn." if len(ranked) > MOST_LINES else ""
         place = "" if last is OWN else f", {last.label}"
         yield Drawing(
             f"profiles_{last.name}" if len(results.judged) > 1 else "profiles",
-            profiles(chosen, label),
+            profiles(chosen, label, colours, results.study.unit),
             f"Performance profiles of {label}{place}. {medians}.",
-            f"Performance profile{place}: the share of {results.study.unit}s above each value.{note}",
+            f"Performance profile{place}: the share of {results.study.unit}s above each value; further right "
+            f"is better.{_grey(colours)}",
         )
+
+
+def _colours(results: StudyResults) -> dict[str, str]:
+    """Return the colour of each arm's label in all figures of a study whose lines are arms."""
+    groups = {arm.label: {"": results.values(arm.name, results.judged[0].name)} for arm in results.study.arms}
+    present = [label for label in _ranked(groups) if groups[label][""].size]
+    return palette([*groups], present)
+
+
+def _grey(colours: Mapping[str, str], what: str = "lines") -> str:
+    """Return a note about set-ups that are too many to be told apart by colours."""
+    if len(colours) <= MOST_LINES:
+        return ""
+    return f" The set-ups with the highest and the lowest mean are coloured; the grey {what} are the others."
 
 
 def _training(results: StudyResults, name: str) -> Iterator[Drawing]:
@@ -199,7 +241,7 @@ def _training(results: StudyResults, name: str) -> Iterator[Drawing]:
         ]
         for arm in results.study.arms
     }
-    drawn = [label for label, curves in groups.items() if curves][:MOST_LINES]
+    drawn = [label for label, curves in groups.items() if curves]
     if not drawn:
         return
     ends = "; ".join(
@@ -207,14 +249,14 @@ def _training(results: StudyResults, name: str) -> Iterator[Drawing]:
         for label in drawn
     )
     what = name if name == LOSS else f"{measure_label(name)} of an evaluation"
-    figure = training_curves({label: groups[label] for label in drawn}, what)
-    left_out = sum(bool(curves) for curves in groups.values()) - len(drawn)
-    note = f" {left_out} more groups are not drawn." if left_out else ""
+    colours = _colours(results)
+    figure = training_curves({label: groups[label] for label in drawn}, what, colours)
+    axis = training_axis([max(curve[-1][0] for curve in groups[label]) for label in drawn])
     yield Drawing(
         f"training_{name}",
         figure,
-        f"{what} over the transitions of training. {ends}.",
-        f"Training: {what}. Thin lines: agents. Thick line: their median.{note}",
+        f"{sentence_start(what)} over the {axis}. {ends}.",
+        f"Training: {what}. Thin lines: agents. Thick line: their median.{_grey(colours, 'medians')}",
     )
 
 
@@ -225,61 +267,22 @@ def _agreement(results: StudyResults) -> Iterator[Drawing]:
     if sum(each.shape[1] for each in present.values()) < FEWEST_PROFILED:
         return
     label = measure_label(results.study.measure)
-    figure = agreement(present, f"{label}, {first.label}", f"{label}, {second.label}")
+    figure = agreement(present, f"{label}, {first.label}", f"{label}, {second.label}", _colours(results))
     yield Drawing(
         "agreement",
         figure,
-        f"{label} of each agent: {second.label} over {first.label}.",
-        f"Each agent on both: a dot on the dashed line has the same {label} on both.{one_colour(present)}",
+        f"{sentence_start(label)} of each agent: {second.label} over {first.label}.",
+        f"Each agent on both: a dot on the dashed line has the same {label} on both. "
+        f"Rank correlation over {_together(present)}.{one_colour(present, 'set-ups')}",
     )
 
 
-def one_colour(groups: Mapping[str, Array]) -> str:
-    """Return a note about groups that are too many to be told apart by colours."""
-    return f" All {len(groups)} groups have one colour." if len(groups) > MOST_LINES else ""
+def _together(groups: Mapping[str, Array]) -> str:
+    """Return whose rank correlation it is; differences between set-ups are part of it."""
+    agents = counted_text(sum(each.shape[1] for each in groups.values()))
+    return f"all {len(groups)} set-ups together, {agents}" if len(groups) > 1 else agents
 
 
-def rank_agreements(results: Sequence[StudyResults]) -> list[Drawing]:
-    """Return the agreement of the agents' order in simulation and on the cart, for each score."""
-    found = (_rank_agreement(results, measure) for measure in get_args(Measure))
-    return [each for each in found if each]
-
-
-def _rank_agreement(results: Sequence[StudyResults], measure: Measure) -> Drawing | None:
-    """Return the `measure` of all agents in the two evaluations that most studies compare; None for too few.
-
-    Only studies of this measure count. An agent that several studies evaluate is drawn once.
-    """
-    compared = [
-        each
-        for each in results
-        if len(each.evaluations) > 1 and each.study.measure == measure and not each.varied
-    ]
-    names = Counter((each.evaluations[0].name, each.evaluations[1].name) for each in compared)
-    if not names:
-        return None
-    common, _ = names.most_common(1)[0]
-    drawn: set[tuple[float, ...]] = set()
-    groups: dict[str, Array] = {}
-    labels = ("", "")
-    for each in compared:
-        first, second = each.evaluations[:2]
-        fresh = {tuple(pair) for pair in each.pairs(first.name, second.name).T.tolist()} - drawn
-        if (first.name, second.name) == common and fresh:
-            drawn |= fresh
-            title = (
-                each.study.title if each.study.title not in groups else f"{each.study.title} ({each.name})"
-            )
-            groups[title] = np.array(sorted(fresh)).T
-            labels = first.label, second.label
-    if len(drawn) < FEWEST_PROFILED:
-        return None
-    label = measure_label(measure)
-    figure = agreement(groups, f"{label}, {labels[0]}", f"{label}, {labels[1]}")
-    return Drawing(
-        f"rank_agreement_{measure}",
-        figure,
-        f"{label} of {len(drawn)} agents of {len(groups)} studies: {labels[1]} over {labels[0]}.",
-        f"{len(drawn)} agents of {len(groups)} studies. The dashed line: the same {label} on both. "
-        f"The simulated cart is the nominal one of each agent's training.{one_colour(groups)}",
-    )
+def one_colour(groups: Mapping[str, Array], name: str) -> str:
+    """Return a note about groups that are too many to be told apart by colours; `name` says what they are."""
+    return f" Colours do not distinguish the {name}." if len(groups) > MOST_LINES else ""

@@ -1,24 +1,24 @@
 """The page of studies and that of a person's own runs, each one HTML file with everything in it."""
 
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 
 from cartpole_rl.reporting.page import Html, document, escaped, table
 from cartpole_rl.reporting.studies.answers import (
-    BEYOND,
     GOOD,
     THESIS_ROWS,
     Status,
     answer,
-    counted_text,
-    estimate_text,
+    opening,
     reason,
     status,
 )
 from cartpole_rl.reporting.studies.comparison import Comparison
-from cartpole_rl.reporting.studies.figures import rank_agreements
+from cartpole_rl.reporting.studies.numbers import counted_text, estimate_text, percent
+from cartpole_rl.reporting.studies.ranks import rank_agreements
 from cartpole_rl.reporting.studies.results import StudyResults
-from cartpole_rl.reporting.studies.robustness import robustness
+from cartpole_rl.reporting.studies.robustness import Robustness, robustness
 from cartpole_rl.reporting.studies.sections import (
     MOST_EXCLUSIONS,
     Picture,
@@ -28,8 +28,21 @@ from cartpole_rl.reporting.studies.sections import (
     figure_parts,
     folded,
     run_list,
+    wide,
 )
-from cartpole_rl.reporting.studies.texts import EMULATED, ENOUGH, METHOD, STYLE, TITLE
+from cartpole_rl.reporting.studies.texts import (
+    EMULATED,
+    EMULATED_CART,
+    ENOUGH,
+    INTRODUCTION,
+    METHOD,
+    STYLE,
+    TITLE,
+)
+
+REAL = "plant=serial"  # the override of a run on a real cart
+UNTOLD = "not in the thesis"
+NO_STUDY = ': <span class="alarm">no study</span>'  # of a row of the thesis's list
 
 
 def studies_page(
@@ -42,12 +55,10 @@ def studies_page(
     `pictures` maps the name of a study to its pictures, `emulators` the name of each emulated cart to its
     settings with their comments.
     """
-    agents = sum(len(each.agents) for each in results)
-    sizes = sorted({each.label for each in results if each.agents and each.label})
-    size = f", size {', '.join(sizes)}" if sizes else ""
     parts = [
         f"<h1>{TITLE}</h1>",
-        f"<p>{_count(results)}{size}, {counted_text(agents, 'run')}.</p>",
+        f"<p>{_count(results)}</p>",
+        _introduction(results, bool(emulators)),
         _tendency(results),
         _summary(results),
         _contents(results),
@@ -81,10 +92,28 @@ def runs_page(
 
 
 def _count(results: Sequence[StudyResults]) -> str:
-    """Return "1 study", "38 studies", or "2 of 38 studies" where the others have no results."""
+    """Return "38 studies, size full: 1122 agents and 10 models.", or "2 of 38 ..." for some with results."""
     made = sum(bool(each.agents) for each in results)
     part = f"{made} of " if made < len(results) else ""
-    return f"{part}{len(results)} {'study' if len(results) == 1 else 'studies'}"
+    sizes = sorted({each.label for each in results if each.agents and each.label})
+    size = f", size {', '.join(sizes)}" if sizes else ""
+    units: Counter[str] = Counter()
+    for each in results:
+        units[each.study.unit] += len(each.agents)
+    *others, last = [counted_text(count, unit) for unit, count in units.items() if count] or ["no result"]
+    runs = f"{', '.join(others)} and {last}" if others else last
+    several = " An agent that several studies evaluate counts in each." if made > 1 else ""
+    return f"{part}{len(results)} {'study' if len(results) == 1 else 'studies'}{size}: {runs}.{several}"
+
+
+def _introduction(results: Sequence[StudyResults], emulated: bool) -> str:
+    """Return what a newcomer must know to read the summary."""
+    variants = [part for each in results for part in (*each.study.arms, *each.evaluations)]
+    real = any(REAL in variant.overrides for variant in variants)
+    carts = " ".join(("" if real else "No real cart was driven.", EMULATED_CART if emulated else "")).strip()
+    terms = ({"Carts": Html(carts)} if carts else {}) | INTRODUCTION
+    listed = "".join(f"<dt>{term}</dt><dd>{escaped(text)}</dd>" for term, text in terms.items())
+    return f'<dl class="terms">{listed}</dl>'
 
 
 def _tendency(results: Sequence[StudyResults]) -> str:
@@ -117,9 +146,9 @@ def _summary(results: Sequence[StudyResults]) -> str:
     rows = [
         {
             "study": _link(each),
-            "the thesis": each.study.thesis or "–",
-            "here": " ".join([*answer(each)[: len(each.judged)], *_comment(each)]),
             "verdict": _status(each),
+            "the thesis": _prose(opening(each.study.thesis or UNTOLD)),
+            "here": _prose(_short_answer(each)),
         }
         for each in ranked
     ]
@@ -129,22 +158,41 @@ def _summary(results: Sequence[StudyResults]) -> str:
     return f'<section id="summary"><h2>Summary: what fails comes first</h2>{found}{lacking}</section>'
 
 
+def _short_answer(results: StudyResults) -> str:
+    """Return the start of what a person wrote about these results, else the numbers that count."""
+    if comment := _comment(results):
+        return opening(*comment)
+    return " ".join(answer(results)[: len(results.judged)])
+
+
 def _contents(results: Sequence[StudyResults]) -> str:
-    """Return the thesis's list with the studies of each row, then those beyond it; empty for one study."""
+    """Return the thesis's list with the studies of each row, those beyond it, and a person's own.
+
+    It is a plain list if none is of the thesis, and empty for one study.
+    """
     if len(results) == 1:
         return ""
-    beyond = "".join(f"<li>{_link(each)}</li>" for each in results if each.study.order >= BEYOND)
-    further = f"<ul>{beyond}</ul>" if beyond else ""
-    if all(each.study.order >= BEYOND for each in results):
-        return f'<nav id="contents"><h2>Contents</h2>{further}</nav>'
-    rows = []
-    for number, what in THESIS_ROWS.items():
-        own = [each for each in results if each.study.order // 10 == number]
-        links = "".join(f"<li>{_link(each)}</li>" for each in own)
-        missing = "" if own else ': <span class="alarm">no study</span>'
-        rows.append(f"<li>{escaped(what)}{missing}<ul>{links}</ul></li>")
-    further = f"<h3>Beyond the thesis</h3>{further}" if beyond else ""
-    return f'<nav id="contents"><h2>The list of the thesis</h2><ol>{"".join(rows)}</ol>{further}</nav>'
+    rows = {
+        number: [each for each in results if each.shipped and each.study.order // 10 == number]
+        for number in THESIS_ROWS
+    }
+    placed = {each.name for row in rows.values() for each in row}
+    if not placed:
+        return f'<nav id="contents"><h2>Contents</h2>{_links(results)}</nav>'
+    listed = "".join(
+        f"<li>{escaped(what)}{'' if rows[number] else NO_STUDY}{_links(rows[number])}</li>"
+        for number, what in THESIS_ROWS.items()
+    )
+    others = {
+        "Beyond the thesis": [each for each in results if each.shipped and each.name not in placed],
+        "Own studies": [each for each in results if not each.shipped],
+    }
+    further = "".join(f"<h3>{heading}</h3>{_links(found)}" for heading, found in others.items() if found)
+    return f'<nav id="contents"><h2>The list of the thesis</h2><ol>{listed}</ol>{further}</nav>'
+
+
+def _links(results: Sequence[StudyResults]) -> str:
+    return f"<ul>{''.join(f'<li>{_link(each)}</li>' for each in results)}</ul>"
 
 
 def _study_section(results: StudyResults, pictures: Sequence[Picture]) -> str:
@@ -152,11 +200,11 @@ def _study_section(results: StudyResults, pictures: Sequence[Picture]) -> str:
     figure = f" <small>({escaped(_figure_name(study.figure))})</small>" if study.figure else ""
     facts = {
         "Question": study.question,
-        "The thesis": study.thesis or "not in the thesis",
-        "Here": " ".join(answer(results)),
-        "Why": " ".join(_comment(results)),
+        "The thesis": study.thesis or UNTOLD,
+        "Answer": " ".join(_comment(results)),
+        "Numbers": " ".join(answer(results)),
     }
-    listed = "".join(f"<dt>{name}</dt><dd>{escaped(text)}</dd>" for name, text in facts.items() if text)
+    listed = "".join(f"<dt>{name}</dt><dd>{_prose(text)}</dd>" for name, text in facts.items() if text)
     parts = [
         f'<section id="{_anchor(results.name)}">',
         f"<h2>{escaped(study.title)}{figure}</h2>",
@@ -185,11 +233,13 @@ def _sweep_section(results: StudyResults, pictures: Sequence[Picture]) -> str:
 
 
 def _ranks(results: Sequence[StudyResults]) -> str:
-    figures = "".join(map(drawn, rank_agreements(results)))
-    if not figures:
+    found = rank_agreements(results)
+    if not found:
         return ""
+    figures = "".join(f"<div><p>{escaped(each.answer)}</p>{drawn(each)}</div>" for each in found)
     return (
         '<section id="ranks"><h2>Does the order in simulation predict that on the cart?</h2>'
+        f"<p>Agents of all studies together; differences between set-ups are part of it.</p>"
         f'<div class="figures">{figures}</div></section>'
     )
 
@@ -203,7 +253,7 @@ def _robustness(results: Sequence[StudyResults]) -> str:
         {
             "set-up": each.label,
             **{name: _percent(score) for name, score in each.criteria.items()},
-            "overall": _percent(each.overall),
+            "overall, 95 % interval": _overall(each),
             "agents": each.agents,
         }
         for each in found
@@ -211,13 +261,21 @@ def _robustness(results: Sequence[StudyResults]) -> str:
     text = (
         f"Share of cases, one agent at one value of a quantity, with a score (6.2) above {GOOD['score']:g}. "
         f"Each quantity is a criterion of weight 1/{len(found[0].criteria)}, after the leaderboard of DFKI's "
-        "double pendulum (Wiebe et al., 2023). A set-up that lacks agents has no score."
+        "double pendulum (Wiebe et al., 2023). A set-up that lacks agents has no score. The interval is that "
+        "of the mean over agents."
     )
-    return f'<section id="robustness"><h2>Robustness score</h2><p>{text}</p>{table(rows)}</section>'
+    return f'<section id="robustness"><h2>Robustness score</h2><p>{text}</p>{wide(rows)}</section>'
+
+
+def _overall(found: Robustness) -> str:
+    """Return the overall score with its interval: "62 % (58 % to 66 %)"."""
+    if found.estimate is None or found.estimate.low is None or found.estimate.high is None:
+        return _percent(found.overall)
+    return f"{_percent(found.overall)} ({percent(found.estimate.low)} to {percent(found.estimate.high)})"
 
 
 def _percent(share: float | None) -> str:
-    return "–" if share is None else f"{share:.0%}"
+    return "–" if share is None else percent(share)
 
 
 def _comparison(comparison: Comparison) -> str:
@@ -272,6 +330,11 @@ def _status(results: StudyResults) -> Html:
     return Html(f'<span class="alarm">{found}</span>{escaped(reason(results))}')
 
 
+def _prose(text: str) -> Html:
+    """Return a text as HTML in which a number and its percent sign stay together."""
+    return Html(escaped(text).replace(" %", "&nbsp;%"))
+
+
 def _comment(results: StudyResults) -> list[str]:
     """Return what a person wrote about these results."""
     return [results.finding.comment] if results.finding else []
@@ -282,4 +345,5 @@ def _is_alarming(results: StudyResults) -> bool:
 
 
 def _anchor(name: str) -> str:
-    return f"study-{name}"
+    """Return the id of a section; no character of a name ends the attribute."""
+    return f"study-{re.sub('[^A-Za-z0-9_.+-]', '-', name)}"

@@ -1,5 +1,6 @@
 """The results of a study as plain numbers, read from run folders or from a small JSON file."""
 
+import hashlib
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -7,16 +8,21 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import TypeAdapter
 
-from cartpole_rl.reporting.studies.settings import Finding, Size, Study, Variant
-from cartpole_rl.reporting.studies.statistics import Estimate, estimate
+from cartpole_rl.reporting.studies.settings import Finding, FolderName, Size, Study, Variant
+from cartpole_rl.reporting.studies.statistics import Estimate, estimate, interquartile_mean
 
 FORMAT = 1  # of the JSON file
 DIGITS = 6  # significant, of the numbers in it
+JUDGED_DIGITS = 3  # significant, of the means that a finding is bound to
+DIGEST = 8  # hex digits
 OWN = Variant(name="own", label="its own evaluation")  # the result of a run without further evaluations
 STAGES = (Variant(name="before", label="before"), Variant(name="after", label="after fine-tuning"))
 
 CART = "emulated"  # evaluation on the cart that stands for the real one
+LARGEST = 1e30  # of all numbers; figures and means of larger ones overflow
+NAME: TypeAdapter[str] = TypeAdapter(FolderName)
 SMALLEST = 0.1  # share of the study's highest value, below which an agent has no ratio
 
 Array = NDArray[np.float64]
@@ -44,7 +50,10 @@ class Exclusion:
 
 @dataclass(frozen=True)
 class StudyResults:
-    """The agents of a study that count, the runs that do not, and remarks on how they were made."""
+    """The agents of a study that count, the runs that do not, and remarks on how they were made.
+
+    A `shipped` study is one of conf/study/; `changed` names what today's file there has made otherwise.
+    """
 
     name: str
     study: Study
@@ -53,6 +62,8 @@ class StudyResults:
     notes: tuple[str, ...] = ()
     versions: str = ""  # of the packages that all agents share
     folder: str = ""  # relative path of the runs
+    shipped: bool = False
+    changed: tuple[str, ...] = ()
 
     @property
     def evaluations(self) -> tuple[Variant, ...]:
@@ -74,10 +85,52 @@ class StudyResults:
 
     @property
     def finding(self) -> Finding | None:
-        """What a person found in these results; None if they are incomplete or of another size."""
+        """What a person found in these very results; None if they are incomplete or others."""
+        found = self._finding_of_size
+        return found if found and not self.changed and found.digest == self.digest else None
+
+    @property
+    def lost_finding(self) -> Finding | None:
+        """What a person found in other complete results of this size; None if there is no such finding."""
+        return None if self.finding else self._finding_of_size
+
+    @property
+    def _finding_of_size(self) -> Finding | None:
         found = self.study.finding
         fits = found and found.size == self.label and not self.missing() and not self.exclusions
         return found if fits else None
+
+    @property
+    def digest(self) -> str:
+        """A short hash of the interquartile means of all arms and evaluations; a finding is bound to it.
+
+        It is the same for the runs and for their JSON file.
+        """
+        means = sorted(
+            f"{arm.name} {evaluation.name} {_judged(values)}"
+            for arm in self.study.arms
+            for evaluation in self.evaluations
+            if (values := self.values(arm.name, evaluation.name)).size
+        )
+        return hashlib.sha256("\n".join(means).encode()).hexdigest()[:DIGEST]
+
+    @property
+    def file(self) -> str:
+        """The file of the study."""
+        return f"conf/study/{self.name}.yaml" if self.shipped else f"{self.folder or self.name}/study.yaml"
+
+    @property
+    def remarks(self) -> list[str]:
+        """Sentences about what today's file of the study says otherwise, and a finding of other results."""
+        said, found = [], self.lost_finding
+        if self.changed:
+            said.append(f"{self.file} has changed since these runs: {', '.join(self.changed)}.")
+        if found and found.digest == self.digest:
+            said.append("Its finding is not shown.")
+        elif found:
+            other = f"(digest {found.digest or 'missing'}; these have {self.digest})"
+            said.append(f"The finding in {self.file} is about other results {other}.")
+        return said
 
     @property
     def varied(self) -> tuple[Variant, ...]:
@@ -181,25 +234,71 @@ def from_json(content: Mapping[str, Any], study: Study) -> StudyResults:
     """Return the results of `study` in a JSON file. Raises KeyError, TypeError or ValueError."""
     if content["format"] != FORMAT:
         raise ValueError(f"format {content['format']}; this version reads format {FORMAT}")
-    agents = [
-        Agent(
-            each["arm"],
-            int(each["seed"]),
-            each["run"],
-            {name: float(value) for name, value in each["values"].items()},
-            {name: tuple((float(x), float(y)) for x, y in curve) for name, curve in each["curves"].items()},
-        )
-        for each in content["agents"]
-    ]
-    return StudyResults(
-        content["name"],
+    results = StudyResults(
+        checked_name(content["name"]),
         study,
-        tuple(agents),
-        tuple(Exclusion(**each) for each in content["exclusions"]),
-        tuple(content["notes"]),
-        content["versions"],
-        content["folder"],
+        tuple(map(_agent, content["agents"])),
+        tuple(Exclusion(str(each["run"]), str(each["reason"])) for each in content["exclusions"]),
+        tuple(map(str, content["notes"])),
+        str(content["versions"]),
+        str(content["folder"]),
     )
+    _check_agents(results)
+    return results
+
+
+def checked_name(name: str) -> str:
+    """Return the name of a study, which names files and parts of the page. Raises ValueError."""
+    try:
+        return NAME.validate_python(name)
+    except ValueError:
+        raise ValueError(f"{name!r} is no name of a study; give letters, digits and . _ + - alone") from None
+
+
+def _agent(content: Mapping[str, Any]) -> Agent:
+    """Return an agent of a JSON file. Raises KeyError, TypeError or ValueError."""
+    return Agent(
+        content["arm"],
+        int(content["seed"]),
+        str(content["run"]),
+        {name: _number(value) for name, value in content["values"].items()},
+        {
+            name: tuple((_number(x), _number(y)) for x, y in curve)
+            for name, curve in content["curves"].items()
+        },
+    )
+
+
+def _check_agents(results: StudyResults) -> None:
+    """Raise ValueError for an agent that is there twice, or of an arm or evaluation that the study lacks."""
+    arms, evaluations = ({each.name for each in kind} for kind in (results.study.arms, results.evaluations))
+    seen = set()
+    for agent in results.agents:
+        if agent.arm not in arms or not evaluations >= agent.values.keys():
+            raise ValueError(
+                f"agent {agent.arm}/{agent.seed} is of an arm or evaluation that the study lacks"
+            )
+        if (agent.arm, agent.seed) in seen:
+            raise ValueError(f"agent {agent.arm}/{agent.seed} is there twice")
+        seen.add((agent.arm, agent.seed))
+
+
+def _number(value: Any) -> float:
+    """Return a number that can be shown. Raises ValueError."""
+    if not is_number(value):
+        raise ValueError(f"{str(value)[:20]} is no number")
+    return float(value)
+
+
+def is_number(value: Any) -> bool:
+    """Return True for a finite number that figures can show; a boolean is none."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= LARGEST
+
+
+def _judged(values: Array) -> str:
+    """Return the interquartile mean of agents [agents], to JUDGED_DIGITS, of the values in a JSON file."""
+    mean = float(interquartile_mean([_rounded(value) for value in values.tolist()]))
+    return f"{mean + 0.0:.{JUDGED_DIGITS}g}"  # + 0.0: no minus zero
 
 
 def _rounded(value: float) -> float:

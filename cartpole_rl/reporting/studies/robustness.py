@@ -12,6 +12,7 @@ import numpy as np
 
 from cartpole_rl.reporting.studies.answers import GOOD
 from cartpole_rl.reporting.studies.results import Array, StudyResults
+from cartpole_rl.reporting.studies.statistics import Estimate, mean_estimate
 
 CRITERIA = "robustness_"  # prefix of the names of studies
 
@@ -20,12 +21,14 @@ CRITERIA = "robustness_"  # prefix of the names of studies
 class Robustness:
     """The score of one set-up: by criterion, and their mean; None where a criterion lacks agents.
 
-    `agents` is the smallest number of agents of any case.
+    `agents` is the smallest number of agents of any case, `estimate` the overall score with the interval of
+    the mean over agents; None where criteria have other numbers of agents.
     """
 
     label: str
     criteria: Mapping[str, float | None]
     agents: int
+    estimate: Estimate | None = None
 
     @property
     def overall(self) -> float | None:
@@ -47,6 +50,7 @@ def robustness(results: Sequence[StudyResults]) -> list[Robustness]:
             label,
             {_quantity(each): _share(each, label) for each in criteria},
             min(values.size for each in criteria for values in _cases(each, label)),
+            _estimate(criteria, label),
         )
         for label in labels
     ]
@@ -62,6 +66,21 @@ def _share(results: StudyResults, label: str) -> float | None:
     if any(each.size < asked for each in values):
         return None
     return float(np.mean([(each > GOOD[results.study.measure]).mean() for each in values]))
+
+
+def _estimate(criteria: Sequence[StudyResults], label: str) -> Estimate | None:
+    """Return the mean over agents of their shares of successful cases, each criterion with equal weight.
+
+    The agents of a set-up are the same in all criteria, so that whole agents are resampled.
+    """
+    counts = {values.size for each in criteria for values in _cases(each, label)}
+    if len(counts) != 1 or 0 in counts or any(_share(each, label) is None for each in criteria):
+        return None
+    shares = [
+        np.mean([values > GOOD[each.study.measure] for values in _cases(each, label)], axis=0)
+        for each in criteria
+    ]
+    return mean_estimate(np.mean(shares, axis=0))
 
 
 def _cases(results: StudyResults, label: str) -> list[Array]:

@@ -8,17 +8,22 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from cartpole_rl.reporting.figures import svg
 from cartpole_rl.reporting.page import escaped, table
-from cartpole_rl.reporting.studies.answers import GOOD, estimate_text, measure_label, ratios
+from cartpole_rl.reporting.studies.answers import GOOD, ratios
 from cartpole_rl.reporting.studies.figures import Drawing, drawings
+from cartpole_rl.reporting.studies.numbers import estimate_text, measure_label, value_text
 from cartpole_rl.reporting.studies.results import Exclusion, StudyResults
 from cartpole_rl.reporting.studies.settings import RUN, Variant
 from cartpole_rl.reporting.studies.statistics import estimate
-from cartpole_rl.reporting.table import number_text
 
 MOST_LISTED = 1000  # runs in the list of a study
 MOST_ROWS = 24  # of a table that is shown unfolded
 MOST_EXCLUSIONS = 40  # runs named one by one
+COMMITS = "The runs are of "  # start of a note that stands with the list of runs
+BLANKS = (
+    "{seed}: 0, 1, 2, … (one run each). {run}: the run folder of an agent. {runs}: the folder of all studies."
+)
 
 
 @dataclass(frozen=True)
@@ -46,7 +51,8 @@ def figure_parts(results: StudyResults, pictures: Sequence[Picture]) -> Iterator
             ],
             "ratios",
         )
-    yield f'<div class="figures">{"".join(map(drawn, drawings(results)))}</div>'
+    figures = "".join(drawn(each, results.name) for each in drawings(results))
+    yield f'<div class="figures">{figures}</div>'
     animations = [each for each in pictures if each.kind == "gif"]
     others = [each for each in pictures if each.kind != "gif"]
     for heading, grid, chosen in (
@@ -71,9 +77,9 @@ def _value_rows(results: StudyResults) -> list[dict[str, Any]]:
             if several:
                 row["evaluation"] = evaluation.label
             row |= {
-                f"{measure_label(measure)}, 95 % interval": estimate_text(estimate(values)),
-                "lowest": number_text(float(values.min())),
-                "highest": number_text(float(values.max())),
+                f"{measure_label(measure)}, 95 % interval": estimate_text(estimate(values), measure),
+                "lowest": value_text(float(values.min()), measure),
+                "highest": value_text(float(values.max()), measure),
             }
             if good := GOOD.get(measure):
                 row[f"above {good:g}"] = f"{(values > good).sum()} of {values.size}"
@@ -83,25 +89,32 @@ def _value_rows(results: StudyResults) -> list[dict[str, Any]]:
 
 
 def folded(rows: Sequence[Mapping[str, Any]], name: str) -> str:
-    """Return a table, folded if it is long."""
+    """Return a table that scrolls on a phone, folded if it is long; paper shows it unfolded."""
     if not rows:
         return ""
-    whole = table(rows)
+    whole = wide(rows)
     if len(rows) <= MOST_ROWS:
         return whole
-    return f"<details><summary>{len(rows)} rows of {name}</summary>{whole}</details>"
+    summary = f"<summary>{len(rows)} rows of {name}</summary>"
+    return f'<details class="values">{summary}{whole}</details>'
+
+
+def wide(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return a table that scrolls by itself where it is wider than the page."""
+    return f'<div class="wide" tabindex="0" role="group" aria-label="table">{table(rows)}</div>'
 
 
 def doubts(results: StudyResults, missing: Sequence[str]) -> str:
-    """Return the box that names what is missing, what does not count and what is mixed; empty without any."""
+    """Return the box that names what is missing and what does not count; empty without any."""
     shown = [f"{each.run} does not count: {each.reason}." for each in results.exclusions[:MOST_EXCLUSIONS]]
     if (more := len(results.exclusions) - len(shown)) > 0:
         shown.append(f"{more} more runs do not count, as: {_reasons(results.exclusions[MOST_EXCLUSIONS:])}.")
-    lines = [*missing, *shown, *results.notes]
+    notes = (note for note in results.notes if not note.startswith(COMMITS))
+    lines = [*missing, *shown, *notes, *results.remarks]
     if not lines:
         return ""
     listed = "".join(f"<li>{escaped(line)}</li>" for line in lines)
-    return f'<aside class="box" role="note" aria-label="Missing or mixed runs"><ul>{listed}</ul></aside>'
+    return f'<aside class="box" role="note" aria-label="Missing or excluded runs"><ul>{listed}</ul></aside>'
 
 
 def _reasons(exclusions: Sequence[Exclusion]) -> str:
@@ -111,12 +124,22 @@ def _reasons(exclusions: Sequence[Exclusion]) -> str:
 def commands(results: StudyResults) -> str:
     """Return the command that repeats the study, and those of its runs by hand."""
     size = f" --size {results.label}" if results.label else ""
-    whole = f"scripts/reproduce {results.name}{size}"
+    whole = f"scripts/reproduce {results.name}{_places(results)}{size}"
     by_hand = "\n".join(_by_hand(results))
     return (
         f"<h3>Command</h3><pre><code>{escaped(whole)}</code></pre>"
-        f"<details><summary>Each run by hand</summary><pre><code>{escaped(by_hand)}</code></pre></details>"
+        f"<details><summary>Each run by hand</summary><p>{BLANKS}</p>"
+        f"<pre><code>{escaped(by_hand)}</code></pre></details>"
     )
+
+
+def _places(results: StudyResults) -> str:
+    """Return the options of an own study: the folder of its file, which the reader knows, and of its runs."""
+    if results.shipped:
+        return ""
+    parts = results.folder.split("/")[:-1]
+    root = "/".join(parts[:-1] if parts[-1:] == [results.label] else parts) or "."
+    return f" --studies FOLDER --folder {_quoted(root)}"
 
 
 def _by_hand(results: StudyResults) -> Iterator[str]:
@@ -126,17 +149,18 @@ def _by_hand(results: StudyResults) -> Iterator[str]:
     experiment = [f"experiment={study.experiment}"] if study.experiment else []
     for arm in study.arms:
         if study.agents_of:
-            yield f"# {arm.label}: agents of {study.agents_of}"
+            yield f"# {arm.label}: agents of the study {study.agents_of}"
         elif named := study.agent_of(arm):
             more = " ".join(study.evaluated_with(arm))
             yield f"# {arm.label}: {RUN}{named}" + (f", each evaluation also with {more}" if more else "")
         else:
             yield _command(study.command, [*experiment, *arm.overrides, *overrides, "seed={seed}"], results)
+    labels = {arm.name: arm.label for arm in study.arms}
     for evaluation in study.evaluations:
         common = size.evaluation_overrides if size else ()
         for name in ("", *evaluation.of_arms):
             if name:
-                yield f"# agents of {name}:"
+                yield f"# agents of {labels[name]}:"
             yield _command("evaluate", ["run={run}", *evaluation.words(name, common), "seed={seed}"], results)
 
 
@@ -152,7 +176,7 @@ def _quoted(word: str) -> str:
 
 
 def run_list(results: StudyResults) -> str:
-    """Return the folded list of the runs that count."""
+    """Return the folded list of the runs that count, with the versions and commits that made them."""
     if not results.agents:
         return ""
     measure = results.study.measure
@@ -160,23 +184,28 @@ def run_list(results: StudyResults) -> str:
         {"run": agent.run, "seed": agent.seed, **_named_values(results, agent.values, measure)}
         for agent in results.agents[:MOST_LISTED]
     ]
-    versions = f"<p>{escaped(results.versions)}</p>" if results.versions else ""
-    heading = f"The {len(results.agents)} runs behind it"
-    return f"<details><summary>{heading}</summary>{versions}{table(rows)}</details>"
+    notes = [note for note in results.notes if note.startswith(COMMITS)]
+    made = "".join(f"<p>{escaped(line)}</p>" for line in (results.versions, *notes) if line)
+    count = len(results.agents)
+    heading = f"The {count} runs behind it" if count > 1 else "The run behind it"
+    heading += f": the first {MOST_LISTED}" if count > MOST_LISTED else ""
+    return f"<details><summary>{heading}</summary>{made}{wide(rows)}</details>"
 
 
 def _named_values(results: StudyResults, values: Mapping[str, float], measure: str) -> dict[str, str]:
     evaluations: Sequence[Variant] = results.evaluations
     if len(evaluations) == 1:
-        return {measure_label(measure): number_text(values[evaluations[0].name])}
+        return {measure_label(measure): value_text(values[evaluations[0].name], measure)}
     return {
-        each.label: number_text(values[each.name]) if each.name in values else "–" for each in evaluations
+        each.label: value_text(values[each.name], measure) if each.name in values else "–"
+        for each in evaluations
     }
 
 
-def drawn(drawing: Drawing) -> str:
-    """Return a figure with its caption."""
-    return f"<figure>{drawing.svg}<figcaption>{escaped(drawing.caption)}</figcaption></figure>"
+def drawn(drawing: Drawing, study: str = "") -> str:
+    """Return a figure of a study with its caption."""
+    figure = svg(drawing.figure, drawing.alt, f"{study}/{drawing.name}")
+    return f"<figure>{figure}<figcaption>{escaped(drawing.caption)}</figcaption></figure>"
 
 
 def _picture(picture: Picture) -> str:

@@ -44,9 +44,13 @@ class Evaluation(Variant):
 
 
 class Finding(Settings):
-    """What a person found in the complete results of one size. It is shown with these results alone."""
+    """What a person found in the complete results of one size. It is shown with these results alone.
+
+    `digest` is that of the results (`StudyResults.digest`); cartpole-report prints the one to enter.
+    """
 
     size: str
+    digest: str = ""  # empty: of no results
     verdict: Literal["fails", "contradicts", "agrees", "answered"]  # the last: no result to compare with
     comment: str  # why the results agree with the thesis or contradict it
 

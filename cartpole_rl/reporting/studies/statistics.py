@@ -25,6 +25,7 @@ from cartpole_rl.intervals import CONFIDENCE
 RESAMPLES = 5000
 TRIMMED = 0.25  # share of the values cut off at each end
 EDGES = (50 * (1 - CONFIDENCE), 50 * (1 + CONFIDENCE))  # percent
+CHUNKS = 20  # of the samples of pairs, so that their ranks need little memory
 FEWEST_RANKED = 4  # agents from which a rank correlation has an interval
 
 Array = NDArray[np.float64]
@@ -64,6 +65,12 @@ def _pooled_estimate(strata: tuple[tuple[float, ...], ...]) -> Estimate:
     return _estimate(lambda *parts: interquartile_mean(np.concatenate(parts, axis=-1)), groups, count)
 
 
+def mean_estimate(values: ArrayLike) -> Estimate:
+    """Return the mean of `values` [n] with its bootstrap interval."""
+    group = np.asarray(values, dtype=float)
+    return _estimate(lambda sample: np.asarray(sample.mean(axis=-1)), [group], group.size)
+
+
 def difference(values: ArrayLike, others: ArrayLike) -> Estimate:
     """Return IQM(values) - IQM(others) for independent agents; `agents` is that of the smaller group."""
     groups = [np.asarray(values, dtype=float), np.asarray(others, dtype=float)]
@@ -76,11 +83,24 @@ def probability_of_improvement(values: ArrayLike, others: ArrayLike) -> Estimate
     """Return the probability that an agent of `values` [n] scores more than one of `others` [m]."""
     groups = [np.asarray(values, dtype=float), np.asarray(others, dtype=float)]
 
-    def share(a: Array, b: Array) -> Array:
-        above = np.sign(a[..., :, None] - b[..., None, :])
-        return np.asarray(0.5 + 0.5 * above.mean(axis=(-2, -1)))
+    def share(*samples: Array) -> Array:
+        if samples[0].ndim == 1:
+            return _share_above(*samples)
+        chunks = (np.array_split(each, CHUNKS) for each in samples)
+        return np.concatenate([_share_above(*chunk) for chunk in zip(*chunks, strict=True)])
 
     return _estimate(share, groups, min(each.size for each in groups))
+
+
+def _share_above(values: Array, others: Array) -> Array:
+    """Return the share of pairs of `values` [..., n] and `others` [..., m] in which the first is higher.
+
+    It is Mann and Whitney's U, from ranks, so that pairs need no memory.
+    """
+    n, m = values.shape[-1], others.shape[-1]
+    ranks = stats.rankdata(np.concatenate([values, others], axis=-1), axis=-1)
+    pairs = ranks[..., :n].sum(axis=-1) - n * (n + 1) / 2
+    return np.asarray(0.5 + 0.5 * ((2 * pairs - n * m) / (n * m)))
 
 
 def performance_profile(values: ArrayLike, scores: ArrayLike) -> tuple[Array, Array, Array]:

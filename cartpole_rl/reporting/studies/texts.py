@@ -11,9 +11,28 @@ METHOD = (
 )
 EMULATED = (
     "The emulated cart is an emulator, not a real cart: a separate program with the physics of MuJoCo that "
-    "speaks the cart's serial protocol and shares no equation with the simulator. The settings below say how "
-    "it differs from the nominal cart. It lacks wear, backlash, a bending track and more. With a real cart, "
-    "plant=serial takes the place of plant=emulated in the same commands."
+    "speaks the cart's serial protocol and shares no equation with the simulator; many of its parameters lie "
+    "inside the training ranges, see the comments below. The settings below say how it differs from the "
+    "nominal cart. It lacks wear, backlash, a bending track and more. With a real cart, plant=serial takes "
+    "the place of plant=emulated in the same commands."
+)
+INTRODUCTION = {  # term: what it means; the carts come before
+    "Score (6.1)": "Balance: at most 500.",
+    "Score (6.2)": "Swing-up: at most 5500; over 2000 is good.",
+    "Values": (
+        "Interquartile means over agents with 95 % intervals, as 4104 (4062 to 4177); the last checkpoint of "
+        "every seed counts."
+    ),
+    "Settings": "Thesis's settings: those of the thesis. Today's settings: this package's defaults.",
+    "Verdicts": (
+        "Agrees, contradicts: compared with the thesis. Answered: the thesis has no result to compare with. "
+        "Fails: it does not work."
+    ),
+    "No difference is shown": "The interval of the difference includes 0.",
+    "Ratio": "Score on the emulated cart divided by that in simulation.",
+}
+EMULATED_CART = (
+    'The emulated cart is a separate MuJoCo simulation that stands in for one (<a href="#emulated">more</a>).'
 )
 ENOUGH = 10  # agents per set-up
 STYLE = """
@@ -22,6 +41,8 @@ svg { width: 100%; height: auto; font-family: inherit; }
 nav ol { padding-left: 1.8rem; } nav ul { padding-left: 1rem; list-style: none; margin: 0; }
 section { margin-top: 2.5rem; border-top: 1px solid var(--faint); }
 dt { color: var(--muted); } dd { margin: 0 0 .6rem 0; }
+.terms { display: grid; grid-template-columns: max-content 1fr; gap: .15rem 1.2rem; font-size: .92rem; }
+.terms dd { margin: 0; }
 .figures { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 24rem), 1fr));
   gap: 1.2rem; }
 .animations { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 14rem), 1fr));
@@ -35,5 +56,21 @@ pre { white-space: pre-wrap; background: var(--faint); padding: .5rem .7rem; bor
 pre code { padding: 0; }
 summary { cursor: pointer; color: var(--link); }
 table { margin: 1rem 0; } h3 { font-size: 1rem; margin: 1.6rem 0 .5rem; } details { margin: .8rem 0; }
-@media print { details:not([open])::details-content { content-visibility: visible; display: block; } }
+@media (min-width: 40.01rem) {
+  #summary td:nth-child(1) { width: 21%; } #summary td:nth-child(2) { width: 13%; }
+  #summary td:nth-child(3) { width: 28%; }
+}
+@media (max-width: 40rem) {
+  .terms { grid-template-columns: 1fr; gap: 0; } .terms dd { margin-bottom: .4rem; }
+  .wide table { display: table; } .wide th { white-space: nowrap; } .wide td:not(.number) { min-width: 8rem; }
+  .wide { overflow-x: auto; background:
+    linear-gradient(to right, var(--paper) 30%, transparent) left / 3rem 100% no-repeat local,
+    linear-gradient(to left, var(--paper) 30%, transparent) right / 3rem 100% no-repeat local,
+    linear-gradient(to right, var(--muted), transparent) left / 1rem 100% no-repeat scroll,
+    linear-gradient(to left, var(--muted), transparent) right / 1rem 100% no-repeat scroll; }
+}
+@media print {
+  details.values:not([open])::details-content { content-visibility: visible; display: block; }
+  .figures { grid-template-columns: 1fr 1fr; }
+}
 """

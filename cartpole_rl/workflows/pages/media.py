@@ -1,17 +1,18 @@
 """Pictures for a page from run folders: animations of agents, made smaller, and figures."""
 
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from PIL import Image
 
 from cartpole_rl.reporting.animation import smaller
-from cartpole_rl.reporting.studies.answers import low_is_good, measure_label
+from cartpole_rl.reporting.studies.numbers import low_is_good, measure_label
 from cartpole_rl.reporting.studies.results import OWN, Agent, StudyResults
 from cartpole_rl.reporting.studies.sections import Picture
 from cartpole_rl.reporting.table import number_text
 from cartpole_rl.run_files import ANIMATION, FIGURES
+from cartpole_rl.workflows.pages.runs import short
 from cartpole_rl.workflows.pages.studies import EVALUATIONS
 
 BUDGET = 12_000_000  # bytes of all pictures; a page takes a third more
@@ -23,7 +24,10 @@ PICTURED = ("identify", "model", "replay")  # commands whose results are figures
 
 
 class Gallery:
-    """Collects pictures until BUDGET is spent. `left_out` counts the animations that had no room."""
+    """Collects pictures until BUDGET is spent.
+
+    `left_out` counts those that had no room, `problems` names those that are damaged.
+    """
 
     def __init__(self, studies: Sequence[StudyResults]) -> None:
         animations = 3 * sum(bool(each.agents) for each in studies)
@@ -31,11 +35,12 @@ class Gallery:
         self.width, self.every = SIZES[next(fitting, len(SIZES) - 1)]
         self.room = BUDGET
         self.left_out = 0
+        self.problems: list[str] = []
 
     def pictures(self, results: StudyResults) -> list[Picture]:
         """Return the pictures of a study that its run folders hold and that there is room for."""
         found = []
-        for picture in (*self._animations(results), *_figures(results)):
+        for picture in (*self._animations(results), *self._figures(results)):
             if len(picture.data) > self.room:
                 self.left_out += 1
                 continue
@@ -48,12 +53,22 @@ class Gallery:
         arms = {arm.name: arm.label for arm in results.study.arms}
         for name, agent, value, path in chosen(results):
             text = f"{name}: {arms[agent.arm]}, seed {agent.seed}, {label} {number_text(value)}"
-            try:
-                data = smaller(path, self.width, self.every)
-            except (OSError, ValueError):  # damaged
-                continue
             alt = f"Animation of one episode of the {name} agent ({arms[agent.arm]}, seed {agent.seed})"
-            yield Picture(data, "gif", alt, text)
+            if data := self._read(path, lambda path: smaller(path, self.width, self.every)):
+                yield Picture(data, "gif", alt, text)
+
+    def _figures(self, results: StudyResults) -> Iterator[Picture]:
+        for path, caption in _chosen_figures(results):
+            if data := self._read(path, _figure):
+                yield Picture(data, "webp", caption, caption)
+
+    def _read(self, path: Path, reader: Callable[[Path], bytes]) -> bytes | None:
+        """Return the bytes of a picture, smaller; None for a damaged one, which `problems` names."""
+        try:
+            return reader(path)
+        except Exception as error:  # whatever the reader of a damaged file raises
+            self.problems.append(f"{path.as_posix()} is damaged and not shown: {short(error)}")
+            return None
 
 
 def chosen(results: StudyResults) -> list[tuple[str, Agent, float, Path]]:
@@ -76,36 +91,34 @@ def chosen(results: StudyResults) -> list[tuple[str, Agent, float, Path]]:
     return []
 
 
-def _figures(results: StudyResults) -> Iterator[Picture]:
-    """Yield the behaviour of the median agent, or all figures of a command whose results are figures."""
+def _chosen_figures(results: StudyResults) -> Iterator[tuple[Path, str]]:
+    """Yield file and caption of the median agent's behaviour, or of all figures if they are the results."""
     if results.study.command in PICTURED:
         for arm in results.study.arms:
             first = next((agent for agent in results.agents if agent.arm == arm.name), None)
             files = sorted(Path(first.run, FIGURES).glob("*.png"))[:MOST_FIGURES] if first else []
             for file in files:
-                yield from _figure(file, f"{file.stem.replace('_', ' ')}, {arm.label}")
+                yield file, f"{file.stem.replace('_', ' ')}, {arm.label}"
         return
     for name, agent, _, path in chosen(results)[:2][-1:]:  # the median; of fewer than three, the last
         if (file := path.with_name("behaviour.png")).is_file():
-            yield from _figure(file, f"An episode of the {name} agent over time (seed {agent.seed})")
+            yield file, f"An episode of the {name} agent over time (seed {agent.seed})"
 
 
-def _figure(path: Path, caption: str) -> Iterator[Picture]:
-    """Yield a figure as WebP; nothing if it is damaged."""
-    try:
-        with Image.open(path) as source:
-            picture = source.convert("RGB")
-            picture.thumbnail((FIGURE_WIDTH, FIGURE_WIDTH))
-    except (OSError, ValueError):
-        return
+def _figure(path: Path) -> bytes:
+    """Return a figure as WebP. A damaged one raises one of many errors."""
+    with Image.open(path) as source:
+        picture = source.convert("RGB")
+        picture.thumbnail((FIGURE_WIDTH, FIGURE_WIDTH))
     buffer = io.BytesIO()
     picture.save(buffer, "WEBP", quality=FIGURE_QUALITY)
-    yield Picture(buffer.getvalue(), "webp", caption, caption)
+    return buffer.getvalue()
 
 
 def _file(agent: Agent, evaluation: str, name: str) -> Path | None:
     """Return a file in figures/ of an evaluation of an agent, or of its own run, if it exists."""
     run = Path(agent.run)
-    inner = run if evaluation == OWN.name else run / EVALUATIONS / evaluation
+    inner = run / EVALUATIONS / evaluation
+    inner = run if evaluation == OWN.name and not inner.is_dir() else inner
     path = inner / FIGURES / name
     return path if path.is_file() else None

@@ -5,17 +5,19 @@ from pathlib import Path
 
 from cartpole_rl.files import write_text
 from cartpole_rl.reporting.figures import save
-from cartpole_rl.reporting.studies.answers import Status, counted_text, status
+from cartpole_rl.reporting.studies.answers import Status, status
 from cartpole_rl.reporting.studies.comparison import compare
-from cartpole_rl.reporting.studies.figures import Drawing, drawings, rank_agreements
+from cartpole_rl.reporting.studies.figures import Drawing, drawings
+from cartpole_rl.reporting.studies.numbers import counted_text
 from cartpole_rl.reporting.studies.page import runs_page, studies_page
+from cartpole_rl.reporting.studies.ranks import rank_agreements
 from cartpole_rl.reporting.studies.results import StudyResults
 from cartpole_rl.reporting.studies.sections import Picture
 from cartpole_rl.run_files import FIGURES, PAGE
 from cartpole_rl.workflows.config import ReportConfig
 from cartpole_rl.workflows.pages.media import Gallery
 from cartpole_rl.workflows.pages.studies import emulators, read_studies, write_data
-from cartpole_rl.workflows.pages.sweeps import Sweep, grouped, read_sweep, results_of, table
+from cartpole_rl.workflows.pages.sweeps import Sweep, grouped, read_sweeps, results_of, table
 from cartpole_rl.workflows.person import print_message
 from cartpole_rl.workflows.run_folder import write_config
 
@@ -46,6 +48,9 @@ def _report_studies(config: ReportConfig, source: Path, folder: Path) -> None:
     write_text(folder / PAGE, studies_page(results, pictures, emulators(results)))
     if config.figures:
         _write_figures(results, folder, rank_agreements(results))
+    for each in results:
+        if each.lost_finding:
+            print(f'{each.name}: {" ".join(each.remarks)} That of these has digest: "{each.digest}"')
     for kind in (Status.FAILS, Status.CONTRADICTS, Status.EMPTY, Status.INCOMPLETE):
         if names := [each.name for each in results if status(each) is kind]:
             print(f"{kind}: {', '.join(names)}")
@@ -54,9 +59,8 @@ def _report_studies(config: ReportConfig, source: Path, folder: Path) -> None:
 
 def _report_runs(config: ReportConfig, folder: Path) -> None:
     sets = {"runs": config.runs, "compare": config.compare}
-    sweeps, between = grouped(
-        [read_sweep(name, sources, config.measure) for name, sources in sets.items() if sources]
-    )
+    given = {name: sources for name, sources in sets.items() if sources}
+    sweeps, between = grouped(read_sweeps(given, config.measure))
     results = [results_of(sweep, config.measure) for sweep in sweeps]
     write_config(folder, "report", {**config.model_dump(mode="json"), "seed": None})
     write_text(folder / TABLE, table(sweeps))
@@ -86,6 +90,8 @@ def _pictures(config: ReportConfig, results: list[StudyResults]) -> dict[str, li
     pictures = {each.name: gallery.pictures(each) for each in results}
     if gallery.left_out:
         print_message("report", f"note: {gallery.left_out} pictures were left out to keep the page small")
+    for problem in gallery.problems:
+        print_message("report", f"note: {problem}")
     return pictures
 
 
@@ -94,6 +100,9 @@ def _title(sweep: Sweep) -> str:
 
 
 def _print_end(results: list[StudyResults], folder: Path) -> None:
-    left_out = sum(len(each.exclusions) for each in results)
-    print(f"{counted_text(sum(len(each.agents) for each in results), 'run')} count, {left_out} do not")
+    counting = sum(len(each.agents) for each in results)
+    others = sum(len(each.exclusions) for each in results)
+    where = "; the page says why" if others else ""
+    count = f"{counted_text(counting, 'run')} {'counts' if counting == 1 else 'count'}"
+    print(f"{count}, {others} {'does' if others == 1 else 'do'} not{where}")
     print(f"{folder}/{PAGE} is written")

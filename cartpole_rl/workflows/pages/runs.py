@@ -1,7 +1,6 @@
 """Reads run folders for a report: settings, results, versions, and why a run does not count."""
 
 import json
-import math
 import os
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
@@ -12,7 +11,18 @@ from typing import Any, TypeVar
 
 import yaml
 
-from cartpole_rl.run_files import COMPARISON, CONFIG, HISTORY, IDENTIFIED, METRICS, MODELLED, PROVENANCE
+from cartpole_rl.reporting.studies.results import is_number
+from cartpole_rl.run_files import (
+    CHECKPOINTS,
+    COMPARISON,
+    CONFIG,
+    ERROR,
+    HISTORY,
+    IDENTIFIED,
+    METRICS,
+    MODELLED,
+    PROVENANCE,
+)
 from cartpole_rl.workflows.run_folder import PREFIX
 from cartpole_rl.workflows.run_inputs import is_outdated
 
@@ -22,6 +32,16 @@ EPISODIC = ("evaluate", "record")  # commands that keep what they have after an 
 COMPARED_PACKAGES = ("cartpole_rl", "torch", "torchrl", "tensordict", "numpy", "mujoco")
 # settings that seeds of one set-up may differ in; the last parts of dotted names
 FREE = ("seed", "label", "threads", "run", "resume", "from", "port", "journal")
+DAMAGE = (  # what reading a damaged file raises
+    OSError,
+    ValueError,
+    LookupError,
+    TypeError,
+    AttributeError,
+    ArithmeticError,
+    RecursionError,
+    yaml.YAMLError,
+)
 LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # ten times faster, where it was compiled
 
 Item = TypeVar("Item")
@@ -47,7 +67,18 @@ class Run:
     def seed(self) -> int | None:
         """The seed of the run."""
         seed = self.config.get("seed")
-        return seed if isinstance(seed, int) else None
+        return seed if isinstance(seed, int) and not isinstance(seed, bool) else None
+
+    @property
+    def command(self) -> list[str]:
+        """The words of the command line that started the run."""
+        words = self.provenance.get("command")
+        return [*map(str, words)] if isinstance(words, list) else []
+
+    @property
+    def agent(self) -> str:
+        """The agent that the run evaluates, as it was given; empty for other commands."""
+        return self.config.get("run") or ""
 
     @property
     def versions(self) -> str:
@@ -63,26 +94,51 @@ class Run:
 
 
 def read_run(folder: Path) -> Run:
-    """Return the run in `folder`, with a problem if it is unfinished or damaged."""
+    """Return the run in `folder`, with a problem if it failed, is unfinished or damaged."""
     try:
-        config = yaml.load((folder / CONFIG).read_text(encoding="utf-8"), LOADER)
-        provenance = json.loads((folder / PROVENANCE).read_text(encoding="utf-8"))
-        program = str(provenance["program"]).removeprefix(PREFIX)
+        run = _started(folder)
     except FileNotFoundError as error:
-        return Run(folder, problem=f"it has no {Path(error.filename).name}")
-    except (OSError, ValueError, yaml.YAMLError, LookupError, TypeError) as error:
-        return Run(folder, problem=f"damaged: {_short(error)}")
+        return Run(folder, problem=_failure(folder) or f"it has no {Path(error.filename).name}")
+    except DAMAGE as error:
+        return Run(folder, problem=f"damaged: {short(error)}")
+    try:
+        run = replace(run, results=_results(folder, run.program))
+        return replace(run, problem=_interruption(run) or _outdated(folder))
+    except FileNotFoundError as error:
+        missing = f"unfinished: it has no {Path(error.filename).name}"
+        return replace(run, problem=_failure(folder) or missing)
+    except DAMAGE as error:
+        return replace(run, problem=f"damaged results: {short(error)}")
+
+
+def _started(folder: Path) -> Run:
+    """Return the run in `folder` without its results. Raises one of DAMAGE."""
+    config = yaml.load((folder / CONFIG).read_text(encoding="utf-8"), LOADER)
+    provenance = json.loads((folder / PROVENANCE).read_text(encoding="utf-8"))
     if not isinstance(config, dict):
-        return Run(folder, problem=f"damaged: {CONFIG} holds no settings")
-    run = Run(folder, program, config, provenance=provenance)
+        raise TypeError(f"{CONFIG} holds no settings")
+    if not isinstance(config.get("run"), str | None):
+        raise TypeError(f"run in {CONFIG} is no path")
+    run = Run(folder, str(provenance["program"]).removeprefix(PREFIX), config, provenance=provenance)
+    if "seed" in config and run.seed is None and config["seed"] is not None:
+        raise TypeError(f"seed in {CONFIG} is no number")
+    _ = run.settings, run.versions, run.commit  # they raise here, not while runs are compared
+    return run
+
+
+def _failure(folder: Path) -> str:
+    """Return why a job of a sweep failed, or that a link leads nowhere; empty for other runs."""
+    if folder.is_symlink() and not folder.exists():
+        return "a link to nothing"
     try:
-        results = _results(folder, program)
-    except FileNotFoundError as error:
-        return replace(run, problem=f"unfinished: it has no {Path(error.filename).name}")
-    except (OSError, ValueError) as error:
-        return replace(run, problem=f"damaged results: {_short(error)}")
-    outdated = "a run that it needs was made again since, with another result" if is_outdated(folder) else ""
-    return replace(run, results=results, problem=_interruption(program, config, results) or outdated)
+        first = (folder / ERROR).read_text(encoding="utf-8", errors="replace").partition("\n")[0]
+    except OSError:
+        return ""
+    return f"failed: {first[:200]}"
+
+
+def _outdated(folder: Path) -> str:
+    return "a run that it needs was made again since, with another result" if is_outdated(folder) else ""
 
 
 def _results(folder: Path, program: str) -> dict[str, Any]:
@@ -96,38 +152,78 @@ def _results(folder: Path, program: str) -> dict[str, Any]:
     return {**first[1], **dict(others)}
 
 
-def _interruption(program: str, config: Mapping[str, Any], results: Mapping[str, Any]) -> str:
+def _interruption(run: Run) -> str:
     """Return the problem of an evaluation with fewer episodes than it was started with."""
-    if program not in EPISODIC:
+    if run.program not in EPISODIC:
         return ""
-    done, asked = len(results.get("episodes") or ()), config.get("episodes")
+    repeated = (run.config.get("repeat") or {}).get("run")
+    done, asked = len(_episodes(run.results)), 1 if repeated else run.config.get("episodes")
     return f"interrupted: {done} of {asked} episodes" if done != asked else ""
+
+
+def _episodes(results: Mapping[str, Any]) -> list[Any]:
+    """Return what results hold of each episode. Raises TypeError."""
+    episodes = results.get("episodes") or []
+    if not isinstance(episodes, list):
+        raise TypeError("its episodes are no list")
+    return episodes
 
 
 def measured(results: Mapping[str, Any], measure: str) -> float | None:
     """Return the number at the dotted key `measure`, the mean if it is one; None if there is no number."""
+    found = _at(results, measure)
+    if isinstance(found, Mapping):
+        found = found.get("mean")
+    return float(found) if is_number(found) else None
+
+
+def _at(results: Mapping[str, Any], measure: str) -> Any:
     found: Any = results
     for key in measure.split("."):
         found = found.get(key) if isinstance(found, Mapping) else None
-    if isinstance(found, Mapping):
-        found = found.get("mean")
-    return float(found) if isinstance(found, int | float) and math.isfinite(found) else None
+    return found
 
 
-def history(folder: Path) -> list[dict[str, float]]:
-    """Return the evaluations of a training; none if its file is missing or damaged."""
-    try:
-        lines = (folder / HISTORY).read_text(encoding="utf-8").splitlines()
-        return [json.loads(line) for line in lines]
-    except (OSError, ValueError):
-        return []
+def partly_measured_note(runs: Iterable[Run], measure: str) -> str:
+    """Return a sentence about means over fewer episodes than the runs have; empty if there is none."""
+    counts = [
+        (found["count"], len(_episodes(run.results)))
+        for run in runs
+        if isinstance(found := _at(run.results, measure), Mapping) and is_number(found.get("count"))
+    ]
+    partial = [(count, all_) for count, all_ in counts if count < all_]
+    if not partial:
+        return ""
+    having, every = map(sum, zip(*partial, strict=True))
+    return (
+        f"{measure}: only {having} of {every} episodes of {len(partial)} runs have it; "
+        "their means are over these episodes."
+    )
 
 
 def learning_curve(folder: Path, measure: str) -> tuple[str, list[tuple[float, float]]]:
-    """Return the evaluations of a training: `measure`, or score if it has none, and (transitions, value)."""
-    records = history(folder)
-    name = measure if all(measure in each for each in records) else "score"
+    """Return the evaluations of a training: `measure`, or score if it has none, and (transitions, value).
+
+    There is none without a file. Raises ValueError for a damaged one.
+    """
+    if not (folder / HISTORY).exists():
+        return measure, []
+    records = [*_history(folder / HISTORY)]
+    name = measure if all(is_number(each.get(measure)) for each in records) else "score"
     return name, [(each["transitions"], each[name]) for each in records]
+
+
+def _history(file: Path) -> Iterator[dict[str, Any]]:
+    """Yield the lines of a history. Raises ValueError for one without transitions and score."""
+    for number, line in enumerate(file.read_text(encoding="utf-8").splitlines(), start=1):
+        try:
+            record = json.loads(line)
+            good = is_number(record["transitions"]) and is_number(record["score"])
+        except DAMAGE:
+            good = False
+        if not good:
+            raise ValueError(f"line {number} of {file.name} is damaged")
+        yield record
 
 
 def shared_settings(tree: Mapping[str, Any]) -> dict[str, Hashable]:
@@ -142,17 +238,31 @@ def flattened(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Hashable]:
         if isinstance(value, Mapping) and value:
             flat |= flattened(value, f"{prefix}{name}.")
         else:
-            flat[f"{prefix}{name}"] = value if isinstance(value, Hashable) else json.dumps(value)
+            flat[f"{prefix}{name}"] = value if isinstance(value, Hashable) else json.dumps(value, default=str)
     return flat
 
 
 def find_runs(folder: Path) -> Iterator[Path]:
-    """Yield `folder` if it is a run, else the runs anywhere below it, in order; runs inside runs are not."""
-    for here, folders, files in os.walk(folder):
+    """Yield `folder` if it is a run, else the runs anywhere below it, in order; runs inside runs are not.
+
+    A failed job of a sweep is a run, so are links that lead nowhere and folders that cannot be read. Links
+    are followed, to each folder once.
+    """
+    seen: set[str] = set()
+    unread: list[Path] = []
+    walk = os.walk(folder, followlinks=True, onerror=lambda error: unread.append(Path(error.filename)))
+    for here, folders, files in walk:
         folders.sort()
-        if CONFIG in files:
+        if (real := os.path.realpath(here)) in seen:
+            folders.clear()
+        elif CONFIG in files or ERROR in files:
             folders.clear()
             yield Path(here)
+        else:
+            links = (Path(here, name) for name in sorted(files))
+            yield from (link for link in links if link.is_symlink() and not link.exists())
+        seen.add(real)
+    yield from unread
 
 
 def split_by_majority(
@@ -188,6 +298,12 @@ def settings_difference(run: Run, common: Run, most: int = 3) -> str:
     return ", ".join((*shown, *more))
 
 
+def run_of(agent: Path) -> Path:
+    """Return the run folder of an agent: that of its checkpoint if it is one."""
+    is_checkpoint = agent.suffix == ".pt" and agent.parent.name == CHECKPOINTS
+    return agent.parent.parent if is_checkpoint else agent
+
+
 def commits_note(runs: Iterable[Run]) -> str:
     """Return a sentence about runs of several commits; empty for one."""
     counts = Counter(run.commit or "no commit" for run in runs)
@@ -201,5 +317,6 @@ def _plain(value: Hashable) -> str:
     return "unset" if value is None else str(value)
 
 
-def _short(error: Exception) -> str:
-    return " ".join(str(error).split())[:120]
+def short(error: Exception) -> str:
+    """Return the text of an error in one line that is not long."""
+    return " ".join(str(error).split())[:120] or type(error).__name__

@@ -1,8 +1,8 @@
 """Reads the results of studies, from run folders or from small JSON files.
 
 A folder of studies has a folder for each: study.yaml, and <arm>/<seed>/ with the run and its
-evaluations/<evaluation>/. Runs that are unfinished, damaged, or of other versions or settings than the rest
-are named and do not count.
+evaluations/<evaluation>/. Runs that are unfinished, damaged, of other versions or settings than the rest, or
+of another seed or agent than their place says, are named and do not count.
 """
 
 import json
@@ -23,18 +23,23 @@ from cartpole_rl.reporting.studies.results import (
     Curve,
     Exclusion,
     StudyResults,
+    checked_name,
     from_json,
 )
-from cartpole_rl.reporting.studies.settings import Study, Variant
+from cartpole_rl.reporting.studies.settings import RUN, Evaluation, Study, Variant
 from cartpole_rl.run_files import CONFIG
 from cartpole_rl.workflows.pages.runs import (
+    DAMAGE,
     Run,
     commits_note,
     learning_curve,
     measured,
+    partly_measured_note,
     read_run,
+    run_of,
     settings_difference,
     settings_key,
+    short,
     split_by_majority,
 )
 from cartpole_rl.workflows.run_folder import write_json
@@ -43,6 +48,10 @@ from cartpole_rl.workflows.studies import STUDIES, read_study_file
 STUDY, EVALUATIONS = "study.yaml", "evaluations"
 EMULATOR = "emulator="
 TEXTS = ("title", "order", "figure", "question", "thesis", "finding", "judged")  # of today's conf/study/
+MADE = ("measure", "command", "experiment", "ratio", "agents_of")  # what the results depend on
+RUNS, SEED = "{runs}/", "{seed}"  # in overrides: the folder of all studies, the seed of the agent
+TRAINING = ("train", "finetune")  # commands that make agents
+ITSELF = ""  # evaluation of a part that is the run of an arm and a seed itself
 LOSS = "learning/loss"  # TensorBoard's curve
 CURVE_POINTS = 60
 
@@ -106,24 +115,36 @@ def read_data(file: Path) -> StudyResults:
         content = json.loads(file.read_text(encoding="utf-8"))
         study = checked(Study, content["study"])
         return _with_texts(from_json(content, study))
-    except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
-        raise ConfigError(f"studies={file} is not a file of results: {error}") from None
+    except json.JSONDecodeError as error:
+        place = f"line {error.lineno}"
+        raise ConfigError(f"studies={file} is damaged ({place}): restore it or remove it") from None
+    except DAMAGE as error:
+        message = f"studies={file} is not a file of results: {short(error)}; restore it or remove it"
+        raise ConfigError(message) from None
 
 
 def read_study(folder: Path) -> StudyResults:
-    """Return the results in the folder of one study."""
+    """Return the results in the folder of one study. Raises ConfigError."""
+    name = _name_of(folder)
     study = read_study_file(folder / STUDY)
     if not study.size and folder.parent.name in study.sizes:
         study = study.model_copy(update={"size": folder.parent.name})
-    parts, exclusions = [*_parts(folder, study)], []
+    parts, exclusions = [*_parts(folder, name, study)], [*_misnamed(folder, study)]
     parts, unusable = _complete(parts)
     exclusions += unusable
     parts, others = _of_one_kind(parts)
     exclusions += others
-    agents, unmeasured = _agents(folder, study, parts)
-    notes = (*_unlisted(folder, study), commits_note(part.run for part in parts))
+    agents, unmeasured, curveless = _agents(folder, study, parts)
+    counted = (part.run for part in parts if part.evaluation != ITSELF or not study.evaluations)
+    notes = (
+        *_unlisted(folder, study),
+        *_untraced(folder, study),
+        commits_note(part.run for part in parts),
+        partly_measured_note(counted, study.measure),
+        *curveless,
+    )
     results = StudyResults(
-        folder.name,
+        name,
         study,
         tuple(agents),
         tuple(exclusions + unmeasured),
@@ -134,18 +155,57 @@ def read_study(folder: Path) -> StudyResults:
     return _with_texts(results)
 
 
-def _parts(folder: Path, study: Study) -> Iterator[Part]:
-    """Yield every run of a study that has a folder."""
+def _name_of(folder: Path) -> str:
+    """Return the name of the study in `folder`. Raises ConfigError."""
+    try:
+        return checked_name(folder.absolute().name)
+    except ValueError as error:
+        raise ConfigError(f"studies={folder}: {error}") from None
+
+
+def _parts(folder: Path, name: str, study: Study) -> Iterator[Part]:
+    """Yield every run of the study `name` that has a folder."""
     for arm in study.arms:
         for place in _seeds(folder / arm.name):
             seed = int(place.name)
-            own = next((each for each in (place, _origin(folder, study, arm, seed)) if _is_run(each)), place)
-            if _is_run(own) or not study.evaluations:
-                yield Part(arm.name, seed, OWN.name, read_run(own))
+            origin = _origin(folder, study, arm, seed)
+            own = next((each for each in (place, origin) if _is_run(each)), place)
+            if _is_run(own) or not study.evaluations or _trains(study, arm):
+                named = int(own.name) if own.name.isdecimal() else None
+                yield Part(arm.name, seed, ITSELF, _fitting(read_run(own), named, ""))
             for evaluation in study.evaluations:
                 inner = place / EVALUATIONS / evaluation.name
-                if inner.is_dir():
-                    yield Part(arm.name, seed, evaluation.name, read_run(inner))
+                if inner.is_dir() or inner.is_symlink():
+                    agent = _agent_of(name, study, arm, evaluation, seed)
+                    yield Part(arm.name, seed, evaluation.name, _fitting(read_run(inner), seed, agent))
+
+
+def _fitting(run: Run, seed: int | None, agent: str) -> Run:
+    """Return a run, with a problem if its place asks for another `seed` (or None) or `agent` (or "")."""
+    if run.problem:
+        return run
+    if seed is not None and run.seed != seed:
+        return replace(run, problem=f"its seed is {run.seed}, that of its place {seed}")
+    asked = Path(agent.removeprefix(RUNS)).parts
+    if agent and Path(run.agent).parts[-len(asked) :] != asked:
+        return replace(run, problem=f"it evaluated {run.agent}, its place asks for {agent}")
+    return run
+
+
+def _agent_of(name: str, study: Study, arm: Variant, evaluation: Evaluation, seed: int) -> str:
+    """Return the agent that an evaluation must name, below RUNS if a study made it; empty if any will do."""
+    words = [word for word in evaluation.words(arm.name, ()) if word.startswith(RUN)]
+    named = words[-1].removeprefix(RUN) if words else study.agent_of(arm)
+    if named is None and study.agents_of:
+        named = f"{RUNS}{study.agents_of}/{arm.name}/{SEED}"
+    if named is None and study.command in TRAINING:
+        named = f"{RUNS}{name}/{arm.name}/{SEED}"
+    return (named or "").replace(SEED, str(seed))
+
+
+def _trains(study: Study, arm: Variant) -> bool:
+    """Return True if each seed of an arm has a training in its own folder."""
+    return study.command in TRAINING and study.agent_of(arm) is None and not study.agents_of
 
 
 def _origin(folder: Path, study: Study, arm: Variant, seed: int) -> Path:
@@ -155,7 +215,7 @@ def _origin(folder: Path, study: Study, arm: Variant, seed: int) -> Path:
     named = study.agent_of(arm)
     if named is None:
         return folder / arm.name / str(seed)
-    return Path(named.replace("{runs}", folder.parent.as_posix()).replace("{seed}", str(seed)))
+    return run_of(Path(named.replace(RUNS, f"{folder.parent.as_posix()}/").replace(SEED, str(seed))))
 
 
 def _is_run(folder: Path) -> bool:
@@ -166,12 +226,24 @@ def _seeds(arm: Path) -> list[Path]:
     """Return the folders of an arm that are named by a seed, in order."""
     if not arm.is_dir():
         return []
-    return sorted((path for path in arm.iterdir() if path.name.isdecimal()), key=lambda path: int(path.name))
+    return sorted((path for path in arm.iterdir() if _is_seed(path.name)), key=lambda path: int(path.name))
+
+
+def _is_seed(name: str) -> bool:
+    """Return True for "1" and "10", and False for "01" and digits of other scripts."""
+    return name.isdecimal() and str(int(name)) == name
+
+
+def _misnamed(folder: Path, study: Study) -> Iterator[Exclusion]:
+    """Yield the folders of arms whose names look like a seed and are none."""
+    for place in (place for arm in study.arms for place in sorted(folder.glob(f"{arm.name}/*"))):
+        if place.name.isnumeric() and not _is_seed(place.name):
+            yield Exclusion(place.as_posix(), "its name is no seed")
 
 
 def _complete(parts: Sequence[Part]) -> tuple[list[Part], list[Exclusion]]:
     """Return the parts without problem, and the others; an agent whose own run has one is left out whole."""
-    broken = {part.place for part in parts if part.evaluation == OWN.name and part.run.problem}
+    broken = {part.place for part in parts if part.evaluation == ITSELF and part.run.problem}
     exclusions = [Exclusion(_name(part.run), part.run.problem) for part in parts if part.run.problem]
     return [part for part in parts if not part.run.problem and part.place not in broken], exclusions
 
@@ -183,7 +255,7 @@ def _of_one_kind(parts: Sequence[Part]) -> tuple[list[Part], list[Exclusion]]:
         Exclusion(_name(part.run), f"other versions: {part.run.versions or 'unknown'} instead of {common}")
         for part, common in others
     ]
-    odd = {part.place for part, _ in others if part.evaluation == OWN.name}
+    odd = {part.place for part, _ in others if part.evaluation == ITSELF}
 
     def kind(part: Part) -> tuple[str, str]:
         return part.arm, part.evaluation
@@ -196,14 +268,16 @@ def _of_one_kind(parts: Sequence[Part]) -> tuple[list[Part], list[Exclusion]]:
             exclusions.append(
                 Exclusion(_name(part.run), f"other settings: {settings_difference(part.run, same[0].run)}")
             )
-            odd |= {part.place} if part.evaluation == OWN.name else set()
+            odd |= {part.place} if part.evaluation == ITSELF else set()
     # an agent whose own run is odd is left out whole
     return [part for part in kept if part.place not in odd], exclusions
 
 
-def _agents(folder: Path, study: Study, parts: Sequence[Part]) -> tuple[list[Agent], list[Exclusion]]:
-    """Return the agents with a measure, and the runs without one."""
-    agents, exclusions = [], []
+def _agents(
+    folder: Path, study: Study, parts: Sequence[Part]
+) -> tuple[list[Agent], list[Exclusion], list[str]]:
+    """Return the agents with a measure, the runs without one, and notes on curves that cannot be read."""
+    agents, exclusions, notes = [], [], []
 
     def place(part: Part) -> tuple[str, int]:
         return part.place
@@ -213,17 +287,18 @@ def _agents(folder: Path, study: Study, parts: Sequence[Part]) -> tuple[list[Age
         values = _values(study, runs)
         for name, value in values.items():
             if value is None:
-                run = runs.get(name, runs.get(OWN.name))
+                run = runs.get(name, runs.get(ITSELF))
                 assert run
                 exclusions.append(Exclusion(_name(run), f"it has no {study.measure}"))
         present = {name: value for name, value in values.items() if value is not None}
         if present:
             path = (folder / arm / str(seed)).as_posix()
             variant = next(each for each in study.arms if each.name == arm)
-            curves = _curves(study, runs.get(OWN.name), _origin(folder, study, variant, seed))
+            curves, note = _curves(study, runs.get(ITSELF), _origin(folder, study, variant, seed))
+            notes += [note] if note else []
             agents.append(Agent(arm, seed, path, present, curves))
     order = [arm.name for arm in study.arms]
-    return sorted(agents, key=lambda agent: (order.index(agent.arm), agent.seed)), exclusions
+    return sorted(agents, key=lambda agent: (order.index(agent.arm), agent.seed)), exclusions, notes
 
 
 def _values(study: Study, runs: Mapping[str, Run]) -> dict[str, float | None]:
@@ -234,24 +309,30 @@ def _values(study: Study, runs: Mapping[str, Run]) -> dict[str, float | None]:
             for each in study.evaluations
             if each.name in runs
         }
-    own = runs[OWN.name].results
+    own = runs[ITSELF].results
     if study.command == "finetune":
         comparison: Any = own.get("comparison", {})
         return {stage.name: measured(comparison.get(stage.name, {}), study.measure) for stage in STAGES}
     return {OWN.name: measured(own, study.measure)}
 
 
-def _curves(study: Study, run: Run | None, origin: Path) -> dict[str, Curve]:
-    """Return the curves of a training that the study shows; TensorBoard's are in its `origin`."""
+def _curves(study: Study, run: Run | None, origin: Path) -> tuple[dict[str, Curve], str]:
+    """Return the curves of a training that the study shows, and a note if they are damaged.
+
+    TensorBoard's are in its `origin`.
+    """
     if run is None or run.program != "train":
-        return {}
+        return {}, ""
     curves: dict[str, Sequence[tuple[float, float]]] = {}
-    if "score" in study.curves:
-        name, curve = learning_curve(run.folder, study.measure)
-        curves[name] = curve
-    if "loss" in study.curves:
-        curves["loss"] = scalars(origin, LOSS)
-    return {name: _thinned(curve) for name, curve in curves.items() if len(curve) > 1}
+    try:
+        if "score" in study.curves:
+            name, curve = learning_curve(run.folder, study.measure)
+            curves[name] = curve
+        if "loss" in study.curves:
+            curves["loss"] = scalars(origin, LOSS)
+    except Exception as error:  # whatever the reader of a damaged file raises
+        return {}, f"The curves of {_name(run)} are not drawn: {short(error)}."
+    return {name: _thinned(curve) for name, curve in curves.items() if len(curve) > 1}, ""
 
 
 def _thinned(curve: Sequence[tuple[float, float]]) -> Curve:
@@ -270,29 +351,58 @@ def _unlisted(folder: Path, study: Study) -> list[str]:
     return [f"Folders that the study does not list as arms were not read: {', '.join(others)}."]
 
 
+def _untraced(folder: Path, study: Study) -> Iterator[str]:
+    """Yield a note on each arm with agents of another study whose trainings are not there."""
+    for arm in study.arms:
+        if not study.agents_of and not (study.agent_of(arm) or "").startswith(RUNS):
+            continue
+        places = _seeds(folder / arm.name)
+        lost = [place for place in places if not _is_run(_origin(folder, study, arm, int(place.name)))]
+        if lost:
+            yield f"{arm.label}: the trainings of {len(lost)} agents were not found and are not checked."
+
+
 def _with_texts(results: StudyResults) -> StudyResults:
-    """Return the results with the texts of today's conf/study/, which are written after the runs."""
+    """Return the results with the texts of today's conf/study/, which are written after the runs.
+
+    A user's own study that has the name of a shipped one keeps its own.
+    """
     file = STUDIES / f"{results.name}.yaml"
     if not file.is_file():
         return results
-    today = read_study_file(file)
-    texts = {name: getattr(today, name) for name in TEXTS}
-    made = ("measure", "arms", "evaluations", "command", "experiment")
-    changed = [name for name in made if getattr(today, name) != getattr(results.study, name)]
-    note = (f"conf/study/{file.name} has changed since these runs: {', '.join(changed)}.",) if changed else ()
-    return replace(results, study=results.study.model_copy(update=texts), notes=results.notes + note)
+    today, then = read_study_file(file), results.study
+    changed = _changes(then, today, results.label)
+    if not changed:
+        study = today.model_copy(update={"size": results.label})
+    elif then.question == today.question or then.title == today.title:
+        study = then.model_copy(update={name: getattr(today, name) for name in TEXTS})
+    else:
+        return results
+    return replace(results, study=study, shipped=True, changed=tuple(changed))
+
+
+def _changes(then: Study, today: Study, size: str) -> list[str]:
+    """Return what today's study makes otherwise; labels make nothing."""
+    changed = [name for name in MADE if getattr(then, name) != getattr(today, name)]
+    changed += ["axis"] if (then.axis and then.axis.unit) != (today.axis and today.axis.unit) else []
+    changed += ["arms"] if _unlabelled(then.arms) != _unlabelled(today.arms) else []
+    changed += ["evaluations"] if _unlabelled(then.evaluations) != _unlabelled(today.evaluations) else []
+    changed += [f"size {size}"] if size and then.sizes.get(size) != today.sizes.get(size) else []
+    return changed
+
+
+def _unlabelled(variants: Sequence[Variant]) -> list[dict[str, Any]]:
+    """Return arms or evaluations without their labels, by name."""
+    return [each.model_dump(exclude={"label"}) for each in sorted(variants, key=lambda each: each.name)]
 
 
 def _with_shipped(found: Sequence[StudyResults]) -> list[StudyResults]:
     """Return `found` with the other studies of conf/study/, if it holds one of them."""
-    shipped = {file.stem: file for file in sorted(STUDIES.glob("*.yaml"))}
-    names = {each.name for each in found}
-    if not names & {*shipped}:
+    if not any(each.shipped for each in found):
         return [*found]
-    lacking = [
-        StudyResults(name, read_study_file(file)) for name, file in shipped.items() if name not in names
-    ]
-    return [*found, *lacking]
+    names = {each.name for each in found}
+    files = [file for file in sorted(STUDIES.glob("*.yaml")) if file.stem not in names]
+    return [*found, *(StudyResults(file.stem, read_study_file(file), shipped=True) for file in files)]
 
 
 def _name(run: Run) -> str:

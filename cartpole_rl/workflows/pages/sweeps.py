@@ -2,45 +2,71 @@
 
 import csv
 import io
+import os
 import re
-from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from glob import glob
 from pathlib import Path
 from typing import Any
 
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.reporting.figures.studies import LONGEST_LABEL
+from cartpole_rl.reporting.scores import SCORES
 from cartpole_rl.reporting.studies.grouping import NULL, Columns, fewest, labels, setting_columns
 from cartpole_rl.reporting.studies.results import OWN, Agent, Curve, Exclusion, StudyResults
 from cartpole_rl.reporting.studies.settings import Size, Study, Variant
 from cartpole_rl.reporting.studies.statistics import interquartile_mean
-from cartpole_rl.run_files import CHECKPOINTS
+from cartpole_rl.workflows.checks import BASELINE
 from cartpole_rl.workflows.pages.runs import (
     Run,
     commits_note,
     find_runs,
     learning_curve,
     measured,
+    partly_measured_note,
     read_run,
+    run_of,
     shared_settings,
-    split_by_majority,
+    short,
 )
 from cartpole_rl.workflows.run_folder import PREFIX
 
+MOST_MEASURES = 20  # in a message
 MOST_UNSORTED = 12  # groups that are shown in the order of their runs
 AGENT = "agent"  # prefix of the settings of the agent that a run evaluates
+MOST_LACKING = 12  # groups that lack seeds and are named one by one
 OVERRIDE = re.compile(r"\+{0,2}([a-z_][\w.]*)=")  # on a command line
 
 
 @dataclass(frozen=True)
 class Member:
-    """A run of a sweep with the settings that it is grouped by: its own and those of its agent."""
+    """A run of a sweep with the settings that it is grouped by: its own and those of its `agent`.
+
+    `agent` is the run that made the agent which this run evaluates; None if there is no such run.
+    """
 
     run: Run
+    agent: Run | None
     tree: Mapping[str, Any]
     settings: Mapping[str, Hashable]
     seed: int
+
+    @property
+    def versions(self) -> str:
+        """The versions of the run, and those of its agent where they differ."""
+        agent = self.agent.versions if self.agent else self.run.versions
+        return self.run.versions if agent == self.run.versions else f"{self.run.versions}, agent {agent}"
+
+    @property
+    def problem(self) -> str:
+        """Why the run or its agent does not count; empty if both do."""
+        of_agent = (
+            self.agent and self.agent.problem and f"its agent {self.agent.folder}: {self.agent.problem}"
+        )
+        return self.run.problem or of_agent or ""
 
 
 @dataclass(frozen=True)
@@ -51,32 +77,75 @@ class Sweep:
     sources: Sequence[str]
     members: Sequence[Member]
     exclusions: Sequence[Exclusion]
+    notes: Sequence[str] = ()
     columns: Mapping[str, Sequence[str]] = field(default_factory=dict)
     labels: Sequence[str] = ()
 
 
 def read_sweep(name: str, sources: Sequence[str], measure: str) -> Sweep:
-    """Return the runs in the folders and glob patterns `sources`, without groups. Raises ConfigError.
+    """Return the runs of one set; see `read_sweeps`."""
+    (sweep,) = read_sweeps({name: sources}, measure)
+    return sweep
 
-    Runs count that are complete, of the most frequent command and of the most frequent versions.
+
+def read_sweeps(sets: Mapping[str, Sequence[str]], measure: str) -> list[Sweep]:
+    """Return the runs in the folders and glob patterns of each set, without groups. Raises ConfigError.
+
+    Runs count that are complete, of the most frequent command and of the most frequent versions of all sets.
+    A set without any such run keeps its own most frequent ones, with a note.
     """
-    folders = dict.fromkeys(run for source in sources for run in _found(name, source))
-    runs = [read_run(folder) for folder in folders]
-    exclusions = [_exclusion(run, run.problem) for run in runs if run.problem]
-    usable, others = split_by_majority([run for run in runs if not run.problem], lambda run: run.program)
-    exclusions += [
-        _exclusion(run, f"a run of {PREFIX}{run.program} among runs of {PREFIX}{common}")
-        for run, common in others
-    ]
-    usable, others = split_by_majority(usable, lambda run: run.versions)
-    exclusions += [
-        _exclusion(run, f"other versions: {run.versions or 'unknown'} instead of {common}")
-        for run, common in others
-    ]
-    unmeasured = [run for run in usable if measured(run.results, measure) is None]
-    exclusions += [_exclusion(run, f"it has no {measure}") for run in unmeasured]
     agents: dict[Path, Run] = {}
-    return Sweep(name, sources, [_member(run, agents) for run in usable if run not in unmeasured], exclusions)
+    sweeps = [
+        Sweep(name, sources, [_member(read_run(folder), agents) for folder in _folders(name, sources)], ())
+        for name, sources in sets.items()
+    ]
+    sweeps = [_without(sweep, lambda member: member.problem) for sweep in sweeps]
+    sweeps = _of_one_kind(sweeps, "commands", lambda member: f"{PREFIX}{member.run.program}")
+    sweeps = _of_one_kind(sweeps, "versions", lambda member: member.versions or "unknown")
+    _check_measure(sweeps, measure)
+    return [_without(sweep, partial(_lack, measure)) for sweep in sweeps]
+
+
+def _folders(name: str, sources: Sequence[str]) -> list[Path]:
+    """Return the runs of all sources, each once, whatever links lead to it. Raises ConfigError."""
+    found = [run for source in sources for run in _found(name, source)]
+    return [*{os.path.realpath(run): run for run in reversed(found)}.values()][::-1]
+
+
+def _lack(measure: str, member: Member) -> str:
+    return "" if measured(member.run.results, measure) is not None else f"it has no {measure}"
+
+
+def _without(sweep: Sweep, problem: Callable[[Member], str]) -> Sweep:
+    """Return a sweep without the members that have a problem, which it names."""
+    reasons = [problem(member) for member in sweep.members]
+    kept = [member for member, reason in zip(sweep.members, reasons, strict=True) if not reason]
+    left_out = [
+        _exclusion(member.run, reason)
+        for member, reason in zip(sweep.members, reasons, strict=True)
+        if reason
+    ]
+    return replace(sweep, members=kept, exclusions=[*sweep.exclusions, *left_out])
+
+
+def _of_one_kind(sweeps: Sequence[Sweep], what: str, kind: Callable[[Member], str]) -> list[Sweep]:
+    """Return the sweeps with members of the most frequent kind of all, or of a sweep that has none of it."""
+    every = Counter(kind(member) for sweep in sweeps for member in sweep.members)
+    common = max(every, key=every.__getitem__, default="")
+    found = []
+    for sweep in sweeps:
+        own = Counter(map(kind, sweep.members))
+        kept = common if common in own else max(own, key=own.__getitem__, default=common)
+        one = _without(sweep, partial(_difference, what, kind, kept))
+        note = f"The {what} of {sweep.name} differ from the rest: {kept}, not {common}."
+        found.append(one if kept == common else replace(one, notes=[*sweep.notes, note]))
+    return found
+
+
+def _difference(what: str, kind: Callable[[Member], str], common: str, member: Member) -> str:
+    """Return in words that a run is of another kind than most; empty if it is not."""
+    own = kind(member)
+    return "" if own == common else f"other {what}: {own} instead of {common}"
 
 
 def grouped(sweeps: Sequence[Sweep]) -> tuple[list[Sweep], Columns]:
@@ -98,7 +167,7 @@ def grouped(sweeps: Sequence[Sweep]) -> tuple[list[Sweep], Columns]:
         name: [next(iter(values[start:stop]), NULL) for start, stop in bounds]
         for name, values in outer.items()
     }
-    named = labels(fewest({name: columns[name] for name in inner}, chosen), len(members))
+    named = _numbered(labels(fewest({name: columns[name] for name in inner}, chosen), len(members)))
     found = [
         replace(
             sweep,
@@ -110,10 +179,18 @@ def grouped(sweeps: Sequence[Sweep]) -> tuple[list[Sweep], Columns]:
     return found, between
 
 
+def _numbered(named: Sequence[str]) -> list[str]:
+    """Return labels with a number each if figures cut one of them; the number tells them apart there."""
+    if not any(len(label) > LONGEST_LABEL for label in named):
+        return [*named]
+    numbers = {label: number for number, label in enumerate(dict.fromkeys(named), start=1)}
+    return [f"{numbers[label]}: {label}" for label in named]
+
+
 def _chosen(run: Run) -> Iterator[str]:
     """Yield the settings that were given on the command line of a run, with those of its agent's prefix."""
-    for word in run.provenance.get("command") or ():
-        if match := OVERRIDE.match(str(word)):
+    for word in run.command:
+        if match := OVERRIDE.match(word):
             yield match[1]
             yield f"{AGENT}.{match[1]}"
 
@@ -132,23 +209,26 @@ def results_of(sweep: Sweep, measure: str) -> StudyResults:
         sorted(groups, key=means.__getitem__, reverse=True) if len(groups) > MOST_UNSORTED else [*groups]
     )
     arms = [Variant(name=f"group_{number}", label=label) for number, label in enumerate(ordered, start=1)]
-    if any(len(label) > LONGEST_LABEL for label in ordered):  # figures cut them: a number tells them apart
-        arms = [
-            arm.model_copy(update={"label": f"{number}: {arm.label}"})
-            for number, arm in enumerate(arms, start=1)
-        ]
+    curves = {member.run.folder: _curves(member, measure) for member, _ in kept}
     agents = [
         Agent(
             arm.name,
             member.seed,
             member.run.folder.as_posix(),
             {OWN.name: _value(member, measure)},
-            _curves(member, measure),
+            curves[member.run.folder][0],
         )
         for arm, label in zip(arms, ordered, strict=True)
         for member in groups[label]
     ]
-    notes = [commits_note(member.run for member in sweep.members), *_unequal_seeds(sweep)]
+    notes = [
+        *sweep.notes,
+        commits_note(member.run for member in sweep.members),
+        partly_measured_note((member.run for member, _ in kept), measure),
+        *_untraced(sweep),
+        *_unequal_seeds(sweep),
+        *(note for _, note in curves.values()),
+    ]
     return StudyResults(
         sweep.name,
         Study(
@@ -184,10 +264,14 @@ def _value(member: Member, measure: str) -> float:
     return value
 
 
-def _curves(member: Member, measure: str) -> dict[str, Curve]:
-    """Return the learning curve of a training."""
-    name, curve = learning_curve(member.run.folder, measure)
-    return {name: tuple(curve)} if len(curve) > 1 else {}
+def _curves(member: Member, measure: str) -> tuple[dict[str, Curve], str]:
+    """Return the learning curve of a training, and a note if it is damaged."""
+    folder = member.run.folder
+    try:
+        name, curve = learning_curve(folder, measure)
+    except (OSError, ValueError) as error:
+        return {}, f"The learning curve of {folder.as_posix()} is not drawn: {short(error)}."
+    return ({name: tuple(curve)} if len(curve) > 1 else {}), ""
 
 
 def table(sweeps: Sequence[Sweep]) -> str:
@@ -218,7 +302,8 @@ def table(sweeps: Sequence[Sweep]) -> str:
 def _found(name: str, source: str) -> list[Path]:
     """Return the runs of a folder or of a glob pattern. Raises ConfigError if there is none."""
     folders = [Path(source)] if Path(source).is_dir() else [Path(path) for path in sorted(glob(source))]  # noqa: PTH207 - absolute patterns too
-    runs = [run for folder in folders if folder.is_dir() for run in find_runs(folder)]
+    folders = [folder for folder in folders if folder.is_dir() or folder.is_symlink()]
+    runs = [run for folder in folders for run in (find_runs(folder) if folder.is_dir() else [folder])]
     if not runs:
         missing = "it holds no run" if folders else "there is no such folder"
         raise ConfigError(
@@ -228,23 +313,23 @@ def _found(name: str, source: str) -> list[Path]:
 
 
 def _member(run: Run, agents: dict[Path, Run]) -> Member:
-    """Return a run with the settings of the agent that it evaluates, if that can be read."""
+    """Return a run with the settings of the agent that it evaluates, if that can be read.
+
+    `agents` are those that were read before.
+    """
     tree = {name: value for name, value in run.config.items() if name not in ("run", "evaluated", "repeat")}
-    seed = run.seed
-    if source := run.config.get("run"):
-        folder, checkpoint = Path(source), "last"
-        if folder.suffix == ".pt":
-            folder, checkpoint = (
-                folder.parent.parent if folder.parent.name == CHECKPOINTS else folder,
-                folder.stem,
-            )
-        agent = agents.setdefault(folder, read_run(folder))
-        if agent.config:
+    seed, agent = run.seed, None
+    if run.agent:
+        path = Path(run.agent)
+        folder, checkpoint = run_of(path), path.stem if path.suffix == ".pt" else "last"
+        if folder.is_dir():
+            agent = agents[folder] = agents.get(folder) or read_run(folder)
+        if agent and agent.config:
             tree[AGENT] = {"checkpoint": checkpoint, **agent.config}
             seed = agent.seed
         else:
-            tree[AGENT] = {"source": str(source)}
-    return Member(run, tree, shared_settings(tree), seed if seed is not None else 0)
+            tree[AGENT] = {"source": run.agent}
+    return Member(run, agent, tree, shared_settings(tree), seed if seed is not None else 0)
 
 
 def _bounds(sweeps: Iterable[Sweep]) -> list[tuple[int, int]]:
@@ -257,19 +342,24 @@ def _bounds(sweeps: Iterable[Sweep]) -> list[tuple[int, int]]:
 
 
 def _unequal_seeds(sweep: Sweep) -> list[str]:
-    """Return a note that names the groups that lack seeds which others have."""
+    """Return notes that name the groups that lack seeds which others have."""
     seeds: dict[str, set[int]] = {}
     for member, label in zip(sweep.members, sweep.labels, strict=True):
         seeds.setdefault(label, set()).add(member.seed)
     everything = set().union(*seeds.values())
-    shared = [own for own in seeds.values() if own == everything]
-    if len(seeds) < 2 or not shared:
-        return []
-    return [
+    lacking = [
         f"{label} lacks seed {', '.join(map(str, sorted(everything - own)))}"
         for label, own in seeds.items()
         if own != everything
     ]
+    more = len(lacking) - MOST_LACKING
+    return lacking if more <= 0 else [*lacking[:MOST_LACKING], f"{more} more groups lack seeds"]
+
+
+def _untraced(sweep: Sweep) -> list[str]:
+    """Return a note on agents whose own runs are not there."""
+    named = {member.run.agent for member in sweep.members if member.agent is None} - {"", str(BASELINE)}
+    return [f"The runs of {len(named)} agents were not found and are not checked."] if named else []
 
 
 def _means(results: Mapping[str, Any]) -> dict[str, float]:
@@ -279,6 +369,26 @@ def _means(results: Mapping[str, Any]) -> dict[str, float]:
         for name in results
         if name != "episodes" and (value := measured(results, name)) is not None
     }
+
+
+def _check_measure(sweeps: Sequence[Sweep], measure: str) -> None:
+    """Raise ConfigError if there are runs and none has the measure."""
+    results = [member.run.results for sweep in sweeps for member in sweep.members]
+    if results and all(measured(each, measure) is None for each in results):
+        names = dict.fromkeys(name for each in results for name in _dotted(each))
+        ranked = sorted(names, key=lambda name: (name not in SCORES, name.count(".")))
+        more = ", ..." if len(ranked) > MOST_MEASURES else ""
+        shown = f"{', '.join(ranked[:MOST_MEASURES])}{more}"
+        raise ConfigError(f"measure={measure}: no run has it; there are {shown}")
+
+
+def _dotted(results: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
+    """Yield the dotted keys of `measured` that results have."""
+    for name, content in results.items():
+        if name != "episodes" and measured(results, name) is not None:
+            yield f"{prefix}{name}"
+        elif isinstance(content, Mapping):
+            yield from _dotted(content, f"{prefix}{name}.")
 
 
 def _exclusion(run: Run, reason: str) -> Exclusion:

@@ -6,7 +6,6 @@ from typing import Any
 
 from tqdm import tqdm
 
-from cartpole_rl.learning.checkpoints import forget_training
 from cartpole_rl.workflows.config import (
     EvaluateConfig,
     FinetuneConfig,
@@ -20,9 +19,7 @@ from cartpole_rl.workflows.identify import identify_cart
 from cartpole_rl.workflows.loading import load_settings
 from cartpole_rl.workflows.model import learn_model
 from cartpole_rl.workflows.reproduce.plan import Task
-from cartpole_rl.workflows.reproduce.process import RESUMABLE
 from cartpole_rl.workflows.run_folder import PREFIX
-from cartpole_rl.workflows.studies import overrides_of
 from cartpole_rl.workflows.train import train
 
 WORKFLOWS: dict[str, tuple[type, Any]] = {
@@ -39,9 +36,5 @@ def carry_out(task: Task, resumed: bool = False) -> None:
     """Run the command of a task in its folder, or resume it. Raises CartPoleError."""
     sys.argv = [f"{PREFIX}{task.command}", *task.words]  # for provenance.json
     schema, workflow = WORKFLOWS[task.command]
-    overrides = overrides_of(task.words)
-    if resumed:
-        overrides["resume"] = str(task.folder)
+    overrides = task.overrides | ({"resume": str(task.folder)} if resumed else {})
     workflow(load_settings(schema, overrides), task.folder)
-    if task.command in RESUMABLE:
-        forget_training(task.folder)

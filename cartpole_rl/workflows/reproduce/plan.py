@@ -9,14 +9,16 @@ import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.reporting.studies.settings import Size, Study, Variant, setting
-from cartpole_rl.workflows.studies import STUDIES, load_study, unknown
+from cartpole_rl.workflows.studies import STUDIES, load_study, overrides_of, unknown
 
 FIRST_SEED = 10  # settings were chosen on seeds 0 to 9
 EVALUATIONS = "evaluations"  # folder in that of an agent
 BASELINE = "lqr"
+RESUMABLE = ("train", "finetune")  # commands
 
 
 @dataclass(frozen=True)
@@ -29,6 +31,11 @@ class Task:
     root: Path  # folder of all studies, as `words` name it
     words: tuple[str, ...]
     needs: tuple[Path, ...] = ()
+
+    @property
+    def overrides(self) -> dict[str, Any]:
+        """The overrides by name."""
+        return overrides_of(self.words, self.root)
 
     def was_made_by(self, words: Sequence[str]) -> bool:
         """Return True for the words of this run, wherever the folder of all studies was then."""
@@ -97,7 +104,7 @@ class Agent:
 
     def tasks(self) -> Iterator[Task]:
         """Yield the run itself, unless it evaluates an agent of another study, then its evaluations."""
-        agent = str(self.folder)
+        agent = f"{{runs}}/{self.name}/{self.arm.name}/{{seed}}"
         if self.study.command != "train" or self.shared is None:
             yield self.own_task()
         else:
@@ -122,11 +129,11 @@ class Agent:
 
     @property
     def shared(self) -> str | None:
-        """The run that this arm evaluates instead of training an agent; None for an agent of its own."""
+        """The run that this arm evaluates, with its placeholders; None if it trains an agent of its own."""
         if named := self.study.agent_of(self.arm):
-            return self.filled(named)
+            return named
         if self.study.agents_of:
-            return str(self.root / self.study.agents_of / self.arm.name / str(self.seed))
+            return f"{{runs}}/{self.study.agents_of}/{self.arm.name}/{{seed}}"
         return None
 
     def words(self, *overrides: str) -> tuple[str, ...]:
@@ -137,7 +144,7 @@ class Agent:
 
     def filled(self, text: str) -> str:
         """Return `text` with `{runs}` and `{seed}` filled in."""
-        return text.replace("{runs}", str(self.root)).replace("{seed}", str(self.seed))
+        return text.replace("{seed}", str(self.seed)).replace("{runs}", str(self.root))
 
     def runs_in(self, words: Iterable[str], own: bool = True) -> Iterator[Path]:
         """Yield the run folders of studies that `words` name, the `own` one too."""

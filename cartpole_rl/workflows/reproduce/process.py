@@ -1,25 +1,29 @@
 """A run of a study as a process of its own, its results and its log. Imports nothing that takes long."""
 
 import json
+import multiprocessing
 import os
 import shutil
 import signal
 import sys
+import threading
 import traceback
+from contextlib import AbstractContextManager, nullcontext, suppress
+from multiprocessing.connection import Connection
 
 from cartpole_rl.choices import choice
 from cartpole_rl.errors import CartPoleError
+from cartpole_rl.files import claimed
 from cartpole_rl.run_files import CHECKPOINTS, COMPARISON, IDENTIFIED, METRICS, MODELLED, RESUME
-from cartpole_rl.signals import RaiseOnce, end_with_parent, ending_signals
-from cartpole_rl.workflows.reproduce.plan import EVALUATIONS, Task
+from cartpole_rl.signals import RaiseOnce, ending_signals
+from cartpole_rl.workflows.reproduce.plan import EVALUATIONS, RESUMABLE, Task
 from cartpole_rl.workflows.run_folder import recorded_provenance
 from cartpole_rl.workflows.run_inputs import is_outdated, write_inputs
-from cartpole_rl.workflows.studies import overrides_of
 
 LOG = "log.txt"
 DEFAULT_EPISODES = choice("evaluate")["episodes"]
 RESULTS = {"identify": IDENTIFIED, "model": MODELLED, "finetune": COMPARISON}  # of the other commands METRICS
-RESUMABLE = ("train", "finetune")
+LONGEST = 1000  # characters of a reason: a pipe holds it until it is read
 SIGNALLED = 128  # added to the number of a signal, as a shell does
 
 
@@ -32,15 +36,20 @@ def is_complete(task: Task) -> bool:
 
 
 def has_results(task: Task) -> bool:
-    """Return True for a run with all of its results."""
+    """Return True for a run with all of its results, and with no state to resume from."""
     result = task.folder / RESULTS.get(task.command, METRICS)
     if task.command != "evaluate":
-        return result.is_file()
-    asked = overrides_of(task.words).get("episodes", DEFAULT_EPISODES)
+        return result.is_file() and not is_unfinished(task)
+    asked = task.overrides.get("episodes", DEFAULT_EPISODES)
     try:
         return len(json.loads(result.read_text(encoding="utf-8"))["episodes"]) == asked
     except (OSError, ValueError, LookupError, TypeError):
         return False
+
+
+def is_unfinished(task: Task) -> bool:
+    """Return True for a training or fine-tuning that was stopped: its last step removes this state."""
+    return task.command in RESUMABLE and (task.folder / CHECKPOINTS / RESUME).is_file()
 
 
 def made_otherwise(task: Task) -> str:
@@ -51,31 +60,57 @@ def made_otherwise(task: Task) -> str:
     return "it was made with other settings; delete its folder to repeat it"
 
 
-def in_own_process(task: Task) -> None:
-    """Do what is left of a run, with everything that it prints in its log. Exits with 1 if it fails."""
-    end_with_parent(os.getppid())
+def in_own_process(task: Task, reasons: Connection) -> None:
+    """Do what is left of a run. If it fails, send why, and exit with 1."""
+    end_with_parent_process()
     RaiseOnce(lambda number: KeyboardInterrupt()).handle(signal.SIGINT, *ending_signals())
-    resumed = prepare(task)
-    task.folder.mkdir(parents=True, exist_ok=True)
-    if not resumed:
-        write_inputs(task.folder, task.needs)
-    with (task.folder / LOG).open("a", encoding="utf-8") as log:
+    try:
+        finish(task)
+    except (Exception, KeyboardInterrupt) as error:
+        with suppress(OSError):  # nobody is there any more
+            reasons.send(reason_of(error)[:LONGEST])
+        stopped = isinstance(error, KeyboardInterrupt)
+        sys.exit(SIGNALLED + signal.SIGINT if stopped else CartPoleError.exit_code)
+
+
+def end_with_parent_process() -> None:
+    """Start a thread that sends SIGTERM to this process when the one that asked for it has ended.
+
+    A forked process has another parent for the system: the server that forks, which outlives that process.
+    """
+    parent = multiprocessing.parent_process()
+
+    def watch() -> None:
+        if parent is not None:
+            parent.join()
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=watch, name="parent watch", daemon=True).start()
+
+
+def finish(task: Task) -> None:
+    """Do what is left of a run, with everything that it prints in its log."""
+    with claimed(task.folder):  # a process of a killed reproduction may still write into it
+        resumed = prepare(task)
+        if not resumed:
+            write_inputs(task.folder, task.needs)
+    with kept(task), (task.folder / LOG).open("a", encoding="utf-8") as log:
         os.dup2(log.fileno(), sys.stdout.fileno())
         os.dup2(log.fileno(), sys.stderr.fileno())
         try:
             from cartpole_rl.workflows.reproduce.carry_out import carry_out
 
             carry_out(task, resumed)
-        except (CartPoleError, OSError) as error:
-            print(f"\n{' '.join(str(error).split())}", flush=True)
-            sys.exit(CartPoleError.exit_code)
-        except KeyboardInterrupt:
-            print("\ninterrupted", flush=True)
-            sys.exit(SIGNALLED + signal.SIGINT)
-        except Exception:
-            traceback.print_exc()
-            sys.exit(CartPoleError.exit_code)
-        print(f"{sum(os.times()[:4]):.1f} s of computing time", flush=True)
+            print(f"{sum(os.times()[:4]):.1f} s of computing time", flush=True)
+        except BaseException as error:
+            with suppress(OSError):  # of a full disk
+                note_failure(error)
+            raise
+
+
+def kept(task: Task) -> AbstractContextManager[None]:
+    """Claim the folder of a run; trainings and fine-tunings claim theirs themselves."""
+    return nullcontext() if task.command in RESUMABLE else claimed(task.folder)
 
 
 def prepare(task: Task) -> bool:
@@ -83,15 +118,34 @@ def prepare(task: Task) -> bool:
 
     The evaluations below an evaluation, which is that of the baseline, are runs of their own and stay.
     """
-    can_resume = task.command in RESUMABLE and (task.folder / CHECKPOINTS / RESUME).is_file()
     command = recorded_provenance(task.folder).get("command")
     has_paths = isinstance(command, list) and command[1:] == [*task.words]  # it resumes with those of then
-    if can_resume and has_paths and not is_outdated(task.folder):
+    if is_unfinished(task) and has_paths and not is_outdated(task.folder):
         return True
     stays = EVALUATIONS if task.command == "evaluate" else None
     for path in task.folder.glob("*"):
-        if path.is_dir() and path.name != stays:
+        if path.name == stays:
+            continue
+        if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path)
-        elif not path.is_dir():
+        else:
             path.unlink()
     return False
+
+
+def note_failure(error: BaseException) -> None:
+    """Print why a run failed, for a defect with its traceback."""
+    if isinstance(error, CartPoleError | OSError | KeyboardInterrupt):
+        print(f"\n{reason_of(error)}", flush=True)
+    else:
+        traceback.print_exception(error)
+
+
+def reason_of(error: BaseException) -> str:
+    """Return why a run failed, in one line."""
+    if isinstance(error, KeyboardInterrupt):
+        return "interrupted"
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+    text = " ".join(str(error).split())
+    return text if isinstance(error, CartPoleError | OSError) else f"{type(error).__name__}: {text}"

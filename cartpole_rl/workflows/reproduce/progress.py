@@ -22,22 +22,27 @@ class Progress:
         if not failure:
             for kind in kinds(task):
                 self._seconds[kind].append(seconds)
-        remaining = self.remaining(left)
-        rest = "" if remaining is None else f", about {duration(remaining)} left"
+        rest = self.remaining(left)
         outcome = f"FAILED: {failure}" if failure else duration(seconds)
         self.show(
             f"[{self.done:{len(str(self.total))}}/{self.total}] {task.command:8} {label}: {outcome}{rest}"
         )
 
-    def remaining(self, left: Iterable[Task]) -> float | None:
-        """Return the seconds that runs still take, by the mean of those like them; None before the first."""
-        if not self._seconds:
-            return None
-        return sum(self._expected(task) for task in left) / self.jobs
+    def remaining(self, left: Iterable[Task]) -> str:
+        """Return how long runs still take, by the mean of those like them; empty if nothing is known.
 
-    def _expected(self, task: Task) -> float:
-        found = next(self._seconds[kind] for kind in kinds(task) if kind in self._seconds)
-        return sum(found) / len(found)
+        It is a lower limit while no run of some command has ended.
+        """
+        expected = [*map(self._expected, left)]
+        known = [seconds for seconds in expected if seconds is not None]
+        if expected and not known:
+            return ""
+        words = "about" if len(known) == len(expected) else "at least"
+        return f", {words} {duration(sum(known) / self.jobs)} left"
+
+    def _expected(self, task: Task) -> float | None:
+        found = next((self._seconds[kind] for kind in kinds(task) if kind in self._seconds), None)
+        return sum(found) / len(found) if found else None
 
 
 def kinds(task: Task) -> tuple[tuple[str, ...], ...]:
@@ -46,7 +51,6 @@ def kinds(task: Task) -> tuple[tuple[str, ...], ...]:
         (task.study, task.command, *task.folder.parts[-1:]),
         (task.study, task.command),
         (task.command,),
-        (),
     )
 
 

@@ -8,16 +8,17 @@ continues after an interruption.
 import multiprocessing
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
-from multiprocessing.connection import wait
+from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import yaml
 
 from cartpole_rl.files import claimed, write_text
-from cartpole_rl.workflows.reproduce.plan import Task, plan
+from cartpole_rl.workflows.reproduce.plan import Task, needed, plan
 from cartpole_rl.workflows.reproduce.process import LOG, in_own_process, is_complete, made_otherwise
 from cartpole_rl.workflows.reproduce.progress import Progress, duration
 from cartpole_rl.workflows.studies import STUDIES, load_study
@@ -46,17 +47,16 @@ def reproduce(
         for name in names:
             if name not in schedule.mixed:  # else the study that its runs were made by stays
                 write_study(name, size, root, source)
-        todo = len(schedule.waiting)
-        show(f"{len(tasks)} runs, {len(tasks) - todo} of them done; {jobs} at a time, in {root}")
+        show(f"{len(tasks)} runs, {schedule.counts()}; {jobs} at a time, in {root}")
         started = time.monotonic()
-        progress = Progress(todo, jobs, show)
+        progress = Progress(len(schedule.waiting), jobs, show)
         with Workers(jobs) as workers:
             while schedule.waiting or workers.running:
                 ended = schedule.lost()
                 for task in schedule.ready(workers.free):
                     workers.start(task)
-                if workers.running and not ended:
-                    ended = workers.finished()
+                if not ended:
+                    ended = workers.finished() if workers.running else schedule.stuck()
                 for task, seconds, failure in ended:
                     schedule.finish(task, failure)
                     left = [*schedule.waiting, *workers.tasks]
@@ -104,6 +104,11 @@ class Schedule:
         """Return the folder of a run below that of all studies."""
         return str(task.folder.relative_to(self._root))
 
+    def counts(self) -> str:
+        """Return how many runs are done and, if there are any, how many are refused."""
+        refused = f", {len(self.failures)} refused" if self.failures else ""
+        return f"{len(self._complete)} of them done{refused}"
+
     def lost(self) -> list[Outcome]:
         """Take the runs that need a failed one."""
         taken = [
@@ -113,6 +118,14 @@ class Schedule:
         ]
         self._take([task for task, _, _ in taken])
         return taken
+
+    def stuck(self) -> list[Outcome]:
+        """Take the runs that need each other; none of them can ever start."""
+        circle = self.waiting
+        while len(inner := [task for task in circle if task.folder in needed(circle)]) < len(circle):
+            circle = inner
+        self._take(circle)
+        return [(task, 0.0, f"it needs {min(map(str, task.needs))}; they need each other") for task in circle]
 
     def ready(self, count: int) -> list[Task]:
         """Take up to `count` runs whose needs are complete."""
@@ -141,12 +154,26 @@ def completed(tasks: Sequence[Task]) -> set[Path]:
     return {*found}
 
 
+class Running(NamedTuple):
+    """A run under way: its process, when it started, and where its process says why it failed."""
+
+    process: BaseProcess
+    since: float
+    reasons: Connection
+
+    def reason(self) -> str:
+        """Return what the ended process said; empty if it said nothing."""
+        with self.reasons, suppress(EOFError, OSError):
+            return str(self.reasons.recv()) if self.reasons.poll() else ""
+        return ""
+
+
 @dataclass
 class Workers:
     """The processes of runs, at most `jobs` at a time; at the end of a `with` all are stopped."""
 
     jobs: int
-    running: dict[Task, tuple[BaseProcess, float]] = field(default_factory=dict)
+    running: dict[Task, Running] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._context: Any = multiprocessing.get_context("spawn")
@@ -158,7 +185,7 @@ class Workers:
         return self
 
     def __exit__(self, *error: object) -> None:
-        processes = [process for process, _ in self.running.values()]
+        processes = [run.process for run in self.running.values()]
         for process in processes:
             process.terminate()
         deadline = time.monotonic() + GRACE
@@ -178,29 +205,28 @@ class Workers:
 
     def start(self, task: Task) -> None:
         """Start a run."""
-        process = self._context.Process(target=in_own_process, args=(task,))
-        process.start()
-        self.running[task] = process, time.monotonic()
+        reasons, sender = self._context.Pipe(duplex=False)
+        with sender:  # the process has a copy
+            process = self._context.Process(target=in_own_process, args=(task, sender))
+            process.start()
+        self.running[task] = Running(process, time.monotonic(), reasons)
 
     def finished(self) -> list[Outcome]:
         """Wait for the next end of a run; return those that ended."""
-        wait([process.sentinel for process, _ in self.running.values()])
-        ended = [task for task, (process, _) in self.running.items() if process.exitcode is not None]
+        wait([run.process.sentinel for run in self.running.values()])
+        ended = [task for task, run in self.running.items() if run.process.exitcode is not None]
         outcomes = []
         for task in ended:
-            process, since = self.running.pop(task)
-            outcomes.append((task, time.monotonic() - since, failure_of(task, process.exitcode or 0)))
+            run = self.running.pop(task)
+            failure = failure_of(task, run.process.exitcode or 0, run.reason())
+            outcomes.append((task, time.monotonic() - run.since, failure))
         return outcomes
 
 
-def failure_of(task: Task, exit_code: int) -> str:
-    """Return why a run failed, the last line of its log; empty if it did not."""
+def failure_of(task: Task, exit_code: int, reason: str) -> str:
+    """Return why a run failed: the `reason` that its process gave, if it did; empty if it did not fail."""
     if exit_code < 0:
         return f"signal {-exit_code} ended its process"
-    if exit_code == 0 and is_complete(task):
-        return ""
-    try:
-        lines = (task.folder / LOG).read_text(errors="replace").strip().splitlines()
-    except OSError:
-        lines = []
-    return lines[-1] if lines else f"exit status {exit_code}"
+    if exit_code == 0:
+        return "" if is_complete(task) else f"it ended without all of its results; see its {LOG}"
+    return reason or f"exit status {exit_code}"

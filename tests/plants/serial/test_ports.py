@@ -5,7 +5,7 @@ from serial.tools.list_ports_common import ListPortInfo
 
 from cartpole_rl.errors import PortError
 from cartpole_rl.plants.serial.cart import SerialCart
-from cartpole_rl.plants.serial.port import found_ports, only_cart, resolved_port
+from cartpole_rl.plants.serial.port import found_ports, only_cart, open_port, resolved_port
 from cartpole_rl.plants.serial.ports import UsbPort, cart_like, changes, described, usb_ports
 from cartpole_rl.plants.serial.settings import SerialSettings
 
@@ -89,3 +89,19 @@ def test_a_named_port_is_taken_as_it_is() -> None:
 def test_a_cart_on_auto_says_why_it_finds_none() -> None:
     with pytest.raises(PortError, match=r"port=auto: .*plant\.port="):
         SerialCart(SerialSettings(port="auto")).open()
+
+
+@pytest.mark.parametrize(
+    ("port", "words"),
+    [
+        ("rfc2217://localhost:1", "is not supported, as its writes have no time limit; let the bridge serve"),
+        ("hwgrep://(", "is neither a device path nor a URL of pyserial: error('missing )"),
+        ("loop://?logging=foo", "is neither a device path nor a URL of pyserial: KeyError('foo')"),
+    ],
+)
+def test_a_url_that_cannot_be_opened_is_named_in_one_line(port: str, words: str) -> None:
+    with pytest.raises(PortError) as raised:
+        open_port(port, 115200, 1.0)
+    assert words in str(raised.value)
+    assert str(raised.value).startswith(port)
+    assert "\n" not in str(raised.value)

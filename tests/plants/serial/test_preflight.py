@@ -1,6 +1,6 @@
 """The checks of a cart, on the emulated one: a good one, wires the wrong way round, and other faults."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
@@ -14,6 +14,7 @@ from cartpole_rl.errors import FaultError
 from cartpole_rl.plants.emulated_cart import EmulatedCart
 from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.checks import (
+    QUESTIONS,
     cart_direction,
     deadband,
     latency,
@@ -25,7 +26,7 @@ from cartpole_rl.plants.serial.errors import NotReadyError
 from cartpole_rl.plants.serial.preflight import Finding, preflight
 from cartpole_rl.plants.serial.probe import Probe
 from cartpole_rl.plants.serial.settings import SerialSettings
-from cartpole_rl.wire import Fault, Flags, Home, Message, State
+from cartpole_rl.wire import Fault, Flags, Frame, Hello, Home, Message, State
 
 TRUTH: dict[str, Any] = {
     "deadband_right": 100.0,
@@ -318,6 +319,26 @@ def test_a_period_that_the_protocol_does_not_allow(period_us: int) -> None:
         cart.close()
     assert (finding.check, finding.ready) == ("link", False)
     assert finding.words.startswith(f"INFO says period {period_us} us, not 5000 to 100000: correct the firm")
+
+
+def test_a_period_of_0_in_a_later_info_is_a_finding() -> None:
+    with CartPeer() as peer:
+        peer.info = good_limits
+        cart = SerialCart(patient(peer.port))
+        cart.open()
+        talk = peer.answer
+
+        def answer(frame: Frame) -> Iterable[bytes]:
+            if isinstance(frame.message, Hello) and len(peer.messages(Hello)) > QUESTIONS:
+                info = peer.encode(replace(good_limits, period_us=0))
+                return info, peer.next_state(last_sequence=frame.sequence)
+            return talk(frame)
+
+        peer.answer = answer
+        (finding,) = preflight(cart)
+        cart.close()
+    assert (finding.check, finding.ready) == ("link", False)
+    assert finding.words.startswith("INFO says period 0 us, not 5000 to 100000: correct the firm")
 
 
 def test_the_check_ends_with_what_is_off_and_the_motor_is_off() -> None:

@@ -1,10 +1,13 @@
 """Interquartile means, their intervals, profiles and rank correlations against scipy and by hand."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from scipy import stats
 
 from cartpole_rl.reporting.studies.statistics import (
+    RESAMPLES,
     difference,
     estimate,
     interquartile_mean,
@@ -73,6 +76,24 @@ def test_probability_of_improvement_is_mann_and_whitneys() -> None:
     expected = stats.mannwhitneyu(SCORES, OTHERS).statistic / 100
     assert probability_of_improvement(SCORES, OTHERS).value == pytest.approx(expected)
     assert probability_of_improvement([1.0, 1.0], [1.0, 1.0]).value == 0.5
+
+
+def test_probability_of_improvement_is_the_share_of_pairs_in_every_resample() -> None:
+    values, others = np.array([1.0, 2.0, 2.0, 3.0, 7.0]), np.array([2.0, 2.0, 0.0])
+    generator = np.random.default_rng(0)
+    a, b = (each[generator.integers(each.size, size=(RESAMPLES, each.size))] for each in (values, others))
+    shares = 0.5 + 0.5 * np.sign(a[:, :, None] - b[:, None, :]).mean(axis=(1, 2))
+    found = probability_of_improvement(values, others)
+    assert found.value == 0.5 + 0.5 * np.sign(values[:, None] - others).mean()
+    np.testing.assert_array_equal([found.low, found.high], np.percentile(shares, [2.5, 97.5]))
+
+
+def test_pairs_of_many_agents_need_no_memory() -> None:
+    tracemalloc.start()
+    probability_of_improvement(np.arange(200.0), np.arange(200.0) + 0.5)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 150e6  # all pairs of all resamples: 1600 MB
 
 
 def test_a_profile_falls_from_one_to_nothing() -> None:

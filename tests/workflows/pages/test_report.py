@@ -14,12 +14,14 @@ import pytest
 from command_line import Outcome, in_process
 
 from cartpole_rl.choices import conf_folder
+from cartpole_rl.workflows.pages.studies import read_study
 
 Edit = Callable[[Path, Callable[[Any], object]], None]
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 BROWSER = next(filter(None, map(shutil.which, BROWSERS)), None)
 FOLDER = "hydra.run.dir="
 LIMIT = 20_000_000  # bytes of a page
+COMMAND = "scripts/reproduce friction --studies FOLDER --folder . --size quick"
 PROBE = """<script>
 const broken = [];
 window.addEventListener("error", event => broken.push(event.message));
@@ -96,7 +98,7 @@ def test_a_browser_shows_the_page_of_studies_on_a_phone_and_in_the_dark(study: P
     (study / "much/1/evaluations/heavy/metrics.json").unlink()
     done, page = report("studies=quick", "data=data")
     assert done.code == 0, done.err
-    assert "\n6 runs count, 1 do not\n" in done.out
+    assert "\n6 runs count, 1 does not; the page says why\n" in done.out
     assert done.out.endswith("report/page.html is written\n")
     assert all(source.startswith("data:image/") for source in Sources(page).found)
     assert len(page) < LIMIT
@@ -140,7 +142,7 @@ def test_the_page_says_what_is_missing_and_what_does_not_count(study: Path) -> N
 
 def test_the_page_has_question_answers_command_and_runs(study: Path) -> None:
     _, page = report("studies=quick/friction", "animations=false")
-    for part in ("Does friction matter?", "It was not asked.", "scripts/reproduce friction --size quick"):
+    for part in ("Does friction matter?", "It was not asked.", COMMAND):
         assert part in page
     for seed in (0, 1, 2):
         assert f'<td data-label="run">quick/friction/much/{seed}</td>' in page
@@ -148,14 +150,45 @@ def test_the_page_has_question_answers_command_and_runs(study: Path) -> None:
     assert "<with>" not in page
 
 
+def test_the_page_says_first_what_its_words_mean(study: Path, edit: Edit) -> None:
+    _, page = report("studies=quick", "animations=false")
+    head = page[page.index("<h1>") : page.index('id="summary"')]
+    assert "1 study, size quick: 6 agents." in head
+    for part in ("No real cart was driven.", "at most 5500", "95 % intervals", "Answered: the thesis has no"):
+        assert part in head
+    words = ["plant=serial"]
+    edit(study / "study.yaml", lambda content: content["evaluations"][1].update(overrides=words))
+    _, page = report("studies=quick", "animations=false", "hydra.run.dir=again")
+    assert "No real cart was driven." not in page
+
+
+def test_commits_stand_with_the_list_of_runs_and_not_in_a_box(study: Path, edit: Edit) -> None:
+    edit(study / "much/1/evaluations/heavy/provenance.json", lambda content: content.update(git_commit="abc"))
+    _, page = report("studies=quick", "animations=false")
+    assert 'class="box"' not in page
+    folded = page[page.index("The 6 runs behind it") :]
+    assert re.search(r"The runs are of \d commits with the same package versions: .*\babc \(1\)", folded)
+
+
+def test_the_commands_by_hand_name_set_ups_by_their_labels(study: Path, edit: Edit) -> None:
+    edit(
+        study / "study.yaml",
+        lambda content: content["evaluations"][1].update(of_arms={"much": ["pole=large"]}),
+    )
+    _, page = report("studies=quick", "animations=false")
+    assert "# agents of much friction:" in page
+    assert "{run}: the run folder of an agent." in page
+
+
 def test_what_fails_comes_first(study: Path, edit: Edit) -> None:
     shutil.copytree(study, "quick/agrees")
     shutil.copytree(study, "quick/contradicts")
+    digest = read_study(study).digest
     for name in ("agrees", "contradicts"):
         edit(
             Path("quick", name, "study.yaml"),
             lambda content, name=name: content.update(
-                finding={"size": "quick", "verdict": name, "comment": f"why it {name}"},
+                finding={"size": "quick", "verdict": name, "comment": f"why it {name}", "digest": digest},
                 title=name,
                 order=10,
             ),
@@ -167,7 +200,32 @@ def test_what_fails_comes_first(study: Path, edit: Edit) -> None:
     assert "why it contradicts" in summary
     contents = page[page.index('id="contents"') : page.index("</nav>")]
     assert contents.index("#study-agrees") < contents.index("#study-friction")
-    assert contents.count("no study") == 16
+    assert "no study" not in contents  # they are a person's own
+
+
+def test_a_finding_about_other_results_is_named_with_the_digest_to_enter(study: Path, edit: Edit) -> None:
+    finding = {"size": "quick", "verdict": "agrees", "comment": "Friction matters.", "digest": "00000000"}
+    edit(study / "study.yaml", lambda content: content.update(finding=finding))
+    done, page = report("studies=quick", "animations=false")
+    digest = read_study(study).digest
+    other = f"is about other results (digest 00000000; these have {digest})."
+    assert f"friction: The finding in quick/friction/study.yaml {other}" in done.out
+    assert f'That of these has digest: "{digest}"' in done.out
+    assert other in page
+    assert "Friction matters." not in page
+
+
+def test_a_damaged_picture_is_named_and_the_others_are_shown(study: Path) -> None:
+    gif = study / "much/1/evaluations/heavy/figures/episode.gif"
+    for evaluation in study.glob("*/*/evaluations/heavy/figures/episode.gif"):
+        if evaluation != gif:
+            evaluation.unlink()
+    gif.write_bytes(gif.read_bytes()[:40] + bytes(500))
+    done, page = report("studies=quick")
+    assert done.code == 0, done.err
+    assert f"note: {gif} is damaged and not shown" in done.err
+    assert "data:image/webp" in page
+    assert "data:image/gif" not in page
 
 
 def test_the_page_says_what_stands_for_the_real_cart(study: Path, edit: Edit) -> None:
@@ -225,6 +283,7 @@ def test_a_page_from_the_small_files_alone(study: Path) -> None:
         (("runs=nowhere",), "runs=nowhere: there is no such folder; give a run folder"),
         (("runs=quick", "data=here"), "data: a report on runs does not read it"),
         (("studies=quick", "measure=steps"), "compare and measure belong to runs="),
+        (("runs=quick", "measure=bogus"), "measure=bogus: no run has it; there are score, score_upright, "),
     ],
 )
 def test_wrong_settings_are_refused_in_one_line(words: tuple[str, ...], complaint: str, study: Path) -> None:

@@ -12,7 +12,7 @@ import pytest
 
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.reporting.studies.comparison import compare
-from cartpole_rl.workflows.pages.sweeps import grouped, read_sweep, results_of, table
+from cartpole_rl.workflows.pages.sweeps import grouped, read_sweep, read_sweeps, results_of, table
 
 Edit = Callable[[Path, Callable[[Any], object]], None]
 MEASURE = "score_upright"
@@ -66,7 +66,7 @@ def test_runs_of_another_command_version_or_without_measure_are_named(study: Pat
     sweep = read_sweep("runs", ["quick"], MEASURE)
     reasons = {each.run: each.reason for each in sweep.exclusions}
     assert len(sweep.members) == 9
-    assert reasons[nominal[0]] == "a run of cartpole-record among runs of cartpole-evaluate"
+    assert reasons[nominal[0]] == "other commands: cartpole-record instead of cartpole-evaluate"
     assert reasons[nominal[1]].startswith("other versions: ")
     assert reasons[nominal[2]] == "it has no score_upright"
 
@@ -110,3 +110,91 @@ def test_settings_that_tell_two_sets_apart_are_not_part_of_the_groups(study: Pat
     for pair in found.pairs:
         assert pair.difference.value == pytest.approx(pair.second.value - pair.first.value)
     assert found.lone == []
+
+
+def test_long_labels_have_the_same_number_in_both_sets(study: Path, edit: Edit) -> None:
+    long = {"cart_mass": 0.7123, "pole_viscous": 0.00123, "cart_coulomb": 0.81234}
+    for arm, factor in (("little", 1), ("much", 2)):
+        for config in (study / arm).glob("*/evaluations/*/config.yaml"):
+            values = {name: factor * value for name, value in long.items()}
+            edit(config, lambda content, values=values: content["parameters"].update(values))
+    for folder in study.glob("*/*/evaluations/nominal"):
+        words = [f"parameters.{name}=1" for name in long]
+        edit(folder / "provenance.json", lambda content, words=words: content.update(command=words))
+    shutil.copytree("quick", "other")
+    Path("other/friction/little").rename("other/friction/zzz")  # now the last of its set
+    sets = {
+        name: [f"{root}/*/*/*/evaluations/nominal"]
+        for name, root in (("runs", "quick"), ("compare", "other"))
+    }
+    sweeps, between = grouped(read_sweeps(sets, MEASURE))
+    first, second = (results_of(sweep, MEASURE) for sweep in sweeps)
+    assert all(len(arm.label) > 48 and arm.label[0] in "12" for arm in first.study.arms)
+    found = compare(first, second, between)
+    assert found.lone == []
+    assert len(found.pairs) == 2
+    assert all(pair.difference.value == 0 for pair in found.pairs)
+
+
+def test_failed_jobs_and_links_are_named_or_followed(study: Path) -> None:
+    failed = study / "much/1/evaluations/heavy"
+    shutil.rmtree(failed)
+    failed.mkdir()
+    (failed / "error.txt").write_text("ConfigError: cart_mass is -1\n")
+    shutil.move(study / "much/2/evaluations/heavy", "away")
+    (study / "much/2/evaluations/heavy").symlink_to(Path("away").resolve())
+    (study / "again").symlink_to((study / "much/0").resolve())
+    sweep = read_sweep("runs", ["quick/friction"], MEASURE)
+    assert len(sweep.members) == 11
+    assert [(each.run, each.reason) for each in sweep.exclusions] == [
+        (failed.as_posix(), "failed: ConfigError: cart_mass is -1")
+    ]
+
+
+def test_the_agents_of_evaluations_count(study: Path, edit: Edit) -> None:
+    for seed in range(3):
+        heavy = study / f"much/{seed}/evaluations/heavy"
+        shutil.copytree(heavy, f"agents/{seed}")
+        edit(heavy / "config.yaml", lambda content, seed=seed: content.update(run=f"agents/{seed}"))
+    edit(Path("agents/1/provenance.json"), lambda content: content["packages"].update(torch="1.0"))
+    Path("agents/2/metrics.json").unlink()
+    sweep = read_sweep("runs", ["quick/friction/*/*/evaluations/heavy"], MEASURE)
+    reasons = {each.run: each.reason for each in sweep.exclusions}
+    assert len(sweep.members) == 4
+    assert reasons["quick/friction/much/2/evaluations/heavy"] == (
+        "its agent agents/2: unfinished: it has no metrics.json"
+    )
+    assert "torch 1.0" in reasons["quick/friction/much/1/evaluations/heavy"]
+    shutil.rmtree("agents")
+    (lost,), _ = grouped([read_sweep("runs", ["quick/friction/*/*/evaluations/heavy"], MEASURE)])
+    assert "The runs of 3 agents were not found and are not checked." in results_of(lost, MEASURE).notes
+
+
+def test_versions_and_commands_are_compared_over_both_sets(study: Path, edit: Edit) -> None:
+    shutil.copytree("quick", "other")
+    sets = {"runs": ["quick"], "compare": ["other"]}
+    old = [*Path("other").rglob("provenance.json")]
+    for file in old[:8]:  # most of the second set, fewest of both
+        edit(file, lambda content: content["packages"].update(torch="1.0"))
+    first, second = read_sweeps(sets, MEASURE)
+    assert (len(first.members), len(second.members)) == (12, 4)
+    for file in old:
+        edit(file, lambda content: content["packages"].update(torch="1.0"))
+        edit(file, lambda content: content.update(program="cartpole-record"))
+    first, second = read_sweeps(sets, MEASURE)
+    assert (len(first.members), len(second.members)) == (12, 12)
+    commands, versions = second.notes
+    assert commands == (
+        "The commands of compare differ from the rest: cartpole-record, not cartpole-evaluate."
+    )
+    assert versions.startswith("The versions of compare differ from the rest: ")
+    assert versions in results_of(grouped([second])[0][0], MEASURE).notes
+
+
+def test_seeds_that_no_group_has_all_of_are_noted(study: Path) -> None:
+    shutil.rmtree(study / "little/0")
+    shutil.rmtree(study / "much/2")
+    (sweep,), _ = grouped([read_sweep("runs", ["quick/friction/*/*/evaluations/nominal"], MEASURE)])
+    notes = results_of(sweep, MEASURE).notes
+    assert "cart_viscous=0.2 lacks seed 0" in notes
+    assert "cart_viscous=3 lacks seed 2" in notes

@@ -1,0 +1,119 @@
+"""One damaged run is named with its problem; no damage stops a report."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cartpole_rl.workflows.pages.runs import (
+    Run,
+    find_runs,
+    learning_curve,
+    measured,
+    partly_measured_note,
+    read_run,
+)
+
+Edit = Callable[[Path, Callable[[Any], object]], None]
+GOOD = '{"transitions": 1, "score": 2.0}\n{"transitions": 2, "score": 3.0}\n'
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "problem"),
+    [
+        ("provenance.json", '{"program": "cartpole-evaluate", "packages": ["a"]}', "damaged: 'list' object"),
+        ("provenance.json", '{"program": "cartpole-evaluate", "git_commit": 5}', "damaged: 'int' object"),
+        ("metrics.json", "[" * 200_000, "damaged results: maximum recursion depth"),
+        ("metrics.json", '{"episodes": 2}', "damaged results: its episodes are no list"),
+        ("metrics.json", '{"episodes": "ab"}', "damaged results: its episodes are no list"),
+        ("config.yaml", "a: &a {b: *a}\n", "damaged: maximum recursion depth"),
+        ("config.yaml", "a: &a [*a]\n", "damaged: Circular reference"),
+        ("config.yaml", "run: 5\n", "damaged: run in config.yaml is no path"),
+        ("config.yaml", "seed: x\n", "damaged: seed in config.yaml is no number"),
+        ("config.yaml", "seed: true\n", "damaged: seed in config.yaml is no number"),
+        ("inputs.json", "[[1, 2]]", "damaged results: unsupported operand"),
+        ("inputs.json", "[" * 200_000, "damaged results: maximum recursion depth"),
+    ],
+)
+def test_damage_is_the_problem_of_its_run(name: str, text: str, problem: str, study: Path) -> None:
+    folder = study / "much/1/evaluations/heavy"
+    assert read_run(folder).problem == ""
+    (folder / name).write_text(text)
+    assert read_run(folder).problem.startswith(problem)
+
+
+def test_a_failed_job_says_why(study: Path) -> None:
+    folder = study / "much/1/evaluations/heavy"
+    (folder / "error.txt").write_text("cart_mass=-1: give more than 0\nTraceback\n")
+    assert read_run(folder).problem == ""  # it has results
+    (folder / "metrics.json").unlink()
+    assert read_run(folder).problem == "failed: cart_mass=-1: give more than 0"
+    (folder / "config.yaml").unlink()
+    assert read_run(folder).problem == "failed: cart_mass=-1: give more than 0"
+
+
+def test_a_repeated_episode_is_a_whole_run(study: Path, edit: Edit) -> None:
+    folder = study / "much/1/evaluations/heavy"
+    edit(folder / "metrics.json", lambda content: content["episodes"].pop())
+    assert read_run(folder).problem == "interrupted: 1 of 2 episodes"
+    edit(folder / "config.yaml", lambda content: content.update(repeat={"run": "x", "episode": 1}))
+    assert read_run(folder).problem == ""
+
+
+@pytest.mark.parametrize("value", [True, float("nan"), 10**400, 1.7e308, "5", None, [1]])
+def test_these_are_no_scores(value: object) -> None:
+    assert measured({"score": {"mean": value}}, "score") is None
+    assert measured({"score": value}, "score") is None
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        (GOOD + '{"transitions": 3, "sc', 3),
+        ("5\n6\n", 1),
+        ('"score"\n', 1),
+        ('{"score": 1}\n', 1),
+        ('{"transitions": 1, "score": NaN}\n', 1),
+    ],
+)
+def test_a_damaged_history_is_named_by_its_line(text: str, line: int, tmp_path: Path) -> None:
+    assert learning_curve(tmp_path, "score") == ("score", [])
+    (tmp_path / "history.jsonl").write_text(GOOD)
+    assert learning_curve(tmp_path, "steps") == ("score", [(1, 2.0), (2, 3.0)])
+    (tmp_path / "history.jsonl").write_text(text)
+    with pytest.raises(ValueError, match=rf"^line {line} of history\.jsonl is damaged$"):
+        learning_curve(tmp_path, "score")
+
+
+def test_failed_jobs_and_links_are_found(tmp_path: Path) -> None:
+    for name in ("sweep/0", "sweep/1", "elsewhere/run"):
+        (tmp_path / name).mkdir(parents=True)
+    (tmp_path / "sweep/0/config.yaml").touch()
+    (tmp_path / "sweep/1/error.txt").write_text("it failed")
+    (tmp_path / "elsewhere/run/config.yaml").touch()
+    (tmp_path / "sweep/2").symlink_to(tmp_path / "elsewhere/run")
+    (tmp_path / "sweep/3").symlink_to("nowhere")
+    (tmp_path / "sweep/loop").symlink_to(tmp_path / "sweep")
+    found = {path.name: path for path in find_runs(tmp_path / "sweep")}
+    assert {*found} == {"0", "1", "2", "3"}
+    assert read_run(found["3"]).problem == "a link to nothing"
+
+
+def test_a_mean_over_a_part_of_the_episodes_is_noted() -> None:
+    def run(count: int) -> Run:
+        return Run(Path("x"), results={"time": {"mean": 1.0, "count": count}, "episodes": [0, 0, 0]})
+
+    assert partly_measured_note([run(3)], "time") == ""
+    assert partly_measured_note([run(3), run(1), run(2)], "time") == (
+        "time: only 3 of 6 episodes of 2 runs have it; their means are over these episodes."
+    )
+
+
+def test_settings_of_any_kind_are_compared(study: Path) -> None:
+    folder = study / "much/1/evaluations/heavy"
+    text = (folder / "config.yaml").read_text()
+    (folder / "config.yaml").write_text(f"{text}dates: [2020-01-01]\n")
+    run = read_run(folder)
+    assert (run.problem, run.settings["dates"]) == ("", json.dumps(["2020-01-01"]))
