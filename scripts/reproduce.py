@@ -1,6 +1,6 @@
 """Carry out the studies of the thesis and those beyond it; the same command continues after an interruption.
 
-    scripts/reproduce --size quick                  everything, small: about 20 minutes on two cores
+    scripts/reproduce --size quick                  everything, small: 20 to 30 minutes on two cores
     scripts/reproduce friction_models perturbations --size full --jobs 8
     scripts/reproduce --list                        names all studies
 
