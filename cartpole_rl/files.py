@@ -1,5 +1,6 @@
 """Atomic writing of files: complete or absent, even after a kill or a power cut. One writer in a folder."""
 
+import errno
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -11,6 +12,8 @@ try:
     import fcntl
 except ImportError:  # Windows has no locks of folders
     fcntl = None  # type: ignore[assignment]
+
+FULL = {errno.ENOSPC, errno.EDQUOT}  # errors of writing: the disk is full, or a user's share of it
 
 
 @contextmanager

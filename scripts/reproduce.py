@@ -10,7 +10,6 @@ results.
 """
 
 import argparse
-import errno
 import os
 import re
 import signal
@@ -20,6 +19,7 @@ from functools import partial
 from pathlib import Path
 
 from cartpole_rl.errors import CartPoleError, ConfigError
+from cartpole_rl.files import FULL
 from cartpole_rl.signals import RaiseOnce, ending_signals
 from cartpole_rl.workflows.person import exit_if_nobody_reads
 from cartpole_rl.workflows.reproduce.process import SIGNALLED, reason_of
@@ -28,7 +28,6 @@ from cartpole_rl.workflows.studies import STUDIES, as_word, load_study, study_na
 
 CHECKOUT = Path(__file__).resolve().parents[1]
 RUNS = Path("runs/reproduce")  # in the checkout
-FULL = {errno.ENOSPC, errno.EDQUOT}  # the disk, or a user's share of it
 
 
 def parse_options() -> argparse.Namespace:

@@ -1,6 +1,5 @@
 """Rewrites errors of Hydra, OmegaConf and the operating system as one line with the remedy."""
 
-import errno
 import re
 import sys
 from collections.abc import Mapping, Sequence
@@ -19,6 +18,7 @@ from cartpole_rl.checking import (
     similarity,
 )
 from cartpole_rl.choices import conf_folder, default_choices, group_choices
+from cartpole_rl.files import FULL
 
 WHOLE_OPTIONS = ("help", "version", "cfg", "resolve", "package", "multirun", "info")
 # Hydra's, each up to its first hyphen; without --run, which has no effect: a user means run=
@@ -26,7 +26,6 @@ HYDRA_OPTIONS = (*WHOLE_OPTIONS, "hydra", "shell", "config")
 NEAR_OPTION = 0.7  # similarity from which an option is suggested; that of resume and resolve is 0.62
 SHOWN = ("job", "hydra", "all")  # by --cfg
 WHOLE = ("experiment", "sweep")  # groups without settings of their own: they change those of others
-FULL = {errno.ENOSPC, errno.EDQUOT}  # the disk, or a user's share of it
 EXTRAS = {  # of the package, that bring launchers and a sweeper
     "hydra/launcher/joblib": "joblib",
     "hydra/launcher/submitit_local": "submitit",

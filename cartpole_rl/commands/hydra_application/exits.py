@@ -16,8 +16,9 @@ from typing import NoReturn
 from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 
-from cartpole_rl.commands.hydra_application.complaints import FULL, in_one_line
+from cartpole_rl.commands.hydra_application.complaints import in_one_line
 from cartpole_rl.errors import CartPoleError, ConfigError
+from cartpole_rl.files import FULL
 from cartpole_rl.signals import RaiseOnce, ending_signals
 from cartpole_rl.workflows.person import exit_if_nobody_reads, print_message
 

@@ -320,14 +320,14 @@ def _legend(axes: Axes, colours: Mapping[str, str]) -> None:
 
 
 def described(
-    groups: Mapping[str, Mapping[str, Array]], measure: str, told: Callable[[float], str], unit: str
+    groups: Mapping[str, Mapping[str, Array]], measure: str, number: Callable[[float], str], unit: str
 ) -> str:
     """Return the alt text of `dot_rows`: the interquartile mean of every row, in words.
 
-    `told` writes a number.
+    `number` writes a value.
     """
     rows = [
-        f"{label}{f', {name}' if name else ''}: {told(float(interquartile_mean(values)))}"
+        f"{label}{f', {name}' if name else ''}: {number(float(interquartile_mean(values)))}"
         if values.size
         else f"{label}: no agent"
         for label, group in groups.items()

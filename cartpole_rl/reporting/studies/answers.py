@@ -38,7 +38,7 @@ THESIS_ROWS = {  # of the thesis's list: what must work
 }
 BEYOND = 200  # order from which a study lies beyond the thesis
 CARTS = ("simulated cart", "emulated cart")  # starts of labels of evaluations
-MOST_TOLD = 4  # set-ups in a sentence; of more, the highest and the lowest
+MOST_LISTED = 4  # set-ups in a sentence; of more, the highest and the lowest
 PLAIN = re.compile(r"[A-Za-z' -]+")  # labels that need no quotation marks
 SENTENCES = re.compile(r"(?<=[a-z0-9)][.?!]) (?=[A-Z])")
 OPENING, SHORT = 200, 30  # characters of a text's first sentences: at most; fewer take another sentence
@@ -153,15 +153,15 @@ def _ranked(found: Mapping[str, Estimate], unit: str = "agent", measure: str = "
         each = "" if len(labels) == 1 else f"each of {len(labels)} set-ups "
         return f"{note}: {each}{estimate_text(best, measure)}, {counted_text(best.agents, unit)}"
 
-    def told(label: str) -> str:
+    def entry(label: str) -> str:
         count = "" if same_count else f" of {counted_text(found[label].agents, unit)}"
         return f"{_quoted(label)} {estimate_text(found[label], measure)}{count}"
 
     end = f"; {counted_text(best.agents, unit)} each" if same_count else ""
     first, last = ("lowest", "highest") if less else ("highest", "lowest")
-    if len(labels) <= MOST_TOLD:
-        return f"{note}: {', '.join(map(told, labels))}{end}"
-    return f"{note}, {len(labels)} set-ups: {first} {told(labels[0])}, {last} {told(labels[-1])}{end}"
+    if len(labels) <= MOST_LISTED:
+        return f"{note}: {', '.join(map(entry, labels))}{end}"
+    return f"{note}, {len(labels)} set-ups: {first} {entry(labels[0])}, {last} {entry(labels[-1])}{end}"
 
 
 def _quoted(label: str) -> str:

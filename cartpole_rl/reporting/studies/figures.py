@@ -9,7 +9,6 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from cartpole_rl.reporting import style
-from cartpole_rl.reporting.figures import svg
 from cartpole_rl.reporting.figures.studies import (
     MOST_LINES,
     agreement,
@@ -54,11 +53,6 @@ class Drawing:
     alt: str
     caption: str
     answer: str = ""
-
-    @property
-    def svg(self) -> str:
-        """The figure as an SVG element."""
-        return svg(self.figure, self.alt)
 
 
 def drawings(results: StudyResults) -> Iterator[Drawing]:

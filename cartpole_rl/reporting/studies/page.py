@@ -41,7 +41,7 @@ from cartpole_rl.reporting.studies.texts import (
 )
 
 REAL = "plant=serial"  # the override of a run on a real cart
-UNTOLD = "not in the thesis"
+NOT_IN_THESIS = "not in the thesis"
 NO_STUDY = ': <span class="alarm">no study</span>'  # of a row of the thesis's list
 
 
@@ -147,7 +147,7 @@ def _summary(results: Sequence[StudyResults]) -> str:
         {
             "study": _link(each),
             "verdict": _status(each),
-            "the thesis": _prose(opening(each.study.thesis or UNTOLD)),
+            "the thesis": _prose(opening(each.study.thesis or NOT_IN_THESIS)),
             "here": _prose(_short_answer(each)),
         }
         for each in ranked
@@ -200,7 +200,7 @@ def _study_section(results: StudyResults, pictures: Sequence[Picture]) -> str:
     figure = f" <small>({escaped(_figure_name(study.figure))})</small>" if study.figure else ""
     facts = {
         "Question": study.question,
-        "The thesis": study.thesis or UNTOLD,
+        "The thesis": study.thesis or NOT_IN_THESIS,
         "Answer": " ".join(_comment(results)),
         "Numbers": " ".join(answer(results)),
     }

@@ -122,15 +122,15 @@ class StudyResults:
     @property
     def remarks(self) -> list[str]:
         """Sentences about what today's file of the study says otherwise, and a finding of other results."""
-        said, found = [], self.lost_finding
+        sentences, found = [], self.lost_finding
         if self.changed:
-            said.append(f"{self.file} has changed since these runs: {', '.join(self.changed)}.")
+            sentences.append(f"{self.file} has changed since these runs: {', '.join(self.changed)}.")
         if found and found.digest == self.digest:
-            said.append("Its finding is not shown.")
+            sentences.append("Its finding is not shown.")
         elif found:
             other = f"(digest {found.digest or 'missing'}; these have {self.digest})"
-            said.append(f"The finding in {self.file} is about other results {other}.")
-        return said
+            sentences.append(f"The finding in {self.file} is about other results {other}.")
+        return sentences
 
     @property
     def varied(self) -> tuple[Variant, ...]:

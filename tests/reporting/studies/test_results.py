@@ -15,6 +15,7 @@ from cartpole_rl.reporting.studies.figures import drawings
 from cartpole_rl.reporting.studies.page import studies_page
 from cartpole_rl.reporting.studies.results import Agent, StudyResults, from_json
 from cartpole_rl.reporting.studies.robustness import robustness
+from cartpole_rl.reporting.studies.sections import drawn
 from cartpole_rl.reporting.studies.settings import Study
 
 SIZES = {"full": {"seeds": 2}}
@@ -83,7 +84,7 @@ def test_arms_over_an_axis_form_a_line_for_each_family() -> None:
     ]
     values = {arm["name"]: [{"own": 10.0 * arm["value"]}] for arm in arms}
     (drawing, *_) = drawings(results("integrators", values, arms=arms, axis={"label": "step", "unit": "ms"}))
-    assert "over step, ms. explicit: 10.0 at 1, 200 at 20; implicit: 10.0 at 1" in drawing.svg
+    assert "over step, ms. explicit: 10.0 at 1, 200 at 20; implicit: 10.0 at 1" in drawn(drawing)
     (axes,) = drawing.figure.axes
     assert [text.get_text() for text in axes.get_xticklabels()] == ["1", "20"]
 
