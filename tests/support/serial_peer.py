@@ -131,9 +131,11 @@ class CartPeer(Peer):
         self.state = replace(self.state, **(ticked | changes))
         return self.encode(self.state, self.flags)
 
-    def tick(self, **changes: int) -> None:
-        """A period passes: the state goes out."""
-        self.send(self.next_state(**changes))
+    def tick(self, **changes: int) -> int:
+        """A period passes: the state goes out. Returns its bytes."""
+        state = self.next_state(**changes)
+        self.send(state)
+        return len(state)
 
     def carry_out(self, message: Message) -> None:
         if isinstance(message, Home):

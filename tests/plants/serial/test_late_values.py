@@ -15,53 +15,57 @@ from cartpole_rl.wire import Hello, SetMotor, Stop
 PERIODS = 15  # a pause; the watchdog waits for three
 
 
+@pytest.fixture(autouse=True)
+def _a_slow_machine_is_not_suspended(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(SerialCart, "longest_suspension", 60.0)
+
+
 @contextmanager
 def driven() -> Iterator[tuple[CartPeer, SerialCart]]:
     """A cart that is armed and has been driven, and that is known to tick on its own."""
     with CartPeer() as peer, SerialCart(quick_settings(peer.port)) as cart:
         cart.start()
+        cart.get_state()
         idle(peer, cart)
         cart.set_motor(50)
         cart.get_state()
         yield peer, cart
 
 
+def pause(peer: CartPeer, cart: SerialCart) -> None:
+    """Let the cart tick until this computer continues; by then all of its states wait."""
+    link = cart._connection.link
+    expected = link.waiting() + sum(peer.tick() for _ in range(PERIODS))
+    wait_for(lambda: link.waiting() >= expected)
+
+
 def idle(peer: CartPeer, cart: SerialCart) -> None:
     """Let the cart tick without frames of the host, and read its states."""
-    for _ in range(10):
-        peer.tick()
-    wait_for(lambda: cart._connection.link.waiting() > 0)
+    pause(peer, cart)
     cart.get_state()
     assert cart._tracker.ticks_alone
 
 
-def after(function: Callable[..., Any], pause: Callable[[], None]) -> Callable[..., Any]:
-    """Return `function`, which pauses once before it returns."""
-    pending = [pause]
+def after(function: Callable[..., Any], action: Callable[[], None]) -> Callable[..., Any]:
+    """Return `function`, which carries out `action` once before it returns."""
+    pending = [action]
 
-    def paused(*args: object) -> object:
+    def extended(*args: object) -> object:
         result = function(*args)
         if pending and result:
             pending.pop()()
         return result
 
-    return paused
+    return extended
 
 
-def test_a_pause_between_the_check_and_the_write(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_pause_between_the_check_and_the_write() -> None:
     with driven() as (peer, cart):
         stopped = len(peer.messages(Stop))
-
-        def send_late(value: int) -> None:
-            time.sleep(0.3)
-            for _ in range(PERIODS):
-                peer.tick()
-            send(value)
-
-        send = cart._connection.send_motor
-        monkeypatch.setattr(cart._connection, "send_motor", send_late)
+        time.sleep(0.3)
+        pause(peer, cart)
         with pytest.raises(LinkError, match="took a motor value too slowly"):
-            cart.set_motor(200)
+            cart._connection.send_motor(200)  # after the check of `set_motor`
         wait_for(lambda: len(peer.messages(Stop)) > stopped)
         assert peer.messages(SetMotor)[-1].motor == 0
 
@@ -70,13 +74,7 @@ def test_a_pause_right_after_a_state_was_read(monkeypatch: pytest.MonkeyPatch) -
     """The state that is handed out is the newest one, not the one that was read before the pause."""
     with driven() as (peer, cart):
         link = cart._connection.link
-
-        def pause() -> None:
-            for _ in range(PERIODS):
-                peer.tick()
-            wait_for(lambda: link.waiting() > 0)
-
-        monkeypatch.setattr(link, "receive", after(link.receive, pause))
+        monkeypatch.setattr(link, "receive", after(link.receive, lambda: pause(peer, cart)))
         cart.set_motor(0)
         assert cart.get_state().tick == peer.state.tick
 
