@@ -11,7 +11,6 @@ results.
 
 import argparse
 import os
-import re
 import signal
 import sys
 from collections.abc import Sequence
@@ -53,16 +52,11 @@ def as_in_checkout(path: str) -> Path:
 def list_studies(source: Path) -> None:
     """Print a table: the name, the figure or section of the thesis and the question of each study."""
     studies = {name: load_study(name, source) for name in study_names(source)}
-    rows = [(name, place(study.figure), study.question) for name, study in studies.items()]
+    rows = [(name, study.place, study.question) for name, study in studies.items()]
     rows = [("study", "figure or section", "question"), *rows]
     wide, middle = (max(len(row[column]) for row in rows) for column in (0, 1))
     for name, figure, question in rows:
         print(f"{name:{wide}}  {figure:{middle}}  {question}")
-
-
-def place(figure: str) -> str:
-    """Return "Section 3.1.3" for "3.1.3" and "Section 7" for "7", figures as they are."""
-    return f"Section {figure}" if re.fullmatch(r"\d+(\.\d+\.\d+)?", figure) else figure
 
 
 def check_options(names: Sequence[str], options: argparse.Namespace) -> None:

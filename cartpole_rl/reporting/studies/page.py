@@ -197,7 +197,7 @@ def _links(results: Sequence[StudyResults]) -> str:
 
 def _study_section(results: StudyResults, pictures: Sequence[Picture]) -> str:
     study = results.study
-    figure = f" <small>({escaped(_figure_name(study.figure))})</small>" if study.figure else ""
+    figure = f" <small>({escaped(study.place)})</small>" if study.figure else ""
     facts = {
         "Question": study.question,
         "The thesis": study.thesis or NOT_IN_THESIS,
@@ -312,15 +312,8 @@ def _method() -> str:
 
 
 def _link(results: StudyResults) -> Html:
-    figure = f" ({escaped(_figure_name(results.study.figure))})" if results.study.figure else ""
+    figure = f" ({escaped(results.study.place)})" if results.study.figure else ""
     return Html(f'<a href="#{_anchor(results.name)}">{escaped(results.study.title)}</a>{figure}')
-
-
-def _figure_name(figure: str) -> str:
-    """Return "Fig. 6.8" for "6.8", "Section 3.1.3" for other numbers, and any other text as it is written."""
-    if re.match(r"\d+\.\d+[a-z]?(,|$)", figure):
-        return f"Fig. {figure}"
-    return f"Section {figure}" if figure[:1].isdigit() else figure
 
 
 def _status(results: StudyResults) -> Html:

@@ -21,9 +21,6 @@ MOST_LISTED = 1000  # runs in the list of a study
 MOST_ROWS = 24  # of a table that is shown unfolded
 MOST_EXCLUSIONS = 40  # runs named one by one
 COMMITS = "The runs are of "  # start of a note that stands with the list of runs
-BLANKS = (
-    "{seed}: 0, 1, 2, … (one run each). {run}: the run folder of an agent. {runs}: the folder of all studies."
-)
 
 
 @dataclass(frozen=True)
@@ -128,8 +125,18 @@ def commands(results: StudyResults) -> str:
     by_hand = "\n".join(_by_hand(results))
     return (
         f"<h3>Command</h3><pre><code>{escaped(whole)}</code></pre>"
-        f"<details><summary>Each run by hand</summary><p>{BLANKS}</p>"
+        f"<details><summary>Each run by hand</summary><p>{_blanks(results)}</p>"
         f"<pre><code>{escaped(by_hand)}</code></pre></details>"
+    )
+
+
+def _blanks(results: StudyResults) -> str:
+    """Return what the blanks of the commands stand for."""
+    seeds = sorted({agent.seed for agent in results.agents})
+    used = f" ({seeds[0]} to {seeds[-1]} here)" if len(seeds) > 1 else ""
+    return (
+        f"{{seed}}: one run for each seed{used}. {{run}}: the run folder of an agent. "
+        "{runs}: the folder of all studies."
     )
 
 

@@ -3,6 +3,7 @@
 The copy of a study in its folder of results, study.yaml, also names its size.
 """
 
+import re
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Literal
 
@@ -86,6 +87,13 @@ class Study(Settings):
     agents_of: str = ""  # name of the study whose agents are evaluated instead of new ones
     sizes: Annotated[dict[str, Size], Field(min_length=1)]
     size: str = ""  # of the results in the same folder, one of `sizes`; empty in conf/study/
+
+    @property
+    def place(self) -> str:
+        """The place in the thesis: "Fig. 6.8" for 6.8, "Section 3.1.3" for other numbers, or the text itself."""
+        if re.match(r"\d+\.\d+[a-z]?(,|$)", self.figure):
+            return f"Fig. {self.figure}"
+        return f"Section {self.figure}" if self.figure[:1].isdigit() else self.figure
 
     @property
     def unit(self) -> str:

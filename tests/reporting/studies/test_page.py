@@ -2,6 +2,8 @@
 
 import re
 
+import pytest
+
 from cartpole_rl.checking import checked
 from cartpole_rl.reporting.studies.page import studies_page
 from cartpole_rl.reporting.studies.results import Agent, StudyResults
@@ -46,6 +48,28 @@ def test_own_studies_are_listed_plainly_with_the_command_that_finds_them() -> No
     assert "scripts/reproduce mine --studies FOLDER --folder here --size quick" in page
     shipped = studies_page([results("shipped", 180, True)], {})
     assert "scripts/reproduce shipped --size quick" in shipped
+
+
+def test_the_seeds_are_those_of_the_results() -> None:
+    assert "{seed}: one run for each seed (0 to 2 here)." in studies_page([results("a", 0, True)], {})
+    assert "{seed}: one run for each seed." in studies_page([results("a", 0, True, agents=1)], {})
+
+
+@pytest.mark.parametrize(
+    ("figure", "place"),
+    [
+        ("6.8", "Fig. 6.8"),
+        ("6.13a", "Fig. 6.13a"),
+        ("5.2, 5.3, 5.5", "Fig. 5.2, 5.3, 5.5"),
+        ("3.1.3", "Section 3.1.3"),
+        ("7", "Section 7"),
+        ("table 6.3", "table 6.3"),
+        ("", ""),
+    ],
+)
+def test_the_place_in_the_thesis(figure: str, place: str) -> None:
+    study = results("a", 0, True).study.model_copy(update={"figure": figure})
+    assert study.place == place
 
 
 def test_no_name_leaves_an_attribute() -> None:
