@@ -90,7 +90,7 @@ class Study(Settings):
 
     @property
     def place(self) -> str:
-        """The place in the thesis: "Fig. 6.8" for 6.8, "Section 3.1.3" for other numbers, or text as it is."""
+        """Place in the thesis: "Fig. 6.8" for 6.8, "Section 3.1.3" for other numbers, or text as it is."""
         if re.match(r"\d+\.\d+[a-z]?(,|$)", self.figure):
             return f"Fig. {self.figure}"
         return f"Section {self.figure}" if self.figure[:1].isdigit() else self.figure
