@@ -82,8 +82,10 @@ def _unnamed(error: BaseException) -> OSError | None:
 
 
 def _flush(path: Path) -> None:
-    """Wait until the content of `path` is on the disk."""
-    descriptor = os.open(path, os.O_RDONLY)
+    """Wait until the content of `path`, a file or a folder, is on the disk."""
+    descriptor = os.open(
+        path, os.O_RDONLY if path.is_dir() else os.O_RDWR
+    )  # Windows flushes what it may write
     try:
         os.fsync(descriptor)
     finally:

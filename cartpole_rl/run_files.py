@@ -1,6 +1,7 @@
 """The names of the files and folders in a run folder that more than one module uses."""
 
 CONFIG, PROVENANCE, MULTIRUN = "config.yaml", "provenance.json", "multirun.yaml"
+LOG = "log.txt"  # what a run of scripts/reproduce printed
 ERROR = "error.txt"  # why a job of a sweep has no result
 METRICS = "metrics.json"  # of an evaluation
 HISTORY = "history.jsonl"  # of a training: a line for each evaluation

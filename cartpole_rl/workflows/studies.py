@@ -29,6 +29,8 @@ def study_names(source: Path = STUDIES) -> list[str]:
 def load_study(name: str, source: Path = STUDIES) -> Study:
     """Return a study of `source`. ConfigError names the nearest study or the mistake."""
     path = source / f"{name}.yaml"
+    if not source.is_dir():
+        raise ConfigError(f"{source}: there is no such folder of studies")
     if not path.is_file():
         raise ConfigError(unknown("study", name, (other.stem for other in source.glob("*.yaml"))))
     return read_study_file(path)

@@ -239,6 +239,12 @@ def test_a_wrong_option_is_one_line(words: tuple[str, ...], complaint: str, sour
     assert (done.complaint, done.code) == (f"scripts/reproduce: {complaint}", 2)
 
 
+def test_a_file_instead_of_the_folder_of_studies_is_one_line(source: Path) -> None:
+    done = script("toy", "--studies", str(source / "toy.yaml"))
+    complaint = f"scripts/reproduce: {source / 'toy.yaml'}: there is no such folder of studies"
+    assert (done.complaint, done.code) == (complaint, 2)
+
+
 def test_a_folder_without_studies_is_one_line(tmp_path: Path) -> None:
     done = script("--list", "--studies", str(tmp_path))
     assert (done.complaint, done.code) == (f"scripts/reproduce: {tmp_path}: it holds no study", 2)

@@ -11,6 +11,7 @@ from cartpole_rl.checking import checked
 from cartpole_rl.choices import compose, conf_folder
 from cartpole_rl.commands.hydra_application.composition import as_mapping
 from cartpole_rl.errors import ConfigError
+from cartpole_rl.reporting.studies.settings import FIRST_SEED
 from cartpole_rl.settings import Settings
 from cartpole_rl.workflows.config import (
     EvaluateConfig,
@@ -19,7 +20,7 @@ from cartpole_rl.workflows.config import (
     ModelConfig,
     TrainConfig,
 )
-from cartpole_rl.workflows.reproduce.plan import FIRST_SEED, Task, plan, study_tasks
+from cartpole_rl.workflows.reproduce.plan import Task, plan, study_tasks
 from cartpole_rl.workflows.studies import load_study, overrides_of, study_names
 
 pytestmark = pytest.mark.usefixtures("hydra_reads_conf")
@@ -131,6 +132,14 @@ def test_a_wrong_name_gets_the_nearest_one(name: str, size: str, complaint: str)
     with pytest.raises(ConfigError) as caught:
         plan([name], size, ROOT)
     assert str(caught.value) == complaint
+
+
+def test_a_needed_study_that_is_not_there_is_named_with_the_one_that_needs_it(tmp_path: Path) -> None:
+    text = (conf_folder() / "study/recovery.yaml").read_text().replace("{runs}/swingup", "{runs}/nope")
+    (tmp_path / "recovery.yaml").write_text(text)
+    with pytest.raises(ConfigError) as caught:
+        plan(["recovery"], "quick", ROOT, tmp_path)
+    assert str(caught.value) == f"recovery: it needs runs of the study nope, which is not in {tmp_path}"
 
 
 EXTENDING = [

@@ -88,7 +88,7 @@ def _columns_of(
     distinct = [json.dumps(content, sort_keys=True, default=str) for content in contents]
     if all(chosen) and len({*zip(chosen, distinct, strict=True)}) == len({*chosen}):
         return {group: [str(each) for each in chosen]}
-    return {name: [_text(each.get(name)) for each in settings] for name in names}
+    return {name: _texts([each.get(name) for each in settings]) for name in names}
 
 
 def _subtree(tree: Tree, group: str) -> Any:
@@ -123,7 +123,13 @@ def _is_choice(choice: Any, content: Any) -> bool:
     return bool(choice == content)
 
 
-def _text(value: Hashable) -> str:
+def _texts(values: Sequence[Hashable]) -> list[str]:
+    """Return the values as text, numbers with the digits that tell them apart."""
+    short = [_text(value, "g") for value in values]
+    return short if len({*short}) == len({*values}) else [_text(value, "") for value in values]
+
+
+def _text(value: Hashable, form: str) -> str:
     if value is None:
         return NULL
-    return f"{value:g}" if isinstance(value, float) else str(value)
+    return format(value, form) if isinstance(value, float) else str(value)

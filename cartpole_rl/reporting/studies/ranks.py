@@ -59,14 +59,20 @@ def _first_two(results: StudyResults) -> tuple[str, str]:
 
 def _pairs_by_study(results: Sequence[StudyResults]) -> dict[str, Array]:
     """Return the pairs [2, agents] of each study's title; an agent of several studies counts once."""
-    known: set[tuple[float, ...]] = set()
+    known: set[str] = set()
     groups: dict[str, Array] = {}
     for each in results:
-        fresh = {tuple(pair) for pair in each.pairs(*_first_two(each)).T.tolist()} - known
+        first, second = _first_two(each)
+        compared = {
+            each.identity(agent): (agent.values[first], agent.values[second])
+            for agent in each.agents
+            if {first, second} <= agent.values.keys()
+        }
+        fresh = [pair for name, pair in compared.items() if name not in known]
+        known |= compared.keys()
         if fresh:
-            known |= fresh
             title = each.study.title
-            groups[title if title not in groups else f"{title} ({each.name})"] = np.array(sorted(fresh)).T
+            groups[title if title not in groups else f"{title} ({each.name})"] = np.array(fresh).T
     return groups
 
 

@@ -2,7 +2,7 @@
 
 import hashlib
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -10,12 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
-from cartpole_rl.reporting.studies.settings import Finding, FolderName, Size, Study, Variant
-from cartpole_rl.reporting.studies.statistics import Estimate, estimate, interquartile_mean
+from cartpole_rl.reporting.studies.settings import RUNS, SEED, Finding, FolderName, Size, Study, Variant
+from cartpole_rl.reporting.studies.statistics import Estimate, estimate
 
 FORMAT = 1  # of the JSON file
 DIGITS = 6  # significant, of the numbers in it
-JUDGED_DIGITS = 3  # significant, of the means that a finding is bound to
 DIGEST = 8  # hex digits
 OWN = Variant(name="own", label="its own evaluation")  # the result of a run without further evaluations
 STAGES = (Variant(name="before", label="before"), Variant(name="after", label="after fine-tuning"))
@@ -23,6 +22,7 @@ STAGES = (Variant(name="before", label="before"), Variant(name="after", label="a
 CART = "emulated"  # evaluation on the cart that stands for the real one
 LARGEST = 1e30  # of all numbers; figures and means of larger ones overflow
 NAME: TypeAdapter[str] = TypeAdapter(FolderName)
+MOST_LACKING = 5  # seeds that are named one by one
 SMALLEST = 0.1  # share of the study's highest value, below which an agent has no ratio
 
 Array = NDArray[np.float64]
@@ -102,17 +102,16 @@ class StudyResults:
 
     @property
     def digest(self) -> str:
-        """A short hash of the interquartile means of all arms and evaluations; a finding is bound to it.
+        """A short hash of the measures of all agents; a finding is bound to it.
 
         It is the same for the runs and for their JSON file.
         """
-        means = sorted(
-            f"{arm.name} {evaluation.name} {_judged(values)}"
-            for arm in self.study.arms
-            for evaluation in self.evaluations
-            if (values := self.values(arm.name, evaluation.name)).size
+        values = sorted(
+            f"{agent.arm} {agent.seed} {evaluation} {_rounded(value)}"
+            for agent in self.agents
+            for evaluation, value in agent.values.items()
         )
-        return hashlib.sha256("\n".join(means).encode()).hexdigest()[:DIGEST]
+        return hashlib.sha256("\n".join(values).encode()).hexdigest()[:DIGEST]
 
     @property
     def file(self) -> str:
@@ -164,6 +163,13 @@ class StudyResults:
             ]
         )
 
+    def identity(self, agent: Agent) -> str:
+        """Return the name that an agent has in all studies which evaluate it, as "swingup/thesis/10"."""
+        arm = next(each for each in self.study.arms if each.name == agent.arm)
+        named = self.study.agent_of(arm) or f"{self.study.agents_of or self.name}/{arm.name}/{SEED}"
+        name = named.removeprefix(RUNS).replace(SEED, str(agent.seed))
+        return name if SEED in named else f"{name} {agent.seed}"  # each seed of the baseline is one
+
     def _has(self, evaluation: Variant) -> bool:
         return any(evaluation.name in agent.values for agent in self.agents)
 
@@ -194,14 +200,17 @@ class StudyResults:
 
     def missing(self) -> list[str]:
         """Return a sentence for each arm and evaluation with fewer agents than the study asks for."""
-        if self.size is None:
-            return []
+        size = self.size
         return [
-            f"{arm.label}, {evaluation.label}: {count} of {self.size.seeds} seeds"
+            f"{arm.label}, {evaluation.label}: {len(seeds)} of {size.seeds} seeds{_lacking(seeds, size)}"
             for arm in self.study.arms
             for evaluation in self.evaluations
-            if (count := self.values(arm.name, evaluation.name).size) < self.size.seeds
+            if size and len(seeds := self._seeds(arm.name, evaluation.name)) < size.seeds
         ]
+
+    def _seeds(self, arm: str, evaluation: str) -> set[int]:
+        """Return the seeds of an arm that have an evaluation."""
+        return {agent.seed for agent in self.agents if agent.arm == arm and evaluation in agent.values}
 
     def as_json(self) -> dict[str, Any]:
         """Return the results as plain data for `from_json`."""
@@ -283,6 +292,15 @@ def _check_agents(results: StudyResults) -> None:
         seen.add((agent.arm, agent.seed))
 
 
+def _lacking(seeds: Collection[int], size: Size) -> str:
+    """Return the seeds that are not there as ", 12 and 15 are missing"; empty if none or many of them are."""
+    lacking = [str(seed) for seed in size.every_seed if seed not in seeds]
+    if not seeds or not lacking or len(lacking) > MOST_LACKING:
+        return ""
+    *others, last = lacking
+    return f", {', '.join(others)} and {last} are missing" if others else f", {last} is missing"
+
+
 def _number(value: Any) -> float:
     """Return a number that can be shown. Raises ValueError."""
     if not is_number(value):
@@ -295,15 +313,11 @@ def is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= LARGEST
 
 
-def _judged(values: Array) -> str:
-    """Return the interquartile mean of agents [agents], to JUDGED_DIGITS, of the values in a JSON file."""
-    mean = float(interquartile_mean([_rounded(value) for value in values.tolist()]))
-    return f"{mean + 0.0:.{JUDGED_DIGITS}g}"  # + 0.0: no minus zero
-
-
 def _rounded(value: float) -> float:
     """Return `value` with DIGITS significant digits, an integer where it is one."""
-    if value == 0 or not math.isfinite(value):
+    if value == 0:
+        return 0  # no minus zero
+    if not math.isfinite(value):
         return value
     rounded = round(value, DIGITS - 1 - math.floor(math.log10(abs(value))))
     return int(rounded) if rounded == int(rounded) else rounded

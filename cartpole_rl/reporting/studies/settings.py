@@ -14,6 +14,8 @@ from cartpole_rl.settings import Count, Finite, Settings
 FolderName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.+-]*$")]
 Overrides = tuple[str, ...]
 RUN = "run="  # the override that names an agent
+RUNS, SEED = "{runs}/", "{seed}"  # in overrides: the folder of all studies, the seed of the agent
+FIRST_SEED = 10  # settings were chosen on seeds 0 to 9
 
 
 class Axis(Settings):
@@ -62,6 +64,11 @@ class Size(Settings):
     seeds: Count
     overrides: Overrides = ()
     evaluation_overrides: Overrides = ()
+
+    @property
+    def every_seed(self) -> range:
+        """The seeds of the agents."""
+        return range(FIRST_SEED, FIRST_SEED + self.seeds)
 
 
 class Study(Settings):

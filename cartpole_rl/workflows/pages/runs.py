@@ -4,6 +4,7 @@ import json
 import os
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -11,6 +12,8 @@ from typing import Any, TypeVar
 
 import yaml
 
+from cartpole_rl.errors import CheckpointError
+from cartpole_rl.learning.checkpoint_files import find_agent
 from cartpole_rl.reporting.studies.results import is_number
 from cartpole_rl.run_files import (
     CHECKPOINTS,
@@ -19,11 +22,12 @@ from cartpole_rl.run_files import (
     ERROR,
     HISTORY,
     IDENTIFIED,
+    LOG,
     METRICS,
     MODELLED,
     PROVENANCE,
 )
-from cartpole_rl.workflows.run_folder import PREFIX
+from cartpole_rl.workflows.run_folder import AGENT_HASH, PREFIX, file_hash
 from cartpole_rl.workflows.run_inputs import is_outdated
 
 RESULTS = {"identify": (IDENTIFIED,), "model": (MODELLED,), "finetune": (METRICS, COMPARISON)}
@@ -82,15 +86,29 @@ class Run:
 
     @property
     def versions(self) -> str:
-        """The versions of the packages that change results: "cartpole_rl 0.1.0, torch 2.15.0, ..."."""
-        packages = self.provenance.get("packages") or {}
-        return ", ".join(f"{name} {packages[name]}" for name in COMPARED_PACKAGES if packages.get(name))
+        """The versions of the packages that change results: "cartpole_rl 0.1.0, torch 2.15.0, ...".
+
+        A run that was resumed with others has those of each start: "..., then ...".
+        """
+        starts = (each.get("packages") or {} for each in self._starts)
+        named = (
+            ", ".join(f"{name} {packages[name]}" for name in COMPARED_PACKAGES if packages.get(name))
+            for packages in starts
+        )
+        return ", then ".join(dict.fromkeys(named))
 
     @property
     def commit(self) -> str:
-        """The commit that made the run, shortened; "-dirty" stays."""
-        whole, _, dirty = (self.provenance.get("git_commit") or "").partition("-")
-        return whole[:10] + (f"-{dirty}" if dirty else "")
+        """The commits that made the run and its resumptions, shortened; "-dirty" stays."""
+        names = ((each.get("git_commit") or "").partition("-") for each in self._starts)
+        return " then ".join(
+            dict.fromkeys(whole[:10] + (f"-{dirty}" if dirty else "") for whole, _, dirty in names)
+        )
+
+    @property
+    def _starts(self) -> list[Mapping[str, Any]]:
+        """The provenance of the first start and of each resumption."""
+        return [self.provenance, *(self.provenance.get("resumed") or [])]
 
 
 def read_run(folder: Path) -> Run:
@@ -98,14 +116,15 @@ def read_run(folder: Path) -> Run:
     try:
         run = _started(folder)
     except FileNotFoundError as error:
-        return Run(folder, problem=_failure(folder) or f"it has no {Path(error.filename).name}")
+        missing = f"it has no {Path(error.filename).name}{_end_of_log(folder)}"
+        return Run(folder, problem=_failure(folder) or missing)
     except DAMAGE as error:
         return Run(folder, problem=f"damaged: {short(error)}")
     try:
         run = replace(run, results=_results(folder, run.program))
-        return replace(run, problem=_interruption(run) or _outdated(folder))
+        return replace(run, problem=_interruption(run) or _outdated(run))
     except FileNotFoundError as error:
-        missing = f"unfinished: it has no {Path(error.filename).name}"
+        missing = f"unfinished: it has no {Path(error.filename).name}{_end_of_log(folder)}"
         return replace(run, problem=_failure(folder) or missing)
     except DAMAGE as error:
         return replace(run, problem=f"damaged results: {short(error)}")
@@ -137,8 +156,25 @@ def _failure(folder: Path) -> str:
     return f"failed: {first[:200]}"
 
 
-def _outdated(folder: Path) -> str:
-    return "a run that it needs was made again since, with another result" if is_outdated(folder) else ""
+def _end_of_log(folder: Path) -> str:
+    """Return the last line of the log of a run of scripts/reproduce; empty without one."""
+    try:
+        lines = (folder / LOG).read_text(encoding="utf-8", errors="replace").split("\n")
+    except OSError:
+        return ""
+    last = next((line.strip() for line in reversed(lines) if line.strip()), "")
+    return f"; its {LOG} ends with: {last[:200]}" if last else ""
+
+
+def _outdated(run: Run) -> str:
+    """Return the problem of a run whose agent, identified cart or model is another one now."""
+    if is_outdated(run.folder):
+        return "a run that it needs was made again since, with another result"
+    used = run.provenance.get(AGENT_HASH)
+    with suppress(CheckpointError):  # the agent is elsewhere
+        if used and file_hash(find_agent(Path(run.agent))) != used:
+            return f"its agent {run.agent} has another checkpoint now; repeat it"
+    return ""
 
 
 def _results(folder: Path, program: str) -> dict[str, Any]:

@@ -26,7 +26,7 @@ from cartpole_rl.reporting.studies.results import (
     checked_name,
     from_json,
 )
-from cartpole_rl.reporting.studies.settings import RUN, Evaluation, Study, Variant
+from cartpole_rl.reporting.studies.settings import RUN, RUNS, SEED, Evaluation, Study, Variant, setting
 from cartpole_rl.run_files import CONFIG
 from cartpole_rl.workflows.pages.runs import (
     DAMAGE,
@@ -49,8 +49,8 @@ STUDY, EVALUATIONS = "study.yaml", "evaluations"
 EMULATOR = "emulator="
 TEXTS = ("title", "order", "figure", "question", "thesis", "finding", "judged")  # of today's conf/study/
 MADE = ("measure", "command", "experiment", "ratio", "agents_of")  # what the results depend on
-RUNS, SEED = "{runs}/", "{seed}"  # in overrides: the folder of all studies, the seed of the agent
 TRAINING = ("train", "finetune")  # commands that make agents
+DERIVED = {"evaluated", "guard"}  # settings that follow from others
 ITSELF = ""  # evaluation of a part that is the run of an arm and a seed itself
 LOSS = "learning/loss"  # TensorBoard's curve
 CURVE_POINTS = 60
@@ -85,7 +85,7 @@ def read_studies(folder: Path) -> list[StudyResults]:
     files = sorted(folder.glob("*.json"))
     if not places and not files:
         raise ConfigError(f"studies={folder}: it holds no study; give a folder that scripts/reproduce wrote")
-    found = [read_study(place) for place in places] or [read_data(file) for file in files]
+    found = [read_study(place) for place in places] or _read_all_data(files)
     return sorted(_with_shipped(found), key=lambda each: (each.study.order, each.name))
 
 
@@ -109,6 +109,18 @@ def write_data(results: Sequence[StudyResults], folder: Path) -> None:
             write_json(folder / f"{each.name}.json", each.as_json())
 
 
+def _read_all_data(files: Sequence[Path]) -> list[StudyResults]:
+    """Return the results in files of `write_data`, each study once. Raises ConfigError."""
+    found = {file: read_data(file) for file in files}
+    for file, results in found.items():
+        if results.name != file.stem:
+            raise ConfigError(
+                f"studies={file}: it holds the study {results.name}; rename it to {results.name}.json, "
+                "or remove it if it is a copy"
+            )
+    return [*found.values()]
+
+
 def read_data(file: Path) -> StudyResults:
     """Return the results in a file of `write_data`. Raises ConfigError if it is damaged."""
     try:
@@ -129,7 +141,7 @@ def read_study(folder: Path) -> StudyResults:
     study = read_study_file(folder / STUDY)
     if not study.size and folder.parent.name in study.sizes:
         study = study.model_copy(update={"size": folder.parent.name})
-    parts, exclusions = [*_parts(folder, name, study)], [*_misnamed(folder, study)]
+    parts, exclusions = [*_parts(folder, name, study)], [*_misnamed(folder, study), *_foreign(folder, study)]
     parts, unusable = _complete(parts)
     exclusions += unusable
     parts, others = _of_one_kind(parts)
@@ -139,6 +151,7 @@ def read_study(folder: Path) -> StudyResults:
     notes = (
         *_unlisted(folder, study),
         *_untraced(folder, study),
+        *_unexplained(study, parts),
         commits_note(part.run for part in parts),
         partly_measured_note(counted, study.measure),
         *curveless,
@@ -166,8 +179,7 @@ def _name_of(folder: Path) -> str:
 def _parts(folder: Path, name: str, study: Study) -> Iterator[Part]:
     """Yield every run of the study `name` that has a folder."""
     for arm in study.arms:
-        for place in _seeds(folder / arm.name):
-            seed = int(place.name)
+        for place, seed in _places(folder, study, arm):
             origin = _origin(folder, study, arm, seed)
             own = next((each for each in (place, origin) if _is_run(each)), place)
             if _is_run(own) or not study.evaluations or _trains(study, arm):
@@ -227,6 +239,25 @@ def _seeds(arm: Path) -> list[Path]:
     if not arm.is_dir():
         return []
     return sorted((path for path in arm.iterdir() if _is_seed(path.name)), key=lambda path: int(path.name))
+
+
+def _places(folder: Path, study: Study, arm: Variant) -> Iterator[tuple[Path, int]]:
+    """Yield the folders of an arm that belong to the size of the study, with their seeds."""
+    size = study.sizes.get(study.size)
+    for place in _seeds(folder / arm.name):
+        if size is None or int(place.name) in size.every_seed:
+            yield place, int(place.name)
+
+
+def _foreign(folder: Path, study: Study) -> Iterator[Exclusion]:
+    """Yield the folders of arms with other seeds than the size of the study has."""
+    for arm in study.arms:
+        kept = {place for place, _ in _places(folder, study, arm)}
+        for place in _seeds(folder / arm.name):
+            if place not in kept:
+                every = study.sizes[study.size].every_seed
+                asked = f"{every[0]} to {every[-1]}" if len(every) > 1 else str(every[0])
+                yield Exclusion(place.as_posix(), f"its seed is none of size {study.size}, which has {asked}")
 
 
 def _is_seed(name: str) -> bool:
@@ -360,6 +391,37 @@ def _untraced(folder: Path, study: Study) -> Iterator[str]:
         lost = [place for place in places if not _is_run(_origin(folder, study, arm, int(place.name)))]
         if lost:
             yield f"{arm.label}: the trainings of {len(lost)} agents were not found and are not checked."
+
+
+def _unexplained(study: Study, parts: Sequence[Part]) -> Iterator[str]:
+    """Yield a note on each evaluation whose arms differ in settings that no override of the study sets.
+
+    The choices or defaults that the overrides start from have changed between the runs then.
+    """
+    for evaluation in (None, *study.evaluations):
+        name = evaluation.name if evaluation else ITSELF
+        runs = {part.arm: part.run for part in parts if part.evaluation == name}
+        words = {word for arm in study.arms for word in (*arm.overrides, *_own_words(evaluation, arm))}
+        if evaluation is None:
+            trained = {arm.name for arm in study.arms if _trains(study, arm)}
+            runs = {arm: run for arm, run in runs.items() if arm in trained}
+        explained = {setting(word) for word in words} | DERIVED
+        names = {each for run in runs.values() for each in run.settings}
+        odd = sorted(
+            each
+            for each in names
+            if not any(each == word or each.startswith(f"{word}.") for word in explained)
+            and len({run.settings.get(each) for run in runs.values()}) > 1
+        )
+        if odd and "experiment" not in explained:
+            values = ", ".join(dict.fromkeys(str(run.settings.get(odd[0])) for run in runs.values()))
+            more = f"; {len(odd) - 1} more settings differ" if len(odd) > 1 else ""
+            place = f"{evaluation.label}: " if evaluation else ""
+            yield f"{place}{odd[0]} differs between arms ({values}) and no override sets it{more}."
+
+
+def _own_words(evaluation: Evaluation | None, arm: Variant) -> Sequence[str]:
+    return evaluation.words(arm.name, ()) if evaluation else ()
 
 
 def _with_texts(results: StudyResults) -> StudyResults:

@@ -306,6 +306,7 @@ def _found(name: str, source: str) -> list[Path]:
     runs = [run for folder in folders for run in (find_runs(folder) if folder.is_dir() else [folder])]
     if not runs:
         missing = "it holds no run" if folders else "there is no such folder"
+        missing += " (in a pattern, [[] stands for a bracket)" if "[" in source and not folders else ""
         raise ConfigError(
             f"{name}={source}: {missing}; give a run folder, a folder that holds some, or a pattern"
         )
@@ -320,16 +321,33 @@ def _member(run: Run, agents: dict[Path, Run]) -> Member:
     tree = {name: value for name, value in run.config.items() if name not in ("run", "evaluated", "repeat")}
     seed, agent = run.seed, None
     if run.agent:
-        path = Path(run.agent)
-        folder, checkpoint = run_of(path), path.stem if path.suffix == ".pt" else "last"
-        if folder.is_dir():
-            agent = agents[folder] = agents.get(folder) or read_run(folder)
-        if agent and agent.config:
-            tree[AGENT] = {"checkpoint": checkpoint, **agent.config}
+        agent = _read_agent(run, agents)
+        if agent:
+            tree[AGENT] = _agent_tree(run, agent, agents, (run.folder,))
             seed = agent.seed
         else:
             tree[AGENT] = {"source": run.agent}
     return Member(run, agent, tree, shared_settings(tree), seed if seed is not None else 0)
+
+
+def _read_agent(run: Run, agents: dict[Path, Run]) -> Run | None:
+    """Return the run that made the agent of `run`; None if it is not there. `agents` were read before."""
+    folder = run_of(Path(run.agent))
+    if folder.is_dir():
+        agents[folder] = agents.get(folder) or read_run(folder)
+    found = agents.get(folder)
+    return found if found and found.config else None
+
+
+def _agent_tree(run: Run, agent: Run, agents: dict[Path, Run], above: tuple[Path, ...]) -> dict[str, Any]:
+    """Return the settings of the agent of `run`, with those of the agent that it was fine-tuned from.
+
+    `above` are the runs that were passed on the way; an agent that is its own origin is read once.
+    """
+    path, tree = Path(run.agent), dict(agent.config)
+    if agent.agent and agent.folder not in above and (origin := _read_agent(agent, agents)):
+        tree[AGENT] = _agent_tree(agent, origin, agents, (*above, agent.folder))
+    return {"checkpoint": path.stem if path.suffix == ".pt" else "last", **tree}
 
 
 def _bounds(sweeps: Iterable[Sweep]) -> list[tuple[int, int]]:

@@ -15,7 +15,6 @@ from cartpole_rl.errors import ConfigError
 from cartpole_rl.reporting.studies.settings import Size, Study, Variant, setting
 from cartpole_rl.workflows.studies import STUDIES, load_study, overrides_of, unknown
 
-FIRST_SEED = 10  # settings were chosen on seeds 0 to 9
 EVALUATIONS = "evaluations"  # folder in that of an agent
 BASELINE = "lqr"
 RESUMABLE = ("train", "finetune")  # commands
@@ -51,7 +50,11 @@ def plan(names: Sequence[str], size: str, root: Path, source: Path = STUDIES) ->
     tasks = {task.folder: task for name in names for task in study_tasks(name, size, root, source)}
     missing = needed(tasks.values()) - tasks.keys()
     while missing:
-        others = {folder.relative_to(root).parts[0] for folder in missing}
+        others = _studies_of(missing, root)
+        if absent := others.difference(file.stem for file in source.glob("*.yaml")):
+            needing = next(task for task in tasks.values() if _studies_of(task.needs, root) & absent)
+            name = min(_studies_of(needing.needs, root) & absent)
+            raise ConfigError(f"{needing.study}: it needs runs of the study {name}, which is not in {source}")
         found = {
             task.folder: task for name in sorted(others) for task in study_tasks(name, size, root, source)
         }
@@ -60,6 +63,11 @@ def plan(names: Sequence[str], size: str, root: Path, source: Path = STUDIES) ->
         tasks = {**{folder: found[folder] for folder in sorted(missing)}, **tasks}
         missing = needed(tasks.values()) - tasks.keys()
     return list(tasks.values())
+
+
+def _studies_of(folders: Iterable[Path], root: Path) -> set[str]:
+    """Return the names of the studies that the run folders belong to."""
+    return {folder.relative_to(root).parts[0] for folder in folders}
 
 
 def needed(tasks: Iterable[Task]) -> set[Path]:
@@ -74,7 +82,7 @@ def study_tasks(name: str, size: str, root: Path, source: Path = STUDIES) -> lis
     return [
         task
         for arm in study.arms
-        for seed in range(FIRST_SEED, FIRST_SEED + chosen.seeds)
+        for seed in chosen.every_seed
         for task in Agent(name, study, chosen, arm, seed, root).tasks()
     ]
 

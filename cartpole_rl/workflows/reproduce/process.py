@@ -14,13 +14,12 @@ from multiprocessing.connection import Connection
 from cartpole_rl.choices import choice
 from cartpole_rl.errors import CartPoleError
 from cartpole_rl.files import claimed
-from cartpole_rl.run_files import CHECKPOINTS, COMPARISON, IDENTIFIED, METRICS, MODELLED, RESUME
+from cartpole_rl.run_files import CHECKPOINTS, COMPARISON, IDENTIFIED, LOG, METRICS, MODELLED, RESUME
 from cartpole_rl.signals import RaiseOnce, ending_signals
 from cartpole_rl.workflows.reproduce.plan import EVALUATIONS, RESUMABLE, Task
 from cartpole_rl.workflows.run_folder import recorded_provenance
 from cartpole_rl.workflows.run_inputs import is_outdated, write_inputs
 
-LOG = "log.txt"
 DEFAULT_EPISODES = choice("evaluate")["episodes"]
 RESULTS = {"identify": IDENTIFIED, "model": MODELLED, "finetune": COMPARISON}  # of the other commands METRICS
 LONGEST = 1000  # characters of a reason: a pipe holds it until it is read

@@ -18,8 +18,9 @@ from typing import Any, NamedTuple
 import yaml
 
 from cartpole_rl.files import claimed, write_text
+from cartpole_rl.run_files import LOG
 from cartpole_rl.workflows.reproduce.plan import Task, needed, plan
-from cartpole_rl.workflows.reproduce.process import LOG, in_own_process, is_complete, made_otherwise
+from cartpole_rl.workflows.reproduce.process import in_own_process, is_complete, made_otherwise
 from cartpole_rl.workflows.reproduce.progress import Progress, duration
 from cartpole_rl.workflows.studies import STUDIES, load_study
 

@@ -18,6 +18,11 @@ def test_settings_that_differ_are_named() -> None:
     assert labels({}, 2) == [ALL, ALL]
 
 
+def test_numbers_have_the_digits_that_tell_them_apart() -> None:
+    near = 0.33333331, 0.33333334
+    assert columns(*({"share": value} for value in near)) == {"share": [str(value) for value in near]}
+
+
 def test_a_choice_of_conf_is_named_by_its_file() -> None:
     trees = [
         {"randomization": choice(f"randomization/{name}") or {}} for name in ("none", "friction_3", "wide")

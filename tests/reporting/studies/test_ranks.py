@@ -11,9 +11,16 @@ Pair = tuple[float, float]
 CARTS = tuple(Evaluation(name=name, label=f"{name} cart") for name in ("simulated", "emulated"))
 
 
-def results(name: str, *arms: list[Pair], measure: str = "score") -> StudyResults:
-    """Results of a study on two carts; each arm has an agent for each pair."""
-    variants = tuple(Variant(name=f"arm_{number}", label=f"arm {number}") for number, _ in enumerate(arms))
+def results(name: str, *arms: list[Pair], measure: str = "score", shared: str = "") -> StudyResults:
+    """Results of a study on two carts; each arm has an agent for each pair, the first those of `shared`."""
+    variants = tuple(
+        Variant(
+            name=f"arm_{number}",
+            label=f"arm {number}",
+            overrides=(f"run={{runs}}/{shared}/{{seed}}",) if shared and not number else (),
+        )
+        for number, _ in enumerate(arms)
+    )
     study = Study(
         title=name,
         order=90,
@@ -35,9 +42,15 @@ SHARED: list[Pair] = [(1, 2), (2, 3), (3, 1), (4, 4)]
 
 
 def test_agents_that_several_studies_share_agree_once() -> None:
-    (drawing,) = rank_agreements([results("one", SHARED), results("two", SHARED, [(5, 5), (6, 9)])])
+    two = results("two", SHARED, [(5, 5), (6, 9)], shared="one/arm_0")
+    (drawing,) = rank_agreements([results("one", SHARED), two])
     assert drawing.caption.startswith("6 agents of 2 studies")
     assert rank_agreements([results("few", SHARED[:2])]) == []
+
+
+def test_different_agents_with_the_same_scores_are_all_ranked() -> None:
+    (drawing,) = rank_agreements([results("one", [(0, 0), (0, 0), (0, 0), (1, 2), (3, 4)])])
+    assert drawing.caption.startswith("5 agents of 1 studies")
 
 
 def test_agents_of_each_score_are_ranked_among_themselves() -> None:

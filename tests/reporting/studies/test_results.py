@@ -3,6 +3,7 @@
 import json
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -135,15 +136,30 @@ def test_a_finding_of_other_numbers_is_not_shown_and_the_page_says_so() -> None:
     ]
 
 
-def test_a_digest_depends_on_three_digits_of_each_mean_and_not_on_the_order_of_agents() -> None:
+def test_a_digest_depends_on_six_digits_of_each_agent_and_not_on_their_order() -> None:
     def digest(*pairs: tuple[float, float]) -> str:
         return results("one", {"wide": on_carts(*pairs)}, evaluations=CARTS).digest
 
     first = digest((4000, 2500), (4000, 2900))
     assert len(first) == 8
-    assert first == digest((4000, 2900), (4000, 2500.0001)) == digest((4001, 2500), (4000, 2900))
-    assert len({first, digest((4100, 2500), (4000, 2900)), digest((4000, 2500))}) == 3
+    assert first == digest((4000, 2500.0001), (4000, 2900))
+    others = digest((4001, 2500), (4000, 2900)), digest((4000, 2500)), digest((4000, 2900), (4000, 2500))
+    assert len({first, *others}) == 4
     assert digest((-0.0, 1.0)) == digest((0.0, 1.0))
+    found = results("one", {"wide": on_carts((4000, 2500), (4000, 2900))}, evaluations=CARTS)
+    assert replace(found, agents=found.agents[::-1]).digest == first
+
+
+def test_a_finding_is_lost_if_a_single_agent_fails_that_no_interquartile_mean_shows() -> None:
+    finding = {"size": "full", "verdict": "agrees", "comment": "All ten hold the pole."}
+    arms = [{"name": "wide", "label": "drawn"}]
+    whole = judged("one", {"wide": on_carts(*[(4000, 4000)] * 10)}, finding, evaluations=CARTS, arms=arms)
+    assert whole.finding
+    *others, last = whole.agents
+    failed = replace(whole, agents=(*others, replace(last, values={"simulated": 0.0, "emulated": 0.0})))
+    means = [each.estimate("wide", "emulated") for each in (whole, failed)]
+    assert [each and each.value for each in means] == [4000, 4000]
+    assert failed.finding is None
 
 
 def test_a_digest_is_that_of_the_small_file() -> None:

@@ -95,7 +95,7 @@ needs_browser = pytest.mark.skipif(
 
 @needs_browser
 def test_a_browser_shows_the_page_of_studies_on_a_phone_and_in_the_dark(study: Path) -> None:
-    (study / "much/1/evaluations/heavy/metrics.json").unlink()
+    (study / "much/11/evaluations/heavy/metrics.json").unlink()
     done, page = report("studies=quick", "data=data")
     assert done.code == 0, done.err
     assert "\n6 runs count, 1 does not; the page says why\n" in done.out
@@ -129,13 +129,13 @@ def test_a_browser_shows_the_page_of_two_sets_of_runs(study: Path) -> None:
 
 
 def test_the_page_says_what_is_missing_and_what_does_not_count(study: Path) -> None:
-    (study / "much/1/evaluations/heavy/metrics.json").unlink()
+    (study / "much/11/evaluations/heavy/metrics.json").unlink()
     done, page = report("studies=quick", "animations=false")
     assert "incomplete: friction" in done.out
     box = re.search(r'<aside class="box".*?</aside>', page, re.S)
     assert box
-    assert "Missing: much friction, heavy cart: 2 of 3 seeds." in box[0]
-    run = "quick/friction/much/1/evaluations/heavy"
+    assert "Missing: much friction, heavy cart: 2 of 3 seeds, 11 is missing." in box[0]
+    run = "quick/friction/much/11/evaluations/heavy"
     assert f"{run} does not count: unfinished: it has no metrics.json." in box[0]
     assert "<img" not in page
 
@@ -144,7 +144,7 @@ def test_the_page_has_question_answers_command_and_runs(study: Path) -> None:
     _, page = report("studies=quick/friction", "animations=false")
     for part in ("Does friction matter?", "It was not asked.", COMMAND):
         assert part in page
-    for seed in (0, 1, 2):
+    for seed in (10, 11, 12):
         assert f'<td data-label="run">quick/friction/much/{seed}</td>' in page
     assert "Energy and LQR &lt;with&gt; friction" in page
     assert "<with>" not in page
@@ -163,7 +163,9 @@ def test_the_page_says_first_what_its_words_mean(study: Path, edit: Edit) -> Non
 
 
 def test_commits_stand_with_the_list_of_runs_and_not_in_a_box(study: Path, edit: Edit) -> None:
-    edit(study / "much/1/evaluations/heavy/provenance.json", lambda content: content.update(git_commit="abc"))
+    edit(
+        study / "much/11/evaluations/heavy/provenance.json", lambda content: content.update(git_commit="abc")
+    )
     _, page = report("studies=quick", "animations=false")
     assert 'class="box"' not in page
     folded = page[page.index("The 6 runs behind it") :]
@@ -216,7 +218,7 @@ def test_a_finding_about_other_results_is_named_with_the_digest_to_enter(study: 
 
 
 def test_a_damaged_picture_is_named_and_the_others_are_shown(study: Path) -> None:
-    gif = study / "much/1/evaluations/heavy/figures/episode.gif"
+    gif = study / "much/11/evaluations/heavy/figures/episode.gif"
     for evaluation in study.glob("*/*/evaluations/heavy/figures/episode.gif"):
         if evaluation != gif:
             evaluation.unlink()

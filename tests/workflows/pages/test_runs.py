@@ -15,6 +15,7 @@ from cartpole_rl.workflows.pages.runs import (
     partly_measured_note,
     read_run,
 )
+from cartpole_rl.workflows.run_folder import file_hash
 
 Edit = Callable[[Path, Callable[[Any], object]], None]
 GOOD = '{"transitions": 1, "score": 2.0}\n{"transitions": 2, "score": 3.0}\n'
@@ -38,14 +39,50 @@ GOOD = '{"transitions": 1, "score": 2.0}\n{"transitions": 2, "score": 3.0}\n'
     ],
 )
 def test_damage_is_the_problem_of_its_run(name: str, text: str, problem: str, study: Path) -> None:
-    folder = study / "much/1/evaluations/heavy"
+    folder = study / "much/11/evaluations/heavy"
     assert read_run(folder).problem == ""
     (folder / name).write_text(text)
     assert read_run(folder).problem.startswith(problem)
 
 
+def test_a_run_that_was_resumed_with_other_versions_has_both(study: Path, edit: Edit) -> None:
+    folder = study / "much/11/evaluations/heavy"
+    first = read_run(folder)
+    later = {"packages": {"torch": "9.9"}, "git_commit": "b" * 40}
+    edit(folder / "provenance.json", lambda content: content.update(resumed=[later, later]))
+    run = read_run(folder)
+    assert run.versions == f"{first.versions}, then torch 9.9"
+    assert run.commit.endswith(" then bbbbbbbbbb")
+    edit(folder / "provenance.json", lambda content: content.update(resumed=[5]))
+    assert read_run(folder).problem.startswith("damaged: 'int' object")
+
+
+def test_an_evaluation_of_an_earlier_checkpoint_does_not_count(study: Path, edit: Edit) -> None:
+    folder, checkpoint = study / "much/11/evaluations/heavy", Path("agent/checkpoints/last.pt")
+    checkpoint.parent.mkdir(parents=True)
+    checkpoint.write_bytes(b"half trained")
+    used = file_hash(checkpoint)
+    edit(folder / "config.yaml", lambda content: content.update(run="agent"))
+    edit(folder / "provenance.json", lambda content: content.update(agent_sha256=used))
+    assert read_run(folder).problem == ""
+    checkpoint.write_bytes(b"trained")
+    assert read_run(folder).problem == "its agent agent has another checkpoint now; repeat it"
+    checkpoint.unlink()
+    assert read_run(folder).problem == ""
+
+
+def test_a_run_that_failed_shows_the_end_of_its_log(study: Path) -> None:
+    folder = study / "much/11/evaluations/heavy"
+    (folder / "log.txt").write_text("starting\nno space left\n\n")
+    assert read_run(folder).problem == ""
+    (folder / "metrics.json").unlink()
+    assert (
+        read_run(folder).problem == "unfinished: it has no metrics.json; its log.txt ends with: no space left"
+    )
+
+
 def test_a_failed_job_says_why(study: Path) -> None:
-    folder = study / "much/1/evaluations/heavy"
+    folder = study / "much/11/evaluations/heavy"
     (folder / "error.txt").write_text("cart_mass=-1: give more than 0\nTraceback\n")
     assert read_run(folder).problem == ""  # it has results
     (folder / "metrics.json").unlink()
@@ -55,7 +92,7 @@ def test_a_failed_job_says_why(study: Path) -> None:
 
 
 def test_a_repeated_episode_is_a_whole_run(study: Path, edit: Edit) -> None:
-    folder = study / "much/1/evaluations/heavy"
+    folder = study / "much/11/evaluations/heavy"
     edit(folder / "metrics.json", lambda content: content["episodes"].pop())
     assert read_run(folder).problem == "interrupted: 1 of 2 episodes"
     edit(folder / "config.yaml", lambda content: content.update(repeat={"run": "x", "episode": 1}))
@@ -112,7 +149,7 @@ def test_a_mean_over_a_part_of_the_episodes_is_noted() -> None:
 
 
 def test_settings_of_any_kind_are_compared(study: Path) -> None:
-    folder = study / "much/1/evaluations/heavy"
+    folder = study / "much/11/evaluations/heavy"
     text = (folder / "config.yaml").read_text()
     (folder / "config.yaml").write_text(f"{text}dates: [2020-01-01]\n")
     run = read_run(folder)

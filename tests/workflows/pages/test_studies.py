@@ -17,13 +17,13 @@ from cartpole_rl.workflows.studies import STUDIES, read_study_file
 
 Edit = Callable[[Path, Callable[[Any], object]], None]
 DATA = Path(__file__).parents[3] / "docs/results/thesis"
-HEAVY = "much/1/evaluations/heavy"
+HEAVY = "much/11/evaluations/heavy"
 
 
 def test_every_agent_has_the_mean_score_of_its_evaluations(study: Path) -> None:
     results = read_study(study)
     assert [(agent.arm, agent.seed) for agent in results.agents] == [
-        (arm, seed) for arm in ("little", "much") for seed in (0, 1, 2)
+        (arm, seed) for arm in ("little", "much") for seed in (10, 11, 12)
     ]
     for agent in results.agents:
         for name, value in agent.values.items():
@@ -95,32 +95,32 @@ def test_a_run_that_does_not_fit_is_named_and_not_averaged(
     assert results.values("much", "heavy").tolist() == [whole[0], whole[2]]
     assert results.values("much", "nominal").shape == (3,)
     assert results.ratios("much").shape == (2,)
-    assert results.missing() == ["much friction, heavy cart: 2 of 3 seeds"]
+    assert results.missing() == ["much friction, heavy cart: 2 of 3 seeds, 11 is missing"]
     assert status(results) is Status.INCOMPLETE
 
 
 def test_a_missing_seed_is_named(study: Path) -> None:
-    shutil.rmtree(study / "little/2")
+    shutil.rmtree(study / "little/12")
     assert read_study(study).missing() == [
-        "little friction, nominal cart: 2 of 3 seeds",
-        "little friction, heavy cart: 2 of 3 seeds",
+        "little friction, nominal cart: 2 of 3 seeds, 12 is missing",
+        "little friction, heavy cart: 2 of 3 seeds, 12 is missing",
     ]
 
 
 def test_an_agent_whose_training_is_unfinished_does_not_count(study: Path) -> None:
     for name in ("config.yaml", "provenance.json"):
-        shutil.copy(study / HEAVY / name, study / "much/1" / name)
+        shutil.copy(study / HEAVY / name, study / "much/11" / name)
     results = read_study(study)
-    assert [each.run for each in results.exclusions] == ["quick/friction/much/1"]
+    assert [each.run for each in results.exclusions] == ["quick/friction/much/11"]
     assert results.values("much", "nominal").shape == (2,)
 
 
 def test_an_agent_whose_training_is_of_other_versions_does_not_count(study: Path, edit: Edit) -> None:
     for name in ("config.yaml", "provenance.json", "metrics.json"):
-        shutil.copy(study / HEAVY / name, study / "much/1" / name)
-    edit(study / "much/1/provenance.json", lambda content: content["packages"].update(torch="1.0"))
+        shutil.copy(study / HEAVY / name, study / "much/11" / name)
+    edit(study / "much/11/provenance.json", lambda content: content["packages"].update(torch="1.0"))
     results = read_study(study)
-    assert [each.run for each in results.exclusions] == ["quick/friction/much/1"]
+    assert [each.run for each in results.exclusions] == ["quick/friction/much/11"]
     assert results.values("much", "nominal").shape == (2,)
 
 
@@ -165,6 +165,22 @@ def test_a_damaged_small_file_is_refused(content: str, message: str, tmp_path: P
         read_studies(tmp_path)
 
 
+def test_a_copy_of_a_small_file_is_refused(study: Path, tmp_path: Path) -> None:
+    write_data([read_study(study)], tmp_path / "data")
+    shutil.copy(tmp_path / "data/friction.json", tmp_path / "data/friction_old.json")
+    with pytest.raises(ConfigError, match=r"friction_old\.json: it holds the study friction; rename it"):
+        read_studies(tmp_path / "data")
+
+
+def test_arms_that_no_override_tells_apart_are_named(study: Path, edit: Edit) -> None:
+    assert not [note for note in read_study(study).notes if "differs between arms" in note]
+    for config in study.glob("much/*/evaluations/heavy/config.yaml"):
+        edit(config, lambda content: content["plant"].update(substeps=7))
+    assert "heavy cart: plant.substeps differs between arms (4, 7) and no override sets it." in (
+        read_study(study).notes
+    )
+
+
 def test_folders_without_studies_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="there is no such folder"):
         read_studies(tmp_path / "nowhere")
@@ -179,14 +195,13 @@ def test_a_wrong_study_is_refused_with_its_file_and_key(study: Path, edit: Edit)
 
 
 def test_a_run_of_another_seed_than_its_folder_does_not_count(study: Path) -> None:
-    shutil.copytree(study / "much/0", study / "much/7")
-    shutil.rmtree(study / "little/1/evaluations/heavy")
-    shutil.copytree(study / "little/0/evaluations/heavy", study / "little/1/evaluations/heavy")
+    shutil.copytree(study / "much/10", study / "much/7")
+    shutil.rmtree(study / "little/11/evaluations/heavy")
+    shutil.copytree(study / "little/10/evaluations/heavy", study / "little/11/evaluations/heavy")
     results = read_study(study)
     assert {each.run: each.reason for each in results.exclusions} == {
-        "quick/friction/little/1/evaluations/heavy": "its seed is 0, that of its place 1",
-        "quick/friction/much/7/evaluations/heavy": "its seed is 0, that of its place 7",
-        "quick/friction/much/7/evaluations/nominal": "its seed is 0, that of its place 7",
+        "quick/friction/little/11/evaluations/heavy": "its seed is 10, that of its place 11",
+        "quick/friction/much/7": "its seed is none of size quick, which has 10 to 12",
     }
     assert results.values("much", "heavy").size == 3
     assert results.values("little", "heavy").size == 2
@@ -194,7 +209,7 @@ def test_a_run_of_another_seed_than_its_folder_does_not_count(study: Path) -> No
 
 @pytest.mark.parametrize("name", ["01", "\uff11", "\u00b2"])
 def test_a_folder_whose_name_is_no_seed_is_named(name: str, study: Path) -> None:
-    shutil.copytree(study / "much/1", study / "much" / name)
+    shutil.copytree(study / "much/11", study / "much" / name)
     results = read_study(study)
     assert [(each.run, each.reason) for each in results.exclusions] == [
         (f"quick/friction/much/{name}", "its name is no seed")
@@ -214,7 +229,7 @@ def as_trainings(study: Path, edit: Edit, **arms: str) -> None:
             ],
         ),
     )
-    for place in (place for arm, agent in arms.items() if not agent for place in (study / arm).glob("?")):
+    for place in (place for arm, agent in arms.items() if not agent for place in (study / arm).glob("1?")):
         for name in ("config.yaml", "provenance.json", "metrics.json"):
             shutil.copy(place / "evaluations/heavy" / name, place / name)
 
@@ -232,12 +247,12 @@ def test_an_evaluation_of_another_agent_does_not_count(picked: str, study: Path,
     evaluate(study, edit, "much", "/abs/quick/friction/much/{seed}")
     evaluate(study, edit, "little", f"quick/friction/much/{{seed}}{picked}")
     assert read_study(study).exclusions == ()
-    wrong = study / "little/1/evaluations/heavy"
-    edit(wrong / "config.yaml", lambda content: content.update(run=f"quick/friction/much/2{picked}"))
+    wrong = study / "little/11/evaluations/heavy"
+    edit(wrong / "config.yaml", lambda content: content.update(run=f"quick/friction/much/12{picked}"))
     (exclusion,) = read_study(study).exclusions
     assert exclusion.run == wrong.as_posix()
     assert exclusion.reason == (
-        f"it evaluated quick/friction/much/2{picked}, its place asks for {{runs}}/friction/much/1{picked}"
+        f"it evaluated quick/friction/much/12{picked}, its place asks for {{runs}}/friction/much/11{picked}"
     )
 
 
@@ -255,20 +270,20 @@ def test_the_training_of_an_agent_counts_wherever_it_is(picked: str, study: Path
     as_trainings(study, edit, much="", little=f"{{runs}}/{agent}")
     evaluate(study, edit, "much", "quick/friction/much/{seed}")
     evaluate(study, edit, "little", f"quick/{agent}")
-    (study / "much/2/metrics.json").unlink()
-    edit(study / "much/1/provenance.json", lambda content: content["packages"].update(torch="1.0"))
+    (study / "much/12/metrics.json").unlink()
+    edit(study / "much/11/provenance.json", lambda content: content["packages"].update(torch="1.0"))
     counted = {(agent.arm, agent.seed) for agent in read_study(study).agents}
-    assert counted == {("much", 0), ("little", 0)}
+    assert counted == {("much", 10), ("little", 10)}
 
 
 def test_a_training_that_is_not_there_is_named(study: Path, edit: Edit) -> None:
     as_trainings(study, edit, much="", little="{runs}/elsewhere/much/{seed}")
     evaluate(study, edit, "much", "quick/friction/much/{seed}")
     evaluate(study, edit, "little", "quick/elsewhere/much/{seed}")
-    (study / "much/1/config.yaml").unlink()
+    (study / "much/11/config.yaml").unlink()
     results = read_study(study)
     assert [(each.run, each.reason) for each in results.exclusions] == [
-        ("quick/friction/much/1", "it has no config.yaml")
+        ("quick/friction/much/11", "it has no config.yaml")
     ]
     assert results.values("much", "nominal").size == 2
     assert "little friction: the trainings of 3 agents were not found and are not checked." in results.notes
@@ -277,16 +292,16 @@ def test_a_training_that_is_not_there_is_named(study: Path, edit: Edit) -> None:
 def test_a_damaged_history_costs_its_curve_alone(study: Path, edit: Edit) -> None:
     as_trainings(study, edit, much="", little="lqr")
     evaluate(study, edit, "much", "quick/friction/much/{seed}")
-    for seed in range(3):
+    for seed in (10, 11, 12):
         edit(study / f"much/{seed}/provenance.json", lambda content: content.update(program="cartpole-train"))
         history = '{"transitions": 1, "score": 2, "score_upright": 3}\n' * 2
         (study / f"much/{seed}/history.jsonl").write_text(history)
-    (study / "much/1/history.jsonl").write_text('{"transitions": 1, "sc')
+    (study / "much/11/history.jsonl").write_text('{"transitions": 1, "sc')
     results = read_study(study)
     assert results.exclusions == ()
-    assert {agent.seed for agent in results.agents if agent.curves} == {0, 2}
+    assert {agent.seed for agent in results.agents if agent.curves} == {10, 12}
     assert (
-        "The curves of quick/friction/much/1 are not drawn: line 1 of history.jsonl is damaged."
+        "The curves of quick/friction/much/11 are not drawn: line 1 of history.jsonl is damaged."
         in results.notes
     )
 
@@ -366,7 +381,7 @@ def test_an_evaluation_may_be_called_own(study: Path, edit: Edit) -> None:
     edit(study / "study.yaml", lambda content: content["evaluations"][0].update(name="own"))
     for nominal in [*study.glob("*/*/evaluations/nominal")]:
         nominal.rename(nominal.with_name("own"))
-    for seed in range(3):
+    for seed in (10, 11, 12):
         edit(study / f"much/{seed}/provenance.json", lambda content: content.update(program="cartpole-train"))
     results = read_study(study)
     assert results.exclusions == ()

@@ -29,29 +29,29 @@ def test_runs_are_grouped_by_the_settings_that_differ(study: Path) -> None:
         "cart_viscous=3",
     ]
     for arm in results.study.arms:
-        assert [agent.seed for agent in results.agents if agent.arm == arm.name] == [0, 1, 2]
+        assert [agent.seed for agent in results.agents if agent.arm == arm.name] == [10, 11, 12]
     of_study = {agent.run: agent.values["own"] for agent in results.agents}
-    metrics = json.loads((study / "much/1/evaluations/heavy/metrics.json").read_text())
-    assert of_study["quick/friction/much/1/evaluations/heavy"] == metrics[MEASURE]["mean"]
+    metrics = json.loads((study / "much/11/evaluations/heavy/metrics.json").read_text())
+    assert of_study["quick/friction/much/11/evaluations/heavy"] == metrics[MEASURE]["mean"]
 
 
 def test_the_table_has_a_row_for_every_run(study: Path) -> None:
-    (study / "much/1/evaluations/heavy/metrics.json").unlink()
+    (study / "much/11/evaluations/heavy/metrics.json").unlink()
     (sweep,), _ = grouped([read_sweep("runs", ["quick"], MEASURE)])
     rows = list(csv.DictReader(io.StringIO(table([sweep]))))
     assert len(rows) == 12
     assert [row["left_out"] for row in rows if row["left_out"]] == ["unfinished: it has no metrics.json"]
     by_run = {row["run"]: row for row in rows}
-    metrics = json.loads((study / "much/2/evaluations/heavy/metrics.json").read_text())
-    row = by_run["quick/friction/much/2/evaluations/heavy"]
+    metrics = json.loads((study / "much/12/evaluations/heavy/metrics.json").read_text())
+    row = by_run["quick/friction/much/12/evaluations/heavy"]
     assert float(row["score"]) == metrics["score"]["mean"]
-    assert (row["seed"], row["setting:parameters.cart_mass"]) == ("2", "1.5")
+    assert (row["seed"], row["setting:parameters.cart_mass"]) == ("12", "1.5")
 
 
 def test_patterns_and_lists_name_runs(study: Path) -> None:
     one = read_sweep("runs", ["quick/*/much/*/evaluations/heavy"], MEASURE)
     two = read_sweep(
-        "runs", ["quick/friction/much/0", "quick/friction/much/1", "quick/friction/much/0"], MEASURE
+        "runs", ["quick/friction/much/10", "quick/friction/much/11", "quick/friction/much/10"], MEASURE
     )
     assert (len(one.members), len(two.members)) == (3, 4)
     with pytest.raises(ConfigError, match=r"compare=quick/none\*: there is no such folder"):
@@ -59,7 +59,7 @@ def test_patterns_and_lists_name_runs(study: Path) -> None:
 
 
 def test_runs_of_another_command_version_or_without_measure_are_named(study: Path, edit: Edit) -> None:
-    nominal = [f"quick/friction/much/{seed}/evaluations/nominal" for seed in (0, 1, 2)]
+    nominal = [f"quick/friction/much/{seed}/evaluations/nominal" for seed in (10, 11, 12)]
     edit(Path(nominal[0], "provenance.json"), lambda content: content.update(program="cartpole-record"))
     edit(Path(nominal[1], "provenance.json"), lambda content: content["packages"].update(numpy="1.0"))
     edit(Path(nominal[2], "metrics.json"), lambda content: content.update(score_upright=None))
@@ -72,21 +72,21 @@ def test_runs_of_another_command_version_or_without_measure_are_named(study: Pat
 
 
 def test_a_seed_counts_once_and_unequal_seeds_are_noted(study: Path) -> None:
-    shutil.copytree(study / "much/0/evaluations/heavy", "quick/zzz_again")
-    shutil.rmtree(study / "little/1/evaluations/heavy")
+    shutil.copytree(study / "much/10/evaluations/heavy", "quick/zzz_again")
+    shutil.rmtree(study / "little/11/evaluations/heavy")
     (sweep,), _ = grouped([read_sweep("runs", ["quick"], MEASURE)])
     results = results_of(sweep, MEASURE)
     assert [(each.run, each.reason) for each in results.exclusions] == [
-        ("quick/zzz_again", "seed 0 of cart_viscous=3, cart_mass=1.5 is there twice")
+        ("quick/zzz_again", "seed 10 of cart_viscous=3, cart_mass=1.5 is there twice")
     ]
-    assert "cart_viscous=0.2, cart_mass=1.5 lacks seed 1" in results.notes
+    assert "cart_viscous=0.2, cart_mass=1.5 lacks seed 11" in results.notes
 
 
 def test_two_sets_are_compared_group_by_group(study: Path) -> None:
     sweeps, between = grouped(
         [
             read_sweep("runs", ["quick/friction/little"], MEASURE),
-            read_sweep("compare", ["quick/friction/much", "quick/friction/little/0"], MEASURE),
+            read_sweep("compare", ["quick/friction/much", "quick/friction/little/10"], MEASURE),
         ]
     )
     first, second = (results_of(sweep, MEASURE) for sweep in sweeps)
@@ -137,13 +137,13 @@ def test_long_labels_have_the_same_number_in_both_sets(study: Path, edit: Edit) 
 
 
 def test_failed_jobs_and_links_are_named_or_followed(study: Path) -> None:
-    failed = study / "much/1/evaluations/heavy"
+    failed = study / "much/11/evaluations/heavy"
     shutil.rmtree(failed)
     failed.mkdir()
     (failed / "error.txt").write_text("ConfigError: cart_mass is -1\n")
-    shutil.move(study / "much/2/evaluations/heavy", "away")
-    (study / "much/2/evaluations/heavy").symlink_to(Path("away").resolve())
-    (study / "again").symlink_to((study / "much/0").resolve())
+    shutil.move(study / "much/12/evaluations/heavy", "away")
+    (study / "much/12/evaluations/heavy").symlink_to(Path("away").resolve())
+    (study / "again").symlink_to((study / "much/10").resolve())
     sweep = read_sweep("runs", ["quick/friction"], MEASURE)
     assert len(sweep.members) == 11
     assert [(each.run, each.reason) for each in sweep.exclusions] == [
@@ -152,22 +152,36 @@ def test_failed_jobs_and_links_are_named_or_followed(study: Path) -> None:
 
 
 def test_the_agents_of_evaluations_count(study: Path, edit: Edit) -> None:
-    for seed in range(3):
+    for seed in (10, 11, 12):
         heavy = study / f"much/{seed}/evaluations/heavy"
         shutil.copytree(heavy, f"agents/{seed}")
         edit(heavy / "config.yaml", lambda content, seed=seed: content.update(run=f"agents/{seed}"))
-    edit(Path("agents/1/provenance.json"), lambda content: content["packages"].update(torch="1.0"))
-    Path("agents/2/metrics.json").unlink()
+    edit(Path("agents/11/provenance.json"), lambda content: content["packages"].update(torch="1.0"))
+    Path("agents/12/metrics.json").unlink()
     sweep = read_sweep("runs", ["quick/friction/*/*/evaluations/heavy"], MEASURE)
     reasons = {each.run: each.reason for each in sweep.exclusions}
     assert len(sweep.members) == 4
-    assert reasons["quick/friction/much/2/evaluations/heavy"] == (
-        "its agent agents/2: unfinished: it has no metrics.json"
+    assert reasons["quick/friction/much/12/evaluations/heavy"] == (
+        "its agent agents/12: unfinished: it has no metrics.json"
     )
-    assert "torch 1.0" in reasons["quick/friction/much/1/evaluations/heavy"]
+    assert "torch 1.0" in reasons["quick/friction/much/11/evaluations/heavy"]
     shutil.rmtree("agents")
     (lost,), _ = grouped([read_sweep("runs", ["quick/friction/*/*/evaluations/heavy"], MEASURE)])
     assert "The runs of 3 agents were not found and are not checked." in results_of(lost, MEASURE).notes
+
+
+def test_agents_that_were_tuned_from_different_agents_are_different_groups(study: Path, edit: Edit) -> None:
+    for seed, carts in ((10, 512), (11, 1024), (12, 1024)):
+        heavy = study / f"much/{seed}/evaluations/heavy"
+        for name, run in (("origins", None), ("tuned", f"origins/{seed}")):
+            shutil.copytree(heavy, f"{name}/{seed}")
+            edit(Path(name, str(seed), "config.yaml"), lambda content, run=run: content.update(run=run))
+        edit(Path(f"origins/{seed}/config.yaml"), lambda content, carts=carts: content.update(carts=carts))
+        edit(heavy / "config.yaml", lambda content, seed=seed: content.update(run=f"tuned/{seed}"))
+    edit(Path("origins/10/config.yaml"), lambda content: content.update(run="tuned/10"))  # a circle
+    (sweep,), _ = grouped([read_sweep("runs", ["quick/friction/much/*/evaluations/heavy"], MEASURE)])
+    assert sweep.columns["agent.agent.carts"] == ["512", "1024", "1024"]
+    assert len({*sweep.labels}) == 2
 
 
 def test_versions_and_commands_are_compared_over_both_sets(study: Path, edit: Edit) -> None:
@@ -192,9 +206,9 @@ def test_versions_and_commands_are_compared_over_both_sets(study: Path, edit: Ed
 
 
 def test_seeds_that_no_group_has_all_of_are_noted(study: Path) -> None:
-    shutil.rmtree(study / "little/0")
-    shutil.rmtree(study / "much/2")
+    shutil.rmtree(study / "little/10")
+    shutil.rmtree(study / "much/12")
     (sweep,), _ = grouped([read_sweep("runs", ["quick/friction/*/*/evaluations/nominal"], MEASURE)])
     notes = results_of(sweep, MEASURE).notes
-    assert "cart_viscous=0.2 lacks seed 0" in notes
-    assert "cart_viscous=3 lacks seed 2" in notes
+    assert "cart_viscous=0.2 lacks seed 10" in notes
+    assert "cart_viscous=3 lacks seed 12" in notes
