@@ -108,7 +108,7 @@ class SerialCart:
         return self.information
 
     def close(self) -> None:
-        """Set the motor to 0, disarm, give the port back. Never raises, so that no error hides another."""
+        """Set the motor to 0, disarm, give the port back. Raises only what interrupts it, such as Ctrl-C."""
         if self._open_connection is None:
             return
         try:
@@ -119,6 +119,10 @@ class SerialCart:
                 "homing: then switch it off",
                 error,
             )
+        except BaseException:  # a signal, before STOP was answered
+            with suppress(PlantError):
+                self._stop(LAST_STOP)
+            raise
         finally:
             self._disconnect(self._open_connection)
 
@@ -164,8 +168,11 @@ class SerialCart:
     def start_policy(self) -> None:
         """Arm the motor and let the policy on the board drive, while `follow_policy` keeps it from stopping.
 
-        Raises what `start` raises, and RefusedError if the board has no policy.
+        Before, the host is silent for some periods: a HELLO in silence, which a lockstep emulator needs,
+        would wake the policy of a cart with its own clock. Raises what `start` raises, and RefusedError if
+        the board has no policy.
         """
+        self._connection.learn_clock()
         self._arm(StartPolicy())
         self._tracker.follow_policy()
 

@@ -41,6 +41,7 @@ from cartpole_rl.wire import (
     SetMotor,
     State,
     Stop,
+    microseconds_between,
     ticks_between,
 )
 from cartpole_rl.wire.frames import END
@@ -50,7 +51,7 @@ Answer = TypeVar("Answer", bound=Message)
 WATCHDOG_PERIODS = 3  # without a command, after which the cart sets its motor to 0
 BACKLOG_BYTES = 1000  # with more waiting, the system's buffer (4096) may have dropped newer bytes
 UNACKNOWLEDGED_PERIODS = 1.5  # after a frame: by then the next state has come, if the frame has arrived
-LONGEST_PAUSE = 0.5  # s between two questions that have to be answered within a given time
+LISTENING_PERIODS = 10  # without a frame, to learn whether the cart has a clock of its own
 LONGEST_DEAFNESS = 1.0  # s; the cart's watchdog has stopped its motor long before
 KEPT_ANSWERS = 64
 
@@ -73,19 +74,22 @@ class Connection:
         self._state_since_refusal = True
 
     def shake_hands(self) -> Info:
-        """Send STOP and HELLO until the cart answers. Whatever a booting board prints before is ignored.
+        """Send STOP until the cart answers it, then HELLO. Whatever a booting board prints before is ignored.
 
         STOP comes first: a host that died may have left the cart armed, with a policy on its board that any
-        accepted frame wakes.
+        accepted frame wakes. HELLO waits for its answer, as STOP may be lost.
         """
         deadline = now() + self._settings.connect_timeout
         pause = min(self._settings.answer_timeout, self._settings.connect_timeout)
+        stops: list[int] = []
         while now() < deadline:
             self._answers.clear()
             self.link.write(END)  # ends a partial frame that the cart may have read
-            self.link.send(Stop(), Hello())
-            until = min(deadline, now() + pause)
-            answer = self._await_answer(until, (), Info, lambda info: True)
+            stops.append(self.link.send(Stop()))
+            if self._await_answer(min(deadline, now() + pause), stops, Ack, lambda ack: True) is None:
+                continue
+            self.link.send(Hello())
+            answer = self._await_answer(min(deadline, now() + pause), (), Info, lambda info: True)
             if answer is not None:
                 return answer
         raise LinkError(f"no cart answers on {self.link.port}: {self._what_came()}")
@@ -110,7 +114,7 @@ class Connection:
         end, pause = now() + within, self._settings.answer_timeout
         attempts: Iterable[int] = range(1 + self._settings.retries)
         if math.isfinite(within):
-            attempts, pause = count(), min(pause, within / 2, LONGEST_PAUSE)
+            attempts, pause = count(), min(pause, within / 2)
         for _ in attempts:
             asked.append(self.link.send(*before, message))
             self.notice_backlog()
@@ -127,6 +131,13 @@ class Connection:
             "check its cable and power"
         )
 
+    def learn_clock(self) -> None:
+        """Send nothing for as long as a cart with its own clock needs to be known as one."""
+        self._tracker.send_question()
+        deadline = now() + LISTENING_PERIODS * self._period_us * 1e-6
+        while not self._tracker.ticks_alone and now() < deadline:
+            self._read()
+
     def send_motor(self, value: int) -> None:
         """Send a motor value once.
 
@@ -135,13 +146,12 @@ class Connection:
         """
         self._refused_sequence = -1
         before, started = self._tracker.last, now()
-        if value and self._tracker.awaits_command:
-            started = self._tracker.newest_at
+        since = self._tracker.newest_at if value and self._tracker.awaits_command else started
         self._motor_sequence = self.link.send(SetMotor(value))
         self._tracker.send_command(self.link.sequence, self.link.sent_at)
-        period_us = min(self._tracker.period_us or LONGEST_PERIOD_US, LONGEST_PERIOD_US)
-        if self.link.sent_at - started > WATCHDOG_PERIODS * period_us * 1e-6:
-            self._check_delay(before)
+        longest = WATCHDOG_PERIODS * self._period_us * 1e-6
+        if self.link.sent_at - since > longest:
+            self._check_delay(before, self.link.sent_at - started > longest)
 
     def current_state(self) -> State:
         """Wait for the newest state that was measured after the cart took the last frame.
@@ -204,15 +214,26 @@ class Connection:
             self._tracker.catch_up()
         return backlog
 
-    def _check_delay(self, before: State | None) -> None:
-        """Stop the cart and raise LinkError if it has ticked on during a slow write.
+    def _check_delay(self, before: State | None, slow_write: bool) -> None:
+        """Stop the cart and raise LinkError if it got the motor value too late by its own clock.
 
-        `before` is the newest state before the write. A lockstep emulator waits for the host.
+        `before` is the newest state before the write. A state that acknowledges the value tells how long ago
+        it came. Otherwise ticks in the meantime count, unless they may be those of a lockstep emulator, which
+        waits for the host and passes a period for each lost frame.
         """
         deadline = now() + self._settings.timeout
+        ticks_count = slow_write or self._tracker.ticks_alone
         while True:
             state = self._tracker.last
-            if before is None or state is None or ticks_between(before.tick, state.tick) >= WATCHDOG_PERIODS:
+            if before is None or state is None:
+                break
+            if state is not before and state.last_sequence == self._motor_sequence:
+                passed_us = microseconds_between(before.time_us, state.time_us)
+                waited_us = passed_us - 1000 * state.command_age_ms
+                if 0 <= waited_us < WATCHDOG_PERIODS * self._period_us:
+                    return
+                ticks_count |= waited_us >= 0  # otherwise the cart does not know the age
+            if ticks_count and ticks_between(before.tick, state.tick) >= WATCHDOG_PERIODS:
                 break
             if state is not before and self._is_current(state):
                 return
@@ -268,9 +289,11 @@ class Connection:
             return True
         if link.sequence == self._refused_sequence and self._state_since_refusal:
             return True
-        waited = now() - link.sent_at
-        period_us = min(self._tracker.period_us or LONGEST_PERIOD_US, LONGEST_PERIOD_US)
-        return waited > UNACKNOWLEDGED_PERIODS * period_us * 1e-6
+        return now() - link.sent_at > UNACKNOWLEDGED_PERIODS * self._period_us * 1e-6
+
+    @property
+    def _period_us(self) -> int:
+        return min(self._tracker.period_us or LONGEST_PERIOD_US, LONGEST_PERIOD_US)
 
     def _endure_silence(self, deadline: float) -> None:
         """Raise LinkError after the deadline; send HELLO after each `nudge_after` seconds without a byte."""
@@ -289,7 +312,9 @@ class Connection:
         for frame in self.link.receive(waiting):
             message = frame.message
             if isinstance(message, State):
-                if self._tracker.receive(message, Flags(frame.flags), self.link.received_at):
+                if self._tracker.receive(
+                    message, Flags(frame.flags), self.link.received_at, self.link.sequence
+                ):
                     self._state_since_refusal = True
             elif isinstance(message, Nack):
                 self._take_refusal(message)

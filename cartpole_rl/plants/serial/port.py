@@ -32,7 +32,11 @@ def open_port(port: str, baud: int, write_timeout: float) -> serial.SerialBase:
             "the port as raw TCP, and give socket://HOST:PORT"
         )
     try:
-        line = TcpPort() if port.startswith("socket://") else serial.serial_for_url(port, do_not_open=True)
+        line = (
+            TcpPort()
+            if port.lower().startswith("socket://")
+            else serial.serial_for_url(port, do_not_open=True)
+        )
         line.port, line.baudrate = port, baud
         line.timeout, line.write_timeout, line.exclusive = READ_SLICE, write_timeout, True
         line.dtr = False

@@ -20,7 +20,7 @@ from cartpole_rl.plants.serial.statistics import LinkStatistics
 from cartpole_rl.wire import Flags, State, microseconds_between, ticks_between, went_back
 
 HALF_MILLISECOND = 500  # us
-IDLE_TICKS = 6  # without a new frame of the host; a lockstep emulator passes one for each frame that is lost
+IDLE_TICKS = 6  # after the host's newest frame; a lockstep emulator passes one for a frame that came twice
 OVERTAKEN_TICKS = 16  # 0.3 s: no frame is delayed for longer, and no cart boots and is driven so soon
 
 
@@ -37,7 +37,7 @@ class StateTracker:
         self.measuring = True  # latencies and late ticks are counted
         self.stopped_clock: tuple[State, State] | None = None  # two states between which no time passed
         self.ticks_alone = False  # the cart is known to have a clock of its own
-        self._same_frame = 0  # ticks in succession that acknowledged the same frame of the host
+        self._same_frame = 0  # ticks in succession that acknowledged the same frame, the newest of the host
         self._newest: State | None = None  # arrived, and not handed out yet
         self.last: State | None = None  # the newest that arrived, handed out or not
         self._missing: set[int] = set()  # ticks that were counted as lost, and may still arrive
@@ -63,8 +63,11 @@ class StateTracker:
         self.ticks_alone, self._same_frame = False, 0
         self._missing.clear()
 
-    def receive(self, state: State, flags: Flags, arrived_at: float) -> bool:
-        """Take in a state that has arrived; return True if it is the newest now."""
+    def receive(self, state: State, flags: Flags, arrived_at: float, sequence: int) -> bool:
+        """Take in a state that has arrived; return True if it is the newest now.
+
+        `sequence` is that of the newest frame that the host has sent.
+        """
         last = self.last
         if last is not None:
             if ticks_between(state.tick, last.tick) < OVERTAKEN_TICKS:
@@ -75,7 +78,7 @@ class StateTracker:
                 self.restarts += 1
             else:
                 self._check_clock(last, state, ticks)
-                self._note_own_clock(last, state, flags)
+                self._note_own_clock(last, state, flags, sequence)
                 self._count_missing(state.tick, ticks - 1)
         if self._newest is not None:
             self.count_passed_over()
@@ -127,9 +130,13 @@ class StateTracker:
         if self._driving:
             self.statistics.late_ticks += 1
 
-    def _note_own_clock(self, last: State, state: State, flags: Flags) -> None:
-        """Note it if the cart ticks without frames. While it homes, a lockstep emulator does that too."""
-        idle = state.last_sequence == last.last_sequence and not flags & Flags.HOMING
+    def _note_own_clock(self, last: State, state: State, flags: Flags, sequence: int) -> None:
+        """Note it if the cart ticks on after it has taken the newest frame of the host.
+
+        A lockstep emulator does that only while it homes. It also ticks for each frame that is lost or
+        refused, which no state acknowledges.
+        """
+        idle = state.last_sequence == last.last_sequence == sequence and not flags & Flags.HOMING
         self._same_frame = self._same_frame + 1 if idle else 0
         self.ticks_alone |= self._same_frame >= IDLE_TICKS
 

@@ -1,16 +1,16 @@
 """A motor value answers a state that is too old: each place where this computer can pause before it sends."""
 
+import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
 
 import pytest
-from serial_peer import CartPeer, quick_settings, wait_for
+from serial_peer import CartPeer, Forgetful, quick_settings, wait_for
 
 from cartpole_rl.errors import LinkError
 from cartpole_rl.plants.serial.cart import SerialCart
-from cartpole_rl.wire import Hello, SetMotor, Stop
+from cartpole_rl.wire import Frame, Hello, SetMotor, Stop
 
 PERIODS = 15  # a pause; the watchdog waits for three
 
@@ -46,19 +46,6 @@ def idle(peer: CartPeer, cart: SerialCart) -> None:
     assert cart._tracker.ticks_alone
 
 
-def after(function: Callable[..., Any], action: Callable[[], None]) -> Callable[..., Any]:
-    """Return `function`, which carries out `action` once before it returns."""
-    pending = [action]
-
-    def extended(*args: object) -> object:
-        result = function(*args)
-        if pending and result:
-            pending.pop()()
-        return result
-
-    return extended
-
-
 def test_a_pause_between_the_check_and_the_write() -> None:
     with driven() as (peer, cart):
         stopped = len(peer.messages(Stop))
@@ -73,10 +60,47 @@ def test_a_pause_between_the_check_and_the_write() -> None:
 def test_a_pause_right_after_a_state_was_read(monkeypatch: pytest.MonkeyPatch) -> None:
     """The state that is handed out is the newest one, not the one that was read before the pause."""
     with driven() as (peer, cart):
-        link = cart._connection.link
-        monkeypatch.setattr(link, "receive", after(link.receive, lambda: pause(peer, cart)))
+        reading, paused, link = threading.Event(), threading.Event(), cart._connection.link
+        receive = link.receive
+
+        def receive_and_pause(waiting: int = 0) -> list[Frame]:
+            if not waiting:
+                reading.set()
+            frames = receive(waiting)
+            if frames and not waiting and not paused.is_set():
+                paused.set()
+                pause(peer, cart)
+            return frames
+
+        def answer_a_reading_host(frame: Frame) -> list[bytes]:
+            reading.wait(20)
+            return [*CartPeer.answer(peer, frame)]
+
+        peer.answer = answer_a_reading_host
+        monkeypatch.setattr(link, "receive", receive_and_pause)
         cart.set_motor(0)
         assert cart.get_state().tick == peer.state.tick
+        assert paused.is_set()
+
+
+def test_a_lockstep_cart_whose_states_are_lost_took_no_value_too_late() -> None:
+    """It passes a period for each frame, and no time while this computer pauses."""
+    with CartPeer() as peer, SerialCart(quick_settings(peer.port)) as cart:
+        cart.start()
+        cart.set_motor(50)
+        cart.get_state()
+
+        def lose_two_states(frame: Frame) -> list[bytes]:
+            peer.answer = lambda frame: CartPeer.answer(peer, frame)
+            [*CartPeer.answer(peer, frame)]
+            peer.next_state()
+            return [peer.next_state(command_age_ms=2 * 20)]
+
+        peer.answer = lose_two_states
+        time.sleep(0.1)  # five periods
+        assert cart.set_motor(200) == 200
+        assert cart.get_state().motor_applied == 200
+        assert not cart._tracker.ticks_alone
 
 
 def test_a_silent_port_after_a_pause_is_no_proof_that_no_time_has_passed() -> None:
@@ -98,6 +122,27 @@ def test_a_cart_that_ticks_on_its_own_gets_no_hello_in_silence() -> None:
             cart.get_state()
         assert len(peer.messages(Hello)) == asked
         peer.answer = lambda frame: CartPeer.answer(peer, frame)
+
+
+def test_a_host_that_watches_a_policy_on_the_board_sends_no_hello_in_silence() -> None:
+    """It listens before the policy is armed, and so learns whether the cart has a clock of its own."""
+    with CartPeer() as peer, SerialCart(quick_settings(peer.port)) as cart:
+        cart.get_state()
+        pause(peer, cart)
+        cart.start_policy()
+        assert cart._tracker.ticks_alone
+        cart.follow_policy()
+        peer.answer = lambda frame: ()
+        asked = len(peer.messages(Hello))
+        with pytest.raises(LinkError, match="no state came"):
+            cart.follow_policy()
+        assert len(peer.messages(Hello)) == asked + 1
+
+
+def test_a_host_whose_first_stop_is_lost_asks_nothing_before_one_is_answered() -> None:
+    with Forgetful(Stop, 1) as peer, SerialCart(quick_settings(peer.port)):
+        kinds = [type(frame.message) for frame in peer.received]
+        assert kinds[: kinds.index(Hello)] == [Stop, Stop]
 
 
 def test_a_host_that_opens_the_port_disarms_before_it_asks() -> None:

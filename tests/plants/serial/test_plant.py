@@ -58,7 +58,11 @@ class SilentOnceArmed(CartPeer):
 
 @pytest.mark.parametrize("on_board", [False, True])
 def test_a_reset_that_fails_after_start_disarms_the_cart(on_board: bool) -> None:
-    with SilentOnceArmed() as peer, closing(SerialPlant(quick_settings(peer.port))) as plant:
+    # without a HELLO in silence, whose state could still come after START
+    with (
+        SilentOnceArmed() as peer,
+        closing(SerialPlant(quick_settings(peer.port, nudge_after=60))) as plant,
+    ):
         plant.on_board = on_board
         with pytest.raises(LinkError, match="no state came"):
             plant.reset()

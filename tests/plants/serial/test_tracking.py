@@ -20,7 +20,7 @@ def tracker_of_a_cart() -> StateTracker:
 
 def drive(tracker: StateTracker, state: State, delay: float) -> None:
     """A state arrives at 0 s, and is answered with a motor value `delay` s later."""
-    tracker.receive(state, Flags.ARMED, 0.0)
+    tracker.receive(state, Flags.ARMED, 0.0, 0)
     tracker.take_newest()
     tracker.hand_out(state)
     tracker.send_command(1, delay)
@@ -28,7 +28,7 @@ def drive(tracker: StateTracker, state: State, delay: float) -> None:
 
 def test_only_a_newer_state_becomes_the_newest() -> None:
     tracker = tracker_of_a_cart()
-    taken = [tracker.receive(state_at(tick), Flags.ARMED, 0.0) for tick in (5, 7, 6, 7, 4, 8)]
+    taken = [tracker.receive(state_at(tick), Flags.ARMED, 0.0, 0) for tick in (5, 7, 6, 7, 4, 8)]
     assert taken == [True, True, False, False, False, True]
     seen = tracker.statistics
     assert (seen.lost_frames, seen.overtaken_frames, seen.repeated_frames) == (0, 1, 2)
@@ -40,8 +40,8 @@ def test_only_a_newer_state_becomes_the_newest() -> None:
 
 def test_a_restart_is_counted_and_its_state_taken() -> None:
     tracker = tracker_of_a_cart()
-    tracker.receive(state_at(5000), Flags.ARMED, 0.0)
-    assert tracker.receive(state_at(2), Flags(0), 0.02)
+    tracker.receive(state_at(5000), Flags.ARMED, 0.0, 0)
+    assert tracker.receive(state_at(2), Flags(0), 0.02, 0)
     assert tracker.restarts == 1
     assert tracker.flags == Flags(0)
     assert tracker.statistics.lost_frames == 0
@@ -49,13 +49,13 @@ def test_a_restart_is_counted_and_its_state_taken() -> None:
 
 def test_another_connection_begins_without_the_states_of_the_last_one() -> None:
     tracker = tracker_of_a_cart()
-    tracker.receive(state_at(5), Flags.HOMED, 0.0)
-    tracker.receive(replace(state_at(6), time_us=state_at(5).time_us), Flags.HOMED, 0.02)
+    tracker.receive(state_at(5), Flags.HOMED, 0.0, 0)
+    tracker.receive(replace(state_at(6), time_us=state_at(5).time_us), Flags.HOMED, 0.02, 0)
     assert tracker.stopped_clock is not None
     tracker.disconnect()
     assert tracker.stopped_clock is None
     assert tracker.take_newest() is None
-    tracker.receive(state_at(1000), Flags.HOMED, 9.0)
+    tracker.receive(state_at(1000), Flags.HOMED, 9.0, 0)
     assert (tracker.restarts, tracker.statistics.lost_frames) == (0, 0)
 
 
@@ -63,7 +63,7 @@ def test_another_connection_begins_without_the_states_of_the_last_one() -> None:
 def test_a_command_is_late_after_a_period_in_which_the_tick_advanced(delay: float, late: int) -> None:
     tracker = tracker_of_a_cart()
     drive(tracker, state_at(1), delay)
-    tracker.receive(state_at(3), Flags.ARMED, 0.04)
+    tracker.receive(state_at(3), Flags.ARMED, 0.04, 0)
     tracker.hand_out(state_at(3))
     assert tracker.statistics.late_ticks == late
     assert tracker.statistics.latency.samples().tolist() == [delay]
@@ -72,7 +72,7 @@ def test_a_command_is_late_after_a_period_in_which_the_tick_advanced(delay: floa
 def test_a_lockstep_cart_waits_and_nothing_is_late() -> None:
     tracker = tracker_of_a_cart()
     drive(tracker, state_at(1), 10.0)
-    tracker.receive(state_at(2), Flags.ARMED, 10.0)
+    tracker.receive(state_at(2), Flags.ARMED, 10.0, 0)
     tracker.hand_out(state_at(2))
     assert tracker.statistics.late_ticks == 0
 
@@ -80,17 +80,34 @@ def test_a_lockstep_cart_waits_and_nothing_is_late() -> None:
 def test_a_state_that_is_passed_over_is_late_only_while_driving() -> None:
     tracker = tracker_of_a_cart()
     for tick in (1, 2):
-        tracker.receive(state_at(tick), Flags.ARMED, 0.0)
+        tracker.receive(state_at(tick), Flags.ARMED, 0.0, 0)
     assert tracker.statistics.late_ticks == 0
     tracker.take_newest()
     tracker.hand_out(state_at(2))
     tracker.send_command(1, 0.0)
     for tick in (3, 4):
-        tracker.receive(state_at(tick), Flags.ARMED, 0.02)
+        tracker.receive(state_at(tick), Flags.ARMED, 0.02, 0)
     assert tracker.statistics.late_ticks == 1
     tracker.send_question()
-    tracker.receive(state_at(5), Flags.ARMED, 0.06)
+    tracker.receive(state_at(5), Flags.ARMED, 0.06, 0)
     assert tracker.statistics.late_ticks == 1
+
+
+@pytest.mark.parametrize(
+    ("sequence", "flags", "alone"),
+    [(0, Flags.ARMED, True), (1, Flags.ARMED, False), (0, Flags.HOMING, False)],
+    ids=["idle", "newest frame lost or refused", "homing"],
+)
+def test_a_cart_has_its_own_clock_if_it_ticks_on_after_the_newest_frame(
+    sequence: int, flags: Flags, alone: bool
+) -> None:
+    tracker = tracker_of_a_cart()
+    for tick in range(6):
+        tracker.receive(state_at(tick), flags, 0.0, sequence)
+    assert not tracker.ticks_alone
+    for tick in range(6, 12):
+        tracker.receive(state_at(tick), flags, 0.0, sequence)
+    assert tracker.ticks_alone == alone
 
 
 def test_the_hosts_own_moves_are_not_measured() -> None:
