@@ -3,7 +3,7 @@
 import json
 import os
 from collections import Counter
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -312,16 +312,22 @@ def split_by_majority(
     return same, [(item, common) for item in items if key(item) != common]
 
 
-def settings_key(run: Run) -> Hashable:
-    """Return a key that runs with the same command and settings share."""
-    return run.program, tuple(sorted(run.settings.items(), key=lambda item: item[0]))
+def settings_key(run: Run, ignored: Collection[str] = ()) -> Hashable:
+    """Return a key that runs with the same command and settings share, those of `ignored` groups aside."""
+    return run.program, tuple((name, run.settings[name]) for name in sorted(_compared(run, ignored)))
 
 
-def settings_difference(run: Run, common: Run, most: int = 3) -> str:
+def _compared(run: Run, ignored: Collection[str]) -> set[str]:
+    """Return the names of the settings of a run that are in none of the `ignored` groups."""
+    groups = tuple(f"{name}." for name in ignored)
+    return {name for name in run.settings if name not in ignored and not name.startswith(groups)}
+
+
+def settings_difference(run: Run, common: Run, ignored: Collection[str] = (), most: int = 3) -> str:
     """Return in words where the settings of `run` differ from those of `common`."""
     names = sorted(
         name
-        for name in {*run.settings, *common.settings}
+        for name in _compared(run, ignored) | _compared(common, ignored)
         if run.settings.get(name) != common.settings.get(name)
     )
     shown = [

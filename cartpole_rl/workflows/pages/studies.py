@@ -6,8 +6,9 @@ of another seed or agent than their place says, are named and do not count.
 """
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,7 @@ from cartpole_rl.reporting.studies.settings import RUN, RUNS, SEED, Evaluation, 
 from cartpole_rl.run_files import CONFIG
 from cartpole_rl.workflows.pages.runs import (
     DAMAGE,
+    FREE,
     Run,
     commits_note,
     learning_curve,
@@ -151,6 +153,7 @@ def read_study(folder: Path) -> StudyResults:
     notes = (
         *_unlisted(folder, study),
         *_untraced(folder, study),
+        *_own_files(study, parts),
         *_unexplained(study, parts),
         commits_note(part.run for part in parts),
         partly_measured_note(counted, study.measure),
@@ -292,16 +295,37 @@ def _of_one_kind(parts: Sequence[Part]) -> tuple[list[Part], list[Exclusion]]:
         return part.arm, part.evaluation
 
     kept: list[Part] = []
-    for _, group in groupby(sorted(parts, key=kind), key=kind):
-        same, different = split_by_majority([*group], lambda part: settings_key(part.run))
+    for (arm, _), group in groupby(sorted(parts, key=kind), key=kind):
+        own = _own_groups(parts, arm)
+        ignored = own | {f"evaluated.{name}" for name in own}
+        same, different = split_by_majority([*group], partial(_settings, ignored))
         kept += same
         for part, _ in different:
-            exclusions.append(
-                Exclusion(_name(part.run), f"other settings: {settings_difference(part.run, same[0].run)}")
-            )
+            difference = settings_difference(part.run, same[0].run, ignored)
+            exclusions.append(Exclusion(_name(part.run), f"other settings: {difference}"))
             odd |= {part.place} if part.evaluation == ITSELF else set()
     # an agent whose own run is odd is left out whole
     return [part for part in kept if part.place not in odd], exclusions
+
+
+def _settings(ignored: set[str], part: Part) -> Hashable:
+    return settings_key(part.run, ignored)
+
+
+def _own_groups(parts: Sequence[Part], arm: str) -> set[str]:
+    """Return the groups of settings that each agent of an arm has from a run of its own seed.
+
+    As cart=runs/.../10/cart.yaml of the agent with seed 10. The track guard is fitted to them.
+    """
+    found = [_given_by_own_seed(part.run) for part in parts if (part.arm, part.evaluation) == (arm, ITSELF)]
+    groups = set.intersection(*found) if len(found) > 1 else set()
+    return groups | {"guard"} if groups else groups
+
+
+def _given_by_own_seed(run: Run) -> set[str]:
+    """Return the settings that were given as a path through a folder named by the seed."""
+    words = (word for word in run.command if str(run.seed) in Path(word.partition("=")[2]).parts[:-1])
+    return {setting(word) for word in words} - {*FREE}
 
 
 def _agents(
@@ -391,6 +415,13 @@ def _untraced(folder: Path, study: Study) -> Iterator[str]:
         lost = [place for place in places if not _is_run(_origin(folder, study, arm, int(place.name)))]
         if lost:
             yield f"{arm.label}: the trainings of {len(lost)} agents were not found and are not checked."
+
+
+def _own_files(study: Study, parts: Sequence[Part]) -> Iterator[str]:
+    """Yield a note on each arm whose agents have settings of their own, from runs of their seeds."""
+    for arm in study.arms:
+        if own := _own_groups(parts, arm.name):
+            yield f"{arm.label}: each agent has its own {', '.join(sorted(own))}, from a run of its seed."
 
 
 def _unexplained(study: Study, parts: Sequence[Part]) -> Iterator[str]:

@@ -172,6 +172,25 @@ def test_a_copy_of_a_small_file_is_refused(study: Path, tmp_path: Path) -> None:
         read_studies(tmp_path / "data")
 
 
+def test_agents_may_have_settings_from_runs_of_their_own_seeds(study: Path, edit: Edit) -> None:
+    as_trainings(study, edit, much="", little="lqr")
+    evaluate(study, edit, "much", "quick/friction/much/{seed}")
+    for seed in (10, 11, 12):
+        place = study / "much" / str(seed)
+        edit(place / "config.yaml", lambda content, seed=seed: content.update(cart={"cart_mass": seed}))
+        for heavy in place.glob("evaluations/*/config.yaml"):
+            edit(heavy, lambda content, seed=seed: content["evaluated"]["cart"].update(cart_mass=seed))
+    assert len(read_study(study).exclusions) == 2 + 4
+    for seed in (10, 11, 12):
+        words = ["cartpole-train", f"cart=runs/identified/{seed}/cart.yaml", f"seed={seed}"]
+        edit(
+            study / f"much/{seed}/provenance.json", lambda content, words=words: content.update(command=words)
+        )
+    results = read_study(study)
+    assert results.exclusions == ()
+    assert "much friction: each agent has its own cart, guard, from a run of its seed." in results.notes
+
+
 def test_arms_that_no_override_tells_apart_are_named(study: Path, edit: Edit) -> None:
     assert not [note for note in read_study(study).notes if "differs between arms" in note]
     for config in study.glob("much/*/evaluations/heavy/config.yaml"):
