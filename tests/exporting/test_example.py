@@ -89,7 +89,9 @@ def test_two_interrupts_stop_the_cart(file: Path, tmp_path: Path) -> None:
         for _ in range(2):
             process.send_signal(signal.SIGINT)
         code, out, err = ended(process)
-    assert (code, out, err) == (128 + signal.SIGINT, "", "")
+    # the second may come after the end of the program, while the interpreter ends
+    assert code in (128 + signal.SIGINT, -signal.SIGINT)
+    assert (out, err) == ("", "")
     assert taken(journal)[-1] == "STOP"
 
 

@@ -86,7 +86,7 @@ class SerialCart:
         self.close()
 
     def open(self) -> Info:
-        """Open the port, shake hands, disarm; return INFO.
+        """Open the port, shake hands, disarm, learn whether the cart has a clock of its own; return INFO.
 
         Raises PortError if the port cannot be opened, LinkError if no cart answers on it.
         """
@@ -101,6 +101,7 @@ class SerialCart:
             try:
                 self._note(self._open_connection.shake_hands())
                 self.stop()
+                self._open_connection.learn_clock()
             except BaseException:
                 self._abandon()
                 raise
@@ -168,9 +169,9 @@ class SerialCart:
     def start_policy(self) -> None:
         """Arm the motor and let the policy on the board drive, while `follow_policy` keeps it from stopping.
 
-        Before, the host is silent for some periods: a HELLO in silence, which a lockstep emulator needs,
-        would wake the policy of a cart with its own clock. Raises what `start` raises, and RefusedError if
-        the board has no policy.
+        A HELLO in silence, which a lockstep emulator needs, would wake the policy of a cart with its own
+        clock: a cart that is not known to have one gets another chance to show it. Raises what `start`
+        raises, and RefusedError if the board has no policy.
         """
         self._connection.learn_clock()
         self._arm(StartPolicy())

@@ -51,7 +51,7 @@ Answer = TypeVar("Answer", bound=Message)
 WATCHDOG_PERIODS = 3  # without a command, after which the cart sets its motor to 0
 BACKLOG_BYTES = 1000  # with more waiting, the system's buffer (4096) may have dropped newer bytes
 UNACKNOWLEDGED_PERIODS = 1.5  # after a frame: by then the next state has come, if the frame has arrived
-LISTENING_PERIODS = 10  # without a frame, to learn whether the cart has a clock of its own
+LISTENING_PERIODS = 6  # without a frame, to learn whether the cart has a clock of its own
 LONGEST_DEAFNESS = 1.0  # s; the cart's watchdog has stopped its motor long before
 KEPT_ANSWERS = 64
 
@@ -82,11 +82,14 @@ class Connection:
         deadline = now() + self._settings.connect_timeout
         pause = min(self._settings.answer_timeout, self._settings.connect_timeout)
         stops: list[int] = []
+        stopped = False
         while now() < deadline:
             self._answers.clear()
             self.link.write(END)  # ends a partial frame that the cart may have read
-            stops.append(self.link.send(Stop()))
-            if self._await_answer(min(deadline, now() + pause), stops, Ack, lambda ack: True) is None:
+            if not stopped:
+                stops.append(self.link.send(Stop()))
+                until = min(deadline, now() + pause)
+                stopped = self._await_answer(until, stops, Ack, lambda ack: True) is not None
                 continue
             self.link.send(Hello())
             answer = self._await_answer(min(deadline, now() + pause), (), Info, lambda info: True)
@@ -132,11 +135,27 @@ class Connection:
         )
 
     def learn_clock(self) -> None:
-        """Send nothing for as long as a cart with its own clock needs to be known as one."""
-        self._tracker.send_question()
-        deadline = now() + LISTENING_PERIODS * self._period_us * 1e-6
-        while not self._tracker.ticks_alone and now() < deadline:
-            self._read()
+        """Send nothing for as long as a disarmed cart with its own clock needs to be known as one.
+
+        If its newest state does not acknowledge the newest frame, that was lost or refused, and no state
+        tells: then HELLO is sent first.
+        """
+        tracker = self._tracker
+        tracker.send_question()
+        for _ in range(2):
+            deadline, limit = (
+                now() + LISTENING_PERIODS * self._period_us * 1e-6,
+                now() + self._settings.timeout,
+            )
+            while not tracker.ticks_alone and (now() < deadline or (self.link.waiting() and now() < limit)):
+                self._read()
+            if (
+                tracker.ticks_alone
+                or tracker.last is None
+                or tracker.last.last_sequence == self.link.sequence
+            ):
+                return
+            self.link.send(Hello())
 
     def send_motor(self, value: int) -> None:
         """Send a motor value once.
@@ -218,7 +237,7 @@ class Connection:
         """Stop the cart and raise LinkError if it got the motor value too late by its own clock.
 
         `before` is the newest state before the write. A state that acknowledges the value tells how long ago
-        it came. Otherwise ticks in the meantime count, unless they may be those of a lockstep emulator, which
+        it came. Otherwise ticks in the meantime count, of a lockstep emulator only if the value was lost: it
         waits for the host and passes a period for each lost frame.
         """
         deadline = now() + self._settings.timeout
@@ -233,9 +252,12 @@ class Connection:
                 if 0 <= waited_us < WATCHDOG_PERIODS * self._period_us:
                     return
                 ticks_count |= waited_us >= 0  # otherwise the cart does not know the age
-            if ticks_count and ticks_between(before.tick, state.tick) >= WATCHDOG_PERIODS:
+            too_late = ticks_between(before.tick, state.tick) >= WATCHDOG_PERIODS
+            if ticks_count and too_late:
                 break
-            if state is not before and self._is_current(state):
+            if state is not before and not self.link.waiting() and self._is_current(state):
+                if too_late and self.link.sequence not in (state.last_sequence, self._refused_sequence):
+                    break  # the value may still be on its way
                 return
             self._endure_silence(deadline)
             self._read()

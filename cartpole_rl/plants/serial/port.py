@@ -1,7 +1,7 @@
 """Find and open the serial port of a cart; explain why it cannot be found or opened.
 
 An ESP32 board restarts when DTR or RTS rise, so both are set low before the port is opened. The operating
-system may still pulse them for a moment; `SerialCart` therefore sends HELLO until the cart has booted.
+system may still pulse them for a moment; `SerialCart` therefore repeats STOP until the cart has booted.
 Source: Espressif, "Boot Mode Selection", esptool documentation; pyserial 3.5.
 """
 

@@ -20,7 +20,7 @@ from cartpole_rl.plants.serial.statistics import LinkStatistics
 from cartpole_rl.wire import Flags, State, microseconds_between, ticks_between, went_back
 
 HALF_MILLISECOND = 500  # us
-IDLE_TICKS = 6  # after the host's newest frame; a lockstep emulator passes one for a frame that came twice
+IDLE_TICKS = 3  # after the host's newest frame; a lockstep emulator passes one for a frame that came twice
 OVERTAKEN_TICKS = 16  # 0.3 s: no frame is delayed for longer, and no cart boots and is driven so soon
 
 

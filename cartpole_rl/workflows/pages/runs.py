@@ -28,7 +28,7 @@ from cartpole_rl.run_files import (
     PROVENANCE,
 )
 from cartpole_rl.workflows.run_folder import AGENT_HASH, PREFIX, file_hash
-from cartpole_rl.workflows.run_inputs import is_outdated
+from cartpole_rl.workflows.run_inputs import INPUTS, is_outdated
 
 RESULTS = {"identify": (IDENTIFIED,), "model": (MODELLED,), "finetune": (METRICS, COMPARISON)}
 EPISODIC = ("evaluate", "record")  # commands that keep what they have after an interruption
@@ -171,10 +171,18 @@ def _outdated(run: Run) -> str:
     if is_outdated(run.folder):
         return "a run that it needs was made again since, with another result"
     used = run.provenance.get(AGENT_HASH)
-    with suppress(CheckpointError):  # the agent is elsewhere
-        if used and file_hash(find_agent(Path(run.agent))) != used:
+    if used and not (run.folder / INPUTS).is_file():
+        found = {*_hashes(run)}
+        if found and used not in found:
             return f"its agent {run.agent} has another checkpoint now; repeat it"
     return ""
+
+
+def _hashes(run: Run) -> Iterator[str]:
+    """Yield the hashes of what may be the agent of a run: moved runs name it as before."""
+    for place in (Path(), *run.folder.absolute().parents):
+        with suppress(CheckpointError, OSError):
+            yield file_hash(find_agent(place / run.agent))
 
 
 def _results(folder: Path, program: str) -> dict[str, Any]:

@@ -6,11 +6,12 @@ of another seed or agent than their place says, are named and do not count.
 """
 
 import json
+from collections import Counter
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import groupby
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import Any
 
 from cartpole_rl.checking import checked
@@ -313,19 +314,21 @@ def _settings(ignored: set[str], part: Part) -> Hashable:
 
 
 def _own_groups(parts: Sequence[Part], arm: str) -> set[str]:
-    """Return the groups of settings that each agent of an arm has from a run of its own seed.
+    """Return the groups of settings that most agents of an arm have from a run of their own seed.
 
     As cart=runs/.../10/cart.yaml of the agent with seed 10. The track guard is fitted to them.
     """
     found = [_given_by_own_seed(part.run) for part in parts if (part.arm, part.evaluation) == (arm, ITSELF)]
-    groups = set.intersection(*found) if len(found) > 1 else set()
+    counts = Counter(name for each in found for name in each)
+    groups = {name for name, count in counts.items() if count > 1 and 2 * count > len(found)}
     return groups | {"guard"} if groups else groups
 
 
 def _given_by_own_seed(run: Run) -> set[str]:
     """Return the settings that were given as a path through a folder named by the seed."""
-    words = (word for word in run.command if str(run.seed) in Path(word.partition("=")[2]).parts[:-1])
-    return {setting(word) for word in words} - {*FREE}
+    paths = {setting(word): PureWindowsPath(word.partition("=")[2]).parts for word in run.command}
+    given = {name for name, parts in paths.items() if len(parts) > 1 and str(run.seed) in parts}
+    return {name for name in given if not name.startswith("hydra.")} - {*FREE}
 
 
 def _agents(

@@ -45,14 +45,20 @@ OVERRIDE = re.compile(r"\+{0,2}([a-z_][\w.]*)=")  # on a command line
 class Member:
     """A run of a sweep with the settings that it is grouped by: its own and those of its `agent`.
 
-    `agent` is the run that made the agent which this run evaluates; None if there is no such run.
+    `agent` is the run that made the agent which this run evaluates; None if there is no such run. `seeds` are
+    those of the agent, of the one that it was fine-tuned from, and so on.
     """
 
     run: Run
     agent: Run | None
     tree: Mapping[str, Any]
     settings: Mapping[str, Hashable]
-    seed: int
+    seeds: tuple[int, ...]
+
+    @property
+    def seed(self) -> int:
+        """The seed of the training at the end of the chain."""
+        return self.seeds[-1]
 
     @property
     def versions(self) -> str:
@@ -248,13 +254,13 @@ def results_of(sweep: Sweep, measure: str) -> StudyResults:
 
 def _without_repetitions(sweep: Sweep) -> tuple[list[tuple[Member, str]], list[Exclusion]]:
     """Return the members with their labels without second runs of the same seed, and those runs."""
-    kept: dict[tuple[str, int], tuple[Member, str]] = {}
+    kept: dict[tuple[str, tuple[int, ...]], tuple[Member, str]] = {}
     repeated = []
     for member, label in zip(sweep.members, sweep.labels, strict=True):
-        if (label, member.seed) in kept:
+        if (label, member.seeds) in kept:
             repeated.append(_exclusion(member.run, f"seed {member.seed} of {label} is there twice"))
         else:
-            kept[label, member.seed] = member, label
+            kept[label, member.seeds] = member, label
     return [*kept.values()], repeated
 
 
@@ -319,15 +325,26 @@ def _member(run: Run, agents: dict[Path, Run]) -> Member:
     `agents` are those that were read before.
     """
     tree = {name: value for name, value in run.config.items() if name not in ("run", "evaluated", "repeat")}
-    seed, agent = run.seed, None
-    if run.agent:
-        agent = _read_agent(run, agents)
-        if agent:
-            tree[AGENT] = _agent_tree(run, agent, agents, (run.folder,))
-            seed = agent.seed
-        else:
-            tree[AGENT] = {"source": run.agent}
-    return Member(run, agent, tree, shared_settings(tree), seed if seed is not None else 0)
+    chain = _chain(run, agents)
+    if chain:
+        tree[AGENT] = _agent_tree((run, *chain))
+    elif run.agent:
+        tree[AGENT] = {"source": run.agent}
+    seeds = tuple(each.seed or 0 for each in chain or [run])
+    return Member(run, chain[0] if chain else None, tree, shared_settings(tree), seeds)
+
+
+def _chain(run: Run, agents: dict[Path, Run]) -> list[Run]:
+    """Return the run that made the agent of `run`, the one that this was fine-tuned from, and so on.
+
+    A run that is its own origin occurs once.
+    """
+    chain: list[Run] = []
+    last = run
+    while last.agent and (found := _read_agent(last, agents)) and found not in (run, *chain):
+        chain.append(found)
+        last = found
+    return chain
 
 
 def _read_agent(run: Run, agents: dict[Path, Run]) -> Run | None:
@@ -339,14 +356,11 @@ def _read_agent(run: Run, agents: dict[Path, Run]) -> Run | None:
     return found if found and found.config else None
 
 
-def _agent_tree(run: Run, agent: Run, agents: dict[Path, Run], above: tuple[Path, ...]) -> dict[str, Any]:
-    """Return the settings of the agent of `run`, with those of the agent that it was fine-tuned from.
-
-    `above` are the runs that were passed on the way; an agent that is its own origin is read once.
-    """
-    path, tree = Path(run.agent), dict(agent.config)
-    if agent.agent and agent.folder not in above and (origin := _read_agent(agent, agents)):
-        tree[AGENT] = _agent_tree(agent, origin, agents, (*above, agent.folder))
+def _agent_tree(chain: Sequence[Run]) -> dict[str, Any]:
+    """Return the settings of the second run of a chain, the agent of the first, with those of the rest."""
+    path, tree = Path(chain[0].agent), dict(chain[1].config)
+    if len(chain) > 2:
+        tree[AGENT] = _agent_tree(chain[1:])
     return {"checkpoint": path.stem if path.suffix == ".pt" else "last", **tree}
 
 

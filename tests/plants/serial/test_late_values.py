@@ -4,6 +4,8 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
+from itertools import count
 
 import pytest
 from serial_peer import CartPeer, Forgetful, quick_settings, wait_for
@@ -83,12 +85,37 @@ def test_a_pause_right_after_a_state_was_read(monkeypatch: pytest.MonkeyPatch) -
         assert paused.is_set()
 
 
-def test_a_lockstep_cart_whose_states_are_lost_took_no_value_too_late() -> None:
-    """It passes a period for each frame, and no time while this computer pauses."""
+@contextmanager
+def lockstep() -> Iterator[tuple[CartPeer, SerialCart]]:
+    """A cart that is armed and has been driven, and that ticks for each frame alone."""
     with CartPeer() as peer, SerialCart(quick_settings(peer.port)) as cart:
         cart.start()
         cart.set_motor(50)
-        cart.get_state()
+        while cart.get_state().last_sequence != cart._connection.link.sequence:
+            pass
+        yield peer, cart
+
+
+def test_a_value_that_is_late_behind_older_states_is_noticed() -> None:
+    """As of a cart that is not known to have its own clock yet, behind a bridge with a backlog."""
+    with lockstep() as (peer, cart):
+
+        def tick_before(frame: Frame) -> Iterator[bytes]:
+            peer.answer = lambda frame: CartPeer.answer(peer, frame)
+            peer.state = replace(peer.state, command_age_ms=0)
+            yield b"".join(peer.next_state() for _ in range(8))
+            time.sleep(0.2)  # ten periods
+            yield from CartPeer.answer(peer, frame)
+
+        peer.answer = tick_before
+        time.sleep(0.1)  # five periods
+        with pytest.raises(LinkError, match="took a motor value too slowly"):
+            cart.set_motor(200)
+
+
+def test_a_lockstep_cart_whose_states_are_lost_took_no_value_too_late() -> None:
+    """It passes a period for each frame, and no time while this computer pauses."""
+    with lockstep() as (peer, cart):
 
         def lose_two_states(frame: Frame) -> list[bytes]:
             peer.answer = lambda frame: CartPeer.answer(peer, frame)
@@ -131,12 +158,18 @@ def test_a_host_that_watches_a_policy_on_the_board_sends_no_hello_in_silence() -
         pause(peer, cart)
         cart.start_policy()
         assert cart._tracker.ticks_alone
-        cart.follow_policy()
         peer.answer = lambda frame: ()
-        asked = len(peer.messages(Hello))
+        before, calls = len(peer.messages(Hello)), count(1)
+
+        def watch() -> None:
+            while next(calls):
+                cart.follow_policy()
+
         with pytest.raises(LinkError, match="no state came"):
-            cart.follow_policy()
-        assert len(peer.messages(Hello)) == asked + 1
+            watch()
+        made = next(calls) - 1
+        wait_for(lambda: len(peer.messages(Hello)) >= before + made)
+        assert len(peer.messages(Hello)) == before + made
 
 
 def test_a_host_whose_first_stop_is_lost_asks_nothing_before_one_is_answered() -> None:

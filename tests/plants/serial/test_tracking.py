@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from cartpole_rl.plants.serial.tracking import StateTracker
+from cartpole_rl.plants.serial.tracking import IDLE_TICKS, StateTracker
 from cartpole_rl.wire import Flags, State
 
 
@@ -102,10 +102,10 @@ def test_a_cart_has_its_own_clock_if_it_ticks_on_after_the_newest_frame(
     sequence: int, flags: Flags, alone: bool
 ) -> None:
     tracker = tracker_of_a_cart()
-    for tick in range(6):
+    for tick in range(IDLE_TICKS):
         tracker.receive(state_at(tick), flags, 0.0, sequence)
     assert not tracker.ticks_alone
-    for tick in range(6, 12):
+    for tick in range(IDLE_TICKS, 12):
         tracker.receive(state_at(tick), flags, 0.0, sequence)
     assert tracker.ticks_alone == alone
 

@@ -67,6 +67,11 @@ def test_an_evaluation_of_an_earlier_checkpoint_does_not_count(study: Path, edit
     assert read_run(folder).problem == ""
     checkpoint.write_bytes(b"trained")
     assert read_run(folder).problem == "its agent agent has another checkpoint now; repeat it"
+    beside = study / "agent/checkpoints/last.pt"  # the runs were moved, the agent with them
+    beside.parent.mkdir(parents=True)
+    beside.write_bytes(b"half trained")
+    assert read_run(folder).problem == ""
+    beside.unlink()
     checkpoint.unlink()
     assert read_run(folder).problem == ""
 

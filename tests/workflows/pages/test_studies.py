@@ -189,6 +189,9 @@ def test_agents_may_have_settings_from_runs_of_their_own_seeds(study: Path, edit
     results = read_study(study)
     assert results.exclusions == ()
     assert "much friction: each agent has its own cart, guard, from a run of its seed." in results.notes
+    edit(study / "much/12/provenance.json", lambda content: content.update(command=["x", "pole=large"]))
+    edit(study / "much/12/config.yaml", lambda content: content.update(pole={"choices": {}}))
+    assert {each.run for each in read_study(study).exclusions} == {"quick/friction/much/12"}
 
 
 def test_arms_that_no_override_tells_apart_are_named(study: Path, edit: Edit) -> None:

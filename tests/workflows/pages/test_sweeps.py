@@ -182,6 +182,10 @@ def test_agents_that_were_tuned_from_different_agents_are_different_groups(study
     (sweep,), _ = grouped([read_sweep("runs", ["quick/friction/much/*/evaluations/heavy"], MEASURE)])
     assert sweep.columns["agent.agent.carts"] == ["512", "1024", "1024"]
     assert len({*sweep.labels}) == 2
+    for seed in (10, 11, 12):  # by default every fine-tuning has seed 0
+        edit(Path(f"tuned/{seed}/config.yaml"), lambda content: content.update(seed=0))
+    (sweep,), _ = grouped([read_sweep("runs", ["quick/friction/much/*/evaluations/heavy"], MEASURE)])
+    assert [agent.seed for agent in results_of(sweep, MEASURE).agents] == [10, 11, 12]
 
 
 def test_versions_and_commands_are_compared_over_both_sets(study: Path, edit: Edit) -> None:
