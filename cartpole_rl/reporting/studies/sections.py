@@ -20,7 +20,10 @@ from cartpole_rl.reporting.studies.statistics import estimate
 MOST_LISTED = 1000  # runs in the list of a study
 MOST_ROWS = 24  # of a table that is shown unfolded
 MOST_EXCLUSIONS = 40  # runs named one by one
-COMMITS = "The runs are of "  # start of a note that stands with the list of runs
+COMMITS, OWN_FILES = (
+    "The runs are of ",
+    ": each agent has its own ",
+)  # of notes that stand with the list of runs
 
 
 @dataclass(frozen=True)
@@ -106,12 +109,17 @@ def doubts(results: StudyResults, missing: Sequence[str]) -> str:
     shown = [f"{each.run} does not count: {each.reason}." for each in results.exclusions[:MOST_EXCLUSIONS]]
     if (more := len(results.exclusions) - len(shown)) > 0:
         shown.append(f"{more} more runs do not count, as: {_reasons(results.exclusions[MOST_EXCLUSIONS:])}.")
-    notes = (note for note in results.notes if not note.startswith(COMMITS))
+    notes = (note for note in results.notes if not _is_of_runs(note))
     lines = [*missing, *shown, *notes, *results.remarks]
     if not lines:
         return ""
     listed = "".join(f"<li>{escaped(line)}</li>" for line in lines)
     return f'<aside class="box" role="note" aria-label="Missing or excluded runs"><ul>{listed}</ul></aside>'
+
+
+def _is_of_runs(note: str) -> bool:
+    """Return True for a note on how the runs were made, which is no reason to doubt them."""
+    return note.startswith(COMMITS) or OWN_FILES in note
 
 
 def _reasons(exclusions: Sequence[Exclusion]) -> str:
@@ -191,7 +199,7 @@ def run_list(results: StudyResults) -> str:
         {"run": agent.run, "seed": agent.seed, **_named_values(results, agent.values, measure)}
         for agent in results.agents[:MOST_LISTED]
     ]
-    notes = [note for note in results.notes if note.startswith(COMMITS)]
+    notes = [note for note in results.notes if _is_of_runs(note)]
     made = "".join(f"<p>{escaped(line)}</p>" for line in (results.versions, *notes) if line)
     count = len(results.agents)
     heading = f"The {count} runs behind it" if count > 1 else "The run behind it"

@@ -28,6 +28,7 @@ from cartpole_rl.reporting.studies.results import (
     checked_name,
     from_json,
 )
+from cartpole_rl.reporting.studies.sections import OWN_FILES
 from cartpole_rl.reporting.studies.settings import RUN, RUNS, SEED, Evaluation, Study, Variant, setting
 from cartpole_rl.run_files import CONFIG
 from cartpole_rl.workflows.pages.runs import (
@@ -424,7 +425,7 @@ def _own_files(study: Study, parts: Sequence[Part]) -> Iterator[str]:
     """Yield a note on each arm whose agents have settings of their own, from runs of their seeds."""
     for arm in study.arms:
         if own := _own_groups(parts, arm.name):
-            yield f"{arm.label}: each agent has its own {', '.join(sorted(own))}, from a run of its seed."
+            yield f"{arm.label}{OWN_FILES}{', '.join(sorted(own))}, from a run of its seed."
 
 
 def _unexplained(study: Study, parts: Sequence[Part]) -> Iterator[str]:

@@ -1,6 +1,7 @@
 """The page of studies: its contents, its anchors, its commands and the ids of its figures."""
 
 import re
+from dataclasses import replace
 
 import pytest
 
@@ -48,6 +49,14 @@ def test_own_studies_are_listed_plainly_with_the_command_that_finds_them() -> No
     assert "scripts/reproduce mine --studies FOLDER --folder here --size quick" in page
     shipped = studies_page([results("shipped", 180, True)], {})
     assert "scripts/reproduce shipped --size quick" in shipped
+
+
+def test_notes_on_how_runs_were_made_stand_with_their_list() -> None:
+    notes = ("one arm: each agent has its own cart, from a run of its seed.", "The runs are of 2 commits.")
+    page = studies_page([replace(results("a", 0, True), notes=notes)], {})
+    assert "<aside" not in page
+    assert all(note in page for note in notes)
+    assert "<aside" in studies_page([replace(results("a", 0, True), notes=("One is odd.",))], {})
 
 
 def test_the_seeds_are_those_of_the_results() -> None:
