@@ -83,9 +83,8 @@ def _unnamed(error: BaseException) -> OSError | None:
 
 def _flush(path: Path) -> None:
     """Wait until the content of `path`, a file or a folder, is on the disk."""
-    descriptor = os.open(
-        path, os.O_RDONLY if path.is_dir() else os.O_RDWR
-    )  # Windows flushes what it may write
+    flags = os.O_RDONLY if path.is_dir() else os.O_RDWR  # Windows flushes only what it may write
+    descriptor = os.open(path, flags)
     try:
         os.fsync(descriptor)
     finally:

@@ -143,17 +143,12 @@ class Connection:
         tracker = self._tracker
         tracker.send_question()
         for _ in range(2):
-            deadline, limit = (
-                now() + LISTENING_PERIODS * self._period_us * 1e-6,
-                now() + self._settings.timeout,
-            )
+            deadline = now() + LISTENING_PERIODS * self._period_us * 1e-6
+            limit = now() + self._settings.timeout
             while not tracker.ticks_alone and (now() < deadline or (self.link.waiting() and now() < limit)):
                 self._read()
-            if (
-                tracker.ticks_alone
-                or tracker.last is None
-                or tracker.last.last_sequence == self.link.sequence
-            ):
+            newest = tracker.last
+            if tracker.ticks_alone or newest is None or newest.last_sequence == self.link.sequence:
                 return
             self.link.send(Hello())
 

@@ -166,7 +166,7 @@ class StudyResults:
     def identity(self, agent: Agent) -> str:
         """Return the name that an agent has in all studies which evaluate it, as "swingup/thesis/10"."""
         arm = next(each for each in self.study.arms if each.name == agent.arm)
-        named = self.study.agent_of(arm) or f"{self.study.agents_of or self.name}/{arm.name}/{SEED}"
+        named = self.study.shared_agent(arm) or f"{self.name}/{arm.name}/{SEED}"
         name = named.removeprefix(RUNS).replace(SEED, str(agent.seed))
         return name if SEED in named else f"{name} {agent.seed}"  # each seed of the baseline is one
 

@@ -112,6 +112,12 @@ class Study(Settings):
         named = [word.removeprefix(RUN) for word in arm.overrides if word.startswith(RUN)]
         return named[-1] if named and self.command == "train" else None
 
+    def shared_agent(self, arm: Variant) -> str | None:
+        """Return the agent that an arm evaluates instead of having a run, with its placeholders, or None."""
+        if named := self.agent_of(arm):
+            return named
+        return f"{RUNS}{self.agents_of}/{arm.name}/{SEED}" if self.agents_of else None
+
     def evaluated_with(self, arm: Variant) -> Overrides:
         """Return the overrides for all evaluations of an arm that names its agent by run=."""
         if self.agent_of(arm) is None:

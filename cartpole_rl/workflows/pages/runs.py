@@ -322,10 +322,10 @@ def split_by_majority(
 
 def settings_key(run: Run, ignored: Collection[str] = ()) -> Hashable:
     """Return a key that runs with the same command and settings share, those of `ignored` groups aside."""
-    return run.program, tuple((name, run.settings[name]) for name in sorted(_compared(run, ignored)))
+    return run.program, tuple((name, run.settings[name]) for name in sorted(compared_settings(run, ignored)))
 
 
-def _compared(run: Run, ignored: Collection[str]) -> set[str]:
+def compared_settings(run: Run, ignored: Collection[str]) -> set[str]:
     """Return the names of the settings of a run that are in none of the `ignored` groups."""
     groups = tuple(f"{name}." for name in ignored)
     return {name for name in run.settings if name not in ignored and not name.startswith(groups)}
@@ -335,7 +335,7 @@ def settings_difference(run: Run, common: Run, ignored: Collection[str] = (), mo
     """Return in words where the settings of `run` differ from those of `common`."""
     names = sorted(
         name
-        for name in _compared(run, ignored) | _compared(common, ignored)
+        for name in compared_settings(run, ignored) | compared_settings(common, ignored)
         if run.settings.get(name) != common.settings.get(name)
     )
     shown = [

@@ -36,6 +36,7 @@ from cartpole_rl.workflows.pages.runs import (
     FREE,
     Run,
     commits_note,
+    compared_settings,
     learning_curve,
     measured,
     partly_measured_note,
@@ -212,9 +213,7 @@ def _fitting(run: Run, seed: int | None, agent: str) -> Run:
 def _agent_of(name: str, study: Study, arm: Variant, evaluation: Evaluation, seed: int) -> str:
     """Return the agent that an evaluation must name, below RUNS if a study made it; empty if any will do."""
     words = [word for word in evaluation.words(arm.name, ()) if word.startswith(RUN)]
-    named = words[-1].removeprefix(RUN) if words else study.agent_of(arm)
-    if named is None and study.agents_of:
-        named = f"{RUNS}{study.agents_of}/{arm.name}/{SEED}"
+    named = words[-1].removeprefix(RUN) if words else study.shared_agent(arm)
     if named is None and study.command in TRAINING:
         named = f"{RUNS}{name}/{arm.name}/{SEED}"
     return (named or "").replace(SEED, str(seed))
@@ -227,9 +226,7 @@ def _trains(study: Study, arm: Variant) -> bool:
 
 def _origin(folder: Path, study: Study, arm: Variant, seed: int) -> Path:
     """Return the run of another study whose agent an arm evaluates; the arm's own where it trains one."""
-    if study.agents_of:
-        return folder.parent / study.agents_of / arm.name / str(seed)
-    named = study.agent_of(arm)
+    named = study.shared_agent(arm)
     if named is None:
         return folder / arm.name / str(seed)
     return run_of(Path(named.replace(RUNS, f"{folder.parent.as_posix()}/").replace(SEED, str(seed))))
@@ -297,9 +294,9 @@ def _of_one_kind(parts: Sequence[Part]) -> tuple[list[Part], list[Exclusion]]:
         return part.arm, part.evaluation
 
     kept: list[Part] = []
+    own = {arm: _own_groups(parts, arm) for arm in {part.arm for part in parts}}
     for (arm, _), group in groupby(sorted(parts, key=kind), key=kind):
-        own = _own_groups(parts, arm)
-        ignored = own | {f"evaluated.{name}" for name in own}
+        ignored = own[arm] | {f"evaluated.{name}" for name in own[arm]}
         same, different = split_by_majority([*group], partial(_settings, ignored))
         kept += same
         for part, _ in different:
@@ -413,7 +410,7 @@ def _unlisted(folder: Path, study: Study) -> list[str]:
 def _untraced(folder: Path, study: Study) -> Iterator[str]:
     """Yield a note on each arm with agents of another study whose trainings are not there."""
     for arm in study.arms:
-        if not study.agents_of and not (study.agent_of(arm) or "").startswith(RUNS):
+        if not (study.shared_agent(arm) or "").startswith(RUNS):
             continue
         places = _seeds(folder / arm.name)
         lost = [place for place in places if not _is_run(_origin(folder, study, arm, int(place.name)))]
@@ -441,13 +438,8 @@ def _unexplained(study: Study, parts: Sequence[Part]) -> Iterator[str]:
             trained = {arm.name for arm in study.arms if _trains(study, arm)}
             runs = {arm: run for arm, run in runs.items() if arm in trained}
         explained = {setting(word) for word in words} | DERIVED
-        names = {each for run in runs.values() for each in run.settings}
-        odd = sorted(
-            each
-            for each in names
-            if not any(each == word or each.startswith(f"{word}.") for word in explained)
-            and len({run.settings.get(each) for run in runs.values()}) > 1
-        )
+        names = set().union(*(compared_settings(run, explained) for run in runs.values()))
+        odd = sorted(each for each in names if len({run.settings.get(each) for run in runs.values()}) > 1)
         if odd and "experiment" not in explained:
             values = ", ".join(dict.fromkeys(str(run.settings.get(odd[0])) for run in runs.values()))
             more = f"; {len(odd) - 1} more settings differ" if len(odd) > 1 else ""

@@ -138,11 +138,7 @@ class Agent:
     @property
     def shared(self) -> str | None:
         """The run that this arm evaluates, with its placeholders; None if it trains an agent of its own."""
-        if named := self.study.agent_of(self.arm):
-            return named
-        if self.study.agents_of:
-            return f"{{runs}}/{self.study.agents_of}/{self.arm.name}/{{seed}}"
-        return None
+        return self.study.shared_agent(self.arm)
 
     def words(self, *overrides: str) -> tuple[str, ...]:
         """Return overrides with their placeholders filled in, and the seed; of one setting the last."""
