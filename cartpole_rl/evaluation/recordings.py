@@ -5,7 +5,7 @@ value chosen on it, its scores and reward. The last row, the end of the episode,
 """
 
 import csv
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,8 @@ FEWEST_COUNTS, MOST_COUNTS = -(2**31), 2**31 - 1  # int32 on the wire
 LENGTH = "pole_length_m"  # in the heading: twice pivot to centre of mass, empty if not known
 GUARDED = "guarded"  # 1 where the track guard replaced the agent's motor value; empty without a guard
 COLUMNS = (*STATE, *COUNTS, "motor", *STEP)  # that every recording has
+LARGEST = 1e6  # of any state, score or reward, in SI units
+KINDS = {float: "a number", int: "a whole number"}
 
 
 def write_recording(path: Path, episode: Episode, facts: Mapping[str, Any] | None = None) -> None:
@@ -52,17 +54,11 @@ def write_recording(path: Path, episode: Episode, facts: Mapping[str, Any] | Non
 
 
 def read_recording(path: Path) -> Episode:
-    """Read the episode in a file. Raises RecordingError if it is damaged or not a recording."""
-    facts, text = {}, []
-    try:
-        for line in path.read_text(encoding="utf-8").splitlines():
-            if line.startswith("#"):
-                key, _, value = line[1:].partition(":")
-                facts[key.strip()] = value.strip()
-            else:
-                text.append(line)
-    except (OSError, UnicodeDecodeError) as error:
-        raise RecordingError(f"{path} cannot be read: {error}") from None
+    """Read the episode in a file, also as a spreadsheet program saved it.
+
+    Raises RecordingError if it is damaged or not a recording.
+    """
+    facts, text = read_heading(path)
     if facts.get("format") != FORMAT:
         raise RecordingError(f"{path} is not a recording: its first line is not '# format: {FORMAT}'")
     rows = list(csv.DictReader(text))
@@ -74,20 +70,54 @@ def read_recording(path: Path) -> Episode:
         raise RecordingError(f"{path} is damaged: its last row is missing")
     try:
         ended_by = str(Ending(facts.get("ended_by", "")))
-        columns: dict[str, Any] = {
-            field: np.array([float(row[name]) for row in rows]) for name, field in STATE.items()
-        }
-        steps: dict[str, Any] = {
-            field: np.array([float(row[name]) for row in rows[:-1]]) for name, field in STEP.items()
-        }
-        counts = np.array([[int(row[name]) for name in COUNTS] for row in rows])
-        motor = np.array([int(row["motor"]) for row in rows[:-1]])
-        marks = [row.get(GUARDED) for row in rows[:-1]]
-        guarded = np.array([int(mark or 0) != 0 for mark in marks]) if any(marks) else None
-    except (ValueError, TypeError) as error:
+    except ValueError as error:
         raise RecordingError(f"{path} is damaged: {error}") from None
+
+    def column(name: str, rows: Sequence[Mapping[str, str]], kind: type[float] = float) -> np.ndarray:
+        return np.array([_number(path, row, name, cells[name], kind) for row, cells in enumerate(rows)])
+
+    columns: dict[str, Any] = {field: column(name, rows) for name, field in STATE.items()}
+    steps: dict[str, Any] = {field: column(name, rows[:-1]) for name, field in STEP.items()}
+    counts = np.stack([column(name, rows, int) for name in COUNTS], 1)
+    motor = column("motor", rows[:-1], int)
+    marks = [{GUARDED: row.get(GUARDED) or "0"} for row in rows[:-1]]
+    has_guard = any(row.get(GUARDED) for row in rows[:-1])
+    guarded = column(GUARDED, marks, int) != 0 if has_guard else None
     _check_numbers(path, {**columns, **steps}, motor, counts)
     return Episode(**columns, **steps, counts=counts, motor=motor, ended_by=ended_by, guarded=guarded)
+
+
+def read_heading(path: Path) -> tuple[dict[str, str], list[str]]:
+    """Return what the heading of a file says, and its other lines. Raises RecordingError.
+
+    Spreadsheet programs write a byte-order mark, quotes around a line, and commas that fill a row.
+    """
+    facts, text = {}, []
+    try:
+        for line in path.read_text(encoding="utf-8-sig").splitlines():
+            if line.lstrip('"').startswith("#"):
+                key, _, value = line.strip('",#').partition(":")
+                facts[key.strip()] = value.strip()
+            else:
+                text.append(line)
+    except (OSError, UnicodeDecodeError) as error:
+        raise RecordingError(f"{path} cannot be read: {error}") from None
+    return facts, text
+
+
+def _number(path: Path, row: int, column: str, cell: str | None, kind: type[float]) -> float:
+    """Return a cell as `kind`; a whole number may be written as -250.0. Raises RecordingError."""
+    try:
+        value = float(cell or "")
+        if kind is int and not value.is_integer():
+            raise ValueError
+        return kind(value)
+    except ValueError:
+        found = f"is {cell!r}" if cell else "is empty"
+        raise RecordingError(
+            f"{path} is damaged: {column} in row {row + 1} {found}; give {KINDS[kind]}, "
+            "or leave this recording out"
+        ) from None
 
 
 def _check_numbers(
@@ -101,6 +131,8 @@ def _check_numbers(
     for name, values in columns.items():
         if not np.isfinite(values).all():
             raise damaged(int(np.flatnonzero(~np.isfinite(values))[0]), f"{name} is not finite")
+        if (beyond := np.abs(values) > LARGEST).any():
+            raise damaged(int(np.flatnonzero(beyond)[0]), f"{name} is beyond {LARGEST:g}")
     if not (steps := np.diff(columns["time"]) > 0).all():
         raise damaged(int(np.flatnonzero(~steps)[0]) + 1, "the time does not increase")
     if (beyond := (motor < -LARGEST_MOTOR) | (motor > LARGEST_MOTOR)).any():

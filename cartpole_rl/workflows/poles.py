@@ -5,7 +5,7 @@ from pathlib import Path
 
 from cartpole_rl.choices import choice
 from cartpole_rl.errors import ConfigError, RecordingError
-from cartpole_rl.evaluation.recordings import LENGTH
+from cartpole_rl.evaluation.recordings import LENGTH, read_heading
 from cartpole_rl.randomization.checks import check_one_pole
 from cartpole_rl.randomization.poles import Pole, PoleSettings
 from cartpole_rl.workflows.trained_poles import POLES
@@ -42,9 +42,7 @@ def recorded_pole(paths: Sequence[Path]) -> tuple[str, Pole]:
 
 def recorded_length(path: Path) -> float | None:
     """Return the pole's length (m) in a recording's header; None where it has none. Raises RecordingError."""
-    with path.open(encoding="utf-8") as file:
-        pairs = (line[1:].partition(":") for line in file if line.startswith("#"))
-        text = {key.strip(): value.strip() for key, _, value in pairs}.get(LENGTH)
+    text = read_heading(path)[0].get(LENGTH)
     try:
         return float(text) if text else None
     except ValueError:

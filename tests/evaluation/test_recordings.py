@@ -12,7 +12,7 @@ import torch
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.errors import RecordingError
 from cartpole_rl.evaluation.episodes import run_batch
-from cartpole_rl.evaluation.recordings import COLUMNS, GUARDED, read_recording, write_recording
+from cartpole_rl.evaluation.recordings import COLUMNS, GUARDED, read_heading, read_recording, write_recording
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.tasks.episode import Episode
 
@@ -59,6 +59,7 @@ def test_any_reader_of_csv_sees_columns_with_units(tmp_path: Path, episode: Epis
     assert rows[-1]["motor"] == ""
 
 
+@pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(
     ("harm", "named"),
     [
@@ -74,6 +75,18 @@ def test_any_reader_of_csv_sees_columns_with_units(tmp_path: Path, episode: Epis
         (lambda text: with_cell(text, 1, "motor", str(-(2**63))), "beyond 255 in row 1; record it again"),
         (lambda text: with_cell(text, 3, "pole_counts", str(10**25)), "beyond 2147483647 in row 3; record"),
         (lambda text: with_cell(text, 4, "cart_counts", str(-(2**63))), "beyond 2147483647 in row 4; record"),
+        (lambda text: with_cell(text, 4, "x_m", "1e308"), "x is beyond 1e\\+06 in row 4; record it again"),
+        (
+            lambda text: with_cell(text, 5, "motor", ""),
+            "motor in row 5 is empty; give a whole number, or leave",
+        ),
+        (
+            lambda text: with_cell(text, 5, "motor", "-250.5"),
+            "motor in row 5 is '-250.5'; give a whole number",
+        ),
+        (lambda text: with_cell(text, 6, "x_m", ""), "x_m in row 6 is empty; give a number, or leave"),
+        (lambda text: with_cell(text, 7, "pole_counts", "1,5"), "damaged"),
+        (lambda text: with_cell(text, 40, "score", "none"), "score in row 40 is 'none'; give a number"),
         (lambda text: text[: len(text) // 2], "damaged"),
     ],
 )
@@ -87,6 +100,31 @@ def test_a_damaged_file_is_named(
         read_recording(path)
     assert str(path) in str(raised.value)
     assert "\n" not in str(raised.value)
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_file_that_a_spreadsheet_program_saved_is_read(tmp_path: Path, episode: Episode) -> None:
+    """It writes a byte-order mark, fills the lines of the heading, quotes some, and adds decimals."""
+    path = tmp_path / "one.csv"
+    write_recording(path, episode, {"pole": "medium", "start": '{"x": 0.1, "theta": 0.2}'})
+    lines = path.read_text().splitlines()
+    heading = [line for line in lines if line.startswith("#")]
+    quoted = ['"{}"'.format(line.replace('"', '""')) if "," in line else line for line in heading]
+    names, *rows = (line.split(",") for line in lines[len(heading) :])
+    whole = [names.index(name) for name in ("motor", "cart_counts", "pole_counts")]
+    decimals = [
+        [f"{cell}.0" if place in whole and cell else cell for place, cell in enumerate(row)] for row in rows
+    ]
+    commas = "," * (len(names) - 1)
+    path.write_text(
+        "\n".join([f"{line}{commas}" for line in quoted] + [",".join(row) for row in [names, *decimals]]),
+        encoding="utf-8-sig",
+    )
+    again = read_recording(path)
+    np.testing.assert_array_equal(again.motor, episode.motor)
+    np.testing.assert_array_equal(again.counts, episode.counts)
+    assert (again.motor.dtype, again.counts.dtype) == (episode.motor.dtype, episode.counts.dtype)
+    assert (again.ended_by, read_heading(path)[0]["pole"]) == (episode.ended_by, "medium")
 
 
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
