@@ -1,10 +1,14 @@
 """Draws carts from a table of carts: the posterior of an identification, correlations included."""
 
+import zlib
 from collections.abc import Collection, Mapping
+from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from cartpole_rl.errors import ConfigError
@@ -15,6 +19,18 @@ from cartpole_rl.randomization.poles import HEAVIER, Pole, PoleSettings
 from cartpole_rl.randomization.randomizer import Randomizer
 from cartpole_rl.randomization.settings import IdentifiedSettings
 
+Array = NDArray[np.float64]
+# what NumPy raises for a file that is missing, cut off, changed or another one
+UNREADABLE = (
+    OSError,
+    ValueError,
+    LookupError,
+    TypeError,
+    EOFError,
+    RuntimeError,
+    BadZipFile,
+    zlib.error,
+)
 LATENCY = CartParameters.names().index("latency")
 
 
@@ -92,21 +108,32 @@ def identified_carts(
     """
     prior = Randomizer(cart, poles, settings.ranges, device)
     try:
-        with np.load(settings.posterior) as stored:
-            posterior = dict(zip(stored["names"].tolist(), stored["carts"], strict=True))
-            identified = [str(name) for name in stored["identified"]]
-    except (OSError, ValueError, KeyError) as error:
-        raise ConfigError(f"randomization.posterior={settings.posterior} cannot be read: {error}") from None
+        posterior, identified = read_posterior(settings.posterior)
+    except UNREADABLE as error:
+        raise ConfigError(
+            f"randomization.posterior={settings.posterior} cannot be read: {error}; copy it again, or run "
+            "cartpole-identify from=<its run>"
+        ) from None
     if not poles.is_single or not is_about(poles.nominal, posterior):
         posterior = {name: values for name, values in posterior.items() if name not in Pole.model_fields}
         identified = [name for name in identified if name in posterior]
     rows = []
     for name, nominal in zip(CartParameters.names(), prior.nominal.tolist(), strict=True):
-        values = np.asarray(posterior.get(name, [nominal]), dtype=np.float64)
+        values = posterior.get(name, np.array([nominal]))
         values = np.median(values) + settings.widen * (values - np.median(values))
         rows.append(np.clip(values, BOUNDS[name].low, BOUNDS[name].high))
     table = torch.from_numpy(np.stack(np.broadcast_arrays(*rows))).float()
     return IdentifiedCarts(table, prior, settings.prior_share, float(table[LATENCY].max()), identified)
+
+
+def read_posterior(path: Path) -> tuple[dict[str, Array], list[str]]:
+    """Return carts, [M] of each parameter by name, and the names that are identified. Raises UNREADABLE."""
+    with path.open("rb") as file, np.load(file) as stored:
+        names, table, identified = (stored[name] for name in ("names", "carts", "identified"))
+    if names.ndim != 1 or table.shape[0] != len(names) or table[0].ndim != 1 or not table[0].size:
+        raise ValueError("it holds no table of carts")
+    carts = dict(zip(names.tolist(), table.astype(np.float64, casting="same_kind"), strict=True))
+    return carts, [str(name) for name in identified]
 
 
 def is_about(pole: Pole, posterior: Mapping[str, Any]) -> bool:

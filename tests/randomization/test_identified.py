@@ -1,5 +1,6 @@
 """Carts drawn from a table of carts keep the parameters of a cart together; some come from the prior."""
 
+import io
 from collections.abc import Callable
 from pathlib import Path
 
@@ -74,3 +75,42 @@ def test_the_identified_cart_carries_the_given_pole(
     pole_mass = drawn[CartParameters.names().index("pole_mass")]
     assert {round(mass, 3) for mass in pole_mass.tolist()} == masses
     assert {round(mass, 3) for mass in drawn[MASS].tolist()} == {0.9, 1.0}
+
+
+def without_end(content: bytes) -> bytes:
+    return content[: len(content) // 2]
+
+
+def with_other_bytes(content: bytes) -> bytes:
+    middle = len(content) // 2
+    return content[:middle] + bytes(each ^ 255 for each in content[middle:])
+
+
+def one_array(content: bytes) -> bytes:
+    np.save(file := io.BytesIO(), np.arange(3))
+    return file.getvalue()
+
+
+def one_number_each(content: bytes) -> bytes:
+    np.savez(file := io.BytesIO(), names=["cart_mass"], carts=np.array([1.0]), identified=["cart_mass"])
+    return file.getvalue()
+
+
+@pytest.mark.parametrize(
+    "harm",
+    [without_end, with_other_bytes, one_array, one_number_each, lambda content: b"", lambda content: b"PK"],
+)
+def test_a_damaged_posterior_is_refused_in_one_line(
+    harm: Callable[[bytes], bytes], ip02: dict[str, float], medium: PoleSettings, tmp_path: Path
+) -> None:
+    posterior = tmp_path / "posterior.npz"
+    np.savez(posterior, names=["cart_mass"], carts=np.array([[0.9, 1.0]]), identified=["cart_mass"])
+    settings = IdentifiedSettings(posterior=posterior, widen=1.0, prior_share=0.0, ranges={})
+    assert identified_carts(settings, ip02, medium)
+    posterior.write_bytes(harm(posterior.read_bytes()))
+    with pytest.raises(
+        ConfigError, match=r"cannot be read: .*; copy it again, or run cartpole-identify"
+    ) as raised:
+        identified_carts(settings, ip02, medium)
+    assert str(raised.value).startswith(f"randomization.posterior={posterior}")
+    assert "\n" not in str(raised.value)
