@@ -5,12 +5,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 from cartpole_rl.emulator.c_library import load_library
+from cartpole_rl.emulator.limits import LEVER
 from cartpole_rl.wire import Fault, Message, SetMotor
 from cartpole_rl.wire.frames import END, open_envelope
 from cartpole_rl.wire.messages import MESSAGES
 
-LONGEST_ANSWER = 64  # bytes: 2 * CART_FRAME_BYTES
-SNAPSHOT_NUMBERS = 46
+LONGEST_ANSWER = 70  # bytes: 2 * CART_FRAME_BYTES
+SNAPSHOT_NUMBERS = 83
 
 
 class CartHead(ctypes.Structure):
@@ -19,7 +20,9 @@ class CartHead(ctypes.Structure):
     _fields_ = (
         ("policy", ctypes.c_void_p),
         ("policy_memory", ctypes.c_void_p),
+        ("policy_identity", ctypes.c_uint32),
         ("pole_trim", ctypes.c_int32),
+        ("pole_lever_um", ctypes.c_int32),
         ("period_us", ctypes.c_uint32),
         ("armed", ctypes.c_bool),
         ("homed", ctypes.c_bool),
@@ -36,11 +39,13 @@ class CFirmware:
         self,
         delay_us: Callable[[], int],
         zero_error: int = 0,
+        lever_um: int = LEVER,
         policy: Path | None = None,
         pole_length: float = 0.0,
     ) -> None:
         """`delay_us` returns a command's latency; homing sets the pole's zero `zero_error` counts too low.
 
+        `lever_um` is that of `TrackLimits`.
         `policy` is a folder with policy.h and policy.c, of an agent that drives on the board; it may observe
         `pole_length` in m. Raises EmulatorError if the C firmware cannot be compiled.
         """
@@ -51,7 +56,7 @@ class CFirmware:
         self._answer = ctypes.create_string_buffer(LONGEST_ANSWER)
         self._library.cart_boot(self._memory)
         self._library.cart_attach_policy(self._memory, self._policy_memory, pole_length)
-        self._head.pole_trim = zero_error
+        self._head.pole_trim, self._head.pole_lever_um = zero_error, lever_um
         self._delay_us = delay_us
         self.carried_out: Message | None = None  # the newest message; None if it was refused or damaged
 
@@ -100,13 +105,22 @@ class CFirmware:
             self._library.cart_delay_command(self._memory, now_us + self._delay_us())
         return self._frames(length)
 
-    def drive(self, start_us: int, end_us: int) -> list[tuple[int, int]]:
-        """Return the motor values in force during a period as (since, value)."""
-        values = [(start_us, self._library.cart_motor(self._memory))]
-        due_us = ctypes.c_uint64()
-        while self._library.cart_drive(self._memory, end_us, due_us):
-            values.append((max(due_us.value, start_us), self._library.cart_motor(self._memory)))
-        return values
+    @property
+    def motor(self) -> int:
+        """The motor value in force."""
+        return int(self._library.cart_motor(self._memory))
+
+    def drive(self, now_us: int) -> None:
+        """Bring the motor values that are due into force."""
+        self._library.cart_drive(self._memory, now_us)
+
+    def next_due(self, before_us: int) -> int:
+        """Return when the next motor value is due, `before_us` if none is due before that."""
+        return int(self._library.cart_next_due(self._memory, before_us))
+
+    def look(self, now_us: int, cart: int, pole: int) -> None:
+        """Apply the rules that cannot wait for the end of a period, to the clock and the raw counts."""
+        self._library.cart_look(self._memory, now_us, cart, pole)
 
     def tick(self, now_us: int, cart: int, pole: int) -> list[bytes]:
         """End a period with two raw counts: apply the rules and return the frames to send, STATE last."""

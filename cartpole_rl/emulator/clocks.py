@@ -7,40 +7,49 @@ from cartpole_rl.emulator.device import CartDevice
 from cartpole_rl.emulator.link import Channel
 from cartpole_rl.scheduling import take_precedence
 
+HOMING_US = 100_000  # that pass for each frame while the cart homes; the host asks as often
+
 
 def run_lockstep(cart: CartDevice, channel: Channel) -> None:
     """Pass one period for each frame from the host, including lost and damaged ones, without a clock.
 
     If a STATE is lost, late or damaged, further periods pass until one arrives undamaged. So a host that
-    sends a frame always receives a STATE. During homing, periods pass without frames.
+    sends a frame always receives a STATE. While the cart homes, further periods pass, `HOMING_US` in all.
     """
     waiting: deque[bytes | None] = deque()
     while not cart.unplugged:
-        homing = cart.firmware.homing
         if not waiting:
-            waiting.extend(channel.receive(0) if homing else channel.receive())
-        if waiting:
-            handle(cart, channel, waiting.popleft(), cart.now_us)
-        elif not homing:
+            waiting.extend(channel.receive())
             continue
-        while not pass_period(cart, channel, cart.period_end_us):
+        handle(cart, channel, waiting.popleft(), cart.now_us)
+        end_us = cart.now_us + HOMING_US
+        while not pass_period(cart, channel, cart.period_end_us) or (
+            cart.firmware.homing and cart.now_us < end_us
+        ):
             pass
 
 
 def run_real(cart: CartDevice, channel: Channel) -> None:
     """Pass one period every 20 ms of the monotonic clock, with deadlines that do not drift.
 
-    Commands get a time stamp on arrival; the physics of a period is computed at its end.
+    Commands get a time stamp on arrival; the physics of a period is computed at its end. If this process was
+    held up, the period lasts until now, as on a board, instead of many periods in a row. What waited
+    meanwhile counts as having arrived in time.
     """
     take_precedence()  # a real cart would not be late either
     boot = time.monotonic()
+
+    def now_us() -> int:
+        return int((time.monotonic() - boot) * 1e6)
+
     while not cart.unplugged:
-        end_us = cart.period_end_us
-        while (left := boot + end_us / 1e6 - time.monotonic()) > 0:
-            for frame in channel.receive(left):
-                arrival_us = int((time.monotonic() - boot) * 1e6)
-                handle(cart, channel, frame, min(max(arrival_us, cart.now_us), end_us))
-        pass_period(cart, channel, end_us)
+        end_us, left_us = cart.period_end_us, 1
+        while left_us > 0:
+            left_us = end_us - now_us()
+            for frame in channel.receive(max(0, left_us) / 1e6):
+                handle(cart, channel, frame, min(max(now_us(), cart.now_us), end_us))
+        late_us = now_us() - end_us
+        pass_period(cart, channel, end_us + late_us if late_us > cart.firmware.period_us // 2 else end_us)
 
 
 def pass_period(cart: CartDevice, channel: Channel, end_us: int) -> bool:

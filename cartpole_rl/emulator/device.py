@@ -17,6 +17,7 @@ FASTEST_BOOT = 8.0  # rad/s, of the pole with boot=anywhere
 STANDS_WITHIN = math.radians(5)  # of upright, the pole stands
 STANDS_US = 2_000_000  # that it has to stand before a hand knocks it
 HAND_ERROR = 0.03  # rad, largest error of a hand that holds the pole upright
+LOOK_US = 1000  # between two looks of the firmware at the cart's position
 
 
 class CartDevice:
@@ -33,6 +34,7 @@ class CartDevice:
         self._settings = settings
         self.physics = CartPhysics(settings)
         self._journal = Journal(settings.journal) if settings.journal else None
+        self.physics.on_contact = self._touch
         self._latencies = random.Random(f"latency {settings.seed}")
         self._people = random.Random(f"people {settings.seed}")
         self._held: float | None = None  # rad, the angle at which the hand holds the pole
@@ -40,6 +42,7 @@ class CartDevice:
         self._knocked = False  # since START
         self._knock = settings.knock  # rad/s of the next knock; to the right and left in turn
         self.now_us = 0
+        self._looked_us = 0
         self._place_cart()
         self._reset_us = microseconds(settings.reset_at)
         self._unplug_us = microseconds(settings.unplug_at)
@@ -75,19 +78,42 @@ class CartDevice:
             self._boot_firmware()
             banner = [BANNER]
         self._move_hand()
-        start, end = self.now_us - self._booted_us, end_us - self._booted_us
-        values = self.firmware.drive(start, end)
-        for (since, motor), (until, _) in zip(values, [*values[1:], (end, 0)], strict=True):
-            self.physics.advance(motor, (until - since) / 1e6)
-            if self._journal:
-                self._journal.in_force(self._booted_us + since, motor)
+        start_us = self.now_us
+        while self.now_us < end_us:
+            self.firmware.drive(self.now_us - self._booted_us)
+            self._note_motor()
+            until_us = self._booted_us + self.firmware.next_due(end_us - self._booted_us)
+            self._move(until_us)
         if self._held is not None:
             self.physics.place_pole(self._held)
-        self.now_us = end_us
-        frames = self.firmware.tick(end, *self._counts())
+        frames = self.firmware.tick(end_us - self._booted_us, *self._counts())
+        self._note_motor()
         self._move_hand()
-        self._maybe_knock(end - start)
+        self._maybe_knock(end_us - start_us)
         return banner + frames
+
+    def _move(self, until_us: int) -> None:
+        """Let the cart move until `until_us`, while the firmware looks at its position."""
+        start_us = self.now_us
+
+        def look(seconds: float) -> int:
+            self.now_us = start_us + round(seconds * 1e6)
+            if self.now_us - self._looked_us >= LOOK_US:
+                self._looked_us = self.now_us
+                self.firmware.look(self.now_us - self._booted_us, *self._counts())
+                self._note_motor()
+            return self.firmware.motor
+
+        self.physics.advance(self.firmware.motor, (until_us - start_us) / 1e6, look)
+        self.now_us = until_us
+
+    def _note_motor(self) -> None:
+        if self._journal:
+            self._journal.in_force(self.now_us, self.firmware.motor)
+
+    def _touch(self, speed: float) -> None:
+        if self._journal:
+            self._journal.touched(self.now_us, speed)
 
     def _place_cart(self) -> None:
         settings, draw = self._settings, self._people.uniform
@@ -106,11 +132,12 @@ class CartDevice:
 
     def _new_firmware(self) -> Firmware | CFirmware:
         """Return the firmware that the settings choose, just booted."""
-        zero_error = round(self._settings.angle_offset / POLE_RADIANS)
-        if self._settings.firmware == "c":
-            length = 2 * self._settings.pole_com
-            return CFirmware(self._latency_us, zero_error, self._settings.policy, length)
-        return Firmware(self._latency_us, zero_error)
+        cart = self._settings
+        zero_error = round(cart.angle_offset / POLE_RADIANS)
+        lever_um = round(1e6 * cart.pole_mass * cart.pole_com / (cart.cart_mass + cart.pole_mass))
+        if cart.firmware == "c":
+            return CFirmware(self._latency_us, zero_error, lever_um, cart.policy, 2 * cart.pole_com)
+        return Firmware(self._latency_us, zero_error, lever_um)
 
     def _counts(self) -> tuple[int, int]:
         """Return the raw counts of cart and pole since boot."""

@@ -1,8 +1,9 @@
-"""The firmware of the emulated cart: protocol version 1 as a state machine without I/O or real clocks.
+"""The firmware of the emulated cart: protocol version 2 as a state machine without I/O or real clocks.
 
-The caller passes frames with their time of arrival and advances the time. A period is `drive` (the motor
-values in force), then `tick` (read the encoders, apply the rules, report). The cart is idle, homing or
-armed; a latched fault disarms it. ``docs/protocol.md`` has the rules. All times are whole microseconds
+The caller passes frames with their time of arrival and advances the time: `drive` brings motor values that
+are due into force, `look` is called once a millisecond with the cart's count, `tick` at the end of each
+period (read the encoders, apply the rules, report). The cart is idle, homing or armed; a latched fault
+disarms it. ``docs/protocol.md`` has the rules. All times are whole microseconds
 since boot.
 """
 
@@ -18,6 +19,7 @@ from cartpole_rl.emulator.guards import (
     StallWatch,
 )
 from cartpole_rl.emulator.homing import HomingError, Reading, Zeros, home
+from cartpole_rl.emulator.limits import HARD_LIMIT, LEVER, SOFT_LIMIT, TrackLimits
 from cartpole_rl.emulator.motor_line import MotorLine
 from cartpole_rl.emulator.settings import LARGEST_MOTOR
 from cartpole_rl.errors import FrameError
@@ -44,16 +46,16 @@ from cartpole_rl.wire.messages import (
     Stop,
 )
 
-FIRMWARE = (1, 1, 1)  # 1.1.0 knows START_POLICY, 1.0.0 does not
+FIRMWARE = (2, 0, 0)  # from 2.0.0 on, protocol version 2
 # the text of an ESP32, and one 0x00 that separates it from the first frame
 BANNER = (
     b"ets Jul 29 2019 12:21:46\r\n\r\nrst:0x1 (POWERON_RESET),boot:0x13\r\ncart %d.%d.%d\r\n\x00" % FIRMWARE
 )
 PERIOD_US = 20_000
 SHORTEST_US, LONGEST_US = 5_000, 100_000
-SOFT_LIMIT = round(0.027 / CART_METRES)  # counts inside a stop
-HARD_LIMIT = round(0.008 / CART_METRES)  # counts inside a stop
-WATCHDOG_PERIODS = 3
+WATCHDOG_PERIODS = 3  # after a state was measured, no motor value that answers it is in force any more
+KEPT_TICKS = WATCHDOG_PERIODS + 1
+LEASE_US = 500_000  # without an accepted frame, after which homing ends
 NO_AGE = 65535
 U32 = 0xFFFFFFFF
 UNDERSTOOD = {kind for kind in MESSAGES if not kind & FROM_CART} - {StartPolicy.TYPE}  # it has no policy
@@ -63,8 +65,11 @@ NOMINAL_HALF_SPAN = round(SPAN / 2 / CART_METRES)
 class Firmware:
     """The firmware of one cart, just booted: idle, not homed, motor 0."""
 
-    def __init__(self, delay_us: Callable[[], int], zero_error: int = 0) -> None:
-        """`delay_us` returns a command's latency; homing sets the pole's zero `zero_error` counts too low."""
+    def __init__(self, delay_us: Callable[[], int], zero_error: int = 0, lever_um: int = LEVER) -> None:
+        """`delay_us` returns a command's latency; homing sets the pole's zero `zero_error` counts too low.
+
+        `lever_um` is that of `TrackLimits`.
+        """
         self.period_us = PERIOD_US
         self.armed = False
         self.homed = False
@@ -73,22 +78,32 @@ class Firmware:
         self._delay_us = delay_us
         self._zero_error = zero_error
         self._line = MotorLine()
+        self._limits = TrackLimits(lever_um)
+        self._limited = False  # the limits have changed the motor value since the newest tick
         self._homing: Generator[int, Reading, Zeros] | None = None
         self._zeros = Zeros(-NOMINAL_HALF_SPAN, NOMINAL_HALF_SPAN, hanging=0)
         self._pole_zero = 0  # raw count that is reported as 0
         self._command_us: int | None = None  # when the newest SET_MOTOR arrived
-        self._watchdog_us = 0  # time of START or of the newest SET_MOTOR
+        self._expires_us = 0  # the watchdog then sets the motor to 0
+        self._heard_us = 0  # when the newest accepted frame arrived
         self._last_sequence = 0  # of the host
         self._sequence = 0  # of the next frame sent
         self._ticks = 0
-        self._ticked_us = 0
-        self._cart = 0  # raw count of the newest period
+        self._measured_us = [0] * KEPT_TICKS  # times of the newest ticks, at their number modulo 4
+        self._cart = self._pole = 0  # raw counts that were read last
         self._reset_watches()
 
     @property
     def homing(self) -> bool:
         """True while the cart is homing."""
         return self._homing is not None
+
+    @property
+    def motor(self) -> int:
+        """The motor value in force."""
+        if self._limits.brake:
+            return self._limits.brake * LARGEST_MOTOR
+        return 0 if self._line.requested * self._limits.blocked > 0 else self._line.requested
 
     def receive(self, stuffed: bytes, now_us: int) -> list[bytes]:
         """Handle one frame without its final 0x00; return the answer, at most one frame."""
@@ -100,30 +115,63 @@ class Firmware:
         answer = self._obey(envelope, now_us)
         if isinstance(answer, Reason):
             return [self._frame(Nack(envelope.sequence, envelope.kind, answer))]
-        self._last_sequence = envelope.sequence
+        self._last_sequence, self._heard_us = envelope.sequence, now_us
         return [self._frame(answer)] if answer else []
 
-    def drive(self, start_us: int, end_us: int) -> list[tuple[int, int]]:
-        """Return the motor values in force during a period as (since, value)."""
-        return self._line.over(start_us, end_us)
+    def drive(self, now_us: int) -> None:
+        """Bring the motor values that are due into force."""
+        self._line.drive(now_us)
+
+    def next_due(self, before_us: int) -> int:
+        """Return when the next motor value is due, `before_us` if none is due before that."""
+        return self._line.next_due(before_us)
+
+    def look(self, now_us: int, cart: int, pole: int) -> None:
+        """Apply the rules that cannot wait for the end of a period, to the clock and the raw counts."""
+        self._expire(now_us)
+        self._limits.sample(now_us, cart, pole)
+        self._limit(now_us, cart, pole)
 
     def tick(self, now_us: int, cart: int, pole: int) -> list[bytes]:
         """End a period with two raw counts: apply the rules and return the frames to send, STATE last."""
         reading = Reading(cart, pole, max(1, now_us - self._ticked_us))
-        self._ticks, self._ticked_us, self._cart = self._ticks + 1, now_us, cart
+        self._ticks += 1
+        self._measured_us[self._ticks % KEPT_TICKS] = now_us
         faults_before = self.fault
-        # checked once a period: the limit has to pass by the next check at the latest
-        expired = self.armed and now_us - self._watchdog_us > (WATCHDOG_PERIODS - 1) * self.period_us
-        if expired:
-            self._line.hold(0)
+        self._limits.sample(now_us, cart, pole)
+        expired = self._expire(now_us)
         if self.armed or self.homing:
             self._check_faults(reading)
         if self._homing:
             self._step_homing(self._homing, reading)
-        self._line.blocked = self._beyond(SOFT_LIMIT, cart) if self.armed else 0
+        self._limit(now_us, cart, pole)
         flags = self._flags() | (Flags.WATCHDOG if expired and self.armed else Flags(0))
+        if self._limited:
+            flags |= Flags.SOFT_LIMIT
+        self._limited = False
         report = [FaultReport(self.fault, self._ticks & U32)] if self.fault != faults_before else []
         return [self._frame(message, flags) for message in (*report, self._state(cart, pole))]
+
+    def _expire(self, now_us: int) -> bool:
+        """End a homing without a host; return whether the watchdog holds the motor at 0."""
+        if self.homing and now_us - self._heard_us > LEASE_US:
+            self._homing = None
+            self._line.hold(0)
+        expired = self.armed and now_us >= self._expires_us
+        if expired:
+            self._line.hold(0)
+        return expired
+
+    def _limit(self, now_us: int, cart: int, pole: int) -> None:
+        """Let the limits of the track decide, which need the zeros of a homing."""
+        self._cart, self._pole = cart, pole
+        if self.homing:
+            self._limits.release()
+        else:
+            zeros = self._zeros
+            angle = pole - self._pole_zero
+            self._limits.apply(now_us, cart - zeros.middle, angle, zeros.half_span, self.armed)
+        self._limited |= self.motor != self._line.requested
 
     def _obey(self, envelope: Envelope, now_us: int) -> Message | Reason | None:
         """Carry out a frame and return the answer; None for SET_MOTOR, which the next STATE acknowledges."""
@@ -135,7 +183,7 @@ class Firmware:
             message = MESSAGES[envelope.kind].unpack(envelope.payload)
         except FrameError:
             return Reason.BAD_LENGTH
-        reason = self._objection(message)
+        reason = self._objection(message, now_us)
         if reason is not None:
             return reason
         self._carry_out(message, now_us)
@@ -146,7 +194,7 @@ class Firmware:
             return self._info()
         return Ack(envelope.sequence, envelope.kind)
 
-    def _objection(self, message: Message) -> Reason | None:
+    def _objection(self, message: Message, now_us: int) -> Reason | None:
         """Return the reason for which a message is refused now, or None."""
         match message:
             case SetMotor(motor) if abs(motor) > LARGEST_MOTOR:
@@ -163,23 +211,37 @@ class Firmware:
                 return Reason.NOT_HOMED
             case SetMotor() if not self.armed:
                 return Reason.NOT_ARMED
+            case SetMotor(motor, tick) if motor and now_us >= self._expiry(tick):
+                return Reason.STALE
         return None
+
+    def _expiry(self, tick: int) -> int:
+        """Return until when an answer to the STATE of `tick` may be in force; 0 for an old or unknown one."""
+        if (self._ticks - tick) & U32 >= KEPT_TICKS:
+            return 0
+        return self._measured_us[tick % KEPT_TICKS] + WATCHDOG_PERIODS * self.period_us
+
+    @property
+    def _ticked_us(self) -> int:
+        return self._measured_us[self._ticks % KEPT_TICKS]
 
     def _carry_out(self, message: Message, now_us: int) -> None:
         match message:
-            case SetMotor(motor):
-                self._command_us = self._watchdog_us = now_us
+            case SetMotor(motor, tick):
+                self._command_us, self._expires_us = now_us, self._expiry(tick)
                 self._line.command(now_us + self._delay_us(), motor)
             case Start() if not self.armed:
-                self.armed, self._watchdog_us = True, now_us
-                self._line.blocked = self._beyond(SOFT_LIMIT, self._cart)
+                self.armed, self._expires_us = True, self._expiry(self._ticks)
                 self._reset_watches()
+                self._limit(now_us, self._cart, self._pole)
             case Stop():
                 self.armed, self._homing = False, None
                 self._line.stop(now_us)
             case Home():
                 self.homed, self._homing = False, home()
                 next(self._homing)
+                self._line.hold(0)
+                self._limits.release()
                 self._reset_watches()
             case ClearFault():
                 self.fault = Fault.NONE
@@ -200,14 +262,15 @@ class Firmware:
 
     def _check_faults(self, reading: Reading) -> None:
         """Latch new faults. Homing may touch the stops and detects a stall itself."""
-        motor = self._line.value
+        motor = self.motor
         jumped = self._cart_jumps.jumped(reading.cart, reading.us)
         if self._cart_freezes.frozen(reading.cart, motor, reading.us) or jumped:
             self._latch(Fault.CART_ENCODER)
         jumped = self._pole_jumps.jumped(reading.pole, reading.us)
         if self._pole_freezes.frozen(reading.pole, reading.cart, reading.us) or jumped:
             self._latch(Fault.POLE_ENCODER)
-        if self.armed and self._beyond(HARD_LIMIT, reading.cart):
+        beyond = abs(reading.cart - self._zeros.middle) >= self._zeros.half_span - HARD_LIMIT
+        if self.armed and beyond:
             self._latch(Fault.HARD_LIMIT)
         if self.armed and self._stalls.stalled(reading.cart, motor, reading.us):
             self._latch(Fault.STALL)
@@ -219,19 +282,14 @@ class Firmware:
         self._line.hold(0)
         if fault in Fault.CART_ENCODER | Fault.POLE_ENCODER:
             self.homed = False
+        if fault == Fault.CART_ENCODER:
+            self._limits.release()  # nobody knows where the cart is
 
     def _reset_watches(self) -> None:
         """Start with new guards: a hand may have moved cart and pole while the motor was off."""
         self._cart_jumps, self._pole_jumps = JumpWatch(FASTEST_CART), JumpWatch(FASTEST_POLE)
         self._cart_freezes, self._pole_freezes = FrozenCartWatch(), FrozenPoleWatch()
         self._stalls = StallWatch()
-
-    def _beyond(self, inside: int, cart: int) -> int:
-        """Return 1 or -1 if the cart is within `inside` counts of the right or left stop, else 0."""
-        from_middle = cart - self._zeros.middle
-        if abs(from_middle) < self._zeros.half_span - inside:
-            return 0
-        return 1 if from_middle > 0 else -1
 
     def _info(self) -> Info:
         half_span = self._zeros.half_span
@@ -243,16 +301,18 @@ class Firmware:
             half_span - SOFT_LIMIT,
             half_span - HARD_LIMIT,
             self.period_us,
+            0,  # it has no policy
         )
 
     def _state(self, cart: int, pole: int) -> State:
-        age = NO_AGE if self._command_us is None else (self._ticked_us - self._command_us) // 1000
+        now_us = self._ticked_us
+        age = NO_AGE if self._command_us is None else (now_us - self._command_us) // 1000
         return State(
             self._ticks & U32,
-            self._ticked_us & U32,
+            now_us & U32,
             cart - self._zeros.middle,
             pole - self._pole_zero,
-            self._line.value,
+            self.motor,
             self._last_sequence,
             self.fault,
             min(age, NO_AGE),
@@ -264,7 +324,7 @@ class Firmware:
             | (Flags.HOMED if self.homed else Flags(0))
             | (Flags.HOMING if self.homing else Flags(0))
             | (Flags.FAULTED if self.fault else Flags(0))
-            | (Flags.SOFT_LIMIT if self._line.limited else Flags(0))
+            | (Flags.SOFT_LIMIT if self.motor != self._line.requested else Flags(0))
         )
 
     def _frame(self, message: Message, flags: Flags | None = None) -> bytes:

@@ -1,7 +1,8 @@
-"""The emulated cart's own record of the commands that it carried out and of the motor values in force.
+"""The emulated cart's own record: commands carried out, motor values in force, end stops touched.
 
 One JSON line for each event, with `us` in microseconds since the emulator's start:
-{"us": 40210, "took": "SET_MOTOR", "motor": -200} and {"us": 43310, "in_force": -200}.
+{"us": 40210, "took": "SET_MOTOR", "motor": -200, "tick": 2}; {"us": 43310, "in_force": -200};
+{"us": 61310, "touched": 0.08}, in m/s.
 """
 
 import json
@@ -21,6 +22,10 @@ class Journal:
     def took(self, us: int, message: Message) -> None:
         """Record a command that the cart carried out."""
         self._write(us, took=message.TYPE.name, **vars(message))
+
+    def touched(self, us: int, speed: float) -> None:
+        """Record that the cart has touched an end stop at `speed` m/s."""
+        self._write(us, touched=round(speed, 4))
 
     def in_force(self, us: int, motor: int) -> None:
         """Record the motor value in force if it has changed."""

@@ -9,22 +9,11 @@ MOST_PENDING = 1024  # the line's memory is bounded, as a board's is
 
 
 class MotorLine:
-    """The motor value in force and the pending ones. No command overtakes another."""
+    """The requested motor value and the pending ones. No command overtakes another."""
 
     def __init__(self) -> None:
-        self.blocked = 0  # direction that the soft limit forbids: 1 right, -1 left, 0 none
-        self._requested = 0
+        self.requested = 0
         self._pending: deque[tuple[int, int]] = deque()  # (due, value)
-
-    @property
-    def value(self) -> int:
-        """Motor value in force."""
-        return 0 if self.limited else self._requested
-
-    @property
-    def limited(self) -> bool:
-        """True if the command in force points in the forbidden direction and is held at 0."""
-        return self._requested * self.blocked > 0
 
     def command(self, due_us: int, value: int) -> None:
         """Bring a value into force at `due_us`, or together with an earlier command that is due later.
@@ -45,12 +34,13 @@ class MotorLine:
     def hold(self, value: int) -> None:
         """Put a value into force at once and discard all pending ones."""
         self._pending.clear()
-        self._requested = value
+        self.requested = value
 
-    def over(self, start_us: int, end_us: int) -> list[tuple[int, int]]:
-        """Return the values in force from start to end as (since, value); the last one remains in force."""
-        values = [(start_us, self.value)]
-        while self._pending and self._pending[0][0] < end_us:
-            due, self._requested = self._pending.popleft()
-            values.append((max(due, start_us), self.value))
-        return values
+    def drive(self, now_us: int) -> None:
+        """Bring the values that are due into force."""
+        while self._pending and self._pending[0][0] <= now_us:
+            _, self.requested = self._pending.popleft()
+
+    def next_due(self, before_us: int) -> int:
+        """Return when the next value is due, `before_us` if none is due before that."""
+        return min(before_us, self._pending[0][0]) if self._pending else before_us

@@ -7,6 +7,7 @@ default a cart at rest would creep); the stops are stiff joint limits.
 """
 
 import math
+from collections.abc import Callable
 from types import ModuleType
 
 from cartpole_rl.emulator.motor import Motor
@@ -66,6 +67,8 @@ class CartPhysics:
         self._mj_step = mujoco.mj_step
         self._settings = settings
         self._motor = Motor(settings)
+        self.on_contact: Callable[[float], None] | None = None  # called with the speed in m/s at an end stop
+        self._touches = False
         self.place(0.0, math.pi)
 
     @property
@@ -99,8 +102,11 @@ class CartPhysics:
         self._data.qpos[1] = angle - self._settings.track_tilt
         self._data.qvel[1] = angle_dot
 
-    def advance(self, motor: int, seconds: float) -> None:
-        """Simulate `seconds` under one motor value, in equal steps of at most `physics_step`."""
+    def advance(self, motor: int, seconds: float, look: Callable[[float], int] | None = None) -> None:
+        """Simulate `seconds` under one motor value, in equal steps of at most `physics_step`.
+
+        `look`, called with the seconds passed after each step, returns the motor value from there on.
+        """
         steps = math.ceil(seconds / self._settings.physics_step - 1e-9)
         if steps == 0:
             return
@@ -109,11 +115,22 @@ class CartPhysics:
         drag, friction = self._settings.pole_drag, self._model.dof_frictionloss
         applied, velocity = self._data.qfrc_applied, self._data.qvel
         target, decay = self._motor.static_force(motor), self._motor.decay(step)
-        for _ in range(steps):
+        for number in range(1, steps + 1):
             applied[0] = self._motor.step(target, decay) + self._cogging(self._data.qpos[0])
             applied[1] = -drag * velocity[1] * abs(velocity[1])
             friction[0] = self._cart_friction(velocity[0])
+            speed = abs(velocity[0])
             self._mj_step(self._model, self._data)
+            self._notice_contact(speed)
+            if look is not None and (chosen := look(number * step)) != motor:
+                motor, target = chosen, self._motor.static_force(chosen)
+
+    def _notice_contact(self, speed: float) -> None:
+        """Report it if the cart, which ran at `speed` m/s, has just touched an end stop."""
+        touches = abs(self._data.qpos[0]) >= self._settings.track_half_length
+        if touches and not self._touches and self.on_contact is not None:
+            self.on_contact(speed)
+        self._touches = touches
 
     def _cogging(self, x: float) -> float:
         """Return the cogging force, which pulls the cart to the nearest stable position, N."""

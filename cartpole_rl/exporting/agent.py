@@ -60,7 +60,16 @@ class ExportedAgent:
         The description is JSON with sorted keys, without spaces, in ASCII. Each array is its name and shape
         as text, as in "layer0.bias [128]", and its float32 numbers, row by row, little-endian.
         """
-        digest = hashlib.sha256(canonical_json(self.description.model_dump(mode="json")).encode())
+        return self._digest(self.description.model_dump(mode="json"))
+
+    @property
+    def identity(self) -> int:
+        """The 32 bits that a board reports of its agent, never 0: such a checksum without the provenance."""
+        functional = self.description.model_dump(mode="json", exclude={"provenance"})
+        return int(self._digest(functional)[:8], 16) or 1
+
+    def _digest(self, description: dict[str, Any]) -> str:
+        digest = hashlib.sha256(canonical_json(description).encode())
         for name, values in self.arrays():
             digest.update(f"{name} {list(values.shape)}".encode())
             digest.update(np.ascontiguousarray(values, "<f4").tobytes())

@@ -106,7 +106,7 @@ def header(agent: ExportedAgent, later: str) -> str:
         "guard": about.guard or "none",
         "origin": in_comment(about.origin),
         "checksum": agent.checksum,
-        "id": identity(agent),
+        "id": f"{agent.identity:08x}",
         "inputs": about.sizes[0],
         "actions": len(about.motors),
         "nanometres": round(1e9 * about.cart_metres_per_count),
@@ -122,11 +122,6 @@ def header(agent: ExportedAgent, later: str) -> str:
     return filled("policy.h", values)
 
 
-def identity(agent: ExportedAgent) -> str:
-    """Return the first 32 bits of the agent's SHA-256 in hexadecimal."""
-    return agent.checksum[:8]
-
-
 def in_comment(text: str) -> str:
     """Return text as one line within a comment; it neither ends the comment nor opens another."""
     return " ".join(text.split()).replace("*/", "* /").replace("/*", "/ *")
@@ -137,7 +132,7 @@ def source(agent: ExportedAgent, first: str, later: str) -> str:
     about = agent.description
     helpers = [text for name, text in c.HELPERS.items() if name in first + later]
     values = {
-        "id": identity(agent),
+        "id": f"{agent.identity:08x}",
         "motors": ", ".join(map(str, about.motors)),
         "rightmost": max(0, *about.motors),
         "leftmost": min(0, *about.motors),

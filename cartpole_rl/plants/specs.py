@@ -12,8 +12,9 @@ from torchrl.envs import EnvBase
 from cartpole_rl.physics.motor import LARGEST_MOTOR
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Origin
+from cartpole_rl.wire import Fault
 
-TERMINATING, TRUNCATING = (Ending.TRACK, Ending.FAULT), (Ending.LINK,)  # the endings that plants report
+TERMINATING, TRUNCATING = (Ending.TRACK,), (Ending.FAULT, Ending.LINK)  # the endings that plants report
 
 
 class Report(NamedTuple):
@@ -50,8 +51,8 @@ class Plant(EnvBase):
     another value, as 0 in place of a late one, writes it there.
     Out: `counts` [N, 2] int64 (cart from the middle of the track, pole from upright, both positive to the
     right, the pole not wrapped), `dt` [N, 1] float32 seconds since the previous frame by the plant's clock,
-    `motor_applied` [N, 1] int64, `terminated` [N, 1] bool (left the track, or a device fault),
-    `truncated` [N, 1] bool (link lost; time limits belong to the task).
+    `motor_applied` [N, 1] int64, `terminated` [N, 1] bool (left the track),
+    `truncated` [N, 1] bool (link lost, or a device fault; time limits belong to the task).
     A plant computes no reward; it returns zeros.
     """
 
@@ -87,6 +88,11 @@ class Plant(EnvBase):
     def track_half_length(self) -> torch.Tensor:
         """m, [N]: from the middle of the track to its end, or to the soft limit. The track guard reads it."""
         raise NotImplementedError
+
+    @property
+    def fault(self) -> Fault:
+        """The faults that a plant of one cart has latched."""
+        return Fault.NONE
 
     def halt(self) -> None:
         """Set the motor to 0 until the next reset. Nothing moves a simulated cart that is not stepped."""

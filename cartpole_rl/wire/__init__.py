@@ -1,4 +1,4 @@
-"""Wire protocol, version 1: bytes <-> dataclasses, without I/O. ``docs/protocol.md`` specifies it."""
+"""Wire protocol, version 2: bytes <-> dataclasses, without I/O. ``docs/protocol.md`` specifies it."""
 
 from cartpole_rl.wire.clock import microseconds_between, seconds_between, ticks_between, went_back
 from cartpole_rl.wire.frames import Frame, FrameSplitter, decode_frame, encode_frame

@@ -8,11 +8,12 @@ from cartpole_rl.wire import cobs
 from cartpole_rl.wire.checksum import crc16
 from cartpole_rl.wire.messages import MESSAGES, Message
 
-VERSION = 1
+VERSION = 2
+OTHER_VERSION = "protocol version"  # in the FrameError for a frame of another version
 END = b"\x00"
 HEADER_BYTES = 4
 CRC_BYTES = 2
-LONGEST_FRAME = 64  # stuffed bytes without the final 0x00; INFO and STATE, the longest messages, take 30
+LONGEST_FRAME = 64  # stuffed bytes without the final 0x00; INFO, the longest message, takes 34
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,7 @@ def decode_frame(stuffed: bytes) -> Frame:
     """
     envelope = open_envelope(stuffed)
     if envelope.version != VERSION:
-        raise FrameError(f"protocol version {envelope.version}; this side speaks {VERSION}")
+        raise FrameError(f"it speaks {OTHER_VERSION} {envelope.version}, this program {VERSION}")
     if envelope.kind not in MESSAGES:
         raise FrameError(f"unknown message type {envelope.kind:#04x}")
     return Frame(MESSAGES[envelope.kind].unpack(envelope.payload), envelope.sequence, envelope.flags)

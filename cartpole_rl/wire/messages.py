@@ -1,4 +1,4 @@
-"""The messages of protocol version 1. Numbers are little-endian; `LAYOUT` is a payload in `struct` notation.
+"""The messages of protocol version 2. Numbers are little-endian; `LAYOUT` is a payload in `struct` notation.
 
 Host to cart: HELLO, START, STOP, SET_MOTOR, HOME, CLEAR_FAULT, SET_PERIOD, START_POLICY.
 Cart to host: INFO, STATE (each period), ACK, NACK, FAULT.
@@ -41,8 +41,8 @@ class Flags(IntFlag):
     HOMED = 0x02
     HOMING = 0x04
     FAULTED = 0x08
-    SOFT_LIMIT = 0x10  # the command in force points outward beyond the soft limit and is held at 0
-    WATCHDOG = 0x20  # no SET_MOTOR was accepted for more than two periods; motor 0
+    SOFT_LIMIT = 0x10  # the limits hold the motor value at 0, or brake the cart, or did since the last STATE
+    WATCHDOG = 0x20  # the newest accepted SET_MOTOR answers a state three periods old or older; motor 0
 
 
 class Fault(IntFlag):
@@ -67,6 +67,7 @@ class Reason(IntEnum):
     FAULT_LATCHED = 6
     BUSY = 7
     BAD_VERSION = 8
+    STALE = 9  # a motor value other than 0 that answers a state three periods old or older
 
 
 MESSAGES: dict[int, "type[Message]"] = {}  # by type byte; each valid message enters itself
@@ -125,16 +126,20 @@ class Stop(Message):
 
 @dataclass(frozen=True)
 class SetMotor(Message):
-    """Sets the motor value, -255 to 255, positive to the right."""
+    """Sets the motor value, -255 to 255, positive to the right. Refused if it answers an old state."""
 
     TYPE = MessageType.SET_MOTOR
-    LAYOUT = "h"
+    LAYOUT = "hI"
     motor: int
+    tick: int = 0  # of the STATE that it answers; any for motor value 0, which is never too old
 
 
 @dataclass(frozen=True)
 class Home(Message):
-    """Starts homing: touch both stops, check the span, centre, wait until the pole is still, set zeros."""
+    """Starts homing: touch both stops, check the span, centre, wait until the pole is still, set zeros.
+
+    Homing ends if no frame is accepted for half a second.
+    """
 
     TYPE = MessageType.HOME
 
@@ -163,20 +168,11 @@ class StartPolicy(Message):
 
 
 @dataclass(frozen=True)
-class PolicyQuestion(Message, valid=False):
-    """START_POLICY with a payload. A cart refuses it: as BAD_LENGTH with a policy, UNKNOWN_TYPE without."""
-
-    TYPE = MessageType.START_POLICY
-    LAYOUT = "B"
-    payload: int = 0
-
-
-@dataclass(frozen=True)
 class Info(Message):
     """The properties of the cart. Answers HELLO and SET_PERIOD."""
 
     TYPE = MessageType.INFO
-    LAYOUT = "BBBHIhiiI"
+    LAYOUT = "BBBHIhiiII"
     firmware_major: int
     firmware_minor: int
     firmware_patch: int
@@ -186,6 +182,7 @@ class Info(Message):
     soft_limit_counts: int  # from the middle; outward commands are held at 0 beyond this
     hard_limit_counts: int  # from the middle; HARD_LIMIT is latched from here on
     period_us: int
+    policy: int  # identity of the agent on the board, 1 or more; 0 without one
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ from cartpole_rl.workflows.build import (
 )
 from cartpole_rl.workflows.checks import BASELINE
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
-from cartpole_rl.workflows.export import compiled_training, on_the_board
+from cartpole_rl.workflows.export import agent_on_board, compiled_training, exported_agent, on_the_board
 from cartpole_rl.workflows.live import LiveView, view_title
 from cartpole_rl.workflows.person import confirm, print_message
 from cartpole_rl.workflows.progress import progress_bar
@@ -50,6 +50,7 @@ class Evaluation:
     training: TrainConfig
     known_poles: Sequence[PoleSettings]  # of the agent
     simulation: CartPoleEnv | None  # that predicts the first episode
+    on_board: int | None  # identity of the agent that the cart's board should have; None if it does not drive
 
     def episodes(self) -> Iterator[Episode]:
         """Drive the repeated episode, or new ones, and yield each as it ends."""
@@ -72,10 +73,10 @@ class Evaluation:
             print_message(command, line)
 
     def check_board(self) -> None:
-        """Raise RefusedError if the cart's board shall drive and has no policy."""
-        if self.config.drives_on_board:
+        """Raise PlantError if the cart's board shall drive and has no agent, or another one."""
+        if self.on_board is not None:
             assert isinstance(self.env.plant, SerialPlant)
-            self.env.plant.cart.check_policy()
+            self.env.plant.cart.check_policy(self.on_board)
 
     def onboard_episodes(self) -> Iterator[Episode]:
         """Let the policy on the cart's board drive, and yield each episode as it ends."""
@@ -110,10 +111,13 @@ def prepared(config: EvaluateConfig) -> Evaluation:
     simulation = (
         predicting_env(settings, agent.training.plant, config.seed) if config.animation.simulation else None
     )
+    on_board = None
+    if config.drives_on_board:
+        on_board = exported_agent(agent_on_board(config, agent, settings), {}).identity
     with on_the_board(config, agent, settings) as equipped:
         env = evaluated_env(settings, equipped, prompt=tqdm.write, confirm=confirm)
     return Evaluation(
-        config, settings, env, agent.policy, again, agent.training, agent.known_poles, simulation
+        config, settings, env, agent.policy, again, agent.training, agent.known_poles, simulation, on_board
     )
 
 

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
-from cartpole_rl.errors import PlantError
 from cartpole_rl.evaluation.metrics import same_as_host
 from cartpole_rl.plants.serial.plant import SerialPlant
 from cartpole_rl.plants.serial.settings import SerialSettings
@@ -50,7 +49,6 @@ def evaluate(config: EvaluateConfig, folder: Path) -> None:
             if config.drives_on_board:
                 for episode in evaluation.onboard_episodes():
                     onboard.append(episode)
-                    check_agent_on_board(config.run, onboard[0])
     finally:  # after a broken link or Ctrl-C, the episodes until then are reported
         if episodes:
             report_evaluation(evaluation, episodes, onboard, folder)
@@ -88,16 +86,6 @@ def same_motors(onboard: Sequence[Episode]) -> str:
     steps = sum(episode.steps for episode in onboard)
     line = f"on the board: {same} of {count} motor values are those that this computer would have sent"
     return f"{line}; {steps - count} more were not compared (docs/firmware.md)" if count < steps else line
-
-
-def check_agent_on_board(run: Path, episode: Episode) -> None:
-    """Raise PlantError if most motor values of the board are not those of the agent of `run`."""
-    same, count = same_as_host(episode)
-    if 2 * same < count:
-        raise PlantError(
-            f"the board drives another agent than run={run}: {same} of {count} motor values are the same; "
-            "export this agent with cartpole-export format=c and compile the firmware with it"
-        )
 
 
 def next_command(evaluation: Evaluation) -> str:

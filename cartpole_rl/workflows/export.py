@@ -65,14 +65,23 @@ def on_the_board(
     if config.emulator.policy != ONBOARD:
         yield config
         return
-    shared = {name: getattr(settings, name) for name in CartPoleSettings.model_fields}
-    evaluated = TrainedAgent(trained.training.model_copy(update=shared), trained.policy)
+    evaluated = agent_on_board(config, trained, settings)
     contents = files_of("c", exported_agent(evaluated, provenance(config.run)), evaluated)
     with tempfile.TemporaryDirectory() as folder:
         for name, content in contents.items():
             Path(folder, name).write_bytes(content)
         emulator = config.emulator.model_copy(update={"policy": Path(folder)})
         yield config.model_copy(update={"emulator": emulator})
+
+
+def agent_on_board(
+    config: EvaluateConfig, trained: TrainedAgent, settings: CartPoleSettings
+) -> TrainedAgent:
+    """Return the agent that the board should have: on an emulated cart, one with `settings`."""
+    if config.has_compiled_agent:
+        return trained
+    shared = {name: getattr(settings, name) for name in CartPoleSettings.model_fields}
+    return TrainedAgent(trained.training.model_copy(update=shared), trained.policy)
 
 
 def compiled_training(trained: TrainedAgent) -> TrainConfig:

@@ -81,17 +81,36 @@ static void add_core(list *all, const cart *self)
     add(all, self->last_sequence);
     add(all, self->sequence);
     add(all, self->ticks);
-    add(all, (int64_t)self->ticked_us);
+    for (size_t tick = 0; tick < CART_WATCHDOG_PERIODS + 1; tick++)
+        add(all, (int64_t)self->measured_us[tick]);
     add(all, self->commanded);
     add(all, (int64_t)self->command_us);
-    add(all, (int64_t)self->watchdog_us);
+    add(all, (int64_t)self->expires_us);
+    add(all, (int64_t)self->heard_us);
     add(all, self->zeros.left_stop);
     add(all, self->zeros.right_stop);
     add(all, self->zeros.hanging);
     add(all, self->pole_zero);
-    add(all, self->line.blocked);
     add(all, self->line.requested);
     add(all, self->line.pending);
+}
+
+static void add_limits(list *all, const cart *self)
+{
+    const cart_limits *limits = &self->limits;
+    add(all, self->limited);
+    add(all, self->cart_count);
+    add(all, self->pole_count);
+    add(all, limits->blocked);
+    add(all, limits->brake);
+    add(all, (int64_t)limits->until_us);
+    add(all, limits->sampled);
+    for (size_t age = 0; age < CART_SPEED_SAMPLES; age++) {
+        size_t slot = (limits->newest + CART_SPEED_SAMPLES - age) % CART_SPEED_SAMPLES;
+        add(all, age < limits->sampled ? (int64_t)limits->us[slot] : 0);
+        add(all, age < limits->sampled ? limits->carts[slot] : 0);
+        add(all, age < limits->sampled ? limits->poles[slot] : 0);
+    }
 }
 
 static void add_guards(list *all, const cart_guards *guards)
@@ -146,6 +165,7 @@ void cart_snapshot(const cart *self, int64_t *numbers)
 {
     list all = {numbers, 0};
     add_core(&all, self);
+    add_limits(&all, self);
     add_guards(&all, &self->guards);
     add_homing(&all, self);
 }

@@ -4,28 +4,41 @@
 
 #include <string.h>
 
-#define SOFT_LIMIT CART_COUNTS(CART_SOFT_LIMIT_UM)
-#define HARD_LIMIT CART_COUNTS(CART_HARD_LIMIT_UM)
 #define HALF_SPAN CART_COUNTS(CART_SPAN_UM / 2)
 #define LONGEST_TICK_US 1000000000u /* a longer period counts as this long */
 #define NO_AGE 65535u
+#define KEPT_TICKS (CART_WATCHDOG_PERIODS + 1)
 
 void cart_boot(cart *self)
 {
     memset(self, 0, sizeof *self);
     self->period_us = CART_PERIOD_US;
+    self->pole_lever_um = CART_POLE_LEVER_UM;
     self->zeros.left_stop = -HALF_SPAN;
     self->zeros.right_stop = HALF_SPAN;
 }
 
 int16_t cart_motor(const cart *self)
 {
-    return cart_line_value(&self->line);
+    const cart_limits *limits = &self->limits;
+    if (limits->brake)
+        return (int16_t)(limits->brake * CART_LARGEST_MOTOR);
+    return (int32_t)self->line.requested * limits->blocked > 0 ? 0 : self->line.requested;
 }
 
-bool cart_drive(cart *self, uint64_t until_us, uint64_t *due_us)
+void cart_drive(cart *self, uint64_t now_us)
 {
-    return cart_line_next(&self->line, until_us, due_us);
+    cart_line_drive(&self->line, now_us);
+}
+
+uint64_t cart_next_due(const cart *self, uint64_t before_us)
+{
+    return cart_line_next_due(&self->line, before_us);
+}
+
+static uint64_t ticked_us(const cart *self)
+{
+    return self->measured_us[self->ticks % KEPT_TICKS];
 }
 
 /* ---- Frames to the host ---- */
@@ -34,7 +47,7 @@ static uint8_t flags(const cart *self)
 {
     return (uint8_t)((self->armed ? CART_ARMED : 0) | (self->homed ? CART_HOMED : 0) |
                      (self->homing ? CART_HOMING : 0) | (self->fault ? CART_FAULTED : 0) |
-                     (cart_line_limited(&self->line) ? CART_SOFT_LIMIT : 0));
+                     (cart_motor(self) != self->line.requested ? CART_SOFT_LIMIT : 0));
 }
 
 static size_t send(cart *self, uint8_t type, uint8_t all_flags, const uint8_t *payload, size_t length,
@@ -47,7 +60,8 @@ static size_t send_info(cart *self, uint8_t *frame)
 {
     uint8_t payload[CART_LONGEST_PAYLOAD];
     int32_t half_span = cart_zeros_half_span(&self->zeros);
-    cart_info info = {half_span - SOFT_LIMIT, half_span - HARD_LIMIT, self->period_us};
+    cart_info info = {half_span - CART_SOFT_COUNTS, half_span - CART_HARD_COUNTS, self->period_us,
+                      self->policy ? self->policy_identity : 0};
     return send(self, CART_INFO, flags(self), payload, cart_pack_info(&info, payload), frame);
 }
 
@@ -65,9 +79,9 @@ static size_t send_state(cart *self, uint8_t all_flags, int32_t cart_count, int3
                          uint8_t *frame)
 {
     uint8_t payload[CART_LONGEST_PAYLOAD];
-    uint64_t age_ms = self->commanded ? (self->ticked_us - self->command_us) / 1000u : NO_AGE;
+    uint64_t age_ms = self->commanded ? (ticked_us(self) - self->command_us) / 1000u : NO_AGE;
     cart_state state = {self->ticks,
-                        (uint32_t)(self->ticked_us & UINT32_MAX),
+                        (uint32_t)(ticked_us(self) & UINT32_MAX),
                         reported_cart(self, cart_count),
                         reported_pole(self, pole_count),
                         cart_motor(self),
@@ -85,6 +99,14 @@ static size_t send_fault(cart *self, uint8_t all_flags, uint8_t *frame)
 }
 
 /* ---- Messages from the host ---- */
+
+/* Until when a motor value that answers the STATE of `tick` may be in force; 0 for an old or unknown one. */
+static uint64_t expiry(const cart *self, uint32_t tick)
+{
+    if (self->ticks - tick >= KEPT_TICKS)
+        return 0;
+    return self->measured_us[tick % KEPT_TICKS] + (uint64_t)CART_WATCHDOG_PERIODS * self->period_us;
+}
 
 static cart_reason objection_in_this_state(const cart *self, uint8_t type)
 {
@@ -108,8 +130,9 @@ static cart_reason objection_in_this_state(const cart *self, uint8_t type)
 }
 
 /* The first reason, in the order of docs/protocol.md, for which a frame is refused. */
-static cart_reason objection(const cart *self, const cart_envelope *envelope)
+static cart_reason objection(const cart *self, const cart_envelope *envelope, uint64_t now_us)
 {
+    cart_reason reason;
     int expected = cart_host_payload(envelope->type);
     if (envelope->version != CART_VERSION)
         return CART_BAD_VERSION;
@@ -127,16 +150,27 @@ static cart_reason objection(const cart *self, const cart_envelope *envelope)
         if (period_us < CART_SHORTEST_US || period_us > CART_LONGEST_US)
             return CART_OUT_OF_RANGE;
     }
-    return objection_in_this_state(self, envelope->type);
+    reason = objection_in_this_state(self, envelope->type);
+    if (reason != CART_ACCEPTED || envelope->type != CART_SET_MOTOR)
+        return reason;
+    bool old = now_us >= expiry(self, cart_read_u32(envelope->payload + 2));
+    return old && cart_read_i16(envelope->payload) != 0 ? CART_STALE : CART_ACCEPTED;
 }
 
-/* 1 or -1 if the cart is within `inside` counts of the right or left stop, else 0. */
-static int8_t beyond(const cart *self, int32_t inside, int32_t cart_count)
+/* Let the limits of the track decide, which need the zeros of a homing. */
+static void apply_limits(cart *self, uint64_t now_us, int32_t cart_count, int32_t pole_count)
 {
-    int32_t middle = cart_zeros_middle(&self->zeros);
-    if (cart_distance(cart_count, middle) < (int64_t)cart_zeros_half_span(&self->zeros) - inside)
-        return 0;
-    return cart_count > middle ? 1 : -1;
+    cart_place place = {(int64_t)cart_count - cart_zeros_middle(&self->zeros),
+                        (int64_t)pole_count - self->pole_zero, cart_zeros_half_span(&self->zeros),
+                        self->pole_lever_um, self->armed};
+    self->cart_count = cart_count;
+    self->pole_count = pole_count;
+    if (self->homing)
+        cart_limits_release(&self->limits);
+    else
+        cart_limits_apply(&self->limits, now_us, &place);
+    if (cart_motor(self) != self->line.requested)
+        self->limited = true;
 }
 
 static void arm(cart *self, uint64_t now_us)
@@ -145,9 +179,9 @@ static void arm(cart *self, uint64_t now_us)
         return;
     self->armed = true;
     self->observed = self->interrupted = false;
-    self->watchdog_us = now_us;
-    self->line.blocked = beyond(self, SOFT_LIMIT, self->reading.cart);
+    self->expires_us = expiry(self, self->ticks);
     cart_guards_reset(&self->guards);
+    apply_limits(self, now_us, self->cart_count, self->pole_count);
 }
 
 /* Give the motor to the host. The policy's last value does not outlive it. */
@@ -163,6 +197,8 @@ static void begin_homing(cart *self)
     self->homed = false;
     self->homing = true;
     cart_homing_begin(&self->procedure);
+    cart_line_hold(&self->line, 0);
+    cart_limits_release(&self->limits);
     cart_guards_reset(&self->guards);
 }
 
@@ -172,7 +208,8 @@ static void carry_out(cart *self, const cart_envelope *envelope, uint64_t now_us
     case CART_SET_MOTOR:
         take_over(self, now_us);
         self->commanded = true;
-        self->command_us = self->watchdog_us = now_us;
+        self->command_us = now_us;
+        self->expires_us = expiry(self, cart_read_u32(envelope->payload + 2));
         cart_line_command(&self->line, now_us, cart_read_i16(envelope->payload));
         break;
     case CART_START:
@@ -213,12 +250,13 @@ size_t cart_receive(cart *self, const uint8_t *stuffed, size_t length, uint64_t 
     self->carried_out = 0;
     if (!cart_open(stuffed, length, &envelope))
         return 0; /* nothing in a damaged frame can be trusted */
-    cart_reason reason = objection(self, &envelope);
+    cart_reason reason = objection(self, &envelope, now_us);
     if (reason != CART_ACCEPTED)
         return refuse(self, &envelope, reason, answer);
     carry_out(self, &envelope, now_us);
+    self->heard_us = now_us;
     if (self->self_driven)
-        self->watchdog_us = now_us; /* any frame shows that the host is there */
+        self->expires_us = expiry(self, self->ticks); /* any frame shows that the host is there */
     self->carried_out = envelope.type;
     self->last_sequence = envelope.sequence;
     if (envelope.type == CART_SET_MOTOR)
@@ -239,6 +277,8 @@ static void latch(cart *self, uint16_t fault)
     cart_line_hold(&self->line, 0);
     if (fault & (CART_FAULT_CART_ENCODER | CART_FAULT_POLE_ENCODER))
         self->homed = false;
+    if (fault & CART_FAULT_CART_ENCODER)
+        cart_limits_release(&self->limits); /* nobody knows where the cart is */
 }
 
 /* Latch new faults. Homing may touch the stops and detects a stall itself. */
@@ -253,7 +293,8 @@ static void check_faults(cart *self, const cart_reading *reading)
     jumped = cart_pole_jumped(&guards->pole_jumps, reading->pole, period_us);
     if (cart_pole_frozen(&guards->pole_freezes, reading->pole, reading->cart, period_us) || jumped)
         latch(self, CART_FAULT_POLE_ENCODER);
-    if (self->armed && beyond(self, HARD_LIMIT, reading->cart))
+    int64_t from_middle = cart_distance(reading->cart, cart_zeros_middle(&self->zeros));
+    if (self->armed && from_middle >= (int64_t)cart_zeros_half_span(&self->zeros) - CART_HARD_COUNTS)
         latch(self, CART_FAULT_HARD_LIMIT);
     if (self->armed && cart_stalled(&guards->stalls, reading->cart, motor, period_us))
         latch(self, CART_FAULT_STALL);
@@ -282,10 +323,30 @@ static void step_homing(cart *self, const cart_reading *reading)
 
 static uint32_t length_of_period(const cart *self, uint64_t now_us)
 {
-    uint64_t length_us = now_us - self->ticked_us;
+    uint64_t length_us = now_us - ticked_us(self);
     if (length_us < 1)
         return 1;
     return (uint32_t)(length_us < LONGEST_TICK_US ? length_us : LONGEST_TICK_US);
+}
+
+/* End a homing without a host; return whether the watchdog holds the motor at 0. */
+static bool expire(cart *self, uint64_t now_us)
+{
+    if (self->homing && now_us - self->heard_us > CART_LEASE_US) {
+        self->homing = false;
+        cart_line_hold(&self->line, 0);
+    }
+    if (!self->armed || now_us < self->expires_us)
+        return false;
+    cart_line_hold(&self->line, 0);
+    return true;
+}
+
+void cart_look(cart *self, uint64_t now_us, int32_t cart_count, int32_t pole_count)
+{
+    expire(self, now_us);
+    cart_limits_sample(&self->limits, now_us, cart_count, pole_count);
+    apply_limits(self, now_us, cart_count, pole_count);
 }
 
 size_t cart_tick(cart *self, uint64_t now_us, int32_t cart_count, int32_t pole_count, uint8_t *frames)
@@ -294,18 +355,17 @@ size_t cart_tick(cart *self, uint64_t now_us, int32_t cart_count, int32_t pole_c
     uint16_t faults_before = self->fault;
     self->reading = reading;
     self->ticks++;
-    self->ticked_us = now_us;
-    /* checked once a period: the limit has to pass by the next check at the latest */
-    uint64_t limit_us = (uint64_t)(CART_WATCHDOG_PERIODS - 1) * self->period_us;
-    self->expired = self->armed && now_us - self->watchdog_us > limit_us;
-    if (self->expired)
-        cart_line_hold(&self->line, 0);
+    self->measured_us[self->ticks % KEPT_TICKS] = now_us;
+    cart_limits_sample(&self->limits, now_us, cart_count, pole_count);
+    self->expired = expire(self, now_us);
     if (self->armed || self->homing)
         check_faults(self, &reading);
     if (self->homing)
         step_homing(self, &reading);
-    self->line.blocked = self->armed ? beyond(self, SOFT_LIMIT, cart_count) : 0;
-    uint8_t all_flags = (uint8_t)(flags(self) | (self->expired && self->armed ? CART_WATCHDOG : 0));
+    apply_limits(self, now_us, cart_count, pole_count);
+    uint8_t all_flags = (uint8_t)(flags(self) | (self->expired && self->armed ? CART_WATCHDOG : 0) |
+                                  (self->limited ? CART_SOFT_LIMIT : 0));
+    self->limited = false;
     size_t length = 0;
     if (self->fault != faults_before)
         length = send_fault(self, all_flags, frames);
@@ -323,7 +383,7 @@ void cart_ask_policy(cart *self)
     }
     const cart_reading *reading = &self->reading;
     cart_observation observation = {reported_cart(self, reading->cart), reported_pole(self, reading->pole),
-                                    cart_zeros_half_span(&self->zeros) - SOFT_LIMIT, reading->period_us,
+                                    cart_zeros_half_span(&self->zeros) - CART_SOFT_COUNTS, reading->period_us,
                                     self->period_us, !self->observed, self->interrupted};
     int16_t motor = self->policy(self->policy_memory, &observation);
     bool valid = motor <= CART_LARGEST_MOTOR && motor >= -CART_LARGEST_MOTOR;

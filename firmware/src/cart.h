@@ -1,15 +1,15 @@
-/* The cart's side of wire protocol version 1: docs/protocol.md as a state machine without I/O.
+/* The cart's side of wire protocol version 2: docs/protocol.md as a state machine without I/O.
 
    Who calls what, when (cart_loop.h does all of it for a board):
 
      cart_boot      once, at power-on or reset
      cart_receive   for each complete run of bytes from the host, on arrival
-     cart_drive     after cart_receive and before cart_tick, until it returns false: it brings motor values
-                    into force; then put cart_motor on the motor
-     cart_tick      once at the end of each period of `period_us`, with the raw counts measured now; then put
-                    cart_motor on the motor at once and send the frames
-     cart_ask_policy  after cart_tick and the sending of its frames; then put cart_motor on the motor
+     cart_look      at least once a millisecond, with the raw counts: limits and watchdog
+     cart_tick      once at the end of each period of `period_us`, with the raw counts measured now; then send
+                    the frames
+     cart_ask_policy  after cart_tick and the sending of its frames
 
+   After each of them call cart_drive, which brings motor values into force, and put cart_motor on the motor.
    All from one thread, never from an interrupt. No function blocks, allocates or recurses. Each takes a
    bounded time; the longest, cart_tick while homing, passes a few times over CART_WINDOW_COUNTS counts.
 
@@ -22,6 +22,7 @@
 #include "cart_frames.h"
 #include "cart_guards.h"
 #include "cart_homing.h"
+#include "cart_limits.h"
 #include "cart_messages.h"
 #include "cart_motor_line.h"
 
@@ -49,8 +50,10 @@ typedef struct {
        drives, any frame that the cart accepts keeps the watchdog quiet. A value out of range counts as 0. */
     cart_policy policy;
     void *policy_memory;
+    uint32_t policy_identity; /* for INFO; not 0 */
 
     int32_t pole_trim; /* counts above half a turn that a hanging pole shows after homing; 0 at boot */
+    int32_t pole_lever_um; /* of the pole that is mounted, see cart_limits.h; CART_POLE_LEVER_UM at boot */
 
     /* Read these; only the core writes them. */
     uint32_t period_us; /* of the next period */
@@ -60,7 +63,9 @@ typedef struct {
 
     /* Private. */
     cart_motor_line line;
+    cart_limits limits;
     cart_guards guards;
+    bool limited;         /* the limits have changed the motor value since the newest tick */
     cart_zeros zeros;
     int32_t pole_zero;    /* raw count that is reported as 0 */
     bool self_driven;     /* the policy chooses the motor values */
@@ -69,8 +74,10 @@ typedef struct {
     bool expired;         /* the watchdog holds the motor at 0 since the newest period */
     bool commanded;       /* a SET_MOTOR was accepted since boot */
     uint64_t command_us;  /* arrival of the newest SET_MOTOR */
-    uint64_t watchdog_us; /* time of the newest frame that the watchdog counts */
-    uint64_t ticked_us;
+    uint64_t expires_us;  /* the watchdog then sets the motor to 0 */
+    uint64_t heard_us;    /* arrival of the newest accepted frame */
+    uint64_t measured_us[CART_WATCHDOG_PERIODS + 1]; /* times of the newest ticks, at their number modulo 4 */
+    int32_t cart_count, pole_count; /* raw, read last */
     cart_reading reading; /* of the newest period */
     uint32_t ticks;
     uint8_t last_sequence; /* of the host */
@@ -85,8 +92,14 @@ void cart_boot(cart *self);
    length, 0 for none. */
 size_t cart_receive(cart *self, const uint8_t *stuffed, size_t length, uint64_t now_us, uint8_t *answer);
 
-/* Bring the next motor value that is due before `until_us` into force; return false if there is none. */
-bool cart_drive(cart *self, uint64_t until_us, uint64_t *due_us);
+/* Bring the motor values that are due into force: on a board, those that have arrived. */
+void cart_drive(cart *self, uint64_t now_us);
+
+/* When the next motor value is due; `before_us` if none is due before that. Only an emulated cart needs it. */
+uint64_t cart_next_due(const cart *self, uint64_t before_us);
+
+/* Apply the rules that cannot wait for the end of a period, to the clock and the raw counts. */
+void cart_look(cart *self, uint64_t now_us, int32_t cart_count, int32_t pole_count);
 
 /* The motor value in force. */
 int16_t cart_motor(const cart *self);

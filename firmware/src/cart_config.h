@@ -16,16 +16,24 @@
 #define CART_PENDING 1 /* motor values that can wait for their latency; a board applies them on arrival */
 #endif
 
-/* 1.1.0 knows START_POLICY, 1.0.0 does not; in 1.1.1 a policy starts anew after the watchdog stopped it. */
-#define CART_FIRMWARE_MAJOR 1
-#define CART_FIRMWARE_MINOR 1
-#define CART_FIRMWARE_PATCH 1
+#ifndef CART_BRAKING_UM_S2
+#define CART_BRAKING_UM_S2 2500000LL /* um/s2: full motor inward slows any healthy cart at least so hard */
+#endif
+#ifndef CART_POLE_LEVER_UM
+#define CART_POLE_LEVER_UM 27000 /* um, m_p l / (m_c + m_p): Quanser's medium pole; 79000 for the large one */
+#endif
+
+/* From 2.0.0 on, protocol version 2. */
+#define CART_FIRMWARE_MAJOR 2
+#define CART_FIRMWARE_MINOR 0
+#define CART_FIRMWARE_PATCH 0
 
 #define CART_LARGEST_MOTOR 255
 #define CART_PERIOD_US 20000u /* at boot */
 #define CART_SHORTEST_US 5000u
 #define CART_LONGEST_US 100000u
-#define CART_WATCHDOG_PERIODS 3u
+#define CART_WATCHDOG_PERIODS 3u /* after a state was measured, no value that answers it is in force any more */
+#define CART_LEASE_US 500000u     /* without an accepted frame, after which homing ends */
 #define CART_SOFT_LIMIT_UM 27000 /* inside a stop */
 #define CART_HARD_LIMIT_UM 8000  /* inside a stop */
 

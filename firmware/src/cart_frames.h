@@ -6,11 +6,11 @@
 #include <stddef.h>
 #include <stdint.h>
 
-#define CART_VERSION 1
+#define CART_VERSION 2
 #define CART_HEADER_BYTES 4
 #define CART_CRC_BYTES 2
 #define CART_LONGEST_RUN 64 /* stuffed bytes of a frame without its final 0x00 */
-#define CART_LONGEST_PAYLOAD 24
+#define CART_LONGEST_PAYLOAD 27
 #define CART_FRAME_BYTES (CART_HEADER_BYTES + CART_LONGEST_PAYLOAD + CART_CRC_BYTES + 2)
 
 /* A frame with a right checksum whose version, type and payload are not checked yet. */

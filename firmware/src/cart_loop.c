@@ -3,6 +3,7 @@
 #include <string.h>
 
 #define BYTES_PER_POLL 64
+#define LOOK_US 1000u /* between two looks at the cart's position */
 
 static const uint8_t END_OF_TEXT = 0;
 
@@ -25,9 +26,7 @@ static void read_clock(cart_loop *loop)
 
 static void apply_motor(cart_loop *loop)
 {
-    uint64_t due_us;
-    while (cart_drive(&loop->core, loop->now_us + 1, &due_us))
-        continue;
+    cart_drive(&loop->core, loop->now_us);
     cart_hardware_set_motor(cart_motor(&loop->core));
 }
 
@@ -66,9 +65,19 @@ static void end_period(cart_loop *loop)
         loop->end_us = loop->now_us + loop->core.period_us;
 }
 
+static void look(cart_loop *loop)
+{
+    if (loop->now_us - loop->looked_us < LOOK_US)
+        return;
+    loop->looked_us = loop->now_us;
+    cart_look(&loop->core, loop->now_us, cart_hardware_cart_count(), cart_hardware_pole_count());
+    apply_motor(loop);
+}
+
 bool cart_loop_poll(cart_loop *loop)
 {
     read_clock(loop);
+    look(loop);
     receive(loop);
     if (loop->now_us < loop->end_us)
         return false;

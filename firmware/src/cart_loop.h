@@ -32,6 +32,7 @@ typedef struct {
     cart_splitter splitter;
     uint32_t clock_us; /* of the last poll */
     uint64_t now_us;   /* since boot */
+    uint64_t looked_us; /* at the cart's position */
     uint64_t end_us;   /* of the present period */
 } cart_loop;
 

@@ -13,7 +13,7 @@ int cart_host_payload(uint8_t type)
     case CART_START_POLICY:
         return 0;
     case CART_SET_MOTOR:
-        return 2;
+        return 6;
     case CART_SET_PERIOD:
         return 4;
     default:
@@ -49,6 +49,7 @@ size_t cart_pack_info(const cart_info *info, uint8_t *payload)
     at = put_u32(at, (uint32_t)info->soft_limit);
     at = put_u32(at, (uint32_t)info->hard_limit);
     at = put_u32(at, info->period_us);
+    at = put_u32(at, info->policy);
     return (size_t)(at - payload);
 }
 

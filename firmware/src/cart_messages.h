@@ -1,4 +1,4 @@
-/* The messages of protocol version 1: numbers of types, flags, faults and reasons, and their payloads. */
+/* The messages of protocol version 2: numbers of types, flags, faults and reasons, and their payloads. */
 #ifndef CART_MESSAGES_H
 #define CART_MESSAGES_H
 
@@ -47,13 +47,15 @@ typedef enum {
     CART_NOT_ARMED = 5,
     CART_FAULT_LATCHED = 6,
     CART_BUSY = 7,
-    CART_BAD_VERSION = 8
+    CART_BAD_VERSION = 8,
+    CART_STALE = 9
 } cart_reason;
 
 typedef struct {
     int32_t soft_limit; /* counts from the middle */
     int32_t hard_limit; /* counts from the middle */
     uint32_t period_us;
+    uint32_t policy; /* identity of the agent on the board; 0 without one */
 } cart_info;
 
 typedef struct {

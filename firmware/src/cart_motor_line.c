@@ -5,16 +5,6 @@ static uint16_t slot(const cart_motor_line *line, uint32_t number)
     return (uint16_t)((line->first + number) % CART_PENDING);
 }
 
-int16_t cart_line_value(const cart_motor_line *line)
-{
-    return cart_line_limited(line) ? 0 : line->requested;
-}
-
-bool cart_line_limited(const cart_motor_line *line)
-{
-    return (int32_t)line->requested * line->blocked > 0;
-}
-
 void cart_line_command(cart_motor_line *line, uint64_t due_us, int16_t value)
 {
     uint64_t newest_us = line->pending ? line->due_us[slot(line, line->pending - 1u)] : 0;
@@ -38,13 +28,18 @@ void cart_line_hold(cart_motor_line *line, int16_t value)
     line->requested = value;
 }
 
-bool cart_line_next(cart_motor_line *line, uint64_t end_us, uint64_t *due_us)
+void cart_line_drive(cart_motor_line *line, uint64_t now_us)
 {
-    if (line->pending == 0 || line->due_us[line->first] >= end_us)
-        return false;
-    *due_us = line->due_us[line->first];
-    line->requested = line->values[line->first];
-    line->first = slot(line, 1);
-    line->pending--;
-    return true;
+    while (line->pending && line->due_us[line->first] <= now_us) {
+        line->requested = line->values[line->first];
+        line->first = slot(line, 1);
+        line->pending--;
+    }
+}
+
+uint64_t cart_line_next_due(const cart_motor_line *line, uint64_t before_us)
+{
+    if (line->pending == 0 || line->due_us[line->first] >= before_us)
+        return before_us;
+    return line->due_us[line->first];
 }

@@ -41,6 +41,7 @@ static inline void onboard_attach_memory(cart *self, onboard_memory *agent, floa
 {
     agent->pole_length = pole_length;
     self->policy = onboard_motor;
+    self->policy_identity = POLICY_ID;
     self->policy_memory = agent;
 }
 

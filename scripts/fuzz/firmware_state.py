@@ -5,13 +5,14 @@ from types import GeneratorType
 from typing import Any
 
 from cartpole_rl.emulator.firmware import Firmware
+from cartpole_rl.emulator.limits import SAMPLES
 
 STAGES = {"find_hanging": 3, "brake_swing": 4, "wait_until_still": 6}  # of homing; see stage_of
 
 
 def state_of(firmware: Firmware) -> list[int]:
     """Return the state of a firmware."""
-    return [*core(firmware), *guards(firmware), *homing(firmware)]
+    return [*core(firmware), *limits(firmware), *guards(firmware), *homing(firmware)]
 
 
 def core(firmware: Any) -> list[int]:
@@ -26,17 +27,34 @@ def core(firmware: Any) -> list[int]:
         firmware._last_sequence,
         firmware._sequence,
         firmware._ticks,
-        firmware._ticked_us,
+        *firmware._measured_us,
         firmware._command_us is not None,
         firmware._command_us or 0,
-        firmware._watchdog_us,
+        firmware._expires_us,
+        firmware._heard_us,
         zeros.left_stop,
         zeros.right_stop,
         zeros.hanging,
         firmware._pole_zero,
-        line.blocked,
-        line._requested,
+        line.requested,
         len(line._pending),
+    ]
+
+
+def limits(firmware: Any) -> list[int]:
+    """Return the limits of the track and the samples of the position, the newest first."""
+    limits = firmware._limits
+    samples = [*zip(*map(reversed, (limits._us, limits._carts, limits._poles)), strict=True)]
+    unused = [(0, 0, 0)] * (SAMPLES - len(samples))
+    return [
+        firmware._limited,
+        firmware._cart,
+        firmware._pole,
+        limits.blocked,
+        limits.brake,
+        limits._until_us,
+        len(samples),
+        *(number for sample in samples + unused for number in sample),
     ]
 
 

@@ -31,16 +31,18 @@ from cartpole_rl.emulator.firmware import Firmware
 from cartpole_rl.wire import (
     ClearFault,
     FrameSplitter,
+    Hello,
     Home,
     Message,
     SetMotor,
     SetPeriod,
     Start,
+    Stop,
     cobs,
     encode_frame,
 )
 from cartpole_rl.wire.checksum import crc16
-from cartpole_rl.wire.frames import END
+from cartpole_rl.wire.frames import END, VERSION
 
 SANITIZERS = ("-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 SPLITTER_BYTES = 256  # at least the size of a cart_splitter
@@ -93,12 +95,28 @@ class Pair:
         """Let a valid frame arrive now."""
         self.feed(encode_frame(message, self.counts["frames"]))
 
-    def drive(self, us: int, leader: int) -> list[tuple[int, int]]:
-        """Pass `us`; return the motor values of the firmware that moves the cart."""
-        values = [firmware.drive(self.now_us, self.now_us + us) for firmware in (self.python, self.c)]
-        self._same("motor values", *values)
-        self.now_us += us
-        return values[leader]
+    def drive(self, until_us: int, leader: int) -> int:
+        """Bring motor values into force; return that of the firmware that moves the cart, as it is now.
+
+        It stays in force until `now_us`, which is moved on to the next motor value or to `until_us`.
+        """
+        firmwares = (self.python, self.c)
+        for firmware in firmwares:
+            firmware.drive(self.now_us)
+        motors = [firmware.motor for firmware in firmwares]
+        dues = [firmware.next_due(until_us) for firmware in firmwares]
+        self._same("motor values", *motors)
+        self._same("next motor values", *dues)
+        self.now_us = dues[leader]
+        return motors[leader]
+
+    def look(self, cart: int, pole: int) -> None:
+        """Look at the counts."""
+        self.counts["looks"] += 1
+        for firmware in (self.python, self.c):
+            firmware.look(self.now_us, cart, pole)
+        self.counts["braked looks"] += self.python._limits.brake != 0
+        self._same_state()
 
     def tick(self, cart: int, pole: int) -> None:
         """End the period with two counts."""
@@ -120,14 +138,18 @@ class Pair:
             )
 
 
-def any_frame(dice: random.Random) -> bytes:
-    """Return a frame with a right checksum: mostly of a known type and length, with any content."""
-    version = 1 if dice.random() < 0.95 else dice.randrange(256)
+def any_frame(dice: random.Random, tick: int) -> bytes:
+    """Return a frame with a right checksum: mostly of a known type and length, with any content.
+
+    `tick` is that of the newest state.
+    """
+    version = VERSION if dice.random() < 0.95 else dice.randrange(256)
     kind = dice.randrange(1, 9) if dice.random() < 0.9 else dice.randrange(256)
-    length = {4: 2, 7: 4}.get(kind, 0) if dice.random() < 0.9 else dice.randrange(48)
+    length = {4: 6, 7: 4}.get(kind, 0) if dice.random() < 0.9 else dice.randrange(48)
     payload = dice.randbytes(length)
-    if kind == SetMotor.TYPE and length == 2:
-        payload = dice.randint(-300, 300).to_bytes(2, "little", signed=True)
+    if kind == SetMotor.TYPE and length == 6:
+        newest = tick - dice.choice([0, 0, 0, 1, 2, 3, 4, dice.randrange(2**32)])
+        payload = SetMotor(dice.randint(-300, 300), newest % 2**32).pack()
     if kind == SetPeriod.TYPE and length == 4:
         payload = dice.choice([dice.randint(4_000, 110_000), 20_000, 5_000, 5_001]).to_bytes(4, "little")
     body = bytes((version, kind, dice.randrange(256), dice.randrange(256))) + payload
@@ -139,7 +161,7 @@ def traffic(kind: str, pair: Pair, dice: random.Random, size: int) -> None:
     streams = {
         "noise": noise(size, dice),
         "damaged": damaged(size, frames_of(FROM_HOST), dice),
-        "any": (any_frame(dice) for _ in range(size)),
+        "any": (any_frame(dice, pair.python._ticks) for _ in range(size)),
     }
     pair.python.homed = pair.c.homed = dice.random() < 0.8
     cart = pole = 0
@@ -151,13 +173,17 @@ def traffic(kind: str, pair: Pair, dice: random.Random, size: int) -> None:
             pole += dice.randint(-jump, jump) if dice.random() < 0.7 else 0
             if dice.random() < 0.01:
                 cart, pole = (dice.randint(-LARGEST_COUNT, LARGEST_COUNT) for _ in range(2))
-            pair.drive(dice.choice([pair.python.period_us, dice.randint(1, 200_000)]), 0)
+            end_us = pair.now_us + dice.choice([pair.python.period_us, dice.randint(1, 200_000)])
+            while pair.now_us < end_us:
+                pair.drive(min(end_us, pair.now_us + dice.randint(1, 60_000)), 0)
+                pair.look(cart, pole)
             pair.tick(cart, pole)
 
 
 def rough_drive(pair: Pair, dice: random.Random, leader: int) -> None:
     """Home a rough cart and drive it with random motor values, pauses and failures."""
-    toy, jitter = ToyCart(dice), dice.choice([0, 0, 300])
+    toy, jitter, between_looks_us = ToyCart(dice), dice.choice([0, 0, 300]), dice.choice([1000, 1000, 4000])
+    silence = 0  # periods in which the host sends nothing
     pair.send(SetPeriod(dice.choice([20_000, 20_000, 10_000, 5_000, 33_333, 100_000])))
     failing, strange = dice.choice([0.0, 0.0005, 0.01]), dice.choice([0.0, 0.0, 0.0003, 0.05])
 
@@ -165,13 +191,13 @@ def rough_drive(pair: Pair, dice: random.Random, leader: int) -> None:
         length_us = max(1, pair.python.period_us + dice.randint(-jitter, jitter))
         rest_us = dice.randint(0, length_us)
         for us in (length_us - rest_us, rest_us):
-            start_us = pair.now_us
-            values = pair.drive(us, leader)
-            ends = [since for since, _ in values[1:]] + [start_us + us]
-            for (since, motor), end in zip(values, ends, strict=True):
-                toy.advance(motor, end - since)
+            end_us = pair.now_us + us
+            while (since_us := pair.now_us) < end_us:
+                motor = pair.drive(min(end_us, since_us + between_looks_us), leader)
+                toy.advance(motor, pair.now_us - since_us)
+                pair.look(*toy.counts())
             if dice.random() < strange:
-                pair.feed(any_frame(dice))
+                pair.feed(any_frame(dice, pair.python._ticks))
         toy.maybe_fail(failing)
         pair.tick(*toy.counts())
 
@@ -181,7 +207,12 @@ def rough_drive(pair: Pair, dice: random.Random, leader: int) -> None:
         if firmware.fault and dice.random() < 0.1:
             toy.repair()
             pair.send(ClearFault())
-        if not firmware.homed and not firmware.homing and dice.random() < 0.3:
+        silence = silence - 1 if silence else dice.choice([0] * 3000 + [2, 5, 40])
+        if silence:
+            pass
+        elif firmware.homing and dice.random() < 0.9:
+            pair.send(Hello())
+        elif not firmware.homed and not firmware.homing and dice.random() < 0.3:
             pair.send(Home())
         elif firmware.homed and not firmware.armed and dice.random() < 0.3:
             pair.send(Start())
@@ -190,10 +221,15 @@ def rough_drive(pair: Pair, dice: random.Random, leader: int) -> None:
                 lasts, motor = dice.randint(1, 40), dice.choice([dice.randint(-255, 255), 200, -200, 255, 0])
             lasts -= 1
             for _ in range(dice.choice([0, 1, 1, 1, 1, 2])):
-                pair.send(SetMotor(motor))
-        homed, fault = firmware.homed, firmware.fault
+                pair.send(SetMotor(motor, firmware._ticks - dice.choice([0, 0, 0, 0, 1, 2, 3])))
+            if dice.random() < 0.002:
+                pair.send(Stop())
+        homed, homing, fault = firmware.homed, firmware.homing, firmware.fault
         period()
         pair.counts["homings"] += firmware.homed and not homed
+        pair.counts["homings without a host"] += homing and not (
+            firmware.homing or firmware.homed or firmware.fault
+        )
         for new in firmware.fault & ~fault:
             pair.counts[str(new.name)] += 1
 

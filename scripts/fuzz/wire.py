@@ -54,14 +54,14 @@ FROM_HOST: list[Message] = [
     Hello(),
     Start(),
     Stop(),
-    SetMotor(-200),
+    SetMotor(-200, 1168),
     Home(),
     ClearFault(),
     SetPeriod(20_000),
     StartPolicy(),
 ]
 FROM_CART: list[Message] = [
-    Info(1, 1, 1, 4096, 22749, 255, 16704, 17539, 20_000),
+    Info(2, 0, 0, 4096, 22749, 255, 16704, 17539, 20_000, 0),
     State(1169, 23_380_000, 43, 2051, -200, 4, 0, 20),
     Ack(2, 5),
     Nack(6, 4, 5),

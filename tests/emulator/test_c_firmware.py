@@ -80,7 +80,7 @@ def test_a_good_frame_is_encoded_and_opened(vector):
     )
     assert frame.raw[:length] == wire
     (run,) = runs_in_c(wire)
-    assert opened_in_c(run) == (bytes((1, kind, vector["sequence"], vector["flags"])), payload)
+    assert opened_in_c(run) == (bytes((2, kind, vector["sequence"], vector["flags"])), payload)
 
 
 @pytest.mark.parametrize("vector", named(VECTORS["damaged"]))

@@ -10,13 +10,15 @@ import pytest
 
 pytest.importorskip("mujoco")
 
+from firmwares import answering
+
 from cartpole_rl.choices import choice
 from cartpole_rl.emulator.device import CartDevice
 from cartpole_rl.emulator.encoders import CART_METRES
-from cartpole_rl.emulator.firmware import SOFT_LIMIT
+from cartpole_rl.emulator.limits import SOFT_LIMIT
 from cartpole_rl.emulator.motor import Motor
 from cartpole_rl.emulator.settings import EmulatorSettings
-from cartpole_rl.wire import Flags, Home, Message, SetMotor, Start, State, decode_frame, encode_frame
+from cartpole_rl.wire import Flags, Hello, Home, Message, SetMotor, Start, State, decode_frame, encode_frame
 
 PAGE = (Path(__file__).parents[2] / "docs" / "emulator.md").read_text(encoding="utf-8")
 LEVELS = choice("actions/nine_levels")["motors"]
@@ -118,7 +120,7 @@ def driven(name: str | None) -> list[tuple[int, int]]:
 
     def period(message: Message | None) -> Flags:
         if message is not None:
-            cart.receive(encode_frame(message, 0)[:-1], cart.now_us)
+            cart.receive(encode_frame(answering(len(counts), message), 0)[:-1], cart.now_us)
         frame = decode_frame(cart.pass_period(cart.period_end_us)[-1][:-1])
         assert isinstance(frame.message, State)
         counts.append((frame.message.cart_counts, frame.message.pole_counts))
@@ -126,7 +128,7 @@ def driven(name: str | None) -> list[tuple[int, int]]:
 
     flags = period(Home())
     while flags & Flags.HOMING:
-        flags = period(None)
+        flags = period(Hello())
     assert flags == Flags.HOMED
     period(Start())
     for motor in (200, 58, 57, -200, -200, -56, -55, 200, 100, 0, -100, -150, 150):

@@ -127,7 +127,7 @@ def test_neither_watchdog_nor_limits_hold_while_homing():
         assert not driven.flags & (Flags.SOFT_LIMIT | Flags.WATCHDOG)
         farthest = max(farthest, abs(state.cart_counts))
         outward += abs(state.cart_counts) > soft and state.motor_applied * state.cart_counts > 0
-        state = driven.tick()
+        state = driven.ask(Hello())
     assert state.fault == 0
     assert farthest > hard
     assert outward > 10
@@ -154,12 +154,14 @@ def test_motor_and_angle_are_positive_to_the_right():
     assert state.pole_counts > before.pole_counts  # the pole's lower end stays behind, to the left
 
 
-def test_hard_push_runs_through_the_soft_limit_into_a_fault_and_home_recovers():
+def test_a_cart_at_the_end_of_its_track_latches_a_fault_and_home_recovers():
     driven = Driven()
     driven.home()
+    driven.cart.physics.place(0.405, driven.angle)
+    for _ in range(10):
+        driven.tick()
     driven.ask(Start())
-    for _ in range(100):
-        state = driven.ask(SetMotor(255))
+    state = driven.ask(SetMotor(255))
     assert state.fault == Fault.HARD_LIMIT
     assert state.motor_applied == 0
     driven.ask(ClearFault())
@@ -213,10 +215,14 @@ def trace(**settings: object) -> bytes:
     cart = CartDevice(truth(**COARSE | settings))
     cart.firmware.homed = True
     sent = cart.receive(encode_frame(Start(), 0)[:-1], 0)
-    for motor in (85, -85, 80, -80, 0, 150, -150, 200, -255, 0, 255, 255, 255) * 2:
-        for _ in range(6):
-            sent += cart.receive(encode_frame(SetMotor(motor), 1)[:-1], cart.now_us)
+    motors = (85, -85, 80, -80, 0, 150, -150, 200, -255, 0, 255, 255, 255) * 2
+    for number, motor in enumerate(motors):
+        for tick in range(6 * number, 6 * number + 6):
+            sent += cart.receive(encode_frame(SetMotor(motor, tick), 1)[:-1], cart.now_us)
             sent += cart.pass_period(cart.period_end_us)
+    sent += cart.receive(encode_frame(Stop(), 2)[:-1], cart.now_us)
+    for _ in range(20):
+        sent += cart.pass_period(cart.period_end_us)
     return b"".join(sent)
 
 
@@ -288,8 +294,8 @@ def test_latency_delays_the_force_by_its_value():
         cart.firmware.homed = True
         cart.receive(encode_frame(Start(), 0)[:-1], 0)
         start = cart.physics.x
-        for _ in range(2):
-            cart.receive(encode_frame(SetMotor(250), 0)[:-1], cart.now_us)
+        for tick in range(2):
+            cart.receive(encode_frame(SetMotor(250, tick), 0)[:-1], cart.now_us)
             cart.pass_period(cart.period_end_us)
         return cart.physics.x - start
 

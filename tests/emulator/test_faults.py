@@ -227,7 +227,7 @@ def test_homing_after_a_lost_zero_neither_pumps_the_pole_nor_strikes_the_stops()
     driven.ask(Home())
     fastest = 0.0
     while driven.flags & Flags.HOMING:
-        state = driven.tick()
+        state = driven.ask(Hello())
         fastest = max(fastest, abs(cart.physics.x_dot))
     assert (state.fault, driven.flags) == (0, Flags.HOMED)
     assert fastest < 0.4

@@ -1,7 +1,7 @@
 """The rules of both firmwares one by one, with artificial encoder counts and without physics."""
 
 import pytest
-from firmwares import make_firmware
+from firmwares import answering, make_firmware, motors_over
 
 from cartpole_rl.wire import (
     Ack,
@@ -40,11 +40,11 @@ class Bench:
     def __init__(self, latency_us: int = 0, homed: bool = True) -> None:
         self.firmware = make_firmware(lambda: latency_us, homed)
         self.now_us = 0
-        self.sequence = 0
+        self.sequence = self.ticks = 0
 
     def send(self, message: Message) -> Message | None:
         """Send a message; return the answer or None."""
-        frame = encode_frame(message, self.sequence)[:-1]
+        frame = encode_frame(answering(self.ticks, message), self.sequence)[:-1]
         self.sequence = (self.sequence + 1) & 0xFF
         answers = [decode_frame(answer[:-1]).message for answer in self.firmware.receive(frame, self.now_us)]
         assert len(answers) <= 1
@@ -58,8 +58,9 @@ class Bench:
     def frames(self, cart: int = 0, pole: int = HANGING) -> list[Frame]:
         """Pass a period; return the frames at its end."""
         end = self.now_us + self.firmware.period_us
-        self.motors = self.firmware.drive(self.now_us, end)
+        self.motors = motors_over(self.firmware, self.now_us, end)
         self.now_us = end
+        self.ticks += 1
         return [decode_frame(frame[:-1]) for frame in self.firmware.tick(end, cart, pole)]
 
     def tick(self, cart: int = 0, pole: int = HANGING) -> tuple[State, Flags]:
@@ -84,7 +85,7 @@ def test_a_cart_boots_idle_with_the_motor_at_zero():
 
 
 def test_hello_is_answered_with_info():
-    assert Bench().send(Hello()) == Info(1, 1, 1, 4096, 22749, 255, SOFT, HARD, 20_000)
+    assert Bench().send(Hello()) == Info(2, 0, 0, 4096, 22749, 255, SOFT, HARD, 20_000, 0)
 
 
 def test_start_needs_homing():
@@ -145,8 +146,7 @@ def test_a_latency_of_more_than_a_period_keeps_the_order():
     for _ in range(3):
         bench.tick()
         motors += bench.motors
-    assert (50_000, 100) in motors
-    assert motors[-1] == (60_000, -100)
+    assert motors == [(20_000, 0), (40_000, 0), (50_000, -100), (60_000, -100)]
 
 
 def test_stop_discards_pending_commands():
@@ -209,13 +209,15 @@ def test_the_soft_limit_holds_from_the_first_command_on(side):
 
 
 @pytest.mark.parametrize("side", [1, -1])
-def test_hard_limit_latches_until_it_is_cleared(bench, side):
-    bench.send(SetMotor(100))
-    bench.tick(side * (HARD - 1))
+def test_hard_limit_latches_until_it_is_cleared(side):
+    bench = Bench()
+    for _ in range(10):
+        bench.tick(side * (HARD - 1))
+    bench.send(Start())
     bench.send(SetMotor(-side * 100))
     report, state = bench.frames(side * HARD)
-    assert report.message == FaultReport(Fault.HARD_LIMIT, 2)
-    assert (report.sequence, state.sequence) == (2, 3)
+    assert report.message == FaultReport(Fault.HARD_LIMIT, 11)
+    assert (report.sequence, state.sequence) == (11, 12)
     assert state.message.fault == Fault.HARD_LIMIT
     assert state.message.motor_applied == 0
     assert Flags(state.flags) == Flags.HOMED | Flags.FAULTED
@@ -224,6 +226,8 @@ def test_hard_limit_latches_until_it_is_cleared(bench, side):
     assert bench.refusal(SetMotor(1)) == Reason.FAULT_LATCHED
     assert bench.refusal(Home()) == Reason.FAULT_LATCHED
     assert isinstance(bench.send(ClearFault()), Ack)
+    for _ in range(10):
+        bench.tick(0)
     assert isinstance(bench.send(Start()), Ack)
     state, flags = bench.tick(0)
     assert state.fault == 0
@@ -301,7 +305,10 @@ def test_homing_is_busy_moves_by_itself_and_is_ended_by_stop():
 def test_a_cart_that_cannot_move_fails_to_home():
     bench = Bench(homed=False)
     bench.send(Home())
-    faults = [bench.tick()[0].fault for _ in range(600)]
+    faults = []
+    for _ in range(600):
+        bench.send(Hello())
+        faults.append(bench.tick()[0].fault)
     assert faults[0] == 0
     assert faults[-1] == Fault.HOMING
     assert bench.refusal(Home()) == Reason.FAULT_LATCHED
@@ -365,11 +372,11 @@ def answer_to(body: bytes) -> list[Message]:
 
 
 def test_invalid_messages_are_refused_with_a_reason():
-    assert answer_to(b"\x02\x01\x07\x00") == [Nack(7, 0x01, Reason.BAD_VERSION)]
-    assert answer_to(b"\x01\x7f\x07\x00") == [Nack(7, 0x7F, Reason.UNKNOWN_TYPE)]
-    assert answer_to(b"\x01\x82\x07\x00") == [Nack(7, 0x82, Reason.UNKNOWN_TYPE)]
-    assert answer_to(b"\x01\x04\x07\x00\x01") == [Nack(7, 0x04, Reason.BAD_LENGTH)]
-    assert answer_to(b"\x01\x02\x07\x00\x01") == [Nack(7, 0x02, Reason.BAD_LENGTH)]
+    assert answer_to(b"\x01\x01\x07\x00") == [Nack(7, 0x01, Reason.BAD_VERSION)]
+    assert answer_to(b"\x02\x7f\x07\x00") == [Nack(7, 0x7F, Reason.UNKNOWN_TYPE)]
+    assert answer_to(b"\x02\x82\x07\x00") == [Nack(7, 0x82, Reason.UNKNOWN_TYPE)]
+    assert answer_to(b"\x02\x04\x07\x00\x01") == [Nack(7, 0x04, Reason.BAD_LENGTH)]
+    assert answer_to(b"\x02\x02\x07\x00\x01") == [Nack(7, 0x02, Reason.BAD_LENGTH)]
 
 
 def test_damaged_frames_are_ignored(bench):

@@ -6,13 +6,13 @@ scripts/fuzz/wire.py is the long version.
 import contextlib
 
 import pytest
-from firmwares import make_firmware
+from firmwares import make_firmware, motors_over
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from cartpole_rl.emulator.firmware import BANNER
 from cartpole_rl.errors import FrameError
-from cartpole_rl.wire import FrameSplitter, Home, SetMotor, Start, State, decode_frame, encode_frame
+from cartpole_rl.wire import Flags, FrameSplitter, Home, SetMotor, Start, State, decode_frame, encode_frame
 from cartpole_rl.wire.frames import LONGEST_FRAME, Envelope, open_envelope
 from cartpole_rl.wire.messages import MESSAGES, Message
 
@@ -72,7 +72,7 @@ def test_a_disarmed_cart_stays_still_and_disarmed_under_any_bytes(stream):
         assert len(answers) <= 1
     assert not firmware.armed
     assert not firmware.homing
-    assert {value for _, value in firmware.drive(0, 20_000)} == {0}
+    assert {value for _, value in motors_over(firmware, 0, 20_000)} == {0}
     assert decode_frame(firmware.tick(20_000, 0, 0)[-1][:-1]).message.motor_applied == 0
     assert len(splitter.pending) <= LONGEST_FRAME
 
@@ -100,19 +100,21 @@ def any_number(letter: str) -> st.SearchStrategy[int]:
 
 @given(st.lists(any_host_message() | st.integers(-40_000, 40_000), max_size=40), st.booleans())
 @settings(max_examples=150, deadline=None)
-def test_the_motor_is_0_whenever_the_cart_is_neither_armed_nor_homing(events, homed):
+def test_a_cart_that_is_neither_armed_nor_homing_is_at_most_braked(events, homed):
     """Valid frames in any order, between periods that end at any count (an int)."""
-    firmware, now_us = make_firmware(lambda: 3_000, homed), 0
+    firmware, now_us, braked, before = make_firmware(lambda: 3_000, homed), 0, False, 0
     for event in events:
         if isinstance(event, Message):
             firmware.receive(encode_frame(event, 1)[:-1], now_us)
             continue
         idle = not firmware.armed and not firmware.homing
         end_us = now_us + firmware.period_us
-        values = firmware.drive(now_us, end_us)
-        assert not idle or values[-1][1] == 0
+        values = motors_over(firmware, now_us, end_us)
+        assert not idle or values[-1][1] == 0 or braked
         now_us = end_us
         state = decode_frame(firmware.tick(now_us, event, event)[-1][:-1])
-        assert abs(state.message.motor_applied) <= 255
+        motor, braked = state.message.motor_applied, bool(Flags(state.flags) & Flags.SOFT_LIMIT)
+        assert abs(motor) <= 255
         if not firmware.armed and not firmware.homing:
-            assert state.message.motor_applied == 0
+            assert motor == 0 or (braked and motor * (event - before) < 0)
+        before = event

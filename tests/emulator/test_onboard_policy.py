@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from driven_cart import Driven
-from firmwares import needs_compiler
+from firmwares import answering, motors_over, needs_compiler
 
 from cartpole_rl.emulator.c_firmware import CFirmware
 from cartpole_rl.emulator.c_library import build_library, compile_c
@@ -29,7 +29,7 @@ from cartpole_rl.wire import (
     decode_frame,
     encode_frame,
 )
-from cartpole_rl.wire.messages import Message, PolicyQuestion
+from cartpole_rl.wire.messages import Message
 
 pytestmark = needs_compiler
 SOFT = 16704  # counts, of the nominal track
@@ -69,12 +69,13 @@ class Board:
         self.firmware = CFirmware(lambda: 0)
         self.firmware._head.policy = ctypes.cast(self._called, ctypes.c_void_p)
         self.firmware.homed = True
-        self.now_us = 0
+        self.now_us = self.ticks = 0
         self.send(start)
 
     def send(self, message: Message) -> Message | None:
         """Send a message; return the answer, if any."""
-        answers = self.firmware.receive(encode_frame(message, 1)[:-1], self.now_us)
+        frame = encode_frame(answering(self.ticks, message), 1)[:-1]
+        answers = self.firmware.receive(frame, self.now_us)
         return decode_frame(answers[0][:-1]).message if answers else None
 
     def heard(self, cart: int = 0, pole: int = 0) -> tuple[State, Flags, int]:
@@ -85,21 +86,21 @@ class Board:
     def tick(self, cart: int = 0, pole: int = 0) -> tuple[State, Flags, int]:
         """Pass a period; return STATE, its flags, and the motor value in force after it."""
         start_us, self.now_us = self.now_us, self.now_us + self.firmware.period_us
-        self.firmware.drive(start_us, self.now_us)
+        motors_over(self.firmware, start_us, self.now_us)
         frame = decode_frame(self.firmware.tick(self.now_us, cart, pole)[-1][:-1])
         assert isinstance(frame.message, State)
-        ((_, motor),) = self.firmware.drive(self.now_us, self.now_us + 1)
-        return frame.message, Flags(frame.flags), motor
+        self.ticks += 1
+        return frame.message, Flags(frame.flags), self.firmware.motor
 
 
 def test_it_observes_each_period_and_chooses_after_state():
     board = Board(lambda seen: seen.cart_counts // 10)
-    ticks = [board.heard(cart, pole) for cart, pole in ((500, 7), (-900, 8), (300, -5))]
-    assert [motor for *_, motor in ticks] == [50, -90, 30]
-    assert [state.motor_applied for state, *_ in ticks] == [0, 50, -90]
+    ticks = [board.heard(cart, pole) for cart, pole in ((500, 7), (-100, 8), (300, -5))]
+    assert [motor for *_, motor in ticks] == [50, -10, 30]
+    assert [state.motor_applied for state, *_ in ticks] == [0, 50, -10]
     assert board.observed == [
         (500, 7, SOFT, 20_000, 20_000, True, False),
-        (-900, 8, SOFT, 20_000, 20_000, False, False),
+        (-100, 8, SOFT, 20_000, 20_000, False, False),
         (300, -5, SOFT, 20_000, 20_000, False, False),
     ]
 
@@ -155,16 +156,12 @@ def test_it_is_refused_where_start_is_and_on_a_cart_that_the_host_drives():
     assert board.send(Start()) == Nack(1, MessageType.START, Reason.NOT_HOMED)
 
 
-@pytest.mark.parametrize("state", [Stop(), Start(), START_POLICY], ids=["idle", "host", "policy"])
-def test_a_board_says_whether_it_has_a_policy_and_arms_nothing(state):
+def test_info_names_the_agent_on_the_board():
     board = Board(lambda seen: 100)
-    for reason in (Reason.BAD_LENGTH, Reason.UNKNOWN_TYPE):
-        board.send(Stop())
-        board.send(state)
-        armed = board.firmware.armed
-        assert board.send(PolicyQuestion()) == Nack(1, MessageType.START_POLICY, reason)
-        assert board.firmware.armed == armed
-        board.firmware._head.policy = None
+    board.firmware._head.policy_identity = 0x1A2B3C4D
+    assert board.send(Hello()).policy == 0x1A2B3C4D
+    board.firmware._head.policy = None
+    assert board.send(Hello()).policy == 0
 
 
 def test_a_motor_value_of_the_host_takes_over_until_the_next_start_policy():
@@ -231,10 +228,11 @@ def test_the_c_code_of_a_policy_gives_0_at_another_period():
     firmware.homed = True
     motors = []
     for number, period_us in enumerate((10_000, 20_000), start=1):
+        firmware.tick(number * 100_000, 0, 2048)
         for message in (Stop(), SetPeriod(period_us), StartPolicy()):
             firmware.receive(encode_frame(message, 1)[:-1], number * 100_000)
         firmware.tick(number * 100_000 + period_us, 0, 2048)
-        motors.append(firmware.drive(number * 100_000 + period_us, number * 100_000 + period_us + 1)[-1][1])
+        motors.append(firmware.motor)
     assert motors[0] == 0 != motors[1]
 
 
@@ -284,7 +282,7 @@ def test_the_c_code_of_a_policy_observes_the_length_of_the_emulated_pole(tmp_pat
         firmware.receive(encode_frame(StartPolicy(), 1)[:-1], 0)
     for firmware in carts:
         firmware.tick(20_000, 0, 2048)
-    assert [firmware.drive(20_000, 20_001)[-1][1] for firmware in carts] == [250, 125]
+    assert [firmware.motor for firmware in carts] == [250, 125]
 
 
 def test_a_policy_that_replaces_another_in_its_folder_is_compiled(tmp_path):
@@ -297,7 +295,7 @@ def test_a_policy_that_replaces_another_in_its_folder_is_compiled(tmp_path):
         firmware.homed = True
         firmware.receive(encode_frame(StartPolicy(), 1)[:-1], 0)
         firmware.tick(20_000, 0, 2048)
-        motors.append(firmware.drive(20_000, 20_001)[-1][1])
+        motors.append(firmware.motor)
     assert motors == [110, 90]
 
 

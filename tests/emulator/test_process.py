@@ -3,6 +3,7 @@
 import itertools
 import json
 import signal
+import statistics
 import subprocess
 import sys
 import time
@@ -17,7 +18,6 @@ from cartpole_rl.wire import (
     Ack,
     Flags,
     Hello,
-    Home,
     Info,
     MessageType,
     Nack,
@@ -30,6 +30,8 @@ from cartpole_rl.wire import (
 )
 
 COARSE = {"physics_step": 1e-3}
+
+OVERFULL = 100  # frames, whose answers fill the line
 
 
 def states_of(host: EmulatorHost, count: int) -> list[State]:
@@ -118,15 +120,13 @@ def test_a_host_may_close_the_port_and_come_back(clock):
             assert host.ask(Hello())[-1].message.tick > before.tick
 
 
-def test_no_state_of_a_homing_is_lost_on_a_host_that_reads_slowly():
+def test_no_state_is_lost_on_a_host_that_reads_slowly():
     with emulator(**COARSE) as host:
-        host.send(Home())
+        for _ in range(OVERFULL):
+            host.send(Hello())
         time.sleep(1.0)  # the line is full by then
-        ticks = [host.state().tick]
-        while host.flags & Flags.HOMING:
-            ticks.append(host.state().tick)
-    assert ticks == list(range(1, len(ticks) + 1))
-    assert len(ticks) > 500
+        ticks = [host.state().tick for _ in range(OVERFULL)]
+    assert ticks == list(range(1, OVERFULL + 1))
 
 
 def test_real_clock_ticks_at_50_hz():
@@ -135,7 +135,9 @@ def test_real_clock_ticks_at_50_hz():
         states = states_of(host, 60)
         seconds = time.monotonic() - started
     assert [state.tick - first.tick for state in states] == list(range(1, 61))
-    assert {after.time_us - before.time_us for before, after in itertools.pairwise(states)} == {20_000}
+    periods = [after.time_us - before.time_us for before, after in itertools.pairwise(states)]
+    assert statistics.median(periods) == 20_000
+    assert min(periods) >= 20_000  # longer ones on a busy machine
     assert 0.6 < seconds < 2.4
 
 
@@ -157,8 +159,9 @@ def test_signals_end_it_quietly(clock, number):
 
 def test_a_signal_ends_it_even_while_it_waits_for_its_host_to_read():
     with emulator() as host:
-        host.send(Home())
-        time.sleep(1.0)  # homing's states fill the line
+        for _ in range(OVERFULL):
+            host.send(Hello())
+        time.sleep(1.0)  # their answers fill the line
         host.process.terminate()
         assert host.process.wait(SILENCE) == 0
 

@@ -3,7 +3,7 @@
 import math
 
 import pytest
-from firmwares import truth
+from firmwares import answering, truth
 
 from cartpole_rl.emulator.device import CartDevice
 from cartpole_rl.emulator.homing import CART_METRES, POLE_RADIANS
@@ -40,6 +40,7 @@ class Driven:
         self.settings = truth(**COARSE | settings)
         self.cart = CartDevice(self.settings)
         self.flags = Flags(0)
+        self.newest = 0  # tick of the newest STATE
 
     @property
     def x(self) -> float:
@@ -53,10 +54,11 @@ class Driven:
         frame = decode_frame(self.cart.pass_period(self.cart.period_end_us)[-1][:-1])
         self.flags = Flags(frame.flags)
         assert isinstance(frame.message, State)
+        self.newest = frame.message.tick
         return frame.message
 
     def ask(self, message: Message) -> State:
-        self.cart.receive(encode_frame(message, 0)[:-1], self.cart.now_us)
+        self.cart.receive(encode_frame(answering(self.newest, message), 0)[:-1], self.cart.now_us)
         return self.tick()
 
     def info(self) -> Info:
@@ -73,7 +75,7 @@ class Driven:
     def home(self) -> State:
         state = self.ask(Home())
         while self.flags & Flags.HOMING:
-            state = self.tick()
+            state = self.ask(Hello())
         return state
 
     def measured(self, state: State) -> tuple[float, float]:

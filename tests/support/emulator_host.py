@@ -8,11 +8,21 @@ from collections import deque
 from collections.abc import Iterator
 
 import serial
-from firmwares import UnderTest
+from firmwares import UnderTest, answering
 
 from cartpole_rl.errors import FrameError
-from cartpole_rl.plants.serial.cart import SerialCart
-from cartpole_rl.wire import Flags, Frame, FrameSplitter, Home, Message, State, decode_frame, encode_frame
+from cartpole_rl.plants.serial.cart import LEASE_RENEWAL_US, SerialCart
+from cartpole_rl.wire import (
+    Flags,
+    Frame,
+    FrameSplitter,
+    Hello,
+    Home,
+    Message,
+    State,
+    decode_frame,
+    encode_frame,
+)
 
 SILENCE = 200.0  # s, timeout of a test
 
@@ -26,6 +36,7 @@ class EmulatorHost:
         self.ready = json.loads(process.stdout.readline())
         self.came = b""
         self.flags = Flags(0)  # of the newest STATE
+        self.tick = self.time_us = 0  # of that STATE
         self.damaged = 0
         self._sequence = 0
         self.open()
@@ -37,7 +48,7 @@ class EmulatorHost:
         self._frames: deque[Frame] = deque()
 
     def send(self, message: Message) -> None:
-        self.serial.write(encode_frame(message, self._sequence))
+        self.serial.write(encode_frame(answering(self.tick, message), self._sequence))
         self._sequence += 1
 
     def frame(self) -> Frame:
@@ -56,8 +67,9 @@ class EmulatorHost:
     def until_state(self) -> list[Frame]:
         """Return the frames up to and including the next STATE."""
         frames = [self.frame()]
-        while not isinstance(frames[-1].message, State):
+        while not isinstance(message := frames[-1].message, State):
             frames.append(self.frame())
+        self.tick, self.time_us = message.tick, message.time_us
         return frames
 
     def state(self) -> State:
@@ -74,8 +86,11 @@ class EmulatorHost:
 
     def home(self) -> Frame:
         """Home the cart; return the STATE that ends homing."""
-        frame = self.ask(Home())[-1]
+        asked_us, frame = self.time_us, self.ask(Home())[-1]
         while frame.flags & Flags.HOMING:
+            if self.time_us >= asked_us + LEASE_RENEWAL_US:
+                asked_us = self.time_us
+                self.send(Hello())
             frame = self.until_state()[-1]
         return frame
 

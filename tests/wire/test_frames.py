@@ -73,10 +73,10 @@ def test_every_cut_is_detected(message):
 @pytest.mark.parametrize(
     ("body", "complaint"),
     [
-        (b"\x02\x01\x00\x00", "version 2"),
-        (b"\x01\x7f\x00\x00", "unknown message type 0x7f"),
-        (b"\x01\x04\x00\x00\x01", "SET_MOTOR has 1 payload bytes, not 2"),
-        (b"\x01\x01", "cut short"),
+        (b"\x01\x01\x00\x00", "version 1, this program 2"),
+        (b"\x02\x7f\x00\x00", "unknown message type 0x7f"),
+        (b"\x02\x04\x00\x00\x01", "SET_MOTOR has 1 payload bytes, not 6"),
+        (b"\x02\x01", "cut short"),
     ],
 )
 def test_valid_frames_with_invalid_content_are_refused_by_name(body, complaint):

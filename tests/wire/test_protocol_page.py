@@ -32,12 +32,12 @@ PAGE = (Path(__file__).parents[2] / "docs" / "protocol.md").read_text(encoding="
 HOMED = Flags.HOMED
 EXAMPLES: dict[str, tuple[Message, int, int]] = {
     "HELLO": (Hello(), 0, 0),
-    "INFO": (Info(1, 1, 1, 4096, 22749, 255, 16704, 17539, 20000), 0, 0),
+    "INFO": (Info(2, 0, 0, 4096, 22749, 255, 16704, 17539, 20000, 0), 0, 0),
     "SET_PERIOD": (SetPeriod(20000), 1, 0),
     "HOME": (Home(), 2, 0),
     "ACK": (Ack(2, MessageType.HOME), 5, Flags.HOMING),
     "START": (Start(), 3, 0),
-    "SET_MOTOR": (SetMotor(-200), 4, 0),
+    "SET_MOTOR": (SetMotor(-200, 1168), 4, 0),
     "STATE": (State(1169, 23380000, 43, 2051, -200, 4, 0, 20), 148, Flags.ARMED | HOMED),
     "STOP": (Stop(), 5, 0),
     "NACK": (Nack(6, MessageType.SET_MOTOR, Reason.NOT_ARMED), 150, HOMED),
@@ -83,12 +83,12 @@ def test_the_length_of_a_frame_is_stated(name):
     assert stated == len(encode_frame(*EXAMPLES[name]))
 
 
-def test_the_longest_messages_fit_a_frame():
-    """INFO and STATE have 23 bytes of payload, and 6 of header and checksum; stuffing adds one."""
+def test_the_longest_message_fits_a_frame():
+    """INFO has 27 bytes of payload, and 6 of header and checksum; stuffing adds one."""
     lengths = {name: len(encode_frame(*example)) - 1 for name, example in EXAMPLES.items()}
     longest = max(lengths.values())
-    assert {name for name, length in lengths.items() if length == longest} == {"INFO", "STATE"}
-    assert longest == 23 + HEADER_BYTES + CRC_BYTES + 1 < LONGEST_FRAME
+    assert {name for name, length in lengths.items() if length == longest} == {"INFO"}
+    assert longest == 27 + HEADER_BYTES + CRC_BYTES + 1 < LONGEST_FRAME
 
 
 @pytest.mark.parametrize("rule", ["Watchdog", "Soft limit", "Faults"])

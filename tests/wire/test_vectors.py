@@ -52,7 +52,7 @@ def test_a_good_frame_is_encoded_and_decoded(vector):
 def test_a_good_frame_is_good_by_hand(vector):
     body, sent, computed = by_hand(bytes.fromhex(vector["hex"])[:-1])
     assert sent == computed
-    assert body[:4] == bytes((1, MessageType[vector["type"]], vector["sequence"], vector["flags"]))
+    assert body[:4] == bytes((2, MessageType[vector["type"]], vector["sequence"], vector["flags"]))
 
 
 @pytest.mark.parametrize("vector", named(DAMAGED))

@@ -21,14 +21,13 @@ from cartpole_rl.plants.serial.port import open_port, resolved_port
 from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.plants.serial.statistics import LinkStatistics
 from cartpole_rl.plants.serial.tracking import StateTracker
-from cartpole_rl.wire.messages import (
+from cartpole_rl.wire import (
     Ack,
     ClearFault,
     Flags,
     Hello,
     Home,
     Info,
-    PolicyQuestion,
     Reason,
     SetMotor,
     SetPeriod,
@@ -36,16 +35,16 @@ from cartpole_rl.wire.messages import (
     StartPolicy,
     State,
     Stop,
+    microseconds_between,
 )
 
 LOGGER = logging.getLogger(__name__)
 
 LONGEST_SUSPENSION = 1.0  # s without an answer of this computer, after which a person may have moved the cart
-LONGEST_SILENCE = (
-    0.25  # s until the port of a cart that ticks on has a newer state, also after this computer slept
-)
 LONGEST_STOP = 3.0  # s to wait for the answer to STOP, whatever the settings: signals.UNWINDING is longer
 LAST_STOP = 0.5  # s to wait for it in `close` if the STOP before was not answered
+LEASE_RENEWAL_US = 100_000  # of the cart's clock between two HELLOs, without which it ends homing
+SLOW_LINK_ATTEMPTS = 3  # to measure a round trip of less than a period, as this computer may be busy
 RESTARTED = "the cart has restarted; check its power"
 
 
@@ -60,7 +59,7 @@ class SerialCart:
 
     Counts and motor values are positive to the right. SIGTERM ends a Python process without leaving a `with`;
     a program that drives a cart turns it into an exception (`cartpole_rl.signals.RaiseOnce`). If it does not,
-    the cart's own watchdog sets the motor to 0 after three periods, but a cart that homes goes on homing.
+    the cart sets its motor to 0 by itself: after three periods, or after half a second while it homes.
 
     Every method raises LinkError when the cart no longer answers.
     """
@@ -116,8 +115,7 @@ class SerialCart:
             self._stop(LAST_STOP if self._stop_unanswered else LONGEST_STOP)
         except PlantError as error:
             LOGGER.warning(
-                "the cart did not confirm that it is disarmed (%s); its watchdog stops it, unless it was "
-                "homing: then switch it off",
+                "the cart did not confirm that it is disarmed (%s); it stops by itself within half a second",
                 error,
             )
         except BaseException:  # a signal, before STOP was answered
@@ -162,9 +160,23 @@ class SerialCart:
         """Arm the motor. Every way to drive a cart from this computer goes through here.
 
         Raises NotReadyError if INFO describes another kind of cart than the one that is driven here,
-        RefusedError if the cart is not homed, FaultError if a fault is latched.
+        RefusedError if the cart is not homed, FaultError if a fault is latched, LinkError if the link takes
+        longer than a period.
         """
         self._arm(Start())
+
+    def check_policy(self, identity: int) -> None:
+        """Raise PlantError unless the board has the agent of this `identity`."""
+        on_board = self.information.policy
+        if on_board == 0:
+            raise PlantError(
+                "the cart's board has no policy: compile its firmware with one (docs/firmware.md)"
+            )
+        if on_board != identity:
+            raise PlantError(
+                f"the cart's board has another agent ({on_board:08x}, not {identity:08x}): export this one "
+                "with cartpole-export format=c and compile the firmware with it"
+            )
 
     def start_policy(self) -> None:
         """Arm the motor and let the policy on the board drive, while `follow_policy` keeps it from stopping.
@@ -176,17 +188,6 @@ class SerialCart:
         self._connection.learn_clock()
         self._arm(StartPolicy())
         self._tracker.follow_policy()
-
-    def check_policy(self) -> None:
-        """Raise RefusedError if the board has no policy. The question arms no cart, homed or not."""
-        try:
-            self._connection.request(PolicyQuestion(), Ack)
-        except RefusedError as error:
-            if error.reason != Reason.BAD_LENGTH:
-                raise
-            return
-        self.stop()
-        raise PlantError("the cart accepted a START_POLICY of the wrong length: correct its firmware")
 
     def stop(self) -> None:
         """Set the motor to 0 and disarm; ends a homing. The bytes go out before anything that can block."""
@@ -213,6 +214,8 @@ class SerialCart:
         Raises FaultError if homing fails, PlantError if it takes longer than `settings.home_timeout`,
         LinkError if the cart restarts meanwhile.
         """
+        self._check_round_trip()
+        before = self._tracker.last
         try:
             self._connection.request(Home(), Ack)
         except RefusedError as error:
@@ -221,6 +224,7 @@ class SerialCart:
         timeout, restarts = self.settings.home_timeout, self.restarts
         deadline = now() + timeout
         state = self._connection.state_since_question()
+        renewed_us = (before or state).time_us
         while True:
             watch(state)
             if state.fault:
@@ -230,19 +234,26 @@ class SerialCart:
             if self.flags & Flags.HOMED and not self.flags & Flags.HOMING:
                 self.info()  # the limits are now those of the span that was measured
                 return self.get_state()
+            if not self.flags & (Flags.HOMED | Flags.HOMING):
+                raise LinkError(
+                    f"the cart on {self.port} ended homing, as no frame of this computer reached it for half "
+                    "a second: check its cable, end what keeps this computer busy"
+                )
             if now() > deadline:
                 self.stop()
                 raise PlantError(
                     f"homing was not done after {timeout:g} s: clear the track, let the pole hang"
                 )
+            if microseconds_between(renewed_us, state.time_us) >= LEASE_RENEWAL_US:
+                self._connection.link.send(Hello())
+                renewed_us = state.time_us
             state = self._connection.current_state()
 
     def set_motor(self, value: int) -> int:
         """Send a motor value; return the value sent.
 
-        That is `value` within the cart's limits, or 0 if it answers a state so old that the cart's watchdog
-        has stopped the motor. Raises LinkError if that state is older than `longest_suspension`, or if the
-        operating system delayed the value for as long as the watchdog waits.
+        That is `value` within the cart's limits, or 0 if it answers a state so old that the cart would refuse
+        it. Raises LinkError if that state is older than `longest_suspension`.
         """
         connection = self._connection
         limit = max(0, self.information.motor_limit)  # 0 stays 0 for any limit in INFO
@@ -274,8 +285,7 @@ class SerialCart:
     def follow_policy(self) -> State:
         """Send HELLO, which lets the policy on the board drive on, and wait for a state.
 
-        Raises LinkError, before it sends anything, if a newer state waits and the last one is older than
-        `longest_suspension`.
+        Raises LinkError, before it sends anything, if the last state is older than `longest_suspension`.
         """
         self.check_suspension(self._unanswered_for())
         return self.poll_state()
@@ -297,7 +307,23 @@ class SerialCart:
     def _arm(self, message: Start | StartPolicy) -> None:
         check_scales(self.information)
         check_limits(self.information)
+        self._check_round_trip()
         self._connection.request(message, Ack)
+
+    def _check_round_trip(self) -> None:
+        """Raise LinkError if the link takes over a period. On a lockstep emulator no time passes."""
+        period = self.information.period_us * 1e-6
+        if not self._tracker.ticks_alone:
+            return
+        for _ in range(SLOW_LINK_ATTEMPTS):
+            trip = self._connection.round_trip()
+            if trip <= period:
+                return
+        raise LinkError(
+            f"the link to the cart on {self.port} is too slow to drive it: the way there and back takes "
+            f"{trip * 1e3:.0f} ms, over a period of {period * 1e3:g} ms; connect the cart by a cable without "
+            "a network between, set an FTDI adapter's latency timer to 1 ms"
+        )
 
     def _stop(self, within: float) -> None:
         """Set the motor to 0 and disarm; wait `within` s at most for the answer."""
@@ -306,7 +332,7 @@ class SerialCart:
         self._stop_unanswered = False
 
     def _is_late(self) -> bool:
-        """Return True if the cart's watchdog has stopped the motor since the newest state.
+        """Return True if the cart would refuse an answer to the newest state.
 
         Raises LinkError if the state is older than `longest_suspension`.
         """
@@ -315,21 +341,13 @@ class SerialCart:
         return waited > self._watchdog_time
 
     def _unanswered_for(self) -> float:
-        """Return for how many seconds the newest state has waited for a motor value.
-
-        It is 0 if no newer state comes, unless the cart is known to have its own clock: no time has passed
-        on a lockstep emulator.
-        """
-        if not self._tracker.awaits_command:
-            return 0.0
-        waited = now() - self._tracker.newest_at
-        if waited <= self._watchdog_time or self._tracker.ticks_alone:
-            return waited
-        return waited if self._connection.link.await_byte(LONGEST_SILENCE) else 0.0
+        """Return for how many s the newest state has waited for a motor value; 0 on a lockstep emulator."""
+        tracker = self._tracker
+        return now() - tracker.newest_at if tracker.awaits_command and tracker.ticks_alone else 0.0
 
     @property
     def _watchdog_time(self) -> float:
-        """The time in s without a motor value after which the cart's watchdog has stopped the motor."""
+        """The time in s after a state for which the cart takes motor values that answer it."""
         return WATCHDOG_PERIODS * self.information.period_us * 1e-6
 
     def check_suspension(self, seconds: float) -> None:

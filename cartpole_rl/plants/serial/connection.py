@@ -11,14 +11,14 @@ If nothing arrives for `nudge_after` seconds, the host sends HELLO: a lockstep e
 period per frame, continues after a lost frame. A cart that is known to have its own clock gets none: an
 accepted frame lets a policy on its board drive on, and the host would not see where to.
 
-A motor value that the operating system delayed for three periods or more, as behind a full buffer, answers
-a state that is too old. The link then counts as broken.
+A motor value names the state that it answers. The cart refuses one that answers an old state, wherever it
+was delayed. The link then counts as broken.
 """
 
 import math
+import statistics
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import suppress
 from itertools import count
 from typing import TypeVar
 
@@ -41,19 +41,19 @@ from cartpole_rl.wire import (
     SetMotor,
     State,
     Stop,
-    microseconds_between,
-    ticks_between,
 )
-from cartpole_rl.wire.frames import END
+from cartpole_rl.wire.frames import END, OTHER_VERSION
 
 Answer = TypeVar("Answer", bound=Message)
 
-WATCHDOG_PERIODS = 3  # without a command, after which the cart sets its motor to 0
+WATCHDOG_PERIODS = 3  # after a state was measured, the cart takes no motor value that answers it
 BACKLOG_BYTES = 1000  # with more waiting, the system's buffer (4096) may have dropped newer bytes
 UNACKNOWLEDGED_PERIODS = 1.5  # after a frame: by then the next state has come, if the frame has arrived
 LISTENING_PERIODS = 6  # without a frame, to learn whether the cart has a clock of its own
 LONGEST_DEAFNESS = 1.0  # s; the cart's watchdog has stopped its motor long before
 KEPT_ANSWERS = 64
+ROUND_TRIPS = 5
+ACKNOWLEDGED_STOPS = 2  # one acknowledgement may be left over from the last host
 
 
 class Connection:
@@ -82,19 +82,22 @@ class Connection:
         deadline = now() + self._settings.connect_timeout
         pause = min(self._settings.answer_timeout, self._settings.connect_timeout)
         stops: list[int] = []
-        stopped = False
+        stopped = 0
         while now() < deadline:
             self._answers.clear()
             self.link.write(END)  # ends a partial frame that the cart may have read
-            if not stopped:
+            until = min(deadline, now() + pause)
+            if stopped < ACKNOWLEDGED_STOPS:
                 stops.append(self.link.send(Stop()))
-                until = min(deadline, now() + pause)
-                stopped = self._await_answer(until, stops, Ack, lambda ack: True) is not None
+                answer = self._await_answer(until, Stop.TYPE, stops, Ack)
+                if answer is not None:
+                    stopped += 1
+                    stops.remove(answer.sequence)
                 continue
             self.link.send(Hello())
-            answer = self._await_answer(min(deadline, now() + pause), (), Info, lambda info: True)
-            if answer is not None:
-                return answer
+            information = self._await_answer(until, Hello.TYPE, (), Info)
+            if information is not None:
+                return information
         raise LinkError(f"no cart answers on {self.link.port}: {self._what_came()}")
 
     def request(
@@ -123,7 +126,7 @@ class Connection:
             self.notice_backlog()
             self._asked_sequence, self._frames_asked = asked[-1], self.link.frames_sent
             deadline = min(end, now() + pause)
-            answer = self._await_answer(deadline, asked, kind, fits)
+            answer = self._await_answer(deadline, message.TYPE, asked, kind, fits)
             if answer is not None:
                 self._refused = None  # of an earlier motor value, which has no meaning any more
                 return answer
@@ -152,30 +155,30 @@ class Connection:
                 return
             self.link.send(Hello())
 
-    def send_motor(self, value: int) -> None:
-        """Send a motor value once.
+    def round_trip(self) -> float:
+        """Return the time in s from a STOP to its answer, the median of several. The cart is disarmed."""
+        times = []
+        for _ in range(ROUND_TRIPS):
+            started = now()
+            self.request(Stop(), Ack)
+            times.append(now() - started)
+        return statistics.median(times)
 
-        Raises LinkError if the system delayed it for as long as the watchdog waits, or if so long has passed
-        since the state that it answers: a value other than 0 is then too old.
-        """
+    def send_motor(self, value: int) -> None:
+        """Send a motor value once, as the answer to the state that was returned last."""
         self._refused_sequence = -1
-        before, started = self._tracker.last, now()
-        since = self._tracker.newest_at if value and self._tracker.awaits_command else started
-        self._motor_sequence = self.link.send(SetMotor(value))
+        self._motor_sequence = self.link.send(SetMotor(value, self._tracker.answered_tick))
         self._tracker.send_command(self.link.sequence, self.link.sent_at)
-        longest = WATCHDOG_PERIODS * self._period_us * 1e-6
-        if self.link.sent_at - since > longest:
-            self._check_delay(before, self.link.sent_at - started > longest)
 
     def current_state(self) -> State:
         """Wait for the newest state that was measured after the cart took the last frame.
 
         Raises RefusedError or FaultError if the cart refused the last motor value, LinkError if no state
-        arrives within `timeout`, the cart's clock stands still, its motor value is none, or the cart does
-        not hear this computer.
+        arrives within `timeout`, the cart's clock stands still or has a wrong rate, its motor value is none,
+        or the cart does not hear this computer or hears it too late.
         """
         state = self._await_current(now() + self._settings.timeout)
-        self._raise_stopped_clock()
+        self._check_clock()
         self._check_motor(state)
         self._check_hearing(state)
         refused, self._refused = self._refused, None
@@ -228,47 +231,19 @@ class Connection:
             self._tracker.catch_up()
         return backlog
 
-    def _check_delay(self, before: State | None, slow_write: bool) -> None:
-        """Stop the cart and raise LinkError if it got the motor value too late by its own clock.
-
-        `before` is the newest state before the write. A state that acknowledges the value tells how long ago
-        it came. Otherwise ticks in the meantime count, of a lockstep emulator only if the value was lost: it
-        waits for the host and passes a period for each lost frame.
-        """
-        deadline = now() + self._settings.timeout
-        ticks_count = slow_write or self._tracker.ticks_alone
-        while True:
-            state = self._tracker.last
-            if before is None or state is None:
-                break
-            if state is not before and state.last_sequence == self._motor_sequence:
-                passed_us = microseconds_between(before.time_us, state.time_us)
-                waited_us = passed_us - 1000 * state.command_age_ms
-                if 0 <= waited_us < WATCHDOG_PERIODS * self._period_us:
-                    return
-                ticks_count |= waited_us >= 0  # otherwise the cart does not know the age
-            too_late = ticks_between(before.tick, state.tick) >= WATCHDOG_PERIODS
-            if ticks_count and too_late:
-                break
-            if state is not before and not self.link.waiting() and self._is_current(state):
-                if too_late and self.link.sequence not in (state.last_sequence, self._refused_sequence):
-                    break  # the value may still be on its way
-                return
-            self._endure_silence(deadline)
-            self._read()
-        with suppress(LinkError):
-            self.link.send(SetMotor(0), Stop())
-        raise LinkError(
-            f"{self.link.port} took a motor value too slowly: check the cart's cable, "
-            "end what keeps this computer busy"
-        )
-
     def _await_answer(
-        self, deadline: float, asked: Sequence[int], kind: type[Answer], fits: Callable[[Answer], bool]
+        self,
+        deadline: float,
+        asked_type: MessageType,
+        asked: Sequence[int],
+        kind: type[Answer],
+        fits: Callable[[Answer], bool] = lambda answer: True,
     ) -> Answer | None:
         while True:
             for answer in self._answers:
-                if isinstance(answer, Ack | Nack) and answer.sequence not in asked:
+                if isinstance(answer, Ack | Nack) and (
+                    answer.type != asked_type or answer.sequence not in asked
+                ):
                     continue
                 if isinstance(answer, Nack):
                     raise refusal(answer)
@@ -346,7 +321,8 @@ class Connection:
         elif (self.link.sequence - nack.sequence) % 256 < self.link.frames_sent - self._frames_asked:
             self._refused = nack  # `current_state` raises it
 
-    def _raise_stopped_clock(self) -> None:
+    def _check_clock(self) -> None:
+        """Raise LinkError if the cart's clock has stood still, or its rate is wrong."""
         stopped, self._tracker.stopped_clock = self._tracker.stopped_clock, None
         if stopped is not None:
             last, state = stopped
@@ -354,11 +330,19 @@ class Connection:
                 f"the clock of the cart on {self.link.port} does not advance: STATE {last.tick} is of "
                 f"{last.time_us} us, STATE {state.tick} of {state.time_us} us; correct its firmware"
             )
+        rate, self._tracker.wrong_rate = self._tracker.wrong_rate, None
+        if rate is not None:
+            raise LinkError(
+                f"the clock of the cart on {self.link.port} passes {rate:.3f} s in a second of this "
+                "computer, so all speeds would be wrong: correct the timer in its firmware"
+            )
 
     def _what_came(self) -> str:
         link = self.link
         if link.bytes_received == 0:
             return "nothing came; is it powered, and is this the right port?"
+        if OTHER_VERSION in link.why_bad:
+            return f"{link.why_bad}: update its firmware, or this program"
         if not link.why_bad:
             return f"{link.bytes_received} bytes came but no frame; is {self._settings.baud} its baud rate?"
         return (

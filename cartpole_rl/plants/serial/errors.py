@@ -1,6 +1,6 @@
 """Errors for the cart's refusals and faults: their meaning in words, each with its remedy."""
 
-from cartpole_rl.errors import FaultError, PlantError
+from cartpole_rl.errors import FaultError, LinkError, PlantError
 from cartpole_rl.wire import Fault, MessageType, Nack, Reason
 
 
@@ -29,6 +29,8 @@ REASONS: dict[int, str] = {
     Reason.FAULT_LATCHED: "a fault is latched: remove its cause, and start again",
     Reason.BUSY: "it is armed or homing; wait until it is homed, or stop it first",
     Reason.BAD_VERSION: "it speaks another protocol version: update its firmware, or this program",
+    Reason.STALE: "it answered a state over three periods old, so it came too late: connect the cart by a "
+    "short cable, without a network between, and end what keeps this computer busy",
 }
 
 FAULTS: dict[Fault, str] = {
@@ -46,7 +48,7 @@ FAULTS: dict[Fault, str] = {
 
 
 def refusal(nack: Nack) -> PlantError:
-    """Return the error for a NACK: FaultError if a fault is latched, otherwise RefusedError."""
+    """Return the error for a NACK: FaultError for a latched fault, LinkError for delay, else RefusedError."""
     known = nack.type in MessageType.__members__.values()
     what = MessageType(nack.type).name if known else f"message {nack.type:#04x}"
     why = REASONS.get(nack.reason, f"reason {nack.reason}, unknown here")
@@ -55,6 +57,8 @@ def refusal(nack: Nack) -> PlantError:
     text = f"the cart refused {what}: {why}"
     if nack.reason == Reason.FAULT_LATCHED:
         return FaultError(text)
+    if nack.reason == Reason.STALE:
+        return LinkError(text)
     return RefusedError(text, Reason(nack.reason) if nack.reason in REASONS else nack.reason)
 
 

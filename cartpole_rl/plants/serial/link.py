@@ -24,7 +24,7 @@ class SerialLink:
         self._port = port
         self._splitter = FrameSplitter()
         self.statistics = statistics
-        self.sequence = 0  # of the newest frame sent
+        self.sequence = os.urandom(1)[0]  # of the newest frame sent; unlike that of the last host
         self.frames_sent = 0
         self.sent_at = self.received_at = now()
         self.bytes_received = 0

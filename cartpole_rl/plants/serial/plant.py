@@ -111,6 +111,11 @@ class SerialPlant(OneCartPlant):
             super().close(raise_if_closed=raise_if_closed)
 
     @property
+    def fault(self) -> Fault:
+        """The latched faults in the newest state."""
+        return Fault(self._state.fault)
+
+    @property
     def track_half_length(self) -> Tensor:
         """m, [1]: the soft limit of the cart, from the span that it measured in homing."""
         return torch.tensor([self.cart.information.soft_limit_counts * CART_METRES_PER_COUNT])

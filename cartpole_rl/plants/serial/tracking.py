@@ -15,12 +15,21 @@ There is no I/O and no clock here: the caller passes the times, in s of `clock.n
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from cartpole_rl.plants.serial.clock import ClockComparison
 from cartpole_rl.plants.serial.information import LONGEST_PERIOD_US
 from cartpole_rl.plants.serial.statistics import LinkStatistics
-from cartpole_rl.wire import Flags, State, microseconds_between, ticks_between, went_back
+from cartpole_rl.wire import (
+    Flags,
+    State,
+    microseconds_between,
+    seconds_between,
+    ticks_between,
+    went_back,
+)
 
 HALF_MILLISECOND = 500  # us
 IDLE_TICKS = 3  # after the host's newest frame; a lockstep emulator passes one for a frame that came twice
+LARGEST_RATE_ERROR = 0.01  # of the cart's clock
 OVERTAKEN_TICKS = 16  # 0.3 s: no frame is delayed for longer, and no cart boots and is driven so soon
 
 
@@ -37,6 +46,8 @@ class StateTracker:
         self.measuring = True  # latencies and late ticks are counted
         self.stopped_clock: tuple[State, State] | None = None  # two states between which no time passed
         self.ticks_alone = False  # the cart is known to have a clock of its own
+        self.wrong_rate: float | None = None  # of that clock, by this computer's
+        self._clocks = ClockComparison()
         self._same_frame = 0  # ticks in succession that acknowledged the same frame, the newest of the host
         self._newest: State | None = None  # arrived, and not handed out yet
         self.last: State | None = None  # the newest that arrived, handed out or not
@@ -59,8 +70,9 @@ class StateTracker:
 
     def disconnect(self) -> None:
         """Forget the states of this connection; the cart may restart before the next one."""
-        self._newest = self.last = self.stopped_clock = self.period_us = None
+        self._newest = self.last = self.stopped_clock = self.period_us = self.wrong_rate = None
         self.ticks_alone, self._same_frame = False, 0
+        self._clocks = ClockComparison()
         self._missing.clear()
 
     def receive(self, state: State, flags: Flags, arrived_at: float, sequence: int) -> bool:
@@ -76,7 +88,9 @@ class StateTracker:
             ticks = ticks_between(last.tick, state.tick)
             if went_back(ticks):
                 self.restarts += 1
+                self._clocks = ClockComparison()
             else:
+                self._compare_clocks(last, state, arrived_at)
                 self._check_clock(last, state, ticks)
                 self._note_own_clock(last, state, flags, sequence)
                 self._count_missing(state.tick, ticks - 1)
@@ -86,6 +100,12 @@ class StateTracker:
         self.newest_at = arrived_at
         self.flags = flags
         return True
+
+    @property
+    def answered_tick(self) -> int:
+        """The tick of the state that the next motor value answers: the one handed out, else the newest."""
+        state = self._handed_out if self.awaits_command else self.last
+        return 0 if state is None else state.tick
 
     def take_newest(self) -> State | None:
         """Return the newest state if it was not returned before."""
@@ -129,6 +149,12 @@ class StateTracker:
         """Count a state that was not answered, if motor values are being sent."""
         if self._driving:
             self.statistics.late_ticks += 1
+
+    def _compare_clocks(self, last: State, state: State, arrived_at: float) -> None:
+        """Note the rate of the cart's clock if it is wrong."""
+        rate = self._clocks.add(seconds_between(last.time_us, state.time_us), arrived_at)
+        if rate is not None and self.ticks_alone and abs(rate - 1) > LARGEST_RATE_ERROR:
+            self.wrong_rate = rate
 
     def _note_own_clock(self, last: State, state: State, flags: Flags, sequence: int) -> None:
         """Note it if the cart ticks on after it has taken the newest frame of the host.

@@ -1,0 +1,98 @@
+"""The limits of the track, which know the cart's position and speed. They are looked at once a millisecond.
+
+Beyond the soft limit an outward motor value gives 0. A cart that runs outward too fast to stop before its
+hard limit is braked with full motor inward:
+
+    left - shake < speed * (lag + reaction) + speed^2 / (2 * BRAKING)
+
+`left` is the way to the hard limit and `lag` the age of the measured speed. A fast pole shakes the cart
+harder than the motor can hold it, by up to `lever` to each side of the common centre of mass. The speed of
+that centre counts here if it is higher than the cart's. `shake` is twice the lever for a pole that turns 1.6
+times a second or faster.
+
+The brake acts while the cart is armed and after that until it has come to rest: a cart that STOP, the
+watchdog or a fault leaves at speed would roll into an end stop. It never pushes a cart that stands or moves
+inward.
+
+All numbers but one are whole, so that ``firmware/src/cart_limits.c`` decides the same.
+"""
+
+import math
+from collections import deque
+
+from cartpole_rl.emulator.encoders import CART_METRES, CART_NANOMETRES, POLE_COUNTS, POLE_RADIANS
+
+SOFT_LIMIT = round(0.027 / CART_METRES)  # counts inside a stop
+HARD_LIMIT = round(0.008 / CART_METRES)  # counts inside a stop
+
+SAMPLE_US = 1000  # between two samples of the position
+SAMPLES = 9  # whose first and last give the speed
+BRAKING = 2_500_000  # um/s^2: full motor inward slows any healthy cart at least so hard
+REACTION_US = 10_000  # until the motor's force has changed its sign
+RELEASE_US = 10_000  # the brake is released this much later than it would be applied: it does not rattle
+REST = 10_000  # um/s; slower outward motion is not braked
+FASTEST = 10_000_000  # um/s; a higher speed counts as this one
+FAST_POLE = POLE_COUNTS * 16 // 10  # counts/s; a higher speed shakes the cart no further
+LEVER = 27_000  # um, of the medium pole on a bare cart: m_p l / (m_c + m_p)
+LONGEST_ROLLING_US = 3_000_000  # after the cart was armed
+
+
+class TrackLimits:
+    """The limits of one cart. `blocked` and `brake` are directions: 1 right, -1 left, 0 none."""
+
+    def __init__(self, lever: int = LEVER) -> None:
+        """`lever` is m_p l / (m_c + m_p) in um, with l from the pivot to the pole's centre of mass."""
+        self.blocked = 0  # direction in which motor values are held at 0
+        self.brake = 0  # direction of the full motor value that brakes the cart
+        self._lever = lever
+        self._us: deque[int] = deque(maxlen=SAMPLES)
+        self._carts: deque[int] = deque(maxlen=SAMPLES)
+        self._poles: deque[int] = deque(maxlen=SAMPLES)
+        self._until_us = 0  # the brake acts until then
+
+    def sample(self, now_us: int, cart: int, pole: int) -> None:
+        """Take a sample of the raw counts, unless the newest is younger than `SAMPLE_US`."""
+        if not self._us or now_us - self._us[-1] >= SAMPLE_US:
+            self._us.append(now_us)
+            self._carts.append(cart)
+            self._poles.append(pole)
+
+    def apply(self, now_us: int, outward: int, pole: int, half_span: int, armed: bool) -> None:
+        """Decide for a cart `outward` counts right of the middle and a pole `pole` counts from upright.
+
+        The stops are `half_span` counts from the middle.
+        """
+        speed = self._speed(self._carts) * CART_NANOMETRES // 1000  # um/s, rounded down
+        if armed:
+            self._until_us = now_us + LONGEST_ROLLING_US
+        elif abs(speed) < REST:
+            self._until_us = 0
+        self.blocked = 0
+        if armed and abs(outward) >= half_span - SOFT_LIMIT:
+            self.blocked = 1 if outward > 0 else -1
+        self.brake = self._brake(speed, outward, pole, half_span) if now_us < self._until_us else 0
+
+    def release(self) -> None:
+        """End all limits: the cart homes, or its count is not to be trusted."""
+        self.blocked = self.brake = self._until_us = 0
+
+    def _brake(self, speed: int, outward: int, pole: int, half_span: int) -> int:
+        if abs(speed) < REST:
+            return 0
+        direction = 1 if speed > 0 else -1
+        turning = max(-FAST_POLE, min(FAST_POLE, self._speed(self._poles)))  # counts/s
+        swing = int(self._lever * (turning * POLE_RADIANS) * math.cos(pole * POLE_RADIANS))  # um/s
+        size = min(FASTEST, max(abs(speed), direction * (speed + swing)))
+        left = (half_span - HARD_LIMIT - direction * outward) * CART_NANOMETRES // 1000  # um
+        shake = 2 * self._lever * turning * turning // (FAST_POLE * FAST_POLE)
+        lag_us = (self._us[-1] - self._us[0]) // 2 + REACTION_US
+        if self.brake == -direction:
+            lag_us += RELEASE_US
+        needed = size * lag_us // 1_000_000 + size * size // (2 * BRAKING)
+        return -direction if left - shake < needed else 0
+
+    def _speed(self, counts: deque[int]) -> int:
+        """Return the speed over the samples, in counts/s, rounded down."""
+        if len(counts) < 2:
+            return 0
+        return (counts[-1] - counts[0]) * 1_000_000 // (self._us[-1] - self._us[0])

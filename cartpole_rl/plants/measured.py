@@ -1,0 +1,104 @@
+"""The part of an episode that both encoders measured.
+
+A frozen count, or one that jumps, is not the state of any cart: nothing may score it, record it or learn from
+it. A cart detects both (docs/protocol.md, rule 3), but a frozen count only after it has been reported for a
+while, and an episode may end before. The same rules are applied here to whole episodes, and two more: nothing
+stops dead, and no pole balances on a standing cart.
+"""
+
+import logging
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_COUNTS_PER_TURN
+from cartpole_rl.tasks.endings import Ending
+from cartpole_rl.tasks.episode import Array, Episode
+from cartpole_rl.tasks.upright import wrap
+from cartpole_rl.wire import Fault
+
+LOGGER = logging.getLogger(__name__)
+
+FASTEST = np.array([5.0 / CART_METRES_PER_COUNT, 16.0 * POLE_COUNTS_PER_TURN])  # counts/s of cart and pole
+PUSH, PUSHED = 200, 0.1 - 1e-6  # motor value that moves any cart; s in each direction
+SPEED_CHANGE = 0.2  # m/s up and down that turn any pole
+SUDDEN = np.array([0.25 / CART_METRES_PER_COUNT, 200.0])  # counts/s, 200 are 0.3 rad/s: a dead stop,
+STILL = 0.5  # s, if the count does not change for as long after it
+LEANING, FALLEN = np.radians((0.7, 10))  # rad: more than friction holds; near enough to upright
+HALF = 0.5  # s, over which a pole of up to 1.4 m multiplies its angle by 2.7 or more
+LATCHED = Fault.CART_ENCODER | Fault.STALL, Fault.POLE_ENCODER  # a dead cart encoder can show as a STALL
+
+
+def measured_part(episode: Episode, fault: Fault = Fault.NONE) -> Episode:
+    """Return the episode up to the last state before a count froze or jumped; log what is left out.
+
+    `fault` are the faults that the cart has latched. A shortened episode ends by a fault, whatever ended it.
+    It has no step if the count never changed in it.
+    """
+    end = episode.measured_steps
+    counts, gaps = episode.counts[: end + 1], np.diff(episode.time[: end + 1])
+    jumps = (np.abs(np.diff(counts, axis=0)) - 1 > FASTEST * gaps[:, None]).any(1)
+    steps, why = end, ""
+    if jumps.any():
+        steps, why = int(np.argmax(jumps)), "a count jumped"
+    motor, cart = episode.motor[:steps], counts[: steps + 1, 0]
+    speed = np.diff(cart) * CART_METRES_PER_COUNT / gaps[:steps]
+    columns = zip(("cart", "pole"), counts[: steps + 1].T, LATCHED, SUDDEN, strict=True)
+    for name, own, faults, sudden in columns:
+        last = int(np.flatnonzero(np.diff(own, prepend=own[0])).max(initial=0))  # row of the last change
+        if name == "cart":
+            frozen = cart_froze(motor, gaps, last) or balanced(episode.theta[last : steps + 1], gaps)
+        else:
+            frozen = pole_froze(speed[max(0, last - 1) :])
+        frozen |= stopped_dead(own, gaps, last, sudden)
+        if (frozen or (fault & faults and not jumps.any())) and last < steps:
+            steps, why = last, f"the {name}'s count froze"
+    if steps == end and fault & (Fault.CART_ENCODER | Fault.POLE_ENCODER):
+        steps, why = max(0, end - 1), "a count jumped"  # lost states may hide the jump
+    return episode if steps == end else _shortened(episode, steps, why)
+
+
+def cart_froze(motor: NDArray[np.int64], gaps: Array, last: int) -> bool:
+    """Return whether pushes in both directions left the count as it is since row `last`.
+
+    `motor` [T]; `gaps` [T] s. The period in which a push begins does not count.
+    """
+    push = np.where(np.abs(motor) < PUSH, 0, np.sign(motor))
+    lasted = np.diff(push, prepend=0)[last:] == 0
+    return all((gaps[last : len(push)] * (lasted & (push[last:] == side))).sum() > PUSHED for side in (1, -1))
+
+
+def stopped_dead(count: NDArray[np.int64], gaps: Array, last: int, sudden: float) -> bool:
+    """Return whether a count [K] faster than `sudden`, counts/s, did not change any more after row `last`."""
+    rest = gaps[last : len(count) - 1].sum()
+    return bool(last and rest > STILL and abs(count[last] - count[last - 1]) > sudden * gaps[last - 1])
+
+
+def balanced(theta: Array, gaps: Array) -> bool:
+    """Return whether the pole leant, but did not fall, at the angles `theta` [K], rad, on a standing cart.
+
+    It obeys theta_ddot = w^2 theta, so theta(t - h) + theta(t + h) = 2 cosh(w h) theta(t) > 5 theta(t).
+    """
+    half = round(HALF / float(np.median(gaps))) if len(gaps) else 0
+    if half == 0 or len(theta) <= 2 * half:
+        return False
+    angle = wrap(theta)
+    before, now, after = angle[: -2 * half], angle[half:-half], angle[2 * half :]
+    near = np.maximum(np.abs(before), np.abs(after)) < FALLEN
+    return bool((near & (np.abs(now) > LEANING) & (np.abs(before + after) < 3 * np.abs(now))).any())
+
+
+def pole_froze(speed: Array) -> bool:
+    """Return whether the cart's speed, m/s, has risen and fallen by `SPEED_CHANGE` since the last change."""
+    if not len(speed):
+        return False
+    rise = (speed - np.minimum.accumulate(speed)).max()
+    fall = (np.maximum.accumulate(speed) - speed).max()
+    return bool(min(rise, fall) >= SPEED_CHANGE)
+
+
+def _shortened(episode: Episode, steps: int, why: str) -> Episode:
+    left_out = f"{why}: the last {episode.steps - steps} of {episode.steps} control periods do not count"
+    LOGGER.warning("%s", left_out)
+    return replace(episode.first(steps), ended_by=str(Ending.FAULT), left_out=left_out)

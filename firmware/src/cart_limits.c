@@ -1,0 +1,99 @@
+#include "cart_limits.h"
+
+#include "cart_numbers.h"
+
+#include <math.h>
+
+#define SAMPLE_US 1000u
+#define REACTION_US 10000 /* until the motor's force has changed its sign */
+#define RELEASE_US 10000  /* the brake is released this much later than it would be applied: it does not rattle */
+#define REST 10000        /* um/s; slower outward motion is not braked */
+#define FASTEST 10000000  /* um/s; a higher speed counts as this one */
+#define FAST_POLE (CART_POLE_COUNTS * 16LL / 10) /* counts/s; a higher speed shakes the cart no further */
+#define PI 3.14159265358979323846
+#define POLE_RADIANS (2 * PI / CART_POLE_COUNTS) /* a count */
+#define LONGEST_ROLLING_US 3000000u /* after the cart was armed */
+
+static uint8_t oldest(const cart_limits *limits)
+{
+    if (limits->sampled < CART_SPEED_SAMPLES)
+        return 0;
+    return (uint8_t)((limits->newest + 1u) % CART_SPEED_SAMPLES);
+}
+
+static int64_t window_us(const cart_limits *limits)
+{
+    return (int64_t)(limits->us[limits->newest] - limits->us[oldest(limits)]);
+}
+
+void cart_limits_sample(cart_limits *limits, uint64_t now_us, int32_t cart_count, int32_t pole_count)
+{
+    if (limits->sampled && now_us < limits->us[limits->newest] + SAMPLE_US)
+        return;
+    if (limits->sampled < CART_SPEED_SAMPLES)
+        limits->newest = limits->sampled++;
+    else
+        limits->newest = oldest(limits);
+    limits->us[limits->newest] = now_us;
+    limits->carts[limits->newest] = cart_count;
+    limits->poles[limits->newest] = pole_count;
+}
+
+/* Over the samples, in counts/s, rounded down. */
+static int64_t speed_of(const cart_limits *limits, const int32_t *counts)
+{
+    if (limits->sampled < 2)
+        return 0;
+    int64_t moved = (int64_t)counts[limits->newest] - counts[oldest(limits)];
+    return cart_floor_divide(moved * 1000000, window_us(limits));
+}
+
+static int64_t within(int64_t number, int64_t largest)
+{
+    if (number > largest)
+        return largest;
+    return number < -largest ? -largest : number;
+}
+
+static int8_t brake(const cart_limits *limits, int64_t speed, const cart_place *place)
+{
+    if (speed < REST && speed > -REST)
+        return 0;
+    int8_t direction = speed > 0 ? 1 : -1;
+    int64_t turning = within(speed_of(limits, limits->poles), FAST_POLE);
+    int64_t swing = (int64_t)(place->lever_um * ((double)turning * POLE_RADIANS) *
+                              cos((double)place->pole * POLE_RADIANS)); /* um/s */
+    int64_t size = direction * speed, of_centre = direction * (speed + swing);
+    if (of_centre > size)
+        size = of_centre;
+    if (size > FASTEST)
+        size = FASTEST;
+    int64_t left = (int64_t)place->half_span - CART_HARD_COUNTS - direction * place->outward;
+    int64_t left_um = cart_floor_divide(left * CART_NANOMETRES, 1000);
+    int64_t shake_um = 2 * (int64_t)place->lever_um * turning * turning / (FAST_POLE * FAST_POLE);
+    int64_t lag_us = window_us(limits) / 2 + REACTION_US;
+    if (limits->brake == -direction)
+        lag_us += RELEASE_US;
+    int64_t needed_um = size * lag_us / 1000000 + size * size / (2 * CART_BRAKING_UM_S2);
+    return (int8_t)(left_um - shake_um < needed_um ? -direction : 0);
+}
+
+void cart_limits_apply(cart_limits *limits, uint64_t now_us, const cart_place *place)
+{
+    int64_t speed = cart_floor_divide(speed_of(limits, limits->carts) * CART_NANOMETRES, 1000); /* um/s */
+    int64_t away = place->outward < 0 ? -place->outward : place->outward;
+    if (place->armed)
+        limits->until_us = now_us + LONGEST_ROLLING_US;
+    else if (speed < REST && speed > -REST)
+        limits->until_us = 0;
+    limits->blocked = 0;
+    if (place->armed && away >= (int64_t)place->half_span - CART_SOFT_COUNTS)
+        limits->blocked = place->outward > 0 ? 1 : -1;
+    limits->brake = now_us < limits->until_us ? brake(limits, speed, place) : 0;
+}
+
+void cart_limits_release(cart_limits *limits)
+{
+    limits->blocked = limits->brake = 0;
+    limits->until_us = 0;
+}

@@ -1,0 +1,53 @@
+/* The limits of the track, which know the cart's position and speed. They are looked at once a millisecond.
+
+   Beyond the soft limit an outward motor value gives 0. A cart that runs outward too fast to stop before its
+   hard limit is braked with full motor inward:
+
+     left - shake < speed * (lag + reaction) + speed^2 / (2 * CART_BRAKING_UM_S2)
+
+   `left` is the way to the hard limit and `lag` the age of the measured speed. A fast pole shakes the cart harder
+   than the motor can hold it: by up to `lever` to each side of the common centre of mass, whose speed counts here
+   if it is higher than the cart's. `shake` is twice the lever for a pole that turns 1.6 times a second or faster.
+
+   The brake acts while the cart is armed and after that until it has come to rest: a cart that STOP, the watchdog
+   or a fault leaves at speed would roll into an end stop. It never pushes a cart that stands or moves inward. */
+#ifndef CART_LIMITS_H
+#define CART_LIMITS_H
+
+#include "cart_config.h"
+
+#include <stdbool.h>
+#include <stdint.h>
+
+#define CART_SOFT_COUNTS CART_COUNTS(CART_SOFT_LIMIT_UM) /* counts inside a stop */
+#define CART_HARD_COUNTS CART_COUNTS(CART_HARD_LIMIT_UM)
+#define CART_SPEED_SAMPLES 9u /* whose first and last give the speed */
+
+/* Directions are 1 right, -1 left, 0 none. */
+typedef struct {
+    int8_t blocked; /* direction in which motor values are held at 0 */
+    int8_t brake;   /* direction of the full motor value that brakes the cart */
+    uint8_t sampled, newest;
+    uint64_t us[CART_SPEED_SAMPLES];
+    int32_t carts[CART_SPEED_SAMPLES], poles[CART_SPEED_SAMPLES];
+    uint64_t until_us; /* the brake acts until then */
+} cart_limits;
+
+/* A cart and its pole, from the zeros of homing. */
+typedef struct {
+    int64_t outward;   /* counts right of the middle */
+    int64_t pole;      /* counts from upright */
+    int32_t half_span; /* counts from the middle to a stop */
+    int32_t lever_um;  /* m_p l / (m_c + m_p), with l from the pivot to the pole's centre of mass */
+    bool armed;
+} cart_place;
+
+/* Take a sample of the raw counts, unless the newest is younger than a millisecond. */
+void cart_limits_sample(cart_limits *limits, uint64_t now_us, int32_t cart_count, int32_t pole_count);
+
+void cart_limits_apply(cart_limits *limits, uint64_t now_us, const cart_place *place);
+
+/* End all limits: the cart homes, or its count is not to be trusted. */
+void cart_limits_release(cart_limits *limits);
+
+#endif
