@@ -33,8 +33,8 @@ All but `raw` are divided by the scales in `tasks.features`. Other keys, [N, 1] 
 this step, `score` (6.2) and `score_upright` (6.1); `step_count`; and those of the plant. `past` holds the
 numbers that an observation needs from earlier steps.
 
-`terminated`: the cart left the track, the pole fell (balance), or the cart reported a fault. `truncated`: the
-time limit, a lost link, or NO_ACTION. `done` is either; an episode that ends in both ways is terminated.
+`terminated`: the cart left the track, or the pole fell (balance). `truncated`: the time limit, a lost link, a
+fault that the cart reported, or NO_ACTION. `done` is either; an episode that ends in both ways is terminated.
 """
 
 from collections.abc import Callable, Sequence

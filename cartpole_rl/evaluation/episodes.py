@@ -5,9 +5,10 @@ over-represented.
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import chain, islice
 
 import numpy as np
 import torch
@@ -18,8 +19,10 @@ from torchrl.modules import QValueActor
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.one_cart import Numbers, OneCart
 from cartpole_rl.envs.perception import FirstPercept, Percept
+from cartpole_rl.errors import FaultError
 from cartpole_rl.evaluation.driving_policy import DrivingPolicy
 from cartpole_rl.evaluation.knocks import Knocks
+from cartpole_rl.plants.measured import measured_part
 from cartpole_rl.plants.serial.plant import SerialPlant
 from cartpole_rl.plants.specs import OneCartPlant, OneFrame, tensordict_of
 from cartpole_rl.scheduling import no_garbage_collection
@@ -35,13 +38,25 @@ _FROM_NEXT = ("score", "score_upright", "reward", "done")
 def run_episodes(
     env: CartPoleEnv, policy: Policy, episodes: int, knocks: Knocks | None = None
 ) -> Iterator[Episode]:
-    """Yield `episodes` episodes, on simulated carts with `knocks`. Raises the errors of the plant's reset."""
+    """Yield `episodes` episodes, on simulated carts with `knocks`. Raises the errors of the plant's reset.
+
+    Raises FaultError if nothing was measured in any of them; such an episode is not yielded.
+    """
     policy = prepared(env, policy)
     warm_up(env, policy)
-    for _ in range(math.ceil(episodes / env.plant.carts)):
-        batch = run_batch(env, policy, knocks)
-        yield from batch[:episodes]
-        episodes -= len(batch)
+    batches = (run_batch(env, policy, knocks) for _ in range(math.ceil(episodes / env.plant.carts)))
+    yield from with_periods(islice(chain.from_iterable(batches), episodes))
+
+
+def with_periods(episodes: Iterable[Episode]) -> Iterator[Episode]:
+    """Yield the episodes in which a control period was measured. Raises FaultError if there is none."""
+    nothing = True
+    for episode in episodes:
+        if episode.steps:
+            nothing = False
+            yield episode
+    if nothing:
+        raise FaultError("no control period was measured: check the cables of the encoders")
 
 
 def prepared(env: CartPoleEnv, policy: Policy) -> Policy:
@@ -133,13 +148,17 @@ def one_episode(
     guarded: np.ndarray,
     ending: str,
 ) -> Episode:
-    """Return the episode of one cart from its percepts, its frames, and its motor values, guarded or not."""
+    """Return the episode of one cart from its percepts, its frames, and its motor values, guarded or not.
+
+    What follows on a count that froze or jumped is left out; no control period may be left.
+    """
     columns = {key: np.array([getattr(step, key) for step in steps])[:, 0] for key in _FROM_NEXT}
     columns["state"] = np.array([first.state, *(step.state for step in steps)])
     columns["counts"] = np.array([frame.counts for frame in frames])
     columns["time"] = np.cumsum([0.0, *(frame.dt for frame in frames[1:])])
     columns |= {"motor": motor, "guarded": guarded}
-    return _episode(columns, ending, env.hardware.guard is not None)
+    episode = _episode(columns, ending, env.hardware.guard is not None)
+    return measured_part(episode, env.plant.fault)
 
 
 @torch.no_grad()

@@ -15,7 +15,14 @@ from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.one_cart import Numbers
 from cartpole_rl.envs.perception import FirstPercept, Percept
 from cartpole_rl.envs.settings import ObservationSettings
-from cartpole_rl.evaluation.episodes import Policy, chosen_action, ending_of, one_episode, prepared
+from cartpole_rl.evaluation.episodes import (
+    Policy,
+    chosen_action,
+    ending_of,
+    one_episode,
+    prepared,
+    with_periods,
+)
 from cartpole_rl.plants.serial.plant import SerialPlant
 from cartpole_rl.plants.specs import OneFrame
 from cartpole_rl.scheduling import no_garbage_collection
@@ -30,11 +37,11 @@ STOPPING = (Ending.TRACK, Ending.FAULT, Ending.LINK)  # the motor is at 0 in the
 def run_onboard_episodes(env: CartPoleEnv, policy: Policy, episodes: int) -> Iterator[Episode]:
     """Yield episodes of the cart's board, with the motor values that `policy` would have chosen here.
 
-    Raises RefusedError if the board has no policy, and the errors of the plant's reset.
+    Raises RefusedError if the board has no policy, FaultError if nothing was measured, and the errors of the
+    plant's reset.
     """
     policy = prepared(env, policy)
-    for _ in range(episodes):
-        yield run_onboard(env, policy)
+    yield from with_periods(run_onboard(env, policy) for _ in range(episodes))
 
 
 @torch.no_grad()

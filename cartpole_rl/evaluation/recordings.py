@@ -38,7 +38,9 @@ KINDS = {float: "a number", int: "a whole number"}
 def write_recording(path: Path, episode: Episode, facts: Mapping[str, Any] | None = None) -> None:
     """Write one episode atomically; `facts` are added to the heading."""
     with replacing(path) as beside, beside.open("w", newline="", encoding="utf-8") as file:
-        for key, value in {"format": FORMAT, "ended_by": episode.ended_by, **(facts or {})}.items():
+        left_out = {"left_out": episode.left_out} if episode.left_out else {}
+        heading = {"format": FORMAT, "ended_by": episode.ended_by, **left_out, **(facts or {})}
+        for key, value in heading.items():
             file.write(f"# {key}: {value}\n")
         lines = csv.writer(file)
         lines.writerow((*COLUMNS, GUARDED))

@@ -25,6 +25,7 @@ from cartpole_rl.identification.moves import (
 )
 from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 from cartpole_rl.physics.motor import LARGEST_MOTOR
+from cartpole_rl.plants.measured import measured_part
 from cartpole_rl.plants.specs import OneFrame, Plant
 from cartpole_rl.scheduling import no_garbage_collection
 from cartpole_rl.tasks.endings import Ending
@@ -130,7 +131,7 @@ HELD_OUT = "held_out"
 def conduct(
     plant: Plant, period: float, seed: int = 0, experiments: tuple[Experiment, ...] = EXPERIMENTS
 ) -> Iterator[tuple[Experiment, Episode]]:
-    """Yield each experiment with its recording, on a plant of one cart.
+    """Yield each experiment with its recording, on a plant of one cart; not one without a control period.
 
     The cart stands, with the motor at 0, whenever a recording is yielded: nothing controls it while a file is
     written. The next experiment continues from there; after an ending by the plant it starts with a reset.
@@ -149,13 +150,16 @@ def conduct(
         ended = recorded.ended_by != Ending.TIME
         if number + 1 == len(experiments):
             plant.halt()
-        yield experiment, recorded
+        if recorded.steps:
+            yield experiment, recorded
 
 
 def run(
     plant: Plant, present: OneFrame, moves: Moves, guard: TrackGuard
 ) -> tuple[Episode, OneFrame, int | None]:
     """Make the moves from the frame `present` on; return the recording, the last frame, and their result.
+
+    The recording ends where a count froze or jumped.
 
     `guard` brakes the cart where the moves do not. The motor is at 0 at the end, whatever the moves or the
     guard requested last.
@@ -178,7 +182,8 @@ def run(
             breakaway = end.value
             present = plant.step_one(0) if motors[-1] else present
             break
-    return recording(np.array(counts), np.array(gaps[1:]), np.array(motors), ended), present, breakaway
+    recorded = recording(np.array(counts), np.array(gaps[1:]), np.array(motors), ended)
+    return measured_part(recorded, plant.fault), present, breakaway
 
 
 def observed(counts: list[tuple[int, int]], gaps: list[float]) -> Observed:

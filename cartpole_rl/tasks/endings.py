@@ -14,7 +14,7 @@ class Ending(StrEnum):
     TIME = "time"  # truncated: the time limit
     ANGLE = "angle"  # terminated: the balance task's pole fell
     TRACK = "track"  # terminated: the cart left the track
-    FAULT = "fault"  # terminated: the cart latched a fault
+    FAULT = "fault"  # truncated: the cart latched a fault, or a count froze or jumped
     LINK = "link"  # truncated: the cart stopped answering
     NON_FINITE = "non_finite"  # truncated: an observation or an action value was not finite
 

@@ -1,7 +1,8 @@
 """One finished episode as arrays, for scores, figures and recordings."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,10 +51,19 @@ class Episode:
         None  # [T] the motor value can be compared with `expected`; None unless the cart's board drove
     )
 
+    left_out: str = ""  # control periods after the last row that do not count, and why
+
     @property
     def measured_steps(self) -> int:
         """Number of control periods whose outcome was measured: all but the last one before a lost link."""
         return self.steps - (self.ended_by == "link")
+
+    def first(self, steps: int) -> "Episode":
+        """Return the first `steps` control periods."""
+        arrays: dict[str, Any] = {each.name: getattr(self, each.name) for each in fields(self)}
+        left = self.steps - steps
+        cut = {name: array[: len(array) - left] for name, array in arrays.items() if hasattr(array, "dtype")}
+        return replace(self, **cut)
 
     def total(self, measure: Measure) -> float:
         """Return the sum of (6.2) or of (6.1) over the episode."""

@@ -37,30 +37,34 @@ class DrivenCart:
     def evaluate(self, stage: Stage, weights: Weights) -> None:
         """Drive the episodes of a stage that are not on disk, without exploration.
 
-        An episode that the link ended says nothing about the agent: it is driven again. Raises LinkError if
-        that happens LARGEST_LOSSES times in succession.
+        Raises the errors of `finish`.
         """
-        losses = 0
         while (number := self.files.count(stage)) < self.config.evaluation_episodes:
             self.start(weights, 0.0, self.config.seed)
-            episode = self.result(stage, number)
-            if episode.ended_by != Ending.LINK:
-                self.keep(stage, number, episode)
-                losses = 0
-                continue
-            losses += 1
-            lost = f"{stage} {number + 1}: {ending_text(episode)}"
-            if losses == LARGEST_LOSSES:
-                raise LinkError(f"{lost}, {losses} times in succession: check the cart's cable")
-            tqdm.write(f"{lost}; the episode does not count and is driven again")
+            self.finish(stage, number)
 
     def start(self, weights: Weights, epsilon: float, seed: int) -> None:
         """Start an episode and return at once. Raises LinkError."""
-        self.driver.start(DriveRequest(weights, epsilon, seed))
+        self.request = DriveRequest(weights, epsilon, seed)
+        self.driver.start(self.request)
 
     def finish(self, stage: Stage, number: int) -> None:
-        """Wait for the started episode, write and log it. Raises the errors of `result`."""
-        self.keep(stage, number, self.result(stage, number))
+        """Wait for the started episode, write and log it.
+
+        An episode without a control period is driven again; so is an evaluation that the link ended, since it
+        says nothing about the agent. Raises LinkError if that happens LARGEST_LOSSES times in succession, and
+        the errors of `result`.
+        """
+        for losses in range(1, LARGEST_LOSSES + 1):
+            episode = self.result(stage, number)
+            if episode.steps and (stage is Stage.TUNE or episode.ended_by != Ending.LINK):
+                self.keep(stage, number, episode)
+                return
+            lost = f"{stage} {number + 1}: {ending_text(episode)}"
+            if losses < LARGEST_LOSSES:
+                tqdm.write(f"{lost}; the episode does not count and is driven again")
+                self.driver.start(self.request)
+        raise LinkError(f"{lost}, {losses} times in succession: check the cart's cables")
 
     def result(self, stage: Stage, number: int) -> Episode:
         """Wait for the started episode.

@@ -119,6 +119,20 @@ def test_the_cart_is_not_driven_after_the_last_experiment(make_plant: Callable) 
     assert len(resets) == 2
 
 
+@pytest.mark.parametrize(("stuck_at", "names"), [(30.0, ["first"]), (24.0, [])])
+def test_what_follows_a_frozen_count_is_not_recorded(stuck_at: float, names: list[str]) -> None:
+    """Nor a recording without a control period: nothing can be fitted to it."""
+    pytest.importorskip("mujoco", reason='pip install "cartpole_rl[emulator]"')
+    truth = EmulatorSettings(physics_step=1e-3, stuck_encoder="pole", stuck_at=stuck_at)
+    experiments = (Experiment("first", "everything", excite),)
+    with closing(emulated_plant(truth)) as plant:
+        found = {each.name: episode for each, episode in conduct(plant, PERIOD, experiments=experiments)}
+    assert list(found) == names
+    for episode in found.values():
+        assert episode.ended_by == "fault"
+        assert episode.counts[-1, 1] != episode.counts[-2, 1]
+
+
 def test_a_value_that_came_too_late_is_recorded_as_what_drove(make_plant: Callable) -> None:
     class LatePlant(SimulatedPlant):
         def step_one(self, motor: int) -> OneFrame:

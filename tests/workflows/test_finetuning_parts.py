@@ -47,7 +47,9 @@ class Script:
 
     def result(self) -> Driven:
         """Return the next episode."""
-        return Driven(replace(EPISODE, ended_by=next(self.endings)), LinkStatistics())
+        ending = next(self.endings)
+        episode = EPISODE.first(0) if ending == "empty" else EPISODE
+        return Driven(replace(episode, ended_by=ending.replace("empty", "fault")), LinkStatistics())
 
 
 @pytest.fixture
@@ -115,6 +117,21 @@ def test_a_link_that_is_lost_again_and_again_ends_the_run(
     with pytest.raises(LinkError, match=r"before 2: the link was lost after 0\.0 s, 3 times in succession"):
         cart.evaluate(Stage.BEFORE, {})
     assert files.count(Stage.BEFORE) == 1
+
+
+@pytest.mark.parametrize("stage", [Stage.BEFORE, Stage.TUNE])
+def test_an_episode_without_a_measured_period_is_driven_again(
+    stage: Stage, files: FinetuningFiles, log: TensorBoardLog, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cart = DrivenCart(Script("empty", "empty", "fault", "empty", "empty", "empty"), files, log)
+    cart.start({}, 0.0, 0)
+    cart.finish(stage, 0)
+    assert [each.steps for each in files.episodes(stage)] == [2]
+    told = f"{stage} 1: the cart reported a fault after 0.0 s; the episode does not count and is driven again"
+    assert capsys.readouterr().out.splitlines()[0] == told
+    cart.start({}, 0.0, 0)
+    with pytest.raises(LinkError, match=r"2: the cart reported a fault after 0\.0 s, 3 times in succession"):
+        cart.finish(stage, 1)
 
 
 def test_an_episode_to_learn_from_counts_until_the_link_ended_it(

@@ -196,7 +196,7 @@ def test_a_latched_fault_is_not_cleared_with_nobody_asked(
 ) -> None:
     plant.reset()
     peer.state = replace(peer.state, fault=int(fault))
-    assert step(plant, 100)["terminated"]
+    assert step(plant, 100)["done"]
     homings = len(peer.messages(Home))
     with pytest.raises(FaultError, match=r"check the cart, then start again in a terminal and confirm"):
         plant.reset()
@@ -244,7 +244,7 @@ def test_a_fault_ends_the_episode_and_is_cleared_in_the_next_reset(peer: CartPee
     plant.reset()
     peer.state = replace(peer.state, fault=int(Fault.STALL))
     frame = step(plant, 0)
-    assert frame["terminated"]
+    assert (frame["terminated"], frame["truncated"]) == (False, True)
     assert plant.ended_by == "fault"
     assert isinstance(plant.last_error, FaultError)
     assert_stopped(peer)
@@ -277,7 +277,7 @@ def test_a_step_after_the_end_sends_nothing(peer: CartPeer, plant: SerialPlant, 
     sent = len(peer.received)
     again = step(plant, 200)
     assert len(peer.received) == sent
-    assert again["terminated"]
+    assert again["done"]
     assert again["counts"].tolist() == ended["counts"].tolist()
 
 
