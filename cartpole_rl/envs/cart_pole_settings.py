@@ -1,9 +1,12 @@
 """Settings of a whole environment: the cart, its randomization, the task, and what the agent observes."""
 
+from collections.abc import Mapping
+from functools import cache
 from typing import Annotated, Any
 
 from pydantic import Discriminator, Field, Tag
 
+from cartpole_rl.choices import group_choices
 from cartpole_rl.envs.settings import GuardSettings, ObservationSettings
 from cartpole_rl.physics.models import Actuator, CartFriction, Models, PoleFriction
 from cartpole_rl.plants.settings import LearnedSettings, SimulatedSettings
@@ -27,17 +30,60 @@ ControlPeriod = Annotated[float, Field(ge=0.005, le=0.1)]  # s
 
 
 class CartFrictionSettings(Settings):
-    """The friction model of the cart, and parameters that replace the cart's own."""
+    """The friction model of the cart, and numbers of the cart under it: see `driven_numbers`."""
 
     model: CartFriction
     parameters: dict[str, Finite]
 
+    @property
+    def defaults(self) -> Mapping[str, float]:
+        """Those of the choice in conf/ with this model."""
+        return shipped_numbers("cart_friction", self.model)
+
 
 class PoleFrictionSettings(Settings):
-    """The friction model of the pole, and parameters that replace the cart's own."""
+    """The friction model of the pole, and numbers of the cart under it: see `driven_numbers`."""
 
     model: PoleFriction
     parameters: dict[str, Finite]
+
+    @property
+    def defaults(self) -> Mapping[str, float]:
+        """Those of the choice in conf/ with this model."""
+        return shipped_numbers("pole_friction", self.model)
+
+
+@cache
+def shipped_numbers(group: str, model: str) -> dict[str, float]:
+    """Return the numbers of the cart that the choice of a friction model in conf/ gives; {} without one."""
+    choices = (each for each in group_choices(group).values() if each["model"] == model)
+    return next((dict(each["parameters"]) for each in choices), {})
+
+
+@cache
+def shipped_carts() -> tuple[dict[str, float], ...]:
+    """Return the carts in conf/, whose numbers are nominal; the first one is ip02."""
+    carts = group_choices("cart")
+    return (carts.pop("ip02"), *carts.values())
+
+
+def driven_numbers(
+    cart: Mapping[str, float], *frictions: CartFrictionSettings | PoleFrictionSettings
+) -> dict[str, float]:
+    """Return the numbers of the cart that is driven, without the pole's.
+
+    A nominal number (of a cart in conf/) gives way to that of a friction model's choice in conf/. What a
+    person gave replaces both; with `cart` and with a friction model, that with the friction model holds.
+    """
+    numbers = dict(cart)
+    for friction in frictions:
+        for name, value in friction.parameters.items():
+            is_nominal = name not in cart or any(
+                cart[name] == shipped.get(name) for shipped in shipped_carts()
+            )
+            if is_nominal or value != friction.defaults.get(name):
+                numbers[name] = value
+    return numbers
 
 
 class CartSettings(Settings):
@@ -48,8 +94,8 @@ class CartSettings(Settings):
 
     @property
     def nominal_cart(self) -> dict[str, float]:
-        """The nominal parameters of the cart, without the pole's."""
-        return {**self.cart, **self.pole_friction.parameters}
+        """The parameters of the cart that is driven, or varied, without the pole's."""
+        return driven_numbers(self.cart, self.pole_friction)
 
     def nominal_with(self, pole: Pole) -> dict[str, float]:
         """Return the nominal parameters of the cart with `pole`."""
@@ -63,8 +109,8 @@ class SimulatedCartSettings(CartSettings):
 
     @property
     def nominal_cart(self) -> dict[str, float]:
-        """The nominal parameters of the cart, without the pole's."""
-        return {**self.cart, **self.cart_friction.parameters, **self.pole_friction.parameters}
+        """The parameters of the cart that is driven, or varied, without the pole's."""
+        return driven_numbers(self.cart, self.cart_friction, self.pole_friction)
 
     def models_with(self, actuator: Actuator, plant: SimulatedSettings | LearnedSettings) -> Models:
         """Return the physics models of the cart with `actuator`, on `plant`."""

@@ -13,7 +13,7 @@ from cartpole_rl.evaluation.onboard import run_onboard_episodes
 from cartpole_rl.evaluation.publishing import followed
 from cartpole_rl.learning.randomness import seed_everything
 from cartpole_rl.plants.serial.plant import SerialPlant
-from cartpole_rl.plants.settings import EmulatedSettings
+from cartpole_rl.plants.settings import EmulatedSettings, SimulatedSettings
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.reporting.words import guard_text
@@ -32,6 +32,7 @@ from cartpole_rl.workflows.checks import BASELINE
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
 from cartpole_rl.workflows.export import agent_on_board, compiled_training, exported_agent, on_the_board
 from cartpole_rl.workflows.live import LiveView, view_title
+from cartpole_rl.workflows.nominal import note_other_numbers
 from cartpole_rl.workflows.person import confirm, print_message
 from cartpole_rl.workflows.progress import progress_bar
 from cartpole_rl.workflows.repeating import Repetition, repetition
@@ -71,6 +72,12 @@ class Evaluation:
         """Print the numbers of the track guard if they are not those of the training, and were not chosen."""
         if line := guard_note(self.training, self.config, self.settings):
             print_message(command, line)
+
+    def note_other_numbers(self, command: str) -> None:
+        """Print the numbers of a simulated cart that are not the nominal ones."""
+        if isinstance(self.config.plant, SimulatedSettings):
+            poles = self.settings.pole.choices or {}
+            note_other_numbers(command, self.settings.nominal_cart, poles.values())
 
     def check_board(self) -> None:
         """Raise PlantError if the cart's board shall drive and has no agent, or another one."""

@@ -36,6 +36,7 @@ def record(config: RecordConfig, folder: Path) -> None:
         with closing(evaluation.env):
             evaluation.note_other_pole("record")
             evaluation.note_refitted_guard("record")
+            evaluation.note_other_numbers("record")
             settings = evaluation.settings.model_dump(mode="json")
             content = {**evaluation.config.model_dump(mode="json"), "recorded": settings}
             write_config(folder, "record", content, agent=agent_file(evaluation.config.run))

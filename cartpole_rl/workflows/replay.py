@@ -19,6 +19,7 @@ from cartpole_rl.reporting.figures.replays import replay_figure
 from cartpole_rl.reporting.words import count_text
 from cartpole_rl.run_files import FIGURES
 from cartpole_rl.workflows.config import ReplayConfig
+from cartpole_rl.workflows.nominal import note_other_numbers
 from cartpole_rl.workflows.poles import chosen_pole
 from cartpole_rl.workflows.recordings import recordings
 from cartpole_rl.workflows.results import print_results, shown
@@ -38,6 +39,8 @@ def replay_recordings(config: ReplayConfig, folder: Path) -> None:
     episodes = [read_recording(path) for path in paths]
     name, pole = chosen_pole("a replay", config.pole, paths)
     parameters = simulated_parameters(config, pole)
+    cart = {name: value for name, value in parameters.items() if name not in Pole.model_fields}
+    note_other_numbers("replay", cart, [Pole(**{name: parameters[name] for name in Pole.model_fields})])
     period, plant = recorded_period(episodes[0]), config.plant
     models = config.models_with(config.actuator, plant)
     dynamics = Dynamics.of(parameters, models, period, plant.substeps)

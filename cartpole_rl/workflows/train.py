@@ -15,7 +15,7 @@ from cartpole_rl.learning.checkpoints import forget_training, restore_weights, w
 from cartpole_rl.learning.randomness import seed_everything
 from cartpole_rl.learning.training import Training
 from cartpole_rl.plants.effects import without_effect
-from cartpole_rl.plants.settings import LearnedSettings
+from cartpole_rl.plants.settings import LearnedSettings, SimulatedSettings
 from cartpole_rl.randomization.draws import Draws
 from cartpole_rl.run_files import CHECKPOINTS, FIGURES, METRICS
 from cartpole_rl.settings import evaluation_seed
@@ -26,6 +26,7 @@ from cartpole_rl.workflows.checks import check_compiler
 from cartpole_rl.workflows.config import TrainConfig
 from cartpole_rl.workflows.loading import recorded_settings
 from cartpole_rl.workflows.monitor import TrainingMonitor
+from cartpole_rl.workflows.nominal import note_other_numbers
 from cartpole_rl.workflows.person import print_message
 from cartpole_rl.workflows.report import report
 from cartpole_rl.workflows.results import print_results, shown
@@ -63,6 +64,8 @@ def train(config: TrainConfig, folder: Path) -> float:
     evaluate = partial(judge_agent, nominal_env(config), agent, policy, config.seed)
     with claimed(folder):
         write_config(folder, "train", config.model_dump(mode="json"), resumed=checkpoint is not None)
+        if isinstance(config.plant, SimulatedSettings):
+            note_other_numbers("train", config.nominal_cart, (config.pole.choices or {}).values())
         note_unused_randomization(config, env.plant.randomizer)
         note_other_carts(config)
         note_guard(config.guard)

@@ -122,7 +122,7 @@ OF: dict[str, Table] = {
         "reward.kind": ("constant", "table 6.1"),
         "cart_friction.model": ("none", "5.2.2, 6.1"),
         "pole_friction.model": ("none", "5.2.2, 6.1"),
-        "cart.cart_viscous": (0.5, UNREAD),
+        "cart.cart_viscous": (0.0, UNREAD),
         "agent.target_period": (200, "table 6.1"),
         "buffer.size": (15_000, "table 6.1"),
         "optimizer.kind": ("adam", "5.1.2, 6.2"),

@@ -1,0 +1,170 @@
+"""One rule decides which number is driven, and a run prints the numbers that are not nominal.
+
+Nominal value < a choice's default < a person's file < the command line, for every group.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import hydra
+import pytest
+import yaml
+
+from cartpole_rl.checking import checked
+from cartpole_rl.choices import choice, conf_folder, default_choices
+from cartpole_rl.commands.hydra_application.choice_files import with_choice_files
+from cartpole_rl.commands.hydra_application.composition import as_mapping
+from cartpole_rl.workflows.build import replaced_settings
+from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
+from cartpole_rl.workflows.loading import load_settings
+from cartpole_rl.workflows.nominal import note_other_numbers
+
+pytestmark = pytest.mark.usefixtures("hydra_reads_conf")
+
+IP02 = choice("cart/ip02")
+VISCOUS = "cart_viscous"
+GIVEN = {  # group: a number of it that a person gives in a file, and then on the command line
+    "cart": ("cart_mass", 0.8, 0.9),
+    "task": ("time_limit", 400, 300),
+    "pole": ("choices.mine.pole_mass", 0.2, 0.3),
+    "actions": ("motors", [-200, 0, 200], [-100, 0, 100]),
+    "cart_friction": ("parameters.cart_coulomb", 0.7, 0.8),
+    "pole_friction": ("parameters.pole_viscous", 1e-3, 2e-3),
+    "reward": ("scale", 0.5, 0.25),
+    "randomization": ("cart_mass.relative", [-0.1, 0.1], [-0.3, 0.3]),
+    "observation": ("past_motors", 5, 6),
+    "guard": ("quantile", 0.9, 0.8),
+    "agent": ("gamma", 0.9, 0.8),
+    "buffer": ("size", 60_000, 70_000),
+    "optimizer": ("learning_rate", 1e-4, 2e-4),
+    "learning": ("transitions", 500_000, 600_000),
+    "plant": ("substeps", 6, 8),
+}
+
+
+def nested(name: str, value: Any) -> dict[str, Any]:
+    first, _, rest = name.partition(".")
+    return {first: nested(rest, value) if rest else value}
+
+
+def value_of(tree: dict[str, Any], name: str) -> Any:
+    for part in name.split("."):
+        tree = tree[part]
+    return tree
+
+
+def trained(*words: str) -> TrainConfig:
+    """The settings of cartpole-train with these words, as the command composes them."""
+    with with_choice_files(words) as replaced:
+        return checked(TrainConfig, as_mapping(hydra.compose("train", replaced)))
+
+
+def written(folder: Path, group: str, content: dict[str, Any]) -> str:
+    """The word that chooses a file with this content."""
+    (folder / f"{group}_mine.yaml").write_text(yaml.safe_dump(content))
+    return f"{group}={folder}/{group}_mine.yaml"
+
+
+def test_the_table_names_every_group_of_a_training() -> None:
+    with_settings = {group for group, name in default_choices("train").items() if name is not None}
+    assert GIVEN.keys() == with_settings
+
+
+@pytest.mark.parametrize("group", GIVEN)
+def test_a_file_replaces_a_choice_and_the_command_line_both(group: str, tmp_path: Path) -> None:
+    name, in_file, typed = GIVEN[group]
+    default = default_choices("train")[group]
+    content = nested(name, in_file)
+    if group == "pole":
+        content = {"choices": {"mine": {"pole_mass": in_file, "pole_com": 0.2, "pole_inertia": 1e-3}}}
+    elif group in ("cart_friction", "pole_friction"):
+        content = {"model": default, **content}
+    else:
+        content = {"defaults": [default], **content}
+    file = written(tmp_path, group, content)
+    others = ["agent.mirrored=true"] if group == "actions" else []
+    chosen = trained(file, *others).model_dump(mode="json")
+    assert value_of(chosen[group], name) == in_file
+    word = f"{group}.{name}={typed}".replace(" ", "")
+    overridden = trained(file, *others, word)
+    assert value_of(overridden.model_dump(mode="json")[group], name) == typed
+    if group in ("cart", "cart_friction", "pole_friction"):
+        assert overridden.nominal_cart[name.rpartition(".")[2]] == typed
+
+
+CARTS = {  # words, and the viscous friction that is driven
+    "nominal": ([], 0.5),
+    "choice": (["cart_friction=linear"], 1.75),
+    "choice of a cart": (["cart=thesis"], 0.0),
+    "two choices": (["cart=thesis", "cart_friction=linear"], 1.75),
+    "experiment": (["experiment=friction_models_fig_6_8"], 0.0),
+    "experiment and choice": (["experiment=friction_models_fig_6_8", "cart_friction=linear"], 1.75),
+    "file": (["cart"], 55.7),
+    "file and choice": (["cart", "cart_friction=linear"], 55.7),
+    "choice and file": (["cart_friction=linear", "cart"], 55.7),
+    "experiment, file and choice": (["experiment=thesis_swingup", "cart", "cart_friction=linear"], 55.7),
+    "command line": (["cart", "cart_friction=linear", "cart.cart_viscous=3"], 3.0),
+    "command line alone": (["cart_friction=linear", "cart.cart_viscous=3"], 3.0),
+    "command line, with the friction": (
+        ["cart", "cart_friction=linear", "cart_friction.parameters.cart_viscous=4"],
+        4.0,
+    ),
+    "file of a friction": (["cart", "cart_friction"], 6.0),
+    "file that leaves it out": (["cart_of_other_mass", "cart_friction=linear"], 1.75),
+}
+
+
+@pytest.mark.parametrize("case", CARTS)
+def test_the_cart_that_is_driven(case: str, tmp_path: Path) -> None:
+    words, viscous = CARTS[case]
+    files = {
+        "cart": written(tmp_path, "cart", {**IP02, VISCOUS: 55.7, "latency": 0.03}),
+        "cart_friction": written(
+            tmp_path, "cart_friction", {"model": "linear", "parameters": {VISCOUS: 6.0}}
+        ),
+    }
+    (tmp_path / "other").mkdir()
+    files["cart_of_other_mass"] = written(
+        tmp_path / "other", "cart", {"defaults": ["ip02"], "cart_mass": 0.9}
+    )
+    config = trained(*(files.get(word, word) for word in words))
+    assert config.nominal_cart[VISCOUS] == viscous
+    if "cart" in words:
+        assert config.nominal_cart["latency"] == 0.03
+
+
+@pytest.mark.parametrize(("group", "model"), [("cart_friction", "linear"), ("pole_friction", "bearing")])
+def test_an_evaluation_keeps_a_cart_that_a_person_gave(group: str, model: str) -> None:
+    """In the training or in the evaluation, whatever friction model either chooses."""
+    given = {**IP02, VISCOUS: 55.7, "pole_viscous": 0.01}
+    for first, second in (({"cart": given}, {group: model}), ({group: model}, {"cart": given})):
+        training = load_settings(TrainConfig, first)
+        config = load_settings(EvaluateConfig, {"run": "somewhere", **second})
+        settings = replaced_settings(training, config)
+        assert (settings.nominal_cart, getattr(settings, group).model) == (given, model)
+
+
+def test_only_one_shipped_friction_choice_has_numbers_of_the_cart() -> None:
+    found = {
+        path.stem: content["parameters"]
+        for group in ("cart_friction", "pole_friction")
+        for path in (conf_folder() / group).glob("*.yaml")
+        if (content := yaml.safe_load(path.read_text()))["parameters"]
+    }
+    assert found == {"linear": {VISCOUS: 1.75}}
+
+
+def test_numbers_that_are_not_nominal_are_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    for words, line in (
+        ([], ""),
+        (["cart_friction=step", "pole=both"], ""),
+        (["cart_friction=linear"], "cart_viscous 1.75 instead of 0.5"),
+        (
+            ["cart.cart_mass=0.8", "pole=large", "pole.choices.large.pole_mass=0.25"],
+            "cart_mass 0.8 instead of 0.703, pole_mass 0.25 instead of 0.23",
+        ),
+    ):
+        config = trained(*words)
+        note_other_numbers("train", config.nominal_cart, (config.pole.choices or {}).values())
+        head = "cartpole-train: note: the cart is not the nominal one: "
+        assert capsys.readouterr().err == (f"{head}{line}\n" if line else "")
