@@ -40,6 +40,8 @@ class CheckpointError(CartPoleError):
 class RecordingError(CartPoleError):
     """A recording is missing, damaged, or incomplete."""
 
+    exit_code = 2
+
 
 class PlantError(CartPoleError):
     """A cart cannot be driven."""

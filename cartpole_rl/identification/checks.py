@@ -1,9 +1,10 @@
-"""Checks of recordings before a cart is fitted to them. A message says what is wrong and what to do.
+"""Checks of recordings, before and after a fit. A message says what is wrong and what to do.
 
 A fit returns a cart for any data. These checks refuse data that no cart could have produced.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from itertools import pairwise
 
 import numpy as np
@@ -11,42 +12,68 @@ from numpy.typing import NDArray
 
 from cartpole_rl.errors import RecordingError
 from cartpole_rl.identification.correlation import correlation
+from cartpole_rl.identification.prediction import REPORTED
+from cartpole_rl.identification.replay import Replayed, away_from_upright, replay
+from cartpole_rl.identification.rollout import Dynamics
+from cartpole_rl.identification.windows import regular_frames
 from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.tasks.upright import wrap
 
 Array = NDArray[np.floating]
 SHORTEST = 20.0  # s
+SHORTEST_HELD_OUT = 5.0  # s
 LEAST_TRAVEL, LEAST_SWING = 0.05, 0.35  # m, rad
+LEAST_OF_EACH = 0.01, 0.05  # m, rad, in each recording: less than any experiment's
 STILL, STILL_ANGLE, STILL_SPREAD = 0.3, 0.2, 0.02  # s, rad from hanging, rad
 FROZEN = 1.0  # s
 STRONG, MOVES = 150, 0.03  # motor value; m of cart that move a hanging pole
+STRONG_SHARE = 0.3  # of a standstill's motor values: no cart with a swinging pole stands still under so many
 SUDDEN = 0.25  # m/s: from here to standing exactly still within a period
 TOLERANCE = 2.0  # counts by which positions in SI units may differ from counts
 SIGNIFICANT = 0.2  # correlation from which its sign is certain
+UNEXPLAINED = 0.5  # RMS error of a prediction over the RMS motion; about 0.02 for a cart of this kind
+SMALL = (0.01, 0.09)  # m, rad: a smaller error is never unexplained
 
 
-def check_recordings(episodes: Sequence[Episode], period: float) -> None:
-    """Raise RecordingError for the first problem."""
+@contextmanager
+def naming(file: str) -> Iterator[None]:
+    """Put the name of a file before the message of a RecordingError."""
+    try:
+        yield
+    except RecordingError as error:
+        raise RecordingError(f"{file}: {error}") from None
+
+
+def check_recordings(fitted: Mapping[str, Episode], held_out: Mapping[str, Episode], period: float) -> None:
+    """Raise RecordingError for the first problem of the recordings, by the names of their files.
+
+    Each one must show a driven cart and a moving pole; those `fitted` to must show them well together, and
+    those `held_out` each for itself.
+    """
+    for file, episode in {**fitted, **held_out}.items():
+        with naming(file):
+            regular_frames(episode, period)
+            _check_units(episode)
+            if not np.ptp(episode.motor):
+                raise RecordingError(
+                    f"the motor value is {episode.motor[0]} throughout; record it with others, "
+                    "or leave it out"
+                )
+            _check_motion([episode], *LEAST_OF_EACH)
+            _check_encoders(episode, period)
+    for file, episode in held_out.items():
+        with naming(file):
+            if (seconds := period * episode.steps) < SHORTEST_HELD_OUT:
+                raise RecordingError(
+                    f"{seconds:.1f} s are too short to judge a fit; give {SHORTEST_HELD_OUT:g} s or more"
+                )
+            _check_motion([episode], LEAST_TRAVEL, LEAST_SWING)
+    episodes = [*fitted.values()]
     seconds = period * sum(episode.steps for episode in episodes)
     if seconds < SHORTEST:
         raise RecordingError(f"{seconds:.1f} s of recordings are too short; record {SHORTEST:g} s or more")
-    for number, episode in enumerate(episodes):
-        _check_units(episode, number)
-    travel = max(float(np.ptp(episode.x)) for episode in episodes)
-    swing = max(float(np.ptp(episode.theta)) for episode in episodes)
-    if travel < LEAST_TRAVEL or not any(episode.motor.any() for episode in episodes):
-        raise RecordingError(
-            f"the cart moves {1e3 * travel:.0f} mm in all: too little to identify its friction and motor; "
-            "drive it over 100 mm or more"
-        )
-    for number, episode in enumerate(episodes):
-        _check_encoders(episode, number, period)
-    if swing < LEAST_SWING:
-        raise RecordingError(
-            f"the pole swings over {np.degrees(swing):.0f} deg in all: too little to identify it; "
-            "let it swing freely, over 20 deg or more"
-        )
+    _check_motion(episodes, LEAST_TRAVEL, LEAST_SWING)
     if not any(_hangs_still(episode, period) for episode in episodes):
         raise RecordingError(
             "the pole never hangs still in the recordings, so its zero cannot be checked; "
@@ -55,7 +82,62 @@ def check_recordings(episodes: Sequence[Episode], period: float) -> None:
     _check_signs(episodes, period)
 
 
-def _check_units(episode: Episode, number: int) -> None:
+def check_explained(recordings: Mapping[str, Episode], dynamics: Dynamics, horizon: float) -> list[Replayed]:
+    """Return each recording beside its replay by the fitted cart; see `replay` for `horizon`, s.
+
+    Raises RecordingError for the first one, by the name of its file, whose motion the cart does not explain.
+    """
+    replays = []
+    for file, episode in recordings.items():
+        with naming(file):
+            replays += replay([episode], dynamics, horizon)
+            _check_explained(replays[-1], horizon)
+    return replays
+
+
+def _check_explained(replayed: Replayed, horizon: float) -> None:
+    kept = away_from_upright(replayed)
+    if not kept.any():
+        return
+    for name, values, errors, small, (unit, factor) in zip(
+        ("cart", "pole"),
+        (replayed.x, replayed.theta),
+        (replayed.x_error, replayed.theta_error),
+        SMALL,
+        REPORTED.items(),
+        strict=True,
+    ):
+        measured = values - errors
+        error, motion = (
+            factor * np.sqrt(np.mean(each[kept] ** 2)) for each in (errors, measured - measured[:, :1])
+        )
+        if error > factor * small and error > UNEXPLAINED * motion:
+            raise RecordingError(
+                f"no cart explains this recording: {horizon:g} s of the {name}'s motion, {motion:.0f} "
+                f"{unit.rpartition('_')[2]}, is predicted {error:.0f} wrong; check its motor values "
+                "and counts, and that all recordings are of one cart, or leave it out"
+            )
+
+
+def _check_motion(episodes: Sequence[Episode], travel: float, swing: float) -> None:
+    """Refuse recordings in which the cart moves less than `travel` m, or the pole less than `swing` rad."""
+    moves, swings = (
+        max(float(np.ptp(each)) for each in values)
+        for values in ([episode.x for episode in episodes], [episode.theta for episode in episodes])
+    )
+    if moves < travel:
+        raise RecordingError(
+            f"the cart moves {1e3 * moves:.0f} mm in all: too little to identify its friction and motor; "
+            f"drive it over {2e3 * travel:.0f} mm or more, or check its encoder"
+        )
+    if swings < swing:
+        raise RecordingError(
+            f"the pole swings over {np.degrees(swings):.0f} deg in all: too little to identify it; "
+            f"let it swing freely, over {np.degrees(swing):.0f} deg or more, or check its encoder"
+        )
+
+
+def _check_units(episode: Episode) -> None:
     for name, values, counts, unit in (
         ("x", episode.x, episode.counts[:, 0], CART_METRES_PER_COUNT),
         ("theta", episode.theta, episode.counts[:, 1], POLE_RADIANS_PER_COUNT),
@@ -66,12 +148,11 @@ def _check_units(episode: Episode, number: int) -> None:
         )
         if np.abs(error - error[0] - turns).max() > TOLERANCE:
             raise RecordingError(
-                f"recording {number}: {name} is not its encoder's count times {unit:.4g}; "
-                "give metres, radians and raw counts"
+                f"{name} is not its encoder's count times {unit:.4g}; give metres, radians and raw counts"
             )
 
 
-def _check_encoders(episode: Episode, number: int, period: float) -> None:
+def _check_encoders(episode: Episode, period: float) -> None:
     """Refuse a count that is constant while the other count or the motor shows that it should change."""
     long = round(FROZEN / period)
     cart, pole = episode.counts[:, 0], episode.counts[:, 1]
@@ -82,10 +163,10 @@ def _check_encoders(episode: Episode, number: int, period: float) -> None:
         for first, last in _standstills(own):
             if last - first < long:
                 continue
-            pushed = np.abs(episode.motor[first:last]).min() >= STRONG
+            pushed = np.mean(np.abs(episode.motor[first:last]) >= STRONG) >= STRONG_SHARE
             if np.ptp(other[first : last + 1]) > enough and (name == "pole" or pushed):
                 raise RecordingError(
-                    f"recording {number}: the {name}'s count stays at {own[first]} from "
+                    f"the {name}'s count stays at {own[first]} from "
                     f"{first * period:.1f} s to {last * period:.1f} s while the "
                     f"{'pole' if name == 'cart' else 'cart'} moves: "
                     f"the encoder is frozen, saturated or unplugged; check its cable"
@@ -94,7 +175,7 @@ def _check_encoders(episode: Episode, number: int, period: float) -> None:
     for first, last in _standstills(cart):
         if last - first >= 5 and first > 0 and speed[first - 1] > SUDDEN:
             raise RecordingError(
-                f"recording {number}: the cart stops dead at {cart[first]} counts from "
+                f"the cart stops dead at {cart[first]} counts from "
                 f"{speed[first - 1]:.2f} m/s at {first * period:.1f} s: it hit a stop, or its count is "
                 "saturated; keep it clear of the ends"
             )

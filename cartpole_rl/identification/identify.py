@@ -7,21 +7,22 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cartpole_rl.identification.checks import check_explained
 from cartpole_rl.identification.fit import Fit, fit_cart
-from cartpole_rl.identification.replay import Replayed, replay
+from cartpole_rl.identification.prediction import Prediction, predict
+from cartpole_rl.identification.replay import LEAD, Replayed, away_from_upright, is_away
 from cartpole_rl.identification.rollout import Dynamics
 from cartpole_rl.identification.unknowns import WEIGHED, limits
-from cartpole_rl.identification.windows import cut_windows
+from cartpole_rl.identification.windows import cut_judging, cut_windows, lead_periods
 from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 from cartpole_rl.physics.models import CartFriction, Models
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
-from cartpole_rl.tasks.upright import wrap
 
 Array = NDArray[np.floating]
 CART_FRICTIONS = (CartFriction.LINEAR, CartFriction.SIGMOID, CartFriction.STEP, CartFriction.STRIBECK)
-HORIZON = 1.0  # s of held-out motion, predicted
-AWAY = 0.6  # rad from upright; nearer to it, an error grows e times in 0.15 s for any cart
+HORIZON = 1.0  # s of motion, predicted
+MOVING = round(0.02 / CART_METRES_PER_COUNT)  # counts in that time, from which a friction model shows
 SCREENING_STEPS = 4  # integration steps a period when a friction model is screened
 CONTENDS = 1.5  # a screened model stays a candidate up to this multiple of the best one's error
 FALLOFF = 4  # a model with twice the error of the best one has a weight of 2^-FALLOFF
@@ -48,11 +49,10 @@ ALIKE = PredictionError(5e-3, np.radians(2.0))  # errors of cart and pole with e
 
 
 class Candidate(NamedTuple):
-    """A fit under one model of the cart's friction, and its predictions of held-out motion."""
+    """A fit under one model of the cart's friction, and its error where it was not fitted."""
 
     fit: Fit
     dynamics: Dynamics
-    held_out: list[Replayed]
     error: PredictionError
 
     @property
@@ -79,23 +79,29 @@ class Identification:
 
 
 def identify(
-    episodes: Sequence[Episode],
-    held_out: Sequence[Episode],
+    fitted: Mapping[str, Episode],
+    held_out: Mapping[str, Episode],
     nominal: Mapping[str, float],
     models: Models,
     period: float,
     substeps: int = 12,
     most: int = 300,
 ) -> Identification:
-    """Identify the cart that `episodes` were recorded on, judged by `held_out`, with the pole of `nominal`.
+    """Identify the cart that recordings, by the names of their files, are of, with the pole of `nominal`.
 
-    The model of the cart's friction is chosen here; `models` gives the others. At most `most` windows are
-    fitted to. Raises RecordingError where the recordings are not sufficient.
+    The model of the cart's friction is chosen here: the one that best predicts seconds of the `fitted`
+    recordings that were left out of its fit. `models` gives the others. The chosen one is then fitted to at
+    most `most` windows of all of them. `held_out` only gives the error that is reported. Raises
+    RecordingError where the recordings are not sufficient, or no cart explains one of them.
     """
+    episodes = [*fitted.values()]
+    judging = cut_judging(episodes, period, HORIZON, lead_periods(LEAD, period), MOVING)
 
-    def attempt(cart_friction: CartFriction, count: int, steps: int, sharpened: bool) -> Candidate:
+    def attempt(
+        cart_friction: CartFriction, count: int, steps: int, judged: bool, sharpened: bool
+    ) -> Candidate:
         under, half_step = models._replace(cart_friction=cart_friction), period / steps / 2
-        windows = cut_windows(episodes, period, most=count)
+        windows = cut_windows(episodes, period, most=count, apart_from=judging if judged else None)
         fit = fit_cart(
             windows,
             nominal,
@@ -107,30 +113,44 @@ def identify(
             extra_latency=half_step,  # (3.8) moves a cart half a step early
         )
         dynamics = Dynamics.of(fit.parameters, under, period, steps, half_step)
-        replays = replay(held_out, dynamics, HORIZON)
-        return Candidate(fit, dynamics, replays, prediction_error(replays))
+        return Candidate(fit, dynamics, judged_error(predict(judging, dynamics)))
 
-    screened = [attempt(each, most // 3, SCREENING_STEPS, False) for each in CART_FRICTIONS]
+    screened = [attempt(each, most // 3, SCREENING_STEPS, True, False) for each in CART_FRICTIONS]
     largest = CONTENDS * min(each.error.size for each in screened)
     contenders = {
-        each.cart_friction: attempt(each.cart_friction, most, substeps, True)
+        each.cart_friction: attempt(each.cart_friction, most, substeps, True, True)
         for each in screened
         if each.error.size < largest
     }
     candidates = [contenders.get(each.cart_friction, each) for each in screened]
     best = min(contenders.values(), key=lambda each: each.error.size)
-    fit = widened(best, [*contenders.values()])
-    found = [*early_endings([*episodes, *held_out]), *warnings(fit)]
-    return Identification(fit, best.dynamics, candidates, best.held_out, best.error, found)
+    whole = attempt(best.cart_friction, most, substeps, False, True)
+    check_explained(fitted, whole.dynamics, HORIZON)
+    replays = check_explained(held_out, whole.dynamics, HORIZON)
+    fit = widened(whole.fit, best, [*contenders.values()])
+    found = [*early_endings([*episodes, *held_out.values()]), *warnings(fit)]
+    return Identification(fit, whole.dynamics, candidates, replays, prediction_error(replays), found)
 
 
 def prediction_error(replays: Sequence[Replayed]) -> PredictionError:
     """Return the RMS errors over a stretch: the medians of the complete stretches away from upright."""
     x = np.concatenate([each.x_error for each in replays])
     theta = np.concatenate([each.theta_error for each in replays])
-    angle = np.concatenate([each.theta - each.theta_error for each in replays])  # as measured
     whole = np.isfinite(x).all(1)
-    away = whole & (np.abs(wrap(np.where(np.isfinite(angle), angle, np.pi))) > AWAY).all(1)
+    return median_error(x, theta, np.concatenate([away_from_upright(each) for each in replays]), whole)
+
+
+def judged_error(prediction: Prediction) -> PredictionError:
+    """Return the same of predicted windows."""
+    x, theta = prediction.error.transpose(1, 2, 0)
+    away = is_away((prediction.simulated[:, 1] - prediction.error[:, 1]).T)
+    return median_error(x, theta, away, np.full(len(x), True))
+
+
+def median_error(
+    x: Array, theta: Array, away: NDArray[np.bool_], whole: NDArray[np.bool_]
+) -> PredictionError:
+    """Return the medians of the RMS errors of stretches, [S, T + 1], that are `away`; if none is, `whole`."""
     kept = away if away.any() else whole
     x_error, theta_error = (float(np.median(np.sqrt((each[kept] ** 2).mean(1)))) for each in (x, theta))
     return PredictionError(x_error, theta_error)
@@ -142,13 +162,14 @@ def early_endings(episodes: Sequence[Episode]) -> list[str]:
     return [f"{len(cut)} of the recordings ended early, by {' and '.join(sorted({*cut}))}"] if cut else []
 
 
-def widened(best: Candidate, candidates: Sequence[Candidate]) -> Fit:
-    """Return the best fit, its covariance enlarged by the distance of the others' numbers from its own.
+def widened(fit: Fit, best: Candidate, candidates: Sequence[Candidate]) -> Fit:
+    """Return `fit`, its covariance enlarged by the distances of the other candidates from the `best` one.
 
-    No friction model is exact: one that predicts nearly as well is nearly as probable.
+    No friction model is exact: one that predicts nearly as well is nearly as probable. `fit` has the friction
+    model of `best`.
     """
-    names = [unknown.name for unknown in best.fit.unknowns]
-    covariance, total = np.zeros_like(best.fit.covariance), 1.0
+    names = [unknown.name for unknown in fit.unknowns]
+    covariance, total = np.zeros_like(fit.covariance), 1.0
     for other in candidates:
         if other is best:
             continue
@@ -161,9 +182,9 @@ def widened(best: Candidate, candidates: Sequence[Candidate]) -> Fit:
         )
         covariance += weight * np.outer(away, away)
         total += weight
-    values, vectors = np.linalg.eigh(best.fit.covariance + covariance / total)
+    values, vectors = np.linalg.eigh(fit.covariance + covariance / total)
     bounded = np.minimum(values, 1.0)  # the posterior is not wider than the prior
-    return replace(best.fit, covariance=vectors * bounded @ vectors.T)
+    return replace(fit, covariance=vectors * bounded @ vectors.T)
 
 
 def warnings(fit: Fit) -> list[str]:

@@ -15,8 +15,10 @@ from cartpole_rl.identification.prediction import predict
 from cartpole_rl.identification.rollout import Dynamics
 from cartpole_rl.identification.windows import cut_stretches, lead_periods
 from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.tasks.upright import wrap
 
 LEAD = 0.1  # s before a stretch
+AWAY = 0.6  # rad from upright; nearer to it, an error grows e times in 0.15 s for any cart
 
 Array = NDArray[np.float64]
 
@@ -58,3 +60,14 @@ def all_errors(replays: Sequence[Replayed]) -> Array:
         ),
         1,
     )
+
+
+def away_from_upright(replayed: Replayed) -> NDArray[np.bool_]:
+    """Return the complete stretches, [S], in which the measured pole stays AWAY from upright."""
+    return np.isfinite(replayed.x_error).all(1) & is_away(replayed.theta - replayed.theta_error)
+
+
+def is_away(theta: Array) -> NDArray[np.bool_]:
+    """Return True, [S], for angles [S, T + 1], rad, that stay AWAY from upright; NaN counts as hanging."""
+    angle = np.abs(wrap(np.where(np.isfinite(theta), theta, np.pi)))
+    return np.all(angle > AWAY, axis=1)

@@ -16,6 +16,7 @@ from cartpole_rl.tasks.episode import Episode
 
 WINDOW = 0.5  # s, of the windows that a cart is fitted to
 HISTORY, LEAST_HISTORY = 0.12, 6  # s and periods of motor values before a window: more than latency and lag
+JUDGING = 4  # one window in so many judges models that are fitted to the others
 LEAST_LEAD = 5  # periods whose positions give an initial state
 IRREGULAR = 0.2  # share of the period that a frame may come early or late
 
@@ -59,6 +60,11 @@ class Windows(NamedTuple):
         """W."""
         return self.positions.shape[2]
 
+    def share_frames(self, episode: int, first: int, last: int) -> bool:
+        """Return True if a window includes one of the rows from `first` to `last` of an episode."""
+        within = (self.first <= last) & (self.first + self.periods >= first)
+        return bool((within & (self.episode == episode)).any())
+
 
 def history_periods(period: float) -> int:
     """Return the number H of motor values before a window, at a control period in s."""
@@ -71,18 +77,23 @@ def lead_periods(seconds: float, period: float) -> int:
 
 
 def cut_windows(
-    episodes: Sequence[Episode], period: float, seconds: float = WINDOW, most: int = 240
+    episodes: Sequence[Episode],
+    period: float,
+    seconds: float = WINDOW,
+    most: int = 240,
+    apart_from: Windows | None = None,
 ) -> Windows:
     """Cut windows of `seconds` s, one after another, evenly thinned to at most `most`.
 
-    A window over a lost or late frame is left out. Raises RecordingError if nothing is left, or if the
-    recordings have another control period than `period` s.
+    A window over a lost or late frame is left out, and so is one that shares frames with `apart_from`. Raises
+    RecordingError if nothing is left, or if the recordings have another control period than `period` s.
     """
     periods = round(seconds / period)
     pieces = [
         piece
         for number, episode in enumerate(episodes)
         for piece in _pieces(episode, period, periods, step=periods, least=periods, number=number)
+        if apart_from is None or not apart_from.share_frames(number, piece.first, piece.first + periods)
     ]
     if not pieces:
         raise RecordingError(
@@ -106,6 +117,28 @@ def cut_stretches(episode: Episode, period: float, seconds: float, lead: int) ->
             "late or lost"
         )
     return Windows.of(pieces, lead)
+
+
+def cut_judging(
+    episodes: Sequence[Episode], period: float, seconds: float, lead: int, moving: int
+) -> Windows:
+    """Cut a window of `lead` periods and `seconds` s at every `seconds` s, and keep every JUDGING-th of them.
+
+    Only those count in which the cart moves over `moving` counts or more and no frame is lost or late.
+    Raises RecordingError where there are none, or for another control period than `period` s.
+    """
+    periods = round(seconds / period)
+    pieces = [
+        piece
+        for number, episode in enumerate(episodes)
+        for piece in _pieces(episode, period, lead + periods, periods, lead + periods, number)
+        if np.ptp(piece.positions[:, 0]) >= moving
+    ]
+    if not pieces:
+        raise RecordingError(
+            f"the cart never moves for {seconds:g} s without a lost frame: drive it more, check the cable"
+        )
+    return Windows.of(pieces[(JUDGING - 1) % len(pieces) :: JUDGING], lead)
 
 
 def _pieces(

@@ -81,6 +81,7 @@ def identification_page(
         ("Friction models of the cart", _friction_rows(found.candidates)),
         (
             "",
+            "The table's errors are those over seconds of the recordings that were left out of these fits. "
             "RMS prediction error over one second of held-out motion away from upright, with the best model: "
             f"{error_text(found.error)}.",
         ),

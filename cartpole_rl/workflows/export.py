@@ -74,9 +74,7 @@ def on_the_board(
         yield config.model_copy(update={"emulator": emulator})
 
 
-def agent_on_board(
-    config: EvaluateConfig, trained: TrainedAgent, settings: CartPoleSettings
-) -> TrainedAgent:
+def agent_on_board(config: EvaluateConfig, trained: TrainedAgent, settings: CartPoleSettings) -> TrainedAgent:
     """Return the agent that the board should have: on an emulated cart, one with `settings`."""
     if config.has_compiled_agent:
         return trained

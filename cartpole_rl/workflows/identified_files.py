@@ -19,8 +19,11 @@ UNIDENTIFIABLE = {  # randomized about the identified cart, since no experiment 
     "latency_jitter": {"distribution": "uniform", "absolute": [0.0, 0.002]},
 }
 WIDEN = 2.0  # factor on the standard deviations, for carts to train on
-UNITS = {
+UNITS = {  # those that are not named have none
     "cart_mass": "kg",
+    "pole_mass": "kg",
+    "pole_com": "m",
+    "pole_inertia": "kg m^2",
     "track_half_length": "m",
     "track_tilt": "rad",
     "cart_viscous": "N s/m",
@@ -30,9 +33,11 @@ UNITS = {
     "pole_viscous": "N m s/rad",
     "pole_drag": "N m s^2/rad^2",
     "pole_coulomb": "N m",
-    "force_quadratic": "N",
-    "force_linear": "N",
+    "force_quadratic": "N per motor value squared",
+    "force_linear": "N per motor value",
     "force_offset": "N",
+    "deadband_left": "motor value",
+    "deadband_right": "motor value",
     "motor_time_constant": "s",
     "latency": "s",
     "latency_jitter": "s",
@@ -51,7 +56,8 @@ def write_choices(found: Identification, carts: np.ndarray, folder: Path) -> Non
     parameters = found.fit.parameters
     pole = Pole(**{name: parameters[name] for name in Pole.model_fields})
     choices = {"choices": {"identified": pole.model_dump()}}
-    write_text(folder / POLE, yaml.safe_dump(choices, sort_keys=False))
+    units = f"# {', '.join(f'{name} in {UNITS[name]}' for name in Pole.model_fields)}.\n"
+    write_text(folder / POLE, units + yaml.safe_dump(choices, sort_keys=False))
     with replacing(folder / POSTERIOR) as beside, beside.open("wb") as file:  # a path would get ".npz"
         np.savez(
             file,
@@ -62,6 +68,7 @@ def write_choices(found: Identification, carts: np.ndarray, folder: Path) -> Non
             point=found.fit.point,
             covariance=found.fit.covariance,
         )
+    absolute = [name for name, line in UNIDENTIFIABLE.items() if "absolute" in line]
     randomization = {
         "posterior": "${here}/" + POSTERIOR,
         "widen": WIDEN,
@@ -71,6 +78,7 @@ def write_choices(found: Identification, carts: np.ndarray, folder: Path) -> Non
     write_text(
         folder / RANDOMIZATION,
         f"# Carts drawn from the posterior, correlations included; standard deviations times {WIDEN:g}.\n"
+        f"# Absolute ranges are in {', '.join(f'{UNITS[name]} ({name})' for name in absolute)}.\n"
         + yaml.safe_dump(randomization, sort_keys=False),
     )
 
@@ -87,7 +95,7 @@ def write_cart(found: Identification, carts: np.ndarray, path: Path) -> None:
     for name in CartParameters.names():
         if name not in Pole.model_fields:
             error = f"+- {deviations[name]:.2g}" if name in identified else "prior value"
-            lines.append(f"{name}: {parameters[name]:.6g}  # {UNITS.get(name, '1')}, {error}")
+            lines.append(f"{name}: {parameters[name]!r}  # {UNITS.get(name, '1')}, {error}")
     write_text(path, "\n".join(lines) + "\n")
 
 

@@ -37,6 +37,7 @@ from cartpole_rl.workflows.build import precedence, use_threads
 from cartpole_rl.workflows.config import IdentifyConfig
 from cartpole_rl.workflows.identified_errors import BY_HAND, errors, known_truth
 from cartpole_rl.workflows.identified_files import report, write_choices
+from cartpole_rl.workflows.nominal import note_other_numbers
 from cartpole_rl.workflows.person import confirm, print_message
 from cartpole_rl.workflows.progress import progress_bar
 from cartpole_rl.workflows.recordings import experiments
@@ -57,23 +58,28 @@ def identify_cart(config: IdentifyConfig, folder: Path) -> None:
     """
     use_threads(config.threads)
     nominal = config.nominal  # or ConfigError, before the cart moves
+    note_other_numbers("identify", config.nominal_cart, [config.pole.nominal])
     source = config.source or folder
-    recordings = {} if config.source is None else read_recordings(source)
-    write_config(folder, "identify", config.model_dump(mode="json", by_alias=True))
     if config.source is None:
+        write_config(folder, "identify", config.model_dump(mode="json", by_alias=True))
         record_experiments(config, folder / RECORDINGS)
-        recordings = read_recordings(source)
-    fitted, held_out = split(recordings, source)
-    check_recordings([*fitted.values()], config.control_period)
+    files = experiments(source)
+    fitted, held_out = split({name: read_recording(path) for name, path in files.items()}, source)
+    by_file, held_out_by_file = (
+        {str(files[name]): episode for name, episode in chosen.items()} for chosen in (fitted, held_out)
+    )
+    check_recordings(by_file, held_out_by_file, config.control_period)
+    if config.source is not None:
+        write_config(folder, "identify", config.model_dump(mode="json", by_alias=True))
     seconds = sum(each.steps for each in fitted.values()) * config.control_period
     print_message("identify", f"fitting {seconds:.0f} s of recordings")
     models = Models(CartFriction.STEP, config.pole_friction.model, Actuator.FORCE_CURVE)
     truth = known_truth(config)
     period, substeps = config.control_period, config.substeps
     if config.method == "one_step":
-        regress([*fitted.values(), held_out], nominal, models, period, truth, folder)
+        regress([*fitted.values(), *held_out.values()], nominal, models, period, truth, folder)
         return
-    found = identify([*fitted.values()], [held_out], nominal, models, period, substeps, config.windows)
+    found = identify(by_file, held_out_by_file, nominal, models, period, substeps, config.windows)
     carts = found.fit.draw(config.carts, np.random.default_rng(config.seed))
     write_choices(found, carts, folder)
     write_json(folder / IDENTIFIED, report(found, carts) | errors(found.fit.parameters, truth, BY_HAND))
@@ -130,18 +136,13 @@ def make_plant(config: IdentifyConfig) -> SerialPlant:
     return cart_plant(config.plant, config.emulator, period, "hanging", tqdm.write, confirm)
 
 
-def read_recordings(source: Path) -> Episodes:
-    """Return the recordings in `source`. Raises RecordingError, ConfigError."""
-    return {name: read_recording(path) for name, path in experiments(source).items()}
-
-
-def split(recordings: Episodes, source: Path) -> tuple[Episodes, Episode]:
+def split(recordings: Episodes, source: Path) -> tuple[Episodes, Episodes]:
     """Return the recordings to fit, and the held-out one: that experiment, or else the last recording."""
     held_out = HELD_OUT if HELD_OUT in recordings else list(recordings)[-1]
     fitted = {name: episode for name, episode in recordings.items() if name != held_out}
     if not fitted or (held_out != HELD_OUT and len(recordings) < 2):
         raise RecordingError(f"from={source}: give two recordings or more; the last one is held out")
-    return fitted, recordings[held_out]
+    return fitted, {held_out: recordings[held_out]}
 
 
 def next_command(found: Identification, folder: Path) -> str:

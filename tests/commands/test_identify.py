@@ -10,7 +10,10 @@ import pytest
 import yaml
 from command_line import ONCE, QUICK, TINY, Outcome, in_process
 
+from cartpole_rl.checking import checked
+from cartpole_rl.choices import without_missing
 from cartpole_rl.physics.parameters import CartParameters
+from cartpole_rl.workflows.config import TrainConfig
 
 
 @pytest.fixture(scope="module")
@@ -70,6 +73,48 @@ def test_offline_is_as_online(run: Path, results: dict[str, Any], tmp_path: Path
     assert json.loads((tmp_path / "again/identification.json").read_text()) == results
 
 
+@pytest.mark.parametrize("friction", ["", "cart_friction=linear"])
+def test_the_printed_command_drives_the_identified_cart_exactly(
+    identified: tuple[Path, Outcome], results: dict[str, Any], friction: str
+) -> None:
+    """Under the selected friction model and any other, which replaces no identified number."""
+    run, done = identified
+    _, *words = done.out.splitlines()[-1].split()
+    words = [friction if friction and word.startswith("cart_friction") else word for word in words]
+    shown = in_process("train", *words, "--cfg", "job", "--resolve", folder=run.parent)
+    config = checked(TrainConfig, without_missing(yaml.safe_load(shown.out)))
+    assert config.nominal_with(config.pole.nominal) == results["parameters"]
+    assert config.cart_friction.model == (friction.partition("=")[2] or results["cart_friction"])
+
+
+@pytest.mark.parametrize("name", ["05_excite", "06_held_out"])
+@pytest.mark.parametrize(
+    ("columns", "said"),
+    [
+        (("motor",), "the motor value is 0 throughout; record it with others, or leave it out"),
+        (("theta_rad", "pole_counts"), "the pole"),
+        (("x_m", "cart_counts", "theta_rad", "pole_counts", "motor"), "the motor value is 0 throughout"),
+        (("x_m", "cart_counts", "theta_rad", "pole_counts"), "the cart moves 0 mm in all"),
+    ],
+)
+def test_a_recording_of_no_cart_gives_no_cart(
+    run: Path, tmp_path: Path, name: str, columns: tuple[str, ...], said: str
+) -> None:
+    shutil.copytree(run / "recordings", tmp_path / "recordings")
+    file = tmp_path / f"recordings/{name}.csv"
+    lines = file.read_text().splitlines()
+    first = next(number for number, line in enumerate(lines) if not line.startswith("#"))
+    names = lines[first].split(",")
+    for number, line in enumerate(lines[first + 1 :], first + 1):
+        cells = zip(names, line.split(","), strict=True)
+        lines[number] = ",".join("0" if column in columns and cell else cell for column, cell in cells)
+    file.write_text("\n".join(lines) + "\n")
+    done = in_process("identify", "from=recordings", *QUICK, "hydra.run.dir=out", folder=tmp_path)
+    assert done.code == 2
+    assert done.complaint.startswith(f"cartpole-identify: recordings/{name}.csv: {said}")
+    assert not (tmp_path / "out").exists()
+
+
 def test_an_agent_trains_on_what_was_found(run: Path, tmp_path: Path) -> None:
     run = shutil.copytree(run, tmp_path / "moved")  # a run folder can be moved
     files = [f"{group}={run}/{group}.yaml" for group in ("cart", "pole", "randomization")]
@@ -98,13 +143,13 @@ class TestBadInput:
 
     def test_an_empty_folder(self, tmp_path: Path) -> None:
         done = in_process("identify", f"from={tmp_path}", folder=tmp_path)
-        assert done.code == 1
+        assert done.code == 2
         assert "it contains no recording; give a run of cartpole-record or cartpole-identify" in done.err
 
     def test_a_single_recording(self, run: Path, tmp_path: Path) -> None:
         shutil.copy(run / "recordings/01_swing.csv", tmp_path)
         done = in_process("identify", f"from={tmp_path}", folder=tmp_path)
-        assert done.code == 1
+        assert done.code == 2
         assert "give two recordings or more" in done.err
 
     @pytest.mark.parametrize(
@@ -126,5 +171,5 @@ class TestBadInput:
 
     def test_another_rate(self, run: Path, tmp_path: Path) -> None:
         done = in_process("identify", f"from={run}", "control_period=0.01", folder=tmp_path)
-        assert done.code == 1
+        assert done.code == 2
         assert "a frame every 20.0 ms, not every 10.0 ms" in done.err

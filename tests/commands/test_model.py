@@ -133,4 +133,4 @@ def test_too_short_a_recording_says_so(recorded: Path, tmp_path: Path) -> None:
     (tmp_path / "short.csv").write_text("\n".join([*lines[: heading + 80], lines[-1]]) + "\n")
     done = in_process("model", "from=short.csv", *SMALL, folder=tmp_path)
     assert "the held-out recordings have no 1.32 s without a lost frame: record longer" in done.err
-    assert done.code == 1
+    assert done.code == 2

@@ -1,5 +1,6 @@
 """Experiments on a simulated cart keep clear of the ends, and identify the cart."""
 
+import re
 from collections.abc import Callable
 from contextlib import closing
 from functools import partial
@@ -13,7 +14,7 @@ from tensordict import TensorDict
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.envs.guard import stopping_distance
 from cartpole_rl.errors import RecordingError
-from cartpole_rl.identification.checks import check_recordings
+from cartpole_rl.identification.checks import check_explained, check_recordings
 from cartpole_rl.identification.experiments import (
     EXPERIMENTS,
     HELD_OUT,
@@ -26,6 +27,7 @@ from cartpole_rl.identification.experiments import (
     hold,
 )
 from cartpole_rl.identification.guard import TRACK_END, experiment_guard, guarded, reach
+from cartpole_rl.identification.held_out import part
 from cartpole_rl.identification.identify import Identification, identify
 from cartpole_rl.identification.quantities import quantities
 from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_COUNTS_PER_TURN
@@ -78,8 +80,13 @@ def nominal(ip02: dict[str, float], medium: PoleSettings) -> dict[str, float]:
 
 @pytest.fixture(scope="module")
 def found(recordings: dict[str, Episode], nominal: dict[str, float]) -> Identification:
-    fitted = [episode for name, episode in recordings.items() if name != HELD_OUT]
-    return identify(fitted, [recordings[HELD_OUT]], nominal, MODELS, PERIOD, substeps=4, most=60)
+    return identify(*split(recordings), nominal, MODELS, PERIOD, substeps=4, most=60)
+
+
+def split(recordings: dict[str, Episode]) -> tuple[dict[str, Episode], dict[str, Episode]]:
+    """Those that are fitted to, and the held-out one."""
+    fitted = {name: episode for name, episode in recordings.items() if name != HELD_OUT}
+    return fitted, {HELD_OUT: recordings[HELD_OUT]}
 
 
 def test_every_experiment_is_made_to_its_end(recordings: dict[str, Episode]) -> None:
@@ -270,52 +277,98 @@ def test_a_one_step_fit_of_the_same_recordings_fails(
     assert max(off) > 0.3, off
 
 
+def refused(recordings: dict[str, Episode], *names: str, **replaced: Episode) -> str:
+    """The message for the held-out recording and those with `names`, or all; some of them are replaced."""
+    fitted, held_out = split({**recordings, **replaced})
+    with pytest.raises(RecordingError) as raised:
+        check_recordings({name: fitted[name] for name in names or fitted}, held_out, PERIOD)
+    assert "\n" not in str(raised.value)
+    return str(raised.value)
+
+
+def still(values: np.ndarray) -> np.ndarray:
+    return np.full_like(values, values[0])
+
+
+def half_still(values: np.ndarray) -> np.ndarray:
+    return np.concatenate((values[:300], np.full(len(values) - 300, values[300])))
+
+
+FROZEN_CART, FROZEN_POLE = {"x": still, "cart": still}, {"theta": still, "pole": still}
+
+
 class TestChecks:
     def test_good_recordings_pass(self, recordings: dict[str, Episode]) -> None:
-        check_recordings(list(recordings.values()), PERIOD)
+        check_recordings(*split(recordings), PERIOD)
 
     def test_too_short(self, recordings: dict[str, Episode]) -> None:
-        with pytest.raises(RecordingError, match="too short; record 20 s or more"):
-            check_recordings([recordings["square"]], PERIOD)
-
-    def test_too_little_motion(self, recordings: dict[str, Episode]) -> None:
-        rest = changed(recordings["excite"], x=lambda x: 0 * x, cart=lambda counts: 0 * counts)
-        with pytest.raises(RecordingError, match="the cart moves 0 mm in all"):
-            check_recordings([rest], PERIOD)
+        assert "too short; record 20 s or more" in refused(recordings, "square")
 
     def test_a_pole_that_never_hangs_still(self, recordings: dict[str, Episode]) -> None:
-        with pytest.raises(RecordingError, match="never hangs still"):
-            check_recordings([recordings["excite"]], PERIOD)
+        assert "never hangs still" in refused(recordings, "excite")
+
+    def test_too_little_motion_in_all(self, recordings: dict[str, Episode]) -> None:
+        slow = {
+            name: changed(each, x=lambda x: 0.05 * x, cart=lambda counts: (0.05 * counts).astype(int))
+            for name, each in split(recordings)[0].items()
+        }
+        message = refused(recordings, **slow)
+        assert re.search(r"the cart moves \d+ mm in all: .* drive it over", message), message
+
+    @pytest.mark.parametrize("name", ["excite", "ramps", HELD_OUT])
+    @pytest.mark.parametrize(
+        ("changes", "said"),
+        [
+            ({"motor": lambda motor: 0 * motor}, "the motor value is 0 throughout; record it with others"),
+            ({"motor": lambda motor: 0 * motor + 120}, "the motor value is 120 throughout"),
+            (FROZEN_CART, "the cart moves 0 mm in all"),
+            (FROZEN_POLE, "the pole"),
+            ({**FROZEN_CART, **FROZEN_POLE}, "the cart moves 0 mm in all"),
+            (
+                {name: lambda values: 0 * values for name in (*FROZEN_CART, *FROZEN_POLE, "motor")},
+                "throughout",
+            ),
+            ({"theta": np.degrees}, "theta is not its encoder's count times"),
+            ({"x": lambda x: 1e3 * x}, "x is not its encoder's count times"),
+            ({"time": lambda time: 1.5 * time}, "a frame every 30.0 ms, not every 20.0 ms"),
+        ],
+    )
+    def test_each_recording_is_checked_and_named(
+        self, recordings: dict[str, Episode], name: str, changes: dict[str, Any], said: str
+    ) -> None:
+        message = refused(recordings, **{name: changed(recordings[name], **changes)})
+        assert message.startswith(f"{name}: ")
+        assert said in message
+
+    @pytest.mark.parametrize("name", ["excite", HELD_OUT])
+    @pytest.mark.parametrize("encoder", ["cart", "pole"])
+    def test_an_encoder_that_freezes_later(
+        self, recordings: dict[str, Episode], name: str, encoder: str
+    ) -> None:
+        position = {"cart": "x", "pole": "theta"}[encoder]
+        frozen = changed(recordings[name], **{position: half_still, encoder: half_still})
+        message = refused(recordings, **{name: frozen})
+        assert message.startswith(f"{name}: the {encoder}'s count stays at ")
+        assert "the encoder is frozen, saturated or unplugged; check its cable" in message
+
+    def test_a_held_out_recording_that_is_too_short(self, recordings: dict[str, Episode]) -> None:
+        short = part(recordings[HELD_OUT], 0, 100)
+        assert refused(recordings, **{HELD_OUT: short}).startswith(
+            f"{HELD_OUT}: 2.0 s are too short to judge"
+        )
 
     def test_swapped_motor_wires(self, recordings: dict[str, Episode]) -> None:
-        swapped = [changed(each, motor=lambda motor: -motor) for each in recordings.values()]
-        with pytest.raises(RecordingError, match="swap the motor's wires"):
-            check_recordings(swapped, PERIOD)
+        swapped = {name: changed(each, motor=lambda motor: -motor) for name, each in recordings.items()}
+        assert "swap the motor's wires" in refused(swapped)
 
     def test_a_swapped_pole_encoder(self, recordings: dict[str, Episode]) -> None:
-        swapped = [
-            changed(
+        swapped = {
+            name: changed(
                 each, theta=lambda theta: 2 * np.pi - theta, pole=lambda counts: POLE_COUNTS_PER_TURN - counts
             )
-            for each in recordings.values()
-        ]
-        with pytest.raises(RecordingError, match="swap the pole encoder's channels"):
-            check_recordings(swapped, PERIOD)
-
-    def test_degrees_in_place_of_radians(self, recordings: dict[str, Episode]) -> None:
-        wrong = [changed(each, theta=np.degrees) for each in recordings.values()]
-        with pytest.raises(RecordingError, match="theta is not its encoder's count times"):
-            check_recordings(wrong, PERIOD)
-
-    def test_a_frozen_pole_encoder(self, recordings: dict[str, Episode]) -> None:
-        def freeze(values: np.ndarray) -> np.ndarray:
-            return np.concatenate((values[:500], np.full(len(values) - 500, values[500])))
-
-        frozen = [changed(recordings["excite"], theta=freeze, pole=freeze), recordings["ramps"]]
-        with pytest.raises(
-            RecordingError, match=r"the pole's count stays at .* frozen, saturated or unplugged"
-        ):
-            check_recordings(frozen, PERIOD)
+            for name, each in recordings.items()
+        }
+        assert "swap the pole encoder's channels" in refused(swapped)
 
     def test_a_saturated_cart_encoder(self, recordings: dict[str, Episode]) -> None:
         most = 9000
@@ -324,8 +377,44 @@ class TestChecks:
             x=lambda x: x.clip(-most * CART_METRES_PER_COUNT, most * CART_METRES_PER_COUNT),
             cart=lambda counts: counts.clip(-most, most),
         )
-        with pytest.raises(RecordingError, match=r"stops dead at -?9000 counts"):
-            check_recordings([recordings["ramps"], saturated], PERIOD)
+        assert re.search(
+            r"^excite: the cart stops dead at -?9000 counts", refused(recordings, excite=saturated)
+        )
+
+
+class TestExplanation:
+    """A recording that no such cart moves like is refused by the name of its file, also the held-out one."""
+
+    @pytest.mark.parametrize("name", ["excite", HELD_OUT])
+    def test_motor_values_of_another_recording(
+        self, recordings: dict[str, Episode], found: Identification, name: str
+    ) -> None:
+        good = {name: recordings[name]}
+        assert len(check_explained(good, found.dynamics, 1.0)) == 1
+        shuffled = changed(recordings[name], motor=lambda motor: np.random.default_rng(0).permutation(motor))
+        with pytest.raises(RecordingError, match=rf"^{name}: no cart explains this recording: 1 s of the "):
+            check_explained({name: shuffled}, found.dynamics, 1.0)
+
+    def test_an_identification_refuses_it(
+        self, recordings: dict[str, Episode], nominal: dict[str, float]
+    ) -> None:
+        fitted, held_out = split(recordings)
+        shifted = changed(held_out[HELD_OUT], motor=lambda motor: np.roll(motor, 40))
+        with pytest.raises(RecordingError, match=f"^{HELD_OUT}: no cart explains this recording"):
+            identify(fitted, {HELD_OUT: shifted}, nominal, MODELS, PERIOD, substeps=4, most=60)
+
+
+def test_the_held_out_recording_chooses_nothing(
+    recordings: dict[str, Episode], nominal: dict[str, float], found: Identification
+) -> None:
+    """With another one, every number but the reported error is the same."""
+    fitted, held_out = split(recordings)
+    other = {HELD_OUT: part(held_out[HELD_OUT], 0, 400)}
+    again = identify(fitted, other, nominal, MODELS, PERIOD, substeps=4, most=60)
+    assert again.models == found.models
+    assert again.fit.parameters == found.fit.parameters
+    assert [each.error for each in again.candidates] == [each.error for each in found.candidates]
+    assert again.error != found.error
 
 
 def changed(episode: Episode, **changes: Callable[[np.ndarray], np.ndarray]) -> Episode:

@@ -22,7 +22,7 @@ FIT = Fit([], np.empty(0), np.empty((0, 0)), {}, np.ones(2), np.zeros(2), 1.0, 1
 
 def candidate(friction: CartFriction, x: float, theta: float) -> Candidate:
     dynamics = Dynamics(torch.empty(0, 1), Models(cart_friction=friction), 0.02, 4)
-    return Candidate(FIT, dynamics, [], PredictionError(x, theta))
+    return Candidate(FIT, dynamics, PredictionError(x, theta))
 
 
 def found(warnings: list[str]) -> Identification:
