@@ -43,11 +43,11 @@ COMPLAINS = {  # command: words, exit code, part of the line on stderr
         ("learner=ray", 2, "learner.address is missing; give learner.address=<host>:6379"),
     ],
     "identify": [
-        ("from=nowhere", 1, "from=nowhere: there is no such file or folder"),
+        ("from=nowhere", 2, "from=nowhere: there is no such file or folder"),
         ("pole=range", 2, "choose one, as pole=medium"),
     ],
     "model": [
-        ("from=nowhere", 1, "from=nowhere: there is no such file or folder"),
+        ("from=nowhere", 2, "from=nowhere: there is no such file or folder"),
         ("from=nowhere windows=1", 2, "give at least 10"),
     ],
     "preflight": [("plant.port=nowhere plant.home_timeout=0", 2, "give more than 0")],
@@ -57,7 +57,7 @@ COMPLAINS = {  # command: words, exit code, part of the line on stderr
         ("seed=1", 2, "seed: there is no such setting"),
         ("animations=maybe studies=nowhere", 2, "give true or false"),
     ],
-    "replay": [("from=nowhere", 1, "from=nowhere: there is no such file or folder")],
+    "replay": [("from=nowhere", 2, "from=nowhere: there is no such file or folder")],
     "train": [
         ("resume=nowhere", 1, "resume=nowhere: there is no such folder"),
         ("seed=abc", 2, "give an integer"),

@@ -88,9 +88,9 @@ def test_a_pole_of_another_length_has_to_be_given(recorded: Path, tmp_path: Path
             "from=nowhere",
             "from=nowhere: there is no such file or folder; "
             "give a run of cartpole-record or cartpole-identify",
-            1,
+            2,
         ),
-        ("from=.", "from=.: it contains no recording; give a run of cartpole-record or cartpole-identify", 1),
+        ("from=.", "from=.: it contains no recording; give a run of cartpole-record or cartpole-identify", 2),
         ("", "from is missing; give from=runs/record/<run>", 2),
         ("from=. restart=0", "restart=0: give at least 0.1", 2),
     ],
