@@ -1,6 +1,7 @@
 """Checks settings given as plain data. The message names each wrong key and the remedy."""
 
 import difflib
+import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, TypeVar, get_args
@@ -66,7 +67,8 @@ def _complaint(detail: Mapping[str, Any], schema: type[Settings], values: Mappin
             return f"{key}={detail['ctx']['tag']}: this command takes {taken}"
         case "union_tag_not_found":  # a plant's file without its kind
             return f"{key}: kind is missing; give {key}={', '.join(kinds(schema, key))}"
-    value = "null" if detail["input"] is None else detail["input"]
+    given = detail["input"]
+    value = json.dumps(given) if given is None or isinstance(given, bool) else given  # as it was typed
     named = f"{key}={value}" if isinstance(value, int | float | str) else key
     return f"{named}: {_reason(detail)}" if key else _reason(detail)
 

@@ -2,19 +2,19 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
-import yaml
+from hydra.core.config_store import ConfigStore
+from omegaconf import OmegaConf
 
 from cartpole_rl.commands.hydra_application.choice_files import with_choice_files
 from cartpole_rl.errors import ConfigError
 
 
-def search_path(words: list[str]) -> Path:
-    """The folder that is added to Hydra's search path."""
-    prefix = "hydra.searchpath=[file://"
-    assert words[-1].startswith(prefix)
-    return Path(words[-1].removeprefix(prefix).removesuffix("]"))
+def stored(group: str, name: str) -> dict[str, Any]:
+    """The choice that a file became."""
+    return OmegaConf.to_container(ConfigStore.instance().repo[group][f"{name}.yaml"].node)
 
 
 def test_words_without_files_stay_as_they_are() -> None:
@@ -27,10 +27,9 @@ def test_a_file_becomes_a_choice_while_the_command_runs(tmp_path: Path) -> None:
     file = tmp_path / "mine.yaml"
     file.write_text("posterior: ${here}/posterior.npz\n")
     with with_choice_files(["seed=0", f"randomization={file}"]) as words:
-        assert words[:2] == ["seed=0", "randomization=mine"]
-        copy = search_path(words) / "randomization/mine.yaml"
-        assert yaml.safe_load(copy.read_text()) == {"posterior": f"{tmp_path}/posterior.npz"}
-    assert not copy.exists()
+        assert words == ["seed=0", "randomization=mine"]
+        assert stored("randomization", "mine") == {"posterior": f"{tmp_path}/posterior.npz"}
+    assert "mine.yaml" not in ConfigStore.instance().repo.get("randomization", {})
 
 
 def test_files_of_equal_names_get_different_ones(tmp_path: Path) -> None:
@@ -40,17 +39,18 @@ def test_files_of_equal_names_get_different_ones(tmp_path: Path) -> None:
     both = f"cart={tmp_path}/first/cart.yaml,{tmp_path}/second/cart.yaml"
     with with_choice_files([both]) as words:
         assert words[0] == "cart=cart,second_cart"
-        folder = search_path(words) / "cart"
-        carts = [yaml.safe_load((folder / f"{name}.yaml").read_text()) for name in ("cart", "second_cart")]
-        assert [cart["cart_mass"] for cart in carts] == [0, 1]
+        assert [stored("cart", name)["cart_mass"] for name in ("cart", "second_cart")] == [0, 1]
 
 
 def test_choices_and_files_can_be_mixed(tmp_path: Path) -> None:
     (tmp_path / "mine.yaml").write_text("")
-    with with_choice_files([f"pole=large,{tmp_path}/mine.yaml"]) as words:
-        assert words[0] == "pole=large,mine"
-    with with_choice_files([f"pole={tmp_path}/mine.yaml,large"]) as words:
-        assert words[0] == "pole=mine,large"
+    for given, name in {
+        "large,{}": "large,mine",
+        "{},large": "mine,large",
+        "[large,{}]": "[large,mine]",
+    }.items():
+        with with_choice_files([f"pole={given.format(tmp_path / 'mine.yaml')}"]) as words:
+            assert words[0] == f"pole={name}"
 
 
 def refused(word: str) -> str:

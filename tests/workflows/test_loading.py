@@ -104,7 +104,7 @@ def test_what_is_wrong_with_a_file_is_one_line(text: str, message: str, tmp_path
     ("overrides", "message"),
     [
         ({"pole": "short"}, "no choice 'pole/short'"),
-        ({"pole": "nowhere.yaml"}, "pole=nowhere.yaml cannot be read"),
+        ({"pole": "nowhere.yaml"}, "pole=nowhere.yaml: there is no such file"),
         ({"learning.transitons": 3}, "did you mean learning.transitions"),
         ({"seed": -1}, "seed=-1"),
     ],

@@ -29,7 +29,7 @@ from cartpole_rl.commands.hydra_application.exits import (
     exit_with_message,
     job_signals,
 )
-from cartpole_rl.commands.hydra_application.sweeps import as_multirun, is_job, run_as_job, sweep
+from cartpole_rl.commands.hydra_application.sweeps import as_multirun, is_job, run_as_job, shown_jobs, sweep
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.settings import Settings
 
@@ -76,8 +76,11 @@ def application(name: str, schema: type[Config]) -> Callable[[Body[Config]], Cal
                 if wrong := wrong_option(given) or dashed_setting(given):
                     raise ConfigError(wrong)
                 with with_choice_files(as_multirun(given)) as words, sweep(name, schema):
-                    sys.argv[1:] = words
-                    hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=name)(task)()
+                    for job in shown_jobs(words) or [words]:
+                        sys.argv[1:] = job
+                        hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=name)(
+                            task
+                        )()
             except EXPECTED as error:
                 exit_with_message(name, error)
             except (KeyboardInterrupt, Terminated) as signalled:

@@ -86,6 +86,16 @@ def as_multirun(words: Sequence[str]) -> list[str]:
     return [*words, "--multirun"] if chosen and not has_mode else [*words]
 
 
+def shown_jobs(words: Sequence[str]) -> list[list[str]]:
+    """Return the command lines that show the settings of each job: those of `-m --cfg job`; else none."""
+    if {"-m", "--multirun"}.isdisjoint(words) or {"-c", "--cfg"}.isdisjoint(words):
+        return []
+    options = [word for word in words if "=" not in word or word.startswith("-")]
+    overrides = OverridesParser.create().parse_overrides([word for word in words if word not in options])
+    (jobs,) = BasicSweeper.split_arguments(overrides, None)
+    return [[*job, *(word for word in options if word not in ("-m", "--multirun"))] for job in jobs]
+
+
 def is_job() -> bool:
     """Return True in a job of a sweep."""
     return HydraConfig.get().mode is RunMode.MULTIRUN
