@@ -384,7 +384,8 @@ void cart_ask_policy(cart *self)
     const cart_reading *reading = &self->reading;
     cart_observation observation = {reported_cart(self, reading->cart), reported_pole(self, reading->pole),
                                     cart_zeros_half_span(&self->zeros) - CART_SOFT_COUNTS, reading->period_us,
-                                    self->period_us, !self->observed, self->interrupted};
+                                    self->period_us, !self->observed, self->interrupted,
+                                    cart_motor(self)};
     int16_t motor = self->policy(self->policy_memory, &observation);
     bool valid = motor <= CART_LARGEST_MOTOR && motor >= -CART_LARGEST_MOTOR;
     self->observed = true;

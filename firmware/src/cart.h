@@ -39,6 +39,7 @@ typedef struct {
     uint32_t set_period_us;
     bool first;   /* the first observation since START_POLICY */
     bool resumed; /* the watchdog held the motor at 0 since the last observation, which is out of date */
+    int16_t motor; /* in force now: the policy's last one, unless a limit of the track has replaced it */
 } cart_observation;
 
 /* A policy on the board: returns the motor value for an observation, in a bounded time. */

@@ -32,6 +32,8 @@ static inline int16_t onboard_motor(void *memory, const cart_observation *observ
         policy_start(policy, (float)(observation->soft_limit * CART_METRES), agent->pole_length);
     else if (observation->resumed)
         policy_resume(policy);
+    else
+        policy_drove(policy, observation->motor);
     return policy_motor(policy, observation->cart_counts, observation->pole_counts,
                         (float)observation->period_us / 1e6f);
 }

@@ -47,6 +47,7 @@ class Observation(ctypes.Structure):
         ("set_period_us", ctypes.c_uint32),
         ("first", ctypes.c_bool),
         ("resumed", ctypes.c_bool),
+        ("motor", ctypes.c_int16),
     )
 
 
@@ -58,7 +59,7 @@ class Board:
     """A homed cart whose policy is a Python function and drives, unless `start` is another message."""
 
     def __init__(self, choose: Callable[[Observation], int], start: Message = START_POLICY) -> None:
-        self.observed: list[tuple[int, int, int, int, int, bool, bool]] = []
+        self.observed: list[tuple[int, int, int, int, int, bool, bool, int]] = []
 
         def called(memory: int, pointer: "ctypes._Pointer[Observation]") -> int:
             seen = pointer.contents
@@ -99,9 +100,9 @@ def test_it_observes_each_period_and_chooses_after_state():
     assert [motor for *_, motor in ticks] == [50, -10, 30]
     assert [state.motor_applied for state, *_ in ticks] == [0, 50, -10]
     assert board.observed == [
-        (500, 7, SOFT, 20_000, 20_000, True, False),
-        (-100, 8, SOFT, 20_000, 20_000, False, False),
-        (300, -5, SOFT, 20_000, 20_000, False, False),
+        (500, 7, SOFT, 20_000, 20_000, True, False, 0),
+        (-100, 8, SOFT, 20_000, 20_000, False, False, 50),
+        (300, -5, SOFT, 20_000, 20_000, False, False, -10),
     ]
 
 

@@ -69,6 +69,11 @@ void policy_resume(policy_t *policy)
     policy->ready = ready;
 }
 
+void policy_drove(policy_t *policy, int16_t motor)
+{
+    policy->motor = motor;
+}
+
 int16_t policy_motor(policy_t *policy, int32_t cart_counts, int32_t pole_counts, float dt)
 {
     const int32_t counts[2] = {cart_counts, pole_counts};

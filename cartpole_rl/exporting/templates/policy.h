@@ -45,7 +45,7 @@ typedef struct {
     float state[4];      /* x m, x_dot m/s, theta rad, theta_dot rad/s */
     float past[@@past@@];       /* the observation of earlier periods */
     int32_t counts[2];   /* of cart and pole, one period ago */
-    int16_t motor;       /* returned last */
+    int16_t motor;       /* of the last period */
     bool started;        /* counts are known */
     bool ready;          /* policy_start() succeeded, and every number since was finite */
 } policy_t;
@@ -58,6 +58,10 @@ void policy_start(policy_t *policy, float track_end, float pole_length);
 /* Continue an episode after periods in which policy_motor() was not called: the next counts are then like the first
  * of an episode, without velocities and past. Once policy_motor() returns 0 for the rest of an episode, it still does. */
 void policy_resume(policy_t *policy);
+
+/* Say before policy_motor() which motor value has been in force since its last call, where that may not be the one
+ * that it returned: a limit of the track replaces it. */
+void policy_drove(policy_t *policy, int16_t motor);
 
 /* Return the motor value, -255 to 255, for the newest counts. dt: s since the counts of the last call, by the
  * clock of the encoders; not read in the first call of an episode. Before policy_start(), once a number was not

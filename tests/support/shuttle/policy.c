@@ -12,6 +12,12 @@ void policy_resume(policy_t *policy)
     (void)policy;
 }
 
+void policy_drove(policy_t *policy, int16_t motor)
+{
+    (void)policy;
+    (void)motor;
+}
+
 int16_t policy_motor(policy_t *policy, int32_t cart_counts, int32_t pole_counts, float dt)
 {
     if (policy->track_end < 0.3f || dt < 0.001f || pole_counts < 1500 || pole_counts > 2600)

@@ -16,6 +16,7 @@ typedef struct {
 
 void policy_start(policy_t *policy, float track_end, float pole_length);
 void policy_resume(policy_t *policy);
+void policy_drove(policy_t *policy, int16_t motor);
 int16_t policy_motor(policy_t *policy, int32_t cart_counts, int32_t pole_counts, float dt);
 
 #endif
