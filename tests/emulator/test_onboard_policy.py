@@ -106,6 +106,15 @@ def test_it_observes_each_period_and_chooses_after_state():
     ]
 
 
+def test_it_observes_what_a_limit_of_the_track_made_of_its_value():
+    board = Board(lambda seen: 100, start=Stop())
+    for _ in range(10):
+        board.tick(SOFT + 5)
+    board.send(START_POLICY)
+    assert [board.heard(SOFT + 5)[2] for _ in range(3)] == [0, 0, 0]
+    assert [motor for *_, motor in board.observed] == [0, 0, 0]
+
+
 def test_any_accepted_frame_keeps_the_watchdog_quiet():
     board = Board(lambda seen: 100)
     for period in range(100):
@@ -126,7 +135,7 @@ def test_the_watchdog_stops_it_and_a_frame_revives_it(frame):
     assert board.tick()[2] == 0
     board.send(frame)
     assert board.tick()[2] == board.heard()[2] == 100
-    assert [seen[-2:] for seen in board.observed[1:]] == [(False, False), (False, True), (False, False)]
+    assert [seen[5:7] for seen in board.observed[1:]] == [(False, False), (False, True), (False, False)]
 
 
 def test_start_never_asks_it():
@@ -175,7 +184,7 @@ def test_a_motor_value_of_the_host_takes_over_until_the_next_start_policy():
     assert board.tick()[2] == 0
     board.send(StartPolicy())
     assert board.tick()[2] == 100
-    assert board.observed[-1][-2:] == (True, False)  # first, resumed
+    assert board.observed[-1][5:7] == (True, False)  # first, resumed
 
 
 def test_stop_ends_it_and_a_disarmed_board_asks_nothing():
@@ -273,6 +282,7 @@ def test_the_c_code_of_a_policy_observes_the_length_of_the_emulated_pole(tmp_pat
         "void policy_start(policy_t *policy, float track_end, float pole_length)\n"
         "{\n    policy->track_end = pole_length;\n}\n"
         "void policy_resume(policy_t *policy)\n{\n    (void)policy;\n}\n"
+        "void policy_drove(policy_t *policy, int16_t motor)\n{\n    (void)policy, (void)motor;\n}\n"
         "int16_t policy_motor(policy_t *policy, int32_t cart_counts, int32_t pole_counts, float dt)\n"
         "{\n    (void)cart_counts, (void)pole_counts, (void)dt;\n"
         "    return (int16_t)(1000 * policy->track_end);\n}\n"

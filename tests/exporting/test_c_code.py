@@ -63,6 +63,9 @@ class Compiled:
     def resume(self) -> None:
         self.library.policy_resume(self.memory)
 
+    def drove(self, motor: int) -> None:
+        self.library.policy_drove(self.memory, ctypes.c_int16(motor))
+
     def motor(self, counts: tuple[int, int], dt: float) -> int:
         return self.library.policy_motor(self.memory, *map(ctypes.c_int32, counts), ctypes.c_float(dt))
 
@@ -86,7 +89,7 @@ def check_motors(training: TrainConfig, policy: Policy, compiled: Compiled, peri
     for _ in range(3):
         observation = cart.reset().observation
         compiled.start(float(env.plant.track_half_length), float(env.plant.pole_length))
-        for _ in range(periods):
+        for period in range(periods):
             present = tensordict_of({"observation": torch.from_numpy(np.array([observation], np.float32))})
             action = int(choose(policy, present))
             motor, found = cart.sent_motor(action), compiled.motor(cart.frame.counts, cart.frame.dt)
@@ -95,7 +98,11 @@ def check_motors(training: TrainConfig, policy: Policy, compiled: Compiled, peri
                 assert_same_actions(np.array([training.actions.motors.index(found)]), values)
                 break
             sent.add(motor)
-            step = cart.step(action)
+            if period % 7 == 6:  # a limit of the track replaces the value
+                compiled.drove(-motor)
+                step = cart.advance(-motor, env.plant.step_one(-motor))
+            else:
+                step = cart.step(action)
             observation = step.observation
             if step.done[0]:
                 break
