@@ -37,16 +37,16 @@ def run_real(cart: CartDevice, channel: Channel) -> None:
     meanwhile counts as having arrived in time.
     """
     take_precedence()  # a real cart would not be late either
-    boot = time.monotonic()
+    boot, rate = time.monotonic(), cart.clock_rate
 
     def now_us() -> int:
-        return int((time.monotonic() - boot) * 1e6)
+        return int((time.monotonic() - boot) * rate * 1e6)
 
     while not cart.unplugged:
         end_us, left_us = cart.period_end_us, 1
         while left_us > 0:
             left_us = end_us - now_us()
-            for frame in channel.receive(max(0, left_us) / 1e6):
+            for frame in channel.receive(max(0, left_us) / 1e6 / rate):
                 handle(cart, channel, frame, min(max(now_us(), cart.now_us), end_us))
         late_us = now_us() - end_us
         pass_period(cart, channel, end_us + late_us if late_us > cart.firmware.period_us // 2 else end_us)

@@ -58,6 +58,11 @@ class CartDevice:
         return answer
 
     @property
+    def clock_rate(self) -> float:
+        """The seconds that the firmware's clock passes in a second."""
+        return self._settings.clock_rate
+
+    @property
     def unplugged(self) -> bool:
         """True once the cable has been pulled."""
         return self._unplug_us is not None and self.now_us >= self._unplug_us
@@ -94,17 +99,17 @@ class CartDevice:
 
     def _move(self, until_us: int) -> None:
         """Let the cart move until `until_us`, while the firmware looks at its position."""
-        start_us = self.now_us
+        start_us, rate = self.now_us, self._settings.clock_rate
 
         def look(seconds: float) -> int:
-            self.now_us = start_us + round(seconds * 1e6)
+            self.now_us = start_us + round(seconds * rate * 1e6)
             if self.now_us - self._looked_us >= LOOK_US:
                 self._looked_us = self.now_us
                 self.firmware.look(self.now_us - self._booted_us, *self._counts())
                 self._note_motor()
             return self.firmware.motor
 
-        self.physics.advance(self.firmware.motor, (until_us - start_us) / 1e6, look)
+        self.physics.advance(self.firmware.motor, (until_us - start_us) / 1e6 / rate, look)
         self.now_us = until_us
 
     def _note_motor(self) -> None:

@@ -154,7 +154,7 @@ class Firmware:
 
     def _expire(self, now_us: int) -> bool:
         """End a homing without a host; return whether the watchdog holds the motor at 0."""
-        if self.homing and now_us - self._heard_us > LEASE_US:
+        if self.homing and now_us > self._heard_us + LEASE_US:
             self._homing = None
             self._line.hold(0)
         expired = self.armed and now_us >= self._expires_us

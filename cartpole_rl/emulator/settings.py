@@ -75,6 +75,7 @@ class EmulatorSettings(Settings):
 
     unplug_at: Positive | None = None  # s since the start; the cable is pulled and the process ends
     reset_at: Positive | None = None  # s since the start; the firmware restarts
+    clock_rate: Annotated[float, Field(ge=0.1, le=10)] = 1.0  # s that the firmware's clock passes in a second
     stuck_encoder: Literal["none", "cart", "pole"] = "none"  # the encoder whose count freezes
     stuck_at: NonNegative = 0.0  # s since the start; the count freezes then
 

@@ -332,7 +332,7 @@ static uint32_t length_of_period(const cart *self, uint64_t now_us)
 /* End a homing without a host; return whether the watchdog holds the motor at 0. */
 static bool expire(cart *self, uint64_t now_us)
 {
-    if (self->homing && now_us - self->heard_us > CART_LEASE_US) {
+    if (self->homing && now_us > self->heard_us + CART_LEASE_US) {
         self->homing = false;
         cart_line_hold(&self->line, 0);
     }

@@ -258,13 +258,28 @@ def test_every_setting_is_tried_here_or_on_the_wire():
     on_the_wire = {"clock", "frame_loss", "frame_corruption"}  # test_emulator_process.py
     order = {"frame_duplication", "frame_reordering"}  # test_emulator_disturbance.py
     faults = {"unplug_at", "stuck_encoder", "stuck_at"}  # test_emulator_faults.py
+    rate = {"clock_rate"}  # below
     cogging = {"cogging", "cogging_pitch"}  # test_emulator_physics.py
     firmware = {"firmware", "policy"}  # this module runs with both; test_onboard_policy.py
     others = {"journal", "knock"}  # tests/plants/test_stops.py, tests/bench/test_soak.py; below
     port = {"port"}  # tests/plants/serial/test_tcp.py
-    assert set(OTHER) | firmware | on_the_wire | order | faults | cogging | others | port == set(
+    assert set(OTHER) | firmware | on_the_wire | order | faults | cogging | others | port | rate == set(
         EmulatorSettings.model_fields
     )
+
+
+def test_a_fast_clock_makes_short_periods():
+    """A pole that falls from upright falls less far in the same number of periods."""
+
+    def fallen(rate: float) -> float:
+        cart = CartDevice(truth(clock_rate=rate))
+        cart.physics.place_pole(0.1)
+        for _ in range(20):
+            cart.pass_period(cart.period_end_us)
+        return cart.physics.angle
+
+    assert fallen(1.3) == pytest.approx(0.1 + (fallen(1.0) - 0.1) / 1.3**2, rel=0.25)
+    assert fallen(0.6) > fallen(1.0) > fallen(1.3) > 0.1
 
 
 def test_a_standing_pole_is_knocked_once_after_each_start_to_either_side():

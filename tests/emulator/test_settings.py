@@ -22,6 +22,7 @@ FAULTS = ["unplug_at", "reset_at", "stuck_encoder", "stuck_at"]
 OURS = [
     "boot",
     "clock",
+    "clock_rate",
     "firmware",
     "journal",
     "knock",
