@@ -65,8 +65,8 @@ def claimed(folder: Path) -> Iterator[None]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write `text` to `path` atomically, in UTF-8."""
-    write_bytes(path, text.encode())
+    """Write `text` to `path` atomically, in UTF-8; bytes of file names that are none are escaped."""
+    write_bytes(path, text.encode(errors="backslashreplace"))
 
 
 def write_bytes(path: Path, content: bytes) -> None:

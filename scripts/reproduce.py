@@ -20,10 +20,10 @@ from pathlib import Path
 from cartpole_rl.errors import CartPoleError, ConfigError
 from cartpole_rl.files import FULL
 from cartpole_rl.signals import RaiseOnce, ending_signals
-from cartpole_rl.workflows.person import exit_if_nobody_reads
+from cartpole_rl.workflows.person import as_word, exit_if_nobody_reads
 from cartpole_rl.workflows.reproduce.process import SIGNALLED, reason_of
 from cartpole_rl.workflows.reproduce.reproduce import reproduce
-from cartpole_rl.workflows.studies import STUDIES, as_word, load_study, study_names
+from cartpole_rl.workflows.studies import STUDIES, load_study, study_names
 
 CHECKOUT = Path(__file__).resolve().parents[1]
 RUNS = Path("runs/reproduce")  # in the checkout

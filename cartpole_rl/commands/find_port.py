@@ -13,6 +13,7 @@ from cartpole_rl.errors import PortError
 from cartpole_rl.plants.serial.port import found_ports
 from cartpole_rl.plants.serial.ports import UsbPort, cart_like, changes, described
 from cartpole_rl.settings import Positive, Settings
+from cartpole_rl.workflows.person import as_word
 
 LOOK_EVERY = 0.2  # s
 REMEDY = (
@@ -53,7 +54,7 @@ def listing(ports: list[UsbPort]) -> str:
 
 def preflight_on(port: UsbPort) -> str:
     """Return the command that checks the cart on `port`."""
-    return f"cartpole-preflight plant=serial plant.port={port.device}"
+    return f"cartpole-preflight plant=serial {as_word('plant.port', port.device)}"
 
 
 def watched(ports: PortList, timeout: float) -> str:
@@ -65,7 +66,10 @@ def watched(ports: PortList, timeout: float) -> str:
         vanished, appeared = changes(before, ports())
         if changed := [*vanished, *appeared]:
             what = "vanished" if vanished else "appeared"
-            lines = [f"{port.device} {what}: plant.port={port.device}  {described(port)}" for port in changed]
+            lines = [
+                f"{port.device} {what}: {as_word('plant.port', port.device)}  {described(port)}"
+                for port in changed
+            ]
             again = "Plug it in again before you use it. Next:" if vanished else "Next:"
             return "\n".join([*lines, f"{again} {preflight_on(changed[0])}"])
         time.sleep(LOOK_EVERY)

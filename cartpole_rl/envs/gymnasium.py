@@ -44,6 +44,7 @@ from cartpole_rl.choices import choice
 from cartpole_rl.envs.build import shipped_settings, simulated_env, with_fitted_guard
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.rendering import RENDER_MODES, Picture, Renderer
+from cartpole_rl.errors import ConfigError
 from cartpole_rl.plants.settings import SimulatedSettings
 from cartpole_rl.registration import MAX_EPISODE_STEPS
 
@@ -72,13 +73,32 @@ def simulated_environment(
     `randomization` is the name of a file in conf/randomization/, or its lines. `time_limit` in control
     periods; None is that of the task. Raises ConfigError.
     """
+    check_count("num_envs", carts)
     settings = shipped_settings({**OF_TASK[task], "pole": "medium", "randomization": randomization})
     if time_limit is not None:
+        check_count("max_episode_steps", time_limit)
         fitted = with_fitted_guard(settings)  # before the change, so that environments share the fit
         limited = fitted.task.model_copy(update={"time_limit": time_limit})
         settings = fitted.model_copy(update={"task": limited})
     plant = SimulatedSettings(**choice("plant/simulated"))
     return simulated_env(settings, plant, carts, settings.task.start, seed=0, compiled=compiled)
+
+
+def check_count(name: str, value: Any) -> None:
+    """Raise ConfigError if `value` is not an integer of at least 1."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
+        raise ConfigError(f"{name}={value}: give an integer of at least 1")
+
+
+def checked_actions(actions: Any, space: spaces.Space[Any], number: int) -> Array:
+    """Return the actions of `space`, indices of `number` motor values. Raises ConfigError for others."""
+    given = np.asarray(actions)
+    fits = given.shape == space.shape and given.dtype.kind in "iu"
+    if not fits or (given < 0).any() or (given >= number).any():
+        wrong = given.tolist() if given.size < 10 else f"{given.dtype} {list(given.shape)}"
+        what = f"{space.shape[0]} integers" if space.shape else "an integer"
+        raise ConfigError(f"action {wrong}: give {what} from 0 to {number - 1}")
+    return given.astype(np.int64)
 
 
 def observation_space(env: CartPoleEnv) -> spaces.Box:
@@ -125,8 +145,10 @@ class CartPoleGymnasium(gymnasium.Env[Array, np.int64]):
         return float32(first.observation), {}
 
     def step(self, action: np.int64) -> tuple[Array, float, bool, bool, dict[str, Any]]:
-        """One control period."""
-        now = self.env.one_cart.step(int(action))
+        """One control period. Raises ConfigError for an action that does not exist."""
+        now = self.env.one_cart.step(
+            int(checked_actions(action, self.action_space, len(self.env.hardware.motors)))
+        )
         (reward,), (terminated,), (truncated,) = now.reward, now.terminated, now.truncated
         scores = {"score": now.score[0], "score_upright": now.score_upright[0]}
         if self.renderer is not None:

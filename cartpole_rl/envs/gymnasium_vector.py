@@ -15,6 +15,7 @@ from cartpole_rl.envs.gymnasium import (
     Array,
     Randomization,
     action_space,
+    checked_actions,
     observation_space,
     renderer,
     seed_plant,
@@ -66,8 +67,9 @@ class CartPoleVector(VectorEnv[Array, Array, Array]):
         return self._present["observation"].numpy().copy(), {}
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
-        """One control period of every cart."""
-        self._present.set("action", torch.as_tensor(np.asarray(actions, dtype=np.int64)))
+        """One control period of every cart. Raises ConfigError for an action that does not exist."""
+        chosen = checked_actions(actions, self.action_space, len(self.env.hardware.motors))
+        self._present.set("action", torch.as_tensor(chosen))
         transition, self._present = self.env.step_and_maybe_reset(self._present)
         if self.renderer is not None:
             self._draw(self.renderer, transition)

@@ -29,6 +29,7 @@ from cartpole_rl.workflows.config import (
     ReportConfig,
     TrainConfig,
 )
+from cartpole_rl.workflows.person import as_value, as_word
 from cartpole_rl.workflows.recordings import experiments, recordings
 from cartpole_rl.workflows.run_folder import PREFIX, check_program, has_ended, program_of, use_of
 
@@ -124,8 +125,9 @@ def check_resumable(program: str, resume: str, folder: Path) -> None:
         raise ConfigError("resume continues in that run's own folder; leave out hydra.run.dir")
     if has_ended(run):
         raise ConfigError(
-            f"resume={run}: this run of {PREFIX}{program} has ended; cartpole-evaluate run={run} drives its "
-            f"agent, {LONGER[program].format(run)}"
+            f"resume={run}: this run of {PREFIX}{program} has ended; cartpole-evaluate "
+            f"{as_word('run', run)} drives its "
+            f"agent, {LONGER[program].format(as_value(run))}"
         )
     find_training(run)
 
@@ -156,7 +158,11 @@ def check_has_agent(run: Path) -> None:
             f"run={run}: this run of {PREFIX}{program} has no agent yet; {use_of(run, program)}"
         )
     can_resume = (run / CHECKPOINTS / RESUME).exists()
-    again = f"{PREFIX}{program} resume={run} continues it" if can_resume else f"start {PREFIX}{program} again"
+    again = (
+        f"{PREFIX}{program} {as_word('resume', run)} continues it"
+        if can_resume
+        else f"start {PREFIX}{program} again"
+    )
     raise ConfigError(f"run={run}: it holds no {CHECKPOINTS}/{LAST}; the file was removed; {again}")
 
 

@@ -16,6 +16,7 @@ from cartpole_rl.workflows.agents import new_agent, trained_agent
 from cartpole_rl.workflows.build import use_threads
 from cartpole_rl.workflows.config import DistillConfig, TrainConfig
 from cartpole_rl.workflows.export import provenance
+from cartpole_rl.workflows.person import as_word
 from cartpole_rl.workflows.progress import progress_bar
 from cartpole_rl.workflows.report import report
 from cartpole_rl.workflows.results import print_results, shown
@@ -56,7 +57,7 @@ def distill(config: DistillConfig, folder: Path) -> float:
     report(folder, episodes, training.plant.kind, training.pole, training.task)
     print(f"a network of {list(config.hidden)} hidden units scores {score:.0f}")
     files = f"{METRICS}, {FIGURES}/ and {CHECKPOINTS}/"
-    print_results(folder, files, f"cartpole-export run={shown(folder)} format=c")
+    print_results(folder, files, f"cartpole-export {as_word('run', shown(folder))} format=c")
     return score
 
 

@@ -18,6 +18,7 @@ from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.checks import BASELINE, agent_file
 from cartpole_rl.workflows.config import EvaluateConfig
 from cartpole_rl.workflows.episodes import Evaluation, prepared
+from cartpole_rl.workflows.person import as_word
 from cartpole_rl.workflows.prediction import draw_beside_simulation
 from cartpole_rl.workflows.repeating import Repetition
 from cartpole_rl.workflows.report import report
@@ -99,9 +100,9 @@ def next_command(evaluation: Evaluation) -> str:
             knows(known, driven) or emulator_for([driven]) != POLES[0]
         )  # not a default that it does not fit
         poles = [driven] if chosen else known
-        return f"cartpole-finetune run={shown(config.run)} {plant_words(config.plant, poles)}"
+        return f"cartpole-finetune {as_word('run', shown(config.run))} {plant_words(config.plant, poles)}"
     poles = known if config.pole is None else [driven]
-    return f"cartpole-evaluate run={shown(config.run)} {emulated_words(poles)}"
+    return f"cartpole-evaluate {as_word('run', shown(config.run))} {emulated_words(poles)}"
 
 
 def compared(again: Repetition, episode: Episode) -> str:

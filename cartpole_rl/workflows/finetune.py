@@ -43,7 +43,7 @@ from cartpole_rl.workflows.finetuning_learner import check_simulation
 from cartpole_rl.workflows.finetuning_session import LocalSession, TunedAgent
 from cartpole_rl.workflows.live import LiveView, view_title
 from cartpole_rl.workflows.loading import recorded_settings
-from cartpole_rl.workflows.person import confirm, print_message
+from cartpole_rl.workflows.person import as_word, confirm, print_message
 from cartpole_rl.workflows.ray_learner.session import RaySession, learner_link
 from cartpole_rl.workflows.resuming import resumed
 from cartpole_rl.workflows.run_folder import AGENT_HASH, file_hash, recorded_provenance, write_config
@@ -117,7 +117,8 @@ def started_from(files: FinetuningFiles) -> Path:
     if file_hash(find_agent(run)) != recorded_provenance(files.folder).get(AGENT_HASH):
         raise CheckpointError(
             f"resume={files.folder}: it holds no {CHECKPOINTS}/{START}, and by {PROVENANCE} the agent of "
-            f"run={run} is not the one that it started from; cartpole-finetune run={run} starts anew"
+            f"run={run} is not the one that it started from; cartpole-finetune "
+            f"{as_word('run', run)} starts anew"
         )
     return run
 

@@ -19,6 +19,7 @@ from cartpole_rl.workflows.config import TrainConfig
 from cartpole_rl.workflows.finetuning_cart import DrivenCart
 from cartpole_rl.workflows.finetuning_files import FinetuningFiles, Stage
 from cartpole_rl.workflows.finetuning_learner import CartLearner
+from cartpole_rl.workflows.person import as_word
 from cartpole_rl.workflows.report import report
 from cartpole_rl.workflows.results import plant_words, print_loop_time, print_results, shown
 from cartpole_rl.workflows.run_folder import write_json
@@ -100,7 +101,7 @@ class Session:
         print(f"kept: the policy {kept} fine-tuning, by its {SCORES[measure]}")
         files = f"{METRICS}, {COMPARISON}, {CHECKPOINTS}/{LAST} and {RECORDINGS}/"
         cart = plant_words(self.config.plant, [self.settings.pole])
-        print_results(folder, files, f"cartpole-evaluate run={shown(folder)} {cart}")
+        print_results(folder, files, f"cartpole-evaluate {as_word('run', shown(folder))} {cart}")
 
     def summarize(self, episodes: list[Episode]) -> dict[str, Any]:
         """Return the metrics of `episodes` and their summary."""

@@ -29,6 +29,7 @@ from cartpole_rl.run_files import FIGURES, MODELLED
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.build import use_threads
 from cartpole_rl.workflows.config import ModelConfig
+from cartpole_rl.workflows.person import as_word
 from cartpole_rl.workflows.poles import chosen_pole
 from cartpole_rl.workflows.progress import progress_bar
 from cartpole_rl.workflows.recordings import recordings
@@ -72,7 +73,7 @@ def learn_model(config: ModelConfig, folder: Path) -> None:
     print(
         f"\n{spread_table(errors[LEARNED], CERTAIN, 'RMS errors and ensemble spreads on the same windows')}"
     )
-    following = f"cartpole-train plant=learned plant.model={shown(folder)}"
+    following = f"cartpole-train plant=learned {as_word('plant.model', shown(folder))}"
     print_results(folder, f"{MODEL}, {MODELLED} and {FIGURE}", following)
 
 

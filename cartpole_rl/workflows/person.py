@@ -1,6 +1,8 @@
 """The person at the terminal."""
 
 import os
+import re
+import shlex
 import sys
 from contextlib import suppress
 
@@ -39,6 +41,19 @@ def print_message(name: str, message: str) -> None:
     """Print one line on stderr; do nothing if the terminal is closed."""
     with suppress(OSError):
         print(f"cartpole-{name.replace('_', '-')}: {message}", file=sys.stderr)
+
+
+def as_word(name: str, value: object) -> str:
+    """Return an override for a command line: "run=runs/train/first"."""
+    return f"{name}={as_value(value)}"
+
+
+def as_value(value: object) -> str:
+    """Return a value for a command line, in quotes where Hydra and the shell need them."""
+    text = str(value)
+    if not re.fullmatch(r"[A-Za-z0-9_./:%+-]+", text):
+        text = '"' + re.sub(r'(\\*)("|$)', lambda end: 2 * end[1] + end[2].replace('"', '\\"'), text) + '"'
+    return shlex.quote(text)
 
 
 def exit_if_nobody_reads() -> None:

@@ -20,6 +20,7 @@ from cartpole_rl.workflows.checks import agent_file
 from cartpole_rl.workflows.config import EvaluateConfig, RecordConfig
 from cartpole_rl.workflows.episodes import prepared
 from cartpole_rl.workflows.origins import stored_origin
+from cartpole_rl.workflows.person import as_word
 from cartpole_rl.workflows.results import shown
 from cartpole_rl.workflows.run_folder import write_config
 
@@ -48,7 +49,7 @@ def record(config: RecordConfig, folder: Path) -> None:
         if kept := [episode for path, episode in episodes.items() if path.exists()]:
             held = f"{count_text(len(kept))}{guard_text(*kept)}"
             print(f"{shown(folder)}/{RECORDINGS}/ holds {held}; next:")
-            print(f"cartpole-replay from={shown(folder)}")
+            print(f"cartpole-replay {as_word('from', shown(folder))}")
 
 
 def heading(config: EvaluateConfig, settings: CartPoleSettings, episode: Episode) -> dict[str, Any]:

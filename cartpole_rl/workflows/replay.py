@@ -20,6 +20,7 @@ from cartpole_rl.reporting.words import count_text
 from cartpole_rl.run_files import FIGURES
 from cartpole_rl.workflows.config import ReplayConfig
 from cartpole_rl.workflows.nominal import note_other_numbers
+from cartpole_rl.workflows.person import as_word
 from cartpole_rl.workflows.poles import chosen_pole
 from cartpole_rl.workflows.recordings import recordings
 from cartpole_rl.workflows.results import print_results, shown
@@ -53,7 +54,7 @@ def replay_recordings(config: ReplayConfig, folder: Path) -> None:
     subtitle = f"above: {paths[0].name},  below: {count},  pole={name}"
     save(replay_figure(replays, period, REPORTED_TIMES, "Measured and simulated", subtitle), folder / FIGURE)
     print(replay_table(errors, f"errors of {count}, pole={name}, over the time since a reset"))
-    print_results(folder, f"{REPLAY} and {FIGURE}", f"cartpole-model from={shown(config.source)}")
+    print_results(folder, f"{REPLAY} and {FIGURE}", f"cartpole-model {as_word('from', shown(config.source))}")
 
 
 def simulated_parameters(config: ReplayConfig, pole: Pole) -> dict[str, float]:

@@ -7,6 +7,7 @@ from pathlib import Path
 from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.plants.settings import EmulatedSettings
 from cartpole_rl.randomization.poles import PoleSettings
+from cartpole_rl.workflows.person import as_word
 from cartpole_rl.workflows.trained_poles import emulated_words
 
 DEFAULT_BAUD = SerialSettings.model_fields["baud"].default
@@ -39,5 +40,5 @@ def plant_words(plant: EmulatedSettings | SerialSettings, poles: Sequence[PoleSe
     if isinstance(plant, SerialSettings):
         length = f" plant.pole_length={plant.pole_length:g}" if plant.pole_length else ""
         baud = f" plant.baud={plant.baud}" if plant.baud != DEFAULT_BAUD else ""
-        return f"plant=serial plant.port={plant.port}{baud}{length}"
+        return f"plant=serial {as_word('plant.port', plant.port)}{baud}{length}"
     return emulated_words(poles) if poles else "plant=emulated"

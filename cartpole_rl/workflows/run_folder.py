@@ -31,6 +31,7 @@ from cartpole_rl.run_files import (
     RANDOMIZATION,
     RESUME,
 )
+from cartpole_rl.workflows.person import as_value, as_word
 
 PREFIX = "cartpole-"
 AGENT_HASH = "agent_sha256"  # in provenance.json: of the checkpoint that a run started from
@@ -41,8 +42,7 @@ USES = {  # command: how its runs can be used
     "evaluate": "cartpole-evaluate drives one of its episodes again: repeat.run={0}",
     "record": "cartpole-replay, cartpole-identify and cartpole-model take it as from={0}",
     "replay": f"its results are replay.json and {FIGURES}/; cartpole-replay from=... makes new ones",
-    "identify": f"cartpole-train takes its files: cart={{0}}/{CART} pole={{0}}/{POLE} "
-    f"randomization={{0}}/{RANDOMIZATION}",
+    "identify": "cartpole-train takes its files: cart={1} pole={2} randomization={3}",
     "report": f"it is a page to read: {{0}}/{PAGE}",
     "model": "cartpole-train, cartpole-evaluate and cartpole-record take it as plant=learned plant.model={0}",
     "export": "its files are for other programs; cartpole-export run=... makes new ones",
@@ -101,7 +101,7 @@ def check_program(setting: str, folder: Path, *taken: str) -> None:
     """Raise ConfigError if `folder` is a run of a command that is not among `taken`."""
     if (folder / MULTIRUN).is_file():
         jobs = sorted(path for path in folder.iterdir() if path.is_dir() and path.name[0] != ".")
-        example = f": {setting}={jobs[0]}" if jobs else ""
+        example = f": {as_word(setting, jobs[0])}" if jobs else ""
         raise ConfigError(
             f"{setting}={folder} is a folder of a multirun; give that of one of its jobs{example}"
         )
@@ -118,11 +118,13 @@ def use_of(folder: Path, program: str) -> str:
     """Return how a run of cartpole-<program> can be used."""
     if program in ("train", "finetune") and not (folder / METRICS).exists():
         if (folder / CHECKPOINTS / RESUME).exists():
-            return f"{PREFIX}{program} resume={folder} continues it"
+            return f"{PREFIX}{program} {as_word('resume', folder)} continues it"
         return f"it was stopped before its first checkpoint; start {PREFIX}{program} again"
     if program == "distill" and not (folder / CHECKPOINTS / LAST).exists():
         return f"it was stopped before its end; start {PREFIX}{program} again"
-    return USES[program].format(folder)
+    return USES[program].format(
+        *map(as_value, (folder, folder / CART, folder / POLE, folder / RANDOMIZATION))
+    )
 
 
 def has_ended(run: Path) -> bool:

@@ -2,7 +2,6 @@
 
 import json
 import re
-import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -61,14 +60,6 @@ def overrides_of(words: Sequence[str], root: Path | None = None) -> dict[str, An
     Paths below `root` are taken as they are: a folder's name may hold what means something else in YAML.
     """
     return {setting(word): yaml.safe_load(_quoted(word.partition("=")[2], root)) for word in words}
-
-
-def as_word(name: str, value: Path) -> str:
-    """Return an override for a command line, in quotes where Hydra and the shell need them."""
-    text = str(value)
-    if not re.fullmatch(r"[A-Za-z0-9_./:%+-]+", text):
-        text = '"' + re.sub(r'(\\*)"', r"\1\1\"", text) + '"'
-    return shlex.quote(f"{name}={text}")
 
 
 def _quoted(value: str, root: Path | None) -> str:

@@ -27,7 +27,7 @@ from cartpole_rl.workflows.config import TrainConfig
 from cartpole_rl.workflows.loading import recorded_settings
 from cartpole_rl.workflows.monitor import TrainingMonitor
 from cartpole_rl.workflows.nominal import note_other_numbers
-from cartpole_rl.workflows.person import print_message
+from cartpole_rl.workflows.person import as_word, print_message
 from cartpole_rl.workflows.report import report
 from cartpole_rl.workflows.results import print_results, shown
 from cartpole_rl.workflows.resuming import resumed
@@ -95,7 +95,9 @@ def train(config: TrainConfig, folder: Path) -> float:
         forget_training(folder)
     print(f"trained for {training.seconds:.0f} s")
     files = f"{METRICS}, {FIGURES}/ and {CHECKPOINTS}/"
-    print_results(folder, files, f"cartpole-evaluate run={shown(folder)} {emulated_words([config.pole])}")
+    print_results(
+        folder, files, f"cartpole-evaluate {as_word('run', shown(folder))} {emulated_words([config.pole])}"
+    )
     score: float = metrics[config.task.measure]["mean"]
     return score
 

@@ -4,6 +4,7 @@ import subprocess
 import sys
 import warnings
 from collections.abc import Iterator
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -14,6 +15,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 
 from cartpole_rl.choices import choice
 from cartpole_rl.envs.gymnasium import PERIOD, simulated_environment
+from cartpole_rl.envs.gymnasium_vector import CartPoleVector
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.registration import ENVIRONMENTS, MAX_EPISODE_STEPS, register
 
@@ -159,3 +161,22 @@ def test_randomization_is_by_name_or_by_lines() -> None:
         assert len(env.plant.parameters.cart_mass.unique()) == 8
     with pytest.raises(ConfigError, match=r"no choice 'randomization/wild' in conf/; choose from .*wide"):
         simulated_environment("swingup", 8, "wild")
+
+
+@pytest.mark.parametrize("action", [-1, 9, 2.7, 2.0, True, None, "2", [2]])
+def test_only_existing_actions_are_taken(action: Any) -> None:
+    one, many = (
+        gymnasium.make("cartpole_rl/SwingUp-v0"),
+        gymnasium.make_vec("cartpole_rl/SwingUp-v0", num_envs=2, vectorization_mode="vector_entry_point"),
+    )
+    for env, given, expected in ((one, action, "an integer"), (many, [action, action], "2 integers")):
+        env.reset(seed=0)
+        with pytest.raises(ConfigError, match=f"give {expected} from 0 to 8"):
+            env.unwrapped.step(given)
+
+
+@pytest.mark.parametrize("setting", ["max_episode_steps", "num_envs"])
+@pytest.mark.parametrize("value", [0, -1, 2.5, True])
+def test_a_count_is_an_integer_of_at_least_one(setting: str, value: Any) -> None:
+    with pytest.raises(ConfigError, match=f"{setting}={value}: give an integer of at least 1"):
+        CartPoleVector("swingup", **{setting: value})

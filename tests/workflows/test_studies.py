@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
-from cartpole_rl.workflows.studies import as_word, overrides_of
+from cartpole_rl.workflows.person import as_word
+from cartpole_rl.workflows.studies import overrides_of
 
 PLAIN = ["runs/reproduce", "100%", "a:b", "-x", "a+b"]
 FOLDERS = [
