@@ -3,6 +3,7 @@
 An exception unwinds every `with`: the motor is at 0 and the cart disarmed before the process ends.
 """
 
+import atexit
 import os
 import signal
 import threading
@@ -31,7 +32,8 @@ class RaiseOnce:
     """A signal handler that raises `error(number)`, and ignores further signals for UNWINDING s.
 
     A second signal could otherwise leave a `with` before the motor is stopped. Later signals raise again, so
-    a program that hangs can still be ended.
+    a program that hangs can still be ended. While the interpreter ends, they are ignored: the exit code is
+    that of the first signal.
     """
 
     def __init__(self, error: Callable[[int], BaseException]) -> None:
@@ -42,6 +44,7 @@ class RaiseOnce:
         """Handle these signals from now on."""
         for number in numbers:
             signal.signal(number, self)
+        atexit.register(self._ignore, *numbers)
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
         """Raise, unless the last error may still be unwinding."""
@@ -49,6 +52,12 @@ class RaiseOnce:
         if now - self._raised_at >= UNWINDING:
             self._raised_at = now
             raise self._error(number)
+
+    def _ignore(self, *numbers: int) -> None:
+        """Ignore the signals that are still handled here: Python would set them to their defaults."""
+        for number in numbers:
+            if signal.getsignal(number) is self:
+                signal.signal(number, signal.SIG_IGN)
 
 
 def end_with_parent(parent: int) -> None:

@@ -30,6 +30,7 @@ from cartpole_rl.wire import Flags
 PERIOD_MS = 20
 WATCHDOG_MS = 3 * PERIOD_MS
 FULL = 255
+MOST_PUSHES = 20
 QUIET = 0.3  # s without a word from the cart: whoever drove it does no more
 
 EMULATOR = """
@@ -63,6 +64,8 @@ process.run(EmulatorSettings(clock="real", cart_mass=20.0, physics_step=1e-3, jo
 
 HOST = """
 import itertools, signal, sys
+from contextlib import suppress
+from cartpole_rl.errors import LinkError
 from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.settings import SerialSettings
 
@@ -81,7 +84,8 @@ with SerialCart(SerialSettings(port=sys.argv[1])) as cart:
     cart.home()
     cart.start()
     for period in itertools.count():
-        cart.get_state()
+        with suppress(LinkError):  # on a busy machine a motor value came too late, and was refused
+            cart.get_state()
         cart.set_motor(255)
         if period == 3:
             print("driving", flush=True)
@@ -255,11 +259,14 @@ def test_an_experiment_of_the_identification(cart: TellingCart) -> None:
         yield from hold(FULL, 0.1, task)
         return None
 
-    experiments = tuple(Experiment(name, "nothing", push) for name in ("first", "second"))
+    experiments = tuple(Experiment(f"number {number}", "nothing", push) for number in range(MOST_PUSHES))
     with closing(serial_plant(cart)) as plant:
+        looked_at = 0
         for _, episode in conduct(plant, PERIOD_MS / 1000, experiments=experiments):
-            if not episode.motor.any():  # a busy machine suspended the host for over a second after START
-                assert episode.ended_by == "link"
+            if (
+                episode.ended_by == "link"
+            ):  # a busy machine suspended the host, and a motor value came too late
+                cart.listen()
                 continue
             after, _ = cart.stopped()
             assert 0 < after <= WATCHDOG_MS
@@ -267,6 +274,10 @@ def test_an_experiment_of_the_identification(cart: TellingCart) -> None:
             assert commands[-1] == 0
             assert episode.motor[-1] == 0
             cart.listen()
+            looked_at += 1
+            if looked_at == 2:
+                return
+    raise AssertionError("no push was done")
 
 
 def test_the_end_of_an_episode(cart: TellingCart, make_environment: Callable) -> None:

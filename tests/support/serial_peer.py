@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 
+from cartpole_rl.plants.serial.connection import WATCHDOG_PERIODS
 from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.wire import (
     Ack,
@@ -22,6 +23,7 @@ from cartpole_rl.wire import (
     Info,
     Message,
     Nack,
+    Reason,
     SetMotor,
     SetPeriod,
     Start,
@@ -30,9 +32,10 @@ from cartpole_rl.wire import (
     Stop,
     decode_frame,
     encode_frame,
+    ticks_between,
 )
 
-INFO = Info(1, 2, 3, 4096, 22749, 255, 14000, 17000, 20000)
+INFO = Info(2, 2, 3, 4096, 22749, 255, 14000, 17000, 20000, 0)
 HANGING = 2048  # pole counts
 
 
@@ -101,7 +104,10 @@ class Peer:
 
 
 class CartPeer(Peer):
-    """HELLO gives INFO, the rest ACK, and each frame a state; if `paced`, only `tick` gives one."""
+    """HELLO gives INFO, the rest ACK, and each frame a state; if `paced`, only `tick` gives one.
+
+    A motor value other than 0 that answers a state three ticks old is refused.
+    """
 
     def __init__(self, boot: bytes = b"", paced: bool = False) -> None:
         super().__init__(boot)
@@ -112,6 +118,11 @@ class CartPeer(Peer):
 
     def answer(self, frame: Frame) -> Iterable[bytes]:
         message = frame.message
+        if isinstance(message, SetMotor) and message.motor and self.is_stale(message):
+            yield self.encode(Nack(frame.sequence, message.TYPE, Reason.STALE))
+            if not self.paced:
+                yield self.next_state()
+            return
         self.state = replace(self.state, last_sequence=frame.sequence)
         if isinstance(message, SetPeriod):
             self.info = replace(self.info, period_us=message.period_us)
@@ -124,6 +135,9 @@ class CartPeer(Peer):
             yield self.encode(Ack(frame.sequence, message.TYPE))
         if not self.paced:
             yield self.next_state()
+
+    def is_stale(self, message: SetMotor) -> bool:
+        return ticks_between(message.tick, self.state.tick) >= WATCHDOG_PERIODS
 
     def next_state(self, **changes: int) -> bytes:
         """The bytes of the state of the next tick."""

@@ -20,15 +20,20 @@ class ClockComparison:
     """Compares the clock of a cart with this computer's, by the arrivals of its states.
 
     An arrival can be late but never early: of each second by the cart's clock the earliest counts. The median
-    of several comparisons is not disturbed by a second in which this computer was busy.
+    of several comparisons is not disturbed by a second in which this computer was busy. After a pause, such
+    as a question to a person, what waited in a buffer comes at once: a comparison begins anew after that.
     """
 
     SECONDS = 8  # that are compared, the newest
+    LONGEST_PAUSE = 0.5  # s between two arrivals; the longest period is 0.1 s
+    CATCHING_UP = 1.0  # s after a pause; what waited has been read by then
 
     def __init__(self) -> None:
         self._earliest: list[float] = []  # s that the host's clock was ahead, of each second so far
         self._elapsed = 0.0  # s by the cart's clock since the first state
         self._second = -1  # that is under way
+        self._arrived_at: float | None = None  # of the last state
+        self._late_until = 0.0
 
     def add(self, elapsed: float, arrived_at: float) -> float | None:
         """Add a state, `elapsed` s after the last one by the cart's clock, that arrived at a time in s.
@@ -36,6 +41,12 @@ class ClockComparison:
         Returns the rate of the cart's clock (1.3: it passes 1.3 s in a second) when a second has ended and
         enough have been compared, otherwise None.
         """
+        last, self._arrived_at = self._arrived_at, arrived_at
+        if last is not None and arrived_at - last > self.LONGEST_PAUSE:
+            self._late_until = arrived_at + self.CATCHING_UP
+        if arrived_at < self._late_until:
+            self._forget()
+            return None
         self._elapsed += elapsed
         ahead, second = arrived_at - self._elapsed, int(self._elapsed)
         if second == self._second:
@@ -45,6 +56,9 @@ class ClockComparison:
         self._earliest = [*self._earliest[-self.SECONDS :], ahead] if second == self._second + 1 else [ahead]
         self._second = second
         return rate
+
+    def _forget(self) -> None:
+        self._earliest, self._elapsed, self._second = [], 0.0, -1
 
     def _rate(self) -> float | None:
         complete, half = self._earliest[1:], self.SECONDS // 2  # the first second was cut short

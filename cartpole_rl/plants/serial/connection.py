@@ -12,7 +12,7 @@ period per frame, continues after a lost frame. A cart that is known to have its
 accepted frame lets a policy on its board drive on, and the host would not see where to.
 
 A motor value names the state that it answers. The cart refuses one that answers an old state, wherever it
-was delayed. The link then counts as broken.
+was delayed. The link then counts as broken, unless the cart has taken a newer value.
 """
 
 import math
@@ -38,6 +38,7 @@ from cartpole_rl.wire import (
     Message,
     MessageType,
     Nack,
+    Reason,
     SetMotor,
     State,
     Stop,
@@ -182,10 +183,15 @@ class Connection:
         self._check_motor(state)
         self._check_hearing(state)
         refused, self._refused = self._refused, None
-        if refused is not None and not state.fault:
+        if refused is not None and not state.fault and not self._was_overtaken(refused, state):
             raise refusal(refused)
         self._tracker.hand_out(state)
         return state
+
+    def _was_overtaken(self, refused: Nack, state: State) -> bool:
+        """Return True if a motor value came late because the newest one, which was taken, overtook it."""
+        newer = refused.sequence != self._motor_sequence
+        return refused.reason == Reason.STALE and newer and self.took_motor(state)
 
     def _check_motor(self, state: State) -> None:
         """Raise LinkError if the cart reports a motor value that no cart has: it would be learned from."""

@@ -11,6 +11,7 @@ import serial
 
 from cartpole_rl.errors import FrameError, LinkError
 from cartpole_rl.plants.serial.clock import now
+from cartpole_rl.plants.serial.port import set_exclusive
 from cartpole_rl.plants.serial.statistics import LinkStatistics
 from cartpole_rl.wire import Frame, FrameSplitter, Message, decode_frame, encode_frame
 
@@ -111,6 +112,7 @@ class SerialLink:
     def close(self) -> None:
         """Give the port back; never raises."""
         with suppress(OSError):  # an unplugged port is as closed as it can be
+            set_exclusive(self._port, False)
             self._port.close()
 
     def _decode(self, stuffed: bytes) -> Frame | None:

@@ -157,8 +157,9 @@ class SerialPlant(OneCartPlant):
     def step_one(self, motor: int) -> OneFrame:
         """Send a motor value; return the frame at the end of the period.
 
-        If the cart does not acknowledge the value, what drove is what it reports: the motor value in force.
-        If its watchdog or a fault has just set the motor to 0, that was the value of the period before.
+        If the cart does not acknowledge the value, or its limits changed one, what drove is what it reports:
+        the motor value in force. If its watchdog or a fault has just set the motor to 0, that was the value
+        of the period before.
         """
         drove = motor
 
@@ -169,7 +170,9 @@ class SerialPlant(OneCartPlant):
             if self.on_command is not None:  # in the time until the next state
                 self.on_command(drove)
             state = self.cart.get_state()
-            if not self.cart.took_motor(state):
+            if self.cart.flags & Flags.SOFT_LIMIT:
+                drove = state.motor_applied
+            elif not self.cart.took_motor(state):
                 has_just_stopped = state.fault or self.cart.flags & ~before & Flags.WATCHDOG
                 drove = self._drove if has_just_stopped else state.motor_applied
             return state

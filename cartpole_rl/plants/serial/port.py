@@ -6,8 +6,10 @@ Source: Espressif, "Boot Mode Selection", esptool documentation; pyserial 3.5.
 """
 
 import errno
+import os
 import re
 from collections.abc import Iterable
+from contextlib import suppress
 
 import serial
 from serial.tools import list_ports
@@ -18,6 +20,7 @@ from cartpole_rl.plants.serial.tcp import TcpPort
 
 READ_SLICE = 0.01  # s that one read blocks at most; callers look at their own clocks in between
 AUTO = "auto"
+PSEUDO_TERMINAL = re.compile(r"/dev/(pts/\d+|ttys\d{3})")
 WRONG_URL = (LookupError, re.error, NotImplementedError)  # of pyserial, for parts of a URL
 
 
@@ -46,7 +49,25 @@ def open_port(port: str, baud: int, write_timeout: float) -> serial.SerialBase:
         raise PortError(why_not_open(port, error)) from error
     except WRONG_URL as error:
         raise PortError(f"{port} is neither a device path nor a URL of pyserial: {error!r}") from error
+    set_exclusive(line, True)
     return line
+
+
+def set_exclusive(line: serial.SerialBase, exclusive: bool) -> None:
+    """Let no other program open a serial port, whether it asks for a lock or not, until it is closed.
+
+    A modem manager that probes a port writes to it and asks for no lock. The port of an emulated cart is left
+    alone: it would stay exclusive when its host is killed, since the emulator keeps it open.
+    """
+    descriptor = getattr(line, "fd", None)
+    if descriptor is None:
+        return
+    with suppress(ImportError, OSError):
+        import fcntl
+        import termios
+
+        if not PSEUDO_TERMINAL.fullmatch(os.ttyname(descriptor)):
+            fcntl.ioctl(descriptor, termios.TIOCEXCL if exclusive else termios.TIOCNXCL)
 
 
 def resolved_port(port: str) -> str:

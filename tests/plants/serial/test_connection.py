@@ -2,6 +2,8 @@
 
 import re
 import threading
+import time
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 
 import pytest
@@ -11,13 +13,108 @@ from cartpole_rl.errors import FaultError, LinkError, PlantError
 from cartpole_rl.plants.serial import connection
 from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.errors import RefusedError
-from cartpole_rl.wire import Fault, Flags, Nack, Reason, SetMotor, Start, Stop
+from cartpole_rl.wire import (
+    Ack,
+    Fault,
+    Flags,
+    Frame,
+    Hello,
+    Home,
+    Message,
+    Nack,
+    Reason,
+    SetMotor,
+    Start,
+    StartPolicy,
+    State,
+    Stop,
+    cobs,
+)
+from cartpole_rl.wire.checksum import crc16
+from cartpole_rl.wire.frames import END
 
 
 def test_a_question_that_was_lost_is_repeated() -> None:
     with Forgetful(Start, 1) as peer, SerialCart(quick_settings(peer.port)) as cart:
         cart.start()
         assert len(peer.messages(Start)) == 2
+
+
+class LeftOver(CartPeer):
+    """Hears no STOP; answers each with the next acknowledgement that is left over from the last host."""
+
+    def __init__(self, left_over: Callable[[Frame], Ack | None]) -> None:
+        super().__init__()
+        self.left_over = left_over
+
+    def answer(self, frame: Frame) -> Iterable[bytes]:
+        ack = self.left_over(frame) if isinstance(frame.message, Stop) else None
+        if ack is not None:
+            yield self.encode(ack)
+
+
+def acks(*made: Ack) -> Callable[[Frame], Ack | None]:
+    left = iter(made)
+    return lambda frame: next(left, None)
+
+
+@pytest.mark.parametrize(
+    "left_over",
+    [
+        lambda frame: Ack(frame.sequence, Hello.TYPE),
+        lambda frame: Ack(frame.sequence, Start.TYPE),
+        lambda frame: Ack((frame.sequence + 100) % 256, Stop.TYPE),
+        acks(*(Ack(sequence, Stop.TYPE) for sequence in range(1, 6))),
+        acks(Ack(101, Stop.TYPE)),
+    ],
+    ids=["HELLO", "START", "sequence", "first of a host", "fits by chance"],
+)
+def test_an_acknowledgement_of_the_last_host_is_not_taken_for_that_of_stop(
+    left_over: Callable[[Frame], Ack | None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A policy of a host that died may still be armed; HELLO would wake it. Here nothing stopped it."""
+    monkeypatch.setattr("cartpole_rl.plants.serial.link.os.urandom", lambda size: bytes([100] * size))
+    with LeftOver(left_over) as peer:
+        with pytest.raises(LinkError, match="no cart answers"):
+            SerialCart(quick_settings(peer.port, connect_timeout=1.0)).open()
+        assert len(peer.messages(Stop)) > 2
+        assert not peer.messages(Hello)
+
+
+def test_a_host_begins_with_any_sequence() -> None:
+    """So the acknowledgements of the last one do not fit its own frames."""
+    firsts = set()
+    for _ in range(20):
+        with CartPeer() as peer, SerialCart(quick_settings(peer.port)):
+            firsts.add(peer.received[0].sequence)
+    assert len(firsts) > 1
+
+
+def frames_of_version(version: int, frames: Iterable[bytes]) -> Iterator[bytes]:
+    """The frames as a cart of another protocol version sends them."""
+    for frame in frames:
+        body = bytes([version]) + cobs.decode(frame[:-1])[1:-2]
+        yield cobs.encode(body + crc16(body).to_bytes(2, "little")) + END
+
+
+class OldCart(CartPeer):
+    """A cart of protocol version 1, which refuses every frame of another one."""
+
+    def answer(self, frame: Frame) -> Iterable[bytes]:
+        refusal = self.encode(Nack(frame.sequence, frame.message.TYPE, Reason.BAD_VERSION))
+        yield from frames_of_version(1, [refusal, self.next_state()])
+
+
+def test_a_cart_of_another_version_is_told_in_one_line() -> None:
+    with OldCart() as peer:
+        with pytest.raises(LinkError) as told:
+            SerialCart(quick_settings(peer.port, connect_timeout=0.5)).open()
+        assert str(told.value) == (
+            f"no cart answers on {peer.port}: it speaks protocol version 1, this program 2: update its "
+            "firmware, or this program"
+        )
+        assert not peer.messages(Hello)
+        assert not any(message.motor for message in peer.messages(SetMotor))
 
 
 def test_a_question_that_is_never_answered() -> None:
@@ -159,6 +256,87 @@ def test_a_homing_that_does_not_end() -> None:
         with pytest.raises(PlantError, match=r"not done after 0\.1 s"):
             cart.home()
         assert isinstance(peer.received[-1].message, Stop)
+
+
+class HomingForever(CartPeer):
+    """Homes and never ends; `carry_out` of another frame is that of a cart."""
+
+    def carry_out(self, message: Message) -> None:
+        super().carry_out(message)
+        if isinstance(message, Home):
+            self.flags = Flags.HOMING
+
+
+def test_a_cart_that_homes_is_asked_ten_times_a_second_of_its_own_clock() -> None:
+    with HomingForever() as peer, SerialCart(quick_settings(peer.port)) as cart:
+        asked: list[int] = []
+
+        def watch(state: State) -> None:
+            asked.append(len(peer.messages(Hello)))
+            if state.tick < 300:
+                peer.tick()
+            else:
+                peer.flags = Flags.HOMED
+
+        began = peer.state.tick
+        cart.home(watch)
+        periods = peer.state.tick - began
+        assert 0.1 * periods < asked[-1] - asked[0] <= 0.2 * periods + 1
+
+
+def test_a_cart_that_ended_its_homing_by_itself_is_a_lost_link() -> None:
+    with HomingForever() as peer, SerialCart(quick_settings(peer.port)) as cart:
+
+        def end(state: State) -> None:
+            peer.flags = Flags(0)
+            peer.tick()
+
+        with pytest.raises(LinkError, match="ended homing, as no frame of this computer reached it"):
+            cart.home(end)
+
+
+def test_the_policy_on_the_board_has_to_be_the_agent_that_is_asked_for() -> None:
+    with CartPeer() as peer:
+        with SerialCart(quick_settings(peer.port)) as cart, pytest.raises(PlantError, match="has no policy"):
+            cart.check_policy(0x1A2B3C4D)
+        peer.info = replace(peer.info, policy=0x1A2B3C4D)
+        with SerialCart(quick_settings(peer.port)) as cart:
+            cart.check_policy(0x1A2B3C4D)
+            with pytest.raises(
+                PlantError, match=r"has another agent \(1a2b3c4d, not 00000005\): export this"
+            ):
+                cart.check_policy(5)
+        assert not peer.flags & Flags.ARMED
+
+
+@pytest.mark.parametrize("begin", [SerialCart.home, SerialCart.start, SerialCart.start_policy])
+def test_a_link_that_takes_over_a_period_drives_no_cart(begin: Callable[[SerialCart], object]) -> None:
+    with Distant() as peer, SerialCart(quick_settings(peer.port, answer_timeout=5.0)) as cart:
+        cart.set_period(5_000)
+        cart._tracker.ticks_alone = True
+        peer.delay = 0.02
+        with pytest.raises(LinkError, match=r"takes 2\d ms|takes \d{2,} ms, over a period of 5 ms"):
+            begin(cart)
+        assert not peer.messages(Home) + peer.messages(Start) + peer.messages(StartPolicy)
+
+
+class Distant(CartPeer):
+    """Answers each STOP `delay` s later."""
+
+    delay = 0.0
+
+    def answer(self, frame: Frame) -> Iterable[bytes]:
+        if isinstance(frame.message, Stop):
+            time.sleep(self.delay)
+        yield from super().answer(frame)
+
+
+def test_on_a_lockstep_cart_no_time_passes_on_the_way() -> None:
+    with Distant() as peer, SerialCart(quick_settings(peer.port, answer_timeout=5.0)) as cart:
+        peer.delay = 0.05
+        stopped = len(peer.messages(Stop))
+        cart.start()
+        assert len(peer.messages(Stop)) == stopped
 
 
 def test_the_period_is_set_and_known() -> None:

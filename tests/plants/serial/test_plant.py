@@ -83,7 +83,7 @@ def test_a_value_that_is_replaced_by_0_is_the_one_that_counts(
     assert commanded == [0, 0]
     monkeypatch.undo()
     assert plant.step_one(200).sent is None
-    assert peer.messages(SetMotor)[-1] == SetMotor(200)
+    assert peer.messages(SetMotor)[-1].motor == 200
 
 
 def test_a_value_that_was_lost_did_not_drive(peer: CartPeer, plant: SerialPlant) -> None:
@@ -97,6 +97,32 @@ def test_a_value_that_was_lost_did_not_drive(peer: CartPeer, plant: SerialPlant)
     assert plant.step_one(200).sent == 100
     assert plant.step_one(200).sent == 0
     peer.answer, peer.flags = answer, peer.flags & ~Flags.WATCHDOG
+    assert plant.step_one(200).sent is None
+
+
+def test_a_value_that_a_limit_of_the_track_replaced_did_not_drive(peer: CartPeer, plant: SerialPlant) -> None:
+    """What drove is the cart's own value, 0 or the brake's: nothing is learned of the one that was sent."""
+    plant.reset()
+    commanded = []
+    plant.on_command = commanded.append
+    answer = peer.answer
+
+    def limited(motor: int) -> None:
+        def override(frame: Frame) -> Iterator[bytes]:
+            *answers, _ = answer(frame)
+            yield from answers
+            yield peer.next_state(motor_applied=motor)
+
+        peer.answer = override
+
+    peer.flags |= Flags.SOFT_LIMIT
+    for motor in (-255, 0):
+        limited(motor)
+        given = TensorDict({"motor": torch.tensor([[200]])}, [1])
+        assert plant._step(given)["motor_applied"].item() == motor
+        assert given["motor"].item() == motor
+    assert commanded == [200, 200]
+    peer.answer, peer.flags = answer, peer.flags & ~Flags.SOFT_LIMIT
     assert plant.step_one(200).sent is None
 
 

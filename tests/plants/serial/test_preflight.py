@@ -233,6 +233,7 @@ class Failing(CartPeer):
 
     def carry_out(self, message: Message) -> None:
         if isinstance(message, Home):
+            self.flags |= Flags.HOMING
             self.state = replace(self.state, cart_counts=self.moved)
 
     def end_homing(self) -> None:

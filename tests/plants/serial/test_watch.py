@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from serial_peer import CartPeer, wait_for
 
-from cartpole_rl.wire import Ack, ClearFault, Fault, Frame, Home, Nack, Reason, SetMotor, Start, Stop
+from cartpole_rl.wire import Ack, ClearFault, Fault, Flags, Frame, Home, Nack, Reason, SetMotor, Start, Stop
 
 SCRIPT = Path(__file__).parents[3] / "scripts/watch.py"
 OUTPUT_SPEED = 5  # of termios.tcgetattr
@@ -27,7 +27,7 @@ def test_counts_are_printed_until_an_interrupt(words: tuple[str, ...], speed: in
         command = [sys.executable, SCRIPT, peer.port, *words]
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
             assert process.stdout is not None
-            assert "firmware_major=1" in process.stdout.readline()
+            assert "firmware_major=2" in process.stdout.readline()
             while not select.select([process.stdout], [], [], 0.01)[0]:
                 peer.tick(cart_counts=123)
             assert "cart      123" in process.stdout.readline()
@@ -74,6 +74,7 @@ class Homing(CartPeer):
         elif not isinstance(frame.message, Home):
             yield from super().answer(frame)
         else:
+            self.flags |= Flags.HOMING
             yield self.encode(Ack(frame.sequence, Home.TYPE))
 
 
