@@ -26,7 +26,7 @@ class ClockComparison:
 
     SECONDS = 8  # that are compared, the newest
     LONGEST_PAUSE = 0.5  # s between two arrivals; the longest period is 0.1 s
-    CATCHING_UP = 1.0  # s after a pause; what waited has been read by then
+    CATCHING_UP = 1.0  # s after a pause and at first; what waited has been read by then
 
     def __init__(self) -> None:
         self._earliest: list[float] = []  # s that the host's clock was ahead, of each second so far
@@ -42,7 +42,7 @@ class ClockComparison:
         enough have been compared, otherwise None.
         """
         last, self._arrived_at = self._arrived_at, arrived_at
-        if last is not None and arrived_at - last > self.LONGEST_PAUSE:
+        if last is None or arrived_at - last > self.LONGEST_PAUSE:
             self._late_until = arrived_at + self.CATCHING_UP
         if arrived_at < self._late_until:
             self._forget()

@@ -1,9 +1,16 @@
 """Which port is the cart: pure functions of a list of ports as pyserial gives it."""
 
+import fcntl
+import os
+import re
+import struct
+import sys
+
 import pytest
 from serial.tools.list_ports_common import ListPortInfo
+from serial_peer import CartPeer, Peer, quick_settings
 
-from cartpole_rl.errors import PortError
+from cartpole_rl.errors import LinkError, PortError
 from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.port import found_ports, only_cart, open_port, resolved_port
 from cartpole_rl.plants.serial.ports import UsbPort, cart_like, changes, described, usb_ports
@@ -105,3 +112,58 @@ def test_a_url_that_cannot_be_opened_is_named_in_one_line(port: str, words: str)
     assert words in str(raised.value)
     assert str(raised.value).startswith(port)
     assert "\n" not in str(raised.value)
+
+
+TIOCGEXCL = 0x80045440  # of Linux; Python's termios does not have it
+
+
+def is_exclusive(peer: Peer) -> bool:
+    return struct.unpack("i", fcntl.ioctl(peer._slave, TIOCGEXCL, bytes(4)))[0] == 1
+
+
+@pytest.fixture
+def _pseudo_terminals_are_ports(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Treat them as the ports of real carts, which nothing holds open once their host is gone."""
+    monkeypatch.setattr("cartpole_rl.plants.serial.port.PSEUDO_TERMINAL", re.compile("none"))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="Linux's call")
+@pytest.mark.usefixtures("_pseudo_terminals_are_ports")
+class TestExclusive:
+    def test_a_port_is_exclusive_while_it_is_open(self) -> None:
+        with CartPeer() as peer:
+            cart = SerialCart(quick_settings(peer.port))
+            for _ in range(2):
+                assert not is_exclusive(peer)
+                cart.open()
+                assert is_exclusive(peer)
+                cart.close()
+            assert not is_exclusive(peer)
+
+    def test_a_port_without_a_cart_is_given_back(self) -> None:
+        with Peer() as peer:
+            with pytest.raises(LinkError, match="no cart answers"):
+                SerialCart(quick_settings(peer.port, connect_timeout=0.3)).open()
+            assert not is_exclusive(peer)
+
+    @pytest.mark.skipif(os.geteuid() == 0, reason="root may open every file")
+    def test_a_program_that_asks_for_no_lock_cannot_open_it(self) -> None:
+        with CartPeer() as peer, SerialCart(quick_settings(peer.port)):
+            with pytest.raises(OSError, match="busy"):
+                os.open(peer.port, os.O_RDWR | os.O_NOCTTY)
+            with pytest.raises(PortError, match="is busy"):
+                open_port(peer.port, 921600, 1.0)
+
+    def test_a_pulled_cable_is_closed_quietly(self) -> None:
+        with CartPeer() as peer:
+            cart = SerialCart(quick_settings(peer.port))
+            cart.open()
+            peer.unplug()
+            cart.close()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="Linux's call")
+def test_the_port_of_an_emulated_cart_can_be_opened_after_its_host_was_killed() -> None:
+    """The emulator keeps it open, so that an exclusive port would stay so."""
+    with CartPeer() as peer, SerialCart(quick_settings(peer.port)):
+        assert not is_exclusive(peer)

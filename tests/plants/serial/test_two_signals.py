@@ -1,0 +1,56 @@
+"""A second signal, while a command that homes a cart ends because of a first one, changes nothing."""
+
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from serial_peer import INFO, CartPeer, wait_for
+
+from cartpole_rl.signals import UNWINDING
+from cartpole_rl.wire import Flags, Home, Message, Stop
+
+PREFLIGHT = (sys.executable, "-m", "cartpole_rl.commands.preflight")
+
+
+class Homing(CartPeer):
+    """A cart that homes until it is stopped."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.info = replace(INFO, soft_limit_counts=16704, hard_limit_counts=17539)
+
+    def carry_out(self, message: Message) -> None:
+        super().carry_out(message)
+        if isinstance(message, Home | Stop):
+            self.flags = Flags.HOMING if isinstance(message, Home) else Flags(0)
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "code"),
+    [(signal.SIGTERM, signal.SIGINT, 143), (signal.SIGINT, signal.SIGTERM, 130)],
+    ids=["SIGTERM first", "SIGINT first"],
+)
+def test_the_exit_code_is_that_of_the_first_signal(
+    first: signal.Signals, second: signal.Signals, code: int, tmp_path: Path
+) -> None:
+    """It comes while the cart is being stopped, and again and again until the interpreter is gone."""
+    with Homing() as peer:
+        words = ["plant=serial", f"plant.port={peer.port}", f"hydra.run.dir={tmp_path}"]
+        with subprocess.Popen(
+            [*PREFLIGHT, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+        ) as process:
+            wait_for(lambda: bool(peer.messages(Home)), 200)
+            stops = len(peer.messages(Stop))
+            process.send_signal(first)
+            taken = time.monotonic()
+            wait_for(lambda: len(peer.messages(Stop)) > stops, 200)
+            while process.poll() is None and time.monotonic() < taken + UNWINDING / 2:
+                process.send_signal(second)
+                time.sleep(0.01)
+            process.communicate(timeout=200)
+        assert process.returncode == code
+    assert peer.flags == Flags(0)
