@@ -62,8 +62,9 @@ def test_without_latency_both_drive_the_same_cart_to_the_same_bytes() -> None:
     assert np.abs(board.theta).min() < 0.5  # it swings up
     assert (board.time == host.time).all()
     assert board.score.sum() == host.score.sum()
-    assert (board.expected == board.motor).all()
-    assert same_as_host(board) == (150, 150)
+    assert (board.expected == board.motor)[board.compared].all()
+    same, compared = same_as_host(board)
+    assert same == compared > 50
     assert host.expected is None
     assert board.ended_by == host.ended_by == Ending.TIME
 

@@ -41,7 +41,7 @@ def board(*options: str) -> Iterator[str]:
 
 
 def test_it_homes_drives_and_stops_like_any_cart() -> None:
-    with board("--fast") as port, SerialCart(SETTINGS.model_copy(update={"port": port})) as cart:
+    with board() as port, SerialCart(SETTINGS.model_copy(update={"port": port})) as cart:
         cart.home()
         assert cart.flags & Flags.HOMED
         before = cart.poll_state()
@@ -49,7 +49,7 @@ def test_it_homes_drives_and_stops_like_any_cart() -> None:
         assert abs(before.pole_counts - 2048) <= 8
         cart.start()
         pushed = []
-        while not pushed or pushed[-1].cart_counts < FAR:  # the board does not wait for the host
+        while not pushed or pushed[-1].cart_counts < FAR:
             cart.set_motor(PUSH)
             pushed.append(cart.get_state())
         assert max(state.pole_counts for state in pushed) > before.pole_counts + 3
@@ -60,7 +60,7 @@ def test_it_homes_drives_and_stops_like_any_cart() -> None:
 
 
 def test_a_policy_on_the_board_drives_while_the_host_listens() -> None:
-    options = ("--policy", str(SHUTTLE), "--fast")
+    options = ("--policy", str(SHUTTLE))
     with board(*options) as port, SerialCart(SETTINGS.model_copy(update={"port": port})) as cart:
         cart.home()
         cart.start_policy()
