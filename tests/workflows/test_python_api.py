@@ -81,7 +81,7 @@ def record_shaken_carts(folder: Path, make_plant: Callable, make_environment: Ca
     actions = torch.randint(len(MOTORS), (50, 6), generator=random).repeat_interleave(10, 0)
     actions[:STILL] = MOTORS.index(0)
     in_turn = iter(actions)
-    env = make_environment(make_plant(6, cart={"track_half_length": 2.0}), MOTORS)
+    env = make_environment(make_plant(6, cart={"track_half_length": 5.0}), MOTORS)
     episodes = run_batch(env, lambda present: present.set("action", next(in_turn)))
     for number, episode in enumerate(episodes):
         write_recording(folder / f"{number}.csv", episode, {"pole_length_m": "0.3556"})

@@ -49,7 +49,7 @@ def test_folders_are_those_of_the_caller(caller: Path) -> None:
     done = reproduce(caller, "--studies", "studies", "--folder", "my #runs")
     assert (done.returncode, done.stderr) == (0, "")
     assert (caller / "my #runs/quick/baseline/lqr/10/metrics.json").exists()
-    page = f"""'studies="{caller}/my #runs/quick"'"""
+    page = f'''studies='"{caller}/my #runs/quick"\''''
     assert done.stdout.splitlines()[-1] == f"the page: cartpole-report {page}"
 
 

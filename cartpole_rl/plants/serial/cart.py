@@ -21,7 +21,8 @@ from cartpole_rl.plants.serial.port import open_port, resolved_port
 from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.plants.serial.statistics import LinkStatistics
 from cartpole_rl.plants.serial.tracking import StateTracker
-from cartpole_rl.wire import (
+from cartpole_rl.wire import microseconds_between
+from cartpole_rl.wire.messages import (
     Ack,
     ClearFault,
     Flags,
@@ -35,7 +36,6 @@ from cartpole_rl.wire import (
     StartPolicy,
     State,
     Stop,
-    microseconds_between,
 )
 
 LOGGER = logging.getLogger(__name__)
