@@ -87,8 +87,8 @@ def memory(observation: ObservationSettings) -> int:
 def comparable(gaps: NDArray[np.bool_], memory: int, ending: str) -> NDArray[np.bool_]:
     """Return [T] in which periods board and computer chose from the same observation.
 
-    `gaps` [T]: before the state at the end of the period, a state was missed, or the watchdog or a limit of the
-    track held the motor.
+    `gaps` [T]: before the state at the end of the period, a state was missed, or the watchdog or a limit
+    held the motor.
     The board then observes other velocities, for `memory` periods more another past. The last state before an
     ending that stops the motor does not report the policy's value.
     """
