@@ -293,7 +293,8 @@ def _overridden(values: dict[str, Any], name: str, value: Any) -> dict[str, Any]
         if last not in place:
             raise ConfigError(f"{name}: there is no {key} to remove")
         return _removed(values, key.split("."))
-    if name.startswith("+") and not name.startswith("++") and last in place:
+    adds = name.startswith("+") and not name.startswith("++")
+    if adds and last in place and not isinstance(value, Mapping | list | tuple):
         raise ConfigError(f"{name}: {key} is there already; leave out the +")
     for part in reversed(key.split(".")):
         value = {part: value}

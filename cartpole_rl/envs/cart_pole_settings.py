@@ -19,7 +19,10 @@ from cartpole_rl.tasks.settings import ActionSettings, RewardSettings, TaskSetti
 
 def _randomization_kind(given: Any) -> str:
     """Return "identified" for the posterior of an identification, "ranges" for ranges by parameter name."""
-    return "identified" if isinstance(given, IdentifiedSettings) or "posterior" in given else "ranges"
+    identified = isinstance(given, IdentifiedSettings) or (
+        isinstance(given, Mapping) and "posterior" in given
+    )
+    return "identified" if identified else "ranges"
 
 
 Randomization = Annotated[
