@@ -12,7 +12,7 @@ period per frame, continues after a lost frame. A cart that is known to have its
 accepted frame lets a policy on its board drive on, and the host would not see where to.
 
 A motor value names the state that it answers. The cart refuses one that answers an old state, wherever it
-was delayed. The link then counts as broken, unless the cart has taken a newer value.
+was delayed. The link then counts as broken, unless the cart has taken a newer frame.
 """
 
 import math
@@ -69,6 +69,7 @@ class Connection:
         self._frames_asked = 0  # sent up to that question; refusals of motor values among them are void
         self._heard: int | None = None  # the newest sequence that a state acknowledged, ...
         self._unheard_since: float | None = None  # ... and when a newer one was sent
+        self._newest_heard: int | None = None  # by any state since the newest question
         self._motor_sequence = 0  # of the newest motor value
         self._refused: Nack | None = None  # of a motor value
         self._refused_sequence = -1  # of the newest frame that was refused; no state will acknowledge it
@@ -116,6 +117,7 @@ class Connection:
         """
         self._tracker.send_question()
         self._refused_sequence = -1
+        self._newest_heard = None
         self._answers.clear()
         asked: list[int] = []
         end, pause = now() + within, self._settings.answer_timeout
@@ -183,15 +185,15 @@ class Connection:
         self._check_motor(state)
         self._check_hearing(state)
         refused, self._refused = self._refused, None
-        if refused is not None and not state.fault and not self._was_overtaken(refused, state):
+        if refused is not None and not state.fault and not self._was_overtaken(refused):
             raise refusal(refused)
         self._tracker.hand_out(state)
         return state
 
-    def _was_overtaken(self, refused: Nack, state: State) -> bool:
-        """Return True if a motor value came late because the newest one, which was taken, overtook it."""
-        newer = refused.sequence != self._motor_sequence
-        return refused.reason == Reason.STALE and newer and self.took_motor(state)
+    def _was_overtaken(self, refused: Nack) -> bool:
+        """Return True if a motor value came late behind a newer frame that was taken, or came twice."""
+        newest = self._newest_heard
+        return refused.reason == Reason.STALE and newest is not None and is_newer(newest, refused.sequence)
 
     def _check_motor(self, state: State) -> None:
         """Raise LinkError if the cart reports a motor value that no cart has: it would be learned from."""
@@ -219,7 +221,7 @@ class Connection:
         deadline = now() + self._settings.timeout
         while True:
             state = self.current_state()
-            if (state.last_sequence - self._asked_sequence) % 256 < 128:
+            if is_newer(state.last_sequence, self._asked_sequence):
                 return state
             if now() > deadline:
                 raise LinkError(
@@ -310,6 +312,8 @@ class Connection:
         for frame in self.link.receive(waiting):
             message = frame.message
             if isinstance(message, State):
+                if self._newest_heard is None or is_newer(message.last_sequence, self._newest_heard):
+                    self._newest_heard = message.last_sequence
                 if self._tracker.receive(
                     message, Flags(frame.flags), self.link.received_at, self.link.sequence
                 ):
@@ -354,3 +358,8 @@ class Connection:
         return (
             f"{link.bytes_received} bytes came, the last bad frame: {link.why_bad}; right port, right baud?"
         )
+
+
+def is_newer(sequence: int, than: int) -> bool:
+    """Return True if the frame of a sequence was sent after that of another, or is the same."""
+    return (sequence - than) % 256 < 128

@@ -126,6 +126,16 @@ def lockstep() -> Iterator[tuple[CartPeer, SerialCart]]:
         yield peer, cart
 
 
+def test_a_value_that_was_taken_and_comes_a_second_time_breaks_no_link() -> None:
+    with driven() as (peer, cart):
+        cart.set_motor(100)
+        cart.get_state()
+        taken = peer.messages(SetMotor)[-1]
+        peer.send(peer.encode(Nack(peer.state.last_sequence, SetMotor.TYPE, Reason.STALE)))
+        peer.tick()
+        assert cart.get_state().motor_applied == taken.motor == 100
+
+
 def test_a_value_that_is_late_behind_older_states_is_noticed() -> None:
     """As of a cart that is not known to have its own clock yet, behind a bridge with a backlog."""
     with lockstep() as (peer, cart):
