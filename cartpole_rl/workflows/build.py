@@ -101,7 +101,7 @@ def replaced_settings(training: TrainConfig, config: EvaluateConfig) -> CartPole
     own = {name: getattr(training, name) for name in CartPoleSettings.model_fields}
     given = {name: value for name in REPLACEABLE if (value := getattr(config, name)) is not None}
     if config.task is not None:
-        given["task"] = {**config.task, "x_max": config.task.get("x_max") or training.task.x_max}
+        given["task"] = {**config.task.model_dump(), "x_max": config.task.x_max or training.task.x_max}
     if isinstance(config.plant, EmulatedSettings):
         given["pole"] = one_pole(emulated_pole(config.emulator))
     if isinstance(config.plant, SerialSettings) and config.pole is None and config.plant.pole_length:

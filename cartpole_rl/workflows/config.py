@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, field_validator, model_validator
 
 from cartpole_rl.agents.settings import AgentSettings
-from cartpole_rl.checking import checked, kinds
+from cartpole_rl.checking import kinds
 from cartpole_rl.emulator.settings import ONBOARD, EmulatorSettings
 from cartpole_rl.envs.cart_pole_settings import (
     CartFrictionSettings,
@@ -19,7 +19,6 @@ from cartpole_rl.envs.cart_pole_settings import (
     SimulatedCartSettings,
 )
 from cartpole_rl.envs.settings import GuardSettings
-from cartpole_rl.errors import ConfigError
 from cartpole_rl.identification.settings import EnsembleSettings
 from cartpole_rl.learning.settings import (
     BufferSettings,
@@ -37,7 +36,7 @@ from cartpole_rl.plants.settings import EmulatedSettings, LearnedSettings, Simul
 from cartpole_rl.randomization.checks import check_one_pole
 from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.randomization.settings import IdentifiedSettings
-from cartpole_rl.settings import Count, Finite, NonNegative, Seed, Settings
+from cartpole_rl.settings import Count, Finite, NonNegative, Positive, Seed, Settings
 from cartpole_rl.tasks.settings import ActionSettings, RewardSettings, TaskSettings
 
 View = Literal["none", "live"]  # of the cart in the terminal, while it is driven
@@ -152,6 +151,12 @@ class AnimationSettings(Settings):
     mp4: bool = False  # each animation also as an MP4, which needs the extra `video`
 
 
+class EvaluatedTask(TaskSettings):
+    """The task of an evaluation. Without `x_max` it has the track of the agent's training."""
+
+    x_max: Positive | None = None  # type: ignore[assignment]
+
+
 class EvaluateConfig(RunSettings):
     """The settings of cartpole-evaluate. Groups that are None are those of the agent's training."""
 
@@ -167,7 +172,7 @@ class EvaluateConfig(RunSettings):
     cart_friction: CartFrictionSettings | None = None
     pole_friction: PoleFrictionSettings | None = None
     pole: PoleSettings | None = None
-    task: dict[str, Any] | None = None  # TaskSettings, whose x_max may be missing: it is then the agent's
+    task: EvaluatedTask | None = None
     reward: RewardSettings | None = None
     guard: GuardSettings | None = None
     actions: ActionSettings | None = None
@@ -175,17 +180,6 @@ class EvaluateConfig(RunSettings):
     repeat: RepeatSettings = RepeatSettings()
     view: View = "none"
     animation: AnimationSettings = AnimationSettings()
-
-    @field_validator("task")
-    @classmethod
-    def _task_is_right(cls, task: dict[str, Any] | None) -> dict[str, Any] | None:
-        """Check the task with any track in place of a missing one."""
-        if task is not None:
-            try:
-                checked(TaskSettings, {**task, "x_max": task.get("x_max") or 1.0})
-            except ConfigError as error:
-                raise ValueError(str(error)) from None
-        return task
 
     @model_validator(mode="after")
     def _plant_reads_every_setting(self) -> "EvaluateConfig":

@@ -66,6 +66,11 @@ def test_a_config_dir_that_is_not_there(words: tuple[str, ...], tmp_path: Path) 
     assert complaint.startswith("--config-dir=/nonexistent: not found")
 
 
+def test_a_search_path_that_is_not_there(tmp_path: Path) -> None:
+    complaint = refused(tmp_path, "hydra.searchpath=[file:///nonexistent]", "seed=x")
+    assert complaint == "hydra.searchpath: /nonexistent not found; give a folder"
+
+
 def test_a_file_extends_a_file_beside_it(tmp_path: Path) -> None:
     (tmp_path / "deep").mkdir()
     (tmp_path / "deep/heavy.yaml").write_text(HEAVY)

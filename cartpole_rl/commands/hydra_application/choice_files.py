@@ -57,6 +57,9 @@ def own_folder(words: Sequence[str]) -> Path | None:
     """Return the folder of --config-dir. Raises ConfigError if it is none, or if its files are ignored."""
     for word, following in pairwise([*words, ""]):
         option, _, value = word.partition("=")
+        searched = re.findall(r"file://([^,\]'\"]+)", word) if option == "hydra.searchpath" else ()
+        if missing := [path for path in searched if not Path(path).is_dir()]:
+            raise ConfigError(f"{option}: {missing[0]} not found; give a folder")
         if option not in ("--config-dir", "-cd"):
             continue
         folder = Path(value or following)
