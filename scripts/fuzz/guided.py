@@ -11,10 +11,10 @@ them periods with any encoder counts (cart) or calls of any method (host). Valid
 the checksum to the state machines. libFuzzer prints what was reached (`cov`, `ft`) and the memory (`rss`);
 options that begin with `-` are its own. An input that breaks a rule is saved as `crash-...`.
 
-Rules for the cart: no exception; the motor is 0 unless the cart is armed or homing; the motor is 0 in the
-third period without a command; bytes that are not a valid frame change nothing and get no answer. Rules for
-the host: no exception outside `errors.py`; no motor value other than 0 is sent unless it was requested; no
-count of its statistics is negative.
+Rules for the cart: no exception; the motor is 0 unless the cart is armed, homing or braked; the motor is 0
+or the brake's in the fourth period without a command; homing ends without frames of the host; bytes that are
+not a valid frame change nothing and get no answer. Rules for the host: no exception outside `errors.py`; no
+motor value other than 0 is sent unless it was requested; no count of its statistics is negative.
 """
 
 import contextlib
@@ -33,19 +33,20 @@ if "--replay" not in sys.argv:
         sys.exit("guided.py needs atheris: pip install atheris")
 
 with fuzzer.instrument_imports(include=LIBRARIES) if fuzzer else contextlib.nullcontext():
-    from cartpole_rl.emulator.firmware import WATCHDOG_PERIODS, Firmware
+    from cartpole_rl.emulator.firmware import LEASE_US, WATCHDOG_PERIODS, Firmware
     from cartpole_rl.plants.serial import cart as serial_cart
     from cartpole_rl.plants.serial import connection
     from cartpole_rl.plants.serial.settings import SerialSettings
     from cartpole_rl.wire import Flags, FrameSplitter, SetMotor, Start, State, cobs, decode_frame
     from cartpole_rl.wire.checksum import crc16
-    from cartpole_rl.wire.frames import END, LONGEST_FRAME, open_envelope
+    from cartpole_rl.wire.frames import END, LONGEST_FRAME, VERSION, open_envelope
     from cartpole_rl.wire.messages import FROM_CART, MESSAGES
 
 from cartpole_rl.errors import CartPoleError, FrameError  # noqa: E402 - after what is instrumented
 
 CART_TYPES = (0x81, 0x82, 0x83, 0x84, 0x85)
 MOST_STEPS = 200
+LOOK_US = 4000  # between two looks of the firmware at its counts
 
 
 class Steps:
@@ -76,11 +77,52 @@ def valid_frame(version: int, kind: int, sequence: int, flags: int, payload: byt
     return cobs.encode(body + crc16(body).to_bytes(2, "little"))
 
 
+class Driven:
+    """A firmware, and what was accepted when; the encoder counts are those of the newest period."""
+
+    def __init__(self, homed: bool) -> None:
+        self.firmware = Firmware(lambda: 3_000)
+        self.firmware.homed = homed
+        self.now_us = self.heard_us = self.carts = self.poles = 0
+        self.silent = 0  # periods since the newest frame that keeps the watchdog quiet
+
+    def receive(self, stuffed: bytes) -> list[bytes]:
+        """Let a frame arrive; return the answers."""
+        answers = self.firmware.receive(stuffed, self.now_us)
+        if self.firmware.carried_out is not None:
+            self.heard_us = self.now_us
+        if isinstance(self.firmware.carried_out, SetMotor | Start):
+            self.silent = 0
+        return answers
+
+    def pass_period(self, cart: int, pole: int) -> None:
+        """Pass a period in which the counts change by `cart` and `pole`; check the rules."""
+        firmware, end_us = self.firmware, self.now_us + self.firmware.period_us
+        idle = not firmware.armed and not firmware.homing
+        self.carts, self.poles, self.silent = self.carts + cart, self.poles + pole, self.silent + 1
+        driven = set()
+        while self.now_us < end_us:
+            firmware.drive(self.now_us)
+            driven.add(0 if firmware._limits.brake else firmware.motor)
+            self.now_us = firmware.next_due(min(end_us, self.now_us + LOOK_US))
+            firmware.look(self.now_us, self.carts, self.poles)
+        frames = [decode_frame(frame[:-1]) for frame in firmware.tick(end_us, self.carts, self.poles)]
+        state = frames[-1].message
+        assert isinstance(state, State)
+        assert not idle or driven == {0}, "the motor ran while it was neither armed nor homing"
+        if firmware.armed and self.silent > WATCHDOG_PERIODS:
+            assert driven == {0}, "the watchdog did not stop the motor"
+        if not firmware.armed and not firmware.homing and state.motor_applied:
+            assert frames[-1].flags & Flags.SOFT_LIMIT, "the motor of an idle cart is not the brake's"
+        if firmware.homing:
+            assert self.now_us - self.heard_us <= LEASE_US, "homing goes on without a host"
+
+
 def cart(data: bytes) -> None:
     """Feed one input to a firmware."""
-    steps, firmware, splitter = Steps(data), Firmware(lambda: 3_000), FrameSplitter()
-    firmware.homed = bool(steps.number() & 1)
-    now_us = carts = poles = silent = 0
+    steps, splitter = Steps(data), FrameSplitter()
+    driven = Driven(bool(steps.number() & 1))
+    firmware = driven.firmware
     for _ in range(MOST_STEPS):
         if not steps.left:
             return
@@ -88,50 +130,27 @@ def cart(data: bytes) -> None:
             case 0:
                 for stuffed in splitter.feed(steps.take(steps.number() % 80)):
                     before = (firmware.armed, firmware.homing, firmware.fault)
-                    answers = firmware.receive(stuffed, now_us)
+                    answers = driven.receive(stuffed)
                     if not opens(stuffed):
                         assert not answers
                         assert before == (firmware.armed, firmware.homing, firmware.fault)
                 assert len(splitter.pending) <= LONGEST_FRAME
             case 1:
                 kinds = tuple(kind for kind in MESSAGES if not kind & FROM_CART)
-                kind, size = kinds[steps.number() % len(kinds)], (0, 0, 2, 2, 4, 4, 1, 3)[steps.number() % 8]
-                fed = firmware.armed
-                for answer in firmware.receive(
-                    valid_frame(1, kind, steps.number(), 0, steps.take(size)), now_us
-                ):
+                kind, size = kinds[steps.number() % len(kinds)], (0, 0, 6, 6, 4, 4, 1, 3)[steps.number() % 8]
+                payload = steps.take(size)
+                if kind == SetMotor.TYPE and size == 6:  # an answer to one of the newest states
+                    tick = (firmware._ticks - payload[-1] % 4) % 2**32
+                    payload = payload[:2] + tick.to_bytes(4, "little")
+                for answer in driven.receive(valid_frame(VERSION, kind, steps.number(), 0, payload)):
                     decode_frame(answer[:-1])
-                if fed and kind in (SetMotor.TYPE, Start.TYPE):
-                    silent = 0
-                if firmware.armed and not fed:
-                    silent = 0
             case 2:
                 version, kind, size = steps.number(), steps.number(), steps.number() % 12
-                firmware.receive(
-                    valid_frame(version, kind, steps.number(), steps.number(), steps.take(size)), now_us
-                )
+                driven.receive(valid_frame(version, kind, steps.number(), steps.number(), steps.take(size)))
             case _:
                 periods, step_cart, step_pole = 1 + steps.number() % 32, steps.number(2), steps.number(2)
                 for _ in range(periods):
-                    armed = firmware.armed or firmware.homing
-                    end_us = now_us + firmware.period_us
-                    driven = in_force(firmware.drive(now_us, end_us), end_us)
-                    carts, poles = carts + step_cart // 64, poles + step_pole // 16
-                    frames = [decode_frame(frame[:-1]) for frame in firmware.tick(end_us, carts, poles)]
-                    state = frames[-1].message
-                    now_us, silent = end_us, silent + 1
-                    assert armed or driven == {0}, "the motor ran while it was neither armed nor homing"
-                    if firmware.armed and not firmware.homing and silent > WATCHDOG_PERIODS:
-                        assert driven == {0}, "the watchdog did not stop the motor"
-                    if not firmware.armed and not firmware.homing:
-                        assert isinstance(state, State)
-                        assert state.motor_applied == 0
-
-
-def in_force(values: list[tuple[int, int]], end_us: int) -> set[int]:
-    """Return the motor values that are in force for a nonzero time."""
-    ends = [since for since, _ in values[1:]] + [end_us]
-    return {value for (since, value), end in zip(values, ends, strict=True) if end > since}
+                    driven.pass_period(step_cart // 64, step_pole // 16)
 
 
 def opens(stuffed: bytes) -> bool:
@@ -166,47 +185,48 @@ class Wire:
 
     def write(self, data: bytes) -> None:
         """Check what the host sends, and answer it."""
-        sequence = 0
+        sequence = kind = 0
         for stuffed in self._splitter.feed(data):
             frame = decode_frame(stuffed)
-            sequence = frame.sequence
+            sequence, kind = frame.sequence, frame.message.TYPE
             if isinstance(frame.message, SetMotor):
                 assert frame.message.motor in (0, self.requested), "the motor value was not requested"
         for _ in range(self._steps.number() % 4):
-            self._inward += self._answer(sequence)
+            self._inward += self._answer(sequence, kind)
 
     def close(self) -> None:
         """Do nothing: no resource is open."""
 
-    def _answer(self, sequence: int) -> bytes:
+    def _answer(self, sequence: int, kind: int) -> bytes:
         steps = self._steps
         match steps.number() % 6:
             case 0:
                 return steps.take(steps.number() % 40)
             case 1:
-                kind, size = CART_TYPES[steps.number() % 5], steps.number() % 32
-                return valid_frame(1, kind, steps.number(), steps.number(), steps.take(size)) + END
+                type_, size = CART_TYPES[steps.number() % 5], steps.number() % 32
+                return valid_frame(VERSION, type_, steps.number(), steps.number(), steps.take(size)) + END
             case 2:
-                info = bytes((1, 1, 1)) + (4096).to_bytes(2, "little") + (22749).to_bytes(4, "little")
-                return valid_frame(1, 0x81, 0, 0, info + steps.take(14)) + END
+                info = bytes((2, 0, 0)) + (4096).to_bytes(2, "little") + (22749).to_bytes(4, "little")
+                return valid_frame(VERSION, 0x81, 0, 0, info + steps.take(18)) + END
             case 3:
-                return valid_frame(1, 0x83, 0, 0, bytes((sequence, steps.number() % 8))) + END
+                acknowledged = kind if steps.number() % 4 else steps.number() % 8
+                return valid_frame(VERSION, 0x83, 0, 0, bytes((sequence, acknowledged))) + END
             case 4:
-                return (
-                    valid_frame(1, 0x84, 0, 0, bytes((sequence, steps.number() % 8, steps.number() % 12)))
-                    + END
-                )
+                refused = kind if steps.number() % 4 else steps.number() % 8
+                payload = bytes((sequence, refused, steps.number() % 12))
+                return valid_frame(VERSION, 0x84, 0, 0, payload) + END
             case _:
                 self._tick = (self._tick + steps.number() % 40 - 4) % 2**32
                 counts = steps.take(8) + (0).to_bytes(2, "little") + bytes((sequence,))
                 times = self._tick.to_bytes(4, "little") + (self._tick * 20_000 % 2**32).to_bytes(4, "little")
                 state = times + counts + bytes((steps.number() & 1, 0)) + steps.take(2)
-                return valid_frame(1, 0x82, 0, steps.number() & int(~Flags(0)), state) + END
+                return valid_frame(VERSION, 0x82, 0, steps.number() & int(~Flags(0)), state) + END
 
 
 def host(data: bytes) -> None:
     """Feed one input to a SerialCart whose timeouts are close to 0."""
     connection.UNACKNOWLEDGED_PERIODS = 1e-3
+    connection.LISTENING_PERIODS = 0
     steps = Steps(data)
     wire = Wire(steps)
     serial_cart.open_port = lambda *given: wire
@@ -226,7 +246,7 @@ def host(data: bytes) -> None:
 
 def call(driven: "serial_cart.SerialCart", wire: Wire, steps: Steps) -> None:
     """Call one method of the host."""
-    match steps.number() % 8:
+    match steps.number() % 11:
         case 0:
             driven.start()
         case 1 | 2:
@@ -240,6 +260,12 @@ def call(driven: "serial_cart.SerialCart", wire: Wire, steps: Steps) -> None:
             driven.home()
         case 6:
             driven.clear_fault()
+        case 7:
+            driven.start_policy()
+        case 8:
+            driven.follow_policy()
+        case 9:
+            driven.check_policy(steps.number(4) % 2**32)
         case _:
             driven.set_period(20_000)
 

@@ -6,7 +6,8 @@
 Each emulated cart is a separate process. It loses, corrupts, duplicates and reorders a drawn share of the
 frames, and it may restart its firmware or freeze an encoder. It is driven for up to four episodes with
 random motor values, through the same plant and environment as a trained agent. The cart's own journal then
-says how long after the last command of each drive the motor was at 0.
+says how long after the last command of each drive the motor was at 0, or at the value of the cart's brake,
+which stops a cart that runs towards its end stop.
 
 Prints a table of the endings. Exit status 1 if a motor was not at 0 within 60 ms after a drive. An
 exception outside the package's error classes ends the run with its traceback.
@@ -40,6 +41,7 @@ from cartpole_rl.tasks.settings import ActionSettings, RewardSettings, TaskSetti
 EPISODES_PER_CART = 4  # fewer if the cart fails for good
 LARGEST_SHARE = 0.05  # of frames, of each disturbance
 FAILURE_TIME = (25.0, 90.0)  # s since the start; homing takes 25
+BRAKE = 255  # size of the brake's motor value; no action has it
 LIMIT_MS = 60  # three periods: the watchdog
 DRIVES = ("START", "HOME")  # commands after which the motor may move again
 
@@ -105,9 +107,9 @@ def reason(error: PlantError) -> str:
 
 
 def stop_times(journal: Path) -> list[float]:
-    """Return the ms from the last accepted motor value to motor 0, for each time the cart was armed."""
+    """Return the ms from the last accepted motor value to motor 0 or the brake, for each arming."""
     times, last, zero = [], None, 0
-    moving = False  # the motor value in force is not 0
+    moving = False  # the motor value in force is neither 0 nor the brake's
 
     def note() -> None:
         if last is not None:
@@ -120,8 +122,9 @@ def stop_times(journal: Path) -> list[float]:
         elif event.get("motor"):
             last = event["us"]
         elif "in_force" in event:
-            moving = event["in_force"] != 0
-            zero = event["us"]
+            was_moving, moving = moving, abs(event["in_force"]) not in (0, BRAKE)
+            if moving or was_moving:
+                zero = event["us"]
     note()
     return times
 
@@ -155,7 +158,7 @@ def main() -> None:
     print(table(rows, {"ending": "ending", "episodes": "episodes"}))
     late = sum(stop > LIMIT_MS for stop in stops)
     print(
-        f"{carts} carts, armed {len(stops)} times; time from the last command to motor 0: "
+        f"{carts} carts, armed {len(stops)} times; time from the last command to motor 0 or the brake: "
         f"{np.median(stops):.1f} ms (median), {max(stops):.1f} ms (longest); over {LIMIT_MS} ms: {late}"
     )
     sys.exit(late > 0)

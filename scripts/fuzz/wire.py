@@ -167,9 +167,13 @@ class CartSide(Side):
 
     def _tick(self) -> None:
         end_us = self._now_us + self._firmware.period_us
-        motors = {value for _, value in self._firmware.drive(self._now_us, end_us)}
+        motors = set()
+        while self._now_us < end_us:
+            self._firmware.drive(self._now_us)
+            motors.add(self._firmware.motor)
+            self._now_us = self._firmware.next_due(end_us)
+            self._firmware.look(self._now_us, 0, 0)
         state = decode_frame(self._firmware.tick(end_us, 0, 0)[-1][:-1]).message
-        self._now_us = end_us
         self.counts["periods"] += 1
         if motors != {0} or not isinstance(state, State) or state.motor_applied:
             self.complaints.append(f"the motor ran in period {self.counts['periods']}")

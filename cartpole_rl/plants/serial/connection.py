@@ -50,7 +50,7 @@ Answer = TypeVar("Answer", bound=Message)
 WATCHDOG_PERIODS = 3  # after a state was measured, the cart takes no motor value that answers it
 BACKLOG_BYTES = 1000  # with more waiting, the system's buffer (4096) may have dropped newer bytes
 UNACKNOWLEDGED_PERIODS = 1.5  # after a frame: by then the next state has come, if the frame has arrived
-LISTENING_PERIODS = 6  # without a frame, to learn whether the cart has a clock of its own
+LISTENING_PERIODS = 8  # without a frame, to learn whether the cart has a clock of its own
 LONGEST_DEAFNESS = 1.0  # s; the cart's watchdog has stopped its motor long before
 KEPT_ANSWERS = 64
 ROUND_TRIPS = 5

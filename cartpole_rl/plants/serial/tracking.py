@@ -28,7 +28,9 @@ from cartpole_rl.wire import (
 )
 
 HALF_MILLISECOND = 500  # us
-IDLE_TICKS = 3  # after the host's newest frame; a lockstep emulator passes one for a frame that came twice
+# After the host's newest frame. A lockstep emulator passes up to three: one for a frame that came twice, and
+# two for an older one that came late and twice, and was refused.
+IDLE_TICKS = 4
 LARGEST_RATE_ERROR = 0.01  # of the cart's clock
 OVERTAKEN_TICKS = 16  # 0.3 s: no frame is delayed for longer, and no cart boots and is driven so soon
 

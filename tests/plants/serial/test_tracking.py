@@ -93,6 +93,14 @@ def test_a_state_that_is_passed_over_is_late_only_while_driving() -> None:
     assert tracker.statistics.late_ticks == 1
 
 
+def test_a_lockstep_cart_with_frames_that_come_twice_has_no_clock_of_its_own() -> None:
+    """Frame 55 came twice, and 54 after it, twice too: it was refused, and no state acknowledges it."""
+    tracker = tracker_of_a_cart()
+    for tick, taken in enumerate((52, 53, 53, 55, 55, 55, 55)):
+        tracker.receive(replace(state_at(tick), last_sequence=taken), Flags.ARMED, 0.0, 55)
+    assert not tracker.ticks_alone
+
+
 @pytest.mark.parametrize(
     ("sequence", "flags", "alone"),
     [(0, Flags.ARMED, True), (1, Flags.ARMED, False), (0, Flags.HOMING, False)],
