@@ -9,10 +9,8 @@
 Needs the Debian packages qemu-system-arm, gcc-arm-none-eabi, libnewlib-arm-none-eabi and make. It compiles
 firmware/ for the board qemu_an386. UART 0 of the board is a pseudo-terminal, which a host opens like any
 serial port. UART 1 carries motor values and encoder counts (firmware/boards/qemu_an386/board.c has the
-format). The clock of the board follows the wall clock, and the physics follows the clock of the board. With
---fast the clock counts instructions, 16 ns each: the board runs as fast as this computer can, and is late
-for no period if the computer is busy, but does not wait for a host. Settings of the clock, the link and
-faults have no effect.
+format). The clock of the board follows the wall clock, and the physics follows the clock of the board.
+Settings of the clock, the link and faults have no effect.
 """
 
 import argparse
@@ -98,12 +96,11 @@ def build(folder: Path, policy: Path | None, pole_length: float) -> Path:
 
 
 @contextmanager
-def board(program: Path, pins: Path, fast: bool) -> Iterator[str]:
+def board(program: Path, pins: Path) -> Iterator[str]:
     """Run a program in QEMU; its UART 1 connects to the socket `pins`. Yield the port of its UART 0."""
     command = ["qemu-system-arm", "-machine", "mps2-an386", "-nographic", "-monitor", "none"]
     command += ["-chardev", "pty,id=host", "-chardev", f"socket,id=pins,path={pins}"]
     command += ["-serial", "chardev:host", "-serial", "chardev:pins", "-kernel", str(program)]
-    command += ["-icount", "shift=4,sleep=off"] if fast else []
     with tempfile.TemporaryFile("w+") as log:
         process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
         try:
@@ -138,7 +135,6 @@ def main() -> int:
     )
     parser.add_argument("settings", nargs="?", default="{}", help="settings of the cart as JSON")
     parser.add_argument("--policy", type=Path, help="folder of cartpole-export format=c: the board drives")
-    parser.add_argument("--fast", action="store_true", help="do not follow the wall clock")
     options = parser.parse_args()
     if missing := missing_programs():
         sys.exit(f"not installed: {', '.join(missing)}")
@@ -152,7 +148,7 @@ def main() -> int:
         listening.settimeout(PATIENCE)
         try:
             program = build(Path(folder), options.policy, 2 * settings.pole_com)
-            with board(program, path, options.fast) as port:
+            with board(program, path) as port:
                 line, _ = listening.accept()
                 print(json.dumps({"port": port}), flush=True)
                 with line:

@@ -16,6 +16,7 @@ pytestmark = pytest.mark.skipif(
     reason=f"needs {', '.join(qemu_cart.PROGRAMS)}: apt-get install",
 )
 
+from cartpole_rl.errors import LinkError  # noqa: E402
 from cartpole_rl.plants.serial.cart import SerialCart  # noqa: E402
 from cartpole_rl.plants.serial.settings import SerialSettings  # noqa: E402
 from cartpole_rl.wire import Fault, Flags  # noqa: E402
@@ -40,10 +41,23 @@ def board(*options: str) -> Iterator[str]:
     assert process.returncode == 0
 
 
+@pytest.fixture(autouse=True)
+def _a_slow_machine_is_not_suspended(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(SerialCart, "longest_suspension", 60.0)
+
+
+def home(cart: SerialCart) -> None:
+    """Home; again if this machine was so busy that the board heard nothing for half a second."""
+    while not cart.flags & Flags.HOMED:
+        try:
+            cart.home()
+        except LinkError as error:
+            assert "ended homing" in str(error) or "is too slow" in str(error)  # noqa: PT017
+
+
 def test_it_homes_drives_and_stops_like_any_cart() -> None:
     with board() as port, SerialCart(SETTINGS.model_copy(update={"port": port})) as cart:
-        cart.home()
-        assert cart.flags & Flags.HOMED
+        home(cart)
         before = cart.poll_state()
         assert abs(before.cart_counts) < 100
         assert abs(before.pole_counts - 2048) <= 8
@@ -51,7 +65,10 @@ def test_it_homes_drives_and_stops_like_any_cart() -> None:
         pushed = []
         while not pushed or pushed[-1].cart_counts < FAR:
             cart.set_motor(PUSH)
-            pushed.append(cart.get_state())
+            try:
+                pushed.append(cart.get_state())
+            except LinkError as error:  # this machine was busy: the board refused a value that came too late
+                assert "over three periods old" in str(error)  # noqa: PT017
         assert max(state.pole_counts for state in pushed) > before.pole_counts + 3
         silent = [cart.poll_state() for _ in range(4)]
         assert silent[-1].motor_applied == 0
@@ -62,7 +79,7 @@ def test_it_homes_drives_and_stops_like_any_cart() -> None:
 def test_a_policy_on_the_board_drives_while_the_host_listens() -> None:
     options = ("--policy", str(SHUTTLE))
     with board(*options) as port, SerialCart(SETTINGS.model_copy(update={"port": port})) as cart:
-        cart.home()
+        home(cart)
         cart.start_policy()
         states = [cart.poll_state() for _ in range(100)]
         assert {110, -110} <= {state.motor_applied for state in states}
