@@ -113,7 +113,7 @@ def test_a_missing_or_damaged_model_is_one_line(tmp_path: Path) -> None:
             "from=nowhere",
             "from=nowhere: there is no such file or folder; "
             "give a run of cartpole-record or cartpole-identify",
-            1,
+            2,
         ),
         ("", "from is missing; give from=runs/record/<run>", 2),
         ("from=. windows=2", "windows=2: give at least 10", 2),

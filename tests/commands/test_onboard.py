@@ -38,18 +38,19 @@ def test_the_scores_stand_side_by_side(trained: Path, tmp_path: Path) -> None:
 
 @needs_compiler
 @pytest.mark.parametrize(
-    ("policy", "complaint", "driven"),
+    ("policy", "complaint"),
     [
-        (None, "its board has no policy: compile its firmware with one", False),
-        (SHUTTLE, "the board drives another agent than run=", True),
+        (None, "the cart's board has no policy: compile its firmware with one"),
+        (SHUTTLE, "the cart's board has another agent (00000005, not "),
     ],
     ids=["no policy", "another agent"],
 )
-def test_a_board_without_the_agent_is_refused(
-    policy: Path | None, complaint: str, driven: bool, trained: Path, tmp_path: Path
+def test_a_board_without_the_agent_is_refused_before_it_moves(
+    policy: Path | None, complaint: str, trained: Path, tmp_path: Path
 ) -> None:
     pytest.importorskip("mujoco", reason='pip install "cartpole_rl[emulator]"')
-    truth = EmulatorSettings(firmware="c", policy=policy, physics_step=1e-3)
+    journal = tmp_path / "journal"
+    truth = EmulatorSettings(firmware="c", policy=policy, physics_step=1e-3, journal=journal)
     with EmulatedCart(truth) as cart:
         words = (
             f"run={trained}",
@@ -62,10 +63,8 @@ def test_a_board_without_the_agent_is_refused(
         done = in_process("evaluate", *words, "hydra.run.dir=run", folder=tmp_path)
     assert done.code == 1
     assert complaint in done.complaint
-    metrics = tmp_path / "run/metrics.json"
-    assert metrics.is_file() == driven
-    if driven:
-        assert len(json.loads(metrics.read_text())["onboard"]["episodes"]) == 1
+    assert not (tmp_path / "run/metrics.json").exists()
+    assert "in_force" not in journal.read_text()
 
 
 @pytest.mark.parametrize(
