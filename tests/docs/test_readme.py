@@ -156,10 +156,10 @@ def test_finetune(command: str, trained: Path, serial_port: Callable[[], str]) -
 
 def test_distill(trained: Path) -> None:
     (command,) = listed("cartpole-distill")
-    folder = "hydra.run.dir=runs/distill/first"
+    folder = "hydra.run.dir=runs/distill/readme"
     result = run_here(command.replace("<run>", "first"), *DISTILLATION, folder, cwd=trained)
     assert result.returncode == 0, result.stderr
-    assert (trained / "runs/distill/first/checkpoints/last.pt").exists()
+    assert (trained / "runs/distill/readme/checkpoints/last.pt").exists()
 
 
 @pytest.mark.parametrize("command", [*listed("cartpole-report"), *listed("cartpole-export")])
