@@ -11,7 +11,7 @@ from cartpole_rl.wire.frames import END, open_envelope
 from cartpole_rl.wire.messages import MESSAGES
 
 LONGEST_ANSWER = 70  # bytes: 2 * CART_FRAME_BYTES
-SNAPSHOT_NUMBERS = 83
+SNAPSHOT_NUMBERS = 90
 
 
 class CartHead(ctypes.Structure):

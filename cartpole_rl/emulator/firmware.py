@@ -74,6 +74,7 @@ class Firmware:
         self.armed = False
         self.homed = False
         self.fault = Fault.NONE
+        self._reported = Fault.NONE  # by the newest FAULT frame
         self.carried_out: Message | None = None  # the newest message; None if it was refused or damaged
         self._delay_us = delay_us
         self._zero_error = zero_error
@@ -137,7 +138,6 @@ class Firmware:
         reading = Reading(cart, pole, max(1, now_us - self._ticked_us))
         self._ticks += 1
         self._measured_us[self._ticks % KEPT_TICKS] = now_us
-        faults_before = self.fault
         self._limits.sample(now_us, cart, pole)
         expired = self._expire(now_us)
         if self.armed or self.homing:
@@ -148,8 +148,9 @@ class Firmware:
         flags = self._flags() | (Flags.WATCHDOG if expired and self.armed else Flags(0))
         if self._limited:
             flags |= Flags.SOFT_LIMIT
-        self._limited = False
-        report = [FaultReport(self.fault, self._ticks & U32)] if self.fault != faults_before else []
+        self._limited = self.motor != self._line.requested
+        report = [FaultReport(self.fault, self._ticks & U32)] if self.fault & ~self._reported else []
+        self._reported = self.fault
         return [self._frame(message, flags) for message in (*report, self._state(cart, pole))]
 
     def _expire(self, now_us: int) -> bool:
@@ -170,6 +171,9 @@ class Firmware:
         else:
             zeros = self._zeros
             angle = pole - self._pole_zero
+            if self.armed and self._limits.lost(now_us, self.motor, angle):
+                self._latch(Fault.CART_ENCODER)
+                self._limits.brake_blindly(now_us)
             self._limits.apply(now_us, cart - zeros.middle, angle, zeros.half_span, self.armed)
         self._limited |= self.motor != self._line.requested
 
@@ -244,7 +248,7 @@ class Firmware:
                 self._limits.release()
                 self._reset_watches()
             case ClearFault():
-                self.fault = Fault.NONE
+                self.fault = self._reported = Fault.NONE
             case SetPeriod(period_us):
                 self.period_us = period_us
 
@@ -290,6 +294,7 @@ class Firmware:
         self._cart_jumps, self._pole_jumps = JumpWatch(FASTEST_CART), JumpWatch(FASTEST_POLE)
         self._cart_freezes, self._pole_freezes = FrozenCartWatch(), FrozenPoleWatch()
         self._stalls = StallWatch()
+        self._limits.forget()
 
     def _info(self) -> Info:
         half_span = self._zeros.half_span

@@ -5,7 +5,7 @@ All numbers are whole, so that ``firmware/src/cart_guards.c`` decides the same. 
 
 from cartpole_rl.emulator.encoders import CART_METRES, CART_NANOMETRES, POLE_COUNTS
 
-STALL_MOTOR = 200  # smallest motor value that moves any healthy cart
+HARD_PUSH = 200  # smallest motor value that moves any healthy cart
 STALL_US = 500_000
 STALL_COUNTS = round(0.001 / CART_METRES)
 PUSH_US = 100_000  # of such pushes one way, after which the count must have changed
@@ -23,7 +23,7 @@ class StallWatch:
 
     def stalled(self, cart: int, motor: int, us: int) -> bool:
         """Return whether the cart stalls, after a period of `us` under `motor` that ended at count `cart`."""
-        if abs(motor) < STALL_MOTOR:
+        if abs(motor) < HARD_PUSH:
             self._anchor = None
         elif self._anchor is None or self._anchor[1] != (motor > 0) or self._moved(cart):
             self._anchor, self._since_us = (cart, motor > 0), 0
@@ -66,7 +66,7 @@ class FrozenCartWatch:
 
     def frozen(self, cart: int, motor: int, us: int) -> bool:
         """Return whether the encoder is frozen, after `us` under `motor` that ended at count `cart`."""
-        direction = 0 if abs(motor) < STALL_MOTOR else 1 if motor > 0 else -1
+        direction = 0 if abs(motor) < HARD_PUSH else 1 if motor > 0 else -1
         lasted, self._direction = direction != 0 and direction == self._direction, direction
         if cart != self._count:
             self._count, self._pushed_us = cart, {1: 0, -1: 0}

@@ -14,6 +14,12 @@ The brake acts while the cart is armed and after that until it has come to rest:
 watchdog or a fault leaves at speed would roll into an end stop. It never pushes a cart that stands or moves
 inward.
 
+A frozen encoder shows a cart that stands. While the count does not change, the cart's motion is estimated
+from its last speed and from pushes while the pole is slow: hard ones, and any below a pole that stands above
+its pivot, which no resting cart balances. After 20 mm of it the cart is `lost`: its encoder is frozen, or
+something holds it. A lost cart is braked for the time that its estimated speed needs, or until its count
+changes.
+
 All numbers but one are whole, so that ``firmware/src/cart_limits.c`` decides the same.
 """
 
@@ -21,6 +27,8 @@ import math
 from collections import deque
 
 from cartpole_rl.emulator.encoders import CART_METRES, CART_NANOMETRES, POLE_COUNTS, POLE_RADIANS
+from cartpole_rl.emulator.guards import HARD_PUSH
+from cartpole_rl.emulator.settings import LARGEST_MOTOR
 
 SOFT_LIMIT = round(0.027 / CART_METRES)  # counts inside a stop
 HARD_LIMIT = round(0.008 / CART_METRES)  # counts inside a stop
@@ -35,6 +43,11 @@ FASTEST = 10_000_000  # um/s; a higher speed counts as this one
 FAST_POLE = POLE_COUNTS * 16 // 10  # counts/s; a higher speed shakes the cart no further
 LEVER = 27_000  # um, of the medium pole on a bare cart: m_p l / (m_c + m_p)
 LONGEST_ROLLING_US = 3_000_000  # after the cart was armed
+SLOW_POLE = POLE_COUNTS * 6 // 10  # counts/s; a faster pole may hold the cart against its motor
+PUSHED = 25_000  # um/s^2: each motor value above IDLE speeds a common cart up by so much
+IDLE = 50  # largest motor value that does not
+SLOWED_US = 100_000  # time constant of the estimated speed without a hard push
+LOST_NM = 20_000_000  # estimated motion without a change of the count
 
 
 class TrackLimits:
@@ -49,6 +62,10 @@ class TrackLimits:
         self._carts: deque[int] = deque(maxlen=SAMPLES)
         self._poles: deque[int] = deque(maxlen=SAMPLES)
         self._until_us = 0  # the brake acts until then
+        self._blind_us = 0  # the brake of a lost cart acts until then
+        self._count: int | None = None  # of the cart, since which its motion is estimated
+        self._looked_us = 0
+        self._speed_um = self._way_nm = 0  # estimated speed, um/s, and motion since the count changed
 
     def sample(self, now_us: int, cart: int, pole: int) -> None:
         """Take a sample of the raw counts, unless the newest is younger than `SAMPLE_US`."""
@@ -57,12 +74,46 @@ class TrackLimits:
             self._carts.append(cart)
             self._poles.append(pole)
 
+    def forget(self) -> None:
+        """Start the estimate anew: the cart is armed now."""
+        self._count = None
+
+    def lost(self, now_us: int, motor: int, pole: int) -> bool:
+        """Return whether the cart's count stands still although the cart must have moved.
+
+        `motor` is the value in force since the last look, `pole` in counts from upright.
+        """
+        us, self._looked_us = min(now_us - self._looked_us, SLOWED_US), now_us
+        if self._newest != self._count:
+            self._count = self._newest
+            self._speed_um, self._way_nm = self._cart_speed(), 0
+            return False
+        weakest = IDLE if math.cos(pole * POLE_RADIANS) > 0 else HARD_PUSH - 1
+        if abs(motor) > weakest and abs(self._speed(self._poles)) < SLOW_POLE:
+            push = PUSHED * (abs(motor) - IDLE)
+            self._speed_um += (push if motor > 0 else -push) * us // 1_000_000
+        elif abs(self._speed_um) < REST:
+            self._speed_um = 0
+        else:
+            self._speed_um -= self._speed_um * us // SLOWED_US
+        self._way_nm += self._speed_um * us // 1000
+        return abs(self._way_nm) >= LOST_NM
+
+    def brake_blindly(self, now_us: int) -> None:
+        """Brake a lost cart by its estimated speed."""
+        self.blocked = self._until_us = 0
+        self._blind_us = now_us + abs(self._speed_um) * 1_000_000 // (PUSHED * (LARGEST_MOTOR - IDLE))
+        self.brake = -1 if self._speed_um > 0 else 1
+
     def apply(self, now_us: int, outward: int, pole: int, half_span: int, armed: bool) -> None:
         """Decide for a cart `outward` counts right of the middle and a pole `pole` counts from upright.
 
         The stops are `half_span` counts from the middle.
         """
-        speed = self._speed(self._carts) * CART_NANOMETRES // 1000  # um/s, rounded down
+        if now_us < self._blind_us and self._newest == self._count:
+            return
+        self._blind_us = 0
+        speed = self._cart_speed()
         if armed:
             self._until_us = now_us + LONGEST_ROLLING_US
         elif abs(speed) < REST:
@@ -74,7 +125,7 @@ class TrackLimits:
 
     def release(self) -> None:
         """End all limits: the cart homes, or its count is not to be trusted."""
-        self.blocked = self.brake = self._until_us = 0
+        self.blocked = self.brake = self._until_us = self._blind_us = 0
 
     def _brake(self, speed: int, outward: int, pole: int, half_span: int) -> int:
         if abs(speed) < REST:
@@ -90,6 +141,14 @@ class TrackLimits:
             lag_us += RELEASE_US
         needed = size * lag_us // 1_000_000 + size * size // (2 * BRAKING)
         return -direction if left - shake < needed else 0
+
+    @property
+    def _newest(self) -> int:
+        return self._carts[-1] if self._carts else 0
+
+    def _cart_speed(self) -> int:
+        """Return the cart's speed in um/s, rounded down."""
+        return self._speed(self._carts) * CART_NANOMETRES // 1000
 
     def _speed(self, counts: deque[int]) -> int:
         """Return the speed over the samples, in counts/s, rounded down."""

@@ -78,6 +78,7 @@ static void add_core(list *all, const cart *self)
     add(all, self->homed);
     add(all, self->homing);
     add(all, self->fault);
+    add(all, self->reported);
     add(all, self->last_sequence);
     add(all, self->sequence);
     add(all, self->ticks);
@@ -104,6 +105,12 @@ static void add_limits(list *all, const cart *self)
     add(all, limits->blocked);
     add(all, limits->brake);
     add(all, (int64_t)limits->until_us);
+    add(all, (int64_t)limits->blind_us);
+    add(all, (int64_t)limits->looked_us);
+    add(all, limits->counted);
+    add(all, limits->counted ? limits->count : 0);
+    add(all, limits->speed_um);
+    add(all, limits->way_nm);
     add(all, limits->sampled);
     for (size_t age = 0; age < CART_SPEED_SAMPLES; age++) {
         size_t slot = (limits->newest + CART_SPEED_SAMPLES - age) % CART_SPEED_SAMPLES;

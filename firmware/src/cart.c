@@ -157,6 +157,18 @@ static cart_reason objection(const cart *self, const cart_envelope *envelope, ui
     return old && cart_read_i16(envelope->payload) != 0 ? CART_STALE : CART_ACCEPTED;
 }
 
+/* Disarm, set motor 0 and latch the fault. An encoder fault makes the zeros invalid. */
+static void latch(cart *self, uint16_t fault)
+{
+    self->fault |= fault;
+    self->armed = self->homing = self->self_driven = false;
+    cart_line_hold(&self->line, 0);
+    if (fault & (CART_FAULT_CART_ENCODER | CART_FAULT_POLE_ENCODER))
+        self->homed = false;
+    if (fault & CART_FAULT_CART_ENCODER)
+        cart_limits_release(&self->limits); /* nobody knows where the cart is */
+}
+
 /* Let the limits of the track decide, which need the zeros of a homing. */
 static void apply_limits(cart *self, uint64_t now_us, int32_t cart_count, int32_t pole_count)
 {
@@ -165,10 +177,16 @@ static void apply_limits(cart *self, uint64_t now_us, int32_t cart_count, int32_
                         self->pole_lever_um, self->armed};
     self->cart_count = cart_count;
     self->pole_count = pole_count;
-    if (self->homing)
+    if (self->homing) {
         cart_limits_release(&self->limits);
-    else
+    } else {
+        if (self->armed && cart_limits_lost(&self->limits, now_us, cart_motor(self), place.pole)) {
+            latch(self, CART_FAULT_CART_ENCODER);
+            cart_limits_brake_blindly(&self->limits, now_us);
+            place.armed = false;
+        }
         cart_limits_apply(&self->limits, now_us, &place);
+    }
     if (cart_motor(self) != self->line.requested)
         self->limited = true;
 }
@@ -181,6 +199,7 @@ static void arm(cart *self, uint64_t now_us)
     self->observed = self->interrupted = false;
     self->expires_us = expiry(self, self->ticks);
     cart_guards_reset(&self->guards);
+    cart_limits_forget(&self->limits);
     apply_limits(self, now_us, self->cart_count, self->pole_count);
 }
 
@@ -200,6 +219,7 @@ static void begin_homing(cart *self)
     cart_line_hold(&self->line, 0);
     cart_limits_release(&self->limits);
     cart_guards_reset(&self->guards);
+    cart_limits_forget(&self->limits);
 }
 
 static void carry_out(cart *self, const cart_envelope *envelope, uint64_t now_us)
@@ -228,7 +248,7 @@ static void carry_out(cart *self, const cart_envelope *envelope, uint64_t now_us
         begin_homing(self);
         break;
     case CART_CLEAR_FAULT:
-        self->fault = 0;
+        self->fault = self->reported = 0;
         break;
     case CART_SET_PERIOD:
         self->period_us = cart_read_u32(envelope->payload);
@@ -268,18 +288,6 @@ size_t cart_receive(cart *self, const uint8_t *stuffed, size_t length, uint64_t 
 }
 
 /* ---- The rules of a period ---- */
-
-/* Disarm, set motor 0 and latch the fault. An encoder fault makes the zeros invalid. */
-static void latch(cart *self, uint16_t fault)
-{
-    self->fault |= fault;
-    self->armed = self->homing = self->self_driven = false;
-    cart_line_hold(&self->line, 0);
-    if (fault & (CART_FAULT_CART_ENCODER | CART_FAULT_POLE_ENCODER))
-        self->homed = false;
-    if (fault & CART_FAULT_CART_ENCODER)
-        cart_limits_release(&self->limits); /* nobody knows where the cart is */
-}
 
 /* Latch new faults. Homing may touch the stops and detects a stall itself. */
 static void check_faults(cart *self, const cart_reading *reading)
@@ -352,7 +360,6 @@ void cart_look(cart *self, uint64_t now_us, int32_t cart_count, int32_t pole_cou
 size_t cart_tick(cart *self, uint64_t now_us, int32_t cart_count, int32_t pole_count, uint8_t *frames)
 {
     cart_reading reading = {cart_count, pole_count, length_of_period(self, now_us)};
-    uint16_t faults_before = self->fault;
     self->reading = reading;
     self->ticks++;
     self->measured_us[self->ticks % KEPT_TICKS] = now_us;
@@ -365,10 +372,11 @@ size_t cart_tick(cart *self, uint64_t now_us, int32_t cart_count, int32_t pole_c
     apply_limits(self, now_us, cart_count, pole_count);
     uint8_t all_flags = (uint8_t)(flags(self) | (self->expired && self->armed ? CART_WATCHDOG : 0) |
                                   (self->limited ? CART_SOFT_LIMIT : 0));
-    self->limited = false;
+    self->limited = cart_motor(self) != self->line.requested;
     size_t length = 0;
-    if (self->fault != faults_before)
+    if (self->fault & ~self->reported)
         length = send_fault(self, all_flags, frames);
+    self->reported = self->fault;
     length += send_state(self, all_flags, cart_count, pole_count, frames + length);
     return length;
 }

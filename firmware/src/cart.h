@@ -66,6 +66,7 @@ typedef struct {
     cart_motor_line line;
     cart_limits limits;
     cart_guards guards;
+    uint16_t reported;    /* by the newest FAULT frame */
     bool limited;         /* the limits have changed the motor value since the newest tick */
     cart_zeros zeros;
     int32_t pole_zero;    /* raw count that is reported as 0 */

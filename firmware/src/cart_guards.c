@@ -4,7 +4,6 @@
 
 #include <string.h>
 
-#define HARD_PUSH 200 /* smallest motor value that moves any healthy cart */
 #define STALL_US 500000u
 #define STALL_COUNTS CART_COUNTS(1000)
 #define PUSH_US 100000u        /* of hard pushes one way, after which the count must have changed */
@@ -15,9 +14,9 @@
 
 static int8_t push(int16_t motor)
 {
-    if (motor >= HARD_PUSH)
+    if (motor >= CART_HARD_PUSH)
         return 1;
-    return motor <= -HARD_PUSH ? -1 : 0;
+    return motor <= -CART_HARD_PUSH ? -1 : 0;
 }
 
 void cart_guards_reset(cart_guards *guards)

@@ -9,6 +9,8 @@
 #include <stdbool.h>
 #include <stdint.h>
 
+#define CART_HARD_PUSH 200 /* smallest motor value that moves any healthy cart */
+
 typedef struct {
     int8_t direction;   /* of the push that is watched: 1, -1, or 0 for none */
     int32_t anchor;     /* cart count at its start */

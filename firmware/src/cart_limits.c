@@ -1,5 +1,6 @@
 #include "cart_limits.h"
 
+#include "cart_guards.h"
 #include "cart_numbers.h"
 
 #include <math.h>
@@ -13,6 +14,11 @@
 #define PI 3.14159265358979323846
 #define POLE_RADIANS (2 * PI / CART_POLE_COUNTS) /* a count */
 #define LONGEST_ROLLING_US 3000000u /* after the cart was armed */
+#define SLOW_POLE (CART_POLE_COUNTS * 6LL / 10) /* counts/s; a faster pole may hold the cart against its motor */
+#define PUSHED 25000LL /* um/s^2: each motor value above IDLE speeds a common cart up by so much */
+#define IDLE 50 /* largest motor value that does not */
+#define SLOWED_US 100000 /* time constant of the estimated speed without a hard push */
+#define LOST_NM 20000000 /* estimated motion without a change of the count */
 
 static uint8_t oldest(const cart_limits *limits)
 {
@@ -48,6 +54,53 @@ static int64_t speed_of(const cart_limits *limits, const int32_t *counts)
     return cart_floor_divide(moved * 1000000, window_us(limits));
 }
 
+/* In um/s, rounded down. */
+static int64_t cart_speed(const cart_limits *limits)
+{
+    return cart_floor_divide(speed_of(limits, limits->carts) * CART_NANOMETRES, 1000);
+}
+
+void cart_limits_forget(cart_limits *limits)
+{
+    limits->counted = false;
+}
+
+bool cart_limits_lost(cart_limits *limits, uint64_t now_us, int16_t motor, int64_t pole)
+{
+    uint64_t passed_us = now_us - limits->looked_us;
+    int64_t us = passed_us < SLOWED_US ? (int64_t)passed_us : SLOWED_US;
+    limits->looked_us = now_us;
+    if (!limits->counted || limits->carts[limits->newest] != limits->count) {
+        limits->counted = true;
+        limits->count = limits->carts[limits->newest];
+        limits->speed_um = cart_speed(limits);
+        limits->way_nm = 0;
+        return false;
+    }
+    int64_t turning = speed_of(limits, limits->poles);
+    bool slow_pole = turning < SLOW_POLE && turning > -SLOW_POLE;
+    int16_t weakest = cos((double)pole * POLE_RADIANS) > 0 ? IDLE : CART_HARD_PUSH - 1;
+    int16_t size = (int16_t)(motor < 0 ? -motor : motor);
+    int64_t push = PUSHED * (size - IDLE);
+    if (slow_pole && size > weakest)
+        limits->speed_um += cart_floor_divide((motor > 0 ? push : -push) * us, 1000000);
+    else if (limits->speed_um < REST && limits->speed_um > -REST)
+        limits->speed_um = 0;
+    else
+        limits->speed_um -= cart_floor_divide(limits->speed_um * us, SLOWED_US);
+    limits->way_nm += cart_floor_divide(limits->speed_um * us, 1000);
+    return limits->way_nm >= LOST_NM || limits->way_nm <= -LOST_NM;
+}
+
+void cart_limits_brake_blindly(cart_limits *limits, uint64_t now_us)
+{
+    int64_t size = limits->speed_um < 0 ? -limits->speed_um : limits->speed_um;
+    limits->blocked = 0;
+    limits->until_us = 0;
+    limits->blind_us = now_us + (uint64_t)(size * 1000000 / (PUSHED * (CART_LARGEST_MOTOR - IDLE)));
+    limits->brake = limits->speed_um > 0 ? -1 : 1;
+}
+
 static int64_t within(int64_t number, int64_t largest)
 {
     if (number > largest)
@@ -80,7 +133,10 @@ static int8_t brake(const cart_limits *limits, int64_t speed, const cart_place *
 
 void cart_limits_apply(cart_limits *limits, uint64_t now_us, const cart_place *place)
 {
-    int64_t speed = cart_floor_divide(speed_of(limits, limits->carts) * CART_NANOMETRES, 1000); /* um/s */
+    if (now_us < limits->blind_us && limits->carts[limits->newest] == limits->count)
+        return;
+    limits->blind_us = 0;
+    int64_t speed = cart_speed(limits);
     int64_t away = place->outward < 0 ? -place->outward : place->outward;
     if (place->armed)
         limits->until_us = now_us + LONGEST_ROLLING_US;
@@ -95,5 +151,5 @@ void cart_limits_apply(cart_limits *limits, uint64_t now_us, const cart_place *p
 void cart_limits_release(cart_limits *limits)
 {
     limits->blocked = limits->brake = 0;
-    limits->until_us = 0;
+    limits->until_us = limits->blind_us = 0;
 }

@@ -10,7 +10,12 @@
    if it is higher than the cart's. `shake` is twice the lever for a pole that turns 1.6 times a second or faster.
 
    The brake acts while the cart is armed and after that until it has come to rest: a cart that STOP, the watchdog
-   or a fault leaves at speed would roll into an end stop. It never pushes a cart that stands or moves inward. */
+   or a fault leaves at speed would roll into an end stop. It never pushes a cart that stands or moves inward.
+
+   A frozen encoder shows a cart that stands. While the count does not change, the cart's motion is estimated from
+   its last speed and from pushes while the pole is slow: hard ones, and any below a pole that stands above its pivot,
+   which no resting cart balances. After 20 mm of it the cart is lost: its encoder is frozen, or something holds it.
+   A lost cart is braked for the time that its estimated speed needs, or until its count changes. */
 #ifndef CART_LIMITS_H
 #define CART_LIMITS_H
 
@@ -31,6 +36,11 @@ typedef struct {
     uint64_t us[CART_SPEED_SAMPLES];
     int32_t carts[CART_SPEED_SAMPLES], poles[CART_SPEED_SAMPLES];
     uint64_t until_us; /* the brake acts until then */
+    uint64_t blind_us; /* the brake of a lost cart acts until then */
+    bool counted;      /* `count` is a count */
+    int32_t count;     /* of the cart, since which its motion is estimated */
+    uint64_t looked_us;
+    int64_t speed_um, way_nm; /* estimated speed, um/s, and motion since the count changed */
 } cart_limits;
 
 /* A cart and its pole, from the zeros of homing. */
@@ -44,6 +54,16 @@ typedef struct {
 
 /* Take a sample of the raw counts, unless the newest is younger than a millisecond. */
 void cart_limits_sample(cart_limits *limits, uint64_t now_us, int32_t cart_count, int32_t pole_count);
+
+/* Start the estimate of the cart's motion anew: the cart is armed now. */
+void cart_limits_forget(cart_limits *limits);
+
+/* Does the cart's count stand still although the cart must have moved? `motor` is the value in force since the last look,
+   `pole` in counts from upright. */
+bool cart_limits_lost(cart_limits *limits, uint64_t now_us, int16_t motor, int64_t pole);
+
+/* Brake a lost cart by its estimated speed. */
+void cart_limits_brake_blindly(cart_limits *limits, uint64_t now_us);
 
 void cart_limits_apply(cart_limits *limits, uint64_t now_us, const cart_place *place);
 

@@ -229,7 +229,7 @@ def drive(case: Case, firmware: str, seed: int) -> dict[str, Any]:
         "firmware": firmware,
         "seed": seed,
         "printed": printed,
-        **figures(events, proxy),
+        **figures(case, events, proxy),
     }
 
 
@@ -257,7 +257,7 @@ def episode_line(url: str) -> str:
         return str(error).replace(url, "PORT")
 
 
-def figures(events: Sequence[dict[str, Any]], proxy: Proxy) -> dict[str, float | None]:
+def figures(case: Case, events: Sequence[dict[str, Any]], proxy: Proxy) -> dict[str, float | None]:
     """Return the figures of an episode from the cart's journal; None where there is nothing to measure."""
     ages, last = [], None
     for since, until, tick in values_of_the_host(events):
@@ -266,7 +266,8 @@ def figures(events: Sequence[dict[str, Any]], proxy: Proxy) -> dict[str, float |
     homing = [event["us"] for event in events if "in_force" in event] if proxy.started_us is None else []
     if homing and proxy.failed_us is not None:
         last = homing[-1]
-    failed, started = proxy.failed_us, proxy.started_us
+    started = proxy.started_us
+    failed = case.emulator["stuck_at"] * 1e6 if "stuck_at" in case.emulator else proxy.failed_us
     touched = [event["touched"] for event in events if "touched" in event and event["us"] > (started or 1e18)]
     return {
         "oldest_ms": max(ages, default=None),

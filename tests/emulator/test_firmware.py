@@ -189,6 +189,8 @@ def test_soft_limit_lets_the_cart_in_and_not_out(bench, side):
     assert state.motor_applied == 0
     assert flags & Flags.SOFT_LIMIT
     bench.send(SetMotor(-side * 100))
+    assert bench.tick(side * (SOFT + 5))[1] & Flags.SOFT_LIMIT  # at the beginning of this period
+    bench.send(SetMotor(-side * 100))
     state, flags = bench.tick(side * (SOFT + 5))
     assert state.motor_applied == -side * 100
     assert not flags & Flags.SOFT_LIMIT
@@ -239,16 +241,32 @@ def test_a_disarmed_cart_may_be_anywhere():
 
 
 def push(bench: Bench, motors: list[int], counts: list[int]) -> State:
-    """Drive with motor values that move the cart to given counts; return the last STATE."""
+    """Drive a cart with a hanging pole to given counts; return the last STATE."""
     for motor, cart in zip(motors, counts, strict=True):
         bench.send(SetMotor(motor))
-        state, _ = bench.tick(cart)
+        state, _ = bench.tick(cart, 2048)
     return state
 
 
-def test_stall_is_a_hard_push_that_moves_nothing(bench):
-    assert push(bench, [255] * 25, [3] * 25).fault == 0
-    assert push(bench, [255] * 2, [3] * 2).fault == Fault.STALL
+def test_stall_is_a_hard_push_that_moves_hardly_anything(bench):
+    assert push(bench, [255] * 25, [3, 4] * 12 + [3]).fault == 0
+    assert push(bench, [255] * 2, [4, 3]).fault == Fault.STALL
+
+
+def test_a_count_that_stands_still_under_hard_pushes_is_a_fault_and_the_brake_ends_when_it_moves(bench):
+    assert push(bench, [255] * 3, [3] * 3).fault == 0
+    state = push(bench, [255] * 4, [3] * 4)
+    assert state.fault == Fault.CART_ENCODER
+    assert state.motor_applied == -255
+    assert bench.tick(3)[0].motor_applied == -255
+    assert bench.tick(2)[0].motor_applied == 0
+
+
+def test_a_small_push_moves_a_cart_below_an_upright_pole_for_sure(bench):
+    for _ in range(40):
+        bench.send(SetMotor(100))
+        state, _ = bench.tick(0, 0)
+    assert state.fault == Fault.CART_ENCODER
 
 
 @pytest.mark.parametrize(
@@ -256,8 +274,8 @@ def test_stall_is_a_hard_push_that_moves_nothing(bench):
     [
         ([255] * 100, [10 * tick for tick in range(100)]),  # it creeps at 1 cm/s
         ([150] * 100, [0] * 100),  # not hard enough to be sure
-        ([255, -255] * 50, [0] * 100),  # to and fro too fast to move
-        (([255] * 20 + [0] * 2) * 4, [0] * 88),  # short pushes
+        ([255, -255] * 50, [0, 1] * 50),  # to and fro too fast to move far
+        (([255] * 20 + [0] * 2) * 4, [0, 1] * 44),  # short pushes
     ],
 )
 def test_a_weaker_or_shorter_push_is_not_a_stall(bench, motors, counts):

@@ -6,10 +6,10 @@ import pytest
 
 from cartpole_rl.emulator.encoders import CART_NANOMETRES
 from cartpole_rl.emulator.guards import (
+    HARD_PUSH,
     PUSH_US,
     SPEED_CHANGE,
     STALL_COUNTS,
-    STALL_MOTOR,
     STALL_US,
     FrozenCartWatch,
     FrozenPoleWatch,
@@ -20,7 +20,7 @@ from cartpole_rl.emulator.guards import (
 PERIOD = 62_500  # us
 
 
-@pytest.mark.parametrize("motor", [STALL_MOTOR, -255])
+@pytest.mark.parametrize("motor", [HARD_PUSH, -255])
 def test_a_cart_that_does_not_move_under_a_long_push_stalls(motor: int) -> None:
     watch = StallWatch()
     answers = [watch.stalled(STALL_COUNTS - 1, motor, PERIOD) for _ in range(10)]
@@ -31,7 +31,7 @@ def test_a_cart_that_does_not_move_under_a_long_push_stalls(motor: int) -> None:
 @pytest.mark.parametrize(
     ("count", "motor"),
     [
-        (lambda period: 0, lambda period: STALL_MOTOR - 1),
+        (lambda period: 0, lambda period: HARD_PUSH - 1),
         (lambda period: period * STALL_COUNTS // 4, lambda period: 255),
         (lambda period: 0, lambda period: 255 if period % 8 < 4 else -255),
     ],

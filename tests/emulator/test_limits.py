@@ -14,6 +14,7 @@ from driven_cart import Driven
 from cartpole_rl.emulator.encoders import CART_METRES
 from cartpole_rl.wire import (
     ClearFault,
+    Fault,
     Flags,
     Hello,
     Home,
@@ -82,6 +83,18 @@ def test_no_host_drives_the_cart_against_a_stop(host, cart, period_us):
         fastest = max(fastest, abs(driven.cart.physics.x_dot))
     assert max(touched, default=0.0) <= 0.1
     assert fastest > 0.5  # the limits leave it room to drive
+
+
+@pytest.mark.parametrize("after", [0.0, 0.1, 0.25, 0.4])
+@pytest.mark.parametrize("cart", [{}, LARGE, HEAVY, SLIPPERY], ids=["default", "large", "heavy", "slippery"])
+@pytest.mark.parametrize("host", [outward, to_and_fro])
+def test_a_cart_whose_encoder_freezes_is_stopped_before_it_touches_a_stop(host, cart, after):
+    driven, touched, _ = ready(**cart, stuck_encoder="cart", stuck_at=60 + after)
+    motors = host(driven)
+    while driven.cart.now_us < 64e6:
+        state = driven.ask(SetMotor(next(motors))) if driven.cart.firmware.armed else driven.tick()
+    assert state.fault & Fault.CART_ENCODER
+    assert max(touched, default=0.0) <= 0.1
 
 
 def ready(period_us: int = 20_000, **cart: float) -> tuple[Driven, list[float], float]:

@@ -208,7 +208,7 @@ def test_the_soft_limit_holds_for_it(side):
 def test_a_fault_ends_it():
     board = Board(lambda seen: 255)
     states = [board.heard(5) for _ in range(30)]
-    assert states[-1][0].fault == Fault.STALL
+    assert states[-1][0].fault == Fault.CART_ENCODER
     assert states[-1][2] == 0
     asked = len(board.observed)
     board.tick(5)
