@@ -171,7 +171,7 @@ class Firmware:
         else:
             zeros = self._zeros
             angle = pole - self._pole_zero
-            if self.armed and self._limits.lost(now_us, self.motor, angle):
+            if self.armed and self._limits.lost(now_us, self.motor):
                 self._latch(Fault.CART_ENCODER)
                 self._limits.brake_blindly(now_us)
             self._limits.apply(now_us, cart - zeros.middle, angle, zeros.half_span, self.armed)

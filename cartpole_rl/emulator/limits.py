@@ -15,10 +15,9 @@ watchdog or a fault leaves at speed would roll into an end stop. It never pushes
 inward.
 
 A frozen encoder shows a cart that stands. While the count does not change, the cart's motion is estimated
-from its last speed and from pushes while the pole is slow: hard ones, and any below a pole that stands above
-its pivot, which no resting cart balances. After 20 mm of it the cart is `lost`: its encoder is frozen, or
-something holds it. A lost cart is braked for the time that its estimated speed needs, or until its count
-changes.
+from its last speed and, while the pole is slow, from hard pushes. After 20 mm of it the cart is `lost`: its
+encoder is frozen, or something holds it. A lost cart is braked for the time that its estimated speed needs,
+or until its count changes. Friction can hold a cart against weaker pushes: they tell nothing.
 
 All numbers but one are whole, so that ``firmware/src/cart_limits.c`` decides the same.
 """
@@ -28,7 +27,6 @@ from collections import deque
 
 from cartpole_rl.emulator.encoders import CART_METRES, CART_NANOMETRES, POLE_COUNTS, POLE_RADIANS
 from cartpole_rl.emulator.guards import HARD_PUSH
-from cartpole_rl.emulator.settings import LARGEST_MOTOR
 
 SOFT_LIMIT = round(0.027 / CART_METRES)  # counts inside a stop
 HARD_LIMIT = round(0.008 / CART_METRES)  # counts inside a stop
@@ -44,8 +42,7 @@ FAST_POLE = POLE_COUNTS * 16 // 10  # counts/s; a higher speed shakes the cart n
 LEVER = 27_000  # um, of the medium pole on a bare cart: m_p l / (m_c + m_p)
 LONGEST_ROLLING_US = 3_000_000  # after the cart was armed
 SLOW_POLE = POLE_COUNTS * 6 // 10  # counts/s; a faster pole may hold the cart against its motor
-PUSHED = 25_000  # um/s^2: each motor value above IDLE speeds a common cart up by so much
-IDLE = 50  # largest motor value that does not
+PUSHED = 5_000_000  # um/s^2: a hard push speeds a common cart up so hard
 SLOWED_US = 100_000  # time constant of the estimated speed without a hard push
 LOST_NM = 20_000_000  # estimated motion without a change of the count
 
@@ -78,20 +75,18 @@ class TrackLimits:
         """Start the estimate anew: the cart is armed now."""
         self._count = None
 
-    def lost(self, now_us: int, motor: int, pole: int) -> bool:
+    def lost(self, now_us: int, motor: int) -> bool:
         """Return whether the cart's count stands still although the cart must have moved.
 
-        `motor` is the value in force since the last look, `pole` in counts from upright.
+        `motor` is the value in force since the last look.
         """
         us, self._looked_us = min(now_us - self._looked_us, SLOWED_US), now_us
         if self._newest != self._count:
             self._count = self._newest
             self._speed_um, self._way_nm = self._cart_speed(), 0
             return False
-        weakest = IDLE if math.cos(pole * POLE_RADIANS) > 0 else HARD_PUSH - 1
-        if abs(motor) > weakest and abs(self._speed(self._poles)) < SLOW_POLE:
-            push = PUSHED * (abs(motor) - IDLE)
-            self._speed_um += (push if motor > 0 else -push) * us // 1_000_000
+        if abs(motor) >= HARD_PUSH and abs(self._speed(self._poles)) < SLOW_POLE:
+            self._speed_um += (PUSHED if motor > 0 else -PUSHED) * us // 1_000_000
         elif abs(self._speed_um) < REST:
             self._speed_um = 0
         else:
@@ -102,7 +97,7 @@ class TrackLimits:
     def brake_blindly(self, now_us: int) -> None:
         """Brake a lost cart by its estimated speed."""
         self.blocked = self._until_us = 0
-        self._blind_us = now_us + abs(self._speed_um) * 1_000_000 // (PUSHED * (LARGEST_MOTOR - IDLE))
+        self._blind_us = now_us + abs(self._speed_um) * 1_000_000 // PUSHED
         self.brake = -1 if self._speed_um > 0 else 1
 
     def apply(self, now_us: int, outward: int, pole: int, half_span: int, armed: bool) -> None:

@@ -180,7 +180,7 @@ static void apply_limits(cart *self, uint64_t now_us, int32_t cart_count, int32_
     if (self->homing) {
         cart_limits_release(&self->limits);
     } else {
-        if (self->armed && cart_limits_lost(&self->limits, now_us, cart_motor(self), place.pole)) {
+        if (self->armed && cart_limits_lost(&self->limits, now_us, cart_motor(self))) {
             latch(self, CART_FAULT_CART_ENCODER);
             cart_limits_brake_blindly(&self->limits, now_us);
             place.armed = false;

@@ -15,8 +15,7 @@
 #define POLE_RADIANS (2 * PI / CART_POLE_COUNTS) /* a count */
 #define LONGEST_ROLLING_US 3000000u /* after the cart was armed */
 #define SLOW_POLE (CART_POLE_COUNTS * 6LL / 10) /* counts/s; a faster pole may hold the cart against its motor */
-#define PUSHED 25000LL /* um/s^2: each motor value above IDLE speeds a common cart up by so much */
-#define IDLE 50 /* largest motor value that does not */
+#define PUSHED 5000000LL /* um/s^2: a hard push speeds a common cart up so hard */
 #define SLOWED_US 100000 /* time constant of the estimated speed without a hard push */
 #define LOST_NM 20000000 /* estimated motion without a change of the count */
 
@@ -65,7 +64,7 @@ void cart_limits_forget(cart_limits *limits)
     limits->counted = false;
 }
 
-bool cart_limits_lost(cart_limits *limits, uint64_t now_us, int16_t motor, int64_t pole)
+bool cart_limits_lost(cart_limits *limits, uint64_t now_us, int16_t motor)
 {
     uint64_t passed_us = now_us - limits->looked_us;
     int64_t us = passed_us < SLOWED_US ? (int64_t)passed_us : SLOWED_US;
@@ -79,15 +78,13 @@ bool cart_limits_lost(cart_limits *limits, uint64_t now_us, int16_t motor, int64
     }
     int64_t turning = speed_of(limits, limits->poles);
     bool slow_pole = turning < SLOW_POLE && turning > -SLOW_POLE;
-    int16_t weakest = cos((double)pole * POLE_RADIANS) > 0 ? IDLE : CART_HARD_PUSH - 1;
-    int16_t size = (int16_t)(motor < 0 ? -motor : motor);
-    int64_t push = PUSHED * (size - IDLE);
-    if (slow_pole && size > weakest)
-        limits->speed_um += cart_floor_divide((motor > 0 ? push : -push) * us, 1000000);
-    else if (limits->speed_um < REST && limits->speed_um > -REST)
+    if (slow_pole && (motor >= CART_HARD_PUSH || motor <= -CART_HARD_PUSH)) {
+        limits->speed_um += cart_floor_divide((motor > 0 ? PUSHED : -PUSHED) * us, 1000000);
+    } else if (limits->speed_um < REST && limits->speed_um > -REST) {
         limits->speed_um = 0;
-    else
+    } else {
         limits->speed_um -= cart_floor_divide(limits->speed_um * us, SLOWED_US);
+    }
     limits->way_nm += cart_floor_divide(limits->speed_um * us, 1000);
     return limits->way_nm >= LOST_NM || limits->way_nm <= -LOST_NM;
 }
@@ -97,7 +94,7 @@ void cart_limits_brake_blindly(cart_limits *limits, uint64_t now_us)
     int64_t size = limits->speed_um < 0 ? -limits->speed_um : limits->speed_um;
     limits->blocked = 0;
     limits->until_us = 0;
-    limits->blind_us = now_us + (uint64_t)(size * 1000000 / (PUSHED * (CART_LARGEST_MOTOR - IDLE)));
+    limits->blind_us = now_us + (uint64_t)(size * 1000000 / PUSHED);
     limits->brake = limits->speed_um > 0 ? -1 : 1;
 }
 

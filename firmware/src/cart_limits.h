@@ -13,9 +13,8 @@
    or a fault leaves at speed would roll into an end stop. It never pushes a cart that stands or moves inward.
 
    A frozen encoder shows a cart that stands. While the count does not change, the cart's motion is estimated from
-   its last speed and from pushes while the pole is slow: hard ones, and any below a pole that stands above its pivot,
-   which no resting cart balances. After 20 mm of it the cart is lost: its encoder is frozen, or something holds it.
-   A lost cart is braked for the time that its estimated speed needs, or until its count changes. */
+   its last speed and, while the pole is slow, from hard pushes. After 20 mm of it the cart is lost: its encoder is
+   frozen, or something holds it. Friction can hold a cart against weaker pushes: they tell nothing. A lost cart is braked for the time that its estimated speed needs, or until its count changes. */
 #ifndef CART_LIMITS_H
 #define CART_LIMITS_H
 
@@ -58,9 +57,8 @@ void cart_limits_sample(cart_limits *limits, uint64_t now_us, int32_t cart_count
 /* Start the estimate of the cart's motion anew: the cart is armed now. */
 void cart_limits_forget(cart_limits *limits);
 
-/* Does the cart's count stand still although the cart must have moved? `motor` is the value in force since the last look,
-   `pole` in counts from upright. */
-bool cart_limits_lost(cart_limits *limits, uint64_t now_us, int16_t motor, int64_t pole);
+/* Does the cart's count stand still although the cart must have moved? `motor` is the value in force since the last look. */
+bool cart_limits_lost(cart_limits *limits, uint64_t now_us, int16_t motor);
 
 /* Brake a lost cart by its estimated speed. */
 void cart_limits_brake_blindly(cart_limits *limits, uint64_t now_us);

@@ -262,13 +262,6 @@ def test_a_count_that_stands_still_under_hard_pushes_is_a_fault_and_the_brake_en
     assert bench.tick(2)[0].motor_applied == 0
 
 
-def test_a_small_push_moves_a_cart_below_an_upright_pole_for_sure(bench):
-    for _ in range(40):
-        bench.send(SetMotor(100))
-        state, _ = bench.tick(0, 0)
-    assert state.fault == Fault.CART_ENCODER
-
-
 @pytest.mark.parametrize(
     ("motors", "counts"),
     [

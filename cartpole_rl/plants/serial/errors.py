@@ -38,7 +38,8 @@ FAULTS: dict[Fault, str] = {
     "back towards the middle, switch the supply on)",
     Fault.STALL: "the motor was driven but the cart did not move (check the motor's supply and cable, free "
     "the cart)",
-    Fault.CART_ENCODER: "the cart's encoder does not answer (check its cable and the motor's supply)",
+    Fault.CART_ENCODER: "the encoder of the cart does not answer, or something holds the cart (check the "
+    "encoder's cable and the motor's supply, free the cart)",
     Fault.POLE_ENCODER: "the pole's encoder does not answer (check its cable)",
     Fault.HOMING: "homing failed: the cart did not move, or moved the wrong way, an end stop was not found, "
     "the distance of the end stops was off by over 3 %, or the pole did not come to rest (check the motor's "
