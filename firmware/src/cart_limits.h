@@ -14,7 +14,8 @@
 
    A frozen encoder shows a cart that stands. While the count does not change, the cart's motion is estimated from
    its last speed and, while the pole is slow, from hard pushes. After 20 mm of it the cart is lost: its encoder is
-   frozen, or something holds it. Friction can hold a cart against weaker pushes: they tell nothing. A lost cart is braked for the time that its estimated speed needs, or until its count changes. */
+   frozen, or something holds it. Friction can hold a cart against weaker pushes: they tell nothing. A
+   lost cart is braked for the time that its estimated speed needs, or until its count changes. */
 #ifndef CART_LIMITS_H
 #define CART_LIMITS_H
 
@@ -57,7 +58,8 @@ void cart_limits_sample(cart_limits *limits, uint64_t now_us, int32_t cart_count
 /* Start the estimate of the cart's motion anew: the cart is armed now. */
 void cart_limits_forget(cart_limits *limits);
 
-/* Does the cart's count stand still although the cart must have moved? `motor` is the value in force since the last look. */
+/* Does the cart's count stand still although the cart must have moved? `motor` is the value in force
+   since the last look. */
 bool cart_limits_lost(cart_limits *limits, uint64_t now_us, int16_t motor);
 
 /* Brake a lost cart by its estimated speed. */

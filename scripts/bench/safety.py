@@ -279,15 +279,21 @@ def figures(case: Case, events: Sequence[dict[str, Any]], proxy: Proxy) -> dict[
 def values_of_the_host(events: Sequence[dict[str, Any]]) -> Iterator[tuple[int, int, int]]:
     """Yield (since, until, tick) of each nonzero motor value of the host, in us, from its arrival on.
 
-    It ends with the arrival of the next one, or when the firmware replaces it.
+    It ends with the arrival of the next one, or when the firmware replaces it. A value that never came into
+    force is left out.
     """
+    in_force = 0
     for number, taken in enumerate(events):
+        in_force = taken.get("in_force", in_force)
         if taken.get("took") != "SET_MOTOR" or not taken["motor"]:
             continue
-        in_force_by = taken["us"] + LATENCY_US
+        in_force_by, began = taken["us"] + LATENCY_US, in_force == taken["motor"]
         for event in events[number + 1 :]:
-            replaced = "in_force" in event and event["in_force"] != taken["motor"]
-            if event.get("took") in ("SET_MOTOR", "STOP") or (replaced and event["us"] > in_force_by):
+            began |= event.get("in_force") == taken["motor"]
+            if not began and event["us"] > in_force_by:
+                break  # the firmware refused it, or its time was over
+            ended = began and "in_force" in event and event["in_force"] != taken["motor"]
+            if event.get("took") in ("SET_MOTOR", "STOP") or ended:
                 yield taken["us"], event["us"], taken["tick"]
                 break
 
