@@ -54,7 +54,7 @@ class JumpWatch:
 class FrozenCartWatch:
     """Detects a cart count that does not change under hard pushes in both directions.
 
-    Under a push one way only, the cart itself may be held by a stop or an obstacle, which is a stall. An
+    Under a push one way only, the cart itself may be held by a stop or an obstacle. An
     obstacle on one side lets the cart move the other way, by at least one count. The period in which a push
     begins does not count: pushes that change their direction in each period may move nothing.
     """

@@ -45,6 +45,7 @@ SLOW_POLE = POLE_COUNTS * 6 // 10  # counts/s; a faster pole may hold the cart a
 PUSHED = 5_000_000  # um/s^2: a hard push speeds a common cart up so hard
 SLOWED_US = 100_000  # time constant of the estimated speed without a hard push
 LOST_NM = 20_000_000  # estimated motion without a change of the count
+FASTEST_LOST = 2_500_000  # um/s; a higher estimate comes from a count that jumped
 
 
 class TrackLimits:
@@ -83,7 +84,7 @@ class TrackLimits:
         us, self._looked_us = min(now_us - self._looked_us, SLOWED_US), now_us
         if self._newest != self._count:
             self._count = self._newest
-            self._speed_um, self._way_nm = self._cart_speed(), 0
+            self._speed_um, self._way_nm = max(-FASTEST, min(FASTEST, self._cart_speed())), 0
             return False
         if abs(motor) >= HARD_PUSH and abs(self._speed(self._poles)) < SLOW_POLE:
             self._speed_um += (PUSHED if motor > 0 else -PUSHED) * us // 1_000_000
@@ -95,10 +96,10 @@ class TrackLimits:
         return abs(self._way_nm) >= LOST_NM
 
     def brake_blindly(self, now_us: int) -> None:
-        """Brake a lost cart by its estimated speed."""
-        self.blocked = self._until_us = 0
-        self._blind_us = now_us + abs(self._speed_um) * 1_000_000 // PUSHED
-        self.brake = -1 if self._speed_um > 0 else 1
+        """Brake a lost cart by its estimated speed, for 0.5 s at most. All limits were released before."""
+        if abs(self._speed_um) <= FASTEST_LOST:
+            self._blind_us = now_us + abs(self._speed_um) * 1_000_000 // PUSHED
+            self.brake = -1 if self._speed_um > 0 else 1
 
     def apply(self, now_us: int, outward: int, pole: int, half_span: int, armed: bool) -> None:
         """Decide for a cart `outward` counts right of the middle and a pole `pole` counts from upright.

@@ -18,6 +18,7 @@
 #define PUSHED 5000000LL /* um/s^2: a hard push speeds a common cart up so hard */
 #define SLOWED_US 100000 /* time constant of the estimated speed without a hard push */
 #define LOST_NM 20000000 /* estimated motion without a change of the count */
+#define FASTEST_LOST 2500000 /* um/s; a higher estimate comes from a count that jumped */
 
 static uint8_t oldest(const cart_limits *limits)
 {
@@ -59,6 +60,13 @@ static int64_t cart_speed(const cart_limits *limits)
     return cart_floor_divide(speed_of(limits, limits->carts) * CART_NANOMETRES, 1000);
 }
 
+static int64_t within(int64_t number, int64_t largest)
+{
+    if (number > largest)
+        return largest;
+    return number < -largest ? -largest : number;
+}
+
 void cart_limits_forget(cart_limits *limits)
 {
     limits->counted = false;
@@ -72,7 +80,7 @@ bool cart_limits_lost(cart_limits *limits, uint64_t now_us, int16_t motor)
     if (!limits->counted || limits->carts[limits->newest] != limits->count) {
         limits->counted = true;
         limits->count = limits->carts[limits->newest];
-        limits->speed_um = cart_speed(limits);
+        limits->speed_um = within(cart_speed(limits), FASTEST);
         limits->way_nm = 0;
         return false;
     }
@@ -92,17 +100,10 @@ bool cart_limits_lost(cart_limits *limits, uint64_t now_us, int16_t motor)
 void cart_limits_brake_blindly(cart_limits *limits, uint64_t now_us)
 {
     int64_t size = limits->speed_um < 0 ? -limits->speed_um : limits->speed_um;
-    limits->blocked = 0;
-    limits->until_us = 0;
+    if (size > FASTEST_LOST)
+        return;
     limits->blind_us = now_us + (uint64_t)(size * 1000000 / PUSHED);
     limits->brake = limits->speed_um > 0 ? -1 : 1;
-}
-
-static int64_t within(int64_t number, int64_t largest)
-{
-    if (number > largest)
-        return largest;
-    return number < -largest ? -largest : number;
 }
 
 static int8_t brake(const cart_limits *limits, int64_t speed, const cart_place *place)

@@ -14,8 +14,8 @@
 
    A frozen encoder shows a cart that stands. While the count does not change, the cart's motion is estimated from
    its last speed and, while the pole is slow, from hard pushes. After 20 mm of it the cart is lost: its encoder is
-   frozen, or something holds it. Friction can hold a cart against weaker pushes: they tell nothing. A
-   lost cart is braked for the time that its estimated speed needs, or until its count changes. */
+   frozen, or something holds it. A lost cart is braked for the time that its estimated speed needs, or until its
+   count changes. Friction can hold a cart against weaker pushes: they tell nothing. */
 #ifndef CART_LIMITS_H
 #define CART_LIMITS_H
 
@@ -62,7 +62,7 @@ void cart_limits_forget(cart_limits *limits);
    since the last look. */
 bool cart_limits_lost(cart_limits *limits, uint64_t now_us, int16_t motor);
 
-/* Brake a lost cart by its estimated speed. */
+/* Brake a lost cart by its estimated speed, for 0.5 s at most. All limits were released before. */
 void cart_limits_brake_blindly(cart_limits *limits, uint64_t now_us);
 
 void cart_limits_apply(cart_limits *limits, uint64_t now_us, const cart_place *place);

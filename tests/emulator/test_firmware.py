@@ -262,6 +262,14 @@ def test_a_count_that_stands_still_under_hard_pushes_is_a_fault_and_the_brake_en
     assert bench.tick(2)[0].motor_applied == 0
 
 
+def test_a_count_that_jumps_and_then_stands_still_is_never_braked(bench):
+    now_us = bench.now_us
+    for look, cart in enumerate([0] * 9 + [300] + [2_000_000] * 10):
+        bench.firmware.look(now_us + 1000 * look, cart, 2048)
+    assert bench.firmware.fault == Fault.CART_ENCODER
+    assert bench.firmware.motor == 0
+
+
 @pytest.mark.parametrize(
     ("motors", "counts"),
     [
