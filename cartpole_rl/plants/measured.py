@@ -25,7 +25,8 @@ PUSH, PUSHED = 200, 0.1 - 1e-6  # motor value that moves any cart; s in each dir
 SPEED_CHANGE = 0.2  # m/s up and down that turn any pole
 SUDDEN = np.array([0.25 / CART_METRES_PER_COUNT, 200.0])  # counts/s, 200 are 0.3 rad/s: a dead stop,
 STILL = 0.5  # s, if the count does not change for as long after it
-LEANING, FALLEN = np.radians((0.7, 10))  # rad: more than friction holds; near enough to upright
+LEANING = 0.025 + 0.008  # rad: largest error of the encoder's zero, and what friction holds
+FALLEN = np.radians(10)  # rad: near enough to upright
 HALF = 0.5  # s, over which a pole of up to 1.4 m multiplies its angle by 2.7 or more
 LATCHED = Fault.CART_ENCODER | Fault.STALL, Fault.POLE_ENCODER  # a dead cart encoder can show as a STALL
 
@@ -78,7 +79,9 @@ def stopped_dead(count: NDArray[np.int64], gaps: Array, last: int, sudden: float
 def balanced(theta: Array, gaps: Array) -> bool:
     """Return whether the pole leant, but did not fall, at the angles `theta` [K], rad, on a standing cart.
 
-    It obeys theta_ddot = w^2 theta, so theta(t - h) + theta(t + h) = 2 cosh(w h) theta(t) > 5 theta(t).
+    On a standing cart its angle a from the true upright obeys a_ddot = w^2 a, so a(t - h) + a(t + h) =
+    2 cosh(w h) a(t) > 5 a(t): less than a third of the second difference is a(t). The angle was in error, or
+    the cart moved, if no error of the zero below `LEANING` explains the three measured angles.
     """
     half = round(HALF / float(np.median(gaps))) if len(gaps) else 0
     if half == 0 or len(theta) <= 2 * half:
@@ -86,7 +89,9 @@ def balanced(theta: Array, gaps: Array) -> bool:
     angle = wrap(theta)
     before, now, after = angle[: -2 * half], angle[half:-half], angle[2 * half :]
     near = np.maximum(np.abs(before), np.abs(after)) < FALLEN
-    return bool((near & (np.abs(now) > LEANING) & (np.abs(before + after) < 3 * np.abs(now))).any())
+    nearest = now - (before + after - 2 * now) / 3  # to upright: the zero lies between this and `now`
+    leans = (now * nearest > 0) & (np.minimum(np.abs(now), np.abs(nearest)) > LEANING)
+    return bool((near & leans).any())
 
 
 def pole_froze(speed: Array) -> bool:

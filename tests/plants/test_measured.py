@@ -113,6 +113,8 @@ FREE_FALL = np.rint(np.degrees(0.02 * np.cosh(6 * TIME[:26])) / 360 * 4096)
         (hanging(0, [*0.1 * TIME[:10], *[0.02] * 40], HANGING), 0),  # at 0.1 m/s, until friction stops it
         (hanging(0, np.zeros(50), [*range(2030, 2050, 2), *[HANGING] * 40]), 0),
         (hanging(0, np.zeros(100), HANGING), Fault.HARD_LIMIT),
+        (hanging(0, np.zeros(100), 10), 0),  # upright, with an error of the encoder's zero of 0.88 degrees
+        (hanging(0, np.zeros(100), 9 + np.arange(100) % 4), 0),
     ],
 )
 def test_what_a_whole_cart_can_do_is_kept(episode: Episode, fault: int) -> None:
@@ -125,7 +127,7 @@ def test_what_a_whole_cart_can_do_is_kept(episode: Episode, fault: int) -> None:
         (hanging(0, FORTH_AND_BACK, HANGING), 0, 0),
         (hanging(0, FORTH_AND_BACK, [HANGING - 1] * 9 + [HANGING] * 91), 0, 9),
         (hanging(([220] * 10 + [-220] * 10) * 4, [0.001] * 5 + [0.0] * 76, np.arange(81)), 0, 5),
-        (hanging(100, np.zeros(100), 9 + np.arange(100) % 4), 0, 0),  # balanced by a cart that stands
+        (hanging(100, np.zeros(100), 24 + np.arange(100) % 4), 0, 0),  # balanced by a cart that stands
         (hanging(0, np.zeros(50), [*range(2000, 2050, 5), *[2045] * 40]), 0, 9),  # in the middle of a swing
         (hanging(0, [*0.4 * TIME[:10], *[0.072] * 40], np.arange(50)), 0, 9),
         (hanging(0, [0.0] * 30 + [0.2] * 3, HANGING), 0, 29),  # 10 m/s

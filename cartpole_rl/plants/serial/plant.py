@@ -46,8 +46,8 @@ class SerialPlant(OneCartPlant):
     if it has another one. With `on_board` the policy on the cart's board drives from the reset on, and
     `listen_one` takes the place of `step_one`.
 
-    `terminated`: the cart is beyond its soft limit, or latched a fault. `truncated`: the link was lost, or
-    the cart restarted; the counts are then the last ones received. `ended_by` is the last ending, "track",
+    `terminated`: the cart is beyond its soft limit. `truncated`: the cart latched a fault, the link was
+    lost, or the cart restarted; the counts are then the last ones received. `ended_by` is the last ending, "track",
     "fault" or "link", and empty while an episode runs; `last_error` is the error behind "fault" or "link".
 
     After an ending or `halt`, steps send nothing until the next reset: they repeat the last frame, truncated
