@@ -47,8 +47,9 @@ class SerialPlant(OneCartPlant):
     `listen_one` takes the place of `step_one`.
 
     `terminated`: the cart is beyond its soft limit. `truncated`: the cart latched a fault, the link was
-    lost, or the cart restarted; the counts are then the last ones received. `ended_by` is the last ending, "track",
-    "fault" or "link", and empty while an episode runs; `last_error` is the error behind "fault" or "link".
+    lost, or the cart restarted; the counts are then the last ones received. `ended_by` is the last ending,
+    "track", "fault" or "link", and empty while an episode runs; `last_error` is the error behind "fault" or
+    "link".
 
     After an ending or `halt`, steps send nothing until the next reset: they repeat the last frame, truncated
     if nothing else has ended the episode.
