@@ -16,9 +16,9 @@ from torch import Tensor
 from cartpole_rl.choices import choice
 from cartpole_rl.envs.perception import PlantOutput, Previous, perceive, perceive_first
 from cartpole_rl.envs.settings import ObservationSettings, TrackGuard
-from cartpole_rl.physics.actuator import Actuator
-from cartpole_rl.physics.friction import CartFriction, PoleFriction
-from cartpole_rl.physics.models import Integrator, Models
+from cartpole_rl.physics.actuator import ACTUATORS
+from cartpole_rl.physics.friction import CART_FRICTIONS, POLE_FRICTIONS
+from cartpole_rl.physics.models import INTEGRATORS, Models
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.simulation import Carts, Inputs, run_carts
 from cartpole_rl.scalar import Scalar, plain
@@ -102,8 +102,8 @@ def cart(draw: st.DrawFn) -> Carts:
     return Carts(table, motion, torch.tensor([[draw(st.floats(-5, 5))], [200.0], [-90.0], [0.0]]))
 
 
-MODELS = [Models(*each) for each in itertools.product(CartFriction, PoleFriction, Actuator)]
-DYNAMICS = list(itertools.product(Integrator, (False, True)))  # integrator, and whether the pole presses
+MODELS = [Models(*each) for each in itertools.product(CART_FRICTIONS, POLE_FRICTIONS, ACTUATORS)]
+DYNAMICS = list(itertools.product(INTEGRATORS, (False, True)))  # integrator, and whether the pole presses
 
 
 @pytest.mark.parametrize("number", range(len(MODELS)), ids=lambda number: "-".join(MODELS[number][:3]))

@@ -18,10 +18,9 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.physics.actuator import static_force
 from cartpole_rl.physics.dynamics import State, advance, coupling, mechanism
-from cartpole_rl.physics.friction import dry_friction, pole_torque, viscous_coefficient
-from cartpole_rl.physics.models import CartFriction, Models
+from cartpole_rl.physics.friction import CART_FRICTIONS, viscous_coefficient
+from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import GRAVITY, CartParameters
 from cartpole_rl.tasks.features import (
     ANGULAR_SPEED_SCALE,
@@ -71,7 +70,7 @@ class EnergyAndRegulator:
         self.cart = CartParameters.from_table(torch.tensor(row).unsqueeze(1))
         self.body = mechanism(self.cart)
         self.motors = torch.tensor(list(motors), dtype=torch.float32)
-        self.forces = static_force(self.motors, self.cart, models.actuator)
+        self.forces = models.actuator(self.motors, self.cart)
         self.strongest = float(self.forces.abs().max())
 
     def __call__(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -82,7 +81,7 @@ class EnergyAndRegulator:
 
     def predict(self, measured: State, motor: Tensor) -> State:
         """Return the state [N] at which the next motor value takes effect; `motor` [N] acts until then."""
-        force = static_force(motor, self.cart, self.models.actuator)
+        force = self.models.actuator(motor, self.cart)
         now = self._after(measured, force, self.period / 2)._replace(x=measured.x, theta=measured.theta)
         return self._after(now, force, float(self.cart.latency))
 
@@ -98,8 +97,8 @@ class EnergyAndRegulator:
     def balance(self, state: State) -> Tensor:
         """Return the regulator's force plus compensation of dry friction, N, [N]."""
         force = -sum(float(gain) * value for gain, value in zip(self.gain, state, strict=True))
-        return force + dry_friction(
-            state.x_dot + self.period * force / self.cart.total_mass, self.cart, self.models.cart_friction
+        return force + self.models.cart_friction(
+            state.x_dot + self.period * force / self.cart.total_mass, self.cart
         )
 
     def swing_up(self, state: State) -> Tensor:
@@ -117,11 +116,11 @@ class EnergyAndRegulator:
         """Return the force that accelerates the cart by `x_ddot` m/s^2, N, [N], by (3.5), (3.6)."""
         terms = coupling(state, self.cart, self.body)
         moment = self.body.first_moment * terms.cos
-        torque = terms.gravity_torque + pole_torque(state.theta_dot, self.cart, self.models.pole_friction)
+        torque = terms.gravity_torque + self.models.pole_friction(state.theta_dot, self.cart)
         theta_ddot = (torque - moment * x_ddot) / self.body.pivot_inertia
         reaction = moment * theta_ddot - self.body.first_moment * state.theta_dot**2 * terms.sin
         viscous = viscous_coefficient(self.cart, self.models.cart_friction) * state.x_dot
-        dry = dry_friction(state.x_dot + self.period * x_ddot, self.cart, self.models.cart_friction)
+        dry = self.models.cart_friction(state.x_dot + self.period * x_ddot, self.cart)
         return self.body.total_mass * x_ddot + reaction + viscous + dry
 
     def on_track(self, state: State, force: Tensor) -> Tensor:
@@ -163,7 +162,7 @@ def regulator(table: Tensor, models: Models, period: float) -> Array:
 def linearized(table: Tensor, models: Models, period: float) -> tuple[Array, Array]:
     """Return (A [4, 4], B [4, 1]) of one period about upright, at constant force, without dry friction."""
     cart = CartParameters.from_table(table)
-    smooth = CartFriction.NONE if models.cart_friction is CartFriction.NONE else CartFriction.LINEAR
+    smooth = CART_FRICTIONS.find("linear" if "cart_viscous" in models.cart_friction.reads else "none")
     body, smooth_models = mechanism(cart), models._replace(cart_friction=smooth)
 
     def after_a_period(numbers: Tensor) -> Tensor:

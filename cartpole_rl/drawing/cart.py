@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageColor, ImageDraw, ImageFont
 
 from cartpole_rl.drawing import colours
-from cartpole_rl.physics.motor import LARGEST_MOTOR
+from cartpole_rl.rig.hardware import LARGEST_MOTOR
 from cartpole_rl.tasks.upright import is_upright
 
 SIZE = (480, 320)  # pixels

@@ -15,7 +15,7 @@ from cartpole_rl.envs.guard_fitting import fitted_guard
 from cartpole_rl.envs.hardware import HardwareTransform
 from cartpole_rl.envs.settings import ObservationSettings, TrackGuard
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.physics.models import Actuator, Models
+from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.physics.residual import UNDER_WAY
 from cartpole_rl.plants.learned import LearnedPlant
@@ -63,8 +63,7 @@ def known_guard_numbers(settings: str) -> TrackGuard:
 
 def guard_numbers(config: CartPoleSettings) -> TrackGuard:
     """Return the numbers of the track guard, fitted to the carts of `config`."""
-    actuator = Actuator(config.actions.actuator)
-    models = Models(config.cart_friction.model, config.pole_friction.model, actuator)
+    models = Models(config.cart_friction.model, config.pole_friction.model, config.actions.actuator)
     motors, period = config.actions.motors, config.control_period
     return fitted_guard(config.guard.quantile, randomizer(config), motors, models, period)
 

@@ -8,7 +8,9 @@ from pydantic import Discriminator, Field, Tag
 
 from cartpole_rl.choices import group_choices
 from cartpole_rl.envs.settings import GuardSettings, ObservationSettings
-from cartpole_rl.physics.models import Actuator, CartFriction, Models, PoleFriction
+from cartpole_rl.physics.friction import CART_FRICTIONS, POLE_FRICTIONS
+from cartpole_rl.physics.laws import Law
+from cartpole_rl.physics.models import Models
 from cartpole_rl.plants.settings import LearnedSettings, SimulatedSettings
 from cartpole_rl.randomization.poles import Pole, PoleSettings
 from cartpole_rl.randomization.ranges import Range
@@ -35,7 +37,7 @@ ControlPeriod = Annotated[float, Field(ge=0.005, le=0.1)]  # s
 class CartFrictionSettings(Settings):
     """The friction model of the cart, and numbers of the cart under it: see `driven_numbers`."""
 
-    model: CartFriction
+    model: Annotated[Law, CART_FRICTIONS]
     parameters: dict[str, Finite]
 
     @property
@@ -47,7 +49,7 @@ class CartFrictionSettings(Settings):
 class PoleFrictionSettings(Settings):
     """The friction model of the pole, and numbers of the cart under it: see `driven_numbers`."""
 
-    model: PoleFriction
+    model: Annotated[Law, POLE_FRICTIONS]
     parameters: dict[str, Finite]
 
     @property
@@ -115,7 +117,7 @@ class SimulatedCartSettings(CartSettings):
         """The parameters of the cart that is driven, or varied, without the pole's."""
         return driven_numbers(self.cart, self.cart_friction, self.pole_friction)
 
-    def models_with(self, actuator: Actuator, plant: SimulatedSettings | LearnedSettings) -> Models:
+    def models_with(self, actuator: Law, plant: SimulatedSettings | LearnedSettings) -> Models:
         """Return the physics models of the cart with `actuator`, on `plant`."""
         friction = self.cart_friction.model, self.pole_friction.model
         return Models(*friction, actuator, plant.integrator, plant.pole_presses)
@@ -141,4 +143,4 @@ class CartPoleSettings(SimulatedCartSettings):
 
     def models(self, plant: SimulatedSettings | LearnedSettings) -> Models:
         """Return the physics models of the simulated cart."""
-        return self.models_with(Actuator(self.actions.actuator), plant)
+        return self.models_with(self.actions.actuator, plant)

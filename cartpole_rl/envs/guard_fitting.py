@@ -22,7 +22,6 @@ from torch import Tensor
 
 from cartpole_rl.envs.settings import LARGEST_MARGIN, TrackGuard
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.physics.actuator import static_force
 from cartpole_rl.physics.dynamics import Drive, State, run_period
 from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import GRAVITY, CartParameters
@@ -86,7 +85,7 @@ def braking_distances(
     commands = commands_under_way(draws.longest_delay(), period)
     right, left = float(max(motors)), float(min(motors))
     outward, inward = torch.where(rightward, right, left), torch.where(rightward, left, right)
-    drive = Drive(static_force(outward, cart, models.actuator), [outward] * commands)
+    drive = Drive(models.actuator(outward, cart), [outward] * commands)
     before, (state, drive) = state, run_period(state, drive, cart.latency, cart, models, period, SUBSTEPS)
     speed, start, farthest = side * (state.x - before.x) / period, state.x, torch.zeros(SAMPLES)
     for step in range(math.ceil(BRAKING / period)):

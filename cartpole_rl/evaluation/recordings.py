@@ -13,7 +13,7 @@ import numpy as np
 
 from cartpole_rl.errors import RecordingError
 from cartpole_rl.files import replacing
-from cartpole_rl.physics.motor import LARGEST_MOTOR
+from cartpole_rl.rig.hardware import LARGEST_MOTOR
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
 

@@ -7,7 +7,7 @@ from pydantic import Field
 
 from cartpole_rl.envs.settings import ObservationSettings, TrackGuard
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_COUNTS_PER_TURN
+from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_COUNTS_PER_TURN
 from cartpole_rl.settings import Count, Finite, Positive, Settings
 from cartpole_rl.tasks.features import (
     LENGTH_SCALE,

@@ -16,7 +16,7 @@ from cartpole_rl.identification.prediction import REPORTED
 from cartpole_rl.identification.replay import Replayed, away_from_upright, replay
 from cartpole_rl.identification.rollout import Dynamics
 from cartpole_rl.identification.windows import regular_frames
-from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
+from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.tasks.upright import wrap
 

@@ -23,10 +23,9 @@ from cartpole_rl.identification.moves import (
     push,
     until_stopped,
 )
-from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
-from cartpole_rl.physics.motor import LARGEST_MOTOR
 from cartpole_rl.plants.measured import measured_part
 from cartpole_rl.plants.specs import OneFrame, Plant
+from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, LARGEST_MOTOR, POLE_RADIANS_PER_COUNT
 from cartpole_rl.scheduling import no_garbage_collection
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode

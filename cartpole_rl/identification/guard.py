@@ -16,7 +16,7 @@ import numpy as np
 
 from cartpole_rl.envs.guard import guard_side
 from cartpole_rl.envs.settings import TrackGuard
-from cartpole_rl.physics.motor import LARGEST_MOTOR
+from cartpole_rl.rig.hardware import LARGEST_MOTOR
 
 TRACK_END = 0.2874  # m from the middle: 0.3, less what carts overrun that are harder to brake than assumed
 RESPONSE = 0.035  # s, latency and lag of the motor

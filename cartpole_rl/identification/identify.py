@@ -14,21 +14,20 @@ from cartpole_rl.identification.replay import LEAD, Replayed, away_from_upright,
 from cartpole_rl.identification.rollout import Dynamics
 from cartpole_rl.identification.unknowns import WEIGHED, limits
 from cartpole_rl.identification.windows import cut_judging, cut_windows, lead_periods
-from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
-from cartpole_rl.physics.models import CartFriction, Models
+from cartpole_rl.physics.friction import CART_FRICTIONS
+from cartpole_rl.physics.laws import Law
+from cartpole_rl.physics.models import Models
+from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
 
 Array = NDArray[np.floating]
-CART_FRICTIONS = (CartFriction.LINEAR, CartFriction.SIGMOID, CartFriction.STEP, CartFriction.STRIBECK)
 HORIZON = 1.0  # s of motion, predicted
 MOVING = round(0.02 / CART_METRES_PER_COUNT)  # counts in that time, from which a friction model shows
 SCREENING_STEPS = 4  # integration steps a period when a friction model is screened
 CONTENDS = 1.5  # a screened model stays a candidate up to this multiple of the best one's error
 FALLOFF = 4  # a model with twice the error of the best one has a weight of 2^-FALLOFF
-FAR = 3.0  # prior standard deviations
 UNINFORMED = 0.7  # posterior over prior standard deviation, from which the data say little
-NO_WARNING = ("stribeck_velocity",)  # below 1 mm/s it makes no difference
 ROUNDING = np.array([0.6, 0.6])  # counts: a generous bound of the effect of quantization
 CORRELATED = 0.5  # correlation of neighbouring residuals from which they are not white
 
@@ -56,7 +55,7 @@ class Candidate(NamedTuple):
     error: PredictionError
 
     @property
-    def cart_friction(self) -> CartFriction:
+    def cart_friction(self) -> Law:
         """The model of the cart's friction."""
         return self.dynamics.models.cart_friction
 
@@ -97,9 +96,7 @@ def identify(
     episodes = [*fitted.values()]
     judging = cut_judging(episodes, period, HORIZON, lead_periods(LEAD, period), MOVING)
 
-    def attempt(
-        cart_friction: CartFriction, count: int, steps: int, judged: bool, sharpened: bool
-    ) -> Candidate:
+    def attempt(cart_friction: Law, count: int, steps: int, judged: bool, sharpened: bool) -> Candidate:
         under, half_step = models._replace(cart_friction=cart_friction), period / steps / 2
         windows = cut_windows(episodes, period, most=count, apart_from=judging if judged else None)
         fit = fit_cart(
@@ -115,7 +112,9 @@ def identify(
         dynamics = Dynamics.of(fit.parameters, under, period, steps, half_step)
         return Candidate(fit, dynamics, judged_error(predict(judging, dynamics)))
 
-    screened = [attempt(each, most // 3, SCREENING_STEPS, True, False) for each in CART_FRICTIONS]
+    screened = [
+        attempt(each, most // 3, SCREENING_STEPS, True, False) for each in CART_FRICTIONS if each.candidate
+    ]
     largest = CONTENDS * min(each.error.size for each in screened)
     contenders = {
         each.cart_friction: attempt(each.cart_friction, most, substeps, True, True)
@@ -199,12 +198,12 @@ def warnings(fit: Fit) -> list[str]:
                 f"{unknown.name} = {values[unknown.name]:g} is at the limit of its range: another friction "
                 "model, or another number, may be wrong"
             )
-        elif abs(point) > FAR and unknown.name not in NO_WARNING:
+        elif abs(point) > unknown.prior.unusual:
             found.append(
                 f"{unknown.name} = {values[unknown.name]:.3g} is unusual for carts of this kind: check that "
                 "the right pole and cart were given"
             )
-        if left > UNINFORMED and unknown.name not in NO_WARNING:
+        if left > UNINFORMED and np.isfinite(unknown.prior.unusual):
             found.append(f"the recordings hardly show {unknown.name}: its prior value is kept")
     units = f"{1e3 * CART_METRES_PER_COUNT:.2g} mm", f"{np.degrees(POLE_RADIANS_PER_COUNT):.2g} deg"
     for name, rms, rounding, correlation, unit in zip(

@@ -15,8 +15,8 @@ from torch import Tensor
 
 from cartpole_rl.errors import RecordingError
 from cartpole_rl.identification.rollout import Dynamics
-from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 from cartpole_rl.physics.residual import Residual
+from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 
 COARSE = torch.tensor([20.0, 3.0], dtype=torch.float64)  # counts, first residual scale: 0.5 mm, 0.26 deg
 FINEST = torch.tensor([1.0, 0.4], dtype=torch.float64)  # counts: the effect of quantization alone, about

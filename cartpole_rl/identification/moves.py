@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cartpole_rl.identification.guard import reach
-from cartpole_rl.physics.motor import LARGEST_MOTOR
+from cartpole_rl.rig.hardware import LARGEST_MOTOR
 
 SIDE = 20 / 27  # share of the guard's reach where a run to the other side starts: 0.2 m at 20 ms
 CLOSE, SLOW = 0.02, 0.05  # m, m/s: at the target, and at rest

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from torch import Tensor
 
-from cartpole_rl.physics.actuator import static_force
 from cartpole_rl.physics.dynamics import State, advance, mechanism
 from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import CartParameters
@@ -102,5 +101,5 @@ def predicted(data: Transitions, values: Mapping[str, float], models: Models, pe
     rod = {**values, "pole_inertia": values["pole_mass"] * values["pole_com"] ** 2 / 3}
     table = torch.tensor([rod[name] for name in CartParameters.names()], dtype=torch.float64)
     cart = CartParameters.from_table(table.unsqueeze(1))
-    force = static_force(data.motor, cart, models.actuator)
+    force = models.actuator(data.motor, cart)
     return torch.stack(advance(State(*data.before), force, cart, mechanism(cart), models, period))

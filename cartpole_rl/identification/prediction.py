@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from cartpole_rl.identification.matching import match_initial_states
 from cartpole_rl.identification.rollout import Dynamics
 from cartpole_rl.identification.windows import Windows
-from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 from cartpole_rl.physics.residual import Residual
+from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 from cartpole_rl.tasks.upright import wrap
 
 CERTAIN = 2.0  # spreads that should hold about 95 % of the errors

@@ -12,10 +12,10 @@ from cartpole_rl.identification.unknowns import LONGEST_LATENCY
 from cartpole_rl.identification.windows import history_periods
 from cartpole_rl.physics.actuator import step_forces
 from cartpole_rl.physics.dynamics import Drive, MakeAddition, State, run_period
-from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.physics.residual import UNDER_WAY, Residual, members_in_turn
+from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 
 
 def rollout(

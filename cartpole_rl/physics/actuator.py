@@ -9,13 +9,15 @@ from collections.abc import Sequence
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
-from cartpole_rl.physics.formula import PhysicsModel
+from cartpole_rl.physics.laws import Law, law_registry
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from cartpole_rl.physics.parameters import CartParameters
 
+# The formula gives the steady force, N, of a motor value of -255 to 255.
+ACTUATORS = law_registry("actuator")
 SHORTEST_TIME_CONSTANT = 1e-12  # s; stands in for no lag
 LAG = "motor_time_constant"
 CURVE = (
@@ -29,11 +31,13 @@ CURVE = (
 )
 
 
+@ACTUATORS.register("newtons")  # without lag, dead-band or asymmetry
 def newtons(motor: "Tensor", cart: "CartParameters") -> "Tensor":
     """Return the thesis's levels and the line through them, whatever the cart."""
     return motor.sign() * (0.02 * motor.abs() - 1).clamp(min=0)
 
 
+@ACTUATORS.register("force_curve", reads=CURVE)
 def force_curve(motor: "Tensor", cart: "CartParameters") -> "Tensor":
     """Return the force of the cart's own curve."""
     size = motor.abs()
@@ -43,24 +47,12 @@ def force_curve(motor: "Tensor", cart: "CartParameters") -> "Tensor":
     return curve * (rightward - leftward.to(curve.dtype))
 
 
-class Actuator(PhysicsModel):
-    """Actuator models; the formula of each gives the steady force of a motor value, N."""
-
-    NEWTONS = "newtons", (), newtons  # exact: without lag, dead-band or asymmetry
-    FORCE_CURVE = "force_curve", CURVE, force_curve
-
-
-def static_force(motor: "Tensor", cart: "CartParameters", model: Actuator) -> "Tensor":
-    """Return the force that a held motor value settles at, N. `motor`: [N], -255 to 255."""
-    return model.formula(motor, cart)
-
-
 def step_forces(
     force: "Tensor",
     motors: "Sequence[Tensor] | Tensor",
     latency: "Tensor",
     cart: "CartParameters",
-    model: Actuator,
+    law: Law,
     period: float,
     substeps: int,
 ) -> "tuple[list[Tensor], Tensor]":
@@ -69,9 +61,9 @@ def step_forces(
     `force` N is the force at its start; `motors` are the motor values of this period and the ones before it,
     newest first; `latency` s, [N], holds for all of them.
     """
-    held = [static_force(motor, cart, model) for motor in motors]
+    held = [law(motor, cart) for motor in motors]
     targets = mean_commands(held, latency, period, substeps)
-    if LAG not in model.reads:
+    if LAG not in law.reads:
         return targets, targets[-1]
     means = []
     for target in targets:

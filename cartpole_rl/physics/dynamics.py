@@ -12,8 +12,9 @@ import torch
 from torch import Tensor
 
 from cartpole_rl.physics.actuator import step_forces
-from cartpole_rl.physics.friction import CartFriction, dry_friction, pole_torque, viscous_coefficient
-from cartpole_rl.physics.models import Integrator, Models
+from cartpole_rl.physics.friction import viscous_coefficient
+from cartpole_rl.physics.laws import Law
+from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import GRAVITY, CartParameters
 
 
@@ -119,18 +120,18 @@ def normal_force_ratio(state: State, theta_ddot: Tensor, body: Mechanism, terms:
 
 
 def speed_lost(
-    x_dot: Tensor, x_dot_free: Tensor, yielding: Tensor, cart: CartParameters, model: CartFriction
+    x_dot: Tensor, x_dot_free: Tensor, yielding: Tensor, cart: CartParameters, friction: Law
 ) -> Tensor:
     """Return the speed that dry friction takes from the cart in one step, m/s, [N].
 
     `x_dot_free` m/s is the velocity after the step without dry friction; `yielding`, m/s per N, is the speed
-    that a force takes in the step. Models with a force at rest stop the cart at most and never reverse it:
+    that a force takes in the step. Laws with a force at rest stop the cart at most and never reverse it:
     the sign of (5.6) is not defined at rest, and taken one step late it feeds energy in.
     """
-    if not model.sticks:
-        return yielding * dry_friction(x_dot, cart, model)
+    if not friction.holds_at_rest:
+        return yielding * friction(x_dot, cart)
     toward = torch.copysign(x_dot.abs().clamp(min=torch.finfo(x_dot.dtype).tiny), x_dot_free)
-    limit = yielding * dry_friction(toward, cart, model).abs()
+    limit = yielding * friction(toward, cart).abs()
     return x_dot_free.clamp(-limit, limit)
 
 
@@ -139,12 +140,12 @@ def advance(
 ) -> State:
     """Return the state after `step` s under a constant `force` (N, [N]); `body` is `mechanism(cart)`."""
     terms = coupling(state, cart, body)
-    torque = pole_torque(state.theta_dot, cart, models.pole_friction)
+    torque = models.pole_friction(state.theta_dot, cart)
     driven = force - viscous_coefficient(cart, models.cart_friction) * state.x_dot
     x_ddot, theta_ddot = accelerations(state, driven, torque, body, terms)
     x_dot = state.x_dot + step * x_ddot
     theta_dot = state.theta_dot + step * theta_ddot
-    if models.cart_friction.has_dry_friction:
+    if models.cart_friction.has_formula:
         yielding = step * body.pivot_inertia / terms.determinant
         if models.pole_presses:
             yielding = yielding * normal_force_ratio(state, theta_ddot, body, terms)
@@ -152,9 +153,8 @@ def advance(
         x_dot = x_dot - lost
         # the pole feels the force through the pivot alone, so that its share follows from (3.5)
         theta_dot = theta_dot + lost * body.first_moment * terms.cos / body.pivot_inertia
-    if models.integrator is Integrator.EXPLICIT:
-        return State(state.x + step * state.x_dot, x_dot, state.theta + step * state.theta_dot, theta_dot)
-    return State(state.x + step * x_dot, x_dot, state.theta + step * theta_dot, theta_dot)
+    rate, turning = models.integrator(state.x_dot, x_dot), models.integrator(state.theta_dot, theta_dot)
+    return State(state.x + step * rate, x_dot, state.theta + step * turning, theta_dot)
 
 
 def run_period(

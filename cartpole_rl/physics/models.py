@@ -1,37 +1,61 @@
-"""The physics models to choose from (friction, actuator, integrator) and the parameters that they ignore.
+"""The physics of a run: one law of each kind (friction, actuator, integrator).
 
 Settings import this module: it does without PyTorch.
 """
 
-from enum import StrEnum
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from cartpole_rl.physics.actuator import Actuator
-from cartpole_rl.physics.friction import CartFriction, PoleFriction
+from cartpole_rl.physics.actuator import ACTUATORS
+from cartpole_rl.physics.friction import CART_FRICTIONS, POLE_FRICTIONS
+from cartpole_rl.physics.laws import Law, law_registry
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+# The formula gives the velocity with which a position moves in a step, from those before and after the step.
+INTEGRATORS = law_registry("integrator")
 
 
-class Integrator(StrEnum):
-    """Explicit Euler (3.7) or semi-implicit Euler (3.8)."""
+@INTEGRATORS.register("explicit")
+def explicit(before: "Tensor", after: "Tensor") -> "Tensor":
+    """Explicit Euler (3.7)."""
+    return before
 
-    EXPLICIT = "explicit"
-    SEMI_IMPLICIT = "semi_implicit"
+
+@INTEGRATORS.register("semi_implicit")
+def semi_implicit(before: "Tensor", after: "Tensor") -> "Tensor":
+    """Semi-implicit Euler (3.8)."""
+    return after
 
 
 class Models(NamedTuple):
-    """The models in force; fixed for a run, so that compiled code has no branches left."""
+    """The laws in force; fixed for a run, so that compiled code has no branches left."""
 
-    cart_friction: CartFriction = CartFriction.SIGMOID
-    pole_friction: PoleFriction = PoleFriction.EXPONENTIAL
-    actuator: Actuator = Actuator.FORCE_CURVE
-    integrator: Integrator = Integrator.SEMI_IMPLICIT
+    cart_friction: Law = CART_FRICTIONS.find("sigmoid")
+    pole_friction: Law = POLE_FRICTIONS.find("exponential")
+    actuator: Law = ACTUATORS.find("force_curve")
+    integrator: Law = INTEGRATORS.find("semi_implicit")
     pole_presses: bool = False  # the pole's vertical force changes the cart's normal force
+
+    @classmethod
+    def of(cls, *, pole_presses: bool = False, **names: str) -> "Models":
+        """Return the laws of those names, the defaults for the others. Raises ConfigError."""
+        laws: dict[str, Any] = {kind: REGISTRIES[kind].find(name) for kind, name in names.items()}
+        return cls(pole_presses=pole_presses)._replace(**laws)
+
+
+REGISTRIES = {
+    "cart_friction": CART_FRICTIONS,
+    "pole_friction": POLE_FRICTIONS,
+    "actuator": ACTUATORS,
+    "integrator": INTEGRATORS,
+}
 
 
 def unused_parameters(models: Models) -> set[str]:
-    """Return the parameters that other friction models or actuators read, and none of `models` does.
+    """Return the parameters that other laws of these kinds read, and none of `models` does.
 
     Drawing them changes nothing.
     """
-    chosen = (models.cart_friction, models.pole_friction, models.actuator)
-    known = {name for choice in chosen for other in type(choice) for name in other.reads}
-    return known - {name for choice in chosen for name in choice.reads}
+    known = {name for registry in REGISTRIES.values() for law in registry for name in law.reads}
+    return known.difference(*(getattr(models, kind).reads for kind in REGISTRIES))

@@ -1,55 +1,52 @@
-"""The parameters of a batch of carts, and of the poles they carry.
+"""Parameters of N carts and their poles: the table of `cartpole_rl.rig.parameters`, in numbers.
 
-Every field is a tensor of shape [N], float32 or float64, in SI units; N is the number of carts. One cart is a
+Every parameter is a tensor [N], float32 or float64, in SI units; N is the number of carts. One cart is a
 batch of one. What can be derived (total mass, pivot inertia) is a property, so it cannot go stale.
 """
 
-import dataclasses
-from typing import Self
+from collections.abc import Mapping
+from typing import Any, Self
 
-from tensordict import TensorClass
+import torch
 from torch import Tensor
+
+from cartpole_rl.rig.parameters import PARAMETERS, completed
 
 GRAVITY = 9.81  # m/s^2
 
 
-class CartParameters(TensorClass["frozen", "tensor_only"]):  # type: ignore[name-defined]
-    """N carts: masses, friction, actuator, delays and sensors.
+class CartParameters:
+    """N carts: masses, friction, actuator, delays and sensors, one attribute for each parameter, [N].
 
-    Nominal numbers and their sources are in ``conf/cart/ip02.yaml`` and ``conf/pole/``.
+    Immutable: rows of `table` [P, N], whose memory they share.
     """
 
-    cart_mass: Tensor  # kg, including the motor's rotor
-    pole_mass: Tensor  # kg
-    pole_com: Tensor  # m, pivot to centre of mass; the l of equation (3.5)
-    pole_inertia: Tensor  # kg m^2, about the centre of mass
-    track_half_length: Tensor  # m, middle of the track to the soft limit, where an episode ends
-    track_tilt: Tensor  # rad, positive: the right end is lower
+    table: Tensor
 
-    cart_viscous: Tensor  # N s/m, the mu of (5.7)
-    cart_coulomb: Tensor  # N, mu * F_norm of (5.6) and (5.8) on a resting pole
-    cart_coulomb_asymmetry: Tensor  # 1, Coulomb friction times 1 + this moving right, 1 - this left
-    cart_stiction_ratio: Tensor  # 1, breakaway / Coulomb friction (Stribeck only)
-    stribeck_velocity: Tensor  # m/s, where the excess of static friction has fallen to 1/e
-    sigmoid_slope: Tensor  # s/m, the rho of (5.8)
+    def __init__(self, table: Tensor) -> None:
+        if len(table) > len(PARAMETERS):
+            raise ValueError(f"{len(table)} rows, but only {len(PARAMETERS)} parameters are known")
+        vars(self).update(zip(PARAMETERS, table.unbind(0), strict=False), table=table)
 
-    pole_viscous: Tensor  # N m s/rad; alone it gives the exponential decay of a small swing
-    pole_drag: Tensor  # N m s^2/rad^2, quadratic air drag
-    pole_coulomb: Tensor  # N m, dry friction of the bearing
+    def __getattr__(self, name: str) -> Tensor:
+        raise AttributeError(f"carts have no parameter {name!r}")
 
-    force_quadratic: Tensor  # N per motor value squared
-    force_linear: Tensor  # N per motor value
-    force_offset: Tensor  # N, negative: the force curve is zero for small motor values
-    force_asymmetry: Tensor  # 1, a force to the right is 1 + this times as large
-    deadband_left: Tensor  # motor values up to this give no force to the left
-    deadband_right: Tensor  # motor values up to this give no force to the right
-    motor_time_constant: Tensor  # s, first-order lag of the force
-    latency: Tensor  # s, from a state's measurement until the motor value chosen on it is in force
-    latency_jitter: Tensor  # s, the latency of each period is drawn from latency +- this, never below 0
+    def __setattr__(self, name: str, value: Any) -> None:
+        raise AttributeError(f"{name} cannot be set: carts are immutable")
 
-    angle_offset: Tensor  # rad, measured minus true angle: the error of the encoder's zero
-    position_noise: Tensor  # m, standard deviation before quantization
-    angle_noise: Tensor  # rad, standard deviation before quantization
+    def clone(self) -> Self:
+        """Return the same carts in memory of their own."""
+        return type(self)(self.table.clone())
+
+    @staticmethod
+    def names() -> tuple[str, ...]:
+        """Return the names of the rows of a table."""
+        return tuple(PARAMETERS)
+
+    @classmethod
+    def from_table(cls, table: Tensor) -> Self:
+        """Return the carts of `table`."""
+        return cls(table)
 
     @property
     def total_mass(self) -> Tensor:
@@ -71,12 +68,8 @@ class CartParameters(TensorClass["frozen", "tensor_only"]):  # type: ignore[name
         """Length of the uniform rod with the same centre of mass, 2 l, m, [N]; the thesis's "length"."""
         return 2 * self.pole_com
 
-    @classmethod
-    def names(cls) -> tuple[str, ...]:
-        """Return the fields, in order."""
-        return tuple(field.name for field in dataclasses.fields(cls))
 
-    @classmethod
-    def from_table(cls, table: Tensor) -> Self:
-        """Return N carts from `table` [P, N], one row per field in the order of `names`, sharing memory."""
-        return cls(**dict(zip(cls.names(), table.unbind(0), strict=True)), batch_size=[table.shape[1]])
+def cart_column(values: Mapping[str, float], dtype: torch.dtype = torch.float64) -> Tensor:
+    """Return the table [P, 1] of one cart from its parameters by name."""
+    values = completed(values)
+    return torch.tensor([[float(values[name])] for name in PARAMETERS], dtype=dtype)

@@ -9,10 +9,10 @@ import torch
 
 from cartpole_rl.errors import CheckpointError
 from cartpole_rl.files import replacing
-from cartpole_rl.physics.bounds import check_values
-from cartpole_rl.physics.models import Actuator, CartFriction, Integrator, Models, PoleFriction
+from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.residual import PLACES, Residual
 from cartpole_rl.plants.model_file import REMEDY, find_model
+from cartpole_rl.rig.parameters import check_values
 
 FORMAT = "cartpole_rl learned model 1"
 
@@ -69,7 +69,6 @@ def load_model(source: Path) -> LearnedModel:
 
 
 def _as_model(content: Mapping[str, Any]) -> LearnedModel:
-    models = content["models"]
     check_values(content["parameters"])
     residual = Residual(**content["residual"])
     if bad := [name for name, part in residual._asdict().items() if not part.isfinite().all()]:
@@ -78,13 +77,7 @@ def _as_model(content: Mapping[str, Any]) -> LearnedModel:
         raise ValueError(f"its tables have {residual.places.shape[1]} places, not {PLACES}")
     return LearnedModel(
         content["parameters"],
-        Models(
-            CartFriction(models["cart_friction"]),
-            PoleFriction(models["pole_friction"]),
-            Actuator(models["actuator"]),
-            Integrator(models["integrator"]),
-            bool(models["pole_presses"]),
-        ),
+        Models.of(**content["models"]),
         float(content["period"]),
         int(content["substeps"]),
         residual,

@@ -5,7 +5,8 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from cartpole_rl.physics.models import Integrator
+from cartpole_rl.physics.laws import Law
+from cartpole_rl.physics.models import INTEGRATORS
 from cartpole_rl.plants.serial.settings import Rehome
 from cartpole_rl.settings import Fraction, Settings
 
@@ -14,7 +15,7 @@ class SimulatedSettings(Settings):
     """plant=simulated."""
 
     kind: Literal["simulated"]
-    integrator: Integrator
+    integrator: Annotated[Law, INTEGRATORS]
     substeps: Annotated[int, Field(ge=1, le=200)]
     pole_presses: bool  # the pole's vertical force changes the cart's friction
 
@@ -25,7 +26,7 @@ class LearnedSettings(Settings):
     kind: Literal["learned"]
     model: Path
     prior_share: Fraction
-    integrator: ClassVar = Integrator.SEMI_IMPLICIT
+    integrator: ClassVar = INTEGRATORS.find("semi_implicit")
     substeps: ClassVar = 4
     pole_presses: ClassVar = False
 

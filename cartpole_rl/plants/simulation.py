@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 from cartpole_rl.physics.dynamics import Drive, MakeAddition, State, run_period
-from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import CartParameters
+from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 
 LARGEST_COUNT = 2**30  # STATE's counts are 32-bit numbers
 

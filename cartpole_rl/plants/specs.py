@@ -9,7 +9,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from cartpole_rl.physics.motor import LARGEST_MOTOR
+from cartpole_rl.rig.hardware import LARGEST_MOTOR
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Origin
 from cartpole_rl.wire import Fault

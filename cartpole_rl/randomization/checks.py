@@ -3,9 +3,9 @@
 from collections.abc import Mapping
 
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.physics.bounds import check_names, check_values
 from cartpole_rl.randomization.poles import Pole, PoleSettings
 from cartpole_rl.randomization.ranges import Range
+from cartpole_rl.rig.parameters import check_names, check_values
 
 
 def check_carts(cart: Mapping[str, float], poles: PoleSettings, ranges: Mapping[str, Range]) -> None:

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.physics.bounds import BOUNDS
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.randomization.draws import Draws
 from cartpole_rl.randomization.poles import HEAVIER, Pole, PoleSettings
 from cartpole_rl.randomization.randomizer import Randomizer
 from cartpole_rl.randomization.settings import IdentifiedSettings
+from cartpole_rl.rig.parameters import PARAMETERS
 
 Array = NDArray[np.float64]
 # what NumPy raises for a file that is missing, cut off, changed or another one
@@ -121,7 +121,7 @@ def identified_carts(
     for name, nominal in zip(CartParameters.names(), prior.nominal.tolist(), strict=True):
         values = posterior.get(name, np.array([nominal]))
         values = np.median(values) + settings.widen * (values - np.median(values))
-        rows.append(np.clip(values, BOUNDS[name].low, BOUNDS[name].high))
+        rows.append(np.clip(values, *PARAMETERS[name].bound[:2]))
     table = torch.from_numpy(np.stack(np.broadcast_arrays(*rows))).float()
     return IdentifiedCarts(table, prior, settings.prior_share, float(table[LATENCY].max()), identified)
 

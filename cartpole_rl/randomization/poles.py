@@ -1,13 +1,26 @@
 """The pole of a cart: one, one of several, or a rod of random length. A pole is chosen whole."""
 
+from typing import Any
+
 from pydantic import model_validator
 
-from cartpole_rl.physics.rod import uniform_rod
 from cartpole_rl.settings import NonNegative, Positive, Settings
 
+# From the thesis (6.4). Quanser's poles have half of it, 0.127 kg on 0.3365 m and 0.230 kg on 0.6413 m:
+# 0.7 kg/m is their mass over the distance from pivot to centre of mass.
+POLE_DENSITY = 0.7  # kg/m
 SIMILAR = 0.1  # largest relative difference between two lengths of the same pole
 HEAVIER = 1.2  # times the mass of a pole of the same length: full motor brakes it noticeably later
 JUDGED_LENGTHS = 5  # rods on which an agent of a range of lengths is evaluated
+
+
+def uniform_rod(length: Any) -> dict[str, Any]:
+    """Return mass, centre of mass and inertia of a rod of POLE_DENSITY: its length sets all three.
+
+    `length` m is a float or a tensor, and so are the three.
+    """
+    mass = POLE_DENSITY * length
+    return {"pole_mass": mass, "pole_com": length / 2, "pole_inertia": mass * length**2 / 12}
 
 
 class Pole(Settings):

@@ -10,9 +10,8 @@ import torch
 from torch import Tensor
 
 from cartpole_rl.physics.parameters import CartParameters
-from cartpole_rl.physics.rod import uniform_rod
 from cartpole_rl.randomization.checks import check_carts, possible_poles
-from cartpole_rl.randomization.poles import Pole, PoleSettings
+from cartpole_rl.randomization.poles import Pole, PoleSettings, uniform_rod
 from cartpole_rl.randomization.ranges import Distribution, Range
 
 POLE_FIELDS = tuple(Pole.model_fields)

@@ -9,7 +9,7 @@ from enum import StrEnum
 from pydantic import model_validator
 
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.physics.bounds import BOUNDS
+from cartpole_rl.rig.parameters import PARAMETERS
 from cartpole_rl.settings import Finite, Settings
 
 Bounds = tuple[Finite, Finite]
@@ -64,8 +64,8 @@ class Range(Settings):
                 )
             low, high = sorted((low * nominal, high * nominal))
         for edge in (low, high):
-            if not BOUNDS[name].holds(edge):
-                raise ConfigError(f"randomization of {name} reaches {edge:g}; it must be {BOUNDS[name]}")
+            if not (bound := PARAMETERS[name].bound).holds(edge):
+                raise ConfigError(f"randomization of {name} reaches {edge:g}; it must be {bound}")
         if self.distribution is Distribution.LOG_UNIFORM and not self.limits()[0] > 0:
             raise ConfigError(f"randomization of {name}: log_uniform needs bounds above 0")
 

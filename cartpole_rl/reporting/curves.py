@@ -7,11 +7,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from cartpole_rl.physics.actuator import static_force
-from cartpole_rl.physics.friction import dry_friction, viscous_coefficient
-from cartpole_rl.physics.models import Actuator, CartFriction
-from cartpole_rl.physics.motor import LARGEST_MOTOR
+from cartpole_rl.physics.friction import viscous_coefficient
+from cartpole_rl.physics.laws import Law
 from cartpole_rl.physics.parameters import CartParameters
+from cartpole_rl.rig.hardware import LARGEST_MOTOR
 
 FASTEST = 0.6  # m/s
 MOST_SAMPLES = 500  # carts in a band
@@ -29,7 +28,7 @@ class Curve(NamedTuple):
     prior: Array  # [S]
 
 
-def friction_curve(identified: Parameters, samples: Array, prior: Parameters, model: CartFriction) -> Curve:
+def friction_curve(identified: Parameters, samples: Array, prior: Parameters, law: Law) -> Curve:
     """Return the cart's friction (N) over its velocity (m/s): figures 5.2 and 5.3 of the thesis.
 
     `samples` [P, N] are carts drawn from the posterior, a row each of `CartParameters.names()`.
@@ -38,17 +37,17 @@ def friction_curve(identified: Parameters, samples: Array, prior: Parameters, mo
 
     def friction(cart: CartParameters) -> torch.Tensor:
         moving = velocity[:, None]
-        return dry_friction(moving, cart, model) + viscous_coefficient(cart, model) * moving
+        return law(moving, cart) + viscous_coefficient(cart, law) * moving
 
     return _curve(velocity, friction, identified, samples, prior)
 
 
-def force_curve(identified: Parameters, samples: Array, prior: Parameters, actuator: Actuator) -> Curve:
+def force_curve(identified: Parameters, samples: Array, prior: Parameters, actuator: Law) -> Curve:
     """Return the force (N) over the motor value: figure 5.5 of the thesis; see `friction_curve`."""
     motor = torch.arange(-LARGEST_MOTOR, LARGEST_MOTOR + 1, dtype=torch.float64)
 
     def force(cart: CartParameters) -> torch.Tensor:
-        return static_force(motor[:, None], cart, actuator)
+        return actuator(motor[:, None], cart)
 
     return _curve(motor, force, identified, samples, prior)
 

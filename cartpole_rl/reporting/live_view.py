@@ -6,7 +6,7 @@ Colours are used only with `colour`: green for an upright pole, red for the trac
 import math
 
 from cartpole_rl.evaluation.snapshots import Snapshot
-from cartpole_rl.physics.motor import LARGEST_MOTOR
+from cartpole_rl.rig.hardware import LARGEST_MOTOR
 from cartpole_rl.tasks.rewards import UPRIGHT_ANGLE
 
 LINES = 7

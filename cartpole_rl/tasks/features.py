@@ -8,12 +8,12 @@ from collections.abc import Callable
 from enum import StrEnum
 from typing import TYPE_CHECKING, NamedTuple, Self
 
-from cartpole_rl.physics.encoders import (
+from cartpole_rl.rig.hardware import (
     CART_METRES_PER_COUNT,
+    LARGEST_MOTOR,
     POLE_COUNTS_PER_TURN,
     POLE_RADIANS_PER_COUNT,
 )
-from cartpole_rl.physics.motor import LARGEST_MOTOR
 
 if TYPE_CHECKING:
     from torch import Tensor

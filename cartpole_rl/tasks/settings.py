@@ -5,7 +5,9 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from cartpole_rl.physics.motor import LARGEST_MOTOR
+from cartpole_rl.physics.actuator import ACTUATORS
+from cartpole_rl.physics.laws import Law
+from cartpole_rl.rig.hardware import LARGEST_MOTOR
 from cartpole_rl.settings import Count, Finite, Fraction, NonNegative, Positive, Settings
 from cartpole_rl.tasks.rewards import Reward
 
@@ -19,7 +21,7 @@ class ActionSettings(Settings):
     """Motor values by action index, and the simulated actuator that interprets them."""
 
     motors: tuple[MotorValue, ...]
-    actuator: Literal["newtons", "force_curve"]
+    actuator: Annotated[Law, ACTUATORS]
 
     @model_validator(mode="after")
     def _distinct(self) -> "ActionSettings":

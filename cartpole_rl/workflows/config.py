@@ -29,13 +29,14 @@ from cartpole_rl.learning.settings import (
     OptimizerSettings,
     RayLearnerSettings,
 )
-from cartpole_rl.physics.bounds import check_values
-from cartpole_rl.physics.models import Actuator
+from cartpole_rl.physics.actuator import ACTUATORS
+from cartpole_rl.physics.laws import Law
 from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.plants.settings import EmulatedSettings, LearnedSettings, SimulatedSettings
 from cartpole_rl.randomization.checks import check_one_pole
 from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.randomization.settings import IdentifiedSettings
+from cartpole_rl.rig.parameters import check_values
 from cartpole_rl.settings import Count, Finite, NonNegative, Positive, Seed, Settings
 from cartpole_rl.tasks.settings import ActionSettings, RewardSettings, TaskSettings
 
@@ -274,7 +275,7 @@ class ReplayConfig(SimulatedCartSettings):
     source: Annotated[Path, Field(alias="from")]
     pole: PoleSettings | None = None
     plant: SimulatedSettings
-    actuator: Actuator
+    actuator: Annotated[Law, ACTUATORS]
     parameters: dict[str, Finite] | None
     restart: Annotated[float, Field(ge=0.1, le=60)]
     label: str
@@ -319,7 +320,7 @@ class ModelConfig(RunSettings, CartSettings):
 
     source: Annotated[tuple[Path, ...], Field(alias="from", min_length=1)]
     pole: PoleSettings | None = None
-    actuator: Actuator
+    actuator: Annotated[Law, ACTUATORS]
     windows: Annotated[int, Field(ge=10, le=10_000)]
     ensemble: EnsembleSettings
 

@@ -21,12 +21,13 @@ from cartpole_rl.learning.checkpoints import whole_state
 from cartpole_rl.learning.finetuning import Finetuning, recorded_chunk
 from cartpole_rl.learning.settings import FinetuningSettings, LearningSettings
 from cartpole_rl.learning.training import Scalars, Training
-from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
-from cartpole_rl.physics.models import CartFriction, Models
+from cartpole_rl.physics.friction import CART_FRICTIONS
+from cartpole_rl.physics.models import Models
 from cartpole_rl.plants.recorded import RecordedPlant
 from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.randomization.identified import IdentifiedCarts
+from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 from cartpole_rl.settings import evaluation_seed
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.config import FinetuneConfig, TrainConfig
@@ -70,8 +71,8 @@ class CartLearner:
         self.show = show
         models = training.models(training.plant)
         self.candidates = [models]  # physics models to fit
-        if models.cart_friction is CartFriction.SIGMOID:
-            self.candidates.append(models._replace(cart_friction=CartFriction.STEP))
+        if models.cart_friction == "sigmoid":
+            self.candidates.append(models._replace(cart_friction=CART_FRICTIONS.find("step")))
         self.loop: Finetuning | None = None
         self.carts: torch.Tensor  # [P, SAMPLES], drawn from the newest fit
 
@@ -90,14 +91,14 @@ class CartLearner:
         """Continue from `snapshot`; `recorded` are the episodes that were learned from until then."""
         with whole_state(f"resume={self.config.resume}"):
             self.carts = snapshot["carts"]
-            friction = CartFriction(snapshot["cart_friction"])
+            friction = CART_FRICTIONS.find(snapshot["cart_friction"])
             self.prepare(recorded, self.candidates[0]._replace(cart_friction=friction))
             self.started.restore(snapshot)
 
     def snapshot(self) -> dict[str, Any]:
         """Return the state from which `restore` continues, to be saved at once."""
         (models,) = self.candidates
-        state = {"carts": self.carts, "cart_friction": models.cart_friction.value}
+        state = {"carts": self.carts, "cart_friction": str(models.cart_friction)}
         return {**self.started.snapshot(), **state}
 
     def prepare(self, recorded: Sequence[Episode], models: Models) -> None:

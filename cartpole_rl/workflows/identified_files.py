@@ -12,6 +12,7 @@ from cartpole_rl.identification.quantities import intervals
 from cartpole_rl.identification.unknowns import WEIGHED
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.randomization.poles import Pole
+from cartpole_rl.rig.parameters import PARAMETERS
 from cartpole_rl.run_files import CART, POLE, POSTERIOR, RANDOMIZATION
 
 UNIDENTIFIABLE = {  # randomized about the identified cart, since no experiment shows them
@@ -19,32 +20,6 @@ UNIDENTIFIABLE = {  # randomized about the identified cart, since no experiment 
     "latency_jitter": {"distribution": "uniform", "absolute": [0.0, 0.002]},
 }
 WIDEN = 2.0  # factor on the standard deviations, for carts to train on
-UNITS = {  # those that are not named have none
-    "cart_mass": "kg",
-    "pole_mass": "kg",
-    "pole_com": "m",
-    "pole_inertia": "kg m^2",
-    "track_half_length": "m",
-    "track_tilt": "rad",
-    "cart_viscous": "N s/m",
-    "cart_coulomb": "N",
-    "stribeck_velocity": "m/s",
-    "sigmoid_slope": "s/m",
-    "pole_viscous": "N m s/rad",
-    "pole_drag": "N m s^2/rad^2",
-    "pole_coulomb": "N m",
-    "force_quadratic": "N per motor value squared",
-    "force_linear": "N per motor value",
-    "force_offset": "N",
-    "deadband_left": "motor value",
-    "deadband_right": "motor value",
-    "motor_time_constant": "s",
-    "latency": "s",
-    "latency_jitter": "s",
-    "angle_offset": "rad",
-    "position_noise": "m",
-    "angle_noise": "rad",
-}
 
 
 def write_choices(found: Identification, carts: np.ndarray, folder: Path) -> None:
@@ -56,7 +31,7 @@ def write_choices(found: Identification, carts: np.ndarray, folder: Path) -> Non
     parameters = found.fit.parameters
     pole = Pole(**{name: parameters[name] for name in Pole.model_fields})
     choices = {"choices": {"identified": pole.model_dump()}}
-    units = f"# {', '.join(f'{name} in {UNITS[name]}' for name in Pole.model_fields)}.\n"
+    units = f"# {', '.join(f'{name} in {PARAMETERS[name].unit}' for name in Pole.model_fields)}.\n"
     write_text(folder / POLE, units + yaml.safe_dump(choices, sort_keys=False))
     with replacing(folder / POSTERIOR) as beside, beside.open("wb") as file:  # a path would get ".npz"
         np.savez(
@@ -78,7 +53,7 @@ def write_choices(found: Identification, carts: np.ndarray, folder: Path) -> Non
     write_text(
         folder / RANDOMIZATION,
         f"# Carts drawn from the posterior, correlations included; standard deviations times {WIDEN:g}.\n"
-        f"# Absolute ranges are in {', '.join(f'{UNITS[name]} ({name})' for name in absolute)}.\n"
+        f"# Absolute ranges are in {', '.join(f'{PARAMETERS[name].unit} ({name})' for name in absolute)}.\n"
         + yaml.safe_dump(randomization, sort_keys=False),
     )
 
@@ -95,7 +70,7 @@ def write_cart(found: Identification, carts: np.ndarray, path: Path) -> None:
     for name in CartParameters.names():
         if name not in Pole.model_fields:
             error = f"+- {deviations[name]:.2g}" if name in identified else "prior value"
-            lines.append(f"{name}: {parameters[name]!r}  # {UNITS.get(name, '1')}, {error}")
+            lines.append(f"{name}: {parameters[name]!r}  # {PARAMETERS[name].unit}, {error}")
     write_text(path, "\n".join(lines) + "\n")
 
 

@@ -20,7 +20,7 @@ from cartpole_rl.identification.experiments import EXPERIMENTS, HELD_OUT, conduc
 from cartpole_rl.identification.identify import Identification, identify
 from cartpole_rl.identification.one_step import one_step_estimates
 from cartpole_rl.identification.quantities import intervals
-from cartpole_rl.physics.models import Actuator, CartFriction, Models
+from cartpole_rl.physics.models import Models
 from cartpole_rl.plants.cart_plant import cart_plant
 from cartpole_rl.plants.serial.plant import SerialPlant
 from cartpole_rl.reporting.figures import save
@@ -73,7 +73,7 @@ def identify_cart(config: IdentifyConfig, folder: Path) -> None:
         write_config(folder, "identify", config.model_dump(mode="json", by_alias=True))
     seconds = sum(each.steps for each in fitted.values()) * config.control_period
     print_message("identify", f"fitting {seconds:.0f} s of recordings")
-    models = Models(CartFriction.STEP, config.pole_friction.model, Actuator.FORCE_CURVE)
+    models = Models.of(cart_friction="step", pole_friction=config.pole_friction.model)
     truth = known_truth(config)
     period, substeps = config.control_period, config.substeps
     if config.method == "one_step":

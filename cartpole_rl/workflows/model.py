@@ -16,7 +16,8 @@ from cartpole_rl.identification.held_out import held_out_windows, split
 from cartpole_rl.identification.prediction import CERTAIN, REPORTED, errors_at, predict
 from cartpole_rl.identification.rollout import Dynamics
 from cartpole_rl.identification.windows import Windows, cut_windows, recorded_period
-from cartpole_rl.physics.models import CartFriction, Models
+from cartpole_rl.physics.friction import CART_FRICTIONS
+from cartpole_rl.physics.models import Models
 from cartpole_rl.plants.learned_model import LearnedModel, save_model
 from cartpole_rl.plants.model_file import MODEL
 from cartpole_rl.plants.settings import LearnedSettings
@@ -37,7 +38,7 @@ from cartpole_rl.workflows.results import print_results, shown
 from cartpole_rl.workflows.run_folder import write_config, write_json
 
 FIGURE = f"{FIGURES}/model.png"
-FRICTION_MODELS = (CartFriction.SIGMOID, CartFriction.STEP)  # candidates for the cart
+FRICTION_MODELS = (CART_FRICTIONS.find("sigmoid"), CART_FRICTIONS.find("step"))  # candidates for the cart
 
 
 def learn_model(config: ModelConfig, folder: Path) -> None:

@@ -11,12 +11,12 @@ from cartpole_rl.identification.prediction import errors_at
 from cartpole_rl.identification.replay import all_errors, replay
 from cartpole_rl.identification.rollout import Dynamics
 from cartpole_rl.identification.windows import recorded_period
-from cartpole_rl.physics.bounds import check_names, check_values
 from cartpole_rl.randomization.poles import Pole
 from cartpole_rl.reporting.error_tables import REPORTED_TIMES, replay_table
 from cartpole_rl.reporting.figures import save
 from cartpole_rl.reporting.figures.replays import replay_figure
 from cartpole_rl.reporting.words import count_text
+from cartpole_rl.rig.parameters import check_names, check_values
 from cartpole_rl.run_files import FIGURES
 from cartpole_rl.workflows.config import ReplayConfig
 from cartpole_rl.workflows.nominal import note_other_numbers

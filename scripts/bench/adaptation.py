@@ -46,11 +46,11 @@ from cartpole_rl.envs.hardware import HardwareTransform
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.learning.randomness import seed_everything
 from cartpole_rl.learning.training import Training
-from cartpole_rl.physics.bounds import BOUNDS
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.randomization.ranges import Distribution, Range
 from cartpole_rl.reporting.table import Cell
+from cartpole_rl.rig.parameters import PARAMETERS
 from cartpole_rl.settings import evaluation_seed
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.tasks.settings import StartSettings
@@ -135,7 +135,7 @@ def wider_range(name: str, line: Range, extra: float, nominal: float) -> Range:
     low, high = widened(line.warped(), extra)
     if line.distribution is Distribution.LOG_UNIFORM:
         low, high = math.exp(low), math.exp(high)
-    if not BOUNDS[name].holds(low * (nominal if line.scales_nominal else 1.0)):
+    if not PARAMETERS[name].bound.holds(low * (nominal if line.scales_nominal else 1.0)):
         low = line.limits()[0]
     kind = "factor" if line.scales_nominal else "absolute"
     return Range(distribution=line.distribution, **{kind: (low, high)})

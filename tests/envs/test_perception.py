@@ -9,7 +9,7 @@ import torch
 from cartpole_rl.choices import choice
 from cartpole_rl.envs.perception import Percept, PlantOutput, Previous, perceive, perceive_first, remember
 from cartpole_rl.envs.settings import ObservationSettings
-from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
+from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 from cartpole_rl.tasks.features import ANGULAR_SPEED_SCALE, MOTOR_SCALE, SPEED_SCALE
 from cartpole_rl.tasks.settings import RewardSettings, StartSettings, TaskSettings
 

@@ -16,11 +16,11 @@ from browser import BROWSER, BROWSERS, in_browser
 from cartpole_rl.envs.build import environment
 from cartpole_rl.exporting.agent import ExportedAgent
 from cartpole_rl.exporting.web_page import LONGEST_LATENCY, web_page
-from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.settings import SimulatedSettings
 from cartpole_rl.plants.simulation import Carts, Inputs, commands_under_way, run_carts
 from cartpole_rl.plants.specs import OneCartPlant, OneFrame
+from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 from cartpole_rl.scalar import Scalar
 from cartpole_rl.workflows.agents import TrainedAgent, new_agent
 from cartpole_rl.workflows.config import TrainConfig

@@ -15,7 +15,8 @@ from cartpole_rl.identification.prediction import errors_at, predict
 from cartpole_rl.identification.rollout import Dynamics
 from cartpole_rl.identification.settings import EnsembleSettings
 from cartpole_rl.identification.windows import Windows, cut_windows
-from cartpole_rl.physics.models import CartFriction, Models
+from cartpole_rl.physics.friction import CART_FRICTIONS
+from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.residual import PLACES, SPACING, UNITS, Residual
 from cartpole_rl.plants.learned import LearnedPlant
 from cartpole_rl.plants.learned_model import LearnedModel
@@ -27,7 +28,7 @@ from cartpole_rl.tasks.settings import Start, StartSettings
 
 PERIOD = 0.02
 MOTORS = (-250, -150, 0, 150, 250)
-STEP = Models(cart_friction=CartFriction.STEP)
+STEP = Models(cart_friction=CART_FRICTIONS.find("step"))
 START = StartSettings(
     angle=Start.HANGING, position_spread=0.2, angle_spread=0.5, speed_spread=0, angular_speed_spread=0
 )

@@ -30,18 +30,19 @@ from cartpole_rl.identification.guard import TRACK_END, experiment_guard, guarde
 from cartpole_rl.identification.held_out import part
 from cartpole_rl.identification.identify import Identification, identify
 from cartpole_rl.identification.quantities import quantities
-from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_COUNTS_PER_TURN
-from cartpole_rl.physics.models import CartFriction, Models, PoleFriction
+from cartpole_rl.physics.friction import CART_FRICTIONS, POLE_FRICTIONS
+from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.emulated import emulated_plant
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.plants.specs import OneFrame
 from cartpole_rl.randomization.poles import PoleSettings
+from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_COUNTS_PER_TURN
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.tasks.settings import Start, StartSettings
 
 PERIOD = 0.02
-MODELS = Models(CartFriction.STEP, PoleFriction.BEARING)
+MODELS = Models(CART_FRICTIONS.find("step"), POLE_FRICTIONS.find("bearing"))
 TRUTH = {
     "cart_viscous": 0.8,
     "cart_coulomb": 0.4,
@@ -229,8 +230,8 @@ def test_the_cart_is_found(found: Identification, nominal: dict[str, float]) -> 
 
 def test_the_true_friction_model_predicts_best(found: Identification) -> None:
     errors = {each.cart_friction: each.error.size for each in found.candidates}
-    assert found.models.cart_friction in (CartFriction.STEP, CartFriction.STRIBECK)
-    assert errors[CartFriction.LINEAR] > 3 * errors[CartFriction.STEP]
+    assert found.models.cart_friction in (CART_FRICTIONS.find("step"), CART_FRICTIONS.find("stribeck"))
+    assert errors[CART_FRICTIONS.find("linear")] > 3 * errors[CART_FRICTIONS.find("step")]
     assert found.error.x < 1e-3
     assert found.error.theta < np.radians(0.5)
 

@@ -16,7 +16,8 @@ from cartpole_rl.identification.prediction import predict
 from cartpole_rl.identification.rollout import Dynamics, rollout
 from cartpole_rl.identification.unknowns import limits, parameters_at, unknowns_of
 from cartpole_rl.identification.windows import WINDOW, cut_windows, history_periods
-from cartpole_rl.physics.models import CartFriction, Models
+from cartpole_rl.physics.friction import CART_FRICTIONS
+from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.randomization.poles import PoleSettings
@@ -24,7 +25,7 @@ from cartpole_rl.tasks.episode import Episode
 
 PERIOD = 0.02
 MOTORS = (-250, -150, 0, 150, 250)
-STEP = Models(cart_friction=CartFriction.STEP)
+STEP = Models(cart_friction=CART_FRICTIONS.find("step"))
 TRUTH = {
     "cart_viscous": 1.2,
     "cart_coulomb": 0.35,

@@ -17,7 +17,7 @@ from cartpole_rl.identification.matching import (
     huber,
     scaled_residuals,
 )
-from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
+from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 
 PERIOD = 0.02
 TIME = PERIOD * torch.arange(26, dtype=torch.float64).reshape(-1, 1, 1)

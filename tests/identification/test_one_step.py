@@ -12,11 +12,12 @@ from cartpole_rl.identification.one_step import (
     predicted,
     regression,
 )
-from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
-from cartpole_rl.physics.models import CartFriction, Models
+from cartpole_rl.physics.friction import CART_FRICTIONS
+from cartpole_rl.physics.models import Models
+from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 
 PERIOD = 0.02
-MODELS = Models(cart_friction=CartFriction.STEP)
+MODELS = Models(cart_friction=CART_FRICTIONS.find("step"))
 NOMINAL = choice("cart/ip02") | choice("pole/medium")["choices"]["medium"]
 TRUTH = {
     **NOMINAL,

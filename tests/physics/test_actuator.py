@@ -9,9 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from cartpole_rl.physics.actuator import lagged_force, mean_commands, static_force
+from cartpole_rl.physics.actuator import ACTUATORS, lagged_force, mean_commands
 from cartpole_rl.physics.dynamics import Drive, State, advance, mechanism, run_period
-from cartpole_rl.physics.models import Actuator, CartFriction, Models, PoleFriction
+from cartpole_rl.physics.friction import CART_FRICTIONS, POLE_FRICTIONS
+from cartpole_rl.physics.laws import Law
+from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import CartParameters
 
 MakeCart = Callable[..., CartParameters]
@@ -24,43 +26,41 @@ def at(*values: float) -> Tensor:
 
 
 class TestForceCurve:
-    @pytest.mark.parametrize("model", Actuator)
-    def test_thesis_levels(self, make_cart: MakeCart, model: Actuator) -> None:
-        torch.testing.assert_close(static_force(LEVELS, make_cart(9), model), NEWTONS)
+    @pytest.mark.parametrize("model", ACTUATORS)
+    def test_thesis_levels(self, make_cart: MakeCart, model: Law) -> None:
+        torch.testing.assert_close(model(LEVELS, make_cart(9)), NEWTONS)
 
-    @pytest.mark.parametrize("model", Actuator)
-    def test_is_exact_in_single_precision(self, make_cart: MakeCart, model: Actuator) -> None:
+    @pytest.mark.parametrize("model", ACTUATORS)
+    def test_is_exact_in_single_precision(self, make_cart: MakeCart, model: Law) -> None:
         cart = CartParameters.from_table(
             torch.stack([getattr(make_cart(9), name) for name in CartParameters.names()]).float()
         )
-        torch.testing.assert_close(
-            static_force(LEVELS.float(), cart, model), NEWTONS.float(), rtol=0, atol=1e-6
-        )
+        torch.testing.assert_close(model(LEVELS.float(), cart), NEWTONS.float(), rtol=0, atol=1e-6)
 
-    @pytest.mark.parametrize("model", Actuator)
-    def test_small_values_do_not_move_the_cart(self, make_cart: MakeCart, model: Actuator) -> None:
-        assert (static_force(at(-50, -30, 0, 30, 50), make_cart(5), model) == 0).all()
+    @pytest.mark.parametrize("model", ACTUATORS)
+    def test_small_values_do_not_move_the_cart(self, make_cart: MakeCart, model: Law) -> None:
+        assert (model(at(-50, -30, 0, 30, 50), make_cart(5)) == 0).all()
 
     def test_is_the_quadratic_fit(self, make_cart: MakeCart) -> None:
         cart = make_cart(2, force_quadratic=1e-5, force_linear=0.01, force_offset=-0.3)
-        force = static_force(at(120, -240), cart, Actuator.FORCE_CURVE)
+        force = ACTUATORS.find("force_curve")(at(120, -240), cart)
         torch.testing.assert_close(force, at(1e-5 * 120**2 + 1.2 - 0.3, -(1e-5 * 240**2 + 2.4 - 0.3)))
 
     def test_dead_bands_are_of_each_side(self, make_cart: MakeCart) -> None:
         cart = make_cart(4, deadband_left=120.0, deadband_right=80.0)
-        force = static_force(at(-120, -121, 80, 81), cart, Actuator.FORCE_CURVE)
+        force = ACTUATORS.find("force_curve")(at(-120, -121, 80, 81), cart)
         torch.testing.assert_close(force, at(0, -1.42, 0, 0.62))
 
     def test_asymmetry_is_of_the_right_side(self, make_cart: MakeCart) -> None:
-        force = static_force(at(-200, 200), make_cart(2, force_asymmetry=0.1), Actuator.FORCE_CURVE)
+        force = ACTUATORS.find("force_curve")(at(-200, 200), make_cart(2, force_asymmetry=0.1))
         torch.testing.assert_close(force, at(-3.0, 3.3))
 
     def test_no_motor_value_no_force(self, make_cart: MakeCart) -> None:
-        assert static_force(at(0), make_cart(1, force_offset=1.0), Actuator.FORCE_CURVE).item() == 0
+        assert ACTUATORS.find("force_curve")(at(0), make_cart(1, force_offset=1.0)).item() == 0
 
     def test_newtons_ignore_the_parameters_of_the_cart(self, make_cart: MakeCart) -> None:
         cart = make_cart(9, force_linear=0.5, force_asymmetry=0.3, deadband_left=200.0)
-        torch.testing.assert_close(static_force(LEVELS, cart, Actuator.NEWTONS), NEWTONS)
+        torch.testing.assert_close(ACTUATORS.find("newtons")(LEVELS, cart), NEWTONS)
 
 
 class TestLag:
@@ -124,16 +124,14 @@ class TestLatency:
     ) -> None:
         torch.testing.assert_close(shares(latency, 3, 0.02, 2), torch.tensor(expected, dtype=torch.float64))
 
-    @pytest.mark.parametrize("actuator", Actuator)
+    @pytest.mark.parametrize("actuator", ACTUATORS)
     @pytest.mark.parametrize("periods", [0.0, 0.5, 1.0, 1.7])
-    def test_latency_equals_later_commands(
-        self, make_cart: MakeCart, periods: float, actuator: Actuator
-    ) -> None:
+    def test_latency_equals_later_commands(self, make_cart: MakeCart, periods: float, actuator: Law) -> None:
         period, substeps, count = 0.02, 10, 40
         step, cart = period / substeps, make_cart()
         generator = torch.Generator().manual_seed(0)
         commands = 50.0 * torch.randint(-5, 6, (count, 1), generator=generator).to(torch.float64)
-        models = Models(CartFriction.STRIBECK, PoleFriction.EXPONENTIAL, actuator)
+        models = Models(CART_FRICTIONS.find("stribeck"), POLE_FRICTIONS.find("exponential"), actuator)
         start = State(at(0), at(0), at(math.pi), at(0))
 
         delayed, drive = start, Drive(at(0), torch.zeros(3, 1, dtype=torch.float64))
@@ -144,6 +142,6 @@ class TestLatency:
         plain, body, late = start, mechanism(cart), round(periods * substeps)
         for index in range(count * substeps):
             given = commands[(index - late) // substeps] if index >= late else torch.zeros(1)
-            plain = advance(plain, static_force(given, cart, actuator), cart, body, models, step)
+            plain = advance(plain, actuator(given, cart), cart, body, models, step)
 
         torch.testing.assert_close(torch.stack(delayed), torch.stack(plain), rtol=0, atol=1e-9)

@@ -14,6 +14,7 @@ from mujoco_reference import MujocoCart
 from torch import Tensor
 
 from cartpole_rl.physics import dynamics
+from cartpole_rl.physics.actuator import ACTUATORS
 from cartpole_rl.physics.dynamics import (
     Drive,
     State,
@@ -24,11 +25,12 @@ from cartpole_rl.physics.dynamics import (
     normal_force_ratio,
     run_period,
 )
-from cartpole_rl.physics.models import Actuator, CartFriction, Integrator, Models, PoleFriction
+from cartpole_rl.physics.friction import CART_FRICTIONS, POLE_FRICTIONS
+from cartpole_rl.physics.models import INTEGRATORS, Models
 from cartpole_rl.physics.parameters import GRAVITY, CartParameters
 
 MakeCart = Callable[..., CartParameters]
-FRICTIONLESS = Models(CartFriction.NONE, PoleFriction.NONE, Actuator.NEWTONS)
+FRICTIONLESS = Models(CART_FRICTIONS.find("none"), POLE_FRICTIONS.find("none"), ACTUATORS.find("newtons"))
 
 
 def draw(count: int, *spread: float, seed: int = 0) -> tuple[Tensor, ...]:
@@ -69,7 +71,7 @@ def test_one_explicit_step_is_gymnasiums(make_cart: MakeCart, monkeypatch: pytes
         pole_com=half_length,
         pole_inertia=reference.masspole * (2 * half_length) ** 2 / 12,
     )
-    models = FRICTIONLESS._replace(integrator=Integrator.EXPLICIT)
+    models = FRICTIONLESS._replace(integrator=INTEGRATORS.find("explicit"))
 
     ours = advance(State(*starts.unbind(1)), pushes, cart, mechanism(cart), models, reference.tau)
 
@@ -181,7 +183,9 @@ def test_a_batch_equals_its_carts_simulated_alone(make_cart: MakeCart) -> None:
     motors = torch.stack([draw(count, 250.0, seed=3)[0], draw(count, 250.0, seed=4)[0]])
     latency = draw(count, 0.02, seed=5)[0].abs()
     drive = Drive(torch.zeros(count, dtype=torch.float64), motors)
-    models = Models(CartFriction.STRIBECK, PoleFriction.EXPONENTIAL_DRAG, pole_presses=True)
+    models = Models(
+        CART_FRICTIONS.find("stribeck"), POLE_FRICTIONS.find("exponential_drag"), pole_presses=True
+    )
 
     together, drive_together = run_period(start, drive, latency, make_cart(count, **changes), models, 0.02, 4)
 

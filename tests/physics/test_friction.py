@@ -7,14 +7,21 @@ import pytest
 import torch
 from torch import Tensor
 
+from cartpole_rl.physics.actuator import ACTUATORS
 from cartpole_rl.physics.dynamics import State, advance, mechanism, speed_lost
-from cartpole_rl.physics.friction import coulomb_force, dry_friction, pole_torque, viscous_coefficient
-from cartpole_rl.physics.models import Actuator, CartFriction, Models, PoleFriction
+from cartpole_rl.physics.friction import (
+    CART_FRICTIONS,
+    POLE_FRICTIONS,
+    coulomb_force,
+    viscous_coefficient,
+)
+from cartpole_rl.physics.laws import Law
+from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import GRAVITY, CartParameters
 
 MakeCart = Callable[..., CartParameters]
-STICKING = [model for model in CartFriction if model.sticks]
-DRY = [model for model in CartFriction if model.has_dry_friction]
+STICKING = [model for model in CART_FRICTIONS if model.holds_at_rest]
+DRY = [model for model in CART_FRICTIONS if model.has_formula]
 NO_POLE = {"pole_mass": 1e-9, "pole_com": 1e-3, "pole_inertia": 1e-15}
 
 
@@ -29,13 +36,13 @@ def still(x_dot: float = 0.0, theta: float = math.pi) -> State:
 def push(
     state: State,
     cart: CartParameters,
-    model: CartFriction,
+    model: Law,
     force: float = 0.0,
     seconds: float = 1.0,
     step: float = 0.01,
 ) -> list[State]:
     """The states that follow under a constant force on the cart."""
-    models = Models(model, PoleFriction.NONE, Actuator.NEWTONS)
+    models = Models(model, POLE_FRICTIONS.find("none"), ACTUATORS.find("newtons"))
     body, states = mechanism(cart), [state]
     for _ in range(round(seconds / step)):
         states.append(advance(states[-1], at(force), cart, body, models, step))
@@ -43,8 +50,8 @@ def push(
 
 
 def test_which_models_stick_and_which_are_dry() -> None:
-    assert STICKING == [CartFriction.STEP, CartFriction.STRIBECK]
-    assert DRY == [CartFriction.STEP, CartFriction.SIGMOID, CartFriction.STRIBECK]
+    assert STICKING == ["step", "stribeck"]
+    assert DRY == ["sigmoid", "step", "stribeck"]
 
 
 class TestPower:
@@ -52,24 +59,24 @@ class TestPower:
 
     speeds = torch.cat((torch.linspace(-3, 3, 601, dtype=torch.float64), at(1e-6, -1e-6, 1e-300, -1e-300)))
 
-    @pytest.mark.parametrize("model", CartFriction)
-    def test_of_the_cart(self, make_cart: MakeCart, model: CartFriction) -> None:
+    @pytest.mark.parametrize("model", CART_FRICTIONS)
+    def test_of_the_cart(self, make_cart: MakeCart, model: Law) -> None:
         cart = make_cart(len(self.speeds), cart_coulomb_asymmetry=0.5)
-        force = dry_friction(self.speeds, cart, model) + viscous_coefficient(cart, model) * self.speeds
+        force = model(self.speeds, cart) + viscous_coefficient(cart, model) * self.speeds
         power = -force * self.speeds
         assert (power <= 0).all()
         moving = self.speeds.abs() > 1e-9
-        assert (power[moving] < 0).all() == (model is not CartFriction.NONE)
+        assert (power[moving] < 0).all() == (model is not CART_FRICTIONS.find("none"))
 
-    @pytest.mark.parametrize("model", PoleFriction)
-    def test_of_the_pole(self, make_cart: MakeCart, model: PoleFriction) -> None:
+    @pytest.mark.parametrize("model", POLE_FRICTIONS)
+    def test_of_the_pole(self, make_cart: MakeCart, model: Law) -> None:
         cart = make_cart(len(self.speeds))
-        power = pole_torque(self.speeds, cart, model) * self.speeds
+        power = model(self.speeds, cart) * self.speeds
         assert (power <= 0).all()
-        assert (power[self.speeds.abs() > 1e-9] < 0).all() == (model is not PoleFriction.NONE)
+        assert (power[self.speeds.abs() > 1e-9] < 0).all() == (model is not POLE_FRICTIONS.find("none"))
 
     @pytest.mark.parametrize("model", DRY)
-    def test_of_a_step(self, make_cart: MakeCart, model: CartFriction) -> None:
+    def test_of_a_step(self, make_cart: MakeCart, model: Law) -> None:
         cart = make_cart(len(self.speeds))
         lost = speed_lost(self.speeds, self.speeds, at(0.02), cart, model)
         assert (lost * self.speeds >= 0).all()
@@ -80,22 +87,22 @@ class TestFormulas:
 
     def test_linear_is_5_7(self, make_cart: MakeCart) -> None:
         cart = make_cart(1, cart_viscous=1.75)
-        assert viscous_coefficient(cart, CartFriction.LINEAR).item() == 1.75
-        assert dry_friction(at(0.3), cart, CartFriction.LINEAR).item() == 0
-        assert viscous_coefficient(cart, CartFriction.NONE).item() == 0
+        assert viscous_coefficient(cart, CART_FRICTIONS.find("linear")).item() == 1.75
+        assert CART_FRICTIONS.find("linear")(at(0.3), cart).item() == 0
+        assert viscous_coefficient(cart, CART_FRICTIONS.find("none")).item() == 0
 
     def test_step_is_5_6(self, make_cart: MakeCart) -> None:
-        force = dry_friction(self.speeds, make_cart(11, cart_coulomb=0.4), CartFriction.STEP)
+        force = CART_FRICTIONS.find("step")(self.speeds, make_cart(11, cart_coulomb=0.4))
         torch.testing.assert_close(force, 0.4 * torch.sign(self.speeds))
 
     def test_sigmoid_is_5_8(self, make_cart: MakeCart) -> None:
         cart = make_cart(11, cart_coulomb=0.4, sigmoid_slope=100.0)
         expected = 0.4 * (2 / (1 + torch.exp(-100 * self.speeds)) - 1)
-        torch.testing.assert_close(dry_friction(self.speeds, cart, CartFriction.SIGMOID), expected)
+        torch.testing.assert_close(CART_FRICTIONS.find("sigmoid")(self.speeds, cart), expected)
 
     def test_stribeck_falls_from_breakaway_to_coulomb(self, make_cart: MakeCart) -> None:
         cart = make_cart(3, cart_coulomb=0.4, cart_stiction_ratio=1.5, stribeck_velocity=0.01)
-        force = dry_friction(at(1e-12, 0.01, 1.0), cart, CartFriction.STRIBECK)
+        force = CART_FRICTIONS.find("stribeck")(at(1e-12, 0.01, 1.0), cart)
         torch.testing.assert_close(force, at(0.6, 0.4 * (1 + 0.5 / math.e), 0.4))
 
     def test_asymmetry_is_more_to_the_right_and_less_to_the_left(self, make_cart: MakeCart) -> None:
@@ -104,12 +111,12 @@ class TestFormulas:
 
     def test_drag_grows_with_the_square(self, make_cart: MakeCart) -> None:
         cart = make_cart(2, pole_viscous=0.0, pole_drag=1e-3)
-        torque = pole_torque(at(2.0, -4.0), cart, PoleFriction.EXPONENTIAL_DRAG)
+        torque = POLE_FRICTIONS.find("exponential_drag")(at(2.0, -4.0), cart)
         torch.testing.assert_close(torque, at(-4e-3, 16e-3))
 
     def test_bearing_friction_is_constant_except_at_low_speed(self, make_cart: MakeCart) -> None:
         cart = make_cart(3, pole_viscous=0.0, pole_drag=0.0, pole_coulomb=1e-3)
-        torque = pole_torque(at(0.0, 0.5, -4.0), cart, PoleFriction.BEARING)
+        torque = POLE_FRICTIONS.find("bearing")(at(0.0, 0.5, -4.0), cart)
         torch.testing.assert_close(torque, at(0.0, -1e-3, 1e-3))
 
 
@@ -117,7 +124,7 @@ class TestCart:
     @pytest.mark.parametrize("step", [0.02, 0.01, 0.002])
     @pytest.mark.parametrize("model", STICKING)
     def test_coasts_to_rest_and_stays_there_exactly(
-        self, make_cart: MakeCart, model: CartFriction, step: float
+        self, make_cart: MakeCart, model: Law, step: float
     ) -> None:
         cart = make_cart(1, **NO_POLE)
         speeds = torch.cat([state.x_dot for state in push(still(0.5), cart, model, step=step)])
@@ -127,19 +134,21 @@ class TestCart:
 
     def test_step_friction_brakes_at_mu_over_m(self, make_cart: MakeCart) -> None:
         cart = make_cart(1, cart_mass=0.5, cart_coulomb=0.4, cart_viscous=0.0, **NO_POLE)
-        middle = push(still(1.0), cart, CartFriction.STEP, seconds=0.5)[-1]
+        middle = push(still(1.0), cart, CART_FRICTIONS.find("step"), seconds=0.5)[-1]
         assert middle.x_dot.item() == pytest.approx(1.0 - 0.8 * 0.5)
 
     def test_viscous_friction_brakes_exponentially(self, make_cart: MakeCart) -> None:
         cart = make_cart(1, cart_mass=0.5, cart_viscous=1.0, **NO_POLE)
-        end = push(still(1.0), cart, CartFriction.LINEAR, step=1e-3)[-1]
+        end = push(still(1.0), cart, CART_FRICTIONS.find("linear"), step=1e-3)[-1]
         assert end.x_dot.item() == pytest.approx(math.exp(-2.0), rel=3e-3)
 
-    @pytest.mark.parametrize(("model", "breakaway"), [(CartFriction.STEP, 0.5), (CartFriction.STRIBECK, 0.6)])
+    @pytest.mark.parametrize(
+        ("model", "breakaway"), [(CART_FRICTIONS.find("step"), 0.5), (CART_FRICTIONS.find("stribeck"), 0.6)]
+    )
     @pytest.mark.parametrize("step", [0.02, 0.01, 0.002])
     @pytest.mark.parametrize("side", [1, -1])
     def test_moves_only_above_the_breakaway_force(
-        self, make_cart: MakeCart, model: CartFriction, breakaway: float, step: float, side: int
+        self, make_cart: MakeCart, model: Law, breakaway: float, step: float, side: int
     ) -> None:
         cart = make_cart(1, cart_coulomb=0.5, cart_stiction_ratio=1.2)
         for state in push(still(), cart, model, side * 0.99 * breakaway, step=step):
@@ -150,12 +159,12 @@ class TestCart:
     def test_breaks_away_with_a_jump_under_stribeck(self, make_cart: MakeCart) -> None:
         """Once it moves, 0.55 N is more than enough; at rest it is not."""
         cart = make_cart(1, cart_coulomb=0.5, cart_stiction_ratio=1.2, cart_viscous=0.0, **NO_POLE)
-        assert push(still(), cart, CartFriction.STRIBECK, 0.55)[-1].x_dot.item() == 0
-        assert push(still(0.05), cart, CartFriction.STRIBECK, 0.55)[-1].x_dot.item() > 0.05
+        assert push(still(), cart, CART_FRICTIONS.find("stribeck"), 0.55)[-1].x_dot.item() == 0
+        assert push(still(0.05), cart, CART_FRICTIONS.find("stribeck"), 0.55)[-1].x_dot.item() > 0.05
 
     def test_a_stuck_cart_lets_its_pole_swing_as_on_a_wall(self, make_cart: MakeCart) -> None:
         cart = make_cart(1, cart_coulomb=50.0)
-        states = push(still(theta=math.pi + 0.02), cart, CartFriction.STEP, seconds=5, step=2e-3)
+        states = push(still(theta=math.pi + 0.02), cart, CART_FRICTIONS.find("step"), seconds=5, step=2e-3)
         assert all(state.x.item() == 0 for state in states)
         angle = torch.cat([state.theta for state in states]) - math.pi
         crossings = ((angle[:-1] > 0) & (angle[1:] <= 0)).nonzero().flatten().to(torch.float64) * 2e-3
@@ -171,7 +180,9 @@ class TestCart:
 def test_a_small_swing_decays_exponentially(make_cart: MakeCart) -> None:
     """On a cart that does not move: amplitude exp(-b t / (2 J))."""
     cart = make_cart(1, cart_mass=1e9, pole_viscous=1e-3)
-    models = Models(CartFriction.NONE, PoleFriction.EXPONENTIAL, Actuator.NEWTONS)
+    models = Models(
+        CART_FRICTIONS.find("none"), POLE_FRICTIONS.find("exponential"), ACTUATORS.find("newtons")
+    )
     body, state, angles = mechanism(cart), still(theta=math.pi + 0.05), []
     for _ in range(9500):
         state = advance(state, at(0.0), cart, body, models, 1e-3)
@@ -189,8 +200,8 @@ def test_drag_shows_at_large_swings_and_bearing_friction_at_small_ones(make_cart
     small, large = at(0.1), at(10.0)
 
     def share_of_drag(speed: Tensor) -> float:
-        models = (PoleFriction.EXPONENTIAL, PoleFriction.EXPONENTIAL_DRAG)
-        viscous, both = (pole_torque(speed, cart, model) for model in models)
+        models = (POLE_FRICTIONS.find("exponential"), POLE_FRICTIONS.find("exponential_drag"))
+        viscous, both = (model(speed, cart) for model in models)
         return 1 - (viscous / both).item()
 
     assert share_of_drag(small) < 0.02
@@ -202,6 +213,11 @@ def test_a_pole_that_swings_through_the_bottom_presses_the_cart_onto_the_track(m
     swinging = State(at(0.0), at(0.5), at(math.pi), at(10.0))
     slowed = {}
     for presses in (False, True):
-        models = Models(CartFriction.STEP, PoleFriction.NONE, Actuator.NEWTONS, pole_presses=presses)
+        models = Models(
+            CART_FRICTIONS.find("step"),
+            POLE_FRICTIONS.find("none"),
+            ACTUATORS.find("newtons"),
+            pole_presses=presses,
+        )
         slowed[presses] = advance(swinging, at(0.0), cart, mechanism(cart), models, 0.01).x_dot.item()
     assert slowed[True] < slowed[False]

@@ -1,16 +1,14 @@
 """The parameters of a batch of carts: names, bounds, derived quantities."""
 
 from collections.abc import Callable
-from dataclasses import FrozenInstanceError
 
 import pytest
 import torch
 
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.physics.bounds import BOUNDS, check_names, check_values
 from cartpole_rl.physics.parameters import CartParameters
-from cartpole_rl.physics.rod import POLE_DENSITY, uniform_rod
-from cartpole_rl.randomization.poles import PoleSettings
+from cartpole_rl.randomization.poles import POLE_DENSITY, PoleSettings, uniform_rod
+from cartpole_rl.rig.parameters import PARAMETERS, check_names, check_values
 
 MakeCart = Callable[..., CartParameters]
 
@@ -21,7 +19,7 @@ def nominal(ip02: dict[str, float], medium: PoleSettings) -> dict[str, float]:
 
 
 def test_every_parameter_has_bounds_and_a_nominal_value(nominal: dict[str, float]) -> None:
-    assert set(CartParameters.names()) == set(BOUNDS) == set(nominal)
+    assert set(CartParameters.names()) == set(PARAMETERS) == set(nominal)
     check_values(nominal)
 
 
@@ -34,11 +32,11 @@ def test_derived_quantities(make_cart: MakeCart) -> None:
 
 
 def test_fields_share_the_tables_memory_and_cannot_be_set() -> None:
-    table = torch.rand(len(BOUNDS), 3)
+    table = torch.rand(len(PARAMETERS), 3)
     cart = CartParameters.from_table(table)
     table[CartParameters.names().index("latency"), 1] = 7.0
     assert cart.latency[1] == 7.0
-    with pytest.raises(FrozenInstanceError):
+    with pytest.raises(AttributeError):
         cart.latency = torch.zeros(3)
 
 

@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from cartpole_rl.physics.dynamics import Drive, State, run_period
-from cartpole_rl.physics.models import CartFriction, Models
+from cartpole_rl.physics.friction import CART_FRICTIONS
+from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.physics.residual import (
     PLACES,
@@ -19,7 +20,7 @@ from cartpole_rl.physics.residual import (
 )
 
 MakeCart = Callable[..., CartParameters]
-STEP = Models(cart_friction=CartFriction.STEP)
+STEP = Models(cart_friction=CART_FRICTIONS.find("step"))
 SETTINGS = (STEP, 0.02, 4)
 
 

@@ -6,7 +6,10 @@ import pytest
 import torch
 
 from cartpole_rl.choices import choice, conf_folder
-from cartpole_rl.physics.models import Actuator, CartFriction, Models, PoleFriction, unused_parameters
+from cartpole_rl.physics.actuator import ACTUATORS
+from cartpole_rl.physics.friction import CART_FRICTIONS, POLE_FRICTIONS
+from cartpole_rl.physics.laws import Law
+from cartpole_rl.physics.models import Models, unused_parameters
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.effects import without_effect
 from cartpole_rl.randomization.identified import IdentifiedCarts
@@ -17,10 +20,10 @@ from cartpole_rl.randomization.ranges import Range
 ACTIONS = sorted(path.stem for path in (conf_folder() / "actions").glob("*.yaml"))
 RANDOMIZATIONS = sorted(path.stem for path in (conf_folder() / "randomization").glob("*.yaml"))
 READ_BY = {  # where the default models do not
-    "cart_stiction_ratio": Models(CartFriction.STRIBECK),
-    "stribeck_velocity": Models(CartFriction.STRIBECK),
-    "pole_drag": Models(pole_friction=PoleFriction.BEARING),
-    "pole_coulomb": Models(pole_friction=PoleFriction.BEARING),
+    "cart_stiction_ratio": Models(CART_FRICTIONS.find("stribeck")),
+    "stribeck_velocity": Models(CART_FRICTIONS.find("stribeck")),
+    "pole_drag": Models(pole_friction=POLE_FRICTIONS.find("bearing")),
+    "pole_coulomb": Models(pole_friction=POLE_FRICTIONS.find("bearing")),
 }
 NARROW = {  # a per cent where nominal is not 0, and about as little where it is
     "track_tilt": (0.0, 1e-4),
@@ -51,7 +54,7 @@ def idle(
 ) -> set[str]:
     """Ranges without effect for an action set of conf/."""
     chosen: dict[str, Any] = choice(f"actions/{actions}")
-    models = models._replace(actuator=Actuator(chosen["actuator"]))
+    models = models._replace(actuator=ACTUATORS.find(chosen["actuator"]))
     return set(without_effect(Randomizer(ip02, poles, ranges), ranges, chosen["motors"], models, 0.02))
 
 
@@ -68,10 +71,12 @@ def test_every_shipped_range_has_an_effect(
         assert found == (left_out if actions == "nine_newtons" else set())
 
 
-@pytest.mark.parametrize("model", [CartFriction.STEP, CartFriction.SIGMOID, CartFriction.STRIBECK])
+@pytest.mark.parametrize(
+    "model", [CART_FRICTIONS.find("step"), CART_FRICTIONS.find("sigmoid"), CART_FRICTIONS.find("stribeck")]
+)
 @pytest.mark.parametrize("randomization", [name for name in RANDOMIZATIONS if name.startswith("friction")])
 def test_the_thesis_perturbs_friction_that_is_read(
-    ip02: dict[str, float], medium: PoleSettings, randomization: str, model: CartFriction
+    ip02: dict[str, float], medium: PoleSettings, randomization: str, model: Law
 ) -> None:
     assert idle(ip02, ranges_of(randomization), medium, models=Models(model)) == set()
 
@@ -94,19 +99,21 @@ def test_one_side_may_have_none(ip02: dict[str, float], medium: PoleSettings) ->
     assert idle(ip02, ranges, medium) == {"deadband_right"}
 
 
-@pytest.mark.parametrize("cart_friction", CartFriction)
-@pytest.mark.parametrize("pole_friction", PoleFriction)
+@pytest.mark.parametrize("cart_friction", CART_FRICTIONS)
+@pytest.mark.parametrize("pole_friction", POLE_FRICTIONS)
 @pytest.mark.parametrize("actions", ["nine_levels", "nine_newtons"])
 def test_a_parameter_that_no_model_reads_has_none(
     ip02: dict[str, float],
     medium: PoleSettings,
-    cart_friction: CartFriction,
-    pole_friction: PoleFriction,
+    cart_friction: Law,
+    pole_friction: Law,
     actions: str,
 ) -> None:
     """Measured and listed are the same, where every range is wide and reaches all motor values."""
-    models = Models(cart_friction, pole_friction, Actuator(choice(f"actions/{actions}")["actuator"]))
-    names = unused_parameters(Models(CartFriction.NONE, PoleFriction.NONE, Actuator.NEWTONS))
+    models = Models(cart_friction, pole_friction, ACTUATORS.find(choice(f"actions/{actions}")["actuator"]))
+    names = unused_parameters(
+        Models(CART_FRICTIONS.find("none"), POLE_FRICTIONS.find("none"), ACTUATORS.find("newtons"))
+    )
     cart = {**ip02, "pole_coulomb": 1e-4}
     ranges = {name: Range(absolute=wide(name, cart[name])) for name in names}
     assert idle(cart, ranges, medium, actions, models) == unused_parameters(models) & names

@@ -10,7 +10,8 @@ from torchrl.envs.utils import check_env_specs
 
 from cartpole_rl.errors import CheckpointError
 from cartpole_rl.physics.dynamics import State
-from cartpole_rl.physics.models import CartFriction, Models
+from cartpole_rl.physics.friction import CART_FRICTIONS
+from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.physics.residual import PLACES, Residual
 from cartpole_rl.plants.learned import LearnedPlant
@@ -20,7 +21,7 @@ from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.randomization.randomizer import Randomizer
 from cartpole_rl.tasks.settings import Start, StartSettings
 
-STEP = Models(cart_friction=CartFriction.STEP)
+STEP = Models(cart_friction=CART_FRICTIONS.find("step"))
 START = StartSettings(
     angle=Start.HANGING, position_spread=0.1, angle_spread=0.1, speed_spread=0, angular_speed_spread=0
 )

@@ -15,9 +15,9 @@ from cartpole_rl.evaluation.metrics import episode_metrics
 from cartpole_rl.evaluation.recordings import read_recording, write_recording
 from cartpole_rl.identification.experiments import recording
 from cartpole_rl.learning.finetuning import recorded_chunk
-from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT
 from cartpole_rl.plants.measured import measured_part
 from cartpole_rl.plants.recorded import RecordedPlant
+from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.wire import Fault
 from cartpole_rl.workflows.agents import trained_agent

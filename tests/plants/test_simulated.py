@@ -11,11 +11,12 @@ from torch import Tensor
 from torchrl.envs.utils import check_env_specs
 
 from cartpole_rl.physics.dynamics import State
-from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
-from cartpole_rl.physics.models import CartFriction, Models
+from cartpole_rl.physics.friction import CART_FRICTIONS
+from cartpole_rl.physics.models import Models
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.randomization.ranges import Range
+from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 from cartpole_rl.tasks.settings import Start, StartSettings
 
 MakePlant = Callable[..., SimulatedPlant]
@@ -173,7 +174,12 @@ class TestSnapshot:
             "latency": Range(absolute=(0.0, 0.04)),
             "motor_time_constant": Range(absolute=(0.0, 0.05)),
         }
-        return {"carts": 4, "ranges": ranges, "start": ANYWHERE, "models": Models(CartFriction.STRIBECK)}
+        return {
+            "carts": 4,
+            "ranges": ranges,
+            "start": ANYWHERE,
+            "models": Models(CART_FRICTIONS.find("stribeck")),
+        }
 
     def test_goes_on_as_if_nothing_had_happened(self, make_plant: MakePlant, settings: dict) -> None:
         plant, motors = make_plant(**settings), random_motors(60, 4)

@@ -9,8 +9,7 @@ from torch import Tensor
 
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.physics.parameters import CartParameters
-from cartpole_rl.physics.rod import POLE_DENSITY
-from cartpole_rl.randomization.poles import Pole, PoleSettings
+from cartpole_rl.randomization.poles import POLE_DENSITY, Pole, PoleSettings
 from cartpole_rl.randomization.randomizer import Randomizer
 from cartpole_rl.randomization.ranges import Range
 

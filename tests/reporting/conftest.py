@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cartpole_rl.identification.replay import Replayed
-from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
+from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 from cartpole_rl.tasks.episode import Episode
 
 PERIOD = 0.02  # s

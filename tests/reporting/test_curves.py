@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from cartpole_rl.physics.models import Actuator, CartFriction
+from cartpole_rl.physics.actuator import ACTUATORS
+from cartpole_rl.physics.friction import CART_FRICTIONS
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.reporting.curves import force_curve, friction_curve
@@ -25,7 +26,7 @@ def samples(prior: dict[str, float], **changes: tuple[float, ...]) -> np.ndarray
 def test_friction_over_velocity(prior: dict[str, float]) -> None:
     identified = {**prior, "cart_coulomb": 0.4, "cart_viscous": 2.0}
     carts = samples(prior, cart_viscous=(1.0, 3.0))
-    curve = friction_curve(identified, carts, prior, CartFriction.STEP)
+    curve = friction_curve(identified, carts, prior, CART_FRICTIONS.find("step"))
     fast = int(np.abs(curve.at - 0.5).argmin())
     assert curve.identified[fast] == pytest.approx(0.4 + 2.0 * 0.5)
     assert curve.identified[-1] == pytest.approx(-curve.identified[0])
@@ -37,7 +38,9 @@ def test_friction_over_velocity(prior: dict[str, float]) -> None:
 def test_force_over_motor_value(prior: dict[str, float], sign: int) -> None:
     symmetric = {**prior, "force_asymmetry": 0.0}
     identified = {**symmetric, "force_linear": 0.03}
-    curve = force_curve(identified, samples(symmetric, force_linear=(0.03,)), symmetric, Actuator.FORCE_CURVE)
+    curve = force_curve(
+        identified, samples(symmetric, force_linear=(0.03,)), symmetric, ACTUATORS.find("force_curve")
+    )
     (at,) = np.flatnonzero(curve.at == sign * 200)
     assert curve.identified[at] - curve.prior[at] == pytest.approx(
         sign * 200 * (0.03 - prior["force_linear"])

@@ -9,7 +9,9 @@ from cartpole_rl.identification.fit import Fit
 from cartpole_rl.identification.identify import Candidate, Identification, PredictionError
 from cartpole_rl.identification.quantities import Quantity
 from cartpole_rl.identification.rollout import Dynamics
-from cartpole_rl.physics.models import CartFriction, Models
+from cartpole_rl.physics.friction import CART_FRICTIONS
+from cartpole_rl.physics.laws import Law
+from cartpole_rl.physics.models import Models
 from cartpole_rl.reporting.identification import CAPTIONS, identification_page, quantities_table
 from cartpole_rl.tasks.episode import Episode
 
@@ -20,14 +22,14 @@ QUANTITIES = [
 FIT = Fit([], np.empty(0), np.empty((0, 0)), {}, np.ones(2), np.zeros(2), 1.0, 1)
 
 
-def candidate(friction: CartFriction, x: float, theta: float) -> Candidate:
+def candidate(friction: Law, x: float, theta: float) -> Candidate:
     dynamics = Dynamics(torch.empty(0, 1), Models(cart_friction=friction), 0.02, 4)
     return Candidate(FIT, dynamics, PredictionError(x, theta))
 
 
 def found(warnings: list[str]) -> Identification:
-    best = candidate(CartFriction.STEP, 1e-3, 0.01)
-    candidates = [best, candidate(CartFriction.LINEAR, 2e-3, 0.02)]
+    best = candidate(CART_FRICTIONS.find("step"), 1e-3, 0.01)
+    candidates = [best, candidate(CART_FRICTIONS.find("linear"), 2e-3, 0.02)]
     return Identification(FIT, best.dynamics, candidates, [], best.error, warnings)
 
 

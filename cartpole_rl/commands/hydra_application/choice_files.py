@@ -31,9 +31,9 @@ from cartpole_rl.choices import (
 )
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.physics.bounds import BOUNDS
 from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.randomization.poles import Pole
+from cartpole_rl.rig.parameters import PARAMETERS, completed
 from cartpole_rl.run_files import CART, CONFIG, POLE, RANDOMIZATION
 from cartpole_rl.workflows.run_folder import PREFIX, USES, check_program, program_of, use_of
 
@@ -220,11 +220,11 @@ def _check_run_folder(group: str, value: str) -> None:
 
 def _check_cart(word: str, cart: Chosen) -> None:
     """Raise ConfigError for an unknown parameter of a cart, or a missing one."""
-    known = [name for name in BOUNDS if name not in Pole.model_fields]
-    for name in cart.own.keys() - BOUNDS.keys():
+    known = [name for name in PARAMETERS if name not in Pole.model_fields]
+    for name in cart.own.keys() - PARAMETERS.keys():
         raise ConfigError(
             f"{word}: {name}: there is no such setting; did you mean {most_similar(name, known)}?"
         )
-    if missing := [name for name in known if name not in cart.values]:
+    if missing := [name for name in known if name not in completed(cart.values)]:
         remedy = "give it, or take what is missing from a choice: defaults: [ip02]"
         raise ConfigError(f"{word}: {missing[0]} is missing; {remedy}")

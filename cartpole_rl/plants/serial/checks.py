@@ -13,7 +13,6 @@ import statistics
 import time
 
 from cartpole_rl.errors import FaultError
-from cartpole_rl.physics.encoders import POLE_COUNTS_PER_TURN, cart_counts, pole_counts
 from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.centring import LEFT, RIGHT
 from cartpole_rl.plants.serial.errors import NotReadyError
@@ -26,6 +25,7 @@ from cartpole_rl.plants.serial.information import (
 )
 from cartpole_rl.plants.serial.moves import GENTLE_MOTOR, metres
 from cartpole_rl.plants.serial.probe import MOVED, NO_MOTION, Probe
+from cartpole_rl.rig.hardware import POLE_COUNTS_PER_TURN, cart_counts, pole_counts
 from cartpole_rl.wire import Fault, Info, State, seconds_between, ticks_between
 
 QUESTIONS = 25  # asked over the link

@@ -4,9 +4,8 @@ Positions, angles and forces are computed from constants: encoder counts per tur
 of motor values. With a cart that has other constants every number would be wrong, so it is refused.
 """
 
-from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT, HALF_SPAN, POLE_COUNTS_PER_TURN
-from cartpole_rl.physics.motor import LARGEST_MOTOR
 from cartpole_rl.plants.serial.errors import NotReadyError
+from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, HALF_SPAN, LARGEST_MOTOR, POLE_COUNTS_PER_TURN
 from cartpole_rl.wire import Info
 
 SPAN_TOLERANCE = 0.05  # share; homing accepts 3 %

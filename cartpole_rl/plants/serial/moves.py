@@ -2,9 +2,9 @@
 
 import math
 
-from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT
 from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.errors import NotReadyError, fault_error
+from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT
 from cartpole_rl.wire import State
 
 GENTLE_MOTOR = 199  # motor value; from 200 on the cart watches for stalls

@@ -14,7 +14,6 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from cartpole_rl.errors import ConfigError, FaultError, LinkError, PlantError, PortError
-from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT
 from cartpole_rl.plants.serial.cart import RESTARTED, SerialCart
 from cartpole_rl.plants.serial.errors import RefusedError, fault_error
 from cartpole_rl.plants.serial.faults import Confirm, FaultClearing, nobody
@@ -22,6 +21,7 @@ from cartpole_rl.plants.serial.information import check_scales
 from cartpole_rl.plants.serial.preparation import Preparation, StartPosition
 from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.plants.specs import TERMINATING, TRUNCATING, OneCartPlant, OneFrame, as_report
+from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.wire import Fault, Flags, State, seconds_between, ticks_between, went_back
 

@@ -1,10 +1,10 @@
 """The moves of the preflight, on a cart that may be wired wrongly."""
 
-from cartpole_rl.physics.encoders import cart_counts, pole_counts
 from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.centring import NOMINAL_DEADBAND, centre
 from cartpole_rl.plants.serial.errors import NotReadyError
 from cartpole_rl.plants.serial.moves import GENTLE_MOTOR, ArmedCart, metres
+from cartpole_rl.rig.hardware import cart_counts, pole_counts
 from cartpole_rl.wire import Flags, State
 
 FARTHEST = 0.08  # m from the middle: no check needs more

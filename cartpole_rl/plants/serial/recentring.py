@@ -12,11 +12,11 @@ import math
 from contextlib import suppress
 
 from cartpole_rl.errors import PlantError
-from cartpole_rl.physics.encoders import POLE_RADIANS_PER_COUNT, pole_counts
 from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.centring import FRICTION, MASS, centre, interval, rough_motor, within
 from cartpole_rl.plants.serial.errors import NotReadyError
 from cartpole_rl.plants.serial.moves import SWING_SECONDS, ArmedCart, metres, spread
+from cartpole_rl.rig.hardware import POLE_RADIANS_PER_COUNT, pole_counts
 from cartpole_rl.wire import State, seconds_between
 
 ROLLING_PERIODS, ROLLING = 10, 0.04  # periods, and m in them: 0.2 m/s, a cart that still rolls

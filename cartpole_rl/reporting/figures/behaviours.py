@@ -10,10 +10,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from cartpole_rl.physics.motor import LARGEST_MOTOR
 from cartpole_rl.reporting import style
 from cartpole_rl.reporting.figures.annotations import at_time, beside, plain
 from cartpole_rl.reporting.words import ending_text, guard_text
+from cartpole_rl.rig.hardware import LARGEST_MOTOR
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.tasks.rewards import UPRIGHT_ANGLE
 from cartpole_rl.tasks.upright import is_upright, upright_since

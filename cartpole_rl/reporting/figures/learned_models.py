@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 
 from cartpole_rl.identification.ensemble import Ensemble
 from cartpole_rl.identification.prediction import Prediction, root_mean_square
-from cartpole_rl.physics.encoders import CART_METRES_PER_COUNT
 from cartpole_rl.physics.residual import SPACING, UNITS
 from cartpole_rl.reporting import style, words
+from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT
 
 PHYSICS, LEARNED = style.VERMILLION, style.BLUE
 SMALLEST = 0.01  # mm and deg, of the logarithmic axes: less than one encoder count

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from cartpole_rl.compilation import Compiled
 from cartpole_rl.envs.build import randomizer
-from cartpole_rl.physics.actuator import static_force
 from cartpole_rl.physics.dynamics import State
 from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import GRAVITY, CartParameters
@@ -56,7 +55,7 @@ class KnownCart:
         self.models = config.models(config.plant)
         self.motors = torch.tensor(config.actions.motors)
         carts = CartParameters.from_table(self.table(len(self.motors)))
-        self.forces = static_force(self.motors.float(), carts, self.models.actuator)
+        self.forces = self.models.actuator(self.motors.float(), carts)
         self.commands = commands_under_way(self.randomizer.longest_delay(), config.control_period)
         self.one = CartParameters.from_table(self.table(1))
         self.reach = float(self.one.track_half_length)

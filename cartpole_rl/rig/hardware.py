@@ -1,4 +1,4 @@
-"""The encoders and the track of the cart that the host drives. Source: Quanser IP02 user manual.
+"""Encoders, track and motor range of the cart that the host drives. Source: Quanser IP02 user manual.
 
 The cart reports the same numbers in INFO; a cart that reports others is refused.
 """
@@ -9,6 +9,7 @@ CART_METRES_PER_COUNT = 2.2749e-5  # encoder pinion of 14.83 mm radius, 4096 cou
 POLE_COUNTS_PER_TURN = 4096
 POLE_RADIANS_PER_COUNT = 2 * math.pi / POLE_COUNTS_PER_TURN
 HALF_SPAN = 0.407  # m, middle of the track to a stop
+LARGEST_MOTOR = 255  # motor value in size, to the left (negative) and to the right
 
 
 def cart_counts(metres: float) -> int:

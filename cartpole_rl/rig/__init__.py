@@ -1,0 +1,1 @@
+"""What a cart is: its parameters and its hardware."""
