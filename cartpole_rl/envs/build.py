@@ -23,11 +23,10 @@ from cartpole_rl.plants.learned_model import LearnedModel, load_model
 from cartpole_rl.plants.settings import LearnedSettings, SimulatedSettings
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.plants.specs import Plant
-from cartpole_rl.randomization.checks import check_one_pole
-from cartpole_rl.randomization.draws import Draws
 from cartpole_rl.randomization.identified import IdentifiedCarts, identified_carts
-from cartpole_rl.randomization.randomizer import Randomizer
-from cartpole_rl.randomization.settings import IdentifiedSettings
+from cartpole_rl.randomization.poles import check_one_pole
+from cartpole_rl.randomization.randomizer import Draws, Randomizer
+from cartpole_rl.randomization.ranges import IdentifiedSettings
 from cartpole_rl.tasks.settings import ActionSettings, RewardSettings, StartSettings, TaskSettings
 
 FITTED_LENGTH = 0.2  # share: a fit may move the centre of mass of the pole by half of that

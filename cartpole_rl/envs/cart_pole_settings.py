@@ -13,8 +13,7 @@ from cartpole_rl.physics.laws import Law
 from cartpole_rl.physics.models import Models
 from cartpole_rl.plants.settings import LearnedSettings, SimulatedSettings
 from cartpole_rl.randomization.poles import Pole, PoleSettings
-from cartpole_rl.randomization.ranges import Range
-from cartpole_rl.randomization.settings import IdentifiedSettings
+from cartpole_rl.randomization.ranges import IdentifiedSettings, Range
 from cartpole_rl.settings import Finite, Settings
 from cartpole_rl.tasks.settings import ActionSettings, RewardSettings, TaskSettings
 

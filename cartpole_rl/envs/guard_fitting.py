@@ -26,7 +26,7 @@ from cartpole_rl.physics.dynamics import Drive, State, run_period
 from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import GRAVITY, CartParameters
 from cartpole_rl.plants.simulation import commands_under_way
-from cartpole_rl.randomization.draws import Draws
+from cartpole_rl.randomization.randomizer import Draws
 
 SAMPLES = 65536
 SPEEDS = (0.0, 2.2)  # m/s, of the cart at the start; agents of the shipped experiments stay within

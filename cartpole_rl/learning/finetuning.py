@@ -18,7 +18,7 @@ from cartpole_rl.learning.settings import FinetuningSettings
 from cartpole_rl.learning.training import Scalars, Training
 from cartpole_rl.plants.recorded import RecordedPlant
 from cartpole_rl.plants.simulated import SimulatedPlant
-from cartpole_rl.randomization.draws import Draws
+from cartpole_rl.randomization.randomizer import Draws
 from cartpole_rl.tasks.episode import Episode
 
 

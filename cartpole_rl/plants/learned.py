@@ -17,7 +17,7 @@ from cartpole_rl.plants.learned_model import LearnedModel
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.plants.simulation import Carts, Inputs, Period, run_carts
 from cartpole_rl.plants.specs import OneFrame, Plant
-from cartpole_rl.randomization.draws import Draws
+from cartpole_rl.randomization.randomizer import Draws
 from cartpole_rl.tasks.settings import StartSettings
 
 

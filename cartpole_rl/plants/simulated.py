@@ -18,7 +18,7 @@ from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.simulation import Carts, Inputs, Period, commands_under_way, encoder_counts, run_carts
 from cartpole_rl.plants.specs import OneFrame, Plant, Report
-from cartpole_rl.randomization.draws import Draws
+from cartpole_rl.randomization.randomizer import Draws
 from cartpole_rl.scalar import Scalar, plain
 from cartpole_rl.tasks.episode import Origin
 from cartpole_rl.tasks.settings import StartSettings

@@ -13,10 +13,9 @@ from torch import Tensor
 
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.physics.parameters import CartParameters
-from cartpole_rl.randomization.draws import Draws
 from cartpole_rl.randomization.poles import HEAVIER, Pole, PoleSettings
-from cartpole_rl.randomization.randomizer import Randomizer
-from cartpole_rl.randomization.settings import IdentifiedSettings
+from cartpole_rl.randomization.randomizer import Draws, Randomizer
+from cartpole_rl.randomization.ranges import IdentifiedSettings
 from cartpole_rl.rig.parameters import PARAMETERS
 
 Array = NDArray[np.float64]

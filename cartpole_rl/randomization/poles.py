@@ -4,6 +4,7 @@ from typing import Any
 
 from pydantic import model_validator
 
+from cartpole_rl.errors import ConfigError
 from cartpole_rl.settings import NonNegative, Positive, Settings
 
 # From the thesis (6.4). Quanser's poles have half of it, 0.127 kg on 0.3365 m and 0.230 kg on 0.6413 m:
@@ -104,3 +105,15 @@ class PoleSettings(Settings):
             return " or ".join(self.choices)
         assert self.lengths is not None
         return f"{self.lengths[0]:g} to {self.lengths[1]:g} m"
+
+
+def possible_poles(poles: PoleSettings) -> list[Pole]:
+    """Return the choices; the rod of middle length represents rods of random length."""
+    return [poles.nominal] if poles.choices is None else list(poles.choices.values())
+
+
+def check_one_pole(owner: str, poles: PoleSettings) -> Pole:
+    """Return the pole. Raises ConfigError, which names `owner`, if there are several `poles`."""
+    if not poles.is_single:
+        raise ConfigError(f"pole: {owner} takes one pole, not {poles.name}; choose one, as pole=medium")
+    return poles.nominal

@@ -5,19 +5,38 @@ finished episodes are replaced by one assignment.
 """
 
 from collections.abc import Iterable, Mapping
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
-from cartpole_rl.physics.parameters import CartParameters
-from cartpole_rl.randomization.checks import check_carts, possible_poles
-from cartpole_rl.randomization.poles import Pole, PoleSettings, uniform_rod
-from cartpole_rl.randomization.ranges import Distribution, Range
+from cartpole_rl.errors import ConfigError
+from cartpole_rl.physics.parameters import CartParameters, cart_column
+from cartpole_rl.randomization.poles import Pole, PoleSettings, possible_poles, uniform_rod
+from cartpole_rl.randomization.ranges import Range, check_carts
 
 POLE_FIELDS = tuple(Pole.model_fields)
 
 
-class Randomizer:
+class Draws(Protocol):
+    """A source of carts with drawn parameters."""
+
+    nominal: Tensor  # [P]
+
+    def draw(self, count: int, generator: torch.Generator) -> Tensor:
+        """Return parameters of `count` carts, [P, count]."""
+
+    def ends(self, name: str, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Return a draw with `name` at the low end of its range, and the same with it at the high end."""
+
+    def longest_delay(self) -> float:
+        """Return the longest latency that a draw can have, jitter included, s."""
+
+    def can_differ_from_zero(self, name: str) -> bool:
+        """Return whether a draw of `name` can be anything but 0."""
+
+
+class Randomizer(Draws):
     """Draws carts about `cart` (every parameter but the pole's), with `poles` and `ranges` by parameter name.
 
     Raises ConfigError when a name is unknown, a nominal value is impossible, a range reaches an impossible
@@ -34,16 +53,20 @@ class Randomizer:
         self.poles, self.ranges = poles, dict(ranges)
         check_carts(cart, poles, ranges)
         nominal = {**cart, **poles.nominal.model_dump()}
-        self.nominal = torch.tensor([float(nominal[name]) for name in CartParameters.names()], device=device)
+        self.nominal = cart_column(nominal, torch.float32)[:, 0].to(device)
         lines = list(self.ranges.values())
         self._rows = self._row_numbers(self.ranges)
-        warped = torch.tensor([line.warped() for line in lines], device=device).reshape(-1, 2)
-        self._low, self._width = warped[:, :1], warped[:, 1:] - warped[:, :1]  # [R, 1] each
-        self._logarithmic = self._flags([line.distribution is Distribution.LOG_UNIFORM for line in lines])
+        limits = torch.tensor([line.limits() for line in lines], dtype=torch.float64, device=device)
+        self._low, self._high = limits.reshape(-1, 2, 1).unbind(1)  # [R, 1] each
+        self._distributions = [
+            (each, self._flags([line.distribution is each for line in lines])[:, 0])
+            for each in {line.distribution: None for line in lines}
+        ]
         self._scales = self._flags([line.scales_nominal for line in lines])
         self._pole_rows = self._row_numbers(POLE_FIELDS)
         choices = [list(pole.model_dump().values()) for pole in possible_poles(poles)]
         self._choices = self.nominal.new_tensor(choices).T  # [3, poles]
+        self._check_distributions()
 
     def draw(self, count: int, generator: torch.Generator) -> Tensor:
         """Return parameters of `count` carts, [P, count]."""
@@ -87,8 +110,10 @@ class Randomizer:
 
     def _table(self, poles: Tensor, unit: Tensor) -> Tensor:
         """Return parameters [P, N] of the carts that `_draw_parts` drew."""
-        value = self._low + unit * self._width
-        value = torch.where(self._logarithmic, value.exp(), value)
+        value = unit.clone()
+        for distribution, lines in self._distributions:
+            drawn = distribution(unit[lines], self._low[lines], self._high[lines])
+            value[lines] = drawn.to(value.dtype)
         value = torch.where(self._scales, poles.index_select(0, self._rows) * value, value)
         return poles.index_copy(0, self._rows, value)
 
@@ -103,6 +128,19 @@ class Randomizer:
         low, high = self.poles.lengths
         rods = uniform_rod(low + (high - low) * torch.rand(count, generator=generator, device=device))
         return torch.stack([torch.as_tensor(rods[name]) for name in POLE_FIELDS])
+
+    def _check_distributions(self) -> None:
+        """Raise ConfigError for a distribution whose ends are not its bounds, or that leaves them."""
+        shares = torch.tensor([0.0, 0.3, 1.0], device=self.nominal.device)
+        for distribution, lines in self._distributions:
+            low, high = self._low[lines], self._high[lines]
+            least, value, most = distribution(shares.expand(len(low), 3), low, high).unbind(1)
+            ends = torch.stack((least, most), 1).double()
+            inside = ((value >= least) & (value <= most)).all()
+            if not (inside and torch.allclose(ends, torch.cat((low, high), 1), rtol=1e-4, atol=1e-9)):
+                raise ConfigError(
+                    f"the distribution {distribution} does not run from the low to the high bound"
+                )
 
     def _nominal_of(self, name: str) -> float:
         return float(self.nominal[CartParameters.names().index(name)])

@@ -9,8 +9,7 @@ from cartpole_rl.agents.dqn import QAgent
 from cartpole_rl.checking import checked
 from cartpole_rl.evaluation.episodes import Policy
 from cartpole_rl.learning.checkpoints import AgentCheckpoint, load_agent, restore_weights
-from cartpole_rl.randomization.checks import check_one_pole
-from cartpole_rl.randomization.poles import PoleSettings
+from cartpole_rl.randomization.poles import PoleSettings, check_one_pole
 from cartpole_rl.workflows.build import replaced_settings
 from cartpole_rl.workflows.checks import BASELINE, check_has_agent
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig

@@ -16,7 +16,8 @@ from cartpole_rl.errors import ConfigError
 from cartpole_rl.learning.checkpoint_files import find_agent, find_training
 from cartpole_rl.plants.model_file import find_model
 from cartpole_rl.plants.settings import LearnedSettings
-from cartpole_rl.randomization.checks import check_carts, check_one_pole
+from cartpole_rl.randomization.poles import check_one_pole
+from cartpole_rl.randomization.ranges import check_carts
 from cartpole_rl.rig.parameters import check_names, check_value, check_values
 from cartpole_rl.run_files import CHECKPOINTS, LAST, METRICS, RESUME
 from cartpole_rl.workflows.config import (

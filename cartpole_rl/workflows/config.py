@@ -33,9 +33,8 @@ from cartpole_rl.physics.actuator import ACTUATORS
 from cartpole_rl.physics.laws import Law
 from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.plants.settings import EmulatedSettings, LearnedSettings, SimulatedSettings
-from cartpole_rl.randomization.checks import check_one_pole
-from cartpole_rl.randomization.poles import PoleSettings
-from cartpole_rl.randomization.settings import IdentifiedSettings
+from cartpole_rl.randomization.poles import PoleSettings, check_one_pole
+from cartpole_rl.randomization.ranges import IdentifiedSettings
 from cartpole_rl.rig.parameters import check_values
 from cartpole_rl.settings import Count, Finite, NonNegative, Positive, Seed, Settings
 from cartpole_rl.tasks.settings import ActionSettings, RewardSettings, TaskSettings

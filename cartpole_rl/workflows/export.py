@@ -24,7 +24,7 @@ from cartpole_rl.files import write_bytes
 from cartpole_rl.learning.checkpoint_files import find_agent
 from cartpole_rl.learning.checkpoints import load_agent
 from cartpole_rl.plants.settings import SimulatedSettings
-from cartpole_rl.randomization.checks import possible_poles
+from cartpole_rl.randomization.poles import possible_poles
 from cartpole_rl.run_files import CHECKPOINTS
 from cartpole_rl.workflows.agents import TrainedAgent, trained_agent
 from cartpole_rl.workflows.build import without_guard_numbers

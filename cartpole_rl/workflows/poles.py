@@ -6,8 +6,7 @@ from pathlib import Path
 from cartpole_rl.choices import choice
 from cartpole_rl.errors import ConfigError, RecordingError
 from cartpole_rl.evaluation.recordings import LENGTH, read_heading
-from cartpole_rl.randomization.checks import check_one_pole
-from cartpole_rl.randomization.poles import Pole, PoleSettings
+from cartpole_rl.randomization.poles import Pole, PoleSettings, check_one_pole
 from cartpole_rl.workflows.trained_poles import POLES
 
 

@@ -16,7 +16,7 @@ from cartpole_rl.learning.randomness import seed_everything
 from cartpole_rl.learning.training import Training
 from cartpole_rl.plants.effects import without_effect
 from cartpole_rl.plants.settings import LearnedSettings, SimulatedSettings
-from cartpole_rl.randomization.draws import Draws
+from cartpole_rl.randomization.randomizer import Draws
 from cartpole_rl.run_files import CHECKPOINTS, FIGURES, METRICS
 from cartpole_rl.settings import evaluation_seed
 from cartpole_rl.tasks.episode import Episode

@@ -48,7 +48,7 @@ from cartpole_rl.learning.randomness import seed_everything
 from cartpole_rl.learning.training import Training
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.simulated import SimulatedPlant
-from cartpole_rl.randomization.ranges import Distribution, Range
+from cartpole_rl.randomization.ranges import Range
 from cartpole_rl.reporting.table import Cell
 from cartpole_rl.rig.parameters import PARAMETERS
 from cartpole_rl.settings import evaluation_seed
@@ -85,7 +85,7 @@ class InformedTransform(HardwareTransform):
         limits, logarithmic = [], []
         for name, line in config.ranges.items():
             scale = nominal[name] if line.scales_nominal else 1.0
-            logarithmic.append(line.distribution is Distribution.LOG_UNIFORM)
+            logarithmic.append(line.distribution == "log_uniform")
             ends = [scale * end for end in line.limits()]
             limits.append([math.log(end) for end in ends] if logarithmic[-1] else ends)
         self.register_buffer("low_high", torch.tensor(limits))
@@ -132,8 +132,9 @@ def wider_ranges(extra: float) -> dict[str, Range]:
 
 def wider_range(name: str, line: Range, extra: float, nominal: float) -> Range:
     """Return `line` extended on the axis on which it is uniform, but not to impossible values below it."""
-    low, high = widened(line.warped(), extra)
-    if line.distribution is Distribution.LOG_UNIFORM:
+    logarithmic = line.distribution == "log_uniform"
+    low, high = widened(tuple(map(math.log, line.limits())) if logarithmic else line.limits(), extra)
+    if logarithmic:
         low, high = math.exp(low), math.exp(high)
     if not PARAMETERS[name].bound.holds(low * (nominal if line.scales_nominal else 1.0)):
         low = line.limits()[0]

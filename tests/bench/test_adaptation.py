@@ -5,7 +5,7 @@ import pytest
 import torch
 from adaptation import MIRRORED, Job, make_env, wider_ranges
 
-from cartpole_rl.randomization.checks import check_carts
+from cartpole_rl.randomization.ranges import check_carts
 from cartpole_rl.workflows.config import TrainConfig
 from cartpole_rl.workflows.loading import load_settings
 

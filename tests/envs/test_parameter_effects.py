@@ -12,8 +12,6 @@ import torch
 from torch import Tensor
 
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
-from cartpole_rl.physics.friction import CART_FRICTIONS, POLE_FRICTIONS
-from cartpole_rl.physics.laws import Law
 from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.simulated import SimulatedPlant
@@ -34,7 +32,7 @@ class Case:
 
     low: float
     high: float
-    friction: Law = CART_FRICTIONS.find("sigmoid")
+    friction: str = "sigmoid"
     motor: int = 200
     cart: dict[str, float] = field(default_factory=dict)
 
@@ -48,8 +46,8 @@ CASES = {
     "cart_viscous": Case(0.1, 3.0),
     "cart_coulomb": Case(0.25, 0.9),
     "cart_coulomb_asymmetry": Case(-0.3, 0.3),
-    "cart_stiction_ratio": Case(1.0, 1.5, CART_FRICTIONS.find("stribeck"), motor=80),
-    "stribeck_velocity": Case(0.001, 0.1, CART_FRICTIONS.find("stribeck"), cart={"cart_stiction_ratio": 1.5}),
+    "cart_stiction_ratio": Case(1.0, 1.5, "stribeck", motor=80),
+    "stribeck_velocity": Case(0.001, 0.1, "stribeck", cart={"cart_stiction_ratio": 1.5}),
     "sigmoid_slope": Case(20.0, 200.0),
     "pole_viscous": Case(1e-4, 5e-3),
     "pole_drag": Case(0.0, 1e-3),
@@ -83,7 +81,7 @@ def environment(make_plant: MakePlant, make_environment: MakeEnvironment) -> Cal
             cart={"track_half_length": 10.0, **case.cart},
             ranges={name: Range(absolute=(case.low, case.high))},
             start=UPRIGHT,
-            models=Models(case.friction, POLE_FRICTIONS.find("bearing")),
+            models=Models.of(cart_friction=case.friction, pole_friction="bearing"),
         )
         return make_environment(plant, motors=(-case.motor, case.motor), time_limit=time_limit)
 

@@ -15,8 +15,7 @@ from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.randomization.identified import IdentifiedCarts, identified_carts
 from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.randomization.randomizer import Randomizer
-from cartpole_rl.randomization.ranges import Range
-from cartpole_rl.randomization.settings import IdentifiedSettings
+from cartpole_rl.randomization.ranges import IdentifiedSettings, Range
 
 MASS, VISCOUS = (CartParameters.names().index(name) for name in ("cart_mass", "cart_viscous"))
 
@@ -77,37 +76,31 @@ def test_the_identified_cart_carries_the_given_pole(
     assert {round(mass, 3) for mass in drawn[MASS].tolist()} == {0.9, 1.0}
 
 
-def without_end(content: bytes) -> bytes:
-    return content[: len(content) // 2]
-
-
-def with_other_bytes(content: bytes) -> bytes:
-    middle = len(content) // 2
-    return content[:middle] + bytes(each ^ 255 for each in content[middle:])
-
-
-def one_array(content: bytes) -> bytes:
-    np.save(file := io.BytesIO(), np.arange(3))
+def saved(*arrays: object, **named: object) -> bytes:
+    file = io.BytesIO()
+    np.savez(file, **named) if named else np.save(file, *arrays)
     return file.getvalue()
 
 
-def one_number_each(content: bytes) -> bytes:
-    np.savez(file := io.BytesIO(), names=["cart_mass"], carts=np.array([1.0]), identified=["cart_mass"])
-    return file.getvalue()
+HARMS: dict[str, Callable[[bytes], bytes]] = {
+    "cut": lambda content: content[: len(content) // 2],
+    "other bytes": lambda content: content[:99] + bytes(each ^ 255 for each in content[99:]),
+    "one array": lambda content: saved(np.arange(3)),
+    "one number": lambda content: saved(names=["cart_mass"], carts=np.ones(1), identified=["cart_mass"]),
+    "empty": lambda content: b"",
+    "start of a zip": lambda content: b"PK",
+}
 
 
-@pytest.mark.parametrize(
-    "harm",
-    [without_end, with_other_bytes, one_array, one_number_each, lambda content: b"", lambda content: b"PK"],
-)
+@pytest.mark.parametrize("harm", HARMS)
 def test_a_damaged_posterior_is_refused_in_one_line(
-    harm: Callable[[bytes], bytes], ip02: dict[str, float], medium: PoleSettings, tmp_path: Path
+    harm: str, ip02: dict[str, float], medium: PoleSettings, tmp_path: Path
 ) -> None:
     posterior = tmp_path / "posterior.npz"
     np.savez(posterior, names=["cart_mass"], carts=np.array([[0.9, 1.0]]), identified=["cart_mass"])
     settings = IdentifiedSettings(posterior=posterior, widen=1.0, prior_share=0.0, ranges={})
     assert identified_carts(settings, ip02, medium)
-    posterior.write_bytes(harm(posterior.read_bytes()))
+    posterior.write_bytes(HARMS[harm](posterior.read_bytes()))
     with pytest.raises(
         ConfigError, match=r"cannot be read: .*; copy it again, or run cartpole-identify"
     ) as raised:
