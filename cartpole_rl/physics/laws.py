@@ -9,8 +9,9 @@ import inspect
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+from cartpole_rl.errors import ConfigError
 from cartpole_rl.registry import Extension, Registry
-from cartpole_rl.rig.parameters import Parameter, add_parameter, check_names
+from cartpole_rl.rig.parameters import PARAMETERS, Parameter, add_parameter, check_names
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -60,6 +61,33 @@ def _check_formula(formula: Any) -> None:
         inspect.signature(formula).bind(None, None)
     except (TypeError, ValueError):
         raise ValueError("it must be a function of two arguments") from None
+
+
+class _Watched:
+    """A cart that remembers which of its parameters a formula reads."""
+
+    def __init__(self, cart: "CartParameters") -> None:
+        self._cart = cart
+        self.read: set[str] = set()
+
+    def __getattr__(self, name: str) -> Any:
+        self.read.add(name)
+        return getattr(self._cart, name)
+
+
+def tried(law: Law, values: "Tensor", cart: "CartParameters") -> "Tensor":
+    """Return the formula at `values` [N], for one cart. Raises ConfigError if it cannot be used."""
+    watched, place = _Watched(cart), f"{law.registry.kind}={law}"
+    try:
+        result = law(values, watched)
+    except Exception as error:
+        reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        raise ConfigError(f"{place}: its formula fails: {reason}") from None
+    if undeclared := sorted((watched.read & PARAMETERS.keys()).difference(law.reads)):
+        raise ConfigError(f"{place} reads {', '.join(undeclared)}: add it to its `reads`")
+    if getattr(result, "shape", None) != values.shape or not result.isfinite().all():
+        raise ConfigError(f"{place}: its formula must give a finite number for each of N carts, [N]")
+    return result
 
 
 def zero(of: "Tensor", cart: "CartParameters") -> "Tensor":

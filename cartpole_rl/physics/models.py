@@ -5,12 +5,15 @@ Settings import this module: it does without PyTorch.
 
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from cartpole_rl.errors import ConfigError
 from cartpole_rl.physics.actuator import ACTUATORS
 from cartpole_rl.physics.friction import CART_FRICTIONS, POLE_FRICTIONS
-from cartpole_rl.physics.laws import Law, law_registry
+from cartpole_rl.physics.laws import Law, law_registry, tried
 
 if TYPE_CHECKING:
     from torch import Tensor
+
+    from cartpole_rl.physics.parameters import CartParameters
 
 # The formula gives the velocity with which a position moves in a step, from those before and after the step.
 INTEGRATORS = law_registry("integrator")
@@ -50,6 +53,24 @@ REGISTRIES = {
     "actuator": ACTUATORS,
     "integrator": INTEGRATORS,
 }
+
+
+SPEEDS = (-3.0, -0.1, -1e-3, 0.0, 1e-3, 0.1, 3.0)  # m/s or rad/s at which friction is tried
+
+
+def check_laws(models: Models, cart: "CartParameters") -> None:
+    """Raise ConfigError for a law that fails with this one cart, or gives energy to it."""
+    speeds = cart.cart_mass.new_tensor(SPEEDS)
+    powers = {
+        "cart_friction": -tried(models.cart_friction, speeds, cart) * speeds,
+        "pole_friction": tried(models.pole_friction, speeds, cart) * speeds,
+    }
+    for kind, power in powers.items():
+        if (power > 0).any():
+            speed = speeds[power.argmax()].item()
+            raise ConfigError(f"{kind}={getattr(models, kind)} drives at {speed:g}: friction only brakes")
+    if (force := tried(models.actuator, 100 * speeds, cart)[len(SPEEDS) // 2]) != 0:
+        raise ConfigError(f"actuator={models.actuator} gives {force.item():g} N at motor value 0, not 0")
 
 
 def unused_parameters(models: Models) -> set[str]:

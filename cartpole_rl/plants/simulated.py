@@ -14,7 +14,7 @@ from torch import Tensor
 
 from cartpole_rl.compilation import Compiled
 from cartpole_rl.physics.dynamics import State
-from cartpole_rl.physics.models import Models
+from cartpole_rl.physics.models import Models, check_laws
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.simulation import Carts, Inputs, Period, commands_under_way, encoder_counts, run_carts
 from cartpole_rl.plants.specs import OneFrame, Plant, Report
@@ -74,6 +74,7 @@ class SimulatedPlant(Plant):
             torch.zeros(1 + commands, carts, device=self.device),
         )
         self._cart = CartParameters.from_table(self._carts.table)  # its fields share the table's memory
+        check_laws(models, CartParameters.from_table(randomizer.nominal.unsqueeze(1)))
         self.set_seed(seed)
 
     @property
