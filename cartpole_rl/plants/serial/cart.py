@@ -71,6 +71,7 @@ class SerialCart:
         self._open_connection: Connection | None = None
         self._information: Info | None = None
         self._stop_unanswered = False
+        self._required_policy: int | None = None  # identity of the only agent that may drive from the board
 
     def __enter__(self) -> Self:
         self.open()
@@ -87,7 +88,8 @@ class SerialCart:
     def open(self) -> Info:
         """Open the port, shake hands, disarm, learn whether the cart has a clock of its own; return INFO.
 
-        Raises PortError if the port cannot be opened, LinkError if no cart answers on it.
+        Raises PortError if the port cannot be opened, LinkError if no cart answers on it, PlantError if its
+        board has another agent than `check_policy` required.
         """
         if self._open_connection is not None:
             return self.information
@@ -105,6 +107,8 @@ class SerialCart:
                 self._abandon()
                 raise
         link.statistics = self.statistics
+        if self._required_policy is not None:
+            self.check_policy(self._required_policy)
         return self.information
 
     def close(self) -> None:
@@ -166,7 +170,11 @@ class SerialCart:
         self._arm(Start())
 
     def check_policy(self, identity: int) -> None:
-        """Raise PlantError unless the board has the agent of this `identity`."""
+        """Raise PlantError unless the board has the agent of this `identity`.
+
+        From then on `open` and `start_policy` check it too: after a lost link another board may answer.
+        """
+        self._required_policy = identity
         on_board = self.information.policy
         if on_board == 0:
             raise PlantError(
@@ -183,9 +191,13 @@ class SerialCart:
 
         A HELLO in silence, which a lockstep emulator needs, would wake the policy of a cart with its own
         clock: a cart that is not known to have one gets another chance to show it. Raises what `start`
-        raises, and RefusedError if the board has no policy.
+        raises, RefusedError if the board has no policy, and PlantError if it has another one than
+        `check_policy` required.
         """
         self._connection.learn_clock()
+        if self._required_policy is not None:
+            self.info()
+            self.check_policy(self._required_policy)
         self._arm(StartPolicy())
         self._tracker.follow_policy()
 
@@ -309,11 +321,12 @@ class SerialCart:
         check_limits(self.information)
         self._check_round_trip()
         self._connection.request(message, Ack)
+        self._tracker.forget_handed_out()
 
     def _check_round_trip(self) -> None:
         """Raise LinkError if the link takes over a period. On a lockstep emulator no time passes."""
         period = self.information.period_us * 1e-6
-        if not self._tracker.ticks_alone:
+        if self._tracker.is_lockstep and not self._tracker.ticks_alone:
             return
         for _ in range(SLOW_LINK_ATTEMPTS):
             trip = self._connection.round_trip()
@@ -341,9 +354,9 @@ class SerialCart:
         return waited > self._watchdog_time
 
     def _unanswered_for(self) -> float:
-        """Return for how many s the newest state has waited for a motor value; 0 on a lockstep emulator."""
+        """Return the age in s of the state that the next motor value answers; 0 on a lockstep emulator."""
         tracker = self._tracker
-        return now() - tracker.newest_at if tracker.awaits_command and tracker.ticks_alone else 0.0
+        return now() - tracker.answered_at if tracker.has_handed_out and tracker.ticks_alone else 0.0
 
     @property
     def _watchdog_time(self) -> float:

@@ -132,6 +132,8 @@ class Connection:
             answer = self._await_answer(deadline, message.TYPE, asked, kind, fits)
             if answer is not None:
                 self._refused = None  # of an earlier motor value, which has no meaning any more
+                if isinstance(answer, Ack):
+                    self._asked_sequence = answer.sequence  # a repetition may still be refused
                 return answer
             if deadline == end:
                 break
@@ -143,20 +145,28 @@ class Connection:
     def learn_clock(self) -> None:
         """Send nothing for as long as a disarmed cart with its own clock needs to be known as one.
 
-        If its newest state does not acknowledge the newest frame, that was lost or refused, and no state
-        tells: then HELLO is sent first.
+        Only states that acknowledge the newest frame tell. If none comes, that frame was lost or refused, or
+        the link is slow: then HELLO is sent, and its state waited for. Without one the clock stays unknown.
         """
-        tracker = self._tracker
+        tracker, link = self._tracker, self.link
         tracker.send_question()
-        for _ in range(2):
-            deadline = now() + LISTENING_PERIODS * self._period_us * 1e-6
-            limit = now() + self._settings.timeout
-            while not tracker.ticks_alone and (now() < deadline or (self.link.waiting() and now() < limit)):
-                self._read()
-            newest = tracker.last
-            if tracker.ticks_alone or newest is None or newest.last_sequence == self.link.sequence:
-                return
-            self.link.send(Hello())
+        tracker.is_lockstep = False
+        listening = LISTENING_PERIODS * self._period_us * 1e-6
+        begin, deadline, asked = now(), math.inf, False
+        while not tracker.ticks_alone:
+            self._read()
+            moment, newest = now(), tracker.last
+            if newest is not None and newest.last_sequence == link.sequence:
+                deadline = min(deadline, moment + max(listening, moment - link.sent_at))
+                limit = deadline + self._settings.timeout  # a device may never pause
+                if moment >= deadline and (not link.waiting() or moment >= limit):
+                    tracker.is_lockstep = True
+                    return
+            elif moment - begin > (self._settings.answer_timeout if asked else listening):
+                if asked:
+                    return
+                link.send(Hello())
+                begin, deadline, asked = moment, math.inf, True
 
     def round_trip(self) -> float:
         """Return the time in s from a STOP to its answer, the median of several. The cart is disarmed."""
@@ -257,7 +267,7 @@ class Connection:
                     raise refusal(answer)
                 if isinstance(answer, kind) and fits(answer):
                     return answer
-            if now() >= deadline:
+            if now() >= deadline and not self.link.waiting():
                 return None
             self._answers.clear()
             self._read()

@@ -48,6 +48,7 @@ class StateTracker:
         self.measuring = True  # latencies and late ticks are counted
         self.stopped_clock: tuple[State, State] | None = None  # two states between which no time passed
         self.ticks_alone = False  # the cart is known to have a clock of its own
+        self.is_lockstep = False  # the cart is known to wait for frames
         self.wrong_rate: float | None = None  # of that clock, by this computer's
         self._clocks = ClockComparison()
         self._same_frame = 0  # ticks in succession that acknowledged the same frame, the newest of the host
@@ -56,7 +57,8 @@ class StateTracker:
         self._missing: set[int] = set()  # ticks that were counted as lost, and may still arrive
         self._catching_up = False  # the operating system dropped states while the host was busy
         self._driving = False  # states are answered with motor values, or a policy on the board is watched
-        self._handed_out: State | None = None
+        self._handed_out: State | None = None  # since START
+        self.answered_at = 0.0  # when that state arrived
         self._overdue: State | None = None  # its command was sent more than a period after it arrived
         self._commanded: tuple[int, State] | None = None  # sequence of a motor value, and the state before it
 
@@ -73,7 +75,7 @@ class StateTracker:
     def disconnect(self) -> None:
         """Forget the states of this connection; the cart may restart before the next one."""
         self._newest = self.last = self.stopped_clock = self.period_us = self.wrong_rate = None
-        self.ticks_alone, self._same_frame = False, 0
+        self.ticks_alone, self._same_frame, self._handed_out = False, 0, None
         self._clocks = ClockComparison()
         self._missing.clear()
 
@@ -106,8 +108,17 @@ class StateTracker:
     @property
     def answered_tick(self) -> int:
         """The tick of the state that the next motor value answers: the one handed out, else the newest."""
-        state = self._handed_out if self.awaits_command else self.last
+        state = self._handed_out or self.last
         return 0 if state is None else state.tick
+
+    @property
+    def has_handed_out(self) -> bool:
+        """True if the caller has got a state since START."""
+        return self._handed_out is not None
+
+    def forget_handed_out(self) -> None:
+        """Note that the motor was armed: the caller has not seen a state of this drive yet."""
+        self._handed_out = None
 
     def take_newest(self) -> State | None:
         """Return the newest state if it was not returned before."""
@@ -118,7 +129,9 @@ class StateTracker:
         """Note that `state` is handed to the caller, who may answer it with a motor value."""
         self._count_overdue(state)
         self._time_loop(state)
-        self._catching_up, self.awaits_command, self._handed_out = False, True, state
+        self._catching_up, self.awaits_command = False, True
+        if self._handed_out is not state:
+            self._handed_out, self.answered_at = state, self.newest_at
 
     def send_command(self, sequence: int, sent_at: float) -> None:
         """Note that a motor value was sent."""

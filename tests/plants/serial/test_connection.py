@@ -309,6 +309,58 @@ def test_the_policy_on_the_board_has_to_be_the_agent_that_is_asked_for() -> None
         assert not peer.flags & Flags.ARMED
 
 
+@pytest.mark.parametrize("reopens", [False, True])
+def test_another_agent_on_a_board_that_came_later_does_not_drive(reopens: bool) -> None:
+    with CartPeer() as peer, SerialCart(quick_settings(peer.port)) as cart:
+        peer.info = replace(peer.info, policy=17)
+        cart.info()
+        cart.check_policy(17)
+        cart.start_policy()
+        cart.stop()
+        peer.info = replace(peer.info, policy=18)
+        if reopens:
+            cart.close()
+        with pytest.raises(PlantError, match=r"another agent \(00000012, not 00000011\)"):
+            cart.open() if reopens else cart.start_policy()
+        assert not peer.flags & Flags.ARMED
+        assert len(peer.messages(StartPolicy)) == 1
+
+
+def test_an_acknowledgement_of_home_that_comes_after_its_repetition() -> None:
+    """The repetition is refused, so that no state acknowledges it."""
+
+    class Stalled(CartPeer):
+        late: tuple[bytes, ...] = ()
+
+        def answer(self, frame: Frame) -> Iterable[bytes]:
+            if not isinstance(frame.message, Home):
+                yield from super().answer(frame)
+            elif not self.late:
+                self.late = (*super().answer(frame),)
+            else:
+                yield from self.late
+                yield self.encode(Nack(frame.sequence, Home.TYPE, Reason.BUSY))
+
+    with Stalled() as peer, SerialCart(quick_settings(peer.port)) as cart:
+        assert cart.home().tick
+        assert len(peer.messages(Home)) == 2
+
+
+def test_a_link_without_states_in_time_is_measured_before_the_cart_is_armed() -> None:
+    """No state tells whether the cart has a clock of its own."""
+
+    class Late(CartPeer):
+        def answer(self, frame: Frame) -> Iterable[bytes]:
+            held = [*super().answer(frame)]
+            time.sleep(0.05)
+            yield from held
+
+    with Late(paced=True) as peer, SerialCart(quick_settings(peer.port, answer_timeout=0.5)) as cart:
+        with pytest.raises(LinkError, match="over a period of 20 ms"):
+            cart.start()
+        assert not peer.messages(Start)
+
+
 @pytest.mark.parametrize("begin", [SerialCart.home, SerialCart.start, SerialCart.start_policy])
 def test_a_link_that_takes_over_a_period_drives_no_cart(begin: Callable[[SerialCart], object]) -> None:
     with Distant() as peer, SerialCart(quick_settings(peer.port, answer_timeout=5.0)) as cart:

@@ -59,6 +59,17 @@ def test_a_motor_value_names_the_state_that_was_handed_out() -> None:
         wait_for(lambda: SetMotor(100, answered) in peer.messages(SetMotor))
 
 
+def test_a_question_does_not_make_an_old_state_a_new_one() -> None:
+    with driven() as (peer, cart):
+        answered = cart._tracker.answered_tick
+        pause(peer, cart)
+        cart.info()
+        cart.set_motor(120)
+        with pytest.raises(LinkError, match="it answered a state over three periods old"):
+            cart.get_state()
+        assert peer.messages(SetMotor)[-1] == SetMotor(120, answered)
+
+
 def test_a_pause_between_the_check_and_the_write() -> None:
     """The cart refuses the value, and the link counts as broken."""
     with driven() as (peer, cart):
