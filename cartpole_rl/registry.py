@@ -104,6 +104,10 @@ class Registry(Generic[Kind]):
         """Iterate over the registered extensions; those of entry points come in once they are used."""
         return iter(self._entries.values())
 
+    def loaded(self) -> list[Kind]:
+        """Return all extensions, those of entry points included. Raises ConfigError."""
+        return [self.find(name) for name in self.names]
+
     @property
     def names(self) -> list[str]:
         """The names to choose from, entry points included."""

@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cartpole_rl.errors import RecordingError
-from cartpole_rl.identification.correlation import correlation
-from cartpole_rl.identification.prediction import REPORTED
-from cartpole_rl.identification.replay import Replayed, away_from_upright, replay
+from cartpole_rl.identification.fit import correlation
+from cartpole_rl.identification.prediction import REPORTED, Replayed, away_from_upright, replay
 from cartpole_rl.identification.rollout import Dynamics
 from cartpole_rl.identification.windows import regular_frames
 from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT

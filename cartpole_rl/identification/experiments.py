@@ -12,13 +12,14 @@ from typing import NamedTuple
 import numpy as np
 
 from cartpole_rl.envs.settings import TrackGuard
-from cartpole_rl.identification.guard import experiment_guard, guarded
 from cartpole_rl.identification.moves import (
     Moves,
     Observed,
     Task,
     and_stop,
+    experiment_guard,
     go_to,
+    guarded,
     hold,
     push,
     until_stopped,

@@ -12,7 +12,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from cartpole_rl.identification.correlation import correlation
 from cartpole_rl.identification.matching import (
     COARSE,
     FINEST,
@@ -25,8 +24,9 @@ from cartpole_rl.identification.matching import (
 from cartpole_rl.identification.rollout import rollout
 from cartpole_rl.identification.unknowns import POLE_LENGTH, Unknown, limits, parameters_at, unknowns_of
 from cartpole_rl.identification.windows import Windows
-from cartpole_rl.physics.models import Models
-from cartpole_rl.physics.parameters import CartParameters
+from cartpole_rl.physics.models import Models, check_laws
+from cartpole_rl.physics.parameters import CartParameters, cart_column
+from cartpole_rl.rig.parameters import completed
 
 Array = NDArray[np.floating]
 STARTS: tuple[Mapping[str, float], ...] = (  # points to search from; an unknown that is not named is 0
@@ -96,7 +96,8 @@ def fit_cart(
     With `sharpened`, a second search weighs errors by the size that the first one left. Raises
     RecordingError for windows in which no cart moves.
     """
-    unknowns, nominal = unknowns_of(models, known), dict(nominal)
+    check_laws(models, CartParameters.from_table(cart_column(nominal)))
+    unknowns, nominal = unknowns_of(models, known), completed(nominal)
     positions, motors = torch.from_numpy(windows.positions), torch.from_numpy(windows.motors)
     guess = first_guess(positions, period)
     low, high = map(torch.from_numpy, limits(unknowns, nominal))
@@ -162,3 +163,9 @@ def neighbours_correlate(residuals: Array) -> float:
     """Return the correlation of each residual with the next one of its window; `residuals` [W, T + 1]."""
     small = np.clip(residuals, -ROBUST, ROBUST)
     return correlation(small[:, :-1].ravel(), small[:, 1:].ravel())
+
+
+def correlation(first: Array, second: Array) -> float:
+    """Return the correlation coefficient, 0 if one of the samples is constant."""
+    varies = first.size > 1 and np.ptp(first) > 0 and np.ptp(second) > 0
+    return float(np.corrcoef(first, second)[0, 1]) if varies else 0.0

@@ -9,8 +9,14 @@ from numpy.typing import NDArray
 
 from cartpole_rl.identification.checks import check_explained
 from cartpole_rl.identification.fit import Fit, fit_cart
-from cartpole_rl.identification.prediction import Prediction, predict
-from cartpole_rl.identification.replay import LEAD, Replayed, away_from_upright, is_away
+from cartpole_rl.identification.prediction import (
+    LEAD,
+    Prediction,
+    Replayed,
+    away_from_upright,
+    is_away,
+    predict,
+)
 from cartpole_rl.identification.rollout import Dynamics
 from cartpole_rl.identification.unknowns import WEIGHED, limits
 from cartpole_rl.identification.windows import cut_judging, cut_windows, lead_periods
@@ -85,13 +91,15 @@ def identify(
     period: float,
     substeps: int = 12,
     most: int = 300,
+    laws: Sequence[Law] = (),
 ) -> Identification:
     """Identify the cart that recordings, by the names of their files, are of, with the pole of `nominal`.
 
-    The model of the cart's friction is chosen here: the one that best predicts seconds of the `fitted`
-    recordings that were left out of its fit. `models` gives the others. The chosen one is then fitted to at
-    most `most` windows of all of them. `held_out` only gives the error that is reported. Raises
-    RecordingError where the recordings are not sufficient, or no cart explains one of them.
+    The law of the cart's friction is chosen here, among the registered candidates and further `laws`: the one
+    that best predicts seconds of the `fitted` recordings that were left out of its fit. `models` gives the
+    others. The chosen one is then fitted to at most `most` windows of all of them. `held_out` only gives the
+    error that is reported. Raises RecordingError where the recordings are not sufficient, or no cart explains
+    one of them.
     """
     episodes = [*fitted.values()]
     judging = cut_judging(episodes, period, HORIZON, lead_periods(LEAD, period), MOVING)
@@ -112,9 +120,8 @@ def identify(
         dynamics = Dynamics.of(fit.parameters, under, period, steps, half_step)
         return Candidate(fit, dynamics, judged_error(predict(judging, dynamics)))
 
-    screened = [
-        attempt(each, most // 3, SCREENING_STEPS, True, False) for each in CART_FRICTIONS if each.candidate
-    ]
+    frictions = dict.fromkeys([*(each for each in CART_FRICTIONS.loaded() if each.candidate), *laws])
+    screened = [attempt(each, most // 3, SCREENING_STEPS, True, False) for each in frictions]
     largest = CONTENDS * min(each.error.size for each in screened)
     contenders = {
         each.cart_friction: attempt(each.cart_friction, most, substeps, True, True)

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from cartpole_rl.physics.dynamics import State, advance, mechanism
 from cartpole_rl.physics.models import Models
-from cartpole_rl.physics.parameters import CartParameters
+from cartpole_rl.physics.parameters import CartParameters, cart_column
 from cartpole_rl.tasks.episode import Episode
 
 Array = NDArray[np.float64]
@@ -99,7 +99,6 @@ def regression(
 def predicted(data: Transitions, values: Mapping[str, float], models: Models, period: float) -> Tensor:
     """Return the states [4, N] one Euler step after `data.before`, of a uniform rod (k = 1/3 in (3.5))."""
     rod = {**values, "pole_inertia": values["pole_mass"] * values["pole_com"] ** 2 / 3}
-    table = torch.tensor([rod[name] for name in CartParameters.names()], dtype=torch.float64)
-    cart = CartParameters.from_table(table.unsqueeze(1))
+    cart = CartParameters.from_table(cart_column(rod))
     force = models.actuator(data.motor, cart)
     return torch.stack(advance(State(*data.before), force, cart, mechanism(cart), models, period))

@@ -2,6 +2,9 @@
 
 The positions in the lead of a window give its initial state, under the model that is judged. Nothing after
 the lead affects where a prediction starts.
+
+A replay predicts a whole recording: the simulated cart is put back onto the measured one at intervals, since
+near upright an error grows e times in 0.15 s.
 """
 
 from collections.abc import Sequence
@@ -13,14 +16,17 @@ from numpy.typing import NDArray
 
 from cartpole_rl.identification.matching import match_initial_states
 from cartpole_rl.identification.rollout import Dynamics
-from cartpole_rl.identification.windows import Windows
+from cartpole_rl.identification.windows import Windows, cut_stretches, lead_periods
 from cartpole_rl.physics.residual import Residual
 from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
+from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.tasks.upright import wrap
 
 CERTAIN = 2.0  # spreads that should hold about 95 % of the errors
 PER_COUNT = np.array([CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT]).reshape(2, 1)  # m, rad
 REPORTED = {"x_mm": 1e3, "theta_deg": 180 / np.pi}  # names of the errors in reports: factor from m and rad
+LEAD = 0.1  # s before a stretch of a replay
+AWAY = 0.6  # rad from upright; nearer to it, an error grows e times in 0.15 s for any cart
 
 Array = NDArray[np.float64]
 
@@ -83,3 +89,47 @@ def root_mean_square(values: Array) -> Array:
     known = np.isfinite(values)
     count, total = known.sum(-1), (np.where(known, values, 0.0) ** 2).sum(-1)
     return np.sqrt(np.where(count > 0, total / np.maximum(count, 1), np.nan))
+
+
+class Replayed(NamedTuple):
+    """One episode beside its replay in S stretches of T periods; NaN where a stretch ends early."""
+
+    episode: Episode
+    time: Array  # [S, T + 1] s
+    x: Array  # [S, T + 1] m, simulated
+    theta: Array  # [S, T + 1] rad, simulated, not wrapped
+    x_error: Array  # [S, T + 1] m, simulated minus measured
+    theta_error: Array  # [S, T + 1] rad, wrapped
+
+
+def replay(episodes: Sequence[Episode], dynamics: Dynamics, restart: float) -> list[Replayed]:
+    """Return each episode beside the cart of `dynamics`, which is put back onto it every `restart` s.
+
+    Raises RecordingError where an episode has another control period than `dynamics`, or is too short.
+    """
+    period, replays = dynamics.period, []
+    for episode in episodes:
+        windows = cut_stretches(episode, period, restart, lead_periods(LEAD, period))
+        simulated, error, _ = predict(windows, dynamics)
+        starts = episode.time[windows.first + windows.lead]
+        time = starts[:, None] + np.arange(len(simulated)) * period
+        motion = (each[:, channel].T for each in (simulated, error) for channel in range(2))
+        replays.append(Replayed(episode, time, *motion))
+    return replays
+
+
+def all_errors(replays: Sequence[Replayed]) -> Array:
+    """Return the errors of all stretches in m and rad, [T + 1, 2, S], as in a Prediction."""
+    errors = zip(*((each.x_error, each.theta_error) for each in replays), strict=True)
+    return np.stack([np.concatenate(each).T for each in errors], 1)
+
+
+def away_from_upright(replayed: Replayed) -> NDArray[np.bool_]:
+    """Return the complete stretches, [S], in which the measured pole stays AWAY from upright."""
+    return np.isfinite(replayed.x_error).all(1) & is_away(replayed.theta - replayed.theta_error)
+
+
+def is_away(theta: Array) -> NDArray[np.bool_]:
+    """Return True, [S], for angles [S, T + 1], rad, that stay AWAY from upright; NaN counts as hanging."""
+    angle = np.abs(wrap(np.where(np.isfinite(theta), theta, np.pi)))
+    return np.all(angle > AWAY, axis=1)

@@ -13,7 +13,7 @@ from cartpole_rl.identification.windows import history_periods
 from cartpole_rl.physics.actuator import step_forces
 from cartpole_rl.physics.dynamics import Drive, MakeAddition, State, run_period
 from cartpole_rl.physics.models import Models
-from cartpole_rl.physics.parameters import CartParameters
+from cartpole_rl.physics.parameters import CartParameters, cart_column
 from cartpole_rl.physics.residual import UNDER_WAY, Residual, members_in_turn
 from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 
@@ -81,8 +81,7 @@ class Dynamics:
         extra_latency: float = 0.0,
     ) -> Self:
         """Return the dynamics of `parameters` by name."""
-        table = [[float(parameters[name])] for name in CartParameters.names()]
-        return cls(torch.tensor(table, dtype=torch.float64), models, period, substeps, extra_latency)
+        return cls(cart_column(parameters), models, period, substeps, extra_latency)
 
     def counts(self, motion: Tensor, motors: Tensor, residual: Residual | None = None) -> Tensor:
         """Return counts [T + 1, 2, M, W] from initial states [4, M, W] and motor values [H + T, W].

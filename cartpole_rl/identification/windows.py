@@ -6,6 +6,7 @@ upright. Half a second is long enough for parameters to show and short enough fo
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -18,6 +19,8 @@ WINDOW = 0.5  # s, of the windows that a cart is fitted to
 HISTORY, LEAST_HISTORY = 0.12, 6  # s and periods of motor values before a window: more than latency and lag
 JUDGING = 4  # one window in so many judges models that are fitted to the others
 LEAST_LEAD = 5  # periods whose positions give an initial state
+HELD_OUT = 5  # one recording in so many is held out
+HELD_OUT_LEAD = 0.2  # s of a held-out window that give its initial state
 IRREGULAR = 0.2  # share of the period that a frame may come early or late
 
 
@@ -174,3 +177,50 @@ def regular_frames(episode: Episode, period: float) -> NDArray[np.bool_]:
 def recorded_period(episode: Episode) -> float:
     """Return the control period of a recording, s: the median time between frames, to 0.1 ms."""
     return round(float(np.median(np.diff(episode.time))), 4)
+
+
+def split(episodes: Sequence[Episode]) -> tuple[list[Episode], list[Episode]]:
+    """Return episodes to learn from and held-out ones: every fifth, or the last fifth of each of a few."""
+    if len(episodes) >= HELD_OUT:
+        chosen = range(HELD_OUT // 2, len(episodes), HELD_OUT)
+        return (
+            [episode for number, episode in enumerate(episodes) if number not in chosen],
+            [episodes[number] for number in chosen],
+        )
+    ends = [episode.steps - episode.steps // HELD_OUT for episode in episodes]
+    return (
+        [part(episode, 0, end) for episode, end in zip(episodes, ends, strict=True)],
+        [part(episode, end, episode.steps) for episode, end in zip(episodes, ends, strict=True)],
+    )
+
+
+def part(episode: Episode, first: int, last: int) -> Episode:
+    """Return the periods from `first` up to, and without, `last` as an episode."""
+    rows = {"time", "x", "x_dot", "theta", "theta_dot", "counts"}
+    cut = {name: getattr(episode, name)[first : last + 1] for name in rows}
+    steps = {
+        name: getattr(episode, name)[first:last] for name in ("motor", "score", "score_upright", "reward")
+    }
+    guarded = None if episode.guarded is None else episode.guarded[first:last]
+    return replace(episode, **cut, **steps, guarded=guarded)
+
+
+def held_out_windows(episodes: Sequence[Episode], period: float, horizon: float) -> Windows:
+    """Return windows of a lead and `horizon` s, overlapping by half.
+
+    The motor values before each window are those of its episode. `Windows.episode` counts the episodes, then
+    the same without the first half window. Raises RecordingError if there is no window.
+    """
+    history, lead = history_periods(period), lead_periods(HELD_OUT_LEAD, period)
+    ahead = lead + round(horizon / period)
+    later = [part(episode, min((history + ahead) // 2, episode.steps), episode.steps) for episode in episodes]
+    seconds = (history + ahead) * period
+    try:
+        cut = cut_windows([*episodes, *later], period, seconds, most=1000)
+    except RecordingError:
+        raise RecordingError(
+            f"the held-out recordings have no {seconds:.2f} s without a lost frame: record longer episodes"
+        ) from None
+    return cut._replace(
+        positions=cut.positions[history:], motors=cut.motors[history:], first=cut.first + history, lead=lead
+    )

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from cartpole_rl.identification.experiments import EXPERIMENTS, HELD_OUT
 from cartpole_rl.identification.identify import HORIZON, Candidate, Identification, PredictionError
+from cartpole_rl.identification.prediction import replay
 from cartpole_rl.identification.quantities import Quantity, intervals
-from cartpole_rl.identification.replay import replay
 from cartpole_rl.reporting.curves import force_curve, friction_curve
 from cartpole_rl.reporting.figures.identified import (
     experiments_figure,

@@ -30,6 +30,7 @@ from cartpole_rl.learning.settings import (
     RayLearnerSettings,
 )
 from cartpole_rl.physics.actuator import ACTUATORS
+from cartpole_rl.physics.friction import CART_FRICTIONS
 from cartpole_rl.physics.laws import Law
 from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.plants.settings import EmulatedSettings, LearnedSettings, SimulatedSettings
@@ -286,6 +287,7 @@ class IdentifyConfig(RunSettings, CartSettings, OnCart):
     source: Annotated[Path | None, Field(alias="from")]
     method: Literal["matching", "one_step"] = "matching"
     pole: PoleSettings
+    friction_laws: tuple[Annotated[Law, CART_FRICTIONS], ...] = ()
     control_period: ControlPeriod
     windows: Annotated[int, Field(ge=20, le=5000)]
     substeps: Annotated[int, Field(ge=1, le=200)]

@@ -79,7 +79,8 @@ def identify_cart(config: IdentifyConfig, folder: Path) -> None:
     if config.method == "one_step":
         regress([*fitted.values(), *held_out.values()], nominal, models, period, truth, folder)
         return
-    found = identify(by_file, held_out_by_file, nominal, models, period, substeps, config.windows)
+    laws = config.friction_laws
+    found = identify(by_file, held_out_by_file, nominal, models, period, substeps, config.windows, laws)
     carts = found.fit.draw(config.carts, np.random.default_rng(config.seed))
     write_choices(found, carts, folder)
     write_json(folder / IDENTIFIED, report(found, carts) | errors(found.fit.parameters, truth, BY_HAND))

@@ -12,10 +12,9 @@ import numpy as np
 from cartpole_rl.evaluation.recordings import read_recording
 from cartpole_rl.identification.ensemble import Ensemble
 from cartpole_rl.identification.fit import Fit, best_fit
-from cartpole_rl.identification.held_out import held_out_windows, split
 from cartpole_rl.identification.prediction import CERTAIN, REPORTED, errors_at, predict
 from cartpole_rl.identification.rollout import Dynamics
-from cartpole_rl.identification.windows import Windows, cut_windows, recorded_period
+from cartpole_rl.identification.windows import Windows, cut_windows, held_out_windows, recorded_period, split
 from cartpole_rl.physics.friction import CART_FRICTIONS
 from cartpole_rl.physics.models import Models
 from cartpole_rl.plants.learned_model import LearnedModel, save_model

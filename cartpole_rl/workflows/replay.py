@@ -7,8 +7,7 @@ diverge.
 from pathlib import Path
 
 from cartpole_rl.evaluation.recordings import read_recording
-from cartpole_rl.identification.prediction import errors_at
-from cartpole_rl.identification.replay import all_errors, replay
+from cartpole_rl.identification.prediction import all_errors, errors_at, replay
 from cartpole_rl.identification.rollout import Dynamics
 from cartpole_rl.identification.windows import recorded_period
 from cartpole_rl.randomization.poles import Pole

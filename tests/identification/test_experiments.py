@@ -26,10 +26,10 @@ from cartpole_rl.identification.experiments import (
     free_swing,
     hold,
 )
-from cartpole_rl.identification.guard import TRACK_END, experiment_guard, guarded, reach
-from cartpole_rl.identification.held_out import part
 from cartpole_rl.identification.identify import Identification, identify
+from cartpole_rl.identification.moves import TRACK_END, experiment_guard, guarded, reach
 from cartpole_rl.identification.quantities import quantities
+from cartpole_rl.identification.windows import part
 from cartpole_rl.physics.friction import CART_FRICTIONS, POLE_FRICTIONS
 from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import CartParameters

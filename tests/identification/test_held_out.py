@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from cartpole_rl.errors import RecordingError
-from cartpole_rl.identification.held_out import LEAD, held_out_windows, split
-from cartpole_rl.identification.windows import history_periods
+from cartpole_rl.identification.windows import LEAD, held_out_windows, history_periods, split
 from cartpole_rl.tasks.episode import Episode
 
 

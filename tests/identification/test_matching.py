@@ -6,8 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from cartpole_rl.identification.correlation import correlation
-from cartpole_rl.identification.fit import neighbours_correlate
+from cartpole_rl.identification.fit import correlation, neighbours_correlate
 from cartpole_rl.identification.matching import (
     FINEST,
     ROBUST,

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from cartpole_rl.identification.replay import Replayed
+from cartpole_rl.identification.prediction import Replayed
 from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 from cartpole_rl.tasks.episode import Episode
 

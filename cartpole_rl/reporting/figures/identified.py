@@ -10,8 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from cartpole_rl.identification.prediction import Replayed
 from cartpole_rl.identification.quantities import Quantity
-from cartpole_rl.identification.replay import Replayed
 from cartpole_rl.reporting import style
 from cartpole_rl.reporting.curves import Curve
 from cartpole_rl.reporting.figures.annotations import beside

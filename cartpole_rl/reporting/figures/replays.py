@@ -7,8 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from cartpole_rl.identification.prediction import root_mean_square
-from cartpole_rl.identification.replay import Replayed, all_errors
+from cartpole_rl.identification.prediction import Replayed, all_errors, root_mean_square
 from cartpole_rl.reporting import style
 from cartpole_rl.reporting.figures.annotations import beside
 from cartpole_rl.reporting.figures.behaviours import wrapped_line

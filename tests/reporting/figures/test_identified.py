@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from figure_contents import line_of, words
 
+from cartpole_rl.identification.prediction import Replayed
 from cartpole_rl.identification.quantities import Quantity
-from cartpole_rl.identification.replay import Replayed
 from cartpole_rl.reporting.curves import Curve
 from cartpole_rl.reporting.figures import png
 from cartpole_rl.reporting.figures.identified import (

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from matplotlib import colors
 
-from cartpole_rl.identification.replay import Replayed
+from cartpole_rl.identification.prediction import Replayed
 from cartpole_rl.reporting.figures import png
 from cartpole_rl.reporting.figures.replays import SIMULATED, replay_figure
 
