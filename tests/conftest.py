@@ -32,6 +32,8 @@ from cartpole_rl.plants.specs import Plant
 from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.randomization.randomizer import Randomizer
 from cartpole_rl.randomization.ranges import Range
+from cartpole_rl.registry import Registry
+from cartpole_rl.rig.parameters import PARAMETERS
 from cartpole_rl.tasks.settings import ActionSettings, RewardSettings, Start, StartSettings, TaskSettings
 
 CONF = Path(__file__).parents[1] / "conf"
@@ -90,6 +92,18 @@ def make_cart(ip02: dict[str, float], medium: PoleSettings) -> Callable[..., Car
         return CartParameters.from_table(torch.stack(rows))
 
     return build
+
+
+@pytest.fixture
+def own_extensions() -> Iterator[None]:
+    """Forget the extensions and parameters that a test registers."""
+    before = {kind: {**registry._entries} for kind, registry in Registry.all.items()}
+    parameters = {**PARAMETERS}
+    yield
+    for kind, registry in Registry.all.items():
+        registry._entries = before.get(kind, registry._entries)
+    for name in PARAMETERS.keys() - parameters.keys():
+        del PARAMETERS[name]
 
 
 STILL = StartSettings(

@@ -66,12 +66,20 @@ class Candidate(NamedTuple):
         return self.dynamics.models.cart_friction
 
 
+class Found(NamedTuple):
+    """An identified cart."""
+
+    fit: Fit  # under the best friction law; its covariance includes how far the other fits lie from it
+    dynamics: Dynamics
+    candidates: list[Candidate]
+
+
 @dataclass(frozen=True)
 class Identification:
-    """The result of an identification."""
+    """The result of an identification: the cart that was found, as held-out recordings judge it."""
 
-    fit: Fit  # under the best friction model; its covariance includes how far the other fits lie from it
-    dynamics: Dynamics  # of the identified cart
+    fit: Fit
+    dynamics: Dynamics
     candidates: list[Candidate]
     held_out: list[Replayed]
     error: PredictionError  # of `held_out`
@@ -95,13 +103,36 @@ def identify(
 ) -> Identification:
     """Identify the cart that recordings, by the names of their files, are of, with the pole of `nominal`.
 
-    The law of the cart's friction is chosen here, among the registered candidates and further `laws`: the one
-    that best predicts seconds of the `fitted` recordings that were left out of its fit. `models` gives the
-    others. The chosen one is then fitted to at most `most` windows of all of them. `held_out` only gives the
-    error that is reported. Raises RecordingError where the recordings are not sufficient, or no cart explains
-    one of them.
+    `held_out` only gives the error that is reported; see `find_cart` for the other arguments. Raises
+    RecordingError where the recordings are not sufficient, or no cart explains one of them.
     """
-    episodes = [*fitted.values()]
+    found = find_cart([*fitted.values()], nominal, models, period, substeps, most, laws)
+    return judged(found, fitted, held_out)
+
+
+def judged(found: Found, fitted: Mapping[str, Episode], held_out: Mapping[str, Episode]) -> Identification:
+    """Return the cart with the error of its predictions. Raises RecordingError for a motion of another cart."""
+    check_explained(fitted, found.dynamics, HORIZON)
+    replays = check_explained(held_out, found.dynamics, HORIZON)
+    doubts = [*early_endings([*fitted.values(), *held_out.values()]), *warnings(found.fit)]
+    return Identification(*found, replays, prediction_error(replays), doubts)
+
+
+def find_cart(
+    episodes: Sequence[Episode],
+    nominal: Mapping[str, float],
+    models: Models,
+    period: float,
+    substeps: int,
+    most: int,
+    laws: Sequence[Law],
+) -> Found:
+    """Return the cart that best explains `episodes`. Raises RecordingError where they are not sufficient.
+
+    The law of the cart's friction is chosen here, among the registered candidates and further `laws`: the one
+    that best predicts seconds of the episodes that were left out of its fit. `models` gives the others. The
+    chosen one is then fitted to at most `most` windows of all episodes.
+    """
     judging = cut_judging(episodes, period, HORIZON, lead_periods(LEAD, period), MOVING)
 
     def attempt(cart_friction: Law, count: int, steps: int, judged: bool, sharpened: bool) -> Candidate:
@@ -131,11 +162,7 @@ def identify(
     candidates = [contenders.get(each.cart_friction, each) for each in screened]
     best = min(contenders.values(), key=lambda each: each.error.size)
     whole = attempt(best.cart_friction, most, substeps, False, True)
-    check_explained(fitted, whole.dynamics, HORIZON)
-    replays = check_explained(held_out, whole.dynamics, HORIZON)
-    fit = widened(whole.fit, best, [*contenders.values()])
-    found = [*early_endings([*episodes, *held_out.values()]), *warnings(fit)]
-    return Identification(fit, whole.dynamics, candidates, replays, prediction_error(replays), found)
+    return Found(widened(whole.fit, best, [*contenders.values()]), whole.dynamics, candidates)
 
 
 def prediction_error(replays: Sequence[Replayed]) -> PredictionError:
@@ -180,12 +207,9 @@ def widened(fit: Fit, best: Candidate, candidates: Sequence[Candidate]) -> Fit:
         if other is best:
             continue
         weight = (best.error.size / other.error.size) ** FALLOFF
-        theirs = {
-            unknown.name: value for unknown, value in zip(other.fit.unknowns, other.fit.point, strict=True)
-        }
-        away = np.array(
-            [theirs.get(name, own) - own for name, own in zip(names, best.fit.point, strict=True)]
-        )
+        theirs = dict(zip((each.name for each in other.fit.unknowns), other.fit.point, strict=True))
+        own = dict(zip(names, best.fit.point, strict=True))
+        away = np.array([theirs.get(name, own[name]) - own[name] for name in names])
         covariance += weight * np.outer(away, away)
         total += weight
     values, vectors = np.linalg.eigh(fit.covariance + covariance / total)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from cartpole_rl.physics.models import Models, unused_parameters
 from cartpole_rl.physics.parameters import CartParameters
-from cartpole_rl.rig.parameters import PARAMETERS, Bound, Prior, factor
+from cartpole_rl.rig.parameters import PARAMETERS, Bound, Prior, completed, factor
 
 Array = NDArray[np.floating]
 POLE_LENGTH = "pole_length"  # not a parameter of its own: see `parameters_at`
@@ -72,6 +72,7 @@ def parameters_at(points: Array, unknowns: Sequence[Unknown], nominal: Mapping[s
     A pole of another length is the nominal one scaled: its mass and centre of mass scale with the length,
     its inertia with the cube of the length. Values stay within their bounds.
     """
+    nominal = completed(nominal)
     values = {
         name: np.full(points.shape[1], float(nominal[name]), dtype=np.float64)
         for name in CartParameters.names()

@@ -12,20 +12,28 @@ from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.errors import RecordingError
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.identification.fit import fit_cart
-from cartpole_rl.identification.prediction import predict
+from cartpole_rl.identification.prediction import errors_at, predict, root_mean_square
 from cartpole_rl.identification.rollout import Dynamics, rollout
 from cartpole_rl.identification.unknowns import limits, parameters_at, unknowns_of
-from cartpole_rl.identification.windows import WINDOW, cut_windows, history_periods
-from cartpole_rl.physics.friction import CART_FRICTIONS
+from cartpole_rl.identification.windows import (
+    HELD_OUT_LEAD,
+    WINDOW,
+    cut_windows,
+    held_out_windows,
+    history_periods,
+    split,
+)
+from cartpole_rl.physics.friction import CART_FRICTIONS, COULOMB, coulomb_force
 from cartpole_rl.physics.models import Models
-from cartpole_rl.physics.parameters import CartParameters
+from cartpole_rl.physics.parameters import CartParameters, cart_column
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.randomization.poles import PoleSettings
+from cartpole_rl.rig.parameters import POSITIVE, Parameter, factor
 from cartpole_rl.tasks.episode import Episode
 
 PERIOD = 0.02
 MOTORS = (-250, -150, 0, 150, 250)
-STEP = Models(cart_friction=CART_FRICTIONS.find("step"))
+STEP = Models.of(cart_friction="step")
 TRUTH = {
     "cart_viscous": 1.2,
     "cart_coulomb": 0.35,
@@ -38,6 +46,9 @@ TRUTH = {
     "angle_offset": 0.008,
     "track_half_length": 2.0,
 }
+
+REACHED = np.where(np.arange(51)[:, None, None] < [51] * 16 + [30] * 2, 1.0, np.nan)  # two of 18 end early
+ERROR = REACHED * np.array([0.02, np.radians(3)])[:, None]  # [51, 2, 18] m, rad
 
 MakePlant = Callable[..., SimulatedPlant]
 MakeEnvironment = Callable[..., CartPoleEnv]
@@ -69,8 +80,7 @@ def test_the_true_cart_predicts_every_count(episodes: list[Episode], nominal: di
     """From the true initial state at rest, to the rounding of the encoders."""
     first = episodes[0]
     motors = np.concatenate((np.zeros(history_periods(PERIOD)), first.motor[:50]))
-    values = {**nominal, **TRUTH}
-    table = torch.tensor([[values[name]] for name in CartParameters.names()], dtype=torch.float64)
+    table = cart_column({**nominal, **TRUTH})
     motion = torch.tensor([[0.0], [0.0], [np.pi], [0.0]], dtype=torch.float64)
     counts = rollout(table, motion, torch.from_numpy(motors).unsqueeze(1), STEP, PERIOD, 4)[..., 0]
     assert np.abs(counts.numpy() - first.counts[:51]).max() < 0.6
@@ -102,7 +112,7 @@ def test_a_fit_finds_another_pole(
     large = PoleSettings(choices={"large": (both_poles.choices or {})["large"]})
     env = make_environment(make_plant(2, poles=large, models=STEP, cart={"track_half_length": 2.0}), MOTORS)
     recorded = run_batch(env, lambda present: present.set("action", torch.randint(5, (2,), generator=random)))
-    found = fit_cart(cut_windows(recorded, PERIOD), nominal, STEP, PERIOD).parameters
+    found = fit_cart(cut_windows(recorded, PERIOD, most=60), nominal, STEP, PERIOD).parameters
     assert found["pole_com"] == pytest.approx(large.nominal.pole_com, rel=0.05)
 
 
@@ -126,6 +136,25 @@ def test_draws_are_physically_possible(episodes: list[Episode], nominal: dict[st
     assert (drawn["latency"] >= 0).all()
     assert (drawn["cart_mass"] > 0).all()
     assert drawn["cart_viscous"].std() > 0
+
+
+@pytest.mark.usefixtures("own_extensions")
+def test_a_law_of_a_user_is_fitted_with_its_own_parameter(
+    episodes: list[Episode], nominal: dict[str, float]
+) -> None:
+    slip = Parameter("test_slip", "m/s", POSITIVE, 0.005, factor(1.0), "speed of 76 % of the friction")
+
+    @CART_FRICTIONS.register("test_tanh", reads=(*COULOMB, slip))
+    def tanh_force(x_dot: torch.Tensor, cart: CartParameters) -> torch.Tensor:
+        return coulomb_force(x_dot, cart) * (x_dot / cart.test_slip).tanh()
+
+    windows, tanh = cut_windows(episodes, PERIOD, most=20), Models.of(cart_friction="test_tanh")
+    fit = fit_cart(windows, nominal, tanh, PERIOD, iterations=4)
+    assert "test_slip" in [unknown.name for unknown in fit.unknowns]
+    assert fit.parameters["test_slip"] != slip.default
+    others = [unknown.name for unknown in unknowns_of(STEP)]
+    assert "test_slip" not in others
+    assert others[-2:] == ["track_tilt", "angle_offset"]
 
 
 def test_limits_match_the_parameter_bounds(nominal: dict[str, float]) -> None:
@@ -173,9 +202,66 @@ class TestWindows:
         cart = {**TRUTH, "latency": latency}
         plant = make_plant(2, cart=cart, models=STEP, period=period, substeps=4)
         recorded = run_batch(make_environment(plant, MOTORS, time_limit=800), shake)
-        windows = cut_windows(recorded, period)
+        windows = cut_windows(recorded, period, most=8)
         assert windows.periods * period == pytest.approx(WINDOW)
         assert len(windows.motors) == windows.periods + history_periods(period)
         assert history_periods(period) * period >= latency
         dynamics = Dynamics.of({**nominal, **cart}, STEP, period, 4)
         assert np.abs(predict(windows._replace(lead=20), dynamics).error[-1, 0]).max() < 1e-3
+
+
+def test_rms_is_of_what_is_known() -> None:
+    errors = np.array([[3.0, 1.0, np.nan], [4.0, np.nan, np.nan]]).T
+    np.testing.assert_allclose(root_mean_square(errors), [np.sqrt(12.5), 1.0, np.nan])
+
+
+def test_errors_count_the_windows_that_reach_a_time() -> None:
+    early, late = errors_at(ERROR, (0.1, 1.0, 7.0), 0.02)  # none at 7 s
+    assert (early["after_s"], early["windows"]) == (0.1, 18)
+    assert (late["after_s"], late["windows"]) == (1.0, 16)
+    for line in (early, late):
+        assert line["rms_x_mm"] == pytest.approx(20)
+        assert line["median_theta_deg"] == pytest.approx(3)
+        assert "rms_spread_x_mm" not in line
+
+
+def test_spreads_stand_beside_the_errors() -> None:
+    spread = np.full_like(ERROR, 0.015)
+    spread[:, :, :9] = 0.005  # too small for the cart's error, within two for the rest
+    (line,) = errors_at(ERROR, [0.1], 0.02, spread)
+    assert line["within_x_mm"] == pytest.approx(0.5)
+    assert line["median_spread_x_mm"] == pytest.approx(10)
+    assert line["rms_spread_x_mm"] == pytest.approx(np.sqrt(125))
+
+
+def numbered(periods: int, period: float) -> Episode:
+    """Motion whose counts and motor values are the numbers of their rows."""
+    rows = np.arange(periods + 1)
+    zeros, steps = np.zeros(periods + 1), np.zeros(periods)
+    counts = np.stack((rows, rows), 1)
+    motor = rows[:-1]
+    return Episode(period * rows, zeros, zeros, zeros, zeros, counts, motor, steps, steps, steps, "time")
+
+
+@pytest.mark.parametrize("period", [0.005, 0.02, 0.1])
+def test_windows_have_their_lead_and_history(period: float) -> None:
+    windows = held_out_windows([numbered(round(8 / period), period)], period, 1.0)
+    assert (windows.periods - windows.lead) * period == pytest.approx(1.0)
+    assert windows.lead * period >= HELD_OUT_LEAD
+    assert (windows.motors[history_periods(period)] == windows.positions[0, 0]).all()
+    assert windows.number > 3
+
+
+def test_too_short_is_named() -> None:
+    with pytest.raises(RecordingError, match=r"have no 1\.32 s without a lost frame"):
+        held_out_windows([numbered(60, 0.02)], 0.02, 1.0)
+
+
+def test_every_fifth_is_held_out_or_the_last_fifth_of_a_few() -> None:
+    whole = [numbered(100 + number, 0.02) for number in range(10)]
+    learned, held_out = split(whole)
+    assert [each.steps for each in held_out] == [102, 107]
+    assert len(learned) == 8
+    learned, held_out = split(whole[:1])
+    assert (learned[0].steps, held_out[0].steps) == (80, 20)
+    assert held_out[0].motor[0] == learned[0].motor[-1] + 1
