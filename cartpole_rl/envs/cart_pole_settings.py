@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from functools import cache
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Discriminator, Field, Tag
 
@@ -14,6 +14,7 @@ from cartpole_rl.physics.models import Models
 from cartpole_rl.plants.settings import LearnedSettings, SimulatedSettings
 from cartpole_rl.randomization.poles import Pole, PoleSettings
 from cartpole_rl.randomization.ranges import IdentifiedSettings, Range
+from cartpole_rl.rig.parameters import completed
 from cartpole_rl.settings import Finite, Settings
 from cartpole_rl.tasks.settings import ActionSettings, RewardSettings, TaskSettings
 
@@ -33,28 +34,31 @@ Randomization = Annotated[
 ControlPeriod = Annotated[float, Field(ge=0.005, le=0.1)]  # s
 
 
-class CartFrictionSettings(Settings):
-    """The friction model of the cart, and numbers of the cart under it: see `driven_numbers`."""
+class FrictionSettings(Settings):
+    """A friction law, and numbers of the cart under it: see `driven_numbers`."""
+
+    if TYPE_CHECKING:
+        model: Law
+        parameters: dict[str, Finite]
+
+    @property
+    def defaults(self) -> Mapping[str, float]:
+        """The numbers of the choice in conf/ with this law."""
+        return shipped_numbers(self.model.registry.kind, self.model)
+
+
+class CartFrictionSettings(FrictionSettings):
+    """The friction law of the cart."""
 
     model: Annotated[Law, CART_FRICTIONS]
     parameters: dict[str, Finite]
 
-    @property
-    def defaults(self) -> Mapping[str, float]:
-        """Those of the choice in conf/ with this model."""
-        return shipped_numbers("cart_friction", self.model)
 
-
-class PoleFrictionSettings(Settings):
-    """The friction model of the pole, and numbers of the cart under it: see `driven_numbers`."""
+class PoleFrictionSettings(FrictionSettings):
+    """The friction law of the pole."""
 
     model: Annotated[Law, POLE_FRICTIONS]
     parameters: dict[str, Finite]
-
-    @property
-    def defaults(self) -> Mapping[str, float]:
-        """Those of the choice in conf/ with this model."""
-        return shipped_numbers("pole_friction", self.model)
 
 
 @cache
@@ -71,9 +75,7 @@ def shipped_carts() -> tuple[dict[str, float], ...]:
     return (carts.pop("ip02"), *carts.values())
 
 
-def driven_numbers(
-    cart: Mapping[str, float], *frictions: CartFrictionSettings | PoleFrictionSettings
-) -> dict[str, float]:
+def driven_numbers(cart: Mapping[str, float], *frictions: FrictionSettings) -> dict[str, float]:
     """Return the numbers of the cart that is driven, without the pole's.
 
     A nominal number (of a cart in conf/) gives way to that of a friction model's choice in conf/. What a
@@ -91,15 +93,20 @@ def driven_numbers(
 
 
 class CartSettings(Settings):
-    """The nominal cart, without a friction model: a fit chooses one."""
+    """The nominal cart, without a friction law of its own: a fit chooses one."""
 
     cart: dict[str, Finite]
     pole_friction: PoleFrictionSettings
 
     @property
+    def frictions(self) -> tuple[FrictionSettings, ...]:
+        """The friction laws that are chosen."""
+        return (self.pole_friction,)
+
+    @property
     def nominal_cart(self) -> dict[str, float]:
         """The parameters of the cart that is driven, or varied, without the pole's."""
-        return driven_numbers(self.cart, self.pole_friction)
+        return completed(driven_numbers(self.cart, *self.frictions))
 
     def nominal_with(self, pole: Pole) -> dict[str, float]:
         """Return the nominal parameters of the cart with `pole`."""
@@ -107,14 +114,14 @@ class CartSettings(Settings):
 
 
 class SimulatedCartSettings(CartSettings):
-    """The nominal cart with its friction models."""
+    """The nominal cart with its friction laws."""
 
     cart_friction: CartFrictionSettings
 
     @property
-    def nominal_cart(self) -> dict[str, float]:
-        """The parameters of the cart that is driven, or varied, without the pole's."""
-        return driven_numbers(self.cart, self.cart_friction, self.pole_friction)
+    def frictions(self) -> tuple[FrictionSettings, ...]:
+        """The friction laws that are chosen."""
+        return self.cart_friction, self.pole_friction
 
     def models_with(self, actuator: Law, plant: SimulatedSettings | LearnedSettings) -> Models:
         """Return the physics models of the cart with `actuator`, on `plant`."""
