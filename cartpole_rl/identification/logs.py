@@ -1,0 +1,244 @@
+"""Logs of other people's carts, read by a layout into episodes.
+
+A layout says which columns a log has, their units and signs, which angle is upright, and whether the motor
+value of a row was chosen on that row's state or was in force before it. A log is split where rows are missing
+or left out, so that each part has a constant period.
+"""
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from cartpole_rl.errors import RecordingError
+from cartpole_rl.identification.experiments import recording
+from cartpole_rl.identification.windows import IRREGULAR
+from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, LARGEST_MOTOR, POLE_COUNTS_PER_TURN
+from cartpole_rl.settings import Finite, Positive, Settings
+from cartpole_rl.tasks.endings import Ending
+from cartpole_rl.tasks.episode import Episode
+
+Array = NDArray[np.float64]
+Direction = Literal["right", "left"]
+SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+TURN = {"rad": 2 * np.pi, "deg": 360.0, "turn": 1.0}
+Name = Annotated[str, Field(min_length=1)]
+
+
+class TimeColumn(Settings):
+    """The time of each row, or the time since the row before."""
+
+    name: Name
+    unit: Literal["s", "ms", "us", "ns"] = "s"
+    since: Literal["start", "previous_row"] = "start"
+
+
+class PositionColumn(Settings):
+    """The position of the cart."""
+
+    name: Name
+    unit: Literal["m", "cm", "mm"] | Positive = "m"  # or metres in one unit of the column
+    positive: Direction = "right"
+    zero: Finite = 0.0  # value in the middle of the track
+
+
+class AngleColumn(Settings):
+    """The angle of the pole."""
+
+    name: Name
+    unit: Literal["rad", "deg", "turn"] | Positive = "rad"  # or units of the column in one turn
+    positive: Direction = "right"  # the side to which the upright pole leans where the value increases
+    upright: Finite = 0.0  # value of the upright pole
+    wraps: bool = True  # the value jumps by a turn somewhere
+
+
+class MotorColumn(Settings):
+    """The motor value."""
+
+    name: Name
+    full: Positive  # largest value in size
+    positive: Direction = "right"  # the side to which a positive value pushes the cart
+    row: Literal["chosen", "in_force"] = "chosen"  # chosen on the row's state, or in force before it
+
+
+class Layout(Settings):
+    """The layout of a log: columns, units, signs, and the rows that count."""
+
+    delimiter: Annotated[str, Field(min_length=1, max_length=1)] | None = None  # None: found in the file
+    decimal: Literal[".", ","] = "."
+    comment: Name = "#"  # at the start of a line
+    time: TimeColumn
+    position: PositionColumn
+    angle: AngleColumn
+    motor: MotorColumn
+    period: Positive | None = None  # s; None: the median
+    resample: bool = False  # where the period varies, by lines between the rows
+    # column: lowest and highest value of a row that counts
+    keep: dict[Name, tuple[Finite, Finite]] = Field(default_factory=dict)
+    shortest: Positive = 1.0  # s of a part that is kept
+
+    @model_validator(mode="after")
+    def _bounds_are_in_order(self) -> "Layout":
+        for name, (low, high) in self.keep.items():
+            if low > high:
+                raise ValueError(f"keep.{name}: give the lower bound first, as [{high:g},{low:g}]")
+        return self
+
+
+class Report(NamedTuple):
+    """The work done on one log."""
+
+    rows: int
+    left_out: Mapping[str, int]  # rows by reason
+    gaps: int  # places where rows are missing
+    saturated: int  # rows with full motor
+    beyond: int  # rows with a motor value beyond full
+    period: float  # s
+    jitter: float  # s, 95 % of the gaps are within this of the period
+
+
+class Log(NamedTuple):
+    """The episodes of one log, the parts of which have a constant period."""
+
+    parts: list[Episode]
+    report: Report
+
+
+def read_log(path: Path, layout: Layout) -> Log:
+    """Return the episodes in a log. Raises RecordingError that names the file and the line."""
+    columns = read_columns(path, layout)
+    time = times(path, columns[layout.time.name], layout.time)
+    gaps = np.diff(time)
+    period = layout.period or float(np.median(gaps))
+    jitter = float(np.quantile(np.abs(gaps - period), 0.95)) if len(gaps) else 0.0
+    x = signed(layout.position.positive) * (columns[layout.position.name] - layout.position.zero)
+    x *= METRES[layout.position.unit] if isinstance(layout.position.unit, str) else layout.position.unit
+    turn = TURN[layout.angle.unit] if isinstance(layout.angle.unit, str) else layout.angle.unit
+    theta = signed(layout.angle.positive) * (columns[layout.angle.name] - layout.angle.upright) / turn
+    motor = signed(layout.motor.positive) * columns[layout.motor.name] / layout.motor.full
+    counted, left_out = np.ones(len(time), bool), {}
+    for name, (low, high) in layout.keep.items():
+        bad = (columns[name] < low) | (columns[name] > high)
+        left_out[f"{name} not in {low:g} to {high:g}"] = int((bad & counted).sum())
+        counted &= ~bad
+    regular = np.ones(len(gaps), bool)
+    if not layout.resample:
+        regular = np.abs(gaps - period) <= IRREGULAR * period
+    together = counted[:-1] & counted[1:] & regular
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], together, [False]))))
+    parts = []
+    for first, last in edges.reshape(-1, 2):  # rows, the last one included
+        rows = np.arange(first, last + 1)
+        if (last - first) * period < layout.shortest:
+            left_out["in a part that is too short"] = left_out.get("in a part that is too short", 0) + len(
+                rows
+            )
+            continue
+        turns = np.unwrap(theta[rows], period=1.0) if layout.angle.wraps else theta[rows]
+        states = np.stack((x[rows] / CART_METRES_PER_COUNT, turns * POLE_COUNTS_PER_TURN), 1)
+        values = motor[rows[1:]] if layout.motor.row == "in_force" else motor[rows[:-1]]
+        if layout.resample:
+            states, values = resampled(time[rows], states, values, period)
+        parts.append(_episode(states, values, period))
+    alone = ~np.concatenate(([False], together)) & ~np.concatenate((together, [False])) & counted
+    left_out["alone between gaps"] = int(alone.sum())
+    report = Report(
+        len(time),
+        {reason: number for reason, number in left_out.items() if number},
+        int((~regular).sum()),
+        int((np.abs(motor) >= 0.999).sum()),
+        int((np.abs(motor) > 1.001).sum()),
+        period,
+        jitter,
+    )
+    return Log(parts, report)
+
+
+def signed(positive: Direction) -> int:
+    """Return 1 for a column that increases to the right, -1 to the left."""
+    return 1 if positive == "right" else -1
+
+
+def read_columns(path: Path, layout: Layout) -> dict[str, Array]:
+    """Return the columns of a log that the layout names."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "it is not UTF-8 text"
+        raise RecordingError(f"{path} cannot be read: {reason}") from None
+    numbered = [
+        (number, line)
+        for number, line in enumerate(text.splitlines(), 1)
+        if line.strip() and not line.lstrip().startswith(layout.comment)
+    ]
+    if len(numbered) < 3:
+        raise RecordingError(f"{path} holds no rows; give a log with a line of column names")
+    delimiter = layout.delimiter or found_delimiter(numbered[0][1], layout.decimal)
+    rows = [*csv.reader(io.StringIO("\n".join(line for _, line in numbered)), delimiter=delimiter)]
+    heading = [name.strip() for name in rows[0]]
+    wanted = [layout.time.name, layout.position.name, layout.angle.name, layout.motor.name, *layout.keep]
+    if missing := [name for name in wanted if name not in heading]:
+        raise RecordingError(f"{path} has no column {', '.join(missing)}; it has {', '.join(heading)}")
+    lines = [number for number, _ in numbered[1:]]
+    return {name: _numbers(path, name, heading.index(name), rows[1:], lines, layout) for name in wanted}
+
+
+def found_delimiter(heading: str, decimal: str) -> str:
+    """Return the delimiter that occurs most often in the line of column names."""
+    candidates = [each for each in ",;\t|" if each != decimal] if decimal == "," else [*",;\t|"]
+    best = max(candidates, key=heading.count)
+    return best if best in heading else " "
+
+
+def _numbers(
+    path: Path, name: str, column: int, rows: Sequence[Sequence[str]], lines: Sequence[int], layout: Layout
+) -> Array:
+    values = np.empty(len(rows))
+    for index, (row, line) in enumerate(zip(rows, lines, strict=True)):
+        cell = row[column].strip() if column < len(row) else ""
+        try:
+            values[index] = float(cell.replace(layout.decimal, "."))
+        except ValueError:
+            found = f"is {cell!r}" if cell else "is empty"
+            raise RecordingError(
+                f"{path}, line {line}: {name} {found}; give a number, or mend decimal= and delimiter= of the "
+                "layout"
+            ) from None
+        if not np.isfinite(values[index]):
+            raise RecordingError(f"{path}, line {line}: {name} is {cell}; give a finite number")
+    return values
+
+
+def times(path: Path, values: Array, column: TimeColumn) -> Array:
+    """Return the time of each row in s, from 0."""
+    seconds = values * SECONDS[column.unit]
+    time = np.cumsum(seconds) - seconds[0] if column.since == "previous_row" else seconds - seconds[0]
+    if (back := np.flatnonzero(np.diff(time) <= 0)).size:
+        raise RecordingError(
+            f"{path}: the time {column.name} does not increase after row {back[0] + 1}; sort the rows, or "
+            "give another column"
+        )
+    return time
+
+
+def resampled(time: Array, states: Array, motor: Array, period: float) -> tuple[Array, Array]:
+    """Return states [T + 1, 2] and motor values [T] at a constant period.
+
+    States lie on lines between the rows; a motor value is the mean of those in force in its period.
+    """
+    grid = np.arange(time[0], time[-1] + 1e-9, period)
+    at = np.stack([np.interp(grid, time, column) for column in states.T], 1)
+    total = np.concatenate((np.zeros(1), np.cumsum(motor * np.diff(time))))
+    return at, np.diff(np.interp(grid, time, total)) / period
+
+
+def _episode(states: Array, motor: Array, period: float) -> Episode:
+    full = np.clip(np.rint(motor * LARGEST_MOTOR), -LARGEST_MOTOR, LARGEST_MOTOR)
+    gaps = np.full(len(full), period)
+    return recording(np.rint(states).astype(np.int64), gaps, full.astype(np.int64), str(Ending.TIME))

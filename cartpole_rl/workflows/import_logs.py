@@ -1,0 +1,228 @@
+"""Make recordings of anyone's logs, and say what is doubtful about them.
+
+Motion tells much of what a layout can get wrong: signs, the scale and the zero of the angle, the scale of the
+position, and a motor value that was chosen a row earlier or later.
+"""
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cartpole_rl.errors import RecordingError
+from cartpole_rl.evaluation.recordings import LENGTH, write_recording
+from cartpole_rl.identification.logs import Layout, Log, Report, read_log
+from cartpole_rl.identification.sensors import Estimate, Motion, Sensors, question_sensors
+from cartpole_rl.run_files import RECORDINGS
+from cartpole_rl.settings import Positive, Settings
+from cartpole_rl.workflows.run_folder import write_config, write_json
+
+IMPORTED = "import.json"
+SUFFIXES = (".csv", ".txt", ".tsv", ".log", ".dat")
+CORRELATED = 0.2  # size of a correlation that has a sign
+ANGLE_SCALE, POSITION_SCALE = 0.01, 0.10  # share by which a scale may differ
+ANGLE_ZERO = 0.02  # rad by which the upright angle may differ
+JITTER = 0.1  # share of the period
+SATURATED = 0.5  # share of rows
+TURN = 2 * np.pi
+
+
+class ImportConfig(Settings):
+    """The settings of cartpole-import."""
+
+    source: Path
+    layout: Layout
+    pole_length: Positive | None = None  # m, of the recorded pole
+    label: str
+
+
+def import_logs(config: ImportConfig, folder: Path) -> Sensors:
+    """Read the logs in `config.source` and write their parts as recordings.
+
+    Writes into `folder` config.yaml, provenance.json, recordings/ and import.json: the rows that were left
+    out, and the estimates of the sensors. Prints them, and each doubt. Raises RecordingError for a log that
+    cannot be read, or if nothing is left.
+    """
+    paths = log_files(config.source)
+    logs = {path: read_log(path, config.layout) for path in paths}
+    periods = sorted({round(log.report.period, 4) for log in logs.values()})
+    if len(periods) > 1:
+        raise RecordingError(
+            f"from={config.source}: the logs have control periods from {1e3 * periods[0]:g} to "
+            f"{1e3 * periods[-1]:g} ms; import those of one period at a time, or give layout.period and "
+            "layout.resample=true"
+        )
+    parts = [part for log in logs.values() for part in log.parts]
+    if not parts:
+        reasons = sum((Counter(log.report.left_out) for log in logs.values()), Counter[str]())
+        raise RecordingError(
+            f"from={config.source}: no part of {config.layout.shortest:g} s is left; left out: "
+            + (", ".join(f"{number} rows {reason}" for reason, number in reasons.items()) or "none")
+        )
+    period = logs[paths[0]].report.period
+    motions = [Motion(part.x, part.theta, part.motor.astype(float)) for part in parts]
+    sensors = question_sensors(motions, period)
+    found = [*doubts([log.report for log in logs.values()], sensors, period, config.layout)]
+    write_config(folder, "import", {**config.model_dump(mode="json", by_alias=True), "seed": 0})
+    for path, log in logs.items():
+        for number, part in enumerate(log.parts):
+            heading = {
+                "plant": "log",
+                "pole": "",
+                LENGTH: config.pole_length or "",
+                "control_period_s": period,
+            }
+            write_recording(
+                folder / RECORDINGS / f"{path.stem}_{number:02d}.csv", part, {**heading, "log": path.name}
+            )
+    write_json(folder / IMPORTED, summary(logs, sensors, found))
+    print_summary(logs, parts, period, sensors, found, folder)
+    return sensors
+
+
+def log_files(source: Path) -> list[Path]:
+    """Return a log, or those in a folder. Raises RecordingError if there is none."""
+    if source.is_file():
+        return [source]
+    found = sorted(path for path in source.glob("*") if path.suffix.lower() in SUFFIXES)
+    if not found:
+        missing = f"it holds no {', '.join(SUFFIXES)} file" if source.is_dir() else "no such file or folder"
+        raise RecordingError(f"from={source}: {missing}; give a log, or a folder of logs")
+    return found
+
+
+def doubts(reports: Sequence[Report], sensors: Sensors, period: float, layout: Layout) -> Iterator[str]:
+    """Yield a sentence for each thing that the motion or the rows contradict."""
+    if sensors.push < -CORRELATED:
+        yield (
+            "positive motor values accelerate the cart to the left: give the other side for "
+            "layout.motor.positive or layout.position.positive"
+        )
+    if sensors.lag < -CORRELATED:
+        yield (
+            "the pole runs ahead of its cart instead of staying behind: give the other side for "
+            "layout.angle.positive"
+        )
+    signs_fit = sensors.push >= -CORRELATED and sensors.lag >= -CORRELATED
+    if signs_fit:
+        yield from _scale_doubts(sensors, layout)
+        yield from _delay_doubts(sensors, period, layout)
+    jitter = max(report.jitter for report in reports)
+    if jitter > JITTER * period and not layout.resample:
+        yield (
+            f"the time between rows varies: 5 % are over {1e3 * jitter:.1f} ms from the period of "
+            f"{1e3 * period:g} ms; give the clock of the cart's board as layout.time, or layout.resample=true"
+        )
+    rows, beyond = sum(each.rows for each in reports), sum(each.beyond for each in reports)
+    if beyond:
+        full = f"layout.motor.full={layout.motor.full:g}"
+        yield f"{beyond} of {rows} motor values are beyond {full}: give the largest"
+    saturated = sum(each.saturated for each in reports)
+    if saturated > SATURATED * rows:
+        yield f"{saturated} of {rows} rows have full motor: the motor's curve cannot be told from them"
+
+
+def _scale_doubts(sensors: Sensors, layout: Layout) -> Iterator[str]:
+    scale, zero, position = sensors.angle_scale, sensors.angle_zero, sensors.position_scale
+    if scale is not None and not scale.holds(1, ANGLE_SCALE):
+        unit = layout.angle.unit
+        turn = {"rad": TURN, "deg": 360.0, "turn": 1.0}[unit] if isinstance(unit, str) else unit
+        factor = _or_unit(scale.value)
+        yield (
+            f"the angle's scale is refuted by its motion: it turns {factor} as far as recorded; a turn has "
+            f"{turn / scale.value:.5g} units of {layout.angle.name} (95 %: {turn / scale.high:.5g} to "
+            f"{turn / scale.low:.5g}), not {turn:.5g}: give it as layout.angle.unit"
+        )
+    elif zero is not None and not zero.holds(0, ANGLE_ZERO):
+        yield (
+            f"the pole is upright at a recorded angle of {np.degrees(zero.value):.1f} degrees (95 %: "
+            f"{np.degrees(zero.low):.1f} to {np.degrees(zero.high):.1f}): mend layout.angle.upright"
+        )
+    if position is not None and scale is not None and not position.holds(1, POSITION_SCALE):
+        yield (
+            f"the position's scale is refuted by the pole: the cart moves {_or_unit(position.value)} as far "
+            f"as recorded (95 %: {position.low:.3g} to {position.high:.3g}): mend layout.position.unit"
+        )
+
+
+def _or_unit(factor: float) -> str:
+    """Return a factor in words, with the unit that it suggests."""
+    for value, unit in (
+        (TURN / 360, "degrees"),
+        (360 / TURN, "radians"),
+        (1e-3, "mm"),
+        (1e-2, "cm"),
+        (1e3, "m"),
+    ):
+        if abs(factor / value - 1) < 0.1:
+            return f"{factor:.3g} times (the column may be in {unit})"
+    return f"{factor:.3f} times"
+
+
+def _delay_doubts(sensors: Sensors, period: float, layout: Layout) -> Iterator[str]:
+    delay = sensors.delay
+    if delay is None or (delay.high >= 0 and delay.low <= 2 * period):
+        return
+    if delay.high < 0:
+        other, when = (
+            ("in_force", "before it was chosen") if layout.motor.row == "chosen" else ("chosen", "too early")
+        )
+    else:
+        other, when = ("chosen" if layout.motor.row == "in_force" else "in_force"), "over two periods later"
+    yield (
+        f"the motor values seem shifted: they move the cart {when} ({1e3 * delay.value:.0f} ms, 95 %: "
+        f"{1e3 * delay.low:.0f} to {1e3 * delay.high:.0f}, after the state of their row); try "
+        f"layout.motor.row={other}"
+    )
+
+
+def summary(logs: dict[Path, Log], sensors: Sensors, found: Sequence[str]) -> dict[str, Any]:
+    """Return the content of import.json."""
+    return {
+        "logs": {
+            path.name: {**log.report._asdict(), "parts": [part.steps for part in log.parts]}
+            for path, log in logs.items()
+        },
+        "sensors": {
+            name: value._asdict() if isinstance(value, Estimate) else value
+            for name, value in sensors._asdict().items()
+        },
+        "doubts": list(found),
+    }
+
+
+def print_summary(
+    logs: dict[Path, Log],
+    parts: Sequence[Any],
+    period: float,
+    sensors: Sensors,
+    found: Sequence[str],
+    folder: Path,
+) -> None:
+    """Print the parts that were kept, the rows that were left out, the estimates and the doubts."""
+    reports = [log.report for log in logs.values()]
+    seconds = period * sum(part.steps for part in parts)
+    print(
+        f"{len(logs)} logs, {sum(each.rows for each in reports)} rows: {len(parts)} recordings, "
+        f"{seconds:.0f} s"
+    )
+    reasons = sum((Counter(each.left_out) for each in reports), Counter[str]())
+    for reason, number in reasons.items():
+        print(f"left out: {number} rows {reason}")
+    if gaps := sum(each.gaps for each in reports):
+        print(f"gaps: {gaps} between rows that are not one period apart")
+    for name, estimate, factor, unit in (
+        ("angle: true over recorded", sensors.angle_scale, 1, ""),
+        ("upright at a recorded angle of", sensors.angle_zero, 180 / np.pi, " degrees"),
+        ("position: true over recorded", sensors.position_scale, 1, ""),
+        ("state to effect of its motor value", sensors.delay, 1e3, " ms"),
+    ):
+        if estimate is not None:
+            value, low, high = (factor * each for each in estimate)
+            print(f"{name}: {value:.4g}{unit} (95 %: {low:.4g} to {high:.4g})")
+    for doubt in found:
+        print(f"doubt: {doubt}")
+    print(f"{folder}/{RECORDINGS}/ holds the recordings; next:")
+    print(f"cartpole-identify from={folder} pole=...")
