@@ -184,7 +184,7 @@ def delay_estimate(
 def _regression(terms: Array, values: Array, weights: Array | None) -> tuple[Array, Array]:
     """Return the least-squares solution, and the weighted errors."""
     root = np.ones(len(values)) if weights is None else np.sqrt(weights)
-    solution: Array = np.linalg.lstsq(terms * root[:, None], values * root, rcond=None)[0]
+    solution = np.asarray(np.linalg.lstsq(terms * root[:, None], values * root, rcond=None)[0], np.float64)
     return solution, (values - terms @ solution) * root
 
 
