@@ -67,10 +67,19 @@ def course(**chosen: str) -> Any:
 
 
 def friction_changes_the_motion(runs: Runs) -> None:
-    _, step, smooth = (metrics(run) for run in runs)
-    assert step["episodes"] != smooth["episodes"]
-    states = [course(cart_friction=name)[0]["state"] for name in ("stribeck", "smooth_stribeck")]
-    assert (states[0] - states[1]).abs().max() > 0.001
+    trained, step, smooth, exported = runs
+    assert metrics(step)["episodes"] != metrics(smooth)["episodes"]
+    assert "model: my_laws:smooth_stribeck" in (trained / "config.yaml").read_text()
+    assert any(exported.rglob("*.c"))
+    chosen = ("stribeck", "smooth_stribeck.yaml")
+    rollouts = [course(cart_friction=name)[0] for name in chosen]
+    assert (rollouts[0]["state"] - rollouts[1]["state"]).abs().max() > 0.001
+
+
+def masses_are_near_the_low_bound(runs: Runs) -> None:
+    chosen = {"randomization.cart_mass.distribution": "my_distributions:squared"}
+    usual, squared = (course(**each)[1].plant.parameters.cart_mass for each in ({}, chosen))
+    assert squared.median() < usual.median() - 0.02
 
 
 def reward_is_the_formula(runs: Runs) -> None:
@@ -148,6 +157,7 @@ EFFECTS: dict[int, Callable[[Runs], None]] = {
     4: counts_are_metres,
     5: agent_sees_the_energy,
     6: message_survives_the_wire,
+    7: masses_are_near_the_low_bound,
 }
 
 
