@@ -14,6 +14,7 @@ from cartpole_rl.errors import RecordingError
 from cartpole_rl.identification.fit import correlation
 from cartpole_rl.identification.prediction import REPORTED, Replayed, away_from_upright, replay
 from cartpole_rl.identification.rollout import Dynamics
+from cartpole_rl.identification.sensors import Motion, question_sensors
 from cartpole_rl.identification.windows import regular_frames
 from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 from cartpole_rl.tasks.episode import Episode
@@ -26,6 +27,7 @@ LEAST_TRAVEL, LEAST_SWING = 0.05, 0.35  # m, rad
 LEAST_OF_EACH = 0.01, 0.05  # m, rad, in each recording: less than any experiment's
 STILL, STILL_ANGLE, STILL_SPREAD = 0.3, 0.2, 0.02  # s, rad from hanging, rad
 FROZEN = 1.0  # s
+ZERO_INTERVAL = 0.02  # rad, 95 % of the zero that motion tells
 STRONG, MOVES = 150, 0.03  # motor value; m of cart that move a hanging pole
 STRONG_SHARE = 0.3  # of a standstill's motor values: no cart with a swinging pole stands still under so many
 SUDDEN = 0.25  # m/s: from here to standing exactly still within a period
@@ -47,8 +49,8 @@ def naming(file: str) -> Iterator[None]:
 def check_recordings(fitted: Mapping[str, Episode], held_out: Mapping[str, Episode], period: float) -> None:
     """Raise RecordingError for the first problem of the recordings, by the names of their files.
 
-    Each one must show a driven cart and a moving pole; those `fitted` to must show them well together, and
-    those `held_out` each for itself.
+    Each one must show a driven cart and a moving pole; those `fitted` to must show them well together, and so
+    must those `held_out`.
     """
     for file, episode in {**fitted, **held_out}.items():
         with naming(file):
@@ -61,24 +63,37 @@ def check_recordings(fitted: Mapping[str, Episode], held_out: Mapping[str, Episo
                 )
             _check_motion([episode], *LEAST_OF_EACH)
             _check_encoders(episode, period)
-    for file, episode in held_out.items():
-        with naming(file):
-            if (seconds := period * episode.steps) < SHORTEST_HELD_OUT:
-                raise RecordingError(
-                    f"{seconds:.1f} s are too short to judge a fit; give {SHORTEST_HELD_OUT:g} s or more"
-                )
-            _check_motion([episode], LEAST_TRAVEL, LEAST_SWING)
+    with naming(", ".join(held_out) if len(held_out) < 3 else f"the {len(held_out)} held-out recordings"):
+        judges = [*held_out.values()]
+        if (seconds := period * sum(episode.steps for episode in judges)) < SHORTEST_HELD_OUT:
+            raise RecordingError(
+                f"{seconds:.1f} s are too short to judge a fit; give {SHORTEST_HELD_OUT:g} s or more"
+            )
+        _check_motion(judges, LEAST_TRAVEL, LEAST_SWING)
     episodes = [*fitted.values()]
     seconds = period * sum(episode.steps for episode in episodes)
     if seconds < SHORTEST:
         raise RecordingError(f"{seconds:.1f} s of recordings are too short; record {SHORTEST:g} s or more")
     _check_motion(episodes, LEAST_TRAVEL, LEAST_SWING)
-    if not any(_hangs_still(episode, period) for episode in episodes):
+    if not any(_hangs_still(episode, period) for episode in episodes) and not zero_is_known(episodes, period):
         raise RecordingError(
-            "the pole never hangs still in the recordings, so its zero cannot be checked; "
+            "the pole never hangs still in the recordings, and its motion does not tell its zero; "
             "start one with half a second of the pole at rest"
         )
     _check_signs(episodes, period)
+
+
+def zero_is_known(episodes: Sequence[Episode], period: float) -> bool:
+    """Return True if motion tells the zero of the angle."""
+    motions = [Motion(each.x, each.theta, each.motor.astype(float)) for each in episodes]
+    zero = question_sensors(motions, period).angle_zero
+    return zero is not None and zero.high - zero.low < ZERO_INTERVAL
+
+
+def shows_motion(episode: Episode) -> bool:
+    """Return True if the motor value changes, and cart and pole move enough to be fitted to."""
+    travel, swing = LEAST_OF_EACH
+    return bool(np.ptp(episode.motor) and np.ptp(episode.x) >= travel and np.ptp(episode.theta) >= swing)
 
 
 def check_explained(recordings: Mapping[str, Episode], dynamics: Dynamics, horizon: float) -> list[Replayed]:

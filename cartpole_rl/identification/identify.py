@@ -111,7 +111,10 @@ def identify(
 
 
 def judged(found: Found, fitted: Mapping[str, Episode], held_out: Mapping[str, Episode]) -> Identification:
-    """Return the cart with the error of its predictions. Raises RecordingError for a motion of another cart."""
+    """Return the cart with the error of its predictions.
+
+    Raises RecordingError for a motion of another cart.
+    """
     check_explained(fitted, found.dynamics, HORIZON)
     replays = check_explained(held_out, found.dynamics, HORIZON)
     doubts = [*early_endings([*fitted.values(), *held_out.values()]), *warnings(found.fit)]

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from cartpole_rl.errors import RecordingError
+from cartpole_rl.identification.checks import shows_motion
 from cartpole_rl.identification.experiments import recording
 from cartpole_rl.identification.windows import IRREGULAR
 from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, LARGEST_MOTOR, POLE_COUNTS_PER_TURN
@@ -28,6 +29,7 @@ Direction = Literal["right", "left"]
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 TURN = {"rad": 2 * np.pi, "deg": 360.0, "turn": 1.0}
+SHORT, STANDING = "in a part that is too short", "in a part in which motor, cart or pole stand still"
 Name = Annotated[str, Field(min_length=1)]
 
 
@@ -81,7 +83,7 @@ class Layout(Settings):
     resample: bool = False  # where the period varies, by lines between the rows
     # column: lowest and highest value of a row that counts
     keep: dict[Name, tuple[Finite, Finite]] = Field(default_factory=dict)
-    shortest: Positive = 1.0  # s of a part that is kept
+    shortest: Positive = 1.5  # s of a part that is kept
 
     @model_validator(mode="after")
     def _bounds_are_in_order(self) -> "Layout":
@@ -136,16 +138,18 @@ def read_log(path: Path, layout: Layout) -> Log:
     for first, last in edges.reshape(-1, 2):  # rows, the last one included
         rows = np.arange(first, last + 1)
         if (last - first) * period < layout.shortest:
-            left_out["in a part that is too short"] = left_out.get("in a part that is too short", 0) + len(
-                rows
-            )
+            left_out[SHORT] = left_out.get(SHORT, 0) + len(rows)
             continue
         turns = np.unwrap(theta[rows], period=1.0) if layout.angle.wraps else theta[rows]
         states = np.stack((x[rows] / CART_METRES_PER_COUNT, turns * POLE_COUNTS_PER_TURN), 1)
         values = motor[rows[1:]] if layout.motor.row == "in_force" else motor[rows[:-1]]
         if layout.resample:
             states, values = resampled(time[rows], states, values, period)
-        parts.append(_episode(states, values, period))
+        part = _episode(states, values, period)
+        if shows_motion(part):
+            parts.append(part)
+        else:
+            left_out[STANDING] = left_out.get(STANDING, 0) + len(rows)
     alone = ~np.concatenate(([False], together)) & ~np.concatenate((together, [False])) & counted
     left_out["alone between gaps"] = int(alone.sum())
     report = Report(

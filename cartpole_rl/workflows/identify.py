@@ -44,6 +44,8 @@ from cartpole_rl.workflows.recordings import experiments
 from cartpole_rl.workflows.results import print_results, shown
 from cartpole_rl.workflows.run_folder import write_config, write_json
 
+HELD_OUT_OF = 5  # one recording in so many is held out
+
 Episodes = dict[str, Episode]  # by the name of the experiment, or of the file
 
 
@@ -138,12 +140,16 @@ def make_plant(config: IdentifyConfig) -> SerialPlant:
 
 
 def split(recordings: Episodes, source: Path) -> tuple[Episodes, Episodes]:
-    """Return the recordings to fit, and the held-out one: that experiment, or else the last recording."""
-    held_out = HELD_OUT if HELD_OUT in recordings else list(recordings)[-1]
-    fitted = {name: episode for name, episode in recordings.items() if name != held_out}
-    if not fitted or (held_out != HELD_OUT and len(recordings) < 2):
+    """Return the recordings to fit, and the held-out ones.
+
+    Held out are the experiment of that name, or else every fifth recording, or the last of fewer than five.
+    """
+    names = list(recordings)
+    held_out = [HELD_OUT] if HELD_OUT in recordings else names[HELD_OUT_OF - 1 :: HELD_OUT_OF] or names[-1:]
+    fitted = {name: episode for name, episode in recordings.items() if name not in held_out}
+    if not fitted:
         raise RecordingError(f"from={source}: give two recordings or more; the last one is held out")
-    return fitted, {held_out: recordings[held_out]}
+    return fitted, {name: recordings[name] for name in held_out}
 
 
 def next_command(found: Identification, folder: Path) -> str:

@@ -1,5 +1,6 @@
 """Finds recordings in run folders, without reading them."""
 
+import re
 from pathlib import Path
 
 from cartpole_rl.errors import RecordingError
@@ -27,4 +28,4 @@ def recordings(source: Path) -> list[Path]:
 
 def experiments(source: Path) -> dict[str, Path]:
     """Return `recordings` by the names of their experiments, or of their files. Raises the same errors."""
-    return {path.stem.partition("_")[2] or path.stem: path for path in recordings(source)}
+    return {re.sub(r"^\d\d_(?=.)", "", path.stem): path for path in recordings(source)}
