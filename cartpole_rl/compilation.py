@@ -15,7 +15,8 @@ from types import BuiltinFunctionType
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import torch
-from torch import Tensor
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from torch import Tensor, nn
 from torch._inductor import standalone_compile
 from torch._ops import OpOverload
 from torch.fx import GraphModule
@@ -24,6 +25,8 @@ from torch.fx.experimental.proxy_tensor import make_fx
 OPTIONS = {"cpp.enable_floating_point_contract_flag": "fast"}  # fused multiply-add on the CPU; Triton has it
 
 Arguments = Sequence[tuple[Tensor, ...]]
+Columns = tuple[Tensor, ...]  # of a batch of transitions
+IMPORTANCE_WEIGHT: NestedKey = "priority_weight"
 Result = TypeVar("Result", bound=tuple)
 
 
@@ -80,48 +83,85 @@ class Traced(Generic[Result]):
     def __init__(self, function: Callable[..., Result]) -> None:
         self._function = function
         self._call: Callable[..., Any] | None = None
-        self._result: Callable[..., Result]
+        self._result: Callable[[Any], Result]
 
     @torch.no_grad()
     def __call__(self, *arguments: tuple[Tensor, ...]) -> Result:
         """Return the function's result."""
         if self._call is None:
-            traced = trace(self._function, arguments)
-            self._call, self._result = bound(traced.graph).forward, traced.result
+            self._call, self._result = self._make(arguments)
         return self._result(self._call(*chain.from_iterable(arguments)))
 
+    def _make(self, arguments: Arguments) -> tuple[Callable[..., Any], Callable[[Any], Result]]:
+        """Return a function of single tensors, and what builds the result from its values."""
+        traced = trace(self._function, arguments)
+        return bound(traced.graph).forward, traced.result
 
-class Compiled(Generic[Result]):
+
+class Compiled(Traced[Result]):
     """A `Traced` function whose graph goes straight to TorchInductor: one compiled call.
 
     It needs a C++ compiler, and Triton for a GPU. TorchInductor caches the code on disk, also for other
     processes.
     """
 
-    def __init__(self, function: Callable[..., Result]) -> None:
-        self._function = function
-        self._call: Callable[..., Any] | None = None
-        self._result: Callable[..., Result]
-        self._types: list[torch.dtype] = []
-
-    @torch.no_grad()
-    def __call__(self, *arguments: tuple[Tensor, ...]) -> Result:
-        """Return the function's result."""
-        tensors = [tensor.contiguous() for tensor in chain.from_iterable(arguments)]
-        if self._call is None:
-            self._call = self._compile(arguments, tensors)
-        values = self._call(*tensors)
-        return self._result(map(Tensor.view, values, self._types))
-
-    def _compile(self, arguments: Arguments, tensors: Sequence[Tensor]) -> Callable[..., Any]:
+    def _make(self, arguments: Arguments) -> tuple[Callable[..., Any], Callable[[Any], Result]]:
         traced = trace(self._function, arguments, as_byte)
-        self._result, self._types = traced.result, traced.types
-        return standalone_compile(
+        compiled = standalone_compile(
             traced.graph,
-            list(tensors),
+            [tensor.contiguous() for tensor in chain.from_iterable(arguments)],
             dynamic_shapes="from_example_inputs",
             options={"config_patches": OPTIONS},
         )
+
+        def call(*tensors: Tensor) -> Any:
+            return compiled(*[tensor.contiguous() for tensor in tensors])
+
+        return call, lambda values: traced.result(map(Tensor.view, values, traced.types))
+
+
+class LossGradient:
+    """The clipped gradient of a TorchRL `loss` as one call, optionally `compiled`.
+
+    It equals `loss.backward()` followed by clipping to `max_norm`. Compiled, it has no module look-ups, no
+    guards and few kernels (scripts/bench/shortcuts.py). `weights` are the trainable weights. The loss reads
+    `keys` of a batch, and "priority_weight" if a prioritized buffer added it.
+    """
+
+    def __init__(
+        self, loss: nn.Module, keys: Sequence[NestedKey], max_norm: float, compiled: bool = False
+    ) -> None:
+        self.loss, self.keys, self.max_norm = loss, (*keys, IMPORTANCE_WEIGHT), max_norm
+        state = dict(TensorDict.from_module(loss).items(True, True))
+        self._trainable = {name: weight for name, weight in state.items() if weight.requires_grad}
+        self._fixed = {name: weight for name, weight in state.items() if not weight.requires_grad}
+        self.weights: list[Tensor] = list(self._trainable.values())
+        self._gradient = Compiled(self._compute) if compiled else self._compute
+
+    def columns(self, transitions: TensorDictBase) -> Columns:
+        """Return the columns that a call takes."""
+        keys = self.keys if IMPORTANCE_WEIGHT in transitions else self.keys[:-1]
+        return tuple(transitions.get(key) for key in keys)
+
+    def __call__(self, columns: Columns) -> tuple[Tensor, Tensor, Tensor]:
+        """Set the gradient of each weight; return loss [], unclipped norm [] and `td_error` [B, 1]."""
+        fixed = tuple(self._fixed.values())
+        loss, norm, errors, *gradients = self._gradient(tuple(self.weights), fixed, columns)
+        for weight, gradient in zip(self.weights, gradients, strict=True):
+            weight.grad = gradient
+        return loss, norm, errors
+
+    def _compute(self, trainable: Columns, fixed: Columns, columns: Columns) -> Columns:
+        """Return loss, norm, errors and gradients as a pure function of weights and batch."""
+        leaves = [weight.detach().requires_grad_() for weight in trainable]
+        state = TensorDict(dict(zip((*self._trainable, *self._fixed), (*leaves, *fixed), strict=True)))
+        batch = TensorDict(dict(zip(self.keys, columns, strict=False)), batch_size=columns[0].shape[:1])
+        with state.to_module(self.loss, preserve_module_state=False), torch.enable_grad():
+            loss = self.loss(batch)["loss"]
+            gradients = torch.autograd.grad(loss, leaves)
+        norm = torch.stack([gradient.square().sum() for gradient in gradients]).sum().sqrt()
+        share = (self.max_norm / norm).clamp(max=1)
+        return loss.detach(), norm, batch["td_error"], *(share * each for each in gradients)
 
 
 def copied(tensor: Tensor) -> Tensor:

@@ -13,6 +13,22 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from cartpole_rl.agents.settings import AgentSettings
+
+
+def q_network(
+    settings: AgentSettings, mirror_signs: Sequence[int], actions: int, frames: Sequence[Sequence[int]]
+) -> "QNetwork | MirrorQNetwork":
+    """Return a new network of `settings` for observations of K numbers.
+
+    `mirror_signs` [K] holds the factor, +1 or -1, of each number when left and right are swapped. `frames`
+    [T, F] holds the indices of the frames that a recurrent network reads.
+    """
+    size = len(mirror_signs)
+    reader = None if settings.recurrent is None else FrameReader(size, frames, settings.recurrent)
+    layers = actions, settings.hidden, settings.layer_norm, reader
+    return MirrorQNetwork(mirror_signs, *layers) if settings.mirrored else QNetwork(size, *layers)
+
 
 class QNetwork(nn.Module):
     """A network from observations [..., K] float32 to action values [..., A], with an optional `reader`."""

@@ -13,10 +13,10 @@ import torch
 from pydantic import TypeAdapter, ValidationError
 from torch import nn
 
-from cartpole_rl.devices import moved
 from cartpole_rl.errors import CheckpointError
 from cartpole_rl.files import replacing
 from cartpole_rl.learning.checkpoint_files import find_agent, find_training
+from cartpole_rl.learning.states import moved
 from cartpole_rl.run_files import CHECKPOINTS, ERROR, RESUME
 
 AGENT_FORMAT = "cartpole_rl agent 1"

@@ -13,11 +13,10 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torch.nn.functional import smooth_l1_loss
 
-from cartpole_rl.agents.dqn import QAgent
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.errors import LearningError
-from cartpole_rl.learning.schedules import half_cosine
-from cartpole_rl.learning.settings import DistillationSettings
+from cartpole_rl.learning.agent import QAgent
+from cartpole_rl.learning.settings import DistillationSettings, half_cosine
 
 LAST_RATE = 0.03  # share of the learning rate at the end
 Driver = Callable[[TensorDictBase], TensorDictBase]  # from `observation` to `action` and `action_value`

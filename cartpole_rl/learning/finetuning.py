@@ -12,10 +12,8 @@ import torch
 from tensordict import TensorDictBase
 
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
-from cartpole_rl.learning.buffer import n_step_transitions
-from cartpole_rl.learning.collector import COLLECTED
+from cartpole_rl.learning.dqn import COLLECTED, Scalars, Training, n_step_transitions
 from cartpole_rl.learning.settings import FinetuningSettings
-from cartpole_rl.learning.training import Scalars, Training
 from cartpole_rl.plants.recorded import RecordedPlant
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.randomization.randomizer import Draws
@@ -65,8 +63,7 @@ class Finetuning(Training):
         """Continue on simulated carts drawn from `carts`; the transitions of older ones are discarded."""
         assert isinstance(self.env.plant, SimulatedPlant)
         self.env.plant.replace_randomizer(carts)
-        self.collector.reset()
-        self.returns.reset()
+        self.start_episodes()
         self.buffer.empty()
         self.fill()
 

@@ -1,11 +1,22 @@
-"""Settings of learning."""
+"""Settings of learning, and the schedules in them: functions of progress, so nothing of them is resumed."""
 
+import math
 import re
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
 from cartpole_rl.settings import Count, Fraction, NonNegative, Positive, Settings
+
+
+def linear(start: float, end: float, progress: float) -> float:
+    """Return a value that goes from `start` at progress 0 to `end` at 1, and stays there."""
+    return start + (end - start) * min(max(progress, 0.0), 1.0)
+
+
+def half_cosine(start: float, end: float, progress: float) -> float:
+    """Return a value that goes from `start` at progress 0 to `end` at 1 along half a cosine."""
+    return linear(end, start, 0.5 * (1 + math.cos(math.pi * min(max(progress, 0.0), 1.0))))
 
 
 class BufferSettings(Settings):
@@ -26,6 +37,10 @@ class OptimizerSettings(Settings):
     learning_rate_end: Fraction  # share of `learning_rate` at the end, reached along half a cosine
     weight_decay: NonNegative
     max_grad_norm: Positive
+
+    def rate(self, progress: float) -> float:
+        """Return the learning rate after a share of the training."""
+        return half_cosine(self.learning_rate, self.learning_rate * self.learning_rate_end, progress)
 
 
 class LearningSettings(Settings):
@@ -66,6 +81,22 @@ class LearningSettings(Settings):
     def collected_transitions(self) -> int:
         """Transitions in whole iterations: `transitions` or slightly fewer."""
         return self.iterations * self.carts * self.chunk
+
+    @property
+    def evaluated_iterations(self) -> list[int]:
+        """The iterations that end with an evaluation: evenly spaced, the last one too."""
+        return [round(self.iterations * (place + 1) / self.evaluations) for place in range(self.evaluations)]
+
+    @property
+    def saved_iterations(self) -> list[int]:
+        """The iterations that end with a checkpoint to resume from; the last one is one of them."""
+        return self.evaluated_iterations[:: -self.checkpoint_interval]
+
+    def exploration(self, transitions: int) -> float:
+        """Return the share of random actions after so many transitions."""
+        if transitions < self.warmup_transitions:
+            return 1.0
+        return linear(*self.epsilon, (transitions - self.warmup_transitions) / self.epsilon_transitions)
 
 
 class DistillationSettings(Settings):

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from cartpole_rl.agents.baseline import EnergyAndRegulator
-from cartpole_rl.agents.dqn import QAgent
 from cartpole_rl.checking import checked
 from cartpole_rl.evaluation.episodes import Policy
+from cartpole_rl.learning.agent import QAgent
 from cartpole_rl.learning.checkpoints import AgentCheckpoint, load_agent, restore_weights
 from cartpole_rl.randomization.poles import PoleSettings, check_one_pole
 from cartpole_rl.workflows.build import replaced_settings

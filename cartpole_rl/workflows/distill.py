@@ -10,7 +10,7 @@ from cartpole_rl.envs.build import simulated_env, with_fitted_guard
 from cartpole_rl.evaluation.driving_policy import DrivingPolicy
 from cartpole_rl.learning.checkpoints import AgentCheckpoint, save_agent
 from cartpole_rl.learning.distillation import Distillation
-from cartpole_rl.learning.randomness import seed_everything
+from cartpole_rl.learning.states import seed_everything
 from cartpole_rl.run_files import CHECKPOINTS, FIGURES, LAST, METRICS
 from cartpole_rl.workflows.agents import new_agent, trained_agent
 from cartpole_rl.workflows.build import use_threads

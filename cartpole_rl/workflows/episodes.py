@@ -11,7 +11,7 @@ from cartpole_rl.evaluation.episodes import Policy, run_batch, run_episodes
 from cartpole_rl.evaluation.knocks import Knocks
 from cartpole_rl.evaluation.onboard import run_onboard_episodes
 from cartpole_rl.evaluation.publishing import followed
-from cartpole_rl.learning.randomness import seed_everything
+from cartpole_rl.learning.states import seed_everything
 from cartpole_rl.plants.serial.plant import SerialPlant
 from cartpole_rl.plants.settings import EmulatedSettings, SimulatedSettings
 from cartpole_rl.plants.simulated import SimulatedPlant

@@ -21,8 +21,8 @@ from cartpole_rl.evaluation.snapshots import Memory
 from cartpole_rl.files import claimed, write_bytes
 from cartpole_rl.learning.checkpoint_files import find_agent
 from cartpole_rl.learning.checkpoints import load_agent
-from cartpole_rl.learning.randomness import seed_everything
 from cartpole_rl.learning.settings import RayLearnerSettings
+from cartpole_rl.learning.states import seed_everything
 from cartpole_rl.plants.serial.faults import Confirm
 from cartpole_rl.plants.settings import EmulatedSettings
 from cartpole_rl.reporting.tensorboard import TensorBoardLog

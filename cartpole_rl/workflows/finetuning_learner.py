@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from cartpole_rl.agents.dqn import QAgent
 from cartpole_rl.envs.build import environment, randomizer, simulated_env
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
@@ -17,10 +16,11 @@ from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.identification.fit import Fit, best_fit
 from cartpole_rl.identification.unknowns import LONGEST_LATENCY
 from cartpole_rl.identification.windows import cut_windows
+from cartpole_rl.learning.agent import QAgent
 from cartpole_rl.learning.checkpoints import whole_state
+from cartpole_rl.learning.dqn import Scalars, Training
 from cartpole_rl.learning.finetuning import Finetuning, recorded_chunk
 from cartpole_rl.learning.settings import FinetuningSettings, LearningSettings
-from cartpole_rl.learning.training import Scalars, Training
 from cartpole_rl.physics.friction import CART_FRICTIONS
 from cartpole_rl.physics.models import Models
 from cartpole_rl.plants.recorded import RecordedPlant
@@ -40,7 +40,7 @@ EVALUATED_CARTS = 10  # of the score in simulation
 
 
 class NoCallbacks:
-    """A `learning.training.Monitor` that does nothing: the session logs by episodes on the cart."""
+    """A `learning.dqn.Monitor` that does nothing: the session logs by episodes on the cart."""
 
     def on_update(self, transitions: int, scalars: Scalars) -> None:
         """Do nothing."""

@@ -3,12 +3,12 @@
 from dataclasses import replace
 from typing import Any
 
-from cartpole_rl.agents.dqn import QAgent
 from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
 from cartpole_rl.evaluation.driving_policy import Weights, as_weights
 from cartpole_rl.evaluation.metrics import episode_metrics, summarize
+from cartpole_rl.learning.agent import QAgent
 from cartpole_rl.learning.checkpoints import AgentCheckpoint, TrainingCheckpoint, restore_weights
-from cartpole_rl.learning.training import Scalars
+from cartpole_rl.learning.dqn import Scalars
 from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.reporting.scores import SCORES, score_table
 from cartpole_rl.reporting.words import count_text, cut_off

@@ -9,7 +9,7 @@ import numpy as np
 
 from cartpole_rl.evaluation.metrics import episode_metrics
 from cartpole_rl.learning.checkpoints import AgentCheckpoint, TrainingCheckpoint, save_agent, save_training
-from cartpole_rl.learning.training import Scalars, Training
+from cartpole_rl.learning.dqn import Scalars, Training
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.reporting.animation import gif
 from cartpole_rl.reporting.figures import behaviour

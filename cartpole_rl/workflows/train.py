@@ -3,17 +3,19 @@
 from functools import partial
 from pathlib import Path
 
-from cartpole_rl.agents.dqn import QAgent
-from cartpole_rl.devices import available_device
+import torch
+
 from cartpole_rl.envs.build import simulated_env, with_fitted_guard
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.settings import GuardSettings
+from cartpole_rl.errors import ConfigError
 from cartpole_rl.evaluation.driving_policy import DrivingPolicy, as_weights
 from cartpole_rl.evaluation.episodes import Policy, run_batch
 from cartpole_rl.files import claimed
+from cartpole_rl.learning.agent import QAgent
 from cartpole_rl.learning.checkpoints import forget_training, restore_weights, whole_state
-from cartpole_rl.learning.randomness import seed_everything
-from cartpole_rl.learning.training import Training
+from cartpole_rl.learning.dqn import Training
+from cartpole_rl.learning.states import seed_everything
 from cartpole_rl.plants.effects import without_effect
 from cartpole_rl.plants.settings import LearnedSettings, SimulatedSettings
 from cartpole_rl.randomization.randomizer import Draws
@@ -100,6 +102,22 @@ def train(config: TrainConfig, folder: Path) -> float:
     )
     score: float = metrics[config.task.measure]["mean"]
     return score
+
+
+def available_device(device: str) -> str:
+    """Return "cpu" or "cuda" for `device`, where "auto" is "cuda" if there is a GPU.
+
+    Raises ConfigError for "cuda" without a GPU.
+    """
+    found = torch.cuda.is_available()
+    if device == "auto":
+        return "cuda" if found else "cpu"
+    if device == "cuda" and not found:
+        raise ConfigError(
+            "device=cuda: PyTorch finds no CUDA GPU on this machine; start a training with device=cpu "
+            "(a resumed one keeps its device)"
+        )
+    return device
 
 
 def note_guard(guard: GuardSettings) -> None:

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any, Protocol
 
-from cartpole_rl.learning.training import Scalars
+from cartpole_rl.learning.dqn import Scalars
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.finetuning_learner import CartLearner
 

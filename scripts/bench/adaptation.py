@@ -38,14 +38,14 @@ from torch import Tensor
 from torchrl.data import Composite, Unbounded
 from truths import widened
 
-from cartpole_rl.agents.dqn import QAgent
 from cartpole_rl.choices import choice
 from cartpole_rl.envs.build import simulated_env, with_fitted_guard
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.hardware import HardwareTransform
 from cartpole_rl.evaluation.episodes import run_batch
-from cartpole_rl.learning.randomness import seed_everything
-from cartpole_rl.learning.training import Training
+from cartpole_rl.learning.agent import QAgent
+from cartpole_rl.learning.dqn import Training
+from cartpole_rl.learning.states import seed_everything
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.randomization.ranges import Range

@@ -25,13 +25,13 @@ import torch
 from common import option_parser, positive_int, print_table, write_json
 from tensordict import TensorDictBase
 
-from cartpole_rl.agents.dqn import QAgent
 from cartpole_rl.agents.settings import AgentSettings
 from cartpole_rl.choices import choice
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.envs.build import environment, shipped_settings
 from cartpole_rl.evaluation.driving_policy import DrivingPolicy
 from cartpole_rl.evaluation.episodes import run_episodes
+from cartpole_rl.learning.agent import QAgent
 from cartpole_rl.plants.emulated import emulated_plant
 from cartpole_rl.scheduling import giving_precedence, taking_precedence
 

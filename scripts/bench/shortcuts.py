@@ -6,10 +6,12 @@
 Each group does the same work; tests show that it gives the same numbers. Carts are compiled, as in training:
 
 - a step with resets: `CartPoleEnv.step_and_maybe_reset` beside that of TransformedEnv, over equal plants;
-- collecting 8 periods: `learning.collector.Collector` beside `torchrl.collectors.Collector`, both on a
-  CartPoleEnv, with the same network and epsilon-greedy exploration;
-- the greedy action of one cart: `DrivingPolicy`, traced and compiled, beside the QValueActor;
-- a gradient of 512 transitions: `LossGradient`, plain and compiled, beside `backward` and clipping.
+- collecting 8 periods into a buffer of n-step transitions: `Training.collect` beside
+  `torchrl.collectors.Collector` and MultiStepTransform, with the same network and exploration;
+- the greedy action of one cart: `DrivingPolicy`, traced and compiled, beside the QValueActor, also under
+  `torch.compile`;
+- a gradient of 512 transitions: `LossGradient`, plain and compiled, beside `backward` and clipping, also of
+  the loss under `torch.compile`.
 
 A time is the processor time of the fastest of many calls, in which the rows take turns, with one thread.
 """
@@ -26,20 +28,21 @@ from environment import Step, stepper
 from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 from torch import nn
-from torchrl.collectors import Collector as StockCollector
-from torchrl.envs import TransformedEnv
+from torchrl.collectors import Collector
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.envs import MultiStepTransform, TransformedEnv
 from torchrl.modules import EGreedyModule
 
-from cartpole_rl.agents.dqn import QAgent
-from cartpole_rl.agents.loss import LossGradient, columns_of
 from cartpole_rl.agents.settings import AgentSettings
 from cartpole_rl.choices import choice
+from cartpole_rl.compilation import LossGradient
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.gymnasium import simulated_environment
 from cartpole_rl.envs.hardware import HardwareTransform
 from cartpole_rl.evaluation.driving_policy import DrivingPolicy
-from cartpole_rl.learning.buffer import n_step_transitions
-from cartpole_rl.learning.collector import Collector
+from cartpole_rl.learning.agent import QAgent
+from cartpole_rl.learning.dqn import COLLECTED, LEARNED, Training, n_step_transitions
+from cartpole_rl.learning.settings import BufferSettings, LearningSettings, OptimizerSettings
 from cartpole_rl.reporting.table import table
 
 CHUNK, EPSILON, BATCH = 8, 0.1, 512
@@ -70,19 +73,29 @@ def steps(carts: int, compiled: bool) -> Pair:
     }
 
 
-def collections(carts: int, compiled: bool) -> Pair:
-    """A chunk of CHUNK periods."""
+def make_training(carts: int, compiled: bool) -> Training:
+    """A training of the default settings that explores with EPSILON from the start."""
     env = environment(carts, compiled)
-    agent = make_agent(env)
-    ours = Collector(env, agent.actor, len(env.hardware.motors), seed=0)
-    ours.epsilon = EPSILON
+    epsilon = {"warmup_transitions": 0, "epsilon": (EPSILON, EPSILON)}
+    learning = choice("learning/fast") | epsilon | {"carts": carts, "chunk": CHUNK}
+    buffer, optimizer = choice("buffer/prioritized"), choice("optimizer/adam")
+    settings = LearningSettings(**learning), BufferSettings(**buffer), OptimizerSettings(**optimizer)
+    return Training(*settings, make_agent(env), env, list, None, seed=0)  # type: ignore[arg-type]
+
+
+def collections(training: Training, compiled: bool) -> Pair:
+    """A chunk of CHUNK periods, added to a buffer as n-step transitions."""
+    carts, n = training.settings.carts, training.settings.n_step
+    env = environment(carts, compiled)
     explore = EGreedyModule(env.action_spec_unbatched, eps_init=EPSILON, eps_end=EPSILON)
-    stock = StockCollector(
-        environment(carts, compiled),
-        TensorDictSequential(agent.actor, explore),
-        frames_per_batch=CHUNK * carts,
-    )
-    return {"TorchRL's collector": partial(next, iter(stock)), "our collector": partial(ours.collect, CHUNK)}
+    policy = TensorDictSequential(training.agent.actor, explore)
+    stock = iter(Collector(env, policy, frames_per_batch=CHUNK * carts))
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(training.buffer_settings.size, ndim=2))
+    buffer.append_transform(MultiStepTransform(n, training.agent.settings.gamma, done_keys=[]))
+    return {
+        "TorchRL's collector": lambda: buffer.extend(next(stock).select(*COLLECTED)),
+        "Training.collect": training.collect,
+    }
 
 
 def choices(agent: QAgent, size: int, compiled: bool) -> Pair:
@@ -91,28 +104,30 @@ def choices(agent: QAgent, size: int, compiled: bool) -> Pair:
     present = TensorDict({"observation": torch.randn(1, size)}, [1])
     ways = {
         "QValueActor": policy,
+        "QValueActor, torch.compile": torch.compile(policy, disable=not compiled),
         "DrivingPolicy, traced": DrivingPolicy(policy),
         "DrivingPolicy": DrivingPolicy(policy, compiled),
     }
     return {name: partial(torch.no_grad()(way), present) for name, way in ways.items()}
 
 
-def gradients(agent: QAgent, chunk: TensorDict, compiled: bool) -> Pair:
+def gradients(training: Training, chunk: TensorDict, compiled: bool) -> Pair:
     """The clipped gradient of the loss of BATCH transitions."""
-    batch = n_step_transitions(chunk, 5, 0.99)[:BATCH]
-    max_norm = choice("optimizer/adam")["max_grad_norm"]
-    weights = list(agent.loss.parameters())
+    loss, max_norm = training.agent.loss, training.optimizer_settings.max_grad_norm
+    batch, weights = n_step_transitions(chunk, 5, 0.99)[:BATCH], list(training.agent.loss.parameters())
 
-    def stock() -> None:
-        agent.loss.zero_grad()
-        agent.loss(batch)["loss"].backward()
+    def stock(function: Any) -> None:
+        loss.zero_grad()
+        function(batch)["loss"].backward()
         nn.utils.clip_grad_norm_(weights, max_norm)
 
-    columns = columns_of(batch)
+    plain = LossGradient(loss, LEARNED, max_norm)
+    columns = plain.columns(batch)
     return {
-        "loss.backward": stock,
-        "LossGradient, not compiled": partial(LossGradient(agent.loss, max_norm), columns),
-        "LossGradient": partial(LossGradient(agent.loss, max_norm, compiled), columns),
+        "loss.backward": partial(stock, loss),
+        "loss.backward, torch.compile": partial(stock, torch.compile(loss, disable=not compiled)),
+        "LossGradient, not compiled": partial(plain, columns),
+        "LossGradient": partial(LossGradient(loss, LEARNED, max_norm, compiled), columns),
     }
 
 
@@ -126,15 +141,13 @@ def seconds(call: Step) -> float:
 
 def measure(carts: int, budget: float, compiled: bool) -> list[dict[str, Any]]:
     """Return the milliseconds per call of each variant, and its speed-up over TorchRL."""
-    env = environment(carts, compiled)
-    agent = make_agent(env)
-    chunk = Collector(env, agent.actor, len(env.hardware.motors), seed=0).collect(CHUNK)
-    size = chunk["observation"].shape[-1]
+    training = make_training(carts, compiled)
+    chunk = training.collect()
     pairs = [
         steps(carts, compiled),
-        collections(carts, compiled),
-        choices(agent, size, compiled),
-        gradients(agent, chunk, compiled),
+        collections(training, compiled),
+        choices(training.agent, chunk["observation"].shape[-1], compiled),
+        gradients(training, chunk, compiled),
     ]
     calls = {name: call for pair in pairs for name, call in pair.items()}
     best = dict.fromkeys(calls, float("inf"))

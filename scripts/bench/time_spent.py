@@ -22,7 +22,7 @@ from typing import Any
 from common import option_parser, print_table, write_json
 
 from cartpole_rl.commands.train import main as train_command
-from cartpole_rl.learning.training import Training
+from cartpole_rl.learning.dqn import Training
 from cartpole_rl.workflows import train
 
 KINDS = {"collect": "stepping", "learn": "updating", "evaluate": "evaluating"}  # method of Training: kind

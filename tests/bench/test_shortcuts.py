@@ -18,7 +18,7 @@ def test_all_rows_are_there(tmp_path: Path) -> None:
     rows = {row["name"]: row for row in json.loads(file.read_text())}
     for ours, stock in (
         ("CartPoleEnv, step", "TransformedEnv, step"),
-        ("our collector", "TorchRL's collector"),
+        ("Training.collect", "TorchRL's collector"),
         ("DrivingPolicy", "QValueActor"),
         ("LossGradient", "loss.backward"),
     ):

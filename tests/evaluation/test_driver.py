@@ -13,7 +13,6 @@ import torch
 from serial_peer import CartPeer
 from torch import nn
 
-from cartpole_rl.agents.dqn import QAgent
 from cartpole_rl.agents.settings import AgentSettings
 from cartpole_rl.choices import choice
 from cartpole_rl.envs.build import make_env
@@ -22,6 +21,7 @@ from cartpole_rl.envs.settings import ObservationSettings
 from cartpole_rl.errors import FaultError, LinkError
 from cartpole_rl.evaluation.driver import Driver, DriveRequest
 from cartpole_rl.evaluation.driving_policy import as_weights
+from cartpole_rl.learning.agent import QAgent
 from cartpole_rl.plants.serial.errors import NotReadyError
 from cartpole_rl.plants.serial.faults import Confirm
 from cartpole_rl.plants.serial.plant import SerialPlant

@@ -5,10 +5,10 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
-from cartpole_rl.agents.dqn import QAgent
 from cartpole_rl.agents.settings import AgentSettings
 from cartpole_rl.choices import choice
 from cartpole_rl.evaluation.driving_policy import DrivingPolicy, as_weights
+from cartpole_rl.learning.agent import QAgent
 
 SETTINGS = choice("agent/dqn") | {"hidden": [8], "mirrored": False}
 

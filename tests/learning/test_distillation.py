@@ -5,10 +5,10 @@ from pathlib import Path
 
 import torch
 
-from cartpole_rl.agents.dqn import QAgent
 from cartpole_rl.envs.build import simulated_env
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.evaluation.driving_policy import DrivingPolicy
+from cartpole_rl.learning.agent import QAgent
 from cartpole_rl.learning.distillation import Distillation
 from cartpole_rl.learning.settings import DistillationSettings
 from cartpole_rl.workflows.agents import new_agent, trained_agent

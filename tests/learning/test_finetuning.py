@@ -9,11 +9,11 @@ import pytest
 import torch
 from tensordict import TensorDictBase
 
-from cartpole_rl.agents.dqn import QAgent
 from cartpole_rl.agents.settings import AgentSettings
 from cartpole_rl.choices import choice
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.evaluation.episodes import run_batch
+from cartpole_rl.learning.agent import QAgent
 from cartpole_rl.learning.finetuning import Finetuning, recorded_chunk
 from cartpole_rl.learning.settings import (
     BufferSettings,

@@ -15,7 +15,7 @@ from cartpole_rl.errors import CheckpointError
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.files import write_bytes
 from cartpole_rl.learning.checkpoints import AgentCheckpoint, save_agent
-from cartpole_rl.learning.randomness import seed_everything
+from cartpole_rl.learning.states import seed_everything
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.agents import new_agent
 from cartpole_rl.workflows.build import evaluated_settings
@@ -164,7 +164,8 @@ def test_a_learner_that_starts_later_continues_the_schedules(recorded: list[Epis
     late = learner()
     late.start(recorded, rounds=2)
     assert late.started.iteration == whole.started.iteration == 6
-    assert late.started.epsilon() == whole.started.epsilon() < late.started.settings.epsilon[0]
+    shares = [each.started.settings.exploration(each.started.transitions) for each in (late, whole)]
+    assert shares[0] == shares[1] < late.started.settings.epsilon[0]
 
 
 def test_simulation_brakes_as_the_cart_does(recorded: list[Episode]) -> None:

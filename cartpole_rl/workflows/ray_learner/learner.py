@@ -10,8 +10,8 @@ import time
 from functools import partial
 
 from cartpole_rl.errors import CartPoleError
-from cartpole_rl.learning.randomness import seed_everything
-from cartpole_rl.learning.training import Scalars
+from cartpole_rl.learning.dqn import Scalars
+from cartpole_rl.learning.states import seed_everything
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.agents import new_agent
 from cartpole_rl.workflows.build import evaluated_settings, use_threads

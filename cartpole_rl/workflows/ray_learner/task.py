@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from cartpole_rl.learning.checkpoints import AgentCheckpoint
-from cartpole_rl.learning.training import Scalars
+from cartpole_rl.learning.dqn import Scalars
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,8 @@ from typing import Any
 import pytest
 import torch
 
-from cartpole_rl.agents.dqn import QAgent
 from cartpole_rl.evaluation.driving_policy import Weights
+from cartpole_rl.learning.agent import QAgent
 from cartpole_rl.learning.checkpoints import FINETUNING_FORMAT, AgentCheckpoint, load_training
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.agents import new_agent

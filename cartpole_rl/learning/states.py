@@ -1,0 +1,97 @@
+"""The state of a training as tensors and plain values: what it resumes from, to the bit."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from cartpole_rl.learning.replay import buffer_state, restore_buffer
+
+
+class Resumable:
+    """The part of a `dqn.Training` that saves and restores its state."""
+
+    def snapshot(self: Any) -> dict[str, Any]:
+        """Return the state of the training, to be saved at once: it shares memory with the training."""
+        return {
+            "iteration": self.iteration,
+            "seconds": self.seconds,
+            "measure": self.measure,
+            "scores": [self.best_score, self.last_score],
+            "agent": self.agent.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "replay": buffer_state(self.buffer),
+            "returns": None if self.waiting is None else self.waiting.to_dict(),
+            "collector": {
+                "current": self.current.to_dict(),
+                "generator": self.random.get_state(),
+                **self.retries.snapshot(),
+            },
+            "plant": self.env.plant.snapshot(),
+            "random": random_state(),
+        }
+
+    def restore(self: Any, snapshot: Mapping[str, Any]) -> None:
+        """Restore the state in `snapshot`; scores in another measure than this training's are forgotten."""
+        device, carts = self.env.device, self.env.batch_size
+        self.iteration, self.seconds = snapshot["iteration"], snapshot["seconds"]
+        if snapshot.get("measure", "score") == self.measure:  # missing in states of earlier versions: (6.2)
+            self.best_score, self.last_score = snapshot["scores"]
+        else:
+            self.best_score, self.last_score = -float("inf"), None
+        self.agent.load_state_dict(snapshot["agent"])
+        self.optimizer.load_state_dict(snapshot["optimizer"])
+        restore_buffer(self.buffer, snapshot["replay"])
+        waiting, collector = moved(snapshot["returns"], device), moved(snapshot["collector"], device)
+        held = self.settings.n_step - 1
+        self.waiting = None if waiting is None else TensorDict(waiting, [*carts, held])
+        self.current = TensorDict(collector["current"], carts)
+        self.retries.restore(collector)
+        self.random.set_state(snapshot["collector"]["generator"])
+        self.env.plant.restore(snapshot["plant"])
+        restore_random_state(snapshot["random"])
+
+
+def moved(value: Any, device: torch.device | str) -> Any:
+    """Return `value` with all tensors in its mappings, lists and tuples on `device`."""
+    if isinstance(value, Tensor):
+        return value.to(device)
+    if isinstance(value, Mapping):
+        return {key: moved(part, device) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return type(value)(moved(part, device) for part in value)
+    return value
+
+
+def seed_everything(seed: int) -> None:
+    """Seed the global generators: torch's (weights, uniform buffer) and NumPy's (prioritized buffer).
+
+    Carts and exploration have generators of their own.
+    """
+    torch.manual_seed(seed)
+    np.random.seed(seed % 2**32)  # noqa: NPY002 - TorchRL's sampler draws from NumPy's global generator
+
+
+def random_state() -> dict[str, Any]:
+    """Return the state of the global generators as tensors and plain values."""
+    state = np.random.get_state(legacy=False)  # noqa: NPY002
+    numbers = torch.from_numpy(state["state"]["key"].astype(np.int64))  # torch has few uint32 operations
+    cuda = {"cuda": torch.cuda.get_rng_state()} if torch.cuda.is_initialized() else {}
+    return {
+        "torch": torch.get_rng_state(),
+        **cuda,
+        "numpy": {**state, "state": {**state["state"], "key": numbers}},
+    }
+
+
+def restore_random_state(snapshot: Mapping[str, Any]) -> None:
+    """Restore the state that `random_state` returned."""
+    torch.set_rng_state(snapshot["torch"])
+    if "cuda" in snapshot:
+        torch.cuda.set_rng_state(snapshot["cuda"])
+    state = snapshot["numpy"]
+    numbers = state["state"]["key"].numpy().astype(np.uint32)
+    np.random.set_state({**state, "state": {**state["state"], "key": numbers}})  # noqa: NPY002
