@@ -33,7 +33,7 @@ from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.randomization.randomizer import Randomizer
 from cartpole_rl.randomization.ranges import Range
 from cartpole_rl.registry import Registry
-from cartpole_rl.rig.parameters import PARAMETERS
+from cartpole_rl.rig.parameters import PARAMETERS, completed
 from cartpole_rl.tasks.settings import ActionSettings, RewardSettings, Start, StartSettings, TaskSettings
 
 CONF = Path(__file__).parents[1] / "conf"
@@ -84,7 +84,7 @@ def make_cart(ip02: dict[str, float], medium: PoleSettings) -> Callable[..., Car
     """Carts in float64; each keyword replaces a nominal number, by a number or a tensor [N]."""
 
     def build(carts: int = 1, **changes: float | torch.Tensor) -> CartParameters:
-        values = {**ip02, **medium.nominal.model_dump(), **changes}
+        values = completed({**ip02, **medium.nominal.model_dump(), **changes})
         rows = [
             torch.as_tensor(values[name], dtype=torch.float64).expand(carts)
             for name in CartParameters.names()

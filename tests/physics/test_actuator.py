@@ -9,9 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from cartpole_rl.physics.actuator import ACTUATORS, lagged_force, mean_commands
+from cartpole_rl.physics.actuator import ACTUATORS, force_curve, lagged_force, mean_commands, newtons
 from cartpole_rl.physics.dynamics import Drive, State, advance, mechanism, run_period
-from cartpole_rl.physics.friction import CART_FRICTIONS, POLE_FRICTIONS
 from cartpole_rl.physics.laws import Law
 from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import CartParameters
@@ -25,42 +24,38 @@ def at(*values: float) -> Tensor:
     return torch.tensor(values, dtype=torch.float64)
 
 
-class TestForceCurve:
-    @pytest.mark.parametrize("model", ACTUATORS)
-    def test_thesis_levels(self, make_cart: MakeCart, model: Law) -> None:
-        torch.testing.assert_close(model(LEVELS, make_cart(9)), NEWTONS)
+@pytest.mark.parametrize("law", ACTUATORS, ids=str)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_thesis_levels(make_cart: MakeCart, law: Law, dtype: torch.dtype) -> None:
+    cart = CartParameters(make_cart(9).table.to(dtype))
+    torch.testing.assert_close(law(LEVELS.to(dtype), cart), NEWTONS.to(dtype), rtol=0, atol=1e-6)
+    small = at(-50, -30, -1, 0, 0, 1, 10, 30, 50).to(dtype)
+    assert (law(small, cart) == 0).all()
 
-    @pytest.mark.parametrize("model", ACTUATORS)
-    def test_is_exact_in_single_precision(self, make_cart: MakeCart, model: Law) -> None:
-        cart = CartParameters.from_table(
-            torch.stack([getattr(make_cart(9), name) for name in CartParameters.names()]).float()
-        )
-        torch.testing.assert_close(model(LEVELS.float(), cart), NEWTONS.float(), rtol=0, atol=1e-6)
 
-    @pytest.mark.parametrize("model", ACTUATORS)
-    def test_small_values_do_not_move_the_cart(self, make_cart: MakeCart, model: Law) -> None:
-        assert (model(at(-50, -30, 0, 30, 50), make_cart(5)) == 0).all()
+@pytest.mark.parametrize(
+    ("changes", "motors", "forces"),
+    [
+        (
+            {"force_quadratic": 1e-5, "force_linear": 0.01, "force_offset": -0.3},
+            (120, -240),
+            (1e-5 * 120**2 + 1.2 - 0.3, -(1e-5 * 240**2 + 2.4 - 0.3)),
+        ),
+        ({"deadband_left": 120.0, "deadband_right": 80.0}, (-120, -121, 80, 81), (0, -1.42, 0, 0.62)),
+        ({"force_asymmetry": 0.1}, (-200, 200), (-3.0, 3.3)),
+        ({"force_offset": 1.0}, (0,), (0,)),
+    ],
+    ids=["quadratic", "a dead-band of each side", "more to the right", "none at 0"],
+)
+def test_force_curve(
+    make_cart: MakeCart, changes: dict[str, float], motors: tuple[float, ...], forces: tuple[float, ...]
+) -> None:
+    torch.testing.assert_close(force_curve(at(*motors), make_cart(len(motors), **changes)), at(*forces))
 
-    def test_is_the_quadratic_fit(self, make_cart: MakeCart) -> None:
-        cart = make_cart(2, force_quadratic=1e-5, force_linear=0.01, force_offset=-0.3)
-        force = ACTUATORS.find("force_curve")(at(120, -240), cart)
-        torch.testing.assert_close(force, at(1e-5 * 120**2 + 1.2 - 0.3, -(1e-5 * 240**2 + 2.4 - 0.3)))
 
-    def test_dead_bands_are_of_each_side(self, make_cart: MakeCart) -> None:
-        cart = make_cart(4, deadband_left=120.0, deadband_right=80.0)
-        force = ACTUATORS.find("force_curve")(at(-120, -121, 80, 81), cart)
-        torch.testing.assert_close(force, at(0, -1.42, 0, 0.62))
-
-    def test_asymmetry_is_of_the_right_side(self, make_cart: MakeCart) -> None:
-        force = ACTUATORS.find("force_curve")(at(-200, 200), make_cart(2, force_asymmetry=0.1))
-        torch.testing.assert_close(force, at(-3.0, 3.3))
-
-    def test_no_motor_value_no_force(self, make_cart: MakeCart) -> None:
-        assert ACTUATORS.find("force_curve")(at(0), make_cart(1, force_offset=1.0)).item() == 0
-
-    def test_newtons_ignore_the_parameters_of_the_cart(self, make_cart: MakeCart) -> None:
-        cart = make_cart(9, force_linear=0.5, force_asymmetry=0.3, deadband_left=200.0)
-        torch.testing.assert_close(ACTUATORS.find("newtons")(LEVELS, cart), NEWTONS)
+def test_newtons_ignore_the_parameters_of_the_cart(make_cart: MakeCart) -> None:
+    cart = make_cart(9, force_linear=0.5, force_asymmetry=0.3, deadband_left=200.0)
+    torch.testing.assert_close(newtons(LEVELS, cart), NEWTONS)
 
 
 class TestLag:
@@ -82,14 +77,9 @@ class TestLag:
 
     @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
     def test_none_without_a_time_constant(self, dtype: torch.dtype) -> None:
-        mean, end = (
-            force.item()
-            for force in lagged_force(
-                *(torch.tensor([value], dtype=dtype) for value in (0.0, 4.0, 0.0)), 0.01
-            )
-        )
-        assert mean == pytest.approx(4.0, rel=1e-9)
-        assert end == 4.0
+        mean, end = lagged_force(*(at(value).to(dtype) for value in (0.0, 4.0, 0.0)), 0.01)
+        assert mean.item() == pytest.approx(4.0, rel=1e-9)
+        assert end.item() == 4.0
 
 
 def shares(latency: float, commands: int, period: float, substeps: int) -> Tensor:
@@ -131,7 +121,7 @@ class TestLatency:
         step, cart = period / substeps, make_cart()
         generator = torch.Generator().manual_seed(0)
         commands = 50.0 * torch.randint(-5, 6, (count, 1), generator=generator).to(torch.float64)
-        models = Models(CART_FRICTIONS.find("stribeck"), POLE_FRICTIONS.find("exponential"), actuator)
+        models = Models.of(cart_friction="stribeck", actuator=actuator)
         start = State(at(0), at(0), at(math.pi), at(0))
 
         delayed, drive = start, Drive(at(0), torch.zeros(3, 1, dtype=torch.float64))

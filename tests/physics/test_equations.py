@@ -14,7 +14,6 @@ from mujoco_reference import MujocoCart
 from torch import Tensor
 
 from cartpole_rl.physics import dynamics
-from cartpole_rl.physics.actuator import ACTUATORS
 from cartpole_rl.physics.dynamics import (
     Drive,
     State,
@@ -25,12 +24,11 @@ from cartpole_rl.physics.dynamics import (
     normal_force_ratio,
     run_period,
 )
-from cartpole_rl.physics.friction import CART_FRICTIONS, POLE_FRICTIONS
 from cartpole_rl.physics.models import INTEGRATORS, Models
 from cartpole_rl.physics.parameters import GRAVITY, CartParameters
 
 MakeCart = Callable[..., CartParameters]
-FRICTIONLESS = Models(CART_FRICTIONS.find("none"), POLE_FRICTIONS.find("none"), ACTUATORS.find("newtons"))
+FRICTIONLESS = Models.of(cart_friction="none", pole_friction="none", actuator="newtons")
 
 
 def draw(count: int, *spread: float, seed: int = 0) -> tuple[Tensor, ...]:
@@ -183,9 +181,7 @@ def test_a_batch_equals_its_carts_simulated_alone(make_cart: MakeCart) -> None:
     motors = torch.stack([draw(count, 250.0, seed=3)[0], draw(count, 250.0, seed=4)[0]])
     latency = draw(count, 0.02, seed=5)[0].abs()
     drive = Drive(torch.zeros(count, dtype=torch.float64), motors)
-    models = Models(
-        CART_FRICTIONS.find("stribeck"), POLE_FRICTIONS.find("exponential_drag"), pole_presses=True
-    )
+    models = Models.of(cart_friction="stribeck", pole_friction="exponential_drag", pole_presses=True)
 
     together, drive_together = run_period(start, drive, latency, make_cart(count, **changes), models, 0.02, 4)
 

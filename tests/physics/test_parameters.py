@@ -6,8 +6,9 @@ import pytest
 import torch
 
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.physics.parameters import CartParameters
-from cartpole_rl.randomization.poles import POLE_DENSITY, PoleSettings, uniform_rod
+from cartpole_rl.physics.models import REGISTRIES
+from cartpole_rl.physics.parameters import CartParameters, cart_column
+from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.rig.parameters import PARAMETERS, check_names, check_values
 
 MakeCart = Callable[..., CartParameters]
@@ -18,9 +19,24 @@ def nominal(ip02: dict[str, float], medium: PoleSettings) -> dict[str, float]:
     return {**ip02, **medium.nominal.model_dump()}
 
 
-def test_every_parameter_has_bounds_and_a_nominal_value(nominal: dict[str, float]) -> None:
-    assert set(CartParameters.names()) == set(PARAMETERS) == set(nominal)
+def test_the_table_is_complete(nominal: dict[str, float]) -> None:
+    assert CartParameters.names() == tuple(PARAMETERS)
+    assert set(nominal) <= set(PARAMETERS)
     check_values(nominal)
+    for each in PARAMETERS.values():
+        assert each.unit
+        assert each.meaning
+        assert each.default is None or each.bound.holds(each.default)
+    read = {name for registry in REGISTRIES.values() for law in registry for name in law.reads}
+    assert {name for name in PARAMETERS if name.startswith(("force", "deadband", "pole_v", "cart_v"))} <= read
+
+
+def test_a_cart_has_the_defaults_of_what_it_lacks(nominal: dict[str, float]) -> None:
+    needed = {name: value for name, value in nominal.items() if PARAMETERS[name].default is None}
+    check_values(needed)
+    cart = CartParameters(cart_column(needed))
+    assert cart.cart_stiction_ratio.item() == 1.0
+    assert cart.track_tilt.item() == 0.0
 
 
 def test_derived_quantities(make_cart: MakeCart) -> None:
@@ -33,11 +49,15 @@ def test_derived_quantities(make_cart: MakeCart) -> None:
 
 def test_fields_share_the_tables_memory_and_cannot_be_set() -> None:
     table = torch.rand(len(PARAMETERS), 3)
-    cart = CartParameters.from_table(table)
+    cart = CartParameters(table)
+    copied = cart.clone()
     table[CartParameters.names().index("latency"), 1] = 7.0
     assert cart.latency[1] == 7.0
-    with pytest.raises(AttributeError):
+    assert copied.latency[1] < 1
+    with pytest.raises(AttributeError, match="cannot be set"):
         cart.latency = torch.zeros(3)
+    with pytest.raises(AttributeError, match="no parameter 'lag'"):
+        _ = cart.lag
 
 
 def test_an_unknown_name_suggests_the_nearest() -> None:
@@ -69,11 +89,3 @@ def test_an_impossible_value_is_refused(
 ) -> None:
     with pytest.raises(ConfigError, match=f"{name} is .*; it must be {right}"):
         check_values({**nominal, name: value})
-
-
-def test_a_rod_is_consistent() -> None:
-    rod = uniform_rod(0.6)
-    assert rod["pole_mass"] == pytest.approx(POLE_DENSITY * 0.6)
-    assert rod["pole_com"] == pytest.approx(0.3)
-    about_pivot = rod["pole_inertia"] + rod["pole_mass"] * rod["pole_com"] ** 2
-    assert about_pivot == pytest.approx(rod["pole_mass"] * 0.6**2 / 3)

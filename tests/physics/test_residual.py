@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from cartpole_rl.physics.dynamics import Drive, State, run_period
-from cartpole_rl.physics.friction import CART_FRICTIONS
 from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.physics.residual import (
@@ -20,7 +19,7 @@ from cartpole_rl.physics.residual import (
 )
 
 MakeCart = Callable[..., CartParameters]
-STEP = Models(cart_friction=CART_FRICTIONS.find("step"))
+STEP = Models.of(cart_friction="step")
 SETTINGS = (STEP, 0.02, 4)
 
 
