@@ -101,6 +101,7 @@ class Report(NamedTuple):
     gaps: int  # places where rows are missing
     saturated: int  # rows with full motor
     beyond: int  # rows with a motor value beyond full
+    leaps: int  # rows in which the angle differs by over a quarter of a turn from the row before
     period: float  # s
     jitter: float  # s, 95 % of the gaps are within this of the period
 
@@ -158,6 +159,7 @@ def read_log(path: Path, layout: Layout) -> Log:
         int((~regular).sum()),
         int((np.abs(motor) >= 0.999).sum()),
         int((np.abs(motor) > 1.001).sum()),
+        int((np.abs((np.diff(theta) + 0.5) % 1 - 0.5) > 0.25).sum()),
         period,
         jitter,
     )

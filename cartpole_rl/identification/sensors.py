@@ -32,6 +32,8 @@ PIECE = 100  # rows of a recording that are drawn together
 SWINGING = 1.0  # rad of the pole that tell its scale
 DELAYS = np.arange(-2.0, 4.01, 0.25)  # periods
 SPEED = 0.05  # m/s from which friction opposes the motion of the cart
+SCALES = (1.0, np.pi / 180, 180 / np.pi)  # of the angle, from which a fit starts
+WIDEST = 0.2, 0.1, 0.5  # interval of an estimate: scale of the angle, its zero in rad, scale of the position
 OUTLIER = 3.0  # residuals, in median sizes, from which one counts less
 
 
@@ -83,7 +85,7 @@ class Samples:
         self._theta = np.concatenate([motion.theta for motion in motions])
         self.theta_dot, self.theta_ddot = self.smooth(self._theta, 1), self.smooth(self._theta, 2)
         x = np.concatenate([motion.x for motion in motions])
-        self.x_dot, self.x_ddot = self.smooth(x, 1), self.smooth(x, 2)
+        self.x, self.x_dot, self.x_ddot = self.smooth(x), self.smooth(x, 1), self.smooth(x, 2)
         self._motions = motions
 
     def smooth(self, values: Array, derivative: int = 0) -> Array:
@@ -121,7 +123,9 @@ def question_sensors(motions: Sequence[Motion], period: float, seed: int = 0) ->
     moves = len(samples.piece) >= LEAST_SAMPLES and samples.x_ddot.std() > 0
     scale = zero = position = delay = None
     if moves and swings:
-        scale, zero, position = angle_estimates(samples, dice)
+        found = angle_estimates(samples, dice)
+        known = (each.high - each.low < widest for each, widest in zip(found, WIDEST, strict=True))
+        scale, zero, position = (each if sure else None for each, sure in zip(found, known, strict=True))
     if moves and pushes[0].std() > 0:
         delay = delay_estimate(samples, pushes, period, dice)
     correlations = [_correlation(push, samples.x_ddot) for push in pushes]
@@ -146,25 +150,24 @@ def angle_estimates(samples: Samples, dice: np.random.Generator) -> tuple[Estima
         solution, errors = _regression(terms, values, weights)
         return errors / guess[0], solution
 
+    def unexplained(guess: Array) -> float:
+        return float(residuals(guess)[0].std() / samples.theta_ddot.std())
+
     def fitted(start: Array, weights: Array | None = None) -> tuple[float, float, float]:
         found = least_squares(
             lambda guess: residuals(guess, weights)[0], start, diff_step=1e-4, loss="soft_l1", f_scale=size
         )
         gravity, push, _ = residuals(found.x, weights)[1]
-        return float(found.x[0]), float(found.x[1]), float(gravity / GRAVITY / push)
+        return float(found.x[0]), float(found.x[1]), float(push * GRAVITY / gravity)
 
-    start = np.array([1.0, 0.0])
+    start = min((np.array([scale, 0.0]) for scale in SCALES), key=unexplained)
     size = OUTLIER * float(np.median(np.abs(residuals(start)[0]))) + 1e-9
     best = fitted(start)
     drawn = [fitted(np.array(best[:2]), _weights(samples.piece, dice)) for _ in range(SAMPLES)]
     scale, zero, position = (
         _estimate(value, [each[column] for each in drawn]) for column, value in enumerate(best)
     )
-    return (
-        scale,
-        zero,
-        position._replace(value=1 / position.value, low=1 / position.high, high=1 / position.low),
-    )
+    return scale, zero, position
 
 
 def delay_estimate(
@@ -174,7 +177,7 @@ def delay_estimate(
     direction = np.tanh(samples.x_dot / SPEED)
 
     def best(weights: Array | None) -> float:
-        terms = (np.stack((push, samples.x_dot, direction), 1) for push in pushes)
+        terms = (np.stack((push, samples.x_dot, direction, samples.x), 1) for push in pushes)
         sizes = [np.mean(_regression(each, samples.x_ddot, weights)[1] ** 2) for each in terms]
         return period * _lowest(DELAYS, np.array(sizes))
 

@@ -25,6 +25,7 @@ CORRELATED = 0.2  # size of a correlation that has a sign
 ANGLE_SCALE, POSITION_SCALE = 0.01, 0.10  # share by which a scale may differ
 ANGLE_ZERO = 0.02  # rad by which the upright angle may differ
 JITTER = 0.1  # share of the period
+LEAPS = 0.02  # share of rows
 SATURATED = 0.5  # share of rows
 TURN = 2 * np.pi
 
@@ -105,6 +106,12 @@ def doubts(reports: Sequence[Report], sensors: Sensors, period: float, layout: L
             "the pole runs ahead of its cart instead of staying behind: give the other side for "
             "layout.angle.positive"
         )
+    rows, leaps = sum(each.rows for each in reports), sum(each.leaps for each in reports)
+    if leaps > LEAPS * rows:
+        yield (
+            f"the angle leaps over a quarter of a turn in {leaps} of {rows} rows: mend layout.angle.unit; "
+            "the column may be in degrees"
+        )
     signs_fit = sensors.push >= -CORRELATED and sensors.lag >= -CORRELATED
     if signs_fit:
         yield from _scale_doubts(sensors, layout)
@@ -115,8 +122,7 @@ def doubts(reports: Sequence[Report], sensors: Sensors, period: float, layout: L
             f"the time between rows varies: 5 % are over {1e3 * jitter:.1f} ms from the period of "
             f"{1e3 * period:g} ms; give the clock of the cart's board as layout.time, or layout.resample=true"
         )
-    rows, beyond = sum(each.rows for each in reports), sum(each.beyond for each in reports)
-    if beyond:
+    if beyond := sum(each.beyond for each in reports):
         full = f"layout.motor.full={layout.motor.full:g}"
         yield f"{beyond} of {rows} motor values are beyond {full}: give the largest"
     saturated = sum(each.saturated for each in reports)

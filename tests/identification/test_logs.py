@@ -1,0 +1,249 @@
+"""Logs of others in every shape that people write, and what motion says of their columns."""
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cartpole_rl.checking import checked
+from cartpole_rl.errors import ConfigError, RecordingError
+from cartpole_rl.evaluation.recordings import read_recording
+from cartpole_rl.identification.logs import Layout, read_log
+from cartpole_rl.identification.sensors import Motion, question_sensors
+from cartpole_rl.workflows.import_logs import ImportConfig, import_logs
+
+PERIOD, STEPS, LENGTH = 0.02, 3000, 0.3  # s; length of the equivalent simple pendulum, m
+LAYOUT: dict[str, Any] = {
+    "time": {"name": "t"},
+    "position": {"name": "x"},
+    "angle": {"name": "a"},
+    "motor": {"name": "u", "full": 255},
+}
+Columns = dict[str, np.ndarray]
+
+
+@pytest.fixture(scope="module")
+def motion() -> Columns:
+    """A swinging pole on a driven cart, by equation (3.6), at a fine step; the motor acts 10 ms late."""
+    dice, fine = np.random.default_rng(3), 20
+    motor = np.repeat(dice.integers(-255, 256, STEPS // 6), 6).astype(float)
+    step, late = PERIOD / fine, fine // 2
+    x, x_dot, theta, theta_dot, rows = 0.0, 0.0, np.pi, 0.5, []
+    for index in range(STEPS * fine):
+        if index % fine == 0:
+            rows.append((x, theta))
+        push = motor[max(0, index - late) // fine]
+        x_ddot = 0.03 * push - 8 * x_dot - 20 * x
+        theta_ddot = (9.81 * np.sin(theta) - x_ddot * np.cos(theta)) / LENGTH - 0.1 * theta_dot
+        x_dot, theta_dot = x_dot + step * x_ddot, theta_dot + step * theta_ddot
+        x, theta = x + step * x_dot, theta + step * theta_dot
+    positions = np.array(rows)
+    return {"t": PERIOD * np.arange(STEPS), "x": positions[:, 0], "a": positions[:, 1], "u": motor}
+
+
+def written(
+    path: Path,
+    columns: Columns,
+    delimiter: str = ",",
+    decimal: str = ".",
+    head: str = "",
+    row: str = "{:.9g}",
+) -> Path:
+    lines = [delimiter.join(columns)]
+    for values in zip(*columns.values(), strict=True):
+        lines.append(delimiter.join(row.format(each).replace(".", decimal) for each in values))
+    path.write_text(head + "\n".join(lines) + "\n", encoding="utf-8")
+    return path
+
+
+def layout(**changes: Any) -> Layout:
+    """The layout above; a mapping changes a column, anything else takes its place."""
+    values = {
+        name: {**LAYOUT.get(name, {}), **change} if isinstance(change, dict) and name in LAYOUT else change
+        for name, change in changes.items()
+    }
+    return checked(Layout, {**LAYOUT, **values})
+
+
+@pytest.mark.parametrize(
+    ("style", "changes"),
+    [
+        ({}, {}),
+        ({"delimiter": ";", "decimal": ","}, {"decimal": ","}),
+        ({"delimiter": "\t", "head": "\ufeff# made by hand\n# second line\n"}, {}),
+        ({"delimiter": " "}, {}),
+        ({"head": "% written by MATLAB\n\n"}, {"comment": "%"}),
+    ],
+)
+def test_a_log_is_read_in_every_style(
+    tmp_path: Path, motion: Columns, style: dict[str, str], changes: dict[str, Any]
+) -> None:
+    log = read_log(written(tmp_path / "log.csv", motion, **style), layout(**changes))
+    (part,) = log.parts
+    assert part.steps == STEPS - 1
+    assert part.x == pytest.approx(motion["x"], abs=2e-5)
+    assert part.theta == pytest.approx(motion["a"], abs=1e-3)
+    assert part.motor.tolist() == motion["u"][:-1].tolist()
+
+
+@pytest.mark.parametrize(
+    ("convert", "changes"),
+    [
+        (lambda each: {**each, "t": 1e6 * each["t"]}, {"time": {"unit": "us"}}),
+        (
+            lambda each: {**each, "t": np.full(STEPS, 20.0)},
+            {"time": {"unit": "ms", "since": "previous_row"}},
+        ),
+        (
+            lambda each: {**each, "x": -1e3 * each["x"] + 7},
+            {"position": {"unit": "mm", "positive": "left", "zero": 7}},
+        ),
+        (lambda each: {**each, "x": each["x"] / 5e-5}, {"position": {"unit": 5e-5}}),
+        (lambda each: {**each, "a": np.degrees(each["a"])}, {"angle": {"unit": "deg"}}),
+        (
+            lambda each: {**each, "a": (1000 - each["a"] / (2 * np.pi) * 4271) % 4271},
+            {"angle": {"unit": 4271, "positive": "left", "upright": 1000}},
+        ),
+        (lambda each: {**each, "u": -each["u"] / 255}, {"motor": {"full": 1, "positive": "left"}}),
+        (lambda each: {**each, "u": np.roll(each["u"], 1)}, {"motor": {"row": "in_force"}}),
+    ],
+)
+def test_units_and_signs(
+    tmp_path: Path, motion: Columns, convert: Callable[[Columns], Columns], changes: dict[str, Any]
+) -> None:
+    (part,) = read_log(written(tmp_path / "log.csv", convert(motion)), layout(**changes)).parts
+    assert part.x == pytest.approx(motion["x"], abs=3e-5)
+    turns = (part.theta - motion["a"]) / (2 * np.pi)
+    assert turns == pytest.approx(np.full(STEPS, round(turns[0])), abs=3e-4)
+    assert part.motor.tolist() == motion["u"][:-1].tolist()
+    assert np.diff(part.time) == pytest.approx(PERIOD)
+
+
+def test_a_log_is_split_where_rows_are_missing_or_left_out(tmp_path: Path, motion: Columns) -> None:
+    kept = np.delete(np.arange(STEPS), [300, 301])
+    columns = {**{name: values[kept] for name, values in motion.items()}, "bad": np.zeros(len(kept))}
+    columns["bad"][[600, 650]] = 1
+    log = read_log(written(tmp_path / "log.csv", columns), layout(keep={"bad": [0, 0]}))
+    assert [part.steps for part in log.parts] == [299, 299, 2346]
+    assert log.report.gaps == 1
+    assert log.report.left_out == {"bad not in 0 to 0": 2, "in a part that is too short": 49}
+
+
+def test_a_log_with_a_varying_period_is_resampled(tmp_path: Path, motion: Columns) -> None:
+    dice = np.random.default_rng(1)
+    times = motion["t"] + dice.uniform(-0.006, 0.006, STEPS)
+    columns = {name: np.interp(times, motion["t"], values) for name, values in motion.items() if name != "u"}
+    log = read_log(
+        written(tmp_path / "log.csv", {**columns, "t": times, "u": motion["u"]}),
+        layout(resample=True, period=PERIOD),
+    )
+    (part,) = log.parts
+    assert log.report.jitter > 0.004
+    assert part.x == pytest.approx(np.interp(part.time + times[0], motion["t"], motion["x"]), abs=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "holds no rows"),
+        ("t,x,a\n0,0,0\n1,1,1\n", r"has no column u; it has t, x, a"),
+        ("t,x,a,u\n0,0,0,0\n1,0,,0\n", "line 3: a is empty"),
+        ("t,x,a,u\n0,0,0,0\n1,0,two,0\n", "line 3: a is 'two'"),
+        ("t,x,a,u\n0,0,0,0\n1,0,nan,0\n", "line 3: a is nan; give a finite number"),
+        ("t,x,a,u\n0,0,0,0\n0,0,0,0\n", "the time t does not increase after row 1"),
+    ],
+)
+def test_a_bad_log_is_one_line(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text(text)
+    with pytest.raises(RecordingError, match=message):
+        read_log(path, layout())
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"keep": {"bad": [1, 0]}}, r"give the lower bound first, as \[0,1\]"),
+        ({"angle": {"unit": "grad"}}, "angle.unit"),
+        ({"motor": {"full": 0}}, "motor.full=0"),
+    ],
+)
+def test_a_bad_layout_is_one_line(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        layout(**changes)
+
+
+def test_sensors_are_known_from_motion(motion: Columns) -> None:
+    """A scale of the angle 4 % wrong, a zero 2 degrees wrong, and a position 10 % too large."""
+    recorded = Motion(1.1 * motion["x"], motion["a"] / 0.96 + np.radians(2), motion["u"][:-1])
+    sensors = question_sensors([recorded], PERIOD)
+    assert sensors.angle_scale is not None
+    assert sensors.angle_scale.value == pytest.approx(0.96, abs=0.004)
+    assert sensors.position_scale is not None
+    assert sensors.position_scale.value == pytest.approx(1 / 1.1, rel=0.03)
+    assert sensors.delay is not None
+    assert sensors.delay.value == pytest.approx(0.01, abs=0.004)
+
+
+def test_the_zero_of_the_angle_is_known_from_motion(motion: Columns) -> None:
+    recorded = Motion(motion["x"], motion["a"] + np.radians(2), motion["u"][:-1])
+    zero = question_sensors([recorded], PERIOD).angle_zero
+    assert zero is not None
+    assert zero.value == pytest.approx(np.radians(2), abs=0.004)
+
+
+BROKEN: dict[str, tuple[Callable[[Columns], Columns], str]] = {
+    "motor sign": (lambda each: {**each, "u": -each["u"]}, "motor.positive"),
+    "angle sign": (lambda each: {**each, "a": -each["a"]}, "angle.positive"),
+    "degrees": (lambda each: {**each, "a": np.degrees(each["a"])}, "may be in degrees"),
+    "scale of 4 %": (lambda each: {**each, "a": 1.04 * each["a"]}, r"0\.96\d times as far"),
+    "zero": (lambda each: {**each, "a": each["a"] + 0.06}, "upright at a recorded angle of 3"),
+    "millimetres": (lambda each: {**each, "x": 1e3 * each["x"]}, "may be in mm"),
+    "a row later": (lambda each: {**each, "u": np.roll(each["u"], 1)}, "layout.motor.row=in_force"),
+    "three rows earlier": (lambda each: {**each, "u": np.roll(each["u"], -3)}, "over two periods later"),
+    "beyond full": (lambda each: {**each, "u": 1.2 * each["u"]}, "beyond layout.motor.full=255"),
+}
+
+
+@pytest.mark.parametrize("fault", BROKEN)
+def test_each_fault_of_a_log_is_a_doubt(
+    tmp_path: Path, motion: Columns, fault: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    convert, doubt = BROKEN[fault]
+    path = written(tmp_path / "log.csv", convert(motion))
+    import_logs(ImportConfig(source=path, layout=layout(), label=""), tmp_path / "run")
+    doubts = re.findall("doubt: (.*)", capsys.readouterr().out)
+    assert any(re.search(doubt, each) for each in doubts), doubts
+
+
+def test_jitter_is_a_doubt(tmp_path: Path, motion: Columns, capsys: pytest.CaptureFixture[str]) -> None:
+    dice = np.random.default_rng(2)
+    columns = {**motion, "t": motion["t"] + dice.uniform(0, 0.0035, STEPS)}
+    import_logs(
+        ImportConfig(source=written(tmp_path / "log.csv", columns), layout=layout(), label=""),
+        tmp_path / "run",
+    )
+    assert "doubt: the time between rows varies" in capsys.readouterr().out
+
+
+def test_logs_of_several_periods_are_refused(tmp_path: Path, motion: Columns) -> None:
+    folder = tmp_path / "logs"
+    folder.mkdir()
+    written(folder / "a.csv", motion)
+    written(folder / "b.csv", {**motion, "t": motion["t"] / 2})
+    with pytest.raises(RecordingError, match="control periods from 10 to 20 ms"):
+        import_logs(ImportConfig(source=folder, layout=layout(), label=""), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_good_log_has_no_doubt_and_becomes_recordings(
+    tmp_path: Path, motion: Columns, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    import_logs(ImportConfig(source=written(tmp_path / "log.csv", motion), layout=layout(), label=""), run)
+    assert "doubt: " not in capsys.readouterr().out
+    episode = read_recording(run / "recordings" / "log_00.csv")
+    assert episode.theta == pytest.approx(motion["a"], abs=1e-3)
