@@ -8,7 +8,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from statistics import fmean
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -37,8 +37,8 @@ OPTIMIZERS = {"adam": torch.optim.Adam, "adamw": torch.optim.AdamW}
 Scalars = dict[str, float]
 
 
-class Monitor(Protocol):
-    """Callbacks of a training."""
+class Monitor:
+    """Callbacks of a training; these do nothing."""
 
     def on_update(self, transitions: int, scalars: Scalars) -> None:
         """Report an iteration; called about 200 times in a training."""

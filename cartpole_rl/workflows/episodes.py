@@ -16,6 +16,7 @@ from cartpole_rl.plants.serial.plant import SerialPlant
 from cartpole_rl.plants.settings import EmulatedSettings, SimulatedSettings
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.randomization.poles import PoleSettings
+from cartpole_rl.reporting.live_view import LiveView, view_title
 from cartpole_rl.reporting.words import guard_text
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.tasks.settings import Measure
@@ -31,7 +32,6 @@ from cartpole_rl.workflows.build import (
 from cartpole_rl.workflows.checks import BASELINE
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
 from cartpole_rl.workflows.export import agent_on_board, compiled_training, exported_agent, on_the_board
-from cartpole_rl.workflows.live import LiveView, view_title
 from cartpole_rl.workflows.nominal import note_other_numbers
 from cartpole_rl.workflows.person import confirm, print_message
 from cartpole_rl.workflows.progress import progress_bar

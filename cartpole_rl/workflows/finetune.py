@@ -5,7 +5,10 @@ exploration (after). A separate process drives the cart while this one learns. E
 disk before the next one starts: an interruption costs at most the current one.
 """
 
-from contextlib import nullcontext
+import secrets
+import time
+from collections.abc import Iterator
+from contextlib import closing, contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
 
@@ -20,13 +23,16 @@ from cartpole_rl.evaluation.publishing import followed
 from cartpole_rl.evaluation.snapshots import Memory
 from cartpole_rl.files import claimed, write_bytes
 from cartpole_rl.learning.checkpoint_files import find_agent
-from cartpole_rl.learning.checkpoints import load_agent
+from cartpole_rl.learning.checkpoints import TrainingCheckpoint, forget_training, load_agent, save_agent
 from cartpole_rl.learning.settings import RayLearnerSettings
 from cartpole_rl.learning.states import seed_everything
 from cartpole_rl.plants.serial.faults import Confirm
 from cartpole_rl.plants.settings import EmulatedSettings
+from cartpole_rl.reporting.live_view import LiveView, view_title
+from cartpole_rl.reporting.scores import SCORES, score_table
 from cartpole_rl.reporting.tensorboard import TensorBoardLog
-from cartpole_rl.run_files import CHECKPOINTS, PROVENANCE, START
+from cartpole_rl.reporting.words import count_text, cut_off
+from cartpole_rl.run_files import CHECKPOINTS, COMPARISON, LAST, METRICS, PROVENANCE, RECORDINGS, START
 from cartpole_rl.workflows.agents import new_agent, trained_agent
 from cartpole_rl.workflows.build import (
     evaluated_env,
@@ -37,17 +43,28 @@ from cartpole_rl.workflows.build import (
 )
 from cartpole_rl.workflows.checks import check_finetuning
 from cartpole_rl.workflows.config import EvaluateConfig, FinetuneConfig, TrainConfig
-from cartpole_rl.workflows.finetuning_cart import DrivenCart, yielding_to
-from cartpole_rl.workflows.finetuning_files import FinetuningFiles
-from cartpole_rl.workflows.finetuning_learner import check_simulation
-from cartpole_rl.workflows.finetuning_session import LocalSession, TunedAgent
-from cartpole_rl.workflows.live import LiveView, view_title
+from cartpole_rl.workflows.finetuning_cart import DrivenCart, FinetuningFiles, Stage, yielding_to
+from cartpole_rl.workflows.finetuning_learner import CartLearner, TunedAgent, check_simulation
 from cartpole_rl.workflows.loading import recorded_settings
 from cartpole_rl.workflows.person import as_word, confirm, print_message
-from cartpole_rl.workflows.ray_learner.session import RaySession, learner_link
+from cartpole_rl.workflows.ray_learner import LearnerTask, Offer
+from cartpole_rl.workflows.ray_link import LearnerLink
+from cartpole_rl.workflows.report import report, summarized
+from cartpole_rl.workflows.results import plant_words, print_loop_time, print_results, shown
 from cartpole_rl.workflows.resuming import resumed
-from cartpole_rl.workflows.run_folder import AGENT_HASH, file_hash, recorded_provenance, write_config
+from cartpole_rl.workflows.run_folder import (
+    AGENT_HASH,
+    file_hash,
+    recorded_provenance,
+    write_config,
+    write_json,
+)
 from cartpole_rl.workflows.trained_poles import other_pole
+
+NAME = "learner"  # in a checkpoint: the name of a learner of Ray
+POLL = 0.1  # s between two looks for weights
+
+show = partial(print_message, "finetune")
 
 
 def finetune(config: FinetuneConfig, folder: Path, new_learner: bool = False) -> None:
@@ -74,10 +91,10 @@ def finetune(config: FinetuneConfig, folder: Path, new_learner: bool = False) ->
     training = agent.training
     evaluation = evaluation_config(config)
     settings = evaluated_settings(training, evaluation)
-    if line := other_pole(agent.known_poles, settings.pole, isinstance(config.plant, EmulatedSettings)):
-        print_message("finetune", line)
-    if line := guard_note(training, evaluation, settings):
-        print_message("finetune", line)
+    emulated = isinstance(config.plant, EmulatedSettings)
+    notes = other_pole(agent.known_poles, settings.pole, emulated), guard_note(training, evaluation, settings)
+    for note in filter(None, notes):
+        show(note)
     if not isinstance(config.learner, RayLearnerSettings):  # whose machine has the files
         check_simulation(training)
     with claimed(folder):
@@ -95,15 +112,20 @@ def finetune(config: FinetuneConfig, folder: Path, new_learner: bool = False) ->
         with (
             live,
             TensorBoardLog(folder) as log,
-            learner_link(files, tuned, evaluation) as link,
+            link_to_learner(files, tuned, evaluation) as link,
             Driver(make_env, partial(greedy_network, training), real_time, confirm) as driver,
             yielding_to(driver, link is None) if real_time else nullcontext(),
         ):
             cart = DrivenCart(driver, files, log)
+            cart.evaluate(Stage.BEFORE, tuned.first_weights)
             if link is None:
-                LocalSession(files, cart, tuned, settings).run()
+                learn_here(cart, tuned, settings)
             else:
-                RaySession(files, cart, tuned, settings, link).run()
+                learn_there(link, cart, tuned)
+            cart.evaluate(Stage.AFTER, tuned.weights)
+            compare(cart, tuned, settings)
+        forget_training(folder)
+        files.start.unlink(missing_ok=True)
 
 
 def started_from(files: FinetuningFiles) -> Path:
@@ -123,13 +145,6 @@ def started_from(files: FinetuningFiles) -> Path:
     return run
 
 
-def driven_env(
-    settings: CartPoleSettings, evaluation: EvaluateConfig, memory: Memory | None, confirm: Confirm
-) -> CartPoleEnv:
-    """Return the environment over the cart, in the process that drives it."""
-    return followed(evaluated_env(settings, evaluation, print, confirm), memory)
-
-
 def evaluation_config(config: FinetuneConfig) -> EvaluateConfig:
     """Return the settings that the cart is driven with."""
     shared = config.model_dump(include={"run", "plant", "emulator", "seed", "label", "threads"})
@@ -137,6 +152,140 @@ def evaluation_config(config: FinetuneConfig) -> EvaluateConfig:
     return checked(EvaluateConfig, {**shared, "episodes": episodes, "randomization": {}, "parameters": None})
 
 
+def driven_env(
+    settings: CartPoleSettings, evaluation: EvaluateConfig, memory: Memory | None, confirm: Confirm
+) -> CartPoleEnv:
+    """Return the environment over the cart, in the process that drives it."""
+    return followed(evaluated_env(settings, evaluation, print, confirm), memory)
+
+
 def greedy_network(training: TrainConfig) -> nn.Module:
     """Return the network that drives, for weights of `as_weights`."""
     return new_agent(training).greedy_policy()
+
+
+@contextmanager
+def link_to_learner(
+    files: FinetuningFiles, tuned: TunedAgent, evaluation: EvaluateConfig
+) -> Iterator[LearnerLink | None]:
+    """Connect to the learner of learner=ray; yield None if the learner is this process.
+
+    A resumed run whose episodes were all learned from needs no learner either. Raises LearnerError.
+    """
+    settings = files.config.learner
+    if not isinstance(settings, RayLearnerSettings) or tuned.learned >= files.config.episodes:
+        yield None
+        return
+    name = tuned.state.setdefault(NAME, secrets.token_hex(8))
+    save_newest(files, tuned)
+    config, driving = files.config.model_dump(mode="json"), evaluation.model_dump(mode="json")
+
+    def task() -> LearnerTask:
+        state = {"agent": {key: weight.clone() for key, weight in tuned.agent.state_dict().items()}}
+        return LearnerTask(name, driving, tuned.start, TrainingCheckpoint(config, state, tuned.learned))
+
+    with closing(LearnerLink(settings, files.folder, files.learned_from, task, show)) as link:
+        link.connect()
+        yield link
+
+
+def learn_here(cart: DrivenCart, tuned: TunedAgent, settings: CartPoleSettings) -> None:
+    """Drive and learn at the same time, episode by episode; what is on disk is not driven again."""
+    files, config, learned = cart.files, cart.config, tuned.learned
+    learner = CartLearner(config, tuned.training, settings, tuned.agent)
+    if learned >= config.episodes:
+        return
+    recorded = files.learned_from()[: config.evaluation_episodes + learned]
+    if "replay" in tuned.state:
+        learner.restore(recorded, tuned.state)
+    else:  # a new run, or one whose learner was on another machine
+        cart.log_learning(learner.start(recorded, learned), learned)
+    for number in range(learned, config.episodes):
+        if drives := number >= files.count(Stage.TUNE):
+            cart.start_tuning(number, tuned.weights)
+        curves = learner.round()
+        if drives:
+            cart.finish(Stage.TUNE, number)
+        learner.add(files.episode(Stage.TUNE, number))
+        cart.log_learning(curves, number + 1)
+        files.save(learner.snapshot(), number + 1)
+
+
+def learn_there(link: LearnerLink, cart: DrivenCart, tuned: TunedAgent) -> None:
+    """Drive each episode that is not on disk with the weights for it, and wait for the last weights.
+
+    Raises LearningError if learning failed.
+    """
+    for number in range(cart.files.count(Stage.TUNE), cart.config.episodes):
+        wait_for_weights(link, cart, tuned, number, link.settings.episodes_ahead)
+        cart.start_tuning(number, tuned.weights)
+        cart.finish(Stage.TUNE, number)
+    wait_for_weights(link, cart, tuned, cart.config.episodes, ahead=0)
+    link.finish()
+
+
+def wait_for_weights(link: LearnerLink, cart: DrivenCart, tuned: TunedAgent, number: int, ahead: int) -> None:
+    """Wait for weights that were learned from `number` episodes, while the cart stands still.
+
+    Weights from up to `ahead` episodes fewer do while the learner is lost.
+    """
+    waits = False
+    while True:
+        for news in link.poll():
+            if isinstance(news, Offer):
+                take(news, cart.files, tuned)
+            else:
+                cart.log_learning(news.scalars, news.learned)
+        lacking = number - tuned.learned
+        if lacking <= 0:
+            return
+        if link.is_lost and lacking <= ahead:
+            show(f"tune {number + 1} is driven with weights from {count_text(tuned.learned)}")
+            return
+        if link.is_lost and not waits:
+            show("the cart waits for the learner; Ctrl-C stops, resume= continues")
+            waits = True
+        time.sleep(POLL)
+
+
+def take(offer: Offer, files: FinetuningFiles, tuned: TunedAgent) -> None:
+    """Take weights that arrived, if they are newer than the present ones, of this network, and finite."""
+    if not tuned.learned < offer.version <= files.config.episodes:
+        return
+    try:
+        tuned.replace(offer.weights, f"version {offer.version} of the learner's weights")
+    except CheckpointError as error:
+        show(f"{error}; the earlier weights are kept")
+        return
+    tuned.learned = offer.version
+    save_newest(files, tuned)
+
+
+def save_newest(files: FinetuningFiles, tuned: TunedAgent) -> None:
+    """Write the checkpoint to resume from: the newest weights, and the learner that has all else."""
+    files.save({"agent": tuned.agent.state_dict(), NAME: tuned.state[NAME]}, tuned.learned)
+
+
+def compare(cart: DrivenCart, tuned: TunedAgent, settings: CartPoleSettings) -> None:
+    """Keep the better policy, and write and print the results."""
+    files, config, task = cart.files, cart.config, settings.task
+    episodes = {stage: files.episodes(stage) for stage in (Stage.BEFORE, Stage.AFTER)}
+    summaries = {}
+    for stage, driven in episodes.items():
+        summary, listed = summarized(driven, task.x_max)
+        summaries[stage] = {**summary, "episodes": listed}
+    scores = {stage: each[task.measure]["mean"] for stage, each in summaries.items()}
+    kept = Stage.AFTER if scores[Stage.AFTER] >= scores[Stage.BEFORE] else Stage.BEFORE
+    folder, link = files.folder, cart.link_summary()
+    save_agent(folder / CHECKPOINTS / LAST, tuned.checkpoint(kept, scores[kept], settings.pole))
+    report(folder, episodes[kept], config.plant.kind, settings.pole, task, link)
+    write_json(folder / COMPARISON, {**summaries, "kept": kept})
+    for stage, summary in summaries.items():
+        print(score_table(summary, f"{stage}, {count_text(len(episodes[stage]))}"))
+    for line in cut_off([*episodes[Stage.BEFORE], *episodes[Stage.AFTER]]):
+        print(line)
+    print_loop_time(link.get("latency_override"))
+    print(f"kept: the policy {kept} fine-tuning, by its {SCORES[task.measure]}")
+    written = f"{METRICS}, {COMPARISON}, {CHECKPOINTS}/{LAST} and {RECORDINGS}/"
+    words = plant_words(config.plant, [settings.pole])
+    print_results(folder, written, f"cartpole-evaluate {as_word('run', shown(folder))} {words}")

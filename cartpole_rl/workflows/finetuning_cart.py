@@ -1,7 +1,12 @@
-"""The cart of a fine-tuning, driven by its own process; each finished episode is written and logged."""
+"""The cart of a fine-tuning: driven by its own process, each finished episode on disk before the next one.
 
-from collections.abc import Iterator
+The recordings in the run folder say how far a fine-tuning has come: what is on disk is not driven again.
+"""
+
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
+from enum import StrEnum
+from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
@@ -9,17 +14,82 @@ from tqdm import tqdm
 from cartpole_rl.errors import LearningError, LinkError
 from cartpole_rl.evaluation.driver import Driver, DriveRequest
 from cartpole_rl.evaluation.driving_policy import Weights
+from cartpole_rl.evaluation.recordings import LENGTH, read_recording, write_recording
+from cartpole_rl.learning.checkpoints import FINETUNING_FORMAT, TrainingCheckpoint, save_training
+from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.plants.serial.statistics import LinkStatistics
 from cartpole_rl.reporting.tensorboard import TensorBoardLog
 from cartpole_rl.reporting.words import ending_text, guard_text
+from cartpole_rl.run_files import CHECKPOINTS, RECORDINGS, START
 from cartpole_rl.scheduling import giving_precedence
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.config import FinetuneConfig
-from cartpole_rl.workflows.finetuning_files import FinetuningFiles, Stage
 from cartpole_rl.workflows.person import print_message
 
 LARGEST_LOSSES = 3  # of the link in succession, in an evaluation
+
+
+class Stage(StrEnum):
+    """Stages of a fine-tuning, in their order."""
+
+    BEFORE = "before"  # evaluation of the trained agent
+    TUNE = "tune"  # episodes to learn from
+    AFTER = "after"  # evaluation of the fine-tuned agent
+
+
+class FinetuningFiles:
+    """Recordings and the checkpoint to resume from, in the run folder `folder`."""
+
+    def __init__(self, folder: Path, config: FinetuneConfig) -> None:
+        self.folder, self.config = folder, config
+
+    @property
+    def start(self) -> Path:
+        """The copy of the agent that the fine-tuning started from; it exists until the end."""
+        return self.folder / CHECKPOINTS / START
+
+    def path(self, stage: Stage, number: int) -> Path:
+        """Return the path of an episode's recording."""
+        return self.folder / RECORDINGS / f"{stage}_{number:03d}.csv"
+
+    def count(self, stage: Stage) -> int:
+        """Return the number of recorded episodes of a stage."""
+        number = 0
+        while self.path(stage, number).exists():
+            number += 1
+        return number
+
+    def episode(self, stage: Stage, number: int) -> Episode:
+        """Read an episode. Raises RecordingError."""
+        return read_recording(self.path(stage, number))
+
+    def episodes(self, stage: Stage) -> list[Episode]:
+        """Read all recorded episodes of a stage, in order. Raises RecordingError."""
+        return [self.episode(stage, number) for number in range(self.count(stage))]
+
+    def learned_from(self, first: int = 0) -> list[Episode]:
+        """Read the recorded episodes that the learner gets, from number `first`: evaluations come first."""
+        stages = (Stage.BEFORE, Stage.TUNE)
+        paths = [self.path(stage, number) for stage in stages for number in range(self.count(stage))]
+        return [read_recording(path) for path in paths[first:]]
+
+    def write_episode(self, stage: Stage, number: int, episode: Episode) -> None:
+        """Write an episode's recording."""
+        length = pole_length(self.config)
+        header = {"stage": stage, "number": number, LENGTH: "" if length is None else f"{length:.4f}"}
+        write_recording(self.path(stage, number), episode, header)
+
+    def save(self, state: dict[str, Any], learned: int) -> None:
+        """Write the checkpoint to resume from, after learning from `learned` episodes."""
+        checkpoint = TrainingCheckpoint(self.config.model_dump(mode="json"), state, learned)
+        save_training(self.folder, checkpoint, FINETUNING_FORMAT)
+
+
+def pole_length(config: FinetuneConfig) -> float | None:
+    """Return the length (m) of the pole on the cart; None if the settings do not state it."""
+    plant = config.plant
+    return plant.pole_length if isinstance(plant, SerialSettings) else 2 * config.emulator.pole_com
 
 
 class DrivenCart:
@@ -27,12 +97,8 @@ class DrivenCart:
 
     def __init__(self, driver: Driver, files: FinetuningFiles, log: TensorBoardLog) -> None:
         self.driver, self.files, self.log = driver, files, log
+        self.config = files.config
         self.link: LinkStatistics | None = None  # since the driver started; None before its first episode
-
-    @property
-    def config(self) -> FinetuneConfig:
-        """The settings of the fine-tuning."""
-        return self.files.config
 
     def evaluate(self, stage: Stage, weights: Weights) -> None:
         """Drive the episodes of a stage that are not on disk, without exploration.
@@ -42,6 +108,10 @@ class DrivenCart:
         while (number := self.files.count(stage)) < self.config.evaluation_episodes:
             self.start(weights, 0.0, self.config.seed)
             self.finish(stage, number)
+
+    def start_tuning(self, number: int, weights: Weights) -> None:
+        """Start episode `number` to learn from, with exploration, and return at once. Raises LinkError."""
+        self.start(weights, self.config.finetuning.epsilon, self.config.seed + number)
 
     def start(self, weights: Weights, epsilon: float, seed: int) -> None:
         """Start an episode and return at once. Raises LinkError."""
@@ -53,12 +123,18 @@ class DrivenCart:
 
         An episode without a control period is driven again; so is an evaluation that the link ended, since it
         says nothing about the agent. Raises LinkError if that happens LARGEST_LOSSES times in succession, and
-        the errors of `result`.
+        LearningError if the network's numbers were not finite: the cart was stopped.
         """
         for losses in range(1, LARGEST_LOSSES + 1):
-            episode = self.result(stage, number)
+            driven = self.driver.result()
+            self.link, episode = driven.link, driven.episode
+            if episode.ended_by == Ending.NON_FINITE:
+                raise LearningError(
+                    f"{stage} {number + 1}: an observation or an action value was not finite, so the cart "
+                    "was stopped; nothing is learned from this episode"
+                )
             if episode.steps and (stage is Stage.TUNE or episode.ended_by != Ending.LINK):
-                self.keep(stage, number, episode)
+                self.keep(stage, number, episode, driven.link)
                 return
             lost = f"{stage} {number + 1}: {ending_text(episode)}"
             if losses < LARGEST_LOSSES:
@@ -66,34 +142,21 @@ class DrivenCart:
                 self.driver.start(self.request)
         raise LinkError(f"{lost}, {losses} times in succession: check the cart's cables")
 
-    def result(self, stage: Stage, number: int) -> Episode:
-        """Wait for the started episode.
-
-        Raises LinkError, and LearningError if the network's numbers were not finite: the cart was stopped.
-        """
-        driven = self.driver.result()
-        self.link = driven.link
-        episode = driven.episode
-        if episode.ended_by == Ending.NON_FINITE:
-            raise LearningError(
-                f"{stage} {number + 1}: an observation or an action value was not finite, so the cart was "
-                "stopped; nothing is learned from this episode"
-            )
-        return episode
-
-    def keep(self, stage: Stage, number: int, episode: Episode) -> None:
+    def keep(self, stage: Stage, number: int, episode: Episode, link: LinkStatistics) -> None:
         """Write and log an episode."""
         self.files.write_episode(stage, number, episode)
         score, step = float(episode.score.sum()), self.step(stage, number + 1)
         share = None if episode.guarded is None else float(episode.guarded.mean())
         self.log.scalars({f"cart/score_{stage}": score, f"cart/guarded_{stage}": share}, step)
-        assert self.link is not None
-        summary = vars(self.link.summary())
-        self.log.scalars({f"link/{key}": float(value) for key, value in summary.items()}, step)
+        self.log.scalars({f"link/{key}": float(value) for key, value in vars(link.summary()).items()}, step)
         self.log.flush()
         tqdm.write(
             f"{stage} {number + 1}: score {score:.0f}, ended by {episode.ended_by}{guard_text(episode)}"
         )
+
+    def log_learning(self, curves: Mapping[str, float], learned: int) -> None:
+        """Log curves at the step of the last episode that was learned from."""
+        self.log.scalars(curves, self.step(Stage.TUNE, learned))
 
     def step(self, stage: Stage, number: int) -> int:
         """Return TensorBoard's step of a stage's episode `number`, from 1: the stages follow each other."""

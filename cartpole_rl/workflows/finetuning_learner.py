@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -9,55 +10,101 @@ import numpy as np
 import torch
 
 from cartpole_rl.envs.build import environment, randomizer, simulated_env
-from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
-from cartpole_rl.errors import RecordingError
+from cartpole_rl.errors import CheckpointError, RecordingError
+from cartpole_rl.evaluation.driving_policy import Weights, as_weights
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.identification.fit import Fit, best_fit
 from cartpole_rl.identification.unknowns import LONGEST_LATENCY
 from cartpole_rl.identification.windows import cut_windows
 from cartpole_rl.learning.agent import QAgent
-from cartpole_rl.learning.checkpoints import whole_state
-from cartpole_rl.learning.dqn import Scalars, Training
+from cartpole_rl.learning.checkpoints import (
+    AgentCheckpoint,
+    TrainingCheckpoint,
+    check_finite,
+    restore_weights,
+    whole_state,
+)
+from cartpole_rl.learning.dqn import Monitor, Scalars
 from cartpole_rl.learning.finetuning import Finetuning, recorded_chunk
 from cartpole_rl.learning.settings import FinetuningSettings, LearningSettings
 from cartpole_rl.physics.friction import CART_FRICTIONS
 from cartpole_rl.physics.models import Models
-from cartpole_rl.plants.recorded import RecordedPlant
 from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.randomization.identified import IdentifiedCarts
+from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 from cartpole_rl.settings import evaluation_seed
 from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.workflows.agents import known_poles, new_agent
 from cartpole_rl.workflows.config import FinetuneConfig, TrainConfig
-from cartpole_rl.workflows.finetuning_files import pole_length
+from cartpole_rl.workflows.finetuning_cart import Stage, pole_length
 from cartpole_rl.workflows.person import print_message
+from cartpole_rl.workflows.trained_poles import guard_holds
 
 PRINT = partial(print_message, "finetune")
 SAMPLES = 4096  # carts drawn from each fit
 EVALUATED_CARTS = 10  # of the score in simulation
+SIMULATED_SCORE = "cart/score_in_simulation"  # TensorBoard's curve beside those of the cart
 
 
-class NoCallbacks:
-    """A `learning.dqn.Monitor` that does nothing: the session logs by episodes on the cart."""
+class TunedAgent:
+    """The agent `start` and the one that it becomes, after `learned` episodes of its cart.
 
-    def on_update(self, transitions: int, scalars: Scalars) -> None:
-        """Do nothing."""
+    An interrupted run continues from `checkpoint`, whose `state` may hold the agent's weights alone.
+    """
 
-    def on_evaluation(self, training: Training, episodes: Sequence[Episode], is_best: bool) -> None:
-        """Do nothing."""
+    def __init__(
+        self, training: TrainConfig, start: AgentCheckpoint, checkpoint: TrainingCheckpoint | None
+    ) -> None:
+        self.training, self.start = training, start
+        self.agent: QAgent = new_agent(training)
+        self.agent.load_state_dict(start.weights)
+        self.first_weights = self.weights
+        self.learned = 0
+        self.state: dict[str, Any] = {}
+        if checkpoint and checkpoint.state:
+            self.learned, self.state = checkpoint.step, checkpoint.state
+            restore_weights(self.agent, self.state.get("agent", {}), "the state to resume from")
 
-    def on_checkpoint(self, training: Training) -> None:
-        """Do nothing."""
+    @property
+    def weights(self) -> Weights:
+        """A copy of the present weights that drive."""
+        return as_weights(self.agent.greedy_policy())
+
+    def replace(self, weights: Weights, source: str) -> None:
+        """Replace the present weights. Raises CheckpointError for others than finite ones of this network."""
+        kinds, own = (
+            {name: (weight.shape, weight.dtype) for name, weight in each.items()}
+            for each in (weights, as_weights(self.agent))
+        )
+        if kinds != own:
+            raise CheckpointError(f"{source} are refused: they are of another network")
+        state = {name: torch.tensor(weight) for name, weight in weights.items()}
+        check_finite(state, f"{source} are refused")
+        self.agent.load_state_dict(state)
+
+    def checkpoint(self, kept: Stage, score: float, driven: PoleSettings) -> AgentCheckpoint:
+        """Return the agent before or after its fine-tuning on a cart with the pole `driven`."""
+        if kept is Stage.BEFORE:
+            return replace(self.start, score=score)
+        poles = self.start.tuned_poles
+        if not any(guard_holds(each, driven) for each in known_poles(self.training, self.start)):
+            poles = [*poles, driven.model_dump(mode="json")]
+        return replace(self.start, weights=self.agent.state_dict(), score=score, tuned_poles=poles)
 
 
 class CartLearner:
     """An agent that learns from the recordings of a cart and from simulations of it.
 
     `training` are the settings that the agent was trained with, `settings` those of the cart that it drives.
-    `show` prints a message. `start` or `restore` must be called before the agent can learn.
+    `show` prints a message. `start` or `restore` makes `loop`, and must be called before the agent can learn.
     """
+
+    loop: Finetuning
+    carts: torch.Tensor  # [P, SAMPLES], drawn from the newest fit
+    recorded: list[Episode]  # evaluations first
 
     def __init__(
         self,
@@ -73,19 +120,19 @@ class CartLearner:
         self.candidates = [models]  # physics models to fit
         if models.cart_friction == "sigmoid":
             self.candidates.append(models._replace(cart_friction=CART_FRICTIONS.find("step")))
-        self.loop: Finetuning | None = None
-        self.carts: torch.Tensor  # [P, SAMPLES], drawn from the newest fit
 
-    def start(self, recorded: Sequence[Episode], rounds: int = 0) -> None:
-        """Fit the simulator to the `recorded` episodes and prepare learning.
+    def start(self, recorded: Sequence[Episode], learned: int = 0) -> Scalars:
+        """Fit the simulator to the `recorded` episodes and prepare learning; return the first curves.
 
-        The agent has made `rounds` rounds already: the schedules continue there. Raises RecordingError.
+        The agent has learned from `learned` episodes already: the schedules continue there. Raises
+        RecordingError.
         """
         fit, models = self.fit_simulator(recorded)
         self.carts = self.draw_carts(fit)
         self.prepare(recorded, models)
-        self.started.iteration = rounds * self.config.finetuning.iterations
-        self.started.fill()
+        self.loop.iteration = learned * self.config.finetuning.iterations
+        self.loop.fill()
+        return {SIMULATED_SCORE: self.simulated_score()}
 
     def restore(self, recorded: Sequence[Episode], snapshot: Mapping[str, Any]) -> None:
         """Continue from `snapshot`; `recorded` are the episodes that were learned from until then."""
@@ -93,47 +140,45 @@ class CartLearner:
             self.carts = snapshot["carts"]
             friction = CART_FRICTIONS.find(snapshot["cart_friction"])
             self.prepare(recorded, self.candidates[0]._replace(cart_friction=friction))
-            self.started.restore(snapshot)
+            self.loop.restore(snapshot)
 
     def snapshot(self) -> dict[str, Any]:
         """Return the state from which `restore` continues, to be saved at once."""
         (models,) = self.candidates
         state = {"carts": self.carts, "cart_friction": str(models.cart_friction)}
-        return {**self.started.snapshot(), **state}
-
-    def prepare(self, recorded: Sequence[Episode], models: Models) -> None:
-        """Make the learning loop for `models`, with the transitions of the `recorded` episodes."""
-        self.candidates = [models]
-        self.loop = self.make_loop(models)
-        for episode in recorded:
-            self.add(episode)
-
-    @property
-    def started(self) -> Finetuning:
-        """The learning loop, once `start` or `restore` has made it."""
-        assert self.loop is not None
-        return self.loop
+        return {**self.loop.snapshot(), **state}
 
     def round(self) -> Scalars:
-        """Learn while one episode is driven. Returns curves for TensorBoard."""
-        return self.started.round()
+        """Learn while one episode is driven; return curves."""
+        return {**self.loop.round(), SIMULATED_SCORE: self.simulated_score()}
 
     def add(self, episode: Episode) -> None:
-        """Learn from one more recorded episode from now on."""
-        self.started.add(self.transitions(episode))
+        """Learn from one more recorded episode from now on, and fit the simulator anew when it is time."""
+        self.recorded.append(episode)
+        self.loop.add(self.transitions(episode))
+        learned = len(self.recorded) - self.config.evaluation_episodes
+        if learned % self.config.finetuning.refit == 0 and learned < self.config.episodes:
+            self.refit()
 
-    def refit(self, recorded: Sequence[Episode]) -> None:
-        """Fit the simulator to the `recorded` episodes, and continue with carts drawn from that fit.
+    def refit(self) -> None:
+        """Fit the simulator to all recorded episodes, and continue with carts drawn from that fit.
 
         An episode that no cart drives, as with a loose encoder, leaves the earlier fit.
         """
         try:
-            fit, _ = self.fit_simulator(recorded)
+            fit, _ = self.fit_simulator(self.recorded)
             self.carts = self.draw_carts(fit)
         except RecordingError as error:
             self.show(f"the simulator keeps its earlier fit: {error}")
             return
-        self.started.simulate(self.randomizer())
+        self.loop.simulate(self.randomizer())
+
+    def prepare(self, recorded: Sequence[Episode], models: Models) -> None:
+        """Make the learning loop for `models`, with the transitions of the `recorded` episodes."""
+        self.candidates, self.recorded = [models], list(recorded)
+        self.loop = self.make_loop(models)
+        for episode in recorded:
+            self.loop.add(self.transitions(episode))
 
     def make_loop(self, models: Models) -> Finetuning:
         """Return the learning loop over simulated carts."""
@@ -157,7 +202,7 @@ class CartLearner:
             self.agent,
             environment(guarded, plant),
             lambda: [],
-            NoCallbacks(),
+            Monitor(),
             config.seed,
             config.compile,
         )
@@ -168,8 +213,7 @@ class CartLearner:
         windows = cut_windows(recorded, period)
         may_be_stated = isinstance(self.config.plant, SerialSettings)  # the length of its pole
         poles = self.settings.pole if may_be_stated else self.training.pole
-        nominal = self.training.nominal_with(poles.nominal)
-        fit, models = best_fit(windows, nominal, self.candidates, period)
+        fit, models = best_fit(windows, self.training.nominal_with(poles.nominal), self.candidates, period)
         self.show(
             f"simulator fitted to {windows.number} windows of {windows.periods * period:g} s: RMS error "
             f"{1e3 * CART_METRES_PER_COUNT * fit.rms[0]:.2f} mm and "
@@ -189,12 +233,8 @@ class CartLearner:
 
     def transitions(self, episode: Episode) -> Any:
         """Return an episode's transitions as the agent observes them; None if it has none."""
-
-        def make_env(plant: RecordedPlant) -> CartPoleEnv:
-            return environment(self.settings, plant)
-
         motors = self.settings.actions.motors
-        chunk = recorded_chunk(episode, make_env, motors, pole_length(self.config))
+        chunk = recorded_chunk(episode, partial(environment, self.settings), motors, pole_length(self.config))
         learned, measured = 0 if chunk is None else chunk.shape[1], episode.measured_steps
         if learned < measured:
             self.show(
@@ -206,13 +246,8 @@ class CartLearner:
     def simulated_score(self) -> float:
         """Return the agent's mean score on carts of its training, the same ones at every call."""
         training, measure = self.training, self.settings.task.measure
-        env = simulated_env(
-            training,
-            training.plant,
-            EVALUATED_CARTS,
-            training.task.evaluation_start,
-            evaluation_seed(self.config.seed),
-        )
+        start, seed = training.task.evaluation_start, evaluation_seed(self.config.seed)
+        env = simulated_env(training, training.plant, EVALUATED_CARTS, start, seed)
         return float(np.mean([each.total(measure) for each in run_batch(env, self.agent.greedy_policy())]))
 
 

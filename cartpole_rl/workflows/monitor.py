@@ -9,7 +9,7 @@ import numpy as np
 
 from cartpole_rl.evaluation.metrics import episode_metrics
 from cartpole_rl.learning.checkpoints import AgentCheckpoint, TrainingCheckpoint, save_agent, save_training
-from cartpole_rl.learning.dqn import Scalars, Training
+from cartpole_rl.learning.dqn import Monitor, Scalars, Training
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.reporting.animation import gif
 from cartpole_rl.reporting.figures import behaviour
@@ -35,7 +35,7 @@ AVERAGED = ("score", "score_upright", "steps", "upright_fraction")  # over the e
 PICTURES = 4  # behaviour figures and animations in TensorBoard, over the whole training
 
 
-class TrainingMonitor:
+class TrainingMonitor(Monitor):
     """Monitor of one training in the run folder `folder`; a context manager around `Training.run`.
 
     `resumed_at` is the number of transitions from which a training is resumed: later records are removed.

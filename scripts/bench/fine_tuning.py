@@ -44,7 +44,7 @@ from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.config import FinetuneConfig
 from cartpole_rl.workflows.finetune import finetune
-from cartpole_rl.workflows.finetuning_files import FinetuningFiles, Stage
+from cartpole_rl.workflows.finetuning_cart import FinetuningFiles, Stage
 from cartpole_rl.workflows.loading import load_settings
 
 PARENT = RUNS / "fine_tuning"

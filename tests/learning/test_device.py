@@ -13,11 +13,10 @@ from cartpole_rl.envs.build import simulated_env, with_fitted_guard
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.evaluation.driving_policy import DrivingPolicy
 from cartpole_rl.learning.checkpoints import TrainingCheckpoint, load_training, save_training
-from cartpole_rl.learning.dqn import Training
+from cartpole_rl.learning.dqn import Monitor, Training
 from cartpole_rl.learning.states import moved, seed_everything
 from cartpole_rl.workflows.agents import new_agent
 from cartpole_rl.workflows.config import TrainConfig
-from cartpole_rl.workflows.finetuning_learner import NoCallbacks
 from cartpole_rl.workflows.loading import load_settings
 from cartpole_rl.workflows.train import (
     available_device,
@@ -48,7 +47,7 @@ def new_training(overrides: dict[str, Any], device: torch.device | str) -> Train
     env = simulated_env(config, config.plant, config.learning.carts, config.task.start, seed=1, device=device)
     note_unused_randomization(config, env.plant.randomizer)
     settings = config.learning, config.buffer, config.optimizer
-    return Training(*settings, new_agent(config, device), env, lambda: [], NoCallbacks(), seed=1)
+    return Training(*settings, new_agent(config, device), env, lambda: [], Monitor(), seed=1)
 
 
 def trained(training: Training, iterations: int) -> dict[str, Tensor]:

@@ -13,8 +13,8 @@ from cartpole_rl.workflows.agents import new_agent, trained_agent
 from cartpole_rl.workflows.build import evaluated_settings
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
 from cartpole_rl.workflows.export import compiled_training, exported_agent, on_the_board
-from cartpole_rl.workflows.finetuning_files import Stage
-from cartpole_rl.workflows.finetuning_session import TunedAgent
+from cartpole_rl.workflows.finetuning_cart import Stage
+from cartpole_rl.workflows.finetuning_learner import TunedAgent
 from cartpole_rl.workflows.loading import load_settings
 
 MEDIUM, LARGE = (PoleSettings(**group_choices("pole")[name]) for name in ("medium", "large"))

@@ -1,0 +1,267 @@
+"""A fine-tuning: its files, the episodes that count, and a learner that goes on as if it had not stopped."""
+
+import io
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from short_episode import EPISODE
+
+from cartpole_rl.choices import choice
+from cartpole_rl.envs.build import simulated_env
+from cartpole_rl.errors import CheckpointError, LinkError
+from cartpole_rl.evaluation.driver import Driven, DriveRequest
+from cartpole_rl.evaluation.episodes import run_batch
+from cartpole_rl.files import write_bytes
+from cartpole_rl.learning.checkpoints import FINETUNING_FORMAT, AgentCheckpoint, load_training, save_agent
+from cartpole_rl.learning.settings import FinetuningSettings, LearningSettings
+from cartpole_rl.learning.states import seed_everything
+from cartpole_rl.plants.serial.statistics import LinkStatistics
+from cartpole_rl.reporting.tensorboard import TensorBoardLog
+from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.workflows.agents import new_agent
+from cartpole_rl.workflows.build import evaluated_settings
+from cartpole_rl.workflows.config import FinetuneConfig, TrainConfig
+from cartpole_rl.workflows.finetune import evaluation_config, started_from
+from cartpole_rl.workflows.finetuning_cart import DrivenCart, FinetuningFiles, Stage
+from cartpole_rl.workflows.finetuning_learner import CartLearner, simulated_learning
+from cartpole_rl.workflows.loading import load_settings, recorded_settings
+from cartpole_rl.workflows.run_folder import write_config
+
+TRAINING = {
+    "task.time_limit": 80,
+    "learning.carts": 16,
+    "learning.chunk": 8,
+    "learning.batch_size": 32,
+    "learning.updates": 2,
+    "observation": "history_length",
+}
+CONFIG = {
+    "run": "somewhere",
+    "seed": 5,
+    "evaluation_episodes": 1,
+    "episodes": 4,
+    "compile": False,
+    "finetuning.iterations": 3,
+    "finetuning.refit": 2,
+    "finetuning.cart_share": 0.5,
+}
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> FinetuningFiles:
+    return FinetuningFiles(tmp_path, load_settings(FinetuneConfig, CONFIG | {"evaluation_episodes": 3}))
+
+
+def test_the_recordings_say_how_far_a_run_has_come(files: FinetuningFiles) -> None:
+    for stage, count in ((Stage.BEFORE, 1), (Stage.TUNE, 2)):
+        for number in range(count):
+            files.write_episode(stage, number, replace(EPISODE, motor=np.array([number, 7])))
+    assert [files.count(stage) for stage in Stage] == [1, 2, 0]
+    assert files.path(Stage.TUNE, 1) == files.folder / "recordings/tune_001.csv"
+    assert [each.motor[0] for each in files.episodes(Stage.TUNE)] == [0, 1]
+    assert [each.motor[0] for each in files.learned_from()] == [0, 0, 1]
+    assert [each.motor[0] for each in files.learned_from(2)] == [1]
+    assert "# pole_length_m: 0.3530" in files.path(Stage.BEFORE, 0).read_text()
+
+
+def test_a_checkpoint_restores_its_settings(files: FinetuningFiles) -> None:
+    files.save({}, 2)
+    checkpoint = load_training(files.folder, FINETUNING_FORMAT)
+    assert checkpoint.step == 2
+    assert recorded_settings(FinetuneConfig, checkpoint.config, "resume=run") == files.config
+    with pytest.raises(CheckpointError, match=r"resume=run is of another version .*prior: there is no such"):
+        recorded_settings(FinetuneConfig, {"run": "somewhere", "prior": 0.1}, "resume=run")
+
+
+class Script:
+    """A driver whose episodes end as `endings` say."""
+
+    def __init__(self, *endings: str) -> None:
+        self.endings = iter(endings)
+
+    def start(self, drive: DriveRequest) -> None:
+        """Do nothing."""
+
+    def result(self) -> Driven:
+        """Return the next episode."""
+        ending = next(self.endings)
+        episode = EPISODE.first(0) if ending == "empty" else EPISODE
+        return Driven(replace(episode, ended_by=ending.replace("empty", "fault")), LinkStatistics())
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Iterator[TensorBoardLog]:
+    with TensorBoardLog(tmp_path) as opened:
+        yield opened
+
+
+def test_an_evaluation_that_the_link_ended_is_driven_again(
+    files: FinetuningFiles, log: TensorBoardLog, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cart = DrivenCart(Script("time", "link", "link", "fault", "link", "link", "link"), files, log)
+    with pytest.raises(LinkError, match=r"before 3: the link was lost after 0\.0 s, 3 times in succession"):
+        cart.evaluate(Stage.BEFORE, {})
+    assert [each.ended_by for each in files.episodes(Stage.BEFORE)] == ["time", "fault"]
+    told = "before 2: the link was lost after 0.0 s; the episode does not count and is driven again"
+    assert capsys.readouterr().out.splitlines()[1] == told
+    cart = DrivenCart(Script("link"), files, log)
+    cart.finish(Stage.TUNE, 0)  # one to learn from counts until then
+    assert files.episode(Stage.TUNE, 0).ended_by == "link"
+
+
+@pytest.mark.parametrize("stage", [Stage.BEFORE, Stage.TUNE])
+def test_an_episode_without_a_measured_period_is_driven_again(
+    stage: Stage, files: FinetuningFiles, log: TensorBoardLog
+) -> None:
+    cart = DrivenCart(Script("empty", "empty", "fault", "empty", "empty", "empty"), files, log)
+    cart.start({}, 0.0, 0)
+    cart.finish(stage, 0)
+    assert [each.steps for each in files.episodes(stage)] == [2]
+    with pytest.raises(LinkError, match=r"2: the cart reported a fault after 0\.0 s, 3 times in succession"):
+        cart.finish(stage, 1)
+
+
+def test_without_its_copy_of_the_agent_a_run_takes_the_same_one_and_no_other(tmp_path: Path) -> None:
+    run = tmp_path / "agent.pt"
+    save_agent(run, AgentCheckpoint({}, {}, transitions=10, score=None))
+    config = load_settings(FinetuneConfig, CONFIG | {"run": str(run)})
+    write_config(tmp_path / "run", "finetune", config.model_dump(mode="json"), agent=run)
+    interrupted = FinetuningFiles(tmp_path / "run", config)
+    assert started_from(interrupted) == run
+    save_agent(run, AgentCheckpoint({}, {}, transitions=20, score=None))
+    with pytest.raises(CheckpointError) as raised:
+        started_from(interrupted)
+    assert str(raised.value) == (
+        f"resume={interrupted.folder}: it holds no checkpoints/start.pt, and by provenance.json the agent of "
+        f"run={run} is not the one that it started from; cartpole-finetune run={run} starts anew"
+    )
+    write_bytes(interrupted.start, b"a copy")
+    assert started_from(interrupted) == interrupted.start
+
+
+def test_learning_in_simulation_follows_the_settings() -> None:
+    learning = LearningSettings(**choice("learning/fast"))
+    gentle = FinetuningSettings(**choice("finetuning/gentle"))
+    simulated = simulated_learning(learning, gentle, episodes=20)
+    assert simulated.iterations == 20 * gentle.iterations
+    assert simulated.epsilon == gentle.simulated_epsilon == (0.1, 0.02)
+    assert simulated.epsilon_transitions == simulated.transitions // 2
+    assert simulated.warmup_transitions == 0
+    assert simulated.batch_size == learning.batch_size
+
+
+def new_learner() -> CartLearner:
+    """A learner with a new agent, the same one each time; its cart brakes later than that of the training."""
+    seed_everything(3)
+    training, config = load_settings(TrainConfig, TRAINING), load_settings(FinetuneConfig, CONFIG)
+    settings = evaluated_settings(training, evaluation_config(config))
+    numbers = settings.guard.active
+    other = numbers.model_copy(update={"margin": 2 * numbers.margin})
+    guard = settings.guard.model_copy(update={"numbers": other})
+    return CartLearner(config, training, settings.model_copy(update={"guard": guard}), new_agent(training))
+
+
+@pytest.fixture(scope="module")
+def recorded() -> list[Episode]:
+    """Three episodes of random motor values."""
+    training = load_settings(TrainConfig, TRAINING)
+    env = simulated_env(training, training.plant, 3, training.task.start, seed=1)
+    random, actions = torch.Generator().manual_seed(0), len(training.actions.motors)
+    return run_batch(
+        env, lambda current: current.set("action", torch.randint(actions, (3,), generator=random))
+    )
+
+
+@pytest.fixture(scope="module")
+def late(recorded: list[Episode]) -> CartLearner:
+    """A learner that starts after two episodes, without the state of the earlier one."""
+    learner = new_learner()
+    learner.start(recorded, learned=2)
+    return learner
+
+
+def from_disk(state: dict[str, Any]) -> dict[str, Any]:
+    """`state` as `save_training` and `load_training` would return it."""
+    file = io.BytesIO()
+    torch.save(state, file)
+    file.seek(0)
+    return torch.load(file, weights_only=True)
+
+
+def go_on(learner: CartLearner, episode: Episode) -> None:
+    learner.round()
+    learner.add(episode)
+    learner.round()
+
+
+def test_a_resumed_fine_tuning_equals_one_that_was_not_stopped(recorded: list[Episode]) -> None:
+    """The pole's length is observed; the simulator is fitted anew before the stop."""
+    whole = new_learner()
+    whole.start(recorded[:2], learned=1)
+    whole.round()
+    carts = whole.carts
+    whole.add(recorded[2])
+    assert not torch.equal(whole.carts, carts)
+    saved = from_disk(whole.snapshot())
+    go_on(whole, recorded[1])
+    resumed = new_learner()
+    resumed.agent.load_state_dict(saved["agent"])
+    resumed.restore(recorded, saved)
+    go_on(resumed, recorded[1])
+    assert resumed.loop.iteration == 12
+    weights = resumed.agent.state_dict()
+    assert all(torch.equal(weights[name], weight) for name, weight in whole.agent.state_dict().items())
+    assert all(weight.isfinite().all() for weight in weights.values())
+
+
+def test_a_state_that_lacks_a_part_is_named(late: CartLearner, recorded: list[Episode]) -> None:
+    state = late.snapshot()
+    for part in ("carts", "chooser", "optimizer"):
+        with pytest.raises(CheckpointError, match=rf"its state lacks '{part}'; start anew"):
+            new_learner().restore(recorded[:1], {key: each for key, each in state.items() if key != part})
+
+
+def test_a_learner_that_starts_later_continues_the_schedules(late: CartLearner) -> None:
+    assert late.loop.iteration == 2 * late.config.finetuning.iterations
+    assert late.loop.epsilon() < late.loop.settings.epsilon[0]
+
+
+def test_simulation_brakes_as_the_cart_does(late: CartLearner) -> None:
+    """The guard of a cart with another pole is not that of the training."""
+    assert late.loop.env.hardware.guard == late.settings.guard.numbers != late.training.guard.numbers
+
+
+def test_a_refit_that_fails_keeps_the_earlier_fit(
+    late: CartLearner, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An encoder came loose: learning goes on."""
+    carts, capacity = late.carts.clone(), len(late.loop.buffer)
+    jumps = np.random.default_rng(0).integers(-(10**6), 10**6, late.recorded[0].counts.shape)
+    loose = [replace(each, counts=each.counts + jumps) for each in late.recorded]
+    monkeypatch.setattr(late, "recorded", loose)
+    late.refit()
+    assert "the simulator keeps its earlier fit: no cart moves as" in capsys.readouterr().err.splitlines()[-1]
+    assert torch.equal(late.carts, carts)
+    assert len(late.loop.buffer) == capacity
+
+
+def test_what_is_not_learned_from_is_told(
+    late: CartLearner, recorded: list[Episode], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A late value was replaced by one that the agent cannot choose."""
+    motor = recorded[0].motor
+    odd = replace(recorded[0], motor=np.concatenate((motor[:10], [7], motor[11:])))
+    assert late.transitions(odd).shape[1] == 10
+    (line,) = capsys.readouterr().err.splitlines()
+    steps, motors = odd.measured_steps, list(late.settings.actions.motors)
+    assert line == (
+        f"cartpole-finetune: an episode is learned from up to step 10 of {steps}: there the motor value 7 "
+        f"drove, which is none of the agent's {motors}"
+    )
+    assert late.transitions(recorded[0]).shape[1] == steps
+    assert not capsys.readouterr().err
