@@ -44,7 +44,7 @@ from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.hardware import HardwareTransform
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.learning.agent import QAgent
-from cartpole_rl.learning.dqn import Training
+from cartpole_rl.learning.dqn import Monitor, Training
 from cartpole_rl.learning.states import seed_everything
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.simulated import SimulatedPlant
@@ -55,7 +55,6 @@ from cartpole_rl.settings import evaluation_seed
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.tasks.settings import StartSettings
 from cartpole_rl.workflows.config import TrainConfig
-from cartpole_rl.workflows.finetuning_learner import NoCallbacks
 from cartpole_rl.workflows.loading import load_settings
 
 WIDTHS = (0.0, 1 / 3, 2 / 3)
@@ -154,7 +153,7 @@ def trained_and_judged(job: Job, overrides: Mapping[str, Any]) -> dict[str, Any]
     env = make_env(config, job, config.learning.carts, config.task.start, job.seed)
     judge = partial(judged, config, job, agent)
     arguments = config.learning, config.buffer, config.optimizer, agent, env, partial(judge, WATCHED_CARTS)
-    Training(*arguments, NoCallbacks(), job.seed, config.compile).run()
+    Training(*arguments, Monitor(), job.seed, config.compile).run()
     scores = np.array([episode.score.sum() for episode in judge(DRAWN_CARTS)])
     return {
         **job._asdict(),
