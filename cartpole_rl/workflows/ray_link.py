@@ -4,6 +4,7 @@ It is a process that starts a Ray node on this machine and calls the learner (`r
 or die without harm: the processes that drive and write episodes use neither Ray nor the network.
 """
 
+import logging
 import multiprocessing
 import os
 import platform
@@ -276,7 +277,7 @@ def joined(address: str) -> "Iterator[subprocess.Popen[bytes]]":
             if node.poll() is not None:
                 raise ConnectionError(f"no Ray cluster answers at {address}")
             with suppress(ConnectionError, ValueError, LookupError):  # not joined yet
-                ray.init(address=address, namespace="cartpole_rl", log_to_driver=False, logging_level="ERROR")
+                ray.init(address=address, namespace="cartpole_rl", log_to_driver=False, logging_level=logging.ERROR)
             time.sleep(PERIOD)
         yield node
     finally:

@@ -9,19 +9,20 @@ from collections import defaultdict
 from dataclasses import replace
 from pathlib import Path
 
-import torch
-from command_line import FINETUNING, ONCE, TINY, Outcome, console_script, in_process, interrupt, outcome
+import pytest
+from command_line import FINETUNING, Outcome, console_script, in_process, interrupt, outcome
 from tensorboard.backend.event_processing.event_file_loader import EventFileLoader
 
 from cartpole_rl.evaluation.recordings import read_recording
-from cartpole_rl.learning.checkpoints import load_agent, save_agent
+from cartpole_rl.learning.checkpoints import (
+    FINETUNING_FORMAT,
+    TrainingCheckpoint,
+    load_agent,
+    load_training,
+    save_agent,
+    save_training,
+)
 from cartpole_rl.workflows.agents import trained_agent
-
-
-def finetune(trained: Path, folder: Path, *words: str) -> Outcome:
-    return in_process(
-        "finetune", f"run={trained}", *FINETUNING, *words, f"hydra.run.dir={folder}/run", folder=folder
-    )
 
 
 def recordings(run: Path) -> list[str]:
@@ -62,18 +63,6 @@ def test_tensorboard_shows_cart_and_simulation_side_by_side(tuned: tuple[Path, O
     assert steps["link/late_ticks"] == [1, 2, 3, 4]
 
 
-def test_an_agent_that_observes_the_poles_length_is_tuned(tmp_path: Path) -> None:
-    """Its own transitions on the cart have that length; without it every weight would be lost."""
-    words = (*TINY, ONCE, "actions=two", "observation=history_length", "hydra.run.dir=trained")
-    assert in_process("train", *words, folder=tmp_path).code == 0
-    done = finetune(tmp_path / "trained", tmp_path, "emulator.pole_com=0.18")
-    assert done.code == 0, done.err
-    tuned = torch.load(tmp_path / "run/checkpoints/last.pt", weights_only=True)["weights"]
-    assert all(weight.isfinite().all() for weight in tuned.values())
-    heading = (tmp_path / "run/recordings/tune_000.csv").read_text()
-    assert "# pole_length_m: 0.3600" in heading
-
-
 def test_one_that_has_ended_is_not_resumed(tuned: tuple[Path, Outcome], tmp_path: Path) -> None:
     run, _ = tuned
     assert [path.name for path in (run / "checkpoints").iterdir()] == ["last.pt"]
@@ -100,44 +89,43 @@ def contents(run: Path) -> dict[str, bytes]:
 
 
 def test_a_run_continues_after_each_kind_of_interruption(trained: Path, tmp_path: Path) -> None:
-    """One run: killed, then interrupted, then terminated, each time after one more episode to learn from.
+    """One run: killed, then interrupted, then its checkpoint is as of a learner on a machine that is lost.
 
     The agent that it started from has gone after the first time.
     """
-    shutil.copytree(trained, tmp_path / "agent")
-    words = (
-        f"run={tmp_path}/agent",
-        *FINETUNING,
-        "finetuning.refit=2",
-        "episodes=4",
-        f"hydra.run.dir={tmp_path}/run",
-    )
+    run, agent = tmp_path / "run", tmp_path / "agent"
+    shutil.copytree(trained, agent)
+    words = (f"run={agent}", *FINETUNING, "finetuning.refit=2", "episodes=3", f"hydra.run.dir={run}")
     process = console_script("finetune", *words, folder=tmp_path)
-    while not (tmp_path / "run/recordings/tune_000.csv").exists():
+    while not (run / "recordings/tune_000.csv").exists():
         assert process.poll() is None, process.communicate()
         time.sleep(0.02)
     os.kill(process.pid, signal.SIGKILL)
     assert outcome(process).code == -signal.SIGKILL
-    kept = contents(tmp_path / "run")
-    shutil.rmtree(tmp_path / "agent")
-    for recording, stop, code in (
-        ("tune_001.csv", signal.SIGINT, 130),
-        ("tune_002.csv", signal.SIGTERM, 143),
-        (None, None, 0),
-    ):
-        if recording is not None:
-            assert recording not in kept
-            interrupt(tmp_path, recording, stop)
-        done = in_process("finetune", f"resume={tmp_path}/run", folder=tmp_path)
-        assert done.code == code, done.err
-        now = contents(tmp_path / "run")
-        assert {name: now[name] for name in kept} == kept
-        kept = now
-    assert recordings(tmp_path / "run") == [
-        "after_000.csv",
-        "before_000.csv",
-        *(f"tune_00{number}.csv" for number in range(4)),
-    ]
+    shutil.rmtree(agent)
+    killed = contents(run)
+    assert "tune_001.csv" not in killed
+
+    interrupt(tmp_path, "tune_001.csv", signal.SIGINT)
+    assert in_process("finetune", f"resume={run}", folder=tmp_path).code == 130
+    interrupted = contents(run)
+    assert {name: interrupted[name] for name in killed} == killed
+    saved = load_training(run, FINETUNING_FORMAT)
+    assert saved.step >= 1
+
+    learner = {"kind": "ray", "address": "gone:6379", "episodes_ahead": 5, "timeout": 10.0}
+    state = {"agent": saved.state["agent"], "learner": "name"}
+    save_training(
+        run, TrainingCheckpoint({**saved.config, "learner": learner}, state, saved.step), FINETUNING_FORMAT
+    )
+    done = in_process("finetune", f"resume={run}", "learner=local", "seed=1", folder=tmp_path)
+    assert done.code == 2
+    assert done.complaint.endswith("resume uses that run's own config; leave out seed=1")
+    done = in_process("finetune", f"resume={run}", "learner=local", folder=tmp_path)
+    assert done.code == 0, done.err
+    ended = contents(run)
+    assert {name: ended[name] for name in interrupted} == interrupted
+    assert [*ended] == ["after_000.csv", "before_000.csv", *(f"tune_00{number}.csv" for number in range(3))]
 
 
 def test_what_the_simulation_reads_is_missed_before_the_cart_moves(trained: Path, tmp_path: Path) -> None:
@@ -145,19 +133,30 @@ def test_what_the_simulation_reads_is_missed_before_the_cart_moves(trained: Path
     agent = load_agent(trained)
     randomization = {"posterior": f"{tmp_path}/posterior.npz", "widen": 1.0, "prior_share": 0.0, "ranges": {}}
     save_agent(tmp_path / "agent.pt", replace(agent, config={**agent.config, "randomization": randomization}))
-    done = finetune(tmp_path / "agent.pt", tmp_path)
+    words = (f"run={tmp_path}/agent.pt", *FINETUNING, f"hydra.run.dir={tmp_path}/run")
+    done = in_process("finetune", *words, folder=tmp_path)
     assert f"randomization.posterior={tmp_path}/posterior.npz cannot be read" in done.complaint
     assert done.code == 2
     assert not (tmp_path / "run").exists()
 
 
-def test_a_run_is_needed(tmp_path: Path) -> None:
-    done = in_process("finetune", "run=null", "hydra.run.dir=run", folder=tmp_path)
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (("run=null",), "run"),
+        (("plant=simulated",), "plant=simulated: this command takes emulated, serial"),
+        (
+            ("learner=ray", "learner.address=server:6379"),
+            'learner=ray needs Ray: pip install "cartpole_rl[ray]"',
+        ),
+    ],
+)
+def test_a_run_a_cart_and_a_learner_are_needed(
+    words: tuple[str, ...], complaint: str, trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("cartpole_rl.workflows.checks.find_spec", lambda name: None)  # nothing is installed
+    words = (*FINETUNING[1:], *(words if "run=null" in words else (f"run={trained}", *words)))
+    done = in_process("finetune", *words, "hydra.run.dir=run", folder=tmp_path)
     assert done.code == 2
-    assert "run" in done.complaint
-
-
-def test_it_is_done_on_a_cart(trained: Path, tmp_path: Path) -> None:
-    done = in_process("finetune", f"run={trained}", "plant=simulated", "hydra.run.dir=run", folder=tmp_path)
-    assert done.code == 2
-    assert "plant=simulated: this command takes emulated, serial" in done.complaint
+    assert complaint in done.complaint
+    assert not (tmp_path / "run").exists()
