@@ -5,7 +5,6 @@ continues on both, with the same loop and the same loss.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from itertools import takewhile
 from typing import Any
 
 import torch
@@ -20,26 +19,29 @@ from cartpole_rl.randomization.randomizer import Draws
 from cartpole_rl.tasks.episode import Episode
 
 
-def recorded_chunk(
+def recorded_chunks(
     episode: Episode,
     make_env: Callable[[RecordedPlant], CartPoleEnv],
     motors: Sequence[int],
     pole_length: float | None,
-) -> TensorDictBase | None:
-    """Return the one-step transitions [1, T] of an episode in the environment that `make_env` builds.
+) -> list[TensorDictBase]:
+    """Return the one-step transitions of an episode in the environment that `make_env` builds.
 
     `pole_length` m is that of the cart, None if it is not known. The last step before a lost link is left
-    out, since its outcome was not measured; so are those from a motor value on that no action has, as of a
-    late one. Return None if no other step is left.
+    out, since its outcome was not measured. So are the steps that no action of the agent drove, such as those
+    of the firmware's brake or of a late value: they part the episode into chunks [1, T].
     """
     env = make_env(RecordedPlant(episode, pole_length))
     index = {motor: action for action, motor in enumerate(motors)}
-    current, taken = env.reset(), []
-    for motor in takewhile(index.__contains__, episode.motor[: episode.measured_steps].tolist()):
-        current["action"] = torch.tensor([index[motor]])
+    current, parts = env.reset(), [[]]
+    for motor in episode.motor[: episode.measured_steps].tolist():
+        current["action"] = torch.tensor([index.get(motor, 0)])
         transition, current = env.step_and_maybe_reset(current)
-        taken.append(transition.select(*COLLECTED))
-    return torch.stack(taken, 1) if taken else None
+        if motor in index:
+            parts[-1].append(transition.select(*COLLECTED))
+        else:
+            parts.append([])
+    return [torch.stack(part, 1) for part in parts if part]
 
 
 class Finetuning(Training):
@@ -51,13 +53,12 @@ class Finetuning(Training):
         self.recorded: TensorDictBase | None = None
         self._chooser = torch.Generator().manual_seed(self.seed)
 
-    def add(self, chunk: TensorDictBase | None) -> None:
-        """Add a recorded episode; None adds nothing."""
-        if chunk is None:
-            return
-        transitions = n_step_transitions(chunk, self.settings.n_step, self.agent.settings.gamma)
-        earlier = self.recorded
-        self.recorded = transitions if earlier is None else torch.cat((earlier, transitions))
+    def add(self, chunks: Sequence[TensorDictBase]) -> None:
+        """Add the chunks of a recorded episode."""
+        for chunk in chunks:
+            transitions = n_step_transitions(chunk, self.settings.n_step, self.agent.settings.gamma)
+            earlier = self.recorded
+            self.recorded = transitions if earlier is None else torch.cat((earlier, transitions))
 
     def simulate(self, carts: Draws) -> None:
         """Continue on simulated carts drawn from `carts`; the transitions of older ones are discarded."""

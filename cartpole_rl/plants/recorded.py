@@ -46,9 +46,9 @@ class RecordedPlant(OneCartPlant):
         return self._frame()
 
     def step_one(self, motor: int) -> OneFrame:
-        """Return the next frame, whatever the motor value."""
+        """Return the next frame, whatever the motor value: the recorded one drove."""
         self._row += 1
-        return self._frame()
+        return self._frame()._replace(sent=int(self.episode.motor[self._row - 1]))
 
     def _frame(self) -> OneFrame:
         episode, row = self.episode, self._row

@@ -26,7 +26,7 @@ from cartpole_rl.learning.checkpoints import (
     whole_state,
 )
 from cartpole_rl.learning.dqn import Monitor, Scalars
-from cartpole_rl.learning.finetuning import Finetuning, recorded_chunk
+from cartpole_rl.learning.finetuning import Finetuning, recorded_chunks
 from cartpole_rl.learning.settings import FinetuningSettings, LearningSettings
 from cartpole_rl.physics.friction import CART_FRICTIONS
 from cartpole_rl.physics.models import Models
@@ -231,17 +231,20 @@ class CartLearner:
         prior, share = randomizer(self.training), self.config.finetuning.prior_share
         return IdentifiedCarts(self.carts, prior, share, LONGEST_LATENCY)
 
-    def transitions(self, episode: Episode) -> Any:
-        """Return an episode's transitions as the agent observes them; None if it has none."""
+    def transitions(self, episode: Episode) -> list[Any]:
+        """Return an episode's transitions in chunks, as the agent observes them."""
         motors = self.settings.actions.motors
-        chunk = recorded_chunk(episode, partial(environment, self.settings), motors, pole_length(self.config))
-        learned, measured = 0 if chunk is None else chunk.shape[1], episode.measured_steps
+        length = pole_length(self.config)
+        chunks = recorded_chunks(episode, partial(environment, self.settings), motors, length)
+        learned, measured = sum(chunk.shape[1] for chunk in chunks), episode.measured_steps
         if learned < measured:
+            others = sorted({*episode.motor[:measured].tolist()} - {*motors})
             self.show(
-                f"an episode is learned from up to step {learned} of {measured}: there the motor value "
-                f"{episode.motor[learned]} drove, which is none of the agent's {list(motors)}"
+                f"{measured - learned} of {measured} steps of an episode are not learned from: the cart's own"
+                f" brake, or a late command, drove them (motor value {', '.join(map(str, others))}), and the "
+                "agent has no such action"
             )
-        return chunk
+        return chunks
 
     def simulated_score(self) -> float:
         """Return the agent's mean score on carts of its training, the same ones at every call."""

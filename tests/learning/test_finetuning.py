@@ -14,7 +14,7 @@ from cartpole_rl.choices import choice
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.learning.agent import QAgent
-from cartpole_rl.learning.finetuning import Finetuning, recorded_chunk
+from cartpole_rl.learning.finetuning import Finetuning, recorded_chunks
 from cartpole_rl.learning.settings import (
     BufferSettings,
     FinetuningSettings,
@@ -92,12 +92,12 @@ def test_a_recording_has_what_the_agent_saw_and_tunes_it(
     def over(plant: Any) -> Any:
         return make_environment(plant, MOTORS, time_limit=40, **observation)
 
-    chunk = recorded_chunk(episode, over, MOTORS, LENGTH)
+    (chunk,) = recorded_chunks(episode, over, MOTORS, LENGTH)
     torch.testing.assert_close(chunk["observation"][0], seen)
     assert all(value.isfinite().all() for value in chunk.values(True, True) if value.is_floating_point())
 
     learner, agent = make_learner(make_plant, make_environment, observation, cart_share=0.5)
-    learner.add(chunk)
+    learner.add([chunk])
     learner.fill()
     before = {name: weight.clone() for name, weight in agent.named_parameters()}
     learner.round()
@@ -109,11 +109,11 @@ def test_a_recording_has_what_the_agent_saw_and_tunes_it(
 def test_the_seed_chooses_the_recorded_transitions(make_plant: Callable, make_environment: Callable) -> None:
     episode, _ = drive(make_plant, make_environment, {})
     env = make_environment
-    chunk = recorded_chunk(episode, lambda plant: env(plant, MOTORS, time_limit=40), MOTORS, None)
+    chunks = recorded_chunks(episode, lambda plant: env(plant, MOTORS, time_limit=40), MOTORS, None)
     batches = []
     for seed in (5, 5, 6):
         learner, _ = make_learner(make_plant, make_environment, {}, cart_share=1.0, seed=seed)
-        learner.add(chunk)
+        learner.add(chunks)
         learner.fill()
         batches.append(learner.sample()["observation"])
     assert torch.equal(batches[0], batches[1])
@@ -124,19 +124,22 @@ def test_unmeasured_transitions_are_left_out(make_plant: Callable, make_environm
     """The last counts are repeated where the link is lost: as if the cart had stopped at once."""
     episode, _ = drive(make_plant, make_environment, {})
     lost = replace(episode, ended_by="link")
-    whole, chunk = (
-        recorded_chunk(each, lambda plant: make_environment(plant, MOTORS, time_limit=40), MOTORS, None)
+    (whole,), (chunk,) = (
+        recorded_chunks(each, lambda plant: make_environment(plant, MOTORS, time_limit=40), MOTORS, None)
         for each in (episode, lost)
     )
     assert chunk.shape[1] == lost.measured_steps == whole.shape[1] - 1
     torch.testing.assert_close(chunk["next", "observation"], whole["next", "observation"][:, :-1])
     assert not chunk["next", "done"].any()
-    late = replace(episode, motor=np.append(episode.motor[:-5], [7] * 5))  # 7 is no action's value
+    braked = replace(episode, motor=np.where(np.arange(episode.steps) // 2 == 5, 255, episode.motor))
     env = make_environment
-    chunk = recorded_chunk(late, lambda plant: env(plant, MOTORS, time_limit=40), MOTORS, None)
-    assert chunk.shape[1] == whole.shape[1] - 5
+    chunks = recorded_chunks(braked, lambda plant: env(plant, MOTORS, time_limit=40), MOTORS, None)
+    assert [each.shape[1] for each in chunks] == [10, whole.shape[1] - 12]
+    after = whole["observation"][:, 12:]
+    assert not torch.equal(chunks[1]["observation"][:, 0], after[:, 0])  # it observes the brake's values, ...
+    torch.testing.assert_close(chunks[1]["observation"][:, -1], after[:, -1])  # ... until they are too old
     only = replace(lost, **{name: getattr(lost, name)[:1] for name in ("motor", "score", "reward")})
-    assert recorded_chunk(only, lambda plant: env(plant, MOTORS), MOTORS, None) is None
+    assert recorded_chunks(only, lambda plant: env(plant, MOTORS), MOTORS, None) == []
 
 
 def test_a_length_that_is_observed_but_not_known_is_an_error(
@@ -145,4 +148,4 @@ def test_a_length_that_is_observed_but_not_known_is_an_error(
     observation = observation_settings("history_length")
     episode, _ = drive(make_plant, make_environment, observation)
     with pytest.raises(ConfigError, match="observes the pole's length"):
-        recorded_chunk(episode, lambda plant: make_environment(plant, MOTORS, **observation), MOTORS, None)
+        recorded_chunks(episode, lambda plant: make_environment(plant, MOTORS, **observation), MOTORS, None)

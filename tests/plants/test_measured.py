@@ -14,7 +14,7 @@ from cartpole_rl.evaluation.episodes import run_episodes
 from cartpole_rl.evaluation.metrics import episode_metrics
 from cartpole_rl.evaluation.recordings import read_recording, write_recording
 from cartpole_rl.identification.experiments import recording
-from cartpole_rl.learning.finetuning import recorded_chunk
+from cartpole_rl.learning.finetuning import recorded_chunks
 from cartpole_rl.plants.measured import measured_part
 from cartpole_rl.plants.recorded import RecordedPlant
 from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT
@@ -83,7 +83,7 @@ def test_a_fault_is_a_truncation_without_the_tracks_penalty(
         def over(plant: RecordedPlant) -> Any:
             return make_environment(plant, motors)
 
-        chunks[ending] = recorded_chunk(episode, over, motors, None)[0, -1]["next"]
+        chunks[ending] = recorded_chunks(episode, over, motors, None)[-1][0, -1]["next"]
     assert (chunks["fault"]["done"].item(), chunks["fault"]["terminated"].item()) == (True, False)
     assert chunks["fault"]["reward"] == chunks["time"]["reward"] > chunks["track"]["reward"]
     assert chunks["track"]["terminated"].item()

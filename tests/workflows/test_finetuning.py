@@ -228,7 +228,7 @@ def test_a_state_that_lacks_a_part_is_named(late: CartLearner, recorded: list[Ep
 
 def test_a_learner_that_starts_later_continues_the_schedules(late: CartLearner) -> None:
     assert late.loop.iteration == 2 * late.config.finetuning.iterations
-    assert late.loop.epsilon() < late.loop.settings.epsilon[0]
+    assert late.loop.epsilon < late.loop.settings.epsilon[0]
 
 
 def test_simulation_brakes_as_the_cart_does(late: CartLearner) -> None:
@@ -253,15 +253,15 @@ def test_a_refit_that_fails_keeps_the_earlier_fit(
 def test_what_is_not_learned_from_is_told(
     late: CartLearner, recorded: list[Episode], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A late value was replaced by one that the agent cannot choose."""
+    """The cart's own brake drove in one period."""
     motor = recorded[0].motor
-    odd = replace(recorded[0], motor=np.concatenate((motor[:10], [7], motor[11:])))
-    assert late.transitions(odd).shape[1] == 10
+    odd = replace(recorded[0], motor=np.concatenate((motor[:10], [-255], motor[11:])))
+    steps = odd.measured_steps
+    assert [chunk.shape[1] for chunk in late.transitions(odd)] == [10, steps - 11]
     (line,) = capsys.readouterr().err.splitlines()
-    steps, motors = odd.measured_steps, list(late.settings.actions.motors)
     assert line == (
-        f"cartpole-finetune: an episode is learned from up to step 10 of {steps}: there the motor value 7 "
-        f"drove, which is none of the agent's {motors}"
+        f"cartpole-finetune: 1 of {steps} steps of an episode are not learned from: the cart's own brake, or a "
+        "late command, drove them (motor value -255), and the agent has no such action"
     )
-    assert late.transitions(recorded[0]).shape[1] == steps
+    assert [chunk.shape[1] for chunk in late.transitions(recorded[0])] == [steps]
     assert not capsys.readouterr().err
