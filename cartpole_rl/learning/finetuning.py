@@ -33,7 +33,8 @@ def recorded_chunks(
     """
     env = make_env(RecordedPlant(episode, pole_length))
     index = {motor: action for action, motor in enumerate(motors)}
-    current, parts = env.reset(), [[]]
+    current = env.reset()
+    parts: list[list[TensorDictBase]] = [[]]
     for motor in episode.motor[: episode.measured_steps].tolist():
         current["action"] = torch.tensor([index.get(motor, 0)])
         transition, current = env.step_and_maybe_reset(current)
