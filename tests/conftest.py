@@ -89,7 +89,7 @@ def make_cart(ip02: dict[str, float], medium: PoleSettings) -> Callable[..., Car
             torch.as_tensor(values[name], dtype=torch.float64).expand(carts)
             for name in CartParameters.names()
         ]
-        return CartParameters.from_table(torch.stack(rows))
+        return CartParameters(torch.stack(rows))
 
     return build
 

@@ -21,7 +21,7 @@ from cartpole_rl.errors import ConfigError
 from cartpole_rl.physics.dynamics import State, advance, coupling, mechanism
 from cartpole_rl.physics.friction import CART_FRICTIONS, viscous_coefficient
 from cartpole_rl.physics.models import Models
-from cartpole_rl.physics.parameters import GRAVITY, CartParameters
+from cartpole_rl.physics.parameters import GRAVITY, CartParameters, cart_column
 from cartpole_rl.tasks.features import (
     ANGULAR_SPEED_SCALE,
     MOTOR_SCALE,
@@ -64,10 +64,10 @@ class EnergyAndRegulator:
                 f"observation.kind={kind}, past_motors={past_motors}: the baseline reads velocities and the "
                 "last motor value; set kind to raw or cos_sin, and past_motors to at least 1"
             )
-        row = [float(nominal[name]) for name in CartParameters.names()]
+        column = cart_column(nominal)
         self.models, self.kind, self.period = models, kind, period
-        self.gain = regulator(torch.tensor(row, dtype=torch.float64).unsqueeze(1), models, period)
-        self.cart = CartParameters.from_table(torch.tensor(row).unsqueeze(1))
+        self.gain = regulator(column, models, period)
+        self.cart = CartParameters(column.float())
         self.body = mechanism(self.cart)
         self.motors = torch.tensor(list(motors), dtype=torch.float32)
         self.forces = models.actuator(self.motors, self.cart)
@@ -161,7 +161,7 @@ def regulator(table: Tensor, models: Models, period: float) -> Array:
 
 def linearized(table: Tensor, models: Models, period: float) -> tuple[Array, Array]:
     """Return (A [4, 4], B [4, 1]) of one period about upright, at constant force, without dry friction."""
-    cart = CartParameters.from_table(table)
+    cart = CartParameters(table)
     smooth = CART_FRICTIONS.find("linear" if "cart_viscous" in models.cart_friction.reads else "none")
     body, smooth_models = mechanism(cart), models._replace(cart_friction=smooth)
 

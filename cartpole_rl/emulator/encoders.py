@@ -1,4 +1,4 @@
-"""The emulated cart's encoders and track. The host has its own numbers: `physics/encoders.py`."""
+"""The emulated cart's encoders and track. The host has its own numbers: `rig/hardware.py`."""
 
 import math
 

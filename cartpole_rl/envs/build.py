@@ -16,7 +16,7 @@ from cartpole_rl.envs.hardware import HardwareTransform
 from cartpole_rl.envs.settings import ObservationSettings, TrackGuard
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.physics.models import Models
-from cartpole_rl.physics.parameters import CartParameters
+from cartpole_rl.physics.parameters import cart_column
 from cartpole_rl.physics.residual import UNDER_WAY
 from cartpole_rl.plants.learned import LearnedPlant
 from cartpole_rl.plants.learned_model import LearnedModel, load_model
@@ -135,7 +135,7 @@ def learned_plant(
     """Return carts of a learned model. Raises CheckpointError; ConfigError for a model of another cart."""
     model = load_model(plant.model)
     check_same_cart(model, config)
-    found = torch.tensor([[model.parameters[name]] for name in CartParameters.names()])
+    found = cart_column(model.parameters, torch.float32)
     prior = randomizer(config, device)
     draws = IdentifiedCarts(found, prior, plant.prior_share, UNDER_WAY * model.period)
     return LearnedPlant(carts, model, draws, start, seed, device, compiled)

@@ -77,7 +77,7 @@ def braking_distances(
     """
     generator = torch.Generator().manual_seed(0)
     table = draws.draw(SAMPLES, generator)
-    cart = CartParameters.from_table(table)
+    cart = CartParameters(table)
     rightward = torch.arange(SAMPLES) % 2 == 0
     side = torch.where(rightward, 1.0, -1.0)
     state = random_states(cart, generator)

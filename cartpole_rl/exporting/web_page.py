@@ -78,7 +78,7 @@ def encoders() -> str:
     """Return the function of the encoders."""
 
     def counted(true: TrueState) -> Counts:
-        cart = CartParameters.from_table(true.table)
+        cart = CartParameters(true.table)
         return Counts(encoder_counts(State(*true.motion.unbind(0)), cart, true.noise))
 
     true = TrueState(torch.ones(len(CartParameters.names()), 1), torch.zeros(4, 1), torch.zeros(3, 1))

@@ -96,7 +96,7 @@ def fit_cart(
     With `sharpened`, a second search weighs errors by the size that the first one left. Raises
     RecordingError for windows in which no cart moves.
     """
-    check_laws(models, CartParameters.from_table(cart_column(nominal)))
+    check_laws(models, CartParameters(cart_column(nominal)))
     unknowns, nominal = unknowns_of(models, known), completed(nominal)
     positions, motors = torch.from_numpy(windows.positions), torch.from_numpy(windows.motors)
     guess = first_guess(positions, period)

@@ -99,6 +99,6 @@ def regression(
 def predicted(data: Transitions, values: Mapping[str, float], models: Models, period: float) -> Tensor:
     """Return the states [4, N] one Euler step after `data.before`, of a uniform rod (k = 1/3 in (3.5))."""
     rod = {**values, "pole_inertia": values["pole_mass"] * values["pole_com"] ** 2 / 3}
-    cart = CartParameters.from_table(cart_column(rod))
+    cart = CartParameters(cart_column(rod))
     force = models.actuator(data.motor, cart)
     return torch.stack(advance(State(*data.before), force, cart, mechanism(cart), models, period))

@@ -34,7 +34,7 @@ def rollout(
     them, since its force lags behind. `extra_latency`, s, is added to each latency: (3.8) moves a cart half a
     step early, so a lead of half a step makes latencies independent of the step.
     """
-    cart = CartParameters.from_table(table)
+    cart = CartParameters(table)
     state, force = State(*motion.unbind(0)), torch.zeros_like(motion[0])
     latency = cart.latency + extra_latency
     history, in_effect = history_periods(period), motors_in_effect(period)

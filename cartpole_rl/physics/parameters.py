@@ -43,11 +43,6 @@ class CartParameters:
         """Return the names of the rows of a table."""
         return tuple(PARAMETERS)
 
-    @classmethod
-    def from_table(cls, table: Tensor) -> Self:
-        """Return the carts of `table`."""
-        return cls(table)
-
     @property
     def total_mass(self) -> Tensor:
         """Cart and pole, kg, [N]."""

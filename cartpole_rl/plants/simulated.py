@@ -19,12 +19,12 @@ from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.simulation import Carts, Inputs, Period, commands_under_way, encoder_counts, run_carts
 from cartpole_rl.plants.specs import OneFrame, Plant, Report
 from cartpole_rl.randomization.randomizer import Draws
+from cartpole_rl.rig.parameters import PARAMETERS
 from cartpole_rl.scalar import Scalar, plain
 from cartpole_rl.tasks.episode import Origin
 from cartpole_rl.tasks.settings import StartSettings
 from cartpole_rl.tasks.starts import draw_start
 
-NOISE_PARAMETERS = ("latency_jitter", "position_noise", "angle_noise")  # drawn in each period
 DRAWN_AT_ONCE = 1024  # episodes; drawing a few takes about as long
 
 
@@ -65,7 +65,9 @@ class SimulatedPlant(Plant):
         self._plain_run = run
         self._run_one: Scalar | None = None  # of a single cart
         self._generator = torch.Generator(device=self.device)
-        self._noisy = any(randomizer.can_differ_from_zero(name) for name in NOISE_PARAMETERS)
+        self._noisy = any(
+            randomizer.can_differ_from_zero(each.name) for each in PARAMETERS.values() if each.noise
+        )
         self._no_noise = torch.zeros(3, carts, device=self.device)
         commands = commands_under_way(randomizer.longest_delay(), period)
         self._carts = Carts(
@@ -73,8 +75,8 @@ class SimulatedPlant(Plant):
             torch.zeros(4, carts, device=self.device),
             torch.zeros(1 + commands, carts, device=self.device),
         )
-        self._cart = CartParameters.from_table(self._carts.table)  # its fields share the table's memory
-        check_laws(models, CartParameters.from_table(randomizer.nominal.unsqueeze(1)))
+        self._cart = CartParameters(self._carts.table)  # its fields share the table's memory
+        check_laws(models, CartParameters(randomizer.nominal.unsqueeze(1)))
         self.set_seed(seed)
 
     @property
@@ -114,9 +116,7 @@ class SimulatedPlant(Plant):
         table = self.randomizer.draw(self.carts, self._generator)
         column = torch.tensor([[state[name]] for name in State._fields], device=self.device)
         motion = column.repeat(1, self.carts)
-        counts = encoder_counts(
-            State(*motion), CartParameters.from_table(table), self._draw_noise(self.carts)
-        )
+        counts = encoder_counts(State(*motion), CartParameters(table), self._draw_noise(self.carts))
         self._coming = Starts(table, motion, counts)
 
     def replace_randomizer(self, randomizer: Draws) -> None:
@@ -131,12 +131,16 @@ class SimulatedPlant(Plant):
         return {**now, **coming, "generator": self._generator.get_state()}
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
-        """Return to `snapshot`."""
-        self._carts.table.copy_(snapshot["table"])
+        """Return to `snapshot`; parameters that are newer than it are nominal."""
 
         def copied(name: str) -> Tensor:
-            return snapshot[name].to(self.device, copy=True)
+            value = snapshot[name].to(self.device, copy=True)
+            if "table" not in name:
+                return value
+            newer = self.randomizer.nominal[len(value) :].unsqueeze(1).repeat(1, value.shape[1])
+            return torch.cat((value, newer))
 
+        self._carts.table.copy_(copied("table"))
         self._carts = Carts(self._carts.table, copied("motion"), copied("drive"))
         self._coming = Starts(*(copied(f"next_{name}") for name in Starts._fields))
         self._generator.set_state(snapshot["generator"])
@@ -150,7 +154,7 @@ class SimulatedPlant(Plant):
         table, motion, counts = self._next_starts(len(rows))
         if again is not None and again.any():
             table = torch.where(again, self._carts.table[:, rows], table)
-            cart = CartParameters.from_table(table)
+            cart = CartParameters(table)
             counts = encoder_counts(State(*motion), cart, self._draw_noise(len(rows)))
         self._carts.table.index_copy_(1, rows, table)
         self._carts = Carts(
@@ -171,7 +175,7 @@ class SimulatedPlant(Plant):
     def _draw_starts(self, count: int) -> Starts:
         table = self.randomizer.draw(count, self._generator)
         motion = draw_start(count, self.start, self._generator).T
-        counts = encoder_counts(State(*motion), CartParameters.from_table(table), self._draw_noise(count))
+        counts = encoder_counts(State(*motion), CartParameters(table), self._draw_noise(count))
         return Starts(table, motion, counts)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDict:

@@ -22,7 +22,7 @@ LARGEST_COUNT = 2**30  # STATE's counts are 32-bit numbers
 class Carts(NamedTuple):
     """The state before a period, in few tensors: each one costs time in every call."""
 
-    table: Tensor  # [P, N], one row per parameter, for `CartParameters.from_table`
+    table: Tensor  # [P, N], one row per parameter, for `CartParameters`
     motion: Tensor  # [4, N], the true `State`
     drive: Tensor  # [1 + D, N], the `Drive`: force, then motor values, newest first
 
@@ -59,7 +59,7 @@ def run_carts(
     addition: MakeAddition | None = None,
 ) -> Period:
     """Run every cart for `period` s in `substeps` steps under a new motor value."""
-    cart = CartParameters.from_table(carts.table)
+    cart = CartParameters(carts.table)
     before = State(*carts.motion.unbind(0))
     force, *motors = carts.drive.unbind(0)
     drive = Drive(force, [inputs.motor[0].to(force.dtype), *motors[:-1]])

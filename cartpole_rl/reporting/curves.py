@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from cartpole_rl.physics.friction import viscous_coefficient
 from cartpole_rl.physics.laws import Law
-from cartpole_rl.physics.parameters import CartParameters
+from cartpole_rl.physics.parameters import CartParameters, cart_column
 from cartpole_rl.rig.hardware import LARGEST_MOTOR
 
 FASTEST = 0.6  # m/s
@@ -60,11 +60,10 @@ def _curve(
     prior: Parameters,
 ) -> Curve:
     def of_table(table: torch.Tensor) -> Array:
-        return function(CartParameters.from_table(table[:, None])).numpy()
+        return function(CartParameters(table[:, None])).numpy()
 
     def of_cart(cart: Parameters) -> Array:
-        column = [[cart[name]] for name in CartParameters.names()]
-        return of_table(torch.tensor(column, dtype=torch.float64))[:, 0]
+        return of_table(cart_column(cart))[:, 0]
 
     band = of_table(torch.from_numpy(samples[:, :MOST_SAMPLES]))
     return Curve(at.numpy(), of_cart(identified), band, of_cart(prior))

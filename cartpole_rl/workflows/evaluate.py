@@ -10,9 +10,9 @@ from cartpole_rl.evaluation.metrics import same_as_host
 from cartpole_rl.plants.serial.plant import SerialPlant
 from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.plants.settings import EmulatedSettings
-from cartpole_rl.plants.simulated import NOISE_PARAMETERS
 from cartpole_rl.reporting.scores import score_columns, score_table
 from cartpole_rl.reporting.words import count_text, cut_off
+from cartpole_rl.rig.parameters import PARAMETERS
 from cartpole_rl.run_files import BESIDE_SIMULATION, FIGURES, METRICS
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.checks import BASELINE, agent_file
@@ -117,7 +117,8 @@ def compared(again: Repetition, episode: Episode) -> str:
 
 def left_to_chance(again: Repetition) -> list[str]:
     """Return the parameters of the cart that make its episodes random."""
-    return [name for name in NOISE_PARAMETERS if again.origin.parameters[name] != 0]
+    noises = (each.name for each in PARAMETERS.values() if each.noise)
+    return [name for name in noises if again.origin.parameters[name] != 0]
 
 
 def link_figures(env: CartPoleEnv) -> dict[str, Any]:

@@ -59,7 +59,6 @@ from cartpole_rl.workflows.loading import load_settings
 
 WIDTHS = (0.0, 1 / 3, 2 / 3)
 DRAWN_CARTS, WATCHED_CARTS = 1000, 10  # carts that judge an agent at the end, and during training
-MIRRORED = ("cart_coulomb_asymmetry", "force_asymmetry", "track_tilt", "angle_offset")  # change sign
 
 
 class Job(NamedTuple):
@@ -148,7 +147,7 @@ def trained_and_judged(job: Job, overrides: Mapping[str, Any]) -> dict[str, Any]
     config = with_fitted_guard(config.model_copy(update={"randomization": wider_ranges(job.wider)}))
     signs, started = config.observation.mirror_signs, time.perf_counter()
     if job.informed:
-        signs = signs + [-1 if name in MIRRORED else 1 for name in config.ranges]
+        signs = signs + [-1 if PARAMETERS[name].mirrored else 1 for name in config.ranges]
     agent = QAgent(config.agent, signs, len(config.actions.motors), config.observation.frames)
     env = make_env(config, job, config.learning.carts, config.task.start, job.seed)
     judge = partial(judged, config, job, agent)

@@ -3,9 +3,10 @@
 import adaptation
 import pytest
 import torch
-from adaptation import MIRRORED, Job, make_env, wider_ranges
+from adaptation import Job, make_env, wider_ranges
 
 from cartpole_rl.randomization.ranges import check_carts
+from cartpole_rl.rig.parameters import PARAMETERS
 from cartpole_rl.workflows.config import TrainConfig
 from cartpole_rl.workflows.loading import load_settings
 
@@ -46,4 +47,4 @@ def test_the_informed_agent_observes_its_own_cart_before_and_after_a_reset(confi
 def test_parameters_that_change_sign_in_a_mirror_have_symmetric_ranges(config: TrainConfig) -> None:
     for name, line in config.ranges.items():
         low, high = line.limits()
-        assert (name in MIRRORED) == (low == -high)
+        assert PARAMETERS[name].mirrored == (low == -high)

@@ -233,7 +233,7 @@ def test_the_true_friction_law_predicts_best(found: Identification) -> None:
 
 
 def test_draws_cover_the_cart(found: Identification, nominal: dict[str, float]) -> None:
-    drawn = CartParameters.from_table(torch.from_numpy(found.fit.draw(500, np.random.default_rng(0))))
+    drawn = CartParameters(torch.from_numpy(found.fit.draw(500, np.random.default_rng(0))))
     ratio = drawn.cart_viscous / drawn.total_mass
     assert 1e-4 < ratio.std() / ratio.mean() < 0.1
     assert (drawn.pole_mass == nominal["pole_mass"]).all()

@@ -161,7 +161,7 @@ def test_limits_match_the_parameter_bounds(nominal: dict[str, float]) -> None:
     unknowns = unknowns_of(STEP)
     low, _ = limits(unknowns, nominal)
     at_low = np.where(np.isfinite(low), low, 0.0)[:, None]
-    cart = CartParameters.from_table(parameters_at(at_low, unknowns, nominal))
+    cart = CartParameters(parameters_at(at_low, unknowns, nominal))
     assert cart.latency.item() == pytest.approx(0, abs=1e-12)
     assert cart.motor_time_constant.item() == pytest.approx(0, abs=1e-12)
     assert "cart_stiction_ratio" not in {unknown.name for unknown in unknowns}

@@ -37,7 +37,7 @@ def half(share: Tensor, low: Tensor, high: Tensor) -> Tensor:
 
 
 def draw(randomizer: Randomizer, seed: int = 0, count: int = COUNT) -> CartParameters:
-    return CartParameters.from_table(randomizer.draw(count, torch.Generator().manual_seed(seed)))
+    return CartParameters(randomizer.draw(count, torch.Generator().manual_seed(seed)))
 
 
 def farthest_from_uniform(values: Tensor) -> float:

@@ -14,6 +14,7 @@ from cartpole_rl.physics.dynamics import State
 from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import GRAVITY, CartParameters
 from cartpole_rl.plants.simulation import Carts, Inputs, Period, commands_under_way, encoder_counts, run_carts
+from cartpole_rl.rig.parameters import PARAMETERS
 from cartpole_rl.tasks.features import (
     Measured,
     measured_position,
@@ -25,7 +26,6 @@ from cartpole_rl.workflows.config import TrainConfig
 MOST = 1 + 2 * BONUS  # points of a step, standing still in the middle
 LOST = 1e9  # points: the loss of leaving the track, more than any score
 COMPILED_SIZES = (1000, 2700, 9000)  # carts in a batch
-ASYMMETRIES = ("track_tilt", "cart_coulomb_asymmetry", "force_asymmetry", "angle_offset")
 
 
 class Nodes(NamedTuple):
@@ -54,10 +54,10 @@ class KnownCart:
         self.randomizer = randomizer(config)
         self.models = config.models(config.plant)
         self.motors = torch.tensor(config.actions.motors)
-        carts = CartParameters.from_table(self.table(len(self.motors)))
+        carts = CartParameters(self.table(len(self.motors)))
         self.forces = self.models.actuator(self.motors.float(), carts)
         self.commands = commands_under_way(self.randomizer.longest_delay(), config.control_period)
-        self.one = CartParameters.from_table(self.table(1))
+        self.one = CartParameters(self.table(1))
         self.reach = float(self.one.track_half_length)
         stiffness = self.one.first_moment * GRAVITY / self.one.pivot_inertia
         self.growth = float(stiffness.sqrt())  # 1/s, growth rate of the angle of a falling pole
@@ -73,9 +73,8 @@ class KnownCart:
         motors = self.config.actions.motors
         mirrored = sorted(motors) == sorted(-motor for motor in motors)
         same_dead_band = bool(self.one.deadband_left == self.one.deadband_right)
-        return (
-            mirrored and same_dead_band and all(float(getattr(self.one, name)) == 0 for name in ASYMMETRIES)
-        )
+        asymmetries = [getattr(self.one, each.name) for each in PARAMETERS.values() if each.mirrored]
+        return mirrored and same_dead_band and not any(map(bool, asymmetries))
 
     def table(self, count: int) -> Tensor:
         """Return the parameters of `count` nominal carts, [P, count]."""
