@@ -11,6 +11,7 @@ lint:
 
 types:
 	$(BIN)/mypy
+	$(BIN)/mypy scripts/thesis
 
 floors:
 	$(BIN)/lint-imports

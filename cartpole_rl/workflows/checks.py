@@ -27,7 +27,6 @@ from cartpole_rl.workflows.config import (
     IdentifyConfig,
     ModelConfig,
     ReplayConfig,
-    ReportConfig,
     TrainConfig,
 )
 from cartpole_rl.workflows.person import as_value, as_word
@@ -110,12 +109,6 @@ def check_identification(config: IdentifyConfig) -> None:
     check_values(config.nominal)
     if config.source is not None:
         experiments(config.source)
-
-
-def check_report(config: ReportConfig) -> None:
-    """Raise ConfigError if a folder of studies does not exist."""
-    if config.studies is not None and not config.studies.is_dir():
-        raise ConfigError(f"studies={config.studies}: there is no such folder")
 
 
 def check_resumable(program: str, resume: str, folder: Path) -> None:

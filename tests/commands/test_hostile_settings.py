@@ -50,7 +50,7 @@ NOT_ALONE = {"sweep"}  # a sweep makes jobs; those of the package are in test_sw
 GROUPS = [
     (command, group) for command in SCHEMAS for group in default_choices(command) if group not in NOT_ALONE
 ]
-PATHS = ("run", "resume", "from", "data", "studies", "repeat.run", "label", "measure", "runs", "compare")
+PATHS = ("run", "resume", "from", "repeat.run", "label", "measure", "runs", "compare")
 
 VALUES: list[Any] = [
     *(True, False, None, -1, 0, 2.5, 1e308, -1e308, 10**400, float("inf"), float("nan")),

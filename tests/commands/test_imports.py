@@ -53,9 +53,9 @@ COMPLAINS = {  # command: words, exit code, part of the line on stderr
     "preflight": [("plant.port=nowhere plant.home_timeout=0", 2, "give more than 0")],
     "record": [("run=nowhere", 1, "run=nowhere: there is no such file or folder")],
     "report": [
-        ("studies=nowhere", 2, "studies=nowhere: there is no such folder"),
+        ("runs=[]", 2, "give runs=<run folders or patterns>"),
         ("seed=1", 2, "seed: there is no such setting"),
-        ("animations=maybe studies=nowhere", 2, "give true or false"),
+        ("animations=maybe runs=nowhere", 2, "give true or false"),
     ],
     "replay": [("from=nowhere", 2, "from=nowhere: there is no such file or folder")],
     "train": [

@@ -20,7 +20,7 @@ from cartpole_rl.workflows.config import EmulateConfig, EvaluateConfig, Finetune
 pytestmark = pytest.mark.usefixtures("hydra_reads_conf")
 
 CONF = conf_folder()
-GROUPS = sorted(path.name for path in CONF.iterdir() if path.is_dir() and path.name not in ("hydra", "study"))
+GROUPS = sorted(path.name for path in CONF.iterdir() if path.is_dir() and path.name != "hydra")
 CHOICES = [f"{group}={path.stem}" for group in GROUPS for path in sorted((CONF / group).glob("*.yaml"))]
 NOT_OF_TRAINING = (
     "emulator",

@@ -25,7 +25,6 @@ from page_commands import (
     run_here,
     within,
 )
-from small_study import make_study
 
 BUDGETS = {  # of each command; what the page gives stays, except where it takes minutes
     "train": [*BUDGET, "seed=0", "agent.action_gap=0.7"],  # the last two narrow the sweeps
@@ -105,14 +104,11 @@ def coarse(command: str) -> list[str]:
 
 
 def lay_out_reports(folder: Path) -> None:
-    """Make the sweeps and studies that the pages name: copies of one run and of one small study."""
+    """Make the sweeps that the pages name: copies of one run."""
     for name in ("2026-11-21_12-00-00_multirun", "a", "b", "first_multirun", "second_multirun"):
         target = folder / "runs/train" / name / ("0_seed-0" if name.endswith("multirun") else ".")
         if not target.exists():
             shutil.copytree(folder / "runs/train/first", target)
-    for size in ("quick", "full"):
-        if not (folder / "runs/reproduce" / size).exists():
-            make_study(folder / "runs/reproduce" / size / "friction_models", size)
 
 
 def test_the_guides_have_commands_of_their_own() -> None:
@@ -133,8 +129,6 @@ def test_the_command_runs(
     need(line, made)
     if verb == "report":
         lay_out_reports(trained)
-        if "studies=docs" in line:
-            run_here("cartpole-report studies=runs/reproduce/full data=docs/results/thesis", cwd=trained)
     if "plant=serial" in line:
         board = ["emulator.start=upright"] if "task=balance" in line else []  # a hand holds the pole
         if "plant.policy=onboard" in line:

@@ -1,4 +1,4 @@
-"""Makes the scripts of scripts/bench and scripts/fuzz importable, and runs them in this process.
+"""Runs the scripts of scripts/bench and scripts/fuzz in this process.
 
 PyTorch takes seconds to import, so a process for each script would take longer than most of the scripts.
 """
@@ -13,8 +13,6 @@ import pytest
 SCRIPTS = Path(__file__).parents[2] / "scripts"
 TINY = ["learning.transitions=2048", "learning.carts=16", "learning.evaluations=2", "compile=false"]
 Run = Callable[..., str]  # (script, folder, *words) -> output; the fixture `run`
-
-sys.path[:0] = [str(SCRIPTS / "bench"), str(SCRIPTS / "fuzz")]
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ import yaml
 
 from cartpole_rl.errors import CheckpointError
 from cartpole_rl.learning.checkpoint_files import find_agent
-from cartpole_rl.reporting.studies.results import is_number
+from cartpole_rl.reporting.results import is_number
 from cartpole_rl.run_files import (
     CHECKPOINTS,
     COMPARISON,

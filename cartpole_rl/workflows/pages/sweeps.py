@@ -13,12 +13,11 @@ from pathlib import Path
 from typing import Any
 
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.reporting.figures.studies import LONGEST_LABEL
+from cartpole_rl.reporting.figures.groups import LONGEST_LABEL
+from cartpole_rl.reporting.grouping import NULL, Columns, fewest, labels, setting_columns
+from cartpole_rl.reporting.results import OWN, Agent, Curve, Exclusion, Group, Results
 from cartpole_rl.reporting.scores import SCORES
-from cartpole_rl.reporting.studies.grouping import NULL, Columns, fewest, labels, setting_columns
-from cartpole_rl.reporting.studies.results import OWN, Agent, Curve, Exclusion, StudyResults
-from cartpole_rl.reporting.studies.settings import Size, Study, Variant
-from cartpole_rl.reporting.studies.statistics import interquartile_mean
+from cartpole_rl.reporting.statistics import interquartile_mean
 from cartpole_rl.workflows.checks import BASELINE
 from cartpole_rl.workflows.pages.runs import (
     Run,
@@ -201,31 +200,31 @@ def _chosen(run: Run) -> Iterator[str]:
             yield f"{AGENT}.{match[1]}"
 
 
-def results_of(sweep: Sweep, measure: str) -> StudyResults:
-    """Return a sweep as the results of a study whose arms are its groups, many of them highest first."""
+def results_of(sweep: Sweep, measure: str) -> Results:
+    """Return the results of a sweep by group, many of them highest first."""
     kept, repeated = _without_repetitions(sweep)
-    groups: dict[str, list[Member]] = {}
+    members: dict[str, list[Member]] = {}
     for member, label in kept:
-        groups.setdefault(label, []).append(member)
+        members.setdefault(label, []).append(member)
     means = {
         label: float(interquartile_mean([_value(each, measure) for each in own]))
-        for label, own in groups.items()
+        for label, own in members.items()
     }
     ordered = (
-        sorted(groups, key=means.__getitem__, reverse=True) if len(groups) > MOST_UNSORTED else [*groups]
+        sorted(members, key=means.__getitem__, reverse=True) if len(members) > MOST_UNSORTED else [*members]
     )
-    arms = [Variant(name=f"group_{number}", label=label) for number, label in enumerate(ordered, start=1)]
+    groups = [Group(f"group_{number}", label) for number, label in enumerate(ordered, start=1)]
     curves = {member.run.folder: _curves(member, measure) for member, _ in kept}
     agents = [
         Agent(
-            arm.name,
+            group.name,
             member.seed,
             member.run.folder.as_posix(),
             {OWN.name: _value(member, measure)},
             curves[member.run.folder][0],
         )
-        for arm, label in zip(arms, ordered, strict=True)
-        for member in groups[label]
+        for group in groups
+        for member in members[group.label]
     ]
     notes = [
         *sweep.notes,
@@ -235,16 +234,11 @@ def results_of(sweep: Sweep, measure: str) -> StudyResults:
         *_unequal_seeds(sweep),
         *(note for _, note in curves.values()),
     ]
-    return StudyResults(
+    return Results(
         sweep.name,
-        Study(
-            title=sweep.name,
-            order=0,
-            question="",
-            measure=measure,
-            arms=tuple(arms) or (Variant(name="none", label="no run"),),
-            sizes={"any": Size(seeds=1)},
-        ),
+        sweep.name,
+        measure,
+        groups or [Group("none", "no run")],
         tuple(agents),
         (*sweep.exclusions, *repeated),
         tuple(note for note in notes if note),

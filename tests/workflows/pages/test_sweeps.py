@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -11,25 +12,30 @@ from typing import Any
 import pytest
 
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.reporting.studies.comparison import compare
+from cartpole_rl.reporting.runs_page import comparison
 from cartpole_rl.workflows.pages.sweeps import grouped, read_sweep, read_sweeps, results_of, table
 
 Edit = Callable[[Path, Callable[[Any], object]], None]
 MEASURE = "score_upright"
 
 
+def cells(page: str, column: str) -> list[str]:
+    """The cells of a column."""
+    return re.findall(f'data-label="{re.escape(column)}">([^<]*)</td>', page)
+
+
 def test_runs_are_grouped_by_the_settings_that_differ(study: Path) -> None:
     (sweep,), between = grouped([read_sweep("runs", ["quick/friction"], MEASURE)])
     results = results_of(sweep, MEASURE)
     assert between == {}
-    assert [arm.label for arm in results.study.arms] == [
+    assert [group.label for group in results.groups] == [
         "cart_viscous=0.2, cart_mass=1.5",
         "cart_viscous=0.2",
         "cart_viscous=3, cart_mass=1.5",
         "cart_viscous=3",
     ]
-    for arm in results.study.arms:
-        assert [agent.seed for agent in results.agents if agent.arm == arm.name] == [10, 11, 12]
+    for group in results.groups:
+        assert [agent.seed for agent in results.agents if agent.group == group.name] == [10, 11, 12]
     of_study = {agent.run: agent.values["own"] for agent in results.agents}
     metrics = json.loads((study / "much/11/evaluations/heavy/metrics.json").read_text())
     assert of_study["quick/friction/much/11/evaluations/heavy"] == metrics[MEASURE]["mean"]
@@ -91,9 +97,10 @@ def test_two_sets_are_compared_group_by_group(study: Path) -> None:
     )
     first, second = (results_of(sweep, MEASURE) for sweep in sweeps)
     assert between == {}  # the second set has both frictions
-    found = compare(first, second, between)
-    assert [pair.label for pair in found.pairs] == ["cart_viscous=0.2, cart_mass=1.5", "cart_viscous=0.2"]
-    assert {label for _, label in found.lone} == {"cart_viscous=3, cart_mass=1.5", "cart_viscous=3"}
+    page = comparison(first, second, between)
+    assert cells(page, "group") == ["cart_viscous=0.2, cart_mass=1.5", "cart_viscous=0.2"]
+    lone = {"cart_viscous=3, cart_mass=1.5 is only in compare.", "cart_viscous=3 is only in compare."}
+    assert {*re.findall("<p>([^<]* is only in [^<]*)</p>", page)} == lone
 
 
 def test_settings_that_tell_two_sets_apart_are_not_part_of_the_groups(study: Path) -> None:
@@ -105,11 +112,18 @@ def test_settings_that_tell_two_sets_apart_are_not_part_of_the_groups(study: Pat
     )
     assert between == {"parameters.cart_viscous": ["0.2", "3"]}
     first, second = (results_of(sweep, MEASURE) for sweep in sweeps)
-    found = compare(first, second, between)
-    assert [pair.label for pair in found.pairs] == ["cart_mass=1.5", "default"]
-    for pair in found.pairs:
-        assert pair.difference.value == pytest.approx(pair.second.value - pair.first.value)
-    assert found.lone == []
+    page = comparison(first, second, between)
+    assert cells(page, "group") == ["cart_mass=1.5", "default"]
+    assert [cells(page, name)[0] for name in ("setting", "runs", "compare")] == [
+        "parameters.cart_viscous",
+        "0.2",
+        "3",
+    ]
+    means = first.estimates("own"), second.estimates("own")
+    differences = cells(page, "difference, 95 % interval")
+    for label, text in zip(("cart_mass=1.5", "default"), differences, strict=True):
+        assert float(text.split()[0]) == pytest.approx(means[1][label].value - means[0][label].value, abs=0.1)
+    assert "is only in" not in page
 
 
 def test_long_labels_have_the_same_number_in_both_sets(study: Path, edit: Edit) -> None:
@@ -129,11 +143,10 @@ def test_long_labels_have_the_same_number_in_both_sets(study: Path, edit: Edit) 
     }
     sweeps, between = grouped(read_sweeps(sets, MEASURE))
     first, second = (results_of(sweep, MEASURE) for sweep in sweeps)
-    assert all(len(arm.label) > 48 and arm.label[0] in "12" for arm in first.study.arms)
-    found = compare(first, second, between)
-    assert found.lone == []
-    assert len(found.pairs) == 2
-    assert all(pair.difference.value == 0 for pair in found.pairs)
+    assert all(len(each.label) > 48 and each.label[0] in "12" for each in first.groups)
+    page = comparison(first, second, between)
+    assert "is only in" not in page
+    assert [float(text.split()[0]) for text in cells(page, "difference, 95 % interval")] == [0, 0]
 
 
 def test_failed_jobs_and_links_are_named_or_followed(study: Path) -> None:

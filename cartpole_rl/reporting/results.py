@@ -1,0 +1,180 @@
+"""The agents of several groups as plain numbers: what the tables and figures of a report show.
+
+A measure is a key of metrics.json; the number of an agent is its mean over the episodes of an evaluation.
+"""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol, get_args
+
+import numpy as np
+
+from cartpole_rl.reporting.statistics import Array, Estimate, estimate
+from cartpole_rl.reporting.table import MOST_DECIMALS, interval_text, number_text
+from cartpole_rl.tasks.settings import Measure
+
+GOOD = {"score": 2000.0}  # measure: value above which the thesis calls an agent good (section 6)
+MEASURES = {  # key of metrics.json: label
+    "score": "score (6.2)",
+    "score_upright": "score (6.1)",
+    "steps": "steps",
+    "upright_fraction": "share of time upright",
+    "upright_at_end": "share upright at the end",
+    "time_to_upright_s": "time to upright, s",
+    "errors.median": "median relative error of the parameters",
+    "network_over_physics.theta_deg": "error of the angle, with / without network",
+}
+LOW_IS_GOOD = ("errors", "rms_", "time_to_", "network_over_")  # starts of measures
+SCORES = get_args(Measure)
+SCORE_DECIMALS = 1  # at most
+LARGEST = 1e30  # of all numbers; figures and means of larger ones overflow
+EVALUATIONS = "evaluations"  # folder in that of an agent
+PLAIN = re.compile(r"[A-Za-z' -]+")  # labels that need no quotation marks
+MOST_LISTED = 4  # groups in a sentence; of more, the highest and the lowest
+
+Curve = tuple[tuple[float, float], ...]  # (transitions, value)
+
+
+class Named(Protocol):
+    """A group of agents or an evaluation: its key, and its label on the page."""
+
+    @property
+    def name(self) -> str: ...  # noqa: D102
+    @property
+    def label(self) -> str: ...  # noqa: D102
+
+
+@dataclass(frozen=True)
+class Group:
+    """A group of agents, or an evaluation of them."""
+
+    name: str
+    label: str
+
+
+OWN = Group("own", "its own evaluation")  # the result of a run without further evaluations
+
+
+@dataclass(frozen=True)
+class Agent:
+    """One run of a group. `values` maps evaluations to the measure; `curves` are those of its training."""
+
+    group: str
+    seed: int
+    run: str  # relative path
+    values: Mapping[str, float]
+    curves: Mapping[str, Curve] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Exclusion:
+    """A run that does not count, and the reason."""
+
+    run: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class Results:
+    """The agents that count, by group and evaluation, the runs that do not, and notes on all runs."""
+
+    name: str
+    title: str
+    measure: str
+    groups: Sequence[Named]
+    agents: tuple[Agent, ...] = ()
+    exclusions: tuple[Exclusion, ...] = ()
+    notes: tuple[str, ...] = ()
+    versions: str = ""  # of the packages that all agents share
+    evaluations: Sequence[Named] = (OWN,)
+    unit: str = "agent"  # what a run makes
+    pictured: bool = False  # the results of the runs are figures
+
+    @property
+    def judged(self) -> Sequence[Named]:
+        """The evaluations that count."""
+        return self.evaluations[-1:]
+
+    def values(self, group: str, evaluation: str) -> Array:
+        """Return the measure of each agent of a group [agents]."""
+        return np.array(
+            [agent.values[evaluation] for agent in self.members(group) if evaluation in agent.values]
+        )
+
+    def members(self, group: str) -> list[Agent]:
+        """Return the agents of a group."""
+        return [agent for agent in self.agents if agent.group == group]
+
+    def estimates(self, evaluation: str) -> dict[str, Estimate]:
+        """Return the interquartile mean of each group (by label) that has agents in an evaluation."""
+        found = {each.label: self.values(each.name, evaluation) for each in self.groups}
+        return {label: estimate(values) for label, values in found.items() if values.size}
+
+    def folder_of(self, agent: Agent, evaluation: str) -> Path:
+        """Return the folder of an evaluation of an agent; that of its own run if it has no others."""
+        inner = Path(agent.run, EVALUATIONS, evaluation)
+        return Path(agent.run) if evaluation == OWN.name and not inner.is_dir() else inner
+
+
+def is_number(value: Any) -> bool:
+    """Return True for a finite number that figures can show; a boolean is none."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= LARGEST
+
+
+def low_is_good(measure: str) -> bool:
+    """Return True for a measure of which less is better."""
+    return measure.startswith(LOW_IS_GOOD)
+
+
+def measure_label(measure: str) -> str:
+    """Return the name of a measure for axes and tables."""
+    return MEASURES.get(measure, measure.replace("_", " ").replace(".", " "))
+
+
+def estimate_text(found: Estimate, measure: str = "") -> str:
+    """Return an estimate with its interval: "4210 (4125 to 4295)"."""
+    return interval_text(found.value, found.low, found.high, ends=True, most_decimals=_decimals(measure))
+
+
+def value_text(value: float, measure: str) -> str:
+    """Return a value of a measure: "4210"."""
+    return number_text(value, _decimals(measure))
+
+
+def _decimals(measure: str) -> int:
+    return SCORE_DECIMALS if measure in SCORES else MOST_DECIMALS
+
+
+def counted_text(count: int, unit: str = "agent") -> str:
+    """Return "1 agent" or "10 agents"."""
+    return f"{count} {unit}{'' if count == 1 else 's'}"
+
+
+def sentence_start(text: str) -> str:
+    """Return a text with a capital letter at its start."""
+    return text[:1].upper() + text[1:]
+
+
+def ranked_text(found: Mapping[str, Estimate], unit: str = "agent", measure: str = "") -> str:
+    """Return ": " and the estimate of each group, the best first; of many the highest and the lowest."""
+    less = low_is_good(measure)
+    note = " (lower is better)" if less else ""
+    labels = sorted(found, key=lambda label: found[label].value, reverse=not less)
+    best = found[labels[0]]
+    same_count = all(each.agents == best.agents for each in found.values())
+    if same_count and len({estimate_text(each, measure) for each in found.values()}) == 1:
+        each = "" if len(labels) == 1 else f"each of {len(labels)} set-ups "
+        return f"{note}: {each}{estimate_text(best, measure)}, {counted_text(best.agents, unit)}"
+
+    def entry(label: str) -> str:
+        count = "" if same_count else f" of {counted_text(found[label].agents, unit)}"
+        name = label if PLAIN.fullmatch(label) else f"“{label}”"
+        return f"{name} {estimate_text(found[label], measure)}{count}"
+
+    end = f"; {counted_text(best.agents, unit)} each" if same_count else ""
+    first, last = ("lowest", "highest") if less else ("highest", "lowest")
+    if len(labels) <= MOST_LISTED:
+        return f"{note}: {', '.join(map(entry, labels))}{end}"
+    return f"{note}, {len(labels)} set-ups: {first} {entry(labels[0])}, {last} {entry(labels[-1])}{end}"

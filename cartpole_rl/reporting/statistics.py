@@ -1,0 +1,121 @@
+"""Statistics of few seeds, after Agarwal et al. (2021), "Deep RL at the edge of the statistical precipice".
+
+One number per agent (the mean over its evaluation episodes) enters; agents are what is resampled.
+
+- Interquartile mean (IQM): the mean of the values without the floor(n / 4) lowest and highest ones, as in the
+  authors' `rliable`. Up to three values it is their mean.
+- Intervals: the 2.5 and 97.5 percentiles of RESAMPLES bootstrap samples. A sample draws, within each group,
+  as many values as it has, with replacement ("stratified bootstrap").
+- Performance profile: the share of agents above a score, for every score.
+- Probability of improvement: the share of pairs (x, y) with x > y, ties counted half (Mann and
+  Whitney, 1947).
+"""
+
+from collections.abc import Callable
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import stats
+
+from cartpole_rl.intervals import CONFIDENCE
+
+RESAMPLES = 5000
+TRIMMED = 0.25  # share of the values cut off at each end
+EDGES = (50 * (1 - CONFIDENCE), 50 * (1 + CONFIDENCE))  # percent
+CHUNKS = 20  # of the samples of pairs, so that their ranks need little memory
+
+Array = NDArray[np.float64]
+Statistic = Callable[..., Array]  # of arrays [..., n], reduced over the last axis
+
+
+class Estimate(NamedTuple):
+    """A statistic, its 95 % interval (None for a single value) and the number of agents."""
+
+    value: float
+    low: float | None
+    high: float | None
+    agents: int
+
+
+def bootstrap(statistic: Statistic, *groups: ArrayLike, agents: int | None = None) -> Estimate:
+    """Return a statistic of independent groups [n_i], each resampled by itself.
+
+    `agents` is the size of the smallest group if not given. The same groups give the same interval.
+    """
+    arrays = [np.asarray(each) for each in groups]
+    count = min(each.size for each in arrays) if agents is None else agents
+    value, generator = float(statistic(*arrays)), np.random.default_rng(0)
+    if count < 2:
+        return Estimate(value, None, None, count)
+    samples = statistic(*(_resampled(each, generator) for each in arrays))
+    low, high = np.nanpercentile(samples, EDGES)
+    return Estimate(value, float(low), float(high), count)
+
+
+def _resampled(values: Array, generator: np.random.Generator) -> Array:
+    """Return bootstrap samples [RESAMPLES, n] of `values` [n]."""
+    return values[generator.integers(values.size, size=(RESAMPLES, values.size))]
+
+
+def interquartile_mean(values: ArrayLike) -> Array:
+    """Return the IQM over the last axis of `values` [..., n]."""
+    ordered = np.sort(np.asarray(values, dtype=float), axis=-1)
+    cut = int(TRIMMED * ordered.shape[-1])
+    return np.asarray(ordered[..., cut : ordered.shape[-1] - cut].mean(axis=-1))
+
+
+def estimate(*groups: ArrayLike) -> Estimate:
+    """Return the IQM of all values of the groups [n_i], each resampled by itself.
+
+    Raises ValueError if there is no value.
+    """
+    return _pooled(tuple(tuple(np.asarray(each, dtype=float).tolist()) for each in groups))
+
+
+@lru_cache(maxsize=4096)  # a page shows the same agents in its text, its tables and its figures
+def _pooled(groups: tuple[tuple[float, ...], ...]) -> Estimate:
+    if not (count := sum(map(len, groups))):
+        raise ValueError("an estimate needs at least one value")
+    return bootstrap(lambda *parts: interquartile_mean(np.concatenate(parts, axis=-1)), *groups, agents=count)
+
+
+def difference(values: ArrayLike, others: ArrayLike) -> Estimate:
+    """Return IQM(values) - IQM(others) for independent agents."""
+    return bootstrap(lambda a, b: interquartile_mean(a) - interquartile_mean(b), values, others)
+
+
+def probability_of_improvement(values: ArrayLike, others: ArrayLike) -> Estimate:
+    """Return the probability that an agent of `values` [n] scores more than one of `others` [m]."""
+
+    def share(*samples: Array) -> Array:
+        if samples[0].ndim == 1:
+            return _share_above(*samples)
+        chunks = (np.array_split(each, CHUNKS) for each in samples)
+        return np.concatenate([_share_above(*chunk) for chunk in zip(*chunks, strict=True)])
+
+    return bootstrap(share, values, others)
+
+
+def _share_above(values: Array, others: Array) -> Array:
+    """Return the share of pairs of `values` [..., n] and `others` [..., m] in which the first is higher.
+
+    It is Mann and Whitney's U, from ranks, so that pairs need no memory.
+    """
+    n, m = values.shape[-1], others.shape[-1]
+    ranks = stats.rankdata(np.concatenate([values, others], axis=-1), axis=-1)
+    pairs = ranks[..., :n].sum(axis=-1) - n * (n + 1) / 2
+    return np.asarray(0.5 + 0.5 * ((2 * pairs - n * m) / (n * m)))
+
+
+def performance_profile(values: ArrayLike, scores: ArrayLike) -> tuple[Array, Array, Array]:
+    """Return the share of `values` [n] above each of `scores` [S], and its pointwise 95 % interval."""
+    data, thresholds = np.asarray(values, dtype=float), np.asarray(scores, dtype=float)
+
+    def above(sample: Array) -> Array:
+        ordered = np.sort(sample, axis=-1)
+        return np.stack([(ordered > threshold).mean(axis=-1) for threshold in thresholds], axis=-1)
+
+    low, high = np.percentile(above(_resampled(data, np.random.default_rng(0))), EDGES, axis=0)
+    return above(data), low, high
