@@ -71,7 +71,8 @@ def test_the_script_and_its_options_exist(page: str, command: str) -> None:
     name, *words = shlex.split(re.sub("<.*?>", "run", command))
     script = ROOT / name
     assert script.stat().st_mode & 0o100, f"{page}: {name} cannot be run"
-    code = "".join(file.read_text() for file in {script, *script.parent.glob("*.py")})
+    files = {script, *script.parent.glob("*.py"), *(script.parent / "thesis").glob("*.py")}
+    code = "".join(file.read_text() for file in files)
     options = [word for word in words if word.startswith("--")]
     assert [option for option in options if option not in code] == [], f"{page}: {command}"
 
