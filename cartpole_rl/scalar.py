@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from cartpole_rl.arithmetic import python
+from cartpole_rl.arithmetic.languages import FUNCTIONS, PYTHON
 from cartpole_rl.arithmetic.writer import Expressions, Writer
 from cartpole_rl.compilation import trace
 
@@ -42,26 +42,23 @@ def plain(tensor: Tensor) -> tuple[Any, ...]:
 
 def compiled(graph: torch.fx.GraphModule, examples: Sequence[tuple[Tensor, ...]]) -> Callable[..., Any]:
     """Return the Python function that computes the outputs of `graph`."""
-    writer = Writer(python.expression)
+    writer = Writer(PYTHON)
     inputs = [
-        [
-            writer.variables((f"i{row}_{part}_{place}" for place in range(tensor.numel())), tensor)
-            for part, tensor in enumerate(example)
-        ]
+        [writer.variables(f"i{row}_{part}_{{0}}", tensor) for part, tensor in enumerate(example)]
         for row, example in enumerate(examples)
     ]
     outputs = writer.write(graph, [each for example in inputs for each in example])
     names = [f"argument_{row}" for row in range(len(inputs))]
     lines = [
         *(f"({''.join(map(display, parts))}) = {name}" for name, parts in zip(names, inputs, strict=True)),
-        *(f"{line.name} = {line.expression}" for line in writer.lines(outputs)),
+        *writer.statements(outputs),
         f"return ({''.join(map(display, outputs))})",
     ]
-    namespace = dict(python.FUNCTIONS)
+    namespace = dict(FUNCTIONS)
     exec("\n    ".join((f"def compute({', '.join(names)}):", *lines)), namespace)
     return namespace["compute"]
 
 
 def display(values: Expressions) -> str:
     """Return a tuple display of all expressions, and a comma."""
-    return f"({''.join(f'{python.spelled(each)}, ' for each in values.reshape(-1))}), "
+    return f"({''.join(f'{PYTHON.text(each)}, ' for each in values.reshape(-1))}), "

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from cartpole_rl.errors import CartPoleError, ConfigError, PlantError
-from cartpole_rl.exporting.weights import read_agent
+from cartpole_rl.exporting.agent import read_agent
 from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.errors import fault_error
 from cartpole_rl.plants.serial.settings import SerialSettings

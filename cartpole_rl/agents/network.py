@@ -9,11 +9,17 @@ Layer normalization after each hidden layer keeps a trained agent from forgettin
 import math
 from collections.abc import Sequence
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
 from cartpole_rl.agents.settings import AgentSettings
+from cartpole_rl.errors import ConfigError
+
+# weight [outputs, inputs] and bias [outputs]; gain and shift [outputs] if the layer is normalized
+PlainLayer = tuple[NDArray[np.float32], ...]
 
 
 def q_network(
@@ -56,6 +62,17 @@ class QNetwork(nn.Module):
     def forward(self, observation: Tensor) -> Tensor:
         """Return the action values."""
         return self.layers(self.reader(observation))
+
+    def plain_layers(self) -> list[PlainLayer]:
+        """Return the numbers of each layer. Raises ConfigError for a recurrent network."""
+        _check_not_recurrent(self.reader)
+        layers: list[list[Tensor]] = []
+        for module in self.layers:
+            if isinstance(module, nn.Linear):
+                layers.append([module.weight, module.bias])
+            elif isinstance(module, nn.LayerNorm):
+                layers[-1] += [module.weight, module.bias]
+        return [tuple(_doubles(each).astype(np.float32) for each in layer) for layer in layers]
 
 
 class MirrorQNetwork(nn.Module):
@@ -100,6 +117,36 @@ class MirrorQNetwork(nn.Module):
             even, odd = layer(even, odd)
         same, opposite = self.even_values(even), self.odd_values(odd)
         return (same + same.flip(-1) + opposite - opposite.flip(-1)) / 2
+
+    def plain_layers(self) -> list[PlainLayer]:
+        """Return the numbers of each layer of an equal network without symmetry.
+
+        Its layers have the features of the scene, then the features of its mirror image:
+
+            even = (scene + image) / sqrt(2),  odd = (scene - image) / sqrt(2)
+            W_even even + W_odd odd = A scene + B image
+            A = (W_even + W_odd) / sqrt(2),    B = (W_even - W_odd) / sqrt(2)
+
+        and B scene + A image for the mirror image. The sums are taken in float64. The two parts of a layer
+        are normalized separately. Raises ConfigError for a recurrent network.
+        """
+        _check_not_recurrent(self.reader)
+        layers, half = [], math.sqrt(0.5)
+        for layer in self.layers:
+            assert isinstance(layer, MirrorLayer)
+            even, odd = half * _doubles(layer.even.weight), half * _doubles(layer.odd.weight)
+            weight = np.block([[even + odd, even - odd], [even - odd, even + odd]])
+            norm = [*layer.norm.parameters()]  # gain and shift
+            layers.append([weight, *(np.tile(_doubles(each), 2) for each in (layer.even.bias, *norm))])
+        even, odd = _doubles(self.even_values.weight), _doubles(self.odd_values.weight)
+        bias = _doubles(self.even_values.bias)
+        same, opposite = half / 2 * (even + even[::-1]), half / 2 * (odd - odd[::-1])
+        layers.append([np.hstack((same + opposite, same - opposite)), (bias + bias[::-1]) / 2])
+        of_scene, of_image = np.split(
+            layers[0][0], 2, 1
+        )  # the image of the observation is signs * observation
+        layers[0][0] = of_scene + of_image * _doubles(self.signs)
+        return [tuple(each.astype(np.float32) for each in layer) for layer in layers]
 
 
 class FrameReader(nn.Module):
@@ -152,3 +199,14 @@ class MirrorLayer(nn.Module):
 def halves(scene: Tensor, image: Tensor) -> tuple[Tensor, Tensor]:
     """Return sum and difference of features and their mirror image, scaled to keep the norm."""
     return (scene + image) * math.sqrt(0.5), (scene - image) * math.sqrt(0.5)
+
+
+def _doubles(tensor: Tensor) -> NDArray[np.float64]:
+    """Return the numbers of a tensor in float64."""
+    return tensor.detach().cpu().double().numpy()
+
+
+def _check_not_recurrent(reader: nn.Module) -> None:
+    """Raise ConfigError for a network with a `FrameReader`."""
+    if not isinstance(reader, nn.Identity):
+        raise ConfigError("run: a recurrent agent (agent.recurrent) cannot be exported")

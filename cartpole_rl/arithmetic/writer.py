@@ -4,15 +4,15 @@ The graph is evaluated once on arrays of expressions instead of numbers: operati
 about, and each arithmetic operation on each number writes a line. NaN, infinities, division by zero and
 conversions behave as in PyTorch.
 
-To support another operation of PyTorch, add it to `SHAPES` or `FILLED` by its name in ATen, or to the
-expressions of each language (`python.py`, `javascript.py`, `c.py`).
+To support another operation of PyTorch, add it by its name in ATen to `SHAPES` or `FILLED`, or to
+`languages.OPERATIONS`.
 """
 
 import math
 import operator
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from torch._ops import OpOverload
 from torch.fx import GraphModule, Node
 
-from cartpole_rl.arithmetic import python
+from cartpole_rl.arithmetic.languages import FUNCTIONS, PYTHON, Line, Operand, Python
 
 Expressions = NDArray[np.object_]  # numbers, and names of variables
 LARGEST_FLOAT = torch.finfo(torch.float32).max
@@ -30,39 +30,19 @@ MOST_OPERANDS = {"clamp": 3, "nan_to_num": 4, "where": 3}
 VARIABLE = re.compile(r"\bv\d+\b")
 
 
-class Operand(NamedTuple):
-    """An operand of an expression: a number, or the name of a variable, of Python's type `kind`."""
-
-    value: Any
-    kind: type
-
-
-class Line(NamedTuple):
-    """A variable and the expression that it holds."""
-
-    name: str
-    kind: type  # bool, int or float
-    expression: str
-
-
-# the expression of an operation, in a language: its name, its operands, and the type of the result;
-# KeyError for an operation that the language does not have
-Language = Callable[[str, Sequence[Operand], type], str]
-
-
 class Writer:
     """The lines of a function that is being written in `language`."""
 
-    def __init__(self, language: Language) -> None:
+    def __init__(self, language: Python) -> None:
         self._language = language
         self._lines: dict[str, Line] = {}  # by expression
         self._kinds: dict[str, type] = {}  # of variables
 
-    def variables(self, names: Iterable[str], example: torch.Tensor) -> Expressions:
-        """Return an input of the shape and type of `example`: variables with these names."""
-        array = np.array([*names], dtype=object).reshape(tuple(example.shape))
-        self._kinds |= dict.fromkeys(array.reshape(-1), kind_of(example.dtype))
-        return array
+    def variables(self, pattern: str, example: torch.Tensor) -> Expressions:
+        """Return an input of the shape and type of `example`: variables named "x[0]", "x[1]" by "x[{0}]"."""
+        names = [pattern.format(place) for place in range(example.numel())]
+        self._kinds |= dict.fromkeys(names, kind_of(example.dtype))
+        return np.array(names, dtype=object).reshape(tuple(example.shape))
 
     def write(self, graph: GraphModule, inputs: Sequence[Expressions]) -> list[Expressions]:
         """Return the outputs of `graph`, after writing the lines that compute them."""
@@ -79,14 +59,14 @@ class Writer:
                 values[node] = self._evaluate(node, values)
         raise AssertionError("a graph has an output")
 
-    def lines(self, outputs: Iterable[Expressions]) -> list[Line]:
-        """Return the lines that `outputs` need, in order."""
+    def statements(self, outputs: Iterable[Expressions]) -> list[str]:
+        """Return the declarations of the variables that `outputs` need, in order."""
         needed = {each for output in outputs for each in output.reshape(-1) if isinstance(each, str)}
         kept = []
         for line in reversed(self._lines.values()):
             if line.name in needed:
                 needed.update(VARIABLE.findall(line.expression))
-                kept.append(line)
+                kept.append(self._language.declaration(line))
         return kept[::-1]
 
     def kind(self, value: Any) -> type:
@@ -126,8 +106,8 @@ class Writer:
         """Write a line unless it is known; return its variable, or the number if all `parts` are numbers."""
         operands = [Operand(part, self.kind(part)) for part in parts]
         if not any(isinstance(part, str) for part in parts):
-            return python.evaluate(operation, operands, kind)
-        expression = self._language(operation, operands, kind)
+            return eval(PYTHON.expression(operation, operands, kind), dict(FUNCTIONS))
+        expression = self._language.expression(operation, operands, kind)
         if expression not in self._lines:
             name = f"v{len(self._lines) + 1}"
             self._lines[expression] = Line(name, kind, expression)

@@ -10,16 +10,12 @@ import textwrap
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-import numpy as np
-
-from cartpole_rl.arithmetic import c
-from cartpole_rl.arithmetic.writer import Expressions, Operand, Writer
-from cartpole_rl.compilation import Trace
+from cartpole_rl.arithmetic.languages import C99, Operand
+from cartpole_rl.arithmetic.writer import Expressions, Writer
 from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.exporting.agent import ExportedAgent, Floats
-from cartpole_rl.exporting.filling import filled
-from cartpole_rl.exporting.perception_graphs import First, Later, perception_graphs
+from cartpole_rl.exporting.code import Graph, filled, perception
 from cartpole_rl.tasks.settings import Start
 
 FLOAT_BYTES, MOTOR_BYTES = 4, 2
@@ -43,48 +39,41 @@ def c_files(agent: ExportedAgent, settings: CartPoleSettings) -> dict[str, str]:
 
     Raises ConfigError for an observation that cannot be written in C.
     """
-    graphs = perception_graphs(settings, agent.description.guard)
     try:
-        first, later = body(graphs.first, graphs.first_inputs), body(graphs.later, graphs.later_inputs)
+        first, later = map(body, perception(settings, agent.description.guard))
     except NotImplementedError as error:
         raise ConfigError(f"format=c: the observation has an operation that is not known: {error}") from None
     return {"policy.h": header(agent, later), "policy.c": source(agent, first, later)}
 
 
-def body(traced: Trace, inputs: First | Later) -> str:
+def body(graph: Graph) -> str:
     """Return the statements of a function that perceives."""
-    writer = Writer(c.expression)
-    named = {
-        name: writer.variables((f"{name}_{place}" for place in range(tensor.numel())), tensor)
-        for name, tensor in inputs._asdict().items()
-    }
-    results = writer.write(traced.graph, list(named.values()))
-    percept = traced.result(results)
-    statements = c.declared(writer.lines(results))
-    for name, values in (("policy->state", percept.state), ("policy->past", percept.past)):
-        statements += assigned(name, values, writer)
-    statements += assigned("observation", percept.observation, writer)
-    statements.append(f"return {in_c(percept.guard.item(), int, writer)};")
+    writer = Writer(C99)
+    named = {name: writer.variables(f"{name}_{{0}}", example) for name, example in graph.inputs.items()}
+    results = writer.write(graph.trace.graph, list(named.values()))
+    percept = graph.trace.result(results)
+
+    def in_c(value: Any, kind: type) -> str:
+        return C99.cast(Operand(value, writer.kind(value)), kind)
+
+    def assigned(array: str, values: Expressions) -> list[str]:
+        return [f"{array}[{place}] = {in_c(value, float)};" for place, value in enumerate(values.reshape(-1))]
+
+    statements = [
+        *writer.statements(results),
+        *assigned("policy->state", percept.state),
+        *assigned("policy->past", percept.past),
+        *assigned("observation", percept.observation),
+        f"return {in_c(percept.guard.item(), int)};",
+    ]
     text = "\n".join(statements)
     read = [
-        f"const {c.TYPES[writer.kind(variable)]} {variable} = {PLACES[name].format(place)};"
+        f"const {C99.types[writer.kind(variable)]} {variable} = {PLACES[name].format(place)};"
         for name, variables in named.items()
         for place, variable in enumerate(variables.reshape(-1))
         if re.search(rf"\b{variable}\b", text)
     ]
     return textwrap.indent("\n".join((*read, text)), "    ")
-
-
-def assigned(array: str, values: Expressions, writer: Writer) -> list[str]:
-    """Return assignments of `values` to an array of floats."""
-    return [
-        f"{array}[{place}] = {in_c(value, float, writer)};" for place, value in enumerate(values.reshape(-1))
-    ]
-
-
-def in_c(value: Any, kind: type, writer: Writer) -> str:
-    """Return a number or a variable as an expression of type `kind`."""
-    return c.cast(Operand(value, writer.kind(value)), kind)
 
 
 def header(agent: ExportedAgent, later: str) -> str:
@@ -111,7 +100,7 @@ def header(agent: ExportedAgent, later: str) -> str:
         "actions": len(about.motors),
         "nanometres": round(1e9 * about.cart_metres_per_count),
         "counts_per_turn": about.pole_counts_per_turn,
-        "track": c.literal(about.track_half_length),
+        "track": C99.literal(about.track_half_length),
         "past": past,
         "observes_length": int(about.observation.pole_length),
         "starts_upright": int(about.start == Start.UPRIGHT),
@@ -130,13 +119,13 @@ def in_comment(text: str) -> str:
 def source(agent: ExportedAgent, first: str, later: str) -> str:
     """Return policy.c."""
     about = agent.description
-    helpers = [text for name, text in c.HELPERS.items() if name in first + later]
+    helpers = [filled(f"{name}.c", {}) for name in ("clamped", "sign") if f"{name}(" in first + later]
     values = {
         "id": f"{agent.identity:08x}",
         "motors": ", ".join(map(str, about.motors)),
         "rightmost": max(0, *about.motors),
         "leftmost": min(0, *about.motors),
-        "angle_limit": c.literal(math.inf if about.angle_limit is None else about.angle_limit),
+        "angle_limit": C99.literal(math.inf if about.angle_limit is None else about.angle_limit),
         "tables": "\n\n".join(table(name, values) for name, values in agent.arrays()),
         "helpers": "".join(f"{text}\n" for text in helpers),
         "first": first,
@@ -151,7 +140,7 @@ def layer_functions(agent: ExportedAgent) -> Iterable[str]:
     """Yield the functions that the layers need."""
     yield filled("linear.c", {})
     if any(layer.gain is not None for layer in agent.layers):
-        yield filled("normalize.c", {"epsilon": c.literal(agent.description.norm_epsilon)})
+        yield filled("normalize.c", {"epsilon": C99.literal(agent.description.norm_epsilon)})
     if len(agent.layers) > 1:
         yield filled("rectify.c", {})
 
@@ -184,6 +173,6 @@ def buffer_sizes(sizes: Sequence[int]) -> dict[str, int]:
 
 def table(name: str, values: Floats) -> str:
     """Return the definition of an array; its numbers are exact."""
-    numbers = " ".join(f"{number!s}f," for number in values.reshape(-1).astype(np.float32))
+    numbers = " ".join(f"{number!s}f," for number in values.reshape(-1))
     rows = textwrap.indent(textwrap.fill(numbers, WIDTH, break_on_hyphens=False), "    ")
     return f"static const float {name.replace('.', '_').upper()}[{values.size}] = {{\n{rows}\n}};"

@@ -13,14 +13,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cartpole_rl.arithmetic import javascript
+from cartpole_rl.arithmetic.languages import JAVASCRIPT
 from cartpole_rl.arithmetic.writer import Writer
-from cartpole_rl.compilation import Trace, trace
 from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.exporting.agent import ExportedAgent
-from cartpole_rl.exporting.filling import filled
-from cartpole_rl.exporting.perception_graphs import NUMBER, perception_graphs
+from cartpole_rl.exporting.agent import FLOATS, ExportedAgent
+from cartpole_rl.exporting.code import COUNT, NUMBER, Graph, filled, perception
 from cartpole_rl.physics.dynamics import Addition, Drive, State
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.settings import SimulatedSettings
@@ -58,74 +56,61 @@ def web_page(agent: ExportedAgent, settings: CartPoleSettings, plant: SimulatedS
 
     Raises ConfigError for an observation that cannot be written in JavaScript.
     """
-    about = agent.description
-    graphs = perception_graphs(settings, about.guard)
     try:
+        first, later = perception(settings, agent.description.guard)
         functions = [
-            function("perceiveFirst", graphs.first, graphs.first_inputs._asdict()),
-            function("perceive", graphs.later, graphs.later_inputs._asdict()),
-            encoders(),
-            physics(settings, plant),
+            function("perceiveFirst", first),
+            function("perceive", later),
+            function("encoderCounts", encoders()),
+            function("runPeriod", physics(settings, plant)),
         ]
     except NotImplementedError as error:
         raise ConfigError(f"format=web: the agent has an operation that is not known: {error}") from None
-    code = "\n".join((javascript.HELPERS, *functions, filled("cart.js", {"data": data(agent, settings)})))
+    script = filled("cart.js", {"data": data(agent, settings)})
+    code = "\n".join((filled("arithmetic.js", {}), *functions, script))
     return filled("cart.html", {"code": code, "page": filled("page.js", {}), **words(agent)})
 
 
-@torch.no_grad()
-def encoders() -> str:
+def encoders() -> Graph:
     """Return the function of the encoders."""
 
     def counted(true: TrueState) -> Counts:
         cart = CartParameters(true.table)
         return Counts(encoder_counts(State(*true.motion.unbind(0)), cart, true.noise))
 
-    true = TrueState(torch.ones(len(CartParameters.names()), 1), torch.zeros(4, 1), torch.zeros(3, 1))
-    return function("encoderCounts", trace(counted, (true,)), true._asdict())
+    table = torch.ones(len(CartParameters.names()), 1)
+    return Graph.of(counted, TrueState(table, torch.zeros(4, 1), torch.zeros(3, 1)))
 
 
-@torch.no_grad()
-def physics(settings: CartPoleSettings, plant: SimulatedSettings) -> str:
+def physics(settings: CartPoleSettings, plant: SimulatedSettings) -> Graph:
     """Return the function of one control period of the simulated cart."""
-    models = settings.models(plant)
-    drive = torch.zeros(1 + commands_under_way(LONGEST_LATENCY, settings.control_period), 1)
-    carts = Carts(torch.ones(len(CartParameters.names()), 1), torch.zeros(4, 1), drive)
-    inputs = Inputs(torch.zeros(1, 1, dtype=torch.int64), torch.zeros(3, 1))
+    models, period = settings.models(plant), settings.control_period
 
     def run(carts: Carts, inputs: Inputs, push: Push) -> Period:
         def pushed(state: State, drive: Drive) -> Addition:
             return Addition(push.force[0], torch.zeros_like, push.angular_acceleration[0])
 
         return run_carts(
-            carts,
-            inputs,
-            models=models,
-            period=settings.control_period,
-            substeps=plant.substeps,
-            addition=pushed,
+            carts, inputs, models=models, period=period, substeps=plant.substeps, addition=pushed
         )
 
-    push = Push(NUMBER, NUMBER)
-    names = {**carts._asdict(), **inputs._asdict(), **push._asdict()}
-    return function("runPeriod", trace(run, (carts, inputs, push)), names)
+    drive = torch.zeros(1 + commands_under_way(LONGEST_LATENCY, period), 1)
+    carts = Carts(torch.ones(len(CartParameters.names()), 1), torch.zeros(4, 1), drive)
+    return Graph.of(run, carts, Inputs(COUNT, torch.zeros(3, 1)), Push(NUMBER, NUMBER))
 
 
-def function(name: str, traced: Trace, inputs: dict[str, Tensor]) -> str:
-    """Return a graph as a function of arrays of numbers, in the order of `inputs`, that returns arrays."""
-    writer = Writer(javascript.expression)
-    variables = [
-        writer.variables((f"{argument}[{place}]" for place in range(example.numel())), example)
-        for argument, example in inputs.items()
-    ]
-    results = writer.write(traced.graph, variables)
+def function(name: str, graph: Graph) -> str:
+    """Return a graph as a function of arrays of numbers, in the order of its inputs, that returns arrays."""
+    writer = Writer(JAVASCRIPT)
+    variables = [writer.variables(f"{each}[{{0}}]", example) for each, example in graph.inputs.items()]
+    results = writer.write(graph.trace.graph, variables)
     parts = [
-        f"{key}: [{', '.join(javascript.spelled(each) for each in values.reshape(-1))}]"
-        for key, values in traced.result(results)._asdict().items()
+        f"{key}: [{', '.join(map(JAVASCRIPT.text, values.reshape(-1)))}]"
+        for key, values in graph.trace.result(results)._asdict().items()
     ]
-    lines = (*javascript.declared(writer.lines(results)), f"return {{ {', '.join(parts)} }};")
+    lines = (*writer.statements(results), f"return {{ {', '.join(parts)} }};")
     body = "\n".join(f"  {line}" for line in lines)
-    return f"function {name}({', '.join(inputs)}) {{\n{body}\n}}\n"
+    return f"function {name}({', '.join(graph.inputs)}) {{\n{body}\n}}\n"
 
 
 def data(agent: ExportedAgent, settings: CartPoleSettings) -> str:
@@ -158,7 +143,7 @@ def data(agent: ExportedAgent, settings: CartPoleSettings) -> str:
 
 def encoded(values: Any) -> str:
     """Return float32 numbers in base64, little-endian."""
-    return base64.b64encode(np.ascontiguousarray(values, "<f4").tobytes()).decode()
+    return base64.b64encode(np.ascontiguousarray(values, FLOATS).tobytes()).decode()
 
 
 def words(agent: ExportedAgent) -> dict[str, str]:

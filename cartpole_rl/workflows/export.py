@@ -13,18 +13,14 @@ from cartpole_rl.envs.build import with_fitted_guard
 from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
 from cartpole_rl.envs.settings import TrackGuard
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.exporting.agent import ExportedAgent, canonical_json
+from cartpole_rl.exporting.agent import ExportedAgent, Layer, canonical_json, description
 from cartpole_rl.exporting.c_code import c_files
-from cartpole_rl.exporting.description import Description, observed_numbers
-from cartpole_rl.exporting.layers import plain_layers
 from cartpole_rl.exporting.onnx_model import onnx_model
 from cartpole_rl.exporting.web_page import web_page
-from cartpole_rl.exporting.weights import weights_file
 from cartpole_rl.files import write_bytes
 from cartpole_rl.learning.checkpoint_files import find_agent
 from cartpole_rl.learning.checkpoints import load_agent
 from cartpole_rl.plants.settings import SimulatedSettings
-from cartpole_rl.randomization.poles import possible_poles
 from cartpole_rl.run_files import CHECKPOINTS
 from cartpole_rl.workflows.agents import TrainedAgent, trained_agent
 from cartpole_rl.workflows.build import without_guard_numbers
@@ -119,7 +115,8 @@ def exported_agent(trained: TrainedAgent, origin: Mapping[str, Any]) -> Exported
 
     Raises ConfigError for an agent that cannot be exported, CheckpointError for one that is not finite.
     """
-    agent = ExportedAgent(description(compiled_training(trained), origin), plain_layers(network_of(trained)))
+    about = description(compiled_training(trained), trained.training.agent, origin)
+    agent = ExportedAgent(about, tuple(Layer(*each) for each in network_of(trained).plain_layers()))
     agent.check("run")
     return agent
 
@@ -129,29 +126,6 @@ def network_of(trained: TrainedAgent) -> QNetwork | MirrorQNetwork:
     network = trained.policy.module[0].module  # type: ignore[attr-defined]
     assert isinstance(network, QNetwork | MirrorQNetwork)
     return network
-
-
-def description(training: TrainConfig, origin: Mapping[str, Any]) -> Description:
-    """Return the description of an agent with these settings, those of `compiled_training`."""
-    lengths = training.pole.lengths or [pole.length for pole in possible_poles(training.pole)]
-    observation, motors, agent = training.observation, training.actions.motors, training.agent
-    return Description(
-        task=training.task.name,
-        observation=observation,
-        numbers=observed_numbers(observation),
-        sizes=(observation.size, *agent.hidden, len(motors)),
-        layer_norm=agent.layer_norm,
-        norm_groups=2 if agent.mirrored else 1,
-        mirrored=agent.mirrored,
-        motors=motors,
-        start=training.task.evaluation_start.angle,
-        angle_limit=training.task.angle_limit,
-        guard=training.guard.active,
-        track_half_length=training.nominal_cart["track_half_length"],
-        control_period=training.control_period,
-        pole_lengths=(min(lengths), max(lengths)),
-        provenance=dict(origin),
-    )
 
 
 def provenance(run: Path) -> dict[str, Any]:
@@ -185,7 +159,7 @@ def files_of(form: str, agent: ExportedAgent, trained: TrainedAgent) -> dict[str
     """Return the contents of the files of a format, by name. Raises ConfigError."""
     match form:
         case "weights":
-            return {"agent.npz": weights_file(agent)}
+            return {"agent.npz": agent.weights_file()}
         case "onnx":
             return {"agent.onnx": onnx_model(agent, network_of(trained))}
         case "c":

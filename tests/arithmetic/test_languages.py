@@ -16,9 +16,9 @@ from browser import BROWSER, BROWSERS, in_browser
 from operations import AWKWARD, OPERATIONS
 from torch import Tensor
 
-from cartpole_rl.arithmetic import c, javascript
+from cartpole_rl.arithmetic.languages import C99, JAVASCRIPT
 from cartpole_rl.arithmetic.writer import Writer
-from cartpole_rl.compilation import trace
+from cartpole_rl.exporting.code import Graph, filled
 from cartpole_rl.exporting.web_page import function
 
 NUMBERS = [*AWKWARD, 0.3, -7.4, 3.0]
@@ -35,10 +35,10 @@ class Result(NamedTuple):
     value: Tensor
 
 
-def operation(number: int, dtype: torch.dtype) -> tuple:
-    """Return the graph of an operation, and examples of its operands."""
-    pair = Pair(torch.zeros(1, dtype=dtype), torch.zeros(1, dtype=dtype))
-    return trace(lambda pair: Result(OPERATIONS[number](*pair)), (pair,)), pair
+def operation(number: int, dtype: torch.dtype) -> Graph:
+    """Return the graph of an operation."""
+    operand = torch.zeros(1, dtype=dtype)
+    return Graph.of(lambda pair: Result(OPERATIONS[number](*pair)), Pair(operand, operand.clone()))
 
 
 def expected(number: int, dtype: torch.dtype) -> np.ndarray:
@@ -50,12 +50,11 @@ def expected(number: int, dtype: torch.dtype) -> np.ndarray:
 @pytest.mark.skipif(BROWSER is None, reason=f"none of {', '.join(BROWSERS)} is installed")
 def test_javascript_behaves_as_pytorch(tmp_path: Path) -> None:
     functions = [
-        function(f"operation{number}", traced, pair._asdict())
-        for number, (traced, pair) in enumerate(operation(n, torch.float64) for n in range(len(OPERATIONS)))
+        function(f"operation{number}", operation(number, torch.float64)) for number in range(len(OPERATIONS))
     ]
-    pairs = ", ".join(f"[{javascript.spelled(a)}, {javascript.spelled(b)}]" for a, b in PAIRS)
+    pairs = ", ".join(f"[{JAVASCRIPT.literal(a)}, {JAVASCRIPT.literal(b)}]" for a, b in PAIRS)
     names = ", ".join(f"operation{number}" for number in range(len(OPERATIONS)))
-    script = f"""{javascript.HELPERS}{"".join(functions)}
+    script = f"""{filled("arithmetic.js", {})}{"".join(functions)}
     const text = (operation, [a, b]) => String(Number(operation([a], [b]).value[0]));
     const results = [{names}].map((operation) => [{pairs}].map((pair) => text(operation, pair)));
     document.body.textContent = JSON.stringify(results);"""
@@ -69,7 +68,9 @@ def test_javascript_behaves_as_pytorch(tmp_path: Path) -> None:
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="gcc is missing: install a C compiler")
 def test_c_behaves_as_pytorch(tmp_path: Path) -> None:
     supported = [number for number in range(len(OPERATIONS)) if number not in NOT_IN_C]
-    text = "#include <math.h>\n#include <stdbool.h>\n#include <stdint.h>\n" + "".join(c.HELPERS.values())
+    text = "#include <math.h>\n#include <stdbool.h>\n#include <stdint.h>\n" + "".join(
+        filled(f"{name}.c", {}) for name in ("clamped", "sign")
+    )
     text += "".join(map(in_c, supported))
     (tmp_path / "operations.c").write_text(text)
     words = ["-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror", "-shared", "-fPIC"]
@@ -87,11 +88,10 @@ def test_c_behaves_as_pytorch(tmp_path: Path) -> None:
 
 def in_c(number: int) -> str:
     """Return an operation as a C function."""
-    traced, pair = operation(number, torch.float32)
-    writer = Writer(c.expression)
-    inputs = [writer.variables([name], example) for name, example in pair._asdict().items()]
-    results = writer.write(traced.graph, inputs)
-    lines = "".join(f"    {line}\n" for line in c.declared(writer.lines(results)))
+    graph, writer = operation(number, torch.float32), Writer(C99)
+    inputs = [writer.variables(name, example) for name, example in graph.inputs.items()]
+    results = writer.write(graph.trace.graph, inputs)
+    lines = "".join(f"    {line}\n" for line in writer.statements(results))
     (result,) = results[0].reshape(-1)
     unused = "    (void)a;\n    (void)b;\n"
     head = f"float operation{number}(float a, float b)"
@@ -106,7 +106,7 @@ def test_what_c_cannot_write_is_named() -> None:
 
 def test_literals_are_exact() -> None:
     for value in (0.1, -3.0, 1e-30, 5):
-        assert float(c.literal(value).strip("()f")) == value
-        assert json.loads(javascript.spelled(value).strip("()")) == value
-    assert [c.literal(value) for value in (math.inf, -math.inf)] == ["INFINITY", "(-INFINITY)"]
-    assert c.literal(math.nan) == "NAN"
+        assert float(C99.literal(value).strip("()f")) == value
+        assert json.loads(JAVASCRIPT.literal(value).strip("()")) == value
+    assert [C99.literal(value) for value in (math.inf, -math.inf)] == ["INFINITY", "(-INFINITY)"]
+    assert C99.literal(math.nan) == "NAN"

@@ -7,7 +7,7 @@ import pytest
 import torch
 from command_line import in_process
 
-from cartpole_rl.exporting.weights import read_agent
+from cartpole_rl.exporting.agent import read_agent
 
 FILES = {
     "weights": {"agent.npz"},

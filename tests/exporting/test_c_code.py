@@ -39,6 +39,25 @@ AGENTS: dict[str, dict[str, Any]] = {
 pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="gcc is missing: install a C compiler")
 
 
+def checked(files: Mapping[str, str], folder: Path) -> subprocess.CompletedProcess[str]:
+    """Write the files, and let the compiler check policy.c without compiling it."""
+    for name, text in files.items():
+        (folder / name).write_text(text)
+    words = ["gcc", *FLAGS, "-fsyntax-only", "policy.c"]
+    return subprocess.run(words, cwd=folder, capture_output=True, text=True)
+
+
+def untrained(**overrides: Any) -> TrainedAgent:
+    """An agent with random weights, also in its layer normalization."""
+    training = load_settings(TrainConfig, {**overrides, "compile": False})
+    agent = new_agent(training)
+    torch.manual_seed(1)
+    with torch.no_grad():
+        for weight in agent.parameters():
+            weight.add_(0.3 * torch.randn_like(weight))
+    return TrainedAgent(training, agent.greedy_policy())
+
+
 class Compiled:
     """The library of an exported agent, with one cart."""
 
@@ -117,49 +136,70 @@ def test_motor_values_are_those_of_the_host(compiled: Compiled, medium_agent: Tr
 @torch.no_grad()
 @pytest.mark.parametrize("name", AGENTS)
 def test_so_they_are_for_every_observation_and_network(name: str, tmp_path: Path) -> None:
-    training = load_settings(TrainConfig, {**AGENTS[name], "compile": False})
-    agent = new_agent(training)
-    torch.manual_seed(1)
-    for weight in agent.parameters():
-        weight.add_(0.3 * torch.randn_like(weight))
-    trained = TrainedAgent(training, agent.greedy_policy())
+    trained = untrained(**AGENTS[name])
     exported = exported_agent(trained, {})
-    compiled = Compiled(c_files(exported, training), tmp_path)
-    check_motors(training, trained.policy, compiled, 200)
-    observes = int(training.observation.pole_length)
+    compiled = Compiled(c_files(exported, trained.training), tmp_path)
+    check_motors(trained.training, trained.policy, compiled, 200)
+    observes = int(trained.training.observation.pole_length)
     assert f"#define POLICY_OBSERVES_LENGTH {observes}" in (tmp_path / "policy.h").read_text()
-    assert_figures(exported, tmp_path, compiled)
+    assert_figures(exported, compiled)
+    if observes:
+        assert_lengths(compiled, trained.training)
+    if name == "plain":
+        assert_overflow_is_no_action(exported, trained.training, tmp_path)
 
 
-def test_the_figures_in_the_comment_are_right(
-    exported: ExportedAgent, medium_agent: TrainedAgent, compiled: Compiled, tmp_path: Path
-) -> None:
-    for name, text in c_files(exported, medium_agent.training).items():
-        (tmp_path / name).write_text(text)
-    assert_figures(exported, tmp_path, compiled)
+def assert_lengths(compiled: Compiled, training: TrainConfig) -> None:
+    """A length that no pole has keeps the motor at 0."""
+    for length in (0.0, -1.0, 355.6, math.nan, math.inf):
+        compiled.start(0.38, length)
+        assert [compiled.motor((0, 2048), 0.02) for _ in range(3)] == [0, 0, 0]
+        compiled.resume()
+        assert compiled.motor((0, 2048), 0.02) == 0
+    compiled.start(0.38, 0.3556)
+    assert compiled.motor((0, 2048), 0.02) in training.actions.motors
+    assert "above 0 and at most 3" in (compiled.folder / "policy.h").read_text()
 
 
-def assert_figures(exported: ExportedAgent, folder: Path, compiled: Compiled) -> None:
-    comment = (folder / "policy.h").read_text().split("*/")[0]
+def assert_overflow_is_no_action(exported: ExportedAgent, training: TrainConfig, folder: Path) -> None:
+    """A unit that is not finite reaches the action values."""
+    first = exported.layers[0]
+    layer = first._replace(weight=np.full_like(first.weight, 3e38))
+    agent = replace(exported, layers=(layer, *exported.layers[1:]))
+    (folder / "overflow").mkdir()
+    compiled = Compiled(c_files(agent, training), folder / "overflow")
+    assert compiled.action(np.array([2, -2] * 5, np.float32)) == -1  # infinity minus infinity
+
+
+def test_the_figures_in_the_comment_are_right(exported: ExportedAgent, compiled: Compiled) -> None:
+    assert_figures(exported, compiled)
+
+
+def assert_figures(exported: ExportedAgent, compiled: Compiled) -> None:
+    comment = (compiled.folder / "policy.h").read_text().split("*/")[0]
     assert f"{len(compiled.memory)} bytes for each cart" in comment
-    tables = re.findall(r"static const float \w+\[(\d+)\]", (folder / "policy.c").read_text())
+    tables = re.findall(r"static const float \w+\[(\d+)\]", (compiled.folder / "policy.c").read_text())
     motors = 2 * (len(exported.description.motors) + 2)
     assert f"{4 * sum(map(int, tables)) + motors} bytes of tables" in comment
-    sizes = exported.description.sizes
-    products = sum(inputs * outputs for inputs, outputs in pairwise(sizes))
+    products = sum(inputs * outputs for inputs, outputs in pairwise(exported.description.sizes))
     assert f"{products} multiply-adds" in comment
     assert exported.checksum in comment
 
 
+@pytest.fixture(scope="module")
+def small() -> tuple[ExportedAgent, TrainConfig]:
+    """A small agent, which is exported and compiled at once."""
+    trained = untrained(**AGENTS["plain"])
+    return exported_agent(trained, {}), trained.training
+
+
 @pytest.mark.parametrize("origin", ["*/ int x; /*", "/*/", "a\nb\\", "a ??/", "**//", "\\"])
 def test_no_origin_leaves_the_comment(
-    origin: str, exported: ExportedAgent, medium_agent: TrainedAgent, tmp_path: Path
+    origin: str, small: tuple[ExportedAgent, TrainConfig], tmp_path: Path
 ) -> None:
+    exported, training = small
     about = exported.description.model_copy(update={"provenance": {"command": [origin]}})
-    for name, text in c_files(replace(exported, description=about), medium_agent.training).items():
-        (tmp_path / name).write_text(text)
-    words = ["gcc", *FLAGS, "-fsyntax-only", "policy.c"]
-    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
+    done = checked(c_files(replace(exported, description=about), training), tmp_path)
     assert done.returncode == 0, done.stderr
     first, second = (tmp_path / "policy.h").read_text().split("*/")[0].splitlines()[-3:-1]
     assert first.startswith(' * Training: "')
@@ -184,9 +224,8 @@ def test_after_a_bad_number_the_motor_stays_at_0(compiled: Compiled) -> None:
 
 
 def test_the_motor_stays_at_0_once_the_pole_fell(tmp_path: Path) -> None:
-    training = load_settings(TrainConfig, {**AGENTS["plain"], "task": "balance", "compile": False})
-    exported = exported_agent(TrainedAgent(training, new_agent(training).greedy_policy()), {})
-    compiled = Compiled(c_files(exported, training), tmp_path)
+    trained = untrained(**AGENTS["plain"], task="balance")
+    compiled = Compiled(c_files(exported_agent(trained, {}), trained.training), tmp_path)
     for sign in (1, -1):  # 100 counts are 8.8 degrees, 140 are 12.3
         compiled.start(0.38, 0.36)
         assert compiled.motor((0, sign * 100), 0.0) != 0
@@ -196,9 +235,7 @@ def test_the_motor_stays_at_0_once_the_pole_fell(tmp_path: Path) -> None:
         assert compiled.motor((0, 0), 0.02) == 0
     compiled.start(0.38, 0.36)
     assert compiled.motor((0, 2048), 0.0) == 0
-    header = (tmp_path / "policy.h").read_text()
-    assert "#define POLICY_STARTS_UPRIGHT 1" in header
-    assert "#define POLICY_OBSERVES_LENGTH 0" in header
+    assert "#define POLICY_STARTS_UPRIGHT 1" in (tmp_path / "policy.h").read_text()
 
 
 def test_a_resumed_policy_forgets_what_it_observed(compiled: Compiled) -> None:
@@ -220,45 +257,18 @@ def test_without_a_start_the_motor_stays_at_0(compiled: Compiled) -> None:
     assert [compiled.motor((0, 2048), 0.02) for _ in range(3)] == [0, 0, 0]
 
 
-@pytest.mark.parametrize("length", [0.0, -1.0, 355.6, math.nan, math.inf])
-def test_a_length_that_no_pole_has_keeps_the_motor_at_0(length: float, tmp_path: Path) -> None:
-    training = load_settings(TrainConfig, {"observation": "history_length", "compile": False})
-    exported = exported_agent(TrainedAgent(training, new_agent(training).greedy_policy()), {})
-    compiled = Compiled(c_files(exported, training), tmp_path)
-    compiled.start(0.38, length)
-    assert [compiled.motor((0, 2048), 0.02) for _ in range(3)] == [0, 0, 0]
-    compiled.resume()
-    assert compiled.motor((0, 2048), 0.02) == 0
-    compiled.start(0.38, 0.3556)
-    assert compiled.motor((0, 2048), 0.02) in training.actions.motors
-    assert "above 0 and at most 3" in (tmp_path / "policy.h").read_text()
-
-
-def test_a_unit_that_is_not_finite_reaches_the_action_values(tmp_path: Path) -> None:
-    training = load_settings(TrainConfig, {**AGENTS["plain"], "compile": False})
-    exported = exported_agent(TrainedAgent(training, new_agent(training).greedy_policy()), {})
-    first = exported.layers[0]
-    layer = first._replace(weight=np.full_like(first.weight, 3e38))
-    agent = replace(exported, layers=(layer, *exported.layers[1:]))
-    compiled = Compiled(c_files(agent, training), tmp_path)
-    numbers = np.array([2, -2] * 5, np.float32)  # infinity minus infinity
-    assert compiled.action(numbers) == -1
-
-
 @pytest.mark.parametrize(
     ("change", "fits"), [({"angle_limit": 1.0}, False), ({"provenance": {}}, True)], ids=["agent", "origin"]
 )
 def test_files_of_two_exports_compile_only_if_the_agent_is_the_same(
-    exported: ExportedAgent, medium_agent: TrainedAgent, tmp_path: Path, change: dict[str, Any], fits: bool
+    small: tuple[ExportedAgent, TrainConfig], tmp_path: Path, change: dict[str, Any], fits: bool
 ) -> None:
-    files = c_files(exported, medium_agent.training)
-    about = exported.description.model_copy(update=change)
-    assert about != exported.description
-    other = c_files(replace(exported, description=about), medium_agent.training)
-    (tmp_path / "policy.h").write_text(other["policy.h"])
-    (tmp_path / "policy.c").write_text(files["policy.c"])
-    words = ["gcc", *FLAGS, "-fsyntax-only", "policy.c"]
-    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
+    exported, training = small
+    about = exported.description.model_copy(update={"provenance": {"command": ["first"]}})
+    files = c_files(replace(exported, description=about), training)
+    other = c_files(replace(exported, description=about.model_copy(update=change)), training)
+    assert other["policy.h"] != files["policy.h"]
+    done = checked({**files, "policy.h": other["policy.h"]}, tmp_path)
     assert (done.returncode == 0) == fits
     assert ("policy.h is of another export than policy.c" in done.stderr) != fits
 

@@ -1,7 +1,10 @@
-"""The part of perception that drives a cart: state, memory, observation and track guard, as graphs."""
+"""Parts of all exported code: templates, and the perception that drives a cart as graphs."""
 
+import re
+from collections.abc import Callable, Mapping
 from functools import partial
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -12,10 +15,31 @@ from cartpole_rl.envs.perception import FirstPercept, Percept, PlantOutput, Prev
 from cartpole_rl.envs.settings import TrackGuard
 from cartpole_rl.tasks.features import LENGTH_SCALE
 
+TEMPLATES = Path(__file__).parent / "templates"
 NUMBER = torch.zeros(1, 1)
 COUNT = torch.zeros(1, 1, dtype=torch.int64)
 COUNTS = torch.zeros(2, 1, dtype=torch.int64)
 FLAG = torch.zeros(1, 1, dtype=torch.bool)
+
+
+def filled(template: str, values: Mapping[str, object]) -> str:
+    """Return the content of a template with `values` in place of @@name@@."""
+    text = (TEMPLATES / template).read_text(encoding="utf-8")
+    return re.sub(r"@@(\w+)@@", lambda match: str(values[match[1]]), text)
+
+
+class Graph(NamedTuple):
+    """A traced function, and examples of its inputs by name."""
+
+    trace: Trace
+    inputs: Mapping[str, Tensor]
+
+    @classmethod
+    def of(cls, function: Callable[..., tuple[Tensor, ...]], *examples: Any) -> "Graph":
+        """Trace a `function` of named tuples of tensors."""
+        with torch.no_grad():
+            traced = trace(function, examples)
+        return cls(traced, {name: part for example in examples for name, part in example._asdict().items()})
 
 
 class First(NamedTuple):
@@ -47,19 +71,14 @@ class DrivingPercept(NamedTuple):
     observation: Tensor  # [size, 1]
     guard: Tensor  # [1, 1] int64, direction of the track guard's motor value
 
-
-class PerceptionGraphs(NamedTuple):
-    """Both graphs, and examples of their inputs."""
-
-    first: Trace
-    first_inputs: First
-    later: Trace
-    later_inputs: Later
+    @classmethod
+    def of(cls, percept: FirstPercept[Tensor] | Percept[Tensor]) -> "DrivingPercept":
+        """Return the part of a percept that drives a cart."""
+        return cls(percept.state, percept.past, percept.observation, percept.guard)
 
 
-@torch.no_grad()
-def perception_graphs(settings: CartPoleSettings, guard: TrackGuard | None) -> PerceptionGraphs:
-    """Return the graphs of perception under `settings` with the track guard `guard`."""
+def perception(settings: CartPoleSettings, guard: TrackGuard | None) -> tuple[Graph, Graph]:
+    """Return the perception of a first and of a later period, with the track guard `guard`."""
     observation = settings.observation
     perceive_start = partial(perceive_first, settings=observation, guard=guard)
     perceive_next = partial(
@@ -70,19 +89,13 @@ def perception_graphs(settings: CartPoleSettings, guard: TrackGuard | None) -> P
         return length[: int(observation.pole_length)] / LENGTH_SCALE
 
     def start(first: First) -> DrivingPercept:
-        return driving_percept(perceive_start(first.counts, scaled(first.pole_length), first.track_end))
+        return DrivingPercept.of(perceive_start(first.counts, scaled(first.pole_length), first.track_end))
 
     def advance(later: Later) -> DrivingPercept:
         remembered = later.last_counts, later.state, later.past, COUNT, later.motor
         previous = Previous(*remembered, scaled(later.pole_length), later.track_end)
-        return driving_percept(perceive_next(previous, PlantOutput(later.counts, later.dt, FLAG, FLAG)))
+        return DrivingPercept.of(perceive_next(previous, PlantOutput(later.counts, later.dt, FLAG, FLAG)))
 
     past = NUMBER.repeat(observation.past_size, 1)
-    first = First(COUNTS, NUMBER, NUMBER)
     later = Later(COUNTS, NUMBER, COUNTS, NUMBER.repeat(4, 1), past, COUNT, NUMBER, NUMBER)
-    return PerceptionGraphs(trace(start, (first,)), first, trace(advance, (later,)), later)
-
-
-def driving_percept(percept: FirstPercept[Tensor] | Percept[Tensor]) -> DrivingPercept:
-    """Return the results that drive a cart."""
-    return DrivingPercept(percept.state, percept.past, percept.observation, percept.guard)
+    return Graph.of(start, First(COUNTS, NUMBER, NUMBER)), Graph.of(advance, later)
