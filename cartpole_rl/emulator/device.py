@@ -1,15 +1,17 @@
 """The emulated cart as a whole: firmware, physics, encoders and a person's hand, period by period."""
 
+import json
 import math
 import random
-from typing import Literal
+from pathlib import Path
+from typing import Any, Literal
 
 from cartpole_rl.emulator.c_firmware import CFirmware
-from cartpole_rl.emulator.encoders import CART_METRES, POLE_RADIANS
 from cartpole_rl.emulator.firmware import BANNER, Firmware
-from cartpole_rl.emulator.journal import Journal
 from cartpole_rl.emulator.physics import CartPhysics
 from cartpole_rl.emulator.settings import EmulatorSettings
+from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
+from cartpole_rl.wire import Message
 
 BOOT_HANGING = 0.3  # largest distance from the middle with boot=hanging, share of the half length
 BOOT_ANYWHERE = 0.99  # the same with boot=anywhere
@@ -138,7 +140,7 @@ class CartDevice:
     def _new_firmware(self) -> Firmware | CFirmware:
         """Return the firmware that the settings choose, just booted."""
         cart = self._settings
-        zero_error = round(cart.angle_offset / POLE_RADIANS)
+        zero_error = round(cart.angle_offset / POLE_RADIANS_PER_COUNT)
         lever_um = round(1e6 * cart.pole_mass * cart.pole_com / (cart.cart_mass + cart.pole_mass))
         if cart.firmware == "c":
             return CFirmware(self._latency_us, zero_error, lever_um, cart.policy, 2 * cart.pole_com)
@@ -164,8 +166,8 @@ class CartDevice:
         The position of the pole's disc includes the fraction of `angle_offset` that is below a count; the
         firmware's zero, a whole number, includes the rest.
         """
-        cart = math.floor(self.physics.x / CART_METRES)
-        pole = math.floor((self.physics.angle + self._settings.angle_offset) / POLE_RADIANS + 0.5)
+        cart = math.floor(self.physics.x / CART_METRES_PER_COUNT)
+        pole = math.floor((self.physics.angle + self._settings.angle_offset) / POLE_RADIANS_PER_COUNT + 0.5)
         return cart, pole
 
     def _latency_us(self) -> int:
@@ -197,6 +199,37 @@ class CartDevice:
             if firmware.homing:
                 self.physics.place_pole(nearest_upright(self.physics.angle) + math.pi)
             self._held = None
+
+
+class Journal:
+    """The cart's own record: commands carried out, motor values in force, end stops touched.
+
+    One JSON line for each event, with `us` in microseconds since the emulator's start:
+    {"us": 40210, "took": "SET_MOTOR", "motor": -200, "tick": 2}; {"us": 43310, "in_force": -200};
+    {"us": 61310, "touched": 0.08}, in m/s.
+    Events are written at once, to a new file. Raises FileExistsError: it overwrites no file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("x", buffering=1, encoding="utf-8")
+        self._motor = 0
+
+    def took(self, us: int, message: Message) -> None:
+        """Record a command that the cart carried out."""
+        self._write(us, took=message.TYPE.name, **vars(message))
+
+    def touched(self, us: int, speed: float) -> None:
+        """Record that the cart has touched an end stop at `speed` m/s."""
+        self._write(us, touched=round(speed, 4))
+
+    def in_force(self, us: int, motor: int) -> None:
+        """Record the motor value in force if it has changed."""
+        if motor != self._motor:
+            self._motor = motor
+            self._write(us, in_force=motor)
+
+    def _write(self, us: int, **event: Any) -> None:
+        self._file.write(json.dumps({"us": us, **event}) + "\n")
 
 
 def nearest_upright(angle: float) -> float:

@@ -7,22 +7,25 @@ disarms it. ``docs/protocol.md`` has the rules. All times are whole microseconds
 since boot.
 """
 
+from collections import deque
 from collections.abc import Callable, Generator
 
-from cartpole_rl.emulator.encoders import CART_METRES, POLE_COUNTS, SPAN
 from cartpole_rl.emulator.guards import (
     FASTEST_CART,
     FASTEST_POLE,
+    HARD_LIMIT,
+    LEVER,
+    SOFT_LIMIT,
     FrozenCartWatch,
     FrozenPoleWatch,
     JumpWatch,
     StallWatch,
+    TrackLimits,
 )
 from cartpole_rl.emulator.homing import HomingError, Reading, Zeros, home
-from cartpole_rl.emulator.limits import HARD_LIMIT, LEVER, SOFT_LIMIT, TrackLimits
-from cartpole_rl.emulator.motor_line import MotorLine
 from cartpole_rl.emulator.settings import LARGEST_MOTOR
 from cartpole_rl.errors import FrameError
+from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_COUNTS_PER_TURN, SPAN
 from cartpole_rl.wire.frames import VERSION, Envelope, encode_frame, open_envelope
 from cartpole_rl.wire.messages import (
     FROM_CART,
@@ -59,7 +62,49 @@ LEASE_US = 500_000  # without an accepted frame, after which homing ends
 NO_AGE = 65535
 U32 = 0xFFFFFFFF
 UNDERSTOOD = {kind for kind in MESSAGES if not kind & FROM_CART} - {StartPolicy.TYPE}  # it has no policy
-NOMINAL_HALF_SPAN = round(SPAN / 2 / CART_METRES)
+MOST_PENDING = 1024  # the line's memory is bounded, as a board's is
+NOMINAL_HALF_SPAN = round(SPAN / 2 / CART_METRES_PER_COUNT)
+
+
+class MotorLine:
+    """The requested motor value and the pending ones, each due one latency after its arrival.
+
+    No command overtakes another.
+    """
+
+    def __init__(self) -> None:
+        self.requested = 0
+        self._pending: deque[tuple[int, int]] = deque()  # (due, value)
+
+    def command(self, due_us: int, value: int) -> None:
+        """Bring a value into force at `due_us`, or together with an earlier command that is due later.
+
+        If no more commands can wait, the value replaces the newest one.
+        """
+        newest = self._pending[-1][0] if self._pending else 0
+        if len(self._pending) == MOST_PENDING:
+            self._pending.pop()
+        self._pending.append((max(due_us, newest), value))
+
+    def stop(self, now_us: int) -> None:
+        """Bring 0 into force at `now_us` and discard values that are due later."""
+        while self._pending and self._pending[-1][0] > now_us:
+            self._pending.pop()
+        self.command(now_us, 0)
+
+    def hold(self, value: int) -> None:
+        """Put a value into force at once and discard all pending ones."""
+        self._pending.clear()
+        self.requested = value
+
+    def drive(self, now_us: int) -> None:
+        """Bring the values that are due into force."""
+        while self._pending and self._pending[0][0] <= now_us:
+            _, self.requested = self._pending.popleft()
+
+    def next_due(self, before_us: int) -> int:
+        """Return when the next value is due, `before_us` if none is due before that."""
+        return min(before_us, self._pending[0][0]) if self._pending else before_us
 
 
 class Firmware:
@@ -258,7 +303,7 @@ class Firmware:
             self._line.hold(homing.send(reading))
         except StopIteration as end:
             self._zeros = end.value
-            self._pole_zero = end.value.hanging - POLE_COUNTS // 2 - self._zero_error
+            self._pole_zero = end.value.hanging - POLE_COUNTS_PER_TURN // 2 - self._zero_error
             self.homed, self._homing = True, None
             self._line.hold(0)
         except HomingError:
@@ -300,8 +345,8 @@ class Firmware:
         half_span = self._zeros.half_span
         return Info(
             *FIRMWARE,
-            POLE_COUNTS,
-            round(CART_METRES * 1e9),
+            POLE_COUNTS_PER_TURN,
+            round(CART_METRES_PER_COUNT * 1e9),
             LARGEST_MOTOR,
             half_span - SOFT_LIMIT,
             half_span - HARD_LIMIT,

@@ -1,17 +1,48 @@
-"""Fault detection while the motor may move: a stalled cart and implausible encoders.
+"""The rules that stop a cart: faults while the motor may move, and the limits of the track.
 
-All numbers are whole, so that ``firmware/src/cart_guards.c`` decides the same. Periods are in microseconds.
+Faults are a stalled cart and implausible encoders, looked for at the end of each period. The limits know the
+cart's position and speed; they are looked at once a millisecond.
+
+Beyond the soft limit an outward motor value gives 0. A cart that runs outward too fast to stop before its
+hard limit is braked with full motor inward:
+
+    left - shake < speed * (lag + reaction) + speed^2 / (2 * BRAKING)
+
+`left` is the way to the hard limit and `lag` the age of the measured speed. A fast pole shakes the cart
+harder than the motor can hold it, by up to `lever` to each side of the common centre of mass. The speed of
+that centre counts here if it is higher than the cart's. `shake` is twice the lever for a pole that turns 1.6
+times a second or faster.
+
+The brake acts while the cart is armed and after that until it has come to rest: a cart that STOP, the
+watchdog or a fault leaves at speed would roll into an end stop. It never pushes a cart that stands or moves
+inward.
+
+A frozen encoder shows a cart that stands. While the count does not change, the cart's motion is estimated
+from its last speed and, while the pole is slow, from hard pushes. After 20 mm of it the cart is `lost`: its
+encoder is frozen, or something holds it. A lost cart is braked for the time that its estimated speed needs,
+or until its count changes. Friction can hold a cart against weaker pushes: they tell nothing.
+
+All numbers but one are whole, so that ``firmware/src/cart_guards.c`` and ``cart_limits.c`` decide the same.
+Periods are in microseconds.
 """
 
-from cartpole_rl.emulator.encoders import CART_METRES, CART_NANOMETRES, POLE_COUNTS
+import math
+from collections import deque
+
+from cartpole_rl.rig.hardware import (
+    CART_METRES_PER_COUNT,
+    CART_NANOMETRES_PER_COUNT,
+    POLE_COUNTS_PER_TURN,
+    POLE_RADIANS_PER_COUNT,
+)
 
 HARD_PUSH = 200  # smallest motor value that moves any healthy cart
 STALL_US = 500_000
-STALL_COUNTS = round(0.001 / CART_METRES)
+STALL_COUNTS = round(0.001 / CART_METRES_PER_COUNT)
 PUSH_US = 100_000  # of such pushes one way, after which the count must have changed
 SPEED_CHANGE = 200_000  # um/s; 0.2 m/s turn any pole by several counts
-FASTEST_CART = 5_000_000_000 // CART_NANOMETRES  # counts/s; 5 m/s: over twice what the motor can reach here
-FASTEST_POLE = 16 * POLE_COUNTS  # counts/s; 16 turns a second is five times a fast swing
+FASTEST_CART = 5_000_000_000 // CART_NANOMETRES_PER_COUNT  # counts/s; 5 m/s: over twice the motor's reach
+FASTEST_POLE = 16 * POLE_COUNTS_PER_TURN  # counts/s; 16 turns a second is five times a fast swing
 
 
 class StallWatch:
@@ -93,7 +124,7 @@ class FrozenPoleWatch:
         last, self._cart = self._cart, cart
         if last is None:
             return False
-        speed = (cart - last) * CART_NANOMETRES * 1000 // us
+        speed = (cart - last) * CART_NANOMETRES_PER_COUNT * 1000 // us
         if pole != self._pole:
             self._pole, self._lowest, self._highest = pole, speed, speed
             self._rise = self._fall = 0
@@ -101,3 +132,130 @@ class FrozenPoleWatch:
         self._rise = max(self._rise, speed - self._lowest)
         self._fall = max(self._fall, self._highest - speed)
         return min(self._rise, self._fall) >= SPEED_CHANGE
+
+
+SOFT_LIMIT = round(0.027 / CART_METRES_PER_COUNT)  # counts inside a stop
+HARD_LIMIT = round(0.008 / CART_METRES_PER_COUNT)  # counts inside a stop
+
+SAMPLE_US = 1000  # between two samples of the position
+SAMPLES = 9  # whose first and last give the speed
+BRAKING = 2_500_000  # um/s^2: full motor inward slows any healthy cart at least so hard
+REACTION_US = 10_000  # until the motor's force has changed its sign
+RELEASE_US = 10_000  # the brake is released this much later than it would be applied: it does not rattle
+REST = 10_000  # um/s; slower outward motion is not braked
+FASTEST = 10_000_000  # um/s; a higher speed counts as this one
+FAST_POLE = POLE_COUNTS_PER_TURN * 16 // 10  # counts/s; a higher speed shakes the cart no further
+LEVER = 27_000  # um, of the medium pole on a bare cart: m_p l / (m_c + m_p)
+LONGEST_ROLLING_US = 3_000_000  # after the cart was armed
+SLOW_POLE = POLE_COUNTS_PER_TURN * 6 // 10  # counts/s; a faster pole may hold the cart against its motor
+PUSHED = 5_000_000  # um/s^2: a hard push speeds a common cart up so hard
+SLOWED_US = 100_000  # time constant of the estimated speed without a hard push
+LOST_NM = 20_000_000  # estimated motion without a change of the count
+FASTEST_LOST = 2_500_000  # um/s; a higher estimate comes from a count that jumped
+
+
+class TrackLimits:
+    """The limits of one cart. `blocked` and `brake` are directions: 1 right, -1 left, 0 none."""
+
+    def __init__(self, lever: int = LEVER) -> None:
+        """`lever` is m_p l / (m_c + m_p) in um, with l from the pivot to the pole's centre of mass."""
+        self.blocked = 0  # direction in which motor values are held at 0
+        self.brake = 0  # direction of the full motor value that brakes the cart
+        self._lever = lever
+        self._us: deque[int] = deque(maxlen=SAMPLES)
+        self._carts: deque[int] = deque(maxlen=SAMPLES)
+        self._poles: deque[int] = deque(maxlen=SAMPLES)
+        self._until_us = 0  # the brake acts until then
+        self._blind_us = 0  # the brake of a lost cart acts until then
+        self._count: int | None = None  # of the cart, since which its motion is estimated
+        self._looked_us = 0
+        self._speed_um = self._way_nm = 0  # estimated speed, um/s, and motion since the count changed
+
+    def sample(self, now_us: int, cart: int, pole: int) -> None:
+        """Take a sample of the raw counts, unless the newest is younger than `SAMPLE_US`."""
+        if not self._us or now_us - self._us[-1] >= SAMPLE_US:
+            self._us.append(now_us)
+            self._carts.append(cart)
+            self._poles.append(pole)
+
+    def forget(self) -> None:
+        """Start the estimate anew: the cart is armed now."""
+        self._count = None
+
+    def lost(self, now_us: int, motor: int) -> bool:
+        """Return whether the cart's count stands still although the cart must have moved.
+
+        `motor` is the value in force since the last look.
+        """
+        us, self._looked_us = min(now_us - self._looked_us, SLOWED_US), now_us
+        if self._newest != self._count:
+            self._count = self._newest
+            self._speed_um, self._way_nm = max(-FASTEST, min(FASTEST, self._cart_speed())), 0
+            return False
+        if abs(motor) >= HARD_PUSH and abs(self._speed(self._poles)) < SLOW_POLE:
+            self._speed_um += (PUSHED if motor > 0 else -PUSHED) * us // 1_000_000
+        elif abs(self._speed_um) < REST:
+            self._speed_um = 0
+        else:
+            self._speed_um -= self._speed_um * us // SLOWED_US
+        self._way_nm += self._speed_um * us // 1000
+        return abs(self._way_nm) >= LOST_NM
+
+    def brake_blindly(self, now_us: int) -> None:
+        """Brake a lost cart by its estimated speed, for 0.5 s at most. All limits were released before."""
+        if abs(self._speed_um) <= FASTEST_LOST:
+            self._blind_us = now_us + abs(self._speed_um) * 1_000_000 // PUSHED
+            self.brake = -1 if self._speed_um > 0 else 1
+
+    def apply(self, now_us: int, outward: int, pole: int, half_span: int, armed: bool) -> None:
+        """Decide for a cart `outward` counts right of the middle and a pole `pole` counts from upright.
+
+        The stops are `half_span` counts from the middle.
+        """
+        if now_us < self._blind_us and self._newest == self._count:
+            return
+        self._blind_us = 0
+        speed = self._cart_speed()
+        if armed:
+            self._until_us = now_us + LONGEST_ROLLING_US
+        elif abs(speed) < REST:
+            self._until_us = 0
+        self.blocked = 0
+        if armed and abs(outward) >= half_span - SOFT_LIMIT:
+            self.blocked = 1 if outward > 0 else -1
+        self.brake = self._brake(speed, outward, pole, half_span) if now_us < self._until_us else 0
+
+    def release(self) -> None:
+        """End all limits: the cart homes, or its count is not to be trusted."""
+        self.blocked = self.brake = self._until_us = self._blind_us = 0
+
+    def _brake(self, speed: int, outward: int, pole: int, half_span: int) -> int:
+        if abs(speed) < REST:
+            return 0
+        direction = 1 if speed > 0 else -1
+        turning = max(-FAST_POLE, min(FAST_POLE, self._speed(self._poles)))  # counts/s
+        swing = int(
+            self._lever * (turning * POLE_RADIANS_PER_COUNT) * math.cos(pole * POLE_RADIANS_PER_COUNT)
+        )  # um/s
+        size = min(FASTEST, max(abs(speed), direction * (speed + swing)))
+        left = (half_span - HARD_LIMIT - direction * outward) * CART_NANOMETRES_PER_COUNT // 1000  # um
+        shake = 2 * self._lever * turning * turning // (FAST_POLE * FAST_POLE)
+        lag_us = (self._us[-1] - self._us[0]) // 2 + REACTION_US
+        if self.brake == -direction:
+            lag_us += RELEASE_US
+        needed = size * lag_us // 1_000_000 + size * size // (2 * BRAKING)
+        return -direction if left - shake < needed else 0
+
+    @property
+    def _newest(self) -> int:
+        return self._carts[-1] if self._carts else 0
+
+    def _cart_speed(self) -> int:
+        """Return the cart's speed in um/s, rounded down."""
+        return self._speed(self._carts) * CART_NANOMETRES_PER_COUNT // 1000
+
+    def _speed(self, counts: deque[int]) -> int:
+        """Return the speed over the samples, in counts/s, rounded down."""
+        if len(counts) < 2:
+            return 0
+        return (counts[-1] - counts[0]) * 1_000_000 // (self._us[-1] - self._us[0])

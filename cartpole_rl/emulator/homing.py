@@ -1,10 +1,11 @@
 """Homing: touch both stops, check the span, centre the cart, wait until the pole hangs still.
 
-Homing works on raw encoder counts, one reading per tick, and needs only rough numbers of the cart. Distances
-and times are whole numbers of counts, nanometres and microseconds; ``servo.py`` computes in SI units. A
-procedure is a generator: it receives a `Reading`, yields the motor value until the next one, and returns
-its result. The pole's zero is the middle of its last small swing. Waiting for a complete stop would not be
-more accurate: friction in the bearing holds a stopped pole up to a count off the vertical.
+Homing works on raw encoder counts, one reading per tick, and needs only rough numbers of the cart (nominal
+motor curve, mass and friction), as firmware does. Distances and times are whole numbers of counts, nanometres
+and microseconds; the speed servo and the brake compute in SI units, positive to the right. A procedure is a
+generator: it receives a `Reading`, yields the motor value until the next one, and returns its result. The
+pole's zero is the middle of its last small swing. Waiting for a complete stop would not be more accurate:
+friction in the bearing holds a stopped pole up to a count off the vertical.
 """
 
 import math
@@ -12,11 +13,16 @@ from collections import deque
 from collections.abc import Generator
 from dataclasses import dataclass
 
-from cartpole_rl.emulator.encoders import CART_METRES, CART_NANOMETRES, POLE_COUNTS, POLE_RADIANS, SPAN
-from cartpole_rl.emulator.servo import PUSH, SpeedServo, SwingBrake, rough_motor
 from cartpole_rl.errors import CartPoleError
+from cartpole_rl.rig.hardware import (
+    CART_METRES_PER_COUNT,
+    CART_NANOMETRES_PER_COUNT,
+    POLE_COUNTS_PER_TURN,
+    POLE_RADIANS_PER_COUNT,
+    SPAN,
+)
 
-QUARTER_TURN = POLE_COUNTS // 4
+QUARTER_TURN = POLE_COUNTS_PER_TURN // 4
 SPAN_NM = round(SPAN * 1e9)
 SPAN_TOLERANCE = SPAN_NM * 3 // 100  # nm
 
@@ -24,21 +30,29 @@ SEARCH_SPEED = 0.08  # m/s, towards a stop
 TRAVEL_SPEED = 0.2  # m/s, far from a stop whose position is known
 TOUCH_ZONE = 60_000_000  # nm, distance from such a stop at which the slow search begins
 ASTRAY = 20_000_000  # nm, a motion the wrong way that means a reversed motor or encoder
-FAST = POLE_COUNTS * 6 // 10  # counts/s of a pole that may move the cart against its motor: 3.8 rad/s
+FAST = POLE_COUNTS_PER_TURN * 6 // 10  # counts/s of a pole that may push a driven cart: 3.8 rad/s
 AGAINST_STOP = 400_000  # us under full push without motion that mean a stop
-STANDS = 300_000 // CART_NANOMETRES  # counts, largest motion in that time: 0.3 mm
+STANDS = 300_000 // CART_NANOMETRES_PER_COUNT  # counts, largest motion in that time: 0.3 mm
 LONGEST_SEARCH = 30_000_000  # us for one stop
 CENTRED = 1_000_000  # nm
 LONGEST_CENTRING = 20_000_000  # us
 
 WHOLE_SWING = 2_000_000  # us: one period of a rod of 1.5 m
-STILL = round(0.7 / 360 * POLE_COUNTS)  # counts peak to peak: 0.7 degrees
-BRAKED = round(2.6 / 360 * POLE_COUNTS)  # counts peak to peak; the brake cannot improve a smaller swing
+STILL = round(0.7 / 360 * POLE_COUNTS_PER_TURN)  # counts peak to peak: 0.7 degrees
+BRAKED = round(2.6 / 360 * POLE_COUNTS_PER_TURN)  # counts peak to peak; no brake improves a smaller swing
 LONGEST_BRAKING = 20_000_000  # us
 PATIENCE = 20_000_000  # us, after which NEARLY_STILL is sufficient, for a pole with hardly any friction
-NEARLY_STILL = round(3.5 / 360 * POLE_COUNTS)  # counts peak to peak
+NEARLY_STILL = round(3.5 / 360 * POLE_COUNTS_PER_TURN)  # counts peak to peak
 LONGEST_WAIT = 60_000_000  # us
 LONGEST_WINDOW = WHOLE_SWING // 5_000 + 1  # counts at the shortest period, plus one
+
+MASS = 0.85  # kg, cart and pole
+FRICTION = 0.5  # N
+PUSH = 3.0  # N, largest force of these motions
+NEGLIGIBLE = 0.02  # N, below which the motor stays off
+MOTOR_OFFSET = 50  # motor value at which the force starts
+MOTOR_PER_NEWTON = 50
+GENTLE = 0.2  # m/s^2, an acceleration that leaves the pole nearly still
 
 
 @dataclass(frozen=True)
@@ -76,6 +90,53 @@ class Zeros:
 
 class HomingError(CartPoleError):
     """A stop was not found, the span was wrong, or the pole did not come to rest."""
+
+
+def rough_motor(force: float) -> int:
+    """Return the motor value for a force in N, roughly: a line with an offset."""
+    if abs(force) < NEGLIGIBLE:
+        return 0
+    return int(math.copysign(MOTOR_OFFSET + MOTOR_PER_NEWTON * min(abs(force), PUSH), force))
+
+
+class SpeedServo:
+    """PI control of the cart's speed with rough friction compensation; the target changes gently."""
+
+    PROPORTIONAL = 12.0  # N s/m
+    INTEGRAL = 80.0  # N/m
+    TUNED_FOR = 0.02  # s, the period for these gains; a longer one needs smaller gains
+
+    def __init__(self) -> None:
+        self._reference = 0.0  # m/s, follows the target at GENTLE
+        self._integral = 0.0  # N
+
+    def motor(self, target: float, speed: float, seconds: float) -> int:
+        """Return the motor value for the next `seconds`; target and measured speed in m/s."""
+        change = GENTLE * seconds
+        self._reference += max(-change, min(change, target - self._reference))
+        error = self._reference - speed
+        share = min(1.0, self.TUNED_FOR / seconds)
+        integral = self._integral + share * self.INTEGRAL * error * seconds
+        self._integral = max(-PUSH, min(PUSH, integral))
+        ahead = math.copysign(FRICTION, self._reference) if self._reference else 0.0
+        return rough_motor(ahead + share * self.PROPORTIONAL * error + self._integral)
+
+
+class SwingBrake:
+    """Brakes the swing of a hanging pole: the cart follows the pole and is pulled back to the middle."""
+
+    FOLLOW = 0.9  # m/s^2 of the cart for 1 rad/s of the pole
+    RETURN = 3.0  # 1/s^2
+    DAMPING = 2.0  # 1/s
+    HARDEST = 2.5  # m/s^2
+    STANDS = 0.002  # m/s, a speed up to which the cart counts as standing
+
+    def motor(self, x: float, x_dot: float, swing: float, swing_dot: float) -> int:
+        """Return the motor value; x in m from the middle, swing in rad from hanging, signed as the angle."""
+        acceleration = -self.FOLLOW * swing_dot * math.cos(swing) - self.RETURN * x - self.DAMPING * x_dot
+        acceleration = max(-self.HARDEST, min(self.HARDEST, acceleration))
+        moving = x_dot if abs(x_dot) > self.STANDS else acceleration
+        return rough_motor(MASS * acceleration + math.copysign(FRICTION, moving))
 
 
 Procedure = Generator[int, Reading, Reading]
@@ -121,9 +182,9 @@ def home() -> Generator[int, Reading, Zeros]:
     reading = yield 0
     reading = yield from touch_stop(-1, None, reading)
     left = reading.cart
-    reading = yield from touch_stop(+1, left + round(SPAN / CART_METRES), reading)
+    reading = yield from touch_stop(+1, left + round(SPAN / CART_METRES_PER_COUNT), reading)
     right = reading.cart
-    span = (right - left) * CART_NANOMETRES
+    span = (right - left) * CART_NANOMETRES_PER_COUNT
     if abs(span - SPAN_NM) > SPAN_TOLERANCE:
         raise HomingError(f"the stops are {span / 1e9:.3f} m apart, not {SPAN} m")
     middle = (left + right) // 2
@@ -143,11 +204,13 @@ def touch_stop(direction: int, expected: int | None, reading: Reading) -> Proced
     servo, window, elapsed, before = SpeedServo(), Window(AGAINST_STOP), 0, reading
     start, rolled = reading.cart, 0.0
     while elapsed < LONGEST_SEARCH:
-        far = expected is not None and abs(expected - reading.cart) * CART_NANOMETRES > TOUCH_ZONE
-        speed = (reading.cart - before.cart) * CART_METRES / reading.seconds
+        far = expected is not None and abs(expected - reading.cart) * CART_NANOMETRES_PER_COUNT > TOUCH_ZONE
+        speed = (reading.cart - before.cart) * CART_METRES_PER_COUNT / reading.seconds
         if elapsed <= reading.us or pole_speed(before, reading) > FAST:  # two readings give the first speed
             start, rolled = reading.cart, -direction * speed
-        if (start - reading.cart) * direction * CART_NANOMETRES > ASTRAY and -direction * speed > rolled:
+        if (
+            start - reading.cart
+        ) * direction * CART_NANOMETRES_PER_COUNT > ASTRAY and -direction * speed > rolled:
             raise HomingError("the cart moves the wrong way: its motor or its encoder is reversed")
         before = reading
         window.add(reading.cart, reading.us)
@@ -164,15 +227,15 @@ def centre(middle: int, reading: Reading) -> Procedure:
     servo, elapsed, before, start = SpeedServo(), 0, reading, reading.cart
     while elapsed < LONGEST_CENTRING:
         away = middle - reading.cart
-        if abs(away) * CART_NANOMETRES < CENTRED:
+        if abs(away) * CART_NANOMETRES_PER_COUNT < CENTRED:
             return reading
         if pole_speed(before, reading) > FAST:
             start = reading.cart
-        if (abs(away) - abs(middle - start)) * CART_NANOMETRES > ASTRAY:
+        if (abs(away) - abs(middle - start)) * CART_NANOMETRES_PER_COUNT > ASTRAY:
             raise HomingError("the cart moves away from the middle")
-        speed_here = away * CART_METRES  # m/s: it slows down over the last second
+        speed_here = away * CART_METRES_PER_COUNT  # m/s: it slows down over the last second
         target = max(-TRAVEL_SPEED, min(TRAVEL_SPEED, speed_here))
-        speed = (reading.cart - before.cart) * CART_METRES / reading.seconds
+        speed = (reading.cart - before.cart) * CART_METRES_PER_COUNT / reading.seconds
         before = reading
         reading = yield servo.motor(target, speed, reading.seconds)
         elapsed += reading.us
@@ -189,10 +252,10 @@ def brake_swing(middle: int, hanging: int, reading: Reading) -> Procedure:
         if window.spread < QUARTER_TURN:  # the middle of such a small swing is the hanging pole
             hanging = window.centre
         motor = brake.motor(
-            (reading.cart - middle) * CART_METRES,
-            (reading.cart - before.cart) * CART_METRES / reading.seconds,
-            (reading.pole - hanging) * POLE_RADIANS,
-            (reading.pole - before.pole) * POLE_RADIANS / reading.seconds,
+            (reading.cart - middle) * CART_METRES_PER_COUNT,
+            (reading.cart - before.cart) * CART_METRES_PER_COUNT / reading.seconds,
+            (reading.pole - hanging) * POLE_RADIANS_PER_COUNT,
+            (reading.pole - before.pole) * POLE_RADIANS_PER_COUNT / reading.seconds,
         )
         before = reading
         reading = yield motor

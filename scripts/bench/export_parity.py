@@ -34,7 +34,7 @@ from common import option_parser, positive_int, print_table, write_json
 from tensordict import TensorDictBase
 from truths import REPORTED, draw_truths
 
-from cartpole_rl.emulator.c_library import firmware_folder
+from cartpole_rl.emulator.c_firmware import firmware_folder
 from cartpole_rl.envs.build import simulated_env
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.evaluation.episodes import Policy, prepared, run_batch, warm_up

@@ -11,11 +11,11 @@ from collections.abc import Mapping
 import numpy as np
 
 from cartpole_rl.choices import choice
-from cartpole_rl.emulator.encoders import CART_METRES
 from cartpole_rl.emulator.firmware import SOFT_LIMIT
 from cartpole_rl.emulator.physics import AT_REST
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.physics.parameters import CartParameters
+from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT
 
 COMPARED = 0  # seed of the carts on which settings are compared
 REPORTED = 2026  # seed of the carts that are reported; no setting was chosen on them
@@ -91,7 +91,7 @@ def simulated_cart(truth: Mapping[str, object]) -> dict[str, float]:
         "cart_coulomb": (left + right) / 2,
         "cart_coulomb_asymmetry": (right - left) / (right + left),
         "stribeck_velocity": AT_REST,
-        "track_half_length": settings["track_half_length"] - SOFT_LIMIT * CART_METRES,
+        "track_half_length": settings["track_half_length"] - SOFT_LIMIT * CART_METRES_PER_COUNT,
         "force_quadratic": a,
         "force_linear": b,
         "force_offset": c,

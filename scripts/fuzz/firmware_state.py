@@ -5,7 +5,7 @@ from types import GeneratorType
 from typing import Any
 
 from cartpole_rl.emulator.firmware import Firmware
-from cartpole_rl.emulator.limits import SAMPLES
+from cartpole_rl.emulator.guards import SAMPLES
 
 STAGES = {"find_hanging": 3, "brake_swing": 4, "wait_until_still": 6}  # of homing; see stage_of
 

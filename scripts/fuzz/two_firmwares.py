@@ -25,7 +25,7 @@ from firmware_state import state_of
 from toy_cart import ToyCart
 from wire import FROM_HOST, damaged, frames_of, noise
 
-from cartpole_rl.emulator import c_library
+from cartpole_rl.emulator import c_firmware
 from cartpole_rl.emulator.c_firmware import CFirmware
 from cartpole_rl.emulator.firmware import Firmware
 from cartpole_rl.wire import (
@@ -70,7 +70,7 @@ class Pair:
         self.python = Firmware(lambda: delay(0))
         self.c = CFirmware(lambda: delay(1))
         self._splitter = FrameSplitter()
-        self._library = c_library.load_library()
+        self._library = c_firmware.load_library()
         self._c_splitter = ctypes.create_string_buffer(SPLITTER_BYTES)
         self._runs = ctypes.create_string_buffer(2 * LONGEST_INPUT + 65)
         self._last = b""
@@ -258,7 +258,7 @@ def run(total_bytes: int, total_frames: int, seed: int) -> Counter[str]:
 
 def restart_with_sanitizers() -> int:
     """Run this script again with the address sanitizer loaded before Python; return its exit status."""
-    compiler = c_library.find_compiler()
+    compiler = c_firmware.find_compiler()
     found = subprocess.run([compiler, "-print-file-name=libasan.so"], capture_output=True, text=True)
     if not Path(found.stdout.strip()).is_absolute():
         sys.exit(f"{compiler} has no libasan.so, which the address sanitizer needs; add --plain")
@@ -284,7 +284,7 @@ def main() -> int:
     if not options.plain:
         if "libasan" not in os.environ.get("LD_PRELOAD", ""):
             return restart_with_sanitizers()
-        c_library.FLAGS = (*c_library.FLAGS, *SANITIZERS)
+        c_firmware.FLAGS = (*c_firmware.FLAGS, *SANITIZERS)
     started = time.perf_counter()
     try:
         counts = run(options.bytes, options.frames, options.seed)

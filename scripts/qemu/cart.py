@@ -29,9 +29,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from cartpole_rl.emulator.encoders import CART_METRES, POLE_RADIANS
 from cartpole_rl.emulator.physics import CartPhysics
 from cartpole_rl.emulator.settings import EmulatorSettings
+from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 
 FIRMWARE = Path(__file__).parents[2] / "firmware"
 PROGRAMS = ("qemu-system-arm", "arm-none-eabi-gcc", "make")
@@ -78,8 +78,8 @@ class Pins:
 
     def _discs(self) -> tuple[int, int]:
         """Return the counts of the encoder discs of cart and pole."""
-        pole = math.floor(self._physics.angle / POLE_RADIANS + 0.5)
-        return math.floor(self._physics.x / CART_METRES), pole
+        pole = math.floor(self._physics.angle / POLE_RADIANS_PER_COUNT + 0.5)
+        return math.floor(self._physics.x / CART_METRES_PER_COUNT), pole
 
 
 def build(folder: Path, policy: Path | None, pole_length: float) -> Path:

@@ -11,9 +11,16 @@ import pytest
 from command_line import in_process
 from firmwares import needs_compiler
 
-from cartpole_rl.emulator import c_library
-from cartpole_rl.emulator.c_firmware import SNAPSHOT_NUMBERS, CartHead, CFirmware
-from cartpole_rl.emulator.c_library import compile_c, find_compiler, firmware_folder, load_library
+from cartpole_rl.emulator import c_firmware
+from cartpole_rl.emulator.c_firmware import (
+    SNAPSHOT_NUMBERS,
+    CartHead,
+    CFirmware,
+    compile_c,
+    find_compiler,
+    firmware_folder,
+    load_library,
+)
 from cartpole_rl.errors import EmulatorError
 from cartpole_rl.wire import FrameSplitter, MessageType
 from cartpole_rl.wire.messages import MESSAGES
@@ -117,7 +124,7 @@ def test_a_file_compiles_without_a_warning_and_with_the_numbers_of_a_board(file,
 
 
 def test_the_library_compiles_without_a_warning(tmp_path):
-    compile_c(tmp_path / "library.so", c_library.sources(), "-shared", "-fPIC", *STRICT[1:])
+    compile_c(tmp_path / "library.so", c_firmware.sources(), "-shared", "-fPIC", *STRICT[1:])
 
 
 def test_an_evaluation_sends_and_receives_the_same_with_both(tmp_path):
@@ -161,9 +168,9 @@ def test_code_that_does_not_compile_is_an_error(tmp_path):
 
 def test_a_library_is_built_once_and_again_for_other_sources(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    first = c_library.build_library()
+    first = c_firmware.build_library()
     written = first.stat().st_mtime_ns
-    assert c_library.build_library() == first
+    assert c_firmware.build_library() == first
     assert first.stat().st_mtime_ns == written
-    monkeypatch.setattr(c_library, "CART", (*c_library.CART, "-DCART_OTHER=1"))
-    assert c_library.build_library() != first
+    monkeypatch.setattr(c_firmware, "CART", (*c_firmware.CART, "-DCART_OTHER=1"))
+    assert c_firmware.build_library() != first

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from firmwares import needs_compiler
 
-from cartpole_rl.emulator.c_library import compile_c, firmware_folder
+from cartpole_rl.emulator.c_firmware import compile_c, firmware_folder
 from cartpole_rl.wire import FrameSplitter, Hello, Message, StartPolicy, State, decode_frame, encode_frame
 
 pytestmark = needs_compiler

@@ -14,10 +14,10 @@ from firmwares import answering
 
 from cartpole_rl.choices import choice
 from cartpole_rl.emulator.device import CartDevice
-from cartpole_rl.emulator.encoders import CART_METRES
-from cartpole_rl.emulator.limits import SOFT_LIMIT
-from cartpole_rl.emulator.motor import Motor
+from cartpole_rl.emulator.guards import SOFT_LIMIT
+from cartpole_rl.emulator.physics import Motor
 from cartpole_rl.emulator.settings import EmulatorSettings
+from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT
 from cartpole_rl.wire import Flags, Hello, Home, Message, SetMotor, Start, State, decode_frame, encode_frame
 
 PAGE = (Path(__file__).parents[2] / "docs" / "emulator.md").read_text(encoding="utf-8")
@@ -25,7 +25,7 @@ LEVELS = choice("actions/nine_levels")["motors"]
 CART = {**choice("cart/ip02"), **choice("pole/medium")["choices"]["medium"]}
 CURVE = (CART["force_quadratic"], CART["force_linear"], CART["force_offset"])
 OTHERWISE = {  # numbers that conf/ has under another name or does not have
-    "track_half_length": CART["track_half_length"] + SOFT_LIMIT * CART_METRES,
+    "track_half_length": CART["track_half_length"] + SOFT_LIMIT * CART_METRES_PER_COUNT,
     "cart_coulomb_left": CART["cart_coulomb"] * (1 - CART["cart_coulomb_asymmetry"]),
     "cart_coulomb_right": CART["cart_coulomb"] * (1 + CART["cart_coulomb_asymmetry"]),
     "force_curve": CURVE,

@@ -10,8 +10,8 @@ from driven_cart import COARSE, OTHER_PHYSICS, Driven, check_homed
 from firmwares import truth
 
 from cartpole_rl.emulator.device import CartDevice
-from cartpole_rl.emulator.encoders import CART_METRES, POLE_RADIANS
 from cartpole_rl.emulator.settings import EmulatorSettings
+from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 from cartpole_rl.wire import (
     ClearFault,
     Fault,
@@ -85,8 +85,8 @@ def test_a_track_of_the_wrong_length_is_a_fault(half_length):
 def test_limits_count_from_the_stops_that_were_found():
     driven = Driven(track_half_length=0.4)
     driven.home()
-    assert driven.info().soft_limit_counts * CART_METRES == pytest.approx(0.4 - 0.027, abs=1e-4)
-    assert driven.info().hard_limit_counts * CART_METRES == pytest.approx(0.4 - 0.008, abs=1e-4)
+    assert driven.info().soft_limit_counts * CART_METRES_PER_COUNT == pytest.approx(0.4 - 0.027, abs=1e-4)
+    assert driven.info().hard_limit_counts * CART_METRES_PER_COUNT == pytest.approx(0.4 - 0.008, abs=1e-4)
 
 
 def test_before_the_first_homing_the_limits_are_nominal():
@@ -105,12 +105,12 @@ def test_limits_and_zeros_last_until_another_homing_succeeds_or_the_cart_restart
     found, state = driven.limits(), driven.ask(Home())
     while driven.flags & Flags.HOMING:
         if driven.cart.now_us < 28e6:
-            assert driven.measured(state)[0] == pytest.approx(driven.x, abs=2 * CART_METRES)
+            assert driven.measured(state)[0] == pytest.approx(driven.x, abs=2 * CART_METRES_PER_COUNT)
         assert driven.limits() == found
         state = driven.tick()
     assert state.fault == Fault.HOMING
     off = driven.measured(state)[1] - driven.angle - driven.settings.angle_offset
-    assert math.remainder(off, 2 * math.pi) == pytest.approx(0, abs=2 * POLE_RADIANS)
+    assert math.remainder(off, 2 * math.pi) == pytest.approx(0, abs=2 * POLE_RADIANS_PER_COUNT)
     assert driven.limits() == found
     while driven.cart.now_us <= 100e6:
         driven.tick()
@@ -140,8 +140,10 @@ def test_counts_follow_the_true_state():
     for tick in range(200):
         state = driven.ask(SetMotor(200 if tick // 10 % 2 else -200))
         x, angle = driven.measured(state)
-        assert x == pytest.approx(driven.x, abs=2 * CART_METRES)
-        assert angle - driven.angle - driven.settings.angle_offset == pytest.approx(0, abs=2 * POLE_RADIANS)
+        assert x == pytest.approx(driven.x, abs=2 * CART_METRES_PER_COUNT)
+        assert angle - driven.angle - driven.settings.angle_offset == pytest.approx(
+            0, abs=2 * POLE_RADIANS_PER_COUNT
+        )
 
 
 def test_motor_and_angle_are_positive_to_the_right():
@@ -186,11 +188,11 @@ def test_a_hand_holds_the_pole_up_until_the_cart_is_armed():
     driven.home()
     held = [driven.ask(Hello()) for _ in range(3)]
     assert len({state.pole_counts for state in held}) == 1
-    assert abs(held[0].pole_counts * POLE_RADIANS) <= 0.03 + POLE_RADIANS
+    assert abs(held[0].pole_counts * POLE_RADIANS_PER_COUNT) <= 0.03 + POLE_RADIANS_PER_COUNT
     driven.ask(Start())
     for _ in range(30):
         state = driven.ask(SetMotor(0))
-    assert abs(state.pole_counts * POLE_RADIANS) > 0.1 or held[0].pole_counts == 0
+    assert abs(state.pole_counts * POLE_RADIANS_PER_COUNT) > 0.1 or held[0].pole_counts == 0
 
 
 def test_a_hand_takes_the_pole_again_at_another_angle_and_releases_it_for_homing():
@@ -202,12 +204,12 @@ def test_a_hand_takes_the_pole_again_at_another_angle_and_releases_it_for_homing
         driven.ask(SetMotor(0))
     driven.ask(Stop())
     second = driven.ask(Hello())
-    assert abs(math.remainder(second.pole_counts * POLE_RADIANS, 2 * math.pi)) <= 0.03 + 0.006
+    assert abs(math.remainder(second.pole_counts * POLE_RADIANS_PER_COUNT, 2 * math.pi)) <= 0.03 + 0.006
     assert second.pole_counts != first.pole_counts
     state = driven.home()
     assert state.fault == 0
-    assert state.pole_counts == pytest.approx(2048 + 0.004 / POLE_RADIANS, abs=3)
-    assert abs(driven.ask(Hello()).pole_counts * POLE_RADIANS) <= 0.03 + 0.006
+    assert state.pole_counts == pytest.approx(2048 + 0.004 / POLE_RADIANS_PER_COUNT, abs=3)
+    assert abs(driven.ask(Hello()).pole_counts * POLE_RADIANS_PER_COUNT) <= 0.03 + 0.006
 
 
 def trace(**settings: object) -> bytes:

@@ -2,7 +2,7 @@
 
 import pytest
 
-from cartpole_rl.emulator.disturbance import Disturbance
+from cartpole_rl.emulator.link import Disturbance
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import FrameError
 from cartpole_rl.wire import SetMotor, decode_frame, encode_frame

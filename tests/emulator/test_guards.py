@@ -4,7 +4,6 @@ import math
 
 import pytest
 
-from cartpole_rl.emulator.encoders import CART_NANOMETRES
 from cartpole_rl.emulator.guards import (
     HARD_PUSH,
     PUSH_US,
@@ -16,6 +15,7 @@ from cartpole_rl.emulator.guards import (
     JumpWatch,
     StallWatch,
 )
+from cartpole_rl.rig.hardware import CART_NANOMETRES_PER_COUNT
 
 PERIOD = 62_500  # us
 
@@ -91,7 +91,7 @@ def pole_encoder_frozen(speeds: list[float], poles: list[int]) -> bool:
     watch, cart, answers = FrozenPoleWatch(), 0, [False]
     watch.frozen(poles[0], cart, PERIOD)
     for speed, pole in zip(speeds, poles, strict=True):
-        cart += math.ceil(speed * PERIOD / CART_NANOMETRES / 1000)
+        cart += math.ceil(speed * PERIOD / CART_NANOMETRES_PER_COUNT / 1000)
         answers.append(watch.frozen(pole, cart, PERIOD))
     return answers[-1]
 

@@ -11,7 +11,7 @@ pytest.importorskip("mujoco", reason='pip install "cartpole_rl[emulator]"')
 
 from driven_cart import Driven
 
-from cartpole_rl.emulator.encoders import CART_METRES
+from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT
 from cartpole_rl.wire import (
     ClearFault,
     Fault,
@@ -140,7 +140,7 @@ def test_a_limit_that_acts_is_reported():
         state = driven.ask(SetMotor(255))
         flags = driven.flags
     assert state.motor_applied in (0, -255)
-    assert state.cart_counts * CART_METRES < 0.375  # before the soft limit
+    assert state.cart_counts * CART_METRES_PER_COUNT < 0.375  # before the soft limit
 
 
 @pytest.mark.parametrize("frames", [0, 4])

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from cartpole_rl.emulator.motor import Motor
+from cartpole_rl.emulator.physics import Motor
 from cartpole_rl.emulator.settings import EmulatorSettings
 
 PLAIN_MOTOR = {

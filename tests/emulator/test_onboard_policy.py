@@ -8,8 +8,7 @@ import pytest
 from driven_cart import Driven
 from firmwares import answering, motors_over, needs_compiler
 
-from cartpole_rl.emulator.c_firmware import CFirmware
-from cartpole_rl.emulator.c_library import build_library, compile_c
+from cartpole_rl.emulator.c_firmware import CFirmware, build_library, compile_c
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import EmulatorError
 from cartpole_rl.wire import (

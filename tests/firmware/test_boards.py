@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from cartpole_rl.emulator.c_library import firmware_folder
+from cartpole_rl.emulator.c_firmware import firmware_folder
 
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Wpedantic", "-Werror")
 ARM = "arm-none-eabi-gcc"

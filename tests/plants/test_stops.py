@@ -38,13 +38,13 @@ import math, sys
 from pathlib import Path
 from cartpole_rl.emulator import firmware, process
 from cartpole_rl.emulator.device import CartDevice
-from cartpole_rl.emulator.encoders import CART_METRES, SPAN
+from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, SPAN
 from cartpole_rl.emulator.homing import Zeros
 from cartpole_rl.emulator.settings import EmulatorSettings
 
 def home_at_once():
     reading = yield 0
-    half = round(SPAN / 2 / CART_METRES)
+    half = round(SPAN / 2 / CART_METRES_PER_COUNT)
     return Zeros(reading.cart - half, reading.cart + half, reading.pole)
 
 class Centred(CartDevice):

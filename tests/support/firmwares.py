@@ -6,8 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from cartpole_rl.emulator.c_firmware import CFirmware
-from cartpole_rl.emulator.c_library import COMPILERS
+from cartpole_rl.emulator.c_firmware import COMPILERS, CFirmware
 from cartpole_rl.emulator.firmware import Firmware
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.wire import Message, SetMotor
