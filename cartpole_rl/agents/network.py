@@ -25,7 +25,7 @@ PlainLayer = tuple[NDArray[np.float32], ...]
 def q_network(
     settings: AgentSettings, mirror_signs: Sequence[int], actions: int, frames: Sequence[Sequence[int]]
 ) -> "QNetwork | MirrorQNetwork":
-    """Return a new network of `settings` for observations of K numbers.
+    """Return a new network from observations [..., K] to action values [..., A].
 
     `mirror_signs` [K] holds the factor, +1 or -1, of each number when left and right are swapped. `frames`
     [T, F] holds the indices of the frames that a recurrent network reads.

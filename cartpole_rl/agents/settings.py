@@ -1,15 +1,38 @@
-"""Settings of an agent."""
+"""Settings of an agent, and the kinds of agents and networks to choose from."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
+from cartpole_rl.registry import Extension, Registry
 from cartpole_rl.settings import Count, Settings
+
+
+class AgentKind(Extension):
+    """A kind of agent: a class such as `learning.agent.QAgent`, which is made with the same arguments.
+
+    Its instances are modules with `greedy_policy()`, from `observation` to `action` and `action_value`.
+    `learner` is a class, or its place, that trains one: such as `learning.dqn.Training`.
+    """
+
+    def __init__(self, name: str, item: Any, learner: Any = "cartpole_rl.learning.dqn:Training") -> None:
+        super().__init__(name, item)
+        self.learner = Extension(f"the learner of {name}", learner)
+
+
+AGENTS = Registry("agent", __name__, AgentKind)
+AGENTS.add("dqn", "cartpole_rl.learning.agent:QAgent")
+NETWORKS: Registry[Extension] = Registry(
+    "network", __name__
+)  # from the arguments of `agents.network.q_network` to a module
+NETWORKS.add("mlp", "cartpole_rl.agents.network:q_network")
 
 
 class AgentSettings(Settings):
     """The agent and its loss."""
 
+    kind: Annotated[AgentKind, AGENTS] = AGENTS.find("dqn")  # missing in checkpoints of earlier versions
+    network: Annotated[Extension, NETWORKS] = NETWORKS.find("mlp")
     hidden: tuple[Count, ...]
     recurrent: Count | None  # units of a recurrent input layer that reads the last frames
     layer_norm: bool

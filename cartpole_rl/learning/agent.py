@@ -10,7 +10,6 @@ from torchrl.data import Categorical
 from torchrl.modules import QValueActor
 from torchrl.objectives.utils import TargetNetUpdater
 
-from cartpole_rl.agents.network import q_network
 from cartpole_rl.agents.settings import AgentSettings
 from cartpole_rl.learning.dqn import AdvantageLearningLoss
 
@@ -33,7 +32,7 @@ class QAgent(nn.Module):
     ) -> None:
         super().__init__()
         self.settings = settings
-        network = q_network(settings, mirror_signs, actions, frames).to(device)
+        network = settings.network(settings, mirror_signs, actions, frames).to(device)
         self.actor = QValueActor(network, in_keys=["observation"], spec=Categorical(actions))
         self.loss = AdvantageLearningLoss(
             self.actor,
@@ -61,17 +60,14 @@ class QAgent(nn.Module):
         The average spans at most a tenth of the updates, so that the initial weights fade soon.
         """
         self.updates += 1
-        tau, period, decay = (
-            self.settings.target_tau,
-            self.settings.target_period,
-            self.settings.average_decay,
-        )
-        if tau is not None:
-            self._target.lerp_(self._online, tau)
-        elif period is not None and self.updates % period == 0:
+        settings = self.settings
+        if settings.target_tau is not None:
+            self._target.lerp_(self._online, settings.target_tau)
+        elif settings.target_period is not None and self.updates % settings.target_period == 0:
             self._target.update_(self._online)
-        if decay is not None:
-            self._average.lerp_(self._online, max(1 - decay, 10 / (9 + int(self.updates))))
+        if settings.average_decay is not None:
+            newest = max(1 - settings.average_decay, 10 / (9 + int(self.updates)))
+            self._average.lerp_(self._online, newest)
 
     def greedy_policy(self) -> nn.Module:
         """Return the policy that is evaluated and saved; it shares memory with the weights in training.

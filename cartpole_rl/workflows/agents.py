@@ -21,7 +21,7 @@ OF_BASELINE = {"observation": "raw", "observation.past_motors": 1}
 def new_agent(config: TrainConfig, device: str = "cpu") -> QAgent:
     """Return an untrained agent on `device`."""
     observation, actions = config.observation, len(config.actions.motors)
-    return QAgent(config.agent, observation.mirror_signs, actions, observation.frames, device)
+    return config.agent.kind(config.agent, observation.mirror_signs, actions, observation.frames, device)
 
 
 @dataclass(frozen=True)

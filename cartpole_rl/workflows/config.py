@@ -36,6 +36,8 @@ from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.plants.settings import EmulatedSettings, LearnedSettings, SimulatedSettings
 from cartpole_rl.randomization.poles import PoleSettings, check_one_pole
 from cartpole_rl.randomization.ranges import IdentifiedSettings
+from cartpole_rl.registry import Extension
+from cartpole_rl.reporting.loggers import LOGGERS
 from cartpole_rl.rig.parameters import check_values
 from cartpole_rl.settings import Count, Finite, NonNegative, Positive, Seed, Settings
 from cartpole_rl.tasks.settings import ActionSettings, RewardSettings, TaskSettings
@@ -95,6 +97,7 @@ class TrainConfig(RunSettings, CartPoleSettings):
     learning: LearningSettings
     compile: bool
     device: Literal["cpu", "cuda", "auto"] = "cpu"  # missing in checkpoints of earlier versions
+    logger: Annotated[Extension, LOGGERS] = LOGGERS.find("tensorboard")  # missing there too
     resume: str | None
 
     @model_validator(mode="before")

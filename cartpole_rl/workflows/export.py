@@ -124,7 +124,9 @@ def exported_agent(trained: TrainedAgent, origin: Mapping[str, Any]) -> Exported
 def network_of(trained: TrainedAgent) -> QNetwork | MirrorQNetwork:
     """Return the network of the greedy policy, from observations to action values."""
     network = trained.policy.module[0].module  # type: ignore[attr-defined]
-    assert isinstance(network, QNetwork | MirrorQNetwork)
+    if not isinstance(network, QNetwork | MirrorQNetwork):
+        own = f"agent.network={trained.training.agent.network}"
+        raise ConfigError(f"run: an agent with {own} cannot be exported, only networks of agent.network=mlp")
     return network
 
 

@@ -1,5 +1,6 @@
-"""Progress bar, TensorBoard events, history and checkpoints of a training."""
+"""The callbacks of a training: progress bar, curves and pictures, history and checkpoints."""
 
+import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -8,31 +9,24 @@ from typing import Any
 import numpy as np
 
 from cartpole_rl.evaluation.metrics import episode_metrics
+from cartpole_rl.files import write_text
 from cartpole_rl.learning.checkpoints import AgentCheckpoint, TrainingCheckpoint, save_agent, save_training
 from cartpole_rl.learning.dqn import Monitor, Scalars, Training
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.reporting.animation import gif
 from cartpole_rl.reporting.figures import behaviour
-from cartpole_rl.reporting.tensorboard import TensorBoardLog
-from cartpole_rl.run_files import BEST, CHECKPOINTS, LAST
+from cartpole_rl.reporting.loggers import Logger
+from cartpole_rl.run_files import BEST, CHECKPOINTS, HISTORY, LAST
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.config import TrainConfig
-from cartpole_rl.workflows.history import read_history, write_history
 from cartpole_rl.workflows.person import print_message
 from cartpole_rl.workflows.progress import progress_bar
 
 GUARDED = "guarded_fraction"  # None without a track guard
-COMPARED = (  # on the HPARAMS page
-    "score",
-    "score_upright",
-    "steps",
-    "time_to_upright_s",
-    "upright_fraction",
-    GUARDED,
-)
-TAGS = {GUARDED: "track_guard_fraction"}  # in TensorBoard, which sorts names: the score comes first
+COMPARED = ("score", "score_upright", "steps", "time_to_upright_s", "upright_fraction", GUARDED)  # at the end
+TAGS = {GUARDED: "track_guard_fraction"}  # of curves, which are sorted by name: the score comes first
 AVERAGED = ("score", "score_upright", "steps", "upright_fraction")  # over the episodes of an evaluation
-PICTURES = 4  # behaviour figures and animations in TensorBoard, over the whole training
+PICTURES = 4  # behaviour figures and animations, over the whole training
 
 
 class TrainingMonitor(Monitor):
@@ -45,11 +39,13 @@ class TrainingMonitor(Monitor):
         self.folder, self.config = folder, config
         self._settings = config.model_dump(mode="json")
         self._logged = resumed_at or 0
-        self._log = TensorBoardLog(folder, purge_step=None if resumed_at is None else resumed_at + 1)
+        self._log: Logger = config.logger(folder, None if resumed_at is None else resumed_at + 1)
         total = config.learning.collected_transitions
         self._bar = progress_bar(total, "transitions", initial=self._logged, unit_scale=True, mininterval=1.0)
-        self.history = [record for record in read_history(folder) if record["transitions"] <= self._logged]
-        write_history(folder, self.history)
+        path = folder / HISTORY
+        lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+        self.history = [each for each in map(json.loads, lines) if each["transitions"] <= self._logged]
+        self._write_history()
 
     def __enter__(self) -> "TrainingMonitor":
         return self
@@ -69,7 +65,7 @@ class TrainingMonitor(Monitor):
         """Log scores and sometimes pictures, and write the last and the best checkpoint."""
         transitions, record = training.transitions, self._record(training, episodes)
         self.history.append(record)
-        write_history(self.folder, self.history)
+        self._write_history()
         curves = {TAGS.get(key, key): value for key, value in record.items() if key != "transitions"}
         self._log.scalars({f"evaluation/{key}": value for key, value in curves.items()}, transitions)
         if len(self.history) % max(1, self.config.learning.evaluations // PICTURES) == 0:
@@ -98,7 +94,7 @@ class TrainingMonitor(Monitor):
             self._log.histogram(f"randomization/{name}", values, self._logged)
 
     def finished(self, summary: Mapping[str, Any]) -> None:
-        """Write the run's line on TensorBoard's HPARAMS page, with means of the last evaluation."""
+        """Log the settings beside the means of the last evaluation."""
         metrics = {key: value["mean"] for key in COMPARED if (value := summary[key]) is not None}
         self._log.hparams(self._settings, metrics)
 
@@ -106,26 +102,21 @@ class TrainingMonitor(Monitor):
         self._bar.update(transitions - self._logged)
         self._logged = transitions
 
+    def _write_history(self) -> None:
+        """Write the evaluations so far, a line each, all or none."""
+        write_text(self.folder / HISTORY, "".join(json.dumps(record) + "\n" for record in self.history))
+
     def _record(self, training: Training, episodes: Sequence[Episode]) -> dict[str, float]:
         """Return the evaluation's line in the history."""
         metrics = [episode_metrics(episode, self.config.task.x_max) for episode in episodes]
         scores = [each[self.config.task.measure] for each in metrics]
         averaged = AVERAGED if metrics[0][GUARDED] is None else (*AVERAGED, GUARDED)
         means = {key: float(np.mean([each[key] for each in metrics])) for key in averaged}
-        return {
-            "transitions": training.transitions,
-            "seconds": training.seconds,
-            **means,
-            "score_min": min(scores),
-            "score_max": max(scores),
-        }
+        counts = {"transitions": training.transitions, "seconds": training.seconds}
+        return {**counts, **means, "score_min": min(scores), "score_max": max(scores)}
 
     def _log_pictures(self, episode: Episode, transitions: int) -> None:
-        half = self.config.task.x_max
-        length = self.config.pole.nominal.length
-        self._log.figure(
-            "pictures/behaviour",
-            behaviour(episode, f"After {transitions / 1e6:.1f} M transitions", half),
-            transitions,
-        )
+        half, length = self.config.task.x_max, self.config.pole.nominal.length
+        title = f"After {transitions / 1e6:.1f} M transitions"
+        self._log.figure("pictures/behaviour", behaviour(episode, title, half), transitions)
         self._log.animation("pictures/cart", gif(episode, length, half), transitions)

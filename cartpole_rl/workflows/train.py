@@ -7,14 +7,12 @@ import torch
 
 from cartpole_rl.envs.build import simulated_env, with_fitted_guard
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
-from cartpole_rl.envs.settings import GuardSettings
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.evaluation.driving_policy import DrivingPolicy, as_weights
 from cartpole_rl.evaluation.episodes import Policy, run_batch
 from cartpole_rl.files import claimed
 from cartpole_rl.learning.agent import QAgent
-from cartpole_rl.learning.checkpoints import forget_training, restore_weights, whole_state
-from cartpole_rl.learning.dqn import Training
+from cartpole_rl.learning.checkpoints import forget_training, load_training, restore_weights, whole_state
 from cartpole_rl.learning.states import seed_everything
 from cartpole_rl.plants.effects import without_effect
 from cartpole_rl.plants.settings import LearnedSettings, SimulatedSettings
@@ -24,7 +22,7 @@ from cartpole_rl.settings import evaluation_seed
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.agents import new_agent
 from cartpole_rl.workflows.build import use_threads
-from cartpole_rl.workflows.checks import check_compiler
+from cartpole_rl.workflows.checks import check_compiler, check_resumable
 from cartpole_rl.workflows.config import TrainConfig
 from cartpole_rl.workflows.loading import recorded_settings
 from cartpole_rl.workflows.monitor import TrainingMonitor
@@ -32,7 +30,6 @@ from cartpole_rl.workflows.nominal import note_other_numbers
 from cartpole_rl.workflows.person import as_word, print_message
 from cartpole_rl.workflows.report import report
 from cartpole_rl.workflows.results import print_results, shown
-from cartpole_rl.workflows.resuming import resumed
 from cartpole_rl.workflows.run_folder import write_config
 from cartpole_rl.workflows.trained_poles import emulated_words
 
@@ -41,13 +38,15 @@ def train(config: TrainConfig, folder: Path) -> float:
     """Train an agent on randomized simulated carts, or resume the training in `folder`; return its score.
 
     The score is that of the task: (6.1) for a balance, (6.2) for a swing-up.
-    Writes config.yaml, provenance.json, TensorBoard events, history.jsonl (evaluations), checkpoints/last.pt
+    Writes config.yaml, provenance.json, the logger's files, history.jsonl (evaluations), checkpoints/last.pt
     and best.pt, metrics.json and figures/; until the end also checkpoints/resume.pt. Raises ConfigError for
     settings that do not fit together or a folder that already holds a run, CheckpointError for a resumed run
     without a checkpoint, LearningError if learning diverges.
     """
-    checkpoint = resumed("train", config.resume, folder)
-    if checkpoint:
+    checkpoint = None
+    if config.resume is not None:
+        check_resumable("train", config.resume, folder)
+        checkpoint = load_training(Path(config.resume))
         config = recorded_settings(TrainConfig, checkpoint.config, f"resume={folder}")
     config = config.model_copy(update={"device": available_device(config.device)})
     if config.compile:
@@ -58,48 +57,30 @@ def train(config: TrainConfig, folder: Path) -> float:
     carts, start = config.learning.carts, config.task.start
     env = simulated_env(config, config.plant, carts, start, config.seed, config.compile, config.device)
     agent = new_agent(config, config.device)
-    if checkpoint:
-        restore_weights(
-            agent, checkpoint.state.get("agent", {}), f"resume={folder}"
-        )  # its error precedes any work
+    if checkpoint:  # before any work
+        restore_weights(agent, checkpoint.state.get("agent", {}), f"resume={folder}")
     policy = DrivingPolicy(agent.greedy_policy(), config.compile)
     evaluate = partial(judge_agent, nominal_env(config), agent, policy, config.seed)
     with claimed(folder):
         write_config(folder, "train", config.model_dump(mode="json"), resumed=checkpoint is not None)
-        if isinstance(config.plant, SimulatedSettings):
-            note_other_numbers("train", config.nominal_cart, (config.pole.choices or {}).values())
-        note_unused_randomization(config, env.plant.randomizer)
-        note_other_carts(config)
-        note_guard(config.guard)
+        print_notes(config, env.plant.randomizer)
         with TrainingMonitor(folder, config, checkpoint.step if checkpoint else None) as monitor:
-            training = Training(
-                config.learning,
-                config.buffer,
-                config.optimizer,
-                agent,
-                env,
-                evaluate,
-                monitor,
-                config.seed,
-                config.compile,
-                config.task.measure,
-            )
+            settings = config.learning, config.buffer, config.optimizer
+            run = config.seed, config.compile, config.task.measure
+            training = config.agent.kind.learner(*settings, agent, env, evaluate, monitor, *run)
             if checkpoint:
                 with whole_state(f"resume={folder}"):
                     training.restore(checkpoint.state)
             else:
                 monitor.randomization(env.plant)
             training.run()
-            metrics = report(
-                folder, evaluate(), config.plant.kind, config.pole, config.task, history=monitor.history
-            )
+            drawn = config.plant.kind, config.pole, config.task
+            metrics = report(folder, evaluate(), *drawn, history=monitor.history)
             monitor.finished(metrics)
         forget_training(folder)
     print(f"trained for {training.seconds:.0f} s")
-    files = f"{METRICS}, {FIGURES}/ and {CHECKPOINTS}/"
-    print_results(
-        folder, files, f"cartpole-evaluate {as_word('run', shown(folder))} {emulated_words([config.pole])}"
-    )
+    next_command = f"cartpole-evaluate {as_word('run', shown(folder))} {emulated_words([config.pole])}"
+    print_results(folder, f"{METRICS}, {FIGURES}/ and {CHECKPOINTS}/", next_command)
     score: float = metrics[config.task.measure]["mean"]
     return score
 
@@ -120,10 +101,14 @@ def available_device(device: str) -> str:
     return device
 
 
-def note_guard(guard: GuardSettings) -> None:
-    """Print the numbers of the track guard, if there is one."""
-    if guard.active:
-        print_message("train", f"track guard: {guard.active}")
+def print_notes(config: TrainConfig, draws: Draws) -> None:
+    """Print how the cart differs from the nominal one and from those in training, and its track guard."""
+    if isinstance(config.plant, SimulatedSettings):
+        note_other_numbers("train", config.nominal_cart, (config.pole.choices or {}).values())
+    note_unused_randomization(config, draws)
+    note_other_carts(config)
+    if config.guard.active:
+        print_message("train", f"track guard: {config.guard.active}")
 
 
 def note_unused_randomization(config: TrainConfig, draws: Draws) -> None:

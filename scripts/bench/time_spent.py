@@ -21,9 +21,9 @@ from typing import Any
 
 from common import option_parser, print_table, write_json
 
+from cartpole_rl.agents.settings import AGENTS
 from cartpole_rl.commands.train import main as train_command
 from cartpole_rl.learning.dqn import Training
-from cartpole_rl.workflows import train
 
 KINDS = {"collect": "stepping", "learn": "updating", "evaluate": "evaluating"}  # method of Training: kind
 spent: dict[str, list[float]] = defaultdict(list)  # s, of each call
@@ -70,7 +70,7 @@ def main() -> None:
     parser = option_parser(__doc__)
     parser.add_argument("overrides", nargs="*", help="overrides of cartpole-train")
     options = parser.parse_intermixed_args()
-    train.Training = TimedTraining  # type: ignore[misc]
+    AGENTS.find("dqn").learner = TimedTraining
     with tempfile.TemporaryDirectory() as folder:
         sys.argv = ["cartpole-train", *options.overrides, f"hydra.run.dir={folder}/run"]
         train_command()
