@@ -23,7 +23,14 @@ from cartpole_rl.evaluation.publishing import followed
 from cartpole_rl.evaluation.snapshots import Memory
 from cartpole_rl.files import claimed, write_bytes
 from cartpole_rl.learning.checkpoint_files import find_agent
-from cartpole_rl.learning.checkpoints import TrainingCheckpoint, forget_training, load_agent, save_agent
+from cartpole_rl.learning.checkpoints import (
+    FINETUNING_FORMAT,
+    TrainingCheckpoint,
+    forget_training,
+    load_agent,
+    load_training,
+    save_agent,
+)
 from cartpole_rl.learning.settings import RayLearnerSettings
 from cartpole_rl.learning.states import seed_everything
 from cartpole_rl.plants.serial.faults import Confirm
@@ -41,7 +48,7 @@ from cartpole_rl.workflows.build import (
     is_real_time,
     use_threads,
 )
-from cartpole_rl.workflows.checks import check_finetuning
+from cartpole_rl.workflows.checks import check_finetuning, check_resumable
 from cartpole_rl.workflows.config import EvaluateConfig, FinetuneConfig, TrainConfig
 from cartpole_rl.workflows.finetuning_cart import DrivenCart, FinetuningFiles, Stage, yielding_to
 from cartpole_rl.workflows.finetuning_learner import CartLearner, TunedAgent, check_simulation
@@ -51,7 +58,6 @@ from cartpole_rl.workflows.ray_learner import LearnerTask, Offer
 from cartpole_rl.workflows.ray_link import LearnerLink
 from cartpole_rl.workflows.report import report, summarized
 from cartpole_rl.workflows.results import plant_words, print_loop_time, print_results, shown
-from cartpole_rl.workflows.resuming import resumed
 from cartpole_rl.workflows.run_folder import (
     AGENT_HASH,
     file_hash,
@@ -78,8 +84,10 @@ def finetune(config: FinetuneConfig, folder: Path, new_learner: bool = False) ->
     checkpoints/start.pt and resume.pt. Prints both scores. Raises ConfigError and CheckpointError before the
     cart moves, PlantError and LinkError for a cart that fails, LearningError if learning diverges.
     """
-    checkpoint = resumed("finetune", config.resume, folder)
-    if checkpoint:
+    checkpoint = None
+    if config.resume is not None:
+        check_resumable("finetune", config.resume, folder)
+        checkpoint = load_training(Path(config.resume), FINETUNING_FORMAT)
         learner = {"learner": config.learner.model_dump()} if new_learner else {}
         values = {**checkpoint.config, "resume": config.resume, **learner}
         config = recorded_settings(FinetuneConfig, values, f"resume={config.resume}")
