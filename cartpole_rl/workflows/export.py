@@ -7,7 +7,6 @@ from functools import reduce
 from pathlib import Path
 from typing import Any
 
-from cartpole_rl.agents.network import MirrorQNetwork, QNetwork
 from cartpole_rl.emulator.settings import ONBOARD
 from cartpole_rl.envs.build import with_fitted_guard
 from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
@@ -121,12 +120,15 @@ def exported_agent(trained: TrainedAgent, origin: Mapping[str, Any]) -> Exported
     return agent
 
 
-def network_of(trained: TrainedAgent) -> QNetwork | MirrorQNetwork:
-    """Return the network of the greedy policy, from observations to action values."""
-    network = trained.policy.module[0].module  # type: ignore[attr-defined]
-    if not isinstance(network, QNetwork | MirrorQNetwork):
-        own = f"agent.network={trained.training.agent.network}"
-        raise ConfigError(f"run: an agent with {own} cannot be exported, only networks of agent.network=mlp")
+def network_of(trained: TrainedAgent) -> Any:
+    """Return the network of the greedy policy, from observations to action values. Raises ConfigError."""
+    agent = trained.training.agent
+    try:
+        network = trained.policy.module[0].module  # type: ignore[attr-defined]
+        assert callable(network.plain_layers)
+    except (AttributeError, TypeError, IndexError):
+        own = f"agent.kind={agent.kind}, agent.network={agent.network}"
+        raise ConfigError(f"run: an agent with {own} cannot be exported: it has no `plain_layers`") from None
     return network
 
 
