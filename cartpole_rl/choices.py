@@ -1,12 +1,8 @@
-"""The choices in conf/ and a person's own, as plain data and composed without a command.
-
-The commands hand a person's own files and mappings to Hydra as they are read here, so both see the same.
-"""
+"""The choices in conf/ and a person's own, read one by one as plain data; `composition` composes them."""
 
 import json
-import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
@@ -14,11 +10,12 @@ import yaml
 
 from cartpole_rl.errors import ConfigError
 
-HERE = "${here}"  # the folder of a user's own file
-INTERPOLATION = re.compile(r"\$\{(?:(oc\.select|oc\.env):)?\s*([\w.]+)\s*\}")
-NOT_SETTINGS = ("defaults", "hydra")
+HERE = "${here}"  # the folder of a person's own file
 WHOLE = ("experiment", "sweep")  # groups without settings of their own: they change those of others
-IN_CODE = ("emulator/medium", "plant//serial_defaults@_here_")  # choices that are a class's defaults
+OF_CLASSES = {  # choices that are the defaults of a settings class
+    "emulator/medium": "cartpole_rl.emulator.settings:EmulatorSettings",
+    "plant//serial_defaults@_here_": "cartpole_rl.plants.serial.settings:SerialSettings",
+}
 OWN_FILES = (".yaml", ".yml")
 REPLACES = "override /"
 
@@ -96,65 +93,19 @@ def group_choices(group: str) -> dict[str, dict[str, Any]]:
 
 def is_shipped(group: str, name: str) -> bool:
     """Return True if conf/ or a settings class has the choice `name` of `group`."""
-    return f"{group}/{name}" in IN_CODE or (conf_folder() / group / f"{name}.yaml").is_file()
+    return f"{group}/{name}" in OF_CLASSES or (conf_folder() / group / f"{name}.yaml").is_file()
 
 
 def default_choices(command: str) -> dict[str, str | None]:
     """Return the default choice of each group that a command reads: {"cart": "ip02", "task": None, ...}."""
     chosen: dict[str, str | None] = {}
-    for line in choice(command)["defaults"]:
+    has_file = (conf_folder() / f"{command}.yaml").is_file()  # a command without one reads no groups
+    for line in choice(command)["defaults"] if has_file else ():
         if isinstance(line, dict):
             chosen |= line
         elif line != "_self_":  # another command's config, which this one extends
             chosen |= default_choices(line)
     return {group: name for group, name in chosen.items() if "/" not in group}
-
-
-def compose(command: str, overrides: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """Return the settings of a command, as Hydra composes them, with `overrides` as on its command line.
-
-    A group (pole, task, ...) takes the name of its file in conf/, the path of another file, a mapping in its
-    place, a list of these, or None; any other name, dotted or not, takes a value. "+name" adds a setting and
-    "~name" removes one. Values that conf/ leaves open ("???") are left out. Raises ConfigError for a missing
-    file.
-    """
-    defaults = default_choices(command)
-    given = {name: value for name, value in (overrides or {}).items() if name in defaults}
-    experiment = load("experiment", given.pop("experiment", None))
-    chosen = {**defaults, **experiment.groups, **given}
-    loaded = {group: load(group, name) for group, name in chosen.items() if name is not None}
-    values = merged({group: each.values for group, each in loaded.items()}, _own(command))
-    values = merged(values, after_files(experiment, {group: each.own for group, each in loaded.items()}))
-    for name, value in (overrides or {}).items():
-        if name not in defaults:
-            values = _overridden(values, name, value)
-    return without_missing(_resolved(values, values))
-
-
-def after_files(experiment: Chosen, files: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the values of an experiment, except where it would replace what a person's `files` say."""
-    return merged(_without(experiment.values, files), experiment.own)
-
-
-def _without(values: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str, Any]:
-    """Return nested mappings without what `others` has too."""
-    kept = {}
-    for name, value in values.items():
-        if name not in others:
-            kept[name] = value
-        elif isinstance(value, Mapping) and isinstance(others[name], Mapping):
-            kept[name] = _without(value, others[name])
-    return kept
-
-
-def _own(command: str) -> dict[str, Any]:
-    """Return a command's own values, with those of the command that it extends."""
-    written = choice(command)
-    extended = [line for line in written["defaults"] if isinstance(line, str) and line != "_self_"]
-    values: dict[str, Any] = {}
-    for other in extended:
-        values = merged(values, _own(other))
-    return merged(values, {name: value for name, value in written.items() if name not in NOT_SETTINGS})
 
 
 def is_own_file(chosen: Any) -> bool:
@@ -174,7 +125,7 @@ def load(group: str, chosen: Choice, folder: Path = Path(), above: tuple[Path, .
         return _joined([load(group, each, folder, above) for each in chosen])
     if isinstance(chosen, Mapping):
         return _extended(group, chosen, {**chosen}, folder, above, True)
-    if f"{group}/{chosen}" in IN_CODE:
+    if f"{group}/{chosen}" in OF_CLASSES:
         return Chosen({}, {})
     beside = folder / f"{chosen}.yaml"
     if not is_own_file(chosen) and (is_shipped(group, str(chosen)) or not (above and beside.is_file())):
@@ -257,7 +208,7 @@ def read_file(group: str, path: Path) -> dict[str, Any]:
     return placed
 
 
-def _mapped(values: Any, function: Any) -> Any:
+def _mapped(values: Any, function: Callable[[str], str]) -> Any:
     """Return nested mappings and lists with `function` of each text."""
     if isinstance(values, Mapping):
         return {name: _mapped(value, function) for name, value in values.items()}
@@ -280,67 +231,3 @@ def merged(base: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]
         nested = isinstance(value, Mapping) and isinstance(result.get(name), Mapping)
         result[name] = merged(result[name], value) if nested else value
     return result
-
-
-def _overridden(values: dict[str, Any], name: str, value: Any) -> dict[str, Any]:
-    """Return `values` with one override: a value, an added setting ("+name") or a removed one ("~name")."""
-    key = name.lstrip("+~")
-    above, _, last = key.rpartition(".")
-    place = values
-    for part in filter(None, above.split(".")):
-        place = place[part] if isinstance(place, Mapping) and isinstance(place.get(part), Mapping) else {}
-    if name.startswith("~"):
-        if last not in place:
-            raise ConfigError(f"{name}: there is no {key} to remove")
-        return _removed(values, key.split("."))
-    adds = name.startswith("+") and not name.startswith("++")
-    if adds and last in place and not isinstance(value, Mapping | list | tuple):
-        raise ConfigError(f"{name}: {key} is there already; leave out the +")
-    for part in reversed(key.split(".")):
-        value = {part: value}
-    return merged(values, value)
-
-
-def _removed(values: Mapping[str, Any], path: Sequence[str]) -> dict[str, Any]:
-    """Return nested mappings without the setting at `path`."""
-    first, *rest = path
-    kept = {name: value for name, value in values.items() if rest or name != first}
-    return {**kept, first: _removed(values[first], rest)} if rest else kept
-
-
-def _resolved(value: Any, values: Mapping[str, Any], above: tuple[str, ...] = ()) -> Any:
-    """Return `value` with each interpolation replaced: ${name}, ${oc.select:name} and ${oc.env:NAME}."""
-
-    def found(kind: str | None, name: str) -> Any:
-        if kind == "oc.env":
-            if name not in os.environ:
-                raise ConfigError(f"${{oc.env:{name}}}: there is no such environment variable")
-            return os.environ[name]
-        place: Any = values
-        for part in name.split("."):
-            place = place.get(part, _MISSING) if isinstance(place, Mapping) else _MISSING
-        if place is _MISSING and kind is None:
-            raise ConfigError(f"${{{name}}}: there is no such setting")
-        if name in above:
-            raise ConfigError(f"${{{name}}} refers to itself; give a value")
-        return None if place is _MISSING else _resolved(place, values, (*above, name))
-
-    def replaced(text: str) -> Any:
-        if whole := INTERPOLATION.fullmatch(text):
-            return found(*whole.groups())
-        text = INTERPOLATION.sub(lambda part: str(found(*part.groups())), text)
-        if "${" in text:
-            raise ConfigError(f"{text}: of interpolations there are ${{name}}, ${{oc.env:NAME}} and {HERE}")
-        return text
-
-    return _mapped(value, replaced)
-
-
-_MISSING = object()
-
-
-def without_missing(values: Any) -> Any:
-    """Return nested mappings without the values that are missing ("???")."""
-    if not isinstance(values, Mapping):
-        return values
-    return {name: without_missing(value) for name, value in values.items() if value != "???"}

@@ -1,6 +1,6 @@
 """The base class of all settings: frozen, strict about unknown keys, checked on construction.
 
-A settings class lives beside the code that it configures; only `cartpole_rl.commands` fills one from Hydra.
+A settings class lives beside the code that it configures; only `cartpole_rl.composition` knows Hydra's files.
 Bounds are written on the field (``Annotated[float, Field(gt=0)]``), units in its comment.
 """
 

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from cartpole_rl.checking import checked
-from cartpole_rl.choices import compose
+from cartpole_rl.composition import compose
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
 

@@ -8,7 +8,6 @@ from typing import Any, TypeVar
 import torch
 
 from cartpole_rl.checking import checked
-from cartpole_rl.choices import compose
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
 from cartpole_rl.envs.guard_fitting import fitted_guard
@@ -33,8 +32,10 @@ FITTED_LENGTH = 0.2  # share: a fit may move the centre of mass of the pole by h
 
 
 def shipped_settings(overrides: Mapping[str, Any] | None = None) -> CartPoleSettings:
-    """Return what conf/train.yaml says of the cart and the task, with `overrides` as in `choices.compose`."""
-    composed = compose("train", overrides)
+    """Return the environment of conf/train.yaml, with `overrides` as in `composition.compose`."""
+    from cartpole_rl.composition import compose  # imports Hydra
+
+    composed = compose("train", overrides or {})
     return checked(CartPoleSettings, {name: composed[name] for name in CartPoleSettings.model_fields})
 
 

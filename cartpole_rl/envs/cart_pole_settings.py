@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from functools import cache
 from typing import TYPE_CHECKING, Annotated, Any
 
-from pydantic import Discriminator, Field, Tag
+from pydantic import Discriminator, Field, Tag, field_validator
 
 from cartpole_rl.choices import group_choices
 from cartpole_rl.envs.settings import GuardSettings, ObservationSettings
@@ -40,6 +40,12 @@ class FrictionSettings(Settings):
     if TYPE_CHECKING:
         model: Law
         parameters: dict[str, Finite]
+
+    @field_validator("parameters", mode="before", check_fields=False)
+    @classmethod
+    def _null_is_the_number_of_the_cart(cls, given: Any) -> Any:
+        is_mapping = isinstance(given, Mapping)
+        return {name: value for name, value in given.items() if value is not None} if is_mapping else given
 
     @property
     def defaults(self) -> Mapping[str, float]:

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from cartpole_rl.errors import CheckpointError
-from cartpole_rl.run_files import CHECKPOINTS, LAST, RESUME
+from cartpole_rl.run_folder import CHECKPOINTS, LAST, RESUME
 
 PRETRAINED = "pretrained"  # run=pretrained/medium is an agent in this package
 PRETRAINED_AGENT = "agent.pt"

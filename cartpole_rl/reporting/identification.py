@@ -22,7 +22,7 @@ from cartpole_rl.reporting.figures.identified import (
 )
 from cartpole_rl.reporting.page import page
 from cartpole_rl.reporting.table import interval_text, number_text, table
-from cartpole_rl.run_files import FIGURES
+from cartpole_rl.run_folder import FIGURES
 from cartpole_rl.tasks.episode import Episode
 
 Array = NDArray[np.floating]

@@ -12,8 +12,7 @@ from cartpole_rl.learning.checkpoints import AgentCheckpoint, load_agent, restor
 from cartpole_rl.randomization.poles import PoleSettings, check_one_pole
 from cartpole_rl.workflows.build import replaced_settings
 from cartpole_rl.workflows.checks import BASELINE, check_has_agent
-from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
-from cartpole_rl.workflows.loading import load_settings, recorded_settings
+from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig, load_settings, recorded_settings
 
 OF_BASELINE = {"observation": "raw", "observation.past_motors": 1}
 

@@ -1,26 +1,41 @@
 """Checks of settings that need no slow imports. Commands call them before they import a workflow.
 
-A workflow does not rely on them: it checks what it reads.
+`words` are the overrides on the command line. A workflow does not rely on these checks: it checks what it
+reads.
 """
 
 import os
 import shutil
 import sys
 import sysconfig
-from collections.abc import Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
 from cartpole_rl.checking import missing
+from cartpole_rl.choices import group_choices
+from cartpole_rl.envs.cart_pole_settings import shipped_carts
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.learning.checkpoint_files import find_agent, find_training
 from cartpole_rl.plants.model_file import find_model
 from cartpole_rl.plants.settings import LearnedSettings
-from cartpole_rl.randomization.poles import check_one_pole
+from cartpole_rl.randomization.poles import Pole, check_one_pole
 from cartpole_rl.randomization.ranges import check_carts
 from cartpole_rl.rig.parameters import check_names, check_value, check_values
-from cartpole_rl.run_files import CHECKPOINTS, LAST, METRICS, RESUME
+from cartpole_rl.run_folder import (
+    CHECKPOINTS,
+    LAST,
+    METRICS,
+    PREFIX,
+    RESUME,
+    check_program,
+    has_ended,
+    program_of,
+    use_of,
+)
+from cartpole_rl.terminal import as_value, as_word, print_message
 from cartpole_rl.workflows.config import (
+    DistillConfig,
     EvaluateConfig,
     ExportConfig,
     FinetuneConfig,
@@ -29,9 +44,7 @@ from cartpole_rl.workflows.config import (
     ReplayConfig,
     TrainConfig,
 )
-from cartpole_rl.workflows.person import as_value, as_word
 from cartpole_rl.workflows.recordings import experiments, recordings
-from cartpole_rl.workflows.run_folder import PREFIX, check_program, has_ended, program_of, use_of
 
 BASELINE = Path("lqr")  # run=lqr is energy and LQR, not a folder
 LARGEST_BATCH = 1024  # carts that an evaluation simulates at once
@@ -41,17 +54,25 @@ LONGER = {  # command: how to train further than a run that has ended
 }
 
 
-def check_training(config: TrainConfig) -> None:
-    """Raise CartPoleError if a new training cannot start."""
+TAKEN_BY_REPEAT = ("run", "repeat.run", "repeat.episode", "label")
+
+
+def check_training(config: TrainConfig, folder: Path, words: Sequence[str]) -> None:
+    """Raise CartPoleError if a training cannot start, or the run of `resume` cannot continue."""
+    if config.resume is not None:
+        refuse_others(words, ("resume",), "resume uses that run's own config")
+        return check_resumable("train", config.resume, folder)
     if config.compile:
         check_compiler()
     check_carts(config.nominal_cart, config.pole, config.ranges)
     if isinstance(config.plant, LearnedSettings):
         check_model(config.plant)
+    return None
 
 
-def check_evaluation(config: EvaluateConfig) -> None:
-    """Raise CartPoleError if the agent or the cart does not exist."""
+def check_evaluation(config: EvaluateConfig, words: Sequence[str]) -> None:
+    """Raise CartPoleError if the agent, the cart or the episode to repeat does not exist."""
+    check_repetition(config, words)
     if config.run != BASELINE:
         check_agent(config.run)
     elif config.drives_on_board:
@@ -61,6 +82,26 @@ def check_evaluation(config: EvaluateConfig) -> None:
     check_parameters(config.parameters or {})
     if config.animation.mp4 and find_spec("av") is None:
         raise ConfigError('animation.mp4=true needs PyAV: pip install "cartpole_rl[video]"')
+
+
+def check_repetition(config: EvaluateConfig, words: Sequence[str]) -> None:
+    """Raise ConfigError where other settings are given, or there is no such episode."""
+    if config.repeat.run is None and config.repeat.episode is None:
+        return
+    if config.repeat.run is not None:
+        refuse_others(words, TAKEN_BY_REPEAT, "repeat uses that evaluation's own settings")
+    from cartpole_rl.workflows.repeating import repetition  # reads numbers by NumPy
+
+    repetition(config)
+
+
+def check_tuning(config: FinetuneConfig, folder: Path, words: Sequence[str]) -> None:
+    """Raise CartPoleError if a fine-tuning cannot start, or the run of `resume` cannot continue."""
+    if config.resume is None:
+        check_finetuning(config)
+    else:
+        refuse_others(words, ("resume", "learner"), "resume uses that run's own config")
+        check_resumable("finetune", config.resume, folder)
 
 
 def check_finetuning(config: FinetuneConfig) -> Path:
@@ -78,6 +119,11 @@ def check_ray(config: FinetuneConfig) -> None:
     """Raise ConfigError if the settings need Ray, and it is not installed."""
     if config.learner.kind == "ray" and find_spec("ray") is None:
         raise ConfigError('learner=ray needs Ray: pip install "cartpole_rl[ray]", on both machines')
+
+
+def check_distillation(config: DistillConfig) -> None:
+    """Raise CartPoleError if there is no agent."""
+    check_agent(config.run)
 
 
 def check_export(config: ExportConfig) -> None:
@@ -124,6 +170,18 @@ def check_resumable(program: str, resume: str, folder: Path) -> None:
             f"agent, {LONGER[program].format(as_value(run))}"
         )
     find_training(run)
+
+
+def refuse_others(words: Iterable[str], allowed: Collection[str], reason: str) -> None:
+    """Raise ConfigError that names the settings given on the command line beside those `allowed`."""
+    if others := [word for word in words if not is_given(allowed, [word])]:
+        raise ConfigError(f"{reason}; leave out {', '.join(others)}")
+
+
+def is_given(settings: Collection[str], words: Iterable[str]) -> bool:
+    """Return True if one of the `words` gives one of the settings, or chooses or sets something in it."""
+    keys = {word.lstrip("+~").partition("=")[0] for word in words}
+    return not {*keys, *(key.partition(".")[0] for key in keys)}.isdisjoint(settings)
 
 
 def check_agent(run: Path) -> None:
@@ -188,3 +246,27 @@ def check_compiler(device: str = "cpu") -> None:
         raise ConfigError(f"compile=true finds no {header}: install Python's headers, or give compile=false")
     if device == "cuda" and find_spec("triton") is None:
         raise ConfigError("compile=true with device=cuda needs Triton: install it, or give compile=false")
+
+
+def note_other_numbers(command: str, cart: Mapping[str, float], poles: Iterable[Pole]) -> None:
+    """Print the numbers of a simulated cart and its poles that are not the nominal ones, if there are any."""
+    found = [*differences(cart, shipped_carts()[0])]
+    for pole in poles:
+        found += differences(pole.model_dump(), nominal_pole(pole).model_dump())
+    if found:
+        print_message(command, f"note: the cart is not the nominal one: {', '.join(found)}")
+
+
+def differences(numbers: Mapping[str, float], nominal: Mapping[str, float]) -> Iterator[str]:
+    """Yield a text for each of the `numbers` that is not the nominal one."""
+    for name, value in numbers.items():
+        if value != nominal.get(name):
+            yield f"{name} {value:.4g}" + (f" instead of {nominal[name]:g}" if name in nominal else "")
+
+
+def nominal_pole(pole: Pole) -> Pole:
+    """Return the pole in conf/ whose length is nearest to that of `pole`."""
+    shipped = (
+        Pole(**each) for found in group_choices("pole").values() for each in found.get("choices", {}).values()
+    )
+    return min(shipped, key=lambda each: abs(each.length - pole.length))

@@ -1,13 +1,14 @@
 """The settings of each command. A config is checked against its class before any work is done."""
 
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, TypeVar
 
 from pydantic import Field, field_validator, model_validator
 
 from cartpole_rl.agents.settings import AgentSettings
-from cartpole_rl.checking import kinds
+from cartpole_rl.checking import checked, kinds
 from cartpole_rl.emulator.settings import ONBOARD, EmulatorSettings
 from cartpole_rl.envs.cart_pole_settings import (
     CartFrictionSettings,
@@ -19,6 +20,7 @@ from cartpole_rl.envs.cart_pole_settings import (
     SimulatedCartSettings,
 )
 from cartpole_rl.envs.settings import GuardSettings
+from cartpole_rl.errors import CheckpointError, ConfigError
 from cartpole_rl.identification.settings import EnsembleSettings
 from cartpole_rl.learning.settings import (
     BufferSettings,
@@ -376,7 +378,26 @@ class PreflightConfig(OnCart):
     """The settings of cartpole-preflight."""
 
 
-class EmulateConfig(Settings):
-    """The settings of cartpole-emulate."""
+Config = TypeVar("Config", bound=Settings)
 
-    emulator: EmulatorSettings
+
+def load_settings(schema: type[Config], overrides: Mapping[str, Any] | Sequence[str] = ()) -> Config:
+    """Return the settings of conf/ for the command of `schema`, with overrides as on its command line.
+
+        load_settings(TrainConfig, {"experiment": "balance", "pole": "large", "learning.carts": 512})
+
+    By name, overrides are as in `composition.compose`. Raises ConfigError for a missing file, an unknown name
+    or a value out of range.
+    """
+    from cartpole_rl.composition import compose  # imports Hydra
+
+    command = re.sub(r"\B([A-Z])", r"_\1", schema.__name__.removesuffix("Config")).lower()
+    return checked(schema, compose(command, overrides))
+
+
+def recorded_settings(schema: type[Config], values: Mapping[str, Any], source: str) -> Config:
+    """Return the settings in a checkpoint. Raises CheckpointError that names `source` of another version."""
+    try:
+        return checked(schema, values)
+    except ConfigError as error:
+        raise CheckpointError(f"{source} is of another version of this package: {error}") from None

@@ -11,16 +11,15 @@ from cartpole_rl.evaluation.driving_policy import DrivingPolicy
 from cartpole_rl.learning.checkpoints import AgentCheckpoint, save_agent
 from cartpole_rl.learning.distillation import Distillation
 from cartpole_rl.learning.states import seed_everything
-from cartpole_rl.run_files import CHECKPOINTS, FIGURES, LAST, METRICS
+from cartpole_rl.run_folder import CHECKPOINTS, FIGURES, LAST, METRICS, write_config
+from cartpole_rl.terminal import as_word
 from cartpole_rl.workflows.agents import new_agent, trained_agent
 from cartpole_rl.workflows.build import use_threads
 from cartpole_rl.workflows.config import DistillConfig, TrainConfig
 from cartpole_rl.workflows.export import provenance
-from cartpole_rl.workflows.person import as_word
 from cartpole_rl.workflows.progress import progress_bar
 from cartpole_rl.workflows.report import report
 from cartpole_rl.workflows.results import print_results, shown
-from cartpole_rl.workflows.run_folder import write_config
 from cartpole_rl.workflows.train import judge, nominal_env
 
 

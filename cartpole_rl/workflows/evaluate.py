@@ -13,17 +13,16 @@ from cartpole_rl.plants.settings import EmulatedSettings
 from cartpole_rl.reporting.scores import score_columns, score_table
 from cartpole_rl.reporting.words import count_text, cut_off
 from cartpole_rl.rig.parameters import PARAMETERS
-from cartpole_rl.run_files import BESIDE_SIMULATION, FIGURES, METRICS
+from cartpole_rl.run_folder import BESIDE_SIMULATION, FIGURES, METRICS, write_config
 from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.terminal import as_word
 from cartpole_rl.workflows.checks import BASELINE, agent_file
 from cartpole_rl.workflows.config import EvaluateConfig
 from cartpole_rl.workflows.episodes import Evaluation, prepared
-from cartpole_rl.workflows.person import as_word
 from cartpole_rl.workflows.prediction import draw_beside_simulation
 from cartpole_rl.workflows.repeating import Repetition
 from cartpole_rl.workflows.report import report
 from cartpole_rl.workflows.results import plant_words, print_loop_time, print_results, shown
-from cartpole_rl.workflows.run_folder import write_config
 from cartpole_rl.workflows.trained_poles import POLES, emulated_words, emulator_for, knows
 
 

@@ -20,11 +20,10 @@ from cartpole_rl.files import write_bytes
 from cartpole_rl.learning.checkpoint_files import find_agent
 from cartpole_rl.learning.checkpoints import load_agent
 from cartpole_rl.plants.settings import SimulatedSettings
-from cartpole_rl.run_files import CHECKPOINTS
+from cartpole_rl.run_folder import CHECKPOINTS, recorded_provenance, write_config
 from cartpole_rl.workflows.agents import TrainedAgent, trained_agent
 from cartpole_rl.workflows.build import without_guard_numbers
 from cartpole_rl.workflows.config import EvaluateConfig, ExportConfig, TrainConfig
-from cartpole_rl.workflows.run_folder import recorded_provenance, write_config
 from cartpole_rl.workflows.trained_poles import guard_holds
 
 

@@ -39,7 +39,21 @@ from cartpole_rl.reporting.live_view import LiveView, view_title
 from cartpole_rl.reporting.scores import SCORES, score_table
 from cartpole_rl.reporting.tensorboard import TensorBoardLog
 from cartpole_rl.reporting.words import count_text, cut_off
-from cartpole_rl.run_files import CHECKPOINTS, COMPARISON, LAST, METRICS, PROVENANCE, RECORDINGS, START
+from cartpole_rl.run_folder import (
+    AGENT_HASH,
+    CHECKPOINTS,
+    COMPARISON,
+    LAST,
+    METRICS,
+    PROVENANCE,
+    RECORDINGS,
+    START,
+    file_hash,
+    recorded_provenance,
+    write_config,
+    write_json,
+)
+from cartpole_rl.terminal import as_word, confirm, print_message
 from cartpole_rl.workflows.agents import new_agent, trained_agent
 from cartpole_rl.workflows.build import (
     evaluated_env,
@@ -49,22 +63,13 @@ from cartpole_rl.workflows.build import (
     use_threads,
 )
 from cartpole_rl.workflows.checks import check_finetuning, check_resumable
-from cartpole_rl.workflows.config import EvaluateConfig, FinetuneConfig, TrainConfig
+from cartpole_rl.workflows.config import EvaluateConfig, FinetuneConfig, TrainConfig, recorded_settings
 from cartpole_rl.workflows.finetuning_cart import DrivenCart, FinetuningFiles, Stage, yielding_to
 from cartpole_rl.workflows.finetuning_learner import CartLearner, TunedAgent, check_simulation
-from cartpole_rl.workflows.loading import recorded_settings
-from cartpole_rl.workflows.person import as_word, confirm, print_message
 from cartpole_rl.workflows.ray_learner import LearnerTask, Offer
 from cartpole_rl.workflows.ray_link import LearnerLink
 from cartpole_rl.workflows.report import report, summarized
 from cartpole_rl.workflows.results import plant_words, print_loop_time, print_results, shown
-from cartpole_rl.workflows.run_folder import (
-    AGENT_HASH,
-    file_hash,
-    recorded_provenance,
-    write_config,
-    write_json,
-)
 from cartpole_rl.workflows.trained_poles import other_pole
 
 NAME = "learner"  # in a checkpoint: the name of a learner of Ray

@@ -20,12 +20,12 @@ from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.plants.serial.statistics import LinkStatistics
 from cartpole_rl.reporting.tensorboard import TensorBoardLog
 from cartpole_rl.reporting.words import ending_text, guard_text
-from cartpole_rl.run_files import CHECKPOINTS, RECORDINGS, START
+from cartpole_rl.run_folder import CHECKPOINTS, RECORDINGS, START
 from cartpole_rl.scheduling import giving_precedence
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.terminal import print_message
 from cartpole_rl.workflows.config import FinetuneConfig
-from cartpole_rl.workflows.person import print_message
 
 LARGEST_LOSSES = 3  # of the link in succession, in an evaluation
 

@@ -10,7 +10,7 @@ from cartpole_rl.checking import checked
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.plants.settings import EmulatedSettings
-from cartpole_rl.run_files import CONFIG
+from cartpole_rl.run_folder import CONFIG
 from cartpole_rl.workflows.config import IdentifyConfig
 
 BY_HAND = ("pole_mass", "pole_com")  # `unknowns.WEIGHED` as parameters: measured with scales and a ruler

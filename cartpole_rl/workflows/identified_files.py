@@ -13,7 +13,7 @@ from cartpole_rl.identification.unknowns import WEIGHED
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.randomization.poles import Pole
 from cartpole_rl.rig.parameters import PARAMETERS
-from cartpole_rl.run_files import CART, POLE, POSTERIOR, RANDOMIZATION
+from cartpole_rl.run_folder import CART, POLE, POSTERIOR, RANDOMIZATION
 
 UNIDENTIFIABLE = {  # randomized about the identified cart, since no experiment shows them
     "track_half_length": {"distribution": "uniform", "relative": [-0.1, 0.0]},

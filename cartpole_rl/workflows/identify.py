@@ -31,18 +31,27 @@ from cartpole_rl.reporting.identification import (
     quantities_table,
 )
 from cartpole_rl.reporting.table import table
-from cartpole_rl.run_files import CART, FIGURES, IDENTIFIED, PAGE, POLE, RANDOMIZATION, RECORDINGS
+from cartpole_rl.run_folder import (
+    CART,
+    FIGURES,
+    IDENTIFIED,
+    PAGE,
+    POLE,
+    RANDOMIZATION,
+    RECORDINGS,
+    write_config,
+    write_json,
+)
 from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.terminal import confirm, print_message
 from cartpole_rl.workflows.build import precedence, use_threads
+from cartpole_rl.workflows.checks import note_other_numbers
 from cartpole_rl.workflows.config import IdentifyConfig
 from cartpole_rl.workflows.identified_errors import BY_HAND, errors, known_truth
 from cartpole_rl.workflows.identified_files import report, write_choices
-from cartpole_rl.workflows.nominal import note_other_numbers
-from cartpole_rl.workflows.person import confirm, print_message
 from cartpole_rl.workflows.progress import progress_bar
 from cartpole_rl.workflows.recordings import experiments
 from cartpole_rl.workflows.results import print_results, shown
-from cartpole_rl.workflows.run_folder import write_config, write_json
 
 HELD_OUT_OF = 5  # one recording in so many is held out
 

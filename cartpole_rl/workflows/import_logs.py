@@ -15,9 +15,8 @@ from cartpole_rl.errors import RecordingError
 from cartpole_rl.evaluation.recordings import LENGTH, write_recording
 from cartpole_rl.identification.logs import Layout, Log, Report, read_log
 from cartpole_rl.identification.sensors import Estimate, Motion, Sensors, question_sensors
-from cartpole_rl.run_files import RECORDINGS
+from cartpole_rl.run_folder import RECORDINGS, write_config, write_json
 from cartpole_rl.settings import Positive, Settings
-from cartpole_rl.workflows.run_folder import write_config, write_json
 
 IMPORTED = "import.json"
 SUFFIXES = (".csv", ".txt", ".tsv", ".log", ".dat")

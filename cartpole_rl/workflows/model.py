@@ -25,16 +25,15 @@ from cartpole_rl.reporting.error_tables import REPORTED_TIMES, model_table, spre
 from cartpole_rl.reporting.figures import save
 from cartpole_rl.reporting.figures.learned_models import ensemble_figure
 from cartpole_rl.reporting.words import LEARNED, PHYSICS, count_text
-from cartpole_rl.run_files import FIGURES, MODELLED
+from cartpole_rl.run_folder import FIGURES, MODELLED, write_config, write_json
 from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.terminal import as_word
 from cartpole_rl.workflows.build import use_threads
 from cartpole_rl.workflows.config import ModelConfig
-from cartpole_rl.workflows.person import as_word
 from cartpole_rl.workflows.poles import chosen_pole
 from cartpole_rl.workflows.progress import progress_bar
 from cartpole_rl.workflows.recordings import recordings
 from cartpole_rl.workflows.results import print_results, shown
-from cartpole_rl.workflows.run_folder import write_config, write_json
 
 FIGURE = f"{FIGURES}/model.png"
 FRICTION_MODELS = (CART_FRICTIONS.find("sigmoid"), CART_FRICTIONS.find("step"))  # candidates for the cart

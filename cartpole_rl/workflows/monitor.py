@@ -16,10 +16,10 @@ from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.reporting.animation import gif
 from cartpole_rl.reporting.figures import behaviour
 from cartpole_rl.reporting.loggers import Logger
-from cartpole_rl.run_files import BEST, CHECKPOINTS, HISTORY, LAST
+from cartpole_rl.run_folder import BEST, CHECKPOINTS, HISTORY, LAST
 from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.terminal import print_message
 from cartpole_rl.workflows.config import TrainConfig
-from cartpole_rl.workflows.person import print_message
 from cartpole_rl.workflows.progress import progress_bar
 
 GUARDED = "guarded_fraction"  # None without a track guard

@@ -12,15 +12,16 @@ from cartpole_rl.plants.serial.preflight import Finding, preflight
 from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.plants.settings import EmulatedSettings
 from cartpole_rl.randomization.poles import Pole
+from cartpole_rl.terminal import confirm
+from cartpole_rl.workflows.checks import is_given
 from cartpole_rl.workflows.config import PreflightConfig
-from cartpole_rl.workflows.person import confirm
 from cartpole_rl.workflows.trained_poles import POLES, emulated_pole, emulator_for, one_pole
 
 
-def check_cart(config: PreflightConfig, given: Sequence[str] = ()) -> None:
+def check_cart(config: PreflightConfig, words: Sequence[str] = ()) -> None:
     """Check the cart of `config.plant` by small moves, and print a line for each check.
 
-    At the end prints the command that identifies the cart, with the words `given` for it, as plant.port=COM3.
+    At the end prints the command that identifies the cart, with the `words` given for it, as plant.port=COM3.
     Writes no files. Raises PlantError after the first check that fails, LinkError if no cart answers.
     """
     with connected_cart(config) as cart:
@@ -32,7 +33,7 @@ def check_cart(config: PreflightConfig, given: Sequence[str] = ()) -> None:
             f"the cart is not ready: {finding.check if finding else 'nothing was checked'} failed"
         )
     print("The cart is ready. Next, with the mounted pole as pole= (medium, large or a file):")
-    print(next_command(config, given))
+    print(next_command(config, [word for word in words if is_given(("plant", "emulator"), [word])]))
 
 
 def next_command(config: PreflightConfig, given: Sequence[str]) -> str:

@@ -21,9 +21,8 @@ from cartpole_rl.learning.states import seed_everything
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.agents import new_agent
 from cartpole_rl.workflows.build import evaluated_settings, use_threads
-from cartpole_rl.workflows.config import EvaluateConfig, FinetuneConfig, TrainConfig
+from cartpole_rl.workflows.config import EvaluateConfig, FinetuneConfig, TrainConfig, recorded_settings
 from cartpole_rl.workflows.finetuning_learner import CartLearner, TunedAgent, check_simulation
-from cartpole_rl.workflows.loading import recorded_settings
 
 ABANDONED = 3600.0  # s without a call of `exchange`, after which the learner ends
 POLL = 0.05  # s between two looks for an episode

@@ -277,7 +277,9 @@ def joined(address: str) -> "Iterator[subprocess.Popen[bytes]]":
             if node.poll() is not None:
                 raise ConnectionError(f"no Ray cluster answers at {address}")
             with suppress(ConnectionError, ValueError, LookupError):  # not joined yet
-                ray.init(address=address, namespace="cartpole_rl", log_to_driver=False, logging_level=logging.ERROR)
+                ray.init(
+                    address=address, namespace="cartpole_rl", log_to_driver=False, logging_level=logging.ERROR
+                )
             time.sleep(PERIOD)
         yield node
     finally:

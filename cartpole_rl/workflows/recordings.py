@@ -4,8 +4,7 @@ import re
 from pathlib import Path
 
 from cartpole_rl.errors import RecordingError
-from cartpole_rl.run_files import RECORDINGS
-from cartpole_rl.workflows.run_folder import check_program
+from cartpole_rl.run_folder import RECORDINGS, check_program
 
 RECORDING = ("record", "identify", "finetune")  # commands whose runs hold recordings
 

@@ -11,12 +11,11 @@ import yaml
 from cartpole_rl.checking import checked
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.randomization.poles import Pole
-from cartpole_rl.run_files import CONFIG, METRICS
+from cartpole_rl.run_folder import CONFIG, METRICS, check_program
 from cartpole_rl.tasks.episode import Origin
 from cartpole_rl.workflows.checks import simulated_carts
 from cartpole_rl.workflows.config import EvaluateConfig
 from cartpole_rl.workflows.origins import read_origin
-from cartpole_rl.workflows.run_folder import check_program
 
 
 @dataclass(frozen=True)

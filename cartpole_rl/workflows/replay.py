@@ -16,14 +16,13 @@ from cartpole_rl.reporting.figures import save
 from cartpole_rl.reporting.figures.replays import replay_figure
 from cartpole_rl.reporting.words import count_text
 from cartpole_rl.rig.parameters import check_names, check_values
-from cartpole_rl.run_files import FIGURES
+from cartpole_rl.run_folder import FIGURES, write_config, write_json
+from cartpole_rl.terminal import as_word
+from cartpole_rl.workflows.checks import note_other_numbers
 from cartpole_rl.workflows.config import ReplayConfig
-from cartpole_rl.workflows.nominal import note_other_numbers
-from cartpole_rl.workflows.person import as_word
 from cartpole_rl.workflows.poles import chosen_pole
 from cartpole_rl.workflows.recordings import recordings
 from cartpole_rl.workflows.results import print_results, shown
-from cartpole_rl.workflows.run_folder import write_config, write_json
 
 REPLAY, FIGURE = "replay.json", f"{FIGURES}/replay.png"
 

@@ -8,11 +8,10 @@ from cartpole_rl.evaluation.metrics import episode_metrics, summarize
 from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.reporting.animation import durations, frames, write_animation
 from cartpole_rl.reporting.figures import behaviour, learning_curve, save
-from cartpole_rl.run_files import ANIMATION, FIGURES, METRICS
+from cartpole_rl.run_folder import ANIMATION, FIGURES, METRICS, write_json
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.tasks.settings import TaskSettings
 from cartpole_rl.workflows.origins import stored_origins
-from cartpole_rl.workflows.run_folder import write_json
 
 
 def report(

@@ -7,7 +7,7 @@ from pathlib import Path
 from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.plants.settings import EmulatedSettings
 from cartpole_rl.randomization.poles import PoleSettings
-from cartpole_rl.workflows.person import as_word
+from cartpole_rl.terminal import as_word
 from cartpole_rl.workflows.trained_poles import emulated_words
 
 DEFAULT_BAUD = SerialSettings.model_fields["baud"].default

@@ -17,20 +17,17 @@ from cartpole_rl.learning.states import seed_everything
 from cartpole_rl.plants.effects import without_effect
 from cartpole_rl.plants.settings import LearnedSettings, SimulatedSettings
 from cartpole_rl.randomization.randomizer import Draws
-from cartpole_rl.run_files import CHECKPOINTS, FIGURES, METRICS
+from cartpole_rl.run_folder import CHECKPOINTS, FIGURES, METRICS, write_config
 from cartpole_rl.settings import evaluation_seed
 from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.terminal import as_word, print_message
 from cartpole_rl.workflows.agents import new_agent
 from cartpole_rl.workflows.build import use_threads
-from cartpole_rl.workflows.checks import check_compiler, check_resumable
-from cartpole_rl.workflows.config import TrainConfig
-from cartpole_rl.workflows.loading import recorded_settings
+from cartpole_rl.workflows.checks import check_compiler, check_resumable, note_other_numbers
+from cartpole_rl.workflows.config import TrainConfig, recorded_settings
 from cartpole_rl.workflows.monitor import TrainingMonitor
-from cartpole_rl.workflows.nominal import note_other_numbers
-from cartpole_rl.workflows.person import as_word, print_message
 from cartpole_rl.workflows.report import report
 from cartpole_rl.workflows.results import print_results, shown
-from cartpole_rl.workflows.run_folder import write_config
 from cartpole_rl.workflows.trained_poles import emulated_words
 
 

@@ -54,8 +54,7 @@ from cartpole_rl.rig.parameters import PARAMETERS
 from cartpole_rl.settings import evaluation_seed
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.tasks.settings import StartSettings
-from cartpole_rl.workflows.config import TrainConfig
-from cartpole_rl.workflows.loading import load_settings
+from cartpole_rl.workflows.config import TrainConfig, load_settings
 
 WIDTHS = (0.0, 1 / 3, 2 / 3)
 DRAWN_CARTS, WATCHED_CARTS = 1000, 10  # carts that judge an agent at the end, and during training

@@ -43,9 +43,8 @@ from cartpole_rl.exporting.onnx_model import onnx_model
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.agents import TrainedAgent, trained_agent
 from cartpole_rl.workflows.build import evaluated_env, evaluated_settings
-from cartpole_rl.workflows.config import EvaluateConfig
+from cartpole_rl.workflows.config import EvaluateConfig, load_settings
 from cartpole_rl.workflows.export import exported_agent, network_of
-from cartpole_rl.workflows.loading import load_settings
 
 CARTS = 200  # simulated at once
 SEED = 1

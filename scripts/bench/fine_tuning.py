@@ -39,13 +39,12 @@ from truths import TUNED, Truth
 
 from cartpole_rl.errors import CartPoleError
 from cartpole_rl.reporting.table import Cell
-from cartpole_rl.run_files import CHECKPOINTS, RESUME
+from cartpole_rl.run_folder import CHECKPOINTS, RESUME
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
-from cartpole_rl.workflows.config import FinetuneConfig
+from cartpole_rl.workflows.config import FinetuneConfig, load_settings
 from cartpole_rl.workflows.finetune import finetune
 from cartpole_rl.workflows.finetuning_cart import FinetuningFiles, Stage
-from cartpole_rl.workflows.loading import load_settings
 
 PARENT = RUNS / "fine_tuning"
 FIGURES = "bench.json"  # in a run folder, written at the end

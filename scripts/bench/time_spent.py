@@ -19,10 +19,10 @@ from collections import defaultdict
 from collections.abc import Callable
 from typing import Any
 
+from cartpole_rl.commands.train import main as train_command
 from common import option_parser, print_table, write_json
 
 from cartpole_rl.agents.settings import AGENTS
-from cartpole_rl.commands.train import main as train_command
 from cartpole_rl.learning.dqn import Training
 
 KINDS = {"collect": "stepping", "learn": "updating", "evaluate": "evaluating"}  # method of Training: kind

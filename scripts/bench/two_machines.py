@@ -113,7 +113,7 @@ class Bench:
 
     def finetune(self, folder: Path, *words: str) -> "subprocess.Popen[bytes]":
         """Start cartpole-finetune on the cart's machine."""
-        command = self.cart.command(sys.executable, "-m", "cartpole_rl.commands.finetune", *words)
+        command = self.cart.command(sys.executable, "-m", "cartpole_rl.cli", "finetune", *words)
         folder.parent.mkdir(parents=True, exist_ok=True)
         with folder.with_suffix(".log").open("ab") as log:
             process = subprocess.Popen(command, env=self.env, stdout=log, stderr=log)

@@ -20,7 +20,7 @@ from cartpole_rl.choices import conf_folder
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.reporting.events import scalars
 from cartpole_rl.reporting.results import EVALUATIONS, OWN, Agent, Curve, Exclusion
-from cartpole_rl.run_files import CONFIG
+from cartpole_rl.run_folder import CONFIG
 from cartpole_rl.workflows.pages.runs import (
     FREE,
     Run,

@@ -33,9 +33,9 @@ from worker import MODULES, SIGNALLED, in_own_process, is_complete, made_otherwi
 
 from cartpole_rl.errors import CartPoleError, ConfigError
 from cartpole_rl.files import FULL, claimed, write_text
-from cartpole_rl.run_files import LOG
+from cartpole_rl.run_folder import LOG
 from cartpole_rl.signals import RaiseOnce, ending_signals
-from cartpole_rl.workflows.person import exit_if_nobody_reads
+from cartpole_rl.terminal import exit_if_nobody_reads
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 RUNS = Path("runs/reproduce")  # in the checkout

@@ -17,8 +17,8 @@ from cartpole_rl.checking import checked
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.reporting.results import GOOD, OWN, Agent, Exclusion, Group, Named, Results, is_number
 from cartpole_rl.reporting.statistics import Array, Estimate, estimate
+from cartpole_rl.run_folder import write_json
 from cartpole_rl.workflows.pages.runs import DAMAGE, short
-from cartpole_rl.workflows.run_folder import write_json
 
 FORMAT = 1  # of the JSON file
 DIGITS = 6  # significant, of the numbers in it

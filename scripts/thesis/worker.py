@@ -18,10 +18,20 @@ from cartpole_rl.choices import choice
 from cartpole_rl.errors import CartPoleError
 from cartpole_rl.files import claimed
 from cartpole_rl.reporting.results import EVALUATIONS
-from cartpole_rl.run_files import CHECKPOINTS, COMPARISON, IDENTIFIED, LOG, METRICS, MODELLED, RESUME
+from cartpole_rl.run_folder import (
+    CHECKPOINTS,
+    COMPARISON,
+    IDENTIFIED,
+    LOG,
+    METRICS,
+    MODELLED,
+    PREFIX,
+    RESUME,
+    is_outdated,
+    recorded_provenance,
+    write_inputs,
+)
 from cartpole_rl.signals import RaiseOnce, ending_signals
-from cartpole_rl.workflows.run_folder import PREFIX, recorded_provenance
-from cartpole_rl.workflows.run_inputs import is_outdated, write_inputs
 
 COMMANDS = {  # command: the module and the function that carry it out, and its settings
     "train": ("cartpole_rl.workflows.train", "train", "TrainConfig"),
@@ -137,7 +147,7 @@ def carry_out(task: Task, resumed: bool = False) -> None:
     from tqdm import tqdm
 
     from cartpole_rl.workflows import config
-    from cartpole_rl.workflows.loading import load_settings
+    from cartpole_rl.workflows.config import load_settings
 
     tqdm.set_lock(threading.RLock())  # its own is a semaphore of the system, which a killed process leaves
     sys.argv = [f"{PREFIX}{task.command}", *task.words]  # for provenance.json

@@ -7,8 +7,7 @@ from adaptation import Job, make_env, wider_ranges
 
 from cartpole_rl.randomization.ranges import check_carts
 from cartpole_rl.rig.parameters import PARAMETERS
-from cartpole_rl.workflows.config import TrainConfig
-from cartpole_rl.workflows.loading import load_settings
+from cartpole_rl.workflows.config import TrainConfig, load_settings
 
 
 @pytest.fixture(scope="module")

@@ -18,18 +18,18 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.plugins import Plugins
 from hydra.core.utils import JobReturn
 
-from cartpole_rl.commands.find_port import FindPortConfig
-from cartpole_rl.commands.hydra_application.application import application
-from cartpole_rl.commands.hydra_application.exits import Terminated, exit_with_message
+from cartpole_rl.cli import VERBS
+from cartpole_rl.command import run_command
+from cartpole_rl.exits import Terminated, exit_with_message
 from cartpole_rl.signals import UNWINDING, RaiseOnce, ending_signals
+from cartpole_rl.workflows.find_port import FindPortConfig
 
 
 def run_until_signalled(number: signal.Signals, folder: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Send signal `number` to a command at work; return what it did."""
     happened: list[str] = []
 
-    @application("find_port", FindPortConfig)
-    def main(config: FindPortConfig, run: Path) -> None:
+    def main(config: FindPortConfig) -> None:
         try:
             os.kill(os.getpid(), number)
             time.sleep(5)
@@ -41,7 +41,7 @@ def run_until_signalled(number: signal.Signals, folder: Path, monkeypatch: pytes
     monkeypatch.chdir(folder)
     with patch("sys.argv", ["cartpole-find-port"]):
         try:
-            main()
+            run_command("find_port", VERBS["find_port"]._replace(function=main))
         except SystemExit as ended:
             happened.append(f"exit code {ended.code}")
     return happened
@@ -94,14 +94,13 @@ def test_a_hangup_that_nohup_ignores_stays_ignored() -> None:
 def test_a_full_disk_ends_a_command_with_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    @application("find_port", FindPortConfig)
-    def main(config: FindPortConfig, run: Path) -> None:
+    def main(config: FindPortConfig) -> None:
         Path("/dev/full").write_text("as a log that is appended to")
 
     GlobalHydra.instance().clear()
     monkeypatch.chdir(tmp_path)
     with patch("sys.argv", ["cartpole-find-port"]), pytest.raises(SystemExit) as ended:
-        main()
+        run_command("find_port", VERBS["find_port"]._replace(function=main))
     assert ended.value.code == 1
     assert capsys.readouterr().err.startswith(
         "cartpole-find-port: a file was not written: No space left on dev"
@@ -116,7 +115,7 @@ def test_an_error_of_the_system_that_concerns_no_file_is_raised() -> None:
 def test_a_pipe_without_a_reader_ends_a_command_quietly() -> None:
     """As in `cartpole-train --cfg job | head -1`, once `head` has ended."""
     program = (
-        "from cartpole_rl.commands.hydra_application.exits import exit_with_message\n"
+        "from cartpole_rl.exits import exit_with_message\n"
         "try:\n"
         "    print('x' * 100_000)\n"
         "except OSError as error:\n"
@@ -158,8 +157,7 @@ def test_a_job_in_a_process_of_its_own_unwinds_after_a_signal(
 ) -> None:
     happened: list[str] = []
 
-    @application("find_port", FindPortConfig)
-    def main(config: FindPortConfig, run: Path) -> None:
+    def main(config: FindPortConfig) -> None:
         assert isinstance(signal.getsignal(signal.SIGTERM), RaiseOnce)  # or pytest would end here
         with pytest.raises(Terminated):
             signal.raise_signal(signal.SIGTERM)
@@ -168,7 +166,7 @@ def test_a_job_in_a_process_of_its_own_unwinds_after_a_signal(
     GlobalHydra.instance().clear()
     monkeypatch.chdir(tmp_path)
     with patch("sys.argv", ["cartpole-find-port", "-m", fresh_launcher]):
-        main()
+        run_command("find_port", VERBS["find_port"]._replace(function=main))
     assert happened == ["unwound"]
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL  # as the launcher left it
 
@@ -177,7 +175,7 @@ def test_a_job_that_a_signal_ended_ends_its_process_by_that_signal() -> None:
     """So that the launcher reports it."""
     program = (
         "import os, signal, time\n"
-        "from cartpole_rl.commands.hydra_application.exits import job_signals\n"
+        "from cartpole_rl.exits import job_signals\n"
         "with job_signals():\n"
         "    try:\n"
         "        os.kill(os.getpid(), signal.SIGTERM)\n"

@@ -6,19 +6,20 @@ import pytest
 from hydra.errors import HydraException, OverrideParseException
 
 from cartpole_rl.choices import default_choices
-from cartpole_rl.commands.hydra_application.complaints import (
-    WHOLE,
-    composed_settings,
-    dashed_setting,
-    hydra_complaint,
-    in_one_line,
-    nearest_choice,
-    wrong_option,
-)
+from cartpole_rl.command import dashed_setting, wrong_option
+from cartpole_rl.composition import error_message, known_settings, nearest_choice
+from cartpole_rl.errors import ConfigError
+from cartpole_rl.exits import one_line
+
+WHOLE = ("experiment", "sweep")
+
+
+def hydra_complaint(text: str, command: str, *words: str) -> str:
+    return error_message(HydraException(text), command, words)
 
 
 def test_a_file_error_names_the_file_and_the_reason() -> None:
-    assert in_one_line(FileNotFoundError(errno.ENOENT, "No such file", "agent.pt"), "train") == (
+    assert one_line(FileNotFoundError(errno.ENOENT, "No such file", "agent.pt"), "train") == (
         "agent.pt: No such file"
     )
 
@@ -26,20 +27,21 @@ def test_a_file_error_names_the_file_and_the_reason() -> None:
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT])
 def test_a_full_disk_gets_a_remedy(number: int) -> None:
     remedy = "; make room, or give hydra.run.dir= a folder on another disk"
-    assert in_one_line(OSError(number, "is full", "last.pt"), "train") == f"last.pt: is full{remedy}"
+    assert one_line(OSError(number, "is full", "last.pt"), "train") == f"last.pt: is full{remedy}"
     unnamed = "a file was not written: is full"
-    assert in_one_line(OSError(number, "is full"), "train") == f"{unnamed}{remedy}"
+    assert one_line(OSError(number, "is full"), "train") == f"{unnamed}{remedy}"
 
 
 def test_a_word_that_is_no_setting_is_repeated() -> None:
-    complaint = in_one_line(OverrideParseException("seed", "LexerNoViableAlt"), "train")
+    complaint = one_line(OverrideParseException("seed", "LexerNoViableAlt"), "train")
     assert complaint.startswith("seed: settings are given as key=value")
 
 
 def test_other_errors_keep_their_first_line() -> None:
-    assert in_one_line(ValueError("the first\nthe second"), "train") == "the first"
-    assert in_one_line(ValueError(), "train") == "ValueError"
-    assert in_one_line(HydraException("broken\n  in two"), "train") == "broken in two"
+    assert one_line(ConfigError("the first\nthe second"), "train") == "the first"
+    assert one_line(ConfigError(), "train") == "ConfigError"
+    assert one_line(ValueError("the first\nthe second"), "train") == "ValueError: the first"
+    assert one_line(HydraException("broken\n  in two"), "train") == "broken in two"
 
 
 def test_a_missing_choice_is_named_with_the_nearest_one() -> None:
@@ -156,6 +158,6 @@ def test_a_misspelt_option_is_found(words: list[str], message: str | None) -> No
 
 @pytest.mark.parametrize("command", ["train", "evaluate", "finetune"])
 def test_no_setting_is_taken_for_an_option(command: str) -> None:
-    settings = {setting.partition(".")[0] for setting in composed_settings(command, [])}
+    settings = {setting.partition(".")[0] for setting in known_settings(command, [])}
     assert len(settings) > 5
     assert [setting for setting in settings if wrong_option([f"--{setting}"])] == []

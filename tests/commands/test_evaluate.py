@@ -14,9 +14,8 @@ from cartpole_rl.evaluation.recordings import read_recording
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.workflows import checks
 from cartpole_rl.workflows.build import predicting_env
-from cartpole_rl.workflows.config import EvaluateConfig
+from cartpole_rl.workflows.config import EvaluateConfig, load_settings
 from cartpole_rl.workflows.episodes import prepared
-from cartpole_rl.workflows.loading import load_settings
 from cartpole_rl.workflows.origins import as_stored, read_origin
 from cartpole_rl.workflows.prediction import predicted_episode
 

@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 from command_line import in_process
 
-from cartpole_rl.commands.find_port import listing, watched
 from cartpole_rl.errors import PortError
 from cartpole_rl.plants.serial.port import found_ports
 from cartpole_rl.plants.serial.ports import UsbPort
+from cartpole_rl.workflows.find_port import listing, watched
 
 CH340 = UsbPort("/dev/ttyUSB0", 0x1A86, 0x7523)
 FTDI = UsbPort("/dev/ttyUSB1", 0x0403, 0x6001)

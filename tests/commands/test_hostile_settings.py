@@ -4,7 +4,6 @@ Each case gives the right settings, or one line that names what is wrong, exit c
 """
 
 import contextlib
-import importlib
 import io
 import os
 import signal
@@ -20,21 +19,15 @@ import yaml
 from command_line import HANDLED, Outcome
 from hydra.core.global_hydra import GlobalHydra
 
-import cartpole_rl.workflows.config as configs
 from cartpole_rl.checking import checked
-from cartpole_rl.choices import choice, compose, default_choices, group_choices, merged
-from cartpole_rl.commands.find_port import FindPortConfig
-from cartpole_rl.commands.hydra_application.application import application
+from cartpole_rl.choices import default_choices, group_choices, merged
+from cartpole_rl.cli import VERBS
+from cartpole_rl.command import run_command
+from cartpole_rl.composition import compose
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.settings import Settings
 
-SCHEMAS: dict[str, type[Settings]] = {
-    name: getattr(configs, f"{name.capitalize()}Config")
-    for name in (
-        *("train", "evaluate", "record", "finetune", "identify", "model", "replay"),
-        *("preflight", "emulate", "export", "distill", "report"),
-    )
-} | {"find_port": FindPortConfig}
+SCHEMAS: dict[str, type[Settings]] = {name: verb.find(verb.settings) for name, verb in VERBS.items()}
 REQUIRED: dict[str, dict[str, Any]] = {
     "evaluate": {"run": "lqr"},
     "record": {"run": "lqr"},
@@ -91,9 +84,7 @@ def run(command: str, *words: str, folder: Path) -> tuple[Outcome, Settings | No
     """Compose and check a command's settings as the command does; return the outcome and the settings."""
     found: list[Settings] = []
 
-    @application(command, SCHEMAS[command])
-    def main(config: Settings, folder: Path) -> None:
-        found.append(config)
+    verb = VERBS[command]._replace(function=lambda config: found.append(config), check="")
 
     GlobalHydra.instance().clear()
     handlers = {number: signal.getsignal(number) for number in HANDLED}
@@ -107,7 +98,7 @@ def run(command: str, *words: str, folder: Path) -> tuple[Outcome, Settings | No
     ):
         warnings.simplefilter("error", RuntimeWarning)
         try:
-            main()
+            run_command(command, verb)
         except SystemExit as ended:
             code = int(ended.code or 0)
         finally:
@@ -293,9 +284,3 @@ def test_settings_on_the_command_line(command: str, tmp_path: Path) -> None:
         assert (config is None) == (done.code == 2), (word, done)
         assert len(done.err.splitlines()) == (done.code == 2), (word, done)
         assert contents(tmp_path) == [], (word, done)
-
-
-def test_all_commands_are_here() -> None:
-    folder = Path(importlib.import_module("cartpole_rl.commands").__file__ or "").parent
-    assert {file.stem for file in folder.glob("*.py") if "__main__" in file.read_text()} == {*SCHEMAS}
-    assert choice("train")["seed"] == 0

@@ -13,7 +13,7 @@ import pytest
 from command_line import COARSE, Outcome, in_process
 from hydra_configs import shipped_choices
 
-from cartpole_rl.commands.hydra_application.composition import wrapped
+from cartpole_rl.command import wrapped
 from cartpole_rl.workflows.progress import progress_bar
 
 SIMULATED = "cartpole-evaluate run=run plant=emulated"

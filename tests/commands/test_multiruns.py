@@ -27,7 +27,7 @@ class StoppedClock(datetime):
 
 @pytest.fixture
 def same_second(monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in ("cartpole_rl.commands.hydra_application.composition", "hydra.core.utils"):
+    for module in ("cartpole_rl.sweeps", "hydra.core.utils"):
         monkeypatch.setattr(f"{module}.datetime", StoppedClock)
 
 

@@ -12,9 +12,8 @@ from command_line import TINY, in_process
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.workflows.config import TrainConfig
-from cartpole_rl.workflows.loading import load_settings
-from cartpole_rl.workflows.person import as_value, as_word
+from cartpole_rl.terminal import as_value, as_word
+from cartpole_rl.workflows.config import TrainConfig, load_settings
 
 TENTH = {"cart_mass": {"relative": [-0.1, 0.1]}}
 REWARD = {"kind": "score", "scale": 0.1, "track_penalty": 0, "position_cost": 0}

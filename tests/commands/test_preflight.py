@@ -9,7 +9,7 @@ from hydra_configs import shipped_choices
 from serial_peer import Between
 
 from cartpole_rl.checking import checked
-from cartpole_rl.choices import compose
+from cartpole_rl.composition import compose
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.plants.emulated_cart import EmulatedCart
 from cartpole_rl.workflows.config import PreflightConfig

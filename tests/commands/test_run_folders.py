@@ -15,11 +15,11 @@ import yaml
 from command_line import TINY, console_script, in_process, outcome, prints_only_progress
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from cartpole_rl.commands.hydra_application.composition import constant_settings, job_name, run_folder
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.errors import LinkError
 from cartpole_rl.evaluation.episodes import Policy, run_episodes
 from cartpole_rl.files import claimed
+from cartpole_rl.sweeps import constant_settings, job_name, run_folder
 from cartpole_rl.tasks.episode import Episode
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from command_line import Outcome, in_process
 
-from cartpole_rl.workflows.run_folder import USES, program_of, write_config
+from cartpole_rl.run_folder import USES, program_of, write_config
 
 MADE_BY = (*USES, "unfinished", "multirun")
 WHAT_TO_DO = {  # with a folder, by what made it

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 from command_line import in_process
 
-from cartpole_rl.commands.hydra_application.complaints import EXTRAS
-from cartpole_rl.commands.hydra_application.sweeps import as_multirun
+from cartpole_rl.composition import EXTRAS
+from cartpole_rl.sweeps import as_multirun
 
 FAILS = "cart.cart_mass=-1"  # at once, by a check of the job: the type is right
 
@@ -51,7 +51,7 @@ def test_the_command_line_replaces_values_of_a_sweep(tmp_path: Path) -> None:
 
 
 def test_a_defect_in_a_job_leaves_its_traceback(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("cartpole_rl.commands.train.check_training", lambda config: 1 / 0)
+    monkeypatch.setattr("cartpole_rl.workflows.checks.check_training", lambda: 1 / 0)
     done = in_process("train", "-m", "seed=0,1", folder=tmp_path)
     assert done.code == 1
     assert done.err.splitlines()[-1] == "cartpole-train: 1_seed-1: ZeroDivisionError: division by zero"

@@ -4,20 +4,18 @@ from collections.abc import Iterator
 from functools import cache
 from typing import Any
 
-import hydra
 import pytest
 import yaml
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from cartpole_rl.checking import checked
 from cartpole_rl.choices import conf_folder
-from cartpole_rl.commands.hydra_application.composition import as_mapping
+from cartpole_rl.composition import compose
 from cartpole_rl.envs.build import randomizer
 from cartpole_rl.tasks.rewards import Reward
 from cartpole_rl.workflows.build import evaluated_settings
-from cartpole_rl.workflows.config import EmulateConfig, EvaluateConfig, FinetuneConfig, TrainConfig
-
-pytestmark = pytest.mark.usefixtures("hydra_reads_conf")
+from cartpole_rl.workflows.config import EvaluateConfig, FinetuneConfig, TrainConfig
+from cartpole_rl.workflows.emulate import EmulateConfig
 
 CONF = conf_folder()
 GROUPS = sorted(path.name for path in CONF.iterdir() if path.is_dir() and path.name != "hydra")
@@ -39,7 +37,7 @@ def group_of(choice: str) -> str:
 
 @cache
 def composed(name: str, *overrides: str) -> dict[str, Any]:
-    return as_mapping(hydra.compose(name, list(overrides)))
+    return compose(name, overrides)
 
 
 @pytest.fixture(scope="module")
@@ -97,17 +95,6 @@ def test_the_emulated_carts_differ_in_the_pole_alone() -> None:
         for choice in ("medium", "large")
     )
     assert {key for key in medium if medium[key] != large[key]} == {"pole_mass", "pole_com", "pole_inertia"}
-
-
-@pytest.mark.parametrize("name", sorted(path.stem for path in CONF.glob("*.yaml")))
-def test_each_command_has_a_help_page_with_three_examples(name: str) -> None:
-    program = f"cartpole-{name.replace('_', '-')}"
-    page = hydra.compose(name, return_hydra_config=True).hydra.help
-    assert page.app_name == program
-    assert page.header.startswith(f"{program} ")
-    examples = page.header.split("Examples\n")[1].splitlines()
-    assert len(examples) == 3
-    assert all(example.startswith(f"  {program}") for example in examples)
 
 
 EXPERIMENTS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))

@@ -11,8 +11,7 @@ from typing import Any
 import pytest
 
 from cartpole_rl.choices import conf_folder
-from cartpole_rl.workflows.config import TrainConfig
-from cartpole_rl.workflows.loading import load_settings
+from cartpole_rl.workflows.config import TrainConfig, load_settings
 
 SILENT = "silent"
 UNREAD = "not read with these settings"

@@ -23,9 +23,8 @@ from cartpole_rl.plants.specs import OneCartPlant, OneFrame
 from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 from cartpole_rl.scalar import Scalar
 from cartpole_rl.workflows.agents import TrainedAgent, new_agent
-from cartpole_rl.workflows.config import TrainConfig
+from cartpole_rl.workflows.config import TrainConfig, load_settings
 from cartpole_rl.workflows.export import exported_agent, network_of
-from cartpole_rl.workflows.loading import load_settings
 
 PERIODS = 100  # 2 s
 HANGING = {"x": 0.05, "x_dot": 0.0, "theta": math.pi, "theta_dot": 0.0}

@@ -16,8 +16,7 @@ from cartpole_rl.learning.checkpoints import TrainingCheckpoint, load_training, 
 from cartpole_rl.learning.dqn import Monitor, Training
 from cartpole_rl.learning.states import moved, seed_everything
 from cartpole_rl.workflows.agents import new_agent
-from cartpole_rl.workflows.config import TrainConfig
-from cartpole_rl.workflows.loading import load_settings
+from cartpole_rl.workflows.config import TrainConfig, load_settings
 from cartpole_rl.workflows.train import (
     available_device,
     judge_agent,

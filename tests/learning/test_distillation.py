@@ -12,9 +12,8 @@ from cartpole_rl.learning.agent import QAgent
 from cartpole_rl.learning.distillation import Distillation
 from cartpole_rl.learning.settings import DistillationSettings
 from cartpole_rl.workflows.agents import new_agent, trained_agent
-from cartpole_rl.workflows.config import DistillConfig
+from cartpole_rl.workflows.config import DistillConfig, load_settings
 from cartpole_rl.workflows.distill import student_settings
-from cartpole_rl.workflows.loading import load_settings
 
 CONFIG = load_settings(DistillConfig, {"run": "pretrained/medium", "hidden": [16, 16]})
 SMALL = DistillationSettings(

@@ -22,8 +22,7 @@ from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.wire import Fault
 from cartpole_rl.workflows.agents import trained_agent
 from cartpole_rl.workflows.build import evaluated_env, evaluated_settings
-from cartpole_rl.workflows.config import EvaluateConfig
-from cartpole_rl.workflows.loading import load_settings
+from cartpole_rl.workflows.config import EvaluateConfig, load_settings
 
 AGENT = "pretrained/medium"
 PERIOD = 0.02

@@ -32,7 +32,7 @@ for module in pkgutil.walk_packages(cartpole_rl.__path__, "cartpole_rl."):
     if not module.name.endswith("__main__"):
         importlib.import_module(module.name)
 
-from cartpole_rl.commands import evaluate, train
+from cartpole_rl.cli import evaluate, train
 for command, words in (
     (train, "compile=false learning.transitions=512 learning.carts=16 learning.chunk=8 learning.updates=1 "
         "learning.batch_size=16 learning.warmup_transitions=64 learning.evaluations=1 buffer.size=1000 "
@@ -41,7 +41,7 @@ for command, words in (
     (evaluate, "run=trained episodes=1 plant=emulated emulator.port=tcp"),
 ):
     sys.argv = ["cartpole", *words.split()]
-    command.main()
+    command()
 """
 
 

@@ -39,8 +39,8 @@ def run(installed: Path, *commands: list[str]) -> Path:
     environment = {**os.environ, "PYTHONPATH": str(installed), "PYTHONSAFEPATH": "1"}
     home = installed.parent / "home"
     home.mkdir()
-    script = "import sys\nfrom cartpole_rl.commands import evaluate, train\n" + "".join(
-        f"sys.argv = {['cartpole-' + name, *words]!r}\n{name}.main()\n" for name, *words in commands
+    script = "import sys\nfrom cartpole_rl.cli import evaluate, train\n" + "".join(
+        f"sys.argv = {['cartpole-' + name, *words]!r}\n{name}()\n" for name, *words in commands
     )
     done = subprocess.run(
         [sys.executable, "-c", script], cwd=home, env=environment, capture_output=True, text=True
@@ -65,7 +65,7 @@ def test_it_holds_the_package_conf_and_the_scripts(wheel: Path) -> None:
     assert firmware <= names
     assert {name.split("/")[0] for name in names if ".dist-info" not in name} == {"cartpole_rl"}
     for command in ("train", "evaluate", "emulate"):
-        assert f"cartpole-{command} = cartpole_rl.commands.{command}:main" in scripts
+        assert f"cartpole-{command} = cartpole_rl.cli:{command}" in scripts
 
 
 def test_what_it_installs_trains_and_evaluates_by_its_own_conf(installed: Path) -> None:

@@ -1,7 +1,6 @@
 """Runs the commands as a user does, in this process (torch takes long to import) or in one of their own."""
 
 import contextlib
-import importlib
 import io
 import os
 import signal
@@ -9,11 +8,16 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 from unittest.mock import patch
 
 from hydra.core.global_hydra import GlobalHydra
+
+from cartpole_rl.cli import VERBS
+from cartpole_rl.command import run_command
 
 BIN = Path(sys.executable).parent
 TINY = (
@@ -67,12 +71,13 @@ class Outcome:
         return lines[0]
 
 
-def in_process(command: str, *words: str, folder: Path) -> Outcome:
-    """`cartpole-<command> words...`, with `folder` as the working directory."""
+def in_process(
+    command: str, *words: str, folder: Path, function: Callable[..., Any] | None = None
+) -> Outcome:
+    """`cartpole-<command> words...` in `folder`, or with a `function` in place of its own and its checks."""
     GlobalHydra.instance().clear()
     handlers = {number: signal.getsignal(number) for number in HANDLED}
     out, err, code = io.StringIO(), io.StringIO(), 0
-    main = importlib.import_module(f"cartpole_rl.commands.{command}").main
     with (
         patch.object(sys, "argv", [f"cartpole-{command}", *words]),
         contextlib.chdir(folder),
@@ -80,7 +85,10 @@ def in_process(command: str, *words: str, folder: Path) -> Outcome:
         contextlib.redirect_stderr(err),
     ):
         try:
-            main()
+            verb = (
+                VERBS[command] if function is None else VERBS[command]._replace(function=function, check="")
+            )
+            run_command(command, verb)
         except SystemExit as exit_:
             code = int(exit_.code or 0)
         finally:
@@ -118,9 +126,9 @@ def modified(file: Path) -> int | None:
 
 
 def console_script(command: str, *words: str, folder: Path) -> "subprocess.Popen[str]":
-    """The installed `cartpole-<command>`, just started."""
+    """`cartpole <command>` in a process of its own, just started."""
     return subprocess.Popen(
-        [BIN / f"cartpole-{command}", *words],
+        [sys.executable, "-m", "cartpole_rl.cli", command, *words],
         cwd=folder,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,

@@ -57,8 +57,7 @@ def course(**chosen: str) -> Any:
     import torch
 
     from cartpole_rl.envs.build import simulated_env
-    from cartpole_rl.workflows.config import TrainConfig
-    from cartpole_rl.workflows.loading import load_settings
+    from cartpole_rl.workflows.config import TrainConfig, load_settings
 
     torch.manual_seed(0)
     config = load_settings(TrainConfig, chosen)

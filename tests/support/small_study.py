@@ -14,9 +14,8 @@ from typing import Any
 import pytest
 import yaml
 
-from cartpole_rl.workflows.config import EvaluateConfig
+from cartpole_rl.workflows.config import EvaluateConfig, load_settings
 from cartpole_rl.workflows.evaluate import evaluate
-from cartpole_rl.workflows.loading import load_settings
 
 STEPS = 40  # control periods of an episode
 STUDY: dict[str, Any] = {

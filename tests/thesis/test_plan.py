@@ -11,7 +11,7 @@ from small_results import CARTS, a_study
 from study import FIRST_SEED, STUDIES, load_study, overrides_of, study_names
 
 from cartpole_rl.checking import checked
-from cartpole_rl.choices import compose
+from cartpole_rl.composition import compose
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.settings import Settings
 from cartpole_rl.workflows import config

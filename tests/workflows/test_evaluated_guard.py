@@ -8,8 +8,7 @@ import pytest
 from cartpole_rl.envs.build import with_fitted_guard
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.workflows.build import evaluated_settings, guard_note
-from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
-from cartpole_rl.workflows.loading import load_settings
+from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig, load_settings
 
 GIVEN = {"margin": 0.05, "delay": 0.2, "deceleration": 2.0}
 

@@ -11,8 +11,7 @@ from cartpole_rl.envs.build import simulated_env
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.settings import NUM_SEEDS, evaluation_seed
 from cartpole_rl.workflows.build import evaluated_env, evaluated_settings
-from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
-from cartpole_rl.workflows.loading import load_settings
+from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig, load_settings
 from cartpole_rl.workflows.train import judge, nominal_env
 
 CARTS = 64

@@ -22,15 +22,14 @@ from cartpole_rl.learning.settings import FinetuningSettings, LearningSettings
 from cartpole_rl.learning.states import seed_everything
 from cartpole_rl.plants.serial.statistics import LinkStatistics
 from cartpole_rl.reporting.tensorboard import TensorBoardLog
+from cartpole_rl.run_folder import write_config
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.agents import new_agent
 from cartpole_rl.workflows.build import evaluated_settings
-from cartpole_rl.workflows.config import FinetuneConfig, TrainConfig
+from cartpole_rl.workflows.config import FinetuneConfig, TrainConfig, load_settings, recorded_settings
 from cartpole_rl.workflows.finetune import evaluation_config, started_from
 from cartpole_rl.workflows.finetuning_cart import DrivenCart, FinetuningFiles, Stage
 from cartpole_rl.workflows.finetuning_learner import CartLearner, simulated_learning
-from cartpole_rl.workflows.loading import load_settings, recorded_settings
-from cartpole_rl.workflows.run_folder import write_config
 
 TRAINING = {
     "task.time_limit": 80,

@@ -6,20 +6,15 @@ Nominal value < a choice's default < a person's file < the command line, for eve
 from pathlib import Path
 from typing import Any
 
-import hydra
 import pytest
 import yaml
 
 from cartpole_rl.checking import checked
 from cartpole_rl.choices import choice, conf_folder, default_choices
-from cartpole_rl.commands.hydra_application.choice_files import with_choice_files
-from cartpole_rl.commands.hydra_application.composition import as_mapping
+from cartpole_rl.composition import compose
 from cartpole_rl.workflows.build import replaced_settings
-from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
-from cartpole_rl.workflows.loading import load_settings
-from cartpole_rl.workflows.nominal import note_other_numbers
-
-pytestmark = pytest.mark.usefixtures("hydra_reads_conf")
+from cartpole_rl.workflows.checks import note_other_numbers
+from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig, load_settings
 
 IP02 = choice("cart/ip02")
 VISCOUS = "cart_viscous"
@@ -55,8 +50,7 @@ def value_of(tree: dict[str, Any], name: str) -> Any:
 
 def trained(*words: str) -> TrainConfig:
     """The settings of cartpole-train with these words, as the command composes them."""
-    with with_choice_files(words) as replaced:
-        return checked(TrainConfig, as_mapping(hydra.compose("train", replaced)))
+    return checked(TrainConfig, compose("train", words))
 
 
 def written(folder: Path, group: str, content: dict[str, Any]) -> str:

@@ -11,13 +11,13 @@ from pathlib import Path
 import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
-from cartpole_rl.workflows.person import as_word, confirm
+from cartpole_rl.terminal import as_word, confirm
 
 FOLDERS = ["runs", "100%", "a:b", "-x", "my runs", "a=b", "a,b", "a #b", "a: b", "é", "[x]", "x]", "{seed}"]
 FOLDERS += ["it's", "'q'", '"', '\\"', "a\\b", "~", "*x", "&x", "!x", "null", "a/../b", "$x", "(x)", "a;b"]
 ASK = """
 import sys
-from cartpole_rl.workflows.person import confirm
+from cartpole_rl.terminal import confirm
 print("ready", flush=True)
 open(sys.argv[1]).read()  # waits until the test has typed ahead
 print("agreed" if confirm("the cart latched a fault: STALL") else "not agreed", flush=True)

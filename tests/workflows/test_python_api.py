@@ -15,7 +15,7 @@ import torch
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.evaluation.recordings import write_recording
 from cartpole_rl.settings import Settings
-from cartpole_rl.workflows import loading
+from cartpole_rl.workflows import config as configs
 from cartpole_rl.workflows.config import (
     EvaluateConfig,
     FinetuneConfig,
@@ -65,12 +65,12 @@ STILL = 30  # periods
 @pytest.fixture
 def notebook(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty working directory in which settings are of toy size."""
-    load = loading.load_settings
+    load = configs.load_settings
 
     def load_toy(schema: type[Settings], overrides: Mapping[str, Any]) -> Settings:
         return load(schema, {**overrides, **TOY.get(schema, {})})
 
-    monkeypatch.setattr(loading, "load_settings", load_toy)
+    monkeypatch.setattr(configs, "load_settings", load_toy)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

@@ -24,11 +24,10 @@ from cartpole_rl.learning.checkpoints import FINETUNING_FORMAT, AgentCheckpoint,
 from cartpole_rl.learning.settings import RayLearnerSettings
 from cartpole_rl.workflows import ray_link
 from cartpole_rl.workflows.agents import new_agent
-from cartpole_rl.workflows.config import FinetuneConfig, TrainConfig
+from cartpole_rl.workflows.config import FinetuneConfig, TrainConfig, load_settings
 from cartpole_rl.workflows.finetune import NAME, learn_there, take
 from cartpole_rl.workflows.finetuning_cart import FinetuningFiles, Stage
 from cartpole_rl.workflows.finetuning_learner import TunedAgent
-from cartpole_rl.workflows.loading import load_settings
 from cartpole_rl.workflows.ray_learner import Curves, Learner, Offer, Taken
 from cartpole_rl.workflows.ray_link import LearnerLink, check_address, check_versions, version_finder
 

@@ -6,8 +6,7 @@ import pytest
 
 from cartpole_rl.choices import choice
 from cartpole_rl.tasks.episode import Origin
-from cartpole_rl.workflows.config import EvaluateConfig
-from cartpole_rl.workflows.loading import load_settings
+from cartpole_rl.workflows.config import EvaluateConfig, load_settings
 from cartpole_rl.workflows.repeating import same_evaluation
 
 GUARD = {**choice("guard/fitted"), "numbers": {"margin": 0.05, "delay": 0.2, "deceleration": 2.0}}

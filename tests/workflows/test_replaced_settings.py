@@ -5,8 +5,7 @@ import pytest
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.tasks.settings import ActionSettings
 from cartpole_rl.workflows.build import replaced_settings
-from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
-from cartpole_rl.workflows.loading import load_settings
+from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig, load_settings
 
 
 def test_motor_values_are_replaced() -> None:

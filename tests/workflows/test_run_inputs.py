@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from cartpole_rl.workflows.run_inputs import is_outdated, write_inputs
+from cartpole_rl.run_folder import is_outdated, write_inputs
 
 
 @pytest.mark.parametrize("result", ["identification.json", "model.json", "checkpoints/last.pt"])

@@ -11,11 +11,10 @@ from cartpole_rl.learning.checkpoints import AgentCheckpoint, save_agent
 from cartpole_rl.randomization.poles import Pole, PoleSettings
 from cartpole_rl.workflows.agents import new_agent, trained_agent
 from cartpole_rl.workflows.build import evaluated_settings
-from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
+from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig, load_settings
 from cartpole_rl.workflows.export import compiled_training, exported_agent, on_the_board
 from cartpole_rl.workflows.finetuning_cart import Stage
 from cartpole_rl.workflows.finetuning_learner import TunedAgent
-from cartpole_rl.workflows.loading import load_settings
 
 MEDIUM, LARGE = (PoleSettings(**group_choices("pole")[name]) for name in ("medium", "large"))
 ROD = PoleSettings(choices={"0.50 m": Pole.rod(0.5)})

@@ -8,12 +8,11 @@ from cartpole_rl.reporting.figures import save
 from cartpole_rl.reporting.figures.groups import Drawing, drawings
 from cartpole_rl.reporting.results import Results, counted_text
 from cartpole_rl.reporting.runs_page import Picture, runs_page
-from cartpole_rl.run_files import FIGURES, PAGE
+from cartpole_rl.run_folder import FIGURES, PAGE, write_config
+from cartpole_rl.terminal import print_message
 from cartpole_rl.workflows.config import ReportConfig
 from cartpole_rl.workflows.pages.media import Gallery
 from cartpole_rl.workflows.pages.sweeps import grouped, read_sweeps, results_of, table
-from cartpole_rl.workflows.person import print_message
-from cartpole_rl.workflows.run_folder import write_config
 
 TABLE = "runs.csv"
 

@@ -15,20 +15,23 @@ import yaml
 from cartpole_rl.errors import CheckpointError
 from cartpole_rl.learning.checkpoint_files import find_agent
 from cartpole_rl.reporting.results import is_number
-from cartpole_rl.run_files import (
+from cartpole_rl.run_folder import (
+    AGENT_HASH,
     CHECKPOINTS,
     COMPARISON,
     CONFIG,
     ERROR,
     HISTORY,
     IDENTIFIED,
+    INPUTS,
     LOG,
     METRICS,
     MODELLED,
+    PREFIX,
     PROVENANCE,
+    file_hash,
+    is_outdated,
 )
-from cartpole_rl.workflows.run_folder import AGENT_HASH, PREFIX, file_hash
-from cartpole_rl.workflows.run_inputs import INPUTS, is_outdated
 
 RESULTS = {"identify": (IDENTIFIED,), "model": (MODELLED,), "finetune": (METRICS, COMPARISON)}
 EPISODIC = ("evaluate", "record")  # commands that keep what they have after an interruption

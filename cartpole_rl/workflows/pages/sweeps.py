@@ -18,6 +18,7 @@ from cartpole_rl.reporting.grouping import NULL, Columns, fewest, labels, settin
 from cartpole_rl.reporting.results import OWN, Agent, Curve, Exclusion, Group, Results
 from cartpole_rl.reporting.scores import SCORES
 from cartpole_rl.reporting.statistics import interquartile_mean
+from cartpole_rl.run_folder import PREFIX
 from cartpole_rl.workflows.checks import BASELINE
 from cartpole_rl.workflows.pages.runs import (
     Run,
@@ -31,7 +32,6 @@ from cartpole_rl.workflows.pages.runs import (
     shared_settings,
     short,
 )
-from cartpole_rl.workflows.run_folder import PREFIX
 
 MOST_MEASURES = 20  # in a message
 MOST_UNSORTED = 12  # groups that are shown in the order of their runs

@@ -13,8 +13,7 @@ from cartpole_rl.errors import ConfigError, LinkError, PlantError
 from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.wire import Flags
 from cartpole_rl.workflows.build import evaluated_env, evaluated_settings
-from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
-from cartpole_rl.workflows.loading import load_settings
+from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig, load_settings
 
 TIMEOUTS = {
     "timeout": 0.35,

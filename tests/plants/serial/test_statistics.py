@@ -2,12 +2,11 @@
 
 import math
 
-import hydra
 import numpy as np
 import pytest
 
 from cartpole_rl.checking import checked
-from cartpole_rl.commands.hydra_application.composition import as_mapping
+from cartpole_rl.composition import compose
 from cartpole_rl.envs.build import randomizer
 from cartpole_rl.errors import PlantError
 from cartpole_rl.plants.serial.statistics import LATENCY_SAMPLES, LatencyRing, LinkStatistics
@@ -54,14 +53,14 @@ def test_the_distribution_is_one_that_the_randomization_takes() -> None:
         seen.loop(share=98)
 
 
-def test_the_override_is_a_word_that_cartpole_train_takes(hydra_reads_conf: None) -> None:
+def test_the_override_is_a_word_that_cartpole_train_takes() -> None:
     seen = LinkStatistics()
     for seconds in np.linspace(0.002, 0.012, 1001):
         seen.loop_times.add(seconds)
     word = seen.latency_override()
     assert word == "++randomization.latency={distribution: uniform, absolute: [0.0021, 0.0119]}"
     for group in ("none", "wide"):
-        config = checked(TrainConfig, as_mapping(hydra.compose("train", [f"randomization={group}", word])))
+        config = checked(TrainConfig, compose("train", [f"randomization={group}", word]))
         assert config.randomization["latency"].limits() == (0.0021, 0.0119)
         assert randomizer(config).longest_delay() == pytest.approx(0.0119)
 

@@ -13,7 +13,7 @@ from serial_peer import INFO, CartPeer, wait_for
 from cartpole_rl.signals import UNWINDING
 from cartpole_rl.wire import Flags, Home, Message, Stop
 
-PREFLIGHT = (sys.executable, "-m", "cartpole_rl.commands.preflight")
+PREFLIGHT = (sys.executable, "-m", "cartpole_rl.cli", "preflight")
 
 
 class Homing(CartPeer):

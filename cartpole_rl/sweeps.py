@@ -1,8 +1,8 @@
-"""Sweeps: a wrong setting of any job ends one before it starts; a failed job does not end one.
+"""Folders of runs and of the jobs of sweeps, and what becomes of jobs that fail.
 
-The end of a sweep names every failed job with the reason.
-Each job keeps error.txt in its run folder until it succeeds. So the report is the same with every launcher,
-and it includes jobs that were killed.
+A wrong setting of any job ends a sweep before it starts; a failed job does not end one. The end of a sweep
+names every failed job with the reason. Each job keeps error.txt in its run folder until it succeeds. So the
+report is the same with every launcher, and it includes jobs that were killed.
 """
 
 import logging
@@ -10,9 +10,10 @@ import os
 import re
 import sys
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from itertools import chain
+from datetime import datetime
+from itertools import chain, count
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -23,21 +24,80 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
-from omegaconf import DictConfig, open_dict, read_write
+from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from omegaconf.errors import OmegaConfBaseException
 
 from cartpole_rl.checking import checked
-from cartpole_rl.commands.hydra_application.complaints import in_one_line
-from cartpole_rl.commands.hydra_application.composition import as_mapping
-from cartpole_rl.commands.hydra_application.exits import EXPECTED, exit_with_message
+from cartpole_rl.composition import as_mapping, is_completing
 from cartpole_rl.errors import CartPoleError, ConfigError
+from cartpole_rl.exits import EXPECTED, exit_with_message, one_line
 from cartpole_rl.files import write_text
-from cartpole_rl.run_files import ERROR
+from cartpole_rl.run_folder import ERROR
 from cartpole_rl.settings import Settings
-from cartpole_rl.workflows.person import print_message
+from cartpole_rl.terminal import print_message
 
 MODES = {"-m", "--multirun", "-r", "--run", "-c", "--cfg", "-i", "--info", "-sc", "--shell-completion"}
 NOT_ENDED = "it was killed or interrupted, or is still running"
+
+LONGEST_NAME = 150  # characters; file systems take 255
+
+
+def run_folder(command: str, label: str, resume: str | None = None) -> str:
+    """Return the folder of a run: that of the resumed run, or a new one named by date and time.
+
+    A new one is made here, so runs that start in the same second do not share it.
+    """
+    if resume is not None and Path(resume).is_dir():
+        return str(resume)
+    return new_folder(command, label)
+
+
+def sweep_folder(command: str) -> str:
+    """Return the folder of a multirun: a new one named by date and time, made here as that of a run.
+
+    Hydra composes the config of each job anew with the cached values of its resolvers, in other processes
+    too, so all jobs of a multirun share the folder. The path is absolute, since such a process may have
+    another working directory.
+    """
+    return str(Path(new_folder(command, "multirun")).absolute())
+
+
+def new_folder(command: str, label: str) -> str:
+    """Make a new folder named by date, time and `label`, and return its path."""
+    name = datetime.now().strftime("%Y-%m-%d_%H-%M-%S") + (f"_{label}" if label else "")
+    for number in count(1):
+        folder = Path("runs", command, name if number == 1 else f"{name}_{number}")
+        with suppress(FileExistsError):
+            try:
+                folder.mkdir(parents=True)
+            except FileNotFoundError:  # a command that failed has just removed the empty parent
+                folder.mkdir(parents=True)
+            break
+    return str(folder)
+
+
+def constant_settings() -> list[str]:
+    """Return the settings on the command line that are the same in all jobs of a multirun."""
+    words = [word for word in sys.argv[1:] if "=" in word and not word.startswith("-")]
+    parsed = OverridesParser.create().parse_overrides(words)
+    return [each.get_key_element() for each in parsed if not each.is_sweep_override()]
+
+
+def job_name(number: int, overrides: Sequence[str], constant: Collection[str]) -> str:
+    """Return the folder of one job of a multirun, by its swept settings: "0_randomization-friction_3_seed-0".
+
+    Characters that a shell or Hydra would interpret become "-".
+    """
+    given = (word for word in overrides if "=" in word and not is_completing(word))
+    swept = (word for word in given if word.split("=")[0] not in constant)
+    plain = (re.sub(r"[^\w.+-]+", "-", word).strip("-") for word in swept)
+    return "_".join((str(number), *plain))[:LONGEST_NAME]
+
+
+OmegaConf.register_new_resolver("run_folder", run_folder, use_cache=True)
+OmegaConf.register_new_resolver("sweep_folder", sweep_folder, use_cache=True)
+OmegaConf.register_new_resolver("constant_settings", constant_settings, use_cache=True, replace=True)
+OmegaConf.register_new_resolver("job_name", job_name)
 
 
 class SweepStart(Callback):
@@ -109,9 +169,9 @@ def run_as_job(name: str, folder: Path, work: Callable[[], float | None]) -> flo
     try:
         result = work()
     except Exception as error:
-        print_message(name, one_line := _one_line(error, name))
+        print_message(name, reason := one_line(error, name))
         details = "" if isinstance(error, EXPECTED) else traceback.format_exc()
-        write_text(folder / ERROR, f"{one_line}\n{details}")
+        write_text(folder / ERROR, f"{reason}\n{details}")
         return None
     (folder / ERROR).unlink(missing_ok=True)
     return result
@@ -130,7 +190,7 @@ def sweep(name: str, schema: type[Settings]) -> Iterator[None]:
     except Exception as error:
         if not _jobs():
             raise
-        print_message(name, f"the sweep was stopped: {_one_line(error, name)}")
+        print_message(name, f"the sweep was stopped: {one_line(error, name)}")
         _report(name)
         sys.exit(CartPoleError.exit_code)
     if _report(name):
@@ -154,10 +214,3 @@ def _jobs() -> list[Path]:
         return []
     jobs = (path for path in SweepStart.folder.iterdir() if path.is_dir() and path.name[0] != ".")
     return sorted(jobs, key=lambda job: [int(number) for number in re.findall(r"^\d+", job.name)])
-
-
-def _one_line(error: Exception, name: str) -> str:
-    """Return the message of `error`, with its class if it is not one of the expected errors."""
-    if isinstance(error, EXPECTED):
-        return in_one_line(error, name)
-    return ": ".join([type(error).__name__, *str(error).splitlines()[:1]])

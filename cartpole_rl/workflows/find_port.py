@@ -1,19 +1,13 @@
-"""cartpole-find-port: list the serial ports and name the one of the cart.
-
-cartpole-find-port                  lists the USB serial ports, each with the chip that identifies its board
-cartpole-find-port watch=true       names the port that vanishes when the cart is unplugged, or appears
-"""
+"""cartpole-find-port: list the USB serial ports, each with its board's chip, and name the one of the cart."""
 
 import time
 from collections.abc import Callable
-from pathlib import Path
 
-from cartpole_rl.commands.hydra_application.application import application
 from cartpole_rl.errors import PortError
 from cartpole_rl.plants.serial.port import found_ports
 from cartpole_rl.plants.serial.ports import UsbPort, cart_like, changes, described
 from cartpole_rl.settings import Positive, Settings
-from cartpole_rl.workflows.person import as_word
+from cartpole_rl.terminal import as_word
 
 LOOK_EVERY = 0.2  # s
 REMEDY = (
@@ -25,14 +19,13 @@ PortList = Callable[[], list[UsbPort]]
 
 
 class FindPortConfig(Settings):
-    """cartpole-find-port."""
+    """The settings of cartpole-find-port."""
 
-    watch: bool
-    timeout: Positive  # s that `watch` waits for a change
+    watch: bool = False  # name the port that vanishes or appears
+    timeout: Positive = 60.0  # s that `watch` waits for it
 
 
-@application("find_port", FindPortConfig)
-def main(config: FindPortConfig, folder: Path) -> None:
+def find_port(config: FindPortConfig) -> None:
     """List the ports, or watch them change. Raises PortError if there is none."""
     print(listing(found_ports()) if not config.watch else watched(found_ports, config.timeout))
 
@@ -74,7 +67,3 @@ def watched(ports: PortList, timeout: float) -> str:
             return "\n".join([*lines, f"{again} {preflight_on(changed[0])}"])
         time.sleep(LOOK_EVERY)
     raise PortError(f"no port appeared or vanished within {timeout:g} s: {REMEDY}")
-
-
-if __name__ == "__main__":
-    main()

@@ -1,4 +1,4 @@
-"""The person at the terminal."""
+"""The terminal: messages, questions, and text that survives a shell and Hydra."""
 
 import os
 import re
@@ -37,10 +37,15 @@ def discard_typed() -> None:
     termios.tcflush(sys.stdin, termios.TCIFLUSH)
 
 
-def print_message(name: str, message: str) -> None:
-    """Print one line on stderr; do nothing if the terminal is closed."""
+def program(verb: str) -> str:
+    """Return the name of the program of a verb: "cartpole-find-port"."""
+    return f"cartpole-{verb.replace('_', '-')}"
+
+
+def print_message(verb: str, message: str) -> None:
+    """Print one line of a verb's program on stderr; do nothing if the terminal is closed."""
     with suppress(OSError):
-        print(f"cartpole-{name.replace('_', '-')}: {message}", file=sys.stderr)
+        print(f"{program(verb)}: {message}", file=sys.stderr)
 
 
 def as_word(name: str, value: object) -> str:
@@ -51,9 +56,12 @@ def as_word(name: str, value: object) -> str:
 def as_value(value: object) -> str:
     """Return a value for a command line, in quotes where Hydra and the shell need them."""
     text = str(value)
-    if not re.fullmatch(r"[A-Za-z0-9_./:%+-]+", text):
-        text = '"' + re.sub(r'(\\*)("|$)', lambda end: 2 * end[1] + end[2].replace('"', '\\"'), text) + '"'
-    return shlex.quote(text)
+    return shlex.quote(text if re.fullmatch(r"[A-Za-z0-9_./:%+-]+", text) else in_quotes(text))
+
+
+def in_quotes(text: str) -> str:
+    """Return `text` in the quotes that Hydra reads."""
+    return '"' + re.sub(r'(\\*)("|$)', lambda end: 2 * end[1] + end[2].replace('"', '\\"'), text) + '"'
 
 
 def exit_if_nobody_reads() -> None:

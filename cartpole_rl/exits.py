@@ -16,15 +16,15 @@ from typing import NoReturn
 from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 
-from cartpole_rl.commands.hydra_application.complaints import in_one_line
+from cartpole_rl.composition import error_message
 from cartpole_rl.errors import CartPoleError, ConfigError
 from cartpole_rl.files import FULL
 from cartpole_rl.signals import RaiseOnce, ending_signals
-from cartpole_rl.workflows.person import exit_if_nobody_reads, print_message
+from cartpole_rl.terminal import exit_if_nobody_reads, print_message
 
 SIGNALLED = 128  # added to the number of a signal, as a shell does
-EXPECTED = (CartPoleError, HydraException, OmegaConfBaseException, OSError)  # printed without a traceback
-
+OF_HYDRA = (HydraException, OmegaConfBaseException)  # some of which are OSErrors too
+EXPECTED = (CartPoleError, *OF_HYDRA, OSError)  # printed without a traceback
 UNNAMED = {*FULL, errno.EFBIG, errno.EIO}  # of writing, which names no file
 
 
@@ -43,12 +43,23 @@ def exit_with_message(name: str, error: Exception) -> NoReturn:
     code = CartPoleError.exit_code
     if isinstance(error, CartPoleError):
         code = error.exit_code
-    elif isinstance(error, HydraException | OmegaConfBaseException):  # some of which are OSErrors too
+    elif isinstance(error, OF_HYDRA):
         code = ConfigError.exit_code
     elif isinstance(error, OSError) and not error.filename and error.errno not in UNNAMED:
         raise error
-    print_message(name, in_one_line(error, name))
+    print_message(name, one_line(error, name))
     sys.exit(code)
+
+
+def one_line(error: Exception, name: str) -> str:
+    """Return what cartpole-<name> prints of an error; with its class if it is not an expected one."""
+    if isinstance(error, OF_HYDRA):
+        return error_message(error, name, sys.argv[1:])
+    if isinstance(error, OSError):
+        remedy = "; make room, or give hydra.run.dir= a folder on another disk" if error.errno in FULL else ""
+        return f"{error.filename or 'a file was not written'}: {error.strerror}{remedy}"
+    first = next(iter(str(error).splitlines()), type(error).__name__)
+    return first if isinstance(error, EXPECTED) else f"{type(error).__name__}: {first}"
 
 
 def exit_after_signal(name: str, signalled: BaseException) -> NoReturn:

@@ -1,14 +1,15 @@
-"""Run folders: the config and the provenance in each, and the command that wrote it.
+"""Run folders: names of their files, config and provenance in each, and the command that wrote it.
 
 A command refuses the run folder of a command whose results it cannot use.
 """
 
 import hashlib
 import json
+import os
 import platform
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -17,21 +18,24 @@ import yaml
 
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.files import write_text
-from cartpole_rl.run_files import (
-    CART,
-    CHECKPOINTS,
-    CONFIG,
-    FIGURES,
-    LAST,
-    METRICS,
-    MULTIRUN,
-    PAGE,
-    POLE,
-    PROVENANCE,
-    RANDOMIZATION,
-    RESUME,
-)
-from cartpole_rl.workflows.person import as_value, as_word
+from cartpole_rl.terminal import as_value, as_word
+
+CONFIG, PROVENANCE, MULTIRUN = "config.yaml", "provenance.json", "multirun.yaml"
+LOG = "log.txt"  # what a run of scripts/reproduce printed
+ERROR = "error.txt"  # why a job of a sweep has no result
+METRICS = "metrics.json"  # of an evaluation
+HISTORY = "history.jsonl"  # of a training: a line for each evaluation
+COMPARISON = "comparison.json"  # of a fine-tuning: metrics before and after
+PAGE = "page.html"  # of an identification and of a report
+IDENTIFIED, MODELLED = "identification.json", "model.json"  # results of these commands
+FIGURES, RECORDINGS = "figures", "recordings"
+ANIMATION, BESIDE_SIMULATION = "episode.gif", "beside_simulation.gif"  # of the first episode
+CHECKPOINTS, LAST, BEST, RESUME = "checkpoints", "last.pt", "best.pt", "resume.pt"  # of an agent
+START = "start.pt"  # in checkpoints/ of an unfinished fine-tuning: a copy of the agent that it started from
+CART, POLE, RANDOMIZATION, POSTERIOR = "cart.yaml", "pole.yaml", "randomization.yaml", "posterior.npz"
+RUN_FILES = (CONFIG, CART, POLE, RANDOMIZATION)
+INPUTS = "inputs.json"  # hashes of files, which are named as seen from the run folder
+FOUND = (Path(CHECKPOINTS, LAST), Path(IDENTIFIED), Path(MODELLED))
 
 PREFIX = "cartpole-"
 AGENT_HASH = "agent_sha256"  # in provenance.json: of the checkpoint that a run started from
@@ -133,6 +137,23 @@ def has_ended(run: Path) -> bool:
     return results and not (run / CHECKPOINTS / RESUME).exists()
 
 
+def write_inputs(folder: Path, needs: Iterable[Path]) -> None:
+    """Write the hashes of what the runs `needs` have found into the run folder."""
+    files = [need / name for need in needs for name in FOUND if (need / name).is_file()]
+    hashes = {Path(os.path.relpath(file, folder)).as_posix(): file_hash(file) for file in files}
+    write_json(folder / INPUTS, hashes)
+
+
+def is_outdated(folder: Path) -> bool:
+    """Return True if a run that the run in `folder` needs was made again since, with another result."""
+    try:
+        recorded = dict(json.loads((folder / INPUTS).read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError):
+        return False
+    there = {folder / name: was for name, was in recorded.items() if (folder / name).is_file()}
+    return any(file_hash(file) != was for file, was in there.items())
+
+
 def provenance() -> dict[str, Any]:
     """Return the command line, the versions and the commit that a result depends on."""
     return {
@@ -145,7 +166,7 @@ def provenance() -> dict[str, Any]:
 
 def git_commit() -> str | None:
     """Return the commit of the checkout that runs, "-dirty" if it was changed; None for a wheel."""
-    checkout = Path(__file__).resolve().parents[2]
+    checkout = Path(__file__).resolve().parents[1]
     if not (checkout / ".git").exists():  # git would find a repository around the installed package
         return None
     command = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]

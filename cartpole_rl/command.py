@@ -1,0 +1,199 @@
+"""Runs a verb of `cartpole_rl.cli`: from the command line to checked settings and the verb's function."""
+
+import inspect
+import logging
+import os
+import re
+import shutil
+import sys
+import textwrap
+import warnings
+from collections.abc import Sequence
+from contextlib import suppress
+from functools import partial
+from io import TextIOWrapper
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import hydra
+from hydra.core.config_store import ConfigStore
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+
+from cartpole_rl import __version__
+from cartpole_rl.checking import checked, kinds, most_similar, similarity
+from cartpole_rl.choices import conf_folder, default_choices
+from cartpole_rl.composition import OwnChoices, as_mapping, is_completing
+from cartpole_rl.errors import ConfigError
+from cartpole_rl.exits import (
+    EXPECTED,
+    Terminated,
+    catch_signals,
+    exit_after_signal,
+    exit_with_message,
+    job_signals,
+)
+from cartpole_rl.settings import Settings
+from cartpole_rl.sweeps import as_multirun, is_job, run_as_job, shown_jobs, sweep
+from cartpole_rl.terminal import program
+
+if TYPE_CHECKING:
+    from cartpole_rl.cli import Verb
+
+WHOLE_OPTIONS = ("help", "version", "cfg", "resolve", "package", "multirun", "info")
+# Hydra's, each up to its first hyphen; without --run, which has no effect: a user means run=
+HYDRA_OPTIONS = (*WHOLE_OPTIONS, "hydra", "shell", "config")
+NEAR_OPTION = 0.7  # similarity from which an option is suggested; that of resume and resolve is 0.62
+SHOWN = ("job", "hydra", "all")  # by --cfg
+
+
+def run_command(name: str, verb: "Verb") -> None:
+    """Run a verb with the words of the command line, and exit with a code after an error or a signal.
+
+    The run folder is removed at the end if nothing was written to it.
+    """
+    given = sys.argv[1:]
+    schema: type[Settings] = verb.find(verb.settings)
+    accept_all_characters()
+    catch_signals()
+    os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra raises its errors instead of printing them
+    OmegaConf.register_new_resolver("help_page", partial(help_page, name, verb, schema), replace=True)
+    try:
+        if "--version" in given:
+            print(f"cartpole_rl {__version__}")
+            return
+        if wrong := wrong_option(given) or dashed_setting(given):
+            raise ConfigError(wrong)
+        provide_config(name, schema)
+        with OwnChoices(name, as_multirun(given)) as own, sweep(name, schema):
+            work = partial(run_job, name, verb, given, own.typed)
+            for words in shown_jobs(own.words) or [own.words]:
+                sys.argv[1:] = words
+                hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=name)(work)()
+    except EXPECTED as error:
+        exit_with_message(name, error)
+    except (KeyboardInterrupt, Terminated) as signalled:
+        exit_after_signal(name, signalled)
+
+
+def run_job(
+    name: str, verb: "Verb", given: Sequence[str], typed: dict[str, str], composed: DictConfig
+) -> float | None:
+    """Run a verb with composed settings, alone or as a job of a sweep; return its score."""
+    sys.argv[1:] = given  # as typed, for provenance.json
+    quieten()  # here, since a launcher may run the job in another process
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    words = [typed.get(word, word) for word in HydraConfig.get().overrides.task if not is_completing(word)]
+
+    def work() -> float | None:
+        config = checked(verb.find(verb.settings), as_mapping(composed))
+        if verb.check:
+            call(verb.find(verb.check), config=config, folder=folder, words=words)
+        return call(verb.find(verb.function), config=config, folder=folder, words=words)
+
+    with job_signals():
+        try:
+            return run_as_job(name, folder, work) if is_job() else work()
+        except EXPECTED as error:
+            exit_with_message(name, error)
+        finally:
+            remove_if_empty(folder, name)
+
+
+def call(function: Any, **given: Any) -> Any:
+    """Return the result of a function of some of these arguments."""
+    taken = inspect.signature(function).parameters
+    return function(**{name: value for name, value in given.items() if name in taken})
+
+
+def provide_config(name: str, schema: type[Settings]) -> None:
+    """Give Hydra the defaults of `schema` as the config of a verb without a file in conf/."""
+    if not (conf_folder() / f"{name}.yaml").is_file() and f"{name}.yaml" not in ConfigStore.instance().repo:
+        defaults = ["_self_", {"hydra/command": "any"}]
+        ConfigStore.instance().store(name, {"defaults": defaults, **schema().model_dump(mode="json")})
+
+
+def help_page(name: str, verb: "Verb", schema: type[Settings]) -> str:
+    """Return the page of --help: what the verb does, examples, and the choices of the groups that it reads.
+
+    Choices in folders of a user's own are listed too; plants that `schema` does not take are not.
+    """
+    pages = ", ".join(f"docs/{page}.md" for page in verb.pages.split())
+    examples = [f"  {program(name)} {words}".rstrip() for words in verb.examples]
+    parts = [f"{program(name)} {verb.about}\nRead {pages}.", "\n".join(["Examples", *examples])]
+    loader = GlobalHydra.instance().config_loader()
+    refused = {"plant": {*loader.get_group_options("plant")} - {*kinds(schema, "plant")}}
+    lines = [
+        f"  {group}: {', '.join(sorted({*loader.get_group_options(group)} - refused.get(group, set())))}"
+        for group in sorted(default_choices(name))
+    ]
+    if lines:
+        parts.append("\n".join(["Choices (group=choice)", *map(wrapped, lines)]))
+    footer = f"{program(name)} --cfg job shows every setting and its value."
+    if verb.has_run_folder:
+        footer += "\n--config-dir adds a folder with your own choices. "
+        footer += f"Results go to runs/{name}/,\nor to hydra.run.dir=<folder>."
+    return "\n\n".join([*parts, f"{footer}\n"])
+
+
+def wrapped(line: str) -> str:
+    """Return a line of choices, wrapped where standard output is a narrow terminal."""
+    if not sys.stdout.isatty():
+        return line
+    width = max(40, shutil.get_terminal_size().columns - 1)
+    return textwrap.fill(line, width, subsequent_indent="    ", break_on_hyphens=False)
+
+
+def wrong_option(words: Sequence[str]) -> str | None:
+    """Return the message about a misspelt option of Hydra or --cfg without its value; None without one."""
+    for word, following in pairwise([*words, ""]):
+        if word in ("--cfg", "-c") and following not in SHOWN:
+            return f"{word}: give {word} job"
+        name = word.removeprefix("--")
+        if name == word or any(option.startswith(name) for option in HYDRA_OPTIONS):
+            continue
+        near = most_similar(name, WHOLE_OPTIONS)
+        if similarity(name, near)[0] >= NEAR_OPTION:
+            return f"{word}: did you mean --{near}?"
+    return None
+
+
+def dashed_setting(words: Sequence[str]) -> str | None:
+    """Return the message about the first word like `--seed=1` or `--seed 1`, which Hydra does not take."""
+    for word, following in pairwise([*words, ""]):
+        dashed = re.fullmatch(r"--?([A-Za-z_.]+)=.*", word) or re.fullmatch(r"--([A-Za-z_.]+)", word)
+        if dashed and not any(option.startswith(dashed[1]) for option in HYDRA_OPTIONS):
+            setting = word.lstrip("-")
+            if "=" not in word:
+                setting += "=..." if re.search("=|^--|^$", following) else f"={following}"
+            return f"{word}: settings are given without dashes: {setting}"
+    return None
+
+
+def accept_all_characters() -> None:
+    """Let the output replace characters that its encoding lacks, as that of a pipe on Windows does."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="replace")
+
+
+def quieten() -> None:
+    """Silence messages of libraries that a user can do nothing about."""
+    os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")  # read when TorchRL is imported
+    logging.getLogger("torchrl").setLevel(logging.WARNING)  # if it is imported already
+    logging.getLogger("torch.utils.cpp_extension").setLevel(logging.ERROR)  # no CUDA compiler
+    # tensordict 0.14 reads a setting that torch 2.15 deprecates
+    warnings.filterwarnings("ignore", r"torch\._dynamo\.config\.inline_inbuilt_nn_modules", FutureWarning)
+
+
+def remove_if_empty(folder: Path, name: str) -> None:
+    """Remove a run folder if nothing was written to it, then runs/<name>/ and runs/ if they are empty."""
+    if folder == Path.cwd():
+        return
+    runs = Path.cwd() / "runs"
+    above = (runs / name, runs) if folder.parent == runs / name else ()
+    with suppress(OSError):  # one is not empty
+        for each in (folder, *above):
+            each.rmdir()

@@ -1,1 +1,0 @@
-"""The commands: compose, check, call one workflow. Only this package imports Hydra."""

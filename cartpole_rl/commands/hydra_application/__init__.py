@@ -1,1 +1,0 @@
-"""The part that all commands share: from the command line to checked settings, and to an exit code."""
