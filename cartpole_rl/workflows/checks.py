@@ -21,7 +21,7 @@ from cartpole_rl.plants.model_file import find_model
 from cartpole_rl.plants.settings import LearnedSettings
 from cartpole_rl.randomization.poles import Pole, check_one_pole
 from cartpole_rl.randomization.ranges import check_carts
-from cartpole_rl.rig.parameters import check_names, check_value, check_values
+from cartpole_rl.rig.parameters import check_names, check_value, check_values, completed
 from cartpole_rl.run_folder import (
     CHECKPOINTS,
     LAST,
@@ -250,7 +250,7 @@ def check_compiler(device: str = "cpu") -> None:
 
 def note_other_numbers(command: str, cart: Mapping[str, float], poles: Iterable[Pole]) -> None:
     """Print the numbers of a simulated cart and its poles that are not the nominal ones, if there are any."""
-    found = [*differences(cart, shipped_carts()[0])]
+    found = [*differences(cart, completed(shipped_carts()[0]))]
     for pole in poles:
         found += differences(pole.model_dump(), nominal_pole(pole).model_dump())
     if found:

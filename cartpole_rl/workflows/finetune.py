@@ -7,7 +7,7 @@ disk before the next one starts: an interruption costs at most the current one.
 
 import secrets
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
@@ -62,7 +62,7 @@ from cartpole_rl.workflows.build import (
     is_real_time,
     use_threads,
 )
-from cartpole_rl.workflows.checks import check_finetuning, check_resumable
+from cartpole_rl.workflows.checks import check_finetuning, check_resumable, is_given
 from cartpole_rl.workflows.config import EvaluateConfig, FinetuneConfig, TrainConfig, recorded_settings
 from cartpole_rl.workflows.finetuning_cart import DrivenCart, FinetuningFiles, Stage, yielding_to
 from cartpole_rl.workflows.finetuning_learner import CartLearner, TunedAgent, check_simulation
@@ -78,11 +78,11 @@ POLL = 0.1  # s between two looks for weights
 show = partial(print_message, "finetune")
 
 
-def finetune(config: FinetuneConfig, folder: Path, new_learner: bool = False) -> None:
+def finetune(config: FinetuneConfig, folder: Path, words: Sequence[str] = ()) -> None:
     """Fine-tune the agent of `config.run` on the cart of `config.plant`, or resume the run in `folder`.
 
-    A resumed run uses its own settings and the agent that it started from; with `new_learner`,
-    `config.learner` replaces its learner.
+    A resumed run uses its own settings and the agent that it started from; where the
+    `words` of the command line choose a learner, `config.learner` replaces its learner.
 
     Writes config.yaml, provenance.json, recordings/, TensorBoard events, comparison.json (before and after),
     metrics.json, figures/ and checkpoints/last.pt with the better of both policies; until the end also
@@ -93,7 +93,7 @@ def finetune(config: FinetuneConfig, folder: Path, new_learner: bool = False) ->
     if config.resume is not None:
         check_resumable("finetune", config.resume, folder)
         checkpoint = load_training(Path(config.resume), FINETUNING_FORMAT)
-        learner = {"learner": config.learner.model_dump()} if new_learner else {}
+        learner = {"learner": config.learner.model_dump()} if is_given(("learner",), words) else {}
         values = {**checkpoint.config, "resume": config.resume, **learner}
         config = recorded_settings(FinetuneConfig, values, f"resume={config.resume}")
     files = FinetuningFiles(folder, config)

@@ -19,10 +19,10 @@ from collections import defaultdict
 from collections.abc import Callable
 from typing import Any
 
-from cartpole_rl.commands.train import main as train_command
 from common import option_parser, print_table, write_json
 
 from cartpole_rl.agents.settings import AGENTS
+from cartpole_rl.cli import run
 from cartpole_rl.learning.dqn import Training
 
 KINDS = {"collect": "stepping", "learn": "updating", "evaluate": "evaluating"}  # method of Training: kind
@@ -73,7 +73,7 @@ def main() -> None:
     AGENTS.find("dqn").learner = TimedTraining
     with tempfile.TemporaryDirectory() as folder:
         sys.argv = ["cartpole-train", *options.overrides, f"hydra.run.dir={folder}/run"]
-        train_command()
+        run("train")
     found = shares()
     print_table(
         [
