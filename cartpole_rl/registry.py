@@ -33,7 +33,7 @@ from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Self, TypeVar
 
 from pydantic import GetCoreSchemaHandler
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
@@ -66,6 +66,12 @@ class Extension(str):
         if isinstance(self._item, str):
             self._item = _object_at(self._item)
         return self._item
+
+    def named(self, name: str) -> Self:
+        """Return the same extension under another name."""
+        other = str.__new__(type(self), name)
+        vars(other).update(vars(self))
+        return other
 
     def __call__(self, *arguments: Any, **named: Any) -> Any:
         """Return the result of the function or class."""
@@ -155,9 +161,9 @@ class Registry(Generic[Kind]):
         found = next((each for each in self if each._item is item), None)
         if found is None and self.decorated:
             raise ConfigError(f"{place} is not registered as a {self.words}; docs/extending.md shows how")
-        if name not in self._entries:  # its module may have registered it under this very name
-            self.add(name, item, **({} if found is None else _properties(found)))
-        return self._entries[name]
+        if found is None:
+            return self.add(name, item)
+        return self._entries.setdefault(name, found.named(name))
 
     @property
     def words(self) -> str:
@@ -193,11 +199,6 @@ def _recall(home: str, kind: str, name: str) -> Extension:
     """Return an extension that was pickled."""
     import_module(home)
     return Registry.all[kind].find(name)
-
-
-def _properties(entry: Extension) -> dict[str, Any]:
-    """Return what was given with an extension when it was registered."""
-    return {name: value for name, value in vars(entry).items() if name not in ("_item", "registry")}
 
 
 @cache

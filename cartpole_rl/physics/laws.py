@@ -37,9 +37,10 @@ class Law(Extension):
         A `candidate` is tried in every identification.
         """
         super().__init__(name, item)
-        for parameter in reads:
-            if isinstance(parameter, Parameter):
-                add_parameter(parameter)
+        own = [each for each in reads if isinstance(each, Parameter)]
+        for parameter in own:
+            add_parameter(parameter)
+        self.brings = tuple(each.name for each in own)  # parameters that no other law knows
         self.reads = tuple(each.name if isinstance(each, Parameter) else each for each in reads)
         check_names(self.reads, f"reads of {name}")
         self.holds_at_rest, self.candidate = holds_at_rest, candidate

@@ -69,6 +69,7 @@ def load_model(source: Path) -> LearnedModel:
 
 
 def _as_model(content: Mapping[str, Any]) -> LearnedModel:
+    models = Models.of(**content["models"])  # a user's law brings its parameters
     check_values(content["parameters"])
     residual = Residual(**content["residual"])
     if bad := [name for name, part in residual._asdict().items() if not part.isfinite().all()]:
@@ -77,7 +78,7 @@ def _as_model(content: Mapping[str, Any]) -> LearnedModel:
         raise ValueError(f"its tables have {residual.places.shape[1]} places, not {PLACES}")
     return LearnedModel(
         content["parameters"],
-        Models.of(**content["models"]),
+        models,
         float(content["period"]),
         int(content["substeps"]),
         residual,

@@ -1,15 +1,19 @@
 """Files of an identification: the cart, its pole and carts to train on, as choices for conf/'s groups."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
 
+from cartpole_rl.choices import is_shipped
 from cartpole_rl.files import replacing, write_text
 from cartpole_rl.identification.identify import Identification
 from cartpole_rl.identification.quantities import intervals
 from cartpole_rl.identification.unknowns import WEIGHED
+from cartpole_rl.physics.laws import Law
+from cartpole_rl.physics.models import REGISTRIES
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.randomization.poles import Pole
 from cartpole_rl.rig.parameters import PARAMETERS
@@ -28,6 +32,8 @@ def write_choices(found: Identification, carts: np.ndarray, folder: Path) -> Non
     `carts` [P, N] are drawn from the fit.
     """
     write_cart(found, carts, folder / CART)
+    for law in found.models[:2]:
+        write_friction(law, found.fit.parameters, folder)
     parameters = found.fit.parameters
     pole = Pole(**{name: parameters[name] for name in Pole.model_fields})
     choices = {"choices": {"identified": pole.model_dump()}}
@@ -67,11 +73,25 @@ def write_cart(found: Identification, carts: np.ndarray, path: Path) -> None:
         f"# cart_friction={models.cart_friction} and pole_friction={models.pole_friction}; masses and forces "
         f"are relative to the pole's mass, {parameters['pole_mass']:g} kg.",
     ]
+    brought = {name for registry in REGISTRIES.values() for law in registry for name in law.brings}
     for name in CartParameters.names():
-        if name not in Pole.model_fields:
+        if name not in brought.union(Pole.model_fields):
             error = f"+- {deviations[name]:.2g}" if name in identified else "prior value"
             lines.append(f"{name}: {parameters[name]!r}  # {PARAMETERS[name].unit}, {error}")
     write_text(path, "\n".join(lines) + "\n")
+
+
+def write_friction(law: Law, parameters: Mapping[str, float], folder: Path) -> None:
+    """Write a friction law that conf/ does not have as a choice, with the parameters that it brings."""
+    if not is_shipped(law.registry.kind, law):
+        choice = {"model": str(law), "parameters": {name: parameters[name] for name in law.brings}}
+        write_text(folder / f"{law.registry.kind}.yaml", yaml.safe_dump(choice, sort_keys=False))
+
+
+def friction_choice(law: Law, folder: Path) -> str:
+    """Return the choice of a friction law on a command line, after `write_friction` into `folder`."""
+    kind = law.registry.kind
+    return f"{kind}={law if is_shipped(kind, law) else f'{folder}/{kind}.yaml'}"
 
 
 def standard_deviations(carts: np.ndarray) -> dict[str, float]:

@@ -48,7 +48,7 @@ from cartpole_rl.workflows.build import precedence, use_threads
 from cartpole_rl.workflows.checks import note_other_numbers
 from cartpole_rl.workflows.config import IdentifyConfig
 from cartpole_rl.workflows.identified_errors import BY_HAND, errors, known_truth
-from cartpole_rl.workflows.identified_files import report, write_choices
+from cartpole_rl.workflows.identified_files import friction_choice, report, write_choices
 from cartpole_rl.workflows.progress import progress_bar
 from cartpole_rl.workflows.recordings import experiments
 from cartpole_rl.workflows.results import print_results, shown
@@ -163,10 +163,10 @@ def split(recordings: Episodes, source: Path) -> tuple[Episodes, Episodes]:
 
 def next_command(found: Identification, folder: Path) -> str:
     """Return the command that trains on carts like the identified one."""
-    run = shown(folder)
+    run, models = shown(folder), found.models
     return (
         f"cartpole-train cart={run}/{CART} pole={run}/{POLE} randomization={run}/{RANDOMIZATION} "
-        f"cart_friction={found.models.cart_friction} pole_friction={found.models.pole_friction}"
+        f"{friction_choice(models.cart_friction, run)} {friction_choice(models.pole_friction, run)}"
     )
 
 

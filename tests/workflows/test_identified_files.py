@@ -12,24 +12,52 @@ from cartpole_rl.identification.fit import Fit
 from cartpole_rl.identification.identify import Candidate, Identification, PredictionError
 from cartpole_rl.identification.rollout import Dynamics
 from cartpole_rl.identification.unknowns import WEIGHED, unknowns_of
+from cartpole_rl.physics.friction import CART_FRICTIONS, COULOMB, stribeck_force
 from cartpole_rl.physics.models import Models
 from cartpole_rl.randomization.poles import Pole, PoleSettings
-from cartpole_rl.workflows.identified_files import write_choices
+from cartpole_rl.rig.parameters import POSITIVE, Parameter, factor
+from cartpole_rl.workflows.identified_files import friction_choice, write_choices
+
+
+def write(models: Models, nominal: dict[str, float], folder: Path) -> dict[str, float]:
+    """Write the files of a cart whose numbers have many digits; return the numbers."""
+    unknowns = unknowns_of(models, WEIGHED)
+    size = len(unknowns)
+    fit = Fit(unknowns, np.full(size, 0.123456789), np.eye(size), nominal, np.ones(2), np.zeros(2), 1.0, 1)
+    dynamics = Dynamics.of(fit.parameters, models, 0.02, 4)
+    error = PredictionError(1e-3, 0.01)
+    found = Identification(fit, dynamics, [Candidate(fit, dynamics, error)], [], error, [])
+    write_choices(found, fit.draw(10, np.random.default_rng(0)), folder)
+    return {name: value for name, value in fit.parameters.items() if name not in Pole.model_fields}
 
 
 @pytest.fixture
-def folder(ip02: dict[str, float], medium: PoleSettings, tmp_path: Path) -> Path:
-    """The files of a cart whose numbers have many digits."""
-    unknowns, nominal = unknowns_of(Models(), WEIGHED), {**ip02, **medium.nominal.model_dump()}
-    size = len(unknowns)
-    fit = Fit(unknowns, np.full(size, 0.123456789), np.eye(size), nominal, np.ones(2), np.zeros(2), 1.0, 1)
-    dynamics = Dynamics.of(fit.parameters, Models(), 0.02, 4)
-    error = PredictionError(1e-3, 0.01)
-    found = Identification(fit, dynamics, [Candidate(fit, dynamics, error)], [], error, [])
-    write_choices(found, fit.draw(10, np.random.default_rng(0)), tmp_path)
-    expected = {name: value for name, value in fit.parameters.items() if name not in Pole.model_fields}
+def nominal(ip02: dict[str, float], medium: PoleSettings) -> dict[str, float]:
+    return {**ip02, **medium.nominal.model_dump()}
+
+
+@pytest.fixture
+def folder(nominal: dict[str, float], tmp_path: Path) -> Path:
+    expected = write(Models(), nominal, tmp_path)
     assert yaml.safe_load((tmp_path / "cart.yaml").read_text()) == expected
+    assert not (tmp_path / "cart_friction.yaml").exists()
+    assert friction_choice(Models().cart_friction, tmp_path) == "cart_friction=sigmoid"
     return tmp_path
+
+
+@pytest.mark.usefixtures("own_extensions")
+def test_a_law_of_a_user_has_a_file_with_the_parameters_that_it_brings(
+    nominal: dict[str, float], tmp_path: Path
+) -> None:
+    """Not the cart's: only a process that has imported the law knows them."""
+    slip = Parameter("test_slip", "m/s", POSITIVE, 0.005, factor(1.0), "speed of 76 % of the friction")
+    CART_FRICTIONS.add("test:law", stribeck_force, reads=(*COULOMB, slip))
+    models = Models.of(cart_friction="test:law")
+    numbers = write(models, nominal, tmp_path)
+    choice = yaml.safe_load((tmp_path / "cart_friction.yaml").read_text())
+    assert choice == {"model": "test:law", "parameters": {"test_slip": numbers.pop("test_slip")}}
+    assert yaml.safe_load((tmp_path / "cart.yaml").read_text()) == numbers
+    assert friction_choice(models.cart_friction, Path("id")) == "cart_friction=id/cart_friction.yaml"
 
 
 def test_the_units_are_those_of_the_nominal_cart(folder: Path) -> None:
