@@ -25,7 +25,7 @@ from omegaconf import DictConfig, OmegaConf
 from cartpole_rl import __version__
 from cartpole_rl.checking import checked, kinds, most_similar, similarity
 from cartpole_rl.choices import conf_folder, default_choices
-from cartpole_rl.composition import OwnChoices, as_mapping, is_completing
+from cartpole_rl.composition import as_mapping, hydra_overrides, is_completing
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.exits import (
     EXPECTED,
@@ -67,10 +67,9 @@ def run_command(name: str, verb: "Verb") -> None:
         if wrong := wrong_option(given) or dashed_setting(given):
             raise ConfigError(wrong)
         provide_config(name, schema)
-        with OwnChoices(name, as_multirun(given)) as own, sweep(name, schema):
-            work = partial(run_job, name, verb, given, own.typed)
-            for words in shown_jobs(own.words) or [own.words]:
-                sys.argv[1:] = words
+        with hydra_overrides(name, as_multirun(given)) as (words, typed), sweep(name, schema):
+            work = partial(run_job, name, verb, given, typed)
+            for sys.argv[1:] in shown_jobs(words) or [words]:
                 hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=name)(work)()
     except EXPECTED as error:
         exit_with_message(name, error)

@@ -19,8 +19,7 @@ from importlib import import_module
 from itertools import chain, count, pairwise
 from pathlib import Path
 from threading import RLock
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import hydra
 from hydra.core.config_store import ConfigStore
@@ -45,7 +44,6 @@ from cartpole_rl.choices import (
     WHOLE,
     Choice,
     Chosen,
-    choice,
     conf_folder,
     default_choices,
     group_choices,
@@ -92,57 +90,78 @@ def compose(command: str, overrides: Mapping[str, Any] | Sequence[str] = ()) -> 
     or a list of these; any other name, dotted or not, takes a value. "+name" adds a setting and "~name"
     removes one. Values that conf/ leaves open ("???") are left out. Raises ConfigError in one line.
     """
-    with OwnChoices(command, overrides) as own:
-        return composed(command, own.words)
-
-
-class OwnChoices:
-    """A user's own choices in the overrides of a command, in Hydra's ConfigStore until the end of a `with`.
-
-    `words` are the overrides with names in place of files and mappings; `typed` finds the words of a command
-    line by these. Raises ConfigError.
-    """
-
-    def __init__(self, command: str, overrides: Mapping[str, Any] | Sequence[str]) -> None:
-        self.command = command
-        self.groups = default_choices(command)
-        self.typed: dict[str, str] = {}
-        self._own: dict[str, dict[str, dict[str, Any]]] = defaultdict(dict)  # group: name: what it gives
-        self._stored: list[tuple[str, str]] = []  # group and name of each, in the ConfigStore
-        self._names: dict[str, set[str]] = defaultdict(set)  # chosen, by group
-        self._swept: set[str] = set()  # groups of which several choices are given
-        self._folder: Path | None = None
+    with hydra_overrides(command, overrides) as (words, _):
         try:
-            if isinstance(overrides, Mapping):
-                words = [self._override(name, value) for name, value in overrides.items()]
-                words = [word for word in words if word]
-            else:
-                self._folder = own_folder(overrides)
-                words = [self._with_names(word) for word in overrides]
-                self.typed = dict(zip(words, overrides, strict=True))
-            self.words = self._completed(words)
-        except BaseException:
-            self.remove()
-            raise
+            find = _composed.__wrapped__ if any("${" in word for word in words) else _composed
+            return deepcopy(find(command, tuple(words)))
+        except (HydraException, OmegaConfBaseException) as error:
+            raise ConfigError(error_message(error, command, words)) from None
 
-    def __enter__(self) -> Self:
-        return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.remove()
+@lru_cache(maxsize=64)
+def _composed(command: str, words: tuple[str, ...]) -> dict[str, Any]:
+    with reading_conf():
+        return as_mapping(hydra.compose(command, [*words]))
 
-    def remove(self) -> None:
-        """Remove the choices from the ConfigStore."""
-        for group, name in self._stored:
-            *above, last = group.split("/")
-            place = ConfigStore.instance().repo
-            for part in above:
-                place = place[part]
-            del place[last][f"{name}.yaml"]
 
-    def _override(self, name: str, value: Any) -> str:
+@contextmanager
+def reading_conf() -> Iterator[None]:
+    """Let `hydra.compose` read conf/, also while a command of Hydra's runs."""
+    with _LOCK:
+        running = GlobalHydra.instance().hydra
+        GlobalHydra.instance().clear()
+        try:
+            with hydra.initialize_config_dir(version_base="1.3", config_dir=str(conf_folder())):
+                yield
+        finally:
+            GlobalHydra.instance().hydra = running
+
+
+def as_mapping(config: DictConfig) -> dict[str, Any]:
+    """Return a composed config, resolved, as plain mappings without the missing values (`???`)."""
+    return without_missing(OmegaConf.to_container(config, resolve=True))
+
+
+def without_missing(values: Any) -> Any:
+    """Return nested mappings without the values that are missing ("???")."""
+    if not isinstance(values, Mapping):
+        return values
+    return {name: without_missing(value) for name, value in values.items() if value != "???"}
+
+
+@contextmanager
+def hydra_overrides(
+    command: str, overrides: Mapping[str, Any] | Sequence[str]
+) -> Iterator[tuple[list[str], dict[str, str]]]:
+    """Yield overrides for Hydra, and the words of a command line by these.
+
+    Names of choices take the place of a user's files and mappings, until the end. Raises ConfigError.
+    """
+    own = _OwnChoices(command)
+    try:
+        if isinstance(overrides, Mapping):
+            words = [word for name, value in overrides.items() if (word := own.by_name(name, value))]
+            yield own.completed(words), {}
+        else:
+            own.folder = own_folder(overrides)
+            words = [own.with_names(word) for word in overrides]
+            yield own.completed(words), dict(zip(words, overrides, strict=True))
+    finally:
+        own.remove()
+
+
+class _OwnChoices:
+    """A user's own choices in the overrides of a command; `folder` is the one of --config-dir."""
+
+    def __init__(self, command: str) -> None:
+        self.folder: Path | None = None
+        self.groups = default_choices(command)
+        self.own: dict[str, dict[str, dict[str, Any]]] = defaultdict(dict)  # group: name: what it gives
+        self.names: dict[str, set[str]] = defaultdict(set)  # other choices, by group
+        self.swept: set[str] = set()  # groups of which several choices are given
+        self.stored: list[tuple[str, str]] = []  # group and name of each, in the ConfigStore
+
+    def by_name(self, name: str, value: Any) -> str:
         """Return a Python value for Hydra's command line; "" where a group stays without a choice."""
         if name not in self.groups:
             return name if name.startswith("~") else f"{name}={as_literal(name, value)}"
@@ -152,8 +171,8 @@ class OwnChoices:
             return ""
         raise ConfigError(NO_CHOICE.format(name))
 
-    def _with_names(self, word: str) -> str:
-        """Return an override with names of choices in place of files and mappings."""
+    def with_names(self, word: str) -> str:
+        """Return an override of a command line with names of choices in place of files and mappings."""
         match = WORD.fullmatch(word)
         if match is None or not (conf_folder() / match[1]).is_dir() or match[1] == "hydra":
             return word
@@ -164,96 +183,121 @@ class OwnChoices:
         if elements is None:
             return word
         if len(elements) > 1:
-            self._swept.add(group)
+            self.swept.add(group)
         return f"{group}={','.join(self._name(group, each) for each in elements)}"
 
-    def _name(self, group: str, chosen: Any) -> str:
-        """Return what stands for one choice, or a list of choices, on Hydra's command line."""
-        if isinstance(chosen, list | tuple):
-            return self._store(group, "_".join(self._name(group, each) for each in chosen), [*chosen])
-        if isinstance(chosen, Mapping):
-            return self._store(group, "given", chosen)
-        name = chosen.text if isinstance(chosen, QuotedString) else _text(chosen)
-        if "${" in name and not is_own_file(name):
-            return name
-        _check_run_folder(group, name)
-        if Path(name).suffix and not is_own_file(name) and Path(name).is_file():
-            raise ConfigError(f"{group}={name}: a file of your own must end in .yaml")
-        if is_own_file(name):
-            return self._store(group, Path(name).stem, Path(name))
-        if self._folder is not None and (file := self._folder / group / f"{name}.yaml").is_file():
-            return self._store(group, name, file)
-        self._names[group].add(name)
-        return name if NAME.fullmatch(name) else "'" + name.replace("\\", "\\\\").replace("'", "\\'") + "'"
+    def completed(self, words: list[str]) -> list[str]:
+        """Return the words, and those by which what the user gave outlasts other choices."""
+        keys = {key_of(word) for word in words}
+        frictions = [group for group in FRICTIONS if self.groups.get(group) is not None or group in keys]
+        groups = sorted(self.own.keys() - {"sweep"}, key=lambda group: (group in WHOLE, group in FRICTIONS))
+        more = []
+        for group in groups:
+            others = {*self.names[group], *self._found(group), self.groups.get(group) or ""}
+            for name in others | {*self.own[group]}:
+                given = self.own[group].get(name, {})
+                values = given if group in WHOLE else {group: _alone(group, given)}
+                nulls = _nulls(_names(values.get("cart")), {each: _replaced(each) for each in frictions})
+                node = merged(nulls, values) if given else {}
+                self._put(f"{OWN}/{group}", name, node, "_global_")
+            in_jobs_alone = group in self.swept and self.groups.get(group) is None
+            chosen = f"choice(${{{group}}})" if in_jobs_alone else f"${{{group}}}"
+            more.append(f"+{OWN}/{group}={chosen}")
+        numbers = [key.removeprefix("cart.") for key in sorted(keys) if key.startswith("cart.")]
+        replaced = {
+            group: _replaced(group).union(
+                *(_names(given.get("parameters")) for given in self.own[group].values())
+            )
+            for group in frictions
+        }
+        for group, values in _nulls(numbers, replaced).items():
+            names = [f"{group}.parameters.{name}" for name in values["parameters"]]
+            if f"{group}.parameters" not in keys:
+                more += [f"++{name}=null" for name in names if name not in keys]
+        place = next((number for number, word in enumerate(words) if key_of(word)), 0)
+        return [*words[:place], *more, *words[place:]]
 
-    def _store(self, group: str, name: str, chosen: Choice) -> str:
+    def remove(self) -> None:
+        """Remove the choices from the ConfigStore."""
+        for group, name in self.stored:
+            place = ConfigStore.instance().repo
+            for part in group.split("/"):
+                place = place[part]
+            del place[f"{name}.yaml"]
+
+    def _name(self, group: str, given: Any) -> str:
+        """Return what stands for a choice, or a list of choices, on Hydra's command line."""
+        chosen = self._chosen(group, given)
+        if not isinstance(chosen, str):
+            return self._store(group, chosen)
+        self.names[group].add(chosen)
+        if NAME.fullmatch(chosen) or "${" in chosen:
+            return chosen
+        return "'" + chosen.replace("\\", "\\\\").replace("'", "\\'") + "'"
+
+    def _chosen(self, group: str, given: Any) -> Choice:
+        """Return the name of a choice, the path of a file, a mapping, or a list of these."""
+        if isinstance(given, list | tuple):
+            return [self._chosen(group, each) for each in given]
+        if isinstance(given, Mapping):
+            return given
+        name = given.text if isinstance(given, QuotedString) else _text(given)
+        if is_own_file(name):
+            _check_run_folder(group, name)
+            return Path(name)
+        if "${" not in name:
+            _check_run_folder(group, name)
+            if Path(name).suffix and Path(name).is_file():
+                raise ConfigError(f"{group}={name}: a file of your own must end in .yaml")
+            if self.folder is not None and (file := self.folder / group / f"{name}.yaml").is_file():
+                return file
+        return name
+
+    def _store(self, group: str, chosen: Choice) -> str:
         """Read a choice, hand it to Hydra, and return its name there."""
-        is_file = isinstance(chosen, Path)
-        folder = Path() if is_file or self._folder is None else self._folder / group
-        loaded = load(group, chosen, folder)
+        folder = self.folder / group if self.folder is not None else Path()
+        loaded = load(group, chosen, Path() if isinstance(chosen, Path) else folder)
         if group == "cart":
-            _check_cart(f"cart={chosen if is_file else '{...}'}", loaded)
-        groups = [{f"{REPLACES}{other}": self._chosen(other, each)} for other, each in loaded.groups.items()]
+            _check_cart(f"cart={chosen if isinstance(chosen, Path) else '{...}'}", loaded)
+        groups = [
+            {f"{REPLACES}{other}": each if each is None else self._name(other, each).strip("'")}
+            for other, each in loaded.groups.items()
+        ]
         values = loaded.values if group in WHOLE else _with_defaults(group, loaded.values)
+        name = self._free_name(group, chosen)
         node = {"defaults": [*groups, "_self_"], **values} if groups else values
-        name = self._free_name(group, name, chosen)
         self._put(group, name, node, "_global_" if group in WHOLE else None)
-        self._own[group][name] = loaded.own
+        self.own[group][name] = loaded.own
         return name
 
     def _put(self, group: str, name: str, node: Any, package: str | None) -> None:
         ConfigStore.instance().store(name, node, group, package)
-        self._stored.append((group, name))
+        self.stored.append((group, name))
 
-    def _chosen(self, group: str, chosen: Any) -> str | None:
-        """Return a choice of another group in an experiment, as Hydra takes it."""
-        return self._name(group, chosen).strip("'") if chosen is not None else None
-
-    def _free_name(self, group: str, name: str, chosen: Choice) -> str:
+    def _free_name(self, group: str, chosen: Choice) -> str:
         """Return a name that Hydra reads as text, and that no other choice of the group has."""
-        plain = re.sub(r"\W+", "_", name, flags=re.ASCII).strip("_")
-        plain = plain if NAME.fullmatch(plain) else f"file_{plain}"
-        names = [plain]
+        names = [_plain(chosen)]
         if isinstance(chosen, Path):
-            parent = re.sub(r"\W+", "_", chosen.resolve().parent.name, flags=re.ASCII)
-            names.append(f"{parent if NAME.fullmatch(parent) else 'file'}_{plain}")
-        stored = ConfigStore.instance().repo.get(group, {})
-        taken = {*self._in_folder(group), *(name.removesuffix(".yaml") for name in stored)}
-        every = chain(names, (f"{plain}_{number}" for number in count(2)))
+            names.append(f"{_plain(chosen.resolve().parent)}_{names[0]}")
+        in_store = (name.removesuffix(".yaml") for name in ConfigStore.instance().repo.get(group, {}))
+        taken = {*self._found(group), *in_store}
+        every = chain(names, (f"{names[0]}_{number}" for number in count(2)))
         return next(each for each in every if each not in taken and not is_shipped(group, each))
 
-    def _in_folder(self, group: str) -> list[str]:
-        """Return the choices of a group in the folder of --config-dir."""
-        return [] if self._folder is None else [file.stem for file in (self._folder / group).glob("*.yaml")]
+    def _found(self, group: str) -> list[str]:
+        """Return the choices of a group in conf/ and in the folder of --config-dir."""
+        folders = [conf_folder(), *([self.folder] if self.folder is not None else [])]
+        return [file.stem for folder in folders for file in (folder / group).glob("*.yaml")]
 
-    def _completed(self, words: list[str]) -> list[str]:
-        """Return the words, and those by which what the user gave outlasts other choices."""
-        typed = {key_of(word) for word in words}
-        frictions = [group for group in FRICTIONS if self.groups.get(group) is not None or group in typed]
-        last = ("experiment", "sweep", *FRICTIONS)
-        own = sorted(self._own.keys() - {"sweep"}, key=lambda group: (group in WHOLE, group in last))
-        for group in own:
-            shipped = (file.stem for file in (conf_folder() / group).glob("*.yaml"))
-            others = {*self._names[group], *shipped, *self._in_folder(group), self.groups.get(group) or ""}
-            for name in others | {*self._own[group]}:
-                given = self._own[group].get(name, {})
-                values = given if group in WHOLE else {group: _alone(group, given)}
-                node = merged(_of_the_cart(values, frictions), values) if given else {}
-                self._put(f"{OWN}/{group}", name, node, "_global_")
-        numbers = {"cart": dict.fromkeys(key[5:] for key in typed if key.startswith("cart."))}
-        more = [f"+{OWN}/{group}={self._reference(group)}" for group in own]
-        for group, values in _of_the_cart(numbers, frictions).items():
-            keys = {f"{group}.parameters.{name}" for name in values["parameters"]}
-            more += (
-                [] if f"{group}.parameters" in typed else [f"++{key}=null" for key in sorted(keys - typed)]
-            )
-        place = next((number for number, word in enumerate(words) if key_of(word)), 0)
-        return [*words[:place], *more, *words[place:]]
 
-    def _reference(self, group: str) -> str:
-        """Return the chosen name for Hydra; a sweep of its own where only the jobs of a sweep have one."""
-        in_jobs_alone = group in self._swept and self.groups.get(group) is None
-        return f"choice(${{{group}}})" if in_jobs_alone else f"${{{group}}}"
+def _plain(chosen: Choice) -> str:
+    """Return a name for a choice."""
+    if isinstance(chosen, Mapping):
+        return "given"
+    if isinstance(chosen, list):
+        return "_".join(map(_plain, chosen))
+    plain = re.sub(r"\W+", "_", chosen.stem if isinstance(chosen, Path) else str(chosen), flags=re.ASCII)
+    return plain.strip("_") if NAME.fullmatch(plain.strip("_")) else f"file_{plain.strip('_')}"
 
 
 def key_of(word: str) -> str:
@@ -263,21 +307,24 @@ def key_of(word: str) -> str:
 
 
 def is_completing(word: str) -> bool:
-    """Return True for an override that no user gave: one that `OwnChoices` has added."""
+    """Return True for an override that no user gave: one that completes others."""
     return word.startswith(f"+{OWN}/") or bool(re.fullmatch(r"\+\+\w+_friction\.parameters\.\w+=null", word))
 
 
-def _of_the_cart(given: Mapping[str, Any], frictions: Iterable[str]) -> dict[str, Any]:
-    """Return null for each number of the cart that is given and that a choice of friction replaces."""
-    names = given.get("cart") or {}
-    found = {group: [name for name in names if name in _replaced_numbers(group)] for group in frictions}
-    return {group: {"parameters": dict.fromkeys(numbers)} for group, numbers in found.items() if numbers}
+def _nulls(numbers: Iterable[str], replaced: Mapping[str, set[str]]) -> dict[str, Any]:
+    """Return null for those `numbers` of the cart that a choice of friction has `replaced`, by its group."""
+    found = {group: [name for name in numbers if name in names] for group, names in replaced.items()}
+    return {group: {"parameters": dict.fromkeys(names)} for group, names in found.items() if names}
 
 
 @cache
-def _replaced_numbers(friction: str) -> set[str]:
+def _replaced(friction: str) -> set[str]:
     """Return the numbers of the cart that the choices of a friction in conf/ replace."""
-    return {name for each in group_choices(friction).values() for name in each.get("parameters", {})}
+    return set().union(*(_names(choice.get("parameters")) for choice in group_choices(friction).values()))
+
+
+def _names(given: Any) -> set[str]:
+    return {*given} if isinstance(given, Mapping) else set()
 
 
 def _alone(group: str, given: dict[str, Any]) -> dict[str, Any]:
@@ -397,7 +444,9 @@ def _check_run_folder(group: str, value: str) -> None:
 
 def _check_cart(word: str, cart: Chosen) -> None:
     """Raise ConfigError for an unknown parameter of a cart, or a missing one."""
-    (pole,) = choice("pole/medium")["choices"].values()  # its numbers are refused with a line of their own
+    (pole,) = group_choices("pole")["medium"][
+        "choices"
+    ].values()  # its numbers are refused with a line of their own
     known = [name for name in PARAMETERS if name not in pole]
     for name in cart.own.keys() - PARAMETERS.keys():
         raise ConfigError(
@@ -406,47 +455,6 @@ def _check_cart(word: str, cart: Chosen) -> None:
     if missing := [name for name in known if name not in completed(cart.values)]:
         remedy = "give it, or take what is missing from a choice: defaults: [ip02]"
         raise ConfigError(f"{word}: {missing[0]} is missing; {remedy}")
-
-
-def composed(command: str, words: Sequence[str]) -> dict[str, Any]:
-    """Return the settings of a command, with overrides that name choices. Raises ConfigError in one line."""
-    try:
-        changes = any("${" in word for word in words)
-        find = _composed.__wrapped__ if changes else _composed
-        return deepcopy(find(command, tuple(words)))
-    except (HydraException, OmegaConfBaseException) as error:
-        raise ConfigError(error_message(error, command, words)) from None
-
-
-@lru_cache(maxsize=64)
-def _composed(command: str, words: tuple[str, ...]) -> dict[str, Any]:
-    with reading_conf():
-        return as_mapping(hydra.compose(command, [*words]))
-
-
-@contextmanager
-def reading_conf() -> Iterator[None]:
-    """Let `hydra.compose` read conf/, also while a command of Hydra's runs."""
-    with _LOCK:
-        running = GlobalHydra.instance().hydra
-        GlobalHydra.instance().clear()
-        try:
-            with hydra.initialize_config_dir(version_base="1.3", config_dir=str(conf_folder())):
-                yield
-        finally:
-            GlobalHydra.instance().hydra = running
-
-
-def as_mapping(config: DictConfig) -> dict[str, Any]:
-    """Return a composed config, resolved, as plain mappings without the missing values (`???`)."""
-    return without_missing(OmegaConf.to_container(config, resolve=True))
-
-
-def without_missing(values: Any) -> Any:
-    """Return nested mappings without the values that are missing ("???")."""
-    if not isinstance(values, Mapping):
-        return values
-    return {name: without_missing(value) for name, value in values.items() if value != "???"}
 
 
 def error_message(error: Exception, command: str, words: Sequence[str]) -> str:
