@@ -1,7 +1,7 @@
 # One target for each check; `make check` runs them all and is what CI runs.
 BIN := .venv/bin
 
-.PHONY: check lint types floors test docs format
+.PHONY: check lint types floors test nightly docs format
 
 check: lint types floors test
 
@@ -18,6 +18,10 @@ floors:
 
 test:
 	$(BIN)/pytest -n 2 --dist worksteal --durations=20 --durations-min=5
+
+# what `make test` leaves out: benches, the wheel and the site
+nightly:
+	$(BIN)/pytest -m nightly -n 2 --dist worksteal
 
 # the site, into build/site; a broken link, a missing page or an unresolved reference is an error
 docs:

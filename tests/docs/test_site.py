@@ -37,6 +37,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "site"
 
 
+@pytest.mark.nightly
 def test_it_builds_and_shows_the_docstrings_of_public_modules(site: Path) -> None:
     page = (site / "docs/api.html").read_text(encoding="utf-8")
     assert [module for module in public_modules() if module not in page] == []
@@ -46,6 +47,7 @@ def test_it_builds_and_shows_the_docstrings_of_public_modules(site: Path) -> Non
     assert [name for name in names if f"<h3>{name}<" not in page] == []
 
 
+@pytest.mark.nightly
 def test_every_page_of_the_table_is_in_the_contents(site: Path) -> None:
     table = (ROOT / "README.md").read_text().partition("\n## Read on")[2]
     pages = re.findall(r"\(([\w./-]+)\.md\)", table)
@@ -54,6 +56,7 @@ def test_every_page_of_the_table_is_in_the_contents(site: Path) -> None:
     assert [page for page in pages if f'href="{page}.html"' not in contents] == []
 
 
+@pytest.mark.nightly
 def test_no_page_loads_anything_from_the_network(site: Path) -> None:
     pages = list(site.rglob("*.html"))
     assert len(pages) > 20

@@ -11,6 +11,7 @@ import pytest
 from command_line import ONCE, TINY
 
 ROOT = Path(__file__).parents[2]
+pytestmark = pytest.mark.nightly
 
 
 def pip(*words: str | Path) -> None:

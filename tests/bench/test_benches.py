@@ -1,0 +1,199 @@
+"""One smoke test of each bench script: it runs, and its figures are what they say; how fast is not tested."""
+
+import json
+import shutil
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import adaptation
+import distillation
+import environment
+import export_parity
+import fine_tuning
+import learning
+import numpy as np
+import one_cart
+import pytest
+import reference
+import shortcuts
+import time_spent
+import torch
+import truth_references
+import zero_shot
+from bench_scripts import TINY, Run
+from best_score.cart import KnownCart
+from common import REFERENCES
+from truths import REPORTED, draw_truths, simulated_cart
+
+from cartpole_rl.agents.settings import AGENTS
+from cartpole_rl.choices import choice
+from cartpole_rl.emulator.settings import EmulatorSettings
+from cartpole_rl.randomization.ranges import Range
+from cartpole_rl.tasks.rewards import UPRIGHT_ANGLE
+from cartpole_rl.workflows.agents import trained_agent
+from cartpole_rl.workflows.config import TrainConfig, load_settings
+
+pytestmark = pytest.mark.nightly
+
+PROCESSOR = ("qemu-system-arm", "arm-none-eabi-gcc", "make")
+SPEEDS = {  # script: words, and the peer of some rows
+    environment: (
+        ["--quick", "--threads", str(torch.get_num_threads())],
+        {"environment, step": "PendulumEnv, step", "environment, rollout": "PendulumEnv, rollout"},
+    ),
+    shortcuts: (["--quick", "--carts", "16"], {"CartPoleEnv, step": "TransformedEnv, step"}),
+}
+
+
+def figures(run: Run, script: ModuleType, folder: Path, *words: str) -> Any:
+    """Run a script in a folder, and return the JSON that it writes."""
+    run(script, folder, *words, "--json", "figures.json")
+    return json.loads((folder / "figures.json").read_text())
+
+
+@pytest.mark.parametrize("script", SPEEDS, ids=lambda script: script.__name__)
+def test_speeds_are_relative_to_a_peer(script: ModuleType, tmp_path: Path, run: Run) -> None:
+    words, peers = SPEEDS[script]
+    rows = {row["name"]: row for row in figures(run, script, tmp_path, *words)}
+    for ours, peer in peers.items():
+        assert rows[ours].get("peer", rows[ours].get("to")) == peer
+        ratio = [rows[name].get("steps_per_second") or 1 / rows[name]["ms"] for name in (ours, peer)]
+        assert rows[ours]["ratio"] == pytest.approx(ratio[0] / ratio[1])
+
+
+def test_one_cart(tmp_path: Path, run: Run) -> None:
+    found = figures(run, one_cart, tmp_path, "--steps", "200", "--episodes", "1")
+    peer, *ours = found["gymnasium"]
+    assert all(row["ratio"] == pytest.approx(row["steps_per_s"] / peer["steps_per_s"]) for row in ours)
+    for row in found["lockstep"]:
+        assert row["steps"] == 500
+        assert 0 < row["median_ms"] <= row["p999_ms"] <= row["longest_ms"]
+
+
+def test_the_shares_of_a_trainings_time_add_up(tmp_path: Path, run: Run, monkeypatch: Any) -> None:
+    kind = AGENTS.find("dqn")
+    monkeypatch.setattr(kind, "learner", kind.learner)  # the script replaces it; this restores it
+    spent = figures(run, time_spent, tmp_path, "experiment=medium", *TINY)
+    assert set(spent) == {"stepping", "updating", "evaluating", "the rest", "compiling"}
+    assert sum(each["share"] for each in spent.values()) == pytest.approx(1)
+
+
+def test_learning_is_judged_by_the_last_checkpoint(trained: Path, run: Run, monkeypatch: Any) -> None:
+    seed = json.loads((trained / "learning.json").read_text())["medium"]["10"]
+    found = seed["plants"]["medium"]
+    assert found["fraction"] == pytest.approx(
+        found["score"] / json.loads(REFERENCES.read_text())["medium"]["score"]
+    )
+    assert found["worst_start"] <= found["score"] < 1500  # hardly trained
+    monkeypatch.setattr(learning, "DRAWN_CARTS", 10)
+    checkpoint = trained / "runs/bench/medium/10/checkpoints/last.pt"
+    before = checkpoint.stat().st_mtime_ns
+    run(learning, trained, "medium", "--seeds", "1")
+    assert checkpoint.stat().st_mtime_ns == before
+
+
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="gcc is missing: install a C compiler")
+def test_exported_agents_choose_the_hosts_actions(run: Run, tmp_path: Path, monkeypatch: Any) -> None:
+    pytest.importorskip("onnxscript", reason='onnxscript is missing: pip install "cartpole_rl[export]"')
+    monkeypatch.setattr(export_parity, "CARTS", 2)
+    processor = ["--processor"] * all(map(shutil.which, PROCESSOR))
+    words = ("pretrained/medium", "--observations", "300", "--emulated", "0", *processor)
+    rows = {row["of"]: row for row in figures(run, export_parity, tmp_path, *words)}
+    counted = rows.pop("C, from counts")
+    assert (counted["episodes"], counted["differ"]) == (2, 0)
+    assert {"C", "ONNX", "PyTorch, one at a time"} <= set(rows)
+    assert all((row["observations"], row["beyond rounding"]) == (300, 0) for row in rows.values())
+    above = np.spacing(np.float32(3.0))
+    values = np.array([[1.0, 2.0], [3.0, np.float32(3.0) + above], [5.0, 4.0]], np.float32)
+    found = export_parity.row("x", np.array([0, 0, 0]), values)
+    assert (found["differ"], found["beyond rounding"]) == (2, 1)
+
+
+def test_the_costs_of_a_distilled_agent_are_those_of_the_exported_code() -> None:
+    found = distillation.costs(trained_agent(Path("pretrained/medium")))
+    assert found == {"hidden": "128, 64", "table bytes": 42_554, "multiply-adds": 10_048}
+
+
+def test_fine_tunings_are_compared_with_the_reference_of_the_cart() -> None:
+    def tuned(before: list[float], after: list[float]) -> dict[str, object]:
+        scores = {"before": before, "tune": [300.0, 4000.0], "after": after}
+        return {"scores": scores, "left_track": 1, "left_track_first": True, "seconds": 60.0}
+
+    better = fine_tuning.cart_figures("a", 0, {}, 5000.0, tuned([4000, 4200], [4400, 4600]))
+    worse = fine_tuning.cart_figures("a", 1, {}, 4000.0, tuned([3600, 3600], [400, 3000]))
+    failed = fine_tuning.cart_figures("a", 2, {}, None, {"error": "homing failed"})
+    assert better["fraction"] == pytest.approx({"before": 0.82, "after": 0.9})
+    row = fine_tuning.agent_row("a", [better, worse, failed])
+    assert (row["carts"], row["not tuned"], row["ended below"]) == (2, 1, 1)
+    assert (row["mean before"], row["worst after"], row["lost before, tuning, after"]) == (
+        "3850",
+        "1700",
+        "0, 2, 1",
+    )
+
+
+def test_an_informed_agent_observes_its_own_cart() -> None:
+    config = load_settings(TrainConfig, {"compile": False})
+    env = adaptation.make_env(config, adaptation.Job(0.0, 0, True), 50, config.task.start, 0)
+    present = env.reset()
+    present["action"] = torch.zeros(50, dtype=torch.int64)
+    known = env.step(present)["next", "observation"][:, config.observation.size :]
+    assert known.shape == (50, len(config.ranges))
+    assert known.abs().max() <= 1 + 1e-4
+    tilt = env.plant.parameters.track_tilt / config.ranges["track_tilt"].limits()[1]
+    torch.testing.assert_close(known[:, list(config.ranges).index("track_tilt")], tilt)
+
+
+def test_the_environment_counts_what_the_search_for_a_reference_counted() -> None:
+    config = reference.composed(["task.time_limit=110"])
+    cart = KnownCart(config)
+    found = reference.search(cart, 0.05, 120, 8)
+    played = reference.replay(config, 0.05, found)
+    assert sum(played.points) == pytest.approx(float(cart.run(cart.hanging(0.05), found).points), abs=0.01)
+    assert all(abs(theta) < UPRIGHT_ANGLE for theta in played.theta[-10:])
+    (truth,) = draw_truths(REPORTED, 1)
+    config, actions = reference.truth_config(truth), [8] * 6 + [0] * 12 + [8] * 4
+    points = KnownCart(config).run(KnownCart(config).hanging(0.0), actions).points
+    assert sum(reference.replay(config, 0.0, actions).points) == pytest.approx(float(points), abs=1e-4)
+
+
+def test_zero_shot_fractions_are_relative_to_the_reference_of_the_cart(
+    trained: Path, run: Run, tmp_path: Path, monkeypatch: Any
+) -> None:
+    monkeypatch.setattr(truth_references, "FOLDER", tmp_path / "references")
+    draw = truth_references.Draw(REPORTED, 0.0)
+    (truth,) = draw.truths(1)
+    truth_references.add_reference(draw, 0, truth, {"score": 100.0})
+    assert truth_references.known_references(draw, [{**truth, "cart_mass": 1.0}]) == [None]
+    words = ("runs/bench/medium/10", "--truths", "1", "--starts", "2")
+    found = figures(run, zero_shot, trained, *words)
+    assert (found["seed"], found["wider"], found["starts"]) == (2026, 0, 2)
+    (agent,) = found["agents"]
+    (cart,) = agent["carts"]
+    assert cart["fraction"] == agent["mean_fraction"] == pytest.approx(sum(cart["scores"]) / 2 / 100)
+    assert cart["lost"] == sum(score < 500 for score in cart["scores"])
+    with pytest.raises(SystemExit, match="was made with --seed 2026: use that, or another --json file"):
+        figures(run, zero_shot, trained, *words, "--seed", "0")
+
+
+def within(value: float, low: float, high: float) -> bool:
+    return low - 1e-9 <= value <= high + 1e-9
+
+
+def test_drawn_carts_are_possible_and_inside_the_ranges_of_training_unless_wider() -> None:
+    nominal = {**choice("cart/ip02"), **choice("pole/medium")["choices"]["medium"]}
+    bounds = {}
+    for name, line in choice("randomization/wide").items():
+        each = Range(**line)
+        bounds[name] = [limit * (nominal[name] if each.scales_nominal else 1) for limit in each.limits()]
+    for wider in (0.0, 1 / 3, 1.0):
+        for truth in draw_truths(REPORTED, 50, wider):
+            EmulatorSettings(**truth)  # has bounds of its own
+            cart = simulated_cart(truth)
+            drawn = {
+                name.removesuffix("_left").replace("coulomb_right", "coulomb_asymmetry") for name in truth
+            }
+            outside = {name for name in drawn & set(bounds) if not within(cart[name], *bounds[name])}
+            assert not outside or wider
+    assert draw_truths(REPORTED, 20)[:5] == draw_truths(REPORTED, 5)
