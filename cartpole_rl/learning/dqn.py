@@ -129,7 +129,7 @@ class Training(Resumable):
             steps.append(stepped.select(*COLLECTED))
             self.current = self.env.advance(stepped, self.retries.record(stepped["next"]))
         chunk: TensorDictBase = torch.stack(steps, 1)
-        self.buffer.extend(self.returns(chunk))
+        self.buffer.extend(self.returns(chunk.exclude("guard")))
         return chunk
 
     def act(self, current: TensorDictBase) -> Tensor:

@@ -49,6 +49,8 @@ BOTH: Table = {
     "observation.past_positions": (0, "5.1.1"),
     "observation.pole_length": (False, "5.1.1"),
     "agent.hidden": ([64, 64], "tables 6.1 and 6.2"),
+    "agent.kind": ("dqn", "4.1.2"),
+    "agent.network": ("mlp", "5.1.1"),
     "agent.recurrent": (None, "5.1.1"),
     "agent.layer_norm": (False, "not named"),
     "agent.mirrored": (False, "not named"),
@@ -152,7 +154,7 @@ OF: dict[str, Table] = {
         "learning.batch_size": (256, "table 6.2"),
     },
 }
-OF_THE_RUN = {"seed", "label", "device", "threads", "compile", "resume"}  # not of the experiment
+OF_THE_RUN = {"seed", "label", "device", "threads", "compile", "resume", "logger"}  # not of the experiment
 EXPECTED = {
     name: {**BOTH, **{f"cart.{key}": row for key, row in CART.items()}, **own} for name, own in OF.items()
 }

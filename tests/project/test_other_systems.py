@@ -17,6 +17,9 @@ import importlib, os, pkgutil, signal, sys
 import torch, torchrl, matplotlib.pyplot, mujoco, serial, hydra, gymnasium, scipy.optimize, tqdm, pydantic
 import subprocess, tempfile, socket, multiprocessing.spawn
 from torch.utils.tensorboard import SummaryWriter
+from contextlib import suppress
+with suppress(ImportError):
+    import ray  # TorchRL imports it where it is installed
 
 for name in ("fcntl", "termios", "pty", "tty", "resource", "pwd", "grp", "readline", "curses"):
     sys.modules[name] = None
