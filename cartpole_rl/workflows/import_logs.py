@@ -13,10 +13,10 @@ import numpy as np
 
 from cartpole_rl.errors import RecordingError
 from cartpole_rl.evaluation.recordings import LENGTH, write_recording
-from cartpole_rl.identification.logs import Layout, Log, Report, read_log
+from cartpole_rl.identification.layout import ImportConfig, Layout
+from cartpole_rl.identification.logs import Log, Report, read_log
 from cartpole_rl.identification.sensors import Estimate, Motion, Sensors, question_sensors
 from cartpole_rl.run_folder import RECORDINGS, write_config, write_json
-from cartpole_rl.settings import Positive, Settings
 
 IMPORTED = "import.json"
 SUFFIXES = (".csv", ".txt", ".tsv", ".log", ".dat")
@@ -27,15 +27,6 @@ JITTER = 0.1  # share of the period
 LEAPS = 0.02  # share of rows
 SATURATED = 0.5  # share of rows
 TURN = 2 * np.pi
-
-
-class ImportConfig(Settings):
-    """The settings of cartpole-import."""
-
-    source: Path
-    layout: Layout
-    pole_length: Positive | None = None  # m, of the recorded pole
-    label: str
 
 
 def import_logs(config: ImportConfig, folder: Path) -> Sensors:

@@ -11,9 +11,10 @@ import pytest
 from cartpole_rl.checking import checked
 from cartpole_rl.errors import ConfigError, RecordingError
 from cartpole_rl.evaluation.recordings import read_recording
-from cartpole_rl.identification.logs import Layout, read_log
+from cartpole_rl.identification.layout import ImportConfig, Layout
+from cartpole_rl.identification.logs import read_log
 from cartpole_rl.identification.sensors import Motion, question_sensors
-from cartpole_rl.workflows.import_logs import ImportConfig, import_logs
+from cartpole_rl.workflows.import_logs import import_logs
 
 PERIOD, STEPS, LENGTH = 0.02, 3000, 0.3  # s; length of the equivalent simple pendulum, m
 LAYOUT: dict[str, Any] = {
