@@ -14,7 +14,7 @@ HERE = "${here}"  # the folder of a person's own file
 WHOLE = ("experiment", "sweep")  # groups without settings of their own: they change those of others
 OF_CLASSES = {  # choices that are the defaults of a settings class
     "emulator/medium": "cartpole_rl.emulator.settings:EmulatorSettings",
-    "plant//serial_defaults@_here_": "cartpole_rl.plants.serial.settings:SerialSettings",
+    "plant//serial_defaults@_here_": "cartpole_rl.plants.settings:SerialSettings",
 }
 OWN_FILES = (".yaml", ".yml")
 REPLACES = "override /"

@@ -20,7 +20,7 @@ from cartpole_rl.errors import CartPoleError, ConfigError, PlantError
 from cartpole_rl.exporting.agent import read_agent
 from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.errors import fault_error
-from cartpole_rl.plants.serial.settings import SerialSettings
+from cartpole_rl.plants.settings import SerialSettings
 from cartpole_rl.signals import RaiseOnce, ending_signals
 from cartpole_rl.wire import Flags, seconds_between
 

@@ -16,7 +16,7 @@ import sys
 
 from cartpole_rl.errors import FaultError, PlantError
 from cartpole_rl.plants.serial.cart import SerialCart
-from cartpole_rl.plants.serial.settings import SerialSettings
+from cartpole_rl.plants.settings import SerialSettings
 from cartpole_rl.signals import RaiseOnce, ending_signals
 from cartpole_rl.wire import Fault, Flags, State
 

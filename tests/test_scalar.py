@@ -20,7 +20,7 @@ from cartpole_rl.physics.actuator import ACTUATORS
 from cartpole_rl.physics.friction import CART_FRICTIONS, POLE_FRICTIONS
 from cartpole_rl.physics.models import INTEGRATORS, Models
 from cartpole_rl.physics.parameters import CartParameters
-from cartpole_rl.plants.simulation import Carts, Inputs, run_carts
+from cartpole_rl.plants.simulated import Carts, Inputs, run_carts
 from cartpole_rl.scalar import Scalar, plain
 from cartpole_rl.tasks.features import ObservationKind
 from cartpole_rl.tasks.rewards import Reward

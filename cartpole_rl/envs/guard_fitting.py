@@ -25,7 +25,7 @@ from cartpole_rl.errors import ConfigError
 from cartpole_rl.physics.dynamics import Drive, State, run_period
 from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import GRAVITY, CartParameters
-from cartpole_rl.plants.simulation import commands_under_way
+from cartpole_rl.plants.simulated import commands_under_way
 from cartpole_rl.randomization.randomizer import Draws
 
 SAMPLES = 65536

@@ -24,8 +24,8 @@ from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.errors import CartPoleError, LinkError
 from cartpole_rl.evaluation.driving_policy import DrivingPolicy, Weights
 from cartpole_rl.evaluation.episodes import run_batch, warm_up
-from cartpole_rl.plants.serial.faults import Confirm, nobody
 from cartpole_rl.plants.serial.plant import SerialPlant
+from cartpole_rl.plants.serial.preparation import Confirm, nobody
 from cartpole_rl.plants.serial.statistics import LinkStatistics
 from cartpole_rl.scheduling import take_precedence
 from cartpole_rl.signals import UNWINDING, RaiseOnce, end_with_parent, ending_signals

@@ -1,7 +1,7 @@
 """An agent as a web page: it drives a simulated cart that the reader pushes.
 
 The page is one file. Its physics, observation and track guard are written from the functions of the
-simulation (`plants/simulation.py`, `envs/perception.py`). It computes in float64.
+simulation (`plants/simulated.py`, `envs/perception.py`). It computes in float64.
 """
 
 import base64
@@ -22,7 +22,7 @@ from cartpole_rl.exporting.code import COUNT, NUMBER, Graph, filled, perception
 from cartpole_rl.physics.dynamics import Addition, Drive, State
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.settings import SimulatedSettings
-from cartpole_rl.plants.simulation import Carts, Inputs, Period, commands_under_way, encoder_counts, run_carts
+from cartpole_rl.plants.simulated import Carts, Inputs, Period, commands_under_way, encoder_counts, run_carts
 from cartpole_rl.randomization.poles import Pole
 from cartpole_rl.tasks.settings import Start
 

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import CartParameters
-from cartpole_rl.plants.simulation import Carts, Inputs, Period, commands_under_way, run_carts
+from cartpole_rl.plants.simulated import Carts, Inputs, Period, commands_under_way, run_carts
 from cartpole_rl.randomization.randomizer import Draws
 
 TESTED = 256  # carts for each parameter

@@ -1,27 +1,132 @@
-"""The plant on an emulated cart.
+"""The emulated cart in a separate process. Imports no torch."""
 
-Only the port's name comes from the emulator: the code that drives it is the code that drives a real cart.
-"""
-
-from collections.abc import Callable
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from queue import Empty, SimpleQueue
+from threading import Thread
+from types import TracebackType
+from typing import Self
 
 from cartpole_rl.emulator.settings import EmulatorSettings
-from cartpole_rl.plants.emulated_cart import EmulatedCart
-from cartpole_rl.plants.serial.faults import always
-from cartpole_rl.plants.serial.plant import SerialPlant
-from cartpole_rl.plants.serial.settings import Rehome
+from cartpole_rl.errors import EmulatorError
+from cartpole_rl.plants.settings import LONGEST_WRITE, SerialSettings
+
+READY_TIMEOUT = 60.0  # s for the first line; the process loads MuJoCo before it
+GRACE = 3.0  # s from SIGTERM to SIGKILL
+STDERR_BYTES = 2000  # of the end of its stderr, for an error
 
 
-def emulated_plant(
-    emulator: EmulatorSettings,
-    control_period: float = 0.02,
-    prompt: Callable[[str], None] = lambda text: None,
-    rehome: Rehome = "once",
-) -> SerialPlant:
-    """Return a serial plant on an emulated cart that lives as long as the plant.
+class EmulatedCart:
+    """A running emulator: `port` to open with pyserial, `pid`. A context manager that ends the process.
 
-    The pole's length and the start position are those of the emulator. Faults are cleared without asking.
+    The process ends when this one dies. Ctrl-C in a terminal reaches only this process, so the
+    cart can still be stopped. Raises EmulatorError if it does not become ready, and at the end of a `with`
+    without another error if it had died before.
     """
-    cart = EmulatedCart(emulator)
-    settings = cart.settings.model_copy(update={"rehome": rehome, "pole_length": 2 * emulator.pole_com})
-    return SerialPlant(settings, emulator.start, control_period, prompt, owned=cart, confirm=always)
+
+    def __init__(self, truth: EmulatorSettings) -> None:
+        self.truth = truth
+        self._stderr = tempfile.TemporaryFile()  # noqa: SIM115 - open as long as the process
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "cartpole_rl.emulator", truth.model_dump_json(), "--exit-with-parent"],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=self._stderr,
+            start_new_session=True,
+            creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),  # the same on Windows
+        )
+        try:
+            self.port = self._read_port()
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def pid(self) -> int:
+        """Process id of the emulator."""
+        return self._process.pid
+
+    @property
+    def settings(self) -> SerialSettings:
+        """Settings for a host that drives this cart.
+
+        Without disturbed frames the host repeats a question late: a busy computer then adds no period to a
+        lockstep run, which is repeatable. With disturbed frames it repeats early, so that a lost answer costs
+        little time. Its system may take a write for stalled when the host was only suspended, hence the long
+        write timeout.
+        """
+        truth = self.truth
+        disturbed = bool(truth.frame_loss or truth.frame_corruption or truth.frame_reordering)
+        return SerialSettings(
+            port=self.port,
+            timeout=5.0,
+            connect_timeout=10.0,
+            answer_timeout=0.1 if disturbed else 2.0,
+            retries=20 if disturbed else 2,
+            write_timeout=LONGEST_WRITE,
+            nudge_after=2.0,
+        )
+
+    @property
+    def died(self) -> str:
+        """The reason why the process ended early, with the end of its stderr; empty while it runs."""
+        code = self._process.poll()
+        return "" if code is None else f"the emulated cart ended with exit code {code}: {self._stderr_end()}"
+
+    def close(self) -> None:
+        """End the process: SIGTERM, and SIGKILL after a grace."""
+        process = self._process
+        if process.poll() is None:
+            process.terminate()
+            try:
+                process.wait(GRACE)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+        assert process.stdout is not None  # a pipe was asked for
+        process.stdout.close()
+        self._stderr.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        died = self.died
+        self.close()
+        if died and error is None:
+            raise EmulatorError(died)
+
+    def _read_port(self) -> str:
+        """Return the port in the JSON line that the process prints when it is ready."""
+        assert self._process.stdout is not None  # a pipe was asked for
+        lines: SimpleQueue[bytes] = SimpleQueue()  # Windows cannot wait for a pipe with a timeout
+        output = self._process.stdout
+        Thread(target=lambda: lines.put(output.readline()), daemon=True).start()
+        try:
+            line = lines.get(timeout=READY_TIMEOUT)
+        except Empty:
+            raise EmulatorError(f"the emulated cart was not ready after {READY_TIMEOUT:g} s") from None
+        if not line:
+            self._process.wait(GRACE)
+            raise EmulatorError(self.died)
+        try:
+            return str(json.loads(line)["port"])
+        except (ValueError, KeyError, TypeError) as error:
+            raise EmulatorError(
+                f"the emulated cart's first line is not JSON with `port`: {line!r}"
+            ) from error
+
+    def _stderr_end(self) -> str:
+        if self._stderr.closed:
+            return "stderr is closed"
+        length = self._stderr.seek(0, os.SEEK_END)
+        self._stderr.seek(max(0, length - STDERR_BYTES))
+        return self._stderr.read().decode(errors="replace").strip() or "it wrote nothing to stderr"

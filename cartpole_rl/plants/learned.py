@@ -14,8 +14,7 @@ from torch import Tensor
 from cartpole_rl.compilation import Compiled
 from cartpole_rl.physics.residual import UNDER_WAY, Residual, chosen_members
 from cartpole_rl.plants.learned_model import LearnedModel
-from cartpole_rl.plants.simulated import SimulatedPlant
-from cartpole_rl.plants.simulation import Carts, Inputs, Period, run_carts
+from cartpole_rl.plants.simulated import Carts, Inputs, Period, SimulatedPlant, run_carts
 from cartpole_rl.plants.specs import OneFrame, Plant
 from cartpole_rl.randomization.randomizer import Draws
 from cartpole_rl.tasks.settings import StartSettings

@@ -17,7 +17,7 @@ from types import TracebackType
 from typing import NoReturn
 
 from cartpole_rl.evaluation.snapshots import Memory, Snapshot, new_memory, read
-from cartpole_rl.plants.serial.settings import SerialSettings
+from cartpole_rl.plants.settings import SerialSettings
 from cartpole_rl.rig.hardware import LARGEST_MOTOR
 from cartpole_rl.scheduling import giving_precedence
 from cartpole_rl.settings import Settings

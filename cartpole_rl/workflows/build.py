@@ -12,12 +12,10 @@ from cartpole_rl.envs.build import environment, simulated_env, with_fitted_guard
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.plants.cart_plant import cart_plant
 from cartpole_rl.plants.learned_model import load_model
-from cartpole_rl.plants.serial.faults import Confirm, nobody
-from cartpole_rl.plants.serial.preparation import StartPosition
-from cartpole_rl.plants.serial.settings import SerialSettings
-from cartpole_rl.plants.settings import EmulatedSettings, LearnedSettings, SimulatedSettings
+from cartpole_rl.plants.serial.plant import cart_plant
+from cartpole_rl.plants.serial.preparation import Confirm, StartPosition, nobody
+from cartpole_rl.plants.settings import EmulatedSettings, LearnedSettings, SerialSettings, SimulatedSettings
 from cartpole_rl.randomization.poles import Pole, PoleSettings
 from cartpole_rl.rig.parameters import check_names
 from cartpole_rl.scheduling import taking_precedence

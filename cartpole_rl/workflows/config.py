@@ -34,8 +34,7 @@ from cartpole_rl.learning.settings import (
 from cartpole_rl.physics.actuator import ACTUATORS
 from cartpole_rl.physics.friction import CART_FRICTIONS
 from cartpole_rl.physics.laws import Law
-from cartpole_rl.plants.serial.settings import SerialSettings
-from cartpole_rl.plants.settings import EmulatedSettings, LearnedSettings, SimulatedSettings
+from cartpole_rl.plants.settings import EmulatedSettings, LearnedSettings, SerialSettings, SimulatedSettings
 from cartpole_rl.randomization.poles import PoleSettings, check_one_pole
 from cartpole_rl.randomization.ranges import IdentifiedSettings
 from cartpole_rl.registry import Extension

@@ -8,8 +8,7 @@ from typing import Any
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.evaluation.metrics import same_as_host
 from cartpole_rl.plants.serial.plant import SerialPlant
-from cartpole_rl.plants.serial.settings import SerialSettings
-from cartpole_rl.plants.settings import EmulatedSettings
+from cartpole_rl.plants.settings import EmulatedSettings, SerialSettings
 from cartpole_rl.reporting.scores import score_columns, score_table
 from cartpole_rl.reporting.words import count_text, cut_off
 from cartpole_rl.rig.parameters import PARAMETERS

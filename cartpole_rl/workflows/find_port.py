@@ -4,8 +4,7 @@ import time
 from collections.abc import Callable
 
 from cartpole_rl.errors import PortError
-from cartpole_rl.plants.serial.port import found_ports
-from cartpole_rl.plants.serial.ports import UsbPort, cart_like, changes, described
+from cartpole_rl.plants.serial.port import UsbPort, cart_like, changes, described, found_ports
 from cartpole_rl.settings import Positive, Settings
 from cartpole_rl.terminal import as_word
 

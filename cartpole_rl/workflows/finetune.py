@@ -33,7 +33,7 @@ from cartpole_rl.learning.checkpoints import (
 )
 from cartpole_rl.learning.settings import RayLearnerSettings
 from cartpole_rl.learning.states import seed_everything
-from cartpole_rl.plants.serial.faults import Confirm
+from cartpole_rl.plants.serial.preparation import Confirm
 from cartpole_rl.plants.settings import EmulatedSettings
 from cartpole_rl.reporting.live_view import LiveView, view_title
 from cartpole_rl.reporting.scores import SCORES, score_table

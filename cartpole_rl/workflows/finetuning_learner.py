@@ -30,7 +30,7 @@ from cartpole_rl.learning.finetuning import Finetuning, recorded_chunks
 from cartpole_rl.learning.settings import FinetuningSettings, LearningSettings
 from cartpole_rl.physics.friction import CART_FRICTIONS
 from cartpole_rl.physics.models import Models
-from cartpole_rl.plants.serial.settings import SerialSettings
+from cartpole_rl.plants.settings import SerialSettings
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.randomization.identified import IdentifiedCarts
 from cartpole_rl.randomization.poles import PoleSettings

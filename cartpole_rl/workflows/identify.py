@@ -21,8 +21,7 @@ from cartpole_rl.identification.identify import Identification, identify
 from cartpole_rl.identification.one_step import one_step_estimates
 from cartpole_rl.identification.quantities import intervals
 from cartpole_rl.physics.models import Models
-from cartpole_rl.plants.cart_plant import cart_plant
-from cartpole_rl.plants.serial.plant import SerialPlant
+from cartpole_rl.plants.serial.plant import SerialPlant, cart_plant
 from cartpole_rl.reporting.figures import save
 from cartpole_rl.reporting.identification import (
     error_text,

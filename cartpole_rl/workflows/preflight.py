@@ -5,12 +5,11 @@ from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 
 from cartpole_rl.errors import PlantError
-from cartpole_rl.plants.emulated_cart import EmulatedCart
+from cartpole_rl.plants.emulated import EmulatedCart
 from cartpole_rl.plants.serial.cart import SerialCart
-from cartpole_rl.plants.serial.faults import FaultClearing, always
 from cartpole_rl.plants.serial.preflight import Finding, preflight
-from cartpole_rl.plants.serial.settings import SerialSettings
-from cartpole_rl.plants.settings import EmulatedSettings
+from cartpole_rl.plants.serial.preparation import FaultClearing, always
+from cartpole_rl.plants.settings import EmulatedSettings, SerialSettings
 from cartpole_rl.randomization.poles import Pole
 from cartpole_rl.terminal import confirm
 from cartpole_rl.workflows.checks import is_given

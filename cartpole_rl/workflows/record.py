@@ -11,7 +11,7 @@ from typing import Any
 
 from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
 from cartpole_rl.evaluation.recordings import LENGTH, write_recording
-from cartpole_rl.plants.serial.settings import SerialSettings
+from cartpole_rl.plants.settings import SerialSettings
 from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.reporting.words import count_text, guard_text
 from cartpole_rl.run_folder import RECORDINGS, write_config

@@ -4,8 +4,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from cartpole_rl.plants.serial.settings import SerialSettings
-from cartpole_rl.plants.settings import EmulatedSettings
+from cartpole_rl.plants.settings import EmulatedSettings, SerialSettings
 from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.terminal import as_word
 from cartpole_rl.workflows.trained_poles import emulated_words

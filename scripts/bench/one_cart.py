@@ -32,7 +32,7 @@ from cartpole_rl.envs.build import environment, shipped_settings
 from cartpole_rl.evaluation.driving_policy import DrivingPolicy
 from cartpole_rl.evaluation.episodes import run_episodes
 from cartpole_rl.learning.agent import QAgent
-from cartpole_rl.plants.emulated import emulated_plant
+from cartpole_rl.plants.serial.plant import emulated_plant
 from cartpole_rl.scheduling import giving_precedence, taking_precedence
 
 PEER = "CartPole-v1"

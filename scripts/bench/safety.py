@@ -40,7 +40,7 @@ from cartpole_rl.checking import checked
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import CartPoleError, FrameError
 from cartpole_rl.evaluation.episodes import run_episodes
-from cartpole_rl.plants.emulated_cart import EmulatedCart
+from cartpole_rl.plants.emulated import EmulatedCart
 from cartpole_rl.plants.serial.plant import SerialPlant
 from cartpole_rl.reporting.table import Cell
 from cartpole_rl.wire import FrameSplitter, Home, Start, State, decode_frame

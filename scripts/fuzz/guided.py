@@ -36,7 +36,7 @@ with fuzzer.instrument_imports(include=LIBRARIES) if fuzzer else contextlib.null
     from cartpole_rl.emulator.firmware import LEASE_US, WATCHDOG_PERIODS, Firmware
     from cartpole_rl.plants.serial import cart as serial_cart
     from cartpole_rl.plants.serial import connection
-    from cartpole_rl.plants.serial.settings import SerialSettings
+    from cartpole_rl.plants.settings import SerialSettings
     from cartpole_rl.wire import Flags, FrameSplitter, SetMotor, Start, State, cobs, decode_frame
     from cartpole_rl.wire.checksum import crc16
     from cartpole_rl.wire.frames import END, LONGEST_FRAME, VERSION, open_envelope

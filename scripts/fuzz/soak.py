@@ -34,7 +34,7 @@ from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.settings import ObservationSettings
 from cartpole_rl.errors import PlantError
 from cartpole_rl.evaluation.episodes import run_batch
-from cartpole_rl.plants.emulated import emulated_plant
+from cartpole_rl.plants.serial.plant import emulated_plant
 from cartpole_rl.reporting.table import table
 from cartpole_rl.tasks.settings import ActionSettings, RewardSettings, TaskSettings
 

@@ -7,8 +7,7 @@ import pytest
 from command_line import in_process
 
 from cartpole_rl.errors import PortError
-from cartpole_rl.plants.serial.port import found_ports
-from cartpole_rl.plants.serial.ports import UsbPort
+from cartpole_rl.plants.serial.port import UsbPort, found_ports
 from cartpole_rl.workflows.find_port import listing, watched
 
 CH340 = UsbPort("/dev/ttyUSB0", 0x1A86, 0x7523)

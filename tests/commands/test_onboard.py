@@ -8,7 +8,7 @@ from command_line import COARSE, in_process
 from firmwares import needs_compiler
 
 from cartpole_rl.emulator.settings import EmulatorSettings
-from cartpole_rl.plants.emulated_cart import EmulatedCart
+from cartpole_rl.plants.emulated import EmulatedCart
 
 SHUTTLE = Path(__file__).parents[1] / "support" / "shuttle"
 SERIAL = ("plant=serial", "plant.port=x", "plant.policy=onboard")

@@ -11,7 +11,7 @@ from serial_peer import Between
 from cartpole_rl.checking import checked
 from cartpole_rl.composition import compose
 from cartpole_rl.emulator.settings import EmulatorSettings
-from cartpole_rl.plants.emulated_cart import EmulatedCart
+from cartpole_rl.plants.emulated import EmulatedCart
 from cartpole_rl.workflows.config import PreflightConfig
 from cartpole_rl.workflows.preflight import next_command
 

@@ -20,10 +20,10 @@ from firmwares import truth
 from cartpole_rl.emulator.device import CartDevice
 from cartpole_rl.emulator.firmware import BANNER
 from cartpole_rl.errors import LinkError
-from cartpole_rl.plants.emulated_cart import EmulatedCart
+from cartpole_rl.plants.emulated import EmulatedCart
 from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.errors import RefusedError
-from cartpole_rl.plants.serial.settings import SerialSettings
+from cartpole_rl.plants.settings import SerialSettings
 from cartpole_rl.wire import (
     ClearFault,
     Fault,

@@ -19,7 +19,7 @@ from cartpole_rl.envs.settings import TrackGuard
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.physics.dynamics import State
-from cartpole_rl.plants.emulated import emulated_plant
+from cartpole_rl.plants.serial.plant import emulated_plant
 from cartpole_rl.plants.settings import SimulatedSettings
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.tasks.endings import Ending

@@ -13,8 +13,8 @@ from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.settings import TrackGuard
 from cartpole_rl.evaluation.episodes import run_batch
-from cartpole_rl.plants.emulated import emulated_plant
 from cartpole_rl.plants.recorded import RecordedPlant
+from cartpole_rl.plants.serial.plant import emulated_plant
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.randomization.ranges import Range
 from cartpole_rl.tasks.settings import NO_ACTION

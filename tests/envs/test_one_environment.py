@@ -12,8 +12,7 @@ from torchrl.envs.utils import check_env_specs
 
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
-from cartpole_rl.plants.emulated import emulated_plant
-from cartpole_rl.plants.serial.plant import SerialPlant
+from cartpole_rl.plants.serial.plant import SerialPlant, emulated_plant
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.plants.specs import Plant, Report
 

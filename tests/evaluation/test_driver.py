@@ -23,9 +23,9 @@ from cartpole_rl.evaluation.driver import Driver, DriveRequest
 from cartpole_rl.evaluation.driving_policy import as_weights
 from cartpole_rl.learning.agent import QAgent
 from cartpole_rl.plants.serial.errors import NotReadyError
-from cartpole_rl.plants.serial.faults import Confirm
 from cartpole_rl.plants.serial.plant import SerialPlant
-from cartpole_rl.plants.serial.settings import SerialSettings
+from cartpole_rl.plants.serial.preparation import Confirm
+from cartpole_rl.plants.settings import SerialSettings
 from cartpole_rl.tasks.settings import ActionSettings, RewardSettings, TaskSettings
 from cartpole_rl.wire import ClearFault, Fault, Message, SetMotor, Stop
 

@@ -13,7 +13,7 @@ from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.envs.build import environment, shipped_settings
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.evaluation.episodes import run_episodes, run_many
-from cartpole_rl.plants.emulated import emulated_plant
+from cartpole_rl.plants.serial.plant import emulated_plant
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.tasks.settings import Start, StartSettings
 from cartpole_rl.wire import Flags

@@ -15,7 +15,7 @@ import pytest
 
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.exporting.agent import ExportedAgent, observed_numbers
-from cartpole_rl.plants.emulated_cart import EmulatedCart
+from cartpole_rl.plants.emulated import EmulatedCart
 from cartpole_rl.tasks.settings import Start
 
 ROOT = Path(__file__).parents[2]

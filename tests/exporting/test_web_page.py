@@ -18,7 +18,7 @@ from cartpole_rl.exporting.agent import ExportedAgent
 from cartpole_rl.exporting.web_page import LONGEST_LATENCY, web_page
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.settings import SimulatedSettings
-from cartpole_rl.plants.simulation import Carts, Inputs, commands_under_way, run_carts
+from cartpole_rl.plants.simulated import Carts, Inputs, commands_under_way, run_carts
 from cartpole_rl.plants.specs import OneCartPlant, OneFrame
 from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 from cartpole_rl.scalar import Scalar

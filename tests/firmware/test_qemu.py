@@ -18,7 +18,7 @@ pytestmark = pytest.mark.skipif(
 
 from cartpole_rl.errors import LinkError  # noqa: E402
 from cartpole_rl.plants.serial.cart import SerialCart  # noqa: E402
-from cartpole_rl.plants.serial.settings import SerialSettings  # noqa: E402
+from cartpole_rl.plants.settings import SerialSettings  # noqa: E402
 from cartpole_rl.wire import Fault, Flags  # noqa: E402
 
 PUSH, FAR = 110, 400  # motor value, and counts from the middle: 9 mm

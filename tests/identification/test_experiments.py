@@ -34,7 +34,7 @@ from cartpole_rl.identification.quantities import quantities
 from cartpole_rl.identification.windows import part
 from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import CartParameters
-from cartpole_rl.plants.emulated import emulated_plant
+from cartpole_rl.plants.serial.plant import emulated_plant
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.plants.specs import OneFrame
 from cartpole_rl.randomization.poles import PoleSettings

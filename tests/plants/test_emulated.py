@@ -15,9 +15,8 @@ from torchrl.envs.utils import check_env_specs
 
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import LinkError
-from cartpole_rl.plants.emulated import emulated_plant
-from cartpole_rl.plants.emulated_cart import EmulatedCart
-from cartpole_rl.plants.serial.plant import SerialPlant
+from cartpole_rl.plants.emulated import EmulatedCart
+from cartpole_rl.plants.serial.plant import SerialPlant, emulated_plant
 
 TURN = 4096
 

@@ -14,10 +14,10 @@ from emulator_host import drive_and_fail
 
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import EmulatorError, LinkError
-from cartpole_rl.plants.emulated_cart import EmulatedCart
+from cartpole_rl.plants.emulated import EmulatedCart
 from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.errors import RefusedError
-from cartpole_rl.plants.serial.settings import SerialSettings
+from cartpole_rl.plants.settings import SerialSettings
 from cartpole_rl.wire import Flags, Reason
 
 fast = partial(EmulatorSettings, physics_step=1e-3)
@@ -77,7 +77,7 @@ class TestProcess:
 
     def test_it_ends_when_the_host_dies(self) -> None:
         program = (
-            "from cartpole_rl.plants.emulated_cart import EmulatedCart\n"
+            "from cartpole_rl.plants.emulated import EmulatedCart\n"
             "from cartpole_rl.emulator.settings import EmulatorSettings\n"
             "import os\n"
             "print(EmulatedCart(EmulatorSettings()).pid, flush=True)\n"

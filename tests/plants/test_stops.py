@@ -24,7 +24,7 @@ from cartpole_rl.identification.experiments import Experiment, conduct
 from cartpole_rl.identification.moves import Moves, Task, hold
 from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.plant import SerialPlant
-from cartpole_rl.plants.serial.settings import SerialSettings
+from cartpole_rl.plants.settings import SerialSettings
 from cartpole_rl.wire import Flags
 
 PERIOD_MS = 20
@@ -67,7 +67,7 @@ import itertools, signal, sys
 from contextlib import suppress
 from cartpole_rl.errors import LinkError
 from cartpole_rl.plants.serial.cart import SerialCart
-from cartpole_rl.plants.serial.settings import SerialSettings
+from cartpole_rl.plants.settings import SerialSettings
 
 from cartpole_rl.signals import ending_signals
 

@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from cartpole_rl.plants.serial.connection import WATCHDOG_PERIODS
-from cartpole_rl.plants.serial.settings import SerialSettings
+from cartpole_rl.plants.settings import SerialSettings
 from cartpole_rl.wire import (
     Ack,
     Flags,

@@ -2,8 +2,8 @@
 
 import pytest
 
-from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.plants.serial.statistics import LinkStatistics
+from cartpole_rl.plants.settings import SerialSettings
 from cartpole_rl.workflows.results import plant_words, print_loop_time
 
 

@@ -12,15 +12,13 @@ from types import TracebackType
 from typing import Self
 
 from cartpole_rl.errors import LinkError, PlantError
-from cartpole_rl.plants.serial.clock import now
 from cartpole_rl.plants.serial.connection import WATCHDOG_PERIODS, Connection
-from cartpole_rl.plants.serial.errors import RefusedError, fault_error
-from cartpole_rl.plants.serial.information import check_limits, check_scales
-from cartpole_rl.plants.serial.link import SerialLink
+from cartpole_rl.plants.serial.errors import RefusedError, check_limits, check_scales, fault_error
+from cartpole_rl.plants.serial.link import SerialLink, now
 from cartpole_rl.plants.serial.port import open_port, resolved_port
-from cartpole_rl.plants.serial.settings import SerialSettings
 from cartpole_rl.plants.serial.statistics import LinkStatistics
 from cartpole_rl.plants.serial.tracking import StateTracker
+from cartpole_rl.plants.settings import SerialSettings
 from cartpole_rl.wire import microseconds_between
 from cartpole_rl.wire.messages import (
     Ack,

@@ -23,12 +23,10 @@ from itertools import count
 from typing import TypeVar
 
 from cartpole_rl.errors import LinkError
-from cartpole_rl.plants.serial.clock import now
-from cartpole_rl.plants.serial.errors import refusal
-from cartpole_rl.plants.serial.information import LONGEST_PERIOD_US
-from cartpole_rl.plants.serial.link import SerialLink
-from cartpole_rl.plants.serial.settings import SerialSettings
+from cartpole_rl.plants.serial.errors import LONGEST_PERIOD_US, refusal
+from cartpole_rl.plants.serial.link import SerialLink, now
 from cartpole_rl.plants.serial.tracking import StateTracker
+from cartpole_rl.plants.settings import SerialSettings
 from cartpole_rl.rig.hardware import LARGEST_MOTOR
 from cartpole_rl.wire import (
     Ack,

@@ -10,16 +10,26 @@ from contextlib import suppress
 import serial
 
 from cartpole_rl.errors import FrameError, LinkError
-from cartpole_rl.plants.serial.clock import now
 from cartpole_rl.plants.serial.port import set_exclusive
 from cartpole_rl.plants.serial.statistics import LinkStatistics
 from cartpole_rl.wire import Frame, FrameSplitter, Message, decode_frame, encode_frame
 
 POLLING = 1e-3  # s
+# Linux's has this name; macOS counts the time asleep in its CLOCK_MONOTONIC, and Windows in perf_counter
+_CLOCK: int | None = getattr(time, "CLOCK_BOOTTIME", getattr(time, "CLOCK_MONOTONIC", None))
+
+
+def now() -> float:
+    """Return s since an arbitrary moment: the host's clock for everything that waits for a cart.
+
+    It goes on while the computer sleeps. `time.perf_counter` stands still then on Linux and macOS: a state
+    from before the sleep would look new, and the motor value that answers it would be sent.
+    """
+    return time.perf_counter() if _CLOCK is None else time.clock_gettime(_CLOCK)
 
 
 class SerialLink:
-    """Both directions of one port. Times are those of `clock.now`, in s."""
+    """Both directions of one port. Times are those of `now`, in s."""
 
     def __init__(self, port: serial.SerialBase, statistics: LinkStatistics) -> None:
         self._port = port

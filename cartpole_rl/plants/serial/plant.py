@@ -13,13 +13,20 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import ConfigError, FaultError, LinkError, PlantError, PortError
+from cartpole_rl.plants.emulated import EmulatedCart
 from cartpole_rl.plants.serial.cart import RESTARTED, SerialCart
-from cartpole_rl.plants.serial.errors import RefusedError, fault_error
-from cartpole_rl.plants.serial.faults import Confirm, FaultClearing, nobody
-from cartpole_rl.plants.serial.information import check_scales
-from cartpole_rl.plants.serial.preparation import Preparation, StartPosition
-from cartpole_rl.plants.serial.settings import SerialSettings
+from cartpole_rl.plants.serial.errors import RefusedError, check_scales, fault_error
+from cartpole_rl.plants.serial.preparation import (
+    Confirm,
+    FaultClearing,
+    Preparation,
+    StartPosition,
+    always,
+    nobody,
+)
+from cartpole_rl.plants.settings import EmulatedSettings, Rehome, SerialSettings
 from cartpole_rl.plants.specs import TERMINATING, TRUNCATING, OneCartPlant, OneFrame, as_report
 from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT
 from cartpole_rl.tasks.endings import Ending
@@ -272,3 +279,37 @@ class SerialPlant(OneCartPlant):
         """Open the port and check the cart's scales. Raises PortError, LinkError, NotReadyError."""
         self.cart.open()
         check_scales(self.cart.information)
+
+
+def cart_plant(
+    plant: EmulatedSettings | SerialSettings,
+    emulator: EmulatorSettings,
+    control_period: float,
+    start: StartPosition,
+    prompt: Callable[[str], None],
+    confirm: Confirm = nobody,
+) -> SerialPlant:
+    """Return the plant of plant=serial, or of plant=emulated on a new cart with the settings `emulator`.
+
+    An emulated cart starts in the position `start` and needs nobody to confirm. Raises PortError, LinkError,
+    NotReadyError, EmulatorError.
+    """
+    if isinstance(plant, EmulatedSettings):
+        emulator = emulator.model_copy(update={"start": start})
+        return emulated_plant(emulator, control_period, prompt, plant.rehome)
+    return SerialPlant(plant, start, control_period, prompt, confirm=confirm)
+
+
+def emulated_plant(
+    emulator: EmulatorSettings,
+    control_period: float = 0.02,
+    prompt: Callable[[str], None] = lambda text: None,
+    rehome: Rehome = "once",
+) -> SerialPlant:
+    """Return a serial plant on an emulated cart that lives as long as the plant.
+
+    The pole's length and the start position are those of the emulator. Faults are cleared without asking.
+    """
+    cart = EmulatedCart(emulator)
+    settings = cart.settings.model_copy(update={"rehome": rehome, "pole_length": 2 * emulator.pole_com})
+    return SerialPlant(settings, emulator.start, control_period, prompt, owned=cart, confirm=always)

@@ -1,27 +1,49 @@
-"""Find and open the serial port of a cart; explain why it cannot be found or opened.
+"""The serial ports of this computer: those that may be a cart, and opening one; why one cannot be opened.
 
-An ESP32 board restarts when DTR or RTS rise, so both are set low before the port is opened. The operating
-system may still pulse them for a moment; `SerialCart` therefore repeats STOP until the cart has booted.
-Source: Espressif, "Boot Mode Selection", esptool documentation; pyserial 3.5.
+A board is recognized by the vendor id of the chip between its USB plug and its serial line (the USB ID
+Repository, linux-usb.org/usb.ids). An ESP32 board restarts when DTR or RTS rise, so both are set low before
+the port is opened. The operating system may still pulse them for a moment; `SerialCart` therefore repeats
+STOP until the cart has booted. Source: Espressif, "Boot Mode Selection", esptool documentation; pyserial 3.5.
 """
 
 import errno
 import os
 import re
-from collections.abc import Iterable
+import socket
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 
 import serial
 from serial.tools import list_ports
+from serial.tools.list_ports_common import ListPortInfo
+from serial.urlhandler.protocol_socket import Serial as SocketPort
 
 from cartpole_rl.errors import PortError
-from cartpole_rl.plants.serial.ports import UsbPort, cart_like, described, usb_ports
-from cartpole_rl.plants.serial.tcp import TcpPort
 
 READ_SLICE = 0.01  # s that one read blocks at most; callers look at their own clocks in between
 AUTO = "auto"
 PSEUDO_TERMINAL = re.compile(r"/dev/(pts/\d+|ttys\d{3})")
 WRONG_URL = (LookupError, re.error, NotImplementedError)  # of pyserial, for parts of a URL
+COUNTED = 1 << 16  # waiting bytes of a TCP port, at most
+BOARDS = {  # vendor ids of chips on ESP32, Arduino and Nucleo boards
+    0x10C4: "Silicon Labs CP210x",
+    0x1A86: "WCH CH340",
+    0x0403: "FTDI",
+    0x303A: "Espressif native USB",
+    0x0483: "STMicroelectronics ST-LINK",
+}
+
+
+@dataclass(frozen=True, order=True)
+class UsbPort:
+    """A serial port on USB. Texts are empty if the device has none."""
+
+    device: str  # path or name to open
+    vendor: int  # USB vendor id
+    product: int  # USB product id
+    name: str = ""  # what the device calls itself
+    serial_number: str = ""
 
 
 def open_port(port: str, baud: int, write_timeout: float) -> serial.SerialBase:
@@ -118,3 +140,50 @@ def why_not_open(port: str, error: OSError | ValueError | OverflowError) -> str:
 def named(ports: Iterable[UsbPort]) -> str:
     """Return the ports in one line: "/dev/ttyUSB0 (CH340), /dev/ttyUSB1 (FTDI)"."""
     return ", ".join(f"{port.device} ({described(port)})" for port in ports)
+
+
+class TcpPort(SocketPort):
+    """socket://HOST:PORT: an emulated cart, or a bridge such as ser2net.
+
+    pyserial's own port of this kind counts at most one waiting byte and collects small frames.
+    """
+
+    def open(self) -> None:
+        """Open the port; frames are sent at once. Raises SerialException."""
+        super().open()
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+    @property
+    def in_waiting(self) -> int:
+        """The number of bytes that have arrived, up to COUNTED. Raises OSError."""
+        try:
+            return len(self._socket.recv(COUNTED, socket.MSG_PEEK))
+        except BlockingIOError:
+            return 0
+
+
+def usb_ports(ports: Iterable[ListPortInfo]) -> list[UsbPort]:
+    """Return pyserial's ports that are on USB, sorted; a computer's own ports have no vendor id."""
+    return sorted(
+        UsbPort(port.device, port.vid, port.pid or 0, port.product or "", port.serial_number or "")
+        for port in ports
+        if port.vid is not None
+    )
+
+
+def cart_like(ports: Iterable[UsbPort]) -> list[UsbPort]:
+    """Return the ports whose chip is used on carts."""
+    return [port for port in ports if port.vendor in BOARDS]
+
+
+def described(port: UsbPort) -> str:
+    """Describe a port to a person: its chip, its own name, its ids and serial number."""
+    chip = BOARDS.get(port.vendor, "no chip that carts have")
+    own = f" {port.name!r}" if port.name else ""
+    number = f", serial number {port.serial_number}" if port.serial_number else ""
+    return f"{chip}{own}, id {port.vendor:04x}:{port.product:04x}{number}"
+
+
+def changes(before: Sequence[UsbPort], after: Sequence[UsbPort]) -> tuple[list[UsbPort], list[UsbPort]]:
+    """Return the ports that vanished and those that appeared, between two lists."""
+    return sorted(set(before) - set(after)), sorted(set(after) - set(before))

@@ -1,14 +1,63 @@
-"""The preflight: checks in order; each relies only on checks that passed before."""
+"""The preflight: checks of a cart in order, by small moves that show its wiring, limits and latency.
 
+Each check relies only on checks that passed before. It moves the cart a few centimetres at most, brings it
+back to the middle, and returns its result as text. It raises NotReadyError, which says what is wrong and what
+to do about it. Signs as in `moves.py`.
+"""
+
+import math
+import statistics
+import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 
-from cartpole_rl.errors import PlantError
-from cartpole_rl.plants.serial import checks
+from cartpole_rl.errors import FaultError, PlantError
 from cartpole_rl.plants.serial.cart import RESTARTED, SerialCart
-from cartpole_rl.plants.serial.faults import FaultClearing
-from cartpole_rl.plants.serial.probe import Probe
+from cartpole_rl.plants.serial.errors import NotReadyError, check_limits, check_period, check_scales
+from cartpole_rl.plants.serial.moves import (
+    GENTLE_MOTOR,
+    LEFT,
+    NOMINAL_DEADBAND,
+    RIGHT,
+    ArmedCart,
+    centre,
+    metres,
+)
+from cartpole_rl.plants.serial.preparation import FaultClearing
+from cartpole_rl.rig.hardware import (
+    CART_NANOMETRES_PER_COUNT,
+    POLE_COUNTS_PER_TURN,
+    cart_counts,
+    pole_counts,
+)
+from cartpole_rl.wire import Fault, Flags, Info, State, seconds_between, ticks_between
+
+FARTHEST = 0.08  # m from the middle: no check needs more
+LEAST_SPEED = 0.03  # m/s of the way back to the middle; slower would take long and show nothing
+NEAR = 0.004  # m from the middle: no check needs to start closer
+RAMP_STEP = 1  # motor values per period
+SMALL_SWING = pole_counts(3.5)  # peak to peak; pushes the cart like three motor values
+SHORT_PATIENCE = 5.0  # s
+MOVED = cart_counts(0.09e-3)  # more than a pole that swings can press into the gears' play
+NO_MOTION = (  # the remedy for a cart whose count does not change
+    "switch the motor's supply on, check the cables of the motor and of the cart's encoder, free the cart"
+)
+
+QUESTIONS = 25  # asked over the link
+LOST_SHARE = 0.05  # of the frames; a good cable loses none
+PERIOD_TOLERANCE = 0.02  # of the period in INFO
+ROUND_TRIP_SHARE = 0.5  # of a period: a command that comes later acts in the next one
+
+SURELY_MOVED = cart_counts(0.001)
+POLE_MOVED = pole_counts(1.25)  # more, where the pole still swings
+PUSH = 60  # motor values above the dead-band: about 1.5 m/s^2
+LONGEST_PUSH, FARTHEST_PUSH = 0.3, 0.035  # s, m
+DRIFT = 4  # periods over which a remaining swing is measured
+NO_SWING, LONG_PATIENCE = pole_counts(0.5), 15.0  # peak to peak, s
+LARGEST_DEADBAND = 150  # motor value; of nine_levels the two weakest, 100 and 150, would not move such a cart
+STEPS = 4  # for the latency, two to each side
+LONGEST_LATENCY_PERIODS = 2.0  # agents are trained on up to about one period
 
 
 @dataclass(frozen=True)
@@ -45,14 +94,14 @@ def preflight(cart: SerialCart, faults: FaultClearing | None = None) -> Iterator
 def _checks(cart: SerialCart, faults: FaultClearing) -> dict[str, Callable[[], str]]:
     probe = Probe(cart)
     return {
-        "link": lambda: checks.link(cart),
-        "limits": lambda: checks.limits(cart.information),
-        "homing": lambda: checks.homing(cart, faults),
-        "cart encoder": lambda: checks.cart_direction(probe),
-        "pole encoder": lambda: checks.pole_direction(probe),
-        "dead-band": lambda: checks.deadband(probe),
-        "latency": lambda: checks.latency(probe),
-        "soft limit": lambda: checks.soft_limit(probe),
+        "link": lambda: link(cart),
+        "limits": lambda: limits(cart.information),
+        "homing": lambda: homing(cart, faults),
+        "cart encoder": lambda: cart_direction(probe),
+        "pole encoder": lambda: pole_direction(probe),
+        "dead-band": lambda: deadband(probe),
+        "latency": lambda: latency(probe),
+        "soft limit": lambda: soft_limit(probe),
     }
 
 
@@ -63,3 +112,263 @@ def _finding(name: str, check: Callable[[], str], cart: SerialCart) -> Finding:
     except PlantError as error:
         finding = Finding(name, False, str(error))
     return finding if cart.restarts == restarts else Finding(name, False, RESTARTED)
+
+
+class Probe(ArmedCart):
+    """An armed cart that is moved a little at a time, and what its moves have shown so far.
+
+    Every move raises NotReadyError when the cart gets too far from the middle, and FaultError when it latches
+    a fault. Positions in counts, times by the cart's clock.
+    """
+
+    def __init__(self, cart: SerialCart) -> None:
+        super().__init__(cart)
+        self.deadband: dict[int, int] = {}  # motor value that just moves it, to the RIGHT and to the LEFT
+        self.farthest = 0  # counts from the middle
+        self.limited = False  # the soft limit has held a motor value back
+
+    def settle(self) -> State:
+        """Apply motor 0 until the pole hardly swings, but not for long; return the last state."""
+        return self.calm(SMALL_SWING, SHORT_PATIENCE)[0][-1]
+
+    def ramp(self, side: int) -> tuple[int, State, State]:
+        """Raise the motor value to one side until the cart moves.
+
+        Returns the size of that value, and the states before and after the move. Raises NotReadyError if the
+        cart never moves.
+        """
+        before = self.settle()
+        for size in range(RAMP_STEP, GENTLE_MOTOR + 1, RAMP_STEP):
+            after = self.drive(side * size)
+            if abs(after.cart_counts - before.cart_counts) >= MOVED:
+                return size, before, after
+        raise NotReadyError(
+            f"motor values up to {side * GENTLE_MOTOR:+d} do not move the cart's count", NO_MOTION
+        )
+
+    def centre(self) -> None:
+        """Bring the cart to the middle and to rest. Needs the sign of the cart's count to be right.
+
+        A dead-band that is not measured yet is taken from the other side. Raises NotReadyError if the cart
+        does not get there.
+        """
+        other_side = {-side: motor for side, motor in self.deadband.items()}
+        known = NOMINAL_DEADBAND | other_side | self.deadband
+        self.rest()
+        centre(self, known, NEAR, LEAST_SPEED)
+        self.rest()
+
+    def check(self, state: State) -> State:
+        """Record the cart's position and return the state. Raises NotReadyError or FaultError."""
+        self.farthest = max(self.farthest, abs(state.cart_counts))
+        self.limited = self.limited or bool(self.cart.flags & Flags.SOFT_LIMIT)
+        super().check(state)
+        if metres(abs(state.cart_counts)) > FARTHEST:
+            self.cart.stop()
+            raise NotReadyError(
+                f"the cart went {metres(state.cart_counts) * 1e3:+.0f} mm, further than any requested move",
+                "put the track level, check the motor driver",
+            )
+        return state
+
+
+def link(cart: SerialCart) -> str:
+    """Check the period by the cart's own clock, the round trip, and that few frames get lost."""
+    check_period(cart.open())
+    first, trips = cart.poll_state(), []
+    for _ in range(QUESTIONS):
+        asked = time.perf_counter()
+        information = cart.info()
+        trips.append(time.perf_counter() - asked)
+        last = cart.poll_state()
+    check_period(information)
+    trip, period = statistics.median(trips), information.period_us * 1e-6
+    measured = seconds_between(first.time_us, last.time_us) / max(1, ticks_between(first.tick, last.tick))
+    counted = cart.statistics
+    bad = counted.bad_frames + counted.lost_frames
+    if bad > LOST_SHARE * (counted.frames_received + counted.lost_frames):
+        raise NotReadyError(
+            f"{counted.lost_frames} frames were lost and {counted.bad_frames} damaged of "
+            f"{counted.frames_received}",
+            "use a short shielded cable, away from the motor's; if that does not help, use 115200 baud: "
+            "set BAUD in the board's file, flash again, and give plant.baud=115200",
+        )
+    if abs(measured / period - 1) > PERIOD_TOLERANCE:
+        raise NotReadyError(
+            f"a period takes {measured * 1e3:.2f} ms by the cart's clock, not {period * 1e3:g} ms as it says",
+            "its firmware does too much in a period, or miscounts its time",
+        )
+    if trip > ROUND_TRIP_SHARE * period:
+        raise NotReadyError(
+            f"a question is answered after {trip * 1e3:.1f} ms, more than half a period",
+            "with an FTDI chip, set its latency_timer in /sys/bus/usb-serial/devices/ to 1; "
+            "end what keeps this computer busy",
+        )
+    version = (information.firmware_major, information.firmware_minor, information.firmware_patch)
+    return (
+        f"firmware {'.'.join(map(str, version))}, period {measured * 1e3:.2f} ms, "
+        f"round trip {trip * 1e3:.1f} ms, {bad} of {counted.frames_received} frames bad or lost"
+    )
+
+
+def limits(information: Info) -> str:
+    """Check that the scales and limits in INFO are those that this package assumes."""
+    check_scales(information)
+    check_limits(information)
+    soft, hard = metres(information.soft_limit_counts), metres(information.hard_limit_counts)
+    return (
+        f"soft {soft * 1e3:.0f} mm, hard {hard * 1e3:.0f} mm from the middle; "
+        f"{CART_NANOMETRES_PER_COUNT} nm and 1/{POLE_COUNTS_PER_TURN} turn a count"
+    )
+
+
+def homing(cart: SerialCart, faults: FaultClearing) -> str:
+    """Home; check that the cart is in the middle, the pole hangs, and the limits fit the track."""
+    if fault := cart.poll_state().fault:
+        faults.clear(cart, fault)
+    before = cart.get_state()
+    state = _homed(cart, before)
+    limits(cart.information)
+    pole = (state.pole_counts - POLE_COUNTS_PER_TURN // 2) * 360 / POLE_COUNTS_PER_TURN
+    if abs(metres(state.cart_counts)) > 0.01 or abs(pole) > 2:
+        raise NotReadyError(
+            f"after homing the cart is {metres(state.cart_counts) * 1e3:+.0f} mm from the middle, "
+            f"the pole {pole:+.1f} deg from hanging",
+            "keep hands off during homing, check that no gear slips",
+        )
+    seconds = seconds_between(before.time_us, state.time_us)
+    off = metres(state.cart_counts) * 1e3
+    return f"{seconds:.0f} s; the cart {off:+.1f} mm from the middle, the pole {pole:+.1f} deg from hanging"
+
+
+def _homed(cart: SerialCart, before: State) -> State:
+    """Home; return the state after it. Raises NotReadyError if the cart never moved away from `before`."""
+    farthest = 0
+
+    def watch(state: State) -> None:
+        nonlocal farthest
+        farthest = max(farthest, abs(state.cart_counts - before.cart_counts))
+
+    try:
+        return cart.home(watch)
+    except FaultError:
+        if farthest >= SURELY_MOVED or cart.poll_state().fault != Fault.HOMING:
+            raise
+        raise NotReadyError("homing failed: the cart's count does not change", NO_MOTION) from None
+
+
+def cart_direction(probe: Probe) -> str:
+    """Check that a positive motor value moves the count up. Arms the cart."""
+    probe.arm()
+    value, before, after = probe.ramp(RIGHT)
+    for _ in range(probe.periods(LONGEST_PUSH)):
+        if abs(after.cart_counts - before.cart_counts) >= SURELY_MOVED:
+            break
+        after = probe.drive(value + 10)
+    moved = after.cart_counts - before.cart_counts
+    if moved < 0:
+        raise NotReadyError(
+            f"motor value {value:+d} moves the cart's count down, by {-moved}",
+            "if the cart went right, swap its encoder's wires A and B; if it went left, swap the motor's two",
+        )
+    probe.deadband[RIGHT] = value
+    probe.centre()
+    return f"motor value {value:+d} moves the count up"
+
+
+def pole_direction(probe: Probe) -> str:
+    """Check that a push to the right leaves the hanging pole's tip behind, on the left: its count goes up.
+
+    A remaining swing is assumed to continue evenly during the push, and is subtracted.
+    """
+    states, swing = probe.calm(NO_SWING, LONG_PATIENCE)
+    before, drift = states[-1], (states[-1].pole_counts - states[-1 - DRIFT].pole_counts) / DRIFT
+    enough = max(POLE_MOVED, NO_SWING + swing // 2)
+    value = min(GENTLE_MOTOR, probe.deadband[RIGHT] + PUSH)
+    for period in range(1, probe.periods(LONGEST_PUSH) + 1):
+        after = probe.drive(value)
+        swung = round(after.pole_counts - before.pole_counts - drift * period)
+        if abs(swung) >= enough or metres(abs(after.cart_counts - before.cart_counts)) > FARTHEST_PUSH:
+            break
+    if abs(swung) < enough:
+        raise NotReadyError(
+            f"the pole's count does not follow a push of the cart; it changed by {swung:+d}, and swung by "
+            f"{swing} before",
+            "check the cable of the pole's encoder, and that the pole is screwed to its shaft",
+        )
+    probe.centre()
+    if swung < 0:
+        raise NotReadyError(
+            f"a push to the right moves the hanging pole's count down, by {-swung}",
+            "swap the wires A and B of the pole's encoder, or turn its sign in the firmware",
+        )
+    return f"a push to the right swings the hanging pole to the left, {swung:+d} counts"
+
+
+def deadband(probe: Probe) -> str:
+    """Measure the smallest motor value that moves the cart, to each side."""
+    for side in (RIGHT, LEFT):
+        probe.deadband[side], _, _ = probe.ramp(side)
+        probe.centre()
+    right, left = probe.deadband[RIGHT], probe.deadband[LEFT]
+    if max(right, left) > LARGEST_DEADBAND:
+        raise NotReadyError(
+            f"it takes a motor value of {right:+d} to move the cart right, {-left:+d} left",
+            "clean the track and the rack, loosen what rubs, check the motor's supply voltage",
+        )
+    return f"{right:+d} moves the cart right, {-left:+d} left"
+
+
+def latency(probe: Probe) -> str:
+    """Measure the time from a motor value's arrival at the cart to the start of the motion."""
+    measured = [step_latency(probe, side) for side in (RIGHT, LEFT) * (STEPS // 2)]
+    middle = statistics.median(seconds for seconds, _ in measured)
+    age = statistics.median(age for _, age in measured)
+    if middle > LONGEST_LATENCY_PERIODS * probe.period:
+        raise NotReadyError(
+            f"the cart begins to move {middle * 1e3:.0f} ms after it took a motor value, which is "
+            f"{middle / probe.period:.1f} periods",
+            "look for a ramp or a filter in the motor driver, and for play in the gears",
+        )
+    return (
+        f"the cart begins to move {middle * 1e3:.0f} ms after it took a motor value; the first state that "
+        f"knew of the value had a command age of {age * 1e3:.0f} ms"
+    )
+
+
+def step_latency(probe: Probe, side: int) -> tuple[float, float]:
+    """Return the latency of one motor step from rest, and the command age in the first state after it, in s.
+
+    With constant acceleration the distance grows with the square of the time since the start of the motion;
+    two states during the motion give that start more precisely than a period.
+    """
+    before = probe.settle()
+    value = side * min(GENTLE_MOTOR, probe.deadband[side] + PUSH)
+    states = [probe.drive(value)]
+    age = states[0].command_age_ms * 1e-3
+    taken_us = states[0].time_us - states[0].command_age_ms * 1000
+    for _ in range(probe.periods(LONGEST_PUSH)):
+        states.append(probe.drive(value))
+        distances = [side * (state.cart_counts - before.cart_counts) for state in states[-2:]]
+        if MOVED <= distances[0] < distances[1]:
+            break
+    probe.centre()
+    if not MOVED <= distances[0] < distances[1]:
+        raise NotReadyError(
+            f"motor value {value:+d} does not move the cart evenly within {LONGEST_PUSH:g} s",
+            "free the cart; look for a ramp or a filter in the motor driver",
+        )
+    first, second = (seconds_between(taken_us, state.time_us) for state in states[-2:])
+    ratio = math.sqrt(distances[0] / distances[1])
+    return max(0.0, (first - ratio * second) / (1 - ratio)), age
+
+
+def soft_limit(probe: Probe) -> str:
+    """Check that none of the moves came near the end of the track."""
+    limit = probe.cart.information.soft_limit_counts
+    if probe.limited or probe.farthest >= limit:
+        raise NotReadyError(
+            f"the soft limit was reached {metres(probe.farthest) * 1e3:.0f} mm from the middle",
+            "check the firmware's limits and the zero that homing set",
+        )
+    return f"not reached; the cart stayed within {metres(probe.farthest) * 1e3:.0f} mm of the middle"

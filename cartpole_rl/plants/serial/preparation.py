@@ -11,11 +11,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
-from cartpole_rl.errors import LinkError, PlantError
+from cartpole_rl.errors import FaultError, LinkError, PlantError
 from cartpole_rl.plants.serial.cart import RESTARTED, SerialCart
-from cartpole_rl.plants.serial.clock import now
-from cartpole_rl.plants.serial.faults import FaultClearing
-from cartpole_rl.plants.serial.recentring import recentre
+from cartpole_rl.plants.serial.errors import fault_words
+from cartpole_rl.plants.serial.link import now
+from cartpole_rl.plants.serial.moves import recentre
 from cartpole_rl.wire import Flags, State, microseconds_between
 
 LOGGER = logging.getLogger(__name__)
@@ -23,6 +23,7 @@ LOGGER = logging.getLogger(__name__)
 STILL_SECONDS = 0.3  # by the cart's clock, for which the pole has to stay
 
 StartPosition = Literal["hanging", "upright"]
+Confirm = Callable[[str], bool]  # shows a person the text; True if the person says that the cart may move
 
 
 @dataclass(frozen=True)
@@ -49,6 +50,49 @@ POSITIONS: dict[StartPosition, PolePosition] = {
         "let it hang until it is still; it may not be touched during homing",
     ),
 }
+
+
+def nobody(text: str) -> bool:
+    """Never confirm: there is no person to ask."""
+    return False
+
+
+def always(text: str) -> bool:
+    """Always confirm: for a cart that cannot be damaged."""
+    return True
+
+
+class FaultClearing:
+    """Clears latched faults after a person has confirmed, or the first `unattended` ones without asking.
+
+    A cart that stopped itself moves again only then.
+    """
+
+    def __init__(self, unattended: int, confirm: Confirm = nobody) -> None:
+        self.unattended = unattended
+        self.cleared = 0  # faults cleared without asking
+        self._confirm = confirm
+
+    def clear(self, cart: SerialCart, fault: int) -> None:
+        """Clear the latched `fault` bits of the cart.
+
+        Raises FaultError if no person confirms, or if the cause of a fault persists.
+        """
+        words = f"the cart latched a fault: {fault_words(fault)}"
+        if self.cleared < self.unattended:
+            self.cleared += 1
+            LOGGER.warning("%s; cleared without asking, %s of %s", words, self.cleared, self.unattended)
+        elif not self._confirm(words):
+            raise FaultError(f"{words}; {self._remedy()}")
+        cart.clear_fault()
+
+    def _remedy(self) -> str:
+        if self.unattended:
+            return f"{self.cleared} faults were cleared unattended (plant.clear_faults): check the cart"
+        return (
+            "check the cart, then start again in a terminal and confirm; for unattended work, "
+            "plant.clear_faults=3 clears three faults without asking"
+        )
 
 
 class Preparation:

@@ -13,7 +13,7 @@ from cartpole_rl.envs.build import randomizer
 from cartpole_rl.physics.dynamics import State
 from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import GRAVITY, CartParameters
-from cartpole_rl.plants.simulation import Carts, Inputs, Period, commands_under_way, encoder_counts, run_carts
+from cartpole_rl.plants.simulated import Carts, Inputs, Period, commands_under_way, encoder_counts, run_carts
 from cartpole_rl.rig.parameters import PARAMETERS
 from cartpole_rl.tasks.features import (
     Measured,

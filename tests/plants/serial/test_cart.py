@@ -17,7 +17,7 @@ from serial_peer import CartPeer, Peer, open_descriptors, quick_settings, wait_f
 from cartpole_rl.errors import LinkError, PortError
 from cartpole_rl.plants.serial.cart import LAST_STOP, LONGEST_STOP, SerialCart
 from cartpole_rl.plants.serial.port import why_not_open
-from cartpole_rl.plants.serial.settings import LONGEST_WRITE, SerialSettings
+from cartpole_rl.plants.settings import LONGEST_WRITE, SerialSettings
 from cartpole_rl.signals import UNWINDING
 from cartpole_rl.wire import Flags, Frame, Hello, SetMotor, Stop
 
@@ -132,7 +132,7 @@ class TestMotor:
 PROGRAM = """
 import sys, time
 from cartpole_rl.plants.serial.cart import SerialCart
-from cartpole_rl.plants.serial.settings import SerialSettings
+from cartpole_rl.plants.settings import SerialSettings
 with SerialCart(SerialSettings(port=sys.argv[1])) as cart:
     cart.start()
     cart.set_motor(200)

@@ -4,8 +4,7 @@ from itertools import pairwise
 
 import pytest
 
-from cartpole_rl.plants.serial.centring import GENTLE, NOMINAL_DEADBAND, Centring, rough_motor
-from cartpole_rl.plants.serial.moves import GENTLE_MOTOR
+from cartpole_rl.plants.serial.moves import GENTLE, GENTLE_MOTOR, NOMINAL_DEADBAND, Centring, rough_motor
 from cartpole_rl.wire import State
 
 PERIOD_US = 20_000

@@ -12,8 +12,8 @@ from serial_peer import INFO, CartPeer, quick_settings, wait_for
 
 from cartpole_rl.errors import LinkError
 from cartpole_rl.plants.serial.cart import SerialCart
-from cartpole_rl.plants.serial.clock import ClockComparison, now
-from cartpole_rl.plants.serial.tracking import LARGEST_RATE_ERROR
+from cartpole_rl.plants.serial.link import now
+from cartpole_rl.plants.serial.tracking import LARGEST_RATE_ERROR, ClockComparison
 from cartpole_rl.wire import Flags, Home, Message
 
 PERIOD = 0.02  # s by the cart's clock

@@ -12,9 +12,18 @@ from serial_peer import CartPeer, Peer, quick_settings
 
 from cartpole_rl.errors import LinkError, PortError
 from cartpole_rl.plants.serial.cart import SerialCart
-from cartpole_rl.plants.serial.port import found_ports, only_cart, open_port, resolved_port
-from cartpole_rl.plants.serial.ports import UsbPort, cart_like, changes, described, usb_ports
-from cartpole_rl.plants.serial.settings import SerialSettings
+from cartpole_rl.plants.serial.port import (
+    UsbPort,
+    cart_like,
+    changes,
+    described,
+    found_ports,
+    only_cart,
+    open_port,
+    resolved_port,
+    usb_ports,
+)
+from cartpole_rl.plants.settings import SerialSettings
 
 
 def listed(device: str, vid: int | None, product: str | None = None) -> ListPortInfo:

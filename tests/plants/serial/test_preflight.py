@@ -11,21 +11,22 @@ from serial_peer import INFO, Between, CartPeer
 
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import FaultError
-from cartpole_rl.plants.emulated_cart import EmulatedCart
+from cartpole_rl.plants.emulated import EmulatedCart
 from cartpole_rl.plants.serial.cart import SerialCart
-from cartpole_rl.plants.serial.checks import (
+from cartpole_rl.plants.serial.errors import NotReadyError
+from cartpole_rl.plants.serial.preflight import (
     QUESTIONS,
+    Finding,
+    Probe,
     cart_direction,
     deadband,
     latency,
     limits,
     pole_direction,
+    preflight,
     soft_limit,
 )
-from cartpole_rl.plants.serial.errors import NotReadyError
-from cartpole_rl.plants.serial.preflight import Finding, preflight
-from cartpole_rl.plants.serial.probe import Probe
-from cartpole_rl.plants.serial.settings import SerialSettings
+from cartpole_rl.plants.settings import SerialSettings
 from cartpole_rl.wire import Fault, Flags, Frame, Hello, Home, Message, State
 
 TRUTH: dict[str, Any] = {

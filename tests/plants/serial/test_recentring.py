@@ -13,12 +13,11 @@ from serial_peer import HANGING, CartPeer
 from tensordict import TensorDict
 
 from cartpole_rl.emulator.settings import EmulatorSettings
-from cartpole_rl.plants.emulated import emulated_plant
 from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.errors import NotReadyError
-from cartpole_rl.plants.serial.plant import SerialPlant
-from cartpole_rl.plants.serial.recentring import recentre
-from cartpole_rl.plants.serial.settings import SerialSettings
+from cartpole_rl.plants.serial.moves import recentre
+from cartpole_rl.plants.serial.plant import SerialPlant, emulated_plant
+from cartpole_rl.plants.settings import SerialSettings
 from cartpole_rl.wire import Fault, Flags, Frame
 
 TURN = 4096

@@ -9,7 +9,7 @@ from serial_peer import CartPeer, Forgetful, quick_settings, wait_for
 
 from cartpole_rl.errors import LinkError
 from cartpole_rl.plants.serial.cart import SerialCart
-from cartpole_rl.plants.serial.clock import now
+from cartpole_rl.plants.serial.link import now
 from cartpole_rl.wire import Frame, Hello, SetMotor
 
 

@@ -15,7 +15,7 @@ pytest.importorskip("mujoco", reason='pip install "cartpole_rl[emulator]"')
 from cartpole_rl.emulator.link import PtyLink, TcpLink, open_link
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import EmulatorError, LinkError, PortError
-from cartpole_rl.plants.emulated_cart import EmulatedCart
+from cartpole_rl.plants.emulated import EmulatedCart
 from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.port import open_port
 from cartpole_rl.wire import Flags, FrameSplitter, SetMotor, State, decode_frame, encode_frame
