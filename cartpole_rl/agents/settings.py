@@ -20,11 +20,14 @@ class AgentKind(Extension):
         self.learner = Extension(f"the learner of {name}", learner)
 
 
-AGENTS = Registry("agent", __name__, AgentKind)
+def _check_agent(item: Any) -> None:
+    if not callable(getattr(item, "greedy_policy", None)):
+        raise ValueError("it has no `greedy_policy`")
+
+
+AGENTS = Registry("agent", __name__, AgentKind, _check_agent)
 AGENTS.add("dqn", "cartpole_rl.learning.agent:QAgent")
-NETWORKS: Registry[Extension] = Registry(
-    "network", __name__
-)  # from the arguments of `agents.network.q_network` to a module
+NETWORKS: Registry[Extension] = Registry("network", __name__)  # functions as `agents.network.q_network`
 NETWORKS.add("mlp", "cartpole_rl.agents.network:q_network")
 
 

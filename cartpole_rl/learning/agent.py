@@ -8,6 +8,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 from torchrl.data import Categorical
 from torchrl.modules import QValueActor
+from torchrl.objectives import DQNLoss
 from torchrl.objectives.utils import TargetNetUpdater
 
 from cartpole_rl.agents.settings import AgentSettings
@@ -34,14 +35,7 @@ class QAgent(nn.Module):
         self.settings = settings
         network = settings.network(settings, mirror_signs, actions, frames).to(device)
         self.actor = QValueActor(network, in_keys=["observation"], spec=Categorical(actions))
-        self.loss = AdvantageLearningLoss(
-            self.actor,
-            action_gap=settings.action_gap,
-            loss_function=settings.loss,
-            delay_value=True,
-            double_dqn=settings.double,
-            action_space="categorical",
-        )
+        self.loss = self.make_loss()
         self.loss.make_value_estimator(gamma=settings.gamma, device=device)
         TargetNetUpdater(self.loss)  # copies the weights; `update_target` moves them
         averaged = settings.average_decay is not None
@@ -52,6 +46,17 @@ class QAgent(nn.Module):
         networks = online, target, TensorDict.from_module(self.greedy_policy())
         weights = [TensorDict({name: network[name] for name in trainable}).lock_() for network in networks]
         self._online, self._target, self._average = weights
+
+    def make_loss(self) -> DQNLoss:
+        """Return the loss of the actor; a subclass may take another one."""
+        return AdvantageLearningLoss(
+            self.actor,
+            action_gap=self.settings.action_gap,
+            loss_function=self.settings.loss,
+            delay_value=True,
+            double_dqn=self.settings.double,
+            action_space="categorical",
+        )
 
     @torch.no_grad()
     def update_target(self) -> None:

@@ -42,5 +42,11 @@ class Logger(Protocol):
         """Flush, and release what is open; nothing is logged afterwards."""
 
 
-LOGGERS: Registry[Extension] = Registry("logger", __name__)
+def _check_logger(item: Any) -> None:
+    missing = [name for name in vars(Logger) if not name.startswith("_") and not hasattr(item, name)]
+    if missing:
+        raise ValueError(f"it has no `{missing[0]}`")
+
+
+LOGGERS: Registry[Extension] = Registry("logger", __name__, check=_check_logger)
 LOGGERS.add("tensorboard", "cartpole_rl.reporting.tensorboard:TensorBoardLog")

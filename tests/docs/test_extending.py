@@ -15,8 +15,8 @@ BIN = Path(sys.executable).parent
 PATHS = paths()
 
 
-def test_the_page_has_the_seven_paths() -> None:
-    assert set(PATHS) == set(EFFECTS) == set(range(1, 8))
+def test_the_page_has_the_eight_paths() -> None:
+    assert set(PATHS) == set(EFFECTS) == set(range(1, 9))
     assert all(path.steps and path.checks for path in PATHS.values())
 
 

@@ -149,6 +149,21 @@ def message_survives_the_wire(runs: Runs) -> None:
     assert decode_frame(answer[:-1]).message == Nack(2, Battery.TYPE, Reason.UNKNOWN_TYPE)
 
 
+def lines_are_written_by_the_stock_loss(runs: Runs) -> None:
+    from torchrl.objectives import DQNLoss
+
+    from cartpole_rl.learning.checkpoints import load_agent
+    from cartpole_rl.workflows.agents import new_agent
+    from cartpole_rl.workflows.config import TrainConfig
+
+    trained, _, exported = runs
+    assert " learning/loss " in (trained / "curves.txt").read_text()
+    assert not list(trained.glob("events*"))
+    agent = new_agent(TrainConfig(**load_agent(trained).config))
+    assert type(agent.loss) is DQNLoss
+    assert any(exported.rglob("*.c"))
+
+
 EFFECTS: dict[int, Callable[[Runs], None]] = {
     1: friction_changes_the_motion,
     2: reward_is_the_formula,
@@ -157,6 +172,7 @@ EFFECTS: dict[int, Callable[[Runs], None]] = {
     5: agent_sees_the_energy,
     6: message_survives_the_wire,
     7: masses_are_near_the_low_bound,
+    8: lines_are_written_by_the_stock_loss,
 }
 
 

@@ -1,0 +1,163 @@
+"""An agent with a learner of its own, a network and a logger, from a module in the current folder."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+from cartpole_rl.agents.settings import AGENTS, NETWORKS
+from cartpole_rl.errors import ConfigError
+from cartpole_rl.evaluation.episodes import run_batch
+from cartpole_rl.reporting.loggers import LOGGERS
+from cartpole_rl.workflows.agents import trained_agent
+from cartpole_rl.workflows.config import TrainConfig
+from cartpole_rl.workflows.export import network_of
+from cartpole_rl.workflows.loading import load_settings
+from cartpole_rl.workflows.train import nominal_env, train
+
+MODULE = '''
+import time
+import torch
+from torchrl.data import Categorical
+from torchrl.modules import QValueActor
+from torchrl.objectives import DQNLoss
+from cartpole_rl.agents.network import q_network
+from cartpole_rl.agents.settings import AGENTS
+from cartpole_rl.learning.agent import QAgent
+
+def calm(settings, mirror_signs, actions, frames):
+    network = q_network(settings, mirror_signs, actions, frames)
+    with torch.no_grad():
+        network.even_values.weight.mul_(0.01)
+    return network
+
+class StockLoss(QAgent):
+    def make_loss(self):
+        return DQNLoss(self.actor, delay_value=True, double_dqn=True, action_space="categorical")
+
+class Search:
+    """Random search: the best of some random changes of the weights."""
+
+    def __init__(self, learning, buffer, optimizer, agent, env, evaluate, monitor, seed, compiled, measure):
+        self.agent, self.evaluate, self.monitor, self.measure = agent, evaluate, monitor, measure
+        self.rounds, self.transitions, self.seconds = learning.evaluations, 0, 0.0
+        self.best = -1.0
+
+    def run(self):
+        for number in range(self.rounds):
+            kept, started = self.agent.state_dict(), time.perf_counter()
+            kept = {name: weight.clone() for name, weight in kept.items()}
+            with torch.no_grad():
+                for weight in self.agent.parameters():
+                    weight.add_(torch.randn_like(weight))
+            episodes = self.evaluate()
+            score = sum(each.total(self.measure) for each in episodes) / len(episodes)
+            if score <= self.best:
+                self.agent.load_state_dict(kept)
+            self.best = max(score, self.best)
+            self.transitions += 100
+            self.seconds += time.perf_counter() - started
+            self.monitor.on_update(self.transitions, {"search/best": self.best})
+            self.monitor.on_evaluation(self, episodes, score == self.best)
+
+    def snapshot(self):
+        return {"agent": self.agent.state_dict()}
+
+    def restore(self, snapshot):
+        self.agent.load_state_dict(snapshot["agent"])
+
+@AGENTS.register(learner=Search)
+class Searched(torch.nn.Module):
+    def __init__(self, settings, mirror_signs, actions, frames, device):
+        super().__init__()
+        network = torch.nn.Linear(len(mirror_signs), actions)
+        self.policy = QValueActor(network, in_keys=["observation"], spec=Categorical(actions))
+
+    def greedy_policy(self):
+        return self.policy
+
+class Lines:
+    def __init__(self, folder, purge_step=None):
+        self.file = (folder / "lines.txt").open("a")
+
+    def scalars(self, values, step):
+        for name, value in values.items():
+            print(step, name, value, file=self.file)
+
+    def nothing(self, *arguments):
+        """Log nothing."""
+
+    histogram = figure = animation = hparams = flush = nothing
+
+    def close(self):
+        self.file.close()
+'''
+TOY = {
+    "learning.transitions": 2048,
+    "learning.carts": 16,
+    "learning.chunk": 8,
+    "learning.updates": 1,
+    "learning.batch_size": 16,
+    "learning.warmup_transitions": 64,
+    "learning.evaluations": 3,
+    "learning.evaluation_episodes": 2,
+    "buffer.size": 2000,
+    "task.time_limit": 50,
+    "compile": False,
+    "logger": "own_agents:Lines",
+}
+
+
+@pytest.fixture(autouse=True)
+def own_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    monkeypatch.delitem(sys.modules, "own_agents", raising=False)
+    for registry in (AGENTS, NETWORKS, LOGGERS):
+        monkeypatch.setattr(registry, "_entries", {**registry._entries})
+    (tmp_path / "own_agents.py").write_text(MODULE)
+
+
+@pytest.mark.parametrize(
+    ("chosen", "curve"),
+    [
+        ({"agent.kind": "own_agents:Searched"}, "search/best"),
+        ({"agent.kind": "own_agents:StockLoss", "agent.network": "own_agents:calm"}, "learning/loss"),
+    ],
+)
+def test_it_is_trained_logged_and_driven(chosen: dict[str, str], curve: str, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    score = train(load_settings(TrainConfig, TOY | chosen), run)
+    assert f" {curve} " in (run / "lines.txt").read_text()
+    assert " evaluation/score " in (run / "lines.txt").read_text()
+    assert not list(run.glob("events*"))
+    assert len((run / "history.jsonl").read_text().splitlines()) == 3
+    agent = trained_agent(run)
+    assert {f"agent.{name}": getattr(agent.training.agent, name) for name in ("kind", "network")} == {
+        "agent.kind": "dqn",
+        "agent.network": "mlp",
+        **chosen,
+    }
+    episodes = run_batch(nominal_env(agent.training), agent.policy)
+    assert len(episodes) == 2
+    assert json.loads((run / "metrics.json").read_text())["score"]["mean"] == pytest.approx(score)
+    if "agent.network" in chosen:
+        assert len(network_of(agent).plain_layers()) == 3
+    else:
+        with pytest.raises(ConfigError, match=r"agent\.kind=own_agents:Searched, .* cannot be exported"):
+            network_of(agent)
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ({"logger": "own_agents:Searched"}, "logger=own_agents:Searched: .*it has no `scalars`"),
+        ({"agent.kind": "own_agents:Lines"}, "agent.kind=own_agents:Lines: .*it has no `greedy_policy`"),
+        ({"agent.network": "own_agents:deep"}, "agent.network=own_agents:deep: .*has no 'deep'"),
+        ({"agent.kind": "ppo"}, "agent.kind=ppo: .*give 'dqn', or your own as module:name$"),
+    ],
+)
+def test_what_cannot_be_one_is_refused(setting: dict[str, str], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        load_settings(TrainConfig, TOY | setting)
