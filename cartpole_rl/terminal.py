@@ -1,10 +1,11 @@
-"""The terminal: messages, questions, and text that survives a shell and Hydra."""
+"""The terminal: messages, questions, progress bars, and text that survives a shell and Hydra."""
 
 import os
 import re
 import shlex
 import sys
 from contextlib import suppress
+from typing import Any
 
 READER_LEFT = 141  # exit code, as of a program that SIGPIPE ends
 
@@ -71,3 +72,14 @@ def exit_if_nobody_reads() -> None:
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for Python's last flush
         sys.exit(READER_LEFT)
+
+
+def progress_bar(total: int, unit: str, **options: Any) -> Any:
+    """Return a bar of `total` units on stderr, as wide as the terminal; options as for tqdm.
+
+    Only a terminal gets one: a pipe or a log file would keep every repaint.
+    """
+    from tqdm import tqdm
+
+    is_terminal = sys.stderr is not None and sys.stderr.isatty()
+    return tqdm(total=total, unit=f" {unit}", dynamic_ncols=True, disable=not is_terminal, **options)

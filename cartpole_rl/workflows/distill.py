@@ -12,12 +12,11 @@ from cartpole_rl.learning.checkpoints import AgentCheckpoint, save_agent
 from cartpole_rl.learning.distillation import Distillation
 from cartpole_rl.learning.states import seed_everything
 from cartpole_rl.run_folder import CHECKPOINTS, FIGURES, LAST, METRICS, write_config
-from cartpole_rl.terminal import as_word
+from cartpole_rl.terminal import as_word, progress_bar
 from cartpole_rl.workflows.agents import new_agent, trained_agent
 from cartpole_rl.workflows.build import use_threads
 from cartpole_rl.workflows.config import DistillConfig, TrainConfig
 from cartpole_rl.workflows.export import provenance
-from cartpole_rl.workflows.progress import progress_bar
 from cartpole_rl.workflows.report import report
 from cartpole_rl.workflows.results import print_results, shown
 from cartpole_rl.workflows.train import judge, nominal_env
@@ -62,7 +61,8 @@ def distill(config: DistillConfig, folder: Path) -> float:
 
 def student_settings(training: TrainConfig, config: DistillConfig) -> TrainConfig:
     """Return the settings of the teacher's training with the student's network. Raises ConfigError."""
-    agent = training.agent.model_dump() | {"hidden": config.hidden, "recurrent": None}
+    network = {"hidden": config.hidden, "recurrent": None, "kind": "dqn", "network": "mlp"}
+    agent = training.agent.model_dump() | network
     own = {"agent": agent, "seed": config.seed, "compile": False, "device": "cpu"}
     values = {**training.model_dump(mode="json"), **own}
     return with_fitted_guard(checked(TrainConfig, values))

@@ -20,7 +20,7 @@ from cartpole_rl.reporting.live_view import LiveView, view_title
 from cartpole_rl.reporting.words import guard_text
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.tasks.settings import Measure
-from cartpole_rl.terminal import confirm, print_message
+from cartpole_rl.terminal import confirm, print_message, progress_bar
 from cartpole_rl.workflows.agents import evaluated_agent
 from cartpole_rl.workflows.build import (
     evaluated_env,
@@ -33,7 +33,6 @@ from cartpole_rl.workflows.build import (
 from cartpole_rl.workflows.checks import BASELINE, note_other_numbers
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
 from cartpole_rl.workflows.export import agent_on_board, compiled_training, exported_agent, on_the_board
-from cartpole_rl.workflows.progress import progress_bar
 from cartpole_rl.workflows.repeating import Repetition, repetition
 from cartpole_rl.workflows.trained_poles import other_pole
 

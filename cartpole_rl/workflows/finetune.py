@@ -17,11 +17,12 @@ from torch import nn
 from cartpole_rl.checking import checked
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
-from cartpole_rl.errors import CheckpointError
+from cartpole_rl.errors import CheckpointError, ConfigError
 from cartpole_rl.evaluation.driver import Driver
 from cartpole_rl.evaluation.publishing import followed
 from cartpole_rl.evaluation.snapshots import Memory
 from cartpole_rl.files import claimed, write_bytes
+from cartpole_rl.learning.agent import QAgent
 from cartpole_rl.learning.checkpoint_files import find_agent
 from cartpole_rl.learning.checkpoints import (
     FINETUNING_FORMAT,
@@ -101,7 +102,9 @@ def finetune(config: FinetuneConfig, folder: Path, words: Sequence[str] = ()) ->
     use_threads(config.threads)
     seed_everything(config.seed)
     agent = trained_agent(run)
-    training = agent.training
+    training, kind = agent.training, agent.training.agent.kind
+    if not (isinstance(kind.item, type) and issubclass(kind.item, QAgent)):
+        raise ConfigError(f"run={run}: fine-tuning trains Q-networks, this is an agent of agent.kind={kind}")
     evaluation = evaluation_config(config)
     settings = evaluated_settings(training, evaluation)
     emulated = isinstance(config.plant, EmulatedSettings)

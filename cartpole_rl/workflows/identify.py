@@ -42,13 +42,12 @@ from cartpole_rl.run_folder import (
     write_json,
 )
 from cartpole_rl.tasks.episode import Episode
-from cartpole_rl.terminal import confirm, print_message
+from cartpole_rl.terminal import confirm, print_message, progress_bar
 from cartpole_rl.workflows.build import precedence, use_threads
 from cartpole_rl.workflows.checks import note_other_numbers
 from cartpole_rl.workflows.config import IdentifyConfig
 from cartpole_rl.workflows.identified_errors import BY_HAND, errors, known_truth
 from cartpole_rl.workflows.identified_files import friction_choice, report, write_choices
-from cartpole_rl.workflows.progress import progress_bar
 from cartpole_rl.workflows.recordings import experiments
 from cartpole_rl.workflows.results import print_results, shown
 

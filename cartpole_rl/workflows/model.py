@@ -27,11 +27,10 @@ from cartpole_rl.reporting.figures.learned_models import ensemble_figure
 from cartpole_rl.reporting.words import LEARNED, PHYSICS, count_text
 from cartpole_rl.run_folder import FIGURES, MODELLED, write_config, write_json
 from cartpole_rl.tasks.episode import Episode
-from cartpole_rl.terminal import as_word
+from cartpole_rl.terminal import as_word, progress_bar
 from cartpole_rl.workflows.build import use_threads
 from cartpole_rl.workflows.config import ModelConfig
 from cartpole_rl.workflows.poles import chosen_pole
-from cartpole_rl.workflows.progress import progress_bar
 from cartpole_rl.workflows.recordings import recordings
 from cartpole_rl.workflows.results import print_results, shown
 

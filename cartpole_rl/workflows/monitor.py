@@ -18,9 +18,8 @@ from cartpole_rl.reporting.figures import behaviour
 from cartpole_rl.reporting.loggers import Logger
 from cartpole_rl.run_folder import BEST, CHECKPOINTS, HISTORY, LAST
 from cartpole_rl.tasks.episode import Episode
-from cartpole_rl.terminal import print_message
+from cartpole_rl.terminal import print_message, progress_bar
 from cartpole_rl.workflows.config import TrainConfig
-from cartpole_rl.workflows.progress import progress_bar
 
 GUARDED = "guarded_fraction"  # None without a track guard
 COMPARED = ("score", "score_upright", "steps", "time_to_upright_s", "upright_fraction", GUARDED)  # at the end

@@ -14,7 +14,7 @@ from command_line import COARSE, Outcome, in_process
 from hydra_configs import shipped_choices
 
 from cartpole_rl.command import wrapped
-from cartpole_rl.workflows.progress import progress_bar
+from cartpole_rl.terminal import progress_bar
 
 SIMULATED = "cartpole-evaluate run=run plant=emulated"
 EMULATED = "cartpole-finetune run=run plant=emulated"

@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from cartpole_rl.workflows.loading import load_settings
 
 from cartpole_rl.agents.settings import AGENTS, NETWORKS
 from cartpole_rl.errors import ConfigError
@@ -13,7 +14,6 @@ from cartpole_rl.reporting.loggers import LOGGERS
 from cartpole_rl.workflows.agents import trained_agent
 from cartpole_rl.workflows.config import TrainConfig
 from cartpole_rl.workflows.export import network_of
-from cartpole_rl.workflows.loading import load_settings
 from cartpole_rl.workflows.train import nominal_env, train
 
 MODULE = '''
