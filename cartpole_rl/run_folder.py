@@ -16,7 +16,7 @@ from typing import Any
 
 import yaml
 
-from cartpole_rl.errors import ConfigError
+from cartpole_rl.errors import CheckpointError, ConfigError
 from cartpole_rl.files import write_text
 from cartpole_rl.terminal import as_value, as_word
 
@@ -32,6 +32,7 @@ FIGURES, RECORDINGS = "figures", "recordings"
 ANIMATION, BESIDE_SIMULATION = "episode.gif", "beside_simulation.gif"  # of the first episode
 CHECKPOINTS, LAST, BEST, RESUME = "checkpoints", "last.pt", "best.pt", "resume.pt"  # of an agent
 START = "start.pt"  # in checkpoints/ of an unfinished fine-tuning: a copy of the agent that it started from
+PRETRAINED, PRETRAINED_AGENT = "pretrained", "agent.pt"  # run=pretrained/medium is an agent in this package
 CART, POLE, RANDOMIZATION, POSTERIOR = "cart.yaml", "pole.yaml", "randomization.yaml", "posterior.npz"
 RUN_FILES = (CONFIG, CART, POLE, RANDOMIZATION)
 INPUTS = "inputs.json"  # hashes of files, which are named as seen from the run folder
@@ -135,6 +136,49 @@ def has_ended(run: Path) -> bool:
     """True if a training or fine-tuning has results and no state to resume from."""
     results = (run / METRICS).exists() and (run / CHECKPOINTS / LAST).exists()
     return results and not (run / CHECKPOINTS / RESUME).exists()
+
+
+def find_agent(run: Path) -> Path:
+    """Return the checkpoint `run` itself, the last one of a run folder, or a pretrained agent.
+
+    Raises CheckpointError.
+    """
+    if not run.exists() and run.parts[:1] == (PRETRAINED,):
+        return find_pretrained(run)
+    if not run.exists():
+        raise CheckpointError(
+            f"run={run}: there is no such file or folder; give a run folder or a checkpoint"
+        )
+    if run.is_file():
+        return run
+    path = run / CHECKPOINTS / LAST
+    if not path.exists():
+        raise CheckpointError(f"run={run}: it holds no {CHECKPOINTS}/{LAST}; give the folder of a training")
+    return path
+
+
+def find_pretrained(run: Path) -> Path:
+    """Return the checkpoint of a pretrained agent, such as pretrained/medium. Raises CheckpointError."""
+    folder = Path(__file__).parent / PRETRAINED
+    path = folder.joinpath(*run.parts[1:]) / PRETRAINED_AGENT
+    if not path.is_file():
+        names = sorted(agent.parent.name for agent in folder.glob(f"*/{PRETRAINED_AGENT}"))
+        choices = ", ".join(f"{PRETRAINED}/{name}" for name in names)
+        raise CheckpointError(f"run={run}: there is no such pretrained agent; there are {choices}")
+    return path
+
+
+def find_training(run: Path) -> Path:
+    """Return the file to resume the training in the folder `run` from. Raises CheckpointError."""
+    if not run.is_dir():
+        raise CheckpointError(f"resume={run}: there is no such folder; give the run folder of a training")
+    path = run / CHECKPOINTS / RESUME
+    if not path.exists():
+        raise CheckpointError(
+            f"resume={run}: it holds no {CHECKPOINTS}/{RESUME}; give the folder of a training that was "
+            "interrupted after its first checkpoint"
+        )
+    return path
 
 
 def write_inputs(folder: Path, needs: Iterable[Path]) -> None:

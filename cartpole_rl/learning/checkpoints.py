@@ -15,9 +15,8 @@ from torch import nn
 
 from cartpole_rl.errors import CheckpointError
 from cartpole_rl.files import replacing
-from cartpole_rl.learning.checkpoint_files import find_agent, find_training
 from cartpole_rl.learning.states import moved
-from cartpole_rl.run_folder import CHECKPOINTS, ERROR, RESUME
+from cartpole_rl.run_folder import CHECKPOINTS, ERROR, RESUME, find_agent, find_training
 
 AGENT_FORMAT = "cartpole_rl agent 1"
 TRAINING_FORMAT = "cartpole_rl training 4"

@@ -16,7 +16,6 @@ from cartpole_rl.checking import missing
 from cartpole_rl.choices import group_choices
 from cartpole_rl.envs.cart_pole_settings import shipped_carts
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.learning.checkpoint_files import find_agent, find_training
 from cartpole_rl.plants.model_file import find_model
 from cartpole_rl.plants.settings import LearnedSettings
 from cartpole_rl.randomization.poles import Pole, check_one_pole
@@ -29,6 +28,8 @@ from cartpole_rl.run_folder import (
     PREFIX,
     RESUME,
     check_program,
+    find_agent,
+    find_training,
     has_ended,
     program_of,
     use_of,

@@ -17,10 +17,9 @@ from cartpole_rl.exporting.c_code import c_files
 from cartpole_rl.exporting.onnx_model import onnx_model
 from cartpole_rl.exporting.web_page import web_page
 from cartpole_rl.files import write_bytes
-from cartpole_rl.learning.checkpoint_files import find_agent
 from cartpole_rl.learning.checkpoints import load_agent
 from cartpole_rl.plants.settings import SimulatedSettings
-from cartpole_rl.run_folder import CHECKPOINTS, recorded_provenance, write_config
+from cartpole_rl.run_folder import CHECKPOINTS, find_agent, recorded_provenance, write_config
 from cartpole_rl.workflows.agents import TrainedAgent, trained_agent
 from cartpole_rl.workflows.build import without_guard_numbers
 from cartpole_rl.workflows.config import EvaluateConfig, ExportConfig, TrainConfig

@@ -23,7 +23,6 @@ from cartpole_rl.evaluation.publishing import followed
 from cartpole_rl.evaluation.snapshots import Memory
 from cartpole_rl.files import claimed, write_bytes
 from cartpole_rl.learning.agent import QAgent
-from cartpole_rl.learning.checkpoint_files import find_agent
 from cartpole_rl.learning.checkpoints import (
     FINETUNING_FORMAT,
     TrainingCheckpoint,
@@ -50,6 +49,7 @@ from cartpole_rl.run_folder import (
     RECORDINGS,
     START,
     file_hash,
+    find_agent,
     recorded_provenance,
     write_config,
     write_json,

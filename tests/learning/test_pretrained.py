@@ -8,8 +8,8 @@ from command_line import COARSE, in_process
 
 import cartpole_rl
 from cartpole_rl.errors import CheckpointError
-from cartpole_rl.learning.checkpoint_files import find_agent
 from cartpole_rl.learning.checkpoints import load_agent
+from cartpole_rl.run_folder import find_agent
 
 FOLDER = Path(cartpole_rl.__file__).parent / "pretrained"
 AGENTS = sorted(path.name for path in FOLDER.iterdir())

@@ -13,7 +13,6 @@ from typing import Any, TypeVar
 import yaml
 
 from cartpole_rl.errors import CheckpointError
-from cartpole_rl.learning.checkpoint_files import find_agent
 from cartpole_rl.reporting.results import is_number
 from cartpole_rl.run_folder import (
     AGENT_HASH,
@@ -30,6 +29,7 @@ from cartpole_rl.run_folder import (
     PREFIX,
     PROVENANCE,
     file_hash,
+    find_agent,
     is_outdated,
 )
 
