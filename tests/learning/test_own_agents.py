@@ -5,14 +5,13 @@ import sys
 from pathlib import Path
 
 import pytest
-from cartpole_rl.workflows.loading import load_settings
 
 from cartpole_rl.agents.settings import AGENTS, NETWORKS
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.reporting.loggers import LOGGERS
 from cartpole_rl.workflows.agents import trained_agent
-from cartpole_rl.workflows.config import TrainConfig
+from cartpole_rl.workflows.config import TrainConfig, load_settings
 from cartpole_rl.workflows.export import network_of
 from cartpole_rl.workflows.train import nominal_env, train
 
