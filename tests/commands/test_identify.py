@@ -11,7 +11,7 @@ import yaml
 from command_line import ONCE, QUICK, TINY, Outcome, in_process
 
 from cartpole_rl.checking import checked
-from cartpole_rl.choices import without_missing
+from cartpole_rl.composition import without_missing
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.workflows.config import TrainConfig
 
