@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from cartpole_rl.reporting.figures import comparison, save
-from cartpole_rl.reporting.scores import SCORES, mean_text
-from cartpole_rl.reporting.table import table
+from cartpole_rl.reporting.scores import SCORES, comparison, mean_text
+from cartpole_rl.reporting.style import save
+from cartpole_rl.reporting.texts import table
 
 EPISODES = 10  # without exploration
 TUNING_EPISODES = 5  # to learn from

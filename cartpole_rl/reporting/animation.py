@@ -1,4 +1,4 @@
-"""Episodes as animated GIFs in real time, small enough for a page or TensorBoard; also as MP4.
+"""Episodes as animated GIFs in real time, small enough for a page or TensorBoard; also as MP4, also in pairs.
 
 All frames share a fixed palette of at most 32 colours, so that a frame stores only the pixels that changed.
 """
@@ -8,13 +8,14 @@ from collections.abc import Iterator, Sequence
 from fractions import Fraction
 from itertools import accumulate
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageSequence
 
-from cartpole_rl.drawing.cart import FINER, CartDrawing, palette
+from cartpole_rl.drawing.cart import FINER, SIZE, CartDrawing, palette
 from cartpole_rl.files import replacing
-from cartpole_rl.reporting.words import ending_text
+from cartpole_rl.reporting.texts import ending_text
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
 
@@ -22,6 +23,8 @@ EVERY = 2  # control periods between frames: 25 frames a second at 50 Hz
 LAST_FRAME = 1000  # ms, of the last frame before the animation repeats
 SHORTEST = 20  # ms; browsers slow down a frame that claims less
 MILLISECOND = Fraction(1, 1000)  # s
+
+Pair = tuple[Episode, Episode]
 
 
 def write_animation(path: Path, pictures: Sequence[Image.Image], times: Sequence[int], mp4: bool) -> None:
@@ -85,6 +88,41 @@ def durations(episode: Episode, every: int = EVERY) -> list[int]:
     return [max(10 * int(wait), SHORTEST) for wait in np.diff(hundredths)] + [LAST_FRAME]
 
 
+def side_by_side(
+    episodes: Pair, titles: tuple[str, str], pole_length: float, track_half_length: float
+) -> tuple[list[Image.Image], list[int]]:
+    """Return pictures of 960 by 320 pixels and the time of each (ms); both episodes start together.
+
+    After the end of the shorter episode its last picture stays. Lengths in m, as for `gif`.
+    """
+    longer = max(episodes, key=lambda episode: episode.time[-1])
+    duration = float(longer.time[-1])
+    halves = [drawn(episode, pole_length, track_half_length, duration) for episode in episodes]
+    backgrounds = [half.background(title) for half, title in zip(halves, titles, strict=True)]
+    pictures = []
+    for pair in zip(*(nearest_rows(episode, longer) for episode in episodes), strict=True):
+        parts = [picture(*each) for each in zip(halves, backgrounds, pair, strict=True)]
+        pictures.append(joined(*parts))
+    return pictures, durations(longer)
+
+
+def nearest_rows(episode: Episode, longer: Episode) -> Iterator[int]:
+    """Yield the row of `episode` nearest in time to each picture of `longer`."""
+    for time in longer.time[rows(longer)]:
+        yield int(np.abs(episode.time - time).argmin())
+
+
+def joined(left: Image.Image, right: Image.Image) -> Image.Image:
+    """Return two pictures in the fixed palette as one, with a line between them."""
+    width, height = SIZE
+    both = Image.new("P", (2 * width, height))
+    both.putpalette(palette().getpalette() or [])
+    both.paste(left, (0, 0))
+    both.paste(right, (width, 0))
+    ImageDraw.Draw(both).line((width, 20, width, height - 20), fill=1)  # ink
+    return both
+
+
 def smaller(path: Path, width: int, every: int) -> bytes:
     """Return the GIF at `path` scaled to `width` pixels with each `every`-th frame, in the same time.
 
@@ -107,16 +145,8 @@ def encoded_gif(pictures: Sequence[Image.Image], times: Sequence[int]) -> bytes:
     """Return pictures in the fixed palette as an endless GIF, each shown for its time (ms)."""
     first, *others = pictures
     buffer = io.BytesIO()
-    first.save(
-        buffer,
-        "GIF",
-        save_all=True,
-        append_images=others,
-        duration=[*times],
-        loop=0,
-        optimize=False,
-        disposal=1,
-    )
+    looks: dict[str, Any] = {"duration": [*times], "loop": 0, "optimize": False, "disposal": 1}
+    first.save(buffer, "GIF", save_all=True, append_images=others, **looks)
     return buffer.getvalue()
 
 

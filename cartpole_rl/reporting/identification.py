@@ -1,31 +1,35 @@
-"""Page, figures and tables of an identification."""
+"""Page, figures and tables of an identification.
+
+The first figure shows figures 5.2, 5.3 and 5.5 of the thesis for the identified cart.
+"""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+import torch
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from cartpole_rl.drawing import colours
 from cartpole_rl.identification.experiments import EXPERIMENTS, HELD_OUT
 from cartpole_rl.identification.identify import HORIZON, Candidate, Identification, PredictionError
-from cartpole_rl.identification.prediction import replay
+from cartpole_rl.identification.prediction import Replayed, replay
 from cartpole_rl.identification.quantities import Quantity, intervals
-from cartpole_rl.reporting.curves import force_curve, friction_curve
-from cartpole_rl.reporting.figures.identified import (
-    experiments_figure,
-    friction_and_force_figure,
-    interval_figure,
-    spectrum_figure,
-)
+from cartpole_rl.physics.friction import viscous_coefficient
+from cartpole_rl.physics.laws import Law
+from cartpole_rl.physics.parameters import CartParameters, cart_column
+from cartpole_rl.reporting import style
+from cartpole_rl.reporting.episodes import wrapped_line
 from cartpole_rl.reporting.page import page
-from cartpole_rl.reporting.table import interval_text, number_text, table
+from cartpole_rl.reporting.texts import interval_text, number_text, table
+from cartpole_rl.rig.hardware import LARGEST_MOTOR
 from cartpole_rl.run_folder import FIGURES
 from cartpole_rl.tasks.episode import Episode
 
-Array = NDArray[np.floating]
 CAPTIONS = {  # figures/<name>.png: caption
     "friction_and_force": "Friction of the cart and force of the motor, with 95 % bands",
     "intervals": "Identified values with 95 % intervals, and prior values",
@@ -34,6 +38,17 @@ CAPTIONS = {  # figures/<name>.png: caption
     "held_out": "The held-out experiment, which was not used in the fit",
     "spectrum": "Remaining uncertainty of each combination of parameters, relative to the prior",
 }
+FASTEST = 0.6  # m/s
+MOST_SAMPLES = 500  # carts in a band
+IDENTIFIED, PRIOR, SIMULATED = colours.BLUE, colours.MUTED, colours.VERMILLION
+TAIL = 2.5  # percent beyond each end of an interval
+LONGEST = 14.0  # s of an experiment that are drawn
+FARTHEST = 12.0  # half widths of the interval; a prior value farther away becomes an arrow
+WRITTEN = 0.3  # smallest weight in a combination that is written as a number
+DARK = 0.6  # weight from which white digits are legible
+
+Array = NDArray[np.floating]
+Parameters = Mapping[str, float]
 
 
 def quantities_table(quantities: Sequence[Quantity]) -> str:
@@ -125,3 +140,171 @@ def _friction_rows(candidates: Sequence[Candidate]) -> list[dict[str, str]]:
         }
         for each in candidates
     ]
+
+
+class Curve(NamedTuple):
+    """A curve at S places: of the identified cart, of N carts from the posterior, and of the prior."""
+
+    at: Array  # [S]
+    identified: Array  # [S]
+    samples: Array  # [S, N]
+    prior: Array  # [S]
+
+
+def friction_curve(identified: Parameters, samples: Array, prior: Parameters, law: Law) -> Curve:
+    """Return the cart's friction (N) over its velocity (m/s): figures 5.2 and 5.3 of the thesis.
+
+    `samples` [P, N] are carts drawn from the posterior, a row each of `CartParameters.names()`.
+    """
+    velocity = torch.linspace(-FASTEST, FASTEST, 241, dtype=torch.float64)[:, None]
+
+    def friction(cart: CartParameters) -> torch.Tensor:
+        return law(velocity, cart) + viscous_coefficient(cart, law) * velocity
+
+    return _curve(velocity, friction, identified, samples, prior)
+
+
+def force_curve(identified: Parameters, samples: Array, prior: Parameters, actuator: Law) -> Curve:
+    """Return the force (N) over the motor value: figure 5.5 of the thesis; see `friction_curve`."""
+    motor = torch.arange(-LARGEST_MOTOR, LARGEST_MOTOR + 1, dtype=torch.float64)[:, None]
+    return _curve(motor, lambda cart: actuator(motor, cart), identified, samples, prior)
+
+
+def _curve(
+    at: torch.Tensor,
+    function: Callable[[CartParameters], torch.Tensor],
+    identified: Parameters,
+    samples: Array,
+    prior: Parameters,
+) -> Curve:
+    def of_table(table: torch.Tensor) -> Array:
+        return function(CartParameters(table[:, None])).numpy()
+
+    def of_cart(cart: Parameters) -> Array:
+        return of_table(cart_column(cart))[:, 0]
+
+    band = of_table(torch.from_numpy(samples[:, :MOST_SAMPLES]))
+    return Curve(at[:, 0].numpy(), of_cart(identified), band, of_cart(prior))
+
+
+def friction_and_force_figure(friction: Curve, force: Curve) -> Figure:
+    """Draw friction (N) over velocity (m/s), and force (N) over motor value, with 95 % bands."""
+    figure = style.new_figure(height=4.4)
+    left, right = figure.subplots(1, 2)
+    _draw_curve(left, friction, "Friction", "cart velocity (m/s)", "friction (N)")
+    _draw_curve(right, force, "Force", "motor value", "force on the cart (N)")
+    left.legend(fontsize=style.SMALL_SIZE, frameon=False, loc="upper left")
+    return figure
+
+
+def _draw_curve(axes: Axes, curve: Curve, title: str, x: str, y: str) -> None:
+    style.dress(axes, x, y)
+    low, high = np.percentile(curve.samples, [TAIL, 100 - TAIL], axis=1)
+    axes.fill_between(curve.at, low, high, color=IDENTIFIED, alpha=0.25, linewidth=0)
+    axes.plot(curve.at, curve.prior, color=PRIOR, linestyle=(0, (4, 3)), label="prior")
+    axes.plot(curve.at, curve.identified, color=IDENTIFIED, linewidth=2, label="identified, 95 % band")
+    style.title(axes, title)
+
+
+def interval_figure(quantities: Sequence[Quantity]) -> Figure:
+    """Draw the 95 % interval of each quantity and its prior value, in units of the interval's half width."""
+    figure = style.new_figure(height=1.2 + 0.36 * len(quantities))
+    axes = figure.subplots()
+    style.dress(axes, x="difference from the identified value\n(half widths of the 95 % interval)", grid="x")
+    for height, quantity in enumerate(reversed(quantities)):
+        _draw_interval(axes, height, quantity)
+    names = [quantity.words for quantity in reversed(quantities)]
+    axes.set_yticks(range(len(names)), names, fontsize=style.SMALL_SIZE)
+    axes.set_xlim(-FARTHEST - 1, FARTHEST + 1)
+    style.title(axes, "Identified values", "blue: value and 95 % interval,  grey: prior")
+    return figure
+
+
+def _draw_interval(axes: Axes, height: int, quantity: Quantity) -> None:
+    value, low, high, prior = quantity[3:]
+    half = max((high - low) / 2, 1e-12)
+    ends = [(low - value) / half, (high - value) / half]
+    axes.plot(ends, [height] * 2, color=IDENTIFIED, linewidth=5, alpha=0.4, solid_capstyle="butt")
+    axes.plot(0, height, "o", color=IDENTIFIED)
+    away = (prior - value) / half
+    marker = "D" if abs(away) <= FARTHEST else (">" if away > 0 else "<")
+    axes.plot(np.clip(away, -FARTHEST, FARTHEST), height, marker, color=PRIOR, markersize=6)
+    text = f"{interval_text(value, low, high)} {quantity.unit}   (prior {number_text(prior)})"
+    style.beside(axes, height, text, colours.INK)
+
+
+def experiments_figure(replays: Mapping[str, Replayed]) -> Figure:
+    """Draw each experiment, measured and simulated: position (cm) and angle from hanging (deg) over time."""
+    figure = style.new_figure(height=1.0 + 2.1 * len(replays), width=10.0)
+    panels = figure.subplots(len(replays), 2, squeeze=False)
+    for (left, right), (name, replayed) in zip(panels, replays.items(), strict=True):
+        _draw_positions(left, replayed)
+        _draw_angles(right, replayed)
+        start = _liveliest(replayed.episode)
+        for axes in (left, right):
+            axes.set_xlim(start, min(start + LONGEST, float(replayed.episode.time[-1])))
+        style.title(left, name)
+    for axes in panels[-1]:
+        style.label(axes, x="time (s)")
+    looks: dict[str, Any] = {"frameon": False, "bbox_to_anchor": (1, 1)}
+    panels[0][1].legend(loc="lower right", ncols=2, fontsize=style.SMALL_SIZE, **looks)
+    return figure
+
+
+def _liveliest(episode: Episode) -> float:
+    """Return the start (s) of the LONGEST seconds in which the cart moves most."""
+    way = np.concatenate((np.zeros(1), np.cumsum(np.abs(np.diff(episode.x)))))
+    starts = episode.time[episode.time <= max(0.0, episode.time[-1] - LONGEST)]
+    covered = np.interp(starts + LONGEST, episode.time, way) - np.interp(starts, episode.time, way)
+    return float(starts[int(np.argmax(covered))])
+
+
+def _draw_positions(axes: Axes, replayed: Replayed) -> None:
+    style.dress(axes, y="cart (cm)")
+    episode = replayed.episode
+    axes.plot(episode.time, 100 * episode.x, color=colours.CART, linewidth=3, alpha=0.55, label="measured")
+    for times, positions in zip(replayed.time, replayed.x, strict=True):
+        known = np.isfinite(positions)
+        axes.plot(times[known], 100 * positions[known], color=SIMULATED, linewidth=1.1)
+
+
+def _draw_angles(axes: Axes, replayed: Replayed) -> None:
+    style.dress(axes, y="from hanging (deg)")
+    measured = wrapped_line(replayed.episode.time, replayed.episode.theta - np.pi)
+    axes.plot(*measured, color=colours.POLE, linewidth=3, alpha=0.45, label="measured")
+    for index, (times, angles) in enumerate(zip(replayed.time, replayed.theta, strict=True)):
+        known = np.isfinite(angles)
+        line = wrapped_line(times[known], angles[known] - np.pi)
+        axes.plot(*line, color=SIMULATED, linewidth=1.1, label="simulated" if index == 0 else None)
+    axes.set_yticks((-180, -90, 0, 90, 180))
+    axes.set_ylim(-190, 190)
+
+
+def spectrum_figure(covariance: Array, names: Sequence[str]) -> Figure:
+    """Draw the remaining uncertainty of combinations of parameters, the best known at the bottom.
+
+    `covariance` [U, U] is in units of the prior variance; the combinations are its eigenvectors.
+    """
+    values, vectors = np.linalg.eigh(covariance)
+    figure = style.new_figure(height=1.6 + 0.34 * len(names), width=11.0)
+    left, right = figure.subplots(1, 2, width_ratios=(1.0, 1.7), sharey=True)
+    rows = np.arange(len(values))
+    style.dress(left, x="standard deviation / prior", y="combination", grid="x")
+    left.barh(rows, np.sqrt(values), color=IDENTIFIED, alpha=0.7)
+    left.axvline(1.0, color=PRIOR, linestyle=(0, (3, 3)))
+    left.set_xscale("log")
+    left.set_yticks(rows, [f"{row + 1}" for row in rows])
+    style.title(left, "Remaining uncertainty", "dashed line: as uncertain as the prior")
+    _draw_weights(right, vectors.T)
+    right.set_xticks(range(len(names)), names, rotation=60, ha="right", fontsize=style.SMALL_SIZE)
+    style.title(right, "Combinations", "weight of each parameter")
+    return figure
+
+
+def _draw_weights(axes: Axes, weights: Array) -> None:
+    """Draw the weights [combinations, parameters] as a picture, large ones as numbers too."""
+    axes.imshow(np.abs(weights), aspect="auto", cmap="Blues", vmin=0, vmax=1, origin="lower")
+    for row, column in zip(*np.nonzero(np.abs(weights) > WRITTEN), strict=True):
+        weight = weights[row, column]
+        colour = colours.PAPER if abs(weight) > DARK else colours.INK
+        axes.text(column, row, f"{weight:+.1f}", ha="center", va="center", fontsize=7, color=colour)

@@ -1,6 +1,6 @@
 """HTML pages that are read on a phone, on a desk and on paper, in light and dark.
 
-A page needs no other file, no network and no script. `reporting.figures.svg` draws in its colours.
+A page needs no other file, no network and no script. `reporting.style.svg` draws in its colours.
 """
 
 import html
@@ -9,13 +9,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from cartpole_rl.drawing.colours import FAINT, INK, MUTED, PAPER
 from cartpole_rl.reporting import style
 
+LIGHTER = ("#4AA3DF", "#FF7B39", "#2FC79B", "#E39CC0", "#F2B430", "#A5DBF8", "#CF9256", "#F0F0F0")
 LIGHT = {
-    "ink": style.INK,
-    "muted": style.MUTED,
-    "faint": style.FAINT,
-    "paper": style.PAPER,
+    "ink": INK,
+    "muted": MUTED,
+    "faint": FAINT,
+    "paper": PAPER,
     "link": "#00588A",
     "alarm": "#A8420A",
     **{f"series-{index}": colour for index, colour in enumerate(style.SERIES)},
@@ -27,12 +29,7 @@ DARK = {  # the same hues, lighter
     "paper": "#16181C",
     "link": "#7CC4F5",
     "alarm": "#FF9B66",
-    **{
-        f"series-{index}": colour
-        for index, colour in enumerate(
-            ("#4AA3DF", "#FF7B39", "#2FC79B", "#E39CC0", "#F2B430", "#A5DBF8", "#CF9256", "#F0F0F0")
-        )
-    },
+    **{f"series-{index}": colour for index, colour in enumerate(LIGHTER)},
 }
 
 
@@ -51,7 +48,7 @@ table {{ border-collapse: collapse; }} th, td {{ text-align: left; padding: .25r
 th {{ color: var(--muted); font-weight: normal; border-bottom: 1px solid var(--muted); }}
 td {{ border-bottom: 1px solid var(--faint); vertical-align: top; }}
 .number {{ white-space: nowrap; }}
-img {{ max-width: 100%; background: {style.PAPER}; border-radius: 4px; }}
+img {{ max-width: 100%; background: {PAPER}; border-radius: 4px; }}
 code {{ background: var(--faint); padding: .1rem .3rem; overflow-wrap: anywhere; }}
 @media (max-width: 40rem) {{
   body {{ margin: 1rem auto; }}

@@ -12,7 +12,7 @@ from typing import Any, Protocol, get_args
 import numpy as np
 
 from cartpole_rl.reporting.statistics import Array, Estimate, estimate
-from cartpole_rl.reporting.table import MOST_DECIMALS, interval_text, number_text
+from cartpole_rl.reporting.texts import MOST_DECIMALS, interval_text, number_text
 from cartpole_rl.tasks.settings import Measure
 
 GOOD = {"score": 2000.0}  # measure: value above which the thesis calls an agent good (section 6)

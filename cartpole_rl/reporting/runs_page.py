@@ -7,8 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from cartpole_rl.reporting.figures import svg
-from cartpole_rl.reporting.figures.groups import Drawing, drawings
+from cartpole_rl.reporting.groups import Drawing, drawings
 from cartpole_rl.reporting.page import document, escaped, table
 from cartpole_rl.reporting.results import (
     GOOD,
@@ -23,6 +22,7 @@ from cartpole_rl.reporting.results import (
     value_text,
 )
 from cartpole_rl.reporting.statistics import difference, estimate, probability_of_improvement
+from cartpole_rl.reporting.style import svg
 
 MOST_LISTED = 1000  # runs in the list of a set
 MOST_ROWS = 24  # of a table that is shown unfolded

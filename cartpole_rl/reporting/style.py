@@ -1,40 +1,63 @@
-"""Colours, sizes and the style of all figures.
+"""The look of all figures: colours, sizes, axes, annotations; and figures as files, bytes or SVG for a page.
 
 The colours are those of `drawing/colours.py`. Figures are built with matplotlib's object API, so nothing here
-touches pyplot or global settings.
+touches pyplot or a global setting, and figures may be made in any thread.
 """
 
+import hashlib
+import html
+import io
+import re
+from pathlib import Path
+from typing import Any
+
+import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from cartpole_rl.drawing.colours import (  # noqa: F401 - figures read all of them as style.POLE, ...
+from cartpole_rl.drawing.colours import (
     BLACK,
     BLUE,
     BROWN,
-    CART,
     FAINT,
     GREEN,
     INK,
-    LIMIT,
-    MOTOR,
     MUTED,
     ORANGE,
     PAPER,
-    POLE,
     PURPLE,
     SKY,
-    UPRIGHT,
     VERMILLION,
 )
+from cartpole_rl.files import replacing
 
+# colours of unrelated series, in order of use
 SERIES = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY, BROWN, BLACK)
-"""Colours of unrelated series, in order of use."""
 
 WIDTH = 8.0  # inch, of every figure
 DPI = 150  # of saved pictures
 TITLE_SIZE = 13.0  # points
 LABEL_SIZE = 11.0
 SMALL_SIZE = 9.5
+LATE = 0.85  # share of a time axis; the text of a later time stands to its left
+CONTROLS = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f]")  # no text of an SVG
+PIXELS_PER_POINT = 1.35  # of a figure that has room; CSS's own is 1.33
+PAGE_COLOURS = {  # variable of the page's style sheet
+    INK: "currentColor",
+    MUTED: "var(--muted)",
+    FAINT: "var(--faint)",
+    PAPER: "var(--paper)",
+    **{colour: f"var(--series-{index})" for index, colour in enumerate(SERIES)},
+}
+Place = tuple[float, float]
+SHORTENED = (  # patterns in matplotlib's SVG, and their replacements
+    (r"<metadata>.*?</metadata>", ""),
+    (r"<defs>\s*<style.*?</style>\s*</defs>", ""),
+    (r' id="[a-zA-Z][\w.]*_\d+"', ""),  # of groups, which nothing refers to
+    (r"font-family: [^;]*; ", ""),
+    (r"font: (?:[a-z]+ )*([\d.]+)px [^;\"]*", r"font-size: \1px"),
+    (r"\s*\n\s*", "\n"),
+)
 
 
 def series_colour(index: int) -> str:
@@ -47,8 +70,8 @@ def new_figure(height: float, width: float = WIDTH) -> Figure:
     return Figure(figsize=(width, height), layout="constrained", facecolor=PAPER)
 
 
-def dress(axes: Axes, grid: str = "both") -> None:
-    """Style `axes`: two spines, and a faint grid ("both", "x", "y" or "none") behind the data."""
+def dress(axes: Axes, x: str | None = None, y: str | None = None, grid: str = "both") -> None:
+    """Style `axes`: labels, two spines, and a faint grid ("both", "x", "y" or "none") behind the data."""
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
     for side in ("left", "bottom"):
@@ -58,6 +81,7 @@ def dress(axes: Axes, grid: str = "both") -> None:
     axes.grid(False)
     if grid != "none":
         axes.grid(True, axis=grid, color=FAINT, linewidth=0.8)  # type: ignore[arg-type]
+    label(axes, x, y)
 
 
 def label(axes: Axes, x: str | None = None, y: str | None = None) -> None:
@@ -72,14 +96,74 @@ def title(axes: Axes, text: str, subtitle: str = "") -> None:
     """Write a title over `axes`, and `subtitle` below it, smaller and grey."""
     room = 1.9 * SMALL_SIZE if subtitle else 0.8 * SMALL_SIZE
     axes.set_title(text, loc="left", fontsize=TITLE_SIZE, color=INK, fontweight="bold", pad=room)
-    if subtitle:
-        axes.annotate(
-            subtitle,
-            in_layout=False,  # the pad above makes room for it
-            xy=(0, 1),
-            xycoords="axes fraction",
-            xytext=(0, 0.6 * SMALL_SIZE),
-            textcoords="offset points",
-            fontsize=SMALL_SIZE,
-            color=MUTED,
-        )
+    if subtitle:  # the pad above makes room for it
+        note(axes, subtitle, (0, 1), "axes fraction", (0, 0.6 * SMALL_SIZE), MUTED, in_layout=False)
+
+
+def note(
+    axes: Axes, text: str, place: Place, of: Any, offset: Place, colour: str = INK, **looks: Any
+) -> None:
+    """Write a small text `offset` points from a `place` in the coordinates that matplotlib calls `of`."""
+    given = {"textcoords": "offset points", "fontsize": SMALL_SIZE, "color": colour, **looks}
+    axes.annotate(text, xy=place, xycoords=of, xytext=offset, **given)
+
+
+def plain(text: str) -> str:
+    """Return a text that a figure shows as it is: between two $ matplotlib expects a formula."""
+    return CONTROLS.sub("", text).replace("$", r"\$")
+
+
+def beside(axes: Axes, height: float, text: str, colour: str) -> None:
+    """Write `text` outside the right edge of a panel, at `height` in data units."""
+    of = "axes fraction", "data"
+    note(axes, text, (1, height), of, (6, 0), colour, va="center", annotation_clip=False)
+
+
+def at_time(axes: Axes, time: float, text: str, colour: str) -> None:
+    """Draw a dashed vertical line at `time` in data units, with `text` on the side where it fits."""
+    axes.axvline(time, color=colour, linewidth=1.2, linestyle=(0, (4, 3)))
+    start, end = axes.get_xlim()
+    side = -1 if time > start + LATE * (end - start) else 1
+    aligned = "right" if side < 0 else "left"
+    note(axes, text, (time, 0.25), ("data", "axes fraction"), (6 * side, 0), colour, ha=aligned, va="center")
+
+
+def guide(axes: Axes, height: float, text: str, colour: str = MUTED) -> None:
+    """Draw a dotted horizontal line at `height` in data units, with `text` outside the right edge."""
+    axes.axhline(height, color=colour, linewidth=1.0, linestyle=(0, (3, 3)), zorder=1)
+    beside(axes, height, text, colour)
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write `figure` to `path` in the format of its suffix (.png, .pdf, .svg), and create its folder."""
+    with replacing(path) as part:
+        figure.savefig(part, format=path.suffix.removeprefix("."), dpi=DPI)
+
+
+def png(figure: Figure, dpi: float = DPI) -> bytes:
+    """Return `figure` as the bytes of a PNG file."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=dpi)
+    return buffer.getvalue()
+
+
+def svg(figure: Figure, alt: str, place: str = "") -> str:
+    """Return `figure` as an SVG element for a page, with the text `alt` for readers who cannot see it.
+
+    Figures of a page with the same `alt` need a `place` each, so that their ids differ.
+    Text stays text, the background is transparent, and the colours of `style` become the variables of the
+    page's style sheet (`reporting.page`), so that the figure follows light and dark.
+    """
+    buffer = io.StringIO()
+    salt = hashlib.sha256(f"{place}\n{alt}".encode()).hexdigest()  # of the ids
+    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": salt}):
+        figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
+    text = buffer.getvalue()
+    for pattern, replacement in SHORTENED:
+        text = re.sub(pattern, replacement, text, flags=re.S)
+    text = re.sub("#[0-9a-fA-F]{6}", lambda match: PAGE_COLOURS.get(match[0].upper(), match[0]), text)
+    opening, body = re.split("(?<=>)", text[text.index("<svg") :], maxsplit=1)
+    view = re.search(r'viewBox="0 0 ([\d.]+) [\d.]+"', opening)
+    assert view
+    size = f'style="max-width: {PIXELS_PER_POINT * float(view[1]):.0f}px"'
+    return f'<svg role="img" aria-label="{html.escape(alt)}" {size} {view[0]}>{body}'

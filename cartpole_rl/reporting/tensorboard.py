@@ -4,21 +4,28 @@ Pictures are stored as PNG or GIF: torch's `add_figure` uses pyplot, and its `ad
 moviepy 2. All events go into one file: TensorBoard may ignore additions to an older file of the same folder
 once it has read a newer one, and torch's `add_hparams` opens a second file.
 
+A resumed run writes some points a second time. TensorBoard has a marker for that, torch's `purge_step`, but
+only one of its three readers obeys it: the default reader replaces points only where new ones exist, and the
+one of `--load_fast=false` shows both (TensorBoard 2.21). So the later points are removed from the files. Such
+a file is a sequence of records: length u64 and its CRC u32, little-endian, the event, and its CRC u32.
+
 No hparams "experiment" is written: with one, TensorBoard's HPARAMS page shows only its settings; without, it
 collects the settings of all runs, those that differ first, and offers all curves as metrics.
 """
 
 import io
 import math
-from collections.abc import Mapping
+import struct
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 from PIL import Image
+from tensorboard.compat.proto.event_pb2 import Event
 from tensorboard.compat.proto.summary_pb2 import (
     DATA_CLASS_BLOB_SEQUENCE,
     DATA_CLASS_SCALAR,
@@ -27,14 +34,67 @@ from tensorboard.compat.proto.summary_pb2 import (
 )
 from torch.utils.tensorboard import FileWriter, summary
 
-from cartpole_rl.reporting.descriptions import description
-from cartpole_rl.reporting.events import FINAL, cut_back
-from cartpole_rl.reporting.figures import png
+from cartpole_rl.reporting.style import png
 
 BINS = 40
 PLUGINS = {DATA_CLASS_SCALAR: "scalars", DATA_CLASS_TENSOR: "histograms", DATA_CLASS_BLOB_SEQUENCE: "images"}
 FLUSH_SECONDS = 10  # largest age of what a running TensorBoard shows
 FIGURE_DPI = 110  # sharp on a page, and a third of the bytes of a saved figure
+
+HEADER = struct.Struct("<QI")
+FOOTER_BYTES = 4
+HPARAMS = "_hparams_/"  # prefix of the tags of TensorBoard's hparams plugin
+FINAL = "summary/"  # prefix of final metrics, one point each; TensorBoard shows them last
+OF_EPISODES = {
+    "score": "Score (6.2) of an episode: the sum over its periods.",
+    "score_upright": "Score (6.1) of an episode: the sum over its periods; only an upright pole scores.",
+    "steps": "Control periods of an episode. Fewer than the time limit: it ended early.",
+    "upright_fraction": "Share of an episode in which the pole is within 5 degrees of upright.",
+    "track_guard_fraction": "Share of the periods in which the track guard replaced the agent's motor value.",
+    "guarded_fraction": "Share of the periods in which the track guard replaced the agent's motor value.",
+    "time_to_upright_s": "Seconds until the pole stays upright for one second.",
+}
+GROUPS = {
+    "evaluation": "Mean over the episodes of an evaluation, without exploration, on nominal carts.",
+    "exploration": "Mean over the training episodes that ended since the last point, with random actions.",
+    "summary": "Mean over the episodes of the last evaluation.",
+}
+DESCRIPTIONS = {
+    "evaluation/score": "Mean score (6.2) of the greedy policy on nominal carts: judge a training by it.",
+    "evaluation/score_min": "Score (6.2) of the worst episode of an evaluation.",
+    "evaluation/score_max": "Score (6.2) of the best episode of an evaluation.",
+    "evaluation/seconds": "Seconds of training until this evaluation.",
+    "exploration/episode_length": "Mean control periods of the episodes that ended since the last point.",
+    "learning/loss": "Mean loss of the updates of an iteration.",
+    "learning/gradient_norm": "Mean norm of the loss's gradient, before it is clipped.",
+    "learning/learning_rate": "Learning rate of the optimizer.",
+    "learning/q_mean": "Mean predicted return of the chosen actions: it should settle, not grow without end.",
+    "learning/q_max": "Largest predicted return of the chosen actions.",
+    "learning/epsilon": "Share of random actions in training.",
+    "learning/updates": "Gradient steps so far.",
+    "speed/transitions_per_second": "Transitions a second, collecting, learning and evaluating included.",
+    "pictures/behaviour": "Position, angle and motor value of the first episode of an evaluation.",
+    "pictures/cart": "Animation of the first episode of an evaluation, in real time.",
+    "cart/score_before": "Score (6.2) of each episode on the cart before fine-tuning, without exploration.",
+    "cart/score_tune": "Score (6.2) of each episode that fine-tuning learns from, with random actions.",
+    "cart/score_after": "Score (6.2) of each episode on the cart after fine-tuning, without exploration.",
+    "cart/score_in_simulation": "Score (6.2) of the agent on simulated carts like this one.",
+    "link/frames_received": "Frames from the cart so far.",
+    "link/bad_frames": "Damaged frames so far.",
+    "link/lost_frames": "States that never arrived, so far.",
+    "link/overtaken_frames": "States that arrived after a newer one, so far.",
+    "link/repeated_frames": "States that arrived twice, so far.",
+    "link/late_ticks": "States that were answered too late or not at all, so far; 0 is good.",
+    "link/latency_samples": "Answers whose latency was measured.",
+    "link/latency_median_ms": "Median time from a state's arrival to the end of its command, ms.",
+    "link/latency_p99_ms": "99th percentile of that time, ms.",
+    "link/latency_p999_ms": "99.9th percentile of that time, ms.",
+    "link/latency_max_ms": "Longest such time, ms.",
+}
+PREFIXES = {
+    "randomization/": "Distribution of this parameter over the simulated carts, in SI units.",
+    "cart/guarded_": "Share of the periods of an episode in which the track guard replaced the motor value.",
+}
 
 
 class TensorBoardLog:
@@ -149,3 +209,58 @@ def _plain(value: Any) -> float | str:
     if isinstance(value, int | float) and math.isfinite(value):
         return value
     return str(value)
+
+
+def description(tag: str) -> str:
+    """Return the description of a curve, a histogram or a picture; empty for an unknown one."""
+    if tag in DESCRIPTIONS:
+        return DESCRIPTIONS[tag]
+    group, _, name = tag.partition("/")
+    if group in GROUPS and name in OF_EPISODES:
+        return f"{OF_EPISODES[name]} {GROUPS[group]}"
+    return next((text for prefix, text in PREFIXES.items() if tag.startswith(prefix)), "")
+
+
+def cut_back(folder: Path, first_step: int) -> None:
+    """Remove points at `first_step` and later, and the final results, from the event files in `folder`.
+
+    The final results are the line on the HPARAMS page and the final metrics; a resumed run writes them again.
+    Other records stay, except a last one that a killed run left incomplete. Files are replaced atomically.
+    """
+    for path in sorted(folder.glob("events.out.tfevents.*")):
+        copy = path.with_name(f"{path.name.replace('tfevents', 'rest')}.part")
+        with path.open("rb") as source, copy.open("wb") as target:
+            for record, event in _records(source):
+                if _is_kept(event, first_step):
+                    target.write(record)
+        copy.replace(path)
+
+
+def scalars(folder: Path, tag: str) -> list[tuple[int, float]]:
+    """Return the points (step, value) of the curve `tag` in the event files in `folder`."""
+    points = []
+    for path in sorted(folder.glob("events.out.tfevents.*")):
+        with path.open("rb") as source:
+            for _, event in _records(source):
+                points += [
+                    (event.step, value.simple_value) for value in event.summary.value if value.tag == tag
+                ]
+    return points
+
+
+def _records(source: BinaryIO) -> Iterator[tuple[bytes, Event]]:
+    """Yield each complete record with its event."""
+    while len(header := source.read(HEADER.size)) == HEADER.size:
+        length, _ = HEADER.unpack(header)
+        body = source.read(length)
+        footer = source.read(FOOTER_BYTES)
+        if len(body) < length or len(footer) < FOOTER_BYTES:
+            return
+        yield header + body + footer, Event.FromString(body)
+
+
+def _is_kept(event: Event, first_step: int) -> bool:
+    """Return True for an event before `first_step` that is not a final result."""
+    tags = [value.tag for value in event.summary.value]
+    is_final = any(tag.startswith((HPARAMS, FINAL)) for tag in tags)
+    return event.step < first_step and not is_final

@@ -17,7 +17,7 @@ from cartpole_rl.plants.settings import EmulatedSettings, SimulatedSettings
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.reporting.live_view import LiveView, view_title
-from cartpole_rl.reporting.words import guard_text
+from cartpole_rl.reporting.texts import guard_text
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.tasks.settings import Measure
 from cartpole_rl.terminal import confirm, print_message, progress_bar

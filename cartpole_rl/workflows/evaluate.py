@@ -10,7 +10,7 @@ from cartpole_rl.evaluation.metrics import same_as_host
 from cartpole_rl.plants.serial.plant import SerialPlant
 from cartpole_rl.plants.settings import EmulatedSettings, SerialSettings
 from cartpole_rl.reporting.scores import score_columns, score_table
-from cartpole_rl.reporting.words import count_text, cut_off
+from cartpole_rl.reporting.texts import count_text, cut_off
 from cartpole_rl.rig.parameters import PARAMETERS
 from cartpole_rl.run_folder import BESIDE_SIMULATION, FIGURES, METRICS, write_config
 from cartpole_rl.tasks.episode import Episode

@@ -38,7 +38,7 @@ from cartpole_rl.plants.settings import EmulatedSettings
 from cartpole_rl.reporting.live_view import LiveView, view_title
 from cartpole_rl.reporting.scores import SCORES, score_table
 from cartpole_rl.reporting.tensorboard import TensorBoardLog
-from cartpole_rl.reporting.words import count_text, cut_off
+from cartpole_rl.reporting.texts import count_text, cut_off
 from cartpole_rl.run_folder import (
     AGENT_HASH,
     CHECKPOINTS,

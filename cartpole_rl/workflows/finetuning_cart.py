@@ -19,7 +19,7 @@ from cartpole_rl.learning.checkpoints import FINETUNING_FORMAT, TrainingCheckpoi
 from cartpole_rl.plants.serial.statistics import LinkStatistics
 from cartpole_rl.plants.settings import SerialSettings
 from cartpole_rl.reporting.tensorboard import TensorBoardLog
-from cartpole_rl.reporting.words import ending_text, guard_text
+from cartpole_rl.reporting.texts import ending_text, guard_text
 from cartpole_rl.run_folder import CHECKPOINTS, RECORDINGS, START
 from cartpole_rl.scheduling import giving_precedence
 from cartpole_rl.tasks.endings import Ending

@@ -22,14 +22,14 @@ from cartpole_rl.identification.one_step import one_step_estimates
 from cartpole_rl.identification.quantities import intervals
 from cartpole_rl.physics.models import Models
 from cartpole_rl.plants.serial.plant import SerialPlant, cart_plant
-from cartpole_rl.reporting.figures import save
 from cartpole_rl.reporting.identification import (
     error_text,
     identification_figures,
     identification_page,
     quantities_table,
 )
-from cartpole_rl.reporting.table import table
+from cartpole_rl.reporting.style import save
+from cartpole_rl.reporting.texts import table
 from cartpole_rl.run_folder import (
     CART,
     FIGURES,

@@ -21,10 +21,16 @@ from cartpole_rl.plants.learned_model import LearnedModel, save_model
 from cartpole_rl.plants.model_file import MODEL
 from cartpole_rl.plants.settings import LearnedSettings
 from cartpole_rl.randomization.poles import Pole
-from cartpole_rl.reporting.error_tables import REPORTED_TIMES, model_table, spread_table
-from cartpole_rl.reporting.figures import save
-from cartpole_rl.reporting.figures.learned_models import ensemble_figure
-from cartpole_rl.reporting.words import LEARNED, PHYSICS, count_text
+from cartpole_rl.reporting.predictions import (
+    LEARNED,
+    PHYSICS,
+    REPORTED_TIMES,
+    ensemble_figure,
+    model_table,
+    spread_table,
+)
+from cartpole_rl.reporting.style import save
+from cartpole_rl.reporting.texts import count_text
 from cartpole_rl.run_folder import FIGURES, MODELLED, write_config, write_json
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.terminal import as_word, progress_bar

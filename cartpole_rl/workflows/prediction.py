@@ -5,8 +5,7 @@ from pathlib import Path
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.evaluation.episodes import Policy, run_batch
 from cartpole_rl.plants.simulated import SimulatedPlant
-from cartpole_rl.reporting.animation import write_animation
-from cartpole_rl.reporting.side_by_side import side_by_side
+from cartpole_rl.reporting.animation import side_by_side, write_animation
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.episodes import Evaluation
 

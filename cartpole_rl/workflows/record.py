@@ -13,7 +13,7 @@ from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
 from cartpole_rl.evaluation.recordings import LENGTH, write_recording
 from cartpole_rl.plants.settings import SerialSettings
 from cartpole_rl.randomization.poles import PoleSettings
-from cartpole_rl.reporting.words import count_text, guard_text
+from cartpole_rl.reporting.texts import count_text, guard_text
 from cartpole_rl.run_folder import RECORDINGS, write_config
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.terminal import as_word

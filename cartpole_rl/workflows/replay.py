@@ -11,10 +11,9 @@ from cartpole_rl.identification.prediction import all_errors, errors_at, replay
 from cartpole_rl.identification.rollout import Dynamics
 from cartpole_rl.identification.windows import recorded_period
 from cartpole_rl.randomization.poles import Pole
-from cartpole_rl.reporting.error_tables import REPORTED_TIMES, replay_table
-from cartpole_rl.reporting.figures import save
-from cartpole_rl.reporting.figures.replays import replay_figure
-from cartpole_rl.reporting.words import count_text
+from cartpole_rl.reporting.predictions import REPORTED_TIMES, replay_figure, replay_table
+from cartpole_rl.reporting.style import save
+from cartpole_rl.reporting.texts import count_text
 from cartpole_rl.rig.parameters import check_names, check_values
 from cartpole_rl.run_folder import FIGURES, write_config, write_json
 from cartpole_rl.terminal import as_word

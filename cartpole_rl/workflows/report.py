@@ -7,7 +7,9 @@ from typing import Any
 from cartpole_rl.evaluation.metrics import episode_metrics, summarize
 from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.reporting.animation import durations, frames, write_animation
-from cartpole_rl.reporting.figures import behaviour, learning_curve, save
+from cartpole_rl.reporting.episodes import behaviour
+from cartpole_rl.reporting.scores import learning_curve
+from cartpole_rl.reporting.style import save
 from cartpole_rl.run_folder import ANIMATION, FIGURES, METRICS, write_json
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.tasks.settings import TaskSettings

@@ -49,7 +49,7 @@ from cartpole_rl.learning.states import seed_everything
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.randomization.ranges import Range
-from cartpole_rl.reporting.table import Cell
+from cartpole_rl.reporting.texts import Cell
 from cartpole_rl.rig.parameters import PARAMETERS
 from cartpole_rl.settings import evaluation_seed
 from cartpole_rl.tasks.episode import Episode

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from cartpole_rl.reporting.table import Cell, table
+from cartpole_rl.reporting.texts import Cell, table
 from cartpole_rl.workflows.build import use_threads
 
 RUNS = Path("runs/bench")  # the parent of every run folder that a bench script makes

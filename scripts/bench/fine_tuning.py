@@ -38,7 +38,7 @@ from truth_references import Draw, known_references, note_missing
 from truths import TUNED, Truth
 
 from cartpole_rl.errors import CartPoleError
-from cartpole_rl.reporting.table import Cell
+from cartpole_rl.reporting.texts import Cell
 from cartpole_rl.run_folder import CHECKPOINTS, RESUME
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode

@@ -42,7 +42,7 @@ from cartpole_rl.errors import CartPoleError, FrameError
 from cartpole_rl.evaluation.episodes import run_episodes
 from cartpole_rl.plants.emulated import EmulatedCart
 from cartpole_rl.plants.serial.plant import SerialPlant
-from cartpole_rl.reporting.table import Cell
+from cartpole_rl.reporting.texts import Cell
 from cartpole_rl.wire import FrameSplitter, Home, Start, State, decode_frame
 from cartpole_rl.workflows.agents import TrainedAgent, trained_agent
 from cartpole_rl.workflows.build import evaluated_env, evaluated_settings

@@ -43,7 +43,7 @@ from cartpole_rl.evaluation.driving_policy import DrivingPolicy
 from cartpole_rl.learning.agent import QAgent
 from cartpole_rl.learning.dqn import COLLECTED, LEARNED, Training, n_step_transitions
 from cartpole_rl.learning.settings import BufferSettings, LearningSettings, OptimizerSettings
-from cartpole_rl.reporting.table import table
+from cartpole_rl.reporting.texts import table
 
 CHUNK, EPSILON, BATCH = 8, 0.1, 512
 Pair = dict[str, Step]  # TorchRL's part first

@@ -47,7 +47,7 @@ from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.errors import PlantError
 from cartpole_rl.evaluation.episodes import Policy, run_episodes
-from cartpole_rl.reporting.table import Cell
+from cartpole_rl.reporting.texts import Cell
 from cartpole_rl.workflows.agents import TrainedAgent, trained_agent
 from cartpole_rl.workflows.build import evaluated_env, evaluated_settings
 from cartpole_rl.workflows.config import EvaluateConfig

@@ -35,7 +35,7 @@ from cartpole_rl.envs.settings import ObservationSettings
 from cartpole_rl.errors import PlantError
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.plants.serial.plant import emulated_plant
-from cartpole_rl.reporting.table import table
+from cartpole_rl.reporting.texts import table
 from cartpole_rl.tasks.settings import ActionSettings, RewardSettings, TaskSettings
 
 EPISODES_PER_CART = 4  # fewer if the cart fails for good

@@ -11,9 +11,8 @@ from numpy.typing import ArrayLike
 from results import SMALLEST, StudyResults
 from scipy import stats
 
-from cartpole_rl.reporting import style
-from cartpole_rl.reporting.figures import groups
-from cartpole_rl.reporting.figures.groups import (
+from cartpole_rl.reporting import groups, style
+from cartpole_rl.reporting.groups import (
     DASHES,
     DOT,
     FEWEST_PROFILED,
@@ -31,7 +30,7 @@ from cartpole_rl.reporting.results import (
     sentence_start,
 )
 from cartpole_rl.reporting.statistics import Array, Estimate, bootstrap, estimate
-from cartpole_rl.reporting.table import number_text
+from cartpole_rl.reporting.texts import number_text
 
 CHARACTER = 0.022  # of the width of a panel, in the label of a tick
 FEWEST_RANKED = 4  # agents from which a rank correlation has an interval

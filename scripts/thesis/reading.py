@@ -18,8 +18,8 @@ from study import RUN, RUNS, SEED, STUDIES, Evaluation, Study, Variant, read_stu
 
 from cartpole_rl.choices import conf_folder
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.reporting.events import scalars
 from cartpole_rl.reporting.results import EVALUATIONS, OWN, Agent, Curve, Exclusion
+from cartpole_rl.reporting.tensorboard import scalars
 from cartpole_rl.run_folder import CONFIG
 from cartpole_rl.workflows.pages.runs import (
     FREE,

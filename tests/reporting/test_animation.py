@@ -10,10 +10,19 @@ import numpy as np
 import pytest
 from PIL import Image, ImageChops, ImageColor
 
+from cartpole_rl.drawing import colours
 from cartpole_rl.drawing.cart import CART_WIDTH, PIVOT_HEIGHT, SIZE
-from cartpole_rl.reporting import style
-from cartpole_rl.reporting.animation import LAST_FRAME, durations, frames, gif, rows, smaller, write_animation
-from cartpole_rl.reporting.side_by_side import nearest_rows, side_by_side
+from cartpole_rl.reporting.animation import (
+    LAST_FRAME,
+    durations,
+    frames,
+    gif,
+    nearest_rows,
+    rows,
+    side_by_side,
+    smaller,
+    write_animation,
+)
 from cartpole_rl.tasks.episode import Episode
 
 POLE, TRACK = 0.3365, 0.407  # m
@@ -44,50 +53,36 @@ def part(episode: Episode, start: int, steps: int, **other: object) -> Episode:
     return Episode(**{**values, "ended_by": episode.ended_by, **other})  # type: ignore[arg-type]
 
 
-@pytest.fixture(scope="module")
-def animation(swing_up: Episode) -> bytes:
-    return gif(swing_up, POLE, TRACK, "Swing-up")
+def first(episode: Episode, title: str = "") -> Image.Image:
+    """The first picture of an episode."""
+    return next(iter(frames(episode, POLE, TRACK, title)))
 
 
-def test_ten_seconds_are_251_frames_of_real_time_and_a_rest(animation: bytes) -> None:
-    waits = [wait for _, wait in shown(animation)]
-    assert len(waits) == 251
-    assert waits[:-1] == [40] * 250
-    assert waits[-1] == LAST_FRAME
-
-
-def test_it_is_small_loops_endlessly_and_has_the_stated_size(animation: bytes) -> None:
+def test_ten_seconds_are_251_frames_of_real_time_and_a_rest(swing_up: Episode) -> None:
+    animation = gif(swing_up, POLE, TRACK, "Swing-up")
     assert len(animation) < 1_500_000
     with Image.open(io.BytesIO(animation)) as picture:
         assert picture.size == SIZE == (480, 320)
         assert picture.info["loop"] == 0
-
-
-def test_every_frame_differs_from_the_one_before(animation: bytes) -> None:
-    pictures = [picture for picture, _ in shown(animation)]
-    assert all(ImageChops.difference(one, next_one).getbbox() for one, next_one in pairwise(pictures))
-
-
-def test_the_file_holds_what_frames_draws(swing_up: Episode, animation: bytes) -> None:
-    expected = list(frames(swing_up, POLE, TRACK, "Swing-up"))
-    for index, (picture, _) in enumerate(shown(animation)):
+    pictures, waits = zip(*shown(animation), strict=True)
+    assert waits == (*[40] * 250, LAST_FRAME)
+    assert all(ImageChops.difference(one, after).getbbox() for one, after in pairwise(pictures))
+    for index, expected in enumerate(frames(swing_up, POLE, TRACK, "Swing-up")):
         if index % 50 == 0:
-            assert ImageChops.difference(picture, expected[index].convert("RGB")).getbbox() is None
+            assert ImageChops.difference(pictures[index], expected.convert("RGB")).getbbox() is None
 
 
 @pytest.mark.parametrize("row", [0, 40, 90, 300])
 def test_cart_and_pole_are_to_scale(swing_up: Episode, row: int) -> None:
     still = part(swing_up, row, 1, motor=np.zeros(1, dtype=np.int64))
-    picture = next(iter(frames(still, POLE, TRACK)))
-    stops = places(picture, style.LIMIT)
-    scale = (np.ptp(stops[:, 0]) - 2 * 5 - CART_WIDTH) / (
-        2 * TRACK
-    )  # pixels a metre, from the expected stops
-    cart = places(picture, style.CART)
+    picture = first(still)
+    stops = places(picture, colours.LIMIT)
+    scale = (np.ptp(stops[:, 0]) - 2 * 5 - CART_WIDTH) / (2 * TRACK)  # pixels a metre
+    cart = places(picture, colours.CART)
     cart = cart[np.abs(cart[:, 1] - PIVOT_HEIGHT) < 9]
     middle = (cart[:, 0].min() + cart[:, 0].max()) / 2
     assert middle == pytest.approx(SIZE[0] / 2 + swing_up.x[row] * scale, abs=2)
-    pole = np.concatenate([places(picture, colour) for colour in (style.POLE, style.UPRIGHT)])
+    pole = np.concatenate([places(picture, colour) for colour in (colours.POLE, colours.UPRIGHT)])
     pole = pole[pole[:, 1] < 292]  # above the bar
     reach = np.hypot(pole[:, 0] - middle, pole[:, 1] - PIVOT_HEIGHT)
     tip = pole[reach.argmax()]
@@ -96,34 +91,26 @@ def test_cart_and_pole_are_to_scale(swing_up: Episode, row: int) -> None:
     assert np.cos(direction - swing_up.theta[row]) > np.cos(0.06)
 
 
-@pytest.mark.parametrize(("motor", "side"), [(250, 1), (-250, -1), (100, 1)])
-def test_the_arrow_points_where_the_motor_pushes(balance: Episode, motor: int, side: int) -> None:
-    still = part(balance, 0, 1, motor=np.array([motor]))
-    arrow = places(next(iter(frames(still, POLE, TRACK))), style.MOTOR)
-    arrow = arrow[arrow[:, 1] < 200]  # without the legend
-    assert np.all(np.sign(arrow[:, 0] - SIZE[0] / 2) == side)
-
-
-def test_a_longer_arrow_is_a_stronger_push(balance: Episode) -> None:
-    widths = []
-    for motor in (100, 250):
-        arrow = places(
-            next(iter(frames(part(balance, 0, 1, motor=np.array([motor])), POLE, TRACK))), style.MOTOR
-        )
-        widths.append(np.ptp(arrow[arrow[:, 1] < 200][:, 0]))
-    assert widths[1] - widths[0] == pytest.approx(150 / 255 * 70, abs=2)
+def test_the_arrow_points_where_the_motor_pushes_and_is_longer_for_a_stronger_push(balance: Episode) -> None:
+    widths = {}
+    for motor in (250, -250, 100):
+        arrow = places(first(part(balance, 0, 1, motor=np.array([motor]))), colours.MOTOR)
+        arrow = arrow[arrow[:, 1] < 200]  # without the legend
+        assert np.all(np.sign(arrow[:, 0] - SIZE[0] / 2) == np.sign(motor))
+        widths[motor] = np.ptp(arrow[:, 0])
+    assert widths[250] - widths[100] == pytest.approx(150 / 255 * 70, abs=2)
 
 
 def test_the_pole_turns_green_when_it_is_upright(swing_up: Episode) -> None:
-    fallen, upright = (next(iter(frames(part(swing_up, row, 1), POLE, TRACK))) for row in (0, 400))
-    assert len(places(upright, style.UPRIGHT)) > 300
-    assert len(places(fallen, style.UPRIGHT)) == 0
-    assert len(places(fallen, style.POLE)) > 300
+    fallen, upright = (first(part(swing_up, row, 1)) for row in (0, 400))
+    assert len(places(upright, colours.UPRIGHT)) > 300
+    assert len(places(fallen, colours.UPRIGHT)) == 0
+    assert len(places(fallen, colours.POLE)) > 300
 
 
 def test_a_large_pole_fits_too(swing_up: Episode) -> None:
     picture = list(frames(part(swing_up, 0, 60), 0.6413, TRACK))[-1]
-    pole = places(picture, style.POLE)
+    pole = places(picture, colours.POLE)
     assert pole[:, 1].min() > 40
 
 
@@ -144,14 +131,14 @@ def test_the_last_row_is_always_drawn(swing_up: Episode) -> None:
 def test_leaving_the_track_is_shown(runaway: Episode) -> None:
     *_, before, last = frames(part(runaway, runaway.steps - 4, 4), POLE, TRACK)
     header = (0, 36, 300, 56)
-    assert len(places(last.crop(header), style.LIMIT)) > 50
-    assert len(places(before.crop(header), style.LIMIT)) == 0
+    assert len(places(last.crop(header), colours.LIMIT)) > 50
+    assert len(places(before.crop(header), colours.LIMIT)) == 0
 
 
 def test_a_title_never_runs_into_the_numbers(balance: Episode) -> None:
     short = part(balance, 0, 1)
     words = "A title that somebody wrote without a thought for the width of pictures"
-    plain, titled = (next(iter(frames(short, POLE, TRACK, text))) for text in ("", words))
+    plain, titled = (first(short, text) for text in ("", words))
     left, _, right, _ = ImageChops.difference(plain.convert("RGB"), titled.convert("RGB")).getbbox()
     assert left >= 18
     assert right <= 295
@@ -161,12 +148,6 @@ def written(episode: Episode, path: Path, mp4: bool = False) -> Path:
     """Write the animation of an episode."""
     write_animation(path, [*frames(episode, POLE, TRACK)], durations(episode), mp4)
     return path
-
-
-def test_writing_makes_folders(tmp_path, balance: Episode) -> None:
-    path = written(part(balance, 0, 10), tmp_path / "figures" / "episode.gif")
-    assert path.read_bytes().startswith(b"GIF89a")
-    assert list(path.parent.iterdir()) == [path]
 
 
 def test_the_mp4_shows_the_same_pictures_for_as_long(tmp_path, swing_up: Episode) -> None:
@@ -183,7 +164,8 @@ def test_the_mp4_shows_the_same_pictures_for_as_long(tmp_path, swing_up: Episode
 
 
 def test_a_smaller_animation_takes_as_long(tmp_path, balance: Episode) -> None:
-    path = written(part(balance, 0, 41), tmp_path / "episode.gif")
+    path = written(part(balance, 0, 41), tmp_path / "figures/episode.gif")
+    assert [*path.parent.iterdir()] == [path]
     whole, small = [*shown(path.read_bytes())], [*shown(smaller(path, 160, 4))]
     assert small[0][0].size == (160, 107)
     assert len(small) == -(-len(whole) // 4)

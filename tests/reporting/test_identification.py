@@ -1,18 +1,39 @@
-"""The page and the table of an identification show what they were given."""
+"""The page, the tables and the figures of an identification show what they were given."""
 
 import dataclasses
 
 import numpy as np
+import pytest
 import torch
+from figure_contents import line_of, words
 
 from cartpole_rl.identification.fit import Fit
 from cartpole_rl.identification.identify import Candidate, Identification, PredictionError
+from cartpole_rl.identification.prediction import Replayed
 from cartpole_rl.identification.quantities import Quantity
 from cartpole_rl.identification.rollout import Dynamics
+from cartpole_rl.physics.actuator import ACTUATORS
 from cartpole_rl.physics.friction import CART_FRICTIONS
 from cartpole_rl.physics.laws import Law
 from cartpole_rl.physics.models import Models
-from cartpole_rl.reporting.identification import CAPTIONS, identification_page, quantities_table
+from cartpole_rl.physics.parameters import CartParameters
+from cartpole_rl.randomization.poles import PoleSettings
+from cartpole_rl.reporting.identification import (
+    CAPTIONS,
+    FARTHEST,
+    IDENTIFIED,
+    PRIOR,
+    SIMULATED,
+    Curve,
+    experiments_figure,
+    force_curve,
+    friction_and_force_figure,
+    friction_curve,
+    identification_page,
+    interval_figure,
+    quantities_table,
+    spectrum_figure,
+)
 from cartpole_rl.tasks.episode import Episode
 
 QUANTITIES = [
@@ -57,3 +78,89 @@ def test_the_page_shows_all_results(swing_up: Episode) -> None:
 def test_without_warnings_it_says_so() -> None:
     text = identification_page(found([]), QUANTITIES, {}, "train")
     assert "<h2>Warnings</h2>\n<ul><li>None.</li></ul>" in text
+
+
+NAMES = CartParameters.names()
+
+
+@pytest.fixture(scope="module")
+def prior(ip02: dict[str, float], medium: PoleSettings) -> dict[str, float]:
+    return {**ip02, **medium.nominal.model_dump(), "cart_coulomb_asymmetry": 0.0}
+
+
+def samples(prior: dict[str, float], **changes: tuple[float, ...]) -> np.ndarray:
+    """Carts [P, N] that differ in `changes` alone."""
+    count = len(next(iter(changes.values())))
+    return np.array([changes.get(name, (prior[name],) * count) for name in NAMES])
+
+
+def test_friction_over_velocity(prior: dict[str, float]) -> None:
+    identified = {**prior, "cart_coulomb": 0.4, "cart_viscous": 2.0}
+    carts = samples(prior, cart_viscous=(1.0, 3.0))
+    curve = friction_curve(identified, carts, prior, CART_FRICTIONS.find("step"))
+    fast = int(np.abs(curve.at - 0.5).argmin())
+    assert curve.identified[fast] == pytest.approx(0.4 + 2.0 * 0.5)
+    assert curve.identified[-1] == pytest.approx(-curve.identified[0])
+    assert np.diff(curve.samples[fast]) == pytest.approx(2.0 * 0.5)
+    assert curve.prior[fast] == pytest.approx(prior["cart_coulomb"] + prior["cart_viscous"] * 0.5)
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_force_over_motor_value(prior: dict[str, float], sign: int) -> None:
+    symmetric = {**prior, "force_asymmetry": 0.0}
+    identified = {**symmetric, "force_linear": 0.03}
+    carts = samples(symmetric, force_linear=(0.03,))
+    curve = force_curve(identified, carts, symmetric, ACTUATORS.find("force_curve"))
+    (at,) = np.flatnonzero(curve.at == sign * 200)
+    more = sign * 200 * (0.03 - prior["force_linear"])
+    assert curve.identified[at] - curve.prior[at] == pytest.approx(more)
+    assert curve.samples[at, 0] == pytest.approx(curve.identified[at])
+
+
+def test_curves_are_drawn_with_their_band() -> None:
+    at = np.linspace(-1, 1, 5)
+    curve = Curve(at, 2 * at, 2 * at[:, None] + np.linspace(-1, 1, 201), 3 * at)
+    left, right = friction_and_force_figure(curve, curve).axes
+    np.testing.assert_allclose(line_of(left, IDENTIFIED)[:, 1], 2 * at)
+    np.testing.assert_allclose(line_of(left, PRIOR)[:, 1], 3 * at)
+    heights = left.collections[0].get_paths()[0].vertices[:, 1]
+    assert (heights.min(), heights.max()) == pytest.approx((-2.95, 2.95))
+    assert left.get_xlabel() == "cart velocity (m/s)"
+    assert right.get_ylabel() == "force on the cart (N)"
+
+
+def test_priors_stand_in_half_widths_and_far_ones_become_arrows() -> None:
+    figure = interval_figure(
+        [
+            Quantity("near", "a near prior", "ms", 12.0, 11.0, 13.0, 15.0),
+            Quantity("far", "a far prior", "N", 1.0, 0.9, 1.1, 9.0),
+        ]
+    )
+    (axes,) = figure.axes
+    priors = {
+        line.get_ydata()[0]: (line.get_xdata()[0], line.get_marker())
+        for line in axes.lines
+        if line.get_color() == PRIOR
+    }
+    assert priors[1] == (pytest.approx(3.0), "D")
+    assert priors[0] == (FARTHEST, ">")
+    assert "12.0 ± 1.0 ms   (prior 15.0)" in words(figure)
+
+
+def test_experiments_are_drawn_with_their_simulation(replay: Replayed) -> None:
+    figure = experiments_figure({"swing": replay, "coast": replay})
+    position, angle = figure.axes[:2]
+    simulated = [line for line in position.lines if line.get_color() == SIMULATED]
+    assert len(simulated) == len(replay.x)
+    np.testing.assert_allclose(simulated[0].get_ydata(), 100 * replay.x[0])
+    assert len(simulated[-1].get_ydata()) == 30  # the rest is not known
+    assert position.get_title(loc="left") == "swing"
+    assert angle.get_ylabel() == "from hanging (deg)"
+
+
+def test_the_spectrum_is_that_of_the_covariance() -> None:
+    figure = spectrum_figure(np.diag([0.25, 0.01]), ["latency", "cart_mass"])
+    bars, weights = figure.axes
+    assert [bar.get_width() for bar in bars.patches] == pytest.approx([0.1, 0.5])
+    np.testing.assert_allclose(weights.images[0].get_array(), [[0, 1], [1, 0]])
+    assert [label.get_text() for label in weights.get_xticklabels()] == ["latency", "cart_mass"]

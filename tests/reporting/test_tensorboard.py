@@ -11,9 +11,8 @@ from tensorboard.backend.event_processing.event_multiplexer import EventMultiple
 from tensorboard.plugins.hparams import metadata
 
 from cartpole_rl.reporting.animation import gif
-from cartpole_rl.reporting.events import scalars
-from cartpole_rl.reporting.figures import behaviour
-from cartpole_rl.reporting.tensorboard import TensorBoardLog, flatten
+from cartpole_rl.reporting.episodes import behaviour
+from cartpole_rl.reporting.tensorboard import TensorBoardLog, flatten, scalars
 from cartpole_rl.tasks.episode import Episode
 
 

@@ -9,7 +9,7 @@ from PIL import Image
 from cartpole_rl.reporting.animation import smaller
 from cartpole_rl.reporting.results import Agent, Results, low_is_good, measure_label
 from cartpole_rl.reporting.runs_page import Picture
-from cartpole_rl.reporting.table import number_text
+from cartpole_rl.reporting.texts import number_text
 from cartpole_rl.run_folder import ANIMATION, FIGURES
 from cartpole_rl.workflows.pages.runs import short
 

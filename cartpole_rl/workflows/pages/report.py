@@ -4,10 +4,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from cartpole_rl.files import write_text
-from cartpole_rl.reporting.figures import save
-from cartpole_rl.reporting.figures.groups import Drawing, drawings
+from cartpole_rl.reporting.groups import Drawing, drawings
 from cartpole_rl.reporting.results import Results, counted_text
 from cartpole_rl.reporting.runs_page import Picture, runs_page
+from cartpole_rl.reporting.style import save
 from cartpole_rl.run_folder import FIGURES, PAGE, write_config
 from cartpole_rl.terminal import print_message
 from cartpole_rl.workflows.config import ReportConfig

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.reporting.figures.groups import LONGEST_LABEL
 from cartpole_rl.reporting.grouping import NULL, Columns, fewest, labels, setting_columns
+from cartpole_rl.reporting.groups import LONGEST_LABEL
 from cartpole_rl.reporting.results import OWN, Agent, Curve, Exclusion, Group, Results
 from cartpole_rl.reporting.scores import SCORES
 from cartpole_rl.reporting.statistics import interquartile_mean

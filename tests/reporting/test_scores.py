@@ -1,14 +1,17 @@
-"""Learning curves show every run and the median of those with one label."""
+"""Learning curves show every run and the median of those with one label; comparisons show all episodes."""
+
+import math
 
 import numpy as np
 import pytest
 from figure_contents import line_of, words
 
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.reporting import style
-from cartpole_rl.reporting.figures import (
-    learning_curve,
-)
+from cartpole_rl.intervals import student_interval
+from cartpole_rl.reporting.scores import comparison, learning_curve
+from cartpole_rl.reporting.style import series_colour
+
+RESULTS = {"simulated": [4000.0, 4100.0, 4200.0], "emulated": [3000.0, 3200.0]}
 
 
 def records(scores: list[float], transitions_apart: int = 100_000) -> list[dict]:
@@ -27,7 +30,7 @@ def records(scores: list[float], transitions_apart: int = 100_000) -> list[dict]
 
 def test_one_run_is_a_line_over_millions_of_transitions_in_its_band() -> None:
     axes = learning_curve([("medium", records([100, 900, 4100]))]).axes[0]
-    np.testing.assert_allclose(line_of(axes, style.series_colour(0)), [[0.1, 100], [0.2, 900], [0.3, 4100]])
+    np.testing.assert_allclose(line_of(axes, series_colour(0)), [[0.1, 100], [0.2, 900], [0.3, 4100]])
     band = axes.collections[0].get_paths()[0].vertices
     assert band[:, 1].min() == 0
     assert band[:, 1].max() == 4200
@@ -47,7 +50,7 @@ def test_runs_of_one_label_get_their_median() -> None:
 def test_each_label_has_its_colour() -> None:
     runs = [("Adam", records([1, 2])), ("AdamW", records([3, 4])), ("Adam", records([5, 6]))]
     axes = learning_curve(runs).axes[0]
-    assert {line.get_color() for line in axes.lines} == {style.series_colour(0), style.series_colour(1)}
+    assert {line.get_color() for line in axes.lines} == {series_colour(0), series_colour(1)}
     assert len(axes.get_legend().get_texts()) == 2
 
 
@@ -74,3 +77,35 @@ def test_label_has_the_time_at_which_the_target_was_reached() -> None:
 def test_nothing_to_draw_is_an_error(histories: list) -> None:
     with pytest.raises(ConfigError, match="at least one"):
         learning_curve(histories)
+
+
+def test_dots_are_the_episodes_and_lines_their_means() -> None:
+    axes = comparison(RESULTS).axes[0]
+    dots, mean = axes.lines[0], axes.lines[1]
+    assert sorted(dots.get_ydata()) == RESULTS["simulated"]
+    np.testing.assert_allclose(mean.get_ydata(), 4100)
+    assert axes.get_ylabel() == "score of an episode"
+
+
+def test_labels_have_interval_and_ratio() -> None:
+    text = words(comparison(RESULTS, intervals={"simulated": (4080.0, 4120.0)}))
+    assert "4100 ± 20" in text
+    assert "0.76 × simulated" in text
+    assert "2 episodes" in text
+
+
+def test_student_interval_holds_the_mean_95_times_in_100() -> None:
+    generator = np.random.default_rng(0)
+    intervals = [student_interval(generator.normal(5, 2, 8)) for _ in range(2000)]
+    assert np.mean([low < 5 < high for low, high in intervals]) == pytest.approx(0.95, abs=0.015)
+
+
+def test_a_single_episode_has_no_interval() -> None:
+    assert "4000" in words(comparison({"serial": [4000.0]}))
+    assert all(math.isnan(end) for end in student_interval(np.array([1.0])))
+
+
+@pytest.mark.parametrize("results", [{}, {"serial": []}])
+def test_nothing_to_compare_is_an_error(results: dict) -> None:
+    with pytest.raises(ConfigError, match="at least one"):
+        comparison(results)

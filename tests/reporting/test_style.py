@@ -1,20 +1,24 @@
-"""A figure becomes an SVG element in the colours of the page."""
+"""A figure becomes a file of the format that its path names, or an SVG element in the colours of the page."""
 
 import re
+import subprocess
+import sys
+from pathlib import Path
 from xml.etree import ElementTree
 
+import pytest
+
+from cartpole_rl.drawing.colours import BLUE
 from cartpole_rl.reporting import style
-from cartpole_rl.reporting.figures import svg
 from cartpole_rl.reporting.page import DARK, LIGHT
 
 
 def drawn(alt: str) -> str:
     figure = style.new_figure(height=2, width=3)
     axes = figure.subplots()
-    style.dress(axes)
-    axes.plot([0, 1], [0, 1], color=style.BLUE)
-    style.label(axes, x="time <s>", y="score")
-    return svg(figure, alt)
+    style.dress(axes, x="time <s>", y="score")
+    axes.plot([0, 1], [0, 1], color=BLUE)
+    return style.svg(figure, alt)
 
 
 def test_it_is_one_element_with_text_and_an_alternative() -> None:
@@ -38,3 +42,19 @@ def test_two_figures_share_no_id_and_the_same_one_is_repeated_exactly() -> None:
     first, second = drawn("first"), drawn("second")
     assert not {*re.findall(r'id="(\S+)"', first)} & {*re.findall(r'id="(\S+)"', second)}
     assert drawn("first") == first
+
+
+@pytest.mark.parametrize(("ending", "magic"), [("png", b"\x89PNG"), ("svg", b"<?xml"), ("pdf", b"%PDF")])
+def test_save_writes_the_format_that_the_ending_names(tmp_path: Path, ending: str, magic: bytes) -> None:
+    path = tmp_path / "new" / f"picture.{ending}"
+    style.save(style.new_figure(height=1, width=1), path)
+    assert path.read_bytes().startswith(magic)
+
+
+def test_no_figure_needs_pyplot() -> None:
+    code = (
+        "import sys; from cartpole_rl.reporting import scores, style;"
+        "style.png(scores.comparison({'a': [1.0, 2.0]}));"
+        "sys.exit('matplotlib.pyplot' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

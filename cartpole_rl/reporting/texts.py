@@ -1,10 +1,21 @@
-"""Small text tables for terminals, with numbers rounded to significant digits."""
+"""Texts that figures, tables and messages share, and small text tables for terminals."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+
+from cartpole_rl.tasks.endings import Ending
+from cartpole_rl.tasks.episode import Episode
 
 Cell = str | int | float | bool | None
 
+ENDINGS = {
+    Ending.TIME: "time was up",
+    Ending.TRACK: "left the track",
+    Ending.ANGLE: "the pole fell",
+    Ending.FAULT: "the cart reported a fault",
+    Ending.LINK: "the link was lost",
+    Ending.NON_FINITE: "a value was not finite",
+}
 MISSING = "–"
 GAP = "  "
 RULE = "─"
@@ -91,3 +102,26 @@ def _text(cell: Cell, decimals: int) -> str:
 def _is_numeric(text: str) -> bool:
     """Return True for a text that is a number, starts with one, or is MISSING."""
     return text == MISSING or text.lstrip("+-")[:1].isdigit()
+
+
+def count_text(count: int, unit: str = "episode") -> str:
+    """Return "1 episode" or "20 episodes"."""
+    return f"{count} {unit}{'' if count == 1 else 's'}"
+
+
+def guard_text(*episodes: Episode) -> str:
+    """Return ", guarded 3.2 %", the mean share of periods under the track guard; empty without one."""
+    shares = [episode.guarded.mean() for episode in episodes if episode.guarded is not None]
+    return f", guarded {100 * sum(shares) / len(shares):.1f} %" if shares else ""
+
+
+def cut_off(episodes: Sequence[Episode]) -> Iterator[str]:
+    """Yield a warning for each fault that ended episodes early; their scores count in the means."""
+    for ending in (Ending.LINK, Ending.FAULT, Ending.NON_FINITE):
+        if count := sum(episode.ended_by == ending for episode in episodes):
+            yield f"warning: {count} of {count_text(len(episodes))} ended early by {ending} (docs/safety.md)"
+
+
+def ending_text(episode: Episode) -> str:
+    """Return why and when an episode ended: "left the track after 6.6 s"."""
+    return f"{ENDINGS[Ending(episode.ended_by)]} after {episode.time[-1] - episode.time[0]:.1f} s"

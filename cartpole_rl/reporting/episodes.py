@@ -1,4 +1,4 @@
-"""Angle, position and motor value of one episode over time (thesis, figures 6.2 and 6.10).
+"""Figure of one episode: angle, position and motor value over time (thesis, figures 6.2 and 6.10).
 
 The thesis scales the three to one axis; here each has a panel with its unit, on a common time axis.
 """
@@ -10,9 +10,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from cartpole_rl.drawing import colours
 from cartpole_rl.reporting import style
-from cartpole_rl.reporting.figures.annotations import at_time, beside, plain
-from cartpole_rl.reporting.words import ending_text, guard_text
+from cartpole_rl.reporting.texts import ending_text, guard_text
 from cartpole_rl.rig.hardware import LARGEST_MOTOR
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.tasks.rewards import UPRIGHT_ANGLE
@@ -35,8 +35,7 @@ def behaviour(episode: Episode, title: str = "One episode", track_half_length: f
     _draw_angle(angle, episode)
     _draw_position(position, episode, track_half_length)
     _draw_motor(motor, episode)
-    style.title(angle, plain(title), _summary(episode))
-    style.label(motor, x="time (s)")
+    style.title(angle, style.plain(title), _summary(episode))
     figure.align_ylabels()
     return figure
 
@@ -66,12 +65,11 @@ def wrapped_line(time: Array, theta: Array) -> tuple[Array, Array]:
 
 def _draw_angle(axes: Axes, episode: Episode) -> None:
     """Draw the wrapped angle, the upright band, and the time from which the pole stays up."""
-    style.dress(axes)
-    style.label(axes, y="pole angle (deg)")
+    style.dress(axes, y="pole angle (deg)")
     band = math.degrees(UPRIGHT_ANGLE)
-    axes.axhspan(-band, band, color=style.UPRIGHT, alpha=0.2, linewidth=0)
-    axes.plot(*wrapped_line(episode.time, episode.theta), color=style.POLE, linewidth=1.6)
-    beside(axes, 0, "upright", style.UPRIGHT)
+    axes.axhspan(-band, band, color=colours.UPRIGHT, alpha=0.2, linewidth=0)
+    axes.plot(*wrapped_line(episode.time, episode.theta), color=colours.POLE, linewidth=1.6)
+    style.beside(axes, 0, "upright", colours.UPRIGHT)
     largest = float(np.degrees(np.abs(episode.theta)).max())
     if largest < SMALL_SWING:
         reach = 1.15 * max(largest, 1.3 * band)
@@ -79,55 +77,45 @@ def _draw_angle(axes: Axes, episode: Episode) -> None:
     else:
         axes.set_ylim(-190, 190)
         axes.set_yticks((-180, -90, 0, 90, 180))
-        beside(axes, 180, "hanging", style.MUTED)
-        beside(axes, -180, "hanging", style.MUTED)
+        style.beside(axes, 180, "hanging", colours.MUTED)
+        style.beside(axes, -180, "hanging", colours.MUTED)
     axes.set_xlim(episode.time[0], episode.time[-1])
     moment = upright_since(episode.time, episode.theta)
     if moment is not None and moment > episode.time[0]:
-        at_time(axes, moment, f"up from {moment:.1f} s", style.UPRIGHT)
+        style.at_time(axes, moment, f"up from {moment:.1f} s", colours.UPRIGHT)
 
 
 def _draw_position(axes: Axes, episode: Episode, track_half_length: float | None) -> None:
     """Draw the cart's position between the ends of its track."""
-    style.dress(axes)
-    style.label(axes, y="cart (cm)")
+    style.dress(axes, y="cart (cm)")
     position = 100 * episode.x
-    axes.plot(episode.time, position, color=style.CART, linewidth=1.6)
+    axes.plot(episode.time, position, color=colours.CART, linewidth=1.6)
     reach = max(1.15 * float(np.abs(position).max()), 2.0)
     if track_half_length is not None:
         end = 100 * track_half_length
         reach = max(reach, 1.15 * end)
         for side in (-end, end):
-            axes.axhline(side, color=style.LIMIT, linewidth=1.4)
-            beside(axes, side, "end of track", style.LIMIT)
+            axes.axhline(side, color=colours.LIMIT, linewidth=1.4)
+            style.beside(axes, side, "end of track", colours.LIMIT)
     axes.set_ylim(-reach, reach)
 
 
 def _draw_motor(axes: Axes, episode: Episode) -> None:
     """Draw the motor value sent in each period; the periods of the track guard are marked."""
-    style.dress(axes)
-    style.label(axes, y="motor value")
-    axes.stairs(episode.motor, episode.time, fill=True, color=style.MOTOR, alpha=0.35)
-    axes.stairs(episode.motor, episode.time, baseline=None, color=style.MOTOR, linewidth=1.0)
+    style.dress(axes, x="time (s)", y="motor value")
+    axes.stairs(episode.motor, episode.time, fill=True, color=colours.MOTOR, alpha=0.35)
+    axes.stairs(episode.motor, episode.time, baseline=None, color=colours.MOTOR, linewidth=1.0)
     if episode.guarded is not None and episode.guarded.any():
         guarded = np.where(episode.guarded, episode.motor, 0)
-        axes.stairs(guarded, episode.time, fill=True, color=style.LIMIT)
-        times = episode.time[:-1][
-            episode.guarded
-        ]  # a single period is a thin line: marked at the edge as well
-        axes.plot(
-            times,
-            np.full_like(times, 1.08 * LARGEST_MOTOR),
-            "v",
-            color=style.LIMIT,
-            markersize=4,
-            clip_on=False,
-        )
-        beside(axes, 0, "track guard", style.LIMIT)
+        axes.stairs(guarded, episode.time, fill=True, color=colours.LIMIT)
+        times = episode.time[:-1][episode.guarded]  # a single period is a thin line: marked at the edge too
+        edge = np.full_like(times, 1.08 * LARGEST_MOTOR)
+        axes.plot(times, edge, "v", color=colours.LIMIT, markersize=4, clip_on=False)
+        style.beside(axes, 0, "track guard", colours.LIMIT)
     axes.set_ylim(-1.15 * LARGEST_MOTOR, 1.15 * LARGEST_MOTOR)
     axes.set_yticks(MOTOR_TICKS)
-    beside(axes, MOTOR_TICKS[-1], "pushes right", style.MUTED)
-    beside(axes, MOTOR_TICKS[0], "pushes left", style.MUTED)
+    style.beside(axes, MOTOR_TICKS[-1], "pushes right", colours.MUTED)
+    style.beside(axes, MOTOR_TICKS[0], "pushes left", colours.MUTED)
 
 
 def _summary(episode: Episode) -> str:

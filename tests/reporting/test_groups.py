@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from cartpole_rl.reporting import style
-from cartpole_rl.reporting.figures.groups import (
+from cartpole_rl.drawing.colours import MUTED
+from cartpole_rl.reporting.groups import (
     dot_rows,
     drawings,
     palette,
@@ -26,7 +26,7 @@ def test_set_ups_and_evaluations_have_other_colours() -> None:
 def test_of_many_set_ups_the_first_and_the_last_have_a_colour() -> None:
     labels = [f"arm {number}" for number in range(9)]
     colours = palette(labels, ["arm 4", "arm 0", "arm 8"])
-    assert {label for label, colour in colours.items() if colour != style.MUTED} == {"arm 4", "arm 8"}
+    assert {label for label, colour in colours.items() if colour != MUTED} == {"arm 4", "arm 8"}
 
 
 def test_all_of_many_set_ups_are_drawn() -> None:

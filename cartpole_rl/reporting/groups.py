@@ -14,8 +14,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from cartpole_rl.drawing.colours import FAINT, INK, MUTED
 from cartpole_rl.reporting import style
-from cartpole_rl.reporting.figures.annotations import plain
 from cartpole_rl.reporting.results import (
     GOOD,
     OWN,
@@ -200,7 +200,7 @@ def palette(labels: Sequence[str], ranked: Sequence[str] = ()) -> dict[str, str]
     if len(labels) <= MOST_LINES:
         return {label: style.series_colour(index) for index, label in enumerate(labels)}
     ends = [*ranked[:1], *ranked[1:][-1:]]
-    return dict.fromkeys(labels, style.MUTED) | dict(zip(ends, style.SERIES, strict=False))
+    return dict.fromkeys(labels, MUTED) | dict(zip(ends, style.SERIES, strict=False))
 
 
 def series_colours(names: Sequence[str]) -> dict[str, str]:
@@ -220,7 +220,7 @@ def finish(axes: Axes, colours: Mapping[str, str], x: str, y: str | None = None)
     """Name the colours above the panel, and label the axes in lines that fit beside them."""
     _legend(axes, colours)
     sides = (("x", x), ("y", y))
-    lines = (plain(textwrap.fill(text, LONGEST_LINE[side])) if text else None for side, text in sides)
+    lines = (style.plain(textwrap.fill(text, LONGEST_LINE[side])) if text else None for side, text in sides)
     style.label(axes, *lines)
 
 
@@ -238,8 +238,8 @@ def dot_rows(groups: Groups, measure: str, guides: Mapping[str, float] | None = 
     axes.spines["left"].set_visible(False)
     height = 0.0
     for label, group in groups.items():
-        axes.axhspan(height - 0.44, height + 0.44, facecolor=style.FAINT, edgecolor="none", zorder=1.5)
-        _row_text(axes, 0.005, height, plain(cut(label)), color=style.INK, fontweight="bold")
+        axes.axhspan(height - 0.44, height + 0.44, facecolor=FAINT, edgecolor="none", zorder=1.5)
+        _row_text(axes, 0.005, height, style.plain(cut(label)), color=INK, fontweight="bold")
         for name, values in group.items():
             height += 1
             _draw_row(axes, height, values, of_groups.get(label, colours[name]))
@@ -260,7 +260,7 @@ def _row_text(axes: Axes, place: float, height: float, text: str, **looks: Any) 
 def _draw_row(axes: Axes, height: float, values: Array, colour: str) -> None:
     """Draw one row: dots above the line, interval and interquartile mean below it."""
     if not values.size:
-        _row_text(axes, 0.01, height, "no agent", color=style.MUTED, style="italic")
+        _row_text(axes, 0.01, height, "no agent", color=MUTED, style="italic")
         return
     places = height - 0.2 + JITTER * (np.arange(values.size) % 3 - 1)
     axes.plot(values, places, "o", color=colour, alpha=0.5, markersize=DOT, markeredgewidth=0)
@@ -273,18 +273,9 @@ def _draw_row(axes: Axes, height: float, values: Array, colour: str) -> None:
 
 def _vertical_guide(axes: Axes, value: float, text: str) -> None:
     """Draw a dashed line, with its text over the panel."""
-    axes.axvline(value, color=style.MUTED, linewidth=1, linestyle=DASHES, zorder=1)
-    axes.annotate(
-        text,
-        xy=(value, 1),
-        xycoords=("data", "axes fraction"),
-        xytext=(0, 2),
-        ha="center",
-        va="bottom",
-        textcoords="offset points",
-        fontsize=style.SMALL_SIZE,
-        color=style.MUTED,
-    )
+    axes.axvline(value, color=MUTED, linewidth=1, linestyle=DASHES, zorder=1)
+    of = "data", "axes fraction"
+    style.note(axes, text, (value, 1), of, (0, 2), MUTED, ha="center", va="bottom")
 
 
 def profile_curves(
@@ -346,12 +337,12 @@ def training_axis(lengths: Sequence[float]) -> str:
 
 def _named(groups: Collection[str], colours: Mapping[str, str]) -> dict[str, str]:
     """Return the groups that have a colour, which the legend names."""
-    return {label: colours[label] for label in groups if colours[label] != style.MUTED}
+    return {label: colours[label] for label in groups if colours[label] != MUTED}
 
 
 def _grey_first(groups: Mapping[str, Content], colours: Mapping[str, str]) -> Iterator[tuple[str, Content]]:
     """Yield the groups without a colour, then those over them."""
-    yield from sorted(groups.items(), key=lambda item: colours[item[0]] != style.MUTED)
+    yield from sorted(groups.items(), key=lambda item: colours[item[0]] != MUTED)
 
 
 def _legend_height(names: Collection[str]) -> float:
@@ -365,11 +356,11 @@ def _legend(axes: Axes, colours: Mapping[str, str]) -> None:
         return
     axes.figure.legend(
         [axes.plot([], [], "s", color=colour, markersize=6)[0] for colour in colours.values()],
-        [plain(cut(label)) for label in colours],
+        [style.plain(cut(label)) for label in colours],
         loc="outside upper left",
         fontsize=style.SMALL_SIZE,
         frameon=False,
-        labelcolor=style.INK,
+        labelcolor=INK,
         handletextpad=0.3,
         borderpad=0,
         labelspacing=0.25,
