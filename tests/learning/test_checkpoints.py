@@ -82,37 +82,26 @@ def test_weights_that_are_not_finite_are_neither_written_nor_read(value: float, 
     assert "is refused: its weight w is not finite" in complaint(load_training, tmp_path)
 
 
-def test_a_missing_path_is_named(tmp_path: Path) -> None:
+def test_a_missing_path_or_checkpoint_is_named(tmp_path: Path) -> None:
     assert "there is no such file or folder" in complaint(load_agent, tmp_path / "nowhere")
     assert "there is no such folder" in complaint(load_training, tmp_path / "nowhere")
-
-
-def test_a_folder_without_checkpoints_is_named(tmp_path: Path) -> None:
     assert "holds no checkpoints/last.pt" in complaint(load_agent, tmp_path)
     assert "holds no checkpoints/resume.pt" in complaint(load_training, tmp_path)
 
 
-@pytest.mark.parametrize("content", [b"", b"hello, I am a text file\n", b"PK\x03\x04 and no more of a zip"])
-def test_a_foreign_file_is_named(content: bytes, tmp_path: Path) -> None:
-    (tmp_path / "foreign.pt").write_bytes(content)
-    assert "is not a checkpoint of this package, or is damaged" in complaint(
-        load_agent, tmp_path / "foreign.pt"
-    )
-
-
-@pytest.mark.parametrize("share", [0.1, 0.5, 0.99])
-def test_a_truncated_checkpoint_is_named(share: float, tmp_path: Path) -> None:
-    save_agent(tmp_path / LAST, AGENT)
-    whole = (tmp_path / LAST).read_bytes()
-    (tmp_path / LAST).write_bytes(whole[: int(share * len(whole))])
-    assert "damaged" in complaint(load_agent, tmp_path / LAST)
+@pytest.mark.parametrize("content", [b"", b"hello, I am a text file\n", b"PK\x03\x04 and no more", 0.1, 0.99])
+def test_a_foreign_or_truncated_file_is_named(content: bytes | float, tmp_path: Path) -> None:
+    """A number is the share of a checkpoint that is left."""
+    save_agent(path := tmp_path / "agent.pt", AGENT)
+    whole = path.read_bytes()
+    path.write_bytes(content if isinstance(content, bytes) else whole[: int(content * len(whole))])
+    assert "is not a checkpoint of this package, or is damaged" in complaint(load_agent, path)
 
 
 def test_a_torch_file_of_another_kind_is_named(tmp_path: Path) -> None:
-    torch.save({"state_dict": {}}, tmp_path / "other.pt")
-    assert "its format is None" in complaint(load_agent, tmp_path / "other.pt")
-    torch.save(torch.zeros(3), tmp_path / "tensor.pt")
-    assert "its format is None" in complaint(load_agent, tmp_path / "tensor.pt")
+    for content in ({"state_dict": {}}, torch.zeros(3)):
+        torch.save(content, tmp_path / "other.pt")
+        assert "its format is None" in complaint(load_agent, tmp_path / "other.pt")
     save_training(tmp_path, TRAINING)
     assert "not an agent" in complaint(load_agent, tmp_path / "checkpoints/resume.pt")
 
@@ -126,21 +115,14 @@ def test_a_torch_file_of_another_kind_is_named(tmp_path: Path) -> None:
         ("transitions", "10", "transitions: Input should be a valid integer"),
         ("score", "high", "score: Input should be a valid number"),
         ("tuned_poles", [5], "tuned_poles: Input should be a valid dictionary"),
-        ("speed", 1, "its parts are config, weights, transitions, score, tuned_poles, speed"),
+        ("speed", 1, "its parts are config, weights, transitions, score, tuned_poles, speed; give another"),
+        ("weights", ..., "its parts are config, transitions, score, tuned_poles; give another one"),
     ],
 )
 def test_an_agent_with_a_wrong_part_is_named(part: str, value: object, named: str, tmp_path: Path) -> None:
-    path = tmp_path / "agent.pt"
-    torch.save({"format": AGENT_FORMAT, **vars(AGENT), part: value}, path)
+    path, parts = tmp_path / "agent.pt", {"format": AGENT_FORMAT, **vars(AGENT), part: value}
+    torch.save({name: each for name, each in parts.items() if each is not ...}, path)
     assert f"is damaged, or of another version of this package: {named}" in complaint(load_agent, path)
-
-
-@pytest.mark.parametrize("part", ["config", "weights", "transitions"])
-def test_an_agent_without_a_part_is_named(part: str, tmp_path: Path) -> None:
-    path, parts = tmp_path / "agent.pt", vars(AGENT).copy()
-    del parts[part]
-    torch.save({"format": AGENT_FORMAT, **parts}, path)
-    assert f"its parts are {', '.join(parts)}; give another one" in complaint(load_agent, path)
 
 
 @pytest.mark.parametrize(
