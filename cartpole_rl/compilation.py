@@ -75,8 +75,8 @@ def bound(graph: GraphModule) -> GraphModule:
 class Traced(Generic[Result]):
     """A `function` that takes tuples of tensors, named or plain, and returns another, as a graph.
 
-    Its graph is that of the first call, whose shapes, types and devices all later calls must have; whatever
-    else `function` reads must not change. No gradient flows through it, though the function may compute one.
+    It is traced in the first call, whose shapes, types and devices all later calls must have; whatever else
+    `function` reads must not change. No gradient flows through it, though the function may compute one.
     Without modules and tensordicts, a small network takes a third of the time.
     """
 

@@ -1,7 +1,7 @@
 """A classical controller to compare agents with: energy control swings the pole up, LQR balances it.
 
 Swing-up: Astrom and Furuta, "Swinging up a pendulum by energy control", Automatica 36, 2000: the pivot is
-accelerated so that the pole's energy rises to that of standing upright. Balance: a discrete linear-quadratic
+accelerated until the pole has the energy that it has upright. Balance: a discrete linear-quadratic
 regulator of the linearized nominal cart (Anderson and Moore, "Optimal control", 1990). Both act on the
 predicted state at the time the force takes effect: the measured velocities are half a period old, and the
 motor responds after the cart's latency.

@@ -76,7 +76,7 @@ class QNetwork(nn.Module):
 
 
 class MirrorQNetwork(nn.Module):
-    """A QNetwork whose value of an action equals that of the mirrored action in the mirrored observation.
+    """A QNetwork that values an action as it values the mirrored action in the mirrored observation.
 
     Swapping left and right multiplies the numbers of an observation by `signs` [K], +1 or -1, and reverses
     the order of the actions. Experience on one side then counts on the other, with half the weights (van der
@@ -189,7 +189,7 @@ class MirrorLayer(nn.Module):
         self.norm = nn.LayerNorm(units) if layer_norm else nn.Identity()
 
     def forward(self, even: Tensor, odd: Tensor) -> tuple[Tensor, Tensor]:
-        """Return even and odd parts [..., units] of those of the previous layer, [..., width]."""
+        """Return the even and odd parts [..., units] from the parts of the previous layer, [..., width]."""
         same, opposite = self.even(even), self.odd(odd)
         scene = functional.relu(self.norm(same + opposite))
         image = functional.relu(self.norm(same - opposite))

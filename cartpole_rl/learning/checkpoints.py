@@ -15,7 +15,7 @@ from torch import nn
 
 from cartpole_rl.errors import CheckpointError
 from cartpole_rl.files import replacing
-from cartpole_rl.learning.states import moved
+from cartpole_rl.learning.states import on_device
 from cartpole_rl.run_folder import CHECKPOINTS, ERROR, RESUME, find_agent, find_training
 
 AGENT_FORMAT = "cartpole_rl agent 1"
@@ -96,7 +96,7 @@ def save_training(run: Path, training: TrainingCheckpoint, file_format: str = TR
 
 
 def forget_training(run: Path) -> None:
-    """Remove the files of an unfinished training: that of `save_training` and the error of a sweep's job."""
+    """Remove the files of an unfinished training: its state and the error of a sweep's job."""
     (run / CHECKPOINTS / RESUME).unlink(missing_ok=True)
     (run / ERROR).unlink(missing_ok=True)
 
@@ -125,7 +125,7 @@ def whole_state(source: str) -> Iterator[None]:
 
 def _save(path: Path, file_format: str, content: Mapping[str, Any]) -> None:
     with replacing(path) as beside, beside.open("wb") as file:  # with a path, torch hides why writing failed
-        torch.save({"format": file_format, **moved(content, "cpu")}, file)
+        torch.save({"format": file_format, **on_device(content, "cpu")}, file)
 
 
 def _load(path: Path, expected: str, kind: type[Checkpoint]) -> Checkpoint:

@@ -199,7 +199,7 @@ class Training(Resumable):
 
     @torch.no_grad()
     def describe(self, chunk: TensorDictBase) -> Scalars:
-        """Return the scalars to plot beside those of `learn`."""
+        """Return the scalars to plot beside the ones of `learn`."""
         value = self.agent.actor(chunk[:, 0].select("observation"))["chosen_action_value"]
         scalars = {
             "learning/q_mean": value.mean().item(),

@@ -20,7 +20,7 @@ def half_cosine(start: float, end: float, progress: float) -> float:
 
 
 class BufferSettings(Settings):
-    """Replay buffer; `alpha` and `beta` are those of Schaul et al., "Prioritized experience replay", 2016."""
+    """Replay buffer; `alpha` and `beta` as in Schaul et al., "Prioritized experience replay", 2016."""
 
     kind: Literal["prioritized", "uniform"]
     size: Count  # transitions
@@ -109,7 +109,7 @@ class DistillationSettings(Settings):
     batch_size: Count
     learning_rate: Positive  # at the start; it falls along half a cosine
     epsilon: Fraction  # share of random actions
-    value_weight: NonNegative  # of the error of the mean action value, beside that of the advantages
+    value_weight: NonNegative  # of the error of the mean action value; the error of the advantages has 1
 
 
 def host_and_port(text: str) -> str:

@@ -45,7 +45,7 @@ class Resumable:
         self.agent.load_state_dict(snapshot["agent"])
         self.optimizer.load_state_dict(snapshot["optimizer"])
         restore_buffer(self.buffer, snapshot["replay"])
-        waiting, collector = moved(snapshot["returns"], device), moved(snapshot["collector"], device)
+        waiting, collector = on_device(snapshot["returns"], device), on_device(snapshot["collector"], device)
         held = self.settings.n_step - 1
         self.waiting = None if waiting is None else TensorDict(waiting, [*carts, held])
         self.current = TensorDict(collector["current"], carts)
@@ -55,14 +55,14 @@ class Resumable:
         restore_random_state(snapshot["random"])
 
 
-def moved(value: Any, device: torch.device | str) -> Any:
+def on_device(value: Any, device: torch.device | str) -> Any:
     """Return `value` with all tensors in its mappings, lists and tuples on `device`."""
     if isinstance(value, Tensor):
         return value.to(device)
     if isinstance(value, Mapping):
-        return {key: moved(part, device) for key, part in value.items()}
+        return {key: on_device(part, device) for key, part in value.items()}
     if isinstance(value, list | tuple):
-        return type(value)(moved(part, device) for part in value)
+        return type(value)(on_device(part, device) for part in value)
     return value
 
 

@@ -34,7 +34,7 @@ from cartpole_rl.workflows.trained_poles import emulated_words
 def train(config: TrainConfig, folder: Path) -> float:
     """Train an agent on randomized simulated carts, or resume the training in `folder`; return its score.
 
-    The score is that of the task: (6.1) for a balance, (6.2) for a swing-up.
+    The score is the task's: (6.1) for a balance, (6.2) for a swing-up.
     Writes config.yaml, provenance.json, the logger's files, history.jsonl (evaluations), checkpoints/last.pt
     and best.pt, metrics.json and figures/; until the end also checkpoints/resume.pt. Raises ConfigError for
     settings that do not fit together or a folder that already holds a run, CheckpointError for a resumed run

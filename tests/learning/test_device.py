@@ -14,7 +14,7 @@ from cartpole_rl.errors import ConfigError
 from cartpole_rl.evaluation.driving_policy import DrivingPolicy
 from cartpole_rl.learning.checkpoints import TrainingCheckpoint, load_training, save_training
 from cartpole_rl.learning.dqn import Monitor, Training
-from cartpole_rl.learning.states import moved, seed_everything
+from cartpole_rl.learning.states import on_device, seed_everything
 from cartpole_rl.workflows.agents import new_agent
 from cartpole_rl.workflows.config import TrainConfig, load_settings
 from cartpole_rl.workflows.train import (
@@ -54,7 +54,7 @@ def trained(training: Training, iterations: int) -> dict[str, Tensor]:
     for _ in range(iterations):
         chunk, _ = training.iterate()
         training.describe(chunk)
-    return moved(training.agent.state_dict(), "cpu")
+    return on_device(training.agent.state_dict(), "cpu")
 
 
 @pytest.mark.filterwarnings("ignore:for .*copying from a non-meta parameter")  # here it is a copy
@@ -94,7 +94,7 @@ def test_a_training_is_evaluated_on_the_cpu() -> None:
         agent = new_agent(config, DEVICE)
         policy = DrivingPolicy(agent.greedy_policy(), compiled=False)
         episodes = judge_agent(nominal_env(config), agent, policy, seed=3)
-        weights = moved(agent.state_dict(), "cpu")
+        weights = on_device(agent.state_dict(), "cpu")
     on_cpu = new_agent(config)
     on_cpu.load_state_dict(weights)
     policy = DrivingPolicy(on_cpu.greedy_policy(), compiled=False)
