@@ -14,13 +14,14 @@ from operations import AWKWARD, OPERATIONS
 from torch import Tensor
 
 from cartpole_rl.choices import choice
-from cartpole_rl.envs.perception import PlantOutput, Previous, perceive, perceive_first
+from cartpole_rl.envs.perception import Previous, perceive, perceive_first
 from cartpole_rl.envs.settings import ObservationSettings, TrackGuard
 from cartpole_rl.physics.actuator import ACTUATORS
 from cartpole_rl.physics.friction import CART_FRICTIONS, POLE_FRICTIONS
 from cartpole_rl.physics.models import INTEGRATORS, Models
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.simulated import Carts, Inputs, run_carts
+from cartpole_rl.plants.specs import PlantOutput
 from cartpole_rl.scalar import Scalar, plain
 from cartpole_rl.tasks.features import ObservationKind
 from cartpole_rl.tasks.rewards import Reward
@@ -136,32 +137,33 @@ def test_perception_is_that_of_many_carts(
     rewards = REWARD.model_copy(update={"kind": reward, "position_cost": 0.1})
     later = partial(perceive, settings=observation, task=task, rewards=rewards, guard=guard)
 
-    def first(frame: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-        return perceive_first(*frame, settings=observation, guard=guard)
+    def first(frame: PlantOutput[Tensor], cart: tuple[Tensor, Tensor]) -> tuple[Tensor, ...]:
+        return perceive_first(frame, *cart, settings=observation, guard=guard)
 
     length = torch.full((int(memory > 1), 1), 0.6)
-    counts, flags = st.integers(-(2**30), 2**30), st.booleans()
+    counts, flags, motor = st.integers(-(2**30), 2**30), st.booleans(), st.integers(-255, 255)
     previous = st.builds(
         Previous,
         columns(2, counts),
         columns(4, numbers),
         columns(observation.past_size, numbers),
         columns(1, st.integers(0, 3)),
-        columns(1, st.integers(-255, 255)),
+        columns(1, motor),
         st.just(length),
         columns(1, st.sampled_from((0.4, math.inf))),
     )
     dt = st.sampled_from((0.0, 0.02, math.nan, 1.0))
-    frame = st.builds(PlantOutput, columns(2, counts), columns(1, dt), columns(1, flags), columns(1, flags))
+    parts = columns(2, counts), columns(1, dt), columns(1, motor), columns(1, flags), columns(1, flags)
+    frame = st.builds(PlantOutput, *parts)
     scalars: list[Scalar] = []
 
     @settings(max_examples=20, deadline=None)
     @given(previous=previous, frame=frame)
     def compare(previous: Previous[Tensor], frame: PlantOutput[Tensor]) -> None:
-        given = frame.counts, length, previous.track_end
+        cart = length, previous.track_end
         if not scalars:
-            scalars.extend((Scalar(first, given), Scalar(later, previous, frame)))
-        check(first, scalars[0], given)
+            scalars.extend((Scalar(first, frame, cart), Scalar(later, previous, frame)))
+        check(first, scalars[0], frame, cart)
         check(later, scalars[1], previous, frame)
 
     compare()

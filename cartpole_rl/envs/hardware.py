@@ -47,9 +47,9 @@ from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import Transform
 
 from cartpole_rl.compilation import Compiled
-from cartpole_rl.envs.perception import FirstPercept, Percept, PlantOutput, Previous, perceive, perceive_first
+from cartpole_rl.envs.perception import Percept, Previous, perceive, perceive_first
 from cartpole_rl.envs.settings import ObservationSettings, TrackGuard
-from cartpole_rl.plants.specs import Plant, tensordict_of
+from cartpole_rl.plants.specs import Plant, PlantOutput, tensordict_of
 from cartpole_rl.tasks.features import LENGTH_SCALE
 from cartpole_rl.tasks.settings import NO_ACTION, RewardSettings, TaskSettings
 
@@ -144,8 +144,8 @@ class HardwareTransform(Transform):
 
     def reset_rows(self, first: TensorDictBase, rows: Tensor | None = None) -> TensorDictBase:
         """Add state and observation to the first frames of the carts `rows` [R]; None means all carts."""
-        counts, length = first.get("counts").T, self.scaled_length(rows)
-        return added(first, self.first_perception(counts, length, self.track_end(rows)))
+        percept = self.first_perception(output_of(first), self.scaled_length(rows), self.track_end(rows))
+        return added(first, percept, without_reward=True)
 
     def perceive(
         self, current: TensorDictBase, command: TensorDictBase, next_frame: TensorDictBase
@@ -160,7 +160,7 @@ class HardwareTransform(Transform):
             self.scaled_length(),
             self.track_end(),
         )
-        frame = PlantOutput(*(next_frame.get(key).T for key in PlantOutput._fields))
+        frame = output_of(next_frame)
         frame = frame._replace(truncated=frame.truncated | (current.get("action") == NO_ACTION))
         return added(next_frame, self._perceive(previous, frame))
 
@@ -188,6 +188,14 @@ class HardwareTransform(Transform):
         return (ends if rows is None else ends[rows]).unsqueeze(0)
 
 
-def added(frame: TensorDictBase, percept: FirstPercept[Tensor] | Percept[Tensor]) -> TensorDict:
-    """Return the frame [N] with the entries of `percept`."""
-    return tensordict_of(dict(frame.items()) | {key: rows.T for key, rows in percept._asdict().items()})
+def output_of(output: TensorDictBase) -> PlantOutput[Tensor]:
+    """Return the frame in the output of a plant."""
+    return PlantOutput(*(output.get(key).T for key in PlantOutput._fields))
+
+
+def added(output: TensorDictBase, percept: Percept[Tensor], without_reward: bool = False) -> TensorDict:
+    """Return the output of a plant with the entries of `percept`."""
+    entries = dict(output.items()) | {key: rows.T for key, rows in percept._asdict().items()}
+    if without_reward:
+        del entries["reward"]
+    return tensordict_of(entries)

@@ -1,21 +1,17 @@
 """The hardware transform over a plant of one cart, on plain numbers: a tick takes microseconds.
 
 Perception is that of `perception.py`, and the plant is the one below the TorchRL environment, so both drive
-the same cart in the same way (tests/envs/test_one_cart.py). A percept holds k numbers in place of each tensor
-[k, N].
+the same cart in the same way (tests/envs/test_one_cart.py). Frames and percepts hold k numbers in place of
+each tensor [k, N].
 """
-
-from typing import Any
 
 import torch
 
 from cartpole_rl.envs.hardware import HardwareTransform
-from cartpole_rl.envs.perception import FirstPercept, Percept, PlantOutput, Previous
-from cartpole_rl.plants.specs import OneFrame, Plant
+from cartpole_rl.envs.perception import Percept, Previous
+from cartpole_rl.plants.specs import Numbers, Plant, PlantOutput
 from cartpole_rl.scalar import Scalar, plain
 from cartpole_rl.tasks.settings import NO_ACTION
-
-Numbers = tuple[Any, ...]  # the k numbers of a [k, 1] tensor
 
 
 class OneCart:
@@ -32,18 +28,18 @@ class OneCart:
         count, flag = torch.zeros(1, 1, dtype=torch.int64), torch.zeros(1, 1, dtype=torch.bool)
         counts, number = count.repeat(2, 1), torch.zeros(1, 1)
         state, past = number.repeat(4, 1), number.repeat(hardware.observation_settings.past_size, 1)
+        frame = PlantOutput(counts, number, count, flag, flag)
         self._perceive_first = Scalar(
-            lambda first: hardware.first_perception(*first), (counts, length, track_end)
+            lambda frame, cart: hardware.first_perception(frame, *cart), frame, (length, track_end)
         )
         previous = Previous(counts, state, past, count, count, length, track_end)
-        output = PlantOutput(counts, number, flag, flag)
-        self._perceive = Scalar(hardware.perception, previous, output)
+        self._perceive = Scalar(hardware.perception, previous, frame)
         self._any_period = tuple(
-            tuple(plain(torch.ones_like(each)) for each in part) for part in (previous, output)
+            tuple(plain(torch.ones_like(each)) for each in part) for part in (previous, frame)
         )
-        self.frame: OneFrame  # the newest
+        self.frame: PlantOutput[Numbers]  # the newest
         self.sent = 0  # motor value of the newest period
-        self.percept: FirstPercept[Numbers] | Percept[Numbers]  # of the newest frame
+        self.percept: Percept[Numbers]  # of the newest frame
 
     def motor(self, action: int) -> int:
         """Return the motor value of an action; 0 for NO_ACTION. Raises IndexError if it does not exist."""
@@ -57,22 +53,19 @@ class OneCart:
         """Return the motor value to send: that of the action, or full motor inward under the track guard."""
         return self.guarded_motor(action, self.percept)
 
-    def guarded_motor(self, action: int, percept: FirstPercept[Numbers] | Percept[Numbers]) -> int:
+    def guarded_motor(self, action: int, percept: Percept[Numbers]) -> int:
         """Return the motor value that would be sent for an action on a percept."""
         motor, (side,) = self.motor(action), percept.guard
         if side == 0 or action == NO_ACTION:
             return motor
         return self._inward[side]
 
-    def reset(self) -> FirstPercept[Numbers]:
+    def reset(self) -> Percept[Numbers]:
         """Start an episode. Raises the errors of the plant's reset."""
         self.frame = self.plant.reset_one()
         self._length, self._track_end = map(plain, (self.hardware.scaled_length(), self.hardware.track_end()))
-        first: FirstPercept[Numbers] = self._perceive_first(
-            (self.frame.counts, self._length, self._track_end)
-        )
-        self.percept = first
-        return first
+        self.percept = self._perceive_first(self.frame, (self._length, self._track_end))
+        return self.percept
 
     def rehearse(self) -> Percept[Numbers]:
         """Perceive a period of ones, which changes nothing."""
@@ -83,15 +76,13 @@ class OneCart:
         """Drive one period."""
         motor = self.sent_motor(action)
         frame = self.plant.step_one(motor)
-        self.sent = frame.drove(motor)
-        return self.advance(self.sent, frame._replace(truncated=frame.truncated or action == NO_ACTION))
+        self.sent = self.plant.drove(motor)
+        return self.advance(self.sent, frame if action != NO_ACTION else frame._replace(truncated=(True,)))
 
-    def advance(self, motor: int, frame: OneFrame) -> Percept[Numbers]:
+    def advance(self, motor: int, frame: PlantOutput[Numbers]) -> Percept[Numbers]:
         """Perceive the frame at the end of a period under a motor value."""
         before, earlier, self.frame = self.percept, self.frame.counts, frame
         memory = before.state, before.past, before.step_count
         previous = Previous(earlier, *memory, (motor,), self._length, self._track_end)
-        output = PlantOutput(frame.counts, (frame.dt,), (frame.terminated,), (frame.truncated,))
-        now: Percept[Numbers] = self._perceive(previous, output)
-        self.percept = now
-        return now
+        self.percept = self._perceive(previous, frame)
+        return self.percept

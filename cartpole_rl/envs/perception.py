@@ -4,13 +4,14 @@ They are the same for simulated and real carts. Every tensor is [k, N], the tran
 that compiled code runs along the carts; `one_cart.py` makes plain arithmetic for one cart of these functions.
 """
 
-from typing import Generic, NamedTuple, TypeVar
+from typing import Generic, NamedTuple
 
 import torch
 from torch import Tensor
 
 from cartpole_rl.envs.guard import guard_side
 from cartpole_rl.envs.settings import ObservationSettings, TrackGuard
+from cartpole_rl.plants.specs import PlantOutput, Values
 from cartpole_rl.tasks.endings import fallen
 from cartpole_rl.tasks.features import (
     ANGULAR_SPEED_SCALE,
@@ -25,8 +26,6 @@ from cartpole_rl.tasks.features import (
 from cartpole_rl.tasks.rewards import SCORE, SCORE_UPRIGHT
 from cartpole_rl.tasks.settings import RewardSettings, TaskSettings
 
-Values = TypeVar("Values")  # Tensor, or a tuple of numbers
-
 
 class Previous(NamedTuple, Generic[Values]):
     """The step before a frame, and the motor value chosen in it."""
@@ -40,34 +39,13 @@ class Previous(NamedTuple, Generic[Values]):
     track_end: Values  # [1, N] m from the middle
 
 
-class PlantOutput(NamedTuple, Generic[Values]):
-    """The plant's output after the period: see `plants.specs.Plant`."""
-
-    counts: Values  # [2, N] int64
-    dt: Values  # [1, N] s
-    terminated: Values  # [1, N] bool
-    truncated: Values  # [1, N] bool
-
-
-class FirstPercept(NamedTuple, Generic[Values]):
-    """Quantities computed from the first frame of an episode."""
+class Percept(NamedTuple, Generic[Values]):
+    """Quantities computed from a plant's output; reward, scores and step count are 0 in a first one."""
 
     state: Values  # [4, N]
     past: Values  # [past_size, N]
     observation: Values  # [size, N]
     guard: Values  # [1, N] int64, direction of the track guard's motor value, 0 if the agent's is sent
-    score: Values  # [1, N], 0
-    score_upright: Values  # [1, N], 0
-    step_count: Values  # [1, N] int64
-
-
-class Percept(NamedTuple, Generic[Values]):
-    """Quantities computed from a later frame."""
-
-    state: Values  # [4, N]
-    past: Values  # [past_size, N]
-    observation: Values  # [size, N]
-    guard: Values  # [1, N] int64, as above
     reward: Values  # [1, N]
     score: Values  # [1, N] equation (6.2)
     score_upright: Values  # [1, N] equation (6.1)
@@ -78,27 +56,31 @@ class Percept(NamedTuple, Generic[Values]):
 
 
 def perceive_first(
-    counts: Tensor,
+    frame: PlantOutput[Tensor],
     length: Tensor,
     track_end: Tensor,
     *,
     settings: ObservationSettings,
     guard: TrackGuard | None,
-) -> FirstPercept[Tensor]:
+) -> Percept[Tensor]:
     """Return the percept of a first frame: velocities and memory are 0."""
-    x, theta = measured_position(counts)
+    x, theta = measured_position(frame.counts)
     unknown = torch.zeros_like(x)
     state = Measured(x, unknown, theta, unknown)
     past = x.new_zeros(settings.past_size, len(x))
     nothing = unknown.unsqueeze(0)
-    return FirstPercept(
+    return Percept(
         torch.stack(state),
         past,
         observation(state, past, length, settings),
         guarded(state, track_end, guard),
-        score=nothing,
-        score_upright=nothing.clone(),
-        step_count=torch.zeros_like(counts[:1]),
+        nothing,
+        nothing.clone(),
+        nothing.clone(),
+        torch.zeros_like(frame.counts[:1]),
+        frame.terminated,
+        frame.truncated,
+        frame.terminated | frame.truncated,
     )
 
 

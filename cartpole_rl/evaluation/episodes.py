@@ -17,14 +17,14 @@ from torch import Tensor
 from torchrl.modules import QValueActor
 
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
-from cartpole_rl.envs.one_cart import Numbers, OneCart
-from cartpole_rl.envs.perception import FirstPercept, Percept
+from cartpole_rl.envs.one_cart import OneCart
+from cartpole_rl.envs.perception import Percept
 from cartpole_rl.errors import FaultError
 from cartpole_rl.evaluation.driving_policy import DrivingPolicy
 from cartpole_rl.evaluation.knocks import Knocks
 from cartpole_rl.plants.measured import measured_part
 from cartpole_rl.plants.serial.plant import SerialPlant
-from cartpole_rl.plants.specs import OneCartPlant, OneFrame, tensordict_of
+from cartpole_rl.plants.specs import Numbers, OneCartPlant, PlantOutput, tensordict_of
 from cartpole_rl.scheduling import no_garbage_collection
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
@@ -141,9 +141,9 @@ def chosen_action(policy: Policy, observation: Sequence[float]) -> int:
 
 def one_episode(
     env: CartPoleEnv,
-    first: FirstPercept[Numbers],
+    first: Percept[Numbers],
     steps: Sequence[Percept[Numbers]],
-    frames: Sequence[OneFrame],
+    frames: Sequence[PlantOutput[Numbers]],
     motor: np.ndarray,
     guarded: np.ndarray,
     ending: str,
@@ -155,7 +155,7 @@ def one_episode(
     columns = {key: np.array([getattr(step, key) for step in steps])[:, 0] for key in _FROM_NEXT}
     columns["state"] = np.array([first.state, *(step.state for step in steps)])
     columns["counts"] = np.array([frame.counts for frame in frames])
-    columns["time"] = np.cumsum([0.0, *(frame.dt for frame in frames[1:])])
+    columns["time"] = np.cumsum([0.0, *(frame.dt[0] for frame in frames[1:])])
     columns |= {"motor": motor, "guarded": guarded}
     episode = _episode(columns, ending, env.hardware.guard is not None)
     return measured_part(episode, env.plant.fault)

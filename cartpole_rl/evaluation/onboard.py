@@ -12,8 +12,6 @@ import torch
 from numpy.typing import NDArray
 
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
-from cartpole_rl.envs.one_cart import Numbers
-from cartpole_rl.envs.perception import FirstPercept, Percept
 from cartpole_rl.envs.settings import ObservationSettings
 from cartpole_rl.evaluation.episodes import (
     Policy,
@@ -24,7 +22,7 @@ from cartpole_rl.evaluation.episodes import (
     with_periods,
 )
 from cartpole_rl.plants.serial.plant import SerialPlant
-from cartpole_rl.plants.specs import OneFrame
+from cartpole_rl.plants.specs import Numbers, PlantOutput
 from cartpole_rl.scheduling import no_garbage_collection
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
@@ -55,18 +53,18 @@ def run_onboard(env: CartPoleEnv, policy: Policy) -> Episode:
         try:
             while not done:
                 frame = plant.listen_one()
-                step = cart.advance(frame.motor_applied, frame)
+                step = cart.advance(frame.motor_applied[0], frame)
                 frames.append(frame)
                 stopped.append(bool(plant.cart.flags & (Flags.WATCHDOG | Flags.SOFT_LIMIT)))
                 steps.append(step)
                 (done,) = step.done
         finally:
             plant.halt()
-    percepts: list[FirstPercept[Numbers] | Percept[Numbers]] = [first, *steps[:-1]]
+    percepts = [first, *steps[:-1]]
     actions = [chosen_action(policy, percept.observation) for percept in percepts]
     chosen = np.array([cart.motor(action) for action in actions])
     expected = np.array([cart.guarded_motor(*pair) for pair in zip(actions, percepts, strict=True)])
-    motor = np.array([frame.motor_applied for frame in frames[1:]])
+    motor = np.array([frame.motor_applied[0] for frame in frames[1:]])
     ending = ending_of(env, 0, steps[-1].truncated[0], steps[-1].state[2])
     episode = one_episode(env, first, steps, frames, motor, expected != chosen, ending)
     gaps = np.array(stopped) | late(frames, plant.cart.information.period_us * 1e-6)
@@ -74,9 +72,9 @@ def run_onboard(env: CartPoleEnv, policy: Policy) -> Episode:
     return replace(episode, expected=expected[: episode.steps], compared=compared[: episode.steps])
 
 
-def late(frames: Sequence[OneFrame], period: float) -> NDArray[np.bool_]:
+def late(frames: Sequence[PlantOutput[Numbers]], period: float) -> NDArray[np.bool_]:
     """Return [T+1] which frames came more than 1.5 periods after the one before: states were missed."""
-    return np.array([frame.dt for frame in frames]) > LATE_PERIODS * period
+    return np.array([frame.dt[0] for frame in frames]) > LATE_PERIODS * period
 
 
 def memory(observation: ObservationSettings) -> int:

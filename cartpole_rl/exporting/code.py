@@ -11,8 +11,9 @@ from torch import Tensor
 
 from cartpole_rl.compilation import Trace, trace
 from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
-from cartpole_rl.envs.perception import FirstPercept, Percept, PlantOutput, Previous, perceive, perceive_first
+from cartpole_rl.envs.perception import Percept, Previous, perceive, perceive_first
 from cartpole_rl.envs.settings import TrackGuard
+from cartpole_rl.plants.specs import PlantOutput
 from cartpole_rl.tasks.features import LENGTH_SCALE
 
 TEMPLATES = Path(__file__).parent / "templates"
@@ -72,7 +73,7 @@ class DrivingPercept(NamedTuple):
     guard: Tensor  # [1, 1] int64, direction of the track guard's motor value
 
     @classmethod
-    def of(cls, percept: FirstPercept[Tensor] | Percept[Tensor]) -> "DrivingPercept":
+    def of(cls, percept: Percept[Tensor]) -> "DrivingPercept":
         """Return the part of a percept that drives a cart."""
         return cls(percept.state, percept.past, percept.observation, percept.guard)
 
@@ -89,12 +90,14 @@ def perception(settings: CartPoleSettings, guard: TrackGuard | None) -> tuple[Gr
         return length[: int(observation.pole_length)] / LENGTH_SCALE
 
     def start(first: First) -> DrivingPercept:
-        return DrivingPercept.of(perceive_start(first.counts, scaled(first.pole_length), first.track_end))
+        output = PlantOutput(first.counts, NUMBER, COUNT, FLAG, FLAG)
+        return DrivingPercept.of(perceive_start(output, scaled(first.pole_length), first.track_end))
 
     def advance(later: Later) -> DrivingPercept:
         remembered = later.last_counts, later.state, later.past, COUNT, later.motor
         previous = Previous(*remembered, scaled(later.pole_length), later.track_end)
-        return DrivingPercept.of(perceive_next(previous, PlantOutput(later.counts, later.dt, FLAG, FLAG)))
+        output = PlantOutput(later.counts, later.dt, COUNT, FLAG, FLAG)
+        return DrivingPercept.of(perceive_next(previous, output))
 
     past = NUMBER.repeat(observation.past_size, 1)
     later = Later(COUNTS, NUMBER, COUNTS, NUMBER.repeat(4, 1), past, COUNT, NUMBER, NUMBER)

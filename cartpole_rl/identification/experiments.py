@@ -25,7 +25,7 @@ from cartpole_rl.identification.moves import (
     until_stopped,
 )
 from cartpole_rl.plants.measured import measured_part
-from cartpole_rl.plants.specs import OneFrame, Plant
+from cartpole_rl.plants.specs import Numbers, Plant, PlantOutput
 from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, LARGEST_MOTOR, POLE_RADIANS_PER_COUNT
 from cartpole_rl.scheduling import no_garbage_collection
 from cartpole_rl.tasks.endings import Ending
@@ -142,7 +142,7 @@ def conduct(
         with no_garbage_collection():
             if number and not ended:
                 present = plant.step_one(0)  # a new frame: the last one is as old as the writing took
-                ended = present.terminated or present.truncated
+                ended = present.ends
             if ended:
                 present = plant.reset_one()
             recorded, present, breakaway = run(plant, present, and_stop(experiment.moves(task), task), guard)
@@ -155,8 +155,8 @@ def conduct(
 
 
 def run(
-    plant: Plant, present: OneFrame, moves: Moves, guard: TrackGuard
-) -> tuple[Episode, OneFrame, int | None]:
+    plant: Plant, present: PlantOutput[Numbers], moves: Moves, guard: TrackGuard
+) -> tuple[Episode, PlantOutput[Numbers], int | None]:
     """Make the moves from the frame `present` on; return the recording, the last frame, and their result.
 
     The recording ends where a count froze or jumped.
@@ -164,16 +164,16 @@ def run(
     `guard` brakes the cart where the moves do not. The motor is at 0 at the end, whatever the moves or the
     guard requested last.
     """
-    counts, gaps, motors, ended = [present.counts], [present.dt], [], str(Ending.TIME)
+    counts, gaps, motors, ended = [present.counts], [*present.dt], [], str(Ending.TIME)
     requested, breakaway = next(moves), None
     while True:
         now = observed(counts, gaps)
         motor = guarded(requested, now.x, now.x_dot, guard)
         present = plant.step_one(motor)
-        motors.append(present.drove(motor))
+        motors.append(plant.drove(motor))
         counts.append(present.counts)
-        gaps.append(present.dt)
-        if present.terminated or present.truncated:
+        gaps += present.dt
+        if present.ends:
             ended = str(plant.ended_by or Ending.TRACK)
             break
         try:
@@ -186,7 +186,7 @@ def run(
     return measured_part(recorded, plant.fault), present, breakaway
 
 
-def observed(counts: list[tuple[int, int]], gaps: list[float]) -> Observed:
+def observed(counts: list[Numbers], gaps: list[float]) -> Observed:
     """Return the newest positions, and speeds from the two newest."""
     (x_before, theta_before), (x, theta) = counts[-2:] if len(counts) > 1 else (counts[0], counts[0])
     return Observed(

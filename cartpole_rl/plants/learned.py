@@ -15,7 +15,7 @@ from cartpole_rl.compilation import Compiled
 from cartpole_rl.physics.residual import UNDER_WAY, Residual, chosen_members
 from cartpole_rl.plants.learned_model import LearnedModel
 from cartpole_rl.plants.simulated import Carts, Inputs, Period, SimulatedPlant, run_carts
-from cartpole_rl.plants.specs import OneFrame, Plant
+from cartpole_rl.plants.specs import Numbers, Plant, PlantOutput
 from cartpole_rl.randomization.randomizer import Draws
 from cartpole_rl.tasks.settings import StartSettings
 
@@ -82,7 +82,7 @@ class LearnedPlant(SimulatedPlant):
         self._member.index_copy_(0, rows, drawn)
         return super().restart(rows, again)
 
-    def step_one(self, motor: int) -> OneFrame:
+    def step_one(self, motor: int) -> PlantOutput[Numbers]:
         """Drive the only cart for a period, on tensors: the residual's networks are products of matrices."""
         return Plant.step_one(self, motor)
 

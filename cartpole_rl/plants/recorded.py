@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.plants.specs import TERMINATING, TRUNCATING, OneCartPlant, OneFrame
+from cartpole_rl.plants.specs import TERMINATING, TRUNCATING, Numbers, OneCartPlant, PlantOutput
 from cartpole_rl.tasks.episode import Episode
 
 
@@ -40,20 +40,25 @@ class RecordedPlant(OneCartPlant):
     def _set_seed(self, seed: int | None) -> None:
         """Do nothing: a recording is not random."""
 
-    def reset_one(self) -> OneFrame:
+    def reset_one(self) -> PlantOutput[Numbers]:
         """Return to the first frame."""
         self._row = 0
         return self._frame()
 
-    def step_one(self, motor: int) -> OneFrame:
+    def step_one(self, motor: int) -> PlantOutput[Numbers]:
         """Return the next frame, whatever the motor value: the recorded one drove."""
         self._row += 1
-        return self._frame()._replace(sent=int(self.episode.motor[self._row - 1]))
+        return self._frame()
 
-    def _frame(self) -> OneFrame:
+    def drove(self, given: int) -> int:
+        """Return the recorded motor value of the newest period."""
+        return int(self.episode.motor[self._row - 1])
+
+    def _frame(self) -> PlantOutput[Numbers]:
         episode, row = self.episode, self._row
         cart, pole = episode.counts[row].tolist()
         since = float(episode.time[row] - episode.time[max(0, row - 1)])
         motor = int(episode.motor[row - 1]) if row else 0
         ending = episode.ended_by if row == episode.steps else ""
-        return OneFrame((cart, pole), since, motor, ending in TERMINATING, ending in TRUNCATING)
+        ends = (ending in TERMINATING,), (ending in TRUNCATING,)
+        return PlantOutput((cart, pole), (since,), (motor,), *ends)

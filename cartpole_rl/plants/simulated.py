@@ -20,7 +20,7 @@ from cartpole_rl.compilation import Compiled
 from cartpole_rl.physics.dynamics import Drive, MakeAddition, State, run_period
 from cartpole_rl.physics.models import Models, check_laws
 from cartpole_rl.physics.parameters import CartParameters
-from cartpole_rl.plants.specs import OneFrame, Plant, Report
+from cartpole_rl.plants.specs import Numbers, Plant, PlantOutput
 from cartpole_rl.randomization.randomizer import Draws
 from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 from cartpole_rl.rig.parameters import PARAMETERS
@@ -239,7 +239,7 @@ class SimulatedPlant(Plant):
             self._carts.drive.index_fill(1, rows, 0),
         )
         no_motor = torch.zeros_like(counts[:1])
-        return self.frame(self._report(counts, no_motor, no_motor.bool()))
+        return self.first_output(self._frame(counts, no_motor, no_motor.bool()))
 
     def _next_starts(self, count: int) -> Starts:
         if count > self._coming.counts.shape[1]:
@@ -269,17 +269,16 @@ class SimulatedPlant(Plant):
         inputs = Inputs(tensordict.get("motor").T, self._draw_noise(self.carts))
         after = self._run(self._carts, inputs)
         self._carts = Carts(self._carts.table, after.motion, after.drive)
-        return self.step_frame(self._report(after.counts, after.motor_applied, after.off_track))
+        return self.output(self._frame(after.counts, after.motor_applied, after.off_track))
 
-    def step_one(self, motor: int) -> OneFrame:
+    def step_one(self, motor: int) -> PlantOutput[Numbers]:
         """Drive the only cart for a period; the same physics as of many carts, as plain arithmetic."""
         inputs = Inputs(torch.tensor([[motor]]), self._draw_noise(1))
         if self._run_one is None:
             self._run_one = Scalar(self._plain_run, self._carts, inputs)
         after = self._run_one(*(tuple(map(plain, each)) for each in (self._carts, inputs)))
         self._carts = Carts(self._carts.table, column(after.motion), column(after.drive))
-        (motor_applied,), (off_track,) = after.motor_applied, after.off_track
-        return OneFrame(after.counts, self.period, motor_applied, off_track, False)
+        return PlantOutput(after.counts, (self.period,), after.motor_applied, after.off_track, (False,))
 
     def _draw_noise(self, count: int) -> Tensor:
         """Return the noise of one period of `count` carts, [3, count]; 0 if no parameter is noisy."""
@@ -288,10 +287,9 @@ class SimulatedPlant(Plant):
         draws = {"generator": self._generator, "device": self.device}
         return torch.cat((2 * torch.rand(1, count, **draws) - 1, torch.randn(2, count, **draws)))
 
-    def _report(self, counts: Tensor, motor_applied: Tensor, off_track: Tensor) -> Report:
-        """Return the report of tensors that are transposed here."""
+    def _frame(self, counts: Tensor, motor_applied: Tensor, off_track: Tensor) -> PlantOutput[Tensor]:
         dt = torch.full(off_track.shape, self.period, device=self.device)
-        return Report(counts.T, dt.T, motor_applied.T, off_track.T, torch.zeros_like(off_track).T)
+        return PlantOutput(counts, dt, motor_applied, off_track, torch.zeros_like(off_track))
 
 
 def column(numbers: Sequence[float]) -> Tensor:

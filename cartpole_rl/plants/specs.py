@@ -1,7 +1,7 @@
 """The contract of every plant: its inputs and outputs, with shapes and types."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -17,31 +17,26 @@ from cartpole_rl.wire import Fault
 TERMINATING, TRUNCATING = (Ending.TRACK,), (Ending.FAULT, Ending.LINK)  # the endings that plants report
 
 
-class Report(NamedTuple):
-    """The outputs of N carts after a period: see `Plant`."""
-
-    counts: torch.Tensor  # [N, 2] int64
-    dt: torch.Tensor  # [N, 1] float32
-    motor_applied: torch.Tensor  # [N, 1] int64
-    terminated: torch.Tensor  # [N, 1] bool
-    truncated: torch.Tensor  # [N, 1] bool
+Values = TypeVar("Values")  # Tensor, or Numbers
+Numbers = tuple[Any, ...]  # of one cart: the k numbers of a [k, 1] tensor
 
 
-class OneFrame(NamedTuple):
-    """The output of one cart after a period, as plain numbers: see `Plant`."""
+class PlantOutput(NamedTuple, Generic[Values]):
+    """The output of a plant after a period: see `Plant`.
 
-    counts: tuple[int, int]
-    dt: float
-    motor_applied: int
-    terminated: bool
-    truncated: bool
-    sent: int | None = (
-        None  # the motor value that drove, where it is not the given one: that was late or lost
-    )
+    Each entry is a tensor [k, N], the transpose of the tensordict's, or the k numbers of one cart.
+    """
 
-    def drove(self, given: int) -> int:
-        """Return the motor value that drove, where `given` was the one to send."""
-        return given if self.sent is None else self.sent
+    counts: Values  # [2, N] int64
+    dt: Values  # [1, N] float32
+    motor_applied: Values  # [1, N] int64
+    terminated: Values  # [1, N] bool
+    truncated: Values  # [1, N] bool
+
+    @property
+    def ends(self) -> bool:
+        """True for one cart whose episode ends."""
+        return bool(self.terminated[0] or self.truncated[0])  # type: ignore[index]
 
 
 class Plant(EnvBase):
@@ -110,26 +105,34 @@ class Plant(EnvBase):
         mask[rows] = True
         return self._reset(TensorDict({"_reset": mask}, self.batch_size))[rows]
 
-    def reset_one(self) -> OneFrame:
+    def reset_one(self) -> PlantOutput[Numbers]:
         """Start a new episode of a plant of one cart; return its first frame."""
         return one_frame(self._reset())
 
-    def step_one(self, motor: int) -> OneFrame:
+    def step_one(self, motor: int) -> PlantOutput[Numbers]:
         """Drive a plant of one cart for a period under a motor value; return the frame at its end."""
         return one_frame(self._step(tensordict_of({"motor": torch.tensor([[motor]])})))
+
+    def drove(self, given: int) -> int:
+        """Return the motor value that drove the newest period of one cart, where `given` was the one to send.
+
+        It is another one if that was late or lost.
+        """
+        return given
 
     @property
     def carts(self) -> int:
         """N, the number of carts in the batch."""
         return self.batch_size[0]
 
-    def frame(self, report: Report) -> TensorDict:
+    def first_output(self, frame: PlantOutput[torch.Tensor]) -> TensorDict:
         """Return the result of `_reset`, of all carts or some; `done` is `terminated | truncated`."""
-        return tensordict_of({**report._asdict(), "done": report.terminated | report.truncated})
+        done = (frame.terminated | frame.truncated).T
+        return tensordict_of({key: value.T for key, value in frame._asdict().items()} | {"done": done})
 
-    def step_frame(self, report: Report) -> TensorDict:
-        """Return the result of `_step`: `frame` of the same report, and the reward 0 for TorchRL."""
-        return self.frame(report).set("reward", torch.zeros_like(report.dt))
+    def output(self, frame: PlantOutput[torch.Tensor]) -> TensorDict:
+        """Return the result of `_step`: as `first_output`, and the reward 0 for TorchRL."""
+        return self.first_output(frame).set("reward", torch.zeros_like(frame.dt.T))
 
 
 def tensordict_of(entries: dict[str, Any]) -> TensorDict:
@@ -142,11 +145,9 @@ def tensordict_of(entries: dict[str, Any]) -> TensorDict:
     return TensorDict._new_unsafe(entries, batch_size=first.shape[:1], device=first.device)
 
 
-def one_frame(frame: TensorDictBase) -> OneFrame:
+def one_frame(output: TensorDictBase) -> PlantOutput[Numbers]:
     """Return the frame of a plant of one cart as plain numbers."""
-    cart, pole = frame["counts"][0].tolist()
-    dt, motor_applied, terminated, truncated = (frame[key].item() for key in Report._fields[1:])
-    return OneFrame((cart, pole), dt, motor_applied, terminated, truncated)
+    return PlantOutput(*(tuple(output[key][0].tolist()) for key in PlantOutput._fields))
 
 
 class OneCartPlant(Plant):
@@ -156,25 +157,21 @@ class OneCartPlant(Plant):
         super().__init__(carts=1)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDict:
-        return self.frame(as_report(self.reset_one()))
+        return self.first_output(on_tensors(self.reset_one()))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        frame = self.step_one(int(tensordict["motor"]))
-        if frame.sent is not None:
-            tensordict["motor"] = torch.tensor([[frame.sent]])
-        return self.step_frame(as_report(frame))
+        given = int(tensordict["motor"])
+        frame = self.step_one(given)
+        if (drove := self.drove(given)) != given:
+            tensordict["motor"] = torch.tensor([[drove]])
+        return self.output(on_tensors(frame))
 
 
-def as_report(frame: OneFrame) -> Report:
-    """Return the report of a single cart. NumPy is five times as fast as torch.tensor."""
-    rows = (
-        np.array([frame.counts], np.int64),
-        np.array([[frame.dt]], np.float32),
-        np.array([[frame.motor_applied]], np.int64),
-        np.array([[frame.terminated]]),
-        np.array([[frame.truncated]]),
-    )
-    return Report(*map(torch.from_numpy, rows))
+def on_tensors(frame: PlantOutput[Numbers]) -> PlantOutput[torch.Tensor]:
+    """Return the frame of one cart on tensors. NumPy is five times as fast as torch.tensor."""
+    columns = (np.array([values], kind).T for values, kind in zip(frame, TYPES, strict=True))
+    return PlantOutput(*map(torch.from_numpy, columns))
 
 
 DONE_KEYS = ("done", "terminated", "truncated")
+TYPES: tuple[type[np.generic], ...] = (np.int64, np.float32, np.int64, np.bool_, np.bool_)  # of an output

@@ -52,8 +52,8 @@ def compare(tensors: CartPoleEnv, plain: CartPoleEnv, actions: Sequence[int], ro
         assert cart.sent_motor(action) == sent.item()
         present, percept = tensors.step(present)["next"], cart.step(action)
         same(percept, present, "terminated", "truncated", "done")
-        assert cart.frame.dt == pytest.approx(present["dt"].item())
-        assert cart.frame.motor_applied == present["motor_applied"].item()
+        assert cart.frame.dt[0] == pytest.approx(present["dt"].item())
+        assert cart.frame.motor_applied[0] == present["motor_applied"].item()
         if present["done"]:
             same(percept, present, "reward", *SCORES)
             break
@@ -94,7 +94,7 @@ def test_no_action_sends_motor_0_and_truncates(
     pair = [make_environment(make_plant(1), MOTORS, guard=GUARD) for _ in range(2)]
     assert compare(*pair, [2, 2, NO_ACTION, 2], rounding=1) == 3
     cart = pair[1].one_cart
-    assert cart.sent_motor(NO_ACTION) == cart.frame.motor_applied == 0
+    assert cart.sent_motor(NO_ACTION) == cart.frame.motor_applied[0] == 0
 
 
 @pytest.mark.parametrize("action", [-2, 3])

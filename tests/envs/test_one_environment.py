@@ -14,7 +14,7 @@ from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.plants.serial.plant import SerialPlant, emulated_plant
 from cartpole_rl.plants.simulated import SimulatedPlant
-from cartpole_rl.plants.specs import Plant, Report
+from cartpole_rl.plants.specs import Plant, PlantOutput
 
 MakePlant = Callable[..., SimulatedPlant]
 MakeEnvironment = Callable[..., CartPoleEnv]
@@ -51,15 +51,15 @@ class RecordedPlant(Plant):
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDict:
         self._next = 0
-        return self.frame(self._read())
+        return self.first_output(self._read())
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        return self.step_frame(self._read())
+        return self.output(self._read())
 
-    def _read(self) -> Report:
+    def _read(self) -> PlantOutput[Tensor]:
         frame = self._frames[self._next]
         self._next += 1
-        return Report(*(frame[key].expand(self.carts, -1).clone() for key in Report._fields))
+        return PlantOutput(*(frame[key].expand(self.carts, -1).clone().T for key in PlantOutput._fields))
 
     def _set_seed(self, seed: int | None) -> None: ...
 
@@ -101,7 +101,7 @@ def test_the_same_counts_give_the_same_observations(
     env: CartPoleEnv = request.getfixturevalue(source)
     actions = torch.randint(3, (STEPS,), generator=torch.Generator().manual_seed(0))
     original = drive(env, actions)
-    recorded = torch.stack([frame.select(*Report._fields) for frame in original])
+    recorded = torch.stack([frame.select(*PlantOutput._fields) for frame in original])
     plant = RecordedPlant(recorded[:, 0], carts, env.plant.pole_length.item())
     again = drive(make_environment(plant, pole_length=True, past_motors=2, past_velocities=2), actions)
     for first, second in zip(original, again, strict=True):

@@ -7,8 +7,9 @@ import pytest
 import torch
 
 from cartpole_rl.choices import choice
-from cartpole_rl.envs.perception import Percept, PlantOutput, Previous, perceive, perceive_first, remember
+from cartpole_rl.envs.perception import Percept, Previous, perceive, perceive_first, remember
 from cartpole_rl.envs.settings import ObservationSettings
+from cartpole_rl.plants.specs import PlantOutput
 from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 from cartpole_rl.tasks.features import ANGULAR_SPEED_SCALE, MOTOR_SCALE, SPEED_SCALE
 from cartpole_rl.tasks.settings import RewardSettings, StartSettings, TaskSettings
@@ -46,6 +47,7 @@ def frame(cart: int = 100, pole: int = 10, terminated: bool = False, truncated: 
     return PlantOutput(
         counts=torch.tensor([[0, cart], [0, pole]]),
         dt=torch.full((1, 2), 0.02),
+        motor_applied=torch.zeros(1, 2, dtype=torch.int64),
         terminated=torch.tensor([[False, terminated]]),
         truncated=torch.tensor([[False, truncated]]),
     )
@@ -81,8 +83,8 @@ def test_the_newest_of_the_past_comes_first_and_the_oldest_is_forgotten() -> Non
 
 
 def test_a_first_frame_has_no_velocity_and_no_memory() -> None:
-    counts = torch.tensor([[100, 0], [0, 1024]])
-    first = perceive_first(counts, NO_LENGTH, TRACK_END, settings=RAW, guard=None)
+    output = frame()._replace(counts=torch.tensor([[100, 0], [0, 1024]]))
+    first = perceive_first(output, NO_LENGTH, TRACK_END, settings=RAW, guard=None)
     assert first.state[1].tolist() == first.state[3].tolist() == [0, 0]
     assert first.state[2, 1] == pytest.approx(math.pi / 2)
     assert not first.past.any()

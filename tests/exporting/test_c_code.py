@@ -110,7 +110,7 @@ def check_motors(training: TrainConfig, policy: Policy, compiled: Compiled, peri
         for period in range(periods):
             present = tensordict_of({"observation": torch.from_numpy(np.array([observation], np.float32))})
             action = int(choose(policy, present))
-            motor, found = cart.sent_motor(action), compiled.motor(cart.frame.counts, cart.frame.dt)
+            motor, found = cart.sent_motor(action), compiled.motor(cart.frame.counts, cart.frame.dt[0])
             if found != motor:  # either is right, and the two remember different motor values
                 values = policy(present)["action_value"].numpy()
                 assert_same_actions(np.array([training.actions.motors.index(found)]), values)

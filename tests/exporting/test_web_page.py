@@ -19,7 +19,7 @@ from cartpole_rl.exporting.web_page import LONGEST_LATENCY, web_page
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.settings import SimulatedSettings
 from cartpole_rl.plants.simulated import Carts, Inputs, commands_under_way, run_carts
-from cartpole_rl.plants.specs import OneCartPlant, OneFrame
+from cartpole_rl.plants.specs import Numbers, OneCartPlant, PlantOutput
 from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 from cartpole_rl.scalar import Scalar
 from cartpole_rl.workflows.agents import TrainedAgent, new_agent
@@ -90,16 +90,16 @@ class ExactPlant(OneCartPlant):
     def _set_seed(self, seed: int | None) -> None:
         """Nothing is random."""
 
-    def reset_one(self) -> OneFrame:
+    def reset_one(self) -> PlantOutput[Numbers]:
         self.motion, self.drive = self.start, (0.0,) * (1 + self.commands)
         x, _, theta, _ = self.start
         counts = round(x / CART_METRES_PER_COUNT), round(theta / POLE_RADIANS_PER_COUNT)
-        return OneFrame(counts, self.period, 0, False, False)
+        return PlantOutput(counts, (self.period,), (0,), (False,), (False,))
 
-    def step_one(self, motor: int) -> OneFrame:
+    def step_one(self, motor: int) -> PlantOutput[Numbers]:
         after = self.run((self.table, self.motion, self.drive), ((motor,), (0.0, 0.0, 0.0)))
         self.motion, self.drive = after.motion, after.drive
-        return OneFrame(after.counts, self.period, motor, after.off_track[0], False)
+        return PlantOutput(after.counts, (self.period,), (motor,), after.off_track, (False,))
 
 
 @torch.no_grad()

@@ -36,7 +36,7 @@ from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.serial.plant import emulated_plant
 from cartpole_rl.plants.simulated import SimulatedPlant
-from cartpole_rl.plants.specs import OneFrame
+from cartpole_rl.plants.specs import Numbers, PlantOutput
 from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_COUNTS_PER_TURN
 from cartpole_rl.tasks.episode import Episode
@@ -139,11 +139,12 @@ def test_what_follows_a_frozen_count_is_not_recorded(stuck_at: float, names: lis
 
 def test_a_value_that_came_too_late_is_recorded_as_what_drove(make_plant: Callable) -> None:
     class LatePlant(SimulatedPlant):
-        def step_one(self, motor: int) -> OneFrame:
-            late = len(given) == 2
+        def step_one(self, motor: int) -> PlantOutput[Numbers]:
             given.append(motor)
-            frame = super().step_one(0 if late else motor)
-            return frame._replace(sent=0) if late else frame
+            return super().step_one(self.drove(motor))
+
+        def drove(self, motor: int) -> int:
+            return 0 if len(given) == 3 else motor
 
     def push(task: Task) -> Moves:
         yield from hold(100, 5 * PERIOD, task)

@@ -27,7 +27,7 @@ from cartpole_rl.plants.serial.preparation import (
     nobody,
 )
 from cartpole_rl.plants.settings import EmulatedSettings, Rehome, SerialSettings
-from cartpole_rl.plants.specs import TERMINATING, TRUNCATING, OneCartPlant, OneFrame, as_report
+from cartpole_rl.plants.specs import TERMINATING, TRUNCATING, Numbers, OneCartPlant, PlantOutput, on_tensors
 from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.wire import Fault, Flags, State, seconds_between, ticks_between, went_back
@@ -86,7 +86,7 @@ class SerialPlant(OneCartPlant):
         faults = FaultClearing(settings.clear_faults, confirm)
         self._preparation = Preparation(self.cart, start, control_period, faults, prompt)
         self._driving = False  # an episode is under way
-        self._drove = 0  # the motor value in the period before
+        self._drove = 0  # the motor value of the newest period
         self._turns = 0  # pole counts of the whole turns that the pole had made before this episode
         self._owned = owned
         self._state = State(0, 0, 0, 0, 0, 0, 0, 0)
@@ -133,10 +133,10 @@ class SerialPlant(OneCartPlant):
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDict:
         if tensordict is not None and "_reset" in tensordict and not tensordict["_reset"].any():
-            return self.frame(as_report(self._frame(self._preparation.control_period)))
+            return self.first_output(on_tensors(self._frame(self._preparation.control_period)))
         return super()._reset()
 
-    def reset_one(self) -> OneFrame:
+    def reset_one(self) -> PlantOutput[Numbers]:
         """Prepare the cart, arm it, and return the first frame of an episode."""
         self._reach()
         self._preparation.prepare()
@@ -162,7 +162,7 @@ class SerialPlant(OneCartPlant):
             self.halt()
             raise
 
-    def step_one(self, motor: int) -> OneFrame:
+    def step_one(self, motor: int) -> PlantOutput[Numbers]:
         """Send a motor value; return the frame at the end of the period.
 
         If the cart does not acknowledge the value, or its limits changed one, what drove is what it reports:
@@ -187,9 +187,13 @@ class SerialPlant(OneCartPlant):
 
         frame = self._pass_period(answer)
         self._drove = drove
-        return frame if drove == motor else frame._replace(sent=drove)
+        return frame
 
-    def listen_one(self) -> OneFrame:
+    def drove(self, given: int) -> int:
+        """Return the motor value that drove the newest period."""
+        return self._drove
+
+    def listen_one(self) -> PlantOutput[Numbers]:
         """Let the policy on the board drive; return the frame at the end of the period."""
 
         def listen() -> State:
@@ -199,7 +203,7 @@ class SerialPlant(OneCartPlant):
 
         return self._pass_period(listen)
 
-    def _pass_period(self, next_state: Callable[[], State]) -> OneFrame:
+    def _pass_period(self, next_state: Callable[[], State]) -> PlantOutput[Numbers]:
         """Return the frame of the next state, or the last one after an ending."""
         if not self._driving:
             return self._frame(self._preparation.control_period)
@@ -242,16 +246,16 @@ class SerialPlant(OneCartPlant):
             self.halt()
         self._state = replace(self._state, motor_applied=0, command_age_ms=0)
 
-    def _frame(self, dt: float) -> OneFrame:
+    def _frame(self, dt: float) -> PlantOutput[Numbers]:
         """Return the frame of the newest state; `dt` in s."""
         state, ending = self._state, self.ended_by
         halted = not self._driving and not ending
-        return OneFrame(
+        return PlantOutput(
             (state.cart_counts, state.pole_counts - self._turns),
-            dt,
-            state.motor_applied,
-            ending in TERMINATING,
-            halted or ending in TRUNCATING,
+            (dt,),
+            (state.motor_applied,),
+            (ending in TERMINATING,),
+            (halted or ending in TRUNCATING,),
         )
 
     def _whole_turns(self) -> int:

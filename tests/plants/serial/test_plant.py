@@ -69,6 +69,12 @@ def test_a_reset_that_fails_after_start_disarms_the_cart(on_board: bool) -> None
         assert not peer.flags & Flags.ARMED
 
 
+def driven(plant: SerialPlant, motor: int) -> int:
+    """The value that drove, of a period with `motor`."""
+    plant.step_one(motor)
+    return plant.drove(motor)
+
+
 def test_a_value_that_is_replaced_by_0_is_the_one_that_counts(
     peer: CartPeer, plant: SerialPlant, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -78,26 +84,26 @@ def test_a_value_that_is_replaced_by_0_is_the_one_that_counts(
     monkeypatch.setattr(plant.cart, "_is_late", lambda: True)
     given = TensorDict({"motor": torch.tensor([[200]])}, [1])
     plant._step(given)
-    assert plant.step_one(200).sent == 0
+    assert driven(plant, 200) == 0
     assert given["motor"].item() == 0
     assert commanded == [0, 0]
     monkeypatch.undo()
-    assert plant.step_one(200).sent is None
+    assert driven(plant, 200) == 200
     assert peer.messages(SetMotor)[-1].motor == 200
 
 
 def test_a_value_that_was_lost_did_not_drive(peer: CartPeer, plant: SerialPlant) -> None:
     """What drove is the value before, also in the period at whose end the watchdog sets the motor to 0."""
     plant.reset()
-    assert plant.step_one(100).sent is None
+    assert driven(plant, 100) == 100
     answer = peer.answer
     peer.answer = lambda frame: [peer.next_state()]  # hears nothing; its states go on
-    assert plant.step_one(200).sent == 100
+    assert driven(plant, 200) == 100
     peer.state, peer.flags = replace(peer.state, motor_applied=0), peer.flags | Flags.WATCHDOG
-    assert plant.step_one(200).sent == 100
-    assert plant.step_one(200).sent == 0
+    assert driven(plant, 200) == 100
+    assert driven(plant, 200) == 0
     peer.answer, peer.flags = answer, peer.flags & ~Flags.WATCHDOG
-    assert plant.step_one(200).sent is None
+    assert driven(plant, 200) == 200
 
 
 def test_a_value_that_a_limit_of_the_track_replaced_did_not_drive(peer: CartPeer, plant: SerialPlant) -> None:
@@ -123,7 +129,7 @@ def test_a_value_that_a_limit_of_the_track_replaced_did_not_drive(peer: CartPeer
         assert given["motor"].item() == motor
     assert commanded == [200, 200]
     peer.answer, peer.flags = answer, peer.flags & ~Flags.SOFT_LIMIT
-    assert plant.step_one(200).sent is None
+    assert driven(plant, 200) == 200
 
 
 def test_a_fault_ends_the_value_that_drove(peer: CartPeer, plant: SerialPlant) -> None:
@@ -131,7 +137,7 @@ def test_a_fault_ends_the_value_that_drove(peer: CartPeer, plant: SerialPlant) -
     plant.step_one(100)
     peer.state = replace(peer.state, motor_applied=0, fault=Fault.STALL)
     peer.answer = lambda frame: [peer.next_state()]
-    assert plant.step_one(200).sent == 100
+    assert driven(plant, 200) == 100
 
 
 @pytest.mark.parametrize("motor", [256, -30_000])
@@ -143,7 +149,7 @@ def test_a_motor_value_that_no_cart_has_is_a_lost_link(
     peer.answer = lambda frame: [peer.next_state()]
     peer.state = replace(peer.state, motor_applied=motor)
     frame = plant.step_one(100)
-    assert (frame.truncated, frame.motor_applied) == (True, 0)
+    assert (frame.truncated, frame.motor_applied) == ((True,), (0,))
     assert f"has motor value {motor}, which is beyond 255" in str(plant.last_error)
 
 
@@ -184,10 +190,10 @@ def test_a_host_that_was_suspended_while_it_waited_is_a_lost_link(
     """A person may have moved the cart meanwhile: the motor stays at 0, and the cart is homed."""
     plant.on_board = on_board
     plant.reset_one()
-    assert not (plant.listen_one() if on_board else plant.step_one(50)).truncated
+    assert not (plant.listen_one() if on_board else plant.step_one(50)).ends
     peer.state = replace(peer.state, time_us=peer.state.time_us + 500_000)
     frame = plant.listen_one() if on_board else plant.step_one(50)
-    assert (frame.truncated, frame.motor_applied, plant.ended_by) == (True, 0, "link")
+    assert (frame.truncated, frame.motor_applied, plant.ended_by) == ((True,), (0,), "link")
     assert "did not answer" in str(plant.last_error)
     assert_stopped(peer)
     plant.reset_one()
