@@ -25,7 +25,7 @@ from omegaconf import DictConfig, OmegaConf
 from cartpole_rl import __version__
 from cartpole_rl.checking import checked, kinds, most_similar, similarity
 from cartpole_rl.choices import conf_folder, default_choices
-from cartpole_rl.composition import as_mapping, hydra_overrides, is_completing
+from cartpole_rl.composition import as_mapping, hydra_overrides, is_completing, task_overrides
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.exits import (
     EXPECTED,
@@ -84,7 +84,8 @@ def run_job(
     sys.argv[1:] = given  # as typed, for provenance.json
     quieten()  # here, since a launcher may run the job in another process
     folder = Path(HydraConfig.get().runtime.output_dir)
-    words = [typed.get(word, word) for word in HydraConfig.get().overrides.task if not is_completing(word)]
+    overrides = task_overrides(HydraConfig.get().overrides.task)
+    words = [typed.get(word, word) for word in overrides if not is_completing(word)]
 
     def work() -> float | None:
         config = checked(verb.find(verb.settings), as_mapping(composed))

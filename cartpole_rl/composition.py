@@ -27,7 +27,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import ChoiceSweep, QuotedString
 from hydra.errors import HydraException, OverrideParseException
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from cartpole_rl.checking import (
@@ -304,6 +304,11 @@ def key_of(word: str) -> str:
     """Return the name in an override: "cart.cart_mass" of "+cart.cart_mass=1"; "" of another word."""
     is_override = not word.startswith("-") and ("=" in word or word.startswith("~"))
     return word.lstrip("+~").partition("=")[0].partition("@")[0] if is_override else ""
+
+
+def task_overrides(given: ListConfig) -> list[str]:
+    """Return the overrides that Hydra notes, as they were given: `${experiment}` may not be resolved there."""
+    return [str(word) for word in OmegaConf.to_container(given, resolve=False)]
 
 
 def is_completing(word: str) -> bool:

@@ -24,11 +24,11 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf, open_dict, read_write
+from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict, read_write
 from omegaconf.errors import OmegaConfBaseException
 
 from cartpole_rl.checking import checked
-from cartpole_rl.composition import as_mapping, is_completing
+from cartpole_rl.composition import as_mapping, is_completing, task_overrides
 from cartpole_rl.errors import CartPoleError, ConfigError
 from cartpole_rl.exits import EXPECTED, exit_with_message, one_line
 from cartpole_rl.files import write_text
@@ -83,12 +83,12 @@ def constant_settings() -> list[str]:
     return [each.get_key_element() for each in parsed if not each.is_sweep_override()]
 
 
-def job_name(number: int, overrides: Sequence[str], constant: Collection[str]) -> str:
+def job_name(number: int, overrides: ListConfig, constant: Collection[str]) -> str:
     """Return the folder of one job of a multirun, by its swept settings: "0_randomization-friction_3_seed-0".
 
     Characters that a shell or Hydra would interpret become "-".
     """
-    given = (word for word in overrides if "=" in word and not is_completing(word))
+    given = (word for word in task_overrides(overrides) if "=" in word and not is_completing(word))
     swept = (word for word in given if word.split("=")[0] not in constant)
     plain = (re.sub(r"[^\w.+-]+", "-", word).strip("-") for word in swept)
     return "_".join((str(number), *plain))[:LONGEST_NAME]
@@ -128,7 +128,8 @@ def check_jobs(config: DictConfig, schema: type[Settings]) -> None:
         return
     loader = GlobalHydra.instance().config_loader()
     words = [f"{key}={value}" for key, value in (sweeper.params or {}).items()]
-    overrides = OverridesParser.create(loader).parse_overrides([*words, *config.hydra.overrides.task])
+    words += task_overrides(config.hydra.overrides.task)
+    overrides = OverridesParser.create(loader).parse_overrides(words)
     for job in chain.from_iterable(BasicSweeper.split_arguments(overrides, None)):
         composed = loader.load_sweep_config(config, list(job))
         with read_write(composed), open_dict(composed):
