@@ -306,9 +306,10 @@ def key_of(word: str) -> str:
     return word.lstrip("+~").partition("=")[0].partition("@")[0] if is_override else ""
 
 
-def task_overrides(given: ListConfig) -> list[str]:
-    """Return the overrides that Hydra notes, as they were given: `${experiment}` may not be resolved there."""
-    return [str(word) for word in OmegaConf.to_container(given, resolve=False)]
+def task_overrides(given: list[str] | ListConfig) -> list[str]:
+    """Return overrides that Hydra notes, as they were given: `${experiment}` may not be resolved there."""
+    words: Any = OmegaConf.to_container(given, resolve=False) if isinstance(given, ListConfig) else given
+    return [*words]
 
 
 def is_completing(word: str) -> bool:

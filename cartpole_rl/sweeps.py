@@ -83,7 +83,7 @@ def constant_settings() -> list[str]:
     return [each.get_key_element() for each in parsed if not each.is_sweep_override()]
 
 
-def job_name(number: int, overrides: ListConfig, constant: Collection[str]) -> str:
+def job_name(number: int, overrides: list[str] | ListConfig, constant: Collection[str]) -> str:
     """Return the folder of one job of a multirun, by its swept settings: "0_randomization-friction_3_seed-0".
 
     Characters that a shell or Hydra would interpret become "-".

@@ -121,27 +121,34 @@ def finetune(config: FinetuneConfig, folder: Path, words: Sequence[str] = ()) ->
             write_bytes(files.start, start.read_bytes())
         if not checkpoint:
             files.save({}, 0)
-        tuned = TunedAgent(training, load_agent(start), checkpoint)
-        live = LiveView(view_title(config.plant), config.view)
-        make_env = partial(driven_env, settings, evaluation, live.memory)  # called with `confirm`
-        real_time = is_real_time(config.plant, config.emulator)
-        with (
-            live,
-            TensorBoardLog(folder) as log,
-            link_to_learner(files, tuned, evaluation) as link,
-            Driver(make_env, partial(greedy_network, training), real_time, confirm) as driver,
-            yielding_to(driver, link is None) if real_time else nullcontext(),
-        ):
-            cart = DrivenCart(driver, files, log)
-            cart.evaluate(Stage.BEFORE, tuned.first_weights)
-            if link is None:
-                learn_here(cart, tuned, settings)
-            else:
-                learn_there(link, cart, tuned)
-            cart.evaluate(Stage.AFTER, tuned.weights)
-            compare(cart, tuned, settings)
+        drive_all(files, TunedAgent(training, load_agent(start), checkpoint), settings, evaluation)
         forget_training(folder)
         files.start.unlink(missing_ok=True)
+
+
+def drive_all(
+    files: FinetuningFiles, tuned: TunedAgent, settings: CartPoleSettings, evaluation: EvaluateConfig
+) -> None:
+    """Drive the three stages, and learn in the second."""
+    config, live = files.config, LiveView(view_title(files.config.plant), files.config.view)
+    real_time = is_real_time(config.plant, config.emulator)
+    make_env = partial(driven_env, settings, evaluation, live.memory)  # called with `confirm`
+    make_policy = partial(greedy_network, tuned.training)
+    with (
+        live,
+        TensorBoardLog(files.folder) as log,
+        link_to_learner(files, tuned, evaluation) as link,
+        Driver(make_env, make_policy, real_time, confirm) as driver,
+        yielding_to(driver, link is None) if real_time else nullcontext(),
+    ):
+        cart = DrivenCart(driver, files, log)
+        cart.evaluate(Stage.BEFORE, tuned.first_weights)
+        if link is None:
+            learn_here(cart, tuned, settings)
+        else:
+            learn_there(link, cart, tuned)
+        cart.evaluate(Stage.AFTER, tuned.weights)
+        compare(cart, tuned, settings)
 
 
 def started_from(files: FinetuningFiles) -> Path:

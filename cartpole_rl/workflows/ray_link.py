@@ -242,7 +242,9 @@ class Link:
                 continue
             except ray.exceptions.RayActorError as error:
                 print(error, file=sys.stderr)
-                raise ConnectionError(f"its process on the other machine ended, see {LOG}") from None
+                died = isinstance(error, ray.exceptions.ActorDiedError)
+                reason = "its process ended" if died else "the connection broke"
+                raise ConnectionError(f"{reason}, see {LOG}") from None
             self.answered.value, patience = time.monotonic(), self.settings.timeout
             taken, news, arrived = answer
             if news:

@@ -11,7 +11,6 @@ import heapq
 import multiprocessing
 import os
 import select
-import socket
 import struct
 import subprocess
 import threading
@@ -76,11 +75,8 @@ def two_machines(prefix: str) -> Iterator[tuple[Machine, Machine, Cable]]:
 
 
 def _make(machine: Machine) -> int:
-    """Make a machine whose name is that of this host, and return its end of the cable as an open file."""
+    """Make a machine, and return its end of the cable as an open file."""
     subprocess.run(["ip", "netns", "add", machine.name], check=True)
-    hosts = _hosts(machine)
-    hosts.parent.mkdir(parents=True, exist_ok=True)
-    hosts.write_text(f"127.0.0.1 localhost\n{machine.address} {socket.gethostname()}\n")
     end = _tun_in(machine.name)
     for words in (
         ("link", "set", "lo", "up"),
@@ -93,14 +89,6 @@ def _make(machine: Machine) -> int:
 
 def _remove(machine: Machine) -> None:
     subprocess.run(["ip", "netns", "delete", machine.name], check=False)
-    _hosts(machine).unlink(missing_ok=True)
-    if _hosts(machine).parent.is_dir():
-        _hosts(machine).parent.rmdir()
-
-
-def _hosts(machine: Machine) -> Path:
-    """Return the file that `ip netns exec` shows as /etc/hosts."""
-    return Path("/etc/netns", machine.name, "hosts")
 
 
 def _tun_in(namespace: str) -> int:

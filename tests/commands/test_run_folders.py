@@ -13,7 +13,6 @@ import pytest
 import torch
 import yaml
 from command_line import TINY, console_script, in_process, outcome, prints_only_progress
-from omegaconf import ListConfig
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
@@ -219,9 +218,9 @@ def test_the_name_of_a_job_needs_no_quotes(sweep: list[Path], tmp_path: Path) ->
 def test_names_of_jobs_show_what_differs(monkeypatch: pytest.MonkeyPatch) -> None:
     words = ["-m", "compile=false", "agent.hidden=[64,64],[8]", "run=runs/a,runs/b", "seed=range(0,2)"]
     monkeypatch.setattr(sys, "argv", ["cartpole-train", *words])
-    job = ListConfig(["compile=False", "agent.hidden=[64,64]", "run=runs/a", "seed=0"])
+    job = ["compile=False", "agent.hidden=[64,64]", "run=runs/a", "seed=0"]
     assert job_name(7, job, constant_settings()) == "7_agent.hidden-64-64_run-runs-a_seed-0"
-    assert job_name(0, ListConfig(["compile=False"]), constant_settings()) == "0"
+    assert job_name(0, ["compile=False"], constant_settings()) == "0"
 
 
 def test_runs_that_start_in_the_same_second_do_not_share_a_folder(
