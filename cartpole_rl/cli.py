@@ -130,7 +130,7 @@ VERBS: dict[str, Verb] = {
     ),
     "report": Verb(
         "workflows.config:ReportConfig",
-        "workflows.pages.report:make_report",
+        "workflows.report:make_report",
         "makes one HTML page from run folders.",
         "reports",
         (

@@ -7,6 +7,7 @@ import hashlib
 import json
 import os
 import platform
+import re
 import subprocess
 import sys
 from collections.abc import Iterable, Mapping
@@ -16,7 +17,7 @@ from typing import Any
 
 import yaml
 
-from cartpole_rl.errors import CheckpointError, ConfigError
+from cartpole_rl.errors import CheckpointError, ConfigError, RecordingError
 from cartpole_rl.files import write_text
 from cartpole_rl.terminal import as_value, as_word
 
@@ -32,6 +33,7 @@ FIGURES, RECORDINGS = "figures", "recordings"
 ANIMATION, BESIDE_SIMULATION = "episode.gif", "beside_simulation.gif"  # of the first episode
 CHECKPOINTS, LAST, BEST, RESUME = "checkpoints", "last.pt", "best.pt", "resume.pt"  # of an agent
 START = "start.pt"  # in checkpoints/ of an unfinished fine-tuning: a copy of the agent that it started from
+BASELINE = Path("lqr")  # run=lqr is energy and LQR, not a folder
 PRETRAINED, PRETRAINED_AGENT = "pretrained", "agent.pt"  # run=pretrained/medium is an agent in this package
 CART, POLE, RANDOMIZATION, POSTERIOR = "cart.yaml", "pole.yaml", "randomization.yaml", "posterior.npz"
 RUN_FILES = (CONFIG, CART, POLE, RANDOMIZATION)
@@ -52,6 +54,7 @@ USES = {  # command: how its runs can be used
     "model": "cartpole-train, cartpole-evaluate and cartpole-record take it as plant=learned plant.model={0}",
     "export": "its files are for other programs; cartpole-export run=... makes new ones",
 }
+RECORDING = ("record", "identify", "finetune")  # commands whose runs hold recordings
 PACKAGES = ("cartpole_rl", "torch", "torchrl", "tensordict", "numpy", "hydra-core", "mujoco", "pyserial")
 
 
@@ -179,6 +182,27 @@ def find_training(run: Path) -> Path:
             "interrupted after its first checkpoint"
         )
     return path
+
+
+def recordings(source: Path) -> list[Path]:
+    """Return `source` itself if it is a file, else the recordings in that folder or run folder.
+
+    Raises RecordingError if there is none, and ConfigError for a run of a command that records nothing.
+    """
+    if source.is_file():
+        return [source]
+    check_program("from", source, *RECORDING)
+    inner = source / RECORDINGS
+    found = sorted((inner if inner.is_dir() else source).glob("*.csv"))
+    if not found:
+        missing = "it contains no recording" if source.exists() else "there is no such file or folder"
+        raise RecordingError(f"from={source}: {missing}; give a run of cartpole-record or cartpole-identify")
+    return found
+
+
+def experiments(source: Path) -> dict[str, Path]:
+    """Return `recordings` by the names of their experiments, or of their files. Raises the same errors."""
+    return {re.sub(r"^\d\d_(?=.)", "", path.stem): path for path in recordings(source)}
 
 
 def write_inputs(folder: Path, needs: Iterable[Path]) -> None:

@@ -5,6 +5,7 @@ import re
 import shlex
 import sys
 from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 READER_LEFT = 141  # exit code, as of a program that SIGPIPE ends
@@ -83,3 +84,25 @@ def progress_bar(total: int, unit: str, **options: Any) -> Any:
 
     is_terminal = sys.stderr is not None and sys.stderr.isatty()
     return tqdm(total=total, unit=f" {unit}", dynamic_ncols=True, disable=not is_terminal, **options)
+
+
+def print_results(folder: Path, files: str, following: str) -> None:
+    """Print that `files` are in `folder`, and the command `following`."""
+    print(f"{shown(folder)}/{files} are written; next:")
+    print(following)
+
+
+def print_loop_time(override: str | None) -> None:
+    """Print the measured loop time of `LinkStatistics.latency_override`, if there is one."""
+    if override is not None:
+        print(
+            "measured loop time as an override of cartpole-train; add the latency that cartpole-preflight "
+            f"prints to both numbers: '{override}'"
+        )
+
+
+def shown(path: Path) -> Path:
+    """Return `path` relative to the working directory if it is below it."""
+    with suppress(ValueError):
+        return path.resolve().relative_to(Path.cwd())
+    return path

@@ -1,7 +1,8 @@
 """Recordings: episodes as CSV files, with units in the column names.
 
 Lines `# key: value` describe the whole episode. A row is a control period: the measured state, then the motor
-value chosen on it, its scores and reward. The last row, the end of the episode, has only the state.
+value chosen on it, its scores and reward. The last row, the end of the episode, has only the state. The
+simulated cart and its initial state are stored as in metrics.json.
 """
 
 import csv
@@ -15,7 +16,7 @@ from cartpole_rl.errors import RecordingError
 from cartpole_rl.files import replacing
 from cartpole_rl.rig.hardware import LARGEST_MOTOR
 from cartpole_rl.tasks.endings import Ending
-from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.tasks.episode import Episode, Origin
 
 FORMAT = "cartpole_rl recording 1"
 STATE = {  # column: field of Episode
@@ -141,3 +142,37 @@ def _check_numbers(
         raise damaged(int(np.flatnonzero(beyond)[0]), f"a motor value is beyond {LARGEST_MOTOR}")
     if (beyond := (counts < FEWEST_COUNTS) | (counts > MOST_COUNTS)).any():
         raise damaged(int(np.flatnonzero(beyond.any(axis=1))[0]), f"a count is beyond {MOST_COUNTS}")
+
+
+def stored_origins(episodes: Sequence[Episode]) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """Return the parameters that all simulated carts share, and the rest for each, for metrics.json.
+
+    Both are empty if a cart was not simulated. `read_origin` is the inverse.
+    """
+    stored = [stored_origin(episode.origin) for episode in episodes if episode.origin is not None]
+    if len(stored) < len(episodes):
+        return {}, [{} for _ in episodes]
+    carts = [each["cart"] for each in stored]
+    shared = {name: value for name, value in carts[0].items() if all(cart[name] == value for cart in carts)}
+    own = [{name: value for name, value in cart.items() if name not in shared} for cart in carts]
+    return {"cart": shared}, [{**each, "cart": cart} for each, cart in zip(stored, own, strict=True)]
+
+
+def stored_origin(origin: Origin) -> dict[str, dict[str, float]]:
+    """Return a cart and its initial state with numbers as short as possible."""
+    return {
+        "cart": {name: as_stored(value) for name, value in origin.parameters.items()},
+        "start": {name: as_stored(value) for name, value in origin.state.items()},
+    }
+
+
+def read_origin(metrics: Mapping[str, Any], number: int) -> Origin:
+    """Return the cart and the initial state of an episode in metrics.json. Raises LookupError."""
+    episode = metrics["episodes"][number]
+    return Origin({**metrics["cart"], **episode["cart"]}, episode["start"])
+
+
+def as_stored(value: float) -> float:
+    """Return the shortest number that is `value` as float32: 0.7 instead of 0.699999988079071."""
+    short = float(str(np.float32(value)))
+    return short if np.float32(short) == np.float32(value) else value

@@ -1,9 +1,13 @@
-"""Figure of one episode: angle, position and motor value over time (thesis, figures 6.2 and 6.10).
+"""Results of episodes: metrics.json, and angle, position and motor value of one episode over time.
 
-The thesis scales the three to one axis; here each has a panel with its unit, on a common time axis.
+Figures 6.2 and 6.10 of the thesis scale the three to one axis; here each has a panel with its unit, on a
+common time axis.
 """
 
 import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,17 +15,76 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from cartpole_rl.drawing import colours
+from cartpole_rl.evaluation.metrics import episode_metrics, summarize
+from cartpole_rl.evaluation.recordings import stored_origins
+from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.reporting import style
+from cartpole_rl.reporting.animation import durations, frames, write_animation
+from cartpole_rl.reporting.scores import learning_curve
 from cartpole_rl.reporting.texts import ending_text, guard_text
 from cartpole_rl.rig.hardware import LARGEST_MOTOR
+from cartpole_rl.run_folder import ANIMATION, FIGURES, METRICS, write_json
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.tasks.rewards import UPRIGHT_ANGLE
+from cartpole_rl.tasks.settings import TaskSettings
 from cartpole_rl.tasks.upright import is_upright, upright_since
 
 SMALL_SWING = 40.0  # deg; the angle axis of an episode within it is enlarged
 MOTOR_TICKS = (-250, -125, 0, 125, 250)
 
 Array = NDArray[np.float64]
+
+
+def report_episodes(
+    folder: Path,
+    episodes: Sequence[Episode],
+    plant: str,
+    pole: PoleSettings,
+    task: TaskSettings,
+    link: Mapping[str, int] | None = None,
+    history: Sequence[Mapping[str, float]] = (),
+    onboard: Sequence[Episode] = (),
+    mp4: bool = False,
+) -> dict[str, Any]:
+    """Write figures/ and metrics.json into `folder`, and return the summary of the episodes (`summarize`).
+
+    metrics.json is written last: a run that has it is complete.
+    Behaviour figure and animation show the first episode; `mp4` adds the animation as an MP4. `history` adds
+    the learning curve, `onboard` the episodes that the cart's board drove, under that key of metrics.json and
+    of the summary.
+    """
+    x_max = task.x_max
+    summary, listed = summarized(episodes, x_max)
+    header = {"plant": plant, "pole": pole.name, **(link or {})}
+    cart, origins = stored_origins(episodes)
+    listed = [{**each, **origin} for each, origin in zip(listed, origins, strict=True)]
+    content = {**header, **summary, **cart, "episodes": listed}
+    figures = folder / FIGURES
+    if onboard:
+        summary["onboard"], listed = summarized(onboard, x_max)
+        content["onboard"] = {**summary["onboard"], "episodes": listed}
+        draw(onboard[0], figures, "onboard_", f"plant={plant}, on the board", pole, x_max, mp4)
+    draw(episodes[0], figures, "", f"plant={plant}", pole, x_max, mp4)
+    if history:
+        curve = learning_curve([(task.measure, history)], measure=task.measure)
+        style.save(curve, figures / "learning_curve.png")
+    write_json(folder / METRICS, content)
+    return summary
+
+
+def summarized(episodes: Sequence[Episode], x_max: float) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """Return the summary of episodes, and the metrics of each."""
+    metrics = [episode_metrics(episode, x_max) for episode in episodes]
+    return summarize(metrics), metrics
+
+
+def draw(
+    episode: Episode, folder: Path, prefix: str, title: str, pole: PoleSettings, x_max: float, mp4: bool
+) -> None:
+    """Write the behaviour figure and the animation of the first episode."""
+    style.save(behaviour(episode, f"First episode, {title}", x_max), folder / f"{prefix}behaviour.png")
+    pictures = [*frames(episode, pole.nominal.length, x_max, title)]
+    write_animation(folder / f"{prefix}{ANIMATION}", pictures, durations(episode), mp4)
 
 
 def behaviour(episode: Episode, title: str = "One episode", track_half_length: float | None = None) -> Figure:

@@ -23,13 +23,7 @@ from cartpole_rl.settings import Settings, evaluation_seed
 from cartpole_rl.tasks.settings import ActionSettings, Start
 from cartpole_rl.workflows.checks import simulated_carts
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
-from cartpole_rl.workflows.trained_poles import (
-    emulated_pole,
-    guard_holds,
-    one_pole,
-    pole_of_length,
-    pole_text,
-)
+from cartpole_rl.workflows.poles import emulated_pole, guard_holds, one_pole, pole_of_length, pole_text
 
 REPLACEABLE = (
     "cart",

@@ -22,16 +22,19 @@ from cartpole_rl.randomization.poles import Pole, check_one_pole
 from cartpole_rl.randomization.ranges import check_carts
 from cartpole_rl.rig.parameters import check_names, check_value, check_values, completed
 from cartpole_rl.run_folder import (
+    BASELINE,
     CHECKPOINTS,
     LAST,
     METRICS,
     PREFIX,
     RESUME,
     check_program,
+    experiments,
     find_agent,
     find_training,
     has_ended,
     program_of,
+    recordings,
     use_of,
 )
 from cartpole_rl.terminal import as_value, as_word, print_message
@@ -45,9 +48,7 @@ from cartpole_rl.workflows.config import (
     ReplayConfig,
     TrainConfig,
 )
-from cartpole_rl.workflows.recordings import experiments, recordings
 
-BASELINE = Path("lqr")  # run=lqr is energy and LQR, not a folder
 LARGEST_BATCH = 1024  # carts that an evaluation simulates at once
 LONGER = {  # command: how to train further than a run that has ended
     "train": "cartpole-train with more learning.transitions makes a longer training",

@@ -11,14 +11,12 @@ from cartpole_rl.evaluation.driving_policy import DrivingPolicy
 from cartpole_rl.learning.checkpoints import AgentCheckpoint, save_agent
 from cartpole_rl.learning.distillation import Distillation
 from cartpole_rl.learning.states import seed_everything
+from cartpole_rl.reporting.episodes import report_episodes
 from cartpole_rl.run_folder import CHECKPOINTS, FIGURES, LAST, METRICS, write_config
-from cartpole_rl.terminal import as_word, progress_bar
-from cartpole_rl.workflows.agents import new_agent, trained_agent
+from cartpole_rl.terminal import as_word, print_results, progress_bar, shown
+from cartpole_rl.workflows.agents import new_agent, provenance, trained_agent
 from cartpole_rl.workflows.build import use_threads
 from cartpole_rl.workflows.config import DistillConfig, TrainConfig
-from cartpole_rl.workflows.export import provenance
-from cartpole_rl.workflows.report import report
-from cartpole_rl.workflows.results import print_results, shown
 from cartpole_rl.workflows.train import judge, nominal_env
 
 
@@ -52,7 +50,7 @@ def distill(config: DistillConfig, folder: Path) -> float:
     tuned_poles = [poles.model_dump(mode="json") for poles in teacher.known_poles[1:]]
     agent = AgentCheckpoint(settings, student.state_dict(), distillation.transitions, score, tuned_poles)
     save_agent(folder / CHECKPOINTS / LAST, agent)
-    report(folder, episodes, training.plant.kind, training.pole, training.task)
+    report_episodes(folder, episodes, training.plant.kind, training.pole, training.task)
     print(f"a network of {list(config.hidden)} hidden units scores {score:.0f}")
     files = f"{METRICS}, {FIGURES}/ and {CHECKPOINTS}/"
     print_results(folder, files, f"cartpole-export {as_word('run', shown(folder))} format=c")

@@ -1,16 +1,22 @@
 """Whole episodes of an agent on any cart, as evaluations and recordings drive them."""
 
+import tempfile
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 
 from tqdm import tqdm
 
+from cartpole_rl.emulator.settings import ONBOARD
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
+from cartpole_rl.errors import ConfigError
 from cartpole_rl.evaluation.episodes import Policy, run_batch, run_episodes
 from cartpole_rl.evaluation.knocks import Knocks
 from cartpole_rl.evaluation.onboard import run_onboard_episodes
 from cartpole_rl.evaluation.publishing import followed
+from cartpole_rl.exporting.c_code import c_files
 from cartpole_rl.learning.states import seed_everything
 from cartpole_rl.plants.serial.plant import SerialPlant
 from cartpole_rl.plants.settings import EmulatedSettings, SimulatedSettings
@@ -18,10 +24,17 @@ from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.reporting.live_view import LiveView, view_title
 from cartpole_rl.reporting.texts import guard_text
+from cartpole_rl.run_folder import BASELINE
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.tasks.settings import Measure
 from cartpole_rl.terminal import confirm, print_message, progress_bar
-from cartpole_rl.workflows.agents import evaluated_agent
+from cartpole_rl.workflows.agents import (
+    TrainedAgent,
+    compiled_training,
+    evaluated_agent,
+    exported_agent,
+    provenance,
+)
 from cartpole_rl.workflows.build import (
     evaluated_env,
     evaluated_settings,
@@ -30,11 +43,10 @@ from cartpole_rl.workflows.build import (
     predicting_env,
     use_threads,
 )
-from cartpole_rl.workflows.checks import BASELINE, note_other_numbers
+from cartpole_rl.workflows.checks import note_other_numbers
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
-from cartpole_rl.workflows.export import agent_on_board, compiled_training, exported_agent, on_the_board
+from cartpole_rl.workflows.poles import other_pole
 from cartpole_rl.workflows.repeating import Repetition, repetition
-from cartpole_rl.workflows.trained_poles import other_pole
 
 
 @dataclass(frozen=True)
@@ -142,3 +154,51 @@ def with_progress(episodes: Iterator[Episode], count: int, name: str, measure: M
             )
             progress.update()
             yield episode
+
+
+@contextmanager
+def on_the_board(
+    config: EvaluateConfig, trained: TrainedAgent, settings: CartPoleSettings
+) -> Iterator[EvaluateConfig]:
+    """Yield `config`; with emulator.policy=onboard its emulated cart has the agent on its board.
+
+    The agent has the actions, guard and task of `settings`, as on this computer. Its files are needed
+    until the cart has started. Raises ConfigError for an agent that cannot be exported, and if `settings`
+    are not those of the agent on the board of a real cart.
+    """
+    if config.has_compiled_agent:
+        check_compiled_settings(trained, settings)
+    if config.emulator.policy != ONBOARD:
+        yield config
+        return
+    evaluated = agent_on_board(config, trained, settings)
+    files = c_files(exported_agent(evaluated, provenance(config.run)), evaluated.training)
+    with tempfile.TemporaryDirectory() as folder:
+        for name, text in files.items():
+            Path(folder, name).write_text(text, encoding="utf-8")
+        emulator = config.emulator.model_copy(update={"policy": Path(folder)})
+        yield config.model_copy(update={"emulator": emulator})
+
+
+def agent_on_board(config: EvaluateConfig, trained: TrainedAgent, settings: CartPoleSettings) -> TrainedAgent:
+    """Return the agent that the board should have: on an emulated cart, one with `settings`."""
+    if config.has_compiled_agent:
+        return trained
+    shared = {name: getattr(settings, name) for name in CartPoleSettings.model_fields}
+    return TrainedAgent(trained.training.model_copy(update=shared), trained.policy)
+
+
+def check_compiled_settings(trained: TrainedAgent, settings: CartPoleSettings) -> None:
+    """Raise ConfigError if `settings` differ from those that the agent is exported with."""
+    compiled = compiled_training(trained)
+    differs = {
+        "actions": settings.actions.motors != compiled.actions.motors,
+        "guard": settings.guard.active != compiled.guard.active,
+        "task": settings.task.angle_limit != compiled.task.angle_limit,
+    }
+    if any(differs.values()):
+        names = ", ".join(name for name in differs if differs[name])
+        raise ConfigError(
+            f"{names}: with plant.policy=onboard the board has those that the agent was exported with; "
+            f"leave out {names}"
+        )

@@ -6,23 +6,24 @@ from pathlib import Path
 from typing import Any
 
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
+from cartpole_rl.evaluation.episodes import Policy, run_batch
 from cartpole_rl.evaluation.metrics import same_as_host
 from cartpole_rl.plants.serial.plant import SerialPlant
 from cartpole_rl.plants.settings import EmulatedSettings, SerialSettings
+from cartpole_rl.plants.simulated import SimulatedPlant
+from cartpole_rl.reporting.animation import side_by_side, write_animation
+from cartpole_rl.reporting.episodes import report_episodes
 from cartpole_rl.reporting.scores import score_columns, score_table
 from cartpole_rl.reporting.texts import count_text, cut_off
 from cartpole_rl.rig.parameters import PARAMETERS
-from cartpole_rl.run_folder import BESIDE_SIMULATION, FIGURES, METRICS, write_config
+from cartpole_rl.run_folder import BASELINE, BESIDE_SIMULATION, FIGURES, METRICS, write_config
 from cartpole_rl.tasks.episode import Episode
-from cartpole_rl.terminal import as_word
-from cartpole_rl.workflows.checks import BASELINE, agent_file
+from cartpole_rl.terminal import as_word, print_loop_time, print_results, shown
+from cartpole_rl.workflows.checks import agent_file
 from cartpole_rl.workflows.config import EvaluateConfig
 from cartpole_rl.workflows.episodes import Evaluation, prepared
-from cartpole_rl.workflows.prediction import draw_beside_simulation
+from cartpole_rl.workflows.poles import POLES, emulated_words, emulator_for, knows, plant_words
 from cartpole_rl.workflows.repeating import Repetition
-from cartpole_rl.workflows.report import report
-from cartpole_rl.workflows.results import plant_words, print_loop_time, print_results, shown
-from cartpole_rl.workflows.trained_poles import POLES, emulated_words, emulator_for, knows
 
 
 def evaluate(config: EvaluateConfig, folder: Path) -> None:
@@ -61,7 +62,9 @@ def report_evaluation(
     plant, settings = evaluation.config.plant.kind, evaluation.settings
     link = link_figures(evaluation.env)
     mp4 = evaluation.config.animation.mp4
-    summary = report(folder, episodes, plant, settings.pole, settings.task, link, onboard=onboard, mp4=mp4)
+    summary = report_episodes(
+        folder, episodes, plant, settings.pole, settings.task, link, onboard=onboard, mp4=mp4
+    )
     heading = f"plant={plant}, {count_text(len(episodes))}"
     if onboard:
         print(score_columns({"this computer": summary, "on the board": summary["onboard"]}, heading))
@@ -130,3 +133,24 @@ def link_figures(env: CartPoleEnv) -> dict[str, Any]:
         "bad_frames": statistics.bad_frames,
         "latency_override": statistics.latency_override(),
     }
+
+
+def draw_beside_simulation(evaluation: Evaluation, episode: Episode, path: Path) -> str:
+    """Draw `episode` and its prediction into `path`, and return a line that compares their scores."""
+    assert evaluation.simulation is not None
+    predicted = predicted_episode(evaluation.simulation, evaluation.policy, episode)
+    titles = f"plant={evaluation.config.plant.kind}", "predicted by simulation"
+    pole, track = evaluation.settings.pole.nominal.length, evaluation.settings.task.x_max
+    pictures, times = side_by_side((episode, predicted), titles, pole, track)
+    write_animation(path, pictures, times, evaluation.config.animation.mp4)
+    scores = f"score {episode.score.sum():.0f}, predicted by simulation {predicted.score.sum():.0f}"
+    return f"first episode: {scores}; {path.name} shows both"
+
+
+def predicted_episode(env: CartPoleEnv, policy: Policy, episode: Episode) -> Episode:
+    """Return an episode of `policy` on the simulated cart of `env`, from the measured start of `episode`."""
+    assert isinstance(env.plant, SimulatedPlant)
+    names = ("x", "x_dot", "theta", "theta_dot")
+    env.plant.start_from({name: float(getattr(episode, name)[0]) for name in names})
+    (predicted,) = run_batch(env, policy)
+    return predicted

@@ -35,6 +35,7 @@ from cartpole_rl.learning.settings import RayLearnerSettings
 from cartpole_rl.learning.states import seed_everything
 from cartpole_rl.plants.serial.preparation import Confirm
 from cartpole_rl.plants.settings import EmulatedSettings
+from cartpole_rl.reporting.episodes import report_episodes, summarized
 from cartpole_rl.reporting.live_view import LiveView, view_title
 from cartpole_rl.reporting.scores import SCORES, score_table
 from cartpole_rl.reporting.tensorboard import TensorBoardLog
@@ -54,7 +55,7 @@ from cartpole_rl.run_folder import (
     write_config,
     write_json,
 )
-from cartpole_rl.terminal import as_word, confirm, print_message
+from cartpole_rl.terminal import as_word, confirm, print_loop_time, print_message, print_results, shown
 from cartpole_rl.workflows.agents import new_agent, trained_agent
 from cartpole_rl.workflows.build import (
     evaluated_env,
@@ -67,11 +68,9 @@ from cartpole_rl.workflows.checks import check_finetuning, check_resumable, is_g
 from cartpole_rl.workflows.config import EvaluateConfig, FinetuneConfig, TrainConfig, recorded_settings
 from cartpole_rl.workflows.finetuning_cart import DrivenCart, FinetuningFiles, Stage, yielding_to
 from cartpole_rl.workflows.finetuning_learner import CartLearner, TunedAgent, check_simulation
+from cartpole_rl.workflows.poles import other_pole, plant_words
 from cartpole_rl.workflows.ray_learner import LearnerTask, Offer
 from cartpole_rl.workflows.ray_link import LearnerLink
-from cartpole_rl.workflows.report import report, summarized
-from cartpole_rl.workflows.results import plant_words, print_loop_time, print_results, shown
-from cartpole_rl.workflows.trained_poles import other_pole
 
 NAME = "learner"  # in a checkpoint: the name of a learner of Ray
 POLL = 0.1  # s between two looks for weights
@@ -301,7 +300,7 @@ def compare(cart: DrivenCart, tuned: TunedAgent, settings: CartPoleSettings) -> 
     kept = Stage.AFTER if scores[Stage.AFTER] >= scores[Stage.BEFORE] else Stage.BEFORE
     folder, link = files.folder, cart.link_summary()
     save_agent(folder / CHECKPOINTS / LAST, tuned.checkpoint(kept, scores[kept], settings.pole))
-    report(folder, episodes[kept], config.plant.kind, settings.pole, task, link)
+    report_episodes(folder, episodes[kept], config.plant.kind, settings.pole, task, link)
     write_json(folder / COMPARISON, {**summaries, "kept": kept})
     for stage, summary in summaries.items():
         print(score_table(summary, f"{stage}, {count_text(len(episodes[stage]))}"))

@@ -41,7 +41,7 @@ from cartpole_rl.terminal import print_message
 from cartpole_rl.workflows.agents import known_poles, new_agent
 from cartpole_rl.workflows.config import FinetuneConfig, TrainConfig
 from cartpole_rl.workflows.finetuning_cart import Stage, pole_length
-from cartpole_rl.workflows.trained_poles import guard_holds
+from cartpole_rl.workflows.poles import guard_holds
 
 PRINT = partial(print_message, "finetune")
 SAMPLES = 4096  # carts drawn from each fit

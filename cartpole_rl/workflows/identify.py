@@ -4,24 +4,34 @@ Each experiment is on disk before the next one starts, and the cart is identifie
 """
 
 import math
-from collections.abc import Mapping, Sequence
+import statistics
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import yaml
 from tqdm import tqdm
 
+from cartpole_rl.checking import checked
+from cartpole_rl.choices import is_shipped
 from cartpole_rl.emulator.settings import EmulatorSettings
-from cartpole_rl.errors import RecordingError
+from cartpole_rl.errors import ConfigError, RecordingError
 from cartpole_rl.evaluation.recordings import read_recording, write_recording
-from cartpole_rl.files import write_text
+from cartpole_rl.files import replacing, write_text
 from cartpole_rl.identification.checks import check_recordings
 from cartpole_rl.identification.experiments import EXPERIMENTS, HELD_OUT, conduct
 from cartpole_rl.identification.identify import Identification, identify
 from cartpole_rl.identification.one_step import one_step_estimates
 from cartpole_rl.identification.quantities import intervals
-from cartpole_rl.physics.models import Models
+from cartpole_rl.identification.unknowns import WEIGHED
+from cartpole_rl.physics.laws import Law
+from cartpole_rl.physics.models import REGISTRIES, Models
+from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.serial.plant import SerialPlant, cart_plant
+from cartpole_rl.plants.settings import EmulatedSettings
+from cartpole_rl.randomization.poles import Pole
 from cartpole_rl.reporting.identification import (
     error_text,
     identification_figures,
@@ -30,28 +40,36 @@ from cartpole_rl.reporting.identification import (
 )
 from cartpole_rl.reporting.style import save
 from cartpole_rl.reporting.texts import table
+from cartpole_rl.rig.parameters import PARAMETERS
 from cartpole_rl.run_folder import (
     CART,
+    CONFIG,
     FIGURES,
     IDENTIFIED,
     PAGE,
     POLE,
+    POSTERIOR,
     RANDOMIZATION,
     RECORDINGS,
+    experiments,
     write_config,
     write_json,
 )
 from cartpole_rl.tasks.episode import Episode
-from cartpole_rl.terminal import confirm, print_message, progress_bar
+from cartpole_rl.terminal import confirm, print_message, print_results, progress_bar, shown
 from cartpole_rl.workflows.build import precedence, use_threads
 from cartpole_rl.workflows.checks import note_other_numbers
 from cartpole_rl.workflows.config import IdentifyConfig
-from cartpole_rl.workflows.identified_errors import BY_HAND, errors, known_truth
-from cartpole_rl.workflows.identified_files import friction_choice, report, write_choices
-from cartpole_rl.workflows.recordings import experiments
-from cartpole_rl.workflows.results import print_results, shown
 
 HELD_OUT_OF = 5  # one recording in so many is held out
+UNIDENTIFIABLE = {  # randomized about the identified cart, since no experiment shows them
+    "track_half_length": {"distribution": "uniform", "relative": [-0.1, 0.0]},
+    "latency_jitter": {"distribution": "uniform", "absolute": [0.0, 0.002]},
+}
+WIDEN = 2.0  # factor on the standard deviations, for carts to train on
+BY_HAND = ("pole_mass", "pole_com")  # `unknowns.WEIGHED` as parameters: measured with scales and a ruler
+MOTOR = 200  # motor value of the force that is compared; coefficients of a curve are not comparable
+SAME = ("cart_mass", "pole_mass", "pole_com", "cart_viscous", "pole_viscous")  # names on both sides
 
 Episodes = dict[str, Episode]  # by the name of the experiment, or of the file
 
@@ -92,7 +110,7 @@ def identify_cart(config: IdentifyConfig, folder: Path) -> None:
     found = identify(by_file, held_out_by_file, nominal, models, period, substeps, config.windows, laws)
     carts = found.fit.draw(config.carts, np.random.default_rng(config.seed))
     write_choices(found, carts, folder)
-    write_json(folder / IDENTIFIED, report(found, carts) | errors(found.fit.parameters, truth, BY_HAND))
+    write_json(folder / IDENTIFIED, results(found, carts) | errors(found.fit.parameters, truth, BY_HAND))
     for name, figure in identification_figures(found, carts, fitted).items():
         save(figure, folder / FIGURES / f"{name}.png")
     identified = intervals(found.fit, carts)
@@ -178,3 +196,150 @@ def print_verdict(found: Identification, folder: Path) -> None:
         print(f"warning: {warning}")
     files = f"{PAGE}, {CART}, {POLE}, {RANDOMIZATION} and {FIGURES}/"
     print_results(folder, files, next_command(found, folder))
+
+
+def write_choices(found: Identification, carts: np.ndarray, folder: Path) -> None:
+    """Write cart.yaml, pole.yaml, randomization.yaml and posterior.npz into `folder`.
+
+    `carts` [P, N] are drawn from the fit.
+    """
+    write_cart(found, carts, folder / CART)
+    for law in found.models[:2]:
+        write_friction(law, found.fit.parameters, folder)
+    parameters = found.fit.parameters
+    pole = Pole(**{name: parameters[name] for name in Pole.model_fields})
+    choices = {"choices": {"identified": pole.model_dump()}}
+    units = f"# {', '.join(f'{name} in {PARAMETERS[name].unit}' for name in Pole.model_fields)}.\n"
+    write_text(folder / POLE, units + yaml.safe_dump(choices, sort_keys=False))
+    with replacing(folder / POSTERIOR) as beside, beside.open("wb") as file:  # a path would get ".npz"
+        np.savez(
+            file,
+            names=np.array(CartParameters.names()),
+            carts=carts,
+            identified=np.array(identified_names(found)),
+            unknowns=np.array([unknown.name for unknown in found.fit.unknowns]),
+            point=found.fit.point,
+            covariance=found.fit.covariance,
+        )
+    absolute = [name for name, line in UNIDENTIFIABLE.items() if "absolute" in line]
+    randomization = {
+        "posterior": "${here}/" + POSTERIOR,
+        "widen": WIDEN,
+        "prior_share": 0.0,
+        "ranges": UNIDENTIFIABLE,
+    }
+    write_text(
+        folder / RANDOMIZATION,
+        f"# Carts drawn from the posterior, correlations included; standard deviations times {WIDEN:g}.\n"
+        f"# Absolute ranges are in {', '.join(f'{PARAMETERS[name].unit} ({name})' for name in absolute)}.\n"
+        + yaml.safe_dump(randomization, sort_keys=False),
+    )
+
+
+def write_cart(found: Identification, carts: np.ndarray, path: Path) -> None:
+    """Write the identified cart without its pole; each parameter with its unit and standard error."""
+    parameters, models = found.fit.parameters, found.models
+    deviations, identified = standard_deviations(carts), identified_names(found)
+    lines = [
+        "# Identified by cartpole-identify; each number with its unit and standard error. Found with",
+        f"# cart_friction={models.cart_friction} and pole_friction={models.pole_friction}; masses and forces "
+        f"are relative to the pole's mass, {parameters['pole_mass']:g} kg.",
+    ]
+    brought = {name for registry in REGISTRIES.values() for law in registry for name in law.brings}
+    for name in CartParameters.names():
+        if name not in brought.union(Pole.model_fields):
+            error = f"+- {deviations[name]:.2g}" if name in identified else "prior value"
+            lines.append(f"{name}: {parameters[name]!r}  # {PARAMETERS[name].unit}, {error}")
+    write_text(path, "\n".join(lines) + "\n")
+
+
+def write_friction(law: Law, parameters: Mapping[str, float], folder: Path) -> None:
+    """Write a friction law that conf/ does not have as a choice, with the parameters that it brings."""
+    if not is_shipped(law.registry.kind, law):
+        choice = {"model": str(law), "parameters": {name: parameters[name] for name in law.brings}}
+        write_text(folder / f"{law.registry.kind}.yaml", yaml.safe_dump(choice, sort_keys=False))
+
+
+def friction_choice(law: Law, folder: Path) -> str:
+    """Return the choice of a friction law on a command line, after `write_friction` into `folder`."""
+    kind = law.registry.kind
+    return f"{kind}={law if is_shipped(kind, law) else f'{folder}/{kind}.yaml'}"
+
+
+def standard_deviations(carts: np.ndarray) -> dict[str, float]:
+    """Return the standard deviation of each parameter among `carts` [P, N]."""
+    return dict(zip(CartParameters.names(), carts.std(1).tolist(), strict=True))
+
+
+def identified_names(found: Identification) -> list[str]:
+    """Return the names of the parameters that were identified, the pole's included."""
+    names = [unknown.name for unknown in found.fit.unknowns if unknown.name not in WEIGHED]
+    return [*names, *Pole.model_fields]
+
+
+def results(found: Identification, carts: np.ndarray) -> dict[str, Any]:
+    """Return the content of identification.json."""
+    deviations = standard_deviations(carts)
+    return {
+        "cart_friction": found.models.cart_friction,
+        "parameters": found.fit.parameters,
+        "standard_errors": {name: deviations[name] for name in identified_names(found) if name in deviations},
+        "quantities": {
+            each.name: {"value": each.value, "low": each.low, "high": each.high, "unit": each.unit}
+            for each in intervals(found.fit, carts)
+        },
+        "candidates": {
+            each.cart_friction: {"x_m": each.error.x, "theta_rad": each.error.theta}
+            for each in found.candidates
+        },
+        "held_out_1_s": {"x_m": found.error.x, "theta_rad": found.error.theta},
+        "residual_counts": found.fit.rms.tolist(),
+        "warnings": found.warnings,
+    }
+
+
+def known_truth(config: IdentifyConfig) -> EmulatorSettings | None:
+    """Return the truth of the emulated cart that the recordings are of; None for any other cart."""
+    if config.source is None:
+        return config.emulator if isinstance(config.plant, EmulatedSettings) else None
+    try:
+        recorded = yaml.safe_load((config.source / CONFIG).read_text(encoding="utf-8"))
+        of_emulator = recorded["plant"]["kind"] == "emulated"
+        return checked(EmulatorSettings, recorded["emulator"]) if of_emulator else None
+    except (OSError, yaml.YAMLError, LookupError, TypeError, ConfigError):  # recordings of another origin
+        return None
+
+
+def errors(
+    found: Mapping[str, float], truth: EmulatorSettings | None, not_estimated: Collection[str] = ()
+) -> dict[str, Any]:
+    """Return `errors` for identification.json: relative errors and their median; {} without a truth.
+
+    Parameters that were `not_estimated` have no error.
+    """
+    if truth is None:
+        return {}
+    true = true_values(truth)
+    values = {**found, "force": force(found)}
+    relative = {
+        name: abs(values[name] / value - 1)
+        for name, value in true.items()
+        if value and name not in not_estimated
+    }
+    return {"errors": {**relative, "median": statistics.median(relative.values())}}
+
+
+def true_values(truth: EmulatorSettings) -> dict[str, float]:
+    """Return the true values of what is compared: those of SAME, dry friction N, and the force at MOTOR N."""
+    curve = dict(zip(("force_quadratic", "force_linear", "force_offset"), truth.force_curve, strict=True))
+    return {
+        **{name: getattr(truth, name) for name in SAME},
+        "cart_coulomb": (truth.cart_coulomb_left + truth.cart_coulomb_right) / 2,
+        "force": force({**curve, "force_asymmetry": truth.force_asymmetry}),
+    }
+
+
+def force(cart: Mapping[str, float]) -> float:
+    """Return the mean force to both sides at MOTOR, N."""
+    curve = (cart["force_quadratic"] * MOTOR + cart["force_linear"]) * MOTOR + cart["force_offset"]
+    return curve * (1 + cart["force_asymmetry"] / 2)

@@ -31,14 +31,12 @@ from cartpole_rl.reporting.predictions import (
 )
 from cartpole_rl.reporting.style import save
 from cartpole_rl.reporting.texts import count_text
-from cartpole_rl.run_folder import FIGURES, MODELLED, write_config, write_json
+from cartpole_rl.run_folder import FIGURES, MODELLED, recordings, write_config, write_json
 from cartpole_rl.tasks.episode import Episode
-from cartpole_rl.terminal import as_word, progress_bar
+from cartpole_rl.terminal import as_word, print_results, progress_bar, shown
 from cartpole_rl.workflows.build import use_threads
 from cartpole_rl.workflows.config import ModelConfig
 from cartpole_rl.workflows.poles import chosen_pole
-from cartpole_rl.workflows.recordings import recordings
-from cartpole_rl.workflows.results import print_results, shown
 
 FIGURE = f"{FIGURES}/model.png"
 FRICTION_MODELS = (CART_FRICTIONS.find("sigmoid"), CART_FRICTIONS.find("step"))  # candidates for the cart

@@ -1,13 +1,104 @@
-"""The pole of a simulated cart that is compared with recordings."""
+"""The poles of agents, carts and recordings, and the words that choose a cart with one of them."""
 
 from collections.abc import Sequence
 from pathlib import Path
 
-from cartpole_rl.choices import choice
+from cartpole_rl.choices import choice, group_choices
+from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import ConfigError, RecordingError
 from cartpole_rl.evaluation.recordings import LENGTH, read_heading
-from cartpole_rl.randomization.poles import Pole, PoleSettings, check_one_pole
-from cartpole_rl.workflows.trained_poles import POLES
+from cartpole_rl.plants.settings import EmulatedSettings, SerialSettings
+from cartpole_rl.randomization.poles import HEAVIER, Pole, PoleSettings, check_one_pole
+from cartpole_rl.terminal import as_word
+
+POLES = ("medium", "large")  # in conf/pole/ and conf/emulator/; the first is the default
+DEFAULT_BAUD = SerialSettings.model_fields["baud"].default
+
+
+def other_pole(known: Sequence[PoleSettings], driven: PoleSettings, emulated: bool) -> str | None:
+    """Return a warning if `driven` has another pole than those that the agent knows, None if not."""
+    if knows(known, driven):
+        return None
+    choice = emulator_for(known) if emulated else None
+    advice = f"; give emulator={choice}" if choice else ""
+    trained, own = " or ".join(dict.fromkeys(map(lengths, known))), lengths(driven)
+    return f"warning: the agent was trained with a pole of {trained}, the cart has one of {own}{advice}"
+
+
+def knows(known: Sequence[PoleSettings], driven: PoleSettings) -> bool:
+    """Return True if each pole that represents `driven` is about one of `known`."""
+    each = (driven.each.choices or {}).values()
+    return all(any(poles.includes(pole) for poles in known) for pole in each)
+
+
+def guard_holds(trained: PoleSettings, driven: PoleSettings) -> bool:
+    """Return True if a track guard that is fitted to `trained` is one for the poles of `driven`, too."""
+    each = (driven.each.choices or {}).values()
+    return knows([trained], driven) and all(pole.pole_mass < heaviest(trained, pole.length) for pole in each)
+
+
+def heaviest(trained: PoleSettings, length: float) -> float:
+    """Return the mass from which a pole of `length` m is another one than those of `trained`, kg."""
+    alike = [pole.pole_mass for pole in (trained.choices or {}).values() if pole.is_about(length)]
+    return HEAVIER * max(alike, default=Pole.rod(length).pole_mass)
+
+
+def pole_of_length(length: float, trained: PoleSettings) -> PoleSettings:
+    """Return the pole of `trained` with about `length` m, else that of `pole=both`, else a uniform rod."""
+    known = trained if trained.includes(Pole.rod(length)) else PoleSettings(**group_choices("pole")["both"])
+    alike = {name: pole for name, pole in (known.choices or {}).items() if pole.is_about(length)}
+    if not alike:
+        return one_pole(Pole.rod(length))
+    nearest = min(alike, key=lambda name: abs(alike[name].length - length))
+    return PoleSettings(choices={nearest: alike[nearest]})
+
+
+def one_pole(pole: Pole) -> PoleSettings:
+    """Return the choice of this pole alone, named by its length."""
+    return PoleSettings(choices={f"{pole.length:.2f} m": pole})
+
+
+def pole_text(poles: PoleSettings) -> str:
+    """Return the length and the mass of each pole for a message."""
+    each = (poles.choices or {}).values()
+    return " or ".join(f"{pole.length:.2f} m, {pole.pole_mass:.3g} kg" for pole in each) or poles.name
+
+
+def lengths(poles: PoleSettings) -> str:
+    """Return the lengths in m for a message."""
+    if poles.choices is None:
+        return poles.name
+    return " or ".join(f"{pole.length:.2f} m" for pole in poles.choices.values())
+
+
+def emulated_words(known: Sequence[PoleSettings]) -> str:
+    """Return the words that choose an emulated cart with one of the `known` poles, if there is one."""
+    choice = emulator_for(known)
+    return f"plant=emulated emulator={choice}" if choice and choice != POLES[0] else "plant=emulated"
+
+
+def emulator_for(known: Sequence[PoleSettings]) -> str | None:
+    """Return the one of POLES whose emulated cart has one of the `known` poles, the newest first."""
+    files = group_choices("emulator")  # without the first, which is in code
+    for poles in reversed(known):
+        for name in POLES:
+            if poles.includes(emulated_pole(EmulatorSettings(**files.get(name, {})))):
+                return name
+    return None
+
+
+def emulated_pole(truth: EmulatorSettings) -> Pole:
+    """Return the pole of an emulated cart."""
+    return Pole(**truth.model_dump(include=set(Pole.model_fields)))
+
+
+def plant_words(plant: EmulatedSettings | SerialSettings, poles: Sequence[PoleSettings] = ()) -> str:
+    """Return the words that choose a cart on the command line, an emulated one with one of `poles`."""
+    if isinstance(plant, SerialSettings):
+        length = f" plant.pole_length={plant.pole_length:g}" if plant.pole_length else ""
+        baud = f" plant.baud={plant.baud}" if plant.baud != DEFAULT_BAUD else ""
+        return f"plant=serial {as_word('plant.port', plant.port)}{baud}{length}"
+    return emulated_words(poles) if poles else "plant=emulated"
 
 
 def chosen_pole(owner: str, poles: PoleSettings | None, paths: Sequence[Path]) -> tuple[str, Pole]:

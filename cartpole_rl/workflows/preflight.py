@@ -14,7 +14,7 @@ from cartpole_rl.randomization.poles import Pole
 from cartpole_rl.terminal import confirm
 from cartpole_rl.workflows.checks import is_given
 from cartpole_rl.workflows.config import PreflightConfig
-from cartpole_rl.workflows.trained_poles import POLES, emulated_pole, emulator_for, one_pole
+from cartpole_rl.workflows.poles import POLES, emulated_pole, emulator_for, one_pole
 
 
 def check_cart(config: PreflightConfig, words: Sequence[str] = ()) -> None:

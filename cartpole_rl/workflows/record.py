@@ -10,18 +10,16 @@ from pathlib import Path
 from typing import Any
 
 from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
-from cartpole_rl.evaluation.recordings import LENGTH, write_recording
+from cartpole_rl.evaluation.recordings import LENGTH, stored_origin, write_recording
 from cartpole_rl.plants.settings import SerialSettings
 from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.reporting.texts import count_text, guard_text
 from cartpole_rl.run_folder import RECORDINGS, write_config
 from cartpole_rl.tasks.episode import Episode
-from cartpole_rl.terminal import as_word
+from cartpole_rl.terminal import as_word, shown
 from cartpole_rl.workflows.checks import agent_file
 from cartpole_rl.workflows.config import EvaluateConfig, RecordConfig
 from cartpole_rl.workflows.episodes import prepared
-from cartpole_rl.workflows.origins import stored_origin
-from cartpole_rl.workflows.results import shown
 
 
 def record(config: RecordConfig, folder: Path) -> None:

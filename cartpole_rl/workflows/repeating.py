@@ -10,12 +10,12 @@ import yaml
 
 from cartpole_rl.checking import checked
 from cartpole_rl.errors import ConfigError
+from cartpole_rl.evaluation.recordings import read_origin
 from cartpole_rl.randomization.poles import Pole
 from cartpole_rl.run_folder import CONFIG, METRICS, check_program
 from cartpole_rl.tasks.episode import Origin
 from cartpole_rl.workflows.checks import simulated_carts
 from cartpole_rl.workflows.config import EvaluateConfig
-from cartpole_rl.workflows.origins import read_origin
 
 
 @dataclass(frozen=True)

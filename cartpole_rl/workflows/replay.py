@@ -15,13 +15,11 @@ from cartpole_rl.reporting.predictions import REPORTED_TIMES, replay_figure, rep
 from cartpole_rl.reporting.style import save
 from cartpole_rl.reporting.texts import count_text
 from cartpole_rl.rig.parameters import check_names, check_values
-from cartpole_rl.run_folder import FIGURES, write_config, write_json
-from cartpole_rl.terminal import as_word
+from cartpole_rl.run_folder import FIGURES, recordings, write_config, write_json
+from cartpole_rl.terminal import as_word, print_results, shown
 from cartpole_rl.workflows.checks import note_other_numbers
 from cartpole_rl.workflows.config import ReplayConfig
 from cartpole_rl.workflows.poles import chosen_pole
-from cartpole_rl.workflows.recordings import recordings
-from cartpole_rl.workflows.results import print_results, shown
 
 REPLAY, FIGURE = "replay.json", f"{FIGURES}/replay.png"
 

@@ -1,69 +1,66 @@
-"""Writes the results of episodes: metrics.json and figures."""
+"""Make a report: one HTML page from any runs."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
-from cartpole_rl.evaluation.metrics import episode_metrics, summarize
-from cartpole_rl.randomization.poles import PoleSettings
-from cartpole_rl.reporting.animation import durations, frames, write_animation
-from cartpole_rl.reporting.episodes import behaviour
-from cartpole_rl.reporting.scores import learning_curve
+from cartpole_rl.files import write_text
+from cartpole_rl.reporting.groups import Drawing, drawings
+from cartpole_rl.reporting.results import Results, counted_text
+from cartpole_rl.reporting.runs_page import Gallery, Picture, runs_page
 from cartpole_rl.reporting.style import save
-from cartpole_rl.run_folder import ANIMATION, FIGURES, METRICS, write_json
-from cartpole_rl.tasks.episode import Episode
-from cartpole_rl.tasks.settings import TaskSettings
-from cartpole_rl.workflows.origins import stored_origins
+from cartpole_rl.reporting.sweeps import grouped, read_sweeps, results_of, table
+from cartpole_rl.run_folder import FIGURES, PAGE, write_config
+from cartpole_rl.terminal import print_message
+from cartpole_rl.workflows.config import ReportConfig
+
+TABLE = "runs.csv"
 
 
-def report(
-    folder: Path,
-    episodes: Sequence[Episode],
-    plant: str,
-    pole: PoleSettings,
-    task: TaskSettings,
-    link: Mapping[str, int] | None = None,
-    history: Sequence[Mapping[str, float]] = (),
-    onboard: Sequence[Episode] = (),
-    mp4: bool = False,
-) -> dict[str, Any]:
-    """Write figures/ and metrics.json into `folder`, and return the summary of the episodes (`summarize`).
+def make_report(config: ReportConfig, folder: Path) -> None:
+    """Write the page of the runs in `config.runs`, and of their comparison with those in `config.compare`.
 
-    metrics.json is written last: a run that has it is complete.
-
-    Behaviour figure and animation show the first episode; `mp4` adds the animation as an MP4. `history` adds
-    the learning curve, `onboard` the episodes that the cart's board drove, under that key of metrics.json and
-    of the summary.
+    Writes config.yaml, provenance.json, page.html and runs.csv into `folder`, with `config.figures` also
+    figures/. Prints how many runs count, and where the page is.
+    Raises ConfigError for folders without runs.
     """
-    x_max = task.x_max
-    summary, listed = summarized(episodes, x_max)
-    header = {"plant": plant, "pole": pole.name, **(link or {})}
-    cart, origins = stored_origins(episodes)
-    listed = [{**each, **origin} for each, origin in zip(listed, origins, strict=True)]
-    content = {**header, **summary, **cart, "episodes": listed}
-    figures = folder / FIGURES
-    if onboard:
-        summary["onboard"], listed = summarized(onboard, x_max)
-        content["onboard"] = {**summary["onboard"], "episodes": listed}
-        draw(onboard[0], figures, "onboard_", f"plant={plant}, on the board", pole, x_max, mp4)
-    draw(episodes[0], figures, "", f"plant={plant}", pole, x_max, mp4)
-    if history:
-        curve = learning_curve([(task.measure, list(history))], measure=task.measure)
-        save(curve, figures / "learning_curve.png")
-    write_json(folder / METRICS, content)
-    return summary
+    sets = {"runs": config.runs, "compare": config.compare}
+    given = {name: sources for name, sources in sets.items() if sources}
+    sweeps, between = grouped(read_sweeps(given, config.measure))
+    results = [results_of(sweep, config.measure) for sweep in sweeps]
+    write_config(folder, "report", {**config.model_dump(mode="json"), "seed": None})
+    write_text(folder / TABLE, table(sweeps))
+    title = " and ".join(f"{sweep.name}: {', '.join(sweep.sources)}" for sweep in sweeps)
+    pictures = pictures_of(results) if config.animations else {}
+    write_text(folder / PAGE, runs_page(title, results, pictures, between))
+    print(f"{folder}/{TABLE} holds all runs")
+    if config.figures:
+        write_figures({f"{each.name}_{one.name}": one for each in results for one in drawings(each)}, folder)
+    print_end(results, folder)
 
 
-def summarized(episodes: Sequence[Episode], x_max: float) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """Return the summary of episodes, and the metrics of each."""
-    metrics = [episode_metrics(episode, x_max) for episode in episodes]
-    return summarize(metrics), metrics
+def pictures_of(results: Sequence[Results]) -> dict[str, list[Picture]]:
+    """Return the pictures of each set of runs by its name; print which are left out or damaged."""
+    gallery = Gallery(results)
+    pictures = {each.name: gallery.pictures(each) for each in results}
+    if gallery.left_out:
+        print_message("report", f"note: {gallery.left_out} pictures were left out to keep the page small")
+    for problem in gallery.problems:
+        print_message("report", f"note: {problem}")
+    return pictures
 
 
-def draw(
-    episode: Episode, folder: Path, prefix: str, title: str, pole: PoleSettings, x_max: float, mp4: bool
-) -> None:
-    """Write the behaviour figure and the animation of the first episode."""
-    save(behaviour(episode, f"First episode, {title}", x_max), folder / f"{prefix}behaviour.png")
-    pictures = [*frames(episode, pole.nominal.length, x_max, title)]
-    write_animation(folder / f"{prefix}{ANIMATION}", pictures, durations(episode), mp4)
+def write_figures(figures: Mapping[str, Drawing], folder: Path) -> None:
+    """Write figures as SVG files by their names, and print where they are."""
+    for name, drawing in figures.items():
+        save(drawing.figure, folder / FIGURES / f"{name}.svg")
+    print(f"{folder}/{FIGURES}/ holds {len(figures)} figures" if figures else "there is no figure to write")
+
+
+def print_end(results: Sequence[Results], folder: Path) -> None:
+    """Print how many runs count, and where the page is."""
+    counting = sum(len(each.agents) for each in results)
+    others = sum(len(each.exclusions) for each in results)
+    where = "; the page says why" if others else ""
+    count = f"{counted_text(counting, 'run')} {'counts' if counting == 1 else 'count'}"
+    print(f"{count}, {others} {'does' if others == 1 else 'do'} not{where}")
+    print(f"{folder}/{PAGE} is written")

@@ -17,18 +17,17 @@ from cartpole_rl.learning.states import seed_everything
 from cartpole_rl.plants.effects import without_effect
 from cartpole_rl.plants.settings import LearnedSettings, SimulatedSettings
 from cartpole_rl.randomization.randomizer import Draws
+from cartpole_rl.reporting.episodes import report_episodes
 from cartpole_rl.run_folder import CHECKPOINTS, FIGURES, METRICS, write_config
 from cartpole_rl.settings import evaluation_seed
 from cartpole_rl.tasks.episode import Episode
-from cartpole_rl.terminal import as_word, print_message
+from cartpole_rl.terminal import as_word, print_message, print_results, shown
 from cartpole_rl.workflows.agents import new_agent
 from cartpole_rl.workflows.build import use_threads
 from cartpole_rl.workflows.checks import check_compiler, check_resumable, note_other_numbers
 from cartpole_rl.workflows.config import TrainConfig, recorded_settings
 from cartpole_rl.workflows.monitor import TrainingMonitor
-from cartpole_rl.workflows.report import report
-from cartpole_rl.workflows.results import print_results, shown
-from cartpole_rl.workflows.trained_poles import emulated_words
+from cartpole_rl.workflows.poles import emulated_words
 
 
 def train(config: TrainConfig, folder: Path) -> float:
@@ -72,7 +71,7 @@ def train(config: TrainConfig, folder: Path) -> float:
                 monitor.randomization(env.plant)
             training.run()
             drawn = config.plant.kind, config.pole, config.task
-            metrics = report(folder, evaluate(), *drawn, history=monitor.history)
+            metrics = report_episodes(folder, evaluate(), *drawn, history=monitor.history)
             monitor.finished(metrics)
         forget_training(folder)
     print(f"trained for {training.seconds:.0f} s")

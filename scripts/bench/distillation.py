@@ -20,10 +20,9 @@ from common import RUNS, option_parser, positive_int, print_table, processes, wr
 from learning import judge
 
 from cartpole_rl.exporting.c_code import c_files
-from cartpole_rl.workflows.agents import TrainedAgent, trained_agent
+from cartpole_rl.workflows.agents import TrainedAgent, exported_agent, trained_agent
 from cartpole_rl.workflows.config import DistillConfig, load_settings
 from cartpole_rl.workflows.distill import distill
-from cartpole_rl.workflows.export import exported_agent
 
 COSTS = {"table bytes": r"(\d+) bytes of tables", "multiply-adds": r"(\d+) multiply-adds"}  # in policy.h
 

@@ -6,12 +6,12 @@ of another seed or agent than their place says, are named and do not count.
 """
 
 from collections import Counter
-from collections.abc import Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import groupby
 from pathlib import Path, PureWindowsPath
-from typing import Any
+from typing import Any, TypeVar
 
 from results import STAGES, StudyResults, checked_name, read_json
 from study import RUN, RUNS, SEED, STUDIES, Evaluation, Study, Variant, read_study_file, setting
@@ -19,24 +19,21 @@ from study import RUN, RUNS, SEED, STUDIES, Evaluation, Study, Variant, read_stu
 from cartpole_rl.choices import conf_folder
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.reporting.results import EVALUATIONS, OWN, Agent, Curve, Exclusion
-from cartpole_rl.reporting.tensorboard import scalars
-from cartpole_rl.run_folder import CONFIG
-from cartpole_rl.workflows.pages.runs import (
+from cartpole_rl.reporting.runs import (
     FREE,
     Run,
     commits_note,
-    compared_settings,
     learning_curve,
     measured,
     partly_measured_note,
     read_run,
     run_of,
-    settings_difference,
-    settings_key,
     short,
-    split_by_majority,
 )
+from cartpole_rl.reporting.tensorboard import scalars
+from cartpole_rl.run_folder import CONFIG, PREFIX
 
+Item = TypeVar("Item")
 STUDY = "study.yaml"
 EMULATOR = "emulator="
 TEXTS = ("title", "order", "figure", "question", "thesis", "finding", "judged")  # of today's study
@@ -407,3 +404,46 @@ def _thinned(curve: Sequence[tuple[float, float]]) -> Curve:
     step = -(-len(curve) // CURVE_POINTS)
     chunks = [curve[start : start + step] for start in range(0, len(curve), step)]
     return tuple((chunk[-1][0], sum(value for _, value in chunk) / len(chunk)) for chunk in chunks)
+
+
+def split_by_majority(
+    items: Sequence[Item], key: Callable[[Item], Hashable]
+) -> tuple[list[Item], list[tuple[Item, Hashable]]]:
+    """Return the items with the most frequent key (the first of several), and the others with that key."""
+    if not items:
+        return [], []
+    common, _ = Counter(map(key, items)).most_common(1)[0]
+    same = [item for item in items if key(item) == common]
+    return same, [(item, common) for item in items if key(item) != common]
+
+
+def settings_key(run: Run, ignored: Collection[str] = ()) -> Hashable:
+    """Return a key that runs with the same command and settings share, those of `ignored` groups aside."""
+    return run.program, tuple((name, run.settings[name]) for name in sorted(compared_settings(run, ignored)))
+
+
+def compared_settings(run: Run, ignored: Collection[str]) -> set[str]:
+    """Return the names of the settings of a run that are in none of the `ignored` groups."""
+    groups = tuple(f"{name}." for name in ignored)
+    return {name for name in run.settings if name not in ignored and not name.startswith(groups)}
+
+
+def settings_difference(run: Run, common: Run, ignored: Collection[str] = (), most: int = 3) -> str:
+    """Return in words where the settings of `run` differ from those of `common`."""
+    names = sorted(
+        name
+        for name in compared_settings(run, ignored) | compared_settings(common, ignored)
+        if run.settings.get(name) != common.settings.get(name)
+    )
+    shown = [
+        f"{name} {_plain(run.settings.get(name))} instead of {_plain(common.settings.get(name))}"
+        for name in names[:most]
+    ]
+    more = [f"{len(names) - most} more"] if len(names) > most else []
+    if run.program != common.program:
+        shown.insert(0, f"a run of {PREFIX}{run.program} instead of {PREFIX}{common.program}")
+    return ", ".join((*shown, *more))
+
+
+def _plain(value: Hashable) -> str:
+    return "unset" if value is None else str(value)

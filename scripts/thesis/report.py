@@ -22,7 +22,7 @@ from results import Status, write_data
 from cartpole_rl.errors import CartPoleError
 from cartpole_rl.files import write_text
 from cartpole_rl.run_folder import PAGE, write_config
-from cartpole_rl.workflows.pages.report import pictures_of, print_end, write_figures
+from cartpole_rl.workflows.report import pictures_of, print_end, write_figures
 
 
 def parse_options() -> argparse.Namespace:

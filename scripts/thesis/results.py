@@ -16,9 +16,9 @@ from study import RUNS, SEED, Finding, FolderName, Size, Study, Variant
 from cartpole_rl.checking import checked
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.reporting.results import GOOD, OWN, Agent, Exclusion, Group, Named, Results, is_number
+from cartpole_rl.reporting.runs import DAMAGE, short
 from cartpole_rl.reporting.statistics import Array, Estimate, estimate
 from cartpole_rl.run_folder import write_json
-from cartpole_rl.workflows.pages.runs import DAMAGE, short
 
 FORMAT = 1  # of the JSON file
 DIGITS = 6  # significant, of the numbers in it

@@ -10,14 +10,13 @@ import yaml
 from command_line import in_process
 from PIL import Image
 
-from cartpole_rl.evaluation.recordings import read_recording
+from cartpole_rl.evaluation.recordings import as_stored, read_origin, read_recording
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.workflows import checks
 from cartpole_rl.workflows.build import predicting_env
 from cartpole_rl.workflows.config import EvaluateConfig, load_settings
 from cartpole_rl.workflows.episodes import prepared
-from cartpole_rl.workflows.origins import as_stored, read_origin
-from cartpole_rl.workflows.prediction import predicted_episode
+from cartpole_rl.workflows.evaluate import predicted_episode
 
 SAME = ("score", "score_upright", "reward", "steps", "ended_by", "min_track_margin_m", "rms_motor_change")
 

@@ -19,7 +19,7 @@ from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.agents import TrainedAgent, new_agent, trained_agent
 from cartpole_rl.workflows.build import evaluated_env, evaluated_settings
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig, load_settings
-from cartpole_rl.workflows.export import on_the_board
+from cartpole_rl.workflows.episodes import on_the_board
 
 pytestmark = needs_compiler
 AGENT = "pretrained/medium"

@@ -8,8 +8,7 @@ import torch
 
 from cartpole_rl.envs.build import simulated_env
 from cartpole_rl.exporting.agent import ExportedAgent, Floats
-from cartpole_rl.workflows.agents import TrainedAgent, trained_agent
-from cartpole_rl.workflows.export import exported_agent, provenance
+from cartpole_rl.workflows.agents import TrainedAgent, exported_agent, provenance, trained_agent
 
 MEDIUM = Path("pretrained/medium")
 

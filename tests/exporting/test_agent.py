@@ -30,9 +30,8 @@ from cartpole_rl.exporting.agent import (
     read_agent,
 )
 from cartpole_rl.tasks.features import Quantity
-from cartpole_rl.workflows.agents import TrainedAgent
+from cartpole_rl.workflows.agents import TrainedAgent, exported_agent, network_of, provenance
 from cartpole_rl.workflows.config import TrainConfig, load_settings
-from cartpole_rl.workflows.export import exported_agent, network_of, provenance
 from examples.drive_without_torch import action_values
 
 Members = dict[str, bytes]

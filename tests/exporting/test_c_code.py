@@ -21,9 +21,8 @@ from cartpole_rl.evaluation.episodes import Policy, choose
 from cartpole_rl.exporting.agent import ExportedAgent, Floats
 from cartpole_rl.exporting.c_code import c_files
 from cartpole_rl.plants.specs import tensordict_of
-from cartpole_rl.workflows.agents import TrainedAgent, new_agent
+from cartpole_rl.workflows.agents import TrainedAgent, exported_agent, new_agent
 from cartpole_rl.workflows.config import TrainConfig, load_settings
-from cartpole_rl.workflows.export import exported_agent
 
 FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Wconversion", "-Wpedantic", "-Wdouble-promotion", "-Werror")
 SIZE = '#include "policy.h"\n#include <stddef.h>\nsize_t policy_size(void);\n'

@@ -22,9 +22,8 @@ from cartpole_rl.plants.simulated import Carts, Inputs, commands_under_way, run_
 from cartpole_rl.plants.specs import Numbers, OneCartPlant, PlantOutput
 from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 from cartpole_rl.scalar import Scalar
-from cartpole_rl.workflows.agents import TrainedAgent, new_agent
+from cartpole_rl.workflows.agents import TrainedAgent, exported_agent, network_of, new_agent
 from cartpole_rl.workflows.config import TrainConfig, load_settings
-from cartpole_rl.workflows.export import exported_agent, network_of
 
 PERIODS = 100  # 2 s
 HANGING = {"x": 0.05, "x_dot": 0.0, "theta": math.pi, "theta_dot": 0.0}

@@ -13,9 +13,8 @@ from cartpole_rl.agents.settings import AGENTS
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.reporting.loggers import LOGGERS
-from cartpole_rl.workflows.agents import trained_agent
+from cartpole_rl.workflows.agents import network_of, trained_agent
 from cartpole_rl.workflows.config import TrainConfig, load_settings
-from cartpole_rl.workflows.export import network_of
 from cartpole_rl.workflows.train import nominal_env, train
 
 MODULE = '''

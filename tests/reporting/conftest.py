@@ -4,6 +4,9 @@ import math
 
 import numpy as np
 import pytest
+from small_study import edit as edit
+from small_study import made as made
+from small_study import study as study
 
 from cartpole_rl.identification.prediction import Replayed
 from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT

@@ -4,7 +4,7 @@ from typing import Any
 
 from cartpole_rl.choices import choice
 from cartpole_rl.reporting.grouping import ALL, fewest, labels, setting_columns
-from cartpole_rl.workflows.pages.runs import flattened
+from cartpole_rl.reporting.runs import flattened
 
 
 def columns(*trees: dict[str, Any]) -> dict[str, list[str]]:

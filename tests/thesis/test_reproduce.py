@@ -27,9 +27,9 @@ from worker import carry_out, finish, is_complete, made_otherwise, prepare, reas
 
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.files import claimed
+from cartpole_rl.reporting.runs import read_run
 from cartpole_rl.run_folder import recorded_provenance
 from cartpole_rl.workflows import report, train
-from cartpole_rl.workflows.pages.runs import read_run
 
 CHECKOUT = Path(script.__file__).parents[2]
 TRAINED, IMPOSSIBLE, LQR, SHARED, HEN, EGG = (

@@ -1,7 +1,7 @@
 """Identified parameters are compared with the truth of the emulated cart."""
 
 from cartpole_rl.emulator.settings import EmulatorSettings
-from cartpole_rl.workflows.identified_errors import errors
+from cartpole_rl.workflows.identify import errors
 
 TRUTH = EmulatorSettings(
     cart_coulomb_left=0.4, cart_coulomb_right=0.6, force_curve=(0.0, 0.02, -1.0), force_asymmetry=0.0

@@ -16,7 +16,7 @@ from cartpole_rl.physics.friction import CART_FRICTIONS, COULOMB, stribeck_force
 from cartpole_rl.physics.models import Models
 from cartpole_rl.randomization.poles import Pole, PoleSettings
 from cartpole_rl.rig.parameters import POSITIVE, Parameter, factor
-from cartpole_rl.workflows.identified_files import friction_choice, write_choices
+from cartpole_rl.workflows.identify import friction_choice, write_choices
 
 
 def write(models: Models, nominal: dict[str, float], folder: Path) -> dict[str, float]:

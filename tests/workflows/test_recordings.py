@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from cartpole_rl.errors import ConfigError, RecordingError
-from cartpole_rl.workflows.recordings import experiments, recordings
+from cartpole_rl.run_folder import experiments, recordings
 
 
 def write(folder: Path, *names: str) -> list[Path]:

@@ -4,7 +4,8 @@ import pytest
 
 from cartpole_rl.plants.serial.statistics import LinkStatistics
 from cartpole_rl.plants.settings import SerialSettings
-from cartpole_rl.workflows.results import plant_words, print_loop_time
+from cartpole_rl.terminal import print_loop_time
+from cartpole_rl.workflows.poles import plant_words
 
 
 def test_a_measured_loop_time_is_printed_with_what_it_lacks(capsys: pytest.CaptureFixture[str]) -> None:

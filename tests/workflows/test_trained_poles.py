@@ -4,7 +4,7 @@ import pytest
 
 from cartpole_rl.choices import group_choices
 from cartpole_rl.randomization.poles import Pole, PoleSettings
-from cartpole_rl.workflows.trained_poles import emulated_words, one_pole, other_pole, pole_of_length
+from cartpole_rl.workflows.poles import emulated_words, one_pole, other_pole, pole_of_length
 
 POLES = group_choices("pole")
 MEDIUM, LARGE, BOTH = (PoleSettings(**POLES[name]) for name in ("medium", "large", "both"))

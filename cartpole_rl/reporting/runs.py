@@ -3,12 +3,12 @@
 import json
 import os
 from collections import Counter
-from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import yaml
 
@@ -50,8 +50,6 @@ DAMAGE = (  # what reading a damaged file raises
     yaml.YAMLError,
 )
 LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # ten times faster, where it was compiled
-
-Item = TypeVar("Item")
 
 
 @dataclass(frozen=True)
@@ -312,45 +310,6 @@ def find_runs(folder: Path) -> Iterator[Path]:
     yield from unread
 
 
-def split_by_majority(
-    items: Sequence[Item], key: Callable[[Item], Hashable]
-) -> tuple[list[Item], list[tuple[Item, Hashable]]]:
-    """Return the items with the most frequent key (the first of several), and the others with that key."""
-    if not items:
-        return [], []
-    common, _ = Counter(map(key, items)).most_common(1)[0]
-    same = [item for item in items if key(item) == common]
-    return same, [(item, common) for item in items if key(item) != common]
-
-
-def settings_key(run: Run, ignored: Collection[str] = ()) -> Hashable:
-    """Return a key that runs with the same command and settings share, those of `ignored` groups aside."""
-    return run.program, tuple((name, run.settings[name]) for name in sorted(compared_settings(run, ignored)))
-
-
-def compared_settings(run: Run, ignored: Collection[str]) -> set[str]:
-    """Return the names of the settings of a run that are in none of the `ignored` groups."""
-    groups = tuple(f"{name}." for name in ignored)
-    return {name for name in run.settings if name not in ignored and not name.startswith(groups)}
-
-
-def settings_difference(run: Run, common: Run, ignored: Collection[str] = (), most: int = 3) -> str:
-    """Return in words where the settings of `run` differ from those of `common`."""
-    names = sorted(
-        name
-        for name in compared_settings(run, ignored) | compared_settings(common, ignored)
-        if run.settings.get(name) != common.settings.get(name)
-    )
-    shown = [
-        f"{name} {_plain(run.settings.get(name))} instead of {_plain(common.settings.get(name))}"
-        for name in names[:most]
-    ]
-    more = [f"{len(names) - most} more"] if len(names) > most else []
-    if run.program != common.program:
-        shown.insert(0, f"a run of {PREFIX}{run.program} instead of {PREFIX}{common.program}")
-    return ", ".join((*shown, *more))
-
-
 def run_of(agent: Path) -> Path:
     """Return the run folder of an agent: that of its checkpoint if it is one."""
     is_checkpoint = agent.suffix == ".pt" and agent.parent.name == CHECKPOINTS
@@ -364,10 +323,6 @@ def commits_note(runs: Iterable[Run]) -> str:
         return ""
     each = ", ".join(f"{commit} ({count})" for commit, count in counts.most_common())
     return f"The runs are of {len(counts)} commits with the same package versions: {each}."
-
-
-def _plain(value: Hashable) -> str:
-    return "unset" if value is None else str(value)
 
 
 def short(error: Exception) -> str:

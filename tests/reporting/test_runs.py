@@ -7,8 +7,7 @@ from typing import Any
 
 import pytest
 
-from cartpole_rl.run_folder import file_hash
-from cartpole_rl.workflows.pages.runs import (
+from cartpole_rl.reporting.runs import (
     Run,
     find_runs,
     learning_curve,
@@ -16,6 +15,7 @@ from cartpole_rl.workflows.pages.runs import (
     partly_measured_note,
     read_run,
 )
+from cartpole_rl.run_folder import file_hash
 
 Edit = Callable[[Path, Callable[[Any], object]], None]
 GOOD = '{"transitions": 1, "score": 2.0}\n{"transitions": 2, "score": 3.0}\n'

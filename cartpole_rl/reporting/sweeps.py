@@ -16,11 +16,7 @@ from cartpole_rl.errors import ConfigError
 from cartpole_rl.reporting.grouping import NULL, Columns, fewest, labels, setting_columns
 from cartpole_rl.reporting.groups import LONGEST_LABEL
 from cartpole_rl.reporting.results import OWN, Agent, Curve, Exclusion, Group, Results
-from cartpole_rl.reporting.scores import SCORES
-from cartpole_rl.reporting.statistics import interquartile_mean
-from cartpole_rl.run_folder import PREFIX
-from cartpole_rl.workflows.checks import BASELINE
-from cartpole_rl.workflows.pages.runs import (
+from cartpole_rl.reporting.runs import (
     Run,
     commits_note,
     find_runs,
@@ -32,6 +28,9 @@ from cartpole_rl.workflows.pages.runs import (
     shared_settings,
     short,
 )
+from cartpole_rl.reporting.scores import SCORES
+from cartpole_rl.reporting.statistics import interquartile_mean
+from cartpole_rl.run_folder import BASELINE, PREFIX
 
 MOST_MEASURES = 20  # in a message
 MOST_UNSORTED = 12  # groups that are shown in the order of their runs
@@ -85,12 +84,6 @@ class Sweep:
     notes: Sequence[str] = ()
     columns: Mapping[str, Sequence[str]] = field(default_factory=dict)
     labels: Sequence[str] = ()
-
-
-def read_sweep(name: str, sources: Sequence[str], measure: str) -> Sweep:
-    """Return the runs of one set; see `read_sweeps`."""
-    (sweep,) = read_sweeps({name: sources}, measure)
-    return sweep
 
 
 def read_sweeps(sets: Mapping[str, Sequence[str]], measure: str) -> list[Sweep]:
@@ -260,7 +253,7 @@ def _without_repetitions(sweep: Sweep) -> tuple[list[tuple[Member, str]], list[E
 
 def _value(member: Member, measure: str) -> float:
     value = measured(member.run.results, measure)
-    assert value is not None  # `read_sweep` leaves such runs out
+    assert value is not None  # `read_sweeps` leaves such runs out
     return value
 
 

@@ -13,7 +13,7 @@ import pytest
 
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.reporting.runs_page import comparison
-from cartpole_rl.workflows.pages.sweeps import grouped, read_sweep, read_sweeps, results_of, table
+from cartpole_rl.reporting.sweeps import Sweep, grouped, read_sweeps, results_of, table
 
 Edit = Callable[[Path, Callable[[Any], object]], None]
 MEASURE = "score_upright"
@@ -22,6 +22,12 @@ MEASURE = "score_upright"
 def cells(page: str, column: str) -> list[str]:
     """The cells of a column."""
     return re.findall(f'data-label="{re.escape(column)}">([^<]*)</td>', page)
+
+
+def read_sweep(name: str, sources: list[str], measure: str) -> Sweep:
+    """The runs of one set."""
+    (sweep,) = read_sweeps({name: sources}, measure)
+    return sweep
 
 
 def test_runs_are_grouped_by_the_settings_that_differ(study: Path) -> None:

@@ -1,1 +1,0 @@
-"""Reports: run folders in, one page out."""
