@@ -3,7 +3,7 @@
 import difflib
 import json
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, TypeVar, get_args
 
 from pydantic import ValidationError
@@ -19,7 +19,7 @@ NEAR = 0.8  # similarity of two names, 0 to 1, from which one is suggested for t
 NEAR_VALUE = 0.6  # similarity from which a value is suggested
 SAME_GROUP = 0.15  # added to the similarity within one group
 EXAMPLES = {  # of required settings
-    "run": "run=runs/train/<run>",
+    "run": "run=runs/train/<run> or run=pretrained/medium",
     "format": "format=weights, onnx, c or web",
     "from": "from=runs/record/<run>",
     "plant.port": "plant.port=/dev/ttyUSB0 (cartpole-find-port lists the ports) or plant.port=auto",
@@ -33,7 +33,6 @@ REMEDIES = {  # by pydantic's type of error; the others keep pydantic's text
     **dict.fromkeys(("string_type", "path_type"), "give text"),
     **dict.fromkeys(("dict_type", "model_type"), "give a mapping, as {{name:value}}"),
     **dict.fromkeys(("literal_error", "enum"), "give {expected}"),
-    "tuple_type": "give a list, as [0.5,0.02]",
     "finite_number": "give a finite number",
     "greater_than": "give more than {gt}",
     "greater_than_equal": "give at least {ge}",
@@ -42,21 +41,41 @@ REMEDIES = {  # by pydantic's type of error; the others keep pydantic's text
     "too_short": "give {min_length} or more values",
     "too_long": "give {max_length} or fewer values",
 }
+IN_SECONDS = (  # ends of the names of settings whose bounds are in seconds
+    "timeout",
+    "latency",
+    "latency_jitter",
+    "control_period",
+    "time_constant",
+    "nudge_after",
+    "restart",
+)
 
 Config = TypeVar("Config", bound=Settings)
 
 
-def checked(schema: type[Config], values: Mapping[str, Any]) -> Config:
-    """Return `values` as a `schema`. Raises ConfigError that names each wrong key and the remedy."""
+def checked(
+    schema: type[Config], values: Mapping[str, Any], source: Callable[[str], str] = lambda key: ""
+) -> Config:
+    """Return `values` as a `schema`. Raises ConfigError that names each wrong key and the remedy.
+
+    `source` returns what stands before the message about a key, such as the file that gave its value.
+    """
     try:
         return schema(**values)
     except ValidationError as error:
-        complaints = (_complaint(detail, schema, values) for detail in error.errors())
+        complaints = (
+            f"{source(_key(detail))}{_complaint(detail, schema, values)}" for detail in error.errors()
+        )
         raise ConfigError("; ".join(complaints)) from None
 
 
+def _key(detail: Mapping[str, Any]) -> str:
+    return TAGS.sub("", ".".join(map(str, detail["loc"])))
+
+
 def _complaint(detail: Mapping[str, Any], schema: type[Settings], values: Mapping[str, Any]) -> str:
-    key = TAGS.sub("", ".".join(map(str, detail["loc"])))
+    key = _key(detail)
     match detail["type"]:
         case "extra_forbidden":
             return no_such_setting(key, (name for name in setting_names(values) if not name.startswith(key)))
@@ -76,8 +95,13 @@ def _complaint(detail: Mapping[str, Any], schema: type[Settings], values: Mappin
 def _reason(detail: Mapping[str, Any]) -> str:
     """Return the remedy for a wrong value, or what is wrong with it."""
     if remedy := REMEDIES.get(detail["type"]):
-        given = {name: _plain(limit) for name, limit in detail.get("ctx", {}).items()}
-        return _meant(detail) + remedy.format(**given)
+        limits = {name: _plain(limit) for name, limit in detail.get("ctx", {}).items()}
+        is_bound = detail["type"].startswith(("greater", "less"))
+        unit = " s" if is_bound and _key(detail).endswith(IN_SECONDS) else ""
+        return f"{_meant(detail)}{remedy.format(**limits)}{unit}"
+    if detail["type"] == "tuple_type":
+        given = detail["input"]
+        return f"give a list, as [{given if isinstance(given, int | float | str) else '0.5,0.02'}]"
     reason: str = detail["msg"].removeprefix("Value error, ")
     return reason[0].lower() + reason[1:] if detail["loc"] else reason
 
@@ -140,6 +164,13 @@ def of_another_choice(key: str, choices: Sequence[str]) -> str:
 def most_similar(wrong: str, names: Iterable[str]) -> str:
     """Return the name that was probably meant by `wrong`."""
     return max(sorted(names), key=lambda name: similarity(wrong, name))
+
+
+def nearest_choice(wrong: str, choices: Sequence[str]) -> str:
+    """Return a hint: the choice that was probably meant, and all choices."""
+    near = most_similar(wrong, choices)
+    hint = f"did you mean {near}? " if similarity(wrong, near)[0] >= NEAR_VALUE else ""
+    return f"{hint}there are {', '.join(choices)}"
 
 
 def similarity(wrong: str, name: str) -> tuple[float, float]:

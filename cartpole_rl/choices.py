@@ -8,7 +8,9 @@ from typing import Any, NamedTuple, NoReturn
 
 import yaml
 
+from cartpole_rl.checking import nearest_choice
 from cartpole_rl.errors import ConfigError
+from cartpole_rl.terminal import shown
 
 HERE = "${here}"  # the folder of a person's own file
 WHOLE = ("experiment", "sweep")  # groups without settings of their own: they change those of others
@@ -129,6 +131,9 @@ def load(group: str, chosen: Choice, folder: Path = Path(), above: tuple[Path, .
         return Chosen({}, {})
     beside = folder / f"{chosen}.yaml"
     if not is_own_file(chosen) and (is_shipped(group, str(chosen)) or not (above and beside.is_file())):
+        if above and not is_shipped(group, str(chosen)):
+            remedy = nearest_choice(str(chosen), [*group_choices(group)])
+            raise ConfigError(f"{group}={shown(above[-1])}: defaults: there is no choice {chosen}; {remedy}")
         return _extended(group, chosen, choice(f"{group}/{chosen}") or {}, folder, above, False)
     path = folder / Path(str(chosen)).expanduser() if is_own_file(chosen) else beside
     if path.resolve() in above:
@@ -220,7 +225,10 @@ def _mapped(values: Any, function: Callable[[str], str]) -> Any:
 def _where_and_why(error: yaml.YAMLError) -> str:
     """Return the line and the problem of an error of the parser: ", line 3: found undefined alias 'a'"."""
     if isinstance(error, yaml.MarkedYAMLError) and error.problem_mark is not None:
-        return f", line {error.problem_mark.line + 1}: {error.problem}"
+        # what is not closed is noticed below it; a block mapping starts far above its problem
+        is_open = error.context_mark is not None and "block" not in str(error.context)
+        mark = error.context_mark if is_open else error.problem_mark
+        return f", line {mark.line + 1}: {error.problem}"
     return f": {' '.join(str(error).split())}"
 
 

@@ -15,6 +15,8 @@ from typing import Any, NamedTuple
 
 from cartpole_rl.terminal import program
 
+INTERRUPTED = 130  # exit code after Ctrl-C
+
 
 class Verb(NamedTuple):
     """One row. Objects are given, or named by their places in this package: "module:name"."""
@@ -209,9 +211,12 @@ VERBS: dict[str, Verb] = {
 
 def run(verb: str) -> None:
     """Run a verb with the words of the command line."""
-    from cartpole_rl.command import run_command  # imports Hydra
+    try:
+        from cartpole_rl.command import run_command  # imports Hydra
 
-    run_command(verb, VERBS[verb])
+        run_command(verb, VERBS[verb])
+    except KeyboardInterrupt:  # before `run_command` handles it
+        sys.exit(INTERRUPTED)
 
 
 def main() -> None:

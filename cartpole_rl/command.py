@@ -25,7 +25,7 @@ from omegaconf import DictConfig, OmegaConf
 from cartpole_rl import __version__
 from cartpole_rl.checking import checked, kinds, most_similar, similarity
 from cartpole_rl.choices import conf_folder, default_choices
-from cartpole_rl.composition import as_mapping, hydra_overrides, is_completing, task_overrides
+from cartpole_rl.composition import as_mapping, hydra_overrides, is_completing, own_file_of, task_overrides
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.exits import (
     EXPECTED,
@@ -35,6 +35,7 @@ from cartpole_rl.exits import (
     exit_with_message,
     job_signals,
 )
+from cartpole_rl.run_folder import CHECKPOINTS, RESUME, use_of
 from cartpole_rl.settings import Settings
 from cartpole_rl.sweeps import as_multirun, is_job, run_as_job, shown_jobs, sweep
 from cartpole_rl.terminal import program
@@ -72,7 +73,7 @@ def run_command(name: str, verb: "Verb") -> None:
             for sys.argv[1:] in shown_jobs(words) or [words]:
                 hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=name)(work)()
     except EXPECTED as error:
-        exit_with_message(name, error)
+        exit_with_message(name, error, kinds(schema, "plant"))
     except (KeyboardInterrupt, Terminated) as signalled:
         exit_after_signal(name, signalled)
 
@@ -88,7 +89,7 @@ def run_job(
     words = [typed.get(word, word) for word in overrides if not is_completing(word)]
 
     def work() -> float | None:
-        config = checked(verb.find(verb.settings), as_mapping(composed))
+        config = checked(verb.find(verb.settings), as_mapping(composed), partial(own_file_of, words=words))
         if verb.check:
             call(verb.find(verb.check), config=config, folder=folder, words=words)
         return call(verb.find(verb.function), config=config, folder=folder, words=words)
@@ -98,6 +99,10 @@ def run_job(
             return run_as_job(name, folder, work) if is_job() else work()
         except EXPECTED as error:
             exit_with_message(name, error)
+        except (KeyboardInterrupt, Terminated) as signalled:
+            if (folder / CHECKPOINTS / RESUME).exists():
+                signalled.add_note(use_of(folder, name))
+            raise
         finally:
             remove_if_empty(folder, name)
 

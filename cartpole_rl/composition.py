@@ -11,7 +11,7 @@ choice and before the command line. So no experiment replaces it, and no frictio
 import re
 import warnings
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
 from functools import cache, lru_cache
@@ -31,12 +31,11 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from cartpole_rl.checking import (
-    NEAR_VALUE,
     most_similar,
+    nearest_choice,
     no_such_setting,
     of_another_choice,
     setting_names,
-    similarity,
 )
 from cartpole_rl.choices import (
     OF_CLASSES,
@@ -53,7 +52,7 @@ from cartpole_rl.choices import (
     merged,
 )
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.rig.parameters import PARAMETERS, completed
+from cartpole_rl.rig.parameters import PARAMETERS, check_value, completed
 from cartpole_rl.run_folder import PREFIX, RUN_FILES, USES, check_program, program_of, use_of
 from cartpole_rl.terminal import in_quotes
 
@@ -458,18 +457,35 @@ def _check_cart(word: str, cart: Chosen) -> None:
         raise ConfigError(
             f"{word}: {name}: there is no such setting; did you mean {most_similar(name, known)}?"
         )
+    for name, value in cart.own.items():
+        if isinstance(value, int | float):
+            try:
+                check_value(name, value)
+            except ConfigError as error:
+                raise ConfigError(f"{word}: {error}") from None
     if missing := [name for name in known if name not in completed(cart.values)]:
         remedy = "give it, or take what is missing from a choice: defaults: [ip02]"
         raise ConfigError(f"{word}: {missing[0]} is missing; {remedy}")
 
 
-def error_message(error: Exception, command: str, words: Sequence[str]) -> str:
-    """Return an error of Hydra in one line with the remedy."""
+def own_file_of(setting: str, words: Sequence[str]) -> str:
+    """Return "mine.yaml: " for a setting that a user's own file among the choices `words` gives, else ""."""
+    if setting in map(key_of, words):
+        return ""
+    for word in reversed(words):
+        group, _, file = word.partition("=")
+        if is_own_file(file) and Path(file).is_file():
+            given = load(group, Path(file)).own
+            names = setting_names(given if group in WHOLE else {group: given})
+            if setting in names:
+                return f"{file}: "
+    return ""
+
+
+def error_message(error: Exception, command: str, words: Sequence[str], plants: Collection[str] = ()) -> str:
+    """Return an error of Hydra in one line with the remedy; `plants` are those that the command takes."""
     if isinstance(error, OverrideParseException):
-        return (
-            f"{error.override}: settings are given as key=value, lists as [1,2], "
-            "text with special characters in quotes"
-        )
+        return _no_override(str(error.override), words)
     if not isinstance(error, HydraException):
         return next(iter(str(error).splitlines()), type(error).__name__)
     text = " ".join(str(error).split())
@@ -479,11 +495,23 @@ def error_message(error: Exception, command: str, words: Sequence[str]) -> str:
         name = wrong[1].removeprefix(f"{wrong[2]}/")
         if extra := EXTRAS.get(wrong[1]):
             return f'{wrong[2]}={name} needs the extra {extra}: pip install "cartpole_rl[{extra}]"'
-        remedy = nearest_choice(name, wrong[3].split(" Config search")[0].split())
-        return f"{wrong[2]}={name}: there is no such choice; {remedy}"
+        if Path(f"{name}.yaml").is_file():
+            return f"{wrong[2]}={name}: there is no such choice; did you mean {wrong[2]}={name}.yaml?"
+        choices = wrong[3].split(" Config search")[0].split()
+        if wrong[2] == "plant" and plants:
+            choices = [each for each in choices if each in plants or not is_shipped("plant", each)]
+        return f"{wrong[2]}={name}: there is no such choice; {nearest_choice(name, choices)}"
     if several := re.match(r"Ambiguous value for argument '([^']+)'", text):
         return f"{several[1]}: -m runs each of several values; a list is one value if written [a,b]"
     return text
+
+
+def _no_override(word: str, words: Sequence[str]) -> str:
+    """Return the message for a word that is no override, as the first of "experiment medium"."""
+    for each, following in pairwise(words):
+        if each == word and re.fullmatch(r"[a-z_.]+", word) and re.fullmatch(r"[\w./]+", following):
+            return f"{word} {following}: settings are given as key=value; did you mean {word}={following}?"
+    return f"{word}: settings are given as key=value, lists as [1,2], text with special characters in quotes"
 
 
 def _unknown_setting(setting: str, command: str, words: Sequence[str]) -> str:
@@ -509,13 +537,6 @@ def known_settings(command: str, words: Sequence[str]) -> set[str]:
             return setting_names(OmegaConf.to_container(hydra.compose(command, [*words]), resolve=False))
     except HydraException:
         return set()
-
-
-def nearest_choice(wrong: str, choices: Sequence[str]) -> str:
-    """Return a hint: the choice that was probably meant, and all choices."""
-    near = most_similar(wrong, choices)
-    hint = f"did you mean {near}? " if similarity(wrong, near)[0] >= NEAR_VALUE else ""
-    return f"{hint}there are {', '.join(choices)}"
 
 
 OmegaConf.register_new_resolver("constant_settings", list)  # of a command; Hydra 1.3 asks for it always

@@ -9,7 +9,7 @@ import errno
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from typing import NoReturn
 
@@ -36,8 +36,11 @@ class Terminated(BaseException):
         self.number = number
 
 
-def exit_with_message(name: str, error: Exception) -> NoReturn:
-    """Print an error and exit. Raises an OSError that concerns no file: it is a defect of this package."""
+def exit_with_message(name: str, error: Exception, plants: Collection[str] = ()) -> NoReturn:
+    """Print an error and exit; `plants` are those that the command takes.
+
+    Raises an OSError that concerns no file: it is a defect of this package.
+    """
     if isinstance(error, BrokenPipeError):
         exit_if_nobody_reads()
     code = CartPoleError.exit_code
@@ -47,14 +50,14 @@ def exit_with_message(name: str, error: Exception) -> NoReturn:
         code = ConfigError.exit_code
     elif isinstance(error, OSError) and not error.filename and error.errno not in UNNAMED:
         raise error
-    print_message(name, one_line(error, name))
+    print_message(name, one_line(error, name, plants))
     sys.exit(code)
 
 
-def one_line(error: Exception, name: str) -> str:
+def one_line(error: Exception, name: str, plants: Collection[str] = ()) -> str:
     """Return what cartpole-<name> prints of an error; with its class if it is not an expected one."""
     if isinstance(error, OF_HYDRA):
-        return error_message(error, name, sys.argv[1:])
+        return error_message(error, name, sys.argv[1:], plants)
     if isinstance(error, OSError):
         remedy = "; make room, or give hydra.run.dir= a folder on another disk" if error.errno in FULL else ""
         return f"{error.filename or 'a file was not written'}: {error.strerror}{remedy}"
@@ -63,9 +66,10 @@ def one_line(error: Exception, name: str) -> str:
 
 
 def exit_after_signal(name: str, signalled: BaseException) -> NoReturn:
-    """Print which kind of signal ended the command, and exit."""
+    """Print which kind of signal ended the command and its notes, and exit."""
     number = signalled.number if isinstance(signalled, Terminated) else signal.SIGINT
-    print_message(name, "interrupted" if number == signal.SIGINT else "terminated")
+    what = "interrupted" if number == signal.SIGINT else "terminated"
+    print_message(name, "; ".join([what, *getattr(signalled, "__notes__", ())]))
     sys.exit(SIGNALLED + number)
 
 

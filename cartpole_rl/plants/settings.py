@@ -1,9 +1,9 @@
 """Settings of the plants: plant=simulated, learned, emulated and serial."""
 
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from cartpole_rl.physics.laws import Law
 from cartpole_rl.physics.models import INTEGRATORS
@@ -78,3 +78,10 @@ class SerialSettings(Settings):
     nudge_after: Annotated[float, Field(ge=0.2, le=60)] = 0.5
     home_timeout: Wait = 120.0  # for homing
     start_timeout: Wait = 60.0  # for the pole to reach the position in which an episode starts
+
+    @field_validator("port", mode="before")
+    @classmethod
+    def _port_is_a_name(cls, port: Any) -> Any:
+        if isinstance(port, int):
+            raise ValueError(f"give the name of a port, as /dev/ttyUSB{port} or COM{port}")
+        return port

@@ -109,7 +109,7 @@ def check_tuning(config: FinetuneConfig, folder: Path, words: Sequence[str]) -> 
 def check_finetuning(config: FinetuneConfig) -> Path:
     """Return the run to fine-tune. Raises CartPoleError if it has no agent."""
     if config.run is None:
-        raise ConfigError(missing("run"))
+        raise ConfigError(f"{missing('run')}, or resume=runs/finetune/<run> to continue a fine-tuning")
     if config.compile:
         check_compiler()
     check_agent(config.run)

@@ -6,7 +6,6 @@ from pathlib import Path
 from cartpole_rl.choices import choice, group_choices
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import ConfigError, RecordingError
-from cartpole_rl.evaluation.recordings import LENGTH, read_heading
 from cartpole_rl.plants.settings import EmulatedSettings, SerialSettings
 from cartpole_rl.randomization.poles import HEAVIER, Pole, PoleSettings, check_one_pole
 from cartpole_rl.terminal import as_word
@@ -132,6 +131,8 @@ def recorded_pole(paths: Sequence[Path]) -> tuple[str, Pole]:
 
 def recorded_length(path: Path) -> float | None:
     """Return the pole's length (m) in a recording's header; None where it has none. Raises RecordingError."""
+    from cartpole_rl.evaluation.recordings import LENGTH, read_heading  # imports PyTorch
+
     text = read_heading(path)[0].get(LENGTH)
     try:
         return float(text) if text else None

@@ -18,6 +18,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.plugins import Plugins
 from hydra.core.utils import JobReturn
 
+from cartpole_rl import cli
 from cartpole_rl.cli import VERBS
 from cartpole_rl.command import run_command
 from cartpole_rl.exits import Terminated, exit_with_message
@@ -67,6 +68,19 @@ def test_a_signal_unwinds_the_work(
     signal.signal(number, signal.SIG_DFL)
     assert run_until_signalled(number, tmp_path, monkeypatch) == ["unwound", f"exit code {code}"]
     assert capsys.readouterr().err == "cartpole-find-port: terminated\n"
+
+
+def test_an_interrupt_during_the_first_imports_is_silent(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("cartpole_rl.command.run_command", interrupted)
+    with pytest.raises(SystemExit) as ended:
+        cli.train()
+    assert ended.value.code == 130
+    assert capsys.readouterr() == ("", "")
 
 
 def test_a_second_signal_does_not_interrupt_the_unwinding(monkeypatch: pytest.MonkeyPatch) -> None:

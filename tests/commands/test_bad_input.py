@@ -22,7 +22,7 @@ WRONG_TRAINING = [
     ("agent.gamma=1.5", "agent.gamma=1.5", "give less than 1"),
     ("agent.loss=l1", "agent.loss=l1", "'l2' or 'smooth_l1'"),
     ("agent.loss=smoth_l1", "agent.loss=smoth_l1", "did you mean smooth_l1? give 'l2' or 'smooth_l1'"),
-    ("control_period=1", "control_period=1", "give at most 0.1"),
+    ("control_period=1", "control_period=1", "give at most 0.1 s"),
     ("pole=tiny", "pole=tiny", "both, large, medium, range"),
     ("pole=null", "pole=null", "leave pole=null out"),
     ("task=null", "task=null", "leave task=null out"),
@@ -32,11 +32,13 @@ WRONG_TRAINING = [
     ("pole=lrage", "pole=lrage", "did you mean large?"),
     ("pole=medium,large", "pole=medium,large", "-m runs each"),
     ("seed", "seed", "key=value"),
+    ("experiment medium", "experiment medium", "did you mean experiment=medium?"),
+    ("agent.hidden=128", "agent.hidden=128", "give a list, as [128]"),
     ("--seed=1", "--seed=1", "without dashes: seed=1"),
     ("--seed 1", "--seed: ", "without dashes: seed=1"),
     ("--hlep", "--hlep", "did you mean --help?"),
     ("--cfg", "--cfg", "give --cfg job"),
-    ("learning.epsilon=0.5", "learning.epsilon=0.5", "give a list, as [0.5,0.02]"),
+    ("learning.epsilon=0.5", "learning.epsilon=0.5", "give a list, as [0.5]"),
     ("learning.epsilon=[0.5]", "learning.epsilon: ", "value 2 is missing"),
     ("learning.transitions=many", "learning.transitions=many", "give an integer"),
     ("agent.mirrored=maybe", "agent.mirrored=maybe", "give true or false"),
@@ -79,7 +81,7 @@ def test_a_choice_file_that_is_no_yaml(tmp_path: Path) -> None:
     (tmp_path / "mine.yaml").write_text("pole_mass: [0.1\n")
     done = in_process("train", "pole=mine.yaml", folder=tmp_path)
     problem = "expected ',' or ']', but got '<stream end>'"
-    assert done.complaint == f"cartpole-train: pole=mine.yaml is not valid YAML, line 2: {problem}"
+    assert done.complaint == f"cartpole-train: pole=mine.yaml is not valid YAML, line 1: {problem}"
     assert done.code == 2
 
 
@@ -89,12 +91,45 @@ def test_a_choice_file_that_is_no_yaml(tmp_path: Path) -> None:
         ("", "cart_mass is missing; give it, or take what is missing from a choice: defaults: [ip02]"),
         ("mas: 1\n", "mas: there is no such setting; did you mean cart_mass?"),
         ("defaults: [ip02]\nmas: 1\n", "mas: there is no such setting; did you mean cart_mass?"),
+        ("defaults: [ip02]\ncart_mass: -1\n", "cart_mass is -1; it must be above 0"),
+        ("defaults: [ip2]\n", "defaults: there is no choice ip2; did you mean ip02? there are ip02, thesis"),
     ],
 )
 def test_a_cart_file_names_what_is_wrong_with_it(text: str, complaint: str, tmp_path: Path) -> None:
     (tmp_path / "mine.yaml").write_text(text)
     done = in_process("train", "cart=mine.yaml", folder=tmp_path)
     assert (done.complaint, done.code) == (f"cartpole-train: cart=mine.yaml: {complaint}", 2)
+
+
+def test_a_wrong_value_is_named_with_the_file_that_gives_it(tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_text("learning: {carts: abc}\n")
+    done = in_process("train", "experiment=mine.yaml", folder=tmp_path)
+    assert done.complaint == "cartpole-train: mine.yaml: learning.carts=abc: give an integer"
+    done = in_process("train", "experiment=mine.yaml", "learning.carts=no", folder=tmp_path)
+    assert done.complaint == "cartpole-train: learning.carts=no: give an integer"
+    done = in_process("train", "experiment=mine", folder=tmp_path)
+    assert done.complaint.endswith("there is no such choice; did you mean experiment=mine.yaml?")
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (
+            "plant=seriel",
+            "there is no such choice; did you mean serial? there are emulated, serial",
+        ),
+        ("plant=serial plant.port=5", "plant.port=5: give the name of a port, as /dev/ttyUSB5 or COM5"),
+        ("plant=serial", "plant.port is missing; give plant.port="),
+    ],
+)
+def test_preflight_says_which_plant_and_port_to_give(words: str, complaint: str, tmp_path: Path) -> None:
+    assert complaint in in_process("preflight", *words.split(), folder=tmp_path).complaint
+
+
+def test_fine_tuning_without_an_agent_names_what_to_give(tmp_path: Path) -> None:
+    complaint = in_process("finetune", folder=tmp_path).complaint
+    assert "run=pretrained/medium" in complaint
+    assert "resume=" in complaint
 
 
 def test_a_file_that_is_no_choice_file(tmp_path: Path) -> None:
@@ -381,6 +416,8 @@ def test_through_a_real_process(tmp_path: Path) -> None:
 def test_an_interrupt_is_reported_in_one_line(interrupted: tuple[Path, Outcome]) -> None:
     _, done = interrupted
     assert done.code == 130
-    assert done.err.splitlines()[-1] == "cartpole-train: interrupted"
+    last = done.err.splitlines()[-1]
+    assert last.startswith("cartpole-train: interrupted; cartpole-train resume=")
+    assert last.endswith(" continues it")
     assert "Traceback" not in done.err
     assert done.out == ""

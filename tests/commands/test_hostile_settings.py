@@ -22,7 +22,7 @@ from hydra.core.global_hydra import GlobalHydra
 from cartpole_rl.checking import checked
 from cartpole_rl.choices import default_choices, group_choices, merged
 from cartpole_rl.cli import VERBS
-from cartpole_rl.command import run_command
+from cartpole_rl.command import provide_config, run_command
 from cartpole_rl.composition import compose
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.settings import Settings
@@ -138,7 +138,7 @@ FILES: dict[str, tuple[bytes, str]] = {  # content, part of the line
     "circle.yaml": (b"defaults: [self.yaml, circle.yaml]\n", "extends itself"),
     "latin.yaml": (b"a: \xe9\n", "save it as UTF-8"),
     "list.yaml": (b"- a\n", "holds no settings"),
-    "cut.yaml": (b"a: [1\n", "not valid YAML, line 2"),
+    "cut.yaml": (b"a: [1\n", "not valid YAML, line 1"),
     "number.yaml": (b"1: 2\n", "must be text"),
     "loop.yaml": (b"a: &a [*a]\n", "give numbers, text"),
     "python.yaml": (b"a: !!python/object:x.y {}\n", "not valid YAML"),
@@ -250,7 +250,9 @@ def keys(tree: Mapping[str, Any], path: str = "") -> Iterator[str]:
 @pytest.mark.parametrize("command", SCHEMAS)
 def test_each_setting_takes_a_value_or_refuses_it_in_one_line(command: str) -> None:
     """The settings are found as given; a truth value is no number, and a refusal names the setting."""
-    schema, base = SCHEMAS[command], compose(command, REQUIRED.get(command))
+    schema = SCHEMAS[command]
+    provide_config(command, schema)
+    base = compose(command, REQUIRED.get(command, ()))
     lines: list[str] = []
     for key in keys(base):
         for value in VALUES:
@@ -275,7 +277,8 @@ def test_each_setting_takes_a_value_or_refuses_it_in_one_line(command: str) -> N
 @pytest.mark.parametrize("command", SCHEMAS)
 def test_settings_on_the_command_line(command: str, tmp_path: Path) -> None:
     """Half of the words on each command, to save time, each on another setting."""
-    settings = [*keys(compose(command, REQUIRED.get(command)))]
+    provide_config(command, SCHEMAS[command])
+    settings = [*keys(compose(command, REQUIRED.get(command, ())))]
     for number, value in enumerate(SETTING_WORDS[len(command) % 2 :: 2]):
         word = f"{settings[7 * number % len(settings)]}={value}"
         done, config = run(command, *required(command), word, folder=tmp_path)

@@ -86,7 +86,7 @@ def test_a_file_extends_a_file_beside_it(tmp_path: Path) -> None:
 @pytest.mark.parametrize("text", ["no", "yes", "1:30", "on"])
 def test_a_number_is_a_number(text: str, tmp_path: Path) -> None:
     (tmp_path / "mine.yaml").write_text(f"defaults: [ip02]\ncart_viscous: {text}\n")
-    assert refused(tmp_path, "cart=mine.yaml") == f"cart.cart_viscous={text}: give a number"
+    assert refused(tmp_path, "cart=mine.yaml") == f"mine.yaml: cart.cart_viscous={text}: give a number"
     with pytest.raises(ConfigError, match=f"cart.cart_viscous={text}: give a number"):
         load_settings(TrainConfig, {"cart": tmp_path / "mine.yaml"})
 

@@ -56,6 +56,8 @@ def open_port(port: str, baud: int, write_timeout: float) -> serial.SerialBase:
             f"{port}: rfc2217:// is not supported, as its writes have no time limit; let the bridge serve "
             "the port as raw TCP, and give socket://HOST:PORT"
         )
+    if port.lower().startswith("socket://") and not re.search(r":\d+(/|$)", port[len("socket://") :]):
+        raise PortError(f"{port} names no TCP port; give socket://HOST:PORT")
     try:
         line = (
             TcpPort()
@@ -121,8 +123,9 @@ def why_not_open(port: str, error: OSError | ValueError | OverflowError) -> str:
     """Return one line: the port, what is wrong with it, and the remedy."""
     number = getattr(error, "errno", None)
     if number in (errno.ENOENT, errno.ENODEV, errno.ENXIO):
+        meant = f" (did you mean /dev/{port}?)" if os.name == "posix" and "/" not in port else ""
         return (
-            f"{port} does not exist: plug the cart in, or choose one of the ports found: "
+            f"{port} does not exist{meant}: plug the cart in, or choose one of the ports found: "
             f"{named(found_ports()) or 'none'}"
         )
     if number in (errno.EACCES, errno.EPERM):
@@ -132,7 +135,10 @@ def why_not_open(port: str, error: OSError | ValueError | OverflowError) -> str:
         )
     if number in (errno.EBUSY, errno.EAGAIN):
         return f"{port} is busy: another program has it open; close that (`fuser {port}` names it)"
-    if errno.ENOTTY in (number, *getattr(error.__context__, "args", ())):  # pyserial drops the number
+    if number == errno.EISDIR or errno.ENOTTY in (
+        number,
+        *getattr(error.__context__, "args", ()),  # pyserial drops the number
+    ):
         return f"{port} is not a serial port; cartpole-find-port lists them"
     return f"{port} cannot be opened as a serial port: {error}"
 

@@ -112,6 +112,9 @@ def test_a_cart_on_auto_says_why_it_finds_none() -> None:
     [
         ("rfc2217://localhost:1", "is not supported, as its writes have no time limit; let the bridge serve"),
         ("hwgrep://(", "is neither a device path nor a URL of pyserial: error('missing )"),
+        ("socket://host", "names no TCP port; give socket://HOST:PORT"),
+        ("ttyUSB77", "did you mean /dev/ttyUSB77?"),
+        ("/tmp", "/tmp is not a serial port; cartpole-find-port lists them"),
         ("loop://?logging=foo", "is neither a device path nor a URL of pyserial: KeyError('foo')"),
     ],
 )
