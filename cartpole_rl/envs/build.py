@@ -1,6 +1,5 @@
 """Builds environments: over a plant, or from settings over simulated carts."""
 
-import math
 from collections.abc import Mapping
 from functools import lru_cache
 from typing import Any, TypeVar
@@ -13,22 +12,13 @@ from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
 from cartpole_rl.envs.guard_fitting import fitted_guard
 from cartpole_rl.envs.hardware import HardwareTransform
 from cartpole_rl.envs.settings import ObservationSettings, TrackGuard
-from cartpole_rl.errors import ConfigError
 from cartpole_rl.physics.models import Models
-from cartpole_rl.physics.parameters import cart_column
-from cartpole_rl.physics.residual import UNDER_WAY
-from cartpole_rl.plants.learned import LearnedPlant
-from cartpole_rl.plants.learned_model import LearnedModel, load_model
-from cartpole_rl.plants.settings import LearnedSettings, SimulatedSettings
-from cartpole_rl.plants.simulated import SimulatedPlant
+from cartpole_rl.plants.settings import PlantSettings
 from cartpole_rl.plants.specs import Plant
-from cartpole_rl.randomization.identified import IdentifiedCarts, identified_carts
-from cartpole_rl.randomization.poles import check_one_pole
+from cartpole_rl.randomization.identified import identified_carts
 from cartpole_rl.randomization.randomizer import Draws, Randomizer
 from cartpole_rl.randomization.ranges import IdentifiedSettings
 from cartpole_rl.tasks.settings import ActionSettings, RewardSettings, StartSettings, TaskSettings
-
-FITTED_LENGTH = 0.2  # share: a fit may move the centre of mass of the pole by half of that
 
 
 def shipped_settings(overrides: Mapping[str, Any] | None = None) -> CartPoleSettings:
@@ -91,7 +81,7 @@ def environment(config: CartPoleSettings, plant: Plant) -> CartPoleEnv:
 
 def simulated_env(
     config: CartPoleSettings,
-    plant: SimulatedSettings | LearnedSettings,
+    plant: PlantSettings,
     carts: int,
     start: StartSettings,
     seed: int,
@@ -99,22 +89,8 @@ def simulated_env(
     device: torch.device | str = "cpu",
 ) -> CartPoleEnv:
     """Return an environment over `carts` simulated carts. Raises CheckpointError, ConfigError."""
-    if isinstance(plant, LearnedSettings):
-        return environment(config, learned_plant(config, plant, carts, start, seed, compiled, device))
-    return environment(
-        config,
-        SimulatedPlant(
-            carts,
-            randomizer(config, device),
-            start,
-            config.models(plant),
-            config.control_period,
-            plant.substeps,
-            seed,
-            device,
-            compiled,
-        ),
-    )
+    draws = randomizer(config, device)
+    return environment(config, plant.build(config, draws, carts, start, seed, compiled, device))
 
 
 def randomizer(config: CartPoleSettings, device: torch.device | str = "cpu") -> Draws:
@@ -122,33 +98,3 @@ def randomizer(config: CartPoleSettings, device: torch.device | str = "cpu") -> 
     if isinstance(config.randomization, IdentifiedSettings):
         return identified_carts(config.randomization, config.nominal_cart, config.pole, device)
     return Randomizer(config.nominal_cart, config.pole, config.randomization, device)
-
-
-def learned_plant(
-    config: CartPoleSettings,
-    plant: LearnedSettings,
-    carts: int,
-    start: StartSettings,
-    seed: int,
-    compiled: bool,
-    device: torch.device | str,
-) -> LearnedPlant:
-    """Return carts of a learned model. Raises CheckpointError; ConfigError for a model of another cart."""
-    model = load_model(plant.model)
-    check_same_cart(model, config)
-    found = cart_column(model.parameters, torch.float32)
-    prior = randomizer(config, device)
-    draws = IdentifiedCarts(found, prior, plant.prior_share, UNDER_WAY * model.period)
-    return LearnedPlant(carts, model, draws, start, seed, device, compiled)
-
-
-def check_same_cart(model: LearnedModel, config: CartPoleSettings) -> None:
-    """Raise ConfigError if a learned model has another period, actuator or pole than `config`."""
-    if not math.isclose(model.period, config.control_period, rel_tol=1e-6):
-        raise ConfigError(f"control_period={config.control_period}: plant.model has {model.period} s")
-    if model.models.actuator != config.actions.actuator:
-        raise ConfigError(f"actions: plant.model has actuator {model.models.actuator}")
-    check_one_pole("plant.model", config.pole)
-    pole, own = config.pole.nominal, 2 * model.parameters["pole_com"]
-    if abs(own / pole.length - 1) > FITTED_LENGTH:
-        raise ConfigError(f"pole: plant.model has one of {own:.2f} m, not {pole.length:.2f} m")

@@ -11,7 +11,7 @@ from cartpole_rl.envs.settings import GuardSettings, ObservationSettings
 from cartpole_rl.physics.friction import CART_FRICTIONS, POLE_FRICTIONS
 from cartpole_rl.physics.laws import Law
 from cartpole_rl.physics.models import Models
-from cartpole_rl.plants.settings import LearnedSettings, SimulatedSettings
+from cartpole_rl.plants.settings import SimulationSettings
 from cartpole_rl.randomization.poles import Pole, PoleSettings
 from cartpole_rl.randomization.ranges import IdentifiedSettings, Range
 from cartpole_rl.rig.parameters import completed
@@ -129,7 +129,7 @@ class SimulatedCartSettings(CartSettings):
         """The friction laws that are chosen."""
         return self.cart_friction, self.pole_friction
 
-    def models_with(self, actuator: Law, plant: SimulatedSettings | LearnedSettings) -> Models:
+    def models_with(self, actuator: Law, plant: SimulationSettings) -> Models:
         """Return the physics models of the cart with `actuator`, on `plant`."""
         friction = self.cart_friction.model, self.pole_friction.model
         return Models(*friction, actuator, plant.integrator, plant.pole_presses)
@@ -153,6 +153,6 @@ class CartPoleSettings(SimulatedCartSettings):
         given = self.randomization
         return given.ranges if isinstance(given, IdentifiedSettings) else given
 
-    def models(self, plant: SimulatedSettings | LearnedSettings) -> Models:
+    def models(self, plant: SimulationSettings) -> Models:
         """Return the physics models of the simulated cart."""
         return self.models_with(self.actions.actuator, plant)

@@ -24,7 +24,6 @@ from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.errors import CartPoleError, LinkError
 from cartpole_rl.evaluation.driving_policy import DrivingPolicy, Weights
 from cartpole_rl.evaluation.episodes import run_batch, warm_up
-from cartpole_rl.plants.serial.plant import SerialPlant
 from cartpole_rl.plants.serial.preparation import Confirm, nobody
 from cartpole_rl.plants.serial.statistics import LinkStatistics
 from cartpole_rl.scheduling import take_precedence
@@ -207,5 +206,4 @@ def _drive(env: CartPoleEnv, policy: DrivingPolicy, drive: DriveRequest, parent:
         return chosen
 
     (episode,) = run_batch(env, act)
-    assert isinstance(env.plant, SerialPlant)
-    return Driven(episode, env.plant.cart.statistics)
+    return Driven(episode, env.plant.statistics)

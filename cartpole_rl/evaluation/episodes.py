@@ -23,8 +23,7 @@ from cartpole_rl.errors import FaultError
 from cartpole_rl.evaluation.driving_policy import DrivingPolicy
 from cartpole_rl.evaluation.knocks import Knocks
 from cartpole_rl.plants.measured import measured_part
-from cartpole_rl.plants.serial.plant import SerialPlant
-from cartpole_rl.plants.specs import Numbers, OneCartPlant, PlantOutput, tensordict_of
+from cartpole_rl.plants.specs import Numbers, PlantOutput, tensordict_of
 from cartpole_rl.scheduling import no_garbage_collection
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
@@ -61,7 +60,7 @@ def with_periods(episodes: Iterable[Episode]) -> Iterator[Episode]:
 
 def prepared(env: CartPoleEnv, policy: Policy) -> Policy:
     """Return the policy to drive with: a Q-network that drives one cart becomes a DrivingPolicy."""
-    if isinstance(env.plant, OneCartPlant) and isinstance(policy, QValueActor):
+    if env.plant.drives_one_cart and isinstance(policy, QValueActor):
         return DrivingPolicy(policy)
     return policy
 
@@ -73,10 +72,9 @@ def warm_up(env: CartPoleEnv, policy: Policy) -> None:
     A serial cart repeats it before each episode, before it is armed: what is not in the processor's caches
     makes the first tick the slowest.
     """
-    if isinstance(env.plant, OneCartPlant):
+    if env.plant.drives_one_cart:
         rehearse(env.one_cart, policy)
-        if isinstance(env.plant, SerialPlant):
-            env.plant.before_start = partial(rehearse, env.one_cart, policy)
+        env.plant.before_start = partial(rehearse, env.one_cart, policy)
         return
     blank = env.fake_tensordict()
     choose(policy, blank)
@@ -104,7 +102,7 @@ def choose(policy: Policy, current: TensorDictBase) -> Tensor:
 
 def run_batch(env: CartPoleEnv, policy: Policy, knocks: Knocks | None = None) -> list[Episode]:
     """Return one episode of each cart, all from one reset."""
-    if isinstance(env.plant, OneCartPlant) and knocks is None:
+    if env.plant.drives_one_cart and knocks is None:
         return [run_one(env, policy)]
     return run_many(env, policy, knocks)
 

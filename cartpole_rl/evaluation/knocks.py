@@ -4,19 +4,19 @@ import math
 
 import torch
 
-from cartpole_rl.plants.simulated import SimulatedPlant
+from cartpole_rl.plants.specs import Plant
 from cartpole_rl.tasks.rewards import UPRIGHT_ANGLE
 
 STANDS = 2.0  # s within 5 degrees of upright, after which the pole is knocked
 
 
 class Knocks:
-    """One knock per episode for each cart of `plant`: `speed` rad/s more, to the right and left in turn.
+    """One knock per episode for each simulated cart: `speed` rad/s more, to the right and left in turn.
 
     Call it in each period, before the step.
     """
 
-    def __init__(self, plant: SimulatedPlant, speed: float) -> None:
+    def __init__(self, plant: Plant, speed: float) -> None:
         self._plant = plant
         self._speeds = speed * torch.tensor([1.0, -1.0]).repeat(1 + plant.carts // 2)[: plant.carts]
         self._patience = round(STANDS / plant.period)

@@ -2,7 +2,6 @@
 
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.evaluation.snapshots import Memory, Snapshot, write
-from cartpole_rl.plants.serial.plant import SerialPlant
 
 
 def followed(env: CartPoleEnv, memory: Memory | None) -> CartPoleEnv:
@@ -16,8 +15,7 @@ class Publisher:
     """Writes a snapshot to `memory` when it is called, each time a motor value has been sent to the cart."""
 
     def __init__(self, env: CartPoleEnv, memory: Memory) -> None:
-        assert isinstance(env.plant, SerialPlant)
-        self._cart, self._statistics, self._memory = env.one_cart, env.plant.cart.statistics, memory
+        self._cart, self._statistics, self._memory = env.one_cart, env.plant.statistics, memory
         (self._track_half_length,) = env.plant.track_half_length.tolist()
         self._written = self._episode = 0
         self._score = 0.0

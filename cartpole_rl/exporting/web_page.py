@@ -21,7 +21,7 @@ from cartpole_rl.exporting.agent import FLOATS, ExportedAgent
 from cartpole_rl.exporting.code import COUNT, NUMBER, Graph, filled, perception
 from cartpole_rl.physics.dynamics import Addition, Drive, State
 from cartpole_rl.physics.parameters import CartParameters
-from cartpole_rl.plants.settings import SimulatedSettings
+from cartpole_rl.plants.settings import SimulationSettings
 from cartpole_rl.plants.simulated import Carts, Inputs, Period, commands_under_way, encoder_counts, run_carts
 from cartpole_rl.randomization.poles import Pole
 from cartpole_rl.tasks.settings import Start
@@ -51,7 +51,7 @@ class Push(NamedTuple):
     angular_acceleration: Tensor  # [1, 1] rad/s^2 of the pole
 
 
-def web_page(agent: ExportedAgent, settings: CartPoleSettings, plant: SimulatedSettings) -> str:
+def web_page(agent: ExportedAgent, settings: CartPoleSettings, plant: SimulationSettings) -> str:
     """Return the page of an agent that was trained with `settings` on `plant`.
 
     Raises ConfigError for an observation that cannot be written in JavaScript.
@@ -82,7 +82,7 @@ def encoders() -> Graph:
     return Graph.of(counted, TrueState(table, torch.zeros(4, 1), torch.zeros(3, 1)))
 
 
-def physics(settings: CartPoleSettings, plant: SimulatedSettings) -> Graph:
+def physics(settings: CartPoleSettings, plant: SimulationSettings) -> Graph:
     """Return the function of one control period of the simulated cart."""
     models, period = settings.models(plant), settings.control_period
 

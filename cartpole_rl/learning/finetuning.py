@@ -14,7 +14,6 @@ from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.learning.dqn import COLLECTED, Scalars, Training, n_step_transitions
 from cartpole_rl.learning.settings import FinetuningSettings
 from cartpole_rl.plants.recorded import RecordedPlant
-from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.randomization.randomizer import Draws
 from cartpole_rl.tasks.episode import Episode
 
@@ -63,7 +62,6 @@ class Finetuning(Training):
 
     def simulate(self, carts: Draws) -> None:
         """Continue on simulated carts drawn from `carts`; the transitions of older ones are discarded."""
-        assert isinstance(self.env.plant, SimulatedPlant)
         self.env.plant.replace_randomizer(carts)
         self.start_episodes()
         self.buffer.empty()

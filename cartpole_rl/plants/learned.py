@@ -4,20 +4,31 @@ The members differ where the recordings give no information, so that an agent is
 as well. Carts are drawn as in any simulated plant; the learned residual is added to all of them.
 """
 
+import math
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from tensordict import TensorDict
 from torch import Tensor
 
 from cartpole_rl.compilation import Compiled
+from cartpole_rl.errors import ConfigError
+from cartpole_rl.physics.parameters import cart_column
 from cartpole_rl.physics.residual import UNDER_WAY, Residual, chosen_members
-from cartpole_rl.plants.learned_model import LearnedModel
+from cartpole_rl.plants.learned_model import LearnedModel, load_model
+from cartpole_rl.plants.settings import LearnedSettings
 from cartpole_rl.plants.simulated import Carts, Inputs, Period, SimulatedPlant, run_carts
 from cartpole_rl.plants.specs import Numbers, Plant, PlantOutput
+from cartpole_rl.randomization.identified import IdentifiedCarts
+from cartpole_rl.randomization.poles import check_one_pole
 from cartpole_rl.randomization.randomizer import Draws
 from cartpole_rl.tasks.settings import StartSettings
+
+if TYPE_CHECKING:
+    from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
+
+FITTED_LENGTH = 0.2  # share: a fit may move the centre of mass of the pole by half of that
 
 
 def run_learned_carts(
@@ -94,3 +105,36 @@ class LearnedPlant(SimulatedPlant):
         """Return to `snapshot`."""
         super().restore(snapshot)
         self._member.copy_(snapshot["member"])
+
+
+def learned_carts(
+    plant: LearnedSettings,
+    config: "CartPoleSettings",
+    prior: Draws,
+    carts: int,
+    start: StartSettings,
+    seed: int,
+    compiled: bool,
+    device: torch.device | str,
+) -> LearnedPlant:
+    """Return the plant of plant=learned. `plant.prior_share` of the carts come from `prior`.
+
+    Raises CheckpointError; ConfigError for a model of another cart.
+    """
+    model = load_model(plant.model)
+    check_same_cart(model, config)
+    found = cart_column(model.parameters, torch.float32)
+    draws = IdentifiedCarts(found, prior, plant.prior_share, UNDER_WAY * model.period)
+    return LearnedPlant(carts, model, draws, start, seed, device, compiled)
+
+
+def check_same_cart(model: LearnedModel, config: "CartPoleSettings") -> None:
+    """Raise ConfigError if a learned model has another period, actuator or pole than `config`."""
+    if not math.isclose(model.period, config.control_period, rel_tol=1e-6):
+        raise ConfigError(f"control_period={config.control_period}: plant.model has {model.period} s")
+    if model.models.actuator != config.actions.actuator:
+        raise ConfigError(f"actions: plant.model has actuator {model.models.actuator}")
+    check_one_pole("plant.model", config.pole)
+    pole, own = config.pole.nominal, 2 * model.parameters["pole_com"]
+    if abs(own / pole.length - 1) > FITTED_LENGTH:
+        raise ConfigError(f"pole: plant.model has one of {own:.2f} m, not {pole.length:.2f} m")

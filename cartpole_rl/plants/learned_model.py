@@ -11,7 +11,7 @@ from cartpole_rl.errors import CheckpointError
 from cartpole_rl.files import replacing
 from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.residual import PLACES, Residual
-from cartpole_rl.plants.model_file import REMEDY, find_model
+from cartpole_rl.plants.settings import REMEDY, find_model
 from cartpole_rl.rig.parameters import check_values
 
 FORMAT = "cartpole_rl learned model 1"

@@ -1,13 +1,24 @@
-"""Settings of the plants: plant=simulated, learned, emulated and serial."""
+"""Settings of the plants: plant=simulated, learned, emulated and serial.
 
+Everything that the commands ask about a plant is an attribute or a method of its settings.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, field_validator
 
+from cartpole_rl.emulator.settings import EmulatorSettings
+from cartpole_rl.errors import CheckpointError
 from cartpole_rl.physics.laws import Law
 from cartpole_rl.physics.models import INTEGRATORS
+from cartpole_rl.randomization.poles import Pole, PoleSettings, one_pole, pole_of_length
+from cartpole_rl.registry import Extension
+from cartpole_rl.run_folder import check_program
 from cartpole_rl.settings import Fraction, Settings
+from cartpole_rl.terminal import as_word
 
 # Homing: after connecting and after faults, and re-centring between other episodes; or before each episode.
 Rehome = Literal["once", "always"]
@@ -17,18 +28,80 @@ Seconds = Annotated[float, Field(gt=0, le=60)]
 Wait = Annotated[float, Field(gt=0, le=600)]  # s, for the cart or a person to move something
 
 
-class SimulatedSettings(Settings):
+OF_SIMULATION = ("parameters", "randomization", "cart", "cart_friction", "pole_friction", "knock")
+
+
+class PlantSettings(Settings):
+    """The settings of a plant. Its answers here are those of carts that this process simulates."""
+
+    kind: str
+    place: ClassVar[str]  # "module:name" of the function that `build` calls
+    is_on_port: ClassVar[bool] = False  # one cart that is driven over a port
+    reads_emulator: ClassVar[bool] = False  # its cart is the one that emulator.* describes
+    has_residual: ClassVar[bool] = False  # more moves its carts than the equations of physics/
+    ignored: ClassVar[tuple[str, ...]] = ()  # settings of an evaluation that it does not read
+    why_ignored: ClassVar[str] = "does not read it"
+
+    @property
+    def title(self) -> str:
+        """The name of a cart in a heading."""
+        return f"{self.kind} cart"
+
+    @property
+    def words(self) -> str:
+        """The words that choose it on the command line."""
+        return f"plant={self.kind}"
+
+    @property
+    def as_evaluated(self) -> "PlantSettings":
+        """These settings as an evaluation has them."""
+        return self
+
+    @property
+    def has_compiled_agent(self) -> bool:
+        """True if the board of a real cart drives: what was compiled for it cannot be changed."""
+        return False
+
+    def check(self) -> None:
+        """Raise CartPoleError if a file that it needs is missing."""
+
+    def is_real_time(self, emulator: EmulatorSettings) -> bool:
+        """Return True for a cart with its own clock, which does not wait for this computer."""
+        return False
+
+    def policy_key(self, emulator: EmulatorSettings) -> str:
+        """Return the setting that gives the cart's board a policy to drive by; empty if there is none."""
+        return ""
+
+    def known_pole_length(self, emulator: EmulatorSettings) -> float | None:
+        """Return the length of the pole on the cart, m; None if the settings of the plant do not have it."""
+        return None
+
+    def own_pole(self, emulator: EmulatorSettings, trained: PoleSettings) -> PoleSettings | None:
+        """Return the pole on the cart, where the agent was trained with `trained`; None for that of pole=."""
+        return None
+
+    def build(self, *arguments: Any, **named: Any) -> Any:
+        """Return the plant. The function at `place` has the arguments and errors."""
+        return Extension(self.kind, self.place)(self, *arguments, **named)
+
+
+class SimulatedSettings(PlantSettings):
     """plant=simulated."""
 
+    place = "cartpole_rl.plants.simulated:simulated_carts"
     kind: Literal["simulated"]
     integrator: Annotated[Law, INTEGRATORS]
     substeps: Annotated[int, Field(ge=1, le=200)]
     pole_presses: bool  # the pole's vertical force changes the cart's friction
 
 
-class LearnedSettings(Settings):
+class LearnedSettings(PlantSettings):
     """plant=learned. The residual of a model is fitted with these physics, so they cannot be chosen."""
 
+    place = "cartpole_rl.plants.learned:learned_carts"
+    has_residual = True
+    ignored = (*OF_SIMULATION, "pole")
     kind: Literal["learned"]
     model: Path
     prior_share: Fraction
@@ -37,24 +110,87 @@ class LearnedSettings(Settings):
     pole_presses: ClassVar = False
 
     @property
-    def without_prior(self) -> "LearnedSettings":
-        """These settings with carts of the model alone, as an evaluation has them."""
+    def as_evaluated(self) -> "LearnedSettings":
+        """These settings with carts of the model alone."""
         return self.model_copy(update={"prior_share": 0.0})
 
+    def check(self) -> None:
+        """Raise CheckpointError or ConfigError if plant.model= names no learned model."""
+        check_program("plant.model", self.model, "model")
+        find_model(self.model)
 
-class EmulatedSettings(Settings):
+    def own_pole(self, emulator: EmulatorSettings, trained: PoleSettings) -> PoleSettings:
+        """Return the pole of the model. Raises CheckpointError."""
+        found = Extension("model", "cartpole_rl.plants.learned_model:load_model")(self.model).parameters
+        return one_pole(Pole(**{name: found[name] for name in Pole.model_fields}))
+
+
+MODEL = "model.pt"  # in a run folder
+REMEDY = "give a run of cartpole-model"
+
+
+def find_model(source: Path) -> Path:
+    """Return the path of a learned model: `source`, or the one in a run folder. Raises CheckpointError."""
+    path = source / MODEL if source.is_dir() else source
+    if not path.exists():
+        missing = f"it holds no {MODEL}" if source.exists() else "there is no such file or folder"
+        raise CheckpointError(f"plant.model={source}: {missing}; {REMEDY}")
+    return path
+
+
+class EmulatedSettings(PlantSettings):
     """plant=emulated."""
 
+    place = "cartpole_rl.plants.serial.plant:emulated_cart"
+    is_on_port = True
+    reads_emulator = True
+    can_be_damaged: ClassVar = False
+    clear_faults: ClassVar = 0
+    ignored = (*OF_SIMULATION, "pole")
+    why_ignored = "has its own cart; set emulator.* or emulator=large"
     kind: Literal["emulated"]
     rehome: Rehome = "once"
 
+    def is_real_time(self, emulator: EmulatorSettings) -> bool:
+        """Return True if the emulated cart has the clock of a real one."""
+        return emulator.clock == "real"
 
-class SerialSettings(Settings):
+    def policy_key(self, emulator: EmulatorSettings) -> str:
+        """Return the setting that gives the cart's board a policy to drive by; empty if there is none."""
+        return "" if emulator.policy is None else f"emulator.policy={emulator.policy}"
+
+    def known_pole_length(self, emulator: EmulatorSettings) -> float:
+        """Return the length of the emulated pole, m."""
+        return emulated_pole(emulator).length
+
+    def own_pole(self, emulator: EmulatorSettings, trained: PoleSettings) -> PoleSettings:
+        """Return the emulated pole."""
+        return one_pole(emulated_pole(emulator))
+
+    @contextmanager
+    def reachable(self, emulator: EmulatorSettings) -> "Iterator[SerialSettings]":
+        """Start a cart whose pole hangs, and yield the settings to reach it. Raises EmulatorError."""
+        from cartpole_rl.plants.emulated import EmulatedCart  # which imports this module
+
+        with EmulatedCart(emulator.model_copy(update={"start": "hanging"})) as cart:
+            yield cart.settings
+
+
+def emulated_pole(emulator: EmulatorSettings) -> Pole:
+    """Return the pole of an emulated cart."""
+    return Pole(**emulator.model_dump(include=set(Pole.model_fields)))
+
+
+class SerialSettings(PlantSettings):
     """Settings of a real cart, `plant=serial`. Times in s.
 
     Each timeout is an upper limit; a working cart answers sooner.
     """
 
+    place = "cartpole_rl.plants.serial.plant:real_cart"
+    is_on_port = True
+    can_be_damaged: ClassVar = True
+    ignored = OF_SIMULATION
     kind: Literal["serial"] = "serial"
     port: Annotated[str, Field(min_length=1)]  # /dev/ttyUSB0, COM3, a URL of pyserial, or auto: the only cart
     baud: Annotated[int, Field(ge=1, le=12_000_000)] = 921600  # 115200 is allowed too
@@ -85,3 +221,46 @@ class SerialSettings(Settings):
         if isinstance(port, int):
             raise ValueError(f"give the name of a port, as /dev/ttyUSB{port} or COM{port}")
         return port
+
+    @property
+    def title(self) -> str:
+        """The name of the cart in a heading."""
+        return f"cart on {self.port}"
+
+    @property
+    def words(self) -> str:
+        """The words that choose the cart on the command line."""
+        length = f" plant.pole_length={self.pole_length:g}" if self.pole_length else ""
+        default = type(self).model_fields["baud"].default
+        baud = f" plant.baud={self.baud}" if self.baud != default else ""
+        return f"plant=serial {as_word('plant.port', self.port)}{baud}{length}"
+
+    @property
+    def has_compiled_agent(self) -> bool:
+        """True if the board drives: what was compiled for it cannot be changed."""
+        return self.policy is not None
+
+    def is_real_time(self, emulator: EmulatorSettings) -> bool:
+        """Return True: a real cart does not wait for this computer."""
+        return True
+
+    def policy_key(self, emulator: EmulatorSettings) -> str:
+        """Return the setting that lets the policy on the board drive; empty if it does not."""
+        return "" if self.policy is None else f"plant.policy={self.policy}"
+
+    def known_pole_length(self, emulator: EmulatorSettings) -> float | None:
+        """Return the stated length of the pole, m; None if it is not stated."""
+        return self.pole_length
+
+    def own_pole(self, emulator: EmulatorSettings, trained: PoleSettings) -> PoleSettings | None:
+        """Return a pole of the stated length; None if it is not stated."""
+        return pole_of_length(self.pole_length, trained) if self.pole_length else None
+
+    @contextmanager
+    def reachable(self, emulator: EmulatorSettings) -> "Iterator[SerialSettings]":
+        """Yield these settings."""
+        yield self
+
+
+SimulationSettings = SimulatedSettings | LearnedSettings
+PortSettings = EmulatedSettings | SerialSettings

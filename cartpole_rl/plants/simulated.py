@@ -9,7 +9,7 @@ compiled code then runs along the carts.
 import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -20,6 +20,7 @@ from cartpole_rl.compilation import Compiled
 from cartpole_rl.physics.dynamics import Drive, MakeAddition, State, run_period
 from cartpole_rl.physics.models import Models, check_laws
 from cartpole_rl.physics.parameters import CartParameters
+from cartpole_rl.plants.settings import SimulatedSettings
 from cartpole_rl.plants.specs import Numbers, Plant, PlantOutput
 from cartpole_rl.randomization.randomizer import Draws
 from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
@@ -28,6 +29,9 @@ from cartpole_rl.scalar import Scalar, plain
 from cartpole_rl.tasks.episode import Origin
 from cartpole_rl.tasks.settings import StartSettings
 from cartpole_rl.tasks.starts import draw_start
+
+if TYPE_CHECKING:
+    from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
 
 LARGEST_COUNT = 2**30  # STATE's counts are 32-bit numbers
 DRAWN_AT_ONCE = 1024  # episodes; drawing a few takes about as long
@@ -290,6 +294,21 @@ class SimulatedPlant(Plant):
     def _frame(self, counts: Tensor, motor_applied: Tensor, off_track: Tensor) -> PlantOutput[Tensor]:
         dt = torch.full(off_track.shape, self.period, device=self.device)
         return PlantOutput(counts, dt, motor_applied, off_track, torch.zeros_like(off_track))
+
+
+def simulated_carts(
+    plant: SimulatedSettings,
+    config: "CartPoleSettings",
+    draws: Draws,
+    carts: int,
+    start: StartSettings,
+    seed: int,
+    compiled: bool,
+    device: torch.device | str,
+) -> SimulatedPlant:
+    """Return the plant of plant=simulated; `draws` is the source of its carts."""
+    models, period = config.models(plant), config.control_period
+    return SimulatedPlant(carts, draws, start, models, period, plant.substeps, seed, device, compiled)
 
 
 def column(numbers: Sequence[float]) -> Tensor:

@@ -1,6 +1,6 @@
 """The contract of every plant: its inputs and outputs, with shapes and types."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
@@ -9,6 +9,10 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from cartpole_rl.errors import PlantError
+from cartpole_rl.physics.dynamics import State
+from cartpole_rl.plants.serial.statistics import LinkStatistics
+from cartpole_rl.randomization.randomizer import Draws
 from cartpole_rl.rig.hardware import LARGEST_MOTOR
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Origin
@@ -52,7 +56,10 @@ class Plant(EnvBase):
     """
 
     compiled = False  # whether the hardware transform above it may compile its arithmetic as well
+    drives_one_cart = False  # by `reset_one` and `step_one`, on plain numbers
     ended_by = ""  # the `Ending` that a plant of one cart reports; "" while it reports none
+    before_start: Callable[[], None] | None = None  # called before the cart on a port is armed
+    on_command: Callable[[int], None] | None = None  # called with each motor value once it is sent to a cart
 
     def __init__(self, carts: int, device: torch.device | str = "cpu") -> None:
         super().__init__(device=torch.device(device), batch_size=torch.Size([carts]))
@@ -89,12 +96,47 @@ class Plant(EnvBase):
         """The faults that a plant of one cart has latched."""
         return Fault.NONE
 
+    @property
+    def statistics(self) -> LinkStatistics:
+        """Frames and times on the link to a cart; zeros without a link."""
+        return LinkStatistics()
+
+    def link_figures(self) -> dict[str, Any]:
+        """Return the counts of lost, damaged and late frames."""
+        link = self.statistics
+        return {
+            "late_ticks": link.late_ticks,
+            "lost_frames": link.lost_frames,
+            "bad_frames": link.bad_frames,
+        }
+
+    def check_policy(self, identity: int) -> None:
+        """Raise PlantError unless the cart's board has the agent of this `identity`."""
+        raise PlantError("only a cart on a port can have an agent on its board")
+
     def halt(self) -> None:
         """Set the motor to 0 until the next reset. Nothing moves a simulated cart that is not stepped."""
 
     def origins(self) -> Sequence[Origin | None]:
         """Return the cart and the true state of each row, [N], right after a reset; None if unknown."""
         return [None] * self.carts
+
+    @property
+    def true_state(self) -> State:
+        """The state of simulated carts that no encoder sees, [N] each."""
+        raise NotImplementedError
+
+    def place(self, state: State) -> None:
+        """Put simulated carts into `state`."""
+        raise NotImplementedError
+
+    def start_from(self, state: Mapping[str, float]) -> None:
+        """Start the next episode of every simulated cart in this true state; `Origin` has the units."""
+        raise NotImplementedError
+
+    def replace_randomizer(self, randomizer: Draws) -> None:
+        """Draw the next episodes of simulated carts from `randomizer`."""
+        raise NotImplementedError
 
     def restart(self, rows: torch.Tensor, again: torch.Tensor | None = None) -> TensorDict:
         """Start a new episode on the carts `rows`, [R] int64; return their first frame, [R].
@@ -152,6 +194,8 @@ def one_frame(output: TensorDictBase) -> PlantOutput[Numbers]:
 
 class OneCartPlant(Plant):
     """A plant of one cart, [1], that overrides `reset_one` and `step_one`; `_reset` and `_step` call them."""
+
+    drives_one_cart = True
 
     def __init__(self) -> None:
         super().__init__(carts=1)

@@ -4,6 +4,7 @@ from typing import Any
 
 from pydantic import model_validator
 
+from cartpole_rl.choices import group_choices
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.settings import NonNegative, Positive, Settings
 
@@ -117,3 +118,18 @@ def check_one_pole(owner: str, poles: PoleSettings) -> Pole:
     if not poles.is_single:
         raise ConfigError(f"pole: {owner} takes one pole, not {poles.name}; choose one, as pole=medium")
     return poles.nominal
+
+
+def one_pole(pole: Pole) -> PoleSettings:
+    """Return the choice of this pole alone, named by its length."""
+    return PoleSettings(choices={f"{pole.length:.2f} m": pole})
+
+
+def pole_of_length(length: float, trained: PoleSettings) -> PoleSettings:
+    """Return the pole of `trained` with about `length` m, else that of `pole=both`, else a uniform rod."""
+    known = trained if trained.includes(Pole.rod(length)) else PoleSettings(**group_choices("pole")["both"])
+    alike = {name: pole for name, pole in (known.choices or {}).items() if pole.is_about(length)}
+    if not alike:
+        return one_pole(Pole.rod(length))
+    nearest = min(alike, key=lambda name: abs(alike[name].length - length))
+    return PoleSettings(choices={nearest: alike[nearest]})

@@ -17,10 +17,8 @@ from types import TracebackType
 from typing import NoReturn
 
 from cartpole_rl.evaluation.snapshots import Memory, Snapshot, new_memory, read
-from cartpole_rl.plants.settings import SerialSettings
 from cartpole_rl.rig.hardware import LARGEST_MOTOR
 from cartpole_rl.scheduling import giving_precedence
-from cartpole_rl.settings import Settings
 from cartpole_rl.signals import end_with_parent
 from cartpole_rl.tasks.rewards import UPRIGHT_ANGLE
 
@@ -61,11 +59,6 @@ class LiveView:
         self._process.join()
         with suppress(OSError):  # the terminal is closed
             put(f"{SAVE}{ALL_LINES}{RESTORE}")
-
-
-def view_title(plant: Settings) -> str:
-    """Return the name of a cart in the heading."""
-    return f"cart on {plant.port}" if isinstance(plant, SerialSettings) else "emulated cart"
 
 
 def has_cursor() -> bool:

@@ -12,18 +12,16 @@ from cartpole_rl.envs.build import environment, simulated_env, with_fitted_guard
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.plants.learned_model import load_model
-from cartpole_rl.plants.serial.plant import cart_plant
 from cartpole_rl.plants.serial.preparation import Confirm, StartPosition, nobody
-from cartpole_rl.plants.settings import EmulatedSettings, LearnedSettings, SerialSettings, SimulatedSettings
+from cartpole_rl.plants.settings import PlantSettings
 from cartpole_rl.randomization.poles import Pole, PoleSettings
 from cartpole_rl.rig.parameters import check_names
 from cartpole_rl.scheduling import taking_precedence
-from cartpole_rl.settings import Settings, evaluation_seed
+from cartpole_rl.settings import evaluation_seed
 from cartpole_rl.tasks.settings import ActionSettings, Start
 from cartpole_rl.workflows.checks import simulated_carts
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
-from cartpole_rl.workflows.poles import emulated_pole, guard_holds, one_pole, pole_of_length, pole_text
+from cartpole_rl.workflows.poles import guard_holds, pole_text
 
 REPLACEABLE = (
     "cart",
@@ -64,7 +62,7 @@ def outdated(training: TrainConfig, config: EvaluateConfig) -> dict[str, Any]:
     Carts that simulation changes in other ways meet the guard that a real one of their kind would meet. The
     guard of a policy on a real board cannot be changed. Raises ConfigError.
     """
-    if config.guard is not None or training.guard.active is None or config.has_compiled_agent:
+    if config.guard is not None or training.guard.active is None or config.plant.has_compiled_agent:
         return {}
     driven = replaced_settings(training, config.model_copy(update={"parameters": None}))
     motors, trained = driven.actions.motors, training.actions
@@ -94,13 +92,8 @@ def replaced_settings(training: TrainConfig, config: EvaluateConfig) -> CartPole
     given = {name: value for name in REPLACEABLE if (value := getattr(config, name)) is not None}
     if config.task is not None:
         given["task"] = {**config.task.model_dump(), "x_max": config.task.x_max or training.task.x_max}
-    if isinstance(config.plant, EmulatedSettings):
-        given["pole"] = one_pole(emulated_pole(config.emulator))
-    if isinstance(config.plant, SerialSettings) and config.pole is None and config.plant.pole_length:
-        given["pole"] = pole_of_length(config.plant.pole_length, training.pole)
-    if isinstance(config.plant, LearnedSettings):
-        found = load_model(config.plant.model).parameters
-        given["pole"] = one_pole(Pole(**{name: found[name] for name in Pole.model_fields}))
+    if config.pole is None and (own_pole := config.plant.own_pole(config.emulator, training.pole)):
+        given["pole"] = own_pole
     if config.actions is not None:
         check_same_meaning(config.actions, training.actions)
     settings = checked(CartPoleSettings, {**own, **given, "randomization": config.randomization})
@@ -126,9 +119,7 @@ def order_and_signs(motors: Sequence[int]) -> list[tuple[int, int]]:
     return [(sorted(motors).index(motor), (motor > 0) - (motor < 0)) for motor in motors]
 
 
-def predicting_env(
-    settings: CartPoleSettings, plant: SimulatedSettings | LearnedSettings, seed: int
-) -> CartPoleEnv:
+def predicting_env(settings: CartPoleSettings, plant: PlantSettings, seed: int) -> CartPoleEnv:
     """Return a simulated cart that predicts an episode on a real one. Raises ConfigError."""
     nominal = settings.model_copy(update={"randomization": {}})
     return simulated_env(nominal, plant, 1, settings.task.evaluation_start, evaluation_seed(seed))
@@ -166,27 +157,19 @@ def evaluated_env(
     """
     start = settings.task.evaluation_start
     carts, seed = simulated_carts(config), evaluation_seed(config.seed)
-    if isinstance(config.plant, LearnedSettings):
-        return simulated_env(settings, config.plant.without_prior, carts, start, seed)
-    if isinstance(config.plant, SimulatedSettings):
-        return simulated_env(settings, config.plant, carts, start, seed)
+    if not config.plant.is_on_port:
+        return simulated_env(settings, config.plant.as_evaluated, carts, start, seed)
     if start.angle is Start.ANY:
         raise ConfigError("task.evaluation_start.angle=any: a cart can start only upright or hanging")
     angle: StartPosition = "upright" if start.angle is Start.UPRIGHT else "hanging"
     emulator = config.emulator.model_copy(update={"seed": config.emulator.seed + config.seed})
-    plant = cart_plant(config.plant, emulator, settings.control_period, angle, prompt, confirm)
+    plant = config.plant.build(emulator, settings.control_period, angle, prompt, confirm)
     return environment(settings, plant)
 
 
-def is_real_time(plant: Settings, emulator: EmulatorSettings) -> bool:
-    """Return True for a cart with its own clock, which does not wait for this computer."""
-    emulated = isinstance(plant, EmulatedSettings)
-    return isinstance(plant, SerialSettings) or (emulated and emulator.clock == "real")
-
-
-def precedence(plant: Settings, emulator: EmulatorSettings) -> AbstractContextManager[None]:
+def precedence(plant: PlantSettings, emulator: EmulatorSettings) -> AbstractContextManager[None]:
     """Return a context with real-time priority for a cart with its own clock."""
-    return taking_precedence() if is_real_time(plant, emulator) else nullcontext()
+    return taking_precedence() if plant.is_real_time(emulator) else nullcontext()
 
 
 def use_threads(threads: int | None) -> None:

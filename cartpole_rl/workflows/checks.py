@@ -16,8 +16,6 @@ from cartpole_rl.checking import missing
 from cartpole_rl.choices import group_choices
 from cartpole_rl.envs.cart_pole_settings import shipped_carts
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.plants.model_file import find_model
-from cartpole_rl.plants.settings import LearnedSettings
 from cartpole_rl.randomization.poles import Pole, check_one_pole
 from cartpole_rl.randomization.ranges import check_carts
 from cartpole_rl.rig.parameters import check_names, check_value, check_values, completed
@@ -67,8 +65,7 @@ def check_training(config: TrainConfig, folder: Path, words: Sequence[str]) -> N
     if config.compile:
         check_compiler()
     check_carts(config.nominal_cart, config.pole, config.ranges)
-    if isinstance(config.plant, LearnedSettings):
-        check_model(config.plant)
+    config.plant.check()
     return None
 
 
@@ -79,8 +76,7 @@ def check_evaluation(config: EvaluateConfig, words: Sequence[str]) -> None:
         check_agent(config.run)
     elif config.drives_on_board:
         raise ConfigError(f"run={BASELINE}: only a trained agent can drive on the board; give its run folder")
-    if isinstance(config.plant, LearnedSettings):
-        check_model(config.plant)
+    config.plant.check()
     check_parameters(config.parameters or {})
     if config.animation.mp4 and find_spec("av") is None:
         raise ConfigError('animation.mp4=true needs PyAV: pip install "cartpole_rl[video]"')
@@ -218,12 +214,6 @@ def check_has_agent(run: Path) -> None:
         else f"start {PREFIX}{program} again"
     )
     raise ConfigError(f"run={run}: it holds no {CHECKPOINTS}/{LAST}; the file was removed; {again}")
-
-
-def check_model(plant: LearnedSettings) -> None:
-    """Raise CheckpointError or ConfigError if plant.model= names no learned model."""
-    check_program("plant.model", plant.model, "model")
-    find_model(plant.model)
 
 
 def check_parameters(given: Mapping[str, float]) -> None:

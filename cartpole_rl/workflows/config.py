@@ -34,7 +34,13 @@ from cartpole_rl.learning.settings import (
 from cartpole_rl.physics.actuator import ACTUATORS
 from cartpole_rl.physics.friction import CART_FRICTIONS
 from cartpole_rl.physics.laws import Law
-from cartpole_rl.plants.settings import EmulatedSettings, LearnedSettings, SerialSettings, SimulatedSettings
+from cartpole_rl.plants.settings import (
+    EmulatedSettings,
+    PlantSettings,
+    PortSettings,
+    SimulatedSettings,
+    SimulationSettings,
+)
 from cartpole_rl.randomization.poles import PoleSettings, check_one_pole
 from cartpole_rl.randomization.ranges import IdentifiedSettings
 from cartpole_rl.registry import Extension
@@ -44,7 +50,6 @@ from cartpole_rl.settings import Count, Finite, NonNegative, Positive, Seed, Set
 from cartpole_rl.tasks.settings import ActionSettings, RewardSettings, TaskSettings
 
 View = Literal["none", "live"]  # of the cart in the terminal, while it is driven
-OF_SIMULATION = ("parameters", "randomization", "cart", "cart_friction", "pole_friction", "knock")
 
 
 class RunSettings(Settings):
@@ -55,35 +60,26 @@ class RunSettings(Settings):
     threads: Count | None
 
 
-def policy_key(plant: Settings, emulator: EmulatorSettings) -> str:
-    """Return the setting that gives the cart's board a policy to drive by; empty if there is none."""
-    if isinstance(plant, EmulatedSettings) and emulator.policy is not None:
-        return f"emulator.policy={emulator.policy}"
-    if isinstance(plant, SerialSettings) and plant.policy is not None:
-        return f"plant.policy={plant.policy}"
-    return ""
-
-
-def check_emulator_is_read(kind: str, emulator: EmulatorSettings) -> None:
-    """Raise ValueError for settings of an emulated cart if plant=`kind` ignores them."""
-    if kind != "emulated" and emulator != EmulatorSettings():
-        raise ValueError(f"emulator: plant={kind} does not read it; give plant=emulated")
+def check_emulator_is_read(plant: PlantSettings, emulator: EmulatorSettings) -> None:
+    """Raise ValueError for settings of an emulated cart if `plant` ignores them."""
+    if not plant.reads_emulator and emulator != EmulatorSettings():
+        raise ValueError(f"emulator: plant={plant.kind} does not read it; give plant=emulated")
 
 
 class OnCart(Settings):
     """The cart on a port: `plant`, which is a real one or one with the settings `emulator`."""
 
-    plant: Annotated[EmulatedSettings | SerialSettings, Field(discriminator="kind")]
+    plant: Annotated[PortSettings, Field(discriminator="kind")]
     emulator: EmulatorSettings
 
     @model_validator(mode="after")
     def _plant_reads_the_emulator(self) -> Self:
-        check_emulator_is_read(self.plant.kind, self.emulator)
+        check_emulator_is_read(self.plant, self.emulator)
         return self
 
     @model_validator(mode="after")
     def _this_computer_drives(self) -> Self:
-        if key := policy_key(self.plant, self.emulator):
+        if key := self.plant.policy_key(self.emulator):
             raise ValueError(f"{key}: only cartpole-evaluate lets the cart's board drive; leave it out")
         return self
 
@@ -91,7 +87,7 @@ class OnCart(Settings):
 class TrainConfig(RunSettings, CartPoleSettings):
     """The settings of cartpole-train."""
 
-    plant: Annotated[SimulatedSettings | LearnedSettings, Field(discriminator="kind")]
+    plant: Annotated[SimulationSettings, Field(discriminator="kind")]
     agent: AgentSettings
     buffer: BufferSettings
     optimizer: OptimizerSettings
@@ -106,7 +102,7 @@ class TrainConfig(RunSettings, CartPoleSettings):
     def _training_is_simulated(cls, values: Any) -> Any:
         plant = values.get("plant") if isinstance(values, Mapping) else None
         kind = plant.get("kind") if isinstance(plant, Mapping) else None
-        if kind in ("emulated", "serial"):
+        if kind in kinds(OnCart, "plant"):
             taken = ", ".join(kinds(cls, "plant"))
             raise ValueError(
                 f"plant={kind}: cartpole-train takes {taken}; use cartpole-evaluate for plant={kind}"
@@ -167,9 +163,7 @@ class EvaluateConfig(RunSettings):
 
     run: Path
     episodes: Annotated[int, Field(ge=1, le=100_000)]
-    plant: Annotated[
-        SimulatedSettings | LearnedSettings | EmulatedSettings | SerialSettings, Field(discriminator="kind")
-    ]
+    plant: Annotated[SimulationSettings | PortSettings, Field(discriminator="kind")]
     emulator: EmulatorSettings
     randomization: Randomization
     parameters: dict[str, Finite] | None
@@ -189,22 +183,16 @@ class EvaluateConfig(RunSettings):
     @model_validator(mode="after")
     def _plant_reads_every_setting(self) -> "EvaluateConfig":
         """Refuse settings that the chosen plant ignores."""
-        kind = self.plant.kind
-        unread = [] if kind == "simulated" else [name for name in OF_SIMULATION if getattr(self, name)]
-        if kind in ("emulated", "learned") and self.pole is not None:
-            unread.append("pole")
-        if unread:
-            reason = "does not read it"
-            if kind == "emulated":
-                reason = "has its own cart; set emulator.* or emulator=large"
-            raise ValueError(f"{', '.join(unread)}: plant={kind} {reason}")
-        if self.view == "live" and kind not in ("emulated", "serial"):
-            raise ValueError(f"view=live: it shows a cart on a port; plant={kind} has none")
-        if self.animation.simulation and kind not in ("emulated", "serial"):
-            raise ValueError(f"animation.simulation=true: plant={kind} is simulated itself; omit it")
-        check_emulator_is_read(kind, self.emulator)
+        plant = self.plant
+        if unread := [name for name in plant.ignored if getattr(self, name)]:
+            raise ValueError(f"{', '.join(unread)}: plant={plant.kind} {plant.why_ignored}")
+        if self.view == "live" and not plant.is_on_port:
+            raise ValueError(f"view=live: it shows a cart on a port; plant={plant.kind} has none")
+        if self.animation.simulation and not plant.is_on_port:
+            raise ValueError(f"animation.simulation=true: plant={plant.kind} is simulated itself; omit it")
+        check_emulator_is_read(plant, self.emulator)
         if self.drives_on_board and self.repeat != RepeatSettings():
-            key = policy_key(self.plant, self.emulator)
+            key = self.plant.policy_key(self.emulator)
             raise ValueError(f"repeat: it repeats an episode in simulation; leave out repeat.*, or {key}")
         if self.emulator.policy not in (None, ONBOARD):
             raise ValueError(
@@ -233,12 +221,7 @@ class EvaluateConfig(RunSettings):
     @property
     def drives_on_board(self) -> bool:
         """True if episodes are also driven by the agent on the cart's board."""
-        return bool(policy_key(self.plant, self.emulator))
-
-    @property
-    def has_compiled_agent(self) -> bool:
-        """True if the board of a real cart drives: what was compiled for it cannot be changed."""
-        return isinstance(self.plant, SerialSettings) and self.plant.policy is not None
+        return bool(self.plant.policy_key(self.emulator))
 
 
 class RecordConfig(EvaluateConfig):
@@ -253,7 +236,7 @@ class RecordConfig(EvaluateConfig):
     @model_validator(mode="after")
     def _this_computer_drives(self) -> Self:
         if self.drives_on_board:
-            key = policy_key(self.plant, self.emulator)
+            key = self.plant.policy_key(self.emulator)
             raise ValueError(f"{key}: only cartpole-evaluate lets the cart's board drive; leave it out")
         return self
 

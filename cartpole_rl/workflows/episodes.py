@@ -18,11 +18,8 @@ from cartpole_rl.evaluation.onboard import run_onboard_episodes
 from cartpole_rl.evaluation.publishing import followed
 from cartpole_rl.exporting.c_code import c_files
 from cartpole_rl.learning.states import seed_everything
-from cartpole_rl.plants.serial.plant import SerialPlant
-from cartpole_rl.plants.settings import EmulatedSettings, SimulatedSettings
-from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.randomization.poles import PoleSettings
-from cartpole_rl.reporting.live_view import LiveView, view_title
+from cartpole_rl.reporting.live_view import LiveView
 from cartpole_rl.reporting.texts import guard_text
 from cartpole_rl.run_folder import BASELINE
 from cartpole_rl.tasks.episode import Episode
@@ -73,8 +70,7 @@ class Evaluation:
 
     def note_other_pole(self, command: str) -> None:
         """Print a warning if the agent was trained with other poles; the baseline was not trained."""
-        emulated = isinstance(self.config.plant, EmulatedSettings)
-        line = other_pole(self.known_poles, self.settings.pole, emulated)
+        line = other_pole(self.known_poles, self.settings.pole, self.config.plant.reads_emulator)
         if line and self.config.run != BASELINE:
             print_message(command, line)
 
@@ -85,15 +81,14 @@ class Evaluation:
 
     def note_other_numbers(self, command: str) -> None:
         """Print the numbers of a simulated cart that are not the nominal ones."""
-        if isinstance(self.config.plant, SimulatedSettings):
+        if "cart" not in self.config.plant.ignored:
             poles = self.settings.pole.choices or {}
             note_other_numbers(command, self.settings.nominal_cart, poles.values())
 
     def check_board(self) -> None:
         """Raise PlantError if the cart's board shall drive and has no agent, or another one."""
         if self.on_board is not None:
-            assert isinstance(self.env.plant, SerialPlant)
-            self.env.plant.cart.check_policy(self.on_board)
+            self.env.plant.check_policy(self.on_board)
 
     def onboard_episodes(self) -> Iterator[Episode]:
         """Let the policy on the cart's board drive, and yield each episode as it ends."""
@@ -103,7 +98,7 @@ class Evaluation:
     def _shown(self, episodes: Iterator[Episode], name: str) -> Iterator[Episode]:
         """Drive episodes behind a progress bar and the live view."""
         config = self.config
-        with LiveView(view_title(config.plant), config.view) as live:
+        with LiveView(config.plant.title, config.view) as live:
             followed(self.env, live.memory)
             with precedence(config.plant, config.emulator):
                 yield from with_progress(episodes, config.episodes, name, self.settings.task.measure)
@@ -111,8 +106,7 @@ class Evaluation:
     @property
     def knocks(self) -> Knocks | None:
         """The knocks of the simulated poles; None for none."""
-        plant, speed = self.env.plant, self.config.knock
-        return Knocks(plant, speed) if speed and isinstance(plant, SimulatedPlant) else None
+        return Knocks(self.env.plant, self.config.knock) if self.config.knock else None
 
 
 def prepared(config: EvaluateConfig) -> Evaluation:
@@ -123,7 +117,7 @@ def prepared(config: EvaluateConfig) -> Evaluation:
     use_threads(config.threads)
     seed_everything(config.seed)
     agent = evaluated_agent(config)
-    training = compiled_training(agent) if config.has_compiled_agent else agent.training
+    training = compiled_training(agent) if config.plant.has_compiled_agent else agent.training
     settings = evaluated_settings(training, config)
     simulation = (
         predicting_env(settings, agent.training.plant, config.seed) if config.animation.simulation else None
@@ -140,7 +134,6 @@ def prepared(config: EvaluateConfig) -> Evaluation:
 
 def repeated(env: CartPoleEnv, policy: Policy, again: Repetition, knocks: Knocks | None) -> Iterator[Episode]:
     """Drive the same simulated cart from the same start."""
-    assert isinstance(env.plant, SimulatedPlant)
     env.plant.start_from(again.origin.state)
     yield run_batch(env, policy, knocks)[again.row]
 
@@ -166,7 +159,7 @@ def on_the_board(
     until the cart has started. Raises ConfigError for an agent that cannot be exported, and if `settings`
     are not those of the agent on the board of a real cart.
     """
-    if config.has_compiled_agent:
+    if config.plant.has_compiled_agent:
         check_compiled_settings(trained, settings)
     if config.emulator.policy != ONBOARD:
         yield config
@@ -182,7 +175,7 @@ def on_the_board(
 
 def agent_on_board(config: EvaluateConfig, trained: TrainedAgent, settings: CartPoleSettings) -> TrainedAgent:
     """Return the agent that the board should have: on an emulated cart, one with `settings`."""
-    if config.has_compiled_agent:
+    if config.plant.has_compiled_agent:
         return trained
     shared = {name: getattr(settings, name) for name in CartPoleSettings.model_fields}
     return TrainedAgent(trained.training.model_copy(update=shared), trained.policy)

@@ -3,14 +3,10 @@
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.evaluation.episodes import Policy, run_batch
 from cartpole_rl.evaluation.metrics import same_as_host
-from cartpole_rl.plants.serial.plant import SerialPlant
-from cartpole_rl.plants.settings import EmulatedSettings, SerialSettings
-from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.reporting.animation import side_by_side, write_animation
 from cartpole_rl.reporting.episodes import report_episodes
 from cartpole_rl.reporting.scores import score_columns, score_table
@@ -60,7 +56,7 @@ def report_evaluation(
 ) -> None:
     """Write metrics.json and figures/, and print the scores; `onboard` are those that the board drove."""
     plant, settings = evaluation.config.plant.kind, evaluation.settings
-    link = link_figures(evaluation.env)
+    link = evaluation.env.plant.link_figures()
     mp4 = evaluation.config.animation.mp4
     summary = report_episodes(
         folder, episodes, plant, settings.pole, settings.task, link, onboard=onboard, mp4=mp4
@@ -96,7 +92,7 @@ def next_command(evaluation: Evaluation) -> str:
     config, known, driven = evaluation.config, evaluation.known_poles, evaluation.settings.pole
     if config.run == BASELINE:
         return "cartpole-train experiment=medium"
-    if isinstance(config.plant, SerialSettings | EmulatedSettings):
+    if config.plant.is_on_port:
         chosen = (
             knows(known, driven) or emulator_for([driven]) != POLES[0]
         )  # not a default that it does not fit
@@ -122,19 +118,6 @@ def left_to_chance(again: Repetition) -> list[str]:
     return [name for name in noises if again.origin.parameters[name] != 0]
 
 
-def link_figures(env: CartPoleEnv) -> dict[str, Any]:
-    """Return the counts of lost, bad and late frames on a serial link, and the measured latency."""
-    if not isinstance(env.plant, SerialPlant):
-        return {"late_ticks": 0, "lost_frames": 0, "bad_frames": 0}
-    statistics = env.plant.cart.statistics
-    return {
-        "late_ticks": statistics.late_ticks,
-        "lost_frames": statistics.lost_frames,
-        "bad_frames": statistics.bad_frames,
-        "latency_override": statistics.latency_override(),
-    }
-
-
 def draw_beside_simulation(evaluation: Evaluation, episode: Episode, path: Path) -> str:
     """Draw `episode` and its prediction into `path`, and return a line that compares their scores."""
     assert evaluation.simulation is not None
@@ -149,7 +132,6 @@ def draw_beside_simulation(evaluation: Evaluation, episode: Episode, path: Path)
 
 def predicted_episode(env: CartPoleEnv, policy: Policy, episode: Episode) -> Episode:
     """Return an episode of `policy` on the simulated cart of `env`, from the measured start of `episode`."""
-    assert isinstance(env.plant, SimulatedPlant)
     names = ("x", "x_dot", "theta", "theta_dot")
     env.plant.start_from({name: float(getattr(episode, name)[0]) for name in names})
     (predicted,) = run_batch(env, policy)

@@ -8,7 +8,6 @@ from cartpole_rl.exporting.c_code import c_files
 from cartpole_rl.exporting.onnx_model import onnx_model
 from cartpole_rl.exporting.web_page import web_page
 from cartpole_rl.files import write_bytes
-from cartpole_rl.plants.settings import SimulatedSettings
 from cartpole_rl.run_folder import write_config
 from cartpole_rl.workflows.agents import TrainedAgent, exported_agent, network_of, provenance, trained_agent
 from cartpole_rl.workflows.config import ExportConfig
@@ -47,6 +46,6 @@ def files_of(form: str, agent: ExportedAgent, trained: TrainedAgent) -> dict[str
 def page(agent: ExportedAgent, trained: TrainedAgent) -> str:
     """Return cart.html. Raises ConfigError for an agent that was not trained in simulation."""
     plant = trained.training.plant
-    if not isinstance(plant, SimulatedSettings):
+    if plant.has_residual:
         raise ConfigError(f"format=web: the agent was trained with plant={plant.kind}, not plant=simulated")
     return web_page(agent, trained.training, plant)

@@ -34,9 +34,8 @@ from cartpole_rl.learning.checkpoints import (
 from cartpole_rl.learning.settings import RayLearnerSettings
 from cartpole_rl.learning.states import seed_everything
 from cartpole_rl.plants.serial.preparation import Confirm
-from cartpole_rl.plants.settings import EmulatedSettings
 from cartpole_rl.reporting.episodes import report_episodes, summarized
-from cartpole_rl.reporting.live_view import LiveView, view_title
+from cartpole_rl.reporting.live_view import LiveView
 from cartpole_rl.reporting.scores import SCORES, score_table
 from cartpole_rl.reporting.tensorboard import TensorBoardLog
 from cartpole_rl.reporting.texts import count_text, cut_off
@@ -61,7 +60,6 @@ from cartpole_rl.workflows.build import (
     evaluated_env,
     evaluated_settings,
     guard_note,
-    is_real_time,
     use_threads,
 )
 from cartpole_rl.workflows.checks import check_finetuning, check_resumable, is_given
@@ -106,7 +104,7 @@ def finetune(config: FinetuneConfig, folder: Path, words: Sequence[str] = ()) ->
         raise ConfigError(f"run={run}: fine-tuning trains Q-networks, this is an agent of agent.kind={kind}")
     evaluation = evaluation_config(config)
     settings = evaluated_settings(training, evaluation)
-    emulated = isinstance(config.plant, EmulatedSettings)
+    emulated = config.plant.reads_emulator
     notes = other_pole(agent.known_poles, settings.pole, emulated), guard_note(training, evaluation, settings)
     for note in filter(None, notes):
         show(note)
@@ -129,8 +127,8 @@ def drive_all(
     files: FinetuningFiles, tuned: TunedAgent, settings: CartPoleSettings, evaluation: EvaluateConfig
 ) -> None:
     """Drive the three stages, and learn in the second."""
-    config, live = files.config, LiveView(view_title(files.config.plant), files.config.view)
-    real_time = is_real_time(config.plant, config.emulator)
+    config, live = files.config, LiveView(files.config.plant.title, files.config.view)
+    real_time = config.plant.is_real_time(config.emulator)
     make_env = partial(driven_env, settings, evaluation, live.memory)  # called with `confirm`
     make_policy = partial(greedy_network, tuned.training)
     with (

@@ -17,7 +17,6 @@ from cartpole_rl.evaluation.driving_policy import Weights
 from cartpole_rl.evaluation.recordings import LENGTH, read_recording, write_recording
 from cartpole_rl.learning.checkpoints import FINETUNING_FORMAT, TrainingCheckpoint, save_training
 from cartpole_rl.plants.serial.statistics import LinkStatistics
-from cartpole_rl.plants.settings import SerialSettings
 from cartpole_rl.reporting.tensorboard import TensorBoardLog
 from cartpole_rl.reporting.texts import ending_text, guard_text
 from cartpole_rl.run_folder import CHECKPOINTS, RECORDINGS, START
@@ -88,8 +87,7 @@ class FinetuningFiles:
 
 def pole_length(config: FinetuneConfig) -> float | None:
     """Return the length (m) of the pole on the cart; None if the settings do not state it."""
-    plant = config.plant
-    return plant.pole_length if isinstance(plant, SerialSettings) else 2 * config.emulator.pole_com
+    return config.plant.known_pole_length(config.emulator)
 
 
 class DrivenCart:

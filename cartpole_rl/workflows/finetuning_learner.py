@@ -30,7 +30,6 @@ from cartpole_rl.learning.finetuning import Finetuning, recorded_chunks
 from cartpole_rl.learning.settings import FinetuningSettings, LearningSettings
 from cartpole_rl.physics.friction import CART_FRICTIONS
 from cartpole_rl.physics.models import Models
-from cartpole_rl.plants.settings import SerialSettings
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.randomization.identified import IdentifiedCarts
 from cartpole_rl.randomization.poles import PoleSettings
@@ -211,8 +210,7 @@ class CartLearner:
         """Return the fit with the lowest cost among the candidate models, and its models."""
         period = self.settings.control_period
         windows = cut_windows(recorded, period)
-        may_be_stated = isinstance(self.config.plant, SerialSettings)  # the length of its pole
-        poles = self.settings.pole if may_be_stated else self.training.pole
+        poles = self.training.pole if self.config.plant.reads_emulator else self.settings.pole
         fit, models = best_fit(windows, self.training.nominal_with(poles.nominal), self.candidates, period)
         self.show(
             f"simulator fitted to {windows.number} windows of {windows.periods * period:g} s: RMS error "

@@ -29,8 +29,7 @@ from cartpole_rl.identification.unknowns import WEIGHED
 from cartpole_rl.physics.laws import Law
 from cartpole_rl.physics.models import REGISTRIES, Models
 from cartpole_rl.physics.parameters import CartParameters
-from cartpole_rl.plants.serial.plant import SerialPlant, cart_plant
-from cartpole_rl.plants.settings import EmulatedSettings
+from cartpole_rl.plants.serial.plant import SerialPlant
 from cartpole_rl.randomization.poles import Pole
 from cartpole_rl.reporting.identification import (
     error_text,
@@ -160,8 +159,10 @@ def record_experiments(config: IdentifyConfig, folder: Path) -> None:
 
 def make_plant(config: IdentifyConfig) -> SerialPlant:
     """Connect to the cart that is identified."""
-    period = config.control_period
-    return cart_plant(config.plant, config.emulator, period, "hanging", tqdm.write, confirm)
+    plant: SerialPlant = config.plant.build(
+        config.emulator, config.control_period, "hanging", tqdm.write, confirm
+    )
+    return plant
 
 
 def split(recordings: Episodes, source: Path) -> tuple[Episodes, Episodes]:
@@ -301,7 +302,7 @@ def results(found: Identification, carts: np.ndarray) -> dict[str, Any]:
 def known_truth(config: IdentifyConfig) -> EmulatorSettings | None:
     """Return the truth of the emulated cart that the recordings are of; None for any other cart."""
     if config.source is None:
-        return config.emulator if isinstance(config.plant, EmulatedSettings) else None
+        return config.emulator if config.plant.reads_emulator else None
     try:
         recorded = yaml.safe_load((config.source / CONFIG).read_text(encoding="utf-8"))
         of_emulator = recorded["plant"]["kind"] == "emulated"

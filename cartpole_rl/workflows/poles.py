@@ -6,12 +6,10 @@ from pathlib import Path
 from cartpole_rl.choices import choice, group_choices
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import ConfigError, RecordingError
-from cartpole_rl.plants.settings import EmulatedSettings, SerialSettings
+from cartpole_rl.plants.settings import PlantSettings, emulated_pole
 from cartpole_rl.randomization.poles import HEAVIER, Pole, PoleSettings, check_one_pole
-from cartpole_rl.terminal import as_word
 
 POLES = ("medium", "large")  # in conf/pole/ and conf/emulator/; the first is the default
-DEFAULT_BAUD = SerialSettings.model_fields["baud"].default
 
 
 def other_pole(known: Sequence[PoleSettings], driven: PoleSettings, emulated: bool) -> str | None:
@@ -40,21 +38,6 @@ def heaviest(trained: PoleSettings, length: float) -> float:
     """Return the mass from which a pole of `length` m is another one than those of `trained`, kg."""
     alike = [pole.pole_mass for pole in (trained.choices or {}).values() if pole.is_about(length)]
     return HEAVIER * max(alike, default=Pole.rod(length).pole_mass)
-
-
-def pole_of_length(length: float, trained: PoleSettings) -> PoleSettings:
-    """Return the pole of `trained` with about `length` m, else that of `pole=both`, else a uniform rod."""
-    known = trained if trained.includes(Pole.rod(length)) else PoleSettings(**group_choices("pole")["both"])
-    alike = {name: pole for name, pole in (known.choices or {}).items() if pole.is_about(length)}
-    if not alike:
-        return one_pole(Pole.rod(length))
-    nearest = min(alike, key=lambda name: abs(alike[name].length - length))
-    return PoleSettings(choices={nearest: alike[nearest]})
-
-
-def one_pole(pole: Pole) -> PoleSettings:
-    """Return the choice of this pole alone, named by its length."""
-    return PoleSettings(choices={f"{pole.length:.2f} m": pole})
 
 
 def pole_text(poles: PoleSettings) -> str:
@@ -86,18 +69,9 @@ def emulator_for(known: Sequence[PoleSettings]) -> str | None:
     return None
 
 
-def emulated_pole(truth: EmulatorSettings) -> Pole:
-    """Return the pole of an emulated cart."""
-    return Pole(**truth.model_dump(include=set(Pole.model_fields)))
-
-
-def plant_words(plant: EmulatedSettings | SerialSettings, poles: Sequence[PoleSettings] = ()) -> str:
+def plant_words(plant: PlantSettings, poles: Sequence[PoleSettings] = ()) -> str:
     """Return the words that choose a cart on the command line, an emulated one with one of `poles`."""
-    if isinstance(plant, SerialSettings):
-        length = f" plant.pole_length={plant.pole_length:g}" if plant.pole_length else ""
-        baud = f" plant.baud={plant.baud}" if plant.baud != DEFAULT_BAUD else ""
-        return f"plant=serial {as_word('plant.port', plant.port)}{baud}{length}"
-    return emulated_words(poles) if poles else "plant=emulated"
+    return emulated_words(poles) if plant.reads_emulator and poles else plant.words
 
 
 def chosen_pole(owner: str, poles: PoleSettings | None, paths: Sequence[Path]) -> tuple[str, Pole]:

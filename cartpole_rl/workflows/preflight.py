@@ -5,16 +5,14 @@ from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 
 from cartpole_rl.errors import PlantError
-from cartpole_rl.plants.emulated import EmulatedCart
 from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.preflight import Finding, preflight
 from cartpole_rl.plants.serial.preparation import FaultClearing, always
-from cartpole_rl.plants.settings import EmulatedSettings, SerialSettings
-from cartpole_rl.randomization.poles import Pole
+from cartpole_rl.randomization.poles import Pole, one_pole
 from cartpole_rl.terminal import confirm
 from cartpole_rl.workflows.checks import is_given
 from cartpole_rl.workflows.config import PreflightConfig
-from cartpole_rl.workflows.poles import POLES, emulated_pole, emulator_for, one_pole
+from cartpole_rl.workflows.poles import POLES, emulator_for
 
 
 def check_cart(config: PreflightConfig, words: Sequence[str] = ()) -> None:
@@ -23,9 +21,10 @@ def check_cart(config: PreflightConfig, words: Sequence[str] = ()) -> None:
     At the end prints the command that identifies the cart, with the `words` given for it, as plant.port=COM3.
     Writes no files. Raises PlantError after the first check that fails, LinkError if no cart answers.
     """
+    faults = FaultClearing(config.plant.clear_faults, confirm if config.plant.can_be_damaged else always)
     with connected_cart(config) as cart:
         finding: Finding | None = None
-        for finding in preflight(cart, fault_clearing(config.plant)):
+        for finding in preflight(cart, faults):
             print(finding, flush=True)
     if finding is None or not finding.ready:
         raise PlantError(
@@ -44,29 +43,12 @@ def next_command(config: PreflightConfig, given: Sequence[str]) -> str:
 
 def mounted_pole(config: PreflightConfig) -> str:
     """Return the one of POLES that is about as long as the cart's; the default if there is none."""
-    if not isinstance(config.plant, SerialSettings):
-        pole = emulated_pole(config.emulator)
-    elif config.plant.pole_length is not None:
-        pole = Pole.rod(config.plant.pole_length)
-    else:
-        return POLES[0]
-    return emulator_for([one_pole(pole)]) or POLES[0]
-
-
-def fault_clearing(plant: EmulatedSettings | SerialSettings) -> FaultClearing:
-    """Return the rule for clearing latched faults."""
-    if isinstance(plant, SerialSettings):
-        return FaultClearing(plant.clear_faults, confirm)
-    return FaultClearing(0, always)
+    length = config.plant.known_pole_length(config.emulator)
+    return (length and emulator_for([one_pole(Pole.rod(length))])) or POLES[0]
 
 
 @contextmanager
 def connected_cart(config: PreflightConfig) -> Iterator[SerialCart]:
     """Yield the cart, not open yet; disarm and close it at the end, and stop an emulated one."""
-    if isinstance(config.plant, SerialSettings):
-        with closing(SerialCart(config.plant)) as cart:
-            yield cart
-        return
-    truth = config.emulator.model_copy(update={"start": "hanging"})
-    with EmulatedCart(truth) as emulated, closing(SerialCart(emulated.settings)) as cart:
+    with config.plant.reachable(config.emulator) as settings, closing(SerialCart(settings)) as cart:
         yield cart

@@ -11,7 +11,6 @@ from typing import Any
 
 from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
 from cartpole_rl.evaluation.recordings import LENGTH, stored_origin, write_recording
-from cartpole_rl.plants.settings import SerialSettings
 from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.reporting.texts import count_text, guard_text
 from cartpole_rl.run_folder import RECORDINGS, write_config
@@ -64,6 +63,7 @@ def heading(config: EvaluateConfig, settings: CartPoleSettings, episode: Episode
 
 def length_to_record(config: EvaluateConfig, poles: PoleSettings) -> str:
     """Return the pole's length in m, as stated for a real cart or that of `poles`; empty for several."""
-    if isinstance(config.plant, SerialSettings) and config.plant.pole_length:
-        return f"{config.plant.pole_length:.4f}"
-    return f"{poles.nominal.length:.4f}" if poles.is_single else ""
+    length = config.plant.known_pole_length(config.emulator)
+    if length is None and poles.is_single:
+        length = poles.nominal.length
+    return "" if length is None else f"{length:.4f}"

@@ -15,7 +15,6 @@ from cartpole_rl.learning.agent import QAgent
 from cartpole_rl.learning.checkpoints import forget_training, load_training, restore_weights, whole_state
 from cartpole_rl.learning.states import seed_everything
 from cartpole_rl.plants.effects import without_effect
-from cartpole_rl.plants.settings import LearnedSettings, SimulatedSettings
 from cartpole_rl.randomization.randomizer import Draws
 from cartpole_rl.reporting.episodes import report_episodes
 from cartpole_rl.run_folder import CHECKPOINTS, FIGURES, METRICS, write_config
@@ -99,7 +98,7 @@ def available_device(device: str) -> str:
 
 def print_notes(config: TrainConfig, draws: Draws) -> None:
     """Print how the cart differs from the nominal one and from those in training, and its track guard."""
-    if isinstance(config.plant, SimulatedSettings):
+    if "cart" not in config.plant.ignored:
         note_other_numbers("train", config.nominal_cart, (config.pole.choices or {}).values())
     note_unused_randomization(config, draws)
     note_other_carts(config)
@@ -139,8 +138,8 @@ def nominal_env(config: TrainConfig) -> CartPoleEnv:
     assert poles.choices is not None
     carts = len(poles.choices) * max(1, config.learning.evaluation_episodes // len(poles.choices))
     nominal = config.model_copy(update={"pole": poles, "randomization": {}})
-    plant = config.plant.without_prior if isinstance(config.plant, LearnedSettings) else config.plant
-    return simulated_env(nominal, plant, carts, config.task.evaluation_start, 0, config.compile)
+    start = config.task.evaluation_start
+    return simulated_env(nominal, config.plant.as_evaluated, carts, start, 0, config.compile)
 
 
 def judge_agent(env: CartPoleEnv, agent: QAgent, policy: DrivingPolicy, seed: int) -> list[Episode]:

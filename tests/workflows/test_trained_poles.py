@@ -3,8 +3,8 @@
 import pytest
 
 from cartpole_rl.choices import group_choices
-from cartpole_rl.randomization.poles import Pole, PoleSettings
-from cartpole_rl.workflows.poles import emulated_words, one_pole, other_pole, pole_of_length
+from cartpole_rl.randomization.poles import Pole, PoleSettings, one_pole, pole_of_length
+from cartpole_rl.workflows.poles import emulated_words, other_pole
 
 POLES = group_choices("pole")
 MEDIUM, LARGE, BOTH = (PoleSettings(**POLES[name]) for name in ("medium", "large", "both"))

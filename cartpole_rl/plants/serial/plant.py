@@ -7,7 +7,7 @@ episode. Every ending, by the track, a fault, the link or `close`, sets the moto
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -26,6 +26,7 @@ from cartpole_rl.plants.serial.preparation import (
     always,
     nobody,
 )
+from cartpole_rl.plants.serial.statistics import LinkStatistics
 from cartpole_rl.plants.settings import EmulatedSettings, Rehome, SerialSettings
 from cartpole_rl.plants.specs import TERMINATING, TRUNCATING, Numbers, OneCartPlant, PlantOutput, on_tensors
 from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT
@@ -80,8 +81,6 @@ class SerialPlant(OneCartPlant):
         self.cart = SerialCart(settings)
         self.ended_by = ""
         self.last_error: PlantError | None = None
-        self.before_start: Callable[[], None] | None = None  # called before START, the cart being ready
-        self.on_command: Callable[[int], None] | None = None  # called with each motor value once it is sent
         self.on_board = False  # resets start the policy on the cart's board; `listen_one` passes periods
         faults = FaultClearing(settings.clear_faults, confirm)
         self._preparation = Preparation(self.cart, start, control_period, faults, prompt)
@@ -117,6 +116,20 @@ class SerialPlant(OneCartPlant):
             if self._owned is not None:
                 self._owned.close()
             super().close(raise_if_closed=raise_if_closed)
+
+    @property
+    def statistics(self) -> LinkStatistics:
+        """Frames and times on the link, over all connections."""
+        return self.cart.statistics
+
+    def link_figures(self) -> dict[str, Any]:
+        """Return the counts of lost, damaged and late frames, and the measured latency."""
+        latency = {"latency_override": self.statistics.latency_override()}
+        return {**super().link_figures(), **latency}
+
+    def check_policy(self, identity: int) -> None:
+        """Raise PlantError unless the board has the agent of this `identity`."""
+        self.cart.check_policy(identity)
 
     @property
     def fault(self) -> Fault:
@@ -285,23 +298,31 @@ class SerialPlant(OneCartPlant):
         check_scales(self.cart.information)
 
 
-def cart_plant(
-    plant: EmulatedSettings | SerialSettings,
+def real_cart(
+    plant: SerialSettings,
     emulator: EmulatorSettings,
     control_period: float,
     start: StartPosition,
     prompt: Callable[[str], None],
     confirm: Confirm = nobody,
 ) -> SerialPlant:
-    """Return the plant of plant=serial, or of plant=emulated on a new cart with the settings `emulator`.
-
-    An emulated cart starts in the position `start` and needs nobody to confirm. Raises PortError, LinkError,
-    NotReadyError, EmulatorError.
-    """
-    if isinstance(plant, EmulatedSettings):
-        emulator = emulator.model_copy(update={"start": start})
-        return emulated_plant(emulator, control_period, prompt, plant.rehome)
+    """Return the plant of plant=serial. Raises PortError, LinkError, NotReadyError."""
     return SerialPlant(plant, start, control_period, prompt, confirm=confirm)
+
+
+def emulated_cart(
+    plant: EmulatedSettings,
+    emulator: EmulatorSettings,
+    control_period: float,
+    start: StartPosition,
+    prompt: Callable[[str], None],
+    confirm: Confirm = nobody,
+) -> SerialPlant:
+    """Return the plant of plant=emulated, on a new cart with the settings `emulator` and the start `start`.
+
+    It needs nobody to confirm. Raises PortError, LinkError, NotReadyError, EmulatorError.
+    """
+    return emulated_plant(emulator.model_copy(update={"start": start}), control_period, prompt, plant.rehome)
 
 
 def emulated_plant(
