@@ -117,8 +117,15 @@ def reading_conf() -> Iterator[None]:
 
 
 def as_mapping(config: DictConfig) -> dict[str, Any]:
-    """Return a composed config, resolved, as plain mappings without the missing values (`???`)."""
-    return without_missing(OmegaConf.to_container(config, resolve=True))
+    """Return a composed config, resolved, as plain mappings without the missing values (`???`).
+
+    Raises ConfigError for an interpolation that has no value.
+    """
+    try:
+        return without_missing(OmegaConf.to_container(config, resolve=True))
+    except OmegaConfBaseException as error:
+        reason = str(error).splitlines()[0]
+        raise ConfigError(f"{error.full_key}: {reason}" if error.full_key else reason) from None
 
 
 def without_missing(values: Any) -> Any:
@@ -490,7 +497,8 @@ def error_message(error: Exception, command: str, words: Sequence[str], plants: 
         return next(iter(str(error).splitlines()), type(error).__name__)
     text = " ".join(str(error).split())
     if unknown := re.match(r"Could not override '([^']+)'", text):
-        return _unknown_setting(unknown[1], command, words)
+        setting = getattr(error.__cause__, "full_key", None) or unknown[1]  # the key inside of a mapping
+        return _unknown_setting(setting, command, words)
     if wrong := re.search(r"Could not find '([^']+)' Available options in '([^']+)': (.*)", text):
         name = wrong[1].removeprefix(f"{wrong[2]}/")
         if extra := EXTRAS.get(wrong[1]):

@@ -35,6 +35,7 @@ BUDGETS = {  # of each command; what the page gives stays, except where it takes
     "distill": [*DISTILLATION],
     "report": ["animations=false"],
     "export": [],
+    "preflight": [],
 }
 LONG = (
     "learning.transitions=",
