@@ -2,7 +2,6 @@
 
 import math
 import re
-from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,15 +9,11 @@ import pytest
 
 pytest.importorskip("mujoco")
 
-from firmwares import answering
 
 from cartpole_rl.choices import choice
-from cartpole_rl.emulator.device import CartDevice
 from cartpole_rl.emulator.guards import SOFT_LIMIT
-from cartpole_rl.emulator.physics import Motor
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT
-from cartpole_rl.wire import Flags, Hello, Home, Message, SetMotor, Start, State, decode_frame, encode_frame
 
 PAGE = (Path(__file__).parents[2] / "docs" / "emulator.md").read_text(encoding="utf-8")
 LEVELS = choice("actions/nine_levels")["motors"]
@@ -102,63 +97,3 @@ def shown(share: float, like: str) -> str:
     digits = len(like.partition(".")[2].removesuffix(" %"))
     rounded = round(100 * share, digits)
     return f"{rounded:+.{digits}f} %" if rounded else "0 %"
-
-
-def changed() -> list[str]:
-    """Return the settings whose truth is not the nominal number."""
-    settings = EmulatorSettings()
-    return [
-        name for row in ROWS for name in row.names if nominal(name) not in (None, getattr(settings, name))
-    ]
-
-
-@cache
-def driven(name: str | None) -> list[tuple[int, int]]:
-    """Return the counts of a homing and a drive with the nominal value of `name`, all else being default."""
-    settings = EmulatorSettings(physics_step=1e-3, **({} if name is None else {name: nominal(name)}))
-    cart, counts = CartDevice(settings), []
-
-    def period(message: Message | None) -> Flags:
-        if message is not None:
-            cart.receive(encode_frame(answering(len(counts), message), 0)[:-1], cart.now_us)
-        frame = decode_frame(cart.pass_period(cart.period_end_us)[-1][:-1])
-        assert isinstance(frame.message, State)
-        counts.append((frame.message.cart_counts, frame.message.pole_counts))
-        return Flags(frame.flags)
-
-    flags = period(Home())
-    while flags & Flags.HOMING:
-        flags = period(Hello())
-    assert flags == Flags.HOMED
-    period(Start())
-    for motor in (200, 58, 57, -200, -200, -56, -55, 200, 100, 0, -100, -150, 150):
-        for _ in range(4):
-            assert period(SetMotor(motor)) & Flags.ARMED
-    return counts
-
-
-def test_equal_carts_move_equally() -> None:
-    """The control for the next test."""
-    assert driven.__wrapped__(None) == driven(None)
-
-
-@pytest.mark.parametrize("name", changed())
-def test_each_number_that_is_off_changes_the_motion(name: str) -> None:
-    assert driven(name) != driven(None)
-
-
-@pytest.mark.parametrize("side", [-1, 1])
-def test_the_dead_bands_affect_the_force(side: int) -> None:
-    """Inside the dead-band the force is 0 although the curve gives one; outside it is that of the page."""
-    settings = EmulatorSettings()
-    edge = int(settings.deadband_right if side > 0 else settings.deadband_left)
-    motor, curve = (
-        Motor(settings),
-        Motor(settings.model_copy(update={"deadband_left": 0, "deadband_right": 0})),
-    )
-    assert motor.static_force(side * edge) == 0
-    assert abs(curve.static_force(side * edge)) > 0.09
-    step = motor.static_force(side * (edge + 1))
-    assert step == curve.static_force(side * (edge + 1))
-    assert 0.1 < abs(step) < 0.23
-    assert f"{abs(step):.2f} N at {side * (edge + 1)}" in PAGE

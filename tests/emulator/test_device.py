@@ -34,12 +34,10 @@ NOMINAL_LIMITS = (16704, 17539)  # counts, as docs/protocol.md has them
     "settings",
     [
         {},
-        {"seed": 1},
         {"angle_offset": -0.02, "track_tilt": -0.004},
         {"cart_coulomb_left": 0.9, "cart_coulomb_right": 0.8, "cart_viscous": 3.0, "latency": 0.02},
         {"cart_coulomb_left": 0.1, "cart_coulomb_right": 0.1, "motor_time_constant": 0.02},
         {"pole_mass": 0.23, "pole_com": 0.3302, "pole_inertia": 7.884e-3},
-        {"pole_viscous": 0.0, "pole_coulomb": 0.0, "pole_drag": 0.0},
     ],
 )
 def test_homing_finds_the_zeros_of_any_healthy_cart(settings):
@@ -82,21 +80,16 @@ def test_a_track_of_the_wrong_length_is_a_fault(half_length):
     assert driven.flags == Flags.FAULTED
 
 
-def test_limits_count_from_the_stops_that_were_found():
-    driven = Driven(track_half_length=0.4)
-    driven.home()
-    assert driven.info().soft_limit_counts * CART_METRES_PER_COUNT == pytest.approx(0.4 - 0.027, abs=1e-4)
-    assert driven.info().hard_limit_counts * CART_METRES_PER_COUNT == pytest.approx(0.4 - 0.008, abs=1e-4)
-
-
-def test_before_the_first_homing_the_limits_are_nominal():
+def test_the_limits_are_nominal_until_homing_has_found_the_stops():
     driven = Driven(track_half_length=0.4)
     assert driven.limits() == NOMINAL_LIMITS
     driven.ask(Home())
     while driven.flags & Flags.HOMING:
         assert driven.limits() == NOMINAL_LIMITS
         driven.tick()
-    assert driven.limits() < NOMINAL_LIMITS
+    assert [limit * CART_METRES_PER_COUNT for limit in driven.limits()] == pytest.approx(
+        [0.4 - 0.027, 0.4 - 0.008], abs=1e-4
+    )
 
 
 def test_limits_and_zeros_last_until_another_homing_succeeds_or_the_cart_restarts():
@@ -257,13 +250,13 @@ def test_another_value_sends_other_bytes(base, name):
 
 
 def test_every_setting_is_tried_here_or_on_the_wire():
-    on_the_wire = {"clock", "frame_loss", "frame_corruption"}  # test_emulator_process.py
-    order = {"frame_duplication", "frame_reordering"}  # test_emulator_disturbance.py
-    faults = {"unplug_at", "stuck_encoder", "stuck_at"}  # test_emulator_faults.py
+    on_the_wire = {"clock", "frame_loss", "frame_corruption"}  # test_process.py
+    order = {"frame_duplication", "frame_reordering"}  # test_disturbance.py
+    faults = {"unplug_at", "stuck_encoder", "stuck_at"}  # test_faults.py
     rate = {"clock_rate"}  # below
-    cogging = {"cogging", "cogging_pitch"}  # test_emulator_physics.py
+    cogging = {"cogging", "cogging_pitch"}  # test_physics.py
     firmware = {"firmware", "policy"}  # this module runs with both; test_onboard_policy.py
-    others = {"journal", "knock"}  # tests/plants/test_stops.py, tests/bench/test_soak.py; below
+    others = {"journal", "knock"}  # tests/plants/test_stops.py, tests/fuzz/test_soak.py; below
     port = {"port"}  # tests/plants/serial/test_tcp.py
     assert set(OTHER) | firmware | on_the_wire | order | faults | cogging | others | port | rate == set(
         EmulatorSettings.model_fields

@@ -19,10 +19,8 @@ from firmwares import truth
 
 from cartpole_rl.emulator.device import CartDevice
 from cartpole_rl.emulator.firmware import BANNER
-from cartpole_rl.errors import LinkError
 from cartpole_rl.plants.emulated import EmulatedCart
 from cartpole_rl.plants.serial.cart import SerialCart
-from cartpole_rl.plants.serial.errors import RefusedError
 from cartpole_rl.plants.settings import SerialSettings
 from cartpole_rl.wire import (
     ClearFault,
@@ -30,7 +28,6 @@ from cartpole_rl.wire import (
     Flags,
     Hello,
     Home,
-    Reason,
     SetMotor,
     Start,
     State,
@@ -71,16 +68,6 @@ def test_a_pulled_cable_ends_the_line_and_the_process(clock):
 
 
 @CLOCKS
-def test_a_pulled_cable_is_a_lost_link_to_the_host(clock):
-    with (
-        pytest.raises(LinkError, match="unplugged"),
-        EmulatedCart(truth(clock=clock, unplug_at=1.0)) as emulated,
-        SerialCart(host_settings(emulated)) as cart,
-    ):
-        poll(cart)
-
-
-@CLOCKS
 def test_a_reset_is_a_boot(clock):
     with emulator(clock=clock, reset_at=1.5) as host:
         ticks = [host.ask(Hello())[-1].message.tick]
@@ -114,28 +101,6 @@ def test_a_reset_while_driving_stops_the_motor_and_loses_the_zeros():
     assert driven.tick().motor_applied == 0
     driven.cart.physics.place(0.0, math.pi)
     check_homed(driven, driven.home())
-
-
-def test_the_host_notices_a_reset():
-    settings = truth(reset_at=60.0, **COARSE)
-    with EmulatedCart(settings) as emulated, SerialCart(host_settings(emulated)) as cart:
-        cart.home()
-        cart.start()
-        with pytest.raises(RefusedError, match="SET_MOTOR") as caught:
-            stand_still(cart)
-        assert caught.value.reason == Reason.NOT_ARMED
-        assert not cart.flags & Flags.HOMED
-
-
-def poll(cart: SerialCart) -> None:
-    while True:
-        cart.poll_state()
-
-
-def stand_still(cart: SerialCart) -> None:
-    while True:
-        cart.set_motor(0)
-        cart.get_state()
 
 
 def test_a_booted_board_prints_text_and_the_host_is_in_step_after_it():
@@ -268,21 +233,6 @@ def test_random_driving_through_swing_ups_raises_no_false_alarm(settings):
     assert fastest > 8.0  # rad/s: the pole went far up
 
 
-def test_a_session_over_a_line_that_doubles_frames_loses_nothing():
-    settings = truth(frame_duplication=0.3, **COARSE)
-    with EmulatedCart(settings) as emulated, SerialCart(host_settings(emulated)) as cart:
-        cart.home()
-        cart.start()
-        cart.statistics.clear()
-        first, ticks = cart.get_state().tick, []
-        for period in range(200):
-            cart.set_motor(60 if period % 20 < 10 else -60)
-            ticks.append(cart.get_state().tick)
-        assert cart.statistics.summary().bad_frames == 0
-        assert cart.statistics.summary().lost_frames == 0
-    assert ticks[-1] - first >= 200
-
-
 @pytest.mark.parametrize("settings", [{"frame_reordering": 0.3}, {"frame_duplication": 0.3}])
 def test_at_least_one_state_comes_for_each_frame_and_lockstep_repeats(settings):
     def session() -> bytes:
@@ -296,10 +246,3 @@ def test_at_least_one_state_comes_for_each_frame_and_lockstep_repeats(settings):
     assert len(set(re.findall(rb"[^\x00]+", first))) > 150
     length = min(len(first), len(again := session()))
     assert first[:length] == again[:length]  # the last answers may not have arrived
-
-
-def test_a_reordered_frame_is_recognized_by_its_tick():
-    with emulator(frame_reordering=0.3, clock="real") as host:
-        ticks = [host.state().tick for _ in range(60)]
-    assert any(after < before for before, after in itertools.pairwise(ticks))
-    assert len(set(ticks)) == len(ticks)

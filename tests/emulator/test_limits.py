@@ -68,8 +68,18 @@ def dying(driven: Driven) -> Host:
             yield motor if driven.cart.now_us < began_us + lasts_us else None
 
 
-@pytest.mark.parametrize("period_us", [5_000, 20_000, 100_000])
-@pytest.mark.parametrize("cart", [{}, LARGE, HEAVY, SLIPPERY], ids=["default", "large", "heavy", "slippery"])
+@pytest.mark.parametrize(
+    ("cart", "period_us"),
+    [
+        ({}, 20_000),
+        (LARGE, 20_000),
+        (HEAVY, 100_000),
+        (SLIPPERY, 5_000),
+        (SLIPPERY, 20_000),
+        (SLIPPERY, 100_000),
+    ],
+    ids=["default", "large", "heavy slow", "slippery fast", "slippery", "slippery slow"],
+)
 @pytest.mark.parametrize("host", [outward, to_and_fro, pumping, dying])
 def test_no_host_drives_the_cart_against_a_stop(host, cart, period_us):
     driven, touched, fastest = ready(**cart, period_us=period_us)
@@ -85,7 +95,7 @@ def test_no_host_drives_the_cart_against_a_stop(host, cart, period_us):
     assert fastest > 0.5  # the limits leave it room to drive
 
 
-@pytest.mark.parametrize("after", [0.0, 0.1, 0.25, 0.4])
+@pytest.mark.parametrize("after", [0.1, 0.4])
 @pytest.mark.parametrize("cart", [{}, LARGE, HEAVY, SLIPPERY], ids=["default", "large", "heavy", "slippery"])
 @pytest.mark.parametrize("host", [outward, to_and_fro])
 def test_a_cart_whose_encoder_freezes_is_stopped_before_it_touches_a_stop(host, cart, after):

@@ -32,16 +32,6 @@ def test_a_host_that_does_not_read_loses_whole_frames_and_never_half_of_one():
     assert motors[-1] > 5000
 
 
-def test_what_a_host_writes_arrives_and_nothing_is_nothing():
-    with PtyLink() as link:
-        assert link.read(0) == b""
-        host = os.open(link.port, os.O_RDWR | os.O_NOCTTY)
-        os.write(host, bytes(range(256)))
-        assert link.read(5) == bytes(range(256))
-        os.close(host)
-        assert link.read(0) == b""  # a closed port is a silent one
-
-
 def test_a_host_that_opens_the_port_is_noticed():
     with PtyLink() as link:
         assert link.read(0) == b""

@@ -8,8 +8,6 @@ pytest.importorskip("mujoco", reason='pip install "cartpole_rl[emulator]"')
 
 import itertools
 
-from driven_cart import OTHER_PHYSICS
-
 from cartpole_rl.emulator.physics import GRAVITY, CartPhysics
 from cartpole_rl.emulator.settings import EmulatorSettings
 
@@ -173,23 +171,6 @@ def test_a_finer_step_changes_little():
     assert ends[0] == pytest.approx(ends[1], abs=0.01)
 
 
-def end_state(**changes: object) -> tuple[float, float]:
-    cart = CartPhysics(EmulatorSettings(**changes))
-    for motor in (85, -85, 80, 0, -200, 200, 255, 255, 255, 255):
-        cart.advance(motor, 0.15)
-    return cart.x, cart.angle
-
-
-@pytest.mark.parametrize("name", OTHER_PHYSICS)
-def test_each_setting_has_an_effect(name):
-    base, other = end_state(), end_state(**{name: OTHER_PHYSICS[name]})
-    assert max(abs(a - b) for a, b in zip(base, other, strict=True)) > 1e-5
-
-
-def test_the_same_settings_end_in_the_same_state():
-    assert end_state() == end_state()
-
-
 # cogging: a force ripple along the track
 
 BARE = FREE | NO_POLE | {"cart_mass": 0.8}
@@ -197,13 +178,6 @@ BARE = FREE | NO_POLE | {"cart_mass": 0.8}
 
 def rippled_cart(amplitude: float, pitch: float = 0.04, **changes: float) -> CartPhysics:
     return CartPhysics(EmulatorSettings(**BARE | changes, cogging=amplitude, cogging_pitch=pitch))
-
-
-def test_there_is_no_cogging_by_default() -> None:
-    plain = CartPhysics(EmulatorSettings(**BARE))
-    plain.place(0.01, math.pi)
-    plain.advance(0, 0.5)
-    assert plain.x == 0.01
 
 
 @pytest.mark.parametrize("pitch", [0.04, 0.01])
@@ -234,24 +208,3 @@ def test_cogging_returns_the_energy_that_it_takes() -> None:
         math.sqrt(fastest**2 - 2 * (amplitude * pitch / math.pi) / BARE["cart_mass"]), rel=0.002
     )
     assert again == pytest.approx(fastest, rel=0.002)
-
-
-def test_cogging_adds_to_the_force_that_friction_holds() -> None:
-    """A cart at rest does not move up to a motor force of Coulomb friction plus amplitude."""
-    coulomb, amplitude = 0.5, 0.4
-    motor = {
-        "force_curve": (0.0, 0.01, 0.0),
-        "force_asymmetry": 0.0,
-        "deadband_left": 0.0,
-        "deadband_right": 0.0,
-        "cart_coulomb_left": coulomb,
-        "cart_coulomb_right": coulomb,
-        "cart_stiction_ratio": 1.0,
-    }
-    for value, comes_free in {85: False, 130: True}.items():
-        pushed = rippled_cart(amplitude, **motor)
-        pushed.place(0.0, math.pi)
-        for step in range(value + 1):  # slowly, without momentum
-            pushed.advance(step, 0.02)
-        pushed.advance(value, 1.0)
-        assert (pushed.x > 0.04) == comes_free

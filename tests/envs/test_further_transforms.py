@@ -9,9 +9,7 @@ from torchrl.envs import (
     CatFrames,
     EnvBase,
     InitTracker,
-    ObservationNorm,
     RewardSum,
-    StepCounter,
     Transform,
     TransformedEnv,
 )
@@ -24,9 +22,7 @@ CARTS, STEPS, LIMIT = 4, 50, 20
 TRANSFORMS: dict[str, Callable[[], Transform]] = {
     "RewardSum": RewardSum,
     "CatFrames": lambda: CatFrames(3, -1, in_keys=["observation"]),
-    "StepCounter": lambda: StepCounter(10, step_count_key="steps"),
     "InitTracker": InitTracker,
-    "ObservationNorm": lambda: ObservationNorm(0.1, 2.0, in_keys=["observation"]),
 }
 
 

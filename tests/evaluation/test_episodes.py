@@ -2,21 +2,16 @@
 
 import math
 from collections.abc import Callable
-from contextlib import closing
 
 import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
 
-from cartpole_rl.emulator.settings import EmulatorSettings
-from cartpole_rl.envs.build import environment, shipped_settings
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
-from cartpole_rl.evaluation.episodes import run_episodes, run_many
-from cartpole_rl.plants.serial.plant import emulated_plant
+from cartpole_rl.evaluation.episodes import run_episodes
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.tasks.settings import Start, StartSettings
-from cartpole_rl.wire import Flags
 
 RIGHT, NONE = 2, 1  # of the motor values -200, 0, 200
 
@@ -34,26 +29,6 @@ def test_the_batch_does_not_change_the_count(make_plant: Callable, make_environm
     env = make_environment(make_plant(4), time_limit=3)
     for count in (1, 4, 6):
         assert len(list(run_episodes(env, always(NONE), count))) == count
-
-
-def test_time_ends_an_episode(make_plant: Callable, make_environment: Callable) -> None:
-    env = make_environment(make_plant(1), time_limit=30)
-    (episode,) = run_episodes(env, always(NONE), 1)
-    assert (episode.steps, episode.ended_by) == (30, "time")
-    assert episode.time == pytest.approx(np.arange(31) * 0.02, abs=1e-5)
-    assert all(len(getattr(episode, key)) == 31 for key in ("x", "x_dot", "theta", "theta_dot"))
-    assert all(len(getattr(episode, key)) == 30 for key in ("motor", "score", "score_upright", "reward"))
-
-
-def test_the_track_ends_an_episode_at_the_first_step_beyond_it(
-    make_plant: Callable, make_environment: Callable
-) -> None:
-    env = make_environment(make_plant(1))
-    (episode,) = run_episodes(env, always(RIGHT), 1)
-    assert episode.ended_by == "track"
-    assert episode.x[-1] > 0.38 - 1e-4
-    assert (np.abs(episode.x[:-1]) < 0.38 + 1e-4).all()
-    assert (episode.motor == 200).all()
 
 
 def test_a_fall_ends_an_episode_of_the_balance(make_plant: Callable, make_environment: Callable) -> None:
@@ -161,20 +136,3 @@ def test_the_same_seed_gives_the_same_episodes(make_plant: Callable, make_enviro
         runs.append(np.concatenate([episode.theta for episode in run_episodes(env, always(RIGHT), 8)]))
     assert np.array_equal(runs[0], runs[1])
     assert not np.array_equal(runs[0], runs[2])
-
-
-def test_an_error_on_the_way_leaves_no_cart_armed() -> None:
-    settings = shipped_settings({"task.time_limit": 40})
-    plant = emulated_plant(EmulatorSettings(physics_step=1e-3), settings.control_period)
-    chosen = iter(range(3))
-
-    def policy(seen: TensorDictBase) -> TensorDictBase:
-        next(chosen)
-        return always(0)(seen)
-
-    with closing(environment(settings, plant)) as env:
-        with pytest.raises(StopIteration):
-            run_many(env, policy)
-        state = plant.cart.poll_state()
-        assert state.motor_applied == 0
-        assert not plant.cart.flags & Flags.ARMED

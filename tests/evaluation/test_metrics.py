@@ -72,14 +72,6 @@ def test_motor_change_and_margin() -> None:
     assert episode_metrics(episode([0, 0], x=[0, 0.5]), 0.4)["min_track_margin_m"] == pytest.approx(-0.1)
 
 
-def test_an_episode_of_one_step_has_no_motor_change() -> None:
-    assert episode_metrics(episode([0, 0]), 0.4)["rms_motor_change"] is None
-
-
-def test_one_value_has_no_interval() -> None:
-    assert interval([3.0]) == (None, None)
-
-
 def test_equal_values_have_an_interval_without_width() -> None:
     assert interval([3.0, 3.0, 3.0]) == (3.0, 3.0)
 

@@ -64,17 +64,13 @@ def test_any_reader_of_csv_sees_columns_with_units(tmp_path: Path, episode: Epis
     ("harm", "named"),
     [
         (lambda text: "nonsense", "not a recording"),
-        (lambda text: text.replace("recording 1", "recording 9"), "not a recording"),
         (lambda text: text.replace("theta_rad", "theta"), "lacks theta_rad"),
         (lambda text: "\n".join(text.splitlines()[:3]), "lacks"),
-        (lambda text: "\n".join(text.splitlines()[:4]), "no control period"),
         (lambda text: text.replace("ended_by: time", "ended_by: luck"), "damaged"),
         (lambda text: with_cell(text, 2, "theta_rad", "nan"), "theta is not finite in row 2"),
         (lambda text: with_cell(text, 2, "time_s", "0.0"), "time does not increase in row 2"),
         (lambda text: with_cell(text, 1, "motor", "999"), "beyond 255 in row 1; record it again"),
-        (lambda text: with_cell(text, 1, "motor", str(-(2**63))), "beyond 255 in row 1; record it again"),
         (lambda text: with_cell(text, 3, "pole_counts", str(10**25)), "beyond 2147483647 in row 3; record"),
-        (lambda text: with_cell(text, 4, "cart_counts", str(-(2**63))), "beyond 2147483647 in row 4; record"),
         (lambda text: with_cell(text, 4, "x_m", "1e308"), "x is beyond 1e\\+06 in row 4; record it again"),
         (
             lambda text: with_cell(text, 5, "motor", ""),
@@ -125,8 +121,3 @@ def test_a_file_that_a_spreadsheet_program_saved_is_read(tmp_path: Path, episode
     np.testing.assert_array_equal(again.counts, episode.counts)
     assert (again.motor.dtype, again.counts.dtype) == (episode.motor.dtype, episode.counts.dtype)
     assert (again.ended_by, read_heading(path)[0]["pole"]) == (episode.ended_by, "medium")
-
-
-def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match="cannot be read"):
-        read_recording(tmp_path / "none.csv")

@@ -35,10 +35,6 @@ def write_until(enough: Event, memory: Memory) -> None:
             return
 
 
-def test_nothing_is_read_before_the_first_snapshot() -> None:
-    assert read(new_memory()) is None
-
-
 def test_the_newest_snapshot_is_read() -> None:
     memory = new_memory()
     for number in (1, 2):

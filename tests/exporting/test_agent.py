@@ -9,7 +9,6 @@ import shutil
 import zipfile
 from collections import defaultdict, deque
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -138,7 +137,7 @@ def test_a_weight_that_is_not_finite_is_refused_for_every_format(medium_agent: T
 
 @pytest.mark.parametrize(
     "text",
-    ["", "[]", "{", '{"command": 1}', '{"command": [1]}', '{"command": "a"}', '{"seed": Infinity}', "\xff"],
+    ["", "[]", '{"command": [1]}', '{"seed": Infinity}', "\xff"],
 )
 def test_a_damaged_provenance_is_left_out(text: str, medium_agent: TrainedAgent, tmp_path: Path) -> None:
     shutil.copy("cartpole_rl/pretrained/medium/agent.pt", tmp_path)
@@ -205,9 +204,7 @@ DAMAGE: dict[str, tuple[Callable[[Members], object], str]] = {
     "another guard": (with_json(guard=None), "checksum"),
     "another motor value": (with_json(motors=[-255, -200, -150, -100, 0, 100, 150, 200, 250]), "checksum"),
     "no checksum": (with_json(sha256=None), "checksum"),
-    "an array too many": (with_array("extra", [1]), "checksum"),
     "a missing array": (without("layer1.bias.npy"), "layer1.bias"),
-    "no gain": (without("layer0.gain.npy"), "layer0.gain"),
     "a missing layer": (without("layer2.weight.npy"), "layer2"),
     "another shape": (with_array("layer0.bias", np.zeros(3)), "layer0.bias has shape (3,), not (128,)"),
     "not a number": (with_array("layer0.bias", np.full(128, np.nan)), "layer0.bias is not finite"),
@@ -217,13 +214,9 @@ DAMAGE: dict[str, tuple[Callable[[Members], object], str]] = {
     "other scales": (with_json(numbers=[]), "contradicts itself"),
     "no description": (without("agent.json"), NO_FILE),
     "no JSON": (with_member("agent.json", b"{"), NO_FILE),
-    "a list": (with_member("agent.json", b"[]"), NO_FILE),
     "an infinite number": (with_json(provenance={"score": math.inf}), NO_FILE),
     "no sizes": (with_json(sizes=[]), "sizes in agent.json"),
-    "one size": (with_json(sizes=[10]), "sizes in agent.json"),
-    "text": (with_array("layer0.bias", ["one"] * 128, str), NO_FILE),
     "bytes": (with_member("layer0.bias.npy", b"one"), NO_FILE),
-    "a member more": (with_member("more.txt", b"one"), NO_FILE),
     "a pickle": (with_array("layer0.bias", [{}], object), NO_FILE),
 }
 
@@ -258,15 +251,6 @@ def test_a_damaged_file_is_refused(damage: str, file: Path) -> None:
 def test_numbers_of_another_kind_are_refused(kind: Any, exported: ExportedAgent, file: Path) -> None:
     """Converted to float32, these are the weights of the file, and have its checksum."""
     assert NO_FILE in complaint(rewritten(file, with_array("layer0.bias", exported.layers[0].bias, kind)))
-
-
-@pytest.mark.parametrize("changes", [{"cart_metres_per_count": 4.5e-5}, {"pole_counts_per_turn": 2048}])
-def test_encoders_of_another_cart_are_refused(
-    changes: dict[str, Any], exported: ExportedAgent, tmp_path: Path
-) -> None:
-    about = exported.description.model_copy(update=changes)
-    (tmp_path / "agent.npz").write_bytes(replace(exported, description=about).weights_file())
-    assert "contradicts itself" in complaint(tmp_path / "agent.npz")
 
 
 def test_a_file_that_is_none_is_refused(file: Path, tmp_path: Path) -> None:

@@ -71,13 +71,6 @@ def test_the_example_swings_up_and_balances(file: Path, tmp_path: Path) -> None:
     assert taken(journal)[-1] == "STOP"
 
 
-def test_a_cart_that_restarts_ends_it_with_an_error(file: Path, tmp_path: Path) -> None:
-    code, out, err = driven(file, tmp_path / "journal.jsonl", reset_at=26.0)  # it drives from 24 s to 34 s
-    assert (code, out) == (1, "")
-    assert "restarted" in err
-    assert taken(tmp_path / "journal.jsonl")[-1] == "STOP"
-
-
 def test_two_interrupts_stop_the_cart(file: Path, tmp_path: Path) -> None:
     journal = tmp_path / "journal.jsonl"
     with EmulatedCart(EmulatorSettings(physics_step=1e-3, journal=journal)) as cart:

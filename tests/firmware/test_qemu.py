@@ -55,8 +55,11 @@ def home(cart: SerialCart) -> None:
             assert "ended homing" in str(error) or "is too slow" in str(error)  # noqa: PT017
 
 
-def test_it_homes_drives_and_stops_like_any_cart() -> None:
-    with board() as port, SerialCart(SETTINGS.model_copy(update={"port": port})) as cart:
+def test_it_homes_drives_and_stops_like_any_cart_and_then_drives_by_its_own_policy() -> None:
+    with (
+        board("--policy", str(SHUTTLE)) as port,
+        SerialCart(SETTINGS.model_copy(update={"port": port})) as cart,
+    ):
         home(cart)
         before = cart.poll_state()
         assert abs(before.cart_counts) < 100
@@ -74,12 +77,7 @@ def test_it_homes_drives_and_stops_like_any_cart() -> None:
         assert silent[-1].motor_applied == 0
         assert cart.flags & Flags.WATCHDOG
         assert silent[-1].fault == Fault.NONE
-
-
-def test_a_policy_on_the_board_drives_while_the_host_listens() -> None:
-    options = ("--policy", str(SHUTTLE))
-    with board(*options) as port, SerialCart(SETTINGS.model_copy(update={"port": port})) as cart:
-        home(cart)
+        cart.stop()
         cart.start_policy()
         states = [cart.poll_state() for _ in range(100)]
         assert {110, -110} <= {state.motor_applied for state in states}

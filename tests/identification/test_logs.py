@@ -189,13 +189,6 @@ def test_sensors_are_known_from_motion(motion: Columns) -> None:
     assert sensors.delay.value == pytest.approx(0.01, abs=0.004)
 
 
-def test_the_zero_of_the_angle_is_known_from_motion(motion: Columns) -> None:
-    recorded = Motion(motion["x"], motion["a"] + np.radians(2), motion["u"][:-1])
-    zero = question_sensors([recorded], PERIOD).angle_zero
-    assert zero is not None
-    assert zero.value == pytest.approx(np.radians(2), abs=0.004)
-
-
 BROKEN: dict[str, tuple[Callable[[Columns], Columns], str]] = {
     "motor sign": (lambda each: {**each, "u": -each["u"]}, "motor.positive"),
     "angle sign": (lambda each: {**each, "a": -each["a"]}, "angle.positive"),
@@ -205,6 +198,10 @@ BROKEN: dict[str, tuple[Callable[[Columns], Columns], str]] = {
     "millimetres": (lambda each: {**each, "x": 1e3 * each["x"]}, "may be in mm"),
     "a row later": (lambda each: {**each, "u": np.roll(each["u"], 1)}, "layout.motor.row=in_force"),
     "three rows earlier": (lambda each: {**each, "u": np.roll(each["u"], -3)}, "over two periods later"),
+    "jitter": (
+        lambda each: {**each, "t": each["t"] + np.random.default_rng(2).uniform(0, 0.0035, STEPS)},
+        "the time between rows varies",
+    ),
     "beyond full": (lambda each: {**each, "u": 1.2 * each["u"]}, "beyond layout.motor.full=255"),
 }
 
@@ -218,16 +215,6 @@ def test_each_fault_of_a_log_is_a_doubt(
     import_logs(ImportConfig(source=path, layout=layout(), label=""), tmp_path / "run")
     doubts = re.findall("doubt: (.*)", capsys.readouterr().out)
     assert any(re.search(doubt, each) for each in doubts), doubts
-
-
-def test_jitter_is_a_doubt(tmp_path: Path, motion: Columns, capsys: pytest.CaptureFixture[str]) -> None:
-    dice = np.random.default_rng(2)
-    columns = {**motion, "t": motion["t"] + dice.uniform(0, 0.0035, STEPS)}
-    import_logs(
-        ImportConfig(source=written(tmp_path / "log.csv", columns), layout=layout(), label=""),
-        tmp_path / "run",
-    )
-    assert "doubt: the time between rows varies" in capsys.readouterr().out
 
 
 def test_logs_of_several_periods_are_refused(tmp_path: Path, motion: Columns) -> None:

@@ -55,13 +55,6 @@ def test_shared_numbers_and_initial_states_are_found(motion: Tensor) -> None:
     assert (error < torch.tensor([2e-5, 2e-4, 1e-3, 1e-2], dtype=torch.float64)).all()  # m, m/s, rad, rad/s
 
 
-def test_initial_states_alone_are_found(motion: Tensor) -> None:
-    matching = problem(motion, [])
-    match = matching.minimize(torch.empty(0, dtype=torch.float64), matching.guess, 5)
-    assert (match.motion - motion)[1].abs().max() < 2e-4  # m/s
-    assert match.cost < 0.1 * matching.cost(match.point, matching.guess).sum()
-
-
 def test_a_point_stays_within_its_limits(motion: Tensor) -> None:
     matching = problem(motion, [ACCELERATION], limit=0.5)
     match = matching.minimize(torch.zeros(1, dtype=torch.float64), matching.guess, 20)

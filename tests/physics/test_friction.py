@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from cartpole_rl.physics.dynamics import State, advance, mechanism, speed_lost
+from cartpole_rl.physics.dynamics import State, advance, mechanism
 from cartpole_rl.physics.friction import (
     CART_FRICTIONS,
     POLE_FRICTIONS,
@@ -18,7 +18,6 @@ from cartpole_rl.physics.friction import (
     step_force,
     stribeck_force,
     viscous_coefficient,
-    viscous_torque,
 )
 from cartpole_rl.physics.laws import Law
 from cartpole_rl.physics.models import Models
@@ -26,7 +25,6 @@ from cartpole_rl.physics.parameters import GRAVITY, CartParameters
 
 MakeCart = Callable[..., CartParameters]
 STICKING = [law for law in CART_FRICTIONS if law.holds_at_rest]
-DRY = [law for law in CART_FRICTIONS if law.has_formula]
 NO_POLE = {"pole_mass": 1e-9, "pole_com": 1e-3, "pole_inertia": 1e-15}
 
 
@@ -49,11 +47,6 @@ def push(
     return states
 
 
-def test_which_laws_stick_and_which_are_dry() -> None:
-    assert STICKING == ["step", "stribeck"]
-    assert DRY == ["sigmoid", "step", "stribeck"]
-
-
 class TestPower:
     """Friction never pushes along: force against velocity, torque against angular velocity."""
 
@@ -68,12 +61,6 @@ class TestPower:
         power = torque * self.speeds
         assert (power <= 0).all()
         assert (power[self.speeds.abs() > 1e-9] < 0).all() == (law != "none")
-
-    @pytest.mark.parametrize("law", DRY, ids=str)
-    def test_of_a_step(self, make_cart: MakeCart, law: Law) -> None:
-        cart = make_cart(len(self.speeds))
-        lost = speed_lost(self.speeds, self.speeds, at(0.02), cart, law)
-        assert (lost * self.speeds >= 0).all()
 
 
 class TestFormulas:
@@ -109,15 +96,9 @@ class TestFormulas:
         cart = make_cart(3, pole_viscous=0.0, pole_drag=0.0, pole_coulomb=1e-3)
         torch.testing.assert_close(bearing_torque(at(0.0, 0.5, -4.0), cart), at(0.0, -1e-3, 1e-3))
 
-    def test_drag_shows_at_large_swings(self, make_cart: MakeCart) -> None:
-        speeds, cart = at(0.1, 10.0), make_cart(2)
-        small, large = (1 - viscous_torque(speeds, cart) / drag_torque(speeds, cart)).tolist()
-        assert small < 0.02
-        assert large > 0.5
-
 
 class TestCart:
-    @pytest.mark.parametrize("step", [0.02, 0.01, 0.002])
+    @pytest.mark.parametrize("step", [0.02, 0.002])
     @pytest.mark.parametrize("law", STICKING)
     def test_coasts_to_rest_and_stays_there_exactly(self, make_cart: MakeCart, law: str, step: float) -> None:
         cart = make_cart(1, **NO_POLE)
@@ -135,7 +116,7 @@ class TestCart:
         assert end.x_dot.item() == pytest.approx(math.exp(-2.0), rel=3e-3)
 
     @pytest.mark.parametrize(("law", "breakaway"), [("step", 0.5), ("stribeck", 0.6)])
-    @pytest.mark.parametrize("step", [0.02, 0.01, 0.002])
+    @pytest.mark.parametrize("step", [0.02, 0.002])
     @pytest.mark.parametrize("side", [1, -1])
     def test_moves_only_above_the_breakaway_force(
         self, make_cart: MakeCart, law: str, breakaway: float, step: float, side: int

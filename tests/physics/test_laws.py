@@ -41,23 +41,6 @@ def test_a_parameter_that_no_law_reads_changes_nothing(models: Models, make_cart
         assert torch.equal(end_state(changed(make_cart, name), models), reference), name
 
 
-@pytest.mark.parametrize(
-    ("name", "law"),
-    [
-        ("cart_coulomb", {"cart_friction": "step"}),
-        ("cart_viscous", {"cart_friction": "linear"}),
-        ("sigmoid_slope", {"cart_friction": "sigmoid"}),
-        ("pole_drag", {"pole_friction": "exponential_drag"}),
-        ("pole_coulomb", {"pole_friction": "bearing"}),
-        ("force_linear", {"actuator": "force_curve"}),
-    ],
-)
-def test_a_parameter_that_a_law_reads_acts(name: str, law: dict[str, str], make_cart: MakeCart) -> None:
-    models = Models.of(**law)
-    assert name not in unused_parameters(models)
-    assert not torch.equal(end_state(changed(make_cart, name), models), end_state(make_cart(), models))
-
-
 def test_an_unknown_law_is_refused_with_the_names_of_all() -> None:
     with pytest.raises(
         ConfigError, match=r"'stribek' is unknown: give 'none', .*'stribeck', or your own as mod"

@@ -9,7 +9,7 @@ from cartpole_rl.errors import ConfigError
 from cartpole_rl.physics.models import REGISTRIES
 from cartpole_rl.physics.parameters import CartParameters, cart_column
 from cartpole_rl.randomization.poles import PoleSettings
-from cartpole_rl.rig.parameters import PARAMETERS, check_names, check_values
+from cartpole_rl.rig.parameters import PARAMETERS, check_values
 
 MakeCart = Callable[..., CartParameters]
 
@@ -58,11 +58,6 @@ def test_fields_share_the_tables_memory_and_cannot_be_set() -> None:
         cart.latency = torch.zeros(3)
     with pytest.raises(AttributeError, match="no parameter 'lag'"):
         _ = cart.lag
-
-
-def test_an_unknown_name_suggests_the_nearest() -> None:
-    with pytest.raises(ConfigError, match="'cart_colomb'; did you mean 'cart_coulomb'"):
-        check_names(["cart_mass", "cart_colomb"])
 
 
 def test_a_missing_value_is_named(nominal: dict[str, float]) -> None:

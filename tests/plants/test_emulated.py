@@ -1,8 +1,10 @@
-"""The serial plant on the emulated cart, as TorchRL drives it."""
+"""The emulated cart as a process and as a plant: pyserial, a pseudo-terminal, lockstep."""
 
 import contextlib
 import os
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from functools import partial
@@ -10,12 +12,11 @@ from functools import partial
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
-from torchrl.envs.utils import check_env_specs
 
 from cartpole_rl.emulator.settings import EmulatorSettings
-from cartpole_rl.errors import LinkError
+from cartpole_rl.errors import EmulatorError, LinkError
 from cartpole_rl.plants.emulated import EmulatedCart
+from cartpole_rl.plants.serial.errors import RefusedError
 from cartpole_rl.plants.serial.plant import SerialPlant, emulated_plant
 
 TURN = 4096
@@ -33,22 +34,10 @@ def push(plant: SerialPlant, motor: int) -> TensorDict:
     return plant.step(TensorDict({"motor": torch.full((1, 1), motor)}, [1]))["next"]
 
 
-def test_specs(plant: SerialPlant) -> None:
-    check_env_specs(plant)
-
-
 def test_an_episode_begins_in_the_middle_with_a_hanging_pole(plant: SerialPlant) -> None:
     cart, pole = plant.reset()["counts"][0].tolist()
     assert abs(cart) < 100
     assert abs(pole % TURN - TURN // 2) < 10
-
-
-def test_a_rollout_is_as_long_as_asked(plant: SerialPlant) -> None:
-    rollout = plant.rollout(
-        50, TensorDictModule(lambda counts: torch.zeros_like(counts[:, :1]), ["counts"], ["motor"])
-    )
-    assert rollout.shape == (1, 50)
-    assert rollout["next", "dt"].flatten().tolist() == pytest.approx([0.02] * 50)
 
 
 @pytest.mark.parametrize("side", [1, -1])
@@ -106,41 +95,83 @@ def test_a_killed_emulator_truncates_and_the_next_reset_says_so() -> None:
             plant.reset()
 
 
-def test_a_bad_cable_still_gives_whole_episodes() -> None:
-    with contextlib.closing(emulated_plant(fast(frame_loss=0.05, frame_corruption=0.05))) as plant:
-        plant.reset()
-        plant.cart.statistics.clear()
-        dts = [round(push(plant, 0)["dt"].item() / 0.02) for _ in range(200)]
-        assert plant.ended_by == ""
-        assert min(dts) == 1
-        summary = plant.cart.statistics.summary()
-        assert sum(dts) == summary.frames_received + summary.lost_frames
-        assert max(dts) > 1
-
-
 def test_pole_length_is_that_of_the_emulated_pole(plant: SerialPlant) -> None:
     assert plant.pole_length.tolist() == pytest.approx([2 * EmulatorSettings().pole_com])
 
 
-def test_closing_ends_the_process() -> None:
-    emulated = EmulatedCart(fast())
-    plant = SerialPlant(emulated.settings, owned=emulated)
-    plant.close()
-    with pytest.raises(ProcessLookupError):
-        os.kill(emulated.pid, 0)
+def test_two_hundred_periods_pass_without_a_loss(plant: SerialPlant) -> None:
+    plant.reset()
+    cart = plant.cart
+    cart.statistics.clear()
+    first = cart.get_state()
+    for _ in range(200):
+        cart.set_motor(0)
+        last = cart.get_state()
+    assert last.tick == first.tick + 200
+    assert last.time_us - first.time_us == 200 * 20_000
+    summary = cart.statistics.summary()
+    assert (summary.bad_frames, summary.lost_frames, summary.late_ticks) == (0, 0, 0)
+    assert summary.latency_samples == 200
 
 
-def test_a_restart_of_the_cart_ends_the_episode_with_what_came_last() -> None:
-    with contextlib.closing(emulated_plant(fast(reset_at=45.0))) as plant:
-        plant.reset()
-        last = None
-        for step in range(2000):
-            frame = push(plant, 100 if step % 20 < 10 else -100)
-            if frame["done"]:
-                break
-            last = frame
-        assert plant.ended_by == "link"
-        assert last is not None
-        assert frame["truncated"]
-        assert frame["counts"].tolist() == last["counts"].tolist()
-        assert frame["dt"].item() == pytest.approx(0.02)
+def test_an_armed_cart_does_not_take_another_period(plant: SerialPlant) -> None:
+    plant.reset()
+    cart = plant.cart
+    cart.statistics.clear()
+    with pytest.raises(RefusedError, match=r"refused SET_PERIOD: .*stop it first"):
+        cart.set_period(10_000)
+    with pytest.raises(RefusedError, match="out of range"):
+        cart.stop() or cart.set_period(1)
+
+
+def ended(pid: int, seconds: float = 10.0) -> bool:
+    """Return True if the process ends within `seconds`."""
+    for _ in range(int(seconds / 0.05)):
+        try:
+            os.kill(pid, 0)
+        except ProcessLookupError:
+            return True
+        time.sleep(0.05)
+    return False
+
+
+class TestProcess:
+    def test_it_runs_within_the_with(self) -> None:
+        with EmulatedCart(fast()) as emulated:
+            os.kill(emulated.pid, 0)
+            assert emulated.died == ""
+        assert ended(emulated.pid)
+
+    def test_an_early_death_is_an_error(self) -> None:
+        with pytest.raises(EmulatorError, match="exit code -9"), EmulatedCart(fast()) as emulated:
+            kill(emulated)
+
+    def test_an_early_death_does_not_hide_another_error(self) -> None:
+        with pytest.raises(ValueError, match="mine"), EmulatedCart(fast()) as emulated:
+            kill(emulated, ValueError("mine"))
+
+    def test_a_process_that_cannot_start_reports_the_reason(self) -> None:
+        wrong = EmulatorSettings.model_construct(cart_mass=-1.0)
+        with pytest.raises(EmulatorError, match=r"exit code 2: .*cart_mass"):
+            EmulatedCart(wrong)
+
+    def test_it_ends_when_the_host_dies(self) -> None:
+        program = (
+            "from cartpole_rl.plants.emulated import EmulatedCart\n"
+            "from cartpole_rl.emulator.settings import EmulatorSettings\n"
+            "import os\n"
+            "print(EmulatedCart(EmulatorSettings()).pid, flush=True)\n"
+            "os.kill(os.getpid(), 9)\n"
+        )
+        host = subprocess.run([sys.executable, "-c", program], stdout=subprocess.PIPE, check=False)
+        assert host.returncode == -signal.SIGKILL
+        assert ended(int(host.stdout))
+
+
+def kill(emulated: EmulatedCart, error: Exception | None = None) -> None:
+    """Kill the process, wait until it is gone, and raise `error`."""
+    os.kill(emulated.pid, signal.SIGKILL)
+    while not emulated.died:
+        time.sleep(0.02)
+    if error is not None:
+        raise error

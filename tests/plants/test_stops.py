@@ -179,7 +179,6 @@ def host() -> Iterator[Callable[..., "subprocess.Popen[bytes]"]]:
         (signal.SIGSTOP, "plain", "watchdog"),
         (signal.SIGTERM, "plain", "watchdog"),
         (signal.SIGTERM, "unwinds", "STOP"),
-        (signal.SIGHUP, "plain", "watchdog"),
         (signal.SIGHUP, "unwinds", "STOP"),
         (signal.SIGINT, "plain", "STOP"),
     ],

@@ -155,10 +155,6 @@ def test_carts_that_cannot_be_drawn_are_refused(
         Randomizer({**ip02, **cart}, choices, {name: Range(**line)} if name else {})
 
 
-def test_a_negative_nominal_value_may_be_scaled() -> None:
-    Range(relative=(-0.5, 0.5)).check("force_offset", -1.0)
-
-
 class TestPoles:
     def test_a_choice_sets_mass_centre_and_inertia_together(
         self, ip02: dict[str, float], both_poles: PoleSettings

@@ -11,7 +11,7 @@ import serial
 from firmwares import UnderTest, answering
 
 from cartpole_rl.errors import FrameError
-from cartpole_rl.plants.serial.cart import LEASE_RENEWAL_US, SerialCart
+from cartpole_rl.plants.serial.cart import LEASE_RENEWAL_US
 from cartpole_rl.wire import (
     Flags,
     Frame,
@@ -117,12 +117,3 @@ def emulator(*options: str, **settings: object) -> Iterator[EmulatorHost]:
         process.wait()
         if process.stdout:
             process.stdout.close()
-
-
-def drive_and_fail(cart: SerialCart) -> None:
-    """Drive a cart, and raise ZeroDivisionError under way."""
-    cart.home()
-    cart.start()
-    cart.set_motor(200)
-    assert cart.get_state().motor_applied == 200
-    raise ZeroDivisionError

@@ -1,9 +1,21 @@
-"""The task's settings: the score that judges an agent."""
+"""The task's settings: possible action sets, and the score that judges an agent."""
 
 import pytest
+from pydantic import ValidationError
 
 from cartpole_rl.choices import choice
-from cartpole_rl.tasks.settings import TaskSettings
+from cartpole_rl.tasks.settings import ActionSettings, TaskSettings
+
+
+@pytest.mark.parametrize("motors", [[], [100], [100, 100], [0, 256], [-256, 0]])
+def test_impossible_action_sets_are_refused(motors: list[int]) -> None:
+    with pytest.raises(ValidationError):
+        ActionSettings(motors=motors, actuator="newtons")
+
+
+def test_an_unknown_actuator_is_refused() -> None:
+    with pytest.raises(ValidationError):
+        ActionSettings(motors=[-1, 1], actuator="rocket")
 
 
 @pytest.mark.parametrize(("task", "measure"), [("balance", "score_upright"), ("swingup", "score")])

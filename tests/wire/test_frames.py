@@ -43,10 +43,6 @@ def test_each_type_has_one_message_and_a_layout_as_long_as_its_fields():
         assert len(kind.LAYOUT) == len(fields(kind))
 
 
-def test_sequence_is_taken_modulo_256():
-    assert decode_frame(encode_frame(Hello(), 256 + 7)[:-1]).sequence == 7
-
-
 def test_a_value_too_wide_for_its_field_is_refused():
     with pytest.raises(FrameError, match="SET_MOTOR"):
         encode_frame(SetMotor(40000), 0)
@@ -115,8 +111,3 @@ def test_splitter_skips_empty_runs_and_stays_bounded():
     assert len(splitter.pending) <= LONGEST_FRAME
     assert splitter.overlong == 1
     assert list(splitter.feed(b"\x00" + encode_frame(Hello(), 0))) == [encode_frame(Hello(), 0)[:-1]]
-
-
-def test_state_has_the_bytes_of_the_protocol():
-    state = State(1, 2, -3, 4, -5, 6, 7, 8)
-    assert state.pack().hex() == "0100000002000000fdffffff04000000fbff0607000800"

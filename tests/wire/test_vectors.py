@@ -66,11 +66,6 @@ def test_a_damaged_frame_is_dropped_and_the_next_one_is_not(vector):
             decode_frame(stuffed)
 
 
-@pytest.mark.parametrize("vector", named([vector for vector in DIALOGUE if vector["answer"]]))
-def test_an_answer_can_be_read(vector):
-    decode_frame(bytes.fromhex(vector["answer"])[:-1])
-
-
 def test_every_type_and_every_refusal_is_there():
     assert {vector["type"] for vector in GOOD} == {kind.name for kind in MessageType}
     reasons = {vector["fields"]["reason"] for vector in GOOD if vector["type"] == "NACK"}

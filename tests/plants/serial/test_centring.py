@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import pytest
 
-from cartpole_rl.plants.serial.moves import GENTLE, GENTLE_MOTOR, NOMINAL_DEADBAND, Centring, rough_motor
+from cartpole_rl.plants.serial.moves import GENTLE, GENTLE_MOTOR, NOMINAL_DEADBAND, Centring
 from cartpole_rl.wire import State
 
 PERIOD_US = 20_000
@@ -50,11 +50,3 @@ def test_the_planned_speed_changes_gently_and_slows_down_near_the_middle() -> No
 def test_a_cart_that_is_too_fast_is_braked() -> None:
     before, state = at(-FAR, 0), at(-FAR + 400, 1)
     assert Centring(0.02, NOMINAL_DEADBAND).motor(before, state) < 0
-
-
-@pytest.mark.parametrize("force", [-100.0, -0.5, 0.0, 0.01, 0.5, 100.0])
-def test_a_motor_value_has_the_sign_of_its_force_and_is_gentle(force: float) -> None:
-    motor = rough_motor(force)
-    assert abs(motor) <= GENTLE_MOTOR
-    assert motor * force >= 0
-    assert (motor == 0) == (abs(force) < 0.02)

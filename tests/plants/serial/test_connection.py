@@ -1,6 +1,5 @@
 """Questions and answers between the host and a scripted cart: repetitions, refusals, faults."""
 
-import re
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -117,13 +116,6 @@ def test_a_cart_of_another_version_is_told_in_one_line() -> None:
         assert not any(message.motor for message in peer.messages(SetMotor))
 
 
-def test_a_question_that_is_never_answered() -> None:
-    with Forgetful(Start, 99) as peer, SerialCart(quick_settings(peer.port)) as cart:
-        with pytest.raises(LinkError, match="did not answer START, asked 2 times"):
-            cart.start()
-        assert len(peer.messages(Start)) == 2
-
-
 @pytest.mark.parametrize(
     ("reason", "words"),
     [
@@ -147,14 +139,6 @@ def test_a_refusal_for_a_fault_is_a_fault() -> None:
         with pytest.raises(FaultError, match="a fault is latched: remove its cause"):
             cart.start()
         assert not peer.flags & Flags.ARMED
-
-
-def test_a_refused_motor_value_is_raised_where_the_state_is_read() -> None:
-    with Refusing(SetMotor, Reason.NOT_ARMED) as peer, SerialCart(quick_settings(peer.port)) as cart:
-        cart.set_motor(10)
-        with pytest.raises(RefusedError, match=re.escape("not armed; has it restarted?")):
-            cart.get_state()
-        assert cart.get_state()
 
 
 @pytest.mark.parametrize("accepted", [10, 140, 300])
@@ -238,13 +222,6 @@ def test_a_fault_that_stays_is_named_with_its_remedy() -> None:
         peer.state = replace(peer.state, fault=int(Fault.POLE_ENCODER | Fault.STALL) | 0x8000)
         with pytest.raises(FaultError, match=r"motor's supply.*pole's encoder.*check its cable.*0x8000"):
             cart.clear_fault()
-
-
-def test_a_homing_that_fails_names_the_fault() -> None:
-    with CartPeer() as peer, SerialCart(quick_settings(peer.port)) as cart:
-        peer.state = replace(peer.state, fault=int(Fault.HOMING))
-        with pytest.raises(FaultError, match="homing failed"):
-            cart.home()
 
 
 def test_a_homing_that_does_not_end() -> None:
@@ -389,9 +366,3 @@ def test_on_a_lockstep_cart_no_time_passes_on_the_way() -> None:
         stopped = len(peer.messages(Stop))
         cart.start()
         assert len(peer.messages(Stop)) == stopped
-
-
-def test_the_period_is_set_and_known() -> None:
-    with CartPeer() as peer, SerialCart(quick_settings(peer.port)) as cart:
-        assert cart.set_period(10_000).period_us == 10_000
-        assert cart.information.period_us == 10_000

@@ -226,9 +226,3 @@ def test_a_host_whose_first_stop_is_lost_asks_nothing_before_one_is_answered() -
     with Forgetful(Stop, 1) as peer, SerialCart(quick_settings(peer.port)):
         kinds = [type(frame.message) for frame in peer.received]
         assert kinds[: kinds.index(Hello)] == [Stop] * 3  # one was lost, two are acknowledged
-
-
-def test_a_host_that_opens_the_port_disarms_before_it_asks() -> None:
-    with CartPeer() as peer, SerialCart(quick_settings(peer.port)):
-        kinds = [type(frame.message) for frame in peer.received]
-        assert kinds[:3] == [Stop, Stop, Hello]

@@ -288,19 +288,6 @@ def test_a_fault_ends_the_episode_and_is_cleared_in_the_next_reset(peer: CartPee
     plant.close()
 
 
-def test_a_clock_that_stands_still_ends_the_episode(peer: CartPeer, plant: SerialPlant) -> None:
-    """Two states of the same time have no velocity between them."""
-    plant.reset()
-    step(plant, 100)
-    peer.state = replace(peer.state, time_us=peer.state.time_us - peer.info.period_us)
-    frame = step(plant, 100)
-    assert frame["truncated"]
-    assert frame["dt"].item() > 0
-    assert plant.ended_by == "link"
-    assert "does not advance" in str(plant.last_error)
-    assert peer.state.motor_applied == 0
-
-
 @pytest.mark.parametrize("fault", [0, int(Fault.STALL)])
 def test_a_step_after_the_end_sends_nothing(peer: CartPeer, plant: SerialPlant, fault: int) -> None:
     plant.reset()
@@ -360,13 +347,6 @@ def test_a_silent_cart_truncates_with_the_last_counts_and_can_come_back(
         plant.reset()
     peer.answer = talk
     assert plant.reset()["counts"].tolist() == [[42, HANGING]]
-
-
-def test_a_reset_mask_of_false_leaves_the_cart_alone(peer: CartPeer, plant: SerialPlant) -> None:
-    plant.reset()
-    began = len(peer.received)
-    plant.restart(torch.tensor([], dtype=torch.int64))
-    assert len(peer.received) == began
 
 
 def test_close_stops_the_motor_and_closes_what_is_owned(peer: CartPeer) -> None:

@@ -20,7 +20,6 @@ from cartpole_rl.plants.serial.port import (
     found_ports,
     only_cart,
     open_port,
-    resolved_port,
     usb_ports,
 )
 from cartpole_rl.plants.settings import SerialSettings
@@ -95,10 +94,6 @@ def test_of_several_a_person_chooses() -> None:
 def test_none_that_looks_like_a_cart(ports: list[UsbPort], words: str) -> None:
     with pytest.raises(PortError, match=words):
         only_cart(ports)
-
-
-def test_a_named_port_is_taken_as_it_is() -> None:
-    assert resolved_port("/dev/nosuch0") == "/dev/nosuch0"
 
 
 @pytest.mark.skipif(len(cart_like(found_ports())) == 1, reason="a cart is plugged in")

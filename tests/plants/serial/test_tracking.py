@@ -26,15 +26,18 @@ def drive(tracker: StateTracker, state: State, delay: float) -> None:
     tracker.send_command(1, delay)
 
 
-def test_only_a_newer_state_becomes_the_newest() -> None:
+@pytest.mark.parametrize("first", [0, 2**32 - 6, 2**32 - 7])
+def test_only_a_newer_state_becomes_the_newest(first: int) -> None:
+    """Across the wrap of the tick too."""
     tracker = tracker_of_a_cart()
-    taken = [tracker.receive(state_at(tick), Flags.ARMED, 0.0, 0) for tick in (5, 7, 6, 7, 4, 8)]
+    ticks = [(first + tick) % 2**32 for tick in (5, 7, 6, 7, 4, 8)]
+    taken = [tracker.receive(replace(state_at(0), tick=tick), Flags.ARMED, 0.0, 0) for tick in ticks]
     assert taken == [True, True, False, False, False, True]
     seen = tracker.statistics
     assert (seen.lost_frames, seen.overtaken_frames, seen.repeated_frames) == (0, 1, 2)
     newest = tracker.take_newest()
     assert newest is not None
-    assert newest.tick == 8
+    assert newest.tick == ticks[-1]
     assert tracker.take_newest() is None
 
 

@@ -17,10 +17,6 @@ SCRIPT = Path(__file__).parents[3] / "scripts/watch.py"
 OUTPUT_SPEED = 5  # of termios.tcgetattr
 
 
-def test_it_can_be_started_by_its_name() -> None:
-    assert SCRIPT.stat().st_mode & 0o100
-
-
 @pytest.mark.parametrize(("words", "speed"), [((), termios.B921600), (("--baud", "115200"), termios.B115200)])
 def test_counts_are_printed_until_an_interrupt(words: tuple[str, ...], speed: int) -> None:
     with CartPeer(paced=True) as peer:
@@ -96,11 +92,3 @@ def test_a_latched_fault_is_printed_with_what_clears_it() -> None:
     assert done.returncode == 1
     assert done.stderr.startswith("the cart refused HOME: a fault is latched")
     assert "a restart of the board clears the fault" in done.stderr
-
-
-def test_another_line_speed_is_refused_in_words() -> None:
-    done = subprocess.run(
-        [sys.executable, SCRIPT, "nosuch", "--baud", "9600"], capture_output=True, text=True
-    )
-    assert done.returncode == 2
-    assert "invalid choice: 9600 (choose from 921600, 115200)" in done.stderr

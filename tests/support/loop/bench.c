@@ -54,6 +54,9 @@ void cart_hardware_write(const uint8_t *frame, size_t length)
 void bench_boot(uint32_t now_us)
 {
     clock_us = now_us;
+    motor = 0;
+    input_length = input_at = output_length = written_when_asked = 0;
+    memset(&loop, 0, sizeof loop);
     cart_loop_boot(&loop);
     loop.core.policy = policy;
     loop.core.homed = true;
