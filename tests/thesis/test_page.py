@@ -5,26 +5,22 @@ import re
 import shutil
 import sys
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import report as script
-from charts import agreement, curves_over_axis, drawings
-from page import opening, studies_page
+from page import studies_page
 from reading import read_study
 from results import StudyResults
 from shown_pages import loaded, needs_browser, shown
-from small_results import CARTS, a_study, found, on_carts
+from small_results import found
 
 from cartpole_rl.choices import conf_folder
-from cartpole_rl.reporting.results import Agent
 
 Edit = Callable[[Path, Callable[[Any], object]], None]
 Report = Callable[..., tuple[str, str]]
-AGENTS = np.array([400.0, 450.0, 490.0])
 
 
 @pytest.fixture
@@ -164,58 +160,3 @@ def test_every_study_is_in_the_contents_whatever_its_order() -> None:
     assert len({*ids}) == len(ids) > 4  # also those of the same figure
     assert "cost $5 to $6" in re.findall(r"<text[^>]*>([^<]*)</text>", own)  # no formula
     assert "No result yet." in studies_page([found("one", {})], {})
-
-
-def test_notes_on_how_runs_were_made_stand_with_their_list() -> None:
-    notes = ("one arm: each agent has its own cart, from a run of its seed.", "The runs are of 2 commits.")
-    page = studies_page([placed("a", notes=notes)], {})
-    assert "<aside" not in page
-    assert all(note in page for note in notes)
-    assert "<aside" in studies_page([replace(placed("a"), notes=("One is odd.",))], {})
-
-
-def test_a_summary_shows_the_first_sentences() -> None:
-    long, short = f"It is {'very ' * 40}good.", "The order does not matter at all here."
-    several = "It is 0.5 of (5.3). Both fall. Neither rises."
-    texts = {f"Yes. {long} So it is.": f"Yes. {long}", f"{short} {long}": short, several: several}
-    assert {text: opening(text) for text in texts} == texts
-
-
-def test_arms_over_an_axis_form_a_line_for_each_family() -> None:
-    arms = [
-        {"name": f"{family}_{step}", "label": f"{family}, {step} ms", "value": step}
-        for family in ("explicit", "implicit")
-        for step in (20, 1)
-    ]
-    values = {arm["name"]: [{"own": 10.0 * arm["value"]}] for arm in arms}
-    (drawing, *_) = drawings(found("integrators", values, arms=arms, axis={"label": "step", "unit": "ms"}))
-    assert "over step, ms. explicit: 10.0 at 1, 200 at 20; implicit: 10.0 at 1" in drawing.alt
-    places = [0.42, 0.56, 0.703, 0.71, 1.4]
-    figure = curves_over_axis({"one": (places, [AGENTS] * 5)}, "mass, kg", "score", {"one": "k"})
-    assert [text.get_text() for text in figure.axes[0].get_xticklabels()] == ["0.42", "0.56", "0.703", "1.4"]
-    assert figure.axes[0].get_xticks(minor=True).tolist() == [0.71]
-
-
-def test_a_set_up_has_one_colour_in_all_figures_and_each_curve_is_drawn() -> None:
-    curves = {"score_upright": ((1e5, 10.0), (2e5, 20.0)), "loss": ((1e5, 0.1), (2e5, 0.5))}
-    agents = [
-        Agent(arm, seed, "run", {"own": value + seed}, curves if arm == "none" else {})
-        for arm, value in (("wide", 10.0), ("none", 30.0))
-        for seed in range(3)
-    ]
-    dots, profile, *trainings = drawings(StudyResults.of("one", a_study(), agents))
-    assert [each.caption.split(".")[0] for each in trainings] == ["Training: score (6", "Training: loss"]
-    panels = [each.figure.axes[0] for each in (profile, trainings[0])]
-    thick = [max(axes.lines, key=lambda line: line.get_linewidth()) for axes in panels]
-    assert panels[0].lines[1].get_color() == thick[1].get_color() == dots.figure.axes[0].lines[-1].get_color()
-
-
-def test_the_figures_of_two_carts() -> None:
-    values = {name: on_carts((100, 50), (first, 50), (80, 60)) for name, first in (("wide", 9), ("none", 90))}
-    names = {each.name: each for each in drawings(found("one", values, evaluations=CARTS, ratio=True))}
-    assert [*names] == ["agents", "ratios", "profiles", "agreement"]
-    assert "1 agent without ratio: under 10 % of the highest" in names["ratios"].caption
-    assert "Rank correlation over all 2 set-ups together, 6 agents." in names["agreement"].caption
-    for lowest, start in ((400.0, 400.0), (100.0, 0.0)):
-        pairs = np.stack([np.array([lowest, 450.0, 490.0])] * 2)
-        assert agreement({"one": pairs}, "x", "y").axes[0].dataLim.x0 == start

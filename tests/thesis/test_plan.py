@@ -41,6 +41,7 @@ def words_of(task: Task) -> tuple[str, ...]:
     return tuple("run=somewhere" if word.startswith("run=") else word for word in kept)
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", NAMES)
 def test_every_run_of_a_study_has_valid_settings(name: str) -> None:
     for size in ("quick", "full"):
@@ -96,16 +97,6 @@ def test_the_folder_of_all_studies_may_have_any_name(folder: str) -> None:
     assert overrides_of([word], root) == {"from": [f"{root}/a/b/1", f"{root}/c/d/1"]}
 
 
-def test_a_wrong_name_gets_the_nearest_one() -> None:
-    for name, size, complaint in (
-        ("friction_model", "quick", "friction_model: there is no such study; did you mean friction_models?"),
-        ("baseline", "fulll", "study baseline: fulll: there is no such size; did you mean full?"),
-        ("x", "quick", "x: there is no such study; --list names them"),
-    ):
-        with pytest.raises(ConfigError, match=re.escape(complaint)):
-            plan([name], size, ROOT)
-
-
 def test_a_needed_study_that_is_not_there_is_named_with_the_one_that_needs_it(tmp_path: Path) -> None:
     text = (STUDIES / "recovery.yaml").read_text().replace("{runs}/swingup", "{runs}/nope")
     (tmp_path / "recovery.yaml").write_text(text)
@@ -132,9 +123,3 @@ def test_a_needed_study_that_is_not_there_is_named_with_the_one_that_needs_it(tm
 def test_a_study_that_cannot_be_is_refused(changes: dict[str, object], complaint: str) -> None:
     with pytest.raises(ConfigError, match=re.escape(complaint)):
         a_study(**changes)
-
-
-def test_the_place_in_the_thesis() -> None:
-    places = {"6.13a": "Fig. 6.13a", "5.2, 5.3": "Fig. 5.2, 5.3", "3.1.3": "Section 3.1.3", "7": "Section 7"}
-    places |= {"table 6.3": "table 6.3", "": ""}
-    assert {figure: a_study(figure=figure).place for figure in places} == places

@@ -92,20 +92,6 @@ def test_folders_that_do_not_belong_are_named(study: Path) -> None:
     assert results.missing()[0] == "little friction, nominal cart: 2 of 3 seeds, 12 is missing"
 
 
-def test_what_is_odd_about_runs_that_count_is_noted(study: Path, edit: Edit) -> None:
-    edit(study / HEAVY / "provenance.json", lambda content: content.update(git_commit="abcdef0123456789"))
-    edit(study / HEAVY / "metrics.json", lambda content: content["score_upright"].update(count=1))
-    for config in study.glob("much/*/evaluations/heavy/config.yaml"):
-        edit(config, lambda content: content["plant"].update(substeps=7))
-    results = read_study(study)
-    unexplained, commits, partial = results.notes
-    assert unexplained == "heavy cart: plant.substeps differs between arms (4, 7) and no override sets it."
-    assert "with the same package versions: " in commits
-    assert "abcdef0123 (1)" in commits
-    assert partial.startswith("score_upright: only 1 of 2 episodes of 1 runs have it; ")
-    assert results.exclusions == ()
-
-
 def as_trainings(study: Path, edit: Edit, little: str, evaluated: str = "") -> None:
     """Turn the study into one of trainings: `much` has one for each seed, `little` names its agent.
 
@@ -140,48 +126,6 @@ def test_an_evaluation_of_another_agent_does_not_count(picked: str, study: Path,
     edit(study / "much/11/provenance.json", lambda content: content["packages"].update(torch="1.0"))
     counted = {(each.group, each.seed) for each in read_study(study).agents}
     assert counted == {("much", 10), ("little", 10)}
-
-
-def test_an_arm_of_the_baseline_is_checked_too(study: Path, edit: Edit) -> None:
-    as_trainings(study, edit, "lqr")
-    for seed, history in ((10, '{"transitions": 1, "score": 2, "score_upright": 3}\n' * 2), (11, "{")):
-        (study / f"much/{seed}/history.jsonl").write_text(history)
-    results = read_study(study)
-    assert results.exclusions == ()
-    assert {agent.seed for agent in results.agents if agent.curves} == {10}
-    damage = "quick/friction/much/11 are not drawn: line 1 of history.jsonl is damaged."
-    assert f"The curves of {damage}" in results.notes
-    as_trainings(study, edit, "lqr", "quick/friction/much/{seed}")
-    assert len(read_study(study).exclusions) == 6
-
-
-def test_a_training_that_is_not_there_is_named(study: Path, edit: Edit) -> None:
-    as_trainings(study, edit, "{runs}/elsewhere/much/{seed}", "quick/elsewhere/much/{seed}")
-    (study / "much/11/config.yaml").unlink()
-    results = read_study(study)
-    assert excluded(results) == {"much/11": "it has no config.yaml"}
-    assert "little friction: the trainings of 3 agents were not found and are not checked." in results.notes
-
-
-def test_agents_may_have_settings_from_runs_of_their_own_seeds(study: Path, edit: Edit) -> None:
-    as_trainings(study, edit, "lqr")
-    for seed in (10, 11, 12):
-        place = study / "much" / str(seed)
-        edit(place / "config.yaml", lambda content, seed=seed: content.update(cart={"cart_mass": seed}))
-        for heavy in place.glob("evaluations/*/config.yaml"):
-            edit(heavy, lambda content, seed=seed: content["evaluated"]["cart"].update(cart_mass=seed))
-    assert len(read_study(study).exclusions) == 2 + 4
-    for seed in (10, 11, 12):
-        words = ["cartpole-train", f"cart=runs/identified/{seed}/cart.yaml", f"seed={seed}"]
-        edit(
-            study / f"much/{seed}/provenance.json", lambda content, words=words: content.update(command=words)
-        )
-    results = read_study(study)
-    assert results.exclusions == ()
-    assert "much friction: each agent has its own cart, guard, from a run of its seed." in results.notes
-    edit(study / "much/12/provenance.json", lambda content: content.update(command=["x", "pole=large"]))
-    edit(study / "much/12/config.yaml", lambda content: content.update(pole={"choices": {}}))
-    assert [*excluded(read_study(study))] == ["much/12"]
 
 
 def test_the_small_files_hold_the_same_results(study: Path) -> None:

@@ -3,7 +3,6 @@
 Runs that were made with other settings, or of an agent that was trained again, do not count as done.
 """
 
-import errno
 import json
 import re
 import shutil
@@ -21,17 +20,18 @@ import reproduce as script
 import yaml
 from command_line import HANDLED, TINY, Outcome, outcome
 from plan import Task, plan
-from reproduce import Progress, Schedule, failure_of, reproduce
+from reproduce import Schedule, reproduce
 from study import Study
-from worker import carry_out, finish, is_complete, made_otherwise, prepare, reason_of
+from worker import carry_out, finish, is_complete, made_otherwise, prepare
 
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.files import claimed
+from cartpole_rl.reporting import style
 from cartpole_rl.reporting.runs import read_run
 from cartpole_rl.run_folder import recorded_provenance
-from cartpole_rl.workflows import report, train
+from cartpole_rl.workflows import train
 
-CHECKOUT = Path(script.__file__).parents[2]
+pytestmark = pytest.mark.nightly
 TRAINED, IMPOSSIBLE, LQR, SHARED, HEN, EGG = (
     {"name": name, "label": name, "overrides": words}
     for name, words in {
@@ -169,20 +169,6 @@ def test_an_agent_of_another_study_is_not_trained_again(done: Done, source: Path
     assert again.out.splitlines()[-1] == f"the page: scripts/thesis/report.py '{done.root}'"
 
 
-def test_of_a_baseline_nothing_but_its_other_evaluations_stays(done: Done, source: Path) -> None:
-    (baseline,) = (
-        task for task in plan(["toy"], "quick", done.root, source) if task.folder.parts[-2] == "lqr"
-    )
-    away = done.root.parent / "away"
-    away.mkdir()
-    (away / "file").touch()
-    (baseline.folder / "link").symlink_to(away)
-    assert not prepare(baseline)
-    assert (away / "file").exists()
-    assert [path.name for path in baseline.folder.iterdir()] == ["evaluations"]
-    assert (baseline.folder / "evaluations/own/metrics.json").exists()
-
-
 def test_only_complete_runs_of_the_same_settings_and_agent_are_done(done: Done, source: Path) -> None:
     trained, evaluation = plan(["toy"], "quick", done.root, source)[:2]
     assert Schedule([trained, evaluation], done.root).waiting == []
@@ -257,7 +243,7 @@ def test_a_run_that_ends_too_early_is_not_complete(
         raise KeyboardInterrupt
 
     monkeypatch.setattr(sys, "argv", [])
-    for name, module, last in (("short", train, "forget_training"), ("lqr", report, "save")):
+    for name, module, last in (("short", train, "forget_training"), ("lqr", style, "save")):
         (task,) = plan([name], "quick", tmp_path, source)
         with monkeypatch.context() as patched:
             patched.setattr(module, last, killed)
@@ -287,47 +273,6 @@ def test_runs_that_need_each_other_fail(source: Path, tmp_path: Path) -> None:
     assert [task.folder.name for task in schedule.waiting] == ["d", "e"]
 
 
-def test_a_failure_has_a_reason_in_one_line(tmp_path: Path) -> None:
-    for error, reason in (
-        (ConfigError("two\nlines"), "two lines"),
-        (ZeroDivisionError("a\nb"), "ZeroDivisionError: a b"),
-        (OSError(errno.ENOSPC, "Full", "a/b"), "a/b: Full"),
-        (OSError(errno.ENOSPC, "Full"), "Full"),
-    ):
-        assert reason_of(error) == reason
-    task = Task("toy", "finetune", tmp_path, tmp_path, ())
-    (tmp_path / "metrics.json").touch()
-    ends = [failure_of(task, *end) for end in ((-9, ""), (1, "it diverged"), (1, ""), (0, ""))]
-    assert ends[:3] == ["signal 9 ended its process", "it diverged", "exit status 1"]
-    assert ends[3].startswith("it ended without all of its results")
-    (tmp_path / "comparison.json").touch()
-    assert failure_of(task, 0, "") == ""
-    (tmp_path / "checkpoints").mkdir()
-    (tmp_path / "checkpoints/resume.pt").touch()
-    assert failure_of(task, 0, "") != ""
-
-
-def test_the_time_left_is_that_of_similar_runs() -> None:
-    run, evaluation, other = (
-        Task(study, command, Path("runs", study, "arm/10"), Path("runs"), ())
-        for study, command in (("toy", "train"), ("toy", "evaluate"), ("other", "train"))
-    )
-    ended, six = (run, 90, ""), (evaluation, 6, "")
-    for done, left, line in (
-        ([ended], [run, run], "2 min, about 2 min left"),
-        ([ended, (other, 10, "")], [run], "10 s, about 45 s left"),
-        ([ended], [other], "2 min, about 45 s left"),
-        ([six], [run], "6 s"),
-        ([six], [run, evaluation], "6 s, at least 3 s left"),
-        ([six, (run, 1, "it diverged")], [evaluation], "FAILED: it diverged, about 3 s left"),
-    ):
-        lines: list[str] = []
-        progress = Progress(9, 2, lines.append)
-        for task, seconds, failure in done:
-            progress.finished(task, "run", seconds, left, failure)
-        assert lines[-1].partition("run: ")[2] == line
-
-
 def test_a_mistake_is_one_line_and_a_list_a_table(source: Path, tmp_path: Path, called: Any) -> None:
     (tmp_path / "file").touch()
     (tmp_path / "quick/lqr").mkdir(parents=True)
@@ -346,22 +291,3 @@ def test_a_mistake_is_one_line_and_a_list_a_table(source: Path, tmp_path: Path, 
     heading, *rows = called("--list").out.splitlines()
     assert re.split(r" {2,}", heading) == ["study", "figure or section", "question"]
     assert sorted(row.split()[0] for row in rows) == sorted(STUDIES)
-
-
-def test_a_folder_in_the_checkout_has_one_name_from_everywhere(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(CHECKOUT / "docs")
-    assert script.as_in_checkout("x") == Path("docs/x")
-    assert script.as_in_checkout(f"{CHECKOUT}/x") == CHECKOUT / "x"
-    monkeypatch.chdir("/")
-    assert script.as_in_checkout("x") == Path("/x")
-
-
-def test_the_shell_script_stays_in_the_folder_of_the_caller(tmp_path: Path) -> None:
-    copy, python = tmp_path / "checkout/scripts/reproduce", tmp_path / "checkout/.venv/bin/python"
-    for file in (copy, python):
-        file.parent.mkdir(parents=True)
-    shutil.copy(CHECKOUT / "scripts/reproduce", copy)
-    python.write_text('#!/bin/sh\npwd\necho "$@"\n')
-    python.chmod(0o755)
-    shown = subprocess.run([copy, "--list"], cwd="/", capture_output=True, text=True)
-    assert shown.stdout.splitlines() == ["/", f"{copy.parent}/thesis/reproduce.py --list"]

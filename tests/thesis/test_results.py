@@ -109,30 +109,6 @@ def test_each_evaluation_that_a_study_judges_counts() -> None:
     assert (results.status(), results.reason()[-13:]) == (Status.FAILS, " (large cart)")
 
 
-def test_an_answer_is_short() -> None:
-    values = {"wide": over_knocks((4000, 3000), (4000, 500)), "none": over_knocks((3000, 0), (3000, 0))}
-    first, last = answer(found("knocks", values, evaluations=KNOCKS, axis={"label": "knock"}))
-    means = "drawn 4000 (4000 to 4000), not drawn 3000 (3000 to 3000)"
-    assert first == f"Score (6.2), knock 0 rad/s: {means}; 2 agents each."
-    assert last.startswith("Score (6.2), knock 4 rad/s: drawn 1750 (500 to 3000), not drawn 0 (0 to 0)")
-    arms = [{"name": f"a{number}", "label": f"force {number} N"} for number in range(5)]
-    values = {each["name"]: [{"own": float(number)}] * 2 for number, each in enumerate(arms)}
-    ends = "highest “force 4 N” 4.00 (4.00 to 4.00), lowest “force 0 N” 0 (0 to 0); 2 agents each."
-    upright = answer(found("one", values, arms=arms, measure="upright_fraction"))
-    assert upright == [f"Share of time upright, 5 set-ups: {ends}"]
-    errors = {"wide": [{"own": 0.5}] * 3, "none": [{"own": 0.25}] * 3}
-    (error,) = answer(found("one", errors, measure="errors.median", command="identify"))
-    assert "(lower is better): not drawn 0.250 (0.250 to 0.250), drawn 0.500" in error
-    assert error.endswith("; 3 identifications each.")
-
-
-def test_agents_that_fail_on_the_first_cart_have_no_ratio() -> None:
-    values = {"wide": on_carts((100, 50), (9, 50), (0, 50)), "none": on_carts((10, 20), (10, 10))}
-    results = found("one", values, evaluations=CARTS, ratio=True)
-    np.testing.assert_allclose(results.ratios("wide"), [0.5])
-    assert answer(results)[1].endswith("not drawn 1.50 (1.00 to 2.00) of 2 agents, drawn 0.500 of 1 agent.")
-
-
 def test_robustness_is_the_mean_share_of_successes_over_criteria() -> None:
     first = {"wide": over_knocks((4000, 3000), (4000, 500)), "none": over_knocks((4000, 0), (100, 0))}
     second = {"wide": over_knocks((4000, 4000), (4000, 4000)), "none": over_knocks((0, 0), (0, 0))}
@@ -148,31 +124,6 @@ def test_robustness_is_the_mean_share_of_successes_over_criteria() -> None:
         "robustness_knocks", {**first, "wide": first["wide"][:1]}, evaluations=KNOCKS, axis={"label": "k"}
     )
     assert [*robustness([lacking])[1].values()] == ["drawn", "–", "–", 1]
-
-
-def test_agents_are_ranked_once_and_by_their_own_score() -> None:
-    shared = on_carts((1, 2), (2, 3), (3, 1), (4, 4))
-    arms = [
-        {"name": "wide", "label": "drawn", "overrides": ["run={runs}/one/wide/{seed}"]},
-        {"name": "none", "label": "b"},
-    ]
-    one, few, same, balances = (
-        found("one", {"wide": values}, evaluations=CARTS, measure=measure)
-        for values, measure in (
-            (shared, "score"),
-            (shared[:2], "score"),
-            (on_carts((0, 0), (0, 0), (1, 2)), "score"),
-            (shared, "score_upright"),
-        )
-    )
-    two = found("two", {"wide": shared, "none": on_carts((5, 5), (6, 9))}, evaluations=CARTS, arms=arms)
-    assert rank_agreements([one, two])[0].caption.startswith("6 agents of 2 studies")
-    assert rank_agreements([few]) == []
-    third, fourth = rank_agreements([same, balances])
-    assert (third.caption[:8], fourth.caption[:8]) == ("3 agents", "4 agents")
-    assert third.answer == "Score (6.2): too few agents for a rank correlation with an interval."
-    many = [found(f"n{n}", {"wide": on_carts((n, 2 * n + 1))}, evaluations=CARTS) for n in range(9)]
-    assert rank_agreements(many)[0].caption.endswith("Colours do not distinguish the studies.")
 
 
 def test_the_answer_follows_the_interval_of_the_rank_correlation() -> None:
