@@ -95,6 +95,15 @@ def make_cart(ip02: dict[str, float], medium: PoleSettings) -> Callable[..., Car
 
 
 @pytest.fixture
+def without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Draw no figures and no animations, which take most of the time of a tiny run."""
+    episodes = "cartpole_rl.reporting.episodes"
+    for name in (f"{episodes}.draw", "cartpole_rl.workflows.monitor.TrainingMonitor._log_pictures"):
+        monkeypatch.setattr(name, lambda *arguments: None)
+    monkeypatch.setattr(f"{episodes}.style.save", lambda *arguments: None)
+
+
+@pytest.fixture
 def own_extensions() -> Iterator[None]:
     """Forget the extensions and parameters that a test registers."""
     before = {kind: {**registry._entries} for kind, registry in Registry.all.items()}

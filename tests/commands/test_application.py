@@ -1,6 +1,5 @@
 """Response of every command to signals that end it."""
 
-import errno
 import os
 import signal
 import subprocess
@@ -21,7 +20,7 @@ from hydra.core.utils import JobReturn
 from cartpole_rl import cli
 from cartpole_rl.cli import VERBS
 from cartpole_rl.command import run_command
-from cartpole_rl.exits import Terminated, exit_with_message
+from cartpole_rl.exits import Terminated
 from cartpole_rl.signals import UNWINDING, RaiseOnce, ending_signals
 from cartpole_rl.workflows.find_port import FindPortConfig
 
@@ -121,11 +120,6 @@ def test_a_full_disk_ends_a_command_with_one_line(
     )
 
 
-def test_an_error_of_the_system_that_concerns_no_file_is_raised() -> None:
-    with pytest.raises(OSError, match="Bad file descriptor"):
-        exit_with_message("train", OSError(errno.EBADF, "Bad file descriptor"))
-
-
 def test_a_pipe_without_a_reader_ends_a_command_quietly() -> None:
     """As in `cartpole-train --cfg job | head -1`, once `head` has ended."""
     program = (
@@ -141,11 +135,6 @@ def test_a_pipe_without_a_reader_ends_a_command_quietly() -> None:
     done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, check=False)
     os.close(writer)
     assert (done.returncode, done.stderr) == (141, b"")
-
-
-def test_another_broken_pipe_is_raised() -> None:
-    with pytest.raises(BrokenPipeError):
-        exit_with_message("train", BrokenPipeError(errno.EPIPE, "Broken pipe"))
 
 
 class FreshLauncher(BasicLauncher):

@@ -42,20 +42,6 @@ def test_the_student_is_an_agent_like_any_other(trained: Path, tmp_path: Path) -
     assert done.code == 0, done.err
 
 
-def test_bad_input_is_answered_with_one_line(trained: Path, tmp_path: Path) -> None:
-    for words, remedy in {
-        "run=nowhere": "run=nowhere: there is no such file or folder",
-        f"run={trained} hidden=[]": "hidden",
-        f"run={trained} hidden=[7]": "even numbers of units",
-        f"run={trained} distillation.rounds=0": "give at least 1",
-        "run=lqr": "run=lqr: the baseline has no network",
-    }.items():
-        done = in_process("distill", *words.split(), "hydra.run.dir=run", folder=tmp_path)
-        assert done.code in (1, 2)
-        assert remedy in done.complaint
-        assert not (tmp_path / "run/config.yaml").exists()
-
-
 def test_an_interrupted_one_says_what_to_do(trained: Path, tmp_path: Path) -> None:
     interrupt_after(tmp_path / "half/provenance.json")
     words = (f"run={trained}", "distillation.rounds=100000", "hydra.run.dir=half")

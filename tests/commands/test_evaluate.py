@@ -47,19 +47,19 @@ def repeat(trained: Path, folder: Path, run: str, number: int, *words: str):
     return in_process("evaluate", f"run={trained}", *given, *words, folder=folder)
 
 
-@pytest.mark.parametrize("number", [0, 3, 6])
-def test_the_same_cart_from_the_same_start_scores_the_same(
-    number: int, trained: Path, evaluated: Path
-) -> None:
-    done = repeat(trained, evaluated, "wide", number)
-    assert done.code == 0, done.err
-    then, now = read(evaluated / "wide"), read(evaluated / f"again_wide_{number}")
-    assert len(now["episodes"]) == 1
-    for key in SAME:
-        assert now["episodes"][0][key] == then["episodes"][number][key], key
-    assert read_origin(now, 0) == read_origin(then, number)
-    assert f"episode {number} of wide had score" in done.out
-    assert "now exactly the same" in done.out
+def test_the_same_cart_from_the_same_start_scores_the_same(trained: Path, evaluated: Path) -> None:
+    """Also where a repetition is repeated."""
+    then = read(evaluated / "wide")
+    for run, number, folder in (("wide", 6, "again_wide_6"), ("again_wide_6", 0, "again_again_wide_6_0")):
+        done = repeat(trained, evaluated, run, number)
+        assert done.code == 0, done.err
+        now = read(evaluated / folder)
+        assert len(now["episodes"]) == 1
+        for key in SAME:
+            assert now["episodes"][0][key] == then["episodes"][6][key], key
+        assert read_origin(now, 0) == read_origin(then, 6)
+        assert f"episode {number} of {run} had score" in done.out
+        assert "now exactly the same" in done.out
 
 
 def test_the_carts_of_an_evaluation_differ_and_are_told_whole(evaluated: Path) -> None:

@@ -34,14 +34,6 @@ def test_a_watch_without_changes_times_out(tmp_path: Path) -> None:
     assert "no port appeared or vanished within 0.3 s" in done.complaint
 
 
-def test_a_wrong_setting_is_reported(tmp_path: Path) -> None:
-    assert in_process("find_port", "timeout=-1", folder=tmp_path).code == 2
-
-
-def test_help_has_examples(tmp_path: Path) -> None:
-    assert "cartpole-find-port watch=true" in in_process("find_port", "--help", folder=tmp_path).out
-
-
 @pytest.mark.parametrize(
     ("ports", "last"),
     [

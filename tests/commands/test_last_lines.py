@@ -16,6 +16,7 @@ from hydra_configs import shipped_choices
 from cartpole_rl.command import wrapped
 from cartpole_rl.terminal import progress_bar
 
+pytestmark = pytest.mark.usefixtures("without_pictures")
 SIMULATED = "cartpole-evaluate run=run plant=emulated"
 EMULATED = "cartpole-finetune run=run plant=emulated"
 

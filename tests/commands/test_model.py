@@ -106,27 +106,6 @@ def test_a_missing_or_damaged_model_is_one_line(tmp_path: Path) -> None:
     assert done.code == 2
 
 
-@pytest.mark.parametrize(
-    ("words", "complaint", "code"),
-    [
-        (
-            "from=nowhere",
-            "from=nowhere: there is no such file or folder; "
-            "give a run of cartpole-record or cartpole-identify",
-            2,
-        ),
-        ("", "from is missing; give from=runs/record/<run>", 2),
-        ("from=. windows=2", "windows=2: give at least 10", 2),
-        ("from=. ensemble.validation=0", "ensemble.validation=0: give more than 0", 2),
-    ],
-)
-def test_what_cannot_be_learned_from(words: str, complaint: str, code: int, tmp_path: Path) -> None:
-    done = in_process("model", *words.split(), folder=tmp_path)
-    assert done.complaint == f"cartpole-model: {complaint}"
-    assert done.code == code
-    assert not list(tmp_path.glob("runs/model/*"))
-
-
 def test_too_short_a_recording_says_so(recorded: Path, tmp_path: Path) -> None:
     lines = (recorded / "recordings/episode_000.csv").read_text().splitlines()
     heading = sum(line.startswith("#") for line in lines)

@@ -1,23 +1,130 @@
-"""A person's own files and mappings: the commands and the Python API read the same from them."""
+"""A user's own files and mappings: the commands and the Python API find them, and read the same from them."""
 
-import os
 import shlex
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
-from command_line import TINY, in_process
+from command_line import ONCE, TINY, in_process
+from every_command import COMMANDS, GROUPS, REQUIRED, SCHEMAS, contents, required, run, value_at
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
+from cartpole_rl.checking import checked
+from cartpole_rl.choices import default_choices, group_choices
+from cartpole_rl.composition import compose
 from cartpole_rl.errors import ConfigError
+from cartpole_rl.settings import Settings
 from cartpole_rl.terminal import as_value, as_word
 from cartpole_rl.workflows.config import TrainConfig, load_settings
 
 TENTH = {"cart_mass": {"relative": [-0.1, 0.1]}}
 REWARD = {"kind": "score", "scale": 0.1, "track_penalty": 0, "position_cost": 0}
 HEAVY = "defaults: [ip02]\ncart_mass: 1.4\n"
+KINDS = {  # of files that are right: name, and what is done with the text
+    "named like a shipped choice": ("{shipped}.yaml", str.encode),
+    "in a folder": ("deep/{shipped}.yaml", str.encode),
+    "with a byte order mark": ("mine.yaml", lambda text: text.encode("utf-8-sig")),
+    "of Windows": ("mine.yaml", lambda text: text.replace("\n", "\r\n").encode()),
+    "with odd characters": ("a b,c#d=e[f](g){h}é'.yaml", str.encode),
+    "named like a value": ("true.yaml", str.encode),
+    "named like a number": ("1.5.yaml", str.encode),
+    "in an odd folder": ("a b,c=#é/mine.yaml", str.encode),
+    "with a short suffix": ("mine.yml", str.encode),
+}
+UNREAD = {command: {"emulator"} for command in ("evaluate", "record", "preflight")}  # by their default plant
+
+
+def numbers(tree: Mapping[str, Any], path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], float]]:
+    """The positive floats in a tree."""
+    for name, value in tree.items():
+        if isinstance(value, dict):
+            yield from numbers(value, (*path, name))
+        elif isinstance(value, float) and value > 0:
+            yield (*path, name), value
+
+
+def own_choice(command: str, group: str) -> tuple[str, dict[str, Any], tuple[str, ...], float | None]:
+    """A shipped choice of a group, changes of it for a file, and which number is then found where."""
+    default = default_choices(command)[group] or next(iter(group_choices(group)))
+    if group == "experiment":
+        return default, {"seed": 7}, ("seed",), 7
+    if group == "emulator":
+        return default, {"cart_viscous": 0.77}, (group, "cart_viscous"), 0.77
+    found = next(numbers(group_choices(group)[default]), None)
+    if found is None:
+        return default, {}, (), None
+    path, value = found
+    changed: Any = round(0.99 * value, 12)
+    number = changed
+    for name in reversed(path):
+        changed = {name: changed}
+    return default, changed, (group, *path), number
+
+
+def own_choices(command: str) -> Iterator[tuple[str, str, dict[str, Any]]]:
+    """Each group of a command, a shipped choice of it, and changes."""
+    for other, group in GROUPS:
+        if other == command and group not in UNREAD.get(command, ()):
+            default, changes, *_ = own_choice(command, group)
+            yield group, default, changes
+
+
+def found_numbers(config: Settings, command: str) -> dict[tuple[str, ...], tuple[float, Any]]:
+    """The number that the file of each group gives, and the one that is composed."""
+    cases = (own_choice(command, group)[2:] for group, *_ in own_choices(command))
+    return {path: (number, value_at(config, path)) for path, number in cases if number is not None}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_files_of_all_groups_are_found_from_everywhere(command: str, tmp_path: Path) -> None:
+    """Here, where one file extends another, by a whole path, in --config-dir, in a sweep, and from Python."""
+    words: dict[str, list[str]] = {"here": [], "whole": [], "folder": ["--config-dir=own"]}
+    by_name: dict[str, Any] = {**REQUIRED.get(command, {})}
+    for group, default, changes in own_choices(command):
+        text = yaml.safe_dump({"defaults": [default], **changes})
+        (tmp_path / f"{group}.yaml").write_text(text)
+        (tmp_path / f"{group}_extended.yaml").write_text(f"defaults: [{group}.yaml]\n")
+        file = tmp_path / "own" / group / "mine.yaml"
+        file.parent.mkdir(parents=True)
+        file.write_text(f"# @package _global_\n{text}" if group == "experiment" else text)
+        words["here"].append(f"{group}={group}_extended.yaml")
+        words["whole"].append(f"{group}={tmp_path}/{group}.yaml")
+        words["folder"].append(f"{group}=mine")
+        by_name[group] = tmp_path / f"{group}.yaml"
+    before = contents(tmp_path)
+    expected = checked(SCHEMAS[command], compose(command, by_name))
+    assert all(given == number for given, number in found_numbers(expected, command).values())
+    for where, given in words.items():
+        done, config = run(command, *required(command), *given, folder=tmp_path)
+        assert (done.code, done.err) == (0, ""), (where, done)
+        assert config == expected, where
+    assert contents(tmp_path) == before
+    group, *_ = next(own_choices(command))
+    both = f"{group}={group}.yaml,{group}_extended.yaml"
+    found: list[Settings] = []
+    swept = (*required(command), *words["here"][1:], "-m", both)
+    done = in_process(command, *swept, folder=tmp_path, function=lambda config: found.append(config))
+    assert (done.code, found) == (0, [expected, expected]), done
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_file_may_have_any_name(kind: str, tmp_path: Path) -> None:
+    """Of cartpole-train, which reads most groups, and of another command."""
+    others = [command for command in COMMANDS if command != "train"]
+    name, encoded = KINDS[kind]
+    for command in ("train", others[[*KINDS].index(kind) % len(others)]):
+        words = required(command)
+        for group, default, changes in own_choices(command):
+            file = tmp_path / command / group / name.replace("{shipped}", default)
+            file.parent.mkdir(parents=True)
+            file.write_bytes(encoded(yaml.safe_dump({"defaults": [default], **changes})))
+            words.append(f"{group}={file}")
+        done, config = run(command, *words, folder=tmp_path)
+        assert (done.code, done.err) == (0, ""), done
+        assert config is not None
+        assert all(given == number for given, number in found_numbers(config, command).values())
 
 
 def shown(folder: Path, *words: str) -> dict[str, Any]:
@@ -36,24 +143,16 @@ def refused(folder: Path, *words: str) -> str:
     return done.complaint.removeprefix("cartpole-train: ")
 
 
-@pytest.mark.parametrize("path", ["ip02.yaml", "./ip02.yaml", "{folder}/ip02.yaml"])
-def test_a_file_named_like_a_shipped_choice_is_read(path: str, tmp_path: Path) -> None:
-    (tmp_path / "ip02.yaml").write_text(HEAVY)
-    assert shown(tmp_path, f"cart={path.format(folder=tmp_path)}")["cart"]["cart_mass"] == 1.4
-    assert load_settings(TrainConfig, {"cart": tmp_path / "ip02.yaml"}).cart["cart_mass"] == 1.4
-
-
-def test_a_sweep_reads_a_file_named_like_a_shipped_choice_too(tmp_path: Path) -> None:
-    (tmp_path / "ip02.yaml").write_text(HEAVY)
-    words = ("-m", "cart=ip02,ip02.yaml", "seed=0,1", "--cfg", "job", "-p", "cart.cart_mass")
-    done = in_process("train", *words, folder=tmp_path)
-    assert (done.code, done.out.split(), done.err) == (0, ["0.703", "0.703", "1.4", "1.4"], "")
-
-
 def test_files_of_config_dir(tmp_path: Path) -> None:
     (tmp_path / "own/cart").mkdir(parents=True)
     (tmp_path / "own/cart/lab.yaml").write_text(HEAVY)
     assert shown(tmp_path, "--config-dir", "own", "cart=lab")["cart"]["cart_mass"] == 1.4
+    (tmp_path / "own/experiment").mkdir()
+    (tmp_path / "own/experiment/trial.yaml").write_text(
+        "# @package _global_\ndefaults: [override /cart: lab]\nagent: {gamma: 0.95}\n"
+    )
+    settings = shown(tmp_path, "--config-dir=own", "experiment=trial")
+    assert (settings["cart"]["cart_mass"], settings["agent"]["gamma"]) == (1.4, 0.95)
     (tmp_path / "own/cart/ip02.yaml").write_text(HEAVY)
     complaint = refused(tmp_path, "--config-dir", "own", "cart=ip02")
     assert complaint == "--config-dir=own: cart/ip02.yaml has the name of a shipped choice; rename it"
@@ -158,14 +257,9 @@ def test_a_printed_word_survives_the_shell_and_hydra(written: Callable[[str, str
     assert (override.is_sweep_override(), override.value()) == (False, value)
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_a_printed_command_with_a_label_of_two_words_runs(tmp_path: Path) -> None:
-    done = in_process("train", *TINY, "label=two words", folder=tmp_path)
+    done = in_process("train", *TINY, ONCE, "label=two words", folder=tmp_path)
     command, *words = shlex.split(done.out.splitlines()[-1])
     done = in_process(command.removeprefix("cartpole-"), *words[:1], "episodes=1", folder=tmp_path)
     assert done.code == 0, done
-    odd = os.fsdecode(os.fsencode(tmp_path / "runs/train/odd") + b"\xff")
-    next((tmp_path / "runs/train").iterdir()).rename(odd)
-    assert in_process("train", *TINY, "seed=1", "hydra.run.dir=runs/train/other", folder=tmp_path).code == 0
-    done = in_process("report", "runs=runs/train", "animations=false", folder=tmp_path)
-    assert (done.code, done.err) == (0, ""), done
-    assert "2 runs count, 0 do not" in done.out

@@ -68,22 +68,3 @@ def test_a_port_without_a_cart_is_reported(tmp_path: Path) -> None:
     done = in_process("preflight", "plant.port=/dev/nosuch0", folder=tmp_path)
     assert done.code == 1
     assert done.out.startswith("BAD  link: /dev/nosuch0 does not exist: plug the cart in")
-
-
-def test_a_port_has_to_be_given(tmp_path: Path) -> None:
-    done = in_process("preflight", folder=tmp_path)
-    assert done.code == 2
-    assert "plant.port is missing; give plant.port=/dev/ttyUSB0" in done.complaint
-
-
-def test_a_simulated_cart_has_nothing_to_check(tmp_path: Path) -> None:
-    done = in_process("preflight", "plant=simulated", folder=tmp_path)
-    assert done.code == 2
-    assert "plant" in done.complaint
-
-
-def test_help_has_examples(tmp_path: Path) -> None:
-    assert (
-        "cartpole-preflight plant=serial plant.port=auto"
-        in in_process("preflight", "--help", folder=tmp_path).out
-    )

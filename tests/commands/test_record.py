@@ -1,6 +1,5 @@
 """cartpole-record on every kind of cart and when it is interrupted, and run=lqr."""
 
-import json
 import math
 from pathlib import Path
 
@@ -43,14 +42,6 @@ def test_the_baseline_drives_the_emulated_cart_with_its_own_pole(tmp_path: Path)
     assert math.remainder(read_recording(path).theta[-1], math.tau) == pytest.approx(0, abs=0.1)
 
 
-def test_an_evaluation_takes_the_baseline(tmp_path: Path) -> None:
-    done = in_process("evaluate", "run=lqr", "pole=large", "episodes=2", "hydra.run.dir=run", folder=tmp_path)
-    assert done.code == 0, done.err
-    metrics = json.loads((tmp_path / "run/metrics.json").read_text())
-    assert metrics["pole"] == "large"
-    assert metrics["score"]["mean"] > 2900
-
-
 def test_the_baseline_knows_the_nominal_cart_and_not_the_simulated_one(tmp_path: Path) -> None:
     for run, parameters in {"nominal": "null", "other": "{force_linear:0.03}"}.items():
         words = ("run=lqr", "episodes=1", f"parameters={parameters}", f"hydra.run.dir={run}")
@@ -67,10 +58,6 @@ def test_the_baseline_has_one_pole(pole: str, tmp_path: Path) -> None:
     assert "run=lqr takes one pole" in done.complaint
     assert "choose one, as pole=medium" in done.complaint
     assert not list(tmp_path.glob("runs/record/*"))
-
-
-def test_recording_needs_a_run(tmp_path: Path) -> None:
-    assert "run is missing; give run=runs/train/<run>" in in_process("record", folder=tmp_path).complaint
 
 
 def test_an_interrupt_keeps_the_finished_episodes(tmp_path: Path) -> None:

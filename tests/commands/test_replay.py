@@ -48,12 +48,6 @@ def test_another_cart_is_not_followed(recorded: Path, tmp_path: Path) -> None:
     assert results["errors"][0]["rms_x_mm"] > 0.3
 
 
-def test_a_longer_stretch_is_one_of_fewer(recorded: Path, tmp_path: Path) -> None:
-    _, results = replay(recorded, tmp_path, "restart=0.5", "cart_friction=step", "plant.substeps=8")
-    assert [each["after_s"] for each in results["errors"]] == [0.1, 0.5]
-    assert results["errors"][0]["windows"] == 40
-
-
 def test_the_recorded_pole_is_the_simulated_one(recorded: Path, tmp_path: Path) -> None:
     text = (recorded / "recordings/episode_000.csv").read_text()
     (tmp_path / "large.csv").write_text(text.replace("pole_length_m: 0.3556", "pole_length_m: 0.6560"))
@@ -79,27 +73,6 @@ def test_a_pole_of_another_length_has_to_be_given(recorded: Path, tmp_path: Path
         "cartpole-replay: pole: one of 0.5 m was recorded; give pole=medium, large or your own"
     )
     assert done.code == 2
-
-
-@pytest.mark.parametrize(
-    ("words", "complaint", "code"),
-    [
-        (
-            "from=nowhere",
-            "from=nowhere: there is no such file or folder; "
-            "give a run of cartpole-record or cartpole-identify",
-            2,
-        ),
-        ("from=.", "from=.: it contains no recording; give a run of cartpole-record or cartpole-identify", 2),
-        ("", "from is missing; give from=runs/record/<run>", 2),
-        ("from=. restart=0", "restart=0: give at least 0.1", 2),
-    ],
-)
-def test_what_cannot_be_replayed(words: str, complaint: str, code: int, tmp_path: Path) -> None:
-    done = in_process("replay", *words.split(), folder=tmp_path)
-    assert done.complaint == f"cartpole-replay: {complaint}"
-    assert done.code == code
-    assert not list(tmp_path.glob("runs/replay/*"))
 
 
 def test_wrong_parameters_and_poles_are_named(recorded: Path, tmp_path: Path) -> None:

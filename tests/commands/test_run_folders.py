@@ -2,7 +2,7 @@
 
 import json
 import shutil
-import subprocess
+import signal
 import sys
 import time
 from collections.abc import Iterator
@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import torch
 import yaml
-from command_line import TINY, console_script, in_process, outcome, prints_only_progress
+from command_line import TINY, console_script, in_process, interrupt_after, prints_only_progress
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
@@ -164,36 +164,23 @@ def test_an_evaluation_may_take_another_task_cart_and_pole(trained: Path, tmp_pa
     assert evaluated["task"]["x_max"] == 0.38
 
 
-def test_the_reported_pole_is_that_of_the_emulator(trained: Path, tmp_path: Path) -> None:
-    words = ["plant=emulated", "emulator=large", "episodes=1", "hydra.run.dir=it"]
-    done = in_process("evaluate", f"run={trained}", *words, folder=tmp_path)
-    assert done.code == 0, done.err
-    assert read(tmp_path / "it/metrics.json")["pole"] == "0.66 m"
-
-
 @pytest.fixture(scope="module")
 def sweep(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """The run folders of four jobs, the first of which has the settings of `trained`."""
+    """The run folders of two jobs, the first of which has the settings of `trained`."""
     folder = tmp_path_factory.mktemp("sweep")
-    swept = ["actions=two", "randomization=wide,friction_6", "seed=0,1"]  # as `trained`
+    swept = ["actions=two", "randomization=wide", "seed=0,1"]  # as `trained`
     done = in_process("train", "-m", *TINY, *swept, folder=folder)
     assert done.code == 0, done.err
-    assert prints_only_progress(done, trainings=4)
+    assert prints_only_progress(done, trainings=2)
     (made,) = folder.glob("runs/train/*_multirun")
     return sorted(path for path in made.iterdir() if path.is_dir())
 
 
 def test_a_sweep_makes_a_folder_a_job(sweep: list[Path]) -> None:
-    assert [job.name for job in sweep] == [
-        "0_randomization-wide_seed-0",
-        "1_randomization-wide_seed-1",
-        "2_randomization-friction_6_seed-0",
-        "3_randomization-friction_6_seed-1",
-    ]
+    assert [job.name for job in sweep] == ["0_seed-0", "1_seed-1"]
     for job in sweep:
         config = yaml.safe_load((job / "config.yaml").read_text())
         assert config["seed"] == int(job.name[-1])
-        assert ("track_tilt" in config["randomization"]) == ("wide" in job.name)
         assert len(read(job / "metrics.json")["episodes"]) == 2
         assert len(history(job)) == 2
         assert (job / "checkpoints/last.pt").exists()
@@ -202,17 +189,11 @@ def test_a_sweep_makes_a_folder_a_job(sweep: list[Path]) -> None:
 
 
 def test_equal_seeds_give_equal_runs_and_another_seed_another(trained: Path, sweep: list[Path]) -> None:
-    same, other, *_ = sweep
+    same, other = sweep
     assert read(same / "metrics.json") == read(trained / "metrics.json")
     assert history(same) == history(trained)
     assert all(torch.equal(weight, weights(trained)[name]) for name, weight in weights(same).items())
     assert read(other / "metrics.json") != read(trained / "metrics.json")
-
-
-def test_the_name_of_a_job_needs_no_quotes(sweep: list[Path], tmp_path: Path) -> None:
-    done = in_process("evaluate", f"run={sweep[2]}/checkpoints/best.pt", "episodes=1", folder=tmp_path)
-    assert done.code == 0, done.err
-    assert len(list(tmp_path.glob("runs/evaluate/*/metrics.json"))) == 1
 
 
 def test_names_of_jobs_show_what_differs(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -232,29 +213,22 @@ def test_runs_that_start_in_the_same_second_do_not_share_a_folder(
     assert all(Path(folder).is_dir() and "_mine" in folder for folder in folders)
 
 
-def when_saved(process: "subprocess.Popen[str]", checkpoint: Path) -> None:
-    """Wait until the process replaces a checkpoint, or writes it for the first time."""
-    before = checkpoint.stat().st_mtime_ns if checkpoint.exists() else 0
-    while not checkpoint.exists() or checkpoint.stat().st_mtime_ns == before:
-        assert process.poll() is None, process.communicate()
-        time.sleep(0.002)
-
-
+@pytest.mark.usefixtures("without_pictures")
 def test_a_stopped_training_resumes_identically(tmp_path: Path) -> None:
     """Killed, resumed, terminated, resumed: the same to the bit as one that ran through."""
     words = (*TINY, "learning.transitions=4096", "learning.evaluations=8", "buffer=prioritized", "pole=both")
     checkpoint = tmp_path / "stopped/checkpoints/resume.pt"
 
     killed = console_script("train", *words, "hydra.run.dir=stopped", folder=tmp_path)
-    when_saved(killed, checkpoint)
+    while not checkpoint.exists():
+        assert killed.poll() is None, killed.communicate()
+        time.sleep(0.002)
     killed.kill()
     killed.communicate()
     assert len(history(tmp_path / "stopped")) < 8
 
-    terminated = console_script("train", "resume=stopped", folder=tmp_path)
-    when_saved(terminated, checkpoint)
-    terminated.terminate()
-    done = outcome(terminated)
+    interrupt_after(checkpoint, signal.SIGTERM)
+    done = in_process("train", "resume=stopped", folder=tmp_path)
     assert done.code == 143
     assert done.err.splitlines()[-1] == "cartpole-train: terminated"
     assert "Traceback" not in done.err

@@ -58,6 +58,7 @@ def test_the_balance_is_learned(tmp_path: Path) -> None:
     assert load_agent(tmp_path).score == pytest.approx(metrics["score_upright"]["mean"])
 
 
+@pytest.mark.nightly
 def test_the_swing_up_is_learned_and_ends_in_balance(tmp_path: Path) -> None:
     metrics, _ = train(tmp_path, "experiment=medium", *SWING_UP)
     assert metrics["upright_fraction"]["mean"] > BALANCED
@@ -81,6 +82,7 @@ def bang_bang(level: int) -> Policy:
     return policy
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("level", [None, 1, 2, 3, 4])
 def test_a_pump_does_not_pass_for_one_that_balances(
     make_plant: Callable, make_environment: Callable, ip02: dict, medium: PoleSettings, level: int | None

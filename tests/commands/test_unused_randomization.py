@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import pytest
 from command_line import ONCE, TINY, in_process
 
 DEADBANDS = (
@@ -9,6 +10,9 @@ DEADBANDS = (
     "+randomization.deadband_right={absolute:[0,110]}",
 )
 SLOPE = "+randomization.sigmoid_slope={factor:[0.5,2]}"
+
+
+pytestmark = pytest.mark.usefixtures("without_pictures")
 
 
 def note(folder: Path, *words: str) -> str:

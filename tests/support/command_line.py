@@ -97,14 +97,14 @@ def in_process(
     return Outcome(code, out.getvalue(), err.getvalue())
 
 
-def interrupt_after(file: Path) -> None:
-    """Send SIGINT to this process as soon as `file` is written, for the first time or again."""
+def interrupt_after(file: Path, number: signal.Signals = signal.SIGINT) -> None:
+    """Send a signal to this process as soon as `file` is written, for the first time or again."""
     before = modified(file)
 
     def interrupt() -> None:
         while modified(file) == before:
             time.sleep(0.01)
-        os.kill(os.getpid(), signal.SIGINT)
+        os.kill(os.getpid(), number)
 
     threading.Thread(target=interrupt, daemon=True).start()
 

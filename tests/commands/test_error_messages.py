@@ -3,11 +3,11 @@
 import errno
 
 import pytest
-from hydra.errors import HydraException, OverrideParseException
+from hydra.errors import HydraException
 
 from cartpole_rl.choices import default_choices
 from cartpole_rl.command import dashed_setting, wrong_option
-from cartpole_rl.composition import error_message, known_settings, nearest_choice
+from cartpole_rl.composition import error_message, known_settings
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.exits import one_line
 
@@ -32,23 +32,11 @@ def test_a_full_disk_gets_a_remedy(number: int) -> None:
     assert one_line(OSError(number, "is full"), "train") == f"{unnamed}{remedy}"
 
 
-def test_a_word_that_is_no_setting_is_repeated() -> None:
-    complaint = one_line(OverrideParseException("seed", "LexerNoViableAlt"), "train")
-    assert complaint.startswith("seed: settings are given as key=value")
-
-
 def test_other_errors_keep_their_first_line() -> None:
     assert one_line(ConfigError("the first\nthe second"), "train") == "the first"
     assert one_line(ConfigError(), "train") == "ConfigError"
     assert one_line(ValueError("the first\nthe second"), "train") == "ValueError: the first"
     assert one_line(HydraException("broken\n  in two"), "train") == "broken in two"
-
-
-def test_a_missing_choice_is_named_with_the_nearest_one() -> None:
-    text = "Could not find 'pole/mediun' Available options in 'pole': both large medium Config search path: x"
-    assert hydra_complaint(text, "train") == (
-        "pole=mediun: there is no such choice; did you mean medium? there are both, large, medium"
-    )
 
 
 def test_a_setting_of_a_group_that_is_not_chosen_names_its_choices() -> None:
@@ -91,30 +79,6 @@ def test_a_setting_of_another_choice_names_that_choice(
 ) -> None:
     monkeypatch.setattr("sys.argv", [f"cartpole-{command}", f"{key}=1"])
     assert hydra_complaint(f"Could not override '{key}'.", command) == complaint
-
-
-def test_several_values_without_a_multirun_are_explained() -> None:
-    assert hydra_complaint("Ambiguous value for argument 'seed=0,1': ...", "train").startswith("seed=0,1: -m")
-
-
-def test_an_unknown_setting_gets_the_nearest_known_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sys.argv", ["cartpole-train", "learning.cart=3"])
-    complaint = hydra_complaint("Could not override 'learning.cart'.", "train")
-    assert "learning.carts" in complaint
-
-
-def test_of_similar_choices_the_one_with_the_same_letters_is_suggested() -> None:
-    assert nearest_choice("lrage", ["large", "medium", "range"]).startswith("did you mean large?")
-
-
-@pytest.mark.parametrize("key", ["emulator", "emulator.cart_viscous"])
-def test_a_group_of_other_commands_is_named(key: str) -> None:
-    complaint = hydra_complaint(f"Could not override '{key}'.", "train")
-    assert complaint == f"{key}: cartpole-train does not read this group"
-
-
-def test_no_hint_without_a_near_choice() -> None:
-    assert nearest_choice("zzz", ["adam", "adamw"]) == "there are adam, adamw"
 
 
 @pytest.mark.parametrize(

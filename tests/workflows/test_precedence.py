@@ -3,6 +3,7 @@
 Nominal value < a choice's default < a person's file < the command line, for every group.
 """
 
+from itertools import permutations
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import pytest
 import yaml
 
 from cartpole_rl.checking import checked
-from cartpole_rl.choices import choice, conf_folder, default_choices
+from cartpole_rl.choices import choice, default_choices, group_choices
 from cartpole_rl.composition import compose
 from cartpole_rl.workflows.build import replaced_settings
 from cartpole_rl.workflows.checks import note_other_numbers
@@ -46,6 +47,11 @@ def value_of(tree: dict[str, Any], name: str) -> Any:
     for part in name.split("."):
         tree = tree[part]
     return tree
+
+
+def has(tree: dict[str, Any], name: str) -> bool:
+    first, _, rest = name.partition(".")
+    return first in tree and (not rest or (isinstance(tree[first], dict) and has(tree[first], rest)))
 
 
 def trained(*words: str) -> TrainConfig:
@@ -94,11 +100,8 @@ CARTS = {  # words, and the viscous friction that is driven
     "experiment": (["experiment=friction_models_fig_6_8"], 0.0),
     "experiment and choice": (["experiment=friction_models_fig_6_8", "cart_friction=linear"], 1.75),
     "file": (["cart"], 55.7),
-    "file and choice": (["cart", "cart_friction=linear"], 55.7),
-    "choice and file": (["cart_friction=linear", "cart"], 55.7),
     "experiment, file and choice": (["experiment=thesis_swingup", "cart", "cart_friction=linear"], 55.7),
     "command line": (["cart", "cart_friction=linear", "cart.cart_viscous=3"], 3.0),
-    "command line alone": (["cart_friction=linear", "cart.cart_viscous=3"], 3.0),
     "command line, with the friction": (
         ["cart", "cart_friction=linear", "cart_friction.parameters.cart_viscous=4"],
         4.0,
@@ -127,6 +130,36 @@ def test_the_cart_that_is_driven(case: str, tmp_path: Path) -> None:
         assert config.nominal_cart["latency"] == 0.03
 
 
+@pytest.mark.parametrize("value", [0.5, 55.7], ids=["nominal", "other"])
+@pytest.mark.parametrize("form", ["typed", "file", "whole file", "mapping"])
+def test_a_number_is_kept_beside_a_friction_that_has_its_own(form: str, value: float, tmp_path: Path) -> None:
+    """Before and after it, wherever the number stands, and equal to the nominal value too."""
+    whole = {**IP02, VISCOUS: value}
+    if form == "mapping":
+        names = {"cart": whole, "cart_friction": "linear"}
+        orders = [checked(TrainConfig, compose("train", dict(each))) for each in permutations(names.items())]
+    else:
+        content = whole if form == "whole file" else {"defaults": ["ip02"], VISCOUS: value}
+        given = f"cart.{VISCOUS}={value}" if form == "typed" else written(tmp_path, "cart", content)
+        orders = [trained(*words) for words in permutations((given, "cart_friction=linear"))]
+    assert [config.nominal_cart[VISCOUS] for config in orders] == [value, value]
+
+
+@pytest.mark.parametrize("group", GIVEN)
+def test_the_order_of_words_changes_nothing(group: str) -> None:
+    """A number that is typed beside a choice is kept, also one that equals the value of another choice."""
+    name = "choices.medium.pole_mass" if group == "pole" else GIVEN[group][0]
+    default = choice(f"{group}/{default_choices('train')[group]}")
+    for chosen in [*group_choices(group)][:2]:
+        shipped = choice(f"{group}/{chosen}")
+        if not has(shipped, name) or (group == "plant" and chosen != "simulated"):
+            continue
+        for value in [GIVEN[group][2], *([value_of(default, name)] if has(default, name) else [])]:
+            words = [f"{group}={chosen}", f"{group}.{name}={value}".replace(" ", "")]
+            found = [compose("train", order)[group] for order in (words, words[::-1])]
+            assert {str(value_of(each, name)) for each in found} == {str(value)}
+
+
 @pytest.mark.parametrize(("group", "model"), [("cart_friction", "linear"), ("pole_friction", "bearing")])
 def test_an_evaluation_keeps_a_cart_that_a_person_gave(group: str, model: str) -> None:
     """In the training or in the evaluation, whatever friction model either chooses."""
@@ -136,16 +169,6 @@ def test_an_evaluation_keeps_a_cart_that_a_person_gave(group: str, model: str) -
         config = load_settings(EvaluateConfig, {"run": "somewhere", **second})
         settings = replaced_settings(training, config)
         assert (settings.nominal_cart, getattr(settings, group).model) == (given, model)
-
-
-def test_only_one_shipped_friction_choice_has_numbers_of_the_cart() -> None:
-    found = {
-        path.stem: content["parameters"]
-        for group in ("cart_friction", "pole_friction")
-        for path in (conf_folder() / group).glob("*.yaml")
-        if (content := yaml.safe_load(path.read_text()))["parameters"]
-    }
-    assert found == {"linear": {VISCOUS: 1.75}}
 
 
 def test_numbers_that_are_not_nominal_are_printed(capsys: pytest.CaptureFixture[str]) -> None:
