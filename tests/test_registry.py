@@ -99,10 +99,6 @@ def test_the_entry_point_of_an_installed_package(monkeypatch: pytest.MonkeyPatch
     registry._entry_points.cache_clear()
 
 
-def test_what_needs_no_decorator() -> None:
-    assert SHAPES.find("pathlib:PureWindowsPath")("a\\b").name == "b"
-
-
 @pytest.mark.parametrize(
     ("name", "message"),
     [

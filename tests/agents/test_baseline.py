@@ -12,7 +12,6 @@ from cartpole_rl.agents.baseline import EnergyAndRegulator, decode, linearized, 
 from cartpole_rl.choices import choice
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
-from cartpole_rl.errors import ConfigError
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.physics.dynamics import State
 from cartpole_rl.physics.models import Models
@@ -87,12 +86,6 @@ def test_predictions_match_the_simulation(ip02: dict[str, float], make_plant: Ma
         assert abs(led_on - truth) < 0.5 * abs(measured - truth)
 
 
-def test_the_nearest_force_is_chosen(ip02: dict[str, float]) -> None:
-    policy = baseline(ip02, "medium")  # 1, 2, 3, 4 N at 100, 150, 200, 250
-    target = torch.tensor([0.4, 0.6, -2.6, 99.0, -99.0])
-    assert policy.motors[policy.value(target).argmax(-1)].tolist() == [0, 100, -200, 250, -250]
-
-
 def test_it_brakes_before_the_end_of_the_track(ip02: dict[str, float]) -> None:
     policy = baseline(ip02, "medium")
     x, x_dot = torch.tensor([0.33, -0.33, 0.1, 0.1]), torch.tensor([1.0, -1.0, 2.0, 0.1])
@@ -100,14 +93,6 @@ def test_it_brakes_before_the_end_of_the_track(ip02: dict[str, float]) -> None:
     force = policy.force(State(x, x_dot, hanging, still))
     assert force[:3].tolist() == [-policy.strongest, policy.strongest, -policy.strongest]
     assert abs(force[3]) < policy.strongest * 2
-
-
-@pytest.mark.parametrize(
-    "changes", [{"kind": ObservationKind.POSITIONS}, {"past_motors": 0}], ids=["positions", "no motors"]
-)
-def test_missing_observations_are_an_error(ip02: dict[str, float], changes: dict[str, Any]) -> None:
-    with pytest.raises(ConfigError, match="the baseline reads velocities and the last motor value"):
-        baseline(ip02, "medium", **changes)
 
 
 @pytest.mark.parametrize(("pole", "score"), [("medium", 3300), ("large", 2900)])

@@ -7,76 +7,35 @@ from types import ModuleType
 from typing import Any
 
 import adaptation
-import distillation
-import environment
 import export_parity
 import fine_tuning
 import learning
 import numpy as np
-import one_cart
 import pytest
 import reference
-import shortcuts
-import time_spent
 import torch
 import truth_references
 import zero_shot
-from bench_scripts import TINY, Run
+from bench_scripts import Run
 from best_score.cart import KnownCart
 from common import REFERENCES
 from truths import REPORTED, draw_truths, simulated_cart
 
-from cartpole_rl.agents.settings import AGENTS
 from cartpole_rl.choices import choice
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.randomization.ranges import Range
 from cartpole_rl.tasks.rewards import UPRIGHT_ANGLE
-from cartpole_rl.workflows.agents import trained_agent
 from cartpole_rl.workflows.config import TrainConfig, load_settings
 
 pytestmark = pytest.mark.nightly
 
 PROCESSOR = ("qemu-system-arm", "arm-none-eabi-gcc", "make")
-SPEEDS = {  # script: words, and the peer of some rows
-    environment: (
-        ["--quick", "--threads", str(torch.get_num_threads())],
-        {"environment, step": "PendulumEnv, step", "environment, rollout": "PendulumEnv, rollout"},
-    ),
-    shortcuts: (["--quick", "--carts", "16"], {"CartPoleEnv, step": "TransformedEnv, step"}),
-}
 
 
 def figures(run: Run, script: ModuleType, folder: Path, *words: str) -> Any:
     """Run a script in a folder, and return the JSON that it writes."""
     run(script, folder, *words, "--json", "figures.json")
     return json.loads((folder / "figures.json").read_text())
-
-
-@pytest.mark.parametrize("script", SPEEDS, ids=lambda script: script.__name__)
-def test_speeds_are_relative_to_a_peer(script: ModuleType, tmp_path: Path, run: Run) -> None:
-    words, peers = SPEEDS[script]
-    rows = {row["name"]: row for row in figures(run, script, tmp_path, *words)}
-    for ours, peer in peers.items():
-        assert rows[ours].get("peer", rows[ours].get("to")) == peer
-        ratio = [rows[name].get("steps_per_second") or 1 / rows[name]["ms"] for name in (ours, peer)]
-        assert rows[ours]["ratio"] == pytest.approx(ratio[0] / ratio[1])
-
-
-def test_one_cart(tmp_path: Path, run: Run) -> None:
-    found = figures(run, one_cart, tmp_path, "--steps", "200", "--episodes", "1")
-    peer, *ours = found["gymnasium"]
-    assert all(row["ratio"] == pytest.approx(row["steps_per_s"] / peer["steps_per_s"]) for row in ours)
-    for row in found["lockstep"]:
-        assert row["steps"] == 500
-        assert 0 < row["median_ms"] <= row["p999_ms"] <= row["longest_ms"]
-
-
-def test_the_shares_of_a_trainings_time_add_up(tmp_path: Path, run: Run, monkeypatch: Any) -> None:
-    kind = AGENTS.find("dqn")
-    monkeypatch.setattr(kind, "learner", kind.learner)  # the script replaces it; this restores it
-    spent = figures(run, time_spent, tmp_path, "experiment=medium", *TINY)
-    assert set(spent) == {"stepping", "updating", "evaluating", "the rest", "compiling"}
-    assert sum(each["share"] for each in spent.values()) == pytest.approx(1)
 
 
 def test_learning_is_judged_by_the_last_checkpoint(trained: Path, run: Run, monkeypatch: Any) -> None:
@@ -108,11 +67,6 @@ def test_exported_agents_choose_the_hosts_actions(run: Run, tmp_path: Path, monk
     values = np.array([[1.0, 2.0], [3.0, np.float32(3.0) + above], [5.0, 4.0]], np.float32)
     found = export_parity.row("x", np.array([0, 0, 0]), values)
     assert (found["differ"], found["beyond rounding"]) == (2, 1)
-
-
-def test_the_costs_of_a_distilled_agent_are_those_of_the_exported_code() -> None:
-    found = distillation.costs(trained_agent(Path("pretrained/medium")))
-    assert found == {"hidden": "128, 64", "table bytes": 42_554, "multiply-adds": 10_048}
 
 
 def test_fine_tunings_are_compared_with_the_reference_of_the_cart() -> None:

@@ -230,7 +230,7 @@ def test_a_stopped_training_resumes_identically(tmp_path: Path) -> None:
     interrupt_after(checkpoint, signal.SIGTERM)
     done = in_process("train", "resume=stopped", folder=tmp_path)
     assert done.code == 143
-    assert done.err.splitlines()[-1] == "cartpole-train: terminated"
+    assert done.err.splitlines()[-1].startswith("cartpole-train: terminated; cartpole-train resume=")
     assert "Traceback" not in done.err
     assert not (tmp_path / "stopped/metrics.json").exists()
 

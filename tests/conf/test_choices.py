@@ -12,10 +12,8 @@ from cartpole_rl.checking import checked
 from cartpole_rl.choices import conf_folder
 from cartpole_rl.composition import compose
 from cartpole_rl.envs.build import randomizer
-from cartpole_rl.tasks.rewards import Reward
 from cartpole_rl.workflows.build import evaluated_settings
 from cartpole_rl.workflows.config import EvaluateConfig, FinetuneConfig, TrainConfig
-from cartpole_rl.workflows.emulate import EmulateConfig
 
 CONF = conf_folder()
 GROUPS = sorted(path.name for path in CONF.iterdir() if path.is_dir() and path.name != "hydra")
@@ -70,33 +68,6 @@ def test_fine_tuning_takes_it(chosen: str) -> None:
     assert checked(FinetuneConfig, composed("finetune", "run=somewhere", chosen)).finetuning.iterations > 0
 
 
-@pytest.mark.parametrize("learner", ["local", "ray learner.address=server:6379"])
-def test_fine_tuning_takes_each_learner(learner: str) -> None:
-    config = checked(FinetuneConfig, composed("finetune", "run=somewhere", *f"learner={learner}".split()))
-    assert config.learner.kind == learner.split()[0]
-
-
-@pytest.mark.parametrize("task", ["balance", "swingup"])
-def test_any_reward_goes_with_any_task(task: str) -> None:
-    for reward in Reward:
-        config = checked(TrainConfig, composed("train", f"task={task}", f"reward={reward}"))
-        assert (config.task.name, config.reward.kind) == (task, reward)
-
-
-@pytest.mark.parametrize("plant", ["simulated", "emulated", "serial plant.port=/dev/ttyUSB0"])
-def test_an_evaluation_takes_each_plant(plant: str) -> None:
-    config = checked(EvaluateConfig, composed("evaluate", "run=somewhere", *f"plant={plant}".split()))
-    assert config.plant.kind == plant.split()[0]
-
-
-def test_the_emulated_carts_differ_in_the_pole_alone() -> None:
-    medium, large = (
-        checked(EmulateConfig, composed("emulate", f"emulator={choice}")).emulator.model_dump()
-        for choice in ("medium", "large")
-    )
-    assert {key for key in medium if medium[key] != large[key]} == {"pole_mass", "pole_com", "pole_inertia"}
-
-
 EXPERIMENTS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
 
 
@@ -107,11 +78,6 @@ def leaves(tree: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
         return
     for key, value in tree.items():
         yield from leaves(value, f"{prefix}{key}.")
-
-
-@pytest.mark.parametrize("experiment", EXPERIMENTS)
-def test_training_takes_an_experiment(experiment: str) -> None:
-    assert checked(TrainConfig, composed("train", f"experiment={experiment}"))
 
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS)

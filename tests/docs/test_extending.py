@@ -13,6 +13,7 @@ from extending_page import PAGE, ROOT, paths
 
 BIN = Path(sys.executable).parent
 PATHS = paths()
+DAILY = (1, 8)  # a friction law; a network, an agent and a logger
 
 
 def test_the_page_has_the_eight_paths() -> None:
@@ -37,7 +38,11 @@ def assert_tidy(folder: Path, files: set[str]) -> None:
         assert done.returncode == 0, done.stdout + done.stderr
 
 
-@pytest.mark.parametrize("number", PATHS, ids=lambda number: PATHS[number].title)
+@pytest.mark.parametrize(
+    "number",
+    [number if number in DAILY else pytest.param(number, marks=pytest.mark.nightly) for number in PATHS],
+    ids=lambda number: PATHS[number].title,
+)
 def test_path(number: int, tmp_path: Path) -> None:
     for folder in ("cartpole_rl", "conf", "docs"):
         shutil.copytree(ROOT / folder, tmp_path / folder, ignore=shutil.ignore_patterns("__pycache__"))

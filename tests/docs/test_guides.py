@@ -1,4 +1,4 @@
-"""Every command of the guides that the README does not have runs to its end, with budgets that take seconds.
+"""Every command of the guides that the README does not have composes, and nightly runs to its end.
 
 Those that need a launcher, Optuna or Ray are run by scripts/sweeps and scripts/bench/two_machines.py.
 """
@@ -25,6 +25,10 @@ from page_commands import (
     run_here,
     within,
 )
+
+from cartpole_rl.checking import checked
+from cartpole_rl.cli import VERBS
+from cartpole_rl.composition import compose
 
 BUDGETS = {  # of each command; what the page gives stays, except where it takes minutes
     "train": [*BUDGET, "seed=0", "agent.action_gap=0.7"],  # the last two narrow the sweeps
@@ -116,6 +120,18 @@ def test_the_guides_have_commands_of_their_own() -> None:
     assert len(COMMANDS) > 30
 
 
+def test_the_settings_of_every_command_compose() -> None:
+    """Those of the README too; nightly tests run them."""
+    for command in [*COMMANDS, *block_lines(README, "cartpole-")]:
+        program, *words = shlex.split(re.sub("<.*?>", "first", command))
+        verb = program.removeprefix("cartpole-").replace("-", "_")
+        swept = "-m" in words or any(word.startswith("sweep=") for word in words)
+        if verb == "find_port" or swept or any(word.endswith(".yaml") for word in words):
+            continue  # several jobs, or files of other runs
+        checked(VERBS[verb].find(VERBS[verb].settings), compose(verb, words))
+
+
+@pytest.mark.nightly
 @pytest.mark.parametrize("command", COMMANDS)
 def test_the_command_runs(
     command: str, trained: Path, made: Callable[[str], None], serial_port: Callable[..., str]
@@ -145,6 +161,7 @@ def test_the_command_runs(
     assert done.stdout
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(("page", "command"), guide_commands("cartpole-emulate"))
 def test_the_emulated_cart_starts(page: str, command: str, tmp_path: Path) -> None:
     name, *words = shlex.split(command)

@@ -65,7 +65,14 @@ def test_every_command_is_one_that_a_test_here_runs() -> None:
     assert {command.split()[0] for command in COMMANDS} == known
 
 
-@pytest.mark.parametrize("command", [c for c in listed("cartpole-train") if "<run>" not in c])
+@pytest.mark.parametrize(
+    "command",
+    [
+        pytest.param(command, marks=[pytest.mark.nightly] * (" -m " in command))
+        for command in listed("cartpole-train")
+        if "<run>" not in command
+    ],
+)
 def test_train(command: str, tmp_path: Path) -> None:
     budget = within(BUDGET, command)
     if "learning.transitions=" in command:
@@ -112,6 +119,7 @@ def test_evaluate(command: str, trained: Path, serial_port: Callable[[], str]) -
     assert len(metrics["episodes"]) == (20 if "episodes=20" in command else 1)
 
 
+@pytest.mark.nightly
 def test_identify_train_on_it_and_model_it(trained: Path, serial_port: Callable[[], str]) -> None:
     (identify,) = listed("cartpole-identify")
     identify = identify.replace("/dev/ttyUSB0", serial_port())
@@ -141,6 +149,7 @@ def test_record_and_replay(trained: Path) -> None:
     assert (trained / "runs/replay/first/replay.json").exists()
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("command", listed("cartpole-finetune"))
 def test_finetune(command: str, trained: Path, serial_port: Callable[[], str]) -> None:
     command = command.replace("<run>", "first").replace("episodes=20", "")
@@ -154,6 +163,7 @@ def test_finetune(command: str, trained: Path, serial_port: Callable[[], str]) -
     assert (trained / folder / "checkpoints/last.pt").exists()
 
 
+@pytest.mark.nightly
 def test_distill(trained: Path) -> None:
     (command,) = listed("cartpole-distill")
     folder = "hydra.run.dir=runs/distill/readme"
@@ -202,6 +212,7 @@ def test_tensorboard_reads_the_runs(trained: Path) -> None:
     assert "evaluation/score" in result.stdout, result.stderr
 
 
+@pytest.mark.nightly
 def test_the_demo_after_its_installation(tmp_path: Path) -> None:
     result = subprocess.run(
         [sys.executable, ROOT / "scripts/demo.py", *BUDGET, "--", *TUNING],

@@ -35,14 +35,6 @@ def complaint(load, path: Path) -> str:
     return text
 
 
-def test_an_agent_comes_back_from_its_folder_and_from_its_file(tmp_path: Path) -> None:
-    save_agent(tmp_path / LAST, AGENT)
-    for run in (tmp_path, tmp_path / LAST):
-        found = load_agent(run)
-        assert (found.config, found.transitions, found.score) == ({"seed": 1}, 10, 2.5)
-        assert torch.equal(found.weights["w"], torch.arange(3.0))
-
-
 def test_a_training_comes_back(tmp_path: Path) -> None:
     save_training(tmp_path, TRAINING)
     assert load_training(tmp_path) == TRAINING
@@ -80,13 +72,6 @@ def test_weights_that_are_not_finite_are_neither_written_nor_read(value: float, 
         tmp_path / "checkpoints/resume.pt",
     )
     assert "is refused: its weight w is not finite" in complaint(load_training, tmp_path)
-
-
-def test_a_missing_path_or_checkpoint_is_named(tmp_path: Path) -> None:
-    assert "there is no such file or folder" in complaint(load_agent, tmp_path / "nowhere")
-    assert "there is no such folder" in complaint(load_training, tmp_path / "nowhere")
-    assert "holds no checkpoints/last.pt" in complaint(load_agent, tmp_path)
-    assert "holds no checkpoints/resume.pt" in complaint(load_training, tmp_path)
 
 
 @pytest.mark.parametrize("content", [b"", b"hello, I am a text file\n", b"PK\x03\x04 and no more", 0.1, 0.99])

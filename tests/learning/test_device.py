@@ -117,11 +117,3 @@ def test_a_gpu_that_does_not_exist_is_one_line_before_any_work(tmp_path: Path) -
     with pytest.raises(ConfigError, match="device=cuda: PyTorch finds no CUDA GPU on this machine"):
         train(config, tmp_path)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_the_devices_of_the_test_do_not_mix() -> None:
-    with separate_device():
-        there = torch.ones(3, device=DEVICE)
-        with pytest.raises(RuntimeError, match="add of tensors on two devices"):
-            there + torch.ones(3)
-        assert torch.equal((there + torch.tensor(1.0)).cpu(), torch.full((3,), 2.0))

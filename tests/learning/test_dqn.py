@@ -131,26 +131,6 @@ def whole(make_training: MakeTraining) -> Training:
     return training
 
 
-def test_it_counts_transitions_and_updates(whole: Training) -> None:
-    assert (whole.transitions, whole.progress, len(whole.buffer)) == (1024, 1, 500)
-    iterations, warmed_up = 1024 // 64, 128 // 64
-    assert whole.agent.updates == 2 * (iterations - warmed_up)
-    assert [transitions for transitions, _ in whole.monitor.evaluations] == [256, 512, 768, 1024]
-    assert list(whole.monitor.snapshots) == [512, 1024]  # after every second evaluation, and the last
-
-
-def test_schedules_reach_their_ends(whole: Training) -> None:
-    share = {
-        transitions: scalars["learning/epsilon"] for transitions, scalars in whole.monitor.scalars.items()
-    }
-    assert share[64] == share[128] == 1.0  # acted before an update could be made
-    assert share[192] == pytest.approx(0.5)  # 128 transitions were seen
-    assert share[192 + 64] == pytest.approx(0.5 - 0.4 * 64 / 400)
-    assert share[1024] == pytest.approx(0.1)
-    assert whole.optimizer.param_groups[0]["lr"] == pytest.approx(5e-5)
-    assert whole.buffer.sampler.beta == pytest.approx(1.0)
-
-
 @pytest.mark.parametrize("schedule", [linear, half_cosine])
 def test_schedules_go_from_start_to_end_and_stay_there(schedule: Callable[..., float]) -> None:
     steps = [schedule(1.0, 0.2, progress) for progress in (-1.0, 0.0, 0.01, 0.5, 0.99, 1.0, 7.0)]
@@ -158,15 +138,6 @@ def test_schedules_go_from_start_to_end_and_stay_there(schedule: Callable[..., f
     assert (steps[0], steps[1], steps[3], steps[5], steps[6]) == pytest.approx((1.0, 1.0, 0.6, 0.2, 0.2))
     if schedule is half_cosine:  # flat at both ends
         assert max(steps[1] - steps[2], steps[4] - steps[5]) < 0.1 * 0.01 * 0.8
-
-
-@pytest.mark.parametrize(("count", "end"), [(1, 7), (3, 10), (12, 427), (5, 5)])
-def test_evaluations_are_evenly_spaced_up_to_the_end(count: int, end: int) -> None:
-    each = {"carts": 1, "chunk": 1, "n_step": 1, "transitions": end, "evaluations": count}
-    spaced = LearningSettings(**{**LEARNING, **each}).evaluated_iterations
-    gaps = [after - before for before, after in zip([0, *spaced], spaced, strict=False)]
-    assert (len(spaced), spaced[-1]) == (count, end)
-    assert 1 <= min(gaps) <= max(gaps) <= min(gaps) + 1
 
 
 @pytest.mark.parametrize(
@@ -283,22 +254,6 @@ def test_no_return_reaches_from_one_fit_of_the_cart_to_the_next(make_training: M
     )  # seven chunks of four periods, two of which wait for their returns
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"transitions": 100},
-        {"n_step": 5},
-        {"carts": 0},
-        {"epsilon": (1.5, 0.1)},
-        {"evaluations": 17},
-        {"speed": 1},
-    ],
-)
-def test_settings_that_make_no_sense_are_refused(wrong: dict) -> None:
-    with pytest.raises(ValueError, match=next(iter(wrong))):
-        LearningSettings(**{**LEARNING, **wrong})
-
-
 # collecting
 
 LIMIT = 20
@@ -338,13 +293,6 @@ def test_transitions_equal_those_of_torchrls_collector_and_rollout(make_training
             assert torch.equal(chunk[key], other[key]), key
     assert len(chunk["action"].unique()) == 3
     assert 0 < chunk["next", "terminated"].sum() < chunk["next", "done"].sum()
-
-
-@pytest.mark.parametrize("epsilon", [0.0, 0.5, 1.0])
-def test_epsilon_is_the_share_of_random_actions(make_training: MakeTraining, epsilon: float) -> None:
-    training = always(greedy(make_training(ONCE), epsilon), 1)
-    others = (training.collect()["action"] != 1).float().mean().item()
-    assert others == pytest.approx(epsilon * 2 / 3, abs=0.03)  # a third of the random ones is 1 too
 
 
 def test_ended_episodes_are_reported_once(make_training: MakeTraining) -> None:

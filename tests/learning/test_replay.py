@@ -93,10 +93,6 @@ def test_a_restored_buffer_goes_on_to_the_bit(kind: str, rows: int, tmp_path: Pa
     assert len(original) == (64 if rows else 40)
 
 
-def test_the_oldest_are_overwritten() -> None:
-    assert sorted(buffer("uniform", 8, rows=100)[:]["number"].tolist()) == [*range(36, 100)]
-
-
 def test_a_file_has_the_size_of_what_is_in_the_buffer(tmp_path: Path) -> None:
     sizes = []
     for size in (1000, 100_000):

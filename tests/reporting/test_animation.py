@@ -17,10 +17,7 @@ from cartpole_rl.reporting.animation import (
     durations,
     frames,
     gif,
-    nearest_rows,
-    rows,
     side_by_side,
-    smaller,
     write_animation,
 )
 from cartpole_rl.tasks.episode import Episode
@@ -101,19 +98,6 @@ def test_the_arrow_points_where_the_motor_pushes_and_is_longer_for_a_stronger_pu
     assert widths[250] - widths[100] == pytest.approx(150 / 255 * 70, abs=2)
 
 
-def test_the_pole_turns_green_when_it_is_upright(swing_up: Episode) -> None:
-    fallen, upright = (first(part(swing_up, row, 1)) for row in (0, 400))
-    assert len(places(upright, colours.UPRIGHT)) > 300
-    assert len(places(fallen, colours.UPRIGHT)) == 0
-    assert len(places(fallen, colours.POLE)) > 300
-
-
-def test_a_large_pole_fits_too(swing_up: Episode) -> None:
-    picture = list(frames(part(swing_up, 0, 60), 0.6413, TRACK))[-1]
-    pole = places(picture, colours.POLE)
-    assert pole[:, 1].min() > 40
-
-
 def test_jitter_does_not_accumulate(balance: Episode) -> None:
     generator = np.random.default_rng(3)
     time = np.concatenate(([0.0], np.cumsum(generator.uniform(0.017, 0.0237, 500))))
@@ -123,25 +107,11 @@ def test_jitter_does_not_accumulate(balance: Episode) -> None:
     assert all(wait % 10 == 0 for wait in waits)
 
 
-def test_the_last_row_is_always_drawn(swing_up: Episode) -> None:
-    assert rows(part(swing_up, 0, 7), every=3) == [0, 3, 6, 7]
-    assert len(list(frames(part(swing_up, 0, 7), POLE, TRACK, every=3))) == 4
-
-
 def test_leaving_the_track_is_shown(runaway: Episode) -> None:
     *_, before, last = frames(part(runaway, runaway.steps - 4, 4), POLE, TRACK)
     header = (0, 36, 300, 56)
     assert len(places(last.crop(header), colours.LIMIT)) > 50
     assert len(places(before.crop(header), colours.LIMIT)) == 0
-
-
-def test_a_title_never_runs_into_the_numbers(balance: Episode) -> None:
-    short = part(balance, 0, 1)
-    words = "A title that somebody wrote without a thought for the width of pictures"
-    plain, titled = (first(short, text) for text in ("", words))
-    left, _, right, _ = ImageChops.difference(plain.convert("RGB"), titled.convert("RGB")).getbbox()
-    assert left >= 18
-    assert right <= 295
 
 
 def written(episode: Episode, path: Path, mp4: bool = False) -> Path:
@@ -163,16 +133,6 @@ def test_the_mp4_shows_the_same_pictures_for_as_long(tmp_path, swing_up: Episode
         assert np.abs(difference).mean() < 3
 
 
-def test_a_smaller_animation_takes_as_long(tmp_path, balance: Episode) -> None:
-    path = written(part(balance, 0, 41), tmp_path / "figures/episode.gif")
-    assert [*path.parent.iterdir()] == [path]
-    whole, small = [*shown(path.read_bytes())], [*shown(smaller(path, 160, 4))]
-    assert small[0][0].size == (160, 107)
-    assert len(small) == -(-len(whole) // 4)
-    assert sum(wait for _, wait in small) == sum(wait for _, wait in whole)
-    assert len(smaller(path, 160, 4)) < path.stat().st_size / 4
-
-
 def test_side_by_side_both_run_in_real_time_until_the_longer_one_ends(swing_up: Episode) -> None:
     short, long = part(swing_up, 0, 10), part(swing_up, 0, 40)
     left, right = list(frames(short, POLE, TRACK)), list(frames(long, POLE, TRACK))
@@ -184,10 +144,3 @@ def test_side_by_side_both_run_in_real_time_until_the_longer_one_ends(swing_up: 
         for half, alone, place in zip(halves, (left, right), (0, 5), strict=True):
             expected = alone[min(number, len(alone) - 1)].convert("RGB").crop((place, 0, 475 + place, bar))
             assert ImageChops.difference(half, expected).getbbox() is None
-
-
-def test_side_by_side_a_late_cart_stays_beside_the_same_time(swing_up: Episode) -> None:
-    late = dataclasses.replace(swing_up, time=swing_up.time * 1.25)
-    chosen = list(nearest_rows(swing_up, late))
-    assert chosen[:40] == pytest.approx(1.25 * np.array(rows(late)[:40]), abs=0.51)
-    assert chosen[-1] == swing_up.steps

@@ -44,10 +44,3 @@ def test_derived_settings_are_left_out_of_labels_and_chosen_ones_stay() -> None:
     found = columns(*trees)
     assert set(fewest(found, [])) == {"pole.mass", "lr"}
     assert [*fewest(found, ["pole.length"])] == ["pole.length", "lr"]
-
-
-def test_many_settings_end_in_a_number() -> None:
-    trees = [{f"a{number}": number + row for number in range(10)} for row in range(2)]
-    first, second = labels(columns(*trees), 2)
-    assert first.endswith(", variant 1")
-    assert second.endswith(", variant 2")

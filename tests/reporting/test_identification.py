@@ -5,11 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from figure_contents import line_of, words
 
 from cartpole_rl.identification.fit import Fit
 from cartpole_rl.identification.identify import Candidate, Identification, PredictionError
-from cartpole_rl.identification.prediction import Replayed
 from cartpole_rl.identification.quantities import Quantity
 from cartpole_rl.identification.rollout import Dynamics
 from cartpole_rl.physics.actuator import ACTUATORS
@@ -20,17 +18,9 @@ from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.reporting.identification import (
     CAPTIONS,
-    FARTHEST,
-    IDENTIFIED,
-    PRIOR,
-    SIMULATED,
-    Curve,
-    experiments_figure,
     force_curve,
-    friction_and_force_figure,
     friction_curve,
     identification_page,
-    interval_figure,
     quantities_table,
     spectrum_figure,
 )
@@ -75,11 +65,6 @@ def test_the_page_shows_all_results(swing_up: Episode) -> None:
         assert f'src="figures/{name}.png" alt="{caption}"' in text
 
 
-def test_without_warnings_it_says_so() -> None:
-    text = identification_page(found([]), QUANTITIES, {}, "train")
-    assert "<h2>Warnings</h2>\n<ul><li>None.</li></ul>" in text
-
-
 NAMES = CartParameters.names()
 
 
@@ -115,47 +100,6 @@ def test_force_over_motor_value(prior: dict[str, float], sign: int) -> None:
     more = sign * 200 * (0.03 - prior["force_linear"])
     assert curve.identified[at] - curve.prior[at] == pytest.approx(more)
     assert curve.samples[at, 0] == pytest.approx(curve.identified[at])
-
-
-def test_curves_are_drawn_with_their_band() -> None:
-    at = np.linspace(-1, 1, 5)
-    curve = Curve(at, 2 * at, 2 * at[:, None] + np.linspace(-1, 1, 201), 3 * at)
-    left, right = friction_and_force_figure(curve, curve).axes
-    np.testing.assert_allclose(line_of(left, IDENTIFIED)[:, 1], 2 * at)
-    np.testing.assert_allclose(line_of(left, PRIOR)[:, 1], 3 * at)
-    heights = left.collections[0].get_paths()[0].vertices[:, 1]
-    assert (heights.min(), heights.max()) == pytest.approx((-2.95, 2.95))
-    assert left.get_xlabel() == "cart velocity (m/s)"
-    assert right.get_ylabel() == "force on the cart (N)"
-
-
-def test_priors_stand_in_half_widths_and_far_ones_become_arrows() -> None:
-    figure = interval_figure(
-        [
-            Quantity("near", "a near prior", "ms", 12.0, 11.0, 13.0, 15.0),
-            Quantity("far", "a far prior", "N", 1.0, 0.9, 1.1, 9.0),
-        ]
-    )
-    (axes,) = figure.axes
-    priors = {
-        line.get_ydata()[0]: (line.get_xdata()[0], line.get_marker())
-        for line in axes.lines
-        if line.get_color() == PRIOR
-    }
-    assert priors[1] == (pytest.approx(3.0), "D")
-    assert priors[0] == (FARTHEST, ">")
-    assert "12.0 ± 1.0 ms   (prior 15.0)" in words(figure)
-
-
-def test_experiments_are_drawn_with_their_simulation(replay: Replayed) -> None:
-    figure = experiments_figure({"swing": replay, "coast": replay})
-    position, angle = figure.axes[:2]
-    simulated = [line for line in position.lines if line.get_color() == SIMULATED]
-    assert len(simulated) == len(replay.x)
-    np.testing.assert_allclose(simulated[0].get_ydata(), 100 * replay.x[0])
-    assert len(simulated[-1].get_ydata()) == 30  # the rest is not known
-    assert position.get_title(loc="left") == "swing"
-    assert angle.get_ylabel() == "from hanging (deg)"
 
 
 def test_the_spectrum_is_that_of_the_covariance() -> None:

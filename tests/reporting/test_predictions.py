@@ -3,23 +3,17 @@
 import numpy as np
 import pytest
 from figure_contents import line_of
-from matplotlib import colors
 
 from cartpole_rl.drawing import colours
-from cartpole_rl.identification.prediction import Prediction, Replayed
+from cartpole_rl.identification.prediction import Prediction
 from cartpole_rl.physics.residual import PLACES, SPACING, UNITS
 from cartpole_rl.reporting.predictions import (
-    SIMULATED,
     forces_along_track,
     learned_model_figure,
-    model_table,
-    replay_figure,
     replay_table,
-    spread_table,
 )
 
 ERRORS = {"rms_x_mm": 1.234, "median_x_mm": 1.0, "rms_theta_deg": 0.5, "median_theta_deg": 0.25}
-SPREADS = {"rms_spread_x_mm": 2.0, "rms_spread_theta_deg": 1.0, "within_x_mm": 0.9, "within_theta_deg": 1.0}
 
 
 def test_a_replay_has_a_row_for_each_time() -> None:
@@ -33,30 +27,6 @@ def test_a_replay_has_a_row_for_each_time() -> None:
         ["0.1", "1.23", "1.00", "0.500", "0.250"],
         ["1", "1.23", "1.00", "0.500", "0.250"],
     ]
-
-
-def test_models_are_compared_at_each_time() -> None:
-    lines = [{"after_s": 0.1, **ERRORS}]
-    rows = model_table({"physics": lines, "learned": lines}, "errors").splitlines()[3:]
-    assert [row.split()[:2] for row in rows] == [["0.1", "physics"], ["learned", "1.23"]]
-
-
-def test_errors_are_listed_with_spreads() -> None:
-    text = spread_table([{"after_s": 0.5, **ERRORS, **SPREADS}], 2.0, "spreads")
-    assert "within 2 spreads" in text
-    assert text.splitlines()[-1].split() == ["0.5", "1.23", "/", "2.00", "90%", "0.500", "/", "1.00", "100%"]
-
-
-def test_both_carts_and_the_error_are_drawn(replay: Replayed) -> None:
-    figure = replay_figure([replay], 0.02, (0.1, 0.5, 1.0, 7.0), "Title")
-    angle, position, left, right = figure.axes
-    simulated = [line for line in position.lines if colors.same_color(line.get_color(), SIMULATED)]
-    np.testing.assert_allclose(simulated[0].get_ydata(), 100 * replay.x[0])
-    assert position.lines[0].get_ydata() == pytest.approx(100 * replay.episode.x)
-    assert angle.get_ylabel() == "pole angle (deg)"
-    for axes, text in ((left, "20.0 mm"), (right, "3.00 deg")):
-        assert [each.get_text() for each in axes.texts].count(text) == 3  # none at 7 s
-    assert left.get_xlabel() == "time since the reset (s)"
 
 
 def test_forces_are_known_where_the_cart_was() -> None:

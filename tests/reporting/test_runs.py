@@ -1,6 +1,5 @@
 """One damaged run is named with its problem; no damage stops a report."""
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,6 @@ from cartpole_rl.reporting.runs import (
     Run,
     find_runs,
     learning_curve,
-    measured,
     partly_measured_note,
     read_run,
 )
@@ -96,20 +94,6 @@ def test_a_failed_job_says_why(study: Path) -> None:
     assert read_run(folder).problem == "failed: cart_mass=-1: give more than 0"
 
 
-def test_a_repeated_episode_is_a_whole_run(study: Path, edit: Edit) -> None:
-    folder = study / "much/11/evaluations/heavy"
-    edit(folder / "metrics.json", lambda content: content["episodes"].pop())
-    assert read_run(folder).problem == "interrupted: 1 of 2 episodes"
-    edit(folder / "config.yaml", lambda content: content.update(repeat={"run": "x", "episode": 1}))
-    assert read_run(folder).problem == ""
-
-
-@pytest.mark.parametrize("value", [True, float("nan"), 10**400, 1.7e308, "5", None, [1]])
-def test_these_are_no_scores(value: object) -> None:
-    assert measured({"score": {"mean": value}}, "score") is None
-    assert measured({"score": value}, "score") is None
-
-
 @pytest.mark.parametrize(
     ("text", "line"),
     [
@@ -151,11 +135,3 @@ def test_a_mean_over_a_part_of_the_episodes_is_noted() -> None:
     assert partly_measured_note([run(3), run(1), run(2)], "time") == (
         "time: only 3 of 6 episodes of 2 runs have it; their means are over these episodes."
     )
-
-
-def test_settings_of_any_kind_are_compared(study: Path) -> None:
-    folder = study / "much/11/evaluations/heavy"
-    text = (folder / "config.yaml").read_text()
-    (folder / "config.yaml").write_text(f"{text}dates: [2020-01-01]\n")
-    run = read_run(folder)
-    assert (run.problem, run.settings["dates"]) == ("", json.dumps(["2020-01-01"]))

@@ -6,9 +6,6 @@ import pytest
 from command_line import Outcome, in_process
 from shown_pages import loaded, needs_browser, shown
 
-from cartpole_rl.reporting.results import Agent, Group, Results
-from cartpole_rl.reporting.runs_page import run_list
-
 FOLDER = "hydra.run.dir=report"
 
 
@@ -34,12 +31,6 @@ def test_a_browser_shows_the_page_of_two_sets_of_runs(study: Path) -> None:
     files = list(Path("report/figures").glob("*.svg"))
     assert len(files) == page.count("<svg") > 0
     assert all("<svg" in file.read_text(encoding="utf-8") for file in files)
-
-
-def test_a_list_that_leaves_runs_out_says_so() -> None:
-    for count, heading in ((1500, "The 1500 runs behind it: the first 1000<"), (3, "The 3 runs behind it<")):
-        agents = tuple(Agent("a", seed, f"runs/{seed}", {"own": 1.0}) for seed in range(count))
-        assert heading in run_list(Results("many", "Many", "score", [Group("a", "arm")], agents))
 
 
 @pytest.mark.parametrize(

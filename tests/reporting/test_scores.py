@@ -1,12 +1,9 @@
 """Learning curves show every run and the median of those with one label; comparisons show all episodes."""
 
-import math
-
 import numpy as np
 import pytest
 from figure_contents import line_of, words
 
-from cartpole_rl.errors import ConfigError
 from cartpole_rl.intervals import student_interval
 from cartpole_rl.reporting.scores import comparison, learning_curve
 from cartpole_rl.reporting.style import series_colour
@@ -47,13 +44,6 @@ def test_runs_of_one_label_get_their_median() -> None:
     assert "median of 3 runs" in axes.get_legend().get_texts()[0].get_text()
 
 
-def test_each_label_has_its_colour() -> None:
-    runs = [("Adam", records([1, 2])), ("AdamW", records([3, 4])), ("Adam", records([5, 6]))]
-    axes = learning_curve(runs).axes[0]
-    assert {line.get_color() for line in axes.lines} == {series_colour(0), series_colour(1)}
-    assert len(axes.get_legend().get_texts()) == 2
-
-
 def test_runs_with_different_evaluation_points_are_interpolated() -> None:
     runs = [("a", records([0, 300], 300_000)), ("a", records([0, 100, 200, 300, 400, 500, 600]))]
     axes = learning_curve(runs).axes[0]
@@ -63,28 +53,6 @@ def test_runs_with_different_evaluation_points_are_interpolated() -> None:
     assert transitions[-1] == pytest.approx(0.6)
     assert scores[0] == pytest.approx((0 + 200) / 2)
     assert scores[-1] == pytest.approx((300 + 500) / 2)
-
-
-def test_label_has_the_time_at_which_the_target_was_reached() -> None:
-    runs = [("a", records([0, 4000, 5000])), ("a", records([0, 0, 4500])), ("a", records([0, 0, 0]))]
-    text = words(learning_curve(runs, threshold=4000, guides={"good": 2000, "very good": 2500}))
-    assert "target 4000\n2 of 3 runs,\nmedian 2 s" in text
-    assert "very good" in text
-    assert "not reached" in words(learning_curve(runs, threshold=6000))
-
-
-@pytest.mark.parametrize("histories", [[], [("a", [])]])
-def test_nothing_to_draw_is_an_error(histories: list) -> None:
-    with pytest.raises(ConfigError, match="at least one"):
-        learning_curve(histories)
-
-
-def test_dots_are_the_episodes_and_lines_their_means() -> None:
-    axes = comparison(RESULTS).axes[0]
-    dots, mean = axes.lines[0], axes.lines[1]
-    assert sorted(dots.get_ydata()) == RESULTS["simulated"]
-    np.testing.assert_allclose(mean.get_ydata(), 4100)
-    assert axes.get_ylabel() == "score of an episode"
 
 
 def test_labels_have_interval_and_ratio() -> None:
@@ -98,14 +66,3 @@ def test_student_interval_holds_the_mean_95_times_in_100() -> None:
     generator = np.random.default_rng(0)
     intervals = [student_interval(generator.normal(5, 2, 8)) for _ in range(2000)]
     assert np.mean([low < 5 < high for low, high in intervals]) == pytest.approx(0.95, abs=0.015)
-
-
-def test_a_single_episode_has_no_interval() -> None:
-    assert "4000" in words(comparison({"serial": [4000.0]}))
-    assert all(math.isnan(end) for end in student_interval(np.array([1.0])))
-
-
-@pytest.mark.parametrize("results", [{}, {"serial": []}])
-def test_nothing_to_compare_is_an_error(results: dict) -> None:
-    with pytest.raises(ConfigError, match="at least one"):
-        comparison(results)

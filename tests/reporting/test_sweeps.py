@@ -132,29 +132,6 @@ def test_settings_that_tell_two_sets_apart_are_not_part_of_the_groups(study: Pat
     assert "is only in" not in page
 
 
-def test_long_labels_have_the_same_number_in_both_sets(study: Path, edit: Edit) -> None:
-    long = {"cart_mass": 0.7123, "pole_viscous": 0.00123, "cart_coulomb": 0.81234}
-    for arm, factor in (("little", 1), ("much", 2)):
-        for config in (study / arm).glob("*/evaluations/*/config.yaml"):
-            values = {name: factor * value for name, value in long.items()}
-            edit(config, lambda content, values=values: content["parameters"].update(values))
-    for folder in study.glob("*/*/evaluations/nominal"):
-        words = [f"parameters.{name}=1" for name in long]
-        edit(folder / "provenance.json", lambda content, words=words: content.update(command=words))
-    shutil.copytree("quick", "other")
-    Path("other/friction/little").rename("other/friction/zzz")  # now the last of its set
-    sets = {
-        name: [f"{root}/*/*/*/evaluations/nominal"]
-        for name, root in (("runs", "quick"), ("compare", "other"))
-    }
-    sweeps, between = grouped(read_sweeps(sets, MEASURE))
-    first, second = (results_of(sweep, MEASURE) for sweep in sweeps)
-    assert all(len(each.label) > 48 and each.label[0] in "12" for each in first.groups)
-    page = comparison(first, second, between)
-    assert "is only in" not in page
-    assert [float(text.split()[0]) for text in cells(page, "difference, 95 % interval")] == [0, 0]
-
-
 def test_failed_jobs_and_links_are_named_or_followed(study: Path) -> None:
     failed = study / "much/11/evaluations/heavy"
     shutil.rmtree(failed)
@@ -189,24 +166,6 @@ def test_the_agents_of_evaluations_count(study: Path, edit: Edit) -> None:
     assert "The runs of 3 agents were not found and are not checked." in results_of(lost, MEASURE).notes
 
 
-def test_agents_that_were_tuned_from_different_agents_are_different_groups(study: Path, edit: Edit) -> None:
-    for seed, carts in ((10, 512), (11, 1024), (12, 1024)):
-        heavy = study / f"much/{seed}/evaluations/heavy"
-        for name, run in (("origins", None), ("tuned", f"origins/{seed}")):
-            shutil.copytree(heavy, f"{name}/{seed}")
-            edit(Path(name, str(seed), "config.yaml"), lambda content, run=run: content.update(run=run))
-        edit(Path(f"origins/{seed}/config.yaml"), lambda content, carts=carts: content.update(carts=carts))
-        edit(heavy / "config.yaml", lambda content, seed=seed: content.update(run=f"tuned/{seed}"))
-    edit(Path("origins/10/config.yaml"), lambda content: content.update(run="tuned/10"))  # a circle
-    (sweep,), _ = grouped([read_sweep("runs", ["quick/friction/much/*/evaluations/heavy"], MEASURE)])
-    assert sweep.columns["agent.agent.carts"] == ["512", "1024", "1024"]
-    assert len({*sweep.labels}) == 2
-    for seed in (10, 11, 12):  # by default every fine-tuning has seed 0
-        edit(Path(f"tuned/{seed}/config.yaml"), lambda content: content.update(seed=0))
-    (sweep,), _ = grouped([read_sweep("runs", ["quick/friction/much/*/evaluations/heavy"], MEASURE)])
-    assert [agent.seed for agent in results_of(sweep, MEASURE).agents] == [10, 11, 12]
-
-
 def test_versions_and_commands_are_compared_over_both_sets(study: Path, edit: Edit) -> None:
     shutil.copytree("quick", "other")
     sets = {"runs": ["quick"], "compare": ["other"]}
@@ -226,12 +185,3 @@ def test_versions_and_commands_are_compared_over_both_sets(study: Path, edit: Ed
     )
     assert versions.startswith("The versions of compare differ from the rest: ")
     assert versions in results_of(grouped([second])[0][0], MEASURE).notes
-
-
-def test_seeds_that_no_group_has_all_of_are_noted(study: Path) -> None:
-    shutil.rmtree(study / "little/10")
-    shutil.rmtree(study / "much/12")
-    (sweep,), _ = grouped([read_sweep("runs", ["quick/friction/*/*/evaluations/nominal"], MEASURE)])
-    notes = results_of(sweep, MEASURE).notes
-    assert "cart_viscous=0.2 lacks seed 10" in notes
-    assert "cart_viscous=3 lacks seed 12" in notes

@@ -12,7 +12,7 @@ from tensorboard.plugins.hparams import metadata
 
 from cartpole_rl.reporting.animation import gif
 from cartpole_rl.reporting.episodes import behaviour
-from cartpole_rl.reporting.tensorboard import TensorBoardLog, flatten, scalars
+from cartpole_rl.reporting.tensorboard import TensorBoardLog, scalars
 from cartpole_rl.tasks.episode import Episode
 
 
@@ -88,24 +88,6 @@ def test_hparams_list_three_runs_with_settings_and_final_metrics(tmp_path: Path)
         assert metadata.SESSION_END_INFO_TAG in content
         assert [event.value for event in runs.Scalars(f"run{seed}", "summary/score")] == [4000.0 + seed]
         assert "summary/never" not in runs.Runs()[f"run{seed}"]["scalars"]
-
-
-def test_flatten_gives_dotted_names_and_plain_values() -> None:
-    config = {
-        "agent": {"layers": [128, 128], "double": True, "lr": 1e-3, "noise": {"sigma": None}},
-        "seed": 3,
-        "limit": float("inf"),
-        "task": "swingup",
-    }
-    assert flatten(config) == {
-        "agent.layers": "[128, 128]",
-        "agent.double": "true",
-        "agent.lr": 1e-3,
-        "agent.noise.sigma": "none",
-        "seed": 3,
-        "limit": "inf",
-        "task": "swingup",
-    }
 
 
 class TestResume:

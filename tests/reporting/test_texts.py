@@ -1,15 +1,12 @@
 """Tables line up; their numbers, and those of reports, are rounded to what a reader can use."""
 
-import dataclasses
 import math
 
 import pytest
 
-from cartpole_rl.reporting.results import estimate_text, low_is_good, sentence_start, value_text
+from cartpole_rl.reporting.results import estimate_text, value_text
 from cartpole_rl.reporting.statistics import Estimate
-from cartpole_rl.reporting.texts import ENDINGS, count_text, ending_text, interval_text, number_text, table
-from cartpole_rl.tasks.endings import Ending
-from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.reporting.texts import interval_text, number_text, table
 
 
 def test_layout_of_a_table() -> None:
@@ -24,19 +21,6 @@ def test_layout_of_a_table() -> None:
         "simulated  4210 ± 85      –  20      0.012",
         "emulated     912 ± 5  0.217   5      0.300",
     ]
-
-
-def test_columns_may_be_just_keys_and_rows_may_lack_them() -> None:
-    assert table([{"a": True}, {"b": "x"}], ["a", "b"]).splitlines() == [
-        "a    b",
-        "───  ─",
-        "yes  –",
-        "–    x",
-    ]
-
-
-def test_without_rows_only_the_heading_is_printed() -> None:
-    assert table([], ["a", "b"]).splitlines() == ["a  b", "─  ─"]
 
 
 def test_nan_is_a_dash_and_does_not_affect_its_column() -> None:
@@ -60,28 +44,12 @@ def test_interval_text(mean: float, low: float, high: float, text: str) -> None:
     assert interval_text(mean, low, high) == text
 
 
-def test_interval_text_on_request_by_its_ends_and_with_fewer_decimals() -> None:
-    assert interval_text(4210.3, 4125.1, 4295.5, ends=True) == "4210 (4125 to 4296)"
-    assert interval_text(2.763, 2.71, 2.81, ends=True, most_decimals=1) == "2.8 (2.7 to 2.8)"
-    assert interval_text(-0.00002, -0.00004, 0.00001, most_decimals=1) == "0.0 (0.0 to 0.0)"
-
-
 @pytest.mark.parametrize(
     ("value", "text"),
     [(4210.4, "4210"), (12.345, "12.3"), (0.004561, "0.00456"), (0.0, "0"), (-7.0, "-7.00"), (math.nan, "–")],
 )
 def test_number_text(value: float, text: str) -> None:
     assert number_text(value) == text
-
-
-def test_every_ending_has_a_text_of_its_own() -> None:
-    assert set(ENDINGS) == set(Ending)
-    assert len(set(ENDINGS.values())) == len(Ending)
-
-
-def test_the_text_has_the_duration(balance: Episode) -> None:
-    later = dataclasses.replace(balance, ended_by=Ending.LINK, time=balance.time + 5)
-    assert ending_text(later) == "the link was lost after 10.0 s"
 
 
 @pytest.mark.parametrize(
@@ -100,14 +68,3 @@ def test_an_interval_is_written_by_its_ends(found: Estimate, measure: str, text:
 @pytest.mark.parametrize(("value", "text"), [(4210.4, "4210"), (2.76, "2.8"), (-0.000019, "0.0")])
 def test_a_score_has_at_most_one_decimal_and_no_minus_zero(value: float, text: str) -> None:
     assert value_text(value, "score") == text
-
-
-def test_less_is_better_of_errors_and_times() -> None:
-    assert low_is_good("errors.median")
-    assert low_is_good("time_to_upright_s")
-    assert not low_is_good("score")
-
-
-def test_counts_and_starts_of_sentences() -> None:
-    assert (count_text(1), count_text(10, "model")) == ("1 episode", "10 models")
-    assert sentence_start("score (6.2)") == "Score (6.2)"

@@ -43,7 +43,6 @@ def test_the_guard_of_the_training_stays() -> None:
 
 
 WEAK = (-150, -130, -110, -90, 0, 90, 110, 130, 150)
-SAME_ENDS = (-250, -188, -125, -63, 0, 63, 125, 188, 250)
 SERIAL = {"plant": "serial", "plant.port": "port"}
 
 
@@ -70,12 +69,6 @@ def test_a_simulated_cart_does_not_tell_its_parameters_to_the_new_guard() -> Non
     evaluation = load_settings(EvaluateConfig, {"run": "any", **unknown, **with_motors(WEAK)})
     settings = evaluated_settings(fitted(), evaluation)
     assert settings.guard.active == fitted(**with_motors(WEAK)).guard.active
-
-
-def test_motor_values_with_the_same_ends_need_no_new_guard() -> None:
-    training = fitted()
-    evaluation = load_settings(EvaluateConfig, {"run": "any", **with_motors(SAME_ENDS)})
-    assert evaluated_settings(training, evaluation).guard == training.guard
 
 
 @pytest.mark.parametrize(

@@ -1,13 +1,11 @@
 """The files of an identification give each number exactly, with the unit that conf/ gives it."""
 
-import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
 
-from cartpole_rl.choices import conf_folder
 from cartpole_rl.identification.fit import Fit
 from cartpole_rl.identification.identify import Candidate, Identification, PredictionError
 from cartpole_rl.identification.rollout import Dynamics
@@ -58,25 +56,3 @@ def test_a_law_of_a_user_has_a_file_with_the_parameters_that_it_brings(
     assert choice == {"model": "test:law", "parameters": {"test_slip": numbers.pop("test_slip")}}
     assert yaml.safe_load((tmp_path / "cart.yaml").read_text()) == numbers
     assert friction_choice(models.cart_friction, Path("id")) == "cart_friction=id/cart_friction.yaml"
-
-
-def test_the_units_are_those_of_the_nominal_cart(folder: Path) -> None:
-    line = re.compile(r"^(\w+): +\S+ +# ([^,:;}\n]+)", re.MULTILINE)
-    written = dict(line.findall((folder / "cart.yaml").read_text()))
-    nominal = {
-        name: unit.strip() for name, unit in line.findall((conf_folder() / "cart/ip02.yaml").read_text())
-    }
-    assert written.keys() == nominal.keys()
-    for name in written.keys() - {"deadband_left", "deadband_right", "latency"}:  # there in words
-        assert written[name] == nominal[name], name
-    assert written["deadband_left"] == written["deadband_right"] == "motor value"
-    assert written["latency"] == "s"
-
-
-def test_pole_and_randomization_name_their_units(folder: Path) -> None:
-    assert (
-        (folder / "pole.yaml")
-        .read_text()
-        .startswith("# pole_mass in kg, pole_com in m, pole_inertia in kg m^2.\n")
-    )
-    assert "# Absolute ranges are in s (latency_jitter).\n" in (folder / "randomization.yaml").read_text()

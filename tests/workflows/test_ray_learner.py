@@ -18,7 +18,7 @@ import pytest
 import torch
 from short_episode import EPISODE
 
-from cartpole_rl.errors import ConfigError, LearnerError, LearningError
+from cartpole_rl.errors import LearnerError, LearningError
 from cartpole_rl.evaluation.driving_policy import Weights, as_weights
 from cartpole_rl.learning.checkpoints import FINETUNING_FORMAT, AgentCheckpoint, load_training
 from cartpole_rl.learning.settings import RayLearnerSettings
@@ -276,15 +276,6 @@ def test_the_reason_of_a_process_that_ends_is_shown_and_it_is_started_again(
     assert not link.is_lost
 
 
-def test_news_are_taken_once(link: PipedLink, shown: list[str]) -> None:
-    link.send((Taken("first", 2), ["fitted", Curves(0, {"loss": 2.0})]))
-    link.send((Taken("first", 3), [Curves(1, {"loss": 1.0})]))
-    assert [news.learned for news in link.poll()] == [0, 1]
-    assert link.poll() == []
-    assert shown[-1] == "learner: fitted"
-    assert link._taken == Taken("first", 3)  # from which the next process goes on
-
-
 def test_a_learning_that_failed_ends_the_session(link: PipedLink) -> None:
     with pytest.raises(LearningError, match="diverged"):
         link.send((Taken("first", 1), [LearningError("diverged")]))
@@ -403,15 +394,3 @@ def test_an_address_that_cannot_be_reached_is_refused(
     monkeypatch.setattr(socket, "create_connection", fail)
     with pytest.raises(ConnectionError, match=error.strerror or str(error)):
         check_address("server:6379")
-
-
-@pytest.mark.parametrize("address", ["server", "ray://server:10001", "server:637900", ""])
-def test_an_address_has_a_host_and_a_port(address: str) -> None:
-    with pytest.raises(ConfigError, match=r"learner\.address=.*: give host:port"):
-        load_settings(FinetuneConfig, {**CONFIG, "learner": {**CONFIG["learner"], "address": address}})
-
-
-@pytest.mark.parametrize("host", ["a..b", "a" * 64])
-def test_a_name_that_no_host_can_have_is_refused(host: str) -> None:
-    with pytest.raises(ConnectionError, match="labels of 1 to 63 characters"):
-        check_address(f"{host}:6379")

@@ -1,11 +1,10 @@
 """The recordings that a folder or a run folder holds."""
 
-import json
 from pathlib import Path
 
 import pytest
 
-from cartpole_rl.errors import ConfigError, RecordingError
+from cartpole_rl.errors import RecordingError
 from cartpole_rl.run_folder import experiments, recordings
 
 
@@ -16,22 +15,10 @@ def write(folder: Path, *names: str) -> list[Path]:
     return [folder / name for name in names]
 
 
-def test_a_file_is_its_own_recording(tmp_path: Path) -> None:
-    (file,) = write(tmp_path, "any.csv")
-    assert recordings(file) == [file]
-
-
 def test_a_folder_gives_its_recordings_in_order(tmp_path: Path) -> None:
     last, first = write(tmp_path, "b.csv", "a.csv")
     write(tmp_path, "notes.txt")
     assert recordings(tmp_path) == [first, last]
-
-
-def test_a_run_folder_gives_those_of_its_subfolder(tmp_path: Path) -> None:
-    write(tmp_path, "history.csv")
-    assert recordings(tmp_path) == [tmp_path / "history.csv"]
-    inner = write(tmp_path / "recordings", "episode_000.csv")
-    assert recordings(tmp_path) == inner
 
 
 def test_experiments_have_the_names_of_their_files_without_the_number(tmp_path: Path) -> None:
@@ -45,14 +32,3 @@ def test_experiments_have_the_names_of_their_files_without_the_number(tmp_path: 
 def test_a_source_without_recordings_is_refused(tmp_path: Path, name: str, missing: str) -> None:
     with pytest.raises(RecordingError, match=f"{missing}; give a run of cartpole-record"):
         recordings(tmp_path / name)
-
-
-def test_the_run_of_a_command_that_records_nothing_is_refused(tmp_path: Path) -> None:
-    write(tmp_path, "a.csv")
-    for program, taken in (("record", True), ("train", False)):
-        (tmp_path / "provenance.json").write_text(json.dumps({"program": f"cartpole-{program}"}))
-        if taken:
-            assert recordings(tmp_path) == [tmp_path / "a.csv"]
-        else:
-            with pytest.raises(ConfigError, match="is a run of cartpole-train"):
-                recordings(tmp_path)

@@ -8,12 +8,6 @@ from cartpole_rl.workflows.build import replaced_settings
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig, load_settings
 
 
-def test_motor_values_are_replaced() -> None:
-    config = load_settings(EvaluateConfig, {"run": "somewhere", "actions": "nine_levels_linear"})
-    settings = replaced_settings(load_settings(TrainConfig), config)
-    assert settings.actions.motors == (-250, -188, -125, -63, 0, 63, 125, 188, 250)
-
-
 def test_another_number_of_them_is_refused() -> None:
     config = load_settings(EvaluateConfig, {"run": "somewhere", "actions": "three"})
     with pytest.raises(ConfigError, match=r"^actions: 3 motor values, but the agent chooses from 9; give 9$"):
@@ -43,18 +37,6 @@ def test_a_serial_cart_has_the_pole_of_the_stated_length(length: float | None, n
     training = load_settings(TrainConfig, {"experiment": "both"})
     settings = replaced_settings(training, load_settings(EvaluateConfig, {"run": "somewhere", **plant}))
     assert settings.pole.name == (name or training.pole.name)
-
-
-def test_a_chosen_pole_is_kept() -> None:
-    words = {
-        "run": "somewhere",
-        "plant": "serial",
-        "plant.port": "port",
-        "plant.pole_length": 0.5,
-        "pole": "large",
-    }
-    settings = replaced_settings(load_settings(TrainConfig), load_settings(EvaluateConfig, words))
-    assert settings.pole.name == "large"
 
 
 def test_only_simulated_poles_are_knocked_by_an_evaluation() -> None:

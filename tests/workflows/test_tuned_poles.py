@@ -66,11 +66,6 @@ def test_a_second_fine_tuning_keeps_the_pole_of_the_first(
     assert saved(twice, tmp_path / "last.pt") == [MEDIUM, LARGE, ROD]
 
 
-def test_a_checkpoint_without_tuned_poles_is_read(agent: AgentCheckpoint, tmp_path: Path) -> None:
-    del vars(agent)["tuned_poles"]  # as before they were stored
-    assert saved(agent, tmp_path / "last.pt") == [MEDIUM]
-
-
 def test_it_is_exported_with_a_track_guard_for_all_poles_that_it_knows(
     training: TrainConfig, agent: AgentCheckpoint, tmp_path: Path
 ) -> None:

@@ -1,17 +1,13 @@
-"""The person at the terminal: asked over a real pseudo-terminal."""
+"""Questions and messages at the terminal, over a real pseudo-terminal."""
 
 import os
 import pty
-import shlex
 import subprocess
 import sys
 import time
 from pathlib import Path
 
-import pytest
-from hydra.core.override_parser.overrides_parser import OverridesParser
-
-from cartpole_rl.terminal import as_word, confirm
+from cartpole_rl.terminal import confirm
 
 FOLDERS = ["runs", "100%", "a:b", "-x", "my runs", "a=b", "a,b", "a #b", "a: b", "é", "[x]", "x]", "{seed}"]
 FOLDERS += ["it's", "'q'", '"', '\\"', "a\\b", "~", "*x", "&x", "!x", "null", "a/../b", "$x", "(x)", "a;b"]
@@ -56,17 +52,3 @@ def test_an_earlier_enter_does_not_answer_the_question(tmp_path: Path) -> None:
 
 def test_without_a_terminal_no_question_is_asked() -> None:
     assert not confirm("the cart latched a fault")
-
-
-@pytest.mark.parametrize("folder", FOLDERS)
-def test_hydra_reads_the_word_of_a_folder_after_the_shell(folder: str) -> None:
-    path = Path(folder, "quick")
-    (word,) = shlex.split(as_word("runs", path))
-    override = OverridesParser.create().parse_override(word)
-    assert not override.is_sweep_override()
-    assert override.value() == str(path)
-
-
-@pytest.mark.parametrize("folder", FOLDERS[:4])
-def test_a_word_without_special_characters_has_no_quotes(folder: str) -> None:
-    assert as_word("runs", Path(folder)) == f"runs={folder}"
