@@ -66,7 +66,7 @@ def report_episodes(
         draw(onboard[0], figures, "onboard_", f"plant={plant}, on the board", pole, x_max, mp4)
     draw(episodes[0], figures, "", f"plant={plant}", pole, x_max, mp4)
     if history:
-        curve = learning_curve([(task.measure, history)], measure=task.measure)
+        curve = learning_curve(history, task.measure)
         style.save(curve, figures / "learning_curve.png")
     write_json(folder / METRICS, content)
     return summary

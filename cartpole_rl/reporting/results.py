@@ -12,7 +12,7 @@ from typing import Any, Protocol, get_args
 import numpy as np
 
 from cartpole_rl.reporting.statistics import Array, Estimate, estimate
-from cartpole_rl.reporting.texts import MOST_DECIMALS, interval_text, number_text
+from cartpole_rl.reporting.texts import MOST_DECIMALS, count_text, interval_text, number_text
 from cartpole_rl.tasks.settings import Measure
 
 GOOD = {"score": 2000.0}  # measure: value above which the thesis calls an agent good (section 6)
@@ -147,11 +147,6 @@ def _decimals(measure: str) -> int:
     return SCORE_DECIMALS if measure in SCORES else MOST_DECIMALS
 
 
-def counted_text(count: int, unit: str = "agent") -> str:
-    """Return "1 agent" or "10 agents"."""
-    return f"{count} {unit}{'' if count == 1 else 's'}"
-
-
 def sentence_start(text: str) -> str:
     """Return a text with a capital letter at its start."""
     return text[:1].upper() + text[1:]
@@ -166,14 +161,14 @@ def ranked_text(found: Mapping[str, Estimate], unit: str = "agent", measure: str
     same_count = all(each.agents == best.agents for each in found.values())
     if same_count and len({estimate_text(each, measure) for each in found.values()}) == 1:
         each = "" if len(labels) == 1 else f"each of {len(labels)} set-ups "
-        return f"{note}: {each}{estimate_text(best, measure)}, {counted_text(best.agents, unit)}"
+        return f"{note}: {each}{estimate_text(best, measure)}, {count_text(best.agents, unit)}"
 
     def entry(label: str) -> str:
-        count = "" if same_count else f" of {counted_text(found[label].agents, unit)}"
+        count = "" if same_count else f" of {count_text(found[label].agents, unit)}"
         name = label if PLAIN.fullmatch(label) else f"“{label}”"
         return f"{name} {estimate_text(found[label], measure)}{count}"
 
-    end = f"; {counted_text(best.agents, unit)} each" if same_count else ""
+    end = f"; {count_text(best.agents, unit)} each" if same_count else ""
     first, last = ("lowest", "highest") if less else ("highest", "lowest")
     if len(labels) <= MOST_LISTED:
         return f"{note}: {', '.join(map(entry, labels))}{end}"

@@ -19,7 +19,6 @@ from cartpole_rl.reporting.results import (
     Agent,
     Exclusion,
     Results,
-    counted_text,
     estimate_text,
     low_is_good,
     measure_label,
@@ -30,7 +29,7 @@ from cartpole_rl.reporting.results import (
 from cartpole_rl.reporting.runs import short
 from cartpole_rl.reporting.statistics import difference, estimate, probability_of_improvement
 from cartpole_rl.reporting.style import svg
-from cartpole_rl.reporting.texts import number_text
+from cartpole_rl.reporting.texts import count_text, number_text
 from cartpole_rl.run_folder import ANIMATION, FIGURES
 
 BUDGET = 12_000_000  # bytes of all pictures; a page takes a third more
@@ -131,7 +130,7 @@ def _section(results: Results, pictures: Sequence[Picture]) -> str:
     parts = [
         f'<section id="{anchor(results.name)}">',
         f"<h2>{escaped(results.title)}</h2>",
-        f"<p>{counted_text(len(results.agents))} in {groups}. {escaped(_answer(results))}</p>",
+        f"<p>{count_text(len(results.agents), 'agent')} in {groups}. {escaped(_answer(results))}</p>",
         doubts(results),
         *figure_parts(results, pictures, drawings(results)),
         run_list(results),

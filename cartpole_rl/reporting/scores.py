@@ -1,7 +1,7 @@
 """Scores of an agent: tables for the terminal, learning curves, and comparisons of carts.
 
-Figure 6.9 of the thesis shows the learning curve of one agent; here every seed is drawn. Figures 6.8 and 6.14
-show the ratio of the real to the simulated score.
+The learning curve is figure 6.9 of the thesis; figures 6.8 and 6.14 show the ratio of the real to the
+simulated score.
 """
 
 import math
@@ -37,8 +37,6 @@ MEAN = 0.12  # offset of its mean and interval
 SPREAD = 0.11  # half width of the cloud of dots
 BOX = 0.07  # half width of a mean's line and of the box that is its interval
 
-Record = Mapping[str, Any]
-Run = Sequence[Record]
 Interval = tuple[float, float]
 Array = NDArray[np.float64]
 
@@ -63,101 +61,39 @@ def mean_text(value: Mapping[str, Any] | None) -> str | None:
     return None if value is None else interval_text(value["mean"], value["low"], value["high"])
 
 
-def learning_curve(
-    histories: Sequence[tuple[str, Run]],
-    threshold: float | None = None,
-    guides: Mapping[str, float] | None = None,
-    title: str = "Learning curve",
-    measure: Measure = "score",
-) -> Figure:
-    """Draw the score of each evaluation over millions of transitions, one colour for each label.
+def learning_curve(history: Sequence[Mapping[str, Any]], measure: Measure) -> Figure:
+    """Draw the mean of each evaluation over millions of transitions, in a band from worst to best episode.
 
-    A history is a label and its records in order, one per evaluation: `transitions`, `seconds` of training,
-    and over the episodes of that evaluation the `measure` (mean), `score_min`, `score_max`.
-    **Runs that share a label are seeds of one set-up**: each is a thin line, their median a thick one. A
-    single run is a thick line. The band spans the worst to the best episode of all runs of that label.
-    `threshold` is a target score; `guides` are other named scores.
-    Raises ConfigError for no history and for one without a record.
+    Each record of `history`, one or more, has `transitions`, and over the episodes of that evaluation the
+    `measure` (mean), `score_min` and `score_max`.
     """
-    if not histories or not all(records for _, records in histories):
-        raise ConfigError("a learning curve needs at least one run, and at least one evaluation in each")
     figure = style.new_figure(height=4.4)
     axes = figure.subplots()
     style.dress(axes, x="transitions (millions)", y=f"{SCORES[measure]} of an episode")
-    groups: dict[str, list[Run]] = {}
-    for label, records in histories:
-        groups.setdefault(label, []).append(records)
-    for index, (name, runs) in enumerate(groups.items()):
-        _draw_runs(axes, name, runs, style.series_colour(index), measure)
-    for name, score in (guides or {}).items():
-        style.guide(axes, score, name)
-    if threshold is not None:
-        reached = _outcome([run for _, run in histories], threshold, measure)
-        style.guide(axes, threshold, f"target {threshold:g}\n{reached}", colours.LIMIT)
+    keys = ("transitions", measure, "score_min", "score_max")
+    transitions, means, lowest, highest = np.array([[each[key] for key in keys] for each in history], float).T
+    millions, colour = transitions / MILLION, style.series_colour(0)
+    axes.fill_between(millions, lowest, highest, color=colour, alpha=0.13, linewidth=0)
+    marker = "o" if len(millions) == 1 else ""
+    axes.plot(millions, means, marker=marker, color=colour, linewidth=2.2, label=measure)
     axes.xaxis.set_major_locator(MaxNLocator(nbins=8, steps=(1, 2, 5, 10)))
     axes.set_xlim(left=0)
     axes.set_ylim(bottom=min(0.0, axes.dataLim.y0))
     axes.legend(loc="lower right", fontsize=style.SMALL_SIZE, frameon=True, framealpha=0.9, edgecolor="none")
-    lines = "thin lines: runs,  thick line: their median" if len(histories) > len(groups) else "line: mean"
-    style.title(axes, title, f"{lines},  band: worst to best episode")
+    style.title(axes, "Learning curve", "line: mean,  band: worst to best episode")
     return figure
-
-
-def _column(run: Run, key: str) -> Array:
-    """Return one key of a run's records as an array [evaluations]."""
-    return np.array([record[key] for record in run], dtype=np.float64)
-
-
-def _on_common_transitions(runs: Sequence[Run], key: str) -> tuple[Array, Array]:
-    """Return transitions [F] that all runs reached, and `key` of each run there, interpolated [runs, F]."""
-    transitions = [_column(run, "transitions") for run in runs]
-    first, last = max(each[0] for each in transitions), min(each[-1] for each in transitions)
-    every = np.unique(np.concatenate(transitions))
-    shared = every[(first <= every) & (every <= last)]
-    shared = shared if shared.size else every  # of runs whose ranges do not overlap
-    values = [np.interp(shared, own, _column(run, key)) for own, run in zip(transitions, runs, strict=True)]
-    return shared, np.stack(values)
-
-
-def _draw_runs(axes: Axes, name: str, runs: Sequence[Run], colour: str, measure: Measure) -> None:
-    """Draw the band, the thin line of each seed and the thick line of a label."""
-    transitions, lowest = _on_common_transitions(runs, "score_min")
-    _, highest = _on_common_transitions(runs, "score_max")
-    millions = transitions / MILLION
-    axes.fill_between(millions, lowest.min(0), highest.max(0), color=colour, alpha=0.13, linewidth=0)
-    if len(runs) > 1:
-        for run in runs:
-            at = _column(run, "transitions") / MILLION
-            axes.plot(at, _column(run, measure), color=colour, alpha=0.55, linewidth=0.9)
-        name = f"{name}: median of {len(runs)} runs"
-    scores, marker = np.median(_on_common_transitions(runs, measure)[1], 0), "o" if len(millions) == 1 else ""
-    axes.plot(millions, scores, marker=marker, color=colour, linewidth=2.2, label=name)
-
-
-def _outcome(runs: Sequence[Run], threshold: float, measure: Measure) -> str:
-    """Return how many runs reached the threshold, and their median time: seconds, or minutes from three."""
-    first = (next((each for each in run if each[measure] >= threshold), None) for run in runs)
-    hits = [record["seconds"] for record in first if record]
-    if not hits:
-        return "not reached"
-    seconds = float(np.median(hits))
-    duration = f"{seconds:.0f} s" if seconds < 180 else f"{seconds / 60:.1f} min"
-    if len(runs) == 1:
-        return f"reached after {duration}"
-    return f"{len(hits)} of {len(runs)} runs,\nmedian {duration}"
 
 
 def comparison(
     results: Mapping[str, ArrayLike],
     title: str = "The same agent on each cart",
     intervals: Mapping[str, Interval] | None = None,
-    guides: Mapping[str, float] | None = None,
 ) -> Figure:
     """Draw each episode's score as a dot, the mean with a 95 % interval, and its ratio to the first mean.
 
     `results` maps a name, such as "simulated", to the scores of its episodes [episodes]. `intervals` maps a
     name to (low, high) of its mean; if it is missing, Student's t interval is drawn, and none for a single
-    episode. `guides` names scores to draw as lines. Raises ConfigError for no result or one without episodes.
+    episode. Raises ConfigError for no result or one without episodes.
     """
     scores = {name: np.asarray(values, dtype=np.float64).ravel() for name, values in results.items()}
     if not scores or not all(each.size for each in scores.values()):
@@ -165,8 +101,6 @@ def comparison(
     figure = style.new_figure(height=4.6, width=max(5.0, 1.6 + 1.9 * len(scores)))
     axes = figure.subplots()
     style.dress(axes, y="score of an episode", grid="y")
-    for name, score in (guides or {}).items():
-        style.guide(axes, score, name)
     for column, (name, each) in enumerate(scores.items()):
         _draw_result(axes, column, each, (intervals or {}).get(name) or student_interval(each))
     _name_columns(axes, scores)

@@ -128,12 +128,6 @@ def at_time(axes: Axes, time: float, text: str, colour: str) -> None:
     note(axes, text, (time, 0.25), ("data", "axes fraction"), (6 * side, 0), colour, ha=aligned, va="center")
 
 
-def guide(axes: Axes, height: float, text: str, colour: str = MUTED) -> None:
-    """Draw a dotted horizontal line at `height` in data units, with `text` outside the right edge."""
-    axes.axhline(height, color=colour, linewidth=1.0, linestyle=(0, (3, 3)), zorder=1)
-    beside(axes, height, text, colour)
-
-
 def save(figure: Figure, path: Path) -> None:
     """Write `figure` to `path` in the format of its suffix (.png, .pdf, .svg), and create its folder."""
     with replacing(path) as part:

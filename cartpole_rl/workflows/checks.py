@@ -88,7 +88,7 @@ def check_repetition(config: EvaluateConfig, words: Sequence[str]) -> None:
         return
     if config.repeat.run is not None:
         refuse_others(words, TAKEN_BY_REPEAT, "repeat uses that evaluation's own settings")
-    from cartpole_rl.workflows.repeating import repetition  # reads numbers by NumPy
+    from cartpole_rl.workflows.episodes import repetition  # imports PyTorch
 
     repetition(config)
 

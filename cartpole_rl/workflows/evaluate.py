@@ -17,9 +17,8 @@ from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.terminal import as_word, print_loop_time, print_results, shown
 from cartpole_rl.workflows.checks import agent_file
 from cartpole_rl.workflows.config import EvaluateConfig
-from cartpole_rl.workflows.episodes import Evaluation, prepared
+from cartpole_rl.workflows.episodes import Evaluation, Repetition, prepared
 from cartpole_rl.workflows.poles import POLES, emulated_words, emulator_for, knows, plant_words
-from cartpole_rl.workflows.repeating import Repetition
 
 
 def evaluate(config: EvaluateConfig, folder: Path) -> None:

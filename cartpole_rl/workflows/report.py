@@ -5,10 +5,11 @@ from pathlib import Path
 
 from cartpole_rl.files import write_text
 from cartpole_rl.reporting.groups import Drawing, drawings
-from cartpole_rl.reporting.results import Results, counted_text
+from cartpole_rl.reporting.results import Results
 from cartpole_rl.reporting.runs_page import Gallery, Picture, runs_page
 from cartpole_rl.reporting.style import save
 from cartpole_rl.reporting.sweeps import grouped, read_sweeps, results_of, table
+from cartpole_rl.reporting.texts import count_text
 from cartpole_rl.run_folder import FIGURES, PAGE, write_config
 from cartpole_rl.terminal import print_message
 from cartpole_rl.workflows.config import ReportConfig
@@ -61,6 +62,6 @@ def print_end(results: Sequence[Results], folder: Path) -> None:
     counting = sum(len(each.agents) for each in results)
     others = sum(len(each.exclusions) for each in results)
     where = "; the page says why" if others else ""
-    count = f"{counted_text(counting, 'run')} {'counts' if counting == 1 else 'count'}"
+    count = f"{count_text(counting, 'run')} {'counts' if counting == 1 else 'count'}"
     print(f"{count}, {others} {'does' if others == 1 else 'do'} not{where}")
     print(f"{folder}/{PAGE} is written")

@@ -24,13 +24,12 @@ from cartpole_rl.reporting.groups import (
 from cartpole_rl.reporting.results import (
     SCORES,
     Named,
-    counted_text,
     estimate_text,
     measure_label,
     sentence_start,
 )
 from cartpole_rl.reporting.statistics import Array, Estimate, bootstrap, estimate
-from cartpole_rl.reporting.texts import number_text
+from cartpole_rl.reporting.texts import count_text, number_text
 
 CHARACTER = 0.022  # of the width of a panel, in the label of a tick
 FEWEST_RANKED = 4  # agents from which a rank correlation has an interval
@@ -108,7 +107,7 @@ def _ratios(results: StudyResults) -> Iterator[Drawing]:
     shown, note = groups.most(found)
     if failed := results.pairs(first.name, second.name).shape[1] - counted:
         least = f"{100 * SMALLEST:.0f} % of the highest on the {first.label}"
-        note += f" {counted_text(failed)} without ratio: under {least}."
+        note += f" {count_text(failed, 'agent')} without ratio: under {least}."
     yield Drawing(
         "ratios",
         groups.dot_rows(shown, label, {"1": 1.0}),
@@ -123,7 +122,7 @@ def _agreement(results: StudyResults) -> Iterator[Drawing]:
     present = {label: each for label, each in pairs.items() if each.size}
     if (count := sum(each.shape[1] for each in present.values())) < FEWEST_PROFILED:
         return
-    label, agents = measure_label(results.measure), counted_text(count)
+    label, agents = measure_label(results.measure), count_text(count, "agent")
     colours = groups.group_colours(results)
     # differences between set-ups are part of it
     whose = f"all {len(present)} set-ups together, {agents}" if len(present) > 1 else agents

@@ -15,7 +15,6 @@ from cartpole_rl.reporting.page import Html, document, escaped, table
 from cartpole_rl.reporting.results import (
     GOOD,
     Named,
-    counted_text,
     estimate_text,
     measure_label,
     ranked_text,
@@ -33,6 +32,7 @@ from cartpole_rl.reporting.runs_page import (
     wide,
 )
 from cartpole_rl.reporting.statistics import Array, Estimate, bootstrap
+from cartpole_rl.reporting.texts import count_text
 
 TITLE = "The thesis, carried out"
 THESIS_ROWS = {  # of the thesis's list: what must work
@@ -126,7 +126,7 @@ def _count(results: Sequence[StudyResults]) -> str:
     units: Counter[str] = Counter()
     for each in results:
         units[each.unit] += len(each.agents)
-    *others, last = [counted_text(count, unit) for unit, count in units.items() if count] or ["no result"]
+    *others, last = [count_text(count, unit) for unit, count in units.items() if count] or ["no result"]
     runs = f"{', '.join(others)} and {last}" if others else last
     several = " An agent that several studies evaluate counts in each." if made > 1 else ""
     return f"{part}{len(results)} {'study' if len(results) == 1 else 'studies'}{size}: {runs}.{several}"
@@ -147,9 +147,8 @@ def _tendency(results: Sequence[StudyResults]) -> str:
     most = max((each.size.seeds for each in results if each.agents and each.size), default=ENOUGH)
     if most >= ENOUGH:
         return ""
-    return (
-        f'<p class="alarm">At most {counted_text(most)} per set-up: these results show tendencies only.</p>'
-    )
+    agents = count_text(most, "agent")
+    return f'<p class="alarm">At most {agents} per set-up: these results show tendencies only.</p>'
 
 
 def _emulators(emulators: Mapping[str, str]) -> str:

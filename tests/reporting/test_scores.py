@@ -1,4 +1,4 @@
-"""Learning curves show every run and the median of those with one label; comparisons show all episodes."""
+"""Learning curves show an evaluation as mean and band; comparisons show all episodes."""
 
 import numpy as np
 import pytest
@@ -26,33 +26,13 @@ def records(scores: list[float], transitions_apart: int = 100_000) -> list[dict]
 
 
 def test_one_run_is_a_line_over_millions_of_transitions_in_its_band() -> None:
-    axes = learning_curve([("medium", records([100, 900, 4100]))]).axes[0]
+    axes = learning_curve(records([100, 900, 4100]), "score").axes[0]
     np.testing.assert_allclose(line_of(axes, series_colour(0)), [[0.1, 100], [0.2, 900], [0.3, 4100]])
     band = axes.collections[0].get_paths()[0].vertices
     assert band[:, 1].min() == 0
     assert band[:, 1].max() == 4200
     assert axes.get_xlabel() == "transitions (millions)"
     assert axes.get_ylabel() == "score (6.2) of an episode"
-
-
-def test_runs_of_one_label_get_their_median() -> None:
-    runs = [("medium", records([score, 2 * score])) for score in (100.0, 300.0, 2000.0)]
-    axes = learning_curve(runs).axes[0]
-    assert len(axes.lines) == 4
-    thick = max(axes.lines, key=lambda line: line.get_linewidth())
-    np.testing.assert_allclose(thick.get_ydata(), [300, 600])
-    assert "median of 3 runs" in axes.get_legend().get_texts()[0].get_text()
-
-
-def test_runs_with_different_evaluation_points_are_interpolated() -> None:
-    runs = [("a", records([0, 300], 300_000)), ("a", records([0, 100, 200, 300, 400, 500, 600]))]
-    axes = learning_curve(runs).axes[0]
-    thick = max(axes.lines, key=lambda line: line.get_linewidth())
-    transitions, scores = thick.get_xydata().T
-    assert transitions[0] == pytest.approx(0.3)
-    assert transitions[-1] == pytest.approx(0.6)
-    assert scores[0] == pytest.approx((0 + 200) / 2)
-    assert scores[-1] == pytest.approx((300 + 500) / 2)
 
 
 def test_labels_have_interval_and_ratio() -> None:

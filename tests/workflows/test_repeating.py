@@ -7,7 +7,7 @@ import pytest
 from cartpole_rl.choices import choice
 from cartpole_rl.tasks.episode import Origin
 from cartpole_rl.workflows.config import EvaluateConfig, load_settings
-from cartpole_rl.workflows.repeating import same_evaluation
+from cartpole_rl.workflows.episodes import same_evaluation
 
 GUARD = {**choice("guard/fitted"), "numbers": {"margin": 0.05, "delay": 0.2, "deceleration": 2.0}}
 POLE = {"pole_mass": 0.127, "pole_com": 0.1778, "pole_inertia": 0.001199}
