@@ -54,7 +54,7 @@ IN_SECONDS = (  # ends of the names of settings whose bounds are in seconds
 Config = TypeVar("Config", bound=Settings)
 
 
-def checked(
+def validated(
     schema: type[Config], values: Mapping[str, Any], source: Callable[[str], str] = lambda key: ""
 ) -> Config:
     """Return `values` as a `schema`. Raises ConfigError that names each wrong key and the remedy.

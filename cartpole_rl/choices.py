@@ -28,7 +28,7 @@ class Chosen(NamedTuple):
     """The values of a choice, those among them that a person gave, and the choices of an experiment."""
 
     values: dict[str, Any]
-    own: dict[str, Any]
+    given: dict[str, Any]
     groups: Mapping[str, Any] = {}  # other groups that it chooses, as in conf/experiment/
 
 
@@ -178,11 +178,15 @@ def _beside(chosen: Any, folder: Path) -> Any:
 def _joined(parts: Iterable[Chosen]) -> Chosen:
     """Return choices of one group, each on top of those before."""
     values: dict[str, Any] = {}
-    own: dict[str, Any] = {}
+    given: dict[str, Any] = {}
     groups: dict[str, Any] = {}
     for each in parts:
-        values, own, groups = merged(values, each.values), merged(own, each.own), {**groups, **each.groups}
-    return Chosen(values, own, groups)
+        values, given, groups = (
+            merged(values, each.values),
+            merged(given, each.given),
+            {**groups, **each.groups},
+        )
+    return Chosen(values, given, groups)
 
 
 def read_file(group: str, path: Path) -> dict[str, Any]:

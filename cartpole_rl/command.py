@@ -23,7 +23,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from cartpole_rl import __version__
-from cartpole_rl.checking import checked, kinds, most_similar, similarity
+from cartpole_rl.checking import kinds, most_similar, similarity, validated
 from cartpole_rl.choices import conf_folder, default_choices
 from cartpole_rl.composition import as_mapping, hydra_overrides, is_completing, own_file_of, task_overrides
 from cartpole_rl.errors import ConfigError
@@ -68,8 +68,8 @@ def run_command(name: str, verb: "Verb") -> None:
         if wrong := wrong_option(given) or dashed_setting(given):
             raise ConfigError(wrong)
         provide_config(name, schema)
-        with hydra_overrides(name, as_multirun(given)) as (words, typed), sweep(name, schema):
-            work = partial(run_job, name, verb, given, typed)
+        with hydra_overrides(name, as_multirun(given)) as (words, as_typed), sweep(name, schema):
+            work = partial(run_job, name, verb, given, as_typed)
             for sys.argv[1:] in shown_jobs(words) or [words]:
                 hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=name)(work)()
     except EXPECTED as error:
@@ -79,17 +79,17 @@ def run_command(name: str, verb: "Verb") -> None:
 
 
 def run_job(
-    name: str, verb: "Verb", given: Sequence[str], typed: dict[str, str], composed: DictConfig
+    name: str, verb: "Verb", given: Sequence[str], as_typed: dict[str, str], composed: DictConfig
 ) -> float | None:
     """Run a verb with composed settings, alone or as a job of a sweep; return its score."""
     sys.argv[1:] = given  # as typed, for provenance.json
     quieten()  # here, since a launcher may run the job in another process
     folder = Path(HydraConfig.get().runtime.output_dir)
     overrides = task_overrides(HydraConfig.get().overrides.task)
-    words = [typed.get(word, word) for word in overrides if not is_completing(word)]
+    words = [as_typed.get(word, word) for word in overrides if not is_completing(word)]
 
     def work() -> float | None:
-        config = checked(verb.find(verb.settings), as_mapping(composed), partial(own_file_of, words=words))
+        config = validated(verb.find(verb.settings), as_mapping(composed), partial(own_file_of, words=words))
         if verb.check:
             call(verb.find(verb.check), config=config, folder=folder, words=words)
         return call(verb.find(verb.function), config=config, folder=folder, words=words)

@@ -143,17 +143,17 @@ def hydra_overrides(
 
     Names of choices take the place of a user's files and mappings, until the end. Raises ConfigError.
     """
-    own = _OwnChoices(command)
+    choices = _OwnChoices(command)
     try:
         if isinstance(overrides, Mapping):
-            words = [word for name, value in overrides.items() if (word := own.by_name(name, value))]
-            yield own.completed(words), {}
+            words = [word for name, value in overrides.items() if (word := choices.by_name(name, value))]
+            yield choices.completed(words), {}
         else:
-            own.folder = own_folder(overrides)
-            words = [own.with_names(word) for word in overrides]
-            yield own.completed(words), dict(zip(words, overrides, strict=True))
+            choices.folder = own_folder(overrides)
+            words = [choices.with_names(word) for word in overrides]
+            yield choices.completed(words), dict(zip(words, overrides, strict=True))
     finally:
-        own.remove()
+        choices.remove()
 
 
 class _OwnChoices:
@@ -162,7 +162,7 @@ class _OwnChoices:
     def __init__(self, command: str) -> None:
         self.folder: Path | None = None
         self.groups = default_choices(command)
-        self.own: dict[str, dict[str, dict[str, Any]]] = defaultdict(dict)  # group: name: what it gives
+        self.given: dict[str, dict[str, dict[str, Any]]] = defaultdict(dict)  # group: name: what it gives
         self.names: dict[str, set[str]] = defaultdict(set)  # other choices, by group
         self.swept: set[str] = set()  # groups of which several choices are given
         self.stored: list[tuple[str, str]] = []  # group and name of each, in the ConfigStore
@@ -196,12 +196,12 @@ class _OwnChoices:
         """Return the words, and those by which what the user gave outlasts other choices."""
         keys = {key_of(word) for word in words}
         frictions = [group for group in FRICTIONS if self.groups.get(group) is not None or group in keys]
-        groups = sorted(self.own.keys() - {"sweep"}, key=lambda group: (group in WHOLE, group in FRICTIONS))
+        groups = sorted(self.given.keys() - {"sweep"}, key=lambda group: (group in WHOLE, group in FRICTIONS))
         more = []
         for group in groups:
             others = {*self.names[group], *self._found(group), self.groups.get(group) or ""}
-            for name in others | {*self.own[group]}:
-                given = self.own[group].get(name, {})
+            for name in others | {*self.given[group]}:
+                given = self.given[group].get(name, {})
                 values = given if group in WHOLE else {group: _alone(group, given)}
                 nulls = _nulls(_names(values.get("cart")), {each: _replaced(each) for each in frictions})
                 node = merged(nulls, values) if given else {}
@@ -212,7 +212,7 @@ class _OwnChoices:
         numbers = [key.removeprefix("cart.") for key in sorted(keys) if key.startswith("cart.")]
         replaced = {
             group: _replaced(group).union(
-                *(_names(given.get("parameters")) for given in self.own[group].values())
+                *(_names(given.get("parameters")) for given in self.given[group].values())
             )
             for group in frictions
         }
@@ -273,7 +273,7 @@ class _OwnChoices:
         name = self._free_name(group, chosen)
         node = {"defaults": [*groups, "_self_"], **values} if groups else values
         self._put(group, name, node, "_global_" if group in WHOLE else None)
-        self.own[group][name] = loaded.own
+        self.given[group][name] = loaded.given
         return name
 
     def _put(self, group: str, name: str, node: Any, package: str | None) -> None:
@@ -456,15 +456,14 @@ def _check_run_folder(group: str, value: str) -> None:
 
 def _check_cart(word: str, cart: Chosen) -> None:
     """Raise ConfigError for an unknown parameter of a cart, or a missing one."""
-    (pole,) = group_choices("pole")["medium"][
-        "choices"
-    ].values()  # its numbers are refused with a line of their own
+    # the numbers of a pole are refused with a line of their own
+    (pole,) = group_choices("pole")["medium"]["choices"].values()
     known = [name for name in PARAMETERS if name not in pole]
-    for name in cart.own.keys() - PARAMETERS.keys():
+    for name in cart.given.keys() - PARAMETERS.keys():
         raise ConfigError(
             f"{word}: {name}: there is no such setting; did you mean {most_similar(name, known)}?"
         )
-    for name, value in cart.own.items():
+    for name, value in cart.given.items():
         if isinstance(value, int | float):
             try:
                 check_value(name, value)
@@ -482,7 +481,7 @@ def own_file_of(setting: str, words: Sequence[str]) -> str:
     for word in reversed(words):
         group, _, file = word.partition("=")
         if is_own_file(file) and Path(file).is_file():
-            given = load(group, Path(file)).own
+            given = load(group, Path(file)).given
             names = setting_names(given if group in WHOLE else {group: given})
             if setting in names:
                 return f"{file}: "

@@ -27,7 +27,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict, read_write
 from omegaconf.errors import OmegaConfBaseException
 
-from cartpole_rl.checking import checked
+from cartpole_rl.checking import validated
 from cartpole_rl.composition import as_mapping, is_completing, task_overrides
 from cartpole_rl.errors import CartPoleError, ConfigError
 from cartpole_rl.exits import EXPECTED, exit_with_message, one_line
@@ -134,7 +134,7 @@ def check_jobs(config: DictConfig, schema: type[Settings]) -> None:
         composed = loader.load_sweep_config(config, list(job))
         with read_write(composed), open_dict(composed):
             del composed["hydra"]
-        checked(schema, as_mapping(composed))
+        validated(schema, as_mapping(composed))
 
 
 def as_multirun(words: Sequence[str]) -> list[str]:

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from cartpole_rl.checking import checked
+from cartpole_rl.checking import validated
 from cartpole_rl.composition import compose
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
@@ -23,7 +23,7 @@ def test_the_kind_of_a_plant_is_no_part_of_a_key(kind: str) -> None:
     values = compose("evaluate", {"plant": {"kind": kind, **PLANTS[kind]}, "run": "lqr"})
     *_, wrong = PLANTS[kind]
     with pytest.raises(ConfigError, match=rf"(^|; )plant\.{wrong}="):
-        checked(EvaluateConfig, values)
+        validated(EvaluateConfig, values)
 
 
 @pytest.mark.parametrize(
@@ -39,9 +39,9 @@ def test_the_kind_of_a_plant_is_no_part_of_a_key(kind: str) -> None:
 )
 def test_the_kind_of_a_randomization_is_no_part_of_a_key(randomization: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=rf"(^|; ){message}"):
-        checked(TrainConfig, {**compose("train"), "randomization": randomization})
+        validated(TrainConfig, {**compose("train"), "randomization": randomization})
 
 
 def test_a_missing_setting_is_named_with_its_remedy() -> None:
     with pytest.raises(ConfigError, match="run is missing; give run=runs/train/<run>"):
-        checked(EvaluateConfig, compose("evaluate"))
+        validated(EvaluateConfig, compose("evaluate"))

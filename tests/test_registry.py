@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import pytest
 
 from cartpole_rl import registry
-from cartpole_rl.checking import checked
+from cartpole_rl.checking import validated
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.registry import Extension, Registry
 from cartpole_rl.settings import Settings
@@ -117,7 +117,7 @@ def test_the_entry_point_of_an_installed_package(monkeypatch: pytest.MonkeyPatch
 )
 def test_the_others_are_refused_in_one_line(name: Any, message: str) -> None:
     with pytest.raises(ConfigError) as raised:
-        checked(Chosen, {"law": name})
+        validated(Chosen, {"law": name})
     assert message in str(raised.value)
     assert str(raised.value).startswith(f"law={name}: ")
     assert "\n" not in str(raised.value)

@@ -6,7 +6,7 @@ from typing import Any, TypeVar
 
 import torch
 
-from cartpole_rl.checking import checked
+from cartpole_rl.checking import validated
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
 from cartpole_rl.envs.guard_fitting import fitted_guard
@@ -26,7 +26,7 @@ def shipped_settings(overrides: Mapping[str, Any] | None = None) -> CartPoleSett
     from cartpole_rl.composition import compose  # imports Hydra
 
     composed = compose("train", overrides or {})
-    return checked(CartPoleSettings, {name: composed[name] for name in CartPoleSettings.model_fields})
+    return validated(CartPoleSettings, {name: composed[name] for name in CartPoleSettings.model_fields})
 
 
 Config = TypeVar("Config", bound=CartPoleSettings)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from cartpole_rl.agents.baseline import EnergyAndRegulator
-from cartpole_rl.checking import checked
+from cartpole_rl.checking import validated
 from cartpole_rl.envs.build import with_fitted_guard
 from cartpole_rl.envs.settings import TrackGuard
 from cartpole_rl.errors import ConfigError
@@ -55,7 +55,7 @@ def known_poles(training: TrainConfig, checkpoint: AgentCheckpoint) -> list[Pole
 
     Raises ConfigError for a damaged pole.
     """
-    return [training.pole, *(checked(PoleSettings, poles) for poles in checkpoint.tuned_poles)]
+    return [training.pole, *(validated(PoleSettings, poles) for poles in checkpoint.tuned_poles)]
 
 
 def evaluated_agent(config: EvaluateConfig) -> TrainedAgent:

@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from cartpole_rl.checking import checked
+from cartpole_rl.checking import validated
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.envs.build import environment, simulated_env, with_fitted_guard
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
@@ -96,7 +96,7 @@ def replaced_settings(training: TrainConfig, config: EvaluateConfig) -> CartPole
         given["pole"] = own_pole
     if config.actions is not None:
         check_same_meaning(config.actions, training.actions)
-    settings = checked(CartPoleSettings, {**own, **given, "randomization": config.randomization})
+    settings = validated(CartPoleSettings, {**own, **given, "randomization": config.randomization})
     return with_parameters(settings, config.parameters or {})
 
 

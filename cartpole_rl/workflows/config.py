@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, Self, TypeVar
 from pydantic import Field, field_validator, model_validator
 
 from cartpole_rl.agents.settings import AgentSettings
-from cartpole_rl.checking import checked, kinds
+from cartpole_rl.checking import kinds, validated
 from cartpole_rl.emulator.settings import ONBOARD, EmulatorSettings
 from cartpole_rl.envs.cart_pole_settings import (
     CartFrictionSettings,
@@ -374,12 +374,12 @@ def load_settings(schema: type[Config], overrides: Mapping[str, Any] | Sequence[
     from cartpole_rl.composition import compose  # imports Hydra
 
     command = re.sub(r"\B([A-Z])", r"_\1", schema.__name__.removesuffix("Config")).lower()
-    return checked(schema, compose(command, overrides))
+    return validated(schema, compose(command, overrides))
 
 
 def recorded_settings(schema: type[Config], values: Mapping[str, Any], source: str) -> Config:
     """Return the settings in a checkpoint. Raises CheckpointError that names `source` of another version."""
     try:
-        return checked(schema, values)
+        return validated(schema, values)
     except ConfigError as error:
         raise CheckpointError(f"{source} is of another version of this package: {error}") from None

@@ -5,7 +5,7 @@ from statistics import mean
 
 from torch import nn
 
-from cartpole_rl.checking import checked
+from cartpole_rl.checking import validated
 from cartpole_rl.envs.build import simulated_env, with_fitted_guard
 from cartpole_rl.evaluation.driving_policy import DrivingPolicy
 from cartpole_rl.learning.checkpoints import AgentCheckpoint, save_agent
@@ -63,4 +63,4 @@ def student_settings(training: TrainConfig, config: DistillConfig) -> TrainConfi
     agent = training.agent.model_dump() | network
     own = {"agent": agent, "seed": config.seed, "compile": False, "device": "cpu"}
     values = {**training.model_dump(mode="json"), **own}
-    return with_fitted_guard(checked(TrainConfig, values))
+    return with_fitted_guard(validated(TrainConfig, values))

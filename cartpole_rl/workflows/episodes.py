@@ -14,7 +14,7 @@ from typing import Any
 import yaml
 from tqdm import tqdm
 
-from cartpole_rl.checking import checked
+from cartpole_rl.checking import validated
 from cartpole_rl.emulator.settings import ONBOARD
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
@@ -275,4 +275,4 @@ def same_evaluation(config: EvaluateConfig, recorded: Mapping[str, Any], origin:
     same_agent = Path(former["run"]).resolve() == config.run.resolve()
     if former.get("guard") or same_agent:  # its numbers may be of all the poles then
         one_cart["guard"] = recorded["evaluated"]["guard"]
-    return checked(EvaluateConfig, {**former, **own, **one_cart})
+    return validated(EvaluateConfig, {**former, **own, **one_cart})

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from torch import nn
 
-from cartpole_rl.checking import checked
+from cartpole_rl.checking import validated
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
 from cartpole_rl.errors import CheckpointError, ConfigError
@@ -169,7 +169,9 @@ def evaluation_config(config: FinetuneConfig) -> EvaluateConfig:
     """Return the settings that the cart is driven with."""
     shared = config.model_dump(include={"run", "plant", "emulator", "seed", "label", "threads"})
     episodes = config.evaluation_episodes
-    return checked(EvaluateConfig, {**shared, "episodes": episodes, "randomization": {}, "parameters": None})
+    return validated(
+        EvaluateConfig, {**shared, "episodes": episodes, "randomization": {}, "parameters": None}
+    )
 
 
 def driven_env(

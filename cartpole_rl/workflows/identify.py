@@ -14,7 +14,7 @@ import numpy as np
 import yaml
 from tqdm import tqdm
 
-from cartpole_rl.checking import checked
+from cartpole_rl.checking import validated
 from cartpole_rl.choices import is_shipped
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import ConfigError, RecordingError
@@ -306,7 +306,7 @@ def known_truth(config: IdentifyConfig) -> EmulatorSettings | None:
     try:
         recorded = yaml.safe_load((config.source / CONFIG).read_text(encoding="utf-8"))
         of_emulator = recorded["plant"]["kind"] == "emulated"
-        return checked(EmulatorSettings, recorded["emulator"]) if of_emulator else None
+        return validated(EmulatorSettings, recorded["emulator"]) if of_emulator else None
     except (OSError, yaml.YAMLError, LookupError, TypeError, ConfigError):  # recordings of another origin
         return None
 

@@ -36,7 +36,7 @@ from typing import Any, Self
 
 from common import option_parser, positive_int, print_table, processes, write_json
 
-from cartpole_rl.checking import checked
+from cartpole_rl.checking import validated
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import CartPoleError, FrameError
 from cartpole_rl.evaluation.episodes import run_episodes
@@ -246,7 +246,7 @@ def episode_line(url: str) -> str:
         "label": "",
         "threads": 1,
     }
-    config = checked(EvaluateConfig, settings)
+    config = validated(EvaluateConfig, settings)
     try:
         with closing(evaluated_env(evaluated_settings(agent().training, config), config, print)) as env:
             (episode,) = run_episodes(env, agent().policy, 1)

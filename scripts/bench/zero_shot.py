@@ -42,7 +42,7 @@ from common import (
 from truth_references import Draw, known_references, note_missing
 from truths import COMPARED, REPORTED, Truth
 
-from cartpole_rl.checking import checked
+from cartpole_rl.checking import validated
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.errors import PlantError
@@ -79,7 +79,7 @@ def drive(run: str, truth: Truth, starts: int) -> Scores:
         "label": "",
         "threads": 1,
     }
-    config, agent = checked(EvaluateConfig, settings), agent_of(run)
+    config, agent = validated(EvaluateConfig, settings), agent_of(run)
     with closing(evaluated_env(evaluated_settings(agent.training, config), config, print)) as env:
         return [episode_score(env, agent.policy, truth) for _ in range(starts)]
 

@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import TypeAdapter
 from study import RUNS, SEED, Finding, FolderName, Size, Study, Variant
 
-from cartpole_rl.checking import checked
+from cartpole_rl.checking import validated
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.reporting.results import GOOD, OWN, Agent, Exclusion, Group, Named, Results, is_number
 from cartpole_rl.reporting.runs import DAMAGE, short
@@ -280,7 +280,7 @@ def read_json(file: Path) -> StudyResults:
     """Return the results in a file of `write_data`. Raises ConfigError if it is damaged."""
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
-        results = from_json(content, checked(Study, content["study"]))
+        results = from_json(content, validated(Study, content["study"]))
     except json.JSONDecodeError as error:
         raise ConfigError(f"{file} is damaged (line {error.lineno}): restore it or remove it") from None
     except DAMAGE as error:

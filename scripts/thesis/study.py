@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal
 import yaml
 from pydantic import Field, StringConstraints, model_validator
 
-from cartpole_rl.checking import checked, most_similar, similarity
+from cartpole_rl.checking import most_similar, similarity, validated
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.settings import Count, Finite, Settings
 
@@ -177,7 +177,7 @@ def read_study_file(file: Path) -> Study:
         values = yaml.safe_load(file.read_text(encoding="utf-8"))
         if not isinstance(values, Mapping):
             raise ConfigError("it holds no study")
-        return checked(Study, values)
+        return validated(Study, values)
     except (ConfigError, OSError, ValueError, yaml.YAMLError) as error:
         raise ConfigError(f"{file}: {' '.join(str(error).split())}") from None
 

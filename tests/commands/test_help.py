@@ -8,7 +8,7 @@ import pytest
 from command_line import in_process
 
 from cartpole_rl import __version__
-from cartpole_rl.checking import checked
+from cartpole_rl.checking import validated
 from cartpole_rl.choices import conf_folder
 from cartpole_rl.cli import VERBS
 from cartpole_rl.composition import compose
@@ -46,7 +46,7 @@ def test_help(command: str, tmp_path: Path) -> None:
         one_job = "-m" in words
         words = [word.partition(",")[0] if one_job else word for word in words if word != "-m"]
         if command != "find_port":
-            checked(SCHEMAS[command], compose(command, words))
+            validated(SCHEMAS[command], compose(command, words))
     assert not list(tmp_path.iterdir())
 
 

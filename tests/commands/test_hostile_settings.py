@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from every_command import COMMANDS, GROUPS, REQUIRED, SCHEMAS, contents, required, run, value_at
 
-from cartpole_rl.checking import checked
+from cartpole_rl.checking import validated
 from cartpole_rl.choices import merged
 from cartpole_rl.composition import compose
 from cartpole_rl.errors import ConfigError
@@ -101,7 +101,7 @@ def test_each_setting_takes_a_value_or_refuses_it_in_one_line(command: str) -> N
             try:
                 with warnings.catch_warnings():
                     warnings.simplefilter("error")
-                    config = checked(schema, replaced)
+                    config = validated(schema, replaced)
             except ConfigError as error:
                 lines.append(str(error))
                 continue

@@ -10,7 +10,7 @@ import pytest
 import yaml
 from command_line import ONCE, QUICK, TINY, Outcome, in_process
 
-from cartpole_rl.checking import checked
+from cartpole_rl.checking import validated
 from cartpole_rl.composition import without_missing
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.workflows.config import TrainConfig
@@ -82,7 +82,7 @@ def test_the_printed_command_drives_the_identified_cart_exactly(
     _, *words = done.out.splitlines()[-1].split()
     words = [friction if friction and word.startswith("cart_friction") else word for word in words]
     shown = in_process("train", *words, "--cfg", "job", "--resolve", folder=run.parent)
-    config = checked(TrainConfig, without_missing(yaml.safe_load(shown.out)))
+    config = validated(TrainConfig, without_missing(yaml.safe_load(shown.out)))
     assert config.nominal_with(config.pole.nominal) == results["parameters"]
     assert config.cart_friction.model == (friction.partition("=")[2] or results["cart_friction"])
 

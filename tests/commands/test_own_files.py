@@ -11,7 +11,7 @@ from command_line import ONCE, TINY, in_process
 from every_command import COMMANDS, GROUPS, REQUIRED, SCHEMAS, contents, required, run, value_at
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
-from cartpole_rl.checking import checked
+from cartpole_rl.checking import validated
 from cartpole_rl.choices import default_choices, group_choices
 from cartpole_rl.composition import compose
 from cartpole_rl.errors import ConfigError
@@ -94,7 +94,7 @@ def test_files_of_all_groups_are_found_from_everywhere(command: str, tmp_path: P
         words["folder"].append(f"{group}=mine")
         by_name[group] = tmp_path / f"{group}.yaml"
     before = contents(tmp_path)
-    expected = checked(SCHEMAS[command], compose(command, by_name))
+    expected = validated(SCHEMAS[command], compose(command, by_name))
     assert all(given == number for given, number in found_numbers(expected, command).values())
     for where, given in words.items():
         done, config = run(command, *required(command), *given, folder=tmp_path)

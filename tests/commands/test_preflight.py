@@ -8,7 +8,7 @@ from command_line import in_process
 from hydra_configs import shipped_choices
 from serial_peer import Between
 
-from cartpole_rl.checking import checked
+from cartpole_rl.checking import validated
 from cartpole_rl.composition import compose
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.plants.emulated import EmulatedCart
@@ -46,7 +46,7 @@ def test_the_emulated_cart_is_ready(tmp_path: Path) -> None:
 )
 def test_the_next_command_is_for_the_same_cart(given: tuple[str, ...], following: str) -> None:
     settings = dict(word.split("=") for word in given)
-    config = checked(PreflightConfig, compose("preflight", settings))
+    config = validated(PreflightConfig, compose("preflight", settings))
     assert next_command(config, given) == f"cartpole-identify {following}"
 
 

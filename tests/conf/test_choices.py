@@ -8,7 +8,7 @@ import pytest
 import yaml
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
-from cartpole_rl.checking import checked
+from cartpole_rl.checking import validated
 from cartpole_rl.choices import conf_folder
 from cartpole_rl.composition import compose
 from cartpole_rl.envs.build import randomizer
@@ -40,12 +40,12 @@ def composed(name: str, *overrides: str) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def trained(hydra_reads_conf: None) -> TrainConfig:
-    return checked(TrainConfig, composed("train"))
+    return validated(TrainConfig, composed("train"))
 
 
 @pytest.mark.parametrize("chosen", [case for case in CHOICES if group_of(case) not in NOT_OF_TRAINING])
 def test_training_takes_it(chosen: str) -> None:
-    config = checked(TrainConfig, composed("train", chosen, *NEEDED.get(chosen, [])))
+    config = validated(TrainConfig, composed("train", chosen, *NEEDED.get(chosen, [])))
     draws = randomizer(config)
     assert float(draws.nominal.abs().sum()) > 0
     assert config.models(config.plant).integrator
@@ -53,10 +53,10 @@ def test_training_takes_it(chosen: str) -> None:
 
 @pytest.mark.parametrize("chosen", [case for case in CHOICES if group_of(case) in REPLACEABLE])
 def test_an_evaluation_can_replace_the_agents_choice(chosen: str, trained: TrainConfig) -> None:
-    config = checked(EvaluateConfig, composed("evaluate", "run=somewhere", chosen))
+    config = validated(EvaluateConfig, composed("evaluate", "run=somewhere", chosen))
     settings = evaluated_settings(trained, config)
     randomizer(settings)
-    wanted = checked(TrainConfig, composed("train", chosen))
+    wanted = validated(TrainConfig, composed("train", chosen))
     group = group_of(chosen)
     if group not in ("cart_friction", "pole_friction"):  # whose numbers are then the cart's
         assert getattr(settings, group) == getattr(wanted, group)
@@ -65,7 +65,7 @@ def test_an_evaluation_can_replace_the_agents_choice(chosen: str, trained: Train
 
 @pytest.mark.parametrize("chosen", [case for case in CHOICES if group_of(case) == "finetuning"])
 def test_fine_tuning_takes_it(chosen: str) -> None:
-    assert checked(FinetuneConfig, composed("finetune", "run=somewhere", chosen)).finetuning.iterations > 0
+    assert validated(FinetuneConfig, composed("finetune", "run=somewhere", chosen)).finetuning.iterations > 0
 
 
 EXPERIMENTS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
@@ -109,7 +109,7 @@ def test_training_takes_every_value_of_a_sweep(sweep: str) -> None:
         values = [interval.start, interval.end] if interval else [*parsed.sweep_string_iterator()]
         assert len({*values}) > 1
         for value in values:
-            config = checked(TrainConfig, composed("train", f"{parsed.get_key_element()}={value}"))
+            config = validated(TrainConfig, composed("train", f"{parsed.get_key_element()}={value}"))
             group, _, name = parsed.get_key_element().partition(".")
             if name:
                 assert getattr(getattr(config, group), name) == float(value)

@@ -26,7 +26,7 @@ from page_commands import (
     within,
 )
 
-from cartpole_rl.checking import checked
+from cartpole_rl.checking import validated
 from cartpole_rl.cli import VERBS
 from cartpole_rl.composition import compose
 
@@ -128,7 +128,7 @@ def test_the_settings_of_every_command_compose() -> None:
         swept = "-m" in words or any(word.startswith("sweep=") for word in words)
         if verb == "find_port" or swept or any(word.endswith(".yaml") for word in words):
             continue  # several jobs, or files of other runs
-        checked(VERBS[verb].find(VERBS[verb].settings), compose(verb, words))
+        validated(VERBS[verb].find(VERBS[verb].settings), compose(verb, words))
 
 
 @pytest.mark.nightly

@@ -37,7 +37,7 @@ AGENTS: dict[str, dict[str, Any]] = {
 pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="gcc is missing: install a C compiler")
 
 
-def checked(files: Mapping[str, str], folder: Path) -> subprocess.CompletedProcess[str]:
+def validated(files: Mapping[str, str], folder: Path) -> subprocess.CompletedProcess[str]:
     """Write the files, and let the compiler check policy.c without compiling it."""
     for name, text in files.items():
         (folder / name).write_text(text)
@@ -193,7 +193,7 @@ def test_no_origin_leaves_the_comment(
 ) -> None:
     exported, training = small
     about = exported.description.model_copy(update={"provenance": {"command": [origin]}})
-    done = checked(c_files(replace(exported, description=about), training), tmp_path)
+    done = validated(c_files(replace(exported, description=about), training), tmp_path)
     assert done.returncode == 0, done.stderr
     first, second = (tmp_path / "policy.h").read_text().split("*/")[0].splitlines()[-3:-1]
     assert first.startswith(' * Training: "')
@@ -262,7 +262,7 @@ def test_files_of_two_exports_compile_only_if_the_agent_is_the_same(
     files = c_files(replace(exported, description=about), training)
     other = c_files(replace(exported, description=about.model_copy(update=change)), training)
     assert other["policy.h"] != files["policy.h"]
-    done = checked({**files, "policy.h": other["policy.h"]}, tmp_path)
+    done = validated({**files, "policy.h": other["policy.h"]}, tmp_path)
     assert (done.returncode == 0) == fits
     assert ("policy.h is of another export than policy.c" in done.stderr) != fits
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cartpole_rl.checking import checked
+from cartpole_rl.checking import validated
 from cartpole_rl.errors import ConfigError, RecordingError
 from cartpole_rl.evaluation.recordings import read_recording
 from cartpole_rl.identification.layout import ImportConfig, Layout
@@ -66,7 +66,7 @@ def layout(**changes: Any) -> Layout:
         name: {**LAYOUT.get(name, {}), **change} if isinstance(change, dict) and name in LAYOUT else change
         for name, change in changes.items()
     }
-    return checked(Layout, {**LAYOUT, **values})
+    return validated(Layout, {**LAYOUT, **values})
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ from typing import Any
 from results import StudyResults
 from study import Study
 
-from cartpole_rl.checking import checked
+from cartpole_rl.checking import validated
 from cartpole_rl.reporting.results import Agent
 
 CARTS = [{"name": "simulated", "label": "simulated cart"}, {"name": "emulated", "label": "emulated cart"}]
@@ -23,7 +23,7 @@ def a_study(**changes: Any) -> Study:
         "arms": ARMS,
         "sizes": {"full": {"seeds": 2}},
     }
-    return checked(Study, {**given, **changes})
+    return validated(Study, {**given, **changes})
 
 
 def found(name: str, values: Values, more: dict[str, Any] | None = None, **changes: Any) -> StudyResults:

@@ -10,7 +10,7 @@ from plan import Task, plan, study_tasks
 from small_results import CARTS, a_study
 from study import FIRST_SEED, STUDIES, load_study, overrides_of, study_names
 
-from cartpole_rl.checking import checked
+from cartpole_rl.checking import validated
 from cartpole_rl.composition import compose
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.settings import Settings
@@ -32,7 +32,7 @@ FOLDERS = ("runs", "my runs", "a,b", "a #b", "a: b", "[x]", "x]", "{seed}", "{ru
 
 @cache
 def composed(command: str, words: tuple[str, ...]) -> Settings:
-    return checked(CONFIGS[command], compose(command, overrides_of(words)))
+    return validated(CONFIGS[command], compose(command, overrides_of(words)))
 
 
 def words_of(task: Task) -> tuple[str, ...]:

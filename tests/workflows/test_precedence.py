@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import yaml
 
-from cartpole_rl.checking import checked
+from cartpole_rl.checking import validated
 from cartpole_rl.choices import choice, default_choices, group_choices
 from cartpole_rl.composition import compose
 from cartpole_rl.workflows.build import replaced_settings
@@ -56,7 +56,7 @@ def has(tree: dict[str, Any], name: str) -> bool:
 
 def trained(*words: str) -> TrainConfig:
     """The settings of cartpole-train with these words, as the command composes them."""
-    return checked(TrainConfig, compose("train", words))
+    return validated(TrainConfig, compose("train", words))
 
 
 def written(folder: Path, group: str, content: dict[str, Any]) -> str:
@@ -137,7 +137,9 @@ def test_a_number_is_kept_beside_a_friction_that_has_its_own(form: str, value: f
     whole = {**IP02, VISCOUS: value}
     if form == "mapping":
         names = {"cart": whole, "cart_friction": "linear"}
-        orders = [checked(TrainConfig, compose("train", dict(each))) for each in permutations(names.items())]
+        orders = [
+            validated(TrainConfig, compose("train", dict(each))) for each in permutations(names.items())
+        ]
     else:
         content = whole if form == "whole file" else {"defaults": ["ip02"], VISCOUS: value}
         given = f"cart.{VISCOUS}={value}" if form == "typed" else written(tmp_path, "cart", content)

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from cartpole_rl.checking import checked
+from cartpole_rl.checking import validated
 from cartpole_rl.composition import compose
 from cartpole_rl.envs.build import randomizer
 from cartpole_rl.errors import PlantError
@@ -60,7 +60,7 @@ def test_the_override_is_a_word_that_cartpole_train_takes() -> None:
     word = seen.latency_override()
     assert word == "++randomization.latency={distribution: uniform, absolute: [0.0021, 0.0119]}"
     for group in ("none", "wide"):
-        config = checked(TrainConfig, compose("train", [f"randomization={group}", word]))
+        config = validated(TrainConfig, compose("train", [f"randomization={group}", word]))
         assert config.randomization["latency"].limits() == (0.0021, 0.0119)
         assert randomizer(config).longest_delay() == pytest.approx(0.0119)
 
