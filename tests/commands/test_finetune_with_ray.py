@@ -57,6 +57,7 @@ def test_it_equals_one_on_a_single_machine_to_the_bit(
     assert [path.name for path in (tmp_path / "run/checkpoints").iterdir()] == ["last.pt"]
 
 
+@pytest.mark.nightly  # test_ray_learner.py has the refusal itself
 def test_an_address_without_a_cluster_is_refused_before_the_cart_moves(trained: Path, tmp_path: Path) -> None:
     pytest.importorskip("ray")
     with socket.create_server(("127.0.0.1", 0)) as server:

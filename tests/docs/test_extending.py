@@ -13,7 +13,7 @@ from extending_page import PAGE, ROOT, paths
 
 BIN = Path(sys.executable).parent
 PATHS = paths()
-DAILY = (1, 8)  # a friction law; a network, an agent and a logger
+DAILY = (1,)  # a friction law; learning/test_own_agents.py has an agent and a logger
 
 
 def test_the_page_has_the_eight_paths() -> None:

@@ -112,16 +112,6 @@ def test_what_fails_comes_first(study: Path, edit: Edit, report: Report) -> None
     assert "why it agrees" not in page
 
 
-def test_a_damaged_picture_is_named_and_the_others_are_shown(study: Path, report: Report) -> None:
-    gif, *others = study.glob("*/*/evaluations/heavy/figures/episode.gif")
-    for other in others:
-        other.unlink()
-    gif.write_bytes(gif.read_bytes()[:40] + bytes(500))
-    out, page = report("quick")
-    assert f"note: {gif} is damaged and not shown" in out
-    assert ("data:image/webp" in page, "data:image/gif" in page) == (True, False)
-
-
 def test_each_figure_is_a_file_and_the_small_files_make_the_same_page(study: Path, report: Report) -> None:
     out, whole = report("quick", "--data", "data", "--no-animations", "--figures")
     files = sorted(Path("report/figures").glob("*.svg"))

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from charts import rank_agreements, rank_correlation
-from page import answer, robustness, studies_page
+from page import studies_page
 from results import Status, as_json, from_json
 from scipy import stats
-from small_results import CARTS, KNOCKS, Values, found, judged, on_carts, over_knocks
+from small_results import CARTS, Values, found, judged, on_carts
 
 LOW: Values = {"wide": on_carts((4000, 1500), (4000, 1900)), "none": on_carts((4000, 100), (4000, 200))}
 HIGH: Values = {name: on_carts((4000, 2500), (4000, 2900)) for name in ("wide", "none")}
@@ -66,15 +66,6 @@ def test_a_digest_depends_on_six_digits_of_each_agent_and_not_on_their_order() -
     assert replace(whole, agents=whole.agents[::-1]).digest == first
 
 
-def test_a_single_agent_that_no_interquartile_mean_shows_changes_the_digest() -> None:
-    values = {"wide": on_carts(*[(4000, 4000)] * 10)}
-    whole = judged("one", values, AGREES, evaluations=CARTS, arms=[{"name": "wide", "label": "drawn"}])
-    *others, last = whole.agents
-    failed = replace(whole, agents=(*others, replace(last, values={"simulated": 0.0, "emulated": 0.0})))
-    assert whole.estimates("emulated")["drawn"].value == failed.estimates("emulated")["drawn"].value == 4000
-    assert (whole.finding is None, failed.finding) == (False, None)
-
-
 def test_the_small_file_has_the_same_digest_and_damage_in_it_is_refused() -> None:
     results = found(
         "one", {"wide": on_carts((1234.49999999, 2500), (1234.5, 0.12344999999))}, evaluations=CARTS
@@ -96,34 +87,6 @@ def test_the_small_file_has_the_same_digest_and_damage_in_it_is_refused() -> Non
     ):
         with pytest.raises(ValueError, match=re.escape(message)):
             from_json(json.loads(text) | change, results.study)
-
-
-def test_each_evaluation_that_a_study_judges_counts() -> None:
-    carts = [*CARTS, {"name": "large", "label": "large cart"}]
-    agents = [{"simulated": 4000.0, "emulated": 4500.0, "large": 150.0}] * 2
-    results = found("one", {"wide": agents, "none": agents}, evaluations=carts, judged=["emulated", "large"])
-    assert answer(results) == [
-        "Score (6.2) on the emulated cart: each of 2 set-ups 4500 (4500 to 4500), 2 agents.",
-        "Score (6.2), large cart: each of 2 set-ups 150 (150 to 150), 2 agents.",
-    ]
-    assert (results.status(), results.reason()[-13:]) == (Status.FAILS, " (large cart)")
-
-
-def test_robustness_is_the_mean_share_of_successes_over_criteria() -> None:
-    first = {"wide": over_knocks((4000, 3000), (4000, 500)), "none": over_knocks((4000, 0), (100, 0))}
-    second = {"wide": over_knocks((4000, 4000), (4000, 4000)), "none": over_knocks((0, 0), (0, 0))}
-    knocks, mass = (
-        found(f"robustness_{name}", values, evaluations=KNOCKS, axis={"label": name})
-        for name, values in (("knock", first), ("mass", second))
-    )
-    assert [[*row.values()] for row in robustness([knocks, mass])] == [
-        ["drawn", "75 %", "100 %", "88 % (75 % to 100 %)", 2],
-        ["not drawn", "25 %", "0 %", "12 % (0 % to 25 %)", 2],
-    ]
-    lacking = found(
-        "robustness_knocks", {**first, "wide": first["wide"][:1]}, evaluations=KNOCKS, axis={"label": "k"}
-    )
-    assert [*robustness([lacking])[1].values()] == ["drawn", "–", "–", 1]
 
 
 def test_the_answer_follows_the_interval_of_the_rank_correlation() -> None:
