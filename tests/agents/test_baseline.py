@@ -12,6 +12,7 @@ from cartpole_rl.agents.baseline import EnergyAndRegulator, decode, linearized, 
 from cartpole_rl.choices import choice
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
+from cartpole_rl.errors import ConfigError
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.physics.dynamics import State
 from cartpole_rl.physics.models import Models
@@ -124,3 +125,11 @@ def test_it_swings_up_and_balances_the_emulated_cart(
     assert episode.ended_by == "time"
     assert is_upright(episode.theta[-100:]).all()
     assert episode.score.sum() > score
+
+
+@pytest.mark.parametrize(
+    "changes", [{"kind": ObservationKind.POSITIONS}, {"past_motors": 0}], ids=["positions", "no motors"]
+)
+def test_missing_observations_are_an_error(ip02: dict[str, float], changes: dict[str, Any]) -> None:
+    with pytest.raises(ConfigError, match="the baseline reads velocities and the last motor value"):
+        baseline(ip02, "medium", **changes)

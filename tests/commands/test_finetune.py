@@ -146,6 +146,10 @@ def test_what_the_simulation_reads_is_missed_before_the_cart_moves(trained: Path
         (("run=null",), "run"),
         (("plant=simulated",), "plant=simulated: this command takes emulated, serial"),
         (
+            ("finetuning.buffer_kind=prioritized",),
+            "finetuning.buffer_kind=uniform, or finetuning.cart_share=0",
+        ),
+        (
             ("learner=ray", "learner.address=server:6379"),
             'learner=ray needs Ray: pip install "cartpole_rl[ray]"',
         ),

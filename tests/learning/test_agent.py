@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 import pytest
 import torch
+from pydantic import ValidationError
 from tensordict import TensorDict, TensorDictParams
 from torch import Tensor, nn
 from torchrl.data import Binary, Categorical, OneHot
@@ -228,3 +229,23 @@ def test_the_greedy_policy_acts_with_the_average_of_the_weights_as_they_move() -
     policy = other.greedy_policy()
     other.load_state_dict(agent.state_dict())  # it follows weights that are loaded later
     assert torch.equal(flat(policy), flat(agent.greedy_policy()))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"target_period": 10},
+        {"target_tau": None},
+        {"target_tau": 0.0},
+        {"target_tau": None, "target_period": 0},
+        {"gamma": 1.0},
+        {"action_gap": 1.0},
+        {"loss": "l3"},
+        {"hidden": [0]},
+        {"hidden": [15], "mirrored": True},
+        {"dropout": 0.1},
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(wrong: dict) -> None:
+    with pytest.raises(ValidationError):
+        AgentSettings(**{**DQN, **wrong})

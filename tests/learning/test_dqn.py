@@ -455,3 +455,40 @@ def test_without_carry_returns_end_with_their_chunk(whole: Training) -> None:
         if not carry:
             alone = [n_step_transitions(part, 5, 0.9) for part in chunk.split(8, 1)]
             assert (parts == torch.cat(alone)).all()
+
+
+def test_schedules_reach_their_ends(whole: Training) -> None:
+    share = {
+        transitions: scalars["learning/epsilon"] for transitions, scalars in whole.monitor.scalars.items()
+    }
+    assert share[64] == share[128] == 1.0  # acted before an update could be made
+    assert share[192] == pytest.approx(0.5)  # 128 transitions were seen
+    assert share[192 + 64] == pytest.approx(0.5 - 0.4 * 64 / 400)
+    assert share[1024] == pytest.approx(0.1)
+    assert whole.optimizer.param_groups[0]["lr"] == pytest.approx(5e-5)
+    assert whole.buffer.sampler.beta == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(("count", "end"), [(1, 7), (3, 10), (12, 427), (5, 5)])
+def test_evaluations_are_evenly_spaced_up_to_the_end(count: int, end: int) -> None:
+    each = {"carts": 1, "chunk": 1, "n_step": 1, "transitions": end, "evaluations": count}
+    spaced = LearningSettings(**{**LEARNING, **each}).evaluated_iterations
+    gaps = [after - before for before, after in zip([0, *spaced], spaced, strict=False)]
+    assert (len(spaced), spaced[-1]) == (count, end)
+    assert 1 <= min(gaps) <= max(gaps) <= min(gaps) + 1
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"transitions": 100},
+        {"n_step": 5},
+        {"carts": 0},
+        {"epsilon": (1.5, 0.1)},
+        {"evaluations": 17},
+        {"speed": 1},
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(wrong: dict) -> None:
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        LearningSettings(**{**LEARNING, **wrong})

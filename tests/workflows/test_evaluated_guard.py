@@ -11,6 +11,7 @@ from cartpole_rl.workflows.build import evaluated_settings, guard_note
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig, load_settings
 
 GIVEN = {"margin": 0.05, "delay": 0.2, "deceleration": 2.0}
+SAME_ENDS = (-250, -188, -125, -63, 0, 63, 125, 188, 250)
 
 
 def fitted(**overrides: object) -> TrainConfig:
@@ -140,4 +141,10 @@ def test_the_guard_of_a_policy_on_a_real_board_stays() -> None:
     training = fitted()
     cart = {**SERIAL, "plant.policy": "onboard", "plant.pole_length": 0.66}
     evaluation = load_settings(EvaluateConfig, {"run": "any", **cart})
+    assert evaluated_settings(training, evaluation).guard == training.guard
+
+
+def test_motor_values_with_the_same_ends_need_no_new_guard() -> None:
+    training = fitted()
+    evaluation = load_settings(EvaluateConfig, {"run": "any", **with_motors(SAME_ENDS)})
     assert evaluated_settings(training, evaluation).guard == training.guard

@@ -18,7 +18,7 @@ import pytest
 import torch
 from short_episode import EPISODE
 
-from cartpole_rl.errors import LearnerError, LearningError
+from cartpole_rl.errors import ConfigError, LearnerError, LearningError
 from cartpole_rl.evaluation.driving_policy import Weights, as_weights
 from cartpole_rl.learning.checkpoints import FINETUNING_FORMAT, AgentCheckpoint, load_training
 from cartpole_rl.learning.settings import RayLearnerSettings
@@ -394,3 +394,9 @@ def test_an_address_that_cannot_be_reached_is_refused(
     monkeypatch.setattr(socket, "create_connection", fail)
     with pytest.raises(ConnectionError, match=error.strerror or str(error)):
         check_address("server:6379")
+
+
+@pytest.mark.parametrize("address", ["server", "ray://server:10001", "server:637900", ""])
+def test_an_address_has_a_host_and_a_port(address: str) -> None:
+    with pytest.raises(ConfigError, match=r"learner\.address=.*: give host:port"):
+        load_settings(FinetuneConfig, {**CONFIG, "learner": {**CONFIG["learner"], "address": address}})

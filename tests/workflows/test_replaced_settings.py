@@ -42,3 +42,9 @@ def test_a_serial_cart_has_the_pole_of_the_stated_length(length: float | None, n
 def test_only_simulated_poles_are_knocked_by_an_evaluation() -> None:
     with pytest.raises(ConfigError, match=r"^knock: plant=emulated has its own cart"):
         load_settings(EvaluateConfig, {"run": "somewhere", "plant": "emulated", "knock": 8})
+
+
+def test_motor_values_are_replaced() -> None:
+    config = load_settings(EvaluateConfig, {"run": "somewhere", "actions": "nine_levels_linear"})
+    settings = replaced_settings(load_settings(TrainConfig), config)
+    assert settings.actions.motors == (-250, -188, -125, -63, 0, 63, 125, 188, 250)

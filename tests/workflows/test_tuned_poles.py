@@ -101,3 +101,8 @@ def test_an_agent_of_the_large_pole_that_was_tuned_on_a_shorter_one_keeps_its_gu
     compiled = compiled_training(trained_agent(tmp_path / "agent")).guard.active
     assert compiled.delay == training.guard.active.delay
     assert compiled.deceleration == training.guard.active.deceleration
+
+
+def test_a_checkpoint_without_tuned_poles_is_read(agent: AgentCheckpoint, tmp_path: Path) -> None:
+    del vars(agent)["tuned_poles"]  # as before they were stored
+    assert saved(agent, tmp_path / "last.pt") == [MEDIUM]
