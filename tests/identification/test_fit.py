@@ -112,7 +112,7 @@ def test_a_fit_finds_another_pole(
     large = PoleSettings(choices={"large": (both_poles.choices or {})["large"]})
     env = make_environment(make_plant(2, poles=large, models=STEP, cart={"track_half_length": 2.0}), MOTORS)
     recorded = run_batch(env, lambda present: present.set("action", torch.randint(5, (2,), generator=random)))
-    found = fit_cart(cut_windows(recorded, PERIOD, most=60), nominal, STEP, PERIOD).parameters
+    found = fit_cart(cut_windows(recorded, PERIOD, most=30), nominal, STEP, PERIOD).parameters
     assert found["pole_com"] == pytest.approx(large.nominal.pole_com, rel=0.05)
 
 
@@ -202,7 +202,7 @@ class TestWindows:
         cart = {**TRUTH, "latency": latency}
         plant = make_plant(2, cart=cart, models=STEP, period=period, substeps=4)
         recorded = run_batch(make_environment(plant, MOTORS, time_limit=800), shake)
-        windows = cut_windows(recorded, period, most=8)
+        windows = cut_windows(recorded, period, most=4)
         assert windows.periods * period == pytest.approx(WINDOW)
         assert len(windows.motors) == windows.periods + history_periods(period)
         assert history_periods(period) * period >= latency

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import gymnasium
 import numpy as np
@@ -10,7 +11,7 @@ import torch
 
 pytest.importorskip("mujoco", reason='pip install "cartpole_rl[emulator]"')
 
-from mujoco_reference import MujocoCart
+import mujoco
 from torch import Tensor
 
 from cartpole_rl.physics import dynamics
@@ -80,6 +81,55 @@ def test_one_explicit_step_is_gymnasiums(make_cart: MakeCart, monkeypatch: pytes
         reference.step(int(push > 0))
         theirs = torch.as_tensor(reference.state)
         torch.testing.assert_close(torch.stack(ours, 1)[row], theirs, rtol=0, atol=1e-6)
+
+
+MODEL = """
+<mujoco>
+  <compiler angle="radian"/>
+  <option integrator="RK4" timestep="{step}">
+    <flag contact="disable"/>
+  </option>
+  <worldbody>
+    <body>
+      <joint type="slide" axis="1 0 0"/>
+      <inertial pos="0 0 0" mass="{cart_mass}" diaginertia="1 1 1"/>
+      <body>
+        <joint type="hinge" axis="0 1 0"/>
+        <inertial pos="0 0 {pole_com}" mass="{pole_mass}" diaginertia="{pole_inertia} {pole_inertia} 1e-6"/>
+      </body>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+
+@dataclass(frozen=True)
+class MujocoCart:
+    """A frictionless cart in MuJoCo, written without the package's equations, in SI units.
+
+    The hinge counts from the track's normal; a tilt of the track, positive where its right end is lower, is
+    a turn of gravity.
+    """
+
+    cart_mass: float
+    pole_mass: float
+    pole_com: float
+    pole_inertia: float
+    tilt: float = 0.0
+    gravity: float = 9.81
+
+    def run(self, start: np.ndarray, force: float, seconds: float, step: float = 1e-3) -> np.ndarray:
+        """State (x, x_dot, theta, theta_dot) after `seconds` from `start` under a constant `force`."""
+        model = mujoco.MjModel.from_xml_string(MODEL.format(step=step, **vars(self)))
+        model.opt.gravity[:] = (self.gravity * math.sin(self.tilt), 0, -self.gravity * math.cos(self.tilt))
+        data = mujoco.MjData(model)
+        data.qpos[:] = start[0], start[2] - self.tilt
+        data.qvel[:] = start[1], start[3]
+        data.qfrc_applied[0] = force
+        for _ in range(round(seconds / step)):
+            mujoco.mj_step(model, data)
+        (x, angle), (x_dot, angle_dot) = data.qpos, data.qvel
+        return np.array([x, x_dot, angle + self.tilt, angle_dot])
 
 
 class TestAgainstMujoco:
