@@ -28,7 +28,7 @@ from cartpole_rl.tasks.settings import NO_ACTION
 
 GUARD = TrackGuard(margin=0.01, delay=0.1, deceleration=5.0)
 END = 0.38  # m
-CARTS = 10_000
+CARTS = 4_000
 
 
 @pytest.mark.parametrize(
@@ -177,7 +177,7 @@ def reversing(env: CartPoleEnv, current, number: int, carts: Tensor) -> Tensor:
 def test_no_sequence_of_actions_overruns_the_quantile(
     policy: Callable[[CartPoleEnv, object, int, Tensor], Tensor], guard: str
 ) -> None:
-    """Of all brakings of 10 000 carts that the fit has not seen, no larger share ends off the track."""
+    """Of all brakings of 4 000 carts that the fit has not seen, no larger share ends off the track."""
     settings = with_fitted_guard(shipped_settings({"guard": guard}))
     plant = SimulatedSettings(**choice("plant/simulated"))
     env = simulated_env(settings, plant, CARTS, settings.task.evaluation_start, seed=20_000)

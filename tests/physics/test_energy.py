@@ -92,7 +92,7 @@ POLES = [
 ]
 
 
-@pytest.mark.parametrize(("step", "seconds"), [(0.02, 6), (0.01, 3), (0.002, 0.6)])
+@pytest.mark.parametrize(("step", "seconds"), [(0.02, 6), (0.002, 0.6)])
 def test_a_coasting_cart_never_gains_energy(make_cart: MakeCart, step: float, seconds: float) -> None:
     """Up to the integration error: 1.5 times that of the same start without friction."""
     cart, start = make_cart(64), random_states(64)
@@ -109,7 +109,7 @@ def test_a_coasting_cart_never_gains_energy(make_cart: MakeCart, step: float, se
 
 
 @pytest.mark.parametrize("law", ["step", "stribeck"])
-@pytest.mark.parametrize("step", [0.02, 0.01, 0.002])
+@pytest.mark.parametrize("step", [0.02, 0.002])
 def test_sticking_friction_takes_kinetic_energy_out_of_every_single_step(
     make_cart: MakeCart, law: str, step: float
 ) -> None:

@@ -57,8 +57,10 @@ def idle(
     return set(without_effect(Randomizer(ip02, poles, ranges), ranges, chosen["motors"], models, 0.02))
 
 
-@pytest.mark.parametrize("actions", ACTIONS)
-@pytest.mark.parametrize("randomization", RANDOMIZATIONS)
+@pytest.mark.parametrize(
+    ("randomization", "actions"),
+    [*((name, "nine_levels") for name in RANDOMIZATIONS), *(("wide", name) for name in ACTIONS)],
+)
 def test_every_shipped_range_has_an_effect(
     ip02: dict[str, float], medium: PoleSettings, both_poles: PoleSettings, randomization: str, actions: str
 ) -> None:

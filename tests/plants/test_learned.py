@@ -6,7 +6,6 @@ from pathlib import Path
 import pytest
 import torch
 from small_files import files_of_at_most
-from torchrl.envs.utils import check_env_specs
 
 from cartpole_rl.errors import CheckpointError
 from cartpole_rl.physics.dynamics import State
@@ -52,10 +51,6 @@ def make_learned(ip02: dict[str, float], medium: PoleSettings, parameters: dict[
         return LearnedPlant(CARTS, learned_model(parameters, size), randomizer, START, **settings)
 
     return build
-
-
-def test_specs(make_learned: MakeLearned) -> None:
-    check_env_specs(make_learned())
 
 
 def driven(plant: SimulatedPlant, periods: int = 30) -> torch.Tensor:

@@ -71,11 +71,6 @@ class TestFrame:
             frame = push(plant, 0)
         assert frame["counts"][0, 1] > 3 * 4096
 
-    def test_time_is_the_control_period(self, make_plant: MakePlant) -> None:
-        plant = make_plant(2, period=0.01)
-        assert plant.reset()["dt"].tolist() == push(plant, 0)["dt"].tolist()
-        assert push(plant, 0)["dt"].flatten().tolist() == pytest.approx([0.01, 0.01])
-
     @pytest.mark.parametrize(
         ("latency", "in_force"),
         [(0.0, [10, 20, 30, 40]), (0.02, [10, 20, 30, 40]), (0.021, [0, 10, 20, 30]), (0.05, [0, 0, 10, 20])],

@@ -83,7 +83,7 @@ def test_an_acknowledgement_of_the_last_host_is_not_taken_for_that_of_stop(
 def test_a_host_begins_with_any_sequence() -> None:
     """So the acknowledgements of the last one do not fit its own frames."""
     firsts = set()
-    for _ in range(20):
+    for _ in range(5):
         with CartPeer() as peer, SerialCart(quick_settings(peer.port)):
             firsts.add(peer.received[0].sequence)
     assert len(firsts) > 1
@@ -155,7 +155,7 @@ def test_a_refusal_is_raised_at_once_however_many_values_were_accepted(accepted:
         cart.set_motor(50)
         with pytest.raises(RefusedError, match="not armed"):
             cart.get_state()
-        peer.answer = lambda frame: CartPeer.answer(peer, frame)
+        del peer.answer
 
 
 def test_a_cart_that_hears_nothing_is_a_lost_link(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -175,7 +175,7 @@ def test_a_cart_that_hears_nothing_is_a_lost_link(monkeypatch: pytest.MonkeyPatc
 
         with pytest.raises(LinkError, match="sends states but acknowledges nothing: check the wire from"):
             drive_on()
-        peer.answer = lambda frame: CartPeer.answer(peer, frame)
+        del peer.answer
 
 
 def test_a_device_that_never_pauses_does_not_hold_up_the_host() -> None:

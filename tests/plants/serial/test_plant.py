@@ -69,6 +69,13 @@ def test_a_reset_that_fails_after_start_disarms_the_cart(on_board: bool) -> None
         assert not peer.flags & Flags.ARMED
 
 
+def hear_only_stop(peer: CartPeer) -> None:
+    """Let all other frames be lost; the states go on."""
+    peer.answer = lambda frame: (
+        CartPeer.answer(peer, frame) if isinstance(frame.message, Stop) else [peer.next_state()]
+    )
+
+
 def driven(plant: SerialPlant, motor: int) -> int:
     """The value that drove, of a period with `motor`."""
     plant.step_one(motor)
@@ -97,7 +104,7 @@ def test_a_value_that_was_lost_did_not_drive(peer: CartPeer, plant: SerialPlant)
     plant.reset()
     assert driven(plant, 100) == 100
     answer = peer.answer
-    peer.answer = lambda frame: [peer.next_state()]  # hears nothing; its states go on
+    hear_only_stop(peer)
     assert driven(plant, 200) == 100
     peer.state, peer.flags = replace(peer.state, motor_applied=0), peer.flags | Flags.WATCHDOG
     assert driven(plant, 200) == 100
@@ -136,7 +143,7 @@ def test_a_fault_ends_the_value_that_drove(peer: CartPeer, plant: SerialPlant) -
     plant.reset()
     plant.step_one(100)
     peer.state = replace(peer.state, motor_applied=0, fault=Fault.STALL)
-    peer.answer = lambda frame: [peer.next_state()]
+    hear_only_stop(peer)
     assert driven(plant, 200) == 100
 
 
@@ -146,7 +153,7 @@ def test_a_motor_value_that_no_cart_has_is_a_lost_link(
 ) -> None:
     """It would be observed and learned from."""
     plant.reset()
-    peer.answer = lambda frame: [peer.next_state()]
+    hear_only_stop(peer)
     peer.state = replace(peer.state, motor_applied=motor)
     frame = plant.step_one(100)
     assert (frame.truncated, frame.motor_applied) == ((True,), (0,))
@@ -349,14 +356,15 @@ def test_a_silent_cart_truncates_with_the_last_counts_and_can_come_back(
     assert plant.reset()["counts"].tolist() == [[42, HANGING]]
 
 
+class Owned:
+    closed = False
+    died = ""
+
+    def close(self) -> None:
+        self.closed = True
+
+
 def test_close_stops_the_motor_and_closes_what_is_owned(peer: CartPeer) -> None:
-    class Owned:
-        closed = False
-        died = ""
-
-        def close(self) -> None:
-            self.closed = True
-
     owned = Owned()
     plant = SerialPlant(quick_settings(peer.port), owned=owned)
     plant.reset()
@@ -368,13 +376,6 @@ def test_close_stops_the_motor_and_closes_what_is_owned(peer: CartPeer) -> None:
 
 
 def test_what_is_owned_is_closed_when_the_port_cannot_be_opened() -> None:
-    class Owned:
-        closed = False
-        died = ""
-
-        def close(self) -> None:
-            self.closed = True
-
     owned = Owned()
     with pytest.raises(PortError):
         SerialPlant(quick_settings("/dev/nosuch0"), owned=owned)
