@@ -21,7 +21,7 @@ SAME_GROUP = 0.15  # added to the similarity within one group
 EXAMPLES = {  # of required settings
     "run": "run=runs/train/<run> or run=pretrained/medium",
     "format": "format=weights, onnx, c or web",
-    "from": "from=runs/record/<run>",
+    "from": "from=<file or folder>",
     "plant.port": "plant.port=/dev/ttyUSB0 (cartpole-find-port lists the ports) or plant.port=auto",
     "plant.model": "plant.model=runs/model/<run>",
     "learner.address": "learner.address=<host>:6379, the address of the Ray head",

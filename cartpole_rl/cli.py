@@ -117,6 +117,19 @@ VERBS: dict[str, Verb] = {
         ),
         "workflows.checks:check_evaluation",
     ),
+    "import": Verb(
+        "identification.layout:ImportConfig",
+        "workflows.import_logs:import_logs",
+        "makes recordings of anyone's logs, and says what is doubtful about them.\n"
+        "A layout names the columns, their units and their signs.",
+        "identification",
+        (
+            "from=logs/ layout=sensorsini_2022",
+            "from=log.csv layout=sensorsini_2020 layout.angle.upright=3120",
+            "from=log.csv layout.time.name=t layout.angle.unit=deg layout.motor.full=255",
+        ),
+        "identification.layout:log_files",
+    ),
     "replay": Verb(
         "workflows.config:ReplayConfig",
         "workflows.replay:replay_recordings",
@@ -232,7 +245,8 @@ def main() -> None:
 
 
 def __getattr__(verb: str) -> Callable[[], None]:
-    """Return the program of a verb, for its entry point: `cartpole_rl.cli:train`."""
+    """Return the program of a verb, for its entry point: `cartpole_rl.cli:train`, or `:import_`."""
+    verb = verb.rstrip("_")
     if verb in VERBS:
         return partial(run, verb)
     raise AttributeError(f"module {__name__} has no attribute {verb!r}")

@@ -48,13 +48,14 @@ USES = {  # command: how its runs can be used
     "distill": "cartpole-evaluate, cartpole-record and cartpole-finetune take it as run={0}",
     "evaluate": "cartpole-evaluate drives one of its episodes again: repeat.run={0}",
     "record": "cartpole-replay, cartpole-identify and cartpole-model take it as from={0}",
+    "import": "cartpole-identify, cartpole-replay and cartpole-model take it as from={0}",
     "replay": f"its results are replay.json and {FIGURES}/; cartpole-replay from=... makes new ones",
     "identify": "cartpole-train takes its files: cart={1} pole={2} randomization={3}",
     "report": f"it is a page to read: {{0}}/{PAGE}",
     "model": "cartpole-train, cartpole-evaluate and cartpole-record take it as plant=learned plant.model={0}",
     "export": "its files are for other programs; cartpole-export run=... makes new ones",
 }
-RECORDING = ("record", "identify", "finetune")  # commands whose runs hold recordings
+RECORDING = ("record", "identify", "finetune", "import")  # commands whose runs hold recordings
 PACKAGES = ("cartpole_rl", "torch", "torchrl", "tensordict", "numpy", "hydra-core", "mujoco", "pyserial")
 
 

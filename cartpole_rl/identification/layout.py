@@ -5,8 +5,10 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from cartpole_rl.errors import ConfigError
 from cartpole_rl.settings import Finite, Positive, Settings
 
+SUFFIXES = (".csv", ".txt", ".tsv", ".log", ".dat")  # of logs in a folder
 Direction = Literal["right", "left"]
 Name = Annotated[str, Field(min_length=1)]
 
@@ -74,7 +76,20 @@ class Layout(Settings):
 class ImportConfig(Settings):
     """The settings of cartpole-import."""
 
-    source: Path
+    source: Annotated[Path, Field(alias="from")]
     layout: Layout
     pole_length: Positive | None = None  # m, of the recorded pole
     label: str
+
+
+def log_files(config: ImportConfig) -> list[Path]:
+    """Return the log `from=`, or those in this folder. Raises ConfigError if there is none."""
+    source = config.source
+    if source.is_file():
+        return [source]
+    if not source.is_dir():
+        raise ConfigError(f"from={source}: there is no such file or folder")
+    found = sorted(path for path in source.iterdir() if path.suffix.lower() in SUFFIXES)
+    if not found:
+        raise ConfigError(f"from={source}: the folder holds no {', '.join(SUFFIXES)} file")
+    return found

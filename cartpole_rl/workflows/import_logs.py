@@ -4,6 +4,7 @@ Motion tells much of what a layout can get wrong: signs, the scale and the zero 
 position, and a motor value that was chosen a row earlier or later.
 """
 
+import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -13,13 +14,13 @@ import numpy as np
 
 from cartpole_rl.errors import RecordingError
 from cartpole_rl.evaluation.recordings import LENGTH, write_recording
-from cartpole_rl.identification.layout import ImportConfig, Layout
+from cartpole_rl.identification.layout import ImportConfig, Layout, log_files
 from cartpole_rl.identification.logs import Log, Report, read_log
 from cartpole_rl.identification.sensors import Estimate, Motion, Sensors, question_sensors
 from cartpole_rl.run_folder import RECORDINGS, write_config, write_json
+from cartpole_rl.terminal import print_results, progress_bar, shown
 
 IMPORTED = "import.json"
-SUFFIXES = (".csv", ".txt", ".tsv", ".log", ".dat")
 CORRELATED = 0.2  # size of a correlation that has a sign
 ANGLE_SCALE, POSITION_SCALE = 0.01, 0.10  # share by which a scale may differ
 ANGLE_ZERO = 0.02  # rad by which the upright angle may differ
@@ -27,6 +28,7 @@ JITTER = 0.1  # share of the period
 LEAPS = 0.02  # share of rows
 SATURATED = 0.5  # share of rows
 TURN = 2 * np.pi
+USUAL_PERIOD = 0.02  # s, the default of cartpole-identify
 
 
 def import_logs(config: ImportConfig, folder: Path) -> Sensors:
@@ -36,8 +38,12 @@ def import_logs(config: ImportConfig, folder: Path) -> Sensors:
     out, and the estimates of the sensors. Prints them, and each doubt. Raises RecordingError for a log that
     cannot be read, or if nothing is left.
     """
-    paths = log_files(config.source)
-    logs = {path: read_log(path, config.layout) for path in paths}
+    paths = log_files(config)
+    logs = {}
+    with progress_bar(len(paths), "logs") as bar:
+        for path in paths:
+            logs[path] = read_log(path, config.layout)
+            bar.update()
     periods = sorted({round(log.report.period, 4) for log in logs.values()})
     if len(periods) > 1:
         raise RecordingError(
@@ -71,17 +77,6 @@ def import_logs(config: ImportConfig, folder: Path) -> Sensors:
     write_json(folder / IMPORTED, summary(logs, sensors, found))
     print_summary(logs, parts, period, sensors, found, folder)
     return sensors
-
-
-def log_files(source: Path) -> list[Path]:
-    """Return a log, or those in a folder. Raises RecordingError if there is none."""
-    if source.is_file():
-        return [source]
-    found = sorted(path for path in source.glob("*") if path.suffix.lower() in SUFFIXES)
-    if not found:
-        missing = f"it holds no {', '.join(SUFFIXES)} file" if source.is_dir() else "no such file or folder"
-        raise RecordingError(f"from={source}: {missing}; give a log, or a folder of logs")
-    return found
 
 
 def doubts(reports: Sequence[Report], sensors: Sensors, period: float, layout: Layout) -> Iterator[str]:
@@ -220,5 +215,9 @@ def print_summary(
             print(f"{name}: {value:.4g}{unit} (95 %: {low:.4g} to {high:.4g})")
     for doubt in found:
         print(f"doubt: {doubt}")
-    print(f"{folder}/{RECORDINGS}/ holds the recordings; next:")
-    print(f"cartpole-identify from={folder} pole=...")
+    rate = "" if math.isclose(period, USUAL_PERIOD) else f" control_period={period:g}"
+    print_results(
+        folder,
+        f"{RECORDINGS}/ and {IMPORTED}",
+        f"cartpole-identify from={shown(folder)} pole=<yours>.yaml{rate}",
+    )

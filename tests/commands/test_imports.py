@@ -58,6 +58,7 @@ COMPLAINS = {  # command: words, exit code, part of the line on stderr
         ("seed=1", 2, "seed: there is no such setting"),
         ("animations=maybe runs=nowhere", 2, "give true or false"),
     ],
+    "import": [("from=nowhere", 2, "from=nowhere: there is no such file or folder")],
     "replay": [("from=nowhere", 2, "from=nowhere: there is no such file or folder")],
     "train": [
         ("resume=nowhere", 1, "resume=nowhere: there is no such folder"),

@@ -1,6 +1,7 @@
 """Each command refuses the run folders of the others in one line, which says what can be done with them."""
 
 import json
+import math
 import shutil
 from pathlib import Path
 
@@ -16,6 +17,7 @@ WHAT_TO_DO = {  # with a folder, by what made it
     "distill": "cartpole-evaluate, cartpole-record and cartpole-finetune take it as run={0}",
     "evaluate": "cartpole-evaluate drives one of its episodes again: repeat.run={0}",
     "record": "cartpole-replay, cartpole-identify and cartpole-model take it as from={0}",
+    "import": "cartpole-identify, cartpole-replay and cartpole-model take it as from={0}",
     "replay": "cartpole-replay from=... makes new ones",
     "identify": "cartpole-train takes its files: cart={0}/cart.yaml",
     "model": "plant=learned plant.model={0}",
@@ -25,7 +27,10 @@ WHAT_TO_DO = {  # with a folder, by what made it
     "multirun": "give that of one of its jobs",
 }
 ENDED = "has ended; cartpole-evaluate run={0} drives its agent"
-AGENTS, RECORDINGS = {"train", "finetune", "distill", "unfinished"}, {"record", "identify", "finetune"}
+AGENTS, RECORDINGS = (
+    {"train", "finetune", "distill", "unfinished"},
+    {"record", "identify", "finetune", "import"},
+)
 SETTINGS = {  # words, with the folder at {0} and an agent at {1}: what is taken, what is said of others
     "train resume={0}": ({"unfinished"}, {"train": ENDED}),
     "finetune run={0} plant=emulated": (AGENTS, {}),
@@ -62,10 +67,13 @@ def runs(
     shutil.copytree(tuned[0], folder / "finetune")
     model = ("windows=20", "ensemble.members=1", "ensemble.hidden=4", "ensemble.updates=2")
     small = [f"distillation.{name}=2" for name in ("carts", "rounds", "periods", "updates", "batch_size")]
+    rows = "".join(f"{row / 50},{math.sin(row / 9) / 9},{row / 9},{row % 2}\n" for row in range(100))
+    (folder / "log.csv").write_text(f"time,position,angle,motor\n{rows}")
     made = (
         ("evaluate", "run=train", "episodes=1", "hydra.run.dir=evaluate"),
         ("record", "run=lqr", "episodes=3", "hydra.run.dir=record"),
         ("record", "-m", "run=train", "episodes=1", "seed=0,1", "hydra.sweep.dir=multirun"),
+        ("import", "from=log.csv", "hydra.run.dir=import"),
         ("replay", "from=record", "hydra.run.dir=replay"),
         ("model", "from=record", *model, "hydra.run.dir=model"),
         ("distill", "run=train", *small, "hydra.run.dir=distill"),

@@ -22,6 +22,7 @@ NOT_OF_TRAINING = (
     "emulator",
     "plant",
     "finetuning",
+    "layout",
     "learner",
     "sweep",
 )  # groups with choices that are not settings of it

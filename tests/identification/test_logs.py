@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from command_line import in_process
 
 from cartpole_rl.checking import validated
 from cartpole_rl.errors import ConfigError, RecordingError
@@ -67,6 +68,10 @@ def layout(**changes: Any) -> Layout:
         for name, change in changes.items()
     }
     return validated(Layout, {**LAYOUT, **values})
+
+
+def imported(source: Path) -> ImportConfig:
+    return validated(ImportConfig, {"from": source, "layout": layout(), "label": ""})
 
 
 @pytest.mark.parametrize(
@@ -212,7 +217,7 @@ def test_each_fault_of_a_log_is_a_doubt(
 ) -> None:
     convert, doubt = BROKEN[fault]
     path = written(tmp_path / "log.csv", convert(motion))
-    import_logs(ImportConfig(source=path, layout=layout(), label=""), tmp_path / "run")
+    import_logs(imported(path), tmp_path / "run")
     doubts = re.findall("doubt: (.*)", capsys.readouterr().out)
     assert any(re.search(doubt, each) for each in doubts), doubts
 
@@ -223,15 +228,28 @@ def test_logs_of_several_periods_are_refused(tmp_path: Path, motion: Columns) ->
     written(folder / "a.csv", motion)
     written(folder / "b.csv", {**motion, "t": motion["t"] / 2})
     with pytest.raises(RecordingError, match="control periods from 10 to 20 ms"):
-        import_logs(ImportConfig(source=folder, layout=layout(), label=""), tmp_path / "run")
+        import_logs(imported(folder), tmp_path / "run")
     assert not (tmp_path / "run").exists()
+
+
+def test_the_command_imports_what_identify_and_replay_take(tmp_path: Path, motion: Columns) -> None:
+    written(tmp_path / "log.csv", motion)
+    (tmp_path / "mine.yaml").write_text("defaults: [plain]\ntime: {name: t}\nposition: {name: x}\n")
+    given = ("from=log.csv", "layout=mine.yaml", "layout.angle.name=a", "layout.motor={name: u, full: 255}")
+    done = in_process("import", *given, "hydra.run.dir=run", folder=tmp_path)
+    assert (done.code, done.err) == (0, "")
+    assert done.out.splitlines()[-1] == "cartpole-identify from=run pole=<yours>.yaml"
+    done = in_process("replay", "from=run", "pole=medium", "hydra.run.dir=replayed", folder=tmp_path)
+    assert (done.code, done.err) == (0, "")
+    again = in_process("import", *given, "hydra.run.dir=run", folder=tmp_path)
+    assert again.complaint.endswith("/run: it holds a run already; give another folder")
 
 
 def test_a_good_log_has_no_doubt_and_becomes_recordings(
     tmp_path: Path, motion: Columns, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = tmp_path / "run"
-    import_logs(ImportConfig(source=written(tmp_path / "log.csv", motion), layout=layout(), label=""), run)
+    import_logs(imported(written(tmp_path / "log.csv", motion)), run)
     assert "doubt: " not in capsys.readouterr().out
     episode = read_recording(run / "recordings" / "log_00.csv")
     assert episode.theta == pytest.approx(motion["a"], abs=1e-3)

@@ -21,6 +21,7 @@ REQUIRED: dict[str, dict[str, Any]] = {
     "finetune": {"run": "some"},
     "model": {"from": "some"},
     "replay": {"from": "some"},
+    "import": {"from": "some"},
     "preflight": {"plant.port": "auto"},
     "export": {"run": "some", "format": "c"},
     "distill": {"run": "some"},
