@@ -14,7 +14,7 @@ from pathlib import Path
 from cartpole_rl.files import write_text
 from cartpole_rl.learning.checkpoints import load_agent, save_agent
 from cartpole_rl.run_folder import PRETRAINED, PRETRAINED_AGENT, PROVENANCE, find_agent
-from cartpole_rl.workflows.agents import provenance
+from cartpole_rl.workflows.build import provenance
 
 PACKAGE = Path(__file__).parents[1] / "cartpole_rl"
 LARGEST = 300_000  # bytes

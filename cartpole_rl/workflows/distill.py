@@ -14,8 +14,7 @@ from cartpole_rl.learning.states import seed_everything
 from cartpole_rl.reporting.episodes import report_episodes
 from cartpole_rl.run_folder import CHECKPOINTS, FIGURES, LAST, METRICS, write_config
 from cartpole_rl.terminal import as_word, print_results, progress_bar, shown
-from cartpole_rl.workflows.agents import new_agent, provenance, trained_agent
-from cartpole_rl.workflows.build import use_threads
+from cartpole_rl.workflows.build import new_agent, provenance, trained_agent, use_threads
 from cartpole_rl.workflows.config import DistillConfig, TrainConfig
 from cartpole_rl.workflows.train import judge, nominal_env
 

@@ -33,19 +33,17 @@ from cartpole_rl.run_folder import BASELINE, CONFIG, METRICS, check_program
 from cartpole_rl.tasks.episode import Episode, Origin
 from cartpole_rl.tasks.settings import Measure
 from cartpole_rl.terminal import confirm, print_message, progress_bar
-from cartpole_rl.workflows.agents import (
+from cartpole_rl.workflows.build import (
     TrainedAgent,
     compiled_training,
     evaluated_agent,
-    exported_agent,
-    provenance,
-)
-from cartpole_rl.workflows.build import (
     evaluated_env,
     evaluated_settings,
+    exported_agent,
     guard_note,
     precedence,
     predicting_env,
+    provenance,
     use_threads,
 )
 from cartpole_rl.workflows.checks import note_other_numbers, simulated_carts

@@ -9,7 +9,7 @@ from cartpole_rl.exporting.onnx_model import onnx_model
 from cartpole_rl.exporting.web_page import web_page
 from cartpole_rl.files import write_bytes
 from cartpole_rl.run_folder import write_config
-from cartpole_rl.workflows.agents import TrainedAgent, exported_agent, network_of, provenance, trained_agent
+from cartpole_rl.workflows.build import TrainedAgent, exported_agent, network_of, provenance, trained_agent
 from cartpole_rl.workflows.config import ExportConfig
 
 

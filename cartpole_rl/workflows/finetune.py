@@ -55,11 +55,12 @@ from cartpole_rl.run_folder import (
     write_json,
 )
 from cartpole_rl.terminal import as_word, confirm, print_loop_time, print_message, print_results, shown
-from cartpole_rl.workflows.agents import new_agent, trained_agent
 from cartpole_rl.workflows.build import (
     evaluated_env,
     evaluated_settings,
     guard_note,
+    new_agent,
+    trained_agent,
     use_threads,
 )
 from cartpole_rl.workflows.checks import check_finetuning, check_resumable, is_given

@@ -37,7 +37,7 @@ from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COU
 from cartpole_rl.settings import evaluation_seed
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.terminal import print_message
-from cartpole_rl.workflows.agents import known_poles, new_agent
+from cartpole_rl.workflows.build import known_poles, new_agent
 from cartpole_rl.workflows.config import FinetuneConfig, TrainConfig
 from cartpole_rl.workflows.finetuning_cart import Stage, pole_length
 from cartpole_rl.workflows.poles import guard_holds

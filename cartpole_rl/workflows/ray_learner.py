@@ -19,8 +19,7 @@ from cartpole_rl.learning.checkpoints import AgentCheckpoint, TrainingCheckpoint
 from cartpole_rl.learning.dqn import Scalars
 from cartpole_rl.learning.states import seed_everything
 from cartpole_rl.tasks.episode import Episode
-from cartpole_rl.workflows.agents import new_agent
-from cartpole_rl.workflows.build import evaluated_settings, use_threads
+from cartpole_rl.workflows.build import evaluated_settings, new_agent, use_threads
 from cartpole_rl.workflows.config import EvaluateConfig, FinetuneConfig, TrainConfig, recorded_settings
 from cartpole_rl.workflows.finetuning_learner import CartLearner, TunedAgent, check_simulation
 

@@ -21,8 +21,7 @@ from cartpole_rl.run_folder import CHECKPOINTS, FIGURES, METRICS, write_config
 from cartpole_rl.settings import evaluation_seed
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.terminal import as_word, print_message, print_results, shown
-from cartpole_rl.workflows.agents import new_agent
-from cartpole_rl.workflows.build import use_threads
+from cartpole_rl.workflows.build import new_agent, use_threads
 from cartpole_rl.workflows.checks import check_compiler, check_resumable, note_other_numbers
 from cartpole_rl.workflows.config import TrainConfig, recorded_settings
 from cartpole_rl.workflows.monitor import TrainingMonitor

@@ -20,7 +20,7 @@ from common import RUNS, option_parser, positive_int, print_table, processes, wr
 from learning import judge
 
 from cartpole_rl.exporting.c_code import c_files
-from cartpole_rl.workflows.agents import TrainedAgent, exported_agent, trained_agent
+from cartpole_rl.workflows.build import TrainedAgent, exported_agent, trained_agent
 from cartpole_rl.workflows.config import DistillConfig, load_settings
 from cartpole_rl.workflows.distill import distill
 

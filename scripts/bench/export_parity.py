@@ -41,8 +41,14 @@ from cartpole_rl.evaluation.episodes import Policy, prepared, run_batch, warm_up
 from cartpole_rl.exporting.c_code import c_files
 from cartpole_rl.exporting.onnx_model import onnx_model
 from cartpole_rl.tasks.episode import Episode
-from cartpole_rl.workflows.agents import TrainedAgent, exported_agent, network_of, trained_agent
-from cartpole_rl.workflows.build import evaluated_env, evaluated_settings
+from cartpole_rl.workflows.build import (
+    TrainedAgent,
+    evaluated_env,
+    evaluated_settings,
+    exported_agent,
+    network_of,
+    trained_agent,
+)
 from cartpole_rl.workflows.config import EvaluateConfig, load_settings
 
 CARTS = 200  # simulated at once

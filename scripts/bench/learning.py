@@ -40,8 +40,7 @@ from cartpole_rl.randomization.poles import Pole, PoleSettings
 from cartpole_rl.randomization.ranges import Range
 from cartpole_rl.settings import evaluation_seed
 from cartpole_rl.tasks.episode import Episode
-from cartpole_rl.workflows.agents import TrainedAgent, trained_agent
-from cartpole_rl.workflows.build import use_threads
+from cartpole_rl.workflows.build import TrainedAgent, trained_agent, use_threads
 from cartpole_rl.workflows.config import TrainConfig
 
 EXPERIMENTS = {  # the plants on which each experiment's agents are judged

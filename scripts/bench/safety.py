@@ -44,8 +44,7 @@ from cartpole_rl.plants.emulated import EmulatedCart
 from cartpole_rl.plants.serial.plant import SerialPlant
 from cartpole_rl.reporting.texts import Cell
 from cartpole_rl.wire import FrameSplitter, Home, Start, State, decode_frame
-from cartpole_rl.workflows.agents import TrainedAgent, trained_agent
-from cartpole_rl.workflows.build import evaluated_env, evaluated_settings
+from cartpole_rl.workflows.build import TrainedAgent, evaluated_env, evaluated_settings, trained_agent
 from cartpole_rl.workflows.config import EvaluateConfig
 
 AGENT = "pretrained/medium"

@@ -48,8 +48,7 @@ from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.errors import PlantError
 from cartpole_rl.evaluation.episodes import Policy, run_episodes
 from cartpole_rl.reporting.texts import Cell
-from cartpole_rl.workflows.agents import TrainedAgent, trained_agent
-from cartpole_rl.workflows.build import evaluated_env, evaluated_settings
+from cartpole_rl.workflows.build import TrainedAgent, evaluated_env, evaluated_settings, trained_agent
 from cartpole_rl.workflows.config import EvaluateConfig
 
 Scores = list[float | None]  # of the episodes on one cart; None for one that was not driven

@@ -10,7 +10,7 @@ from command_line import DISTILLATION, in_process, interrupt_after
 
 from cartpole_rl.choices import choice
 from cartpole_rl.learning.checkpoints import load_agent, save_agent
-from cartpole_rl.workflows.agents import trained_agent
+from cartpole_rl.workflows.build import trained_agent
 
 
 def test_the_student_is_an_agent_like_any_other(trained: Path, tmp_path: Path) -> None:

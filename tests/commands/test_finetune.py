@@ -22,7 +22,7 @@ from cartpole_rl.learning.checkpoints import (
     save_agent,
     save_training,
 )
-from cartpole_rl.workflows.agents import trained_agent
+from cartpole_rl.workflows.build import trained_agent
 
 
 def recordings(run: Path) -> list[str]:

@@ -16,8 +16,13 @@ from cartpole_rl.evaluation.onboard import comparable, run_onboard_episodes
 from cartpole_rl.plants.serial.errors import RefusedError
 from cartpole_rl.tasks.endings import Ending
 from cartpole_rl.tasks.episode import Episode
-from cartpole_rl.workflows.agents import TrainedAgent, new_agent, trained_agent
-from cartpole_rl.workflows.build import evaluated_env, evaluated_settings
+from cartpole_rl.workflows.build import (
+    TrainedAgent,
+    evaluated_env,
+    evaluated_settings,
+    new_agent,
+    trained_agent,
+)
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig, load_settings
 from cartpole_rl.workflows.episodes import on_the_board
 

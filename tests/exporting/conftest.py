@@ -8,7 +8,7 @@ import torch
 
 from cartpole_rl.envs.build import simulated_env
 from cartpole_rl.exporting.agent import ExportedAgent, Floats
-from cartpole_rl.workflows.agents import TrainedAgent, exported_agent, provenance, trained_agent
+from cartpole_rl.workflows.build import TrainedAgent, exported_agent, provenance, trained_agent
 
 MEDIUM = Path("pretrained/medium")
 

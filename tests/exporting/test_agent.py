@@ -29,7 +29,7 @@ from cartpole_rl.exporting.agent import (
     read_agent,
 )
 from cartpole_rl.tasks.features import Quantity
-from cartpole_rl.workflows.agents import TrainedAgent, exported_agent, network_of, provenance
+from cartpole_rl.workflows.build import TrainedAgent, exported_agent, network_of, provenance
 from cartpole_rl.workflows.config import TrainConfig, load_settings
 from examples.drive_without_torch import action_values
 

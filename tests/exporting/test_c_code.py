@@ -21,7 +21,7 @@ from cartpole_rl.evaluation.episodes import Policy, choose
 from cartpole_rl.exporting.agent import ExportedAgent, Floats
 from cartpole_rl.exporting.c_code import c_files
 from cartpole_rl.plants.specs import tensordict_of
-from cartpole_rl.workflows.agents import TrainedAgent, exported_agent, new_agent
+from cartpole_rl.workflows.build import TrainedAgent, exported_agent, new_agent
 from cartpole_rl.workflows.config import TrainConfig, load_settings
 
 FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Wconversion", "-Wpedantic", "-Wdouble-promotion", "-Werror")

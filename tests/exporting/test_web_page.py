@@ -22,7 +22,7 @@ from cartpole_rl.plants.simulated import Carts, Inputs, commands_under_way, run_
 from cartpole_rl.plants.specs import Numbers, OneCartPlant, PlantOutput
 from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 from cartpole_rl.scalar import Scalar
-from cartpole_rl.workflows.agents import TrainedAgent, exported_agent, network_of, new_agent
+from cartpole_rl.workflows.build import TrainedAgent, exported_agent, network_of, new_agent
 from cartpole_rl.workflows.config import TrainConfig, load_settings
 
 PERIODS = 100  # 2 s

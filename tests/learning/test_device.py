@@ -15,7 +15,7 @@ from cartpole_rl.evaluation.driving_policy import DrivingPolicy
 from cartpole_rl.learning.checkpoints import TrainingCheckpoint, load_training, save_training
 from cartpole_rl.learning.dqn import Monitor, Training
 from cartpole_rl.learning.states import on_device, seed_everything
-from cartpole_rl.workflows.agents import new_agent
+from cartpole_rl.workflows.build import new_agent
 from cartpole_rl.workflows.config import TrainConfig, load_settings
 from cartpole_rl.workflows.train import (
     available_device,

@@ -11,7 +11,7 @@ from cartpole_rl.evaluation.driving_policy import DrivingPolicy
 from cartpole_rl.learning.agent import QAgent
 from cartpole_rl.learning.distillation import Distillation
 from cartpole_rl.learning.settings import DistillationSettings
-from cartpole_rl.workflows.agents import TrainedAgent, new_agent, trained_agent
+from cartpole_rl.workflows.build import TrainedAgent, new_agent, trained_agent
 from cartpole_rl.workflows.config import DistillConfig, TrainConfig, load_settings
 from cartpole_rl.workflows.distill import student_settings
 

@@ -13,7 +13,7 @@ from cartpole_rl.agents.settings import AGENTS
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.reporting.loggers import LOGGERS
-from cartpole_rl.workflows.agents import network_of, trained_agent
+from cartpole_rl.workflows.build import network_of, trained_agent
 from cartpole_rl.workflows.config import TrainConfig, load_settings
 from cartpole_rl.workflows.train import nominal_env, train
 

@@ -20,8 +20,7 @@ from cartpole_rl.plants.recorded import RecordedPlant
 from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.wire import Fault
-from cartpole_rl.workflows.agents import trained_agent
-from cartpole_rl.workflows.build import evaluated_env, evaluated_settings
+from cartpole_rl.workflows.build import evaluated_env, evaluated_settings, trained_agent
 from cartpole_rl.workflows.config import EvaluateConfig, load_settings
 
 AGENT = "pretrained/medium"

@@ -153,7 +153,7 @@ def lines_are_written_by_the_stock_loss(runs: Runs) -> None:
     from torchrl.objectives import DQNLoss
 
     from cartpole_rl.learning.checkpoints import load_agent
-    from cartpole_rl.workflows.agents import new_agent
+    from cartpole_rl.workflows.build import new_agent
     from cartpole_rl.workflows.config import TrainConfig
 
     trained, _, exported = runs

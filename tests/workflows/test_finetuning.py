@@ -24,8 +24,7 @@ from cartpole_rl.plants.serial.statistics import LinkStatistics
 from cartpole_rl.reporting.tensorboard import TensorBoardLog
 from cartpole_rl.run_folder import write_config
 from cartpole_rl.tasks.episode import Episode
-from cartpole_rl.workflows.agents import new_agent
-from cartpole_rl.workflows.build import evaluated_settings
+from cartpole_rl.workflows.build import evaluated_settings, new_agent
 from cartpole_rl.workflows.config import FinetuneConfig, TrainConfig, load_settings, recorded_settings
 from cartpole_rl.workflows.finetune import evaluation_config, started_from
 from cartpole_rl.workflows.finetuning_cart import DrivenCart, FinetuningFiles, Stage

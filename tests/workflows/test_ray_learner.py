@@ -23,7 +23,7 @@ from cartpole_rl.evaluation.driving_policy import Weights, as_weights
 from cartpole_rl.learning.checkpoints import FINETUNING_FORMAT, AgentCheckpoint, load_training
 from cartpole_rl.learning.settings import RayLearnerSettings
 from cartpole_rl.workflows import ray_link
-from cartpole_rl.workflows.agents import new_agent
+from cartpole_rl.workflows.build import new_agent
 from cartpole_rl.workflows.config import FinetuneConfig, TrainConfig, load_settings
 from cartpole_rl.workflows.finetune import NAME, learn_there, take
 from cartpole_rl.workflows.finetuning_cart import FinetuningFiles, Stage

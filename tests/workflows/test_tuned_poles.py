@@ -9,8 +9,13 @@ from cartpole_rl.choices import group_choices
 from cartpole_rl.envs.build import with_fitted_guard
 from cartpole_rl.learning.checkpoints import AgentCheckpoint, save_agent
 from cartpole_rl.randomization.poles import Pole, PoleSettings
-from cartpole_rl.workflows.agents import compiled_training, exported_agent, new_agent, trained_agent
-from cartpole_rl.workflows.build import evaluated_settings
+from cartpole_rl.workflows.build import (
+    compiled_training,
+    evaluated_settings,
+    exported_agent,
+    new_agent,
+    trained_agent,
+)
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig, load_settings
 from cartpole_rl.workflows.episodes import on_the_board
 from cartpole_rl.workflows.finetuning_cart import Stage
