@@ -1,6 +1,7 @@
 """Logs of others in every shape that people write, and what motion says of their columns."""
 
 import re
+import textwrap
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,8 @@ import pytest
 from command_line import in_process
 
 from cartpole_rl.checking import validated
+from cartpole_rl.choices import conf_folder
+from cartpole_rl.composition import compose
 from cartpole_rl.errors import ConfigError, RecordingError
 from cartpole_rl.evaluation.recordings import read_recording
 from cartpole_rl.identification.layout import ImportConfig, Layout
@@ -243,6 +246,15 @@ def test_the_command_imports_what_identify_and_replay_take(tmp_path: Path, motio
     assert (done.code, done.err) == (0, "")
     again = in_process("import", *given, "hydra.run.dir=run", folder=tmp_path)
     assert again.complaint.endswith("/run: it holds a run already; give another folder")
+
+
+def test_the_layout_of_the_guide_is_taken(tmp_path: Path) -> None:
+    page = (conf_folder().parent / "docs/identification.md").read_text()
+    lines = page[page.index("    defaults: [plain]") :].partition("\n\n")[0]
+    (tmp_path / "mine.yaml").write_text(textwrap.dedent(lines))
+    given = {"from": "log.csv", "layout": tmp_path / "mine.yaml"}
+    taken = validated(ImportConfig, compose("import", given)).layout
+    assert (taken.time.name, taken.motor.row, taken.keep) == ("t_ms", "in_force", {"error": (0, 0)})
 
 
 def test_a_good_log_has_no_doubt_and_becomes_recordings(

@@ -88,7 +88,7 @@ def record_shaken_carts(folder: Path, make_plant: Callable, make_environment: Ca
 
 
 def test_the_page_has_a_block_for_each_function() -> None:
-    assert len(BLOCKS) == 12
+    assert len(BLOCKS) == 13
     for name in re.findall(r"`workflows\.([\w.]+)\.(\w+)\(", PAGE.read_text()):
         assert any(f"from cartpole_rl.workflows.{name[0]} import {name[1]}" in block for block in BLOCKS)
 
@@ -114,7 +114,7 @@ def test_every_block_runs(notebook: Path, make_plant: Callable, make_environment
         printed.append(output.getvalue())
     runs = {path.parent.relative_to("runs").as_posix() for path in Path("runs").glob("*/*/provenance.json")}
     commands = {"train", "evaluate", "record", "replay", "model", "identify", "finetune", "report"}
-    commands |= {"export", "distill"}
+    commands |= {"export", "distill", "import"}
     assert runs == {f"{command}/first" for command in commands} | {"evaluate/on_model"}
     assert len(list(Path("runs/record/first/recordings").glob("*.csv"))) == 2
     comparison = json.loads(Path("runs/finetune/first/comparison.json").read_text())
