@@ -11,6 +11,7 @@ import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 from command_line import BIN, COARSE, DISTILLATION, interrupt_after
 from page_commands import (
@@ -29,6 +30,7 @@ from page_commands import (
 from cartpole_rl.checking import validated
 from cartpole_rl.cli import VERBS
 from cartpole_rl.composition import compose
+from cartpole_rl.evaluation.recordings import read_recording
 
 BUDGETS = {  # of each command; what the page gives stays, except where it takes minutes
     "train": [*BUDGET, "seed=0", "agent.action_gap=0.7"],  # the last two narrow the sweeps
@@ -39,6 +41,7 @@ BUDGETS = {  # of each command; what the page gives stays, except where it takes
     "distill": [*DISTILLATION],
     "report": ["animations=false"],
     "export": [],
+    "import": [],
     "preflight": [],
 }
 LONG = (
@@ -54,6 +57,7 @@ MAKERS = {  # the command that makes the first run of each kind, most of them fr
     "model": "cartpole-model from=runs/identify/<run> pole_friction=bearing",
     "distill": "cartpole-distill run=runs/train/<run> hidden=[32,32]",
     "finetune": "cartpole-finetune run=runs/train/first episodes=3",  # interrupted, as a page resumes it
+    "import": "cartpole-import from=logs/ layout=sensorsini_2022",
     "evaluate": "cartpole-evaluate run=runs/train/first episodes=18",  # a page repeats episode 17
 }
 
@@ -84,6 +88,9 @@ def made(trained: Path) -> Callable[[str], None]:
     def make(kind: str) -> None:
         if (trained / f"runs/{kind}/first").exists():
             return
+        if kind == "import":
+            make("identify")
+            lay_out_logs(trained)
         command = MAKERS[kind].replace("<run>", "first")
         need(command, make)
         more = [*within(BUDGETS[kind], command), *coarse(command), f"hydra.run.dir=runs/{kind}/first"]
@@ -114,6 +121,20 @@ def lay_out_reports(folder: Path) -> None:
         target = folder / "runs/train" / name / ("0_seed-0" if name.endswith("multirun") else ".")
         if not target.exists():
             shutil.copytree(folder / "runs/train/first", target)
+
+
+def lay_out_logs(folder: Path) -> None:
+    """Write the recordings of the identification as logs of another cart, and a file of its pole."""
+    (folder / "logs").mkdir()
+    (folder / "mine.yaml").write_text("defaults: [medium]\n")
+    for path in (folder / "runs/identify/first/recordings").glob("*.csv"):
+        episode = read_recording(path)
+        motor = np.concatenate(([0], episode.motor)) * -4706 / 255
+        angle = (3344 - 4271 * episode.theta / (2 * np.pi)) % 4271
+        rows = zip(-episode.x / 8.498e-5, angle, motor, strict=True)
+        lines = (f"20,{x:.0f},{theta:.0f},{value:.0f},0,0" for x, theta, value in rows)
+        head = "deltaTimeMs,position_raw,angle_raw,actualMotorSave,invalid_steps,frozen"
+        (folder / "logs" / path.name).write_text("\n".join([head, *lines]))
 
 
 def test_the_guides_have_commands_of_their_own() -> None:
