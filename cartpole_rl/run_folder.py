@@ -10,6 +10,7 @@ import platform
 import re
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -202,8 +203,13 @@ def recordings(source: Path) -> list[Path]:
 
 
 def experiments(source: Path) -> dict[str, Path]:
-    """Return `recordings` by the names of their experiments, or of their files. Raises the same errors."""
-    return {re.sub(r"^\d\d_(?=.)", "", path.stem): path for path in recordings(source)}
+    """Return `recordings` by the names of their experiments, or of their files. Raises the same errors.
+
+    "01_swing" is the experiment swing, unless there is a second one.
+    """
+    names = {path: re.sub(r"^\d\d_(?=.)", "", path.stem) for path in recordings(source)}
+    number = Counter(names.values())
+    return {name if number[name] == 1 else path.stem: path for path, name in names.items()}
 
 
 def write_inputs(folder: Path, needs: Iterable[Path]) -> None:

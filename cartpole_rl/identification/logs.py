@@ -27,6 +27,7 @@ Array = NDArray[np.float64]
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 TURN = {"rad": 2 * np.pi, "deg": 360.0, "turn": 1.0}
+MOST_COUNTS = 2**31 - 1  # of an encoder, as in recordings
 SHORT, STANDING = "in a part that is too short", "in a part in which motor, cart or pole stand still"
 
 
@@ -80,6 +81,13 @@ def read_log(path: Path, layout: Layout) -> Log:
             continue
         turns = np.unwrap(theta[rows], period=1.0) if layout.angle.wraps else theta[rows]
         states = np.stack((x[rows] / CART_METRES_PER_COUNT, turns * POLE_COUNTS_PER_TURN), 1)
+        if (beyond := np.abs(states) > MOST_COUNTS).any():
+            place, column = np.argwhere(beyond)[0]
+            name, row = (layout.position.name, layout.angle.name)[column], first + place
+            raise RecordingError(
+                f"{path}: {name} is {columns[name][row]:g} in row {row + 1}, which no "
+                "encoder counts: correct it, or leave the row out by layout.keep"
+            )
         values = motor[rows[1:]] if layout.motor.row == "in_force" else motor[rows[:-1]]
         if layout.resample:
             states, values = resampled(time[rows], states, values, period)

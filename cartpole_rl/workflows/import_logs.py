@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from cartpole_rl.choices import choice
 from cartpole_rl.errors import RecordingError
 from cartpole_rl.evaluation.recordings import LENGTH, write_recording
 from cartpole_rl.identification.layout import ImportConfig, Layout, log_files
@@ -28,7 +29,6 @@ JITTER = 0.1  # share of the period
 LEAPS = 0.02  # share of rows
 SATURATED = 0.5  # share of rows
 TURN = 2 * np.pi
-USUAL_PERIOD = 0.02  # s, the default of cartpole-identify
 
 
 def import_logs(config: ImportConfig, folder: Path) -> Sensors:
@@ -63,7 +63,9 @@ def import_logs(config: ImportConfig, folder: Path) -> Sensors:
     sensors = question_sensors(motions, period)
     found = [*doubts([log.report for log in logs.values()], sensors, period, config.layout)]
     write_config(folder, "import", {**config.model_dump(mode="json", by_alias=True), "seed": 0})
+    stems = Counter(path.stem for path in logs)
     for path, log in logs.items():
+        name = path.stem if stems[path.stem] == 1 else path.name  # log.csv and log.txt
         for number, part in enumerate(log.parts):
             heading = {
                 "plant": "log",
@@ -72,7 +74,7 @@ def import_logs(config: ImportConfig, folder: Path) -> Sensors:
                 "control_period_s": period,
             }
             write_recording(
-                folder / RECORDINGS / f"{path.stem}_{number:02d}.csv", part, {**heading, "log": path.name}
+                folder / RECORDINGS / f"{name}_{number:02d}.csv", part, {**heading, "log": path.name}
             )
     write_json(folder / IMPORTED, summary(logs, sensors, found))
     print_summary(logs, parts, period, sensors, found, folder)
@@ -215,7 +217,7 @@ def print_summary(
             print(f"{name}: {value:.4g}{unit} (95 %: {low:.4g} to {high:.4g})")
     for doubt in found:
         print(f"doubt: {doubt}")
-    rate = "" if math.isclose(period, USUAL_PERIOD) else f" control_period={period:g}"
+    rate = "" if math.isclose(period, choice("identify")["control_period"]) else f" control_period={period:g}"
     print_results(
         folder,
         f"{RECORDINGS}/ and {IMPORTED}",

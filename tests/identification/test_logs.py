@@ -18,6 +18,7 @@ from cartpole_rl.evaluation.recordings import read_recording
 from cartpole_rl.identification.layout import ImportConfig, Layout
 from cartpole_rl.identification.logs import read_log
 from cartpole_rl.identification.sensors import Motion, question_sensors
+from cartpole_rl.run_folder import experiments
 from cartpole_rl.workflows.import_logs import import_logs
 
 PERIOD, STEPS, LENGTH = 0.02, 3000, 0.3  # s; length of the equivalent simple pendulum, m
@@ -246,6 +247,23 @@ def test_the_command_imports_what_identify_and_replay_take(tmp_path: Path, motio
     assert (done.code, done.err) == (0, "")
     again = in_process("import", *given, "hydra.run.dir=run", folder=tmp_path)
     assert again.complaint.endswith("/run: it holds a run already; give another folder")
+
+
+def test_no_log_of_a_folder_replaces_another(tmp_path: Path, motion: Columns) -> None:
+    (tmp_path / "logs").mkdir()
+    for name in ("a.csv", "a.txt", "01_run.csv", "02_run.csv"):
+        written(tmp_path / "logs" / name, {column: values[:200] for column, values in motion.items()})
+    import_logs(imported(tmp_path / "logs"), tmp_path / "run")
+    assert len(experiments(tmp_path / "run")) == 4
+
+
+def test_a_position_that_no_encoder_counts_is_one_line(tmp_path: Path, motion: Columns) -> None:
+    columns = {**motion, "x": motion["x"].copy()}
+    columns["x"][50] = 1e300
+    path = written(tmp_path / "log.csv", columns)
+    with pytest.raises(RecordingError, match=r"log.csv: x is 1e\+300 in row 51, which no encoder counts"):
+        import_logs(imported(path), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
 
 
 def test_the_layout_of_the_guide_is_taken(tmp_path: Path) -> None:
