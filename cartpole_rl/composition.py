@@ -105,8 +105,9 @@ def _composed(command: str, words: tuple[str, ...]) -> dict[str, Any]:
 
 @contextmanager
 def reading_conf() -> Iterator[None]:
-    """Let `hydra.compose` read conf/, also while a command of Hydra's runs."""
-    with _LOCK:
+    """Let `hydra.compose` read conf/, also while a command of Hydra's runs, and where warnings are errors."""
+    with _LOCK, warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "|".join(DEPRECATED_IN_1_4))
         running = GlobalHydra.instance().hydra
         GlobalHydra.instance().clear()
         try:

@@ -65,7 +65,6 @@ def test_passes_gymnasiums_checker(name: str) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warnings.filterwarnings("ignore", message=".*infinity.*")  # a measured state has no bounds
-        warnings.filterwarnings("ignore", message=".*deprecated", module="cartpole_rl")  # Hydra 1.4
         check_env(gymnasium.make(name).unwrapped, skip_render_check=True)
 
 
