@@ -118,7 +118,7 @@ VERBS: dict[str, Verb] = {
         "workflows.checks:check_evaluation",
     ),
     "import": Verb(
-        "identification.layout:ImportConfig",
+        "identification.settings:ImportConfig",
         "workflows.import_logs:import_logs",
         "makes recordings of anyone's logs, and says what is doubtful about them.\n"
         "A layout names the columns, their units and their signs.",
@@ -128,7 +128,7 @@ VERBS: dict[str, Verb] = {
             "from=log.csv layout=sensorsini_2020 layout.angle.upright=3120",
             "from=log.csv layout.time.name=t layout.angle.unit=deg layout.motor.full=255",
         ),
-        "identification.layout:log_files",
+        "identification.settings:log_files",
     ),
     "replay": Verb(
         "workflows.config:ReplayConfig",

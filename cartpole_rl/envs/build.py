@@ -8,10 +8,9 @@ import torch
 
 from cartpole_rl.checking import validated
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
-from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
-from cartpole_rl.envs.guard_fitting import fitted_guard
+from cartpole_rl.envs.guard import fitted_guard
 from cartpole_rl.envs.hardware import HardwareTransform
-from cartpole_rl.envs.settings import ObservationSettings, TrackGuard
+from cartpole_rl.envs.settings import CartPoleSettings, ObservationSettings, TrackGuard
 from cartpole_rl.physics.models import Models
 from cartpole_rl.plants.settings import PlantSettings
 from cartpole_rl.plants.specs import Plant

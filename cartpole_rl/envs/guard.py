@@ -9,16 +9,48 @@ to the left, at
     x + margin + delay v + v |v| / (2 deceleration)
 
 Beyond the track's end, the guard replaces the agent's motor value by full motor to the left; likewise on the
-left. The three numbers are fitted to the carts in question: see `envs/guard_fitting.py`.
+left.
+
+The three numbers are fitted to the carts in question. Carts are drawn as in training and put into random
+states: a speed, an angle of the pole, and an energy of the pole up to somewhat more than upright. Each has
+full motor outward under way, keeps it for one more period, since the guard decides once a period, and then
+brakes with full motor inward. Half of them run to the right, half to the left: carts may brake better in one
+direction. A share `quantile` of each half stays within some way, which depends on the measured speed. The
+guard's way bounds it from above as closely as possible: a linear program in margin, delay and
+1 / deceleration.
 """
 
+import math
+from collections.abc import Sequence
 from typing import TypeVar
 
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.optimize import linprog
 from torch import Tensor
 
-from cartpole_rl.envs.settings import TrackGuard
+from cartpole_rl.envs.settings import LARGEST_MARGIN, TrackGuard
+from cartpole_rl.errors import ConfigError
+from cartpole_rl.physics.dynamics import Drive, State, run_period
+from cartpole_rl.physics.models import Models
+from cartpole_rl.physics.parameters import GRAVITY, CartParameters
+from cartpole_rl.plants.simulated import commands_under_way
+from cartpole_rl.randomization.randomizer import Draws
 
 Number = TypeVar("Number", float, Tensor)
+
+# The fit
+SAMPLES = 65536
+SPEEDS = (0.0, 2.2)  # m/s, of the cart at the start; agents of the shipped experiments stay within
+BIN = 0.1  # m/s
+LEAST_SAMPLES = 500  # in a bin, for its quantile
+MOST_ENERGY = 1.3  # of the pole, as a multiple of that of the upright pole at rest, above hanging
+BRAKING = 1.2  # s; the slowest carts of randomization=wide stop within 1
+SUBSTEPS = 4
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
 
 
 def stopping_distance(x_dot: Number, guard: TrackGuard) -> Number:
@@ -34,3 +66,92 @@ def guard_side(x: Number, x_dot: Number, track_end: Number | float, guard: Track
     too_far_right = x + stopping_distance(x_dot, guard) > track_end
     too_far_left = -x + stopping_distance(-x_dot, guard) > track_end
     return 1 * too_far_left - 1 * too_far_right
+
+
+def fitted_guard(
+    quantile: float, draws: Draws, motors: Sequence[int], models: Models, period: float
+) -> TrackGuard:
+    """Return the guard that a share `quantile` of the carts of `draws` obeys in time.
+
+    `motors` are the motor values of the agent, `period` is the control period, s. Raises ConfigError if full
+    motor does not brake the carts, or so late that they need most of the track.
+    """
+    if not min(motors) < 0 < max(motors):
+        raise ConfigError(f"guard: actions.motors={list(motors)} brake in one direction; choose guard=none")
+    speed, way, rightward = braking_distances(draws, motors, models, period)
+    if not np.isfinite((speed, way)).all():
+        raise ConfigError(
+            "guard: simulated carts brake to numbers that are not finite; check cart.*, or guard=none"
+        )
+    halves = [quantiles(speed[half], way[half], quantile) for half in (rightward, ~rightward)]
+    margin, delay, curvature = closest_bound(*map(np.concatenate, zip(*halves, strict=True)))
+    if curvature <= 0:
+        raise ConfigError("guard: full motor does not stop these carts; choose guard=none, or other actions")
+    if round(margin, 4) >= LARGEST_MARGIN:
+        raise ConfigError(
+            f"guard: even from rest these carts run on by {margin:.3f} m before full motor stops them; this "
+            f"margin must be below {LARGEST_MARGIN:g} m: give a shorter control_period, less latency or "
+            "smaller motor values, or guard=none"
+        )
+    return TrackGuard(margin=round(margin, 4), delay=round(delay, 4), deceleration=round(0.5 / curvature, 3))
+
+
+def braking_distances(
+    draws: Draws, motors: Sequence[int], models: Models, period: float
+) -> tuple[Array, Array, Flags]:
+    """Return measured speeds, m/s, ways that carts run on, m, and which run to the right, [SAMPLES] each.
+
+    Speeds and ways are positive in the direction of motion.
+    """
+    generator = torch.Generator().manual_seed(0)
+    table = draws.draw(SAMPLES, generator)
+    cart = CartParameters(table)
+    rightward = torch.arange(SAMPLES) % 2 == 0
+    side = torch.where(rightward, 1.0, -1.0)
+    state = random_states(cart, generator)
+    state = state._replace(x_dot=side * state.x_dot)
+    commands = commands_under_way(draws.longest_delay(), period)
+    right, left = float(max(motors)), float(min(motors))
+    outward, inward = torch.where(rightward, right, left), torch.where(rightward, left, right)
+    drive = Drive(models.actuator(outward, cart), [outward] * commands)
+    before, (state, drive) = state, run_period(state, drive, cart.latency, cart, models, period, SUBSTEPS)
+    speed, start, farthest = side * (state.x - before.x) / period, state.x, torch.zeros(SAMPLES)
+    for step in range(math.ceil(BRAKING / period)):
+        drive = Drive(drive.force, [inward if step else outward, *drive.motors[:-1]])
+        state, drive = run_period(state, drive, cart.latency, cart, models, period, SUBSTEPS)
+        farthest = torch.maximum(farthest, side * (state.x - start))
+    return speed.double().numpy(), farthest.double().numpy(), rightward.numpy()
+
+
+def random_states(cart: CartParameters, generator: torch.Generator) -> State:
+    """Return true states [N] in the middle of the track, with speeds in SPEEDS and a swinging pole."""
+    count = len(cart.cart_mass)
+
+    def uniform(low: float, high: float) -> Tensor:
+        return low + (high - low) * torch.rand(count, generator=generator)
+
+    theta = uniform(-math.pi, math.pi)
+    stiffness = cart.first_moment * GRAVITY / cart.pivot_inertia  # 1/s^2
+    kinetic = stiffness * (uniform(0, 2 * MOST_ENERGY) - 1 - torch.cos(theta))
+    theta_dot = (2 * kinetic.clamp(min=0)).sqrt() * uniform(-1, 1).sign()
+    return State(torch.zeros(count), uniform(*SPEEDS), theta, theta_dot)
+
+
+def quantiles(speed: Array, way: Array, quantile: float) -> tuple[Array, Array]:
+    """Return the middles of bins of `speed`, m/s, and the quantile of the `way` in each, m."""
+    bins = np.floor(speed / BIN).astype(int)
+    middles, ways = [], []
+    for number in np.unique(bins):
+        inside = bins == number
+        if inside.sum() >= LEAST_SAMPLES:
+            middles.append((number + 0.5) * BIN)
+            ways.append(np.quantile(way[inside], quantile))
+    return np.array(middles), np.array(ways)
+
+
+def closest_bound(speed: Array, way: Array) -> tuple[float, float, float]:
+    """Return (margin m, delay s, curvature s^2/m) of the least upper bound on `way` that is a guard's."""
+    terms = np.stack((np.ones_like(speed), speed, speed * np.abs(speed)), 1)
+    result = linprog(terms.sum(0), A_ub=-terms, b_ub=-way, bounds=[(0, None)] * 3)
+    margin, delay, curvature = result.x
+    return float(margin), float(delay), float(curvature)

@@ -12,7 +12,6 @@ from torch import Tensor
 from cartpole_rl.envs.guard import guard_side
 from cartpole_rl.envs.settings import ObservationSettings, TrackGuard
 from cartpole_rl.plants.specs import PlantOutput, Values
-from cartpole_rl.tasks.endings import fallen
 from cartpole_rl.tasks.features import (
     ANGULAR_SPEED_SCALE,
     MOTOR_SCALE,
@@ -100,7 +99,7 @@ def perceive(
     past = remember(previous, settings)
     step_count = previous.step_count + 1
     off_track = frame.terminated
-    terminated = off_track | fallen(state, task.angle_limit)
+    terminated = off_track | fallen(theta, task.angle_limit)
     ended = terminated | frame.truncated | (step_count >= task.time_limit)
     values = {  # each once: the reward is often a score
         kind: kind.formula(state, task.x_max).unsqueeze(0) for kind in {rewards.kind, SCORE, SCORE_UPRIGHT}
@@ -118,6 +117,13 @@ def perceive(
         ended & ~terminated,
         ended,
     )
+
+
+def fallen(theta: Tensor, angle_limit: float | None) -> Tensor:
+    """Return [N] bool: the measured |theta| exceeds `angle_limit` rad; None means no limit."""
+    if angle_limit is None:
+        return torch.zeros_like(theta, dtype=torch.bool)
+    return theta.abs() > angle_limit
 
 
 def remember(previous: Previous[Tensor], settings: ObservationSettings) -> Tensor:

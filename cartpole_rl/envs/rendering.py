@@ -33,14 +33,14 @@ class EpisodeSoFar:
 
     def picture(self, pole_length: float, track_half_length: float, period: float, steps: int) -> Picture:
         """Return the newest state; lengths in m, the time bar spans `steps` periods of `period` s."""
-        course = Driven(self, period)
+        course = Course(self, period)
         drawing = CartDrawing.of(course, pole_length, track_half_length, duration=steps * period)
         canvas = drawing.background("")
         drawing.draw(ImageDraw.Draw(canvas), len(self.xs) - 1)
         return np.asarray(canvas.reduce(FINER))
 
 
-class Driven:
+class Course:
     """An `EpisodeSoFar` as arrays, as `CartDrawing` reads them."""
 
     def __init__(self, episode: EpisodeSoFar, period: float) -> None:

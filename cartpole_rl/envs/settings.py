@@ -1,11 +1,22 @@
-"""Settings of the observation and of the track guard."""
+"""Settings of a whole environment: cart, randomization, task, observation and track guard."""
 
-from typing import Annotated
+from collections.abc import Mapping
+from functools import cache
+from typing import TYPE_CHECKING, Annotated, Any
 
-from pydantic import Field
+from pydantic import Discriminator, Field, Tag, field_validator
 
-from cartpole_rl.settings import NonNegative, Positive, Settings
+from cartpole_rl.choices import group_choices
+from cartpole_rl.physics.friction import CART_FRICTIONS, POLE_FRICTIONS
+from cartpole_rl.physics.laws import Law
+from cartpole_rl.physics.models import Models
+from cartpole_rl.plants.settings import SimulationSettings
+from cartpole_rl.randomization.poles import Pole, PoleSettings
+from cartpole_rl.randomization.ranges import IdentifiedSettings, Range
+from cartpole_rl.rig.parameters import completed
+from cartpole_rl.settings import Finite, NonNegative, Positive, Settings
 from cartpole_rl.tasks.features import ObservationKind
+from cartpole_rl.tasks.settings import ActionSettings, RewardSettings, TaskSettings
 
 POSITIONS = ObservationKind.POSITIONS.mirror_signs
 LARGEST_MARGIN = 0.3  # m, of a track guard: most of half a track
@@ -84,3 +95,142 @@ class GuardSettings(Settings):
     def active(self) -> TrackGuard | None:
         """The guard to drive with, None if it is disabled or not yet fitted."""
         return self.numbers if self.enabled else None
+
+
+def _randomization_kind(given: Any) -> str:
+    """Return "identified" for the posterior of an identification, "ranges" for ranges by parameter name."""
+    identified = isinstance(given, IdentifiedSettings) or (
+        isinstance(given, Mapping) and "posterior" in given
+    )
+    return "identified" if identified else "ranges"
+
+
+Randomization = Annotated[
+    Annotated[dict[str, Range], Tag("ranges")] | Annotated[IdentifiedSettings, Tag("identified")],
+    Discriminator(_randomization_kind),
+]
+ControlPeriod = Annotated[float, Field(ge=0.005, le=0.1)]  # s
+
+
+class FrictionSettings(Settings):
+    """A friction law, and numbers of the cart under it: see `driven_numbers`."""
+
+    if TYPE_CHECKING:
+        model: Law
+        parameters: dict[str, Finite]
+
+    @field_validator("parameters", mode="before", check_fields=False)
+    @classmethod
+    def _null_is_the_number_of_the_cart(cls, given: Any) -> Any:
+        is_mapping = isinstance(given, Mapping)
+        return {name: value for name, value in given.items() if value is not None} if is_mapping else given
+
+    @property
+    def defaults(self) -> Mapping[str, float]:
+        """The numbers of the choice in conf/ with this law."""
+        return shipped_numbers(self.model.registry.kind, self.model)
+
+
+class CartFrictionSettings(FrictionSettings):
+    """The friction law of the cart."""
+
+    model: Annotated[Law, CART_FRICTIONS]
+    parameters: dict[str, Finite]
+
+
+class PoleFrictionSettings(FrictionSettings):
+    """The friction law of the pole."""
+
+    model: Annotated[Law, POLE_FRICTIONS]
+    parameters: dict[str, Finite]
+
+
+@cache
+def shipped_numbers(group: str, model: str) -> dict[str, float]:
+    """Return the numbers of the cart that the choice of a friction model in conf/ gives; {} without one."""
+    choices = (each for each in group_choices(group).values() if each["model"] == model)
+    return next((dict(each["parameters"]) for each in choices), {})
+
+
+@cache
+def shipped_carts() -> tuple[dict[str, float], ...]:
+    """Return the carts in conf/, whose numbers are nominal; the first one is ip02."""
+    carts = group_choices("cart")
+    return (carts.pop("ip02"), *carts.values())
+
+
+def driven_numbers(cart: Mapping[str, float], *frictions: FrictionSettings) -> dict[str, float]:
+    """Return the numbers of the cart that is driven, without the pole's.
+
+    A nominal number (of a cart in conf/) gives way to that of a friction model's choice in conf/. What a
+    person gave replaces both; with `cart` and with a friction model, that with the friction model holds.
+    """
+    numbers = dict(cart)
+    for friction in frictions:
+        for name, value in friction.parameters.items():
+            is_nominal = name not in cart or any(
+                cart[name] == shipped.get(name) for shipped in shipped_carts()
+            )
+            if is_nominal or value != friction.defaults.get(name):
+                numbers[name] = value
+    return numbers
+
+
+class CartSettings(Settings):
+    """The nominal cart, without a friction law of its own: a fit chooses one."""
+
+    cart: dict[str, Finite]
+    pole_friction: PoleFrictionSettings
+
+    @property
+    def frictions(self) -> tuple[FrictionSettings, ...]:
+        """The friction laws that are chosen."""
+        return (self.pole_friction,)
+
+    @property
+    def nominal_cart(self) -> dict[str, float]:
+        """The parameters of the cart that is driven, or varied, without the pole's."""
+        return completed(driven_numbers(self.cart, *self.frictions))
+
+    def nominal_with(self, pole: Pole) -> dict[str, float]:
+        """Return the nominal parameters of the cart with `pole`."""
+        return {**self.nominal_cart, **pole.model_dump()}
+
+
+class SimulatedCartSettings(CartSettings):
+    """The nominal cart with its friction laws."""
+
+    cart_friction: CartFrictionSettings
+
+    @property
+    def frictions(self) -> tuple[FrictionSettings, ...]:
+        """The friction laws that are chosen."""
+        return self.cart_friction, self.pole_friction
+
+    def models_with(self, actuator: Law, plant: SimulationSettings) -> Models:
+        """Return the physics models of the cart with `actuator`, on `plant`."""
+        friction = self.cart_friction.model, self.pole_friction.model
+        return Models(*friction, actuator, plant.integrator, plant.pole_presses)
+
+
+class CartPoleSettings(SimulatedCartSettings):
+    """Settings of an environment without its plant, shared by training and evaluation."""
+
+    pole: PoleSettings
+    actions: ActionSettings
+    task: TaskSettings
+    reward: RewardSettings
+    observation: ObservationSettings
+    guard: GuardSettings
+    randomization: Randomization
+    control_period: ControlPeriod
+
+    @property
+    def ranges(self) -> dict[str, Range]:
+        """The ranges of the randomization; of an identified cart, those that it leaves open."""
+        given = self.randomization
+        return given.ranges if isinstance(given, IdentifiedSettings) else given
+
+    def models(self, plant: SimulationSettings) -> Models:
+        """Return the physics models of the simulated cart."""
+        return self.models_with(self.actions.actuator, plant)

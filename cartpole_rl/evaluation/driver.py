@@ -35,7 +35,7 @@ MakeEnv = Callable[[Confirm], CartPoleEnv]  # over a cart whose faults are clear
 
 
 @dataclass(frozen=True)
-class DriveRequest:
+class EpisodeRequest:
     """A request to drive one episode."""
 
     weights: Weights  # of the greedy policy
@@ -44,8 +44,8 @@ class DriveRequest:
 
 
 @dataclass(frozen=True)
-class Driven:
-    """The result of a DriveRequest: the episode, and the statistics of the link since the process started."""
+class EpisodeResult:
+    """The result of an `EpisodeRequest`: the episode, and the link since the process started."""
 
     episode: Episode
     link: LinkStatistics
@@ -95,15 +95,15 @@ class Driver:
         assert self._process.pid is not None
         return self._process.pid
 
-    def start(self, drive: DriveRequest) -> None:
+    def start(self, drive: EpisodeRequest) -> None:
         """Start an episode, and return at once. Raises LinkError if the process died."""
         with _alive():
             self._ours.send(drive)
 
-    def result(self) -> Driven:
+    def result(self) -> EpisodeResult:
         """Wait for the started episode. Raises the errors of its reset, or LinkError if the process died."""
         driven = self._receive()
-        assert isinstance(driven, Driven)
+        assert isinstance(driven, EpisodeResult)
         return driven
 
     def close(self) -> None:
@@ -178,7 +178,7 @@ def _drive_on_demand(
     real_time: bool,
     parent: int,
 ) -> None:
-    """Drive an episode for each `DriveRequest` in the pipe, until it is closed."""
+    """Drive an episode for each `EpisodeRequest` in the pipe, until it is closed."""
     with closing(make_env(partial(_ask, pipe))) as env:
         warm_up(env, policy)
         pipe.send(real_time and take_precedence())
@@ -192,7 +192,7 @@ def _ask(pipe: Connection, text: str) -> bool:
     return bool(pipe.recv())
 
 
-def _drive(env: CartPoleEnv, policy: DrivingPolicy, drive: DriveRequest, parent: int) -> Driven:
+def _drive(env: CartPoleEnv, policy: DrivingPolicy, drive: EpisodeRequest, parent: int) -> EpisodeResult:
     policy.load(drive.weights)
     random = np.random.default_rng(drive.seed)
     actions = len(env.hardware.motors)
@@ -206,4 +206,4 @@ def _drive(env: CartPoleEnv, policy: DrivingPolicy, drive: DriveRequest, parent:
         return chosen
 
     (episode,) = run_batch(env, act)
-    return Driven(episode, env.plant.statistics)
+    return EpisodeResult(episode, env.plant.statistics)

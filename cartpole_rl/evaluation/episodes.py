@@ -21,17 +21,47 @@ from cartpole_rl.envs.one_cart import OneCart
 from cartpole_rl.envs.perception import Percept
 from cartpole_rl.errors import FaultError
 from cartpole_rl.evaluation.driving_policy import DrivingPolicy
-from cartpole_rl.evaluation.knocks import Knocks
 from cartpole_rl.plants.measured import measured_part
-from cartpole_rl.plants.specs import Numbers, PlantOutput, tensordict_of
+from cartpole_rl.plants.specs import Numbers, Plant, PlantOutput, tensordict_of
 from cartpole_rl.scheduling import no_garbage_collection
-from cartpole_rl.tasks.endings import Ending
-from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.tasks.episode import Ending, Episode
+from cartpole_rl.tasks.rewards import UPRIGHT_ANGLE
 from cartpole_rl.tasks.settings import NO_ACTION
 
 # reads `observation` [N, K]; writes `action` [N] and, if it has them, the `action_value` [N, A]
 Policy = Callable[[TensorDictBase], TensorDictBase]
 _FROM_NEXT = ("score", "score_upright", "reward", "done")
+STANDS = 2.0  # s within 5 degrees of upright, after which the pole is knocked
+
+
+class Knocks:
+    """A hand tips each pole over once it stands, as in the thesis's figure 6.10b.
+
+    One knock per episode for each simulated cart: `speed` rad/s more, to the right and left in turn.
+
+    Call it in each period, before the step.
+    """
+
+    def __init__(self, plant: Plant, speed: float) -> None:
+        self._plant = plant
+        self._speeds = speed * torch.tensor([1.0, -1.0]).repeat(1 + plant.carts // 2)[: plant.carts]
+        self._patience = round(STANDS / plant.period)
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin an episode on all carts."""
+        self._standing = torch.zeros(self._plant.carts, dtype=torch.int64)  # periods
+        self._knocked = torch.zeros(self._plant.carts, dtype=torch.bool)
+
+    def __call__(self) -> None:
+        """Knock the poles that have stood for STANDS and were not knocked in this episode."""
+        state = self._plant.true_state
+        upright = state.theta.cos() > math.cos(UPRIGHT_ANGLE)
+        self._standing = torch.where(upright, self._standing + 1, 0)
+        due = (self._standing >= self._patience) & ~self._knocked
+        if due.any():
+            self._plant.place(state._replace(theta_dot=state.theta_dot + self._speeds * due))
+            self._knocked |= due
 
 
 def run_episodes(

@@ -24,8 +24,7 @@ from cartpole_rl.evaluation.episodes import (
 from cartpole_rl.plants.serial.plant import SerialPlant
 from cartpole_rl.plants.specs import Numbers, PlantOutput
 from cartpole_rl.scheduling import no_garbage_collection
-from cartpole_rl.tasks.endings import Ending
-from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.tasks.episode import Ending, Episode
 from cartpole_rl.wire import Flags
 
 LATE_PERIODS = 1.5

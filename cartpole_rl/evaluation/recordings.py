@@ -15,8 +15,7 @@ import numpy as np
 from cartpole_rl.errors import RecordingError
 from cartpole_rl.files import replacing
 from cartpole_rl.rig.hardware import LARGEST_MOTOR
-from cartpole_rl.tasks.endings import Ending
-from cartpole_rl.tasks.episode import Episode, Origin
+from cartpole_rl.tasks.episode import Ending, Episode, Origin
 
 FORMAT = "cartpole_rl recording 1"
 STATE = {  # column: field of Episode

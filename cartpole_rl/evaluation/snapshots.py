@@ -7,7 +7,10 @@ cart in any case. Nothing is locked. A counter that is odd during a write lets t
 import multiprocessing
 import struct
 from ctypes import Array, c_char
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 
 COUNTER = struct.Struct("<Q")
 FIELDS = struct.Struct("<2I 2i 2Q 6d")  # a jump of the cart's tick can add 2^32 lost frames at once
@@ -55,3 +58,47 @@ def read(memory: Memory) -> tuple[int, Snapshot] | None:
         if before == after and before % 2 == 0:
             return (before // 2, snapshot) if before else None
     return None
+
+
+def followed(env: "CartPoleEnv", memory: Memory | None) -> "CartPoleEnv":
+    """Return `env`, whose cart is published in `memory` from now on, if there is one."""
+    if memory is not None:
+        env.plant.on_command = Publisher(env, memory)
+    return env
+
+
+class Publisher:
+    """Writes a snapshot to `memory` when it is called, each time a motor value has been sent to the cart."""
+
+    def __init__(self, env: "CartPoleEnv", memory: Memory) -> None:
+        self._cart, self._statistics, self._memory = env.one_cart, env.plant.statistics, memory
+        (self._track_half_length,) = env.plant.track_half_length.tolist()
+        self._written = self._episode = 0
+        self._score = 0.0
+
+    def __call__(self, motor: int) -> None:
+        """Write the state that the motor value was chosen on."""
+        percept = self._cart.percept
+        (step,), (guard,), (score,) = percept.step_count, percept.guard, percept.score
+        if step == 0:
+            self._episode += 1
+            self._score = 0.0
+        self._score += score
+        self._written += 1
+        statistics = self._statistics
+        x, x_dot, theta, theta_dot = percept.state
+        snapshot = Snapshot(
+            self._episode,
+            step,
+            motor,
+            guard,
+            statistics.late_ticks,
+            statistics.lost_frames,
+            x,
+            x_dot,
+            theta,
+            theta_dot,
+            self._score,
+            self._track_half_length,
+        )
+        write(self._memory, self._written, snapshot)

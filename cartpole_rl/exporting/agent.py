@@ -27,8 +27,7 @@ from numpy.typing import NDArray
 from pydantic import Field, ValidationError
 
 from cartpole_rl.agents.settings import AgentSettings
-from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
-from cartpole_rl.envs.settings import ObservationSettings, TrackGuard
+from cartpole_rl.envs.settings import CartPoleSettings, ObservationSettings, TrackGuard
 from cartpole_rl.errors import CheckpointError, ConfigError
 from cartpole_rl.randomization.poles import possible_poles
 from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_COUNTS_PER_TURN

@@ -12,7 +12,7 @@ from typing import Any
 
 from cartpole_rl.arithmetic.languages import C99, Operand
 from cartpole_rl.arithmetic.writer import Expressions, Writer
-from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
+from cartpole_rl.envs.settings import CartPoleSettings
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.exporting.agent import ExportedAgent, Floats
 from cartpole_rl.exporting.code import Graph, filled, perception

@@ -10,9 +10,8 @@ import torch
 from torch import Tensor
 
 from cartpole_rl.compilation import Trace, trace
-from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
 from cartpole_rl.envs.perception import Percept, Previous, perceive, perceive_first
-from cartpole_rl.envs.settings import TrackGuard
+from cartpole_rl.envs.settings import CartPoleSettings, TrackGuard
 from cartpole_rl.plants.specs import PlantOutput
 from cartpole_rl.tasks.features import LENGTH_SCALE
 

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from cartpole_rl.arithmetic.languages import JAVASCRIPT
 from cartpole_rl.arithmetic.writer import Writer
-from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
+from cartpole_rl.envs.settings import CartPoleSettings
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.exporting.agent import FLOATS, ExportedAgent
 from cartpole_rl.exporting.code import COUNT, NUMBER, Graph, filled, perception

@@ -28,8 +28,7 @@ from cartpole_rl.plants.measured import measured_part
 from cartpole_rl.plants.specs import Numbers, Plant, PlantOutput
 from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, LARGEST_MOTOR, POLE_RADIANS_PER_COUNT
 from cartpole_rl.scheduling import no_garbage_collection
-from cartpole_rl.tasks.endings import Ending
-from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.tasks.episode import Ending, Episode
 
 BREAKAWAY = 90  # motor value that moves most carts, before it is known
 BROKEN_AWAY = 0.002  # m

@@ -24,8 +24,7 @@ from cartpole_rl.physics.friction import CART_FRICTIONS
 from cartpole_rl.physics.laws import Law
 from cartpole_rl.physics.models import Models
 from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
-from cartpole_rl.tasks.endings import Ending
-from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.tasks.episode import Ending, Episode
 
 Array = NDArray[np.floating]
 HORIZON = 1.0  # s of motion, predicted

@@ -17,11 +17,10 @@ from numpy.typing import NDArray
 from cartpole_rl.errors import RecordingError
 from cartpole_rl.identification.checks import shows_motion
 from cartpole_rl.identification.experiments import recording
-from cartpole_rl.identification.layout import Direction, Layout, TimeColumn
+from cartpole_rl.identification.settings import Direction, Layout, TimeColumn
 from cartpole_rl.identification.windows import IRREGULAR
 from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, LARGEST_MOTOR, POLE_COUNTS_PER_TURN
-from cartpole_rl.tasks.endings import Ending
-from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.tasks.episode import Ending, Episode
 
 Array = NDArray[np.float64]
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_COUNTS_PER_TURN
-from cartpole_rl.tasks.endings import Ending
-from cartpole_rl.tasks.episode import Array, Episode
+from cartpole_rl.tasks.episode import Array, Ending, Episode
 from cartpole_rl.tasks.upright import wrap
 from cartpole_rl.wire import Fault
 

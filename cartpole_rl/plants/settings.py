@@ -121,7 +121,7 @@ class LearnedSettings(PlantSettings):
 
     def own_pole(self, emulator: EmulatorSettings, trained: PoleSettings) -> PoleSettings:
         """Return the pole of the model. Raises CheckpointError."""
-        found = Extension("model", "cartpole_rl.plants.learned_model:load_model")(self.model).parameters
+        found = Extension("model", "cartpole_rl.plants.learned:load_model")(self.model).parameters
         return one_pole(Pole(**{name: found[name] for name in Pole.model_fields}))
 
 

@@ -31,7 +31,7 @@ from cartpole_rl.tasks.settings import StartSettings
 from cartpole_rl.tasks.starts import draw_start
 
 if TYPE_CHECKING:
-    from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
+    from cartpole_rl.envs.settings import CartPoleSettings
 
 LARGEST_COUNT = 2**30  # STATE's counts are 32-bit numbers
 DRAWN_AT_ONCE = 1024  # episodes; drawing a few takes about as long

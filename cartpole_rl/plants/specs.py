@@ -14,8 +14,7 @@ from cartpole_rl.physics.dynamics import State
 from cartpole_rl.plants.serial.statistics import LinkStatistics
 from cartpole_rl.randomization.randomizer import Draws
 from cartpole_rl.rig.hardware import LARGEST_MOTOR
-from cartpole_rl.tasks.endings import Ending
-from cartpole_rl.tasks.episode import Origin
+from cartpole_rl.tasks.episode import Ending, Origin
 from cartpole_rl.wire import Fault
 
 TERMINATING, TRUNCATING = (Ending.TRACK,), (Ending.FAULT, Ending.LINK)  # the endings that plants report

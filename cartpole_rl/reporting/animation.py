@@ -16,8 +16,7 @@ from PIL import Image, ImageDraw, ImageSequence
 from cartpole_rl.drawing.cart import FINER, SIZE, CartDrawing, palette
 from cartpole_rl.files import replacing
 from cartpole_rl.reporting.texts import ending_text
-from cartpole_rl.tasks.endings import Ending
-from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.tasks.episode import Ending, Episode
 
 EVERY = 2  # control periods between frames: 25 frames a second at 50 Hz
 LAST_FRAME = 1000  # ms, of the last frame before the animation repeats

@@ -3,8 +3,7 @@
 import math
 from collections.abc import Iterator, Mapping, Sequence
 
-from cartpole_rl.tasks.endings import Ending
-from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.tasks.episode import Ending, Episode
 
 Cell = str | int | float | bool | None
 

@@ -1,7 +1,11 @@
-"""One finished episode as arrays, for scores, figures and recordings."""
+"""One finished episode as arrays, for scores, figures and recordings, and the reasons of its ending.
+
+The plant reports track, fault and link; angle and time belong to the task.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from enum import StrEnum
 from typing import Any
 
 import numpy as np
@@ -10,6 +14,17 @@ from numpy.typing import NDArray
 from cartpole_rl.tasks.settings import Measure
 
 Array = NDArray[np.float64]
+
+
+class Ending(StrEnum):
+    """The reasons of ending in metrics.json and recordings."""
+
+    TIME = "time"  # truncated: the time limit
+    ANGLE = "angle"  # terminated: the balance task's pole fell
+    TRACK = "track"  # terminated: the cart left the track
+    FAULT = "fault"  # truncated: the cart latched a fault, or a count froze or jumped
+    LINK = "link"  # truncated: the cart stopped answering
+    NON_FINITE = "non_finite"  # truncated: an observation or an action value was not finite
 
 
 @dataclass(frozen=True)
@@ -37,20 +52,14 @@ class Episode:
     score: Array  # [T] equation (6.2) of each step, at state t+1
     score_upright: Array  # [T] equation (6.1) of each step, at state t+1
     reward: Array  # [T]
-    ended_by: str  # an `endings.Ending`
+    ended_by: str  # an `Ending`
     origin: Origin | None = None  # None on a real cart
-    guarded: NDArray[np.bool_] | None = (
-        None  # [T] the track guard replaced the agent's motor value; None without one
-    )
-
-    expected: NDArray[np.int64] | None = (
-        None  # [T] motor value that this computer would have sent, where a policy on the cart's board drove
-    )
-
-    compared: NDArray[np.bool_] | None = (
-        None  # [T] the motor value can be compared with `expected`; None unless the cart's board drove
-    )
-
+    # [T] the track guard replaced the agent's motor value; None without one
+    guarded: NDArray[np.bool_] | None = None
+    # [T] motor value that this computer would have sent, where a policy on the cart's board drove
+    expected: NDArray[np.int64] | None = None
+    # [T] the motor value can be compared with `expected`; None unless the cart's board drove
+    compared: NDArray[np.bool_] | None = None
     left_out: str = ""  # control periods after the last row that do not count, and why
 
     @property

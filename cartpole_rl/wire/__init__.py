@@ -1,6 +1,5 @@
 """Wire protocol, version 2: bytes <-> dataclasses, without I/O. ``docs/protocol.md`` specifies it."""
 
-from cartpole_rl.wire.clock import microseconds_between, seconds_between, ticks_between, went_back
 from cartpole_rl.wire.frames import Frame, FrameSplitter, decode_frame, encode_frame
 from cartpole_rl.wire.messages import (
     Ack,
@@ -21,6 +20,10 @@ from cartpole_rl.wire.messages import (
     StartPolicy,
     State,
     Stop,
+    microseconds_between,
+    seconds_between,
+    ticks_between,
+    went_back,
 )
 
 __all__ = [

@@ -1,11 +1,11 @@
 """Frames: COBS of (version u8, type u8, sequence u8, flags u8, payload, CRC-16 little-endian), then 0x00."""
 
+import binascii
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 from cartpole_rl.errors import FrameError
 from cartpole_rl.wire import cobs
-from cartpole_rl.wire.checksum import crc16
 from cartpole_rl.wire.messages import MESSAGES, Message
 
 VERSION = 2
@@ -94,3 +94,11 @@ class FrameSplitter:
                     self.pending.clear()
                     self._dropping = True
                     self.overlong += 1
+
+
+def crc16(data: bytes) -> int:
+    """Return CRC-16/IBM-3740 of `data`, alias CCITT-FALSE; of "123456789" it is 0x29B1.
+
+    Polynomial 0x1021, start 0xFFFF, not reflected, no final xor. Source: the CRC catalogue.
+    """
+    return binascii.crc_hqx(data, 0xFFFF)

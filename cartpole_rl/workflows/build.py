@@ -14,8 +14,7 @@ from cartpole_rl.checking import validated
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.envs.build import environment, simulated_env, with_fitted_guard
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
-from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
-from cartpole_rl.envs.settings import TrackGuard
+from cartpole_rl.envs.settings import CartPoleSettings, TrackGuard
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.evaluation.episodes import Policy
 from cartpole_rl.exporting.agent import ExportedAgent, Layer, canonical_json, description

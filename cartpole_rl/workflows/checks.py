@@ -14,7 +14,7 @@ from pathlib import Path
 
 from cartpole_rl.checking import missing
 from cartpole_rl.choices import group_choices
-from cartpole_rl.envs.cart_pole_settings import shipped_carts
+from cartpole_rl.envs.settings import shipped_carts
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.randomization.poles import Pole, check_one_pole
 from cartpole_rl.randomization.ranges import check_carts

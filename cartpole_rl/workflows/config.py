@@ -10,16 +10,16 @@ from pydantic import Field, field_validator, model_validator
 from cartpole_rl.agents.settings import AgentSettings
 from cartpole_rl.checking import kinds, validated
 from cartpole_rl.emulator.settings import ONBOARD, EmulatorSettings
-from cartpole_rl.envs.cart_pole_settings import (
+from cartpole_rl.envs.settings import (
     CartFrictionSettings,
     CartPoleSettings,
     CartSettings,
     ControlPeriod,
+    GuardSettings,
     PoleFrictionSettings,
     Randomization,
     SimulatedCartSettings,
 )
-from cartpole_rl.envs.settings import GuardSettings
 from cartpole_rl.errors import CheckpointError, ConfigError
 from cartpole_rl.identification.settings import EnsembleSettings
 from cartpole_rl.learning.settings import (

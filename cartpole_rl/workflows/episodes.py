@@ -17,13 +17,12 @@ from tqdm import tqdm
 from cartpole_rl.checking import validated
 from cartpole_rl.emulator.settings import ONBOARD
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
-from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
+from cartpole_rl.envs.settings import CartPoleSettings
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.evaluation.episodes import Policy, run_batch, run_episodes
-from cartpole_rl.evaluation.knocks import Knocks
+from cartpole_rl.evaluation.episodes import Knocks, Policy, run_batch, run_episodes
 from cartpole_rl.evaluation.onboard import run_onboard_episodes
-from cartpole_rl.evaluation.publishing import followed
 from cartpole_rl.evaluation.recordings import read_origin
+from cartpole_rl.evaluation.snapshots import followed
 from cartpole_rl.exporting.c_code import c_files
 from cartpole_rl.learning.states import seed_everything
 from cartpole_rl.randomization.poles import Pole, PoleSettings

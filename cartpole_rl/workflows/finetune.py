@@ -16,11 +16,10 @@ from torch import nn
 
 from cartpole_rl.checking import validated
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
-from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
+from cartpole_rl.envs.settings import CartPoleSettings
 from cartpole_rl.errors import CheckpointError, ConfigError
 from cartpole_rl.evaluation.driver import Driver
-from cartpole_rl.evaluation.publishing import followed
-from cartpole_rl.evaluation.snapshots import Memory
+from cartpole_rl.evaluation.snapshots import Memory, followed
 from cartpole_rl.files import claimed, write_bytes
 from cartpole_rl.learning.agent import QAgent
 from cartpole_rl.learning.checkpoints import (
@@ -65,7 +64,7 @@ from cartpole_rl.workflows.build import (
 )
 from cartpole_rl.workflows.checks import check_finetuning, check_resumable, is_given
 from cartpole_rl.workflows.config import EvaluateConfig, FinetuneConfig, TrainConfig, recorded_settings
-from cartpole_rl.workflows.finetuning_cart import DrivenCart, FinetuningFiles, Stage, yielding_to
+from cartpole_rl.workflows.finetuning_cart import FinetuningCart, FinetuningFiles, Stage, yielding_to
 from cartpole_rl.workflows.finetuning_learner import CartLearner, TunedAgent, check_simulation
 from cartpole_rl.workflows.poles import other_pole, plant_words
 from cartpole_rl.workflows.ray_learner import LearnerTask, Offer
@@ -139,7 +138,7 @@ def drive_all(
         Driver(make_env, make_policy, real_time, confirm) as driver,
         yielding_to(driver, link is None) if real_time else nullcontext(),
     ):
-        cart = DrivenCart(driver, files, log)
+        cart = FinetuningCart(driver, files, log)
         cart.evaluate(Stage.BEFORE, tuned.first_weights)
         if link is None:
             learn_here(cart, tuned, settings)
@@ -212,7 +211,7 @@ def link_to_learner(
         yield link
 
 
-def learn_here(cart: DrivenCart, tuned: TunedAgent, settings: CartPoleSettings) -> None:
+def learn_here(cart: FinetuningCart, tuned: TunedAgent, settings: CartPoleSettings) -> None:
     """Drive and learn at the same time, episode by episode; what is on disk is not driven again."""
     files, config, learned = cart.files, cart.config, tuned.learned
     learner = CartLearner(config, tuned.training, settings, tuned.agent)
@@ -234,7 +233,7 @@ def learn_here(cart: DrivenCart, tuned: TunedAgent, settings: CartPoleSettings) 
         files.save(learner.snapshot(), number + 1)
 
 
-def learn_there(link: LearnerLink, cart: DrivenCart, tuned: TunedAgent) -> None:
+def learn_there(link: LearnerLink, cart: FinetuningCart, tuned: TunedAgent) -> None:
     """Drive each episode that is not on disk with the weights for it, and wait for the last weights.
 
     Raises LearningError if learning failed.
@@ -247,7 +246,9 @@ def learn_there(link: LearnerLink, cart: DrivenCart, tuned: TunedAgent) -> None:
     link.finish()
 
 
-def wait_for_weights(link: LearnerLink, cart: DrivenCart, tuned: TunedAgent, number: int, ahead: int) -> None:
+def wait_for_weights(
+    link: LearnerLink, cart: FinetuningCart, tuned: TunedAgent, number: int, ahead: int
+) -> None:
     """Wait for weights that were learned from `number` episodes, while the cart stands still.
 
     Weights from up to `ahead` episodes fewer do while the learner is lost.
@@ -289,7 +290,7 @@ def save_newest(files: FinetuningFiles, tuned: TunedAgent) -> None:
     files.save({"agent": tuned.agent.state_dict(), NAME: tuned.state[NAME]}, tuned.learned)
 
 
-def compare(cart: DrivenCart, tuned: TunedAgent, settings: CartPoleSettings) -> None:
+def compare(cart: FinetuningCart, tuned: TunedAgent, settings: CartPoleSettings) -> None:
     """Keep the better policy, and write and print the results."""
     files, config, task = cart.files, cart.config, settings.task
     episodes = {stage: files.episodes(stage) for stage in (Stage.BEFORE, Stage.AFTER)}

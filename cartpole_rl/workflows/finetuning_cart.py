@@ -12,7 +12,7 @@ from typing import Any
 from tqdm import tqdm
 
 from cartpole_rl.errors import LearningError, LinkError
-from cartpole_rl.evaluation.driver import Driver, DriveRequest
+from cartpole_rl.evaluation.driver import Driver, EpisodeRequest
 from cartpole_rl.evaluation.driving_policy import Weights
 from cartpole_rl.evaluation.recordings import LENGTH, read_recording, write_recording
 from cartpole_rl.learning.checkpoints import FINETUNING_FORMAT, TrainingCheckpoint, save_training
@@ -21,8 +21,7 @@ from cartpole_rl.reporting.tensorboard import TensorBoardLog
 from cartpole_rl.reporting.texts import ending_text, guard_text
 from cartpole_rl.run_folder import CHECKPOINTS, RECORDINGS, START
 from cartpole_rl.scheduling import giving_precedence
-from cartpole_rl.tasks.endings import Ending
-from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.tasks.episode import Ending, Episode
 from cartpole_rl.terminal import print_message
 from cartpole_rl.workflows.config import FinetuneConfig
 
@@ -90,7 +89,7 @@ def pole_length(config: FinetuneConfig) -> float | None:
     return config.plant.known_pole_length(config.emulator)
 
 
-class DrivenCart:
+class FinetuningCart:
     """Drives episodes with `driver`, writes them to `files` and logs them to `log`."""
 
     def __init__(self, driver: Driver, files: FinetuningFiles, log: TensorBoardLog) -> None:
@@ -113,7 +112,7 @@ class DrivenCart:
 
     def start(self, weights: Weights, epsilon: float, seed: int) -> None:
         """Start an episode and return at once. Raises LinkError."""
-        self.request = DriveRequest(weights, epsilon, seed)
+        self.request = EpisodeRequest(weights, epsilon, seed)
         self.driver.start(self.request)
 
     def finish(self, stage: Stage, number: int) -> None:

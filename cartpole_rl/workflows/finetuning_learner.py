@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from cartpole_rl.envs.build import environment, randomizer, simulated_env
-from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
+from cartpole_rl.envs.settings import CartPoleSettings
 from cartpole_rl.errors import CheckpointError, RecordingError
 from cartpole_rl.evaluation.driving_policy import Weights, as_weights
 from cartpole_rl.evaluation.episodes import run_batch

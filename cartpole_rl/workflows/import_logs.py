@@ -15,9 +15,9 @@ import numpy as np
 from cartpole_rl.choices import choice
 from cartpole_rl.errors import RecordingError
 from cartpole_rl.evaluation.recordings import LENGTH, write_recording
-from cartpole_rl.identification.layout import ImportConfig, Layout, log_files
 from cartpole_rl.identification.logs import Log, Report, read_log
 from cartpole_rl.identification.sensors import Estimate, Motion, Sensors, question_sensors
+from cartpole_rl.identification.settings import ImportConfig, Layout, log_files
 from cartpole_rl.run_folder import RECORDINGS, write_config, write_json
 from cartpole_rl.terminal import print_results, progress_bar, shown
 

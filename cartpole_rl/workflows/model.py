@@ -17,7 +17,7 @@ from cartpole_rl.identification.rollout import Dynamics
 from cartpole_rl.identification.windows import Windows, cut_windows, held_out_windows, recorded_period, split
 from cartpole_rl.physics.friction import CART_FRICTIONS
 from cartpole_rl.physics.models import Models
-from cartpole_rl.plants.learned_model import LearnedModel, save_model
+from cartpole_rl.plants.learned import LearnedModel, save_model
 from cartpole_rl.plants.settings import MODEL, LearnedSettings
 from cartpole_rl.randomization.poles import Pole
 from cartpole_rl.reporting.predictions import (

@@ -9,7 +9,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
+from cartpole_rl.envs.settings import CartPoleSettings
 from cartpole_rl.evaluation.recordings import LENGTH, stored_origin, write_recording
 from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.reporting.texts import count_text, guard_text

@@ -40,8 +40,7 @@ from truths import TUNED, Truth
 from cartpole_rl.errors import CartPoleError
 from cartpole_rl.reporting.texts import Cell
 from cartpole_rl.run_folder import CHECKPOINTS, RESUME
-from cartpole_rl.tasks.endings import Ending
-from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.tasks.episode import Ending, Episode
 from cartpole_rl.workflows.config import FinetuneConfig, load_settings
 from cartpole_rl.workflows.finetune import finetune
 from cartpole_rl.workflows.finetuning_cart import FinetuningFiles, Stage

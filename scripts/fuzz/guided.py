@@ -38,8 +38,7 @@ with fuzzer.instrument_imports(include=LIBRARIES) if fuzzer else contextlib.null
     from cartpole_rl.plants.serial import connection
     from cartpole_rl.plants.settings import SerialSettings
     from cartpole_rl.wire import Flags, FrameSplitter, SetMotor, Start, State, cobs, decode_frame
-    from cartpole_rl.wire.checksum import crc16
-    from cartpole_rl.wire.frames import END, LONGEST_FRAME, VERSION, open_envelope
+    from cartpole_rl.wire.frames import END, LONGEST_FRAME, VERSION, crc16, open_envelope
     from cartpole_rl.wire.messages import FROM_CART, MESSAGES
 
 from cartpole_rl.errors import CartPoleError, FrameError  # noqa: E402 - after what is instrumented

@@ -41,8 +41,7 @@ from cartpole_rl.wire import (
     cobs,
     encode_frame,
 )
-from cartpole_rl.wire.checksum import crc16
-from cartpole_rl.wire.frames import END, VERSION
+from cartpole_rl.wire.frames import END, VERSION, crc16
 
 SANITIZERS = ("-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 SPLITTER_BYTES = 256  # at least the size of a cart_splitter

@@ -25,8 +25,7 @@ from cartpole_rl.wire import (
     decode_frame,
     encode_frame,
 )
-from cartpole_rl.wire.checksum import crc16
-from cartpole_rl.wire.frames import Frame
+from cartpole_rl.wire.frames import Frame, crc16
 
 pytestmark = pytest.mark.usefixtures("each_firmware")
 

@@ -12,17 +12,15 @@ from cartpole_rl.choices import choice
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.envs.build import environment, randomizer, shipped_settings, simulated_env, with_fitted_guard
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
-from cartpole_rl.envs.cart_pole_settings import CartPoleSettings
-from cartpole_rl.envs.guard import guard_side, stopping_distance
-from cartpole_rl.envs.guard_fitting import braking_distances, closest_bound
-from cartpole_rl.envs.settings import TrackGuard
+from cartpole_rl.envs.guard import braking_distances, closest_bound, guard_side, stopping_distance
+from cartpole_rl.envs.settings import CartPoleSettings, TrackGuard
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.physics.dynamics import State
 from cartpole_rl.plants.serial.plant import emulated_plant
 from cartpole_rl.plants.settings import SimulatedSettings
 from cartpole_rl.plants.simulated import SimulatedPlant
-from cartpole_rl.tasks.endings import Ending
+from cartpole_rl.tasks.episode import Ending
 from cartpole_rl.tasks.features import MOTOR_SCALE
 from cartpole_rl.tasks.settings import NO_ACTION
 

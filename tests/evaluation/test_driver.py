@@ -19,7 +19,7 @@ from cartpole_rl.envs.build import make_env
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.settings import ObservationSettings
 from cartpole_rl.errors import FaultError, LinkError
-from cartpole_rl.evaluation.driver import Driver, DriveRequest
+from cartpole_rl.evaluation.driver import Driver, EpisodeRequest
 from cartpole_rl.evaluation.driving_policy import as_weights
 from cartpole_rl.learning.agent import QAgent
 from cartpole_rl.plants.serial.errors import NotReadyError
@@ -86,7 +86,7 @@ def test_a_person_is_asked_and_a_hangup_stops_the_motor(
     peer: Faulty, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """The person declines, then confirms; the terminal is closed while the cart is driven."""
-    drive, asked = DriveRequest(as_weights(network()), 0.0, 0), []
+    drive, asked = EpisodeRequest(as_weights(network()), 0.0, 0), []
 
     def disagree(text: str) -> bool:
         asked.append(text)

@@ -7,8 +7,7 @@ import pytest
 import torch
 from tensordict import TensorDictBase
 
-from cartpole_rl.evaluation.episodes import run_episodes
-from cartpole_rl.evaluation.knocks import Knocks
+from cartpole_rl.evaluation.episodes import Knocks, run_episodes
 from cartpole_rl.tasks.settings import Start, StartSettings
 
 UPRIGHT = StartSettings(

@@ -14,8 +14,7 @@ from cartpole_rl.evaluation.episodes import run_episodes
 from cartpole_rl.evaluation.metrics import same_as_host
 from cartpole_rl.evaluation.onboard import comparable, run_onboard_episodes
 from cartpole_rl.plants.serial.errors import RefusedError
-from cartpole_rl.tasks.endings import Ending
-from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.tasks.episode import Ending, Episode
 from cartpole_rl.workflows.build import (
     TrainedAgent,
     evaluated_env,

@@ -12,8 +12,7 @@ from tensordict import TensorDictBase
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.envs.build import environment, shipped_settings
 from cartpole_rl.evaluation.episodes import run_episodes
-from cartpole_rl.evaluation.publishing import followed
-from cartpole_rl.evaluation.snapshots import COUNTER, Memory, Snapshot, new_memory, read, write
+from cartpole_rl.evaluation.snapshots import COUNTER, Memory, Snapshot, followed, new_memory, read, write
 from cartpole_rl.plants.serial.plant import emulated_plant
 
 ENOUGH = 200  # different snapshots

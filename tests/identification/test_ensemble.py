@@ -17,8 +17,7 @@ from cartpole_rl.identification.settings import EnsembleSettings
 from cartpole_rl.identification.windows import Windows, cut_windows
 from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.residual import PLACES, SPACING, UNITS, Residual
-from cartpole_rl.plants.learned import LearnedPlant
-from cartpole_rl.plants.learned_model import LearnedModel
+from cartpole_rl.plants.learned import LearnedModel, LearnedPlant
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.randomization.randomizer import Randomizer

@@ -15,9 +15,9 @@ from cartpole_rl.choices import conf_folder
 from cartpole_rl.composition import compose
 from cartpole_rl.errors import ConfigError, RecordingError
 from cartpole_rl.evaluation.recordings import read_recording
-from cartpole_rl.identification.layout import ImportConfig, Layout
 from cartpole_rl.identification.logs import read_log
 from cartpole_rl.identification.sensors import Motion, question_sensors
+from cartpole_rl.identification.settings import ImportConfig, Layout
 from cartpole_rl.run_folder import experiments
 from cartpole_rl.workflows.import_logs import import_logs
 

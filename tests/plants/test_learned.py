@@ -13,8 +13,7 @@ from cartpole_rl.physics.friction import CART_FRICTIONS
 from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.physics.residual import PLACES, Residual
-from cartpole_rl.plants.learned import LearnedPlant
-from cartpole_rl.plants.learned_model import FORMAT, LearnedModel, load_model, save_model
+from cartpole_rl.plants.learned import FORMAT, LearnedModel, LearnedPlant, load_model, save_model
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.randomization.randomizer import Randomizer

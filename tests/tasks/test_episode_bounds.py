@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from cartpole_rl.tasks.endings import fallen
+from cartpole_rl.envs.perception import fallen
 from cartpole_rl.tasks.features import Measured
 from cartpole_rl.tasks.rewards import BALANCE_ANGLE
 from cartpole_rl.tasks.settings import Start, StartSettings
@@ -57,10 +57,10 @@ class TestFallen:
 
     def test_beyond_twelve_degrees_on_either_side(self) -> None:
         assert math.degrees(BALANCE_ANGLE) == pytest.approx(12)
-        assert fallen(self.state, BALANCE_ANGLE).tolist() == [False, False, True, False, True, True]
+        assert fallen(self.state.theta, BALANCE_ANGLE).tolist() == [False, False, True, False, True, True]
 
     def test_never_without_a_limit(self) -> None:
-        assert fallen(self.state, None).tolist() == [False] * 6
+        assert fallen(self.state.theta, None).tolist() == [False] * 6
 
 
 class TestUpright:

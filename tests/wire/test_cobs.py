@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from cartpole_rl.errors import FrameError
 from cartpole_rl.wire import cobs
-from cartpole_rl.wire.checksum import crc16
+from cartpole_rl.wire.frames import crc16
 
 
 def span(first: int, last: int) -> bytes:

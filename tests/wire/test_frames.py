@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 
 from cartpole_rl.errors import FrameError
 from cartpole_rl.wire import Frame, FrameSplitter, Hello, SetMotor, State, cobs, decode_frame, encode_frame
-from cartpole_rl.wire.checksum import crc16
-from cartpole_rl.wire.frames import LONGEST_FRAME, open_envelope
+from cartpole_rl.wire.frames import LONGEST_FRAME, crc16, open_envelope
 from cartpole_rl.wire.messages import MESSAGES, Message, MessageType
 
 LIMITS = {"B": (0, 255), "h": (-(2**15), 2**15 - 1), "H": (0, 2**16 - 1)}

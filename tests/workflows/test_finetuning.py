@@ -14,7 +14,7 @@ from short_episode import EPISODE
 from cartpole_rl.choices import choice
 from cartpole_rl.envs.build import simulated_env
 from cartpole_rl.errors import CheckpointError, LinkError
-from cartpole_rl.evaluation.driver import Driven, DriveRequest
+from cartpole_rl.evaluation.driver import EpisodeRequest, EpisodeResult
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.files import write_bytes
 from cartpole_rl.learning.checkpoints import FINETUNING_FORMAT, AgentCheckpoint, load_training, save_agent
@@ -27,7 +27,7 @@ from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.build import evaluated_settings, new_agent
 from cartpole_rl.workflows.config import FinetuneConfig, TrainConfig, load_settings, recorded_settings
 from cartpole_rl.workflows.finetune import evaluation_config, started_from
-from cartpole_rl.workflows.finetuning_cart import DrivenCart, FinetuningFiles, Stage
+from cartpole_rl.workflows.finetuning_cart import FinetuningCart, FinetuningFiles, Stage
 from cartpole_rl.workflows.finetuning_learner import CartLearner, simulated_learning
 
 TRAINING = {
@@ -82,14 +82,14 @@ class Script:
     def __init__(self, *endings: str) -> None:
         self.endings = iter(endings)
 
-    def start(self, drive: DriveRequest) -> None:
+    def start(self, drive: EpisodeRequest) -> None:
         """Do nothing."""
 
-    def result(self) -> Driven:
+    def result(self) -> EpisodeResult:
         """Return the next episode."""
         ending = next(self.endings)
         episode = EPISODE.first(0) if ending == "empty" else EPISODE
-        return Driven(replace(episode, ended_by=ending.replace("empty", "fault")), LinkStatistics())
+        return EpisodeResult(replace(episode, ended_by=ending.replace("empty", "fault")), LinkStatistics())
 
 
 @pytest.fixture
@@ -101,13 +101,13 @@ def log(tmp_path: Path) -> Iterator[TensorBoardLog]:
 def test_an_evaluation_that_the_link_ended_is_driven_again(
     files: FinetuningFiles, log: TensorBoardLog, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    cart = DrivenCart(Script("time", "link", "link", "fault", "link", "link", "link"), files, log)
+    cart = FinetuningCart(Script("time", "link", "link", "fault", "link", "link", "link"), files, log)
     with pytest.raises(LinkError, match=r"before 3: the link was lost after 0\.0 s, 3 times in succession"):
         cart.evaluate(Stage.BEFORE, {})
     assert [each.ended_by for each in files.episodes(Stage.BEFORE)] == ["time", "fault"]
     told = "before 2: the link was lost after 0.0 s; the episode does not count and is driven again"
     assert capsys.readouterr().out.splitlines()[1] == told
-    cart = DrivenCart(Script("link"), files, log)
+    cart = FinetuningCart(Script("link"), files, log)
     cart.finish(Stage.TUNE, 0)  # one to learn from counts until then
     assert files.episode(Stage.TUNE, 0).ended_by == "link"
 
@@ -116,7 +116,7 @@ def test_an_evaluation_that_the_link_ended_is_driven_again(
 def test_an_episode_without_a_measured_period_is_driven_again(
     stage: Stage, files: FinetuningFiles, log: TensorBoardLog
 ) -> None:
-    cart = DrivenCart(Script("empty", "empty", "fault", "empty", "empty", "empty"), files, log)
+    cart = FinetuningCart(Script("empty", "empty", "fault", "empty", "empty", "empty"), files, log)
     cart.start({}, 0.0, 0)
     cart.finish(stage, 0)
     assert [each.steps for each in files.episodes(stage)] == [2]

@@ -30,7 +30,7 @@ from cartpole_rl.plants.serial.statistics import LinkStatistics
 from cartpole_rl.plants.settings import EmulatedSettings, Rehome, SerialSettings
 from cartpole_rl.plants.specs import TERMINATING, TRUNCATING, Numbers, OneCartPlant, PlantOutput, on_tensors
 from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT
-from cartpole_rl.tasks.endings import Ending
+from cartpole_rl.tasks.episode import Ending
 from cartpole_rl.wire import Fault, Flags, State, seconds_between, ticks_between, went_back
 
 

@@ -29,8 +29,7 @@ from cartpole_rl.wire import (
     Stop,
     cobs,
 )
-from cartpole_rl.wire.checksum import crc16
-from cartpole_rl.wire.frames import END
+from cartpole_rl.wire.frames import END, crc16
 
 
 def test_a_question_that_was_lost_is_repeated() -> None:
