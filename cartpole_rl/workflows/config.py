@@ -175,7 +175,7 @@ class EvaluateConfig(RunSettings):
     reward: RewardSettings | None = None
     guard: GuardSettings | None = None
     actions: ActionSettings | None = None
-    knock: NonNegative = 0.0  # rad/s, see `evaluation/knocks.py`
+    knock: NonNegative = 0.0  # rad/s, see `evaluation/episodes.py`
     repeat: RepeatSettings = RepeatSettings()
     view: View = "none"
     animation: AnimationSettings = AnimationSettings()
