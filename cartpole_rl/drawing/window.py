@@ -1,19 +1,31 @@
 """A window of matplotlib that shows pictures one after another in real time."""
 
+import os
+import sys
 import time
+from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.figure import Figure
-from matplotlib.image import AxesImage
 from numpy.typing import NDArray
 
 from cartpole_rl.errors import ConfigError
+
+if TYPE_CHECKING:  # matplotlib is slow to import
+    from matplotlib.figure import Figure
+    from matplotlib.image import AxesImage
 
 DPI = 100.0
 NO_WINDOW = (
     "a window needs a display and a toolkit, and matplotlib found only {backend!r}: install one, such as "
     "tkinter or PyQt6, or take pictures with render_mode=rgb_array"
 )
+
+
+def has_display() -> bool:
+    """Return whether this computer has a display that a window could be shown on."""
+    return not sys.platform.startswith("linux") or bool(
+        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    )
 
 
 class Window:
@@ -50,7 +62,7 @@ class Window:
 
             pyplot.close(self._figure)
 
-    def _opened(self, picture: NDArray[np.uint8]) -> tuple[Figure, AxesImage]:
+    def _opened(self, picture: NDArray[np.uint8]) -> "tuple[Figure, AxesImage]":
         """Open the window with the size of `picture`; return its figure and image."""
         from matplotlib import pyplot
 

@@ -21,13 +21,13 @@ guard's way bounds it from above as closely as possible: a linear program in mar
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import TypeVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.optimize import linprog
 from torch import Tensor
 
 from cartpole_rl.envs.settings import LARGEST_MARGIN, TrackGuard
@@ -78,7 +78,8 @@ def fitted_guard(
     """
     if not min(motors) < 0 < max(motors):
         raise ConfigError(f"guard: actions.motors={list(motors)} brake in one direction; choose guard=none")
-    speed, way, rightward = braking_distances(draws, motors, models, period)
+    with one_thread():
+        speed, way, rightward = braking_distances(draws, motors, models, period)
     if not np.isfinite((speed, way)).all():
         raise ConfigError(
             "guard: simulated carts brake to numbers that are not finite; check cart.*, or guard=none"
@@ -94,6 +95,21 @@ def fitted_guard(
             "smaller motor values, or guard=none"
         )
     return TrackGuard(margin=round(margin, 4), delay=round(delay, 4), deceleration=round(0.5 / curvature, 3))
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Let torch use one thread.
+
+    The fit is many short operations: beside other programs several threads take 5 to 30 times as long. A
+    process that never started threads can also be forked, as Gymnasium's AsyncVectorEnv does.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def braking_distances(
@@ -151,6 +167,8 @@ def quantiles(speed: Array, way: Array, quantile: float) -> tuple[Array, Array]:
 
 def closest_bound(speed: Array, way: Array) -> tuple[float, float, float]:
     """Return (margin m, delay s, curvature s^2/m) of the least upper bound on `way` that is a guard's."""
+    from scipy.optimize import linprog  # slow to import
+
     terms = np.stack((np.ones_like(speed), speed, speed * np.abs(speed)), 1)
     result = linprog(terms.sum(0), A_ub=-terms, b_ub=-way, bounds=[(0, None)] * 3)
     margin, delay, curvature = result.x

@@ -4,6 +4,18 @@
     gymnasium.make_vec("cartpole_rl/Balance-v0", num_envs=1024, vectorization_mode="vector_entry_point")
 
 Both wrap the same `CartPoleEnv` as everything else, with the nominal cart and the medium pole of conf/.
+Keyword arguments take what the configuration takes, with the same checks: the name of a choice, a file of
+yours or a mapping.
+
+    gymnasium.make("cartpole_rl/SwingUp-v0", pole="large", observation="raw", cart="mine.yaml", period=0.01)
+    gymnasium.make("cartpole_rl/SwingUp-v0", reward={"defaults": ["score"], "scale": 1.0}, guard="none")
+
+In several processes, they start soonest if they are forked; TorchRL makes others start from nothing:
+
+    gymnasium.make_vec("cartpole_rl/SwingUp-v0", 4, "async", vector_kwargs={"context": "fork"})
+
+The keyword arguments are `pole`, `reward`, `observation`, `actions`, `cart`, `cart_friction`,
+`pole_friction`, `guard`, `randomization` ("none" by default) and `period`, s.
 
 | id         | actions                       | reward                            | ends          |
 |------------|-------------------------------|-----------------------------------|---------------|
@@ -12,10 +24,11 @@ Both wrap the same `CartPoleEnv` as everything else, with the nominal cart and t
 
 An action is an index of the motor values, from full left to full right. The track guard (envs/guard.py)
 replaces them near the end of the track. An episode is truncated after `max_episode_steps`, by default 500
-control periods of 20 ms. `info` has the step's scores (6.1) `score_upright` and (6.2) `score`.
+control periods. `info` has the step's scores (6.1) `score_upright` and (6.2) `score`.
 
 The observation is a Box of float32. The space itself is unbounded, because a measured speed has no bound;
-the table gives the bounds of each number, or the usual range. Times the unit, a number is in SI units.
+the table gives the bounds of each number of `observation="history"`, or the usual range. Times the unit, a
+number is in SI units.
 
 | index | observation                               | unit    | range                       |
 |-------|-------------------------------------------|---------|-----------------------------|
@@ -29,7 +42,8 @@ the table gives the bounds of each number, or the usual range. Times the unit, a
 | 9     | theta_dot a period ago                    | 8 rad/s | as 4                        |
 
 `render_mode="rgb_array"` returns pictures of 320 by 480 pixels, one for each cart. `render_mode="human"`
-shows up to nine carts in a window of matplotlib, in real time (envs/rendering.py).
+shows up to nine carts in a window of matplotlib, in real time (envs/rendering.py); it needs a display.
+A pickle holds the arguments: a copy starts anew, as with Gymnasium's own environments.
 """
 
 from collections.abc import Mapping, Sequence
@@ -38,12 +52,16 @@ from typing import Any, Protocol
 import gymnasium
 import numpy as np
 from gymnasium import spaces
+from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
+from cartpole_rl.checking import nearest_choice
 from cartpole_rl.choices import choice
+from cartpole_rl.drawing.window import has_display
 from cartpole_rl.envs.build import shipped_settings, simulated_env, with_fitted_guard
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.rendering import RENDER_MODES, Picture, Renderer
+from cartpole_rl.envs.settings import CartPoleSettings
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.plants.settings import SimulatedSettings
 from cartpole_rl.registration import MAX_EPISODE_STEPS
@@ -56,6 +74,10 @@ SCORES = ("score", "score_upright")
 PERIOD = 0.02  # s, the control period of conf/train.yaml
 UNLIMITED = 2**62  # control periods, where Gymnasium's TimeLimit ends the episode
 METADATA = {"render_modes": list(RENDER_MODES), "render_fps": round(1 / PERIOD)}
+TAKEN = (
+    *(name for name in CartPoleSettings.model_fields if name not in ("task", "control_period")),
+    "period",
+)
 
 Array = NDArray[Any]
 Randomization = str | Mapping[str, Mapping[str, Any]]
@@ -67,14 +89,16 @@ def simulated_environment(
     randomization: Randomization = "none",
     compiled: bool = False,
     time_limit: int | None = None,
+    **choices: Any,
 ) -> CartPoleEnv:
     """Return the environment of `task`, "swingup" or "balance", with the other choices of conf/train.yaml.
 
-    `randomization` is the name of a file in conf/randomization/, or its lines. `time_limit` in control
-    periods; None is that of the task. Raises ConfigError.
+    `randomization` is the name of a file in conf/randomization/, or its lines; `choices` are the other
+    settings, see `environment_settings`. `time_limit` in control periods; None is that of the task. Raises
+    ConfigError.
     """
     check_count("num_envs", carts)
-    settings = shipped_settings({**OF_TASK[task], "pole": "medium", "randomization": randomization})
+    settings = environment_settings(task, {"randomization": randomization, **choices})
     if time_limit is not None:
         check_count("max_episode_steps", time_limit)
         fitted = with_fitted_guard(settings)  # before the change, so that environments share the fit
@@ -82,6 +106,27 @@ def simulated_environment(
         settings = fitted.model_copy(update={"task": limited})
     plant = SimulatedSettings(**choice("plant/simulated"))
     return simulated_env(settings, plant, carts, settings.task.start, seed=0, compiled=compiled)
+
+
+def environment_settings(task: str, choices: Mapping[str, Any]) -> CartPoleSettings:
+    """Return the settings of the environment of `task`, with `choices` as in `composition.compose`.
+
+    `period`, s, is `control_period`. Raises ConfigError for a setting of anything but the environment.
+    """
+    if task not in OF_TASK:
+        raise ConfigError(f"task={task}: {nearest_choice(str(task), [*OF_TASK])}")
+    if unknown := [name for name in choices if name.partition(".")[0] not in TAKEN]:
+        raise ConfigError(
+            f"{unknown[0]}: an environment has no such setting; {nearest_choice(unknown[0], TAKEN)}"
+        )
+    named = {"control_period" if name == "period" else name: value for name, value in choices.items()}
+    return shipped_settings({**OF_TASK[task], "pole": "medium", **named})
+
+
+def metadata_here(metadata: Mapping[str, Any], period: float) -> dict[str, Any]:
+    """Return `metadata` with the render modes that work on this computer, for a control period in s."""
+    modes = [mode for mode in RENDER_MODES if mode != "human" or has_display()]
+    return {**metadata, "render_modes": modes, "render_fps": round(1 / period)}
 
 
 def check_count(name: str, value: Any) -> None:
@@ -111,24 +156,37 @@ def action_space(env: CartPoleEnv) -> spaces.Discrete:
     return spaces.Discrete(len(env.hardware.motors))
 
 
-def renderer(mode: str | None, env: CartPoleEnv, task: str, steps: int | None) -> Renderer | None:
-    """Return the renderer of a mode, or None without one; `steps` is the length of an episode."""
+def renderer(
+    mode: str | None, env: CartPoleEnv, task: str, period: float, steps: int | None
+) -> Renderer | None:
+    """Return the renderer of a mode, or None without one; `steps` periods of `period` s are an episode."""
     if mode is None:
         return None
-    return Renderer(mode, env.plant, f"cartpole_rl {task}", PERIOD, steps or MAX_EPISODE_STEPS)
+    return Renderer(mode, env.plant, f"cartpole_rl {task}", period, steps or MAX_EPISODE_STEPS)
 
 
-class CartPoleGymnasium(gymnasium.Env[Array, np.int64]):
-    """One simulated cart. It has no time limit; `gymnasium.make` adds that of the registration."""
+class CartPoleGymnasium(gymnasium.Env[Array, np.int64], EzPickle):
+    """One simulated cart. It has no time limit; `gymnasium.make` adds that of the registration.
+
+    `choices` are the settings named above, as keyword arguments. Raises ConfigError.
+    """
 
     metadata = METADATA
 
     def __init__(
-        self, task: str, randomization: Randomization = "none", render_mode: str | None = None
+        self,
+        task: str,
+        randomization: Randomization = "none",
+        render_mode: str | None = None,
+        period: float = PERIOD,
+        **choices: Any,
     ) -> None:
-        self.env = simulated_environment(task, 1, randomization, time_limit=UNLIMITED)
+        EzPickle.__init__(self, task, randomization, render_mode, period, **choices)
+        choices = {**choices, "randomization": randomization, "period": period}
+        self.env = simulated_environment(task, 1, time_limit=UNLIMITED, **choices)
+        self.metadata = metadata_here(METADATA, period)
         self.observation_space, self.action_space = observation_space(self.env), action_space(self.env)
-        self.render_mode, self.renderer = render_mode, renderer(render_mode, self.env, task, None)
+        self.render_mode, self.renderer = render_mode, renderer(render_mode, self.env, task, period, None)
         self.seeded = False  # the plant, from `np_random`
 
     def reset(

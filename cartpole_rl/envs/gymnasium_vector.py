@@ -5,17 +5,20 @@ from typing import Any
 
 import numpy as np
 import torch
+from gymnasium.utils import EzPickle
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from tensordict import TensorDictBase
 
 from cartpole_rl.envs.gymnasium import (
     METADATA,
+    PERIOD,
     SCORES,
     Array,
     Randomization,
     action_space,
     checked_actions,
+    metadata_here,
     observation_space,
     renderer,
     seed_plant,
@@ -24,10 +27,11 @@ from cartpole_rl.envs.gymnasium import (
 from cartpole_rl.envs.rendering import Picture, Renderer
 
 
-class CartPoleVector(VectorEnv[Array, Array, Array]):
+class CartPoleVector(VectorEnv[Array, Array, Array], EzPickle):
     """Many simulated carts at once; a cart whose episode ends starts the next in the same step.
 
     `info` then holds the last observation under `final_obs`, as in Gymnasium's own vector environments.
+    `choices` are the settings named in `gymnasium.py`. Raises ConfigError.
     """
 
     metadata = METADATA | {"autoreset_mode": AutoresetMode.SAME_STEP}
@@ -40,12 +44,20 @@ class CartPoleVector(VectorEnv[Array, Array, Array]):
         compiled: bool = False,
         render_mode: str | None = None,
         max_episode_steps: int | None = None,
+        period: float = PERIOD,
+        **choices: Any,
     ) -> None:
-        self.env = simulated_environment(task, num_envs, randomization, compiled, max_episode_steps)
+        arguments = task, num_envs, randomization, compiled, render_mode, max_episode_steps, period
+        EzPickle.__init__(self, *arguments, **choices)
+        choices = {**choices, "randomization": randomization, "period": period}
+        self.env = simulated_environment(
+            task, num_envs, compiled=compiled, time_limit=max_episode_steps, **choices
+        )
+        self.metadata = metadata_here(self.metadata, period)
         self.num_envs = num_envs
         self.render_mode, self.renderer = (
             render_mode,
-            renderer(render_mode, self.env, task, max_episode_steps),
+            renderer(render_mode, self.env, task, period, max_episode_steps),
         )
         self.single_observation_space = observation_space(self.env)
         self.single_action_space = action_space(self.env)

@@ -1,5 +1,6 @@
 """By Gymnasium's rules: its checker is content, seeds repeat, and one cart does what a batch of one does."""
 
+import pickle
 import subprocess
 import sys
 import warnings
@@ -60,12 +61,15 @@ def course(env: VectorEnv, seed: int) -> Iterator[tuple]:
 
 
 @pytest.mark.parametrize("name", ENVIRONMENTS)
-def test_passes_gymnasiums_checker(name: str) -> None:
-    """Its render modes are checked in test_rendering.py, on a display."""
+def test_passes_both_checkers_without_a_display(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a display, test_rendering.py checks the windows too."""
+    monkeypatch.setattr("cartpole_rl.envs.gymnasium.has_display", bool)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warnings.filterwarnings("ignore", message=".*infinity.*")  # a measured state has no bounds
-        check_env(gymnasium.make(name).unwrapped, skip_render_check=True)
+        check_env(gymnasium.make(name).unwrapped)
+        env_checker = pytest.importorskip("stable_baselines3.common.env_checker")
+        env_checker.check_env(gymnasium.make(name))
 
 
 @pytest.mark.parametrize(("name", "actions", "limit"), [("SwingUp", 9, None), ("Balance", 3, np.radians(12))])
@@ -152,6 +156,55 @@ def test_randomization_is_by_name_or_by_lines() -> None:
         assert len(env.plant.parameters.cart_mass.unique()) == 8
     with pytest.raises(ConfigError, match="randomization=wild: there is no such choice; did you mean wide"):
         simulated_environment("swingup", 8, "wild")
+
+
+CHOSEN = {"pole": "large", "observation": "raw", "actions": "three", "guard": "careful", "period": 0.025}
+
+
+@pytest.mark.parametrize("make", [gymnasium.make, gymnasium.make_vec])
+def test_keyword_arguments_take_what_the_configuration_takes(make: Any) -> None:
+    reward = {"defaults": ["score"], "scale": 2.0}
+    env = make("cartpole_rl/SwingUp-v0", **CHOSEN, reward=reward).unwrapped
+    copy = pickle.loads(pickle.dumps(env))
+    for each in (env, copy):
+        assert each.env.plant.pole_length.item() == pytest.approx(0.6604)
+        assert each.env.plant.period == 0.025
+        assert each.env.hardware.reward.scale == 2.0
+        assert each.env.hardware.observation_settings.size == 4
+        assert len(each.env.hardware.motors) == 3
+        assert each.metadata["render_fps"] == 40
+    assert (env.reset(seed=1)[0] == copy.reset(seed=1)[0]).all()
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"pole": "larg"}, "pole=larg: there is no such choice; did you mean large"),
+        ({"period": 0.5}, "control_period=0.5: give at most 0.1 s"),
+        ({"cart": {"defaults": ["ip02"], "cart_mas": 1}}, "cart_mas: .* did you mean cart_mass"),
+        ({"poles": "large"}, "poles: an environment has no such setting; did you mean pole"),
+        ({"agent": "dqn"}, "agent: an environment has no such setting"),
+    ],
+)
+def test_keyword_arguments_are_checked_as_the_configuration(given: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        gymnasium.make("cartpole_rl/SwingUp-v0", **given)
+
+
+FORKED = """
+import gymnasium, torch, cartpole_rl
+torch.set_num_threads(2)
+envs = gymnasium.make_vec("cartpole_rl/Balance-v0", 1, "async", vector_kwargs={"context": "fork"})
+envs.reset(seed=0)
+print(envs.step(envs.action_space.sample())[0].shape)
+envs.close()
+"""
+
+
+def test_processes_can_be_forked() -> None:
+    """Fitting the guard starts no threads: in a process that is forked from one with threads torch blocks."""
+    done = subprocess.run([sys.executable, "-c", FORKED], capture_output=True, text=True, timeout=120)
+    assert done.stdout == "(1, 10)\n", done.stderr
 
 
 @pytest.mark.parametrize("action", [-1, 9, 2.0, True, [2]])
