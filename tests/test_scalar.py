@@ -29,7 +29,7 @@ from cartpole_rl.tasks.settings import RewardSettings, TaskSettings
 
 numbers = st.sampled_from(AWKWARD) | st.floats(-10, 10)
 GUARD = TrackGuard(margin=0.01, delay=0.05, deceleration=3.0)
-TASK = TaskSettings(**choice("task/swingup") | {"x_max": 0.38})
+TASK = TaskSettings(**choice("task/swingup") | {"x_max": 0.38, "time_limit": 500})
 REWARD = RewardSettings(**choice("reward/score"))
 quick = settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 

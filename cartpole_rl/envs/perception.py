@@ -100,7 +100,7 @@ def perceive(
     step_count = previous.step_count + 1
     off_track = frame.terminated
     terminated = off_track | fallen(theta, task.angle_limit)
-    ended = terminated | frame.truncated | (step_count >= task.time_limit)
+    ended = terminated | frame.truncated | (step_count >= task.periods)
     values = {  # each once: the reward is often a score
         kind: kind.formula(state, task.x_max).unsqueeze(0) for kind in {rewards.kind, SCORE, SCORE_UPRIGHT}
     }

@@ -69,7 +69,7 @@ class Finetuning(Training):
 
     def fill(self) -> None:
         """Collect a whole episode of each simulated cart, so that the buffer holds all parts of it."""
-        for _ in range(self.env.hardware.task.time_limit // self.settings.chunk):
+        for _ in range(self.env.hardware.task.periods // self.settings.chunk):
             self.collect()
 
     def round(self) -> Scalars:

@@ -41,7 +41,7 @@ class Retries:
         lengths = outcome["step_count"].squeeze(-1)[done]
         self._ended += zip(self._score[done].tolist(), lengths.tolist(), strict=True)
         chance = torch.rand(self.env.batch_size, generator=self.random, device=self.env.device)
-        whole_score = self._mean_score * self.env.hardware.task.time_limit
+        whole_score = self._mean_score * self.env.hardware.task.periods
         retry = (self._score < FAILURE_SHARE * whole_score) & (chance < self.probability)
         self._score.masked_fill_(done, 0)
         return retry

@@ -1,7 +1,7 @@
 """Settings of a task: actions, starts, rewards."""
 
 from enum import StrEnum
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -64,9 +64,29 @@ class TaskSettings(Settings):
     name: str
     start: StartSettings  # of training episodes
     evaluation_start: StartSettings
-    time_limit: Count  # control periods
+    duration: Positive | None = None  # s, of an episode; missing in checkpoints of earlier versions
+    time_limit: Count | None = None  # or its length in control periods, which takes precedence
     angle_limit: Finite | None  # rad; None: the pole may hang
     x_max: Positive  # m, of (5.4), (6.1), (6.2)
+
+    @model_validator(mode="after")
+    def _has_an_end(self) -> Self:
+        if self.duration is None and self.time_limit is None:
+            raise ValueError("give duration (s), or time_limit (control periods)")
+        return self
+
+    @property
+    def periods(self) -> int:
+        """The length of an episode in control periods; `at` sets it where only seconds are given."""
+        assert self.time_limit is not None
+        return self.time_limit
+
+    def at(self, control_period: float) -> Self:
+        """Return the task with its `time_limit`, for a control period in s."""
+        if self.time_limit is not None:
+            return self
+        assert self.duration is not None
+        return self.model_copy(update={"time_limit": max(1, round(self.duration / control_period))})
 
     @property
     def measure(self) -> Measure:

@@ -17,7 +17,7 @@ from cartpole_rl.learning.states import seed_everything
 from cartpole_rl.plants.effects import without_effect
 from cartpole_rl.randomization.randomizer import Draws
 from cartpole_rl.reporting.episodes import report_episodes
-from cartpole_rl.run_folder import CHECKPOINTS, FIGURES, METRICS, write_config
+from cartpole_rl.run_folder import BEST, CHECKPOINTS, FIGURES, METRICS, write_config
 from cartpole_rl.settings import evaluation_seed
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.terminal import as_word, print_message, print_results, shown
@@ -26,6 +26,8 @@ from cartpole_rl.workflows.checks import check_compiler, check_resumable, note_o
 from cartpole_rl.workflows.config import TrainConfig, recorded_settings
 from cartpole_rl.workflows.monitor import TrainingMonitor
 from cartpole_rl.workflows.poles import emulated_words
+
+FALLEN = 0.9  # of the best score: a training that ends below it says so
 
 
 def train(config: TrainConfig, folder: Path) -> float:
@@ -75,8 +77,20 @@ def train(config: TrainConfig, folder: Path) -> float:
     print(f"trained for {training.seconds:.0f} s")
     next_command = f"cartpole-evaluate {as_word('run', shown(folder))} {emulated_words([config.pole])}"
     print_results(folder, f"{METRICS}, {FIGURES}/ and {CHECKPOINTS}/", next_command)
+    if fall := fall_note(training.best_score, training.last_score):
+        print(fall)
     score: float = metrics[config.task.measure]["mean"]
     return score
+
+
+def fall_note(best: float, last: float | None) -> str | None:
+    """Return a line if the `last` evaluation's score is more than a tenth below the `best`, None if not."""
+    if last is None or best <= 0 or last >= FALLEN * best:
+        return None
+    return (
+        f"note: the last evaluation scored {last:.0f}, the best {best:.0f}: the agent became worse; "
+        f"{CHECKPOINTS}/{BEST} is the best one, but train again with another seed"
+    )
 
 
 def available_device(device: str) -> str:

@@ -65,7 +65,7 @@ def environment(truth: EmulatorSettings) -> CartPoleEnv:
     return make_env(
         emulated_plant(truth),
         ActionSettings(**choice("actions/nine_levels")),
-        TaskSettings(**task),
+        TaskSettings(**task).at(choice("train")["control_period"]),
         ObservationSettings(**choice("observation/history")),
         RewardSettings(**choice("reward/score")),
     )

@@ -20,6 +20,7 @@ from cartpole_rl.physics.models import Models
 from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.tasks.features import ObservationKind
 from cartpole_rl.tasks.settings import StartSettings
+from cartpole_rl.workflows.train import fall_note
 
 MOTORS = tuple(choice("actions/nine_levels")["motors"])
 SHORT = [
@@ -97,3 +98,9 @@ def test_a_pump_does_not_pass_for_one_that_balances(
     if level is None:
         assert {episode.ended_by for episode in episodes} == {"time"}
         assert max(np.cos(episode.theta).max() for episode in episodes) > 0.9  # it does come up
+
+
+def test_a_training_that_became_worse_says_so() -> None:
+    assert fall_note(9077, 8200) is None
+    assert "scored 1248, the best 9077" in str(fall_note(9077, 1248))
+    assert fall_note(-1.0, -2.0) is None  # it never scored

@@ -83,7 +83,9 @@ def test_the_tasks_are_those_of_conf(name: str, actions: int, limit: float | Non
 
 def test_the_constants_are_those_of_conf() -> None:
     assert choice("train")["control_period"] == PERIOD
-    assert {choice(f"task/{task}")["time_limit"] for task in ENVIRONMENTS.values()} == {MAX_EPISODE_STEPS}
+    assert {choice(f"task/{task}")["duration"] for task in ENVIRONMENTS.values()} == {
+        MAX_EPISODE_STEPS * PERIOD
+    }
     assert {gymnasium.spec(name).max_episode_steps for name in ENVIRONMENTS} == {MAX_EPISODE_STEPS}
 
 

@@ -309,7 +309,7 @@ def test_ended_episodes_are_reported_once(make_training: MakeTraining) -> None:
 def test_a_failed_cart_is_retried(make_training: MakeTraining, probability: float) -> None:
     """A quarter of the carts scores nothing; the mean of a period is 0.75, a whole episode's 7.5."""
     carts, random = 400, torch.Generator().manual_seed(0)
-    task = SimpleNamespace(task=SimpleNamespace(time_limit=10))
+    task = SimpleNamespace(task=SimpleNamespace(periods=10))
     env = SimpleNamespace(batch_size=[carts], device="cpu", hardware=task)
     retries, fails = Retries(env, probability, random), torch.arange(carts) % 4 == 0
     kept = []

@@ -21,3 +21,11 @@ def test_an_unknown_actuator_is_refused() -> None:
 @pytest.mark.parametrize(("task", "measure"), [("balance", "score_upright"), ("swingup", "score")])
 def test_a_balance_is_judged_by_6_1_and_a_swing_up_by_6_2(task: str, measure: str) -> None:
     assert TaskSettings(**{**choice(f"task/{task}"), "x_max": 0.38}).measure == measure
+
+
+def test_an_episode_lasts_as_many_seconds_at_any_control_period() -> None:
+    task = TaskSettings(**{**choice("task/swingup"), "x_max": 0.38})
+    assert [task.at(period).periods for period in (0.01, 0.02, 0.03, 0.04)] == [1000, 500, 333, 250]
+    assert task.model_copy(update={"time_limit": 300}).at(0.01).periods == 300
+    with pytest.raises(ValidationError, match="give duration"):
+        TaskSettings(**{**choice("task/swingup"), "x_max": 0.38, "duration": None})

@@ -65,7 +65,7 @@ class KnownCart:
     @property
     def steps(self) -> int:
         """Control periods in an episode."""
-        return self.config.task.time_limit
+        return self.config.task.at(self.config.control_period).periods
 
     @property
     def symmetric(self) -> bool:
