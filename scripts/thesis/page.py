@@ -83,8 +83,10 @@ TERMS = {  # what they mean; the carts come before
     ),
     "Settings": "Thesis's settings: those of the thesis. Today's settings: this package's defaults.",
     "Verdicts": (
-        "Agrees, contradicts: compared with the thesis. Answered: the thesis has no result to compare with. "
-        "Fails: it does not work."
+        "Agrees, contradicts: the 95 % interval lies on the thesis's side, or on the other. Differs: on the "
+        "other side, but a method, plant or budget that is not the thesis's may be why. Not shown: the "
+        "interval excludes neither. New: the thesis has no result. Fails: it does not work. Of several "
+        "claims the worst counts."
     ),
     "No difference is shown": "The interval of the difference includes 0.",
     "Ratio": "Score on the emulated cart divided by that in simulation.",
@@ -219,7 +221,7 @@ def _link(results: StudyResults) -> Html:
 
 def _status(results: StudyResults) -> Html:
     found = results.status()
-    if found in (Status.AGREES, Status.ANSWERED, Status.OPEN, Status.EMPTY):
+    if found in (Status.AGREES, Status.NOT_SHOWN, Status.NEW, Status.OPEN, Status.EMPTY):
         return Html(found)
     return Html(f'<span class="alarm">{found}</span>{escaped(results.reason())}')
 

@@ -56,7 +56,7 @@ def make_page(options: argparse.Namespace) -> None:
     for each in results:
         if each.lost_finding:
             print(f'{each.name}: {" ".join(each.remarks)} That of these has digest: "{each.digest}"')
-    for kind in (Status.FAILS, Status.CONTRADICTS, Status.EMPTY, Status.INCOMPLETE):
+    for kind in (Status.FAILS, Status.CONTRADICTS, Status.DIFFERS, Status.EMPTY, Status.INCOMPLETE):
         if names := [each.name for each in results if each.status() is kind]:
             print(f"{kind}: {', '.join(names)}")
     print_end(results, folder)

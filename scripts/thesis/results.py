@@ -36,10 +36,12 @@ class Status(StrEnum):
 
     FAILS = "fails"
     CONTRADICTS = "contradicts the thesis"
+    DIFFERS = "differs from the thesis"
     EMPTY = "no result"
     INCOMPLETE = "incomplete"
     OPEN = "not judged"
-    ANSWERED = "answered"
+    NOT_SHOWN = "not shown"
+    NEW = "new"
     AGREES = "agrees"
 
 
@@ -164,7 +166,7 @@ class StudyResults(Results):
         if not self.agents:
             return Status.EMPTY
         if self.finding:
-            return Status[self.finding.verdict.upper()]
+            return Status[self.finding.verdict.upper().replace(" ", "_")]
         if self._all_low():
             return Status.FAILS
         return Status.INCOMPLETE if self.missing() or self.exclusions else Status.OPEN

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import Field, StringConstraints, model_validator
+from pydantic import Field, StringConstraints, field_validator, model_validator
 
 from cartpole_rl.checking import most_similar, similarity, validated
 from cartpole_rl.errors import ConfigError
@@ -62,21 +62,28 @@ class Finding(Settings):
 
     size: str
     digest: str = ""  # of the results (`results.StudyResults.digest`); report.py prints the one to enter
-    verdict: Literal["fails", "contradicts", "agrees", "answered"]  # the last: no result to compare with
+    # the thesis's claims are judged by claims.py; "fails": it does not work
+    verdict: Literal["fails", "contradicts", "differs", "not shown", "agrees", "new"]
     comment: str  # why the results agree with the thesis or contradict it
+
+    @field_validator("verdict", mode="before")
+    @classmethod
+    def _of_earlier_files(cls, verdict: object) -> object:
+        return "new" if verdict == "answered" else verdict
 
 
 class Size(Settings):
     """The number of agents per arm, and overrides for all arms and all evaluations."""
 
     seeds: Count
+    first_seed: Count = FIRST_SEED
     overrides: Overrides = ()
     evaluation_overrides: Overrides = ()
 
     @property
     def every_seed(self) -> range:
         """The seeds of the agents."""
-        return range(FIRST_SEED, FIRST_SEED + self.seeds)
+        return range(self.first_seed, self.first_seed + self.seeds)
 
 
 class Study(Settings):

@@ -1,20 +1,20 @@
-"""The stored results of the studies: complete data, and a row in the pages for each study.
-
-docs/thesis-results.md has those of the thesis with their verdicts, docs/thesis.md those beyond it.
-"""
+"""The stored results of the studies: complete data, and pages whose tables and verdicts are theirs."""
 
 import re
 
 import pytest
+from claims import PAGES, Evidence, Row, Word, blocks, read_claims, rebuilt
 from page import BEYOND
 from page_commands import ROOT
 from reading import read_studies
 from results import StudyResults
+from small_results import found
 from study import study_names
 
-OF_THE_THESIS = re.compile(r"(\| [^|]+ ){3}\| (?P<verdict>[^|]+) \| `(?P<study>\w+)` \|")
 BEYOND_IT = re.compile(r"(\| [^|]+ ){2,}\| `(?P<study>\w+)` \|")
+CLAIMS = read_claims()
 RESULTS = [each for each in read_studies(ROOT / "docs/results/thesis") if each.agents]
+EVIDENCE = Evidence({each.name: each for each in RESULTS})
 
 
 def test_every_study_has_results() -> None:
@@ -32,17 +32,50 @@ def test_set_ups_have_ten_agents() -> None:
     assert {name for name, count in counts.items() if count != {10}} == {"integrators"}  # a pole alone
 
 
-def rows(page: str, row: re.Pattern[str]) -> list[re.Match[str]]:
-    return [found for found in map(row.fullmatch, (ROOT / page).read_text().splitlines()) if found]
+@pytest.mark.parametrize("page", PAGES)
+def test_tables_verdicts_and_numbers_are_those_of_the_data(page: str) -> None:
+    text = (ROOT / page).read_text(encoding="utf-8")
+    assert rebuilt(text, blocks(CLAIMS, EVIDENCE)) == text, "run scripts/thesis/claims.py"
 
 
-def test_the_table_has_each_study_of_the_thesis_with_the_verdict_of_its_finding() -> None:
-    found = {row["study"]: row["verdict"] for row in rows("docs/thesis-results.md", OF_THE_THESIS)}
-    assert found == {
-        each.name: each.finding.verdict for each in RESULTS if each.finding and each.study.order < BEYOND
+def test_each_study_of_the_thesis_has_a_row_and_the_verdict_of_its_rows() -> None:
+    verdicts = {
+        each.name: {"fails": "new"}.get(each.finding.verdict, each.finding.verdict)
+        for each in RESULTS
+        if each.finding and each.study.order < BEYOND
     }
+    assert EVIDENCE.study_words(CLAIMS.rows) == verdicts
+
+
+@pytest.mark.parametrize(
+    ("claim", "word"),
+    [
+        ("difference high/own low/own > 0", Word.AGREES),
+        ("difference low/own high/own > 0", Word.CONTRADICTS),
+        ("difference low/own low/own > 0", Word.NOT_SHOWN),
+        ("difference low/own low/own ~ 0", Word.AGREES),
+        ("mean low/own = 4.5", Word.NOT_SHOWN),
+        ("mean high/own = 4.5", Word.CONTRADICTS),
+        ("most high/own > 100", Word.AGREES),
+        ("over 100 high/own > 0.5", Word.AGREES),
+        ("over 4 low/own < 0.5", Word.NOT_SHOWN),
+        ("difference high/own low/own > 0; over 4 low/own < 0.5", Word.NOT_SHOWN),
+        ("", Word.NEW),
+    ],
+)
+def test_the_word_follows_the_interval(claim: str, word: Word) -> None:
+    agents = {"low": [{"own": float(x)} for x in range(10)], "high": [{"own": 101.0 + x} for x in range(10)]}
+    evidence = Evidence({"one": found("one", agents)})
+    row = Row(place="1", thesis="", study="one", claim=claim)
+    assert evidence.word(row) is word
+    explained = row.model_copy(update={"because": True})
+    assert evidence.word(explained) is (Word.DIFFERS if word is Word.CONTRADICTS else word)
+
+
+def rows(page: str, row: re.Pattern[str]) -> list[re.Match[str]]:
+    return [match for match in map(row.fullmatch, (ROOT / page).read_text().splitlines()) if match]
 
 
 def test_the_page_of_the_thesis_has_each_study_beyond_it() -> None:
-    found = {row["study"] for row in rows("docs/thesis.md", BEYOND_IT)} & {*study_names()}
-    assert found == {each.name for each in RESULTS if each.study.order >= BEYOND}
+    shown = {row["study"] for row in rows("docs/thesis.md", BEYOND_IT)} & {*study_names()}
+    assert shown == {each.name for each in RESULTS if each.study.order >= BEYOND}
