@@ -64,7 +64,7 @@ class Extension(str):
     def item(self) -> Any:
         """The function or class. Raises ConfigError if its module cannot be imported."""
         if isinstance(self._item, str):
-            self._item = _object_at(self._item)
+            self._item = object_at(self._item)
         return self._item
 
     def named(self, name: str) -> Self:
@@ -157,7 +157,7 @@ class Registry(Generic[Kind]):
 
     def _own(self, name: str, place: str) -> Kind:
         """Return the extension of a user, registered under `name`. Raises ConfigError."""
-        item = _object_at(place)
+        item = object_at(place)
         found = next((each for each in self if each._item is item), None)
         if found is None and self.decorated:
             raise ConfigError(f"{place} is not registered as a {self.words}; docs/extending.md shows how")
@@ -207,7 +207,7 @@ def _entry_points(kind: str) -> dict[str, str]:
     return {point.name: point.value for point in entry_points(group=f"cartpole_rl.{kind}")}
 
 
-def _object_at(place: str) -> Any:
+def object_at(place: str) -> Any:
     """Return the object at "module:name". Raises ConfigError."""
     module, _, name = place.partition(":")
     if not re.fullmatch(r"\w+(\.\w+)*", module) or not name:

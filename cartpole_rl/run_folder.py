@@ -35,6 +35,7 @@ ANIMATION, BESIDE_SIMULATION = "episode.gif", "beside_simulation.gif"  # of the 
 CHECKPOINTS, LAST, BEST, RESUME = "checkpoints", "last.pt", "best.pt", "resume.pt"  # of an agent
 START = "start.pt"  # in checkpoints/ of an unfinished fine-tuning: a copy of the agent that it started from
 BASELINE = Path("lqr")  # run=lqr is energy and LQR, not a folder
+OWN_POLICY = re.compile(r"[a-zA-Z_]\w*(\.\w+)*:[a-zA-Z_]\w*(\.\w+)*")  # run=module:name
 PRETRAINED, PRETRAINED_AGENT = "pretrained", "agent.pt"  # run=pretrained/medium is an agent in this package
 CART, POLE, RANDOMIZATION, POSTERIOR = "cart.yaml", "pole.yaml", "randomization.yaml", "posterior.npz"
 RUN_FILES = (CONFIG, CART, POLE, RANDOMIZATION)
@@ -141,6 +142,13 @@ def has_ended(run: Path) -> bool:
     """True if a training or fine-tuning has results and no state to resume from."""
     results = (run / METRICS).exists() and (run / CHECKPOINTS / LAST).exists()
     return results and not (run / CHECKPOINTS / RESUME).exists()
+
+
+def is_own_policy(run: Path | None) -> bool:
+    """Return True if `run` is a policy of one's own: module:name, or an ONNX file."""
+    if run is None:
+        return False
+    return run.suffix == ".onnx" or (bool(OWN_POLICY.fullmatch(str(run))) and not run.exists())
 
 
 def find_agent(run: Path) -> Path:

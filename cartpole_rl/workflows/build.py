@@ -10,6 +10,7 @@ from typing import Any
 import torch
 
 from cartpole_rl.agents.baseline import EnergyAndRegulator
+from cartpole_rl.agents.own import OwnPolicy
 from cartpole_rl.checking import validated
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.envs.build import environment, simulated_env, with_fitted_guard
@@ -24,7 +25,7 @@ from cartpole_rl.plants.serial.preparation import Confirm, StartPosition, nobody
 from cartpole_rl.plants.settings import PlantSettings
 from cartpole_rl.randomization.poles import Pole, PoleSettings, check_one_pole
 from cartpole_rl.rig.parameters import check_names
-from cartpole_rl.run_folder import BASELINE, CHECKPOINTS, find_agent, recorded_provenance
+from cartpole_rl.run_folder import BASELINE, CHECKPOINTS, find_agent, is_own_policy, recorded_provenance
 from cartpole_rl.scheduling import taking_precedence
 from cartpole_rl.settings import evaluation_seed
 from cartpole_rl.tasks.settings import ActionSettings, Start
@@ -72,11 +73,24 @@ def known_poles(training: TrainConfig, checkpoint: AgentCheckpoint) -> list[Pole
 
 
 def evaluated_agent(config: EvaluateConfig) -> TrainedAgent:
-    """Return the agent of config.run, or the baseline controller. Raises CheckpointError, ConfigError."""
+    """Return the agent of config.run, the baseline controller or a policy of one's own.
+
+    Raises CheckpointError, ConfigError.
+    """
+    if is_own_policy(config.run):
+        return own_agent(config)
     if config.run != BASELINE:
         return trained_agent(config.run)
     training = load_settings(TrainConfig, OF_BASELINE)
     return baseline_agent(config, training.model_copy(update={"actions": config.actions or training.actions}))
+
+
+def own_agent(config: EvaluateConfig) -> TrainedAgent:
+    """Return the policy of one's own at `config.run`, with the settings of conf/train.yaml otherwise."""
+    training = load_settings(TrainConfig, {})
+    given = {name: value for name in ("observation", "actions") if (value := getattr(config, name))}
+    training = training.model_copy(update=given)
+    return TrainedAgent(training, OwnPolicy(config.run, training.actions.motors))
 
 
 def baseline_agent(config: EvaluateConfig, training: TrainConfig) -> TrainedAgent:

@@ -15,7 +15,7 @@ from pathlib import Path
 from cartpole_rl.checking import missing
 from cartpole_rl.choices import group_choices
 from cartpole_rl.envs.settings import shipped_carts
-from cartpole_rl.errors import ConfigError
+from cartpole_rl.errors import CheckpointError, ConfigError
 from cartpole_rl.randomization.poles import Pole, check_one_pole
 from cartpole_rl.randomization.ranges import check_carts
 from cartpole_rl.rig.parameters import check_names, check_value, check_values, completed
@@ -31,6 +31,7 @@ from cartpole_rl.run_folder import (
     find_agent,
     find_training,
     has_ended,
+    is_own_policy,
     program_of,
     recordings,
     use_of,
@@ -72,10 +73,14 @@ def check_training(config: TrainConfig, folder: Path, words: Sequence[str]) -> N
 def check_evaluation(config: EvaluateConfig, words: Sequence[str]) -> None:
     """Raise CartPoleError if the agent, the cart or the episode to repeat does not exist."""
     check_repetition(config, words)
-    if config.run != BASELINE:
+    if config.run != BASELINE and not is_own_policy(config.run):
         check_agent(config.run)
+    elif config.run.suffix == ".onnx" and not config.run.is_file():
+        raise CheckpointError(f"run={config.run}: there is no such file; give an ONNX model")
     elif config.drives_on_board:
-        raise ConfigError(f"run={BASELINE}: only a trained agent can drive on the board; give its run folder")
+        raise ConfigError(
+            f"run={config.run}: only a trained agent can drive on the board; give its run folder"
+        )
     config.plant.check()
     check_parameters(config.parameters or {})
     if config.animation.mp4 and find_spec("av") is None:
@@ -188,13 +193,20 @@ def check_agent(run: Path) -> None:
         raise ConfigError(
             f"run={BASELINE}: the baseline has no network; give a training, such as run=pretrained/medium"
         )
+    if is_own_policy(run):
+        raise ConfigError(
+            f"run={run}: only cartpole-evaluate and cartpole-record drive a policy of your own; give a "
+            "training, such as run=pretrained/medium"
+        )
     check_has_agent(run)
     find_agent(run)
 
 
 def agent_file(run: Path) -> Path | None:
-    """Return the checkpoint of an agent; None for the baseline. Raises CheckpointError."""
-    return None if run == BASELINE else find_agent(run)
+    """Return the checkpoint or ONNX file of an agent; None without one. Raises CheckpointError."""
+    if run.suffix == ".onnx":
+        return run
+    return None if run == BASELINE or is_own_policy(run) else find_agent(run)
 
 
 def check_has_agent(run: Path) -> None:

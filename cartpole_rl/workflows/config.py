@@ -16,6 +16,7 @@ from cartpole_rl.envs.settings import (
     CartSettings,
     ControlPeriod,
     GuardSettings,
+    ObservationSettings,
     PoleFrictionSettings,
     Randomization,
     SimulatedCartSettings,
@@ -46,6 +47,7 @@ from cartpole_rl.randomization.ranges import IdentifiedSettings
 from cartpole_rl.registry import Extension
 from cartpole_rl.reporting.loggers import LOGGERS
 from cartpole_rl.rig.parameters import check_values
+from cartpole_rl.run_folder import is_own_policy
 from cartpole_rl.settings import Count, Finite, NonNegative, Positive, Seed, Settings
 from cartpole_rl.tasks.settings import ActionSettings, RewardSettings, TaskSettings
 
@@ -175,6 +177,7 @@ class EvaluateConfig(RunSettings):
     reward: RewardSettings | None = None
     guard: GuardSettings | None = None
     actions: ActionSettings | None = None
+    observation: ObservationSettings | None = None  # of a policy of one's own
     knock: NonNegative = 0.0  # rad/s, see `evaluation/episodes.py`
     repeat: RepeatSettings = RepeatSettings()
     view: View = "none"
@@ -191,6 +194,11 @@ class EvaluateConfig(RunSettings):
         if self.animation.simulation and not plant.is_on_port:
             raise ValueError(f"animation.simulation=true: plant={plant.kind} is simulated itself; omit it")
         check_emulator_is_read(plant, self.emulator)
+        if self.observation is not None and not is_own_policy(self.run):
+            raise ValueError(
+                "observation: an agent observes what it did in its training; leave it out. Only a policy of "
+                "your own takes it (run=module:name or run=file.onnx)"
+            )
         if self.drives_on_board and self.repeat != RepeatSettings():
             key = self.plant.policy_key(self.emulator)
             raise ValueError(f"repeat: it repeats an episode in simulation; leave out repeat.*, or {key}")

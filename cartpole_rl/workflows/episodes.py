@@ -28,7 +28,7 @@ from cartpole_rl.learning.states import seed_everything
 from cartpole_rl.randomization.poles import Pole, PoleSettings
 from cartpole_rl.reporting.live_view import LiveView
 from cartpole_rl.reporting.texts import guard_text
-from cartpole_rl.run_folder import BASELINE, CONFIG, METRICS, check_program
+from cartpole_rl.run_folder import CONFIG, METRICS, check_program
 from cartpole_rl.tasks.episode import Episode, Origin
 from cartpole_rl.tasks.settings import Measure
 from cartpole_rl.terminal import confirm, print_message, progress_bar
@@ -83,9 +83,9 @@ class Evaluation:
         yield from self._shown(run_episodes(self.env, self.policy, count, self.knocks), "episodes")
 
     def note_other_pole(self, command: str) -> None:
-        """Print a warning if the agent was trained with other poles; the baseline was not trained."""
+        """Print a warning if the agent was trained with other poles; other policies were not trained here."""
         line = other_pole(self.known_poles, self.settings.pole, self.config.plant.reads_emulator)
-        if line and self.config.run != BASELINE:
+        if line and self.known_poles:
             print_message(command, line)
 
     def note_refitted_guard(self, command: str) -> None:

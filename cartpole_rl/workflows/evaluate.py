@@ -12,7 +12,7 @@ from cartpole_rl.reporting.episodes import report_episodes
 from cartpole_rl.reporting.scores import score_columns, score_table
 from cartpole_rl.reporting.texts import count_text, cut_off
 from cartpole_rl.rig.parameters import PARAMETERS
-from cartpole_rl.run_folder import BASELINE, BESIDE_SIMULATION, FIGURES, METRICS, write_config
+from cartpole_rl.run_folder import BASELINE, BESIDE_SIMULATION, FIGURES, METRICS, is_own_policy, write_config
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.terminal import as_word, print_loop_time, print_results, shown
 from cartpole_rl.workflows.checks import agent_file
@@ -91,13 +91,15 @@ def next_command(evaluation: Evaluation) -> str:
     config, known, driven = evaluation.config, evaluation.known_poles, evaluation.settings.pole
     if config.run == BASELINE:
         return "cartpole-train experiment=medium"
+    if config.plant.is_on_port and is_own_policy(config.run):
+        return f"cartpole-record {as_word('run', shown(config.run))} {plant_words(config.plant, [driven])}"
     if config.plant.is_on_port:
         chosen = (
             knows(known, driven) or emulator_for([driven]) != POLES[0]
         )  # not a default that it does not fit
         poles = [driven] if chosen else known
         return f"cartpole-finetune {as_word('run', shown(config.run))} {plant_words(config.plant, poles)}"
-    poles = known if config.pole is None else [driven]
+    poles = known if config.pole is None and known else [driven]
     return f"cartpole-evaluate {as_word('run', shown(config.run))} {emulated_words(poles)}"
 
 
