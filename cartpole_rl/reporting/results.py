@@ -59,13 +59,17 @@ OWN = Group("own", "its own evaluation")  # the result of a run without further 
 
 @dataclass(frozen=True)
 class Agent:
-    """One run of a group. `values` maps evaluations to the measure; `curves` are those of its training."""
+    """One run of a group. `values` maps evaluations to the measure; `curves` are those of its training.
+
+    `behaviour` maps evaluations to further means over the episodes, by their keys in metrics.json.
+    """
 
     group: str
     seed: int
     run: str  # relative path
     values: Mapping[str, float]
     curves: Mapping[str, Curve] = field(default_factory=dict)
+    behaviour: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

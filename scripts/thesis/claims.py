@@ -8,7 +8,8 @@ A page marks a generated block with `<!-- claims: NAME -->`; the block ends at t
 Texts and statements name values of agents as study/arm/evaluation; within a row the study may be left out.
 `a+b` in place of an arm pools the agents of two arms. In place of an evaluation, `a:b` is the ratio of two
 evaluations of each agent, `ratio` that of the second to the first, `a&b` the lower and `a,b` the mean of
-several; names with @ are numbers of an agent's curves (CURVES). In a text `{iqm arm/evaluation}` is replaced
+several; names with @ are numbers of an agent's curves (CURVES), `a#key` is a mean of metrics.json that
+`report.py --data` stores (reading.BEHAVIOUR). In a text `{iqm arm/evaluation}` is replaced
 by that number, `{claim}` by the statistics of the row's statements with their 95 % intervals.
 
 A statement is a statistic (STATISTICS) with its values, an operator and a number, as
@@ -117,6 +118,10 @@ CURVES: Mapping[str, tuple[str, Callable[[Curve], float]]] = {  # name: curve, n
 }
 
 
+def _exact(value: float, agents: int) -> Estimate:
+    return Estimate(float(value), None, None, agents)
+
+
 def _share(threshold: Array, values: Array) -> Estimate:
     """Return the share of `values` above a threshold, with its exact interval."""
     count = int((values > threshold).sum())
@@ -144,8 +149,12 @@ def _wider(values: Array, others: Array) -> Estimate:
 STATISTICS: Mapping[str, tuple[str, Callable[..., Estimate]]] = {  # name: in words, function
     "iqm": ("", estimate),
     "mean": ("mean", _mean),
-    "most": ("best agent", lambda values: Estimate(float(values.max()), None, None, values.size)),
-    "least": ("worst agent", lambda values: Estimate(float(values.min()), None, None, values.size)),
+    "most": ("best agent", lambda values: _exact(values.max(), values.size)),
+    "least": ("worst agent", lambda values: _exact(values.min(), values.size)),
+    "apart": (
+        "largest difference",
+        lambda values, others: _exact(np.abs(values - others).max(), values.size),
+    ),
     "over": ("", _share),
     "less": ("percent less", lambda values, others: bootstrap(_percent_less, values, others)),
     "difference": ("difference", difference),
@@ -240,6 +249,9 @@ def _of_agents(results: StudyResults, arm: str, evaluation: str) -> Array:
     if evaluation in CURVES:
         name, function = CURVES[evaluation]
         return np.array([function(agent.curves[name]) for agent in agents])
+    if "#" in evaluation:
+        evaluation, key = evaluation.split("#")
+        return np.array([agent.behaviour[evaluation][key] for agent in agents])
     if evaluation == "ratio":
         return results.ratios(arm)
     if ":" in evaluation:
@@ -262,10 +274,9 @@ def _is_number(word: str) -> bool:
 
 
 def number_text(value: float) -> str:
-    """Return a number without decimals from 10 on, with two below, and with two digits below 0.1."""
-    if abs(value) >= 9.995:
-        return f"{value:.0f}"
-    return f"{value:.2f}" if abs(value) >= 0.0995 else f"{value:.2g}"
+    """Return a number without decimals from 10 on, with two below, and with three below 0.1."""
+    decimals = 0 if abs(value) >= 9.995 else 2 if abs(value) >= 0.0995 else 3
+    return f"{round(value, decimals) + 0.0:.{decimals}f}"  # + 0.0: no minus zero
 
 
 def _count(found: Estimate) -> str:

@@ -41,6 +41,8 @@ MADE = ("measure", "command", "experiment", "ratio", "agents_of")  # what the re
 DERIVED = {"evaluated", "guard"}  # settings that follow from others
 ITSELF = ""  # evaluation of a part that is the run of an arm and a seed itself
 CURVE_POINTS = 60
+# keys of metrics.json that are stored with the scores
+BEHAVIOUR = ("upright_at_end", "time_to_upright_s", "rms_motor_change")
 
 
 @dataclass(frozen=True)
@@ -268,7 +270,8 @@ class _Reader:
                 path = (self.folder / arm / str(seed)).as_posix()
                 own = found[ITSELF].run if ITSELF in found else None
                 curves = self._curves(own, self._origin(arms[arm], seed))
-                agents.append(Agent(arm, seed, path, present, curves))
+                behaviour = {name: _behaviour(found[name].run) for name in present if name in found}
+                agents.append(Agent(arm, seed, path, present, curves, behaviour))
         order = [*arms]
         return sorted(agents, key=lambda agent: (order.index(agent.group), agent.seed))
 
@@ -341,6 +344,12 @@ class _Reader:
                 more = f"; {len(odd) - 1} more settings differ" if len(odd) > 1 else ""
                 place = f"{evaluation.label}: " if evaluation else ""
                 yield f"{place}{odd[0]} differs between arms ({values}) and no override sets it{more}."
+
+
+def _behaviour(run: Run) -> dict[str, float]:
+    """Return what an agent did in an evaluation beside its score."""
+    found = {name: measured(run.results, name) for name in BEHAVIOUR}
+    return {name: value for name, value in found.items() if value is not None}
 
 
 def _fitting(run: Run, seed: int | None, agent: str) -> Run:

@@ -263,6 +263,10 @@ def as_json(results: StudyResults) -> dict[str, Any]:
             "curves": {
                 name: [[_rounded(x), _rounded(y)] for x, y in curve] for name, curve in agent.curves.items()
             },
+            "behaviour": {
+                name: {key: _rounded(value) for key, value in each.items()}
+                for name, each in agent.behaviour.items()
+            },
         }
         for agent in results.agents
     ]
@@ -330,7 +334,11 @@ def _agent(content: Mapping[str, Any]) -> Agent:
     curves = {
         name: tuple((_number(x), _number(y)) for x, y in curve) for name, curve in content["curves"].items()
     }
-    return Agent(content["arm"], int(content["seed"]), str(content["run"]), values, curves)
+    behaviour = {  # earlier files have none
+        name: {key: _number(value) for key, value in each.items()}
+        for name, each in content.get("behaviour", {}).items()
+    }
+    return Agent(content["arm"], int(content["seed"]), str(content["run"]), values, curves, behaviour)
 
 
 def _number(value: Any) -> float:

@@ -76,14 +76,13 @@ class Size(Settings):
     """The number of agents per arm, and overrides for all arms and all evaluations."""
 
     seeds: Count
-    first_seed: Count = FIRST_SEED
     overrides: Overrides = ()
     evaluation_overrides: Overrides = ()
 
     @property
     def every_seed(self) -> range:
         """The seeds of the agents."""
-        return range(self.first_seed, self.first_seed + self.seeds)
+        return range(FIRST_SEED, FIRST_SEED + self.seeds)
 
 
 class Study(Settings):

@@ -54,6 +54,13 @@ def test_the_readme_opens_with_the_two_commands() -> None:
         assert (ROOT / command.split()[0]).stat().st_mode & 0o100
 
 
+def test_the_results_are_those_of_the_pages() -> None:
+    pages = "".join((ROOT / "docs/results" / name).read_text() for name in ("learning.md", "fine-tuning.md"))
+    table = [row for row in README.read_text().splitlines() if re.match(r"\|.*\| \d+ \| ", row)]
+    assert len(table) == 7
+    assert not {number for number in re.findall(r"\d\.\d{3}", "".join(table)) if number not in pages}
+
+
 def test_the_installation_is_that_of_the_demo() -> None:
     (install,) = listed("./scripts/install")
     assert install.removeprefix("./") in (ROOT / "scripts/demo").read_text().splitlines()
