@@ -13,11 +13,11 @@ from extending_page import PAGE, ROOT, paths
 
 BIN = Path(sys.executable).parent
 PATHS = paths()
-DAILY = (1,)  # a friction law; learning/test_own_agents.py has an agent and a logger
+DAILY = (1,)  # a friction law
 
 
-def test_the_page_has_the_eight_paths() -> None:
-    assert set(PATHS) == set(EFFECTS) == set(range(1, 9))
+def test_the_page_has_the_six_paths() -> None:
+    assert set(PATHS) == set(EFFECTS) == set(range(1, 7))
     assert all(path.steps and path.checks for path in PATHS.values())
 
 

@@ -1,6 +1,6 @@
 """An agent with a learner of its own and a logger, from a module in the current folder.
 
-docs/extending.md has a Q-network and a loss of one's own.
+docs/your-own-code.md has a Q-network and a loss of one's own.
 """
 
 import json

@@ -1,0 +1,50 @@
+"""Every recipe of docs/your-own-code.md runs, in the order of the page, in at most 30 lines."""
+
+import contextlib
+import io
+import re
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+from torchrl.objectives import DQNLoss
+from toy_settings import TOY
+
+from cartpole_rl.settings import Settings
+from cartpole_rl.workflows import config as configs
+from cartpole_rl.workflows.build import network_of, new_agent, trained_agent
+
+PAGE = Path(__file__).parents[2] / "docs/your-own-code.md"
+BLOCKS = re.findall(r"^```python\n(.*?)^```$", PAGE.read_text(encoding="utf-8"), re.M | re.S)
+PRINTED = re.compile(r"^ *print\(.*\)  # (.*)$", re.M)
+
+
+@pytest.mark.usefixtures("without_pictures", "own_extensions")
+def test_every_recipe_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    load = configs.load_settings
+
+    def load_toy(schema: type[Settings], overrides: Mapping[str, Any]) -> Settings:
+        return load(schema, {**overrides, **TOY.get(schema, {})})
+
+    monkeypatch.setattr(configs, "load_settings", load_toy)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    names: dict[str, Any] = {"__name__": "notebook"}
+    for block in BLOCKS:
+        assert block.count("\n") <= 30, block
+        if file := re.match(r"# (my_\w+\.py)\n", block):
+            monkeypatch.delitem(sys.modules, Path(file[1]).stem, raising=False)
+            Path(file[1]).write_text(block, encoding="utf-8")
+            continue
+        with contextlib.redirect_stdout(io.StringIO()) as output:
+            exec(compile(block, PAGE.name, "exec"), names)
+        for expected in PRINTED.findall(block):
+            assert expected in output.getvalue().splitlines()
+    assert "['against', 'network', 'stock'] 6 episodes failed" in output.getvalue()
+    agent = trained_agent(Path("runs/train/stock"))
+    assert network_of(agent).plain_layers()  # it can be exported
+    assert type(new_agent(agent.training).loss) is DQNLoss
+    lines = Path("runs/train/light/curves.txt").read_text()
+    assert " learning/loss " in lines
