@@ -9,8 +9,9 @@ Texts and statements name values of agents as study/arm/evaluation; within a row
 `a+b` in place of an arm pools the agents of two arms. In place of an evaluation, `a:b` is the ratio of two
 evaluations of each agent, `ratio` that of the second to the first, `a&b` the lower and `a,b` the mean of
 several; names with @ are numbers of an agent's curves (CURVES), `a#key` is a mean of metrics.json that
-`report.py --data` stores (reading.BEHAVIOUR). In a text `{iqm arm/evaluation}` is replaced
-by that number, `{claim}` by the statistics of the row's statements with their 95 % intervals.
+`report.py --data` stores (reading.BEHAVIOUR). In a text `{iqm arm/evaluation}` is replaced by that number,
+`{iqm arm/evaluation []}` by it with its 95 % interval, `{claim}` by the statistics of the row's statements
+with theirs.
 
 A statement is a statistic (STATISTICS) with its values, an operator and a number, as
 `difference position/emulated constant/emulated > 0`.
@@ -158,8 +159,8 @@ STATISTICS: Mapping[str, tuple[str, Callable[..., Estimate]]] = {  # name: in wo
     "over": ("", _share),
     "less": ("percent less", lambda values, others: bootstrap(_percent_less, values, others)),
     "difference": ("difference", difference),
-    "distance": ("difference of the distances from 1", _nearer),
-    "spread": ("difference of the standard deviations", _wider),
+    "distance": ("difference", _nearer),
+    "spread": ("difference", _wider),
 }
 
 
@@ -236,8 +237,10 @@ class Evidence:
         def number(match: re.Match[str]) -> str:
             if row and match[1] == "claim":
                 return ", ".join(each.text for each in self.statements(row))
-            words = match[1].split()
+            words = match[1].removesuffix(" []").split()
             found = self.statistic(words, row.study if row else "")
+            if match[1].endswith(" []"):
+                return _with_interval(words[0], found)
             return _count(found) if words[0] == "over" else number_text(found.value)
 
         return FORMULA.sub(number, text)
@@ -298,7 +301,8 @@ def read_claims(file: Path = CLAIMS) -> Claims:
 
 def blocks(claims: Claims, evidence: Evidence) -> dict[str, str]:
     """Return every generated block by name."""
-    found = {"rows": _rows_table(claims, evidence), "counts": _counts(claims, evidence)}
+    found = {"rows": _rows_table(claims, evidence), "not_asked": _not_asked(claims)}
+    found["counts"] = _counts(claims, evidence)
     found |= {"robustness_score": _robustness_score(evidence), "ranks": _ranks(evidence)}
     found |= {name: _tables(parts, evidence) for name, parts in claims.tables.items()}
     found |= {name: evidence.filled(text) for name, text in claims.texts.items()}
@@ -307,11 +311,15 @@ def blocks(claims: Claims, evidence: Evidence) -> dict[str, str]:
 
 def _rows_table(claims: Claims, evidence: Evidence) -> str:
     lines = ["| place | the thesis | here | done otherwise | verdict | study |", "|---|---|---|---|---|---|"]
-    for row in claims.rows:
-        word = evidence.word(row)
-        cells = (row.place, row.thesis, evidence.filled(row.here, row), row.otherwise, word)
-        lines.append(f"| {' | '.join(cells)} | {f'`{row.study}`' if row.study else ''} |".replace("  ", " "))
+    for row in filter(lambda row: row.study, claims.rows):
+        cells = (row.place, row.thesis, evidence.filled(row.here, row), row.otherwise, evidence.word(row))
+        lines.append(f"| {' | '.join(cells)} | `{row.study}` |")
     return "\n".join(lines)
+
+
+def _not_asked(claims: Claims) -> str:
+    lines = ["| place | the thesis |", "|---|---|"]
+    return "\n".join([*lines, *(f"| {row.place} | {row.thesis} |" for row in claims.rows if not row.study)])
 
 
 def _counts(claims: Claims, evidence: Evidence) -> str:
