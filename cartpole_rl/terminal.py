@@ -75,10 +75,10 @@ def exit_if_nobody_reads() -> None:
         sys.exit(READER_LEFT)
 
 
-def progress_bar(total: int, unit: str, **options: Any) -> Any:
-    """Return a bar of `total` units on stderr, as wide as the terminal; options as for tqdm.
+def progress_bar(total: int | None, unit: str, **options: Any) -> Any:
+    """Return a bar of `total` units on stderr, as wide as the terminal; without a total, it counts them.
 
-    Only a terminal gets one: a pipe or a log file would keep every repaint.
+    Options are those of tqdm. Only a terminal gets one: a pipe or a log file would keep every repaint.
     """
     from tqdm import tqdm
 

@@ -3,7 +3,7 @@
 A fit returns a cart for any data. These checks refuse data that no cart could have produced.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import pairwise
 
@@ -12,7 +12,13 @@ from numpy.typing import NDArray
 
 from cartpole_rl.errors import RecordingError
 from cartpole_rl.identification.fit import correlation
-from cartpole_rl.identification.prediction import REPORTED, Replayed, away_from_upright, replay
+from cartpole_rl.identification.prediction import (
+    REPORTED,
+    Replayed,
+    away_from_upright,
+    replay_stretches,
+    stretches,
+)
 from cartpole_rl.identification.rollout import Dynamics
 from cartpole_rl.identification.sensors import Motion, question_sensors
 from cartpole_rl.identification.windows import regular_frames
@@ -46,11 +52,16 @@ def naming(file: str) -> Iterator[None]:
         raise RecordingError(f"{file}: {error}") from None
 
 
-def check_recordings(fitted: Mapping[str, Episode], held_out: Mapping[str, Episode], period: float) -> None:
+def check_recordings(
+    fitted: Mapping[str, Episode],
+    held_out: Mapping[str, Episode],
+    period: float,
+    on_step: Callable[[], object] = lambda: None,
+) -> None:
     """Raise RecordingError for the first problem of the recordings, by the names of their files.
 
     Each one must show a driven cart and a moving pole; those `fitted` to must show them well together, and so
-    must those `held_out`.
+    must those `held_out`. `on_step` is called at intervals of a slow check.
     """
     for file, episode in {**fitted, **held_out}.items():
         with naming(file):
@@ -75,7 +86,9 @@ def check_recordings(fitted: Mapping[str, Episode], held_out: Mapping[str, Episo
     if seconds < SHORTEST:
         raise RecordingError(f"{seconds:.1f} s of recordings are too short; record {SHORTEST:g} s or more")
     _check_motion(episodes, LEAST_TRAVEL, LEAST_SWING)
-    if not any(_hangs_still(episode, period) for episode in episodes) and not zero_is_known(episodes, period):
+    if not any(_hangs_still(episode, period) for episode in episodes) and not zero_is_known(
+        episodes, period, on_step
+    ):
         raise RecordingError(
             "the pole never hangs still in the recordings, and its motion does not tell its zero; "
             "start one with half a second of the pole at rest"
@@ -83,10 +96,10 @@ def check_recordings(fitted: Mapping[str, Episode], held_out: Mapping[str, Episo
     _check_signs(episodes, period)
 
 
-def zero_is_known(episodes: Sequence[Episode], period: float) -> bool:
+def zero_is_known(episodes: Sequence[Episode], period: float, on_step: Callable[[], object]) -> bool:
     """Return True if motion tells the zero of the angle."""
     motions = [Motion(each.x, each.theta, each.motor.astype(float)) for each in episodes]
-    zero = question_sensors(motions, period).angle_zero
+    zero = question_sensors(motions, period, on_step=on_step).angle_zero
     return zero is not None and zero.high - zero.low < ZERO_INTERVAL
 
 
@@ -101,11 +114,14 @@ def check_explained(recordings: Mapping[str, Episode], dynamics: Dynamics, horiz
 
     Raises RecordingError for the first one, by the name of its file, whose motion the cart does not explain.
     """
-    replays = []
+    cut = []
     for file, episode in recordings.items():
         with naming(file):
-            replays += replay([episode], dynamics, horizon)
-            _check_explained(replays[-1], horizon)
+            cut.append(stretches(episode, dynamics, horizon))
+    replays = replay_stretches([*recordings.values()], cut, dynamics)
+    for file, replayed in zip(recordings, replays, strict=True):
+        with naming(file):
+            _check_explained(replayed, horizon)
     return replays
 
 

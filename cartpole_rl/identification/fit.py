@@ -4,7 +4,8 @@ Residuals are encoder counts of positions only; see `matching`. One-step regress
 the same quantized sample into regressor and target, and one count at 50 Hz is 0.077 rad/s.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -86,15 +87,17 @@ def fit_cart(
     substeps: int = 4,
     iterations: int = 25,
     known: Sequence[str] = (),
-    sharpened: bool = False,
     extra_latency: float = 0.0,
+    near: Fit | None = None,
+    sizes: Array | None = None,
+    on_step: Callable[[], object] = lambda: None,
 ) -> Fit:
     """Return the most probable cart, searched for from several starts.
 
     The names `known`, of UNKNOWNS, keep their nominal values. Motion shows only ratios of forces and
     masses: unless WEIGHED are known, the prior sets the scale. `extra_latency` is that of `rollout`.
-    With `sharpened`, a second search weighs errors by the size that the first one left. Raises
-    RecordingError for windows in which no cart moves.
+    The search is from the cart of `near`, if it is given; `sizes`, counts, [2], scale the errors.
+    `on_step` is called before each linearization. Raises RecordingError for windows in which no cart moves.
     """
     check_laws(models, CartParameters(cart_column(nominal)))
     unknowns, nominal = unknowns_of(models, known), completed(nominal)
@@ -109,14 +112,14 @@ def fit_cart(
         counts = rollout(table, motion.flatten(1), every, models, period, substeps, extra_latency)
         return counts.unflatten(2, (windows.number, variants))
 
-    problem = Matching(simulate, positions, COARSE, guess, (low, high))
-    screened = [problem.minimize(start, guess, SCREENING) for start in starting_points(unknowns)]
-    best = min(screened, key=lambda each: each.cost)
+    scale = COARSE if sizes is None else torch.maximum(torch.from_numpy(sizes), FINEST)
+    problem = Matching(simulate, positions, scale, guess, (low, high), on_step)
+    if near is None:
+        screened = [problem.minimize(start, guess, SCREENING) for start in starting_points(unknowns)]
+        best = min(screened, key=lambda each: each.cost)
+    else:
+        best = Match(starting_point(unknowns, near), guess, math.inf, 0)
     best = problem.minimize(best.point, best.motion, iterations)
-    if sharpened:
-        scale = torch.maximum(spread(problem, best), FINEST)
-        problem = Matching(simulate, positions, scale, guess, (low, high))
-        best = problem.minimize(best.point, best.motion, iterations)
     return described(problem, best, windows, unknowns, nominal)
 
 
@@ -128,6 +131,12 @@ def starting_points(unknowns: Sequence[Unknown]) -> list[Tensor]:
         for start in STARTS
         if start.keys() <= {*names}
     ]
+
+
+def starting_point(unknowns: Sequence[Unknown], near: Fit) -> Tensor:
+    """Return the point of another fit, [U]; an unknown that it lacks is 0."""
+    theirs = dict(zip((each.name for each in near.unknowns), near.point.tolist(), strict=True))
+    return torch.tensor([theirs.get(each.name, 0.0) for each in unknowns], dtype=torch.float64)
 
 
 def described(

@@ -1,6 +1,6 @@
 """Identification of a cart from recordings: friction model, parameters with uncertainty, warnings."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -19,7 +19,7 @@ from cartpole_rl.identification.prediction import (
 )
 from cartpole_rl.identification.rollout import Dynamics
 from cartpole_rl.identification.unknowns import WEIGHED, limits
-from cartpole_rl.identification.windows import cut_judging, cut_windows, lead_periods
+from cartpole_rl.identification.windows import Windows, cut_judging, cut_windows, lead_periods
 from cartpole_rl.physics.friction import CART_FRICTIONS
 from cartpole_rl.physics.laws import Law
 from cartpole_rl.physics.models import Models
@@ -29,7 +29,7 @@ from cartpole_rl.tasks.episode import Ending, Episode
 Array = NDArray[np.floating]
 HORIZON = 1.0  # s of motion, predicted
 MOVING = round(0.02 / CART_METRES_PER_COUNT)  # counts in that time, from which a friction model shows
-SCREENING_STEPS = 4  # integration steps a period when a friction model is screened
+COARSE_STEPS = 4  # integration steps a period when friction models are compared
 CONTENDS = 1.5  # a screened model stays a candidate up to this multiple of the best one's error
 FALLOFF = 4  # a model with twice the error of the best one has a weight of 2^-FALLOFF
 UNINFORMED = 0.7  # posterior over prior standard deviation, from which the data say little
@@ -80,6 +80,7 @@ class Identification:
     fit: Fit
     dynamics: Dynamics
     candidates: list[Candidate]
+    fitted: list[Replayed]
     held_out: list[Replayed]
     error: PredictionError  # of `held_out`
     warnings: list[str]  # sentences: results that may be wrong
@@ -99,13 +100,14 @@ def identify(
     substeps: int = 12,
     most: int = 300,
     laws: Sequence[Law] = (),
+    on_step: Callable[[], object] = lambda: None,
 ) -> Identification:
     """Identify the cart that recordings, by the names of their files, are of, with the pole of `nominal`.
 
     `held_out` only gives the error that is reported; see `find_cart` for the other arguments. Raises
     RecordingError where the recordings are not sufficient, or no cart explains one of them.
     """
-    found = find_cart([*fitted.values()], nominal, models, period, substeps, most, laws)
+    found = find_cart([*fitted.values()], nominal, models, period, substeps, most, laws, on_step)
     return judged(found, fitted, held_out)
 
 
@@ -114,10 +116,10 @@ def judged(found: Found, fitted: Mapping[str, Episode], held_out: Mapping[str, E
 
     Raises RecordingError for a motion of another cart.
     """
-    check_explained(fitted, found.dynamics, HORIZON)
+    explained = check_explained(fitted, found.dynamics, HORIZON)
     replays = check_explained(held_out, found.dynamics, HORIZON)
     doubts = [*early_endings([*fitted.values(), *held_out.values()]), *warnings(found.fit)]
-    return Identification(*found, replays, prediction_error(replays), doubts)
+    return Identification(*found, explained, replays, prediction_error(replays), doubts)
 
 
 def find_cart(
@@ -128,18 +130,26 @@ def find_cart(
     substeps: int,
     most: int,
     laws: Sequence[Law],
+    on_step: Callable[[], object] = lambda: None,
 ) -> Found:
     """Return the cart that best explains `episodes`. Raises RecordingError where they are not sufficient.
 
     The law of the cart's friction is chosen here, among the registered candidates and further `laws`: the one
-    that best predicts seconds of the episodes that were left out of its fit. `models` gives the others. The
-    chosen one is then fitted to at most `most` windows of all episodes.
+    that best predicts seconds of the episodes that were left out of its fit. `models` gives the others, and
+    the law that is tried first. Each search starts where the one before it ended. The chosen law is then
+    fitted to at most `most` windows of all episodes.
     """
     judging = cut_judging(episodes, period, HORIZON, lead_periods(LEAD, period), MOVING)
 
-    def attempt(cart_friction: Law, count: int, steps: int, judged: bool, sharpened: bool) -> Candidate:
+    def attempt(
+        cart_friction: Law,
+        count: int,
+        steps: int,
+        near: Fit | None = None,
+        apart_from: Windows | None = judging,
+    ) -> Candidate:
         under, half_step = models._replace(cart_friction=cart_friction), period / steps / 2
-        windows = cut_windows(episodes, period, most=count, apart_from=judging if judged else None)
+        windows = cut_windows(episodes, period, most=count, apart_from=apart_from)
         fit = fit_cart(
             windows,
             nominal,
@@ -147,23 +157,29 @@ def find_cart(
             period,
             steps,
             known=WEIGHED,
-            sharpened=sharpened,
             extra_latency=half_step,  # (3.8) moves a cart half a step early
+            near=near,
+            sizes=None if near is None else first.fit.rms,
+            on_step=on_step,
         )
         dynamics = Dynamics.of(fit.parameters, under, period, steps, half_step)
         return Candidate(fit, dynamics, judged_error(predict(judging, dynamics)))
 
     frictions = dict.fromkeys([*(each for each in CART_FRICTIONS.loaded() if each.candidate), *laws])
-    screened = [attempt(each, most // 3, SCREENING_STEPS, True, False) for each in frictions]
+    first = attempt(models.cart_friction, most // 3, COARSE_STEPS)
+    screened = [
+        first if each == first.cart_friction else attempt(each, most // 3, COARSE_STEPS, first.fit)
+        for each in frictions
+    ]
     largest = CONTENDS * min(each.error.size for each in screened)
     contenders = {
-        each.cart_friction: attempt(each.cart_friction, most, substeps, True, True)
+        each.cart_friction: attempt(each.cart_friction, most, COARSE_STEPS, each.fit)
         for each in screened
         if each.error.size < largest
     }
     candidates = [contenders.get(each.cart_friction, each) for each in screened]
     best = min(contenders.values(), key=lambda each: each.error.size)
-    whole = attempt(best.cart_friction, most, substeps, False, True)
+    whole = attempt(best.cart_friction, most, substeps, best.fit, apart_from=None)
     return Found(widened(whole.fit, best, [*contenders.values()]), whole.dynamics, candidates)
 
 

@@ -29,8 +29,10 @@ FARTHEST = 3.0  # of STATE_SPREAD: the largest distance of an initial state from
 GUESSED_FROM = 3  # positions; when the motor reverses, later ones bend away from any parabola
 CORRELATED = 10.0  # this many correlated residuals of a window count as one independent residual
 FIRST_DAMPING, LEAST_DAMPING = 1e-3, 1e-6
+SETTLED_DAMPING = 0.01  # beyond it, a step is short because it is damped
 ATTEMPTS = 6  # to lower the cost from one linearization, with ever more damping
 CONVERGED = 1e-4  # relative fall of the cost
+SETTLED = 0.3  # standard deviations: the last step of a point; outliers' initial states may still move
 ROUNDS = 10  # steps from a first guess of the initial states
 
 
@@ -99,6 +101,19 @@ class NormalEquations(NamedTuple):
         rest = self.state_slope + torch.einsum("wis,i->ws", self.point_state, step)
         return step, -torch.einsum("wst,wt->sw", inverse, rest)
 
+    def length(self, step: Tensor) -> float:
+        """Return the length of a step of the point [U] in standard deviations, as windows disagree."""
+        matrix, slopes, _ = self.reduced(step.new_zeros(1))
+        pulled = matrix @ step
+        return float(pulled @ torch.linalg.solve(self.disagreement(slopes), pulled)) ** 0.5
+
+    @staticmethod
+    def disagreement(slopes: Tensor) -> Tensor:
+        """Return the covariance of the sum of the windows' slopes [W, U] and of the prior's, [U, U]."""
+        centred, count = slopes - slopes.mean(0), len(slopes)
+        identity = torch.eye(slopes.shape[1], dtype=slopes.dtype)
+        return centred.mT @ centred * count / max(1, count - 1) + identity
+
     @solvable()
     def covariance(self, episode: Tensor) -> Tensor:
         """Return that of the point, [U, U]: prior, and disagreement of windows and episodes (`episode` [W]).
@@ -108,10 +123,8 @@ class NormalEquations(NamedTuple):
         one is left out, which is the jackknife's variance (Tukey, 1958), to first order.
         """
         matrix, slopes, _ = self.reduced(torch.zeros(1, dtype=torch.float64))
-        inverse, count = torch.linalg.inv(matrix), len(slopes)
-        centred = slopes - slopes.mean(0)
-        spread = centred.mT @ centred * count / max(1, count - 1)
-        sampled = inverse @ (spread + torch.eye(len(matrix), dtype=matrix.dtype)) @ inverse
+        inverse = torch.linalg.inv(matrix)
+        sampled = inverse @ self.disagreement(slopes) @ inverse
         groups = episode.unique()
         if len(groups) < 2:
             return sampled
@@ -169,7 +182,7 @@ class Matching:
     `simulate` takes K points [U, K] and K initial states of each window [4, W, K] to counts [F, 2, W, K];
     `measured` [F, 2, W] are counts, `scale` [2] scales residuals, in counts, and `guess` [4, W] the initial
     states before the search. A point is prior to measurement 0 with standard deviation 1, and stays within
-    `limits`, [U] each.
+    `limits`, [U] each. `on_step` is called before each linearization.
     """
 
     def __init__(
@@ -179,8 +192,10 @@ class Matching:
         scale: Tensor,
         guess: Tensor,
         limits: tuple[Tensor, Tensor] | None = None,
+        on_step: Callable[[], object] = lambda: None,
     ) -> None:
         self.simulate, self.measured, self.scale, self.guess = simulate, measured, scale, guess
+        self.on_step = on_step
         self.limits = limits or (guess.new_empty(0), guess.new_empty(0))
         farthest = FARTHEST * STATE_SPREAD.unsqueeze(1)
         self.bounds = guess - farthest, guess + farthest
@@ -200,6 +215,7 @@ class Matching:
 
     def linearize(self, point: Tensor, motion: Tensor) -> Linearization:
         """Return the residuals and their differences: one simulation of U + 5 carts per window."""
+        self.on_step()
         size = len(point)
         moves = torch.block_diag(POINT_STEP * torch.eye(size, dtype=point.dtype), torch.diag(STATE_STEP))
         moves = torch.cat((moves.new_zeros(size + 4, 1), moves), 1)  # [U + 4, U + 5]
@@ -230,12 +246,14 @@ class Matching:
                 trial = (motion + moves).clamp(*self.bounds)
                 trial_cost = self.cost(trial_point, trial)
                 better = trial_cost < cost
+                moved = trial_point - point
                 point = trial_point if better.all() else point
                 motion, cost = torch.where(better, trial, motion), torch.where(better, trial_cost, cost)
                 damping = torch.where(better, (damping / 5).clamp(min=LEAST_DAMPING), damping * 8)
                 if better.any():
                     break
-            if shared and before - cost < CONVERGED * before:
+            settled = shared and damping.max() <= SETTLED_DAMPING and normal.length(moved) < SETTLED
+            if settled or (shared and before - cost < CONVERGED * before):
                 break
         return Match(point, motion, float(cost.sum()), made)
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from cartpole_rl.identification.matching import match_initial_states
 from cartpole_rl.identification.rollout import Dynamics
-from cartpole_rl.identification.windows import Windows, cut_stretches, lead_periods
+from cartpole_rl.identification.windows import Windows, cut_stretches, joined, lead_periods
 from cartpole_rl.physics.residual import Residual
 from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 from cartpole_rl.tasks.episode import Episode
@@ -102,18 +102,36 @@ class Replayed(NamedTuple):
     theta_error: Array  # [S, T + 1] rad, wrapped
 
 
+def stretches(episode: Episode, dynamics: Dynamics, restart: float) -> Windows:
+    """Return the stretches of a replay.
+
+    Raises RecordingError for an episode that is too short, or has another control period than `dynamics`.
+    """
+    return cut_stretches(episode, dynamics.period, restart, lead_periods(LEAD, dynamics.period))
+
+
 def replay(episodes: Sequence[Episode], dynamics: Dynamics, restart: float) -> list[Replayed]:
     """Return each episode beside the cart of `dynamics`, which is put back onto it every `restart` s.
 
     Raises RecordingError where an episode has another control period than `dynamics`, or is too short.
     """
-    period, replays = dynamics.period, []
-    for episode in episodes:
-        windows = cut_stretches(episode, period, restart, lead_periods(LEAD, period))
-        simulated, error, _ = predict(windows, dynamics)
-        starts = episode.time[windows.first + windows.lead]
-        time = starts[:, None] + np.arange(len(simulated)) * period
-        motion = (each[:, channel].T for each in (simulated, error) for channel in range(2))
+    return replay_stretches(episodes, [stretches(each, dynamics, restart) for each in episodes], dynamics)
+
+
+def replay_stretches(
+    episodes: Sequence[Episode], cut: Sequence[Windows], dynamics: Dynamics
+) -> list[Replayed]:
+    """Return each episode beside the cart of `dynamics`, in its own `stretches`; all run at once."""
+    if not episodes:
+        return []
+    simulated, error, _ = predict(joined(cut), dynamics)
+    steps = np.arange(len(simulated)) * dynamics.period
+    ends = np.cumsum([windows.number for windows in cut])
+    replays = []
+    for episode, windows, end in zip(episodes, cut, ends, strict=True):
+        own = slice(end - windows.number, end)
+        time = episode.time[windows.first + windows.lead][:, None] + steps
+        motion = (each[:, channel, own].T for each in (simulated, error) for channel in range(2))
         replays.append(Replayed(episode, time, *motion))
     return replays
 

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from cartpole_rl.identification.unknowns import LONGEST_LATENCY
 from cartpole_rl.identification.windows import history_periods
-from cartpole_rl.physics.actuator import step_forces
-from cartpole_rl.physics.dynamics import Drive, MakeAddition, State, run_period
+from cartpole_rl.physics.actuator import LAG, lag_shares, mean_commands, step_forces
+from cartpole_rl.physics.dynamics import Drive, MakeAddition, State, advance, mechanism, run_period
 from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import CartParameters, cart_column
 from cartpole_rl.physics.residual import UNDER_WAY, Residual, members_in_turn
@@ -34,11 +34,18 @@ def rollout(
     them, since its force lags behind. `extra_latency`, s, is added to each latency: (3.8) moves a cart half a
     step early, so a lead of half a step makes latencies independent of the step.
     """
-    cart = CartParameters(table)
-    state, force = State(*motion.unbind(0)), torch.zeros_like(motion[0])
-    latency = cart.latency + extra_latency
-    history, in_effect = history_periods(period), motors_in_effect(period)
+    cart, state = CartParameters(table), State(*motion.unbind(0))
     counts = [as_counts(state, cart)]
+    if addition is None:
+        body, step = mechanism(cart), period / substeps
+        forces = forces_in_steps(cart, motors, models, period, substeps, extra_latency)
+        for number, force in enumerate(forces, 1):
+            state = advance(state, force, cart, body, models, step)
+            if number % substeps == 0:
+                counts.append(as_counts(state, cart))
+        return torch.stack(counts)
+    latency, force = cart.latency + extra_latency, torch.zeros_like(motion[0])
+    history, in_effect = history_periods(period), motors_in_effect(period)
     for now in range(in_effect - 1, len(motors)):
         drive = Drive(force, [motors[now - age] for age in range(in_effect)])
         if now < history:
@@ -47,6 +54,34 @@ def rollout(
         state, (force, _) = run_period(state, drive, latency, cart, models, period, substeps, addition)
         counts.append(as_counts(state, cart))
     return torch.stack(counts)
+
+
+def forces_in_steps(
+    cart: CartParameters,
+    motors: Tensor,
+    models: Models,
+    period: float,
+    substeps: int,
+    extra_latency: float = 0.0,
+) -> Tensor:
+    """Return the mean force in each of the T x `substeps` steps of a window, N, [T x substeps, N].
+
+    Equals `step_forces`, period by period; `motors` [H + T, N] and `extra_latency` are as in `rollout`.
+    """
+    law, history, in_effect = models.actuator, history_periods(period), motors_in_effect(period)
+    held = law(motors, cart)
+    every = [held[in_effect - 1 - age : len(held) - age] for age in range(in_effect)]
+    means = mean_commands(every, cart.latency + extra_latency, period, substeps)
+    targets = torch.stack(means, 1).flatten(0, 1)
+    before = substeps * (history - in_effect + 1)  # steps of history
+    if LAG not in law.reads:
+        return targets[before:]
+    mean, end = lag_shares(cart.motor_time_constant, period / substeps)
+    gaps, force = [], torch.zeros_like(targets[0])
+    for target in targets:
+        gaps.append(force - target)
+        force = target + gaps[-1] * end
+    return targets[before:] + torch.stack(gaps[before:]) * mean
 
 
 def motors_in_effect(period: float) -> int:

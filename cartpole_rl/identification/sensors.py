@@ -12,7 +12,7 @@ Derivatives are those of cubics through seven or more samples (Savitzky and Gola
 Intervals are 95 % by a bootstrap over recordings, or over pieces of one recording.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -110,8 +110,13 @@ class Samples:
         return self.smooth(np.concatenate([delayed(motion.motor, periods) for motion in self._motions]))
 
 
-def question_sensors(motions: Sequence[Motion], period: float, seed: int = 0) -> Sensors:
-    """Return what the motion says of the sensors of recordings with the control period `period`, s."""
+def question_sensors(
+    motions: Sequence[Motion], period: float, seed: int = 0, on_step: Callable[[], object] = lambda: None
+) -> Sensors:
+    """Return what the motion says of the sensors of recordings with the control period `period`, s.
+
+    `on_step` is called for each sample of the bootstrap.
+    """
     rows = max(LEAST_ROWS, 2 * round(WINDOW / period / 2) + 1)
     kept = [motion for motion in motions if len(motion.motor) > rows + 2]
     if not kept:
@@ -123,11 +128,11 @@ def question_sensors(motions: Sequence[Motion], period: float, seed: int = 0) ->
     moves = len(samples.piece) >= LEAST_SAMPLES and samples.x_ddot.std() > 0
     scale = zero = position = delay = None
     if moves and swings:
-        found = angle_estimates(samples, dice)
+        found = angle_estimates(samples, dice, on_step)
         known = (each.high - each.low < widest for each, widest in zip(found, WIDEST, strict=True))
         scale, zero, position = (each if sure else None for each, sure in zip(found, known, strict=True))
     if moves and pushes[0].std() > 0:
-        delay = delay_estimate(samples, pushes, period, dice)
+        delay = delay_estimate(samples, pushes, period, dice, on_step)
     correlations = [_correlation(push, samples.x_ddot) for push in pushes]
     return Sensors(scale, zero, position, delay, max(correlations, key=abs), _lag(samples))
 
@@ -142,7 +147,9 @@ def delayed(motor: Array, periods: float) -> Array:
     return np.interp(steps + 0.5 - periods, steps, edges) - np.interp(steps - 0.5 - periods, steps, edges)
 
 
-def angle_estimates(samples: Samples, dice: np.random.Generator) -> tuple[Estimate, Estimate, Estimate]:
+def angle_estimates(
+    samples: Samples, dice: np.random.Generator, on_step: Callable[[], object]
+) -> tuple[Estimate, Estimate, Estimate]:
     """Return scale and zero of the angle, and the scale of the position."""
 
     def residuals(guess: Array, weights: Array | None = None) -> tuple[Array, Array]:
@@ -154,6 +161,7 @@ def angle_estimates(samples: Samples, dice: np.random.Generator) -> tuple[Estima
         return float(residuals(guess)[0].std() / samples.theta_ddot.std())
 
     def fitted(start: Array, weights: Array | None = None) -> tuple[float, float, float]:
+        on_step()
         found = least_squares(
             lambda guess: residuals(guess, weights)[0], start, diff_step=1e-4, loss="soft_l1", f_scale=size
         )
@@ -171,12 +179,17 @@ def angle_estimates(samples: Samples, dice: np.random.Generator) -> tuple[Estima
 
 
 def delay_estimate(
-    samples: Samples, pushes: Sequence[Array], period: float, dice: np.random.Generator
+    samples: Samples,
+    pushes: Sequence[Array],
+    period: float,
+    dice: np.random.Generator,
+    on_step: Callable[[], object],
 ) -> Estimate:
     """Return the time from a state to the effect of its motor value on the cart, s."""
     direction = np.tanh(samples.x_dot / SPEED)
 
     def best(weights: Array | None) -> float:
+        on_step()
         terms = (np.stack((push, samples.x_dot, direction, samples.x), 1) for push in pushes)
         sizes = [np.mean(_regression(each, samples.x_ddot, weights)[1] ** 2) for each in terms]
         return period * _lowest(DELAYS, np.array(sizes))

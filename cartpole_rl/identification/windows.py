@@ -69,6 +69,14 @@ class Windows(NamedTuple):
         return bool((within & (self.episode == episode)).any())
 
 
+def joined(windows: Sequence[Windows]) -> Windows:
+    """Return windows of one length and lead together, in their order."""
+    positions, motors, episode, first = (
+        np.concatenate([each[part] for each in windows], -1) for part in range(4)
+    )
+    return Windows(positions, motors, episode, first, windows[0].lead)
+
+
 def history_periods(period: float) -> int:
     """Return the number H of motor values before a window, at a control period in s."""
     return max(LEAST_HISTORY, math.ceil(HISTORY / period - 1e-9))

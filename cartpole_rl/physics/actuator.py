@@ -96,7 +96,13 @@ def lagged_force(
     force: "Tensor", target: "Tensor", time_constant: "Tensor", step: float
 ) -> "tuple[Tensor, Tensor]":
     """Return (mean force over the step, force at its end), N, [N] each: the exact first-order lag."""
+    mean, end = lag_shares(time_constant, step)
+    gap = force - target
+    return target + gap * mean, target + gap * end
+
+
+def lag_shares(time_constant: "Tensor", step: float) -> "tuple[Tensor, Tensor]":
+    """Return the shares of a force's gap to its target that are left: mean over a step, and at its end."""
     ratio = time_constant.clamp(min=SHORTEST_TIME_CONSTANT) / step
     decay = (-1 / ratio).exp()
-    gap = force - target
-    return target + gap * ratio * (1 - decay), target + gap * decay
+    return ratio * (1 - decay), decay

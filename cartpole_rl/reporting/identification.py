@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from cartpole_rl.drawing import colours
 from cartpole_rl.identification.experiments import EXPERIMENTS, HELD_OUT
-from cartpole_rl.identification.identify import HORIZON, Candidate, Identification, PredictionError
-from cartpole_rl.identification.prediction import Replayed, replay
+from cartpole_rl.identification.identify import Candidate, Identification, PredictionError
+from cartpole_rl.identification.prediction import Replayed
 from cartpole_rl.identification.quantities import Quantity, intervals
 from cartpole_rl.physics.friction import viscous_coefficient
 from cartpole_rl.physics.laws import Law
@@ -33,8 +33,8 @@ from cartpole_rl.tasks.episode import Episode
 CAPTIONS = {  # figures/<name>.png: caption
     "friction_and_force": "Friction of the cart and force of the motor, with 95 % bands",
     "intervals": "Identified values with 95 % intervals, and prior values",
-    "experiments": "The experiments, measured and simulated; the simulated cart is reset to the measured "
-    "state every second",
+    "experiments": "The experiments (at most 12), measured and simulated; the simulated cart is reset to the "
+    "measured state every second",
     "held_out": "The held-out experiment, which was not used in the fit",
     "spectrum": "Remaining uncertainty of each combination of parameters, relative to the prior",
 }
@@ -42,6 +42,7 @@ FASTEST = 0.6  # m/s
 MOST_SAMPLES = 500  # carts in a band
 IDENTIFIED, PRIOR, SIMULATED = colours.BLUE, colours.MUTED, colours.VERMILLION
 TAIL = 2.5  # percent beyond each end of an interval
+MOST_DRAWN = 12  # recordings
 LONGEST = 14.0  # s of an experiment that are drawn
 FARTHEST = 12.0  # half widths of the interval; a prior value farther away becomes an arrow
 WRITTEN = 0.3  # smallest weight in a combination that is written as a number
@@ -70,14 +71,13 @@ def identification_figures(
 ) -> dict[str, Figure]:
     """Return the figures of CAPTIONS; `carts` [P, N] are drawn from the fit to the `fitted` recordings."""
     fit, models = found.fit, found.models
-    replays = replay([*fitted.values()], found.dynamics, HORIZON)
     return {
         "friction_and_force": friction_and_force_figure(
             friction_curve(fit.parameters, carts, fit.nominal, models.cart_friction),
             force_curve(fit.parameters, carts, fit.nominal, models.actuator),
         ),
         "intervals": interval_figure(intervals(fit, carts)),
-        "experiments": experiments_figure(dict(zip(fitted, replays, strict=True))),
+        "experiments": experiments_figure(thinned(dict(zip(fitted, found.fitted, strict=True)))),
         "held_out": experiments_figure({HELD_OUT: found.held_out[0]}),
         "spectrum": spectrum_figure(fit.covariance, [unknown.name for unknown in fit.unknowns]),
     }
@@ -231,6 +231,13 @@ def _draw_interval(axes: Axes, height: int, quantity: Quantity) -> None:
     axes.plot(np.clip(away, -FARTHEST, FARTHEST), height, marker, color=PRIOR, markersize=6)
     text = f"{interval_text(value, low, high)} {quantity.unit}   (prior {number_text(prior)})"
     style.beside(axes, height, text, colours.INK)
+
+
+def thinned(replays: Mapping[str, Replayed]) -> dict[str, Replayed]:
+    """Return at most MOST_DRAWN replays, evenly spread over all."""
+    names = list(replays)
+    chosen = np.unique(np.linspace(0, len(names) - 1, min(MOST_DRAWN, len(names))).round().astype(int))
+    return {names[index]: replays[names[index]] for index in chosen}
 
 
 def experiments_figure(replays: Mapping[str, Replayed]) -> Figure:

@@ -94,7 +94,8 @@ def identify_cart(config: IdentifyConfig, folder: Path) -> None:
     by_file, held_out_by_file = (
         {str(files[name]): episode for name, episode in chosen.items()} for chosen in (fitted, held_out)
     )
-    check_recordings(by_file, held_out_by_file, config.control_period)
+    with progress_bar(None, "steps", desc="checking", leave=False) as bar:
+        check_recordings(by_file, held_out_by_file, config.control_period, bar.update)
     if config.source is not None:
         write_config(folder, "identify", config.model_dump(mode="json", by_alias=True))
     seconds = sum(each.steps for each in fitted.values()) * config.control_period
@@ -106,7 +107,10 @@ def identify_cart(config: IdentifyConfig, folder: Path) -> None:
         regress([*fitted.values(), *held_out.values()], nominal, models, period, truth, folder)
         return
     laws = config.friction_laws
-    found = identify(by_file, held_out_by_file, nominal, models, period, substeps, config.windows, laws)
+    with progress_bar(None, "steps", desc="fitting") as bar:
+        found = identify(
+            by_file, held_out_by_file, nominal, models, period, substeps, config.windows, laws, bar.update
+        )
     carts = found.fit.draw(config.carts, np.random.default_rng(config.seed))
     write_choices(found, carts, folder)
     write_json(folder / IDENTIFIED, results(found, carts) | errors(found.fit.parameters, truth, BY_HAND))

@@ -60,7 +60,8 @@ def import_logs(config: ImportConfig, folder: Path) -> Sensors:
         )
     period = logs[paths[0]].report.period
     motions = [Motion(part.x, part.theta, part.motor.astype(float)) for part in parts]
-    sensors = question_sensors(motions, period)
+    with progress_bar(None, "steps", desc="sensors") as bar:
+        sensors = question_sensors(motions, period, on_step=bar.update)
     found = [*doubts([log.report for log in logs.values()], sensors, period, config.layout)]
     write_config(folder, "import", {**config.model_dump(mode="json", by_alias=True), "seed": 0})
     stems = Counter(path.stem for path in logs)

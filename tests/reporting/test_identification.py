@@ -41,7 +41,7 @@ def candidate(friction: Law, x: float, theta: float) -> Candidate:
 def found(warnings: list[str]) -> Identification:
     best = candidate(CART_FRICTIONS.find("step"), 1e-3, 0.01)
     candidates = [best, candidate(CART_FRICTIONS.find("linear"), 2e-3, 0.02)]
-    return Identification(FIT, best.dynamics, candidates, [], best.error, warnings)
+    return Identification(FIT, best.dynamics, candidates, [], [], best.error, warnings)
 
 
 def test_the_table_has_values_with_intervals_and_units() -> None:

@@ -24,7 +24,7 @@ def write(models: Models, nominal: dict[str, float], folder: Path) -> dict[str, 
     fit = Fit(unknowns, np.full(size, 0.123456789), np.eye(size), nominal, np.ones(2), np.zeros(2), 1.0, 1)
     dynamics = Dynamics.of(fit.parameters, models, 0.02, 4)
     error = PredictionError(1e-3, 0.01)
-    found = Identification(fit, dynamics, [Candidate(fit, dynamics, error)], [], error, [])
+    found = Identification(fit, dynamics, [Candidate(fit, dynamics, error)], [], [], error, [])
     write_choices(found, fit.draw(10, np.random.default_rng(0)), folder)
     return {name: value for name, value in fit.parameters.items() if name not in Pole.model_fields}
 
