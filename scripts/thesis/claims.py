@@ -18,6 +18,7 @@ A statement is a statistic (STATISTICS) with its values, an operator and a numbe
 """
 
 import re
+import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from enum import StrEnum
@@ -34,7 +35,7 @@ from results import SMALLEST, StudyResults
 from scipy.stats import binomtest
 
 from cartpole_rl.checking import validated
-from cartpole_rl.errors import ConfigError
+from cartpole_rl.errors import CartPoleError, ConfigError
 from cartpole_rl.files import write_text
 from cartpole_rl.reporting.results import Agent, Curve
 from cartpole_rl.reporting.statistics import (
@@ -104,17 +105,17 @@ class Statement(NamedTuple):
     word: Word
 
 
-def _late(curve: Curve, first: float, last: float) -> float:
+def _mean_between(curve: Curve, first: float, last: float) -> float:
     """Return the mean of a curve between two shares of its length."""
     at, values = np.array(curve).T
     return float(values[(at > first * at[-1]) & (at <= last * at[-1])].mean())
 
 
 CURVES: Mapping[str, tuple[str, Callable[[Curve], float]]] = {  # name: curve, number
-    "@loss": ("loss", lambda curve: _late(curve, LATE, 1.0)),
-    "@growth": ("loss", lambda curve: _late(curve, LATE, 1.0) - _late(curve, 0.25, MIDDLE)),
+    "@loss": ("loss", lambda curve: _mean_between(curve, LATE, 1.0)),
+    "@growth": ("loss", lambda curve: _mean_between(curve, LATE, 1.0) - _mean_between(curve, 0.25, MIDDLE)),
     "@jumps": ("score_upright", lambda curve: float(np.abs(np.diff([y for _, y in curve])).mean())),
-    "@start": ("score_upright", lambda curve: _late(curve, 0.0, 0.3)),
+    "@start": ("score_upright", lambda curve: _mean_between(curve, 0.0, 0.3)),
     "@first": ("score_upright", lambda curve: next((x for x, y in curve if y > 400), curve[-1][0])),
 }
 
@@ -201,7 +202,9 @@ class Evidence:
         return found
 
     def statistic(self, words: list[str], study: str) -> Estimate:
-        """Return a statistic: its name, and the numbers and values that it takes."""
+        """Return a statistic: its name, and the numbers and values that it takes. Raises ConfigError."""
+        if words[0] not in STATISTICS:
+            raise ConfigError(f"{words[0]}: there is no such statistic; give one of {', '.join(STATISTICS)}")
         function = STATISTICS[words[0]][1]
         return function(*(float(w) if _is_number(w) else self.values(w, study) for w in words[1:]))
 
@@ -296,7 +299,10 @@ def _with_interval(name: str, found: Estimate) -> str:
 
 def read_claims(file: Path = CLAIMS) -> Claims:
     """Return the claims in a YAML file. Raises ConfigError."""
-    return validated(Claims, yaml.safe_load(file.read_text(encoding="utf-8")))
+    try:
+        return validated(Claims, yaml.safe_load(file.read_text(encoding="utf-8")))
+    except (ConfigError, yaml.YAMLError) as error:
+        raise ConfigError(f"{file}: {' '.join(str(error).split())}") from None
 
 
 def blocks(claims: Claims, evidence: Evidence) -> dict[str, str]:
@@ -359,7 +365,9 @@ def _tables(parts: tuple[Table, ...], evidence: Evidence) -> str:
 
 
 def rebuilt(page: str, contents: Mapping[str, str]) -> str:
-    """Return a page with its generated blocks made again. Raises KeyError for an unknown block."""
+    """Return a page with its generated blocks made again. Raises ConfigError for an unknown block."""
+    if unknown := {name for _, name, _ in BLOCK.findall(page)} - contents.keys():
+        raise ConfigError(f"{min(unknown)}: there is no such block; give one of {', '.join(contents)}")
     return BLOCK.sub(lambda found: f"{found[1]}{contents[found[2]]}\n", page)
 
 
@@ -368,8 +376,8 @@ def stored() -> Evidence:
     return Evidence({each.name: each for each in read_studies(DATA) if each.agents})
 
 
-def main() -> None:
-    """Rewrite the generated blocks of all pages."""
+def rebuild_pages() -> None:
+    """Rewrite the generated blocks of all pages. Raises ConfigError."""
     contents = blocks(read_claims(), stored())
     for page in PAGES:
         text = (CHECKOUT / page).read_text(encoding="utf-8")
@@ -378,5 +386,15 @@ def main() -> None:
             print(f"{page} is rewritten")
 
 
+def main() -> int:
+    """Rewrite the pages; return the exit code."""
+    try:
+        rebuild_pages()
+    except (CartPoleError, OSError) as error:
+        print(f"scripts/thesis/claims.py: {' '.join(str(error).split())}", file=sys.stderr)
+        return getattr(error, "exit_code", CartPoleError.exit_code)
+    return 0
+
+
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -1,6 +1,7 @@
 """The stored results of the studies: complete data, and pages whose tables and verdicts are theirs."""
 
 import re
+from functools import cache
 
 import pytest
 from claims import PAGES, Evidence, Row, Word, blocks, read_claims, rebuilt
@@ -32,10 +33,15 @@ def test_set_ups_have_ten_agents() -> None:
     assert {name for name, count in counts.items() if count != {10}} == {"integrators"}  # a pole alone
 
 
+@cache
+def generated() -> dict[str, str]:
+    return blocks(CLAIMS, EVIDENCE)
+
+
 @pytest.mark.parametrize("page", PAGES)
 def test_tables_verdicts_and_numbers_are_those_of_the_data(page: str) -> None:
     text = (ROOT / page).read_text(encoding="utf-8")
-    assert rebuilt(text, blocks(CLAIMS, EVIDENCE)) == text, "run scripts/thesis/claims.py"
+    assert rebuilt(text, generated()) == text, "run scripts/thesis/claims.py"
 
 
 def test_each_study_of_the_thesis_has_a_row_and_the_verdict_of_its_rows() -> None:
