@@ -46,6 +46,7 @@ IN_SECONDS = (  # ends of the names of settings whose bounds are in seconds
     "latency",
     "latency_jitter",
     "control_period",
+    "duration",
     "time_constant",
     "nudge_after",
     "restart",

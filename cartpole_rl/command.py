@@ -38,7 +38,7 @@ from cartpole_rl.exits import (
 from cartpole_rl.run_folder import CHECKPOINTS, RESUME, use_of
 from cartpole_rl.settings import Settings
 from cartpole_rl.sweeps import as_multirun, is_job, run_as_job, shown_jobs, sweep
-from cartpole_rl.terminal import program
+from cartpole_rl.terminal import program, waiting
 
 if TYPE_CHECKING:
     from cartpole_rl.cli import Verb
@@ -92,7 +92,9 @@ def run_job(
         config = validated(verb.find(verb.settings), as_mapping(composed), partial(own_file_of, words=words))
         if verb.check:
             call(verb.find(verb.check), config=config, folder=folder, words=words)
-        return call(verb.find(verb.function), config=config, folder=folder, words=words)
+        with waiting("starting"):  # PyTorch takes seconds to import
+            function = verb.find(verb.function)
+        return call(function, config=config, folder=folder, words=words)
 
     with job_signals():
         try:

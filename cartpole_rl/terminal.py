@@ -4,17 +4,27 @@ import os
 import re
 import shlex
 import sys
-from contextlib import suppress
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 READER_LEFT = 141  # exit code, as of a program that SIGPIPE ends
+BLINK = 1.0  # s, between two updates of a line about work under way
+_under_way: list[str] = []  # the texts of `waiting`, innermost last; "" shows nothing
 
 
 def confirm(text: str) -> bool:
     """Show `text` and wait for Enter. Return False at once if standard input is not a terminal."""
     if sys.stdin is None or not sys.stdin.isatty():
         return False
+    with waiting(""):
+        return _confirmed(text)
+
+
+def _confirmed(text: str) -> bool:
     print(f"{text}.", file=sys.stderr)
     print("Check the cart. It homes as soon as you confirm: keep the track clear.", file=sys.stderr)
     discard_typed()
@@ -84,6 +94,62 @@ def progress_bar(total: int | None, unit: str, **options: Any) -> Any:
 
     is_terminal = sys.stderr is not None and sys.stderr.isatty()
     return tqdm(total=total, unit=f" {unit}", dynamic_ncols=True, disable=not is_terminal, **options)
+
+
+@contextmanager
+def waiting(text: str) -> Iterator[None]:
+    """Show `text` and the seconds so far on a terminal's stderr while the block runs.
+
+    Progress bars are updated instead if there are any. A block inside another one shows its own text; with ""
+    nothing is shown. Not for a loop that keeps a cart's time: a thread does it.
+    """
+    # a process that was started by another one shares its terminal and leaves it alone
+    processes = sys.modules.get("multiprocessing.process")
+    is_child = processes is not None and processes.parent_process() is not None
+    if sys.stderr is None or not sys.stderr.isatty() or is_child:
+        yield
+        return
+    ended, started = threading.Event(), time.monotonic()
+    _under_way.append(text)
+    place = len(_under_way)
+
+    def show() -> None:
+        while not ended.wait(BLINK):
+            if text and len(_under_way) == place:
+                _show_line(f"{text}, {time.monotonic() - started:.0f} s")
+
+    thread = threading.Thread(target=show, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+        del _under_way[place - 1 :]
+        if text and time.monotonic() - started > BLINK and not _bars():
+            _write("\r\x1b[K")
+
+
+def _show_line(line: str) -> None:
+    """Show a line that the next one replaces, or update the progress bars."""
+    if bars := _bars():
+        for bar in bars:
+            bar.refresh()
+    else:
+        _write(f"\r\x1b[K{line}\r")
+
+
+def _bars() -> list[Any]:
+    """Return the progress bars that are shown."""
+    tqdm = sys.modules.get("tqdm")
+    shown = [*getattr(tqdm.tqdm, "_instances", ())] if tqdm else []
+    return [bar for bar in shown if not bar.disable]
+
+
+def _write(text: str) -> None:
+    with suppress(OSError, ValueError):  # the terminal is closed
+        sys.stderr.write(text)
+        sys.stderr.flush()
 
 
 def print_results(folder: Path, files: str, following: str) -> None:

@@ -4,6 +4,7 @@ import os
 import pty
 import subprocess
 import sys
+import termios
 import time
 from pathlib import Path
 
@@ -52,3 +53,31 @@ def test_an_earlier_enter_does_not_answer_the_question(tmp_path: Path) -> None:
 
 def test_without_a_terminal_no_question_is_asked() -> None:
     assert not confirm("the cart latched a fault")
+
+
+WAIT = """
+import time
+from cartpole_rl.terminal import progress_bar, waiting
+with waiting("homing"):
+    time.sleep(1.2)
+    with waiting(""):
+        time.sleep(1.2)
+with progress_bar(2, "episodes") as bar, waiting("driving"):
+    time.sleep(1.2)
+print("end", flush=True)
+"""
+
+
+def test_work_under_way_is_shown_with_its_seconds_and_a_bar_goes_on() -> None:
+    master, slave = pty.openpty()
+    termios.tcsetwinsize(slave, (24, 100))
+    with subprocess.Popen([sys.executable, "-c", WAIT], stdin=slave, stdout=slave, stderr=slave):
+        shown = read_until(master, b"end").decode()
+    os.close(slave)
+    os.close(master)
+    assert shown.count("homing, 1 s") == 1
+    assert "homing, 2 s" not in shown  # the inner block shows nothing
+    assert "driving" not in shown
+    assert shown.count("0/2 [00:01") >= 1
+    piped = subprocess.run([sys.executable, "-c", WAIT], capture_output=True, text=True, check=True)
+    assert (piped.stdout, piped.stderr) == ("end\n", "")

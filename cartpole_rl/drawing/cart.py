@@ -212,7 +212,7 @@ class CartDrawing:
         right, font = FINER * (SIZE[0] - MARGIN), _font(15)
         clock = f"{self.episode.time[row] - self.episode.time[0]:.2f} s"
         draw.text((right, FINER * 24), clock, fill=colours.INK, font=font, anchor="rm")
-        score = f"score {self.score[row]:.0f}"
+        score = f"score {self.score[row]:z.0f}"
         draw.text((right - FINER * 75, FINER * 24), score, fill=colours.INK, font=font, anchor="rm")
         if self.ending and row == len(self.upright) - 1:
             place = (FINER * MARGIN, FINER * 46)

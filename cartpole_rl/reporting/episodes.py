@@ -185,4 +185,4 @@ def _summary(episode: Episode) -> str:
     """Return the episode in one line."""
     share = 100 * is_upright(episode.theta[1:]).mean()
     shares = f"upright {share:.0f} % of the time{guard_text(episode)}"
-    return f"score {episode.score.sum():.0f},  {shares},  {ending_text(episode)}"
+    return f"score {episode.score.sum():z.0f},  {shares},  {ending_text(episode)}"

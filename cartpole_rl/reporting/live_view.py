@@ -134,7 +134,7 @@ def gauges(snapshot: Snapshot, width: int) -> list[tuple[str, str]]:
         (gauge("cart", snapshot.x / snapshot.track_half_length, place, width), ""),
         (gauge("pole", lean / math.pi, angle, width), upright),
         (gauge("motor", snapshot.motor / LARGEST_MOTOR, f"{snapshot.motor:+5d}", width), ""),
-        (f"{'score':<{LABEL}}{snapshot.score:.0f}   track guard {guard}", RED if snapshot.guard else ""),
+        (f"{'score':<{LABEL}}{snapshot.score:z.0f}   track guard {guard}", RED if snapshot.guard else ""),
         (f"{'link':<{LABEL}}{late}", RED if snapshot.late_ticks else ""),
     ]
 

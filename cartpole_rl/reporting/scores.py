@@ -47,18 +47,24 @@ def score_table(summary: Mapping[str, Any], heading: str) -> str:
 
 
 def score_columns(summaries: Mapping[str, Mapping[str, Any]], heading: str) -> str:
-    """Return a table with a column of means for each summary, by its name."""
-    rows = [
-        {"figure": label, **{name: mean_text(summary[key]) for name, summary in summaries.items()}}
-        for key, label in SCORES.items()
-        if any(summary[key] is not None for summary in summaries.values())
-    ]
+    """Return a table with a column of means for each summary, by its name.
+
+    The intervals of a row have one form: by their ends if one of them is asymmetric.
+    """
+    rows = []
+    for key, label in SCORES.items():
+        means = {name: summary[key] for name, summary in summaries.items()}
+        if any(mean is not None for mean in means.values()):
+            texts = {name: mean_text(mean) for name, mean in means.items()}
+            if any(" to " in (text or "") for text in texts.values()):
+                texts = {name: mean_text(mean, ends=True) for name, mean in means.items()}
+            rows.append({"figure": label, **texts})
     return table(rows, {"figure": heading, **{name: name for name in summaries}})
 
 
-def mean_text(value: Mapping[str, Any] | None) -> str | None:
-    """Return a mean with its interval; None without one."""
-    return None if value is None else interval_text(value["mean"], value["low"], value["high"])
+def mean_text(value: Mapping[str, Any] | None, ends: bool = False) -> str | None:
+    """Return a mean with its interval, by its `ends` or as `interval_text` chooses; None without one."""
+    return None if value is None else interval_text(value["mean"], value["low"], value["high"], ends)
 
 
 def learning_curve(history: Sequence[Mapping[str, Any]], measure: Measure) -> Figure:

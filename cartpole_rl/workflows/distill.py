@@ -50,7 +50,7 @@ def distill(config: DistillConfig, folder: Path) -> float:
     agent = AgentCheckpoint(settings, student.state_dict(), distillation.transitions, score, tuned_poles)
     save_agent(folder / CHECKPOINTS / LAST, agent)
     report_episodes(folder, episodes, training.plant.kind, training.pole, training.task)
-    print(f"a network of {list(config.hidden)} hidden units scores {score:.0f}")
+    print(f"a network of {list(config.hidden)} hidden units scores {score:z.0f}")
     files = f"{METRICS}, {FIGURES}/ and {CHECKPOINTS}/"
     print_results(folder, files, f"cartpole-export {as_word('run', shown(folder))} format=c")
     return score

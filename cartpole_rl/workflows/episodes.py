@@ -6,7 +6,7 @@
 import json
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,7 +31,7 @@ from cartpole_rl.reporting.texts import guard_text
 from cartpole_rl.run_folder import CONFIG, METRICS, check_program
 from cartpole_rl.tasks.episode import Episode, Origin
 from cartpole_rl.tasks.settings import Measure
-from cartpole_rl.terminal import confirm, print_message, progress_bar
+from cartpole_rl.terminal import confirm, print_message, progress_bar, waiting
 from cartpole_rl.workflows.build import (
     TrainedAgent,
     compiled_training,
@@ -114,7 +114,8 @@ class Evaluation:
         config = self.config
         with LiveView(config.plant.title, config.view) as live:
             followed(self.env, live.memory)
-            with precedence(config.plant, config.emulator):
+            silent = config.plant.is_real_time(config.emulator) or config.view != "none"
+            with nullcontext() if silent else waiting(name), precedence(config.plant, config.emulator):
                 yield from with_progress(episodes, config.episodes, name, self.settings.task.measure)
 
     @property
@@ -123,6 +124,7 @@ class Evaluation:
         return Knocks(self.env.plant, self.config.knock) if self.config.knock else None
 
 
+@waiting("preparing the cart and its track guard")
 def prepared(config: EvaluateConfig) -> Evaluation:
     """Load the agent of `config` and build its environment. Raises CartPoleError."""
     again = repetition(config)
@@ -157,7 +159,7 @@ def with_progress(episodes: Iterator[Episode], count: int, name: str, measure: M
     with progress_bar(count, name) as progress:
         for episode in episodes:
             progress.set_postfix_str(
-                f"{measure} {episode.total(measure):.0f}{guard_text(episode)}", refresh=False
+                f"{measure} {episode.total(measure):z.0f}{guard_text(episode)}", refresh=False
             )
             progress.update()
             yield episode

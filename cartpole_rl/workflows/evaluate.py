@@ -127,7 +127,7 @@ def draw_beside_simulation(evaluation: Evaluation, episode: Episode, path: Path)
     pole, track = evaluation.settings.pole.nominal.length, evaluation.settings.task.x_max
     pictures, times = side_by_side((episode, predicted), titles, pole, track)
     write_animation(path, pictures, times, evaluation.config.animation.mp4)
-    scores = f"score {episode.score.sum():.0f}, predicted by simulation {predicted.score.sum():.0f}"
+    scores = f"score {episode.score.sum():z.0f}, predicted by simulation {predicted.score.sum():z.0f}"
     return f"first episode: {scores}; {path.name} shows both"
 
 

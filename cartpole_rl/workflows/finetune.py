@@ -53,7 +53,15 @@ from cartpole_rl.run_folder import (
     write_config,
     write_json,
 )
-from cartpole_rl.terminal import as_word, confirm, print_loop_time, print_message, print_results, shown
+from cartpole_rl.terminal import (
+    as_word,
+    confirm,
+    print_loop_time,
+    print_message,
+    print_results,
+    shown,
+    waiting,
+)
 from cartpole_rl.workflows.build import (
     evaluated_env,
     evaluated_settings,
@@ -76,6 +84,7 @@ POLL = 0.1  # s between two looks for weights
 show = partial(print_message, "finetune")
 
 
+@waiting("preparing")
 def finetune(config: FinetuneConfig, folder: Path, words: Sequence[str] = ()) -> None:
     """Fine-tune the agent of `config.run` on the cart of `config.plant`, or resume the run in `folder`.
 

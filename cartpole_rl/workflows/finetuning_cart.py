@@ -148,7 +148,7 @@ class FinetuningCart:
         self.log.scalars({f"link/{key}": float(value) for key, value in vars(link.summary()).items()}, step)
         self.log.flush()
         tqdm.write(
-            f"{stage} {number + 1}: score {score:.0f}, ended by {episode.ended_by}{guard_text(episode)}"
+            f"{stage} {number + 1}: score {score:z.0f}, ended by {episode.ended_by}{guard_text(episode)}"
         )
 
     def log_learning(self, curves: Mapping[str, float], learned: int) -> None:

@@ -55,7 +55,7 @@ from cartpole_rl.run_folder import (
     write_json,
 )
 from cartpole_rl.tasks.episode import Episode
-from cartpole_rl.terminal import confirm, print_message, print_results, progress_bar, shown
+from cartpole_rl.terminal import confirm, print_message, print_results, progress_bar, shown, waiting
 from cartpole_rl.workflows.build import precedence, use_threads
 from cartpole_rl.workflows.checks import note_other_numbers
 from cartpole_rl.workflows.config import IdentifyConfig
@@ -107,7 +107,7 @@ def identify_cart(config: IdentifyConfig, folder: Path) -> None:
         regress([*fitted.values(), *held_out.values()], nominal, models, period, truth, folder)
         return
     laws = config.friction_laws
-    with progress_bar(None, "steps", desc="fitting") as bar:
+    with progress_bar(None, "steps", desc="fitting") as bar, waiting("fitting"):
         found = identify(
             by_file, held_out_by_file, nominal, models, period, substeps, config.windows, laws, bar.update
         )

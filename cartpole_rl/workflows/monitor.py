@@ -73,7 +73,7 @@ class TrainingMonitor(Monitor):
         agent = AgentCheckpoint(self._settings, training.agent.state_dict(), transitions, score)
         for name in (LAST, BEST) if is_best else (LAST,):
             save_agent(self.folder / CHECKPOINTS / name, agent)
-        scored = f"{self.config.task.measure} {score:.0f}"
+        scored = f"{self.config.task.measure} {score:z.0f}"
         self._bar.set_postfix_str(scored)
         self._advance(transitions)
         if self._bar.disable:

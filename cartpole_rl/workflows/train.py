@@ -20,7 +20,7 @@ from cartpole_rl.reporting.episodes import report_episodes
 from cartpole_rl.run_folder import BEST, CHECKPOINTS, FIGURES, METRICS, write_config
 from cartpole_rl.settings import evaluation_seed
 from cartpole_rl.tasks.episode import Episode
-from cartpole_rl.terminal import as_word, print_message, print_results, shown
+from cartpole_rl.terminal import as_word, print_message, print_results, shown, waiting
 from cartpole_rl.workflows.build import new_agent, use_threads
 from cartpole_rl.workflows.checks import check_compiler, check_resumable, note_other_numbers
 from cartpole_rl.workflows.config import TrainConfig, recorded_settings
@@ -30,6 +30,7 @@ from cartpole_rl.workflows.poles import emulated_words
 FALLEN = 0.9  # of the best score: a training that ends below it says so
 
 
+@waiting("preparing: fitting the track guard, compiling")
 def train(config: TrainConfig, folder: Path) -> float:
     """Train an agent on randomized simulated carts, or resume the training in `folder`; return its score.
 

@@ -5,7 +5,7 @@ import pytest
 from figure_contents import line_of, words
 
 from cartpole_rl.intervals import student_interval
-from cartpole_rl.reporting.scores import comparison, learning_curve
+from cartpole_rl.reporting.scores import SCORES, comparison, learning_curve, score_columns
 from cartpole_rl.reporting.style import series_colour
 
 RESULTS = {"simulated": [4000.0, 4100.0, 4200.0], "emulated": [3000.0, 3200.0]}
@@ -40,6 +40,15 @@ def test_labels_have_interval_and_ratio() -> None:
     assert "4100 ± 20" in text
     assert "0.76 × simulated" in text
     assert "2 episodes" in text
+
+
+def test_the_intervals_of_a_row_have_one_form() -> None:
+    def summary(low: float) -> dict:
+        return {**dict.fromkeys(SCORES), "score": {"mean": 4000.0, "low": low, "high": 4100.0}}
+
+    assert "4000 ± 100" in score_columns({"mean": summary(3900.0)}, "")
+    row = score_columns({"here": summary(3900.0), "there": summary(3500.0)}, "").splitlines()[-1]
+    assert "4000 (3900 to 4100)  4000 (3500 to 4100)" in row
 
 
 def test_student_interval_holds_the_mean_95_times_in_100() -> None:

@@ -19,6 +19,7 @@ from cartpole_rl.plants.serial.port import open_port, resolved_port
 from cartpole_rl.plants.serial.statistics import LinkStatistics
 from cartpole_rl.plants.serial.tracking import StateTracker
 from cartpole_rl.plants.settings import SerialSettings
+from cartpole_rl.terminal import waiting
 from cartpole_rl.wire import microseconds_between
 from cartpole_rl.wire.messages import (
     Ack,
@@ -216,6 +217,7 @@ class SerialCart:
             self._connection.request(SetPeriod(period_us), Info, lambda info: info.period_us == period_us)
         )
 
+    @waiting("homing: the cart moves by itself, usually for 15 to 40 s")
     def home(self, watch: Callable[[State], None] = lambda state: None) -> State:
         """Home, and wait until it is done: zeros set, the cart in the middle, the pole hanging still.
 
