@@ -1,11 +1,11 @@
 """Settings of an agent, and the kinds of agents and networks to choose from."""
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
 from cartpole_rl.registry import Extension, Registry
-from cartpole_rl.settings import Count, Settings
+from cartpole_rl.settings import Count, Positive, Settings
 
 
 class AgentKind(Extension):
@@ -40,9 +40,15 @@ class AgentSettings(Settings):
     recurrent: Count | None  # units of a recurrent input layer that reads the last frames
     layer_norm: bool
     mirrored: bool  # the network has the mirror symmetry of left and right
-    gamma: Annotated[float, Field(ge=0, lt=1)]
+    horizon: Positive | None = (
+        None  # s over which rewards count: their sum is discounted by exp(-t / horizon)
+    )
+    gamma: Annotated[float, Field(ge=0, lt=1)] | None = None  # or the discount of a control period
     double: bool  # van Hasselt et al., 2016
-    action_gap: Annotated[float, Field(ge=0, lt=1)]  # alpha of advantage learning, 0 for plain Q-learning
+    action_time: Positive | None = None  # s for which an action seems to last, by the action gap
+    action_gap: Annotated[float, Field(ge=0, lt=1)] | None = (
+        None  # or alpha of advantage learning, 0 for none
+    )
     loss: Literal["l2", "smooth_l1"]
     target_tau: Annotated[float, Field(gt=0, le=1)] | None  # Polyak averaging each update
     target_period: Count | None  # or a copy after this many updates
@@ -55,6 +61,39 @@ class AgentSettings(Settings):
         if (self.target_tau is None) == (self.target_period is None):
             raise ValueError("give either target_tau or target_period, and null for the other")
         return self
+
+    @model_validator(mode="after")
+    def _times_or_periods(self) -> Self:
+        if self.horizon is None and self.gamma is None:
+            raise ValueError("give horizon (s), or gamma (of a control period)")
+        if self.action_time is None and self.action_gap is None:
+            raise ValueError("give action_time (s), or action_gap (of a control period)")
+        return self
+
+    @property
+    def discount(self) -> float:
+        """The discount of a control period; `at` sets it where only seconds are given."""
+        assert self.gamma is not None
+        return self.gamma
+
+    @property
+    def gap(self) -> float:
+        """The action gap of a control period, likewise."""
+        assert self.action_gap is not None
+        return self.action_gap
+
+    def at(self, control_period: float) -> Self:
+        """Return the settings with `gamma` and `action_gap`, for a control period in s.
+
+        The action gap widens the lead of the best action 1 / (1 - action_gap) times, as if an action lasted
+        `action_time`. Both are 0 for a control period that is longer than their time.
+        """
+        gamma, gap = self.gamma, self.action_gap
+        if gamma is None and self.horizon is not None:
+            gamma = max(0.0, 1 - control_period / self.horizon)
+        if gap is None and self.action_time is not None:
+            gap = max(0.0, round(1 - control_period / self.action_time, 4))
+        return self.model_copy(update={"gamma": gamma, "action_gap": gap})
 
     @model_validator(mode="after")
     def _halves_for_the_mirror(self) -> "AgentSettings":

@@ -73,8 +73,8 @@ def make_env(
 def environment(config: CartPoleSettings, plant: Plant) -> CartPoleEnv:
     """Return the environment of `config` over `plant`, with the track guard of `with_fitted_guard`."""
     config = with_fitted_guard(config)
-    task = config.task.at(config.control_period)
-    return make_env(plant, config.actions, task, config.observation, config.reward, config.guard.active)
+    task, reward = config.task.at(config.control_period), config.reward.at(config.control_period)
+    return make_env(plant, config.actions, task, config.observation, reward, config.guard.active)
 
 
 def simulated_env(

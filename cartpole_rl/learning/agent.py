@@ -36,7 +36,7 @@ class QAgent(nn.Module):
         network = settings.network(settings, mirror_signs, actions, frames).to(device)
         self.actor = QValueActor(network, in_keys=["observation"], spec=Categorical(actions))
         self.loss = self.make_loss()
-        self.loss.make_value_estimator(gamma=settings.gamma, device=device)
+        self.loss.make_value_estimator(gamma=settings.discount, device=device)
         TargetNetUpdater(self.loss)  # copies the weights; `update_target` moves them
         averaged = settings.average_decay is not None
         self.average = copy.deepcopy(self.actor).requires_grad_(False) if averaged else None
@@ -51,7 +51,7 @@ class QAgent(nn.Module):
         """Return the loss of the actor; a subclass may take another one."""
         return AdvantageLearningLoss(
             self.actor,
-            action_gap=self.settings.action_gap,
+            action_gap=self.settings.gap,
             loss_function=self.settings.loss,
             delay_value=True,
             double_dqn=self.settings.double,

@@ -34,6 +34,7 @@ NEXT: tuple[NestedKey, ...] = ("next", "observation"), ("next", "reward"), ("nex
 COLLECTED: tuple[NestedKey, ...] = ("observation", "action", "guard", *NEXT, ("next", "done"))
 LEARNED: tuple[NestedKey, ...] = ("observation", "action", "steps_to_next_obs", *NEXT)
 OPTIMIZERS = {"adam": torch.optim.Adam, "adamw": torch.optim.AdamW}
+FEW_EPISODES = 1.5  # of each cart in a full buffer
 Scalars = dict[str, float]
 
 
@@ -84,10 +85,26 @@ class Training(Resumable):
         self.start_episodes()
 
     def start_episodes(self) -> None:
-        """Start a new episode on every cart."""
+        """Start a new episode on every cart.
+
+        Carts that all start at once stay in step: the buffer then holds the starts of one policy only, and
+        nothing corrects an agent that begins to leave the pole hanging until all start again.
+        """
         self.current = self.env.reset()
+        if self.staggers:
+            carts, periods = self.settings.carts, self.env.hardware.task.periods
+            started = torch.arange(carts, device=self.env.device) * periods // carts
+            self.current["step_count"] = started.unsqueeze(1)
         self.retries.reset()
         self.waiting: TensorDictBase | None = None  # [N, n - 1], the last periods if their returns go on
+
+    @property
+    def staggers(self) -> bool:
+        """True if the first episodes end one after the other; by default where the buffer is short."""
+        if self.settings.staggered is not None:
+            return self.settings.staggered
+        episodes = self.buffer_settings.size / self.settings.carts / self.env.hardware.task.periods
+        return episodes < FEW_EPISODES
 
     @property
     def transitions(self) -> int:
@@ -147,10 +164,10 @@ class Training(Resumable):
         With `carry` its last n - 1 periods wait for the next chunk, so that every return has n steps or ends
         with its episode. Without, the mean return in a chunk of T periods has n - n (n - 1) / (2 T) steps.
         """
-        held = self.settings.n_step - 1 if self.settings.carry else 0
+        held = self.settings.steps - 1 if self.settings.carry else 0
         steps = chunk if self.waiting is None else torch.cat((self.waiting, chunk), 1)
         self.waiting = steps[:, -held:].clone() if held else None
-        return n_step_transitions(steps, self.settings.n_step, self.agent.settings.gamma, held)
+        return n_step_transitions(steps, self.settings.steps, self.agent.settings.discount, held)
 
     def sample(self) -> TensorDictBase:
         """Return the transitions of one iteration's updates, `updates` batches long."""

@@ -56,7 +56,7 @@ class Finetuning(Training):
     def add(self, chunks: Sequence[TensorDictBase]) -> None:
         """Add the chunks of a recorded episode."""
         for chunk in chunks:
-            transitions = n_step_transitions(chunk, self.settings.n_step, self.agent.settings.gamma)
+            transitions = n_step_transitions(chunk, self.settings.steps, self.agent.settings.discount)
             earlier = self.recorded
             self.recorded = transitions if earlier is None else torch.cat((earlier, transitions))
 

@@ -2,7 +2,7 @@
 
 import math
 import re
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
@@ -43,6 +43,9 @@ class OptimizerSettings(Settings):
         return half_cosine(self.learning_rate, self.learning_rate * self.learning_rate_end, progress)
 
 
+LONGEST_RETURN = 20  # control periods
+
+
 class LearningSettings(Settings):
     """The training loop: an iteration collects `chunk` periods on each cart, then makes `updates` updates."""
 
@@ -52,7 +55,10 @@ class LearningSettings(Settings):
     retry_probability: Fraction  # that a cart is kept for another episode after a failed one
     updates: Count  # gradient steps per iteration
     batch_size: Count
-    n_step: Annotated[int, Field(ge=1, le=20)]  # the longest return
+    return_time: Positive | None = None  # s, the longest return
+    n_step: Annotated[int, Field(ge=1, le=LONGEST_RETURN)] | None = None  # or its length in control periods
+    # The first episodes end one after the other, not all at once. None: if the buffer holds few episodes
+    staggered: bool | None = False  # missing in checkpoints of earlier versions
     carry: bool  # the last n_step - 1 periods of a chunk wait for the next one, for whole returns
     warmup_transitions: Annotated[int, Field(ge=0)]  # random actions before the first update
     epsilon: tuple[Fraction, Fraction]  # exploration, from first to last
@@ -68,9 +74,30 @@ class LearningSettings(Settings):
                 f"transitions={self.transitions} is too few; give at least "
                 f"{self.carts * self.chunk * self.evaluations}, or fewer evaluations"
             )
-        if self.chunk < self.n_step:
+        if self.n_step is None and self.return_time is None:
+            raise ValueError("give return_time (s), or n_step (control periods)")
+        if self.n_step is not None and self.chunk < self.n_step:
             raise ValueError(f"chunk {self.chunk} must be at least n_step {self.n_step}")
         return self
+
+    def at(self, control_period: float) -> Self:
+        """Return the settings with `n_step`, for a control period in s.
+
+        A chunk that is shorter than a return is lengthened, with as many updates more.
+        """
+        if self.n_step is not None:
+            return self
+        assert self.return_time is not None
+        n_step = min(max(1, round(self.return_time / control_period)), LONGEST_RETURN)
+        chunk = max(self.chunk, n_step)
+        updates = round(self.updates * chunk / self.chunk)
+        return self.model_copy(update={"n_step": n_step, "chunk": chunk, "updates": updates})
+
+    @property
+    def steps(self) -> int:
+        """The longest return in control periods; `at` sets it where only seconds are given."""
+        assert self.n_step is not None
+        return self.n_step
 
     @property
     def iterations(self) -> int:

@@ -46,7 +46,7 @@ class Resumable:
         self.optimizer.load_state_dict(snapshot["optimizer"])
         restore_buffer(self.buffer, snapshot["replay"])
         waiting, collector = on_device(snapshot["returns"], device), on_device(snapshot["collector"], device)
-        held = self.settings.n_step - 1
+        held = self.settings.steps - 1
         self.waiting = None if waiting is None else TensorDict(waiting, [*carts, held])
         self.current = TensorDict(collector["current"], carts)
         self.retries.restore(collector)

@@ -56,6 +56,15 @@ class RewardSettings(Settings):
     scale: Positive
     track_penalty: NonNegative  # for leaving the track
     position_cost: NonNegative  # of each step, times (x / x_max)^2
+    period: Positive | None = None  # s that `scale` and `position_cost` are for; None: any control period
+
+    def at(self, control_period: float) -> Self:
+        """Return the reward with the same sum over a second, for steps of a control period in s."""
+        if self.period is None:
+            return self
+        share = control_period / self.period
+        scaled = {"scale": share * self.scale, "position_cost": share * self.position_cost}
+        return self.model_copy(update={**scaled, "period": None})
 
 
 class TaskSettings(Settings):

@@ -42,7 +42,8 @@ OUTDATING = {"actions": "other full motor values", "pole": "another pole"}  # a 
 def new_agent(config: TrainConfig, device: str = "cpu") -> QAgent:
     """Return an untrained agent on `device`."""
     observation, actions = config.observation, len(config.actions.motors)
-    return config.agent.kind(config.agent, observation.mirror_signs, actions, observation.frames, device)
+    settings = config.agent.at(config.control_period)
+    return config.agent.kind(settings, observation.mirror_signs, actions, observation.frames, device)
 
 
 @dataclass(frozen=True)

@@ -131,6 +131,16 @@ class TrainConfig(RunSettings, CartPoleSettings):
         return self
 
     @model_validator(mode="after")
+    def _learning_is_long_enough_at_its_period(self) -> "TrainConfig":
+        learning = self.learning.at(self.control_period)
+        if learning.iterations < learning.evaluations:
+            raise ValueError(
+                f"learning.transitions={learning.transitions} is too few; give at least "
+                f"{learning.carts * learning.chunk * learning.evaluations}, or fewer evaluations"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _buffer_holds_a_batch(self) -> "TrainConfig":
         if self.buffer.size < self.learning.batch_size:
             raise ValueError(

@@ -195,7 +195,7 @@ class CartLearner:
         )
         return Finetuning(
             finetuning,
-            simulated_learning(training.learning, finetuning, config.episodes),
+            simulated_learning(training.learning.at(training.control_period), finetuning, config.episodes),
             training.buffer.model_copy(update={"kind": finetuning.buffer_kind}),
             training.optimizer.model_copy(update={"learning_rate": finetuning.learning_rate}),
             self.agent,

@@ -39,8 +39,10 @@ class TrainingMonitor(Monitor):
         self._settings = config.model_dump(mode="json")
         self._logged = resumed_at or 0
         self._log: Logger = config.logger(folder, None if resumed_at is None else resumed_at + 1)
-        total = config.learning.collected_transitions
-        self._bar = progress_bar(total, "transitions", initial=self._logged, unit_scale=True, mininterval=1.0)
+        self._total = config.learning.at(config.control_period).collected_transitions
+        self._bar = progress_bar(
+            self._total, "transitions", initial=self._logged, unit_scale=True, mininterval=1.0
+        )
         path = folder / HISTORY
         lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
         self.history = [each for each in map(json.loads, lines) if each["transitions"] <= self._logged]
@@ -77,7 +79,7 @@ class TrainingMonitor(Monitor):
         self._bar.set_postfix_str(scored)
         self._advance(transitions)
         if self._bar.disable:
-            done, total = transitions / 1e6, self.config.learning.collected_transitions / 1e6
+            done, total = transitions / 1e6, self._total / 1e6
             print_message("train", f"{done:.2f} of {total:.2f} M transitions, {scored}")
 
     def on_checkpoint(self, training: Training) -> None:

@@ -1,5 +1,6 @@
 """Train an agent in randomized simulation, from settings to a run folder."""
 
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -62,7 +63,7 @@ def train(config: TrainConfig, folder: Path) -> float:
         write_config(folder, "train", config.model_dump(mode="json"), resumed=checkpoint is not None)
         print_notes(config, env.plant.randomizer)
         with TrainingMonitor(folder, config, checkpoint.step if checkpoint else None) as monitor:
-            settings = config.learning, config.buffer, config.optimizer
+            settings = config.learning.at(config.control_period), config.buffer, config.optimizer
             run = config.seed, config.compile, config.task.measure
             training = config.agent.kind.learner(*settings, agent, env, evaluate, monitor, *run)
             if checkpoint:
@@ -78,18 +79,19 @@ def train(config: TrainConfig, folder: Path) -> float:
     print(f"trained for {training.seconds:.0f} s")
     next_command = f"cartpole-evaluate {as_word('run', shown(folder))} {emulated_words([config.pole])}"
     print_results(folder, f"{METRICS}, {FIGURES}/ and {CHECKPOINTS}/", next_command)
-    if fall := fall_note(training.best_score, training.last_score):
+    if fall := fall_note([evaluation[config.task.measure] for evaluation in monitor.history]):
         print(fall)
     score: float = metrics[config.task.measure]["mean"]
     return score
 
 
-def fall_note(best: float, last: float | None) -> str | None:
-    """Return a line if the `last` evaluation's score is more than a tenth below the `best`, None if not."""
-    if last is None or best <= 0 or last >= FALLEN * best:
+def fall_note(scores: Sequence[float]) -> str | None:
+    """Return a line if the last evaluation's score is more than a tenth below the best, None if not."""
+    best = max(scores, default=0.0)
+    if best <= 0 or scores[-1] >= FALLEN * best:
         return None
     return (
-        f"note: the last evaluation scored {last:.0f}, the best {best:.0f}: the agent became worse; "
+        f"note: the last evaluation scored {scores[-1]:.0f}, the best {best:.0f}: the agent became worse; "
         f"{CHECKPOINTS}/{BEST} is the best one, but train again with another seed"
     )
 

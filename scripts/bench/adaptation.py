@@ -75,8 +75,9 @@ class InformedTransform(HardwareTransform):
     """
 
     def __init__(self, config: TrainConfig, cart: CartParameters) -> None:
-        motors, task, observation = config.actions.motors, config.task, config.observation
-        super().__init__(motors, task, observation, config.reward, config.guard.active, config.compile)
+        motors, observation, period = config.actions.motors, config.observation, config.control_period
+        task, reward = config.task.at(period), config.reward.at(period)
+        super().__init__(motors, task, observation, reward, config.guard.active, config.compile)
         self.cart, self.names = cart, list(config.ranges)
         nominal = config.nominal_with(config.pole.nominal)
         limits, logarithmic = [], []
@@ -147,10 +148,13 @@ def trained_and_judged(job: Job, overrides: Mapping[str, Any]) -> dict[str, Any]
     signs, started = config.observation.mirror_signs, time.perf_counter()
     if job.informed:
         signs = signs + [-1 if PARAMETERS[name].mirrored else 1 for name in config.ranges]
-    agent = QAgent(config.agent, signs, len(config.actions.motors), config.observation.frames)
+    agent = QAgent(
+        config.agent.at(config.control_period), signs, len(config.actions.motors), config.observation.frames
+    )
     env = make_env(config, job, config.learning.carts, config.task.start, job.seed)
     judge = partial(judged, config, job, agent)
-    arguments = config.learning, config.buffer, config.optimizer, agent, env, partial(judge, WATCHED_CARTS)
+    learning = config.learning.at(config.control_period)
+    arguments = learning, config.buffer, config.optimizer, agent, env, partial(judge, WATCHED_CARTS)
     Training(*arguments, Monitor(), job.seed, config.compile).run()
     scores = np.array([episode.score.sum() for episode in judge(DRAWN_CARTS)])
     return {

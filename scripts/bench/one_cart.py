@@ -58,7 +58,7 @@ class StandingStill:
     """Computes the action values of an untrained network of the default settings, and chooses motor 0."""
 
     def __init__(self, signs: list[int], motors: list[int]) -> None:
-        agent = QAgent(AgentSettings(**choice("agent/dqn")), signs, len(motors))
+        agent = QAgent(AgentSettings(**choice("agent/dqn")).at(0.02), signs, len(motors))
         self.network, self.action = DrivingPolicy(agent.greedy_policy()), torch.tensor([motors.index(0)])
 
     def __call__(self, present: TensorDictBase) -> TensorDictBase:

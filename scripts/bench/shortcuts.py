@@ -57,7 +57,7 @@ def environment(carts: int, compiled: bool) -> CartPoleEnv:
 def make_agent(env: CartPoleEnv) -> QAgent:
     """An untrained agent of the default settings."""
     signs = env.hardware.observation_settings.mirror_signs
-    return QAgent(AgentSettings(**choice("agent/dqn")), signs, len(env.hardware.motors))
+    return QAgent(AgentSettings(**choice("agent/dqn")).at(0.02), signs, len(env.hardware.motors))
 
 
 def steps(carts: int, compiled: bool) -> Pair:
@@ -79,19 +79,19 @@ def make_training(carts: int, compiled: bool) -> Training:
     epsilon = {"warmup_transitions": 0, "epsilon": (EPSILON, EPSILON)}
     learning = choice("learning/fast") | epsilon | {"carts": carts, "chunk": CHUNK}
     buffer, optimizer = choice("buffer/prioritized"), choice("optimizer/adam")
-    settings = LearningSettings(**learning), BufferSettings(**buffer), OptimizerSettings(**optimizer)
+    settings = LearningSettings(**learning).at(0.02), BufferSettings(**buffer), OptimizerSettings(**optimizer)
     return Training(*settings, make_agent(env), env, list, None, seed=0)  # type: ignore[arg-type]
 
 
 def collections(training: Training, compiled: bool) -> Pair:
     """A chunk of CHUNK periods, added to a buffer as n-step transitions."""
-    carts, n = training.settings.carts, training.settings.n_step
+    carts, n = training.settings.carts, training.settings.steps
     env = environment(carts, compiled)
     explore = EGreedyModule(env.action_spec_unbatched, eps_init=EPSILON, eps_end=EPSILON)
     policy = TensorDictSequential(training.agent.actor, explore)
     stock = iter(Collector(env, policy, frames_per_batch=CHUNK * carts))
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(training.buffer_settings.size, ndim=2))
-    buffer.append_transform(MultiStepTransform(n, training.agent.settings.gamma, done_keys=[]))
+    buffer.append_transform(MultiStepTransform(n, training.agent.settings.discount, done_keys=[]))
     return {
         "TorchRL's collector": lambda: buffer.extend(next(stock).select(*COLLECTED)),
         "Training.collect": training.collect,

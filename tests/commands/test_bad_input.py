@@ -17,7 +17,7 @@ WRONG_TRAINING = [
     ("gamma=0.9", "gamma", "did you mean agent.gamma?"),
     ("polee=large", "polee", "did you mean pole?"),
     ("cart.cart_mas=1", "cart.cart_mas", "did you mean cart.cart_mass?"),
-    ("~agent.gamma", "agent.gamma is missing", "give agent.gamma=..."),
+    ("~agent.double", "agent.double is missing", "give agent.double=..."),
     ("agent.loss=smoth_l1", "agent.loss=smoth_l1", "did you mean smooth_l1? give 'l2' or 'smooth_l1'"),
     ("control_period=1", "control_period=1", "give at most 0.1"),
     ("pole=null", "pole=null", "leave pole=null out"),

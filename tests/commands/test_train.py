@@ -101,6 +101,7 @@ def test_a_pump_does_not_pass_for_one_that_balances(
 
 
 def test_a_training_that_became_worse_says_so() -> None:
-    assert fall_note(9077, 8200) is None
-    assert "scored 1248, the best 9077" in str(fall_note(9077, 1248))
-    assert fall_note(-1.0, -2.0) is None  # it never scored
+    assert fall_note([100, 9077, 8200]) is None
+    assert "scored 1248, the best 9077" in str(fall_note([100, 9077, 1248]))
+    assert fall_note([-1.0, -2.0]) is None  # it never scored
+    assert fall_note([]) is None

@@ -49,7 +49,7 @@ def network() -> nn.Module:
     """An untrained one, the same each time."""
     torch.manual_seed(0)
     observation = ObservationSettings(**choice("observation/history"))
-    return QAgent(AgentSettings(**choice("agent/dqn")), observation.mirror_signs, 2).greedy_policy()
+    return QAgent(AgentSettings(**choice("agent/dqn")).at(0.02), observation.mirror_signs, 2).greedy_policy()
 
 
 class Faulty(CartPeer):

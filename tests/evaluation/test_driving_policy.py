@@ -15,7 +15,7 @@ SETTINGS = choice("agent/dqn") | {"hidden": [8], "mirrored": False}
 
 def network(seed: int, **changes: object) -> nn.Module:
     torch.manual_seed(seed)
-    agent = QAgent(AgentSettings(**(SETTINGS | changes)), [1, -1, -1, 1], 5, [[2, 3], [0, 1]])
+    agent = QAgent(AgentSettings(**(SETTINGS | changes)).at(0.02), [1, -1, -1, 1], 5, [[2, 3], [0, 1]])
     return agent.greedy_policy()
 
 

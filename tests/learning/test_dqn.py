@@ -31,7 +31,7 @@ from cartpole_rl.learning.settings import (
 )
 from cartpole_rl.learning.states import seed_everything
 from cartpole_rl.tasks.episode import Episode
-from cartpole_rl.tasks.settings import Measure, Start, StartSettings
+from cartpole_rl.tasks.settings import Measure, RewardSettings, Start, StartSettings
 
 LEARNING = choice("learning/fast") | {
     "transitions": 1024,
@@ -41,6 +41,7 @@ LEARNING = choice("learning/fast") | {
     "updates": 2,
     "batch_size": 32,
     "n_step": 3,
+    "staggered": False,
     "carry": False,
     "warmup_transitions": 128,
     "epsilon": (0.5, 0.1),
@@ -492,3 +493,27 @@ def test_evaluations_are_evenly_spaced_up_to_the_end(count: int, end: int) -> No
 def test_settings_that_make_no_sense_are_refused(wrong: dict) -> None:
     with pytest.raises(ValueError, match=next(iter(wrong))):
         LearningSettings(**{**LEARNING, **wrong})
+
+
+def test_seconds_give_the_same_learning_at_any_control_period() -> None:
+    agent, learning = AgentSettings(**choice("agent/dqn")), LearningSettings(**choice("learning/fast"))
+    found = {
+        period: (agent.at(period).gamma, agent.at(period).action_gap, learning.at(period).n_step)
+        for period in (0.01, 0.02, 0.1)
+    }
+    assert found == {0.01: (0.995, 0.85, 10), 0.02: (0.99, 0.7, 5), 0.1: (0.95, 0.0, 1)}
+    assert (learning.at(0.01).chunk, learning.at(0.01).updates) == (10, 80)  # 64 updates for 8 periods
+    given = learning.model_copy(update={"n_step": 3})
+    assert (given.at(0.01).n_step, given.at(0.01).chunk) == (3, 8)
+    reward = RewardSettings(**choice("reward/score"))
+    assert (reward.at(0.01).scale, reward.at(0.02).scale) == (0.025, 0.05)
+    assert reward.model_copy(update={"period": None}).at(0.01).scale == 0.05
+
+
+@pytest.mark.parametrize(("size", "spread"), [(16 * 30, True), (16 * 60, False)])
+def test_with_a_short_buffer_the_episodes_end_one_after_the_other(
+    size: int, spread: bool, make_training: MakeTraining
+) -> None:
+    training = make_training({"staggered": None}, buffer={"size": size})  # an episode has 30 periods
+    started = training.current["step_count"].squeeze(-1).tolist()
+    assert started == ([30 * cart // 16 for cart in range(16)] if spread else [0] * 16)

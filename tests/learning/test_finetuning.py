@@ -25,6 +25,7 @@ from cartpole_rl.learning.settings import (
 MOTORS = (-250, -200, 0, 200, 250)
 LENGTH = 2 * 0.1778  # m, the medium pole
 KINDS = ("history", "history_length", "positions", "raw")
+DQN = AgentSettings(**choice("agent/dqn")).at(0.02)
 LEARNING = choice("learning/fast") | {
     "transitions": 2560,
     "carts": 16,
@@ -65,11 +66,11 @@ def make_learner(
     """A fine-tuning of a new agent on 16 simulated carts, and the agent."""
     env = make_environment(make_plant(16), MOTORS, time_limit=40, **observation)
     observed = env.hardware.observation_settings
-    agent = QAgent(AgentSettings(**choice("agent/dqn")), observed.mirror_signs, len(MOTORS), observed.frames)
+    agent = QAgent(DQN, observed.mirror_signs, len(MOTORS), observed.frames)
     finetuning = choice("finetuning/gentle") | {"iterations": 3, "cart_share": cart_share}
     learner = Finetuning(
         FinetuningSettings(**finetuning),
-        LearningSettings(**LEARNING),
+        LearningSettings(**LEARNING).at(0.02),
         BufferSettings(**choice("buffer/uniform") | {"size": 5000}),
         OptimizerSettings(**choice("optimizer/adam")),
         agent,
