@@ -33,7 +33,11 @@ KINDS = {  # of files that are right: name, and what is done with the text
     "in an odd folder": ("a b,c=#é/mine.yaml", str.encode),
     "with a short suffix": ("mine.yml", str.encode),
 }
-UNREAD = {command: {"emulator"} for command in ("evaluate", "record", "preflight")}  # by their default plant
+UNREAD = {  # by their default plant, or but for policies of one's own
+    "evaluate": {"emulator", "observation"},
+    "record": {"emulator", "observation"},
+    "preflight": {"emulator"},
+}
 
 
 def numbers(tree: Mapping[str, Any], path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], float]]:

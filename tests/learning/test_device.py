@@ -45,7 +45,7 @@ def new_training(overrides: dict[str, Any], device: torch.device | str) -> Train
     seed_everything(1)
     env = simulated_env(config, config.plant, config.learning.carts, config.task.start, seed=1, device=device)
     note_unused_randomization(config, env.plant.randomizer)
-    settings = config.learning, config.buffer, config.optimizer
+    settings = config.learning.at(config.control_period), config.buffer, config.optimizer
     return Training(*settings, new_agent(config, device), env, lambda: [], Monitor(), seed=1)
 
 
