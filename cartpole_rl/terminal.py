@@ -67,6 +67,8 @@ def as_word(name: str, value: object) -> str:
 
 def as_value(value: object) -> str:
     """Return a value for a command line, in quotes where Hydra and the shell need them."""
+    if isinstance(value, list | tuple):
+        return shlex.quote(f"[{','.join(map(str, value))}]")
     text = str(value)
     return shlex.quote(text if re.fullmatch(r"[A-Za-z0-9_./:%+-]+", text) else in_quotes(text))
 

@@ -3,7 +3,7 @@
 Everything that the commands ask about a plant is an attribute or a method of its settings.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -31,6 +31,11 @@ Wait = Annotated[float, Field(gt=0, le=600)]  # s, for the cart or a person to m
 OF_SIMULATION = ("parameters", "randomization", "cart", "cart_friction", "pole_friction", "knock")
 
 
+def changed_words(group: str, settings: Settings, defaults: Mapping[str, Any]) -> list[str]:
+    """Return the words that set what differs from `defaults`."""
+    return [as_word(f"{group}.{name}", value) for name, value in settings if value != defaults[name]]
+
+
 class PlantSettings(Settings):
     """The settings of a plant. Its answers here are those of carts that this process simulates."""
 
@@ -49,8 +54,10 @@ class PlantSettings(Settings):
 
     @property
     def words(self) -> str:
-        """The words that choose it on the command line."""
-        return f"plant={self.kind}"
+        """The words that choose it on the command line, as a cart that this computer drives."""
+        defaults = {name: field.default for name, field in type(self).model_fields.items()}
+        kept = {**defaults, "kind": self.kind, "policy": getattr(self, "policy", None)}
+        return " ".join([f"plant={self.kind}", *changed_words("plant", self, kept)])
 
     @property
     def as_evaluated(self) -> "PlantSettings":
@@ -226,14 +233,6 @@ class SerialSettings(PlantSettings):
     def title(self) -> str:
         """The name of the cart in a heading."""
         return f"cart on {self.port}"
-
-    @property
-    def words(self) -> str:
-        """The words that choose the cart on the command line."""
-        length = f" plant.pole_length={self.pole_length:g}" if self.pole_length else ""
-        default = type(self).model_fields["baud"].default
-        baud = f" plant.baud={self.baud}" if self.baud != default else ""
-        return f"plant=serial {as_word('plant.port', self.port)}{baud}{length}"
 
     @property
     def has_compiled_agent(self) -> bool:

@@ -141,8 +141,7 @@ def check_replay(config: ReplayConfig) -> None:
     recordings(config.source)
     if config.pole is not None:
         check_one_pole("a replay", config.pole)
-    check_names(config.nominal_cart)
-    check_parameters({**config.nominal_cart, **(config.parameters or {})})
+    check_parameters({**(config.cart or {}), **(config.parameters or {})})
 
 
 def check_modelling(config: ModelConfig) -> None:

@@ -19,7 +19,6 @@ from cartpole_rl.envs.settings import (
     ObservationSettings,
     PoleFrictionSettings,
     Randomization,
-    SimulatedCartSettings,
 )
 from cartpole_rl.errors import CheckpointError, ConfigError
 from cartpole_rl.identification.settings import EnsembleSettings
@@ -274,13 +273,16 @@ class FinetuneConfig(RunSettings, OnCart):
     view: View = "none"
 
 
-class ReplayConfig(SimulatedCartSettings):
-    """The settings of cartpole-replay."""
+class ReplayConfig(Settings):
+    """The settings of cartpole-replay. Groups that are None are those of the recorded agent."""
 
     source: Annotated[Path, Field(alias="from")]
+    cart: dict[str, Finite] | None = None
+    cart_friction: CartFrictionSettings | None = None
+    pole_friction: PoleFrictionSettings | None = None
     pole: PoleSettings | None = None
     plant: SimulatedSettings
-    actuator: Annotated[Law, ACTUATORS]
+    actuator: Annotated[Law, ACTUATORS] | None = None
     parameters: dict[str, Finite] | None
     restart: Annotated[float, Field(ge=0.1, le=60)]
     label: str

@@ -12,13 +12,22 @@ from cartpole_rl.reporting.episodes import report_episodes
 from cartpole_rl.reporting.scores import score_columns, score_table
 from cartpole_rl.reporting.texts import count_text, cut_off
 from cartpole_rl.rig.parameters import PARAMETERS
-from cartpole_rl.run_folder import BASELINE, BESIDE_SIMULATION, FIGURES, METRICS, is_own_policy, write_config
+from cartpole_rl.run_folder import (
+    BASELINE,
+    BESIDE_SIMULATION,
+    FIGURES,
+    METRICS,
+    PRETRAINED,
+    is_own_policy,
+    program_of,
+    write_config,
+)
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.terminal import as_word, print_loop_time, print_results, shown
 from cartpole_rl.workflows.checks import agent_file
 from cartpole_rl.workflows.config import EvaluateConfig
 from cartpole_rl.workflows.episodes import Evaluation, Repetition, prepared
-from cartpole_rl.workflows.poles import POLES, emulated_words, emulator_for, knows, plant_words
+from cartpole_rl.workflows.poles import POLES, emulated_words, emulator_for, plant_words
 
 
 def evaluate(config: EvaluateConfig, folder: Path) -> None:
@@ -87,20 +96,21 @@ def same_motors(onboard: Sequence[Episode]) -> str:
 
 
 def next_command(evaluation: Evaluation) -> str:
-    """Return the command that brings the agent nearer to a real cart; the baseline leads to an agent."""
-    config, known, driven = evaluation.config, evaluation.known_poles, evaluation.settings.pole
+    """Return the command of docs/first-hour.md that follows, for the same cart."""
+    config, known = evaluation.config, evaluation.known_poles
+    run, plant = as_word("run", shown(config.run)), plant_words(config.plant, config.emulator, known)
     if config.run == BASELINE:
         return "cartpole-train experiment=medium"
-    if config.plant.is_on_port and is_own_policy(config.run):
-        return f"cartpole-record {as_word('run', shown(config.run))} {plant_words(config.plant, [driven])}"
-    if config.plant.is_on_port:
-        chosen = (
-            knows(known, driven) or emulator_for([driven]) != POLES[0]
-        )  # not a default that it does not fit
-        poles = [driven] if chosen else known
-        return f"cartpole-finetune {as_word('run', shown(config.run))} {plant_words(config.plant, poles)}"
-    poles = known if config.pole is None and known else [driven]
-    return f"cartpole-evaluate {as_word('run', shown(config.run))} {emulated_words(poles)}"
+    if not config.plant.is_on_port:
+        poles = known if config.pole is None and known else [evaluation.settings.pole]
+        return f"cartpole-evaluate {run} {emulated_words(poles)}"
+    if is_own_policy(config.run) or program_of(config.run) == "finetune":
+        return f"cartpole-record {run} {plant}"
+    if program_of(config.run) is not None or config.run.parts[0] != PRETRAINED:
+        return f"cartpole-finetune {run} {plant}"
+    if evaluation.settings.task.evaluation_start != evaluation.training.task.evaluation_start:
+        return f"cartpole-evaluate {run} guard=careful {plant} episodes=1"
+    return f"cartpole-identify {plant} pole={emulator_for(known) or POLES[0]}"
 
 
 def compared(again: Repetition, episode: Episode) -> str:

@@ -320,5 +320,5 @@ def compare(cart: FinetuningCart, tuned: TunedAgent, settings: CartPoleSettings)
     print_loop_time(link.get("latency_override"))
     print(f"kept: the policy {kept} fine-tuning, by its {SCORES[task.measure]}")
     written = f"{METRICS}, {COMPARISON}, {CHECKPOINTS}/{LAST} and {RECORDINGS}/"
-    words = plant_words(config.plant, [settings.pole])
+    words = plant_words(config.plant, config.emulator)
     print_results(folder, written, f"cartpole-evaluate {as_word('run', shown(folder))} {words}")

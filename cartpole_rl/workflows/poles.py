@@ -1,13 +1,18 @@
 """The poles of agents, carts and recordings, and the words that choose a cart with one of them."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Annotated
+
+import yaml
+from pydantic import Field, TypeAdapter
 
 from cartpole_rl.choices import choice, group_choices
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import ConfigError, RecordingError
-from cartpole_rl.plants.settings import PlantSettings, emulated_pole
-from cartpole_rl.randomization.poles import HEAVIER, Pole, PoleSettings, check_one_pole
+from cartpole_rl.plants.settings import PlantSettings, PortSettings, changed_words, emulated_pole
+from cartpole_rl.randomization.poles import HEAVIER, Pole, PoleSettings, check_one_pole, one_pole
+from cartpole_rl.run_folder import CONFIG
 
 POLES = ("medium", "large")  # in conf/pole/ and conf/emulator/; the first is the default
 
@@ -69,30 +74,61 @@ def emulator_for(known: Sequence[PoleSettings]) -> str | None:
     return None
 
 
-def plant_words(plant: PlantSettings, poles: Sequence[PoleSettings] = ()) -> str:
-    """Return the words that choose a cart on the command line, an emulated one with one of `poles`."""
-    return emulated_words(poles) if plant.reads_emulator and poles else plant.words
+def plant_words(
+    plant: PlantSettings, emulator: EmulatorSettings | None = None, known: Sequence[PoleSettings] = ()
+) -> str:
+    """Return the words that choose the same cart on the command line.
+
+    An emulated cart whose pole was not chosen gets one of the `known` poles.
+    """
+    if not plant.reads_emulator or emulator is None:
+        return plant.words
+    files = {name: EmulatorSettings(**file) for name, file in group_choices("emulator").items()}
+    default, pole = EmulatorSettings(), emulated_pole(emulator)
+    if known and pole == emulated_pole(default) and not knows(known, one_pole(pole)):
+        pole = emulated_pole(files.get(emulator_for(known) or "", default))
+    driven = emulator.model_copy(update={**pole.model_dump(), "policy": None})
+    choices = [
+        [f"emulator={name}"] * bool(name) + changed_words("emulator", driven, file.model_dump())
+        for name, file in {"": default, **files}.items()
+    ]
+    return " ".join([plant.words, *min(choices, key=len)])
 
 
-def chosen_pole(owner: str, poles: PoleSettings | None, paths: Sequence[Path]) -> tuple[str, Pole]:
-    """Return name and parameters of the pole in `poles`; without a choice, of the recorded one.
+def words_of_run(folder: Path) -> str | None:
+    """Return the words of the cart that the recordings of a run in `folder` are of; None if it is unknown."""
+    try:
+        content = yaml.safe_load((folder / CONFIG).read_text(encoding="utf-8"))
+        if content.get("from"):
+            return words_of_run(Path(content["from"]))
+        plant = TypeAdapter(Annotated[PortSettings, Field(discriminator="kind")])
+        return plant_words(plant.validate_python(content["plant"]), EmulatorSettings(**content["emulator"]))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, yaml.YAMLError):
+        return None
+
+
+def chosen_pole(
+    owner: str, poles: PoleSettings | None, paths: Sequence[Path], own: PoleSettings | None = None
+) -> tuple[str, Pole]:
+    """Return name and parameters of the pole in `poles`; without a choice, of the recorded one, as in `own`.
 
     Raises ConfigError where `poles` are several, naming `owner`, and what `recorded_pole` raises.
     """
     if poles is None:
-        return recorded_pole(paths)
+        return recorded_pole(paths, own.choices if own else None)
     return poles.name, check_one_pole(owner, poles)
 
 
-def recorded_pole(paths: Sequence[Path]) -> tuple[str, Pole]:
-    """Return the one of POLES with the recorded length; the first where no recording states its length.
+def recorded_pole(paths: Sequence[Path], own: Mapping[str, Pole] | None = None) -> tuple[str, Pole]:
+    """Return the one of `own` or POLES with the recorded length; the first where no recording states it.
 
     Raises ConfigError for several lengths or the length of another pole, RecordingError for a damaged header.
     """
-    known = {name: Pole(**choice(f"pole/{name}")["choices"][name]) for name in POLES}
+    shipped = {name: Pole(**choice(f"pole/{name}")["choices"][name]) for name in POLES}
+    known = {**(own or {}), **{name: pole for name, pole in shipped.items() if name not in (own or {})}}
     lengths = sorted({length for path in paths if (length := recorded_length(path))})
     if not lengths:
-        return POLES[0], known[POLES[0]]
+        return next(iter(known.items()))
     if len(lengths) > 1:
         several = ", ".join(f"{length:g}" for length in lengths)
         raise ConfigError(f"pole: poles of {several} m were recorded; replay those of one pole at a time")

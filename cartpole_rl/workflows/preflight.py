@@ -1,7 +1,6 @@
 """Check a cart by small moves before an agent drives it."""
 
-import shlex
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import closing, contextmanager
 
 from cartpole_rl.errors import PlantError
@@ -10,16 +9,15 @@ from cartpole_rl.plants.serial.preflight import Finding, preflight
 from cartpole_rl.plants.serial.preparation import FaultClearing, always
 from cartpole_rl.randomization.poles import Pole, one_pole
 from cartpole_rl.terminal import confirm
-from cartpole_rl.workflows.checks import is_given
 from cartpole_rl.workflows.config import PreflightConfig
-from cartpole_rl.workflows.poles import POLES, emulator_for
+from cartpole_rl.workflows.poles import POLES, emulator_for, plant_words
 
 
-def check_cart(config: PreflightConfig, words: Sequence[str] = ()) -> None:
+def check_cart(config: PreflightConfig) -> None:
     """Check the cart of `config.plant` by small moves, and print a line for each check.
 
-    At the end prints the command that identifies the cart, with the `words` given for it, as plant.port=COM3.
-    Writes no files. Raises PlantError after the first check that fails, LinkError if no cart answers.
+    At the end prints the command that balances the pole. Writes no files. Raises PlantError after the first
+    check that fails, LinkError if no cart answers.
     """
     faults = FaultClearing(config.plant.clear_faults, confirm if config.plant.can_be_damaged else always)
     with connected_cart(config) as cart:
@@ -30,15 +28,14 @@ def check_cart(config: PreflightConfig, words: Sequence[str] = ()) -> None:
         raise PlantError(
             f"the cart is not ready: {finding.check if finding else 'nothing was checked'} failed"
         )
-    print("The cart is ready. Next, with the mounted pole as pole= (medium, large or a file):")
-    print(next_command(config, [word for word in words if is_given(("plant", "emulator"), [word])]))
+    print("The cart is ready. Next, hold the pole up when asked (pretrained/large is for one of 0.66 m):")
+    print(next_command(config))
 
 
-def next_command(config: PreflightConfig, given: Sequence[str]) -> str:
-    """Return the command that identifies the cart of the words `given`, with its pole if it is known."""
-    chosen = any(word.startswith("plant=") for word in given)
-    plant = [*given] if chosen else [f"plant={config.plant.kind}", *given]
-    return f"cartpole-identify {shlex.join(plant)} pole={mounted_pole(config)}"
+def next_command(config: PreflightConfig) -> str:
+    """Return the command that balances the pole on the same cart, with an agent for its length."""
+    plant = plant_words(config.plant, config.emulator)
+    return f"cartpole-evaluate run=pretrained/{mounted_pole(config)} task=balance {plant} episodes=1"
 
 
 def mounted_pole(config: PreflightConfig) -> str:

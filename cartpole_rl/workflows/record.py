@@ -18,7 +18,7 @@ from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.terminal import as_word, shown
 from cartpole_rl.workflows.checks import agent_file
 from cartpole_rl.workflows.config import EvaluateConfig, RecordConfig
-from cartpole_rl.workflows.episodes import prepared
+from cartpole_rl.workflows.episodes import Evaluation, prepared
 
 
 def record(config: RecordConfig, folder: Path) -> None:
@@ -34,7 +34,7 @@ def record(config: RecordConfig, folder: Path) -> None:
             evaluation.note_other_pole("record")
             evaluation.note_refitted_guard("record")
             evaluation.note_other_numbers("record")
-            settings = evaluation.settings.model_dump(mode="json")
+            settings = agents_settings(evaluation).model_dump(mode="json")
             content = {**evaluation.config.model_dump(mode="json"), "recorded": settings}
             write_config(folder, "record", content, agent=agent_file(evaluation.config.run))
             for episode in evaluation.episodes():
@@ -46,6 +46,14 @@ def record(config: RecordConfig, folder: Path) -> None:
             held = f"{count_text(len(kept))}{guard_text(*kept)}"
             print(f"{shown(folder)}/{RECORDINGS}/ holds {held}; next:")
             print(f"cartpole-replay {as_word('from', shown(folder))}")
+
+
+def agents_settings(evaluation: Evaluation) -> CartPoleSettings:
+    """Return the settings of an episode with the pole as the agent knows it, where that is on the cart."""
+    settings, driven = evaluation.settings, evaluation.settings.pole.nominal
+    own = [poles for poles in evaluation.known_poles if poles.is_single and poles.includes(driven)]
+    on_port = evaluation.config.plant.is_on_port and own
+    return settings.model_copy(update={"pole": own[-1]}) if on_port else settings
 
 
 def heading(config: EvaluateConfig, settings: CartPoleSettings, episode: Episode) -> dict[str, Any]:

@@ -4,10 +4,15 @@ The simulated cart is reset to the measured state every `restart` seconds: over 
 diverge.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+import yaml
+
+from cartpole_rl.envs.settings import CartPoleSettings
 from cartpole_rl.evaluation.recordings import read_recording
-from cartpole_rl.identification.prediction import all_errors, errors_at, replay
+from cartpole_rl.identification.prediction import all_errors, away_from_upright, errors_at, replay
 from cartpole_rl.identification.rollout import Dynamics
 from cartpole_rl.identification.windows import recorded_period
 from cartpole_rl.randomization.poles import Pole
@@ -15,13 +20,15 @@ from cartpole_rl.reporting.predictions import REPORTED_TIMES, replay_figure, rep
 from cartpole_rl.reporting.style import save
 from cartpole_rl.reporting.texts import count_text
 from cartpole_rl.rig.parameters import check_names, check_values
-from cartpole_rl.run_folder import FIGURES, recordings, write_config, write_json
+from cartpole_rl.run_folder import CONFIG, FIGURES, program_of, recordings, write_config, write_json
 from cartpole_rl.terminal import as_word, print_results, shown
+from cartpole_rl.workflows.build import trained_agent
 from cartpole_rl.workflows.checks import note_other_numbers
-from cartpole_rl.workflows.config import ReplayConfig
+from cartpole_rl.workflows.config import ReplayConfig, TrainConfig, load_settings, recorded_settings
 from cartpole_rl.workflows.poles import chosen_pole
 
 REPLAY, FIGURE = "replay.json", f"{FIGURES}/replay.png"
+GROUPS = ("cart", "cart_friction", "pole_friction")
 
 
 def replay_recordings(config: ReplayConfig, folder: Path) -> None:
@@ -33,29 +40,47 @@ def replay_recordings(config: ReplayConfig, folder: Path) -> None:
     """
     paths = recordings(config.source)
     episodes = [read_recording(path) for path in paths]
-    name, pole = chosen_pole("a replay", config.pole, paths)
-    parameters = simulated_parameters(config, pole)
+    settings = recorded_cart(paths)
+    given = {name: value for name in GROUPS if (value := getattr(config, name)) is not None}
+    settings = settings.model_copy(update=given)
+    name, pole = chosen_pole("a replay", config.pole, paths, settings.pole)
+    parameters = {**settings.nominal_with(pole), **(config.parameters or {})}
+    check_names(parameters, "parameters")
+    check_values(parameters)
     cart = {name: value for name, value in parameters.items() if name not in Pole.model_fields}
     note_other_numbers("replay", cart, [Pole(**{name: parameters[name] for name in Pole.model_fields})])
     period, plant = recorded_period(episodes[0]), config.plant
-    models = config.models_with(config.actuator, plant)
+    models = settings.models_with(config.actuator or settings.actions.actuator, plant)
     dynamics = Dynamics.of(parameters, models, period, plant.substeps)
     replays = replay(episodes, dynamics, config.restart)
     errors = errors_at(all_errors(replays), REPORTED_TIMES, period)
+    kept = np.concatenate([away_from_upright(each) for each in replays])
+    away = errors_at(all_errors(replays)[:, :, kept], REPORTED_TIMES, period)
     write_config(folder, "replay", {**config.model_dump(mode="json", by_alias=True), "seed": None})
     results = {"pole": name, "control_period_s": period, "parameters": parameters, "errors": errors}
+    results["errors_away_from_upright"] = away
     write_json(folder / REPLAY, {"recordings": [str(path) for path in paths], **results})
     count = count_text(len(episodes))
     subtitle = f"above: {paths[0].name},  below: {count},  pole={name}"
     save(replay_figure(replays, period, REPORTED_TIMES, "Measured and simulated", subtitle), folder / FIGURE)
     print(replay_table(errors, f"errors of {count}, pole={name}, over the time since a reset"))
+    if away:
+        print(replay_table(away, "the same away from upright; near it an error grows e times in 0.15 s"))
     print_results(folder, f"{REPLAY} and {FIGURE}", f"cartpole-model {as_word('from', shown(config.source))}")
 
 
-def simulated_parameters(config: ReplayConfig, pole: Pole) -> dict[str, float]:
-    """Return all parameters of the simulated cart. Raises ConfigError."""
-    explicit = config.parameters or {}
-    check_names(explicit, "parameters")
-    parameters = {**config.nominal_with(pole), **explicit}
-    check_values(parameters)
-    return parameters
+def recorded_cart(paths: Sequence[Path]) -> CartPoleSettings:
+    """Return the settings of the agent that was recorded; those of conf/train.yaml where it is unknown.
+
+    Raises CheckpointError for settings of another version.
+    """
+    folder = paths[0].parent.parent
+    try:
+        recorded = yaml.safe_load((folder / CONFIG).read_text(encoding="utf-8")).get("recorded")
+    except (OSError, yaml.YAMLError, AttributeError):
+        recorded = None
+    if program_of(folder) == "record" and recorded:
+        return recorded_settings(CartPoleSettings, recorded, f"from={folder}")
+    if program_of(folder) == "finetune":
+        return trained_agent(folder).training
+    return load_settings(TrainConfig)

@@ -17,6 +17,7 @@ from cartpole_rl.learning.checkpoints import forget_training, load_training, res
 from cartpole_rl.learning.states import seed_everything
 from cartpole_rl.plants.effects import without_effect
 from cartpole_rl.randomization.randomizer import Draws
+from cartpole_rl.randomization.ranges import IdentifiedSettings
 from cartpole_rl.reporting.episodes import report_episodes
 from cartpole_rl.run_folder import BEST, CHECKPOINTS, FIGURES, METRICS, write_config
 from cartpole_rl.settings import evaluation_seed
@@ -26,7 +27,7 @@ from cartpole_rl.workflows.build import new_agent, use_threads
 from cartpole_rl.workflows.checks import check_compiler, check_resumable, note_other_numbers
 from cartpole_rl.workflows.config import TrainConfig, recorded_settings
 from cartpole_rl.workflows.monitor import TrainingMonitor
-from cartpole_rl.workflows.poles import emulated_words
+from cartpole_rl.workflows.poles import emulated_words, words_of_run
 
 FALLEN = 0.9  # of the best score: a training that ends below it says so
 
@@ -77,10 +78,13 @@ def train(config: TrainConfig, folder: Path) -> float:
             monitor.finished(metrics)
         forget_training(folder)
     print(f"trained for {training.seconds:.0f} s")
-    next_command = f"cartpole-evaluate {as_word('run', shown(folder))} {emulated_words([config.pole])}"
-    print_results(folder, f"{METRICS}, {FIGURES}/ and {CHECKPOINTS}/", next_command)
     if fall := fall_note([evaluation[config.task.measure] for evaluation in monitor.history]):
         print(fall)
+    identified = config.randomization
+    source = identified.posterior.parent if isinstance(identified, IdentifiedSettings) else None
+    cart = (source and words_of_run(source)) or emulated_words([config.pole])
+    following = f"cartpole-evaluate {as_word('run', shown(folder))} {cart}"
+    print_results(folder, f"{METRICS}, {FIGURES}/ and {CHECKPOINTS}/", following)
     score: float = metrics[config.task.measure]["mean"]
     return score
 

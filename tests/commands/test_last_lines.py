@@ -18,7 +18,7 @@ from cartpole_rl.terminal import progress_bar
 
 pytestmark = pytest.mark.usefixtures("without_pictures")
 SIMULATED = "cartpole-evaluate run=run plant=emulated"
-EMULATED = "cartpole-finetune run=run plant=emulated"
+EMULATED = "cartpole-finetune run=run plant=emulated emulator.physics_step=0.001"
 
 
 def compose(command: str) -> None:
@@ -47,7 +47,7 @@ def test_an_agent_on_another_pole_is_told_which_cart_has_its_own(tmp_path: Path)
     done = in_process("evaluate", "run=pretrained/large", *words, folder=tmp_path)
     assert "trained with a pole of 0.66 m, the cart has one of 0.35 m; give emulator=large" in done.err
     last = done.out.splitlines()[-1]
-    assert last == "cartpole-finetune run=pretrained/large plant=emulated emulator=large"
+    assert last == "cartpole-identify plant=emulated emulator=large emulator.physics_step=0.001 pole=large"
     compose(last)
     known = in_process("evaluate", "run=pretrained/large", "emulator=large", *words, folder=tmp_path)
     assert "trained with" not in known.err
@@ -60,7 +60,7 @@ def test_an_agent_on_another_pole_is_told_which_cart_has_its_own(tmp_path: Path)
         (("pole=large",), "cartpole-evaluate run=run plant=emulated emulator=large"),
         (
             ("plant=emulated", "emulator=large", COARSE),
-            "cartpole-finetune run=run plant=emulated emulator=large",
+            "cartpole-finetune run=run plant=emulated emulator=large emulator.physics_step=0.001",
         ),
     ],
 )
@@ -86,7 +86,7 @@ def test_recordings_lead_to_a_replay_and_to_a_model(trained: Path) -> None:
 def test_a_fine_tuning_leads_to_an_evaluation_on_its_cart(tuned: tuple[Path, Outcome]) -> None:
     *_, written, last = tuned[1].out.splitlines()
     assert written.startswith("run/metrics.json, comparison.json, checkpoints/last.pt and recordings/ are")
-    assert last == "cartpole-evaluate run=run plant=emulated"
+    assert last == "cartpole-evaluate run=run plant=emulated emulator.physics_step=0.001"
 
 
 class Narrow(io.StringIO):

@@ -23,31 +23,34 @@ def test_the_emulated_cart_is_ready(tmp_path: Path) -> None:
     *checks, last, following = done.out.splitlines()
     assert len(checks) == 8
     assert all(line.startswith("OK   ") for line in checks)
-    assert last == "The cart is ready. Next, with the mounted pole as pole= (medium, large or a file):"
-    assert following == f"cartpole-identify {' '.join(words)} pole=large"
+    assert (
+        last
+        == "The cart is ready. Next, hold the pole up when asked (pretrained/large is for one of 0.66 m):"
+    )
+    assert following == f"cartpole-evaluate run=pretrained/large task=balance {' '.join(words)} episodes=1"
     with shipped_choices():
-        hydra.compose("identify", following.split()[1:])
+        hydra.compose("evaluate", following.split()[1:])
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(
     ("given", "following"),
     [
-        (("plant.port=COM3",), "plant=serial plant.port=COM3 pole=medium"),
+        (("plant.port=COM3",), "medium task=balance plant=serial plant.port=COM3"),
         (
-            ("plant=serial", "plant.port=auto", "plant.baud=115200", "plant.pole_length=0.65"),
-            "plant=serial plant.port=auto plant.baud=115200 plant.pole_length=0.65 pole=large",
+            ("plant.port=auto", "plant.baud=115200", "plant.pole_length=0.65"),
+            "large task=balance plant=serial plant.port=auto plant.baud=115200 plant.pole_length=0.65",
         ),
         (
-            ("plant.port=x", "plant.pole_length=1"),
-            "plant=serial plant.port=x plant.pole_length=1 pole=medium",
+            ("plant.port=x", "plant.pole_length=1.0"),
+            "medium task=balance plant=serial plant.port=x plant.pole_length=1.0",
         ),
     ],
 )
 def test_the_next_command_is_for_the_same_cart(given: tuple[str, ...], following: str) -> None:
     settings = dict(word.split("=") for word in given)
     config = validated(PreflightConfig, compose("preflight", settings))
-    assert next_command(config, given) == f"cartpole-identify {following}"
+    assert next_command(config) == f"cartpole-evaluate run=pretrained/{following} episodes=1"
 
 
 def test_a_motor_the_wrong_way_round_is_refused(tmp_path: Path) -> None:

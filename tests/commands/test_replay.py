@@ -48,6 +48,19 @@ def test_another_cart_is_not_followed(recorded: Path, tmp_path: Path) -> None:
     assert results["errors"][0]["rms_x_mm"] > 0.3
 
 
+def test_the_cart_of_the_recorded_agent_is_followed(tmp_path: Path) -> None:
+    cart = ("cart_friction=linear", "parameters={cart_viscous:3,pole_viscous:0.002}", "episodes=1")
+    done = in_process("record", "run=lqr", *cart, "hydra.run.dir=recorded", folder=tmp_path)
+    assert done.code == 0, done.err
+    _, own = replay(tmp_path / "recorded", tmp_path)
+    assert own["parameters"]["cart_viscous"] == 3
+    assert own["errors_away_from_upright"][2]["median_theta_deg"] < 0.5
+    assert own["errors"][2]["median_theta_deg"] < 5
+    (tmp_path / "run").rename(tmp_path / "own")
+    _, other = replay(tmp_path / "recorded", tmp_path, "cart=ip02", "cart_friction=sigmoid")
+    assert other["errors"][2]["median_theta_deg"] > 2 * own["errors"][2]["median_theta_deg"]
+
+
 def test_the_recorded_pole_is_the_simulated_one(recorded: Path, tmp_path: Path) -> None:
     text = (recorded / "recordings/episode_000.csv").read_text()
     (tmp_path / "large.csv").write_text(text.replace("pole_length_m: 0.3556", "pole_length_m: 0.6560"))
