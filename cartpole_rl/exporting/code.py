@@ -81,9 +81,8 @@ def perception(settings: CartPoleSettings, guard: TrackGuard | None) -> tuple[Gr
     """Return the perception of a first and of a later period, with the track guard `guard`."""
     observation = settings.observation
     perceive_start = partial(perceive_first, settings=observation, guard=guard)
-    perceive_next = partial(
-        perceive, settings=observation, task=settings.task, rewards=settings.reward, guard=guard
-    )
+    task = settings.task.at(settings.control_period)
+    perceive_next = partial(perceive, settings=observation, task=task, rewards=settings.reward, guard=guard)
 
     def scaled(length: Tensor) -> Tensor:
         return length[: int(observation.pole_length)] / LENGTH_SCALE

@@ -101,6 +101,7 @@ class NormalEquations(NamedTuple):
         rest = self.state_slope + torch.einsum("wis,i->ws", self.point_state, step)
         return step, -torch.einsum("wst,wt->sw", inverse, rest)
 
+    @solvable()
     def length(self, step: Tensor) -> float:
         """Return the length of a step of the point [U] in standard deviations, as windows disagree."""
         matrix, slopes, _ = self.reduced(step.new_zeros(1))

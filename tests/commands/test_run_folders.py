@@ -38,11 +38,11 @@ def weights(run: Path) -> dict[str, torch.Tensor]:
 
 
 def curves(run: Path) -> dict[str, list[tuple[int, float]]]:
-    """Return the points of every TensorBoard curve that is not a duration."""
+    """Return the points of every TensorBoard curve that is not a duration, by step."""
     events = EventAccumulator(str(run), size_guidance={"scalars": 0})
     events.Reload()
     names = [tag for tag in events.Tags()["scalars"] if "second" not in tag]
-    return {name: [(event.step, event.value) for event in events.Scalars(name)] for name in names}
+    return {name: sorted((event.step, event.value) for event in events.Scalars(name)) for name in names}
 
 
 def timeless(value: Any) -> bool:

@@ -171,7 +171,7 @@ def test_keyword_arguments_take_what_the_configuration_takes(make: Any) -> None:
     for each in (env, copy):
         assert each.env.plant.pole_length.item() == pytest.approx(0.6604)
         assert each.env.plant.period == 0.025
-        assert each.env.hardware.reward.scale == 2.0
+        assert each.env.hardware.reward.scale == 2.5  # a period of 0.025 s in place of 0.02 s
         assert each.env.hardware.observation_settings.size == 4
         assert len(each.env.hardware.motors) == 3
         assert each.metadata["render_fps"] == 40
