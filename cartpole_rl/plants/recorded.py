@@ -9,7 +9,6 @@ from torch import Tensor
 
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.plants.specs import TERMINATING, TRUNCATING, Numbers, OneCartPlant, PlantOutput
-from cartpole_rl.rig.hardware import Hardware
 from cartpole_rl.tasks.episode import Episode
 
 
@@ -20,8 +19,8 @@ class RecordedPlant(OneCartPlant):
     unknown.
     """
 
-    def __init__(self, episode: Episode, pole_length: float | None, hardware: Hardware | None = None) -> None:
-        super().__init__(hardware)
+    def __init__(self, episode: Episode, pole_length: float | None) -> None:
+        super().__init__()
         self.episode = episode
         self._pole_length = pole_length
         self._row = 0

@@ -129,10 +129,7 @@ def print_notes(config: TrainConfig, draws: Draws) -> None:
 def note_unused_randomization(config: TrainConfig, draws: Draws) -> None:
     """Print the ranges that change nothing with the chosen actions and friction models."""
     models = config.models(config.plant)
-    encoders = config.hardware.encoders
-    if unused := without_effect(
-        draws, config.ranges, config.actions.motors, models, config.control_period, encoders
-    ):
+    if unused := without_effect(draws, config.ranges, config.actions.motors, models, config.control_period):
         chosen = (
             f"cart_friction={config.cart_friction.model}, pole_friction={config.pole_friction.model} and "
             f"actuator {config.actions.actuator} with motor values {list(config.actions.motors)}"

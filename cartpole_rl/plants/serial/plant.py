@@ -29,7 +29,7 @@ from cartpole_rl.plants.serial.preparation import (
 from cartpole_rl.plants.serial.statistics import LinkStatistics
 from cartpole_rl.plants.settings import EmulatedSettings, Rehome, SerialSettings
 from cartpole_rl.plants.specs import TERMINATING, TRUNCATING, Numbers, OneCartPlant, PlantOutput, on_tensors
-from cartpole_rl.rig.hardware import Hardware, check_of_ip02, nominal_hardware
+from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT
 from cartpole_rl.tasks.episode import Ending
 from cartpole_rl.wire import Fault, Flags, State, seconds_between, ticks_between, went_back
 
@@ -75,11 +75,10 @@ class SerialPlant(OneCartPlant):
         prompt: Callable[[str], None] = print,
         owned: Owned | None = None,
         confirm: Confirm = nobody,
-        hardware: Hardware | None = None,
     ) -> None:
-        super().__init__(hardware)
+        super().__init__()
         self.settings = settings
-        self.cart = SerialCart(settings, self.hardware)
+        self.cart = SerialCart(settings)
         self.ended_by = ""
         self.last_error: PlantError | None = None
         self.on_board = False  # resets start the policy on the cart's board; `listen_one` passes periods
@@ -140,7 +139,7 @@ class SerialPlant(OneCartPlant):
     @property
     def track_half_length(self) -> Tensor:
         """m, [1]: the soft limit of the cart, from the span that it measured in homing."""
-        return torch.tensor([self.cart.information.soft_limit_counts * self.hardware.encoders.metres])
+        return torch.tensor([self.cart.information.soft_limit_counts * CART_METRES_PER_COUNT])
 
     def _set_seed(self, seed: int | None) -> None:
         """Do nothing: a real cart has its own randomness, an emulated one has its seed in its settings."""
@@ -296,7 +295,7 @@ class SerialPlant(OneCartPlant):
     def _connect(self) -> None:
         """Open the port and check the cart's scales. Raises PortError, LinkError, NotReadyError."""
         self.cart.open()
-        check_scales(self.cart.information, self.hardware)
+        check_scales(self.cart.information)
 
 
 def real_cart(
@@ -306,10 +305,9 @@ def real_cart(
     start: StartPosition,
     prompt: Callable[[str], None],
     confirm: Confirm = nobody,
-    hardware: Hardware | None = None,
 ) -> SerialPlant:
     """Return the plant of plant=serial. Raises PortError, LinkError, NotReadyError."""
-    return SerialPlant(plant, start, control_period, prompt, confirm=confirm, hardware=hardware)
+    return SerialPlant(plant, start, control_period, prompt, confirm=confirm)
 
 
 def emulated_cart(
@@ -319,14 +317,11 @@ def emulated_cart(
     start: StartPosition,
     prompt: Callable[[str], None],
     confirm: Confirm = nobody,
-    hardware: Hardware | None = None,
 ) -> SerialPlant:
     """Return the plant of plant=emulated, on a new cart with the settings `emulator` and the start `start`.
 
-    It needs nobody to confirm. Raises PortError, LinkError, NotReadyError, EmulatorError,
-    and ConfigError for the hardware of another cart than ip02.
+    It needs nobody to confirm. Raises PortError, LinkError, NotReadyError, EmulatorError.
     """
-    check_of_ip02(hardware or nominal_hardware(), "plant=emulated emulates")
     return emulated_plant(emulator.model_copy(update={"start": start}), control_period, prompt, plant.rehome)
 
 
