@@ -52,6 +52,7 @@ from cartpole_rl.choices import (
     merged,
 )
 from cartpole_rl.errors import ConfigError
+from cartpole_rl.rig.hardware import HARDWARE, hardware_of
 from cartpole_rl.rig.parameters import PARAMETERS, check_value, completed
 from cartpole_rl.run_folder import PREFIX, RUN_FILES, USES, check_program, program_of, use_of
 from cartpole_rl.terminal import in_quotes
@@ -460,16 +461,16 @@ def _check_cart(word: str, cart: Chosen) -> None:
     # the numbers of a pole are refused with a line of their own
     (pole,) = group_choices("pole")["medium"]["choices"].values()
     known = [name for name in PARAMETERS if name not in pole]
-    for name in cart.given.keys() - PARAMETERS.keys():
-        raise ConfigError(
-            f"{word}: {name}: there is no such setting; did you mean {most_similar(name, known)}?"
-        )
-    for name, value in cart.given.items():
-        if isinstance(value, int | float):
-            try:
-                check_value(name, value)
-            except ConfigError as error:
-                raise ConfigError(f"{word}: {error}") from None
+    for name in cart.given.keys() - PARAMETERS.keys() - {*HARDWARE}:
+        nearest = most_similar(name, [*known, *HARDWARE])
+        raise ConfigError(f"{word}: {name}: there is no such setting; did you mean {nearest}?")
+    numbers = {name: value for name, value in cart.given.items() if isinstance(value, int | float)}
+    try:
+        for name in numbers.keys() & PARAMETERS.keys():
+            check_value(name, numbers[name])
+        hardware_of({**cart.values, **numbers})
+    except ConfigError as error:
+        raise ConfigError(f"{word}: {str(error).removeprefix('cart.').removeprefix('cart: ')}") from None
     if missing := [name for name in known if name not in completed(cart.values)]:
         remedy = "give it, or take what is missing from a choice: defaults: [ip02]"
         raise ConfigError(f"{word}: {missing[0]} is missing; {remedy}")

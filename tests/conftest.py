@@ -33,6 +33,7 @@ from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.randomization.randomizer import Randomizer
 from cartpole_rl.randomization.ranges import Range
 from cartpole_rl.registry import Registry
+from cartpole_rl.rig.hardware import parameters_of
 from cartpole_rl.rig.parameters import PARAMETERS, completed
 from cartpole_rl.tasks.settings import ActionSettings, RewardSettings, Start, StartSettings, TaskSettings
 
@@ -66,7 +67,7 @@ def hydra_reads_conf() -> Iterator[None]:
 @pytest.fixture(scope="session")
 def ip02() -> dict[str, float]:
     """Nominal numbers of the cart, without a pole."""
-    return conf("cart/ip02")
+    return parameters_of(conf("cart/ip02"))
 
 
 @pytest.fixture(scope="session")

@@ -22,6 +22,7 @@ from cartpole_rl.physics.models import INTEGRATORS, Models
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.simulated import Carts, Inputs, run_carts
 from cartpole_rl.plants.specs import PlantOutput
+from cartpole_rl.rig.hardware import nominal_encoders
 from cartpole_rl.scalar import Scalar, plain
 from cartpole_rl.tasks.features import ObservationKind
 from cartpole_rl.tasks.rewards import Reward
@@ -111,7 +112,7 @@ DYNAMICS = list(itertools.product(INTEGRATORS, (False, True)))  # integrator, an
 def test_physics_is_that_of_many_carts(number: int) -> None:
     integrator, pole_presses = DYNAMICS[number % len(DYNAMICS)]
     models = MODELS[number]._replace(integrator=integrator, pole_presses=pole_presses)
-    run = partial(run_carts, models=models, period=0.02, substeps=2)
+    run = partial(run_carts, models=models, period=0.02, substeps=2, encoders=nominal_encoders())
     inputs = Inputs(torch.tensor([[0]]), torch.tensor([[0.5], [1.0], [-1.0]]))
     scalar = Scalar(run, Carts(torch.zeros(len(CartParameters.names()), 1), *torch.zeros(2, 4, 1)), inputs)
 
@@ -135,10 +136,13 @@ def test_perception_is_that_of_many_carts(
     )
     task = TASK.model_copy(update={"angle_limit": 0.2 if memory else None, "time_limit": 3})
     rewards = REWARD.model_copy(update={"kind": reward, "position_cost": 0.1})
-    later = partial(perceive, settings=observation, task=task, rewards=rewards, guard=guard)
+    encoders = nominal_encoders()
+    later = partial(
+        perceive, settings=observation, task=task, rewards=rewards, guard=guard, encoders=encoders
+    )
 
     def first(frame: PlantOutput[Tensor], cart: tuple[Tensor, Tensor]) -> tuple[Tensor, ...]:
-        return perceive_first(frame, *cart, settings=observation, guard=guard)
+        return perceive_first(frame, *cart, settings=observation, guard=guard, encoders=encoders)
 
     length = torch.full((int(memory > 1), 1), 0.6)
     counts, flags, motor = st.integers(-(2**30), 2**30), st.booleans(), st.integers(-255, 255)

@@ -1,6 +1,6 @@
 """The C firmware, ``firmware/src/``, with the methods of `Firmware`: either can run an emulated cart.
 
-It is built as a shared library with the machine's own C compiler, on first use.
+It is built for a rig as a shared library with the machine's own C compiler, on first use.
 """
 
 import ctypes
@@ -15,21 +15,29 @@ from collections.abc import Callable
 from pathlib import Path
 
 from cartpole_rl.emulator.firmware import MOST_PENDING
-from cartpole_rl.emulator.guards import LEVER
+from cartpole_rl.emulator.guards import LEVER, micrometres
 from cartpole_rl.errors import EmulatorError
-from cartpole_rl.rig.hardware import CART_NANOMETRES_PER_COUNT, POLE_COUNTS_PER_TURN, SPAN
+from cartpole_rl.rig.hardware import Hardware, nominal_hardware
 from cartpole_rl.wire import Fault, Message, SetMotor
 from cartpole_rl.wire.frames import END, open_envelope
 from cartpole_rl.wire.messages import MESSAGES
 
 COMPILERS = ("cc", "gcc", "clang")
-FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-ffp-contract=off")
-CART = (
-    f"-DCART_NANOMETRES={CART_NANOMETRES_PER_COUNT}",
-    f"-DCART_POLE_COUNTS={POLE_COUNTS_PER_TURN}",
-    f"-DCART_SPAN_UM={round(SPAN * 1e6)}",
-    f"-DCART_PENDING={MOST_PENDING}",
-)
+FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-ffp-contract=off", f"-DCART_PENDING={MOST_PENDING}")
+RIG = {  # macros of cart_rig.h
+    "CART_NANOMETRES": "nm per count of the cart's encoder",
+    "CART_POLE_COUNTS": "counts per turn of the pole's encoder",
+    "CART_SPAN_UM": "um between the stops, nominal",
+    "CART_SOFT_LIMIT_UM": "um inside a stop: from there on outward motor values give 0",
+    "CART_HARD_LIMIT_UM": "um inside a stop: an armed cart there is faulted",
+    "CART_BRAKING_UM_S2": "um/s^2: full motor inward slows any healthy cart at least so hard",
+    "CART_HARD_PUSH": "smallest motor value that moves any healthy cart",
+    "CART_MOVING_MASS": "kg: cart and pole, roughly, as all numbers below",
+    "CART_MOVING_FRICTION": "N",
+    "CART_MOTOR_OFFSET": "motor value at which the force starts",
+    "CART_MOTOR_PER_NEWTON": "motor values per N beyond it",
+    "CART_GENTLE_FORCE": "N, the largest of homing",
+}
 LONGEST_ANSWER = 70  # bytes: 2 * CART_FRAME_BYTES
 SNAPSHOT_NUMBERS = 90
 
@@ -62,14 +70,15 @@ class CFirmware:
         lever_um: int = LEVER,
         policy: Path | None = None,
         pole_length: float = 0.0,
+        hardware: Hardware | None = None,
     ) -> None:
         """`delay_us` returns a command's latency; homing sets the pole's zero `zero_error` counts too low.
 
-        `lever_um` is that of `TrackLimits`.
+        `lever_um` is that of `TrackLimits`; `hardware` is ip02's if it is None.
         `policy` is a folder with policy.h and policy.c, of an agent that drives on the board; it may observe
         `pole_length` in m. Raises EmulatorError if the C firmware cannot be compiled.
         """
-        self._library = load_library(policy)
+        self._library = load_library(policy, hardware)
         self._memory = ctypes.create_string_buffer(self._library.cart_size())
         self._policy_memory = ctypes.create_string_buffer(max(1, self._library.cart_policy_size()))
         self._head = CartHead.from_buffer(self._memory)
@@ -177,11 +186,48 @@ def sources() -> list[Path]:
     return [*core, folder / "host" / "library.c"]
 
 
+def rig_macros(hardware: Hardware) -> dict[str, str | int]:
+    """Return the values of the macros in ``firmware/src/cart_rig.h`` for a rig."""
+    values = (
+        hardware.cart_nanometres_per_count,
+        hardware.pole_counts_per_turn,
+        micrometres(hardware.track_span),
+        micrometres(hardware.soft_limit),
+        micrometres(hardware.hard_limit),
+        micrometres(hardware.braking),
+        hardware.hard_push,
+        repr(hardware.moving_mass),
+        repr(hardware.moving_friction),
+        repr(hardware.motor_offset),
+        repr(hardware.motor_per_newton),
+        repr(hardware.gentle_force),
+    )
+    return dict(zip(RIG, values, strict=True))
+
+
+def definitions(hardware: Hardware) -> tuple[str, ...]:
+    """Return the compiler's flags for a rig."""
+    return tuple(f"-D{name}={value}" for name, value in rig_macros(hardware).items())
+
+
+def rig_header(hardware: Hardware, source: str) -> str:
+    """Return the text of ``firmware/src/cart_rig.h`` for the rig of the cart `source`."""
+    macros = [
+        f"#ifndef {name}\n#define {name} {value} /* {RIG[name]} */\n#endif\n"
+        for name, value in rig_macros(hardware).items()
+    ]
+    about = (
+        f"/* Encoders, track and motor of cart={source}. cartpole-export format=firmware writes this file;\n"
+        "   flags -D override single numbers. No count is converted: the host needs the same numbers. */\n"
+    )
+    return f"{about}#ifndef CART_RIG_H\n#define CART_RIG_H\n\n{''.join(macros)}\n#endif\n"
+
+
 def compile_c(output: Path, files: list[Path], *flags: str) -> None:
     """Compile C files of the firmware to `output`. Raises EmulatorError."""
     folder = firmware_folder()
     include = (f"-I{folder / 'src'}", f"-I{folder / 'host'}")
-    command = [find_compiler(), *FLAGS, *CART, *include, *flags, "-o", str(output), *map(str, files), "-lm"]
+    command = [find_compiler(), *FLAGS, *include, *flags, "-o", str(output), *map(str, files), "-lm"]
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode:
         raise EmulatorError(f"the C firmware was not compiled: {done.stderr.strip() or done.returncode}")
@@ -199,15 +245,16 @@ def policy_sources(policy: Path | None) -> list[Path]:
     return [policy.resolve() / "policy.c"]
 
 
-def build_library(policy: Path | None = None) -> Path:
-    """Return the shared library, built unless these sources were built before.
+def build_library(policy: Path | None = None, hardware: Hardware | None = None) -> Path:
+    """Return the shared library for a rig, ip02's if it is None, built unless that was built before.
 
     `policy` is a folder with policy.h and policy.c, of an agent that drives on the board. Raises
     EmulatorError.
     """
     files = [*sources(), *policy_sources(policy)]
+    flags = ["-shared", "-fPIC", *definitions(hardware or nominal_hardware())]
     folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "cartpole_rl"
-    content = hashlib.sha256(" ".join((platform.platform(), find_compiler(), *FLAGS, *CART)).encode())
+    content = hashlib.sha256(" ".join((platform.platform(), find_compiler(), *FLAGS, *flags)).encode())
     read = [*firmware_folder().glob("src/*"), *firmware_folder().glob("host/*")]
     for path in (*sorted(read), *(sorted(policy.glob("policy.[ch]")) if policy else ())):
         content.update(path.read_bytes())
@@ -216,15 +263,16 @@ def build_library(policy: Path | None = None) -> Path:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder) as beside:
             built = Path(beside, library.name)
-            flags = ("-DCART_ONBOARD_POLICY", f"-I{policy.resolve()}") if policy else ()
-            compile_c(built, files, "-shared", "-fPIC", *flags)
+            if policy:
+                flags += ["-DCART_ONBOARD_POLICY", f"-I{policy.resolve()}"]
+            compile_c(built, files, *flags)
             built.replace(library)
     return library
 
 
-def load_library(policy: Path | None = None) -> ctypes.CDLL:
+def load_library(policy: Path | None = None, hardware: Hardware | None = None) -> ctypes.CDLL:
     """Return the C firmware with the types of its functions. Raises EmulatorError."""
-    return _loaded(build_library(policy))
+    return _loaded(build_library(policy, hardware))
 
 
 @functools.cache

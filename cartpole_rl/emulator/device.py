@@ -10,7 +10,7 @@ from cartpole_rl.emulator.c_firmware import CFirmware
 from cartpole_rl.emulator.firmware import BANNER, Firmware
 from cartpole_rl.emulator.physics import CartPhysics
 from cartpole_rl.emulator.settings import EmulatorSettings
-from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
+from cartpole_rl.rig.hardware import nominal_hardware
 from cartpole_rl.wire import Message
 
 BOOT_HANGING = 0.3  # largest distance from the middle with boot=hanging, share of the half length
@@ -34,6 +34,8 @@ class CartDevice:
         Raises OSError if the journal cannot be created.
         """
         self._settings = settings
+        self._hardware = settings.hardware or nominal_hardware()
+        self._encoders = self._hardware.encoders
         self.physics = CartPhysics(settings)
         self._journal = Journal(settings.journal) if settings.journal else None
         self.physics.on_contact = self._touch
@@ -139,12 +141,12 @@ class CartDevice:
 
     def _new_firmware(self) -> Firmware | CFirmware:
         """Return the firmware that the settings choose, just booted."""
-        cart = self._settings
-        zero_error = round(cart.angle_offset / POLE_RADIANS_PER_COUNT)
+        cart, rig = self._settings, self._hardware
+        zero_error = round(cart.angle_offset / self._encoders.radians)
         lever_um = round(1e6 * cart.pole_mass * cart.pole_com / (cart.cart_mass + cart.pole_mass))
         if cart.firmware == "c":
-            return CFirmware(self._latency_us, zero_error, lever_um, cart.policy, 2 * cart.pole_com)
-        return Firmware(self._latency_us, zero_error, lever_um)
+            return CFirmware(self._latency_us, zero_error, lever_um, cart.policy, 2 * cart.pole_com, rig)
+        return Firmware(self._latency_us, zero_error, lever_um, rig)
 
     def _counts(self) -> tuple[int, int]:
         """Return the raw counts of cart and pole since boot."""
@@ -166,9 +168,10 @@ class CartDevice:
         The position of the pole's disc includes the fraction of `angle_offset` that is below a count; the
         firmware's zero, a whole number, includes the rest.
         """
-        cart = math.floor(self.physics.x / CART_METRES_PER_COUNT)
-        pole = math.floor((self.physics.angle + self._settings.angle_offset) / POLE_RADIANS_PER_COUNT + 0.5)
-        return cart, pole
+        angle = self.physics.angle + self._settings.angle_offset
+        return math.floor(self.physics.x / self._encoders.metres), math.floor(
+            angle / self._encoders.radians + 0.5
+        )
 
     def _latency_us(self) -> int:
         jitter = self._settings.latency_jitter

@@ -13,19 +13,19 @@ from collections.abc import Callable, Generator
 from cartpole_rl.emulator.guards import (
     FASTEST_CART,
     FASTEST_POLE,
-    HARD_LIMIT,
     LEVER,
-    SOFT_LIMIT,
     FrozenCartWatch,
     FrozenPoleWatch,
     JumpWatch,
     StallWatch,
     TrackLimits,
+    micrometres,
+    nearest_count,
 )
-from cartpole_rl.emulator.homing import HomingError, Reading, Zeros, home
+from cartpole_rl.emulator.homing import Homing, HomingError, Reading, Zeros
 from cartpole_rl.emulator.settings import LARGEST_MOTOR
 from cartpole_rl.errors import FrameError
-from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_COUNTS_PER_TURN, SPAN
+from cartpole_rl.rig.hardware import Hardware, nominal_hardware
 from cartpole_rl.wire.frames import VERSION, Envelope, encode_frame, open_envelope
 from cartpole_rl.wire.messages import (
     FROM_CART,
@@ -63,7 +63,6 @@ NO_AGE = 65535
 U32 = 0xFFFFFFFF
 UNDERSTOOD = {kind for kind in MESSAGES if not kind & FROM_CART} - {StartPolicy.TYPE}  # it has no policy
 MOST_PENDING = 1024  # the line's memory is bounded, as a board's is
-NOMINAL_HALF_SPAN = round(SPAN / 2 / CART_METRES_PER_COUNT)
 
 
 class MotorLine:
@@ -110,11 +109,18 @@ class MotorLine:
 class Firmware:
     """The firmware of one cart, just booted: idle, not homed, motor 0."""
 
-    def __init__(self, delay_us: Callable[[], int], zero_error: int = 0, lever_um: int = LEVER) -> None:
+    def __init__(
+        self,
+        delay_us: Callable[[], int],
+        zero_error: int = 0,
+        lever_um: int = LEVER,
+        hardware: Hardware | None = None,
+    ) -> None:
         """`delay_us` returns a command's latency; homing sets the pole's zero `zero_error` counts too low.
 
-        `lever_um` is that of `TrackLimits`.
+        `lever_um` is that of `TrackLimits`; `hardware` is ip02's if it is None.
         """
+        self._hardware = hardware = hardware or nominal_hardware()
         self.period_us = PERIOD_US
         self.armed = False
         self.homed = False
@@ -124,10 +130,11 @@ class Firmware:
         self._delay_us = delay_us
         self._zero_error = zero_error
         self._line = MotorLine()
-        self._limits = TrackLimits(lever_um)
+        self._limits = TrackLimits(hardware, lever_um)
         self._limited = False  # the limits have changed the motor value since the newest tick
         self._homing: Generator[int, Reading, Zeros] | None = None
-        self._zeros = Zeros(-NOMINAL_HALF_SPAN, NOMINAL_HALF_SPAN, hanging=0)
+        half_span = nearest_count(micrometres(hardware.track_span) // 2, hardware)
+        self._zeros = Zeros(-half_span, half_span, hanging=0)
         self._pole_zero = 0  # raw count that is reported as 0
         self._command_us: int | None = None  # when the newest SET_MOTOR arrived
         self._expires_us = 0  # the watchdog then sets the motor to 0
@@ -287,7 +294,7 @@ class Firmware:
                 self.armed, self._homing = False, None
                 self._line.stop(now_us)
             case Home():
-                self.homed, self._homing = False, home()
+                self.homed, self._homing = False, Homing(self._hardware).home()
                 next(self._homing)
                 self._line.hold(0)
                 self._limits.release()
@@ -303,7 +310,7 @@ class Firmware:
             self._line.hold(homing.send(reading))
         except StopIteration as end:
             self._zeros = end.value
-            self._pole_zero = end.value.hanging - POLE_COUNTS_PER_TURN // 2 - self._zero_error
+            self._pole_zero = end.value.hanging - self._hardware.pole_counts_per_turn // 2 - self._zero_error
             self.homed, self._homing = True, None
             self._line.hold(0)
         except HomingError:
@@ -318,7 +325,7 @@ class Firmware:
         jumped = self._pole_jumps.jumped(reading.pole, reading.us)
         if self._pole_freezes.frozen(reading.pole, reading.cart, reading.us) or jumped:
             self._latch(Fault.POLE_ENCODER)
-        beyond = abs(reading.cart - self._zeros.middle) >= self._zeros.half_span - HARD_LIMIT
+        beyond = abs(reading.cart - self._zeros.middle) >= self._zeros.half_span - self._limits.hard
         if self.armed and beyond:
             self._latch(Fault.HARD_LIMIT)
         if self.armed and self._stalls.stalled(reading.cart, motor, reading.us):
@@ -336,20 +343,22 @@ class Firmware:
 
     def _reset_watches(self) -> None:
         """Start with new guards: a hand may have moved cart and pole while the motor was off."""
-        self._cart_jumps, self._pole_jumps = JumpWatch(FASTEST_CART), JumpWatch(FASTEST_POLE)
-        self._cart_freezes, self._pole_freezes = FrozenCartWatch(), FrozenPoleWatch()
-        self._stalls = StallWatch()
+        hardware = self._hardware
+        self._cart_jumps = JumpWatch(FASTEST_CART // hardware.cart_nanometres_per_count)
+        self._pole_jumps = JumpWatch(FASTEST_POLE * hardware.pole_counts_per_turn)
+        self._cart_freezes, self._pole_freezes = FrozenCartWatch(hardware), FrozenPoleWatch(hardware)
+        self._stalls = StallWatch(hardware)
         self._limits.forget()
 
     def _info(self) -> Info:
-        half_span = self._zeros.half_span
+        half_span, limits = self._zeros.half_span, self._limits
         return Info(
             *FIRMWARE,
-            POLE_COUNTS_PER_TURN,
-            round(CART_METRES_PER_COUNT * 1e9),
+            self._hardware.pole_counts_per_turn,
+            self._hardware.cart_nanometres_per_count,
             LARGEST_MOTOR,
-            half_span - SOFT_LIMIT,
-            half_span - HARD_LIMIT,
+            half_span - limits.soft,
+            half_span - limits.hard,
             self.period_us,
             0,  # it has no policy
         )

@@ -6,7 +6,7 @@ cart's position and speed; they are looked at once a millisecond.
 Beyond the soft limit an outward motor value gives 0. A cart that runs outward too fast to stop before its
 hard limit is braked with full motor inward:
 
-    left - shake < speed * (lag + reaction) + speed^2 / (2 * BRAKING)
+    left - shake < speed * (lag + reaction) + speed^2 / (2 * braking)
 
 `left` is the way to the hard limit and `lag` the age of the measured speed. A fast pole shakes the cart
 harder than the motor can hold it, by up to `lever` to each side of the common centre of mass. The speed of
@@ -29,32 +29,40 @@ Periods are in microseconds.
 import math
 from collections import deque
 
-from cartpole_rl.rig.hardware import (
-    CART_METRES_PER_COUNT,
-    CART_NANOMETRES_PER_COUNT,
-    POLE_COUNTS_PER_TURN,
-    POLE_RADIANS_PER_COUNT,
-)
+from cartpole_rl.rig.hardware import Hardware
 
-HARD_PUSH = 200  # smallest motor value that moves any healthy cart
 STALL_US = 500_000
-STALL_COUNTS = round(0.001 / CART_METRES_PER_COUNT)
+STALL_UM = 1000
 PUSH_US = 100_000  # of such pushes one way, after which the count must have changed
 SPEED_CHANGE = 200_000  # um/s; 0.2 m/s turn any pole by several counts
-FASTEST_CART = 5_000_000_000 // CART_NANOMETRES_PER_COUNT  # counts/s; 5 m/s: over twice the motor's reach
-FASTEST_POLE = 16 * POLE_COUNTS_PER_TURN  # counts/s; 16 turns a second is five times a fast swing
+ROUNDING_US = 1250  # such a change is at least a count in this time, four in the shortest period
+FASTEST_CART = 5_000_000_000  # nm/s; 5 m/s: over twice the motor's reach
+FASTEST_POLE = 16  # turns/s; five times a fast swing
+
+
+def micrometres(metres: float) -> int:
+    """Return the whole micrometres in which the firmware has a distance of the rig."""
+    return round(1e6 * metres)
+
+
+def nearest_count(um: int, hardware: Hardware) -> int:
+    """Return the nearest whole count to a distance in um, like CART_COUNTS in C."""
+    nanometres = hardware.cart_nanometres_per_count
+    return (um * 1000 + nanometres // 2) // nanometres
 
 
 class StallWatch:
     """Detects a hard push one way for half a second that moves the cart by less than a millimetre."""
 
-    def __init__(self) -> None:
+    def __init__(self, hardware: Hardware) -> None:
+        self._hard_push = hardware.hard_push
+        self._moves = nearest_count(STALL_UM, hardware)
         self._since_us = 0  # of pushing since the anchor was set
         self._anchor: tuple[int, bool] | None = None  # count and direction at the start of this push
 
     def stalled(self, cart: int, motor: int, us: int) -> bool:
         """Return whether the cart stalls, after a period of `us` under `motor` that ended at count `cart`."""
-        if abs(motor) < HARD_PUSH:
+        if abs(motor) < self._hard_push:
             self._anchor = None
         elif self._anchor is None or self._anchor[1] != (motor > 0) or self._moved(cart):
             self._anchor, self._since_us = (cart, motor > 0), 0
@@ -63,7 +71,7 @@ class StallWatch:
         return self._anchor is not None and self._since_us >= STALL_US
 
     def _moved(self, cart: int) -> bool:
-        return self._anchor is not None and abs(cart - self._anchor[0]) >= STALL_COUNTS
+        return self._anchor is not None and abs(cart - self._anchor[0]) >= self._moves
 
 
 class JumpWatch:
@@ -90,14 +98,15 @@ class FrozenCartWatch:
     begins does not count: pushes that change their direction in each period may move nothing.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, hardware: Hardware) -> None:
+        self._hard_push = hardware.hard_push
         self._count: int | None = None
         self._direction = 0  # of the present push: 1, -1, or 0 for none
         self._pushed_us = {1: 0, -1: 0}  # in each direction since the count changed, at most PUSH_US
 
     def frozen(self, cart: int, motor: int, us: int) -> bool:
         """Return whether the encoder is frozen, after `us` under `motor` that ended at count `cart`."""
-        direction = 0 if abs(motor) < HARD_PUSH else 1 if motor > 0 else -1
+        direction = 0 if abs(motor) < self._hard_push else 1 if motor > 0 else -1
         lasted, self._direction = direction != 0 and direction == self._direction, direction
         if cart != self._count:
             self._count, self._pushed_us = cart, {1: 0, -1: 0}
@@ -113,7 +122,9 @@ class FrozenPoleWatch:
     at the same angle during an opposite acceleration.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, hardware: Hardware) -> None:
+        self._nanometres = hardware.cart_nanometres_per_count
+        self._change = max(SPEED_CHANGE, self._nanometres * 1000 // ROUNDING_US)
         self._pole: int | None = None
         self._cart: int | None = None
         self._lowest = self._highest = 0  # cart speed in um/s since the pole's count changed
@@ -124,30 +135,26 @@ class FrozenPoleWatch:
         last, self._cart = self._cart, cart
         if last is None:
             return False
-        speed = (cart - last) * CART_NANOMETRES_PER_COUNT * 1000 // us
+        speed = (cart - last) * self._nanometres * 1000 // us
         if pole != self._pole:
             self._pole, self._lowest, self._highest = pole, speed, speed
             self._rise = self._fall = 0
         self._lowest, self._highest = min(self._lowest, speed), max(self._highest, speed)
         self._rise = max(self._rise, speed - self._lowest)
         self._fall = max(self._fall, self._highest - speed)
-        return min(self._rise, self._fall) >= SPEED_CHANGE
+        return min(self._rise, self._fall) >= self._change
 
-
-SOFT_LIMIT = round(0.027 / CART_METRES_PER_COUNT)  # counts inside a stop
-HARD_LIMIT = round(0.008 / CART_METRES_PER_COUNT)  # counts inside a stop
 
 SAMPLE_US = 1000  # between two samples of the position
 SAMPLES = 9  # whose first and last give the speed
-BRAKING = 2_500_000  # um/s^2: full motor inward slows any healthy cart at least so hard
 REACTION_US = 10_000  # until the motor's force has changed its sign
 RELEASE_US = 10_000  # the brake is released this much later than it would be applied: it does not rattle
 REST = 10_000  # um/s; slower outward motion is not braked
 FASTEST = 10_000_000  # um/s; a higher speed counts as this one
-FAST_POLE = POLE_COUNTS_PER_TURN * 16 // 10  # counts/s; a higher speed shakes the cart no further
+FAST_POLE = 16  # tenths of a turn a second; a higher speed shakes the cart no further
 LEVER = 27_000  # um, of the medium pole on a bare cart: m_p l / (m_c + m_p)
 LONGEST_ROLLING_US = 3_000_000  # after the cart was armed
-SLOW_POLE = POLE_COUNTS_PER_TURN * 6 // 10  # counts/s; a faster pole may hold the cart against its motor
+SLOW_POLE = 6  # tenths of a turn a second; a faster pole may hold the cart against its motor
 PUSHED = 5_000_000  # um/s^2: a hard push speeds a common cart up so hard
 SLOWED_US = 100_000  # time constant of the estimated speed without a hard push
 LOST_NM = 20_000_000  # estimated motion without a change of the count
@@ -157,8 +164,16 @@ FASTEST_LOST = 2_500_000  # um/s; a higher estimate comes from a count that jump
 class TrackLimits:
     """The limits of one cart. `blocked` and `brake` are directions: 1 right, -1 left, 0 none."""
 
-    def __init__(self, lever: int = LEVER) -> None:
+    def __init__(self, hardware: Hardware, lever: int = LEVER) -> None:
         """`lever` is m_p l / (m_c + m_p) in um, with l from the pivot to the pole's centre of mass."""
+        self.soft = nearest_count(micrometres(hardware.soft_limit), hardware)  # counts inside a stop
+        self.hard = nearest_count(micrometres(hardware.hard_limit), hardware)  # counts inside a stop
+        self._nanometres = hardware.cart_nanometres_per_count
+        self._radians = hardware.encoders.radians
+        self._fast_pole = hardware.pole_counts_per_turn * FAST_POLE // 10  # counts/s
+        self._slow_pole = hardware.pole_counts_per_turn * SLOW_POLE // 10  # counts/s
+        self._hard_push = hardware.hard_push
+        self._braking = round(1e6 * hardware.braking)  # um/s^2
         self.blocked = 0  # direction in which motor values are held at 0
         self.brake = 0  # direction of the full motor value that brakes the cart
         self._lever = lever
@@ -192,7 +207,7 @@ class TrackLimits:
             self._count = self._newest
             self._speed_um, self._way_nm = max(-FASTEST, min(FASTEST, self._cart_speed())), 0
             return False
-        if abs(motor) >= HARD_PUSH and abs(self._speed(self._poles)) < SLOW_POLE:
+        if abs(motor) >= self._hard_push and abs(self._speed(self._poles)) < self._slow_pole:
             self._speed_um += (PUSHED if motor > 0 else -PUSHED) * us // 1_000_000
         elif abs(self._speed_um) < REST:
             self._speed_um = 0
@@ -221,7 +236,7 @@ class TrackLimits:
         elif abs(speed) < REST:
             self._until_us = 0
         self.blocked = 0
-        if armed and abs(outward) >= half_span - SOFT_LIMIT:
+        if armed and abs(outward) >= half_span - self.soft:
             self.blocked = 1 if outward > 0 else -1
         self.brake = self._brake(speed, outward, pole, half_span) if now_us < self._until_us else 0
 
@@ -233,17 +248,16 @@ class TrackLimits:
         if abs(speed) < REST:
             return 0
         direction = 1 if speed > 0 else -1
-        turning = max(-FAST_POLE, min(FAST_POLE, self._speed(self._poles)))  # counts/s
-        swing = int(
-            self._lever * (turning * POLE_RADIANS_PER_COUNT) * math.cos(pole * POLE_RADIANS_PER_COUNT)
-        )  # um/s
+        fast = self._fast_pole
+        turning = max(-fast, min(fast, self._speed(self._poles)))  # counts/s
+        swing = int(self._lever * (turning * self._radians) * math.cos(pole * self._radians))  # um/s
         size = min(FASTEST, max(abs(speed), direction * (speed + swing)))
-        left = (half_span - HARD_LIMIT - direction * outward) * CART_NANOMETRES_PER_COUNT // 1000  # um
-        shake = 2 * self._lever * turning * turning // (FAST_POLE * FAST_POLE)
+        left = (half_span - self.hard - direction * outward) * self._nanometres // 1000  # um
+        shake = 2 * self._lever * turning * turning // (fast * fast)
         lag_us = (self._us[-1] - self._us[0]) // 2 + REACTION_US
         if self.brake == -direction:
             lag_us += RELEASE_US
-        needed = size * lag_us // 1_000_000 + size * size // (2 * BRAKING)
+        needed = size * lag_us // 1_000_000 + size * size // (2 * self._braking)
         return -direction if left - shake < needed else 0
 
     @property
@@ -252,7 +266,7 @@ class TrackLimits:
 
     def _cart_speed(self) -> int:
         """Return the cart's speed in um/s, rounded down."""
-        return self._speed(self._carts) * CART_NANOMETRES_PER_COUNT // 1000
+        return self._speed(self._carts) * self._nanometres // 1000
 
     def _speed(self, counts: deque[int]) -> int:
         """Return the speed over the samples, in counts/s, rounded down."""

@@ -1,11 +1,11 @@
 """Homing: touch both stops, check the span, centre the cart, wait until the pole hangs still.
 
-Homing works on raw encoder counts, one reading per tick, and needs only rough numbers of the cart (nominal
-motor curve, mass and friction), as firmware does. Distances and times are whole numbers of counts, nanometres
-and microseconds; the speed servo and the brake compute in SI units, positive to the right. A procedure is a
-generator: it receives a `Reading`, yields the motor value until the next one, and returns its result. The
-pole's zero is the middle of its last small swing. Waiting for a complete stop would not be more accurate:
-friction in the bearing holds a stopped pole up to a count off the vertical.
+Homing works on raw encoder counts, one reading per tick, and needs only rough numbers of the cart (motor
+curve, mass and friction in `Hardware`), as firmware does. Distances and times are whole numbers of counts,
+nanometres and microseconds; the speed servo and the brake compute in SI units, positive to the right. A
+procedure is a generator: it receives a `Reading`, yields the motor value until the next one, and returns its
+result. The pole's zero is the middle of its last small swing. Waiting for a complete stop would not be more
+accurate: friction in the bearing holds a stopped pole up to a count off the vertical.
 """
 
 import math
@@ -13,45 +13,32 @@ from collections import deque
 from collections.abc import Generator
 from dataclasses import dataclass
 
+from cartpole_rl.emulator.guards import micrometres, nearest_count
 from cartpole_rl.errors import CartPoleError
-from cartpole_rl.rig.hardware import (
-    CART_METRES_PER_COUNT,
-    CART_NANOMETRES_PER_COUNT,
-    POLE_COUNTS_PER_TURN,
-    POLE_RADIANS_PER_COUNT,
-    SPAN,
-)
-
-QUARTER_TURN = POLE_COUNTS_PER_TURN // 4
-SPAN_NM = round(SPAN * 1e9)
-SPAN_TOLERANCE = SPAN_NM * 3 // 100  # nm
+from cartpole_rl.rig.hardware import Hardware
 
 SEARCH_SPEED = 0.08  # m/s, towards a stop
 TRAVEL_SPEED = 0.2  # m/s, far from a stop whose position is known
 TOUCH_ZONE = 60_000_000  # nm, distance from such a stop at which the slow search begins
 ASTRAY = 20_000_000  # nm, a motion the wrong way that means a reversed motor or encoder
-FAST = POLE_COUNTS_PER_TURN * 6 // 10  # counts/s of a pole that may push a driven cart: 3.8 rad/s
+FAST = 6  # tenths of a turn a second of a pole that may push a driven cart: 3.8 rad/s
 AGAINST_STOP = 400_000  # us under full push without motion that mean a stop
-STANDS = 300_000 // CART_NANOMETRES_PER_COUNT  # counts, largest motion in that time: 0.3 mm
-LONGEST_SEARCH = 30_000_000  # us for one stop
+STANDS = 300_000  # nm, largest motion in that time, or one count
+LONGEST_SEARCH = 30_000_000, 20  # us for one stop; at least so many for a um of the track
 CENTRED = 1_000_000  # nm
-LONGEST_CENTRING = 20_000_000  # us
+LONGEST_CENTRING = 20_000_000, 5  # the same for the way to the middle
 
 WHOLE_SWING = 2_000_000  # us: one period of a rod of 1.5 m
-STILL = round(0.7 / 360 * POLE_COUNTS_PER_TURN)  # counts peak to peak: 0.7 degrees
-BRAKED = round(2.6 / 360 * POLE_COUNTS_PER_TURN)  # counts peak to peak; no brake improves a smaller swing
+STILL = 70  # hundredths of a degree, peak to peak
+BRAKED = 260  # the same; no brake improves a smaller swing
 LONGEST_BRAKING = 20_000_000  # us
 PATIENCE = 20_000_000  # us, after which NEARLY_STILL is sufficient, for a pole with hardly any friction
-NEARLY_STILL = round(3.5 / 360 * POLE_COUNTS_PER_TURN)  # counts peak to peak
+NEARLY_STILL = 350  # hundredths of a degree, peak to peak
 LONGEST_WAIT = 60_000_000  # us
 LONGEST_WINDOW = WHOLE_SWING // 5_000 + 1  # counts at the shortest period, plus one
 
-MASS = 0.85  # kg, cart and pole
-FRICTION = 0.5  # N
-PUSH = 3.0  # N, largest force of these motions
+TUNED_MASS = 0.85  # kg of cart and pole, for which the next number and the servo's gains were chosen
 NEGLIGIBLE = 0.02  # N, below which the motor stays off
-MOTOR_OFFSET = 50  # motor value at which the force starts
-MOTOR_PER_NEWTON = 50
 GENTLE = 0.2  # m/s^2, an acceleration that leaves the pole nearly still
 
 
@@ -92,11 +79,19 @@ class HomingError(CartPoleError):
     """A stop was not found, the span was wrong, or the pole did not come to rest."""
 
 
-def rough_motor(force: float) -> int:
-    """Return the motor value for a force in N, roughly: a line with an offset."""
-    if abs(force) < NEGLIGIBLE:
-        return 0
-    return int(math.copysign(MOTOR_OFFSET + MOTOR_PER_NEWTON * min(abs(force), PUSH), force))
+class RoughMotor:
+    """The motor value for a force in N, roughly: a line with an offset."""
+
+    def __init__(self, hardware: Hardware) -> None:
+        self._offset, self._per_newton = hardware.motor_offset, hardware.motor_per_newton
+        self._most = hardware.gentle_force  # N, largest force of these motions
+        self._negligible = NEGLIGIBLE * (hardware.moving_mass / TUNED_MASS)
+
+    def value(self, force: float) -> int:
+        """Return the motor value."""
+        if abs(force) < self._negligible:
+            return 0
+        return int(math.copysign(self._offset + self._per_newton * min(abs(force), self._most), force))
 
 
 class SpeedServo:
@@ -106,7 +101,11 @@ class SpeedServo:
     INTEGRAL = 80.0  # N/m
     TUNED_FOR = 0.02  # s, the period for these gains; a longer one needs smaller gains
 
-    def __init__(self) -> None:
+    def __init__(self, hardware: Hardware) -> None:
+        heavier = hardware.moving_mass / TUNED_MASS
+        self._proportional, self._integrating = self.PROPORTIONAL * heavier, self.INTEGRAL * heavier
+        self._friction, self._most = hardware.moving_friction, hardware.gentle_force
+        self._motor = RoughMotor(hardware)
         self._reference = 0.0  # m/s, follows the target at GENTLE
         self._integral = 0.0  # N
 
@@ -116,10 +115,10 @@ class SpeedServo:
         self._reference += max(-change, min(change, target - self._reference))
         error = self._reference - speed
         share = min(1.0, self.TUNED_FOR / seconds)
-        integral = self._integral + share * self.INTEGRAL * error * seconds
-        self._integral = max(-PUSH, min(PUSH, integral))
-        ahead = math.copysign(FRICTION, self._reference) if self._reference else 0.0
-        return rough_motor(ahead + share * self.PROPORTIONAL * error + self._integral)
+        integral = self._integral + share * self._integrating * error * seconds
+        self._integral = max(-self._most, min(self._most, integral))
+        ahead = math.copysign(self._friction, self._reference) if self._reference else 0.0
+        return self._motor.value(ahead + share * self._proportional * error + self._integral)
 
 
 class SwingBrake:
@@ -129,14 +128,21 @@ class SwingBrake:
     RETURN = 3.0  # 1/s^2
     DAMPING = 2.0  # 1/s
     HARDEST = 2.5  # m/s^2
+    LONG_TRACK = 800_000  # um from stop to stop; on a shorter track the cart follows by so much less
     STANDS = 0.002  # m/s, a speed up to which the cart counts as standing
+
+    def __init__(self, hardware: Hardware) -> None:
+        room = min(1.0, micrometres(hardware.track_span) / self.LONG_TRACK)
+        self._follow, self._hardest = self.FOLLOW * room, self.HARDEST * room
+        self._mass, self._friction = hardware.moving_mass, hardware.moving_friction
+        self._motor = RoughMotor(hardware)
 
     def motor(self, x: float, x_dot: float, swing: float, swing_dot: float) -> int:
         """Return the motor value; x in m from the middle, swing in rad from hanging, signed as the angle."""
-        acceleration = -self.FOLLOW * swing_dot * math.cos(swing) - self.RETURN * x - self.DAMPING * x_dot
-        acceleration = max(-self.HARDEST, min(self.HARDEST, acceleration))
+        acceleration = -self._follow * swing_dot * math.cos(swing) - self.RETURN * x - self.DAMPING * x_dot
+        acceleration = max(-self._hardest, min(self._hardest, acceleration))
         moving = x_dot if abs(x_dot) > self.STANDS else acceleration
-        return rough_motor(MASS * acceleration + math.copysign(FRICTION, moving))
+        return self._motor.value(self._mass * acceleration + math.copysign(self._friction, moving))
 
 
 Procedure = Generator[int, Reading, Reading]
@@ -174,93 +180,124 @@ class Window:
         return round((max(self._counts) + min(self._counts)) / 2)
 
 
-def home() -> Generator[int, Reading, Zeros]:
-    """Perform the whole homing. Raises HomingError.
+class Homing:
+    """The homing of one rig."""
 
-    Nothing is taken from an earlier homing: its zeros may be why the cart is homed again.
-    """
-    reading = yield 0
-    reading = yield from touch_stop(-1, None, reading)
-    left = reading.cart
-    reading = yield from touch_stop(+1, left + round(SPAN / CART_METRES_PER_COUNT), reading)
-    right = reading.cart
-    span = (right - left) * CART_NANOMETRES_PER_COUNT
-    if abs(span - SPAN_NM) > SPAN_TOLERANCE:
-        raise HomingError(f"the stops are {span / 1e9:.3f} m apart, not {SPAN} m")
-    middle = (left + right) // 2
-    reading = yield from centre(middle, reading)
-    hanging, reading = yield from find_hanging(reading)
-    reading = yield from brake_swing(middle, hanging, reading)
-    reading = yield from centre(middle, reading)
-    return Zeros(left, right, (yield from wait_until_still(reading)))
-
-
-def touch_stop(direction: int, expected: int | None, reading: Reading) -> Procedure:
-    """Move until a stop holds the cart. `expected` is the raw count of the stop, or None if it is unknown.
-
-    Raises HomingError if the cart moves the wrong way, faster than at the beginning, when it may have rolled,
-    and faster than when a fast pole last pushed it.
-    """
-    servo, window, elapsed, before = SpeedServo(), Window(AGAINST_STOP), 0, reading
-    start, rolled = reading.cart, 0.0
-    while elapsed < LONGEST_SEARCH:
-        far = expected is not None and abs(expected - reading.cart) * CART_NANOMETRES_PER_COUNT > TOUCH_ZONE
-        speed = (reading.cart - before.cart) * CART_METRES_PER_COUNT / reading.seconds
-        if elapsed <= reading.us or pole_speed(before, reading) > FAST:  # two readings give the first speed
-            start, rolled = reading.cart, -direction * speed
-        if (
-            start - reading.cart
-        ) * direction * CART_NANOMETRES_PER_COUNT > ASTRAY and -direction * speed > rolled:
-            raise HomingError("the cart moves the wrong way: its motor or its encoder is reversed")
-        before = reading
-        window.add(reading.cart, reading.us)
-        motor = servo.motor(direction * (TRAVEL_SPEED if far else SEARCH_SPEED), speed, reading.seconds)
-        if window.spread <= STANDS and motor == direction * abs(rough_motor(PUSH)):
-            return reading
-        reading = yield motor
-        elapsed += reading.us
-    raise HomingError(f"no {'right' if direction > 0 else 'left'} stop within {LONGEST_SEARCH / 1e6:.0f} s")
-
-
-def centre(middle: int, reading: Reading) -> Procedure:
-    """Move gently to the middle and switch the motor off."""
-    servo, elapsed, before, start = SpeedServo(), 0, reading, reading.cart
-    while elapsed < LONGEST_CENTRING:
-        away = middle - reading.cart
-        if abs(away) * CART_NANOMETRES_PER_COUNT < CENTRED:
-            return reading
-        if pole_speed(before, reading) > FAST:
-            start = reading.cart
-        if (abs(away) - abs(middle - start)) * CART_NANOMETRES_PER_COUNT > ASTRAY:
-            raise HomingError("the cart moves away from the middle")
-        speed_here = away * CART_METRES_PER_COUNT  # m/s: it slows down over the last second
-        target = max(-TRAVEL_SPEED, min(TRAVEL_SPEED, speed_here))
-        speed = (reading.cart - before.cart) * CART_METRES_PER_COUNT / reading.seconds
-        before = reading
-        reading = yield servo.motor(target, speed, reading.seconds)
-        elapsed += reading.us
-    raise HomingError(f"not in the middle after {LONGEST_CENTRING / 1e6:.0f} s")
-
-
-def brake_swing(middle: int, hanging: int, reading: Reading) -> Procedure:
-    """Brake the pole's swing by moving the cart about the middle."""
-    brake, window, elapsed, before = SwingBrake(), Window(WHOLE_SWING), 0, reading
-    while elapsed < LONGEST_BRAKING:
-        window.add(reading.pole, reading.us)
-        if window.spread <= BRAKED:
-            return reading
-        if window.spread < QUARTER_TURN:  # the middle of such a small swing is the hanging pole
-            hanging = window.centre
-        motor = brake.motor(
-            (reading.cart - middle) * CART_METRES_PER_COUNT,
-            (reading.cart - before.cart) * CART_METRES_PER_COUNT / reading.seconds,
-            (reading.pole - hanging) * POLE_RADIANS_PER_COUNT,
-            (reading.pole - before.pole) * POLE_RADIANS_PER_COUNT / reading.seconds,
+    def __init__(self, hardware: Hardware) -> None:
+        self._hardware = hardware
+        self._nanometres = hardware.cart_nanometres_per_count
+        self._metres, self._turn = hardware.encoders
+        self._radians = hardware.encoders.radians
+        self._span_um = micrometres(hardware.track_span)
+        self._stands = max(1, STANDS // self._nanometres)  # counts
+        self._longest_search, self._longest_centring = (
+            max(shortest, self._span_um * us) for shortest, us in (LONGEST_SEARCH, LONGEST_CENTRING)
         )
-        before = reading
-        reading = yield motor
-        elapsed += reading.us
-    return reading
+        self._fast = self._turn * FAST // 10  # counts/s
+        self._full_push = RoughMotor(hardware).value(hardware.gentle_force)
+
+    def home(self) -> Generator[int, Reading, Zeros]:
+        """Perform the whole homing. Raises HomingError.
+
+        Nothing is taken from an earlier homing: its zeros may be why the cart is homed again.
+        """
+        reading = yield 0
+        reading = yield from self.touch_stop(-1, None, reading)
+        left = reading.cart
+        expected = left + nearest_count(self._span_um, self._hardware)
+        reading = yield from self.touch_stop(+1, expected, reading)
+        right = reading.cart
+        span, nominal = (right - left) * self._nanometres, self._span_um * 1000  # nm
+        if abs(span - nominal) > nominal * 3 // 100:
+            track = f"{self._hardware.track_span:g} m"
+            raise HomingError(f"the stops are {span / 1e9:.3f} m apart, not {track}")
+        middle = (left + right) // 2
+        reading = yield from self.centre(middle, reading)
+        hanging, reading = yield from find_hanging(reading)
+        reading = yield from self.brake_swing(middle, hanging, reading)
+        reading = yield from self.centre(middle, reading)
+        return Zeros(left, right, (yield from self.wait_until_still(reading)))
+
+    def touch_stop(self, direction: int, expected: int | None, reading: Reading) -> Procedure:
+        """Move until a stop holds the cart. `expected` is its raw count, or None if that is unknown.
+
+        Raises HomingError if the cart moves the wrong way, faster than at the beginning, when it may have
+        rolled, and faster than when a fast pole last pushed it.
+        """
+        servo, window, elapsed, before = SpeedServo(self._hardware), Window(AGAINST_STOP), 0, reading
+        start, rolled = reading.cart, 0.0
+        while elapsed < self._longest_search:
+            far = expected is not None and abs(expected - reading.cart) * self._nanometres > TOUCH_ZONE
+            speed = (reading.cart - before.cart) * self._metres / reading.seconds
+            fast = pole_speed(before, reading) > self._fast
+            if elapsed <= reading.us or fast:  # two readings give the first speed
+                start, rolled = reading.cart, -direction * speed
+            astray = (start - reading.cart) * direction * self._nanometres > ASTRAY
+            if astray and -direction * speed > rolled:
+                raise HomingError("the cart moves the wrong way: its motor or its encoder is reversed")
+            before = reading
+            window.add(reading.cart, reading.us)
+            motor = servo.motor(direction * (TRAVEL_SPEED if far else SEARCH_SPEED), speed, reading.seconds)
+            if window.spread <= self._stands and motor == direction * self._full_push:
+                return reading
+            reading = yield motor
+            elapsed += reading.us
+        side, seconds = "right" if direction > 0 else "left", self._longest_search / 1e6
+        raise HomingError(f"no {side} stop within {seconds:.0f} s")
+
+    def centre(self, middle: int, reading: Reading) -> Procedure:
+        """Move gently to the middle and switch the motor off."""
+        servo, elapsed, before, start = SpeedServo(self._hardware), 0, reading, reading.cart
+        while elapsed < self._longest_centring:
+            away = middle - reading.cart
+            if abs(away) * self._nanometres < CENTRED:
+                return reading
+            if pole_speed(before, reading) > self._fast:
+                start = reading.cart
+            if (abs(away) - abs(middle - start)) * self._nanometres > ASTRAY:
+                raise HomingError("the cart moves away from the middle")
+            speed_here = away * self._metres  # m/s: it slows down over the last second
+            target = max(-TRAVEL_SPEED, min(TRAVEL_SPEED, speed_here))
+            speed = (reading.cart - before.cart) * self._metres / reading.seconds
+            before = reading
+            reading = yield servo.motor(target, speed, reading.seconds)
+            elapsed += reading.us
+        raise HomingError(f"not in the middle after {self._longest_centring / 1e6:.0f} s")
+
+    def brake_swing(self, middle: int, hanging: int, reading: Reading) -> Procedure:
+        """Brake the pole's swing by moving the cart about the middle."""
+        brake, window, elapsed, before = SwingBrake(self._hardware), Window(WHOLE_SWING), 0, reading
+        while elapsed < LONGEST_BRAKING:
+            window.add(reading.pole, reading.us)
+            if window.spread <= self._swing(BRAKED):
+                return reading
+            if window.spread < self._turn // 4:  # the middle of such a small swing is the hanging pole
+                hanging = window.centre
+            motor = brake.motor(
+                (reading.cart - middle) * self._metres,
+                (reading.cart - before.cart) * self._metres / reading.seconds,
+                (reading.pole - hanging) * self._radians,
+                (reading.pole - before.pole) * self._radians / reading.seconds,
+            )
+            before = reading
+            reading = yield motor
+            elapsed += reading.us
+        return reading
+
+    def wait_until_still(self, reading: Reading) -> Generator[int, Reading, int]:
+        """Wait with the motor off until the pole's swing is small; return the count in its middle."""
+        window, elapsed = Window(WHOLE_SWING), 0
+        while elapsed < LONGEST_WAIT:
+            window.add(reading.pole, reading.us)
+            if window.spread <= self._swing(STILL if elapsed < PATIENCE else NEARLY_STILL):
+                return window.centre
+            reading = yield 0
+            elapsed += reading.us
+        raise HomingError(f"the pole still swings by {window.spread} counts after {LONGEST_WAIT / 1e6:.0f} s")
+
+    def _swing(self, centidegrees: int) -> int:
+        """Return an angle in counts, at least one."""
+        return max(1, (centidegrees * self._turn + 18_000) // 36_000)
 
 
 def find_hanging(reading: Reading) -> Generator[int, Reading, tuple[int, Reading]]:
@@ -279,15 +316,3 @@ def find_hanging(reading: Reading) -> Generator[int, Reading, tuple[int, Reading
 def pole_speed(before: Reading, reading: Reading) -> int:
     """Return the pole's speed between two readings, in counts/s."""
     return abs(reading.pole - before.pole) * 1_000_000 // reading.us
-
-
-def wait_until_still(reading: Reading) -> Generator[int, Reading, int]:
-    """Wait with the motor off until the pole's swing is small; return the count in its middle."""
-    window, elapsed = Window(WHOLE_SWING), 0
-    while elapsed < LONGEST_WAIT:
-        window.add(reading.pole, reading.us)
-        if window.spread <= (STILL if elapsed < PATIENCE else NEARLY_STILL):
-            return window.centre
-        reading = yield 0
-        elapsed += reading.us
-    raise HomingError(f"the pole still swings by {window.spread} counts after {LONGEST_WAIT / 1e6:.0f} s")

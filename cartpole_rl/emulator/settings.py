@@ -10,12 +10,12 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
+from cartpole_rl.rig.hardware import LARGEST_MOTOR, Hardware
 from cartpole_rl.settings import NonNegative, Positive, Settings
 
 Share = Annotated[
     float, Field(allow_inf_nan=False, ge=0, le=0.9)
 ]  # of frames; above 0.9 hardly any frame would arrive
-LARGEST_MOTOR = 255
 ONBOARD = Path("onboard")  # as `policy`: the agent that is evaluated
 Port = Literal["auto", "pty", "tcp"]
 MotorValue = Annotated[float, Field(ge=0, le=LARGEST_MOTOR)]
@@ -32,6 +32,9 @@ class EmulatorSettings(Settings):
     # folder of an agent in C that drives after START_POLICY; in cartpole-evaluate onboard: the agent of run=
     policy: Path | None = None
     port: Port = "auto"  # a pseudo-terminal or a local TCP port; auto: pty where the system has it
+    hardware: Hardware | None = (
+        None  # encoders, nominal track and rough numbers in the firmware; None: ip02's
+    )
     seed: Annotated[int, Field(ge=0)] = (
         0  # of latencies, disturbed frames, boot position and the hand's angle
     )
@@ -40,7 +43,7 @@ class EmulatorSettings(Settings):
     pole_mass: Positive = 0.129  # kg
     pole_com: Positive = 0.1765  # m, pivot to centre of mass
     pole_inertia: Positive = 1.22e-3  # kg m^2, about the centre of mass
-    track_half_length: Annotated[float, Field(ge=0.1, le=10)] = 0.409  # m, middle to a stop
+    track_half_length: Annotated[float, Field(ge=0.05, le=10)] = 0.409  # m, middle to a stop
 
     cart_viscous: NonNegative = 0.65  # N s/m
     cart_coulomb_left: NonNegative = 0.58  # N, while the cart moves left
@@ -100,3 +103,10 @@ class EmulatorSettings(Settings):
                 "stuck_at has no effect without stuck_encoder: set stuck_encoder=cart or stuck_encoder=pole"
             )
         return self
+
+    def with_hardware(self, hardware: Hardware) -> Self:
+        """Return the settings with a rig; a track of the default length becomes 4 mm longer than its."""
+        changes: dict[str, object] = {"hardware": hardware}
+        if self.track_half_length == type(self).model_fields["track_half_length"].default:
+            changes["track_half_length"] = round(hardware.half_span + 0.002, 6)
+        return self.model_copy(update=changes)

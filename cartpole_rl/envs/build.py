@@ -66,7 +66,9 @@ def make_env(
     guard: TrackGuard | None = None,
 ) -> CartPoleEnv:
     """Return the environment over `plant`; its specs do not depend on the plant."""
-    hardware = HardwareTransform(actions.motors, task, observation, reward, guard, compiled=plant.compiled)
+    hardware = HardwareTransform(
+        actions.motors, task, observation, reward, guard, plant.compiled, plant.hardware.encoders
+    )
     return CartPoleEnv(plant, hardware)
 
 

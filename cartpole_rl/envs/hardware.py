@@ -50,6 +50,7 @@ from cartpole_rl.compilation import Compiled
 from cartpole_rl.envs.perception import Percept, Previous, perceive, perceive_first
 from cartpole_rl.envs.settings import ObservationSettings, TrackGuard
 from cartpole_rl.plants.specs import Plant, PlantOutput, tensordict_of
+from cartpole_rl.rig.hardware import Encoders, nominal_encoders
 from cartpole_rl.tasks.features import LENGTH_SCALE
 from cartpole_rl.tasks.settings import NO_ACTION, RewardSettings, TaskSettings
 
@@ -67,17 +68,20 @@ class HardwareTransform(Transform):
         reward: RewardSettings,
         guard: TrackGuard | None = None,
         compiled: bool = False,
+        encoders: Encoders | None = None,
     ) -> None:
+        """`encoders` are the plant's, ip02's if they are not given."""
         super().__init__()
+        encoders = encoders or nominal_encoders()
         self.task, self.observation_settings, self.reward = task, observation, reward
         self.register_buffer("motors", torch.tensor(list(motors), dtype=torch.int64))
         inward = torch.tensor([0, max(0, *motors), min(0, *motors)])  # by the guard's direction: 0, 1, -1
         self.register_buffer("inward", inward)
         self.guard = guard
         self.register_buffer("_by_action", torch.tensor([0, *motors], dtype=torch.int64))  # from NO_ACTION on
-        self.first_perception = partial(perceive_first, settings=observation, guard=guard)
+        self.first_perception = partial(perceive_first, settings=observation, guard=guard, encoders=encoders)
         self.perception: Perception = partial(
-            perceive, settings=observation, task=task, rewards=reward, guard=guard
+            perceive, settings=observation, task=task, rewards=reward, guard=guard, encoders=encoders
         )
         self._perceive: Perception = Compiled(self.perception) if compiled else self.perception
 

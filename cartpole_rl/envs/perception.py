@@ -12,6 +12,7 @@ from torch import Tensor
 from cartpole_rl.envs.guard import guard_side
 from cartpole_rl.envs.settings import ObservationSettings, TrackGuard
 from cartpole_rl.plants.specs import PlantOutput, Values
+from cartpole_rl.rig.hardware import Encoders
 from cartpole_rl.tasks.features import (
     ANGULAR_SPEED_SCALE,
     MOTOR_SCALE,
@@ -61,9 +62,10 @@ def perceive_first(
     *,
     settings: ObservationSettings,
     guard: TrackGuard | None,
+    encoders: Encoders,
 ) -> Percept[Tensor]:
     """Return the percept of a first frame: velocities and memory are 0."""
-    x, theta = measured_position(frame.counts)
+    x, theta = measured_position(frame.counts, encoders)
     unknown = torch.zeros_like(x)
     state = Measured(x, unknown, theta, unknown)
     past = x.new_zeros(settings.past_size, len(x))
@@ -91,10 +93,11 @@ def perceive(
     task: TaskSettings,
     rewards: RewardSettings,
     guard: TrackGuard | None,
+    encoders: Encoders,
 ) -> Percept[Tensor]:
     """Return the percept of the frame after `previous`."""
-    x, theta = measured_position(frame.counts)
-    x_dot, theta_dot = measured_velocity(frame.counts, previous.counts, frame.dt[0])
+    x, theta = measured_position(frame.counts, encoders)
+    x_dot, theta_dot = measured_velocity(frame.counts, previous.counts, frame.dt[0], encoders)
     state = Measured(x, x_dot, theta, theta_dot)
     past = remember(previous, settings)
     step_count = previous.step_count + 1

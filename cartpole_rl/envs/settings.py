@@ -2,17 +2,19 @@
 
 from collections.abc import Mapping
 from functools import cache
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Self
 
-from pydantic import Discriminator, Field, Tag, field_validator
+from pydantic import Discriminator, Field, Tag, field_validator, model_validator
 
 from cartpole_rl.choices import group_choices
+from cartpole_rl.errors import ConfigError
 from cartpole_rl.physics.friction import CART_FRICTIONS, POLE_FRICTIONS
 from cartpole_rl.physics.laws import Law
 from cartpole_rl.physics.models import Models
 from cartpole_rl.plants.settings import SimulationSettings
 from cartpole_rl.randomization.poles import Pole, PoleSettings
 from cartpole_rl.randomization.ranges import IdentifiedSettings, Range
+from cartpole_rl.rig.hardware import Hardware, hardware_of, parameters_of
 from cartpole_rl.rig.parameters import completed
 from cartpole_rl.settings import Finite, NonNegative, Positive, Settings
 from cartpole_rl.tasks.features import ObservationKind
@@ -176,10 +178,28 @@ def driven_numbers(cart: Mapping[str, float], *frictions: FrictionSettings) -> d
     return numbers
 
 
-class CartSettings(Settings):
-    """The nominal cart, without a friction law of its own: a fit chooses one."""
+class RigSettings(Settings):
+    """A cart's file: parameters of its motion, and its hardware."""
 
     cart: dict[str, Finite]
+
+    @model_validator(mode="after")
+    def _hardware_is_possible(self) -> Self:
+        try:
+            hardware_of(self.cart)
+        except ConfigError as error:
+            raise ValueError(str(error)) from None
+        return self
+
+    @property
+    def hardware(self) -> Hardware:
+        """The encoders, track and motor of the cart."""
+        return hardware_of(self.cart)
+
+
+class CartSettings(RigSettings):
+    """The nominal cart, without a friction law of its own: a fit chooses one."""
+
     pole_friction: PoleFrictionSettings
 
     @property
@@ -190,7 +210,7 @@ class CartSettings(Settings):
     @property
     def nominal_cart(self) -> dict[str, float]:
         """The parameters of the cart that is driven, or varied, without the pole's."""
-        return completed(driven_numbers(self.cart, *self.frictions))
+        return completed(driven_numbers(parameters_of(self.cart), *self.frictions))
 
     def nominal_with(self, pole: Pole) -> dict[str, float]:
         """Return the nominal parameters of the cart with `pole`."""

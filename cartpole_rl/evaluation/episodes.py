@@ -186,7 +186,7 @@ def one_episode(
     columns["time"] = np.cumsum([0.0, *(frame.dt[0] for frame in frames[1:])])
     columns |= {"motor": motor, "guarded": guarded}
     episode = _episode(columns, ending, env.hardware.guard is not None)
-    return measured_part(episode, env.plant.fault)
+    return measured_part(episode, env.plant.fault, env.plant.hardware)
 
 
 @torch.no_grad()

@@ -30,7 +30,7 @@ from cartpole_rl.agents.settings import AgentSettings
 from cartpole_rl.envs.settings import CartPoleSettings, ObservationSettings, TrackGuard
 from cartpole_rl.errors import CheckpointError, ConfigError
 from cartpole_rl.randomization.poles import possible_poles
-from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_COUNTS_PER_TURN
+from cartpole_rl.rig.hardware import nominal_encoders
 from cartpole_rl.settings import Count, Finite, Positive, Settings
 from cartpole_rl.tasks.features import (
     LENGTH_SCALE,
@@ -82,8 +82,8 @@ class Description(Settings):
     guard: TrackGuard | None  # its rule is in cartpole_rl/envs/guard.py
     track_half_length: Positive  # m, of the nominal cart; a real one reports its own
     control_period: Positive  # s
-    cart_metres_per_count: Positive = CART_METRES_PER_COUNT
-    pole_counts_per_turn: Count = POLE_COUNTS_PER_TURN
+    cart_metres_per_count: Positive = nominal_encoders().metres
+    pole_counts_per_turn: Count = nominal_encoders().turn
     pole_lengths: tuple[Positive, Positive]  # m, the shortest and the longest pole of the training
     provenance: dict[str, Any]  # of the training: command, versions, commit, seed, score
 
@@ -94,14 +94,10 @@ class Description(Settings):
 
     @property
     def is_consistent(self) -> bool:
-        """True if the parts that repeat each other agree, and the encoders are those of the cart."""
+        """True if the parts that repeat each other agree."""
         ends = len(self.numbers), len(self.motors)
-        scales = self.cart_metres_per_count, self.pole_counts_per_turn
-        return (
-            ends == (self.sizes[0], self.sizes[-1])
-            and self.numbers == observed_numbers(self.observation)
-            and scales == (CART_METRES_PER_COUNT, POLE_COUNTS_PER_TURN)
-        )
+        agree = ends == (self.sizes[0], self.sizes[-1])
+        return agree and self.numbers == observed_numbers(self.observation)
 
     def shapes(self) -> Iterator[tuple[str, tuple[int, ...]]]:
         """Yield the name and the shape of each array of weights."""
@@ -133,6 +129,8 @@ def description(
         guard=settings.guard.active,
         track_half_length=settings.nominal_cart["track_half_length"],
         control_period=settings.control_period,
+        cart_metres_per_count=settings.hardware.encoders.metres,
+        pole_counts_per_turn=settings.hardware.encoders.turn,
         pole_lengths=(min(lengths), max(lengths)),
         provenance=dict(provenance),
     )

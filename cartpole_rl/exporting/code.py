@@ -80,9 +80,12 @@ class DrivingPercept(NamedTuple):
 def perception(settings: CartPoleSettings, guard: TrackGuard | None) -> tuple[Graph, Graph]:
     """Return the perception of a first and of a later period, with the track guard `guard`."""
     observation = settings.observation
-    perceive_start = partial(perceive_first, settings=observation, guard=guard)
+    encoders = settings.hardware.encoders
+    perceive_start = partial(perceive_first, settings=observation, guard=guard, encoders=encoders)
     task = settings.task.at(settings.control_period)
-    perceive_next = partial(perceive, settings=observation, task=task, rewards=settings.reward, guard=guard)
+    perceive_next = partial(
+        perceive, settings=observation, task=task, rewards=settings.reward, guard=guard, encoders=encoders
+    )
 
     def scaled(length: Tensor) -> Tensor:
         return length[: int(observation.pole_length)] / LENGTH_SCALE

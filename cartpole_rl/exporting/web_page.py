@@ -61,7 +61,7 @@ def web_page(agent: ExportedAgent, settings: CartPoleSettings, plant: Simulation
         functions = [
             function("perceiveFirst", first),
             function("perceive", later),
-            function("encoderCounts", encoders()),
+            function("encoderCounts", encoders(settings)),
             function("runPeriod", physics(settings, plant)),
         ]
     except NotImplementedError as error:
@@ -71,12 +71,13 @@ def web_page(agent: ExportedAgent, settings: CartPoleSettings, plant: Simulation
     return filled("cart.html", {"code": code, "page": filled("page.js", {}), **words(agent)})
 
 
-def encoders() -> Graph:
+def encoders(settings: CartPoleSettings) -> Graph:
     """Return the function of the encoders."""
 
     def counted(true: TrueState) -> Counts:
         cart = CartParameters(true.table)
-        return Counts(encoder_counts(State(*true.motion.unbind(0)), cart, true.noise))
+        motion = State(*true.motion.unbind(0))
+        return Counts(encoder_counts(motion, cart, true.noise, settings.hardware.encoders))
 
     table = torch.ones(len(CartParameters.names()), 1)
     return Graph.of(counted, TrueState(table, torch.zeros(4, 1), torch.zeros(3, 1)))
@@ -91,7 +92,13 @@ def physics(settings: CartPoleSettings, plant: SimulationSettings) -> Graph:
             return Addition(push.force[0], torch.zeros_like, push.angular_acceleration[0])
 
         return run_carts(
-            carts, inputs, models=models, period=period, substeps=plant.substeps, addition=pushed
+            carts,
+            inputs,
+            models=models,
+            period=period,
+            substeps=plant.substeps,
+            encoders=settings.hardware.encoders,
+            addition=pushed,
         )
 
     drive = torch.zeros(1 + commands_under_way(LONGEST_LATENCY, period), 1)

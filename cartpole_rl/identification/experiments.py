@@ -182,7 +182,7 @@ def run(
             present = plant.step_one(0) if motors[-1] else present
             break
     recorded = recording(np.array(counts), np.array(gaps[1:]), np.array(motors), ended)
-    return measured_part(recorded, plant.fault), present, breakaway
+    return measured_part(recorded, plant.fault, plant.hardware), present, breakaway
 
 
 def observed(counts: list[Numbers], gaps: list[float]) -> Observed:

@@ -8,6 +8,7 @@ periods under the motor values of the agent. If all motions and reports are equa
 
 import math
 from collections.abc import Collection, Sequence
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -16,6 +17,7 @@ from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.simulated import Carts, Inputs, Period, commands_under_way, run_carts
 from cartpole_rl.randomization.randomizer import Draws
+from cartpole_rl.rig.hardware import Encoders
 
 TESTED = 256  # carts for each parameter
 PERIODS = 6
@@ -25,7 +27,12 @@ TRACK_HALF_LENGTH = CartParameters.names().index("track_half_length")
 
 
 def without_effect(
-    draws: Draws, names: Collection[str], motors: Sequence[int], models: Models, period: float
+    draws: Draws,
+    names: Collection[str],
+    motors: Sequence[int],
+    models: Models,
+    period: float,
+    encoders: Encoders,
 ) -> list[str]:
     """Return those of `names`, each with a range in `draws`, whose value within the range changes nothing.
 
@@ -42,8 +49,9 @@ def without_effect(
     motion, drive, inputs = _situations(track_end, motors, commands)
     carts = [Carts(table, motion, drive) for table in (low, high)]
     same = torch.ones_like(track_end, dtype=torch.bool)
+    run = partial(run_carts, models=models, period=period, substeps=SUBSTEPS, encoders=encoders)
     for now in inputs:
-        after = [run_carts(each, now, models=models, period=period, substeps=SUBSTEPS) for each in carts]
+        after = [run(each, now) for each in carts]
         same &= _alike(*after)
         carts = [Carts(each.table, end.motion, end.drive) for each, end in zip(carts, after, strict=True)]
     changes_nothing = same.reshape(-1, TESTED).all(1).tolist()

@@ -27,6 +27,7 @@ from cartpole_rl.plants.specs import Numbers, Plant, PlantOutput
 from cartpole_rl.randomization.identified import IdentifiedCarts
 from cartpole_rl.randomization.poles import check_one_pole
 from cartpole_rl.randomization.randomizer import Draws
+from cartpole_rl.rig.hardware import Hardware
 from cartpole_rl.rig.parameters import check_values
 from cartpole_rl.tasks.settings import StartSettings
 
@@ -130,6 +131,7 @@ class LearnedPlant(SimulatedPlant):
         seed: int = 0,
         device: torch.device | str = "cpu",
         compiled: bool = False,
+        hardware: Hardware | None = None,
     ) -> None:
         super().__init__(
             carts,
@@ -141,13 +143,20 @@ class LearnedPlant(SimulatedPlant):
             seed,
             device,
             compiled,
+            hardware,
         )
         self._member = torch.zeros(carts, dtype=torch.int64, device=self.device)
         if len(self._carts.drive) < 1 + UNDER_WAY:
             missing = self._carts.drive.new_zeros(1 + UNDER_WAY - len(self._carts.drive), carts)
             self._carts = self._carts._replace(drive=torch.cat((self._carts.drive, missing)))
         self._residual = Residual(*(part.to(self.device) for part in model.residual))
-        run = partial(run_learned_carts, models=model.models, period=model.period, substeps=model.substeps)
+        run = partial(
+            run_learned_carts,
+            models=model.models,
+            period=model.period,
+            substeps=model.substeps,
+            encoders=self.hardware.encoders,
+        )
         self._run_learned = Compiled(run) if compiled else run
         self._run = self._run_members
 
@@ -201,7 +210,7 @@ def learned_carts(
     check_same_cart(model, config)
     found = cart_column(model.parameters, torch.float32)
     draws = IdentifiedCarts(found, prior, plant.prior_share, UNDER_WAY * model.period)
-    return LearnedPlant(carts, model, draws, start, seed, device, compiled)
+    return LearnedPlant(carts, model, draws, start, seed, device, compiled, config.hardware)
 
 
 def check_same_cart(model: LearnedModel, config: "CartPoleSettings") -> None:

@@ -12,17 +12,17 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_COUNTS_PER_TURN
+from cartpole_rl.rig.hardware import Hardware, nominal_hardware
 from cartpole_rl.tasks.episode import Array, Ending, Episode
 from cartpole_rl.tasks.upright import wrap
 from cartpole_rl.wire import Fault
 
 LOGGER = logging.getLogger(__name__)
 
-FASTEST = np.array([5.0 / CART_METRES_PER_COUNT, 16.0 * POLE_COUNTS_PER_TURN])  # counts/s of cart and pole
-PUSH, PUSHED = 200, 0.1 - 1e-6  # motor value that moves any cart; s in each direction
+FASTEST = 5.0, 16.0  # m/s of the cart, turns/s of the pole
+PUSHED = 0.1 - 1e-6  # s of hard pushes in each direction
 SPEED_CHANGE = 0.2  # m/s up and down that turn any pole
-SUDDEN = np.array([0.25 / CART_METRES_PER_COUNT, 200.0])  # counts/s, 200 are 0.3 rad/s: a dead stop,
+SUDDEN = 0.25, 0.05  # m/s, turns/s: a dead stop,
 STILL = 0.5  # s, if the count does not change for as long after it
 LEANING = 0.025 + 0.008  # rad: largest error of the encoder's zero, and what friction holds
 FALLEN = np.radians(10)  # rad: near enough to upright
@@ -30,25 +30,29 @@ HALF = 0.5  # s, over which a pole of up to 1.4 m multiplies its angle by 2.7 or
 LATCHED = Fault.CART_ENCODER | Fault.STALL, Fault.POLE_ENCODER  # a dead cart encoder can show as a STALL
 
 
-def measured_part(episode: Episode, fault: Fault = Fault.NONE) -> Episode:
+def measured_part(episode: Episode, fault: Fault = Fault.NONE, hardware: Hardware | None = None) -> Episode:
     """Return the episode up to the last state before a count froze or jumped; log what is left out.
 
-    `fault` are the faults that the cart has latched. A shortened episode ends by a fault, whatever ended it.
-    It has no step if the count never changed in it.
+    `fault` are the faults that the cart has latched, `hardware` is its own, ip02's if it is not given. A
+    shortened episode ends by a fault, whatever ended it. It has no step if the count never changed in it.
     """
+    hardware = hardware or nominal_hardware()
+    per_unit = np.array([1 / hardware.encoders.metres, float(hardware.encoders.turn)])  # counts
     end = episode.measured_steps
     counts, gaps = episode.counts[: end + 1], np.diff(episode.time[: end + 1])
-    jumps = (np.abs(np.diff(counts, axis=0)) - 1 > FASTEST * gaps[:, None]).any(1)
+    jumps = (np.abs(np.diff(counts, axis=0)) - 1 > FASTEST * per_unit * gaps[:, None]).any(1)
     steps, why = end, ""
     if jumps.any():
         steps, why = int(np.argmax(jumps)), "a count jumped"
     motor, cart = episode.motor[:steps], counts[: steps + 1, 0]
-    speed = np.diff(cart) * CART_METRES_PER_COUNT / gaps[:steps]
-    columns = zip(("cart", "pole"), counts[: steps + 1].T, LATCHED, SUDDEN, strict=True)
+    speed = np.diff(cart) * hardware.encoders.metres / gaps[:steps]
+    columns = zip(("cart", "pole"), counts[: steps + 1].T, LATCHED, SUDDEN * per_unit, strict=True)
     for name, own, faults, sudden in columns:
         last = int(np.flatnonzero(np.diff(own, prepend=own[0])).max(initial=0))  # row of the last change
         if name == "cart":
-            frozen = cart_froze(motor, gaps, last) or balanced(episode.theta[last : steps + 1], gaps)
+            frozen = cart_froze(motor, gaps, last, hardware.hard_push) or balanced(
+                episode.theta[last : steps + 1], gaps
+            )
         else:
             frozen = pole_froze(speed[max(0, last - 1) :])
         frozen |= stopped_dead(own, gaps, last, sudden)
@@ -59,12 +63,12 @@ def measured_part(episode: Episode, fault: Fault = Fault.NONE) -> Episode:
     return episode if steps == end else _shortened(episode, steps, why)
 
 
-def cart_froze(motor: NDArray[np.int64], gaps: Array, last: int) -> bool:
+def cart_froze(motor: NDArray[np.int64], gaps: Array, last: int, hard_push: int) -> bool:
     """Return whether pushes in both directions left the count as it is since row `last`.
 
     `motor` [T]; `gaps` [T] s. The period in which a push begins does not count.
     """
-    push = np.where(np.abs(motor) < PUSH, 0, np.sign(motor))
+    push = np.where(np.abs(motor) < hard_push, 0, np.sign(motor))
     lasted = np.diff(push, prepend=0)[last:] == 0
     return all((gaps[last : len(push)] * (lasted & (push[last:] == side))).sum() > PUSHED for side in (1, -1))
 

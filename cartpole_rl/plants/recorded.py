@@ -9,6 +9,7 @@ from torch import Tensor
 
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.plants.specs import TERMINATING, TRUNCATING, Numbers, OneCartPlant, PlantOutput
+from cartpole_rl.rig.hardware import Hardware
 from cartpole_rl.tasks.episode import Episode
 
 
@@ -19,8 +20,8 @@ class RecordedPlant(OneCartPlant):
     unknown.
     """
 
-    def __init__(self, episode: Episode, pole_length: float | None) -> None:
-        super().__init__()
+    def __init__(self, episode: Episode, pole_length: float | None, hardware: Hardware | None = None) -> None:
+        super().__init__(hardware)
         self.episode = episode
         self._pole_length = pole_length
         self._row = 0

@@ -23,7 +23,7 @@ from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.settings import SimulatedSettings
 from cartpole_rl.plants.specs import Numbers, Plant, PlantOutput
 from cartpole_rl.randomization.randomizer import Draws
-from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
+from cartpole_rl.rig.hardware import Encoders, Hardware
 from cartpole_rl.rig.parameters import PARAMETERS
 from cartpole_rl.scalar import Scalar, plain
 from cartpole_rl.tasks.episode import Origin
@@ -74,6 +74,7 @@ def run_carts(
     models: Models,
     period: float,
     substeps: int,
+    encoders: Encoders,
     addition: MakeAddition | None = None,
 ) -> Period:
     """Run every cart for `period` s in `substeps` steps under a new motor value."""
@@ -86,17 +87,17 @@ def run_carts(
     return Period(
         torch.stack(state),
         torch.stack((drive.force, *drive.motors)),
-        encoder_counts(state, cart, inputs.noise),
+        encoder_counts(state, cart, inputs.noise, encoders),
         motor_in_force(drive.motors, cart.latency, period),
         ~(state.x.abs() <= cart.track_half_length).unsqueeze(0),  # also if it is NaN
     )
 
 
-def encoder_counts(state: State, cart: CartParameters, noise: Tensor) -> Tensor:
+def encoder_counts(state: State, cart: CartParameters, noise: Tensor, encoders: Encoders) -> Tensor:
     """Return counts [2, N] int64 of the true state, with the error of the zero and `noise` [3, N]."""
     x = state.x + noise[1] * cart.position_noise
     theta = state.theta + cart.angle_offset + noise[2] * cart.angle_noise
-    counts = torch.stack((x / CART_METRES_PER_COUNT, theta / POLE_RADIANS_PER_COUNT)).round()
+    counts = torch.stack((x / encoders.metres, theta / encoders.radians)).round()
     return counts.nan_to_num(0.0).clamp(-LARGEST_COUNT, LARGEST_COUNT).long()
 
 
@@ -135,12 +136,14 @@ class SimulatedPlant(Plant):
         seed: int = 0,
         device: torch.device | str = "cpu",
         compiled: bool = False,
+        hardware: Hardware | None = None,
     ) -> None:
-        super().__init__(carts, device)
+        super().__init__(carts, device, hardware)
         self.compiled = compiled
         self.randomizer, self.start, self.models = randomizer, start, models
         self.period, self.substeps = period, substeps
-        run = partial(run_carts, models=models, period=period, substeps=substeps)
+        encoders = self.hardware.encoders
+        run = partial(run_carts, models=models, period=period, substeps=substeps, encoders=encoders)
         self._run: Callable[[Carts, Inputs], Period] = Compiled(run) if compiled else run
         self._plain_run = run
         self._run_one: Scalar | None = None  # of a single cart
@@ -196,7 +199,7 @@ class SimulatedPlant(Plant):
         table = self.randomizer.draw(self.carts, self._generator)
         column = torch.tensor([[state[name]] for name in State._fields], device=self.device)
         motion = column.repeat(1, self.carts)
-        counts = encoder_counts(State(*motion), CartParameters(table), self._draw_noise(self.carts))
+        counts = self._first_counts(table, motion)
         self._coming = Starts(table, motion, counts)
 
     def replace_randomizer(self, randomizer: Draws) -> None:
@@ -234,8 +237,7 @@ class SimulatedPlant(Plant):
         table, motion, counts = self._next_starts(len(rows))
         if again is not None and again.any():
             table = torch.where(again, self._carts.table[:, rows], table)
-            cart = CartParameters(table)
-            counts = encoder_counts(State(*motion), cart, self._draw_noise(len(rows)))
+            counts = self._first_counts(table, motion)
         self._carts.table.index_copy_(1, rows, table)
         self._carts = Carts(
             self._carts.table,
@@ -255,8 +257,11 @@ class SimulatedPlant(Plant):
     def _draw_starts(self, count: int) -> Starts:
         table = self.randomizer.draw(count, self._generator)
         motion = draw_start(count, self.start, self._generator).T
-        counts = encoder_counts(State(*motion), CartParameters(table), self._draw_noise(count))
-        return Starts(table, motion, counts)
+        return Starts(table, motion, self._first_counts(table, motion))
+
+    def _first_counts(self, table: Tensor, motion: Tensor) -> Tensor:
+        noise = self._draw_noise(motion.shape[1])
+        return encoder_counts(State(*motion), CartParameters(table), noise, self.hardware.encoders)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDict:
         """Return the first frame of the carts that reset; TorchRL keeps the others', which are zeros here."""
@@ -308,7 +313,9 @@ def simulated_carts(
 ) -> SimulatedPlant:
     """Return the plant of plant=simulated; `draws` is the source of its carts."""
     models, period = config.models(plant), config.control_period
-    return SimulatedPlant(carts, draws, start, models, period, plant.substeps, seed, device, compiled)
+    return SimulatedPlant(
+        carts, draws, start, models, period, plant.substeps, seed, device, compiled, config.hardware
+    )
 
 
 def column(numbers: Sequence[float]) -> Tensor:

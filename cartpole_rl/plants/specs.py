@@ -13,7 +13,7 @@ from cartpole_rl.errors import PlantError
 from cartpole_rl.physics.dynamics import State
 from cartpole_rl.plants.serial.statistics import LinkStatistics
 from cartpole_rl.randomization.randomizer import Draws
-from cartpole_rl.rig.hardware import LARGEST_MOTOR
+from cartpole_rl.rig.hardware import LARGEST_MOTOR, Hardware, nominal_hardware
 from cartpole_rl.tasks.episode import Ending, Origin
 from cartpole_rl.wire import Fault
 
@@ -60,8 +60,12 @@ class Plant(EnvBase):
     before_start: Callable[[], None] | None = None  # called before the cart on a port is armed
     on_command: Callable[[int], None] | None = None  # called with each motor value once it is sent to a cart
 
-    def __init__(self, carts: int, device: torch.device | str = "cpu") -> None:
+    def __init__(
+        self, carts: int, device: torch.device | str = "cpu", hardware: Hardware | None = None
+    ) -> None:
+        """`hardware` is that of the carts, ip02's if it is not given."""
         super().__init__(device=torch.device(device), batch_size=torch.Size([carts]))
+        self.hardware = hardware or nominal_hardware()
         self.action_spec = Composite(
             motor=Bounded(-LARGEST_MOTOR, LARGEST_MOTOR, shape=(carts, 1), dtype=torch.int64, device=device),
             shape=(carts,),
@@ -196,8 +200,8 @@ class OneCartPlant(Plant):
 
     drives_one_cart = True
 
-    def __init__(self) -> None:
-        super().__init__(carts=1)
+    def __init__(self, hardware: Hardware | None = None) -> None:
+        super().__init__(carts=1, hardware=hardware)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDict:
         return self.first_output(on_tensors(self.reset_one()))

@@ -1,24 +1,157 @@
-"""Encoders, track and motor range of the cart that the host drives. Source: Quanser IP02 user manual.
+"""Encoders, track and motor of a cart, and the rough numbers that its firmware homes and brakes by.
 
-The cart reports the same numbers in INFO; a cart that reports others is refused.
+They stand in the cart's file (`conf/cart/` or a person's own) beside the parameters of its motion. The
+simulator, the host, recordings, exported agents, the emulated cart and the firmware read them from there. A
+cart without one of them has that of ip02.
 """
 
 import math
+from collections.abc import Mapping
+from functools import cache
+from typing import Annotated, NamedTuple, Self
 
-CART_METRES_PER_COUNT = 2.2749e-5  # encoder pinion of 14.83 mm radius, 4096 counts a turn
-CART_NANOMETRES_PER_COUNT = round(CART_METRES_PER_COUNT * 1e9)
-POLE_COUNTS_PER_TURN = 4096
-POLE_RADIANS_PER_COUNT = 2 * math.pi / POLE_COUNTS_PER_TURN
-HALF_SPAN = 0.407  # m, middle of the track to a stop
-SPAN = 2 * HALF_SPAN  # m, from stop to stop
+from pydantic import Field, ValidationError, model_validator
+
+from cartpole_rl.choices import choice
+from cartpole_rl.errors import ConfigError
+from cartpole_rl.settings import NonNegative, Positive, Settings
+
 LARGEST_MOTOR = 255  # motor value in size, to the left (negative) and to the right
 
 
-def cart_counts(metres: float) -> int:
-    """Return a distance of the cart in counts."""
-    return round(metres / CART_METRES_PER_COUNT)
+class Encoders(NamedTuple):
+    """The scales of the two encoders. Counts are positive to the right."""
+
+    metres: float  # of the cart a count
+    turn: int  # counts of the pole a turn
+
+    @property
+    def radians(self) -> float:
+        """Of the pole a count."""
+        return 2 * math.pi / self.turn
+
+    def cart_counts(self, metres: float) -> int:
+        """Return a distance of the cart in counts."""
+        return round(metres / self.metres)
+
+    def pole_counts(self, degrees: float) -> int:
+        """Return an angle of the pole in counts."""
+        return round(degrees / 360 * self.turn)
 
 
-def pole_counts(degrees: float) -> int:
-    """Return an angle of the pole in counts."""
-    return round(degrees / 360 * POLE_COUNTS_PER_TURN)
+class Hardware(Settings):
+    """The numbers of a rig that no simulated cart varies. The cart's INFO reports the first five."""
+
+    cart_nanometres_per_count: Annotated[int, Field(ge=1_000, le=1_000_000)]  # nm
+    pole_counts_per_turn: Annotated[int, Field(ge=200, le=1_000_000)]
+    track_span: Annotated[float, Field(ge=0.15, le=10)]  # m, from stop to stop
+    soft_limit: Annotated[float, Field(ge=0.003, le=1)]  # m inside a stop: outward motor values give 0
+    hard_limit: Annotated[float, Field(ge=0.001, le=1)]  # m inside a stop: the cart is faulted
+    braking: Annotated[float, Field(ge=0.2, le=50)]  # m/s^2: full motor inward slows the cart at least so
+    hard_push: Annotated[int, Field(ge=1, le=LARGEST_MOTOR)]  # motor value that moves any healthy cart
+    moving_mass: Positive  # kg, cart and pole
+    moving_friction: NonNegative  # N
+    motor_offset: Annotated[float, Field(ge=0, le=LARGEST_MOTOR)]  # motor value at which the force starts
+    motor_per_newton: Positive
+    gentle_force: Positive  # N, the largest of homing
+
+    @model_validator(mode="after")
+    def _limits_lie_on_the_track(self) -> Self:
+        if not self.hard_limit < self.soft_limit < self.track_span / 4:
+            raise ValueError(
+                f"hard_limit {self.hard_limit:g} m and soft_limit {self.soft_limit:g} m are distances from a "
+                f"stop; give hard_limit < soft_limit < {self.track_span / 4:g} m, a quarter of track_span"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _motor_reaches_the_gentle_force(self) -> Self:
+        if self.gentle_motor > LARGEST_MOTOR:
+            most = (LARGEST_MOTOR - self.motor_offset) / self.motor_per_newton
+            raise ValueError(
+                f"gentle_force {self.gentle_force:g} N needs a motor value of {self.gentle_motor} by "
+                f"motor_offset and motor_per_newton; give at most {most:.3g} N"
+            )
+        if self.gentle_force <= self.moving_friction:
+            raise ValueError(
+                f"gentle_force {self.gentle_force:g} N does not overcome moving_friction; give more than "
+                f"{self.moving_friction:g} N"
+            )
+        return self
+
+    @property
+    def encoders(self) -> Encoders:
+        """The scales of the encoders."""
+        return Encoders(self.cart_nanometres_per_count / 1e9, self.pole_counts_per_turn)
+
+    @property
+    def half_span(self) -> float:
+        """Middle of the track to a stop, m."""
+        return self.track_span / 2
+
+    @property
+    def gentle_motor(self) -> int:
+        """The motor value of `gentle_force`."""
+        return int(self.motor_offset + self.motor_per_newton * self.gentle_force)
+
+
+HARDWARE = tuple(Hardware.model_fields)
+
+
+def parameters_of(cart: Mapping[str, float]) -> dict[str, float]:
+    """Return the numbers of a cart's file that are parameters of its motion."""
+    return {name: value for name, value in cart.items() if name not in HARDWARE}
+
+
+def hardware_of(cart: Mapping[str, float]) -> Hardware:
+    """Return the hardware in a cart's file, ip02's where it gives none. Raises ConfigError."""
+    given = {name: cart[name] for name in HARDWARE if name in cart}
+    return nominal_hardware() if not given else _hardware(tuple(given.items()))
+
+
+@cache
+def _hardware(given: tuple[tuple[str, float], ...]) -> Hardware:
+    try:
+        return Hardware.model_validate({**_of_ip02(), **dict(given)})
+    except ValidationError as error:
+        first = error.errors()[0]
+        name = ".".join(("cart", *map(str, first["loc"])))
+        text = first["msg"].removeprefix("Value error, ")
+        number = f" is {first['input']:g}" if first["loc"] else ""
+        raise ConfigError(f"{name}{number}: {text[0].lower()}{text[1:]}") from None
+
+
+@cache
+def _of_ip02() -> dict[str, float]:
+    cart = choice("cart/ip02")
+    return {name: cart[name] for name in HARDWARE}
+
+
+@cache
+def nominal_hardware() -> Hardware:
+    """Return the hardware of ip02."""
+    return Hardware.model_validate(_of_ip02())
+
+
+def nominal_encoders() -> Encoders:
+    """Return the encoders of ip02."""
+    return nominal_hardware().encoders
+
+
+def check_of_ip02(hardware: Hardware, what: str) -> None:
+    """Raise ConfigError unless `hardware` is ip02's; `what` ("cartpole-model reads") knows no other."""
+    given, known = hardware.model_dump(), nominal_hardware().model_dump()
+    if others := [f"cart.{name}={given[name]:g}" for name in known if given[name] != known[name]]:
+        raise ConfigError(
+            f"{', '.join(others)}: {what} only carts with the encoders, track and motor of cart=ip02; leave "
+            "them out"
+        )
+
+
+# of ip02, for recordings and pictures of one scale
+CART_METRES_PER_COUNT, POLE_COUNTS_PER_TURN = nominal_encoders()
+POLE_RADIANS_PER_COUNT = nominal_encoders().radians
+CART_NANOMETRES_PER_COUNT = nominal_hardware().cart_nanometres_per_count
+SPAN = nominal_hardware().track_span
+HALF_SPAN = nominal_hardware().half_span
+cart_counts, pole_counts = nominal_encoders().cart_counts, nominal_encoders().pole_counts

@@ -8,12 +8,7 @@ from collections.abc import Callable
 from enum import StrEnum
 from typing import TYPE_CHECKING, NamedTuple, Self
 
-from cartpole_rl.rig.hardware import (
-    CART_METRES_PER_COUNT,
-    LARGEST_MOTOR,
-    POLE_COUNTS_PER_TURN,
-    POLE_RADIANS_PER_COUNT,
-)
+from cartpole_rl.rig.hardware import LARGEST_MOTOR, Encoders
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -35,26 +30,29 @@ class Measured(NamedTuple):
     theta_dot: "Tensor"  # rad/s
 
 
-def measured_position(counts: "Tensor") -> tuple["Tensor", "Tensor"]:
+def measured_position(counts: "Tensor", encoders: Encoders) -> tuple["Tensor", "Tensor"]:
     """Return (x m, theta rad) of counts [2, N] int64; theta is wrapped as an integer, which is exact."""
-    return counts[0] * CART_METRES_PER_COUNT, wrapped(counts[1]) * POLE_RADIANS_PER_COUNT
+    return counts[0] * encoders.metres, wrapped(counts[1], encoders.turn) * encoders.radians
 
 
-def wrapped(pole: "Tensor") -> "Tensor":
+def wrapped(pole: "Tensor", turn: int) -> "Tensor":
     """Return pole counts of any number of turns within half a turn of upright, int64."""
-    half_turn = POLE_COUNTS_PER_TURN // 2
-    if POLE_COUNTS_PER_TURN.bit_count() == 1:  # a power of two, where a mask takes half the time
-        return ((pole + half_turn) & (POLE_COUNTS_PER_TURN - 1)) - half_turn
-    return (pole + half_turn) % POLE_COUNTS_PER_TURN - half_turn
+    half_turn = turn // 2
+    if turn.bit_count() == 1:  # a power of two, where a mask takes half the time
+        return ((pole + half_turn) & (turn - 1)) - half_turn
+    return (pole + half_turn) % turn - half_turn
 
 
-def measured_velocity(counts: "Tensor", previous: "Tensor", dt: "Tensor") -> tuple["Tensor", "Tensor"]:
+def measured_velocity(
+    counts: "Tensor", previous: "Tensor", dt: "Tensor", encoders: Encoders
+) -> tuple["Tensor", "Tensor"]:
     """Return (x_dot m/s, theta_dot rad/s): the difference of counts [2, N] divided by `dt` [N] s.
 
-    One count in 20 ms is 1.1 mm/s and 0.077 rad/s. The difference is the velocity half a period earlier.
+    One count of ip02 in 20 ms is 1.1 mm/s and 0.077 rad/s. The difference is the velocity half a period
+    earlier.
     """
     cart, pole = (counts - previous).to(dt.dtype)
-    return cart * CART_METRES_PER_COUNT / dt, pole * POLE_RADIANS_PER_COUNT / dt
+    return cart * encoders.metres / dt, pole * encoders.radians / dt
 
 
 class Quantity(NamedTuple):

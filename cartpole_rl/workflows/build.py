@@ -280,7 +280,7 @@ def with_parameters(settings: CartPoleSettings, parameters: Mapping[str, float])
     poles = {name: pole.model_copy(update=of_pole) for name, pole in (settings.pole.choices or {}).items()}
     return settings.model_copy(
         update={
-            "cart": {**settings.nominal_cart, **of_cart},
+            "cart": {**settings.cart, **settings.nominal_cart, **of_cart},
             "cart_friction": settings.cart_friction.model_copy(update={"parameters": {}}),
             "pole_friction": settings.pole_friction.model_copy(update={"parameters": {}}),
             "pole": PoleSettings(choices=poles) if poles else settings.pole,
@@ -306,7 +306,9 @@ def evaluated_env(
         raise ConfigError("task.evaluation_start.angle=any: a cart can start only upright or hanging")
     angle: StartPosition = "upright" if start.angle is Start.UPRIGHT else "hanging"
     emulator = config.emulator.model_copy(update={"seed": config.emulator.seed + config.seed})
-    plant = config.plant.build(emulator, settings.control_period, angle, prompt, confirm)
+    plant = config.plant.build(
+        emulator, settings.control_period, angle, prompt, confirm, hardware=settings.hardware
+    )
     return environment(settings, plant)
 
 

@@ -18,6 +18,7 @@ from cartpole_rl.envs.settings import shipped_carts
 from cartpole_rl.errors import CheckpointError, ConfigError
 from cartpole_rl.randomization.poles import Pole, check_one_pole
 from cartpole_rl.randomization.ranges import check_carts
+from cartpole_rl.rig.hardware import check_of_ip02, hardware_of, parameters_of
 from cartpole_rl.rig.parameters import check_names, check_value, check_values, completed
 from cartpole_rl.run_folder import (
     BASELINE,
@@ -141,11 +142,13 @@ def check_replay(config: ReplayConfig) -> None:
     recordings(config.source)
     if config.pole is not None:
         check_one_pole("a replay", config.pole)
-    check_parameters({**(config.cart or {}), **(config.parameters or {})})
+    check_of_ip02(hardware_of(config.cart or {}), "cartpole-replay reads")
+    check_parameters({**parameters_of(config.cart or {}), **(config.parameters or {})})
 
 
 def check_modelling(config: ModelConfig) -> None:
     """Raise CartPoleError if there is no recording, or more than one pole is chosen."""
+    check_of_ip02(config.hardware, "cartpole-model reads")
     for source in config.source:
         recordings(source)
     if config.pole is not None:
@@ -154,6 +157,7 @@ def check_modelling(config: ModelConfig) -> None:
 
 def check_identification(config: IdentifyConfig) -> None:
     """Raise CartPoleError if the prior cart is impossible, or there is no recording."""
+    check_of_ip02(config.hardware, "cartpole-identify reads")
     check_values(config.nominal)
     if config.source is not None:
         experiments(config.source)

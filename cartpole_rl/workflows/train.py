@@ -129,7 +129,10 @@ def print_notes(config: TrainConfig, draws: Draws) -> None:
 def note_unused_randomization(config: TrainConfig, draws: Draws) -> None:
     """Print the ranges that change nothing with the chosen actions and friction models."""
     models = config.models(config.plant)
-    if unused := without_effect(draws, config.ranges, config.actions.motors, models, config.control_period):
+    encoders = config.hardware.encoders
+    if unused := without_effect(
+        draws, config.ranges, config.actions.motors, models, config.control_period, encoders
+    ):
         chosen = (
             f"cart_friction={config.cart_friction.model}, pole_friction={config.pole_friction.model} and "
             f"actuator {config.actions.actuator} with motor values {list(config.actions.motors)}"

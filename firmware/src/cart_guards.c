@@ -7,7 +7,8 @@
 #define STALL_US 500000u
 #define STALL_COUNTS CART_COUNTS(1000)
 #define PUSH_US 100000u        /* of hard pushes one way, after which the count must have changed */
-#define SPEED_CHANGE 200000    /* um/s; 0.2 m/s turn any pole by several counts */
+#define ROUNDING_UM_S (CART_NANOMETRES * 1000LL / 1250) /* um/s: four counts in the shortest period */
+#define SPEED_CHANGE (ROUNDING_UM_S > 200000 ? ROUNDING_UM_S : 200000) /* 0.2 m/s turn any pole by several counts */
 #define FASTEST_CART (5000000000LL / CART_NANOMETRES) /* counts/s: 5 m/s */
 #define FASTEST_POLE (16LL * CART_POLE_COUNTS)        /* counts/s: 16 turns a second */
 #define SECOND_US 1000000LL

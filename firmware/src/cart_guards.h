@@ -9,8 +9,6 @@
 #include <stdbool.h>
 #include <stdint.h>
 
-#define CART_HARD_PUSH 200 /* smallest motor value that moves any healthy cart */
-
 typedef struct {
     int8_t direction;   /* of the push that is watched: 1, -1, or 0 for none */
     int32_t anchor;     /* cart count at its start */
@@ -47,7 +45,7 @@ typedef struct {
 /* Forget everything: a hand may have moved cart and pole while the motor was off. */
 void cart_guards_reset(cart_guards *guards);
 
-/* A push of at least 200 one way for 0.5 s that moves the cart by less than 1 mm. */
+/* A push of at least CART_HARD_PUSH one way for 0.5 s that moves the cart by less than 1 mm. */
 bool cart_stalled(cart_stall_watch *watch, int32_t cart, int16_t motor, uint32_t period_us);
 
 /* A count that changes faster than cart or pole can move. */

@@ -2,6 +2,7 @@
 
 #include "cart_numbers.h"
 
+#define AT_LEAST_ONE(counts) ((counts) > 0 ? (counts) : 1)
 #define QUARTER_TURN (CART_POLE_COUNTS / 4)
 #define PI 3.14159265358979323846
 #define POLE_RADIANS (2 * PI / CART_POLE_COUNTS) /* a count */
@@ -14,13 +15,13 @@
 #define ASTRAY_NM 20000000 /* a motion the wrong way that means a reversed motor or encoder */
 #define FAST_POLE (CART_POLE_COUNTS * 6 / 10) /* counts/s; it may move the cart against its motor: 3.8 rad/s */
 #define AGAINST_STOP_US 400000u /* under full push without motion that mean a stop */
-#define STANDS_COUNTS (300000 / CART_NANOMETRES) /* largest motion in that time: 0.3 mm */
-#define LONGEST_SEARCH_US 30000000u /* for one stop */
+#define STANDS_COUNTS AT_LEAST_ONE(300000 / CART_NANOMETRES) /* largest motion in that time: 0.3 mm */
+#define LONGEST_SEARCH_US (CART_SPAN_UM > 1500000 ? CART_SPAN_UM * 20u : 30000000u) /* for one stop */
 #define CENTRED_NM 1000000
-#define LONGEST_CENTRING_US 20000000u
+#define LONGEST_CENTRING_US (CART_SPAN_UM > 4000000 ? CART_SPAN_UM * 5u : 20000000u)
 
 #define WHOLE_SWING_US 2000000u /* one period of a rod of 1.5 m */
-#define SWING(centidegrees) (((int64_t)(centidegrees)*CART_POLE_COUNTS + 18000) / 36000) /* counts */
+#define SWING(centidegrees) AT_LEAST_ONE(((int64_t)(centidegrees)*CART_POLE_COUNTS + 18000) / 36000) /* counts */
 #define STILL SWING(70)   /* peak to peak */
 #define BRAKED SWING(260) /* peak to peak; the brake cannot improve a smaller swing */
 #define LONGEST_BRAKING_US 20000000u

@@ -1,14 +1,17 @@
 /* Slow motions: a speed servo and a brake for the swinging pole. The only floating-point code.
 
-   Both use rough numbers of the cart: nominal motor curve, mass and friction. SI units; positive to the
+   Both use rough numbers of the cart: motor curve, mass and friction in cart_rig.h. SI units; positive to the
    right. Compile without contraction of products and sums (-ffp-contract=off), so that every machine computes
    the same motor values. */
 #ifndef CART_SERVO_H
 #define CART_SERVO_H
 
+#include "cart_config.h"
+
 #include <stdint.h>
 
-#define CART_FULL_PUSH 200 /* motor value of the largest force of these motions */
+/* The motor value of the largest force of these motions. */
+#define CART_FULL_PUSH ((int16_t)(CART_MOTOR_OFFSET + CART_MOTOR_PER_NEWTON * CART_GENTLE_FORCE))
 #define CART_METRES (CART_NANOMETRES / 1e9) /* per count */
 
 typedef struct {

@@ -6,7 +6,7 @@
 #include "policy.h"
 
 #if POLICY_CART_NANOMETRES_PER_COUNT != CART_NANOMETRES || POLICY_POLE_COUNTS_PER_TURN != CART_POLE_COUNTS
-#error "policy.h is for other encoders than cart_config.h: export the agent for this cart"
+#error "policy.h is for other encoders than cart_rig.h: export the agent for this cart"
 #endif
 
 #ifndef CART_POLE_LENGTH

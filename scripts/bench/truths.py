@@ -11,11 +11,10 @@ from collections.abc import Mapping
 import numpy as np
 
 from cartpole_rl.choices import choice
-from cartpole_rl.emulator.firmware import SOFT_LIMIT
 from cartpole_rl.emulator.physics import AT_REST
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.physics.parameters import CartParameters
-from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT
+from cartpole_rl.rig.hardware import nominal_hardware, parameters_of
 
 COMPARED = 0  # seed of the carts on which settings are compared
 REPORTED = 2026  # seed of the carts that are reported; no setting was chosen on them
@@ -84,14 +83,17 @@ def simulated_cart(truth: Mapping[str, object]) -> dict[str, float]:
     settings = EmulatorSettings(**truth).model_dump()
     left, right = settings["cart_coulomb_left"], settings["cart_coulomb_right"]
     a, b, c = settings["force_curve"]
+    hardware = nominal_hardware()
+    encoders = hardware.encoders
+    soft_limit = encoders.cart_counts(hardware.soft_limit) * encoders.metres
     same = {name: settings[name] for name in CartParameters.names() if name in settings}
     return {
-        **choice("cart/ip02"),
+        **parameters_of(choice("cart/ip02")),
         **same,
         "cart_coulomb": (left + right) / 2,
         "cart_coulomb_asymmetry": (right - left) / (right + left),
         "stribeck_velocity": AT_REST,
-        "track_half_length": settings["track_half_length"] - SOFT_LIMIT * CART_METRES_PER_COUNT,
+        "track_half_length": settings["track_half_length"] - soft_limit,
         "force_quadratic": a,
         "force_linear": b,
         "force_offset": c,

@@ -3,8 +3,8 @@
 import math
 import random
 
-METRES = 22749e-9  # a count
-TURN = 4096  # counts
+from cartpole_rl.rig.hardware import Hardware
+
 GRAVITY, LENGTH = 9.81, 0.24  # m/s^2 and m, of the pole as a pendulum
 STEP = 1e-3  # s, longest step
 
@@ -12,10 +12,10 @@ STEP = 1e-3  # s, longest step
 class ToyCart:
     """A cart on a track with stops, and a pendulum. Some tracks are too short or too long."""
 
-    def __init__(self, dice: random.Random) -> None:
-        self._dice = dice
-        self._half = 0.407 if dice.random() < 0.8 else dice.uniform(0.38, 0.43)  # m
-        self._x, self._v = dice.uniform(-0.3, 0.3), 0.0
+    def __init__(self, dice: random.Random, rig: Hardware) -> None:
+        self._dice, self._rig = dice, rig
+        self._half = rig.half_span * (1.0 if dice.random() < 0.8 else dice.uniform(0.93, 1.06))  # m
+        self._x, self._v = rig.half_span * dice.uniform(-0.7, 0.7), 0.0
         self._swing, self._rate = dice.uniform(-0.6, 0.6), dice.uniform(-1.0, 1.0)  # rad from hanging
         self._damping = dice.choice([0.05, 0.3, 3.0])  # 1/s
         self._origin = self._counts()
@@ -26,11 +26,13 @@ class ToyCart:
         """Move for `us` under one motor value."""
         steps = max(1, math.ceil(us / 1e6 / STEP))
         step = us / 1e6 / steps
-        force = math.copysign(max(0.0, 0.02 * abs(motor) - 1.0), motor)
+        rig = self._rig
+        force = math.copysign(max(0.0, (abs(motor) - rig.motor_offset) / rig.motor_per_newton), motor)
+        dry = 1.1 * rig.moving_friction  # N
         for _ in range(steps):
-            friction = 0.55 if abs(self._v) > 1e-3 or abs(force) > 0.55 else 0.0
+            friction = dry if abs(self._v) > 1e-3 or abs(force) > dry else 0.0
             pull = force - math.copysign(friction, self._v if abs(self._v) > 1e-3 else force)
-            acceleration = (pull - 0.6 * self._v) / 0.85 if friction else 0.0
+            acceleration = (pull - 0.6 * self._v) / rig.moving_mass if friction else 0.0
             self._v = self._v + acceleration * step if friction else 0.0
             self._x += 0.0 if self._jammed else self._v * step
             if abs(self._x) > self._half:
@@ -67,7 +69,8 @@ class ToyCart:
         """Free the encoders and the cart, and put the cart near the middle."""
         self._frozen.clear()
         self._jammed = False
-        self._x, self._v = self._dice.uniform(-0.1, 0.1), 0.0
+        self._x, self._v = self._half * self._dice.uniform(-0.25, 0.25), 0.0
 
     def _counts(self) -> tuple[int, int]:
-        return math.floor(self._x / METRES), math.floor(self._swing / math.tau * TURN)
+        metres, turn = self._rig.encoders
+        return math.floor(self._x / metres), math.floor(self._swing / math.tau * turn)

@@ -2,6 +2,7 @@
 """Do the Python and the C firmware answer any traffic with the same bytes, and are they in the same state?
 
     scripts/fuzz/two_firmwares.py --bytes 10000000 --frames 1000000 --seed 0
+    scripts/fuzz/two_firmwares.py --rig '{"cart_nanometres_per_count": 50000, "track_span": 0.5}'
 
 Both receive the same input: random bytes; frames of any type, valid or damaged, between periods with any
 counts; and whole runs on a rough cart with homing, driving, latencies, other periods, silence and failing
@@ -13,6 +14,7 @@ error. Prints counts. Exit status 1 at the first difference, which is printed.
 
 import argparse
 import ctypes
+import json
 import os
 import random
 import subprocess
@@ -28,6 +30,7 @@ from wire import FROM_HOST, damaged, frames_of, noise
 from cartpole_rl.emulator import c_firmware
 from cartpole_rl.emulator.c_firmware import CFirmware
 from cartpole_rl.emulator.firmware import Firmware
+from cartpole_rl.rig.hardware import Hardware, hardware_of, nominal_hardware
 from cartpole_rl.wire import (
     ClearFault,
     FrameSplitter,
@@ -59,17 +62,17 @@ class DifferenceError(Exception):
 class Pair:
     """Both firmwares with their splitters, at the same time of the same cart."""
 
-    def __init__(self, seed: int, largest_delay_us: int, counts: Counter[str]) -> None:
-        self.counts = counts
+    def __init__(self, seed: int, largest_delay_us: int, counts: Counter[str], rig: Hardware) -> None:
+        self.counts, self.rig = counts, rig
         self._dice = [random.Random(seed), random.Random(seed)]
 
         def delay(number: int) -> int:
             return self._dice[number].randint(0, largest_delay_us)
 
-        self.python = Firmware(lambda: delay(0))
-        self.c = CFirmware(lambda: delay(1))
+        self.python = Firmware(lambda: delay(0), hardware=rig)
+        self.c = CFirmware(lambda: delay(1), hardware=rig)
         self._splitter = FrameSplitter()
-        self._library = c_firmware.load_library()
+        self._library = c_firmware.load_library(hardware=rig)
         self._c_splitter = ctypes.create_string_buffer(SPLITTER_BYTES)
         self._runs = ctypes.create_string_buffer(2 * LONGEST_INPUT + 65)
         self._last = b""
@@ -181,7 +184,8 @@ def traffic(kind: str, pair: Pair, dice: random.Random, size: int) -> None:
 
 def rough_drive(pair: Pair, dice: random.Random, leader: int) -> None:
     """Home a rough cart and drive it with random motor values, pauses and failures."""
-    toy, jitter, between_looks_us = ToyCart(dice), dice.choice([0, 0, 300]), dice.choice([1000, 1000, 4000])
+    toy, jitter = ToyCart(dice, pair.rig), dice.choice([0, 0, 300])
+    between_looks_us = dice.choice([1000, 1000, 4000])
     silence = 0  # periods in which the host sends nothing
     pair.send(SetPeriod(dice.choice([20_000, 20_000, 10_000, 5_000, 33_333, 100_000])))
     failing, strange = dice.choice([0.0, 0.0005, 0.01]), dice.choice([0.0, 0.0, 0.0003, 0.05])
@@ -233,8 +237,12 @@ def rough_drive(pair: Pair, dice: random.Random, leader: int) -> None:
             pair.counts[str(new.name)] += 1
 
 
-def run(total_bytes: int, total_frames: int, seed: int) -> Counter[str]:
-    """Compare the two until so many random bytes and so many frames have arrived. Raises DifferenceError."""
+def run(total_bytes: int, total_frames: int, seed: int, rig: Hardware | None = None) -> Counter[str]:
+    """Compare the two until so many random bytes and so many frames have arrived. Raises DifferenceError.
+
+    The rig is ip02's if it is None.
+    """
+    rig = rig or nominal_hardware()
     counts: Counter[str] = Counter()
     session = random_bytes = 0
     while random_bytes < total_bytes or counts["frames"] < total_frames:
@@ -242,7 +250,7 @@ def run(total_bytes: int, total_frames: int, seed: int) -> Counter[str]:
         if kind == "noise" and random_bytes >= total_bytes:
             kind = "drive"
         dice = random.Random(f"{session} {seed}")
-        pair = Pair(dice.randrange(2**31), dice.choice([0, 3_000, 60_000]), counts)
+        pair = Pair(dice.randrange(2**31), dice.choice([0, 3_000, 60_000]), counts, rig)
         if kind == "drive":
             rough_drive(pair, dice, leader=session // len(KINDS) % 2)
         else:
@@ -278,6 +286,7 @@ def main() -> int:
     parser.add_argument("--bytes", type=int, default=10_000_000, help="random bytes (10^7)")
     parser.add_argument("--frames", type=int, default=1_000_000, help="runs of bytes that end in 0x00 (10^6)")
     parser.add_argument("--seed", type=int, default=0, help="of all input (0)")
+    parser.add_argument("--rig", default="{}", help="numbers of the rig as JSON; the rest is ip02's")
     parser.add_argument("--plain", action="store_true", help="compile without sanitizers")
     options = parser.parse_args()
     if not options.plain:
@@ -286,7 +295,7 @@ def main() -> int:
         c_firmware.FLAGS = (*c_firmware.FLAGS, *SANITIZERS)
     started = time.perf_counter()
     try:
-        counts = run(options.bytes, options.frames, options.seed)
+        counts = run(options.bytes, options.frames, options.seed, hardware_of(json.loads(options.rig)))
     except DifferenceError as difference:
         print(difference)
         return 1

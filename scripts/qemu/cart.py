@@ -29,9 +29,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from cartpole_rl.emulator.c_firmware import rig_header
 from cartpole_rl.emulator.physics import CartPhysics
 from cartpole_rl.emulator.settings import EmulatorSettings
-from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
+from cartpole_rl.rig.hardware import Hardware, nominal_hardware
 
 FIRMWARE = Path(__file__).parents[2] / "firmware"
 PROGRAMS = ("qemu-system-arm", "arm-none-eabi-gcc", "make")
@@ -52,6 +53,7 @@ class Pins:
 
     def __init__(self, settings: EmulatorSettings) -> None:
         self._physics = CartPhysics(settings)
+        self._encoders = (settings.hardware or nominal_hardware()).encoders
         self._physics.place(*BOOT)
         self._boot = self._discs()
         self._clock_us: int | None = None  # of the board, at the present state of the physics
@@ -78,16 +80,18 @@ class Pins:
 
     def _discs(self) -> tuple[int, int]:
         """Return the counts of the encoder discs of cart and pole."""
-        pole = math.floor(self._physics.angle / POLE_RADIANS_PER_COUNT + 0.5)
-        return math.floor(self._physics.x / CART_METRES_PER_COUNT), pole
+        pole = math.floor(self._physics.angle / self._encoders.radians + 0.5)
+        return math.floor(self._physics.x / self._encoders.metres), pole
 
 
-def build(folder: Path, policy: Path | None, pole_length: float) -> Path:
-    """Compile the firmware, with a policy if there is one, into a folder; return the program.
+def build(folder: Path, policy: Path | None, pole_length: float, hardware: Hardware) -> Path:
+    """Compile the firmware for a rig, with a policy if there is one, into a folder; return the program.
 
     The policy may observe `pole_length`, in m.
     """
-    make = ["make", "-C", str(FIRMWARE), f"BUILD={folder}", "qemu_an386"]
+    rig = folder / "rig.h"
+    rig.write_text(rig_header(hardware, "the emulator's settings"), encoding="utf-8")
+    make = ["make", "-C", str(FIRMWARE), f"BUILD={folder}", f"RIG={rig}", "qemu_an386"]
     make += [f"POLICY={policy.resolve()}", f"POLE_LENGTH={pole_length}"] if policy else []
     done = subprocess.run(make, capture_output=True, text=True)
     if done.returncode:
@@ -147,7 +151,8 @@ def main() -> int:
         listening.listen(1)
         listening.settimeout(PATIENCE)
         try:
-            program = build(Path(folder), options.policy, 2 * settings.pole_com)
+            hardware = settings.hardware or nominal_hardware()
+            program = build(Path(folder), options.policy, 2 * settings.pole_com, hardware)
             with board(program, path) as port:
                 line, _ = listening.accept()
                 print(json.dumps({"port": port}), flush=True)

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from cartpole_rl.choices import conf_folder
+from cartpole_rl.rig.hardware import HARDWARE
 from cartpole_rl.workflows.config import TrainConfig, load_settings
 
 SILENT = "silent"
@@ -168,7 +169,9 @@ EXPECTED = {
 def settings(experiment: str) -> dict[str, Any]:
     """Each setting of an experiment by its whole name."""
     config = load_settings(TrainConfig, {"experiment": experiment})
-    return dict(leaves(config.model_dump(mode="json", exclude=OF_THE_RUN)))
+    of_the_rig = {f"cart.{name}" for name in HARDWARE}  # no agent reads it
+    found = leaves(config.model_dump(mode="json", exclude=OF_THE_RUN))
+    return {name: value for name, value in found if name not in of_the_rig}
 
 
 def leaves(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

@@ -3,6 +3,7 @@
 import ctypes
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -20,8 +21,10 @@ from cartpole_rl.emulator.c_firmware import (
     find_compiler,
     firmware_folder,
     load_library,
+    rig_header,
 )
 from cartpole_rl.errors import EmulatorError
+from cartpole_rl.rig.hardware import nominal_hardware
 from cartpole_rl.wire import FrameSplitter, MessageType
 from cartpole_rl.wire.messages import MESSAGES
 
@@ -162,5 +165,15 @@ def test_a_library_is_built_once_and_again_for_other_sources(tmp_path, monkeypat
     written = first.stat().st_mtime_ns
     assert c_firmware.build_library() == first
     assert first.stat().st_mtime_ns == written
-    monkeypatch.setattr(c_firmware, "CART", (*c_firmware.CART, "-DCART_OTHER=1"))
+    other = nominal_hardware().model_copy(update={"hard_push": 199})
+    assert c_firmware.build_library(hardware=nominal_hardware()) == first
+    assert c_firmware.build_library(hardware=other) != first
+    monkeypatch.setattr(c_firmware, "FLAGS", (*c_firmware.FLAGS, "-DCART_OTHER=1"))
     assert c_firmware.build_library() != first
+
+
+def test_the_shipped_header_is_that_of_ip02():
+    """Write it again after a change: cartpole-export format=firmware cart=ip02."""
+    shipped = (firmware_folder() / "src" / "cart_rig.h").read_text(encoding="utf-8")
+    assert shipped == rig_header(nominal_hardware(), "ip02")
+    assert [*c_firmware.RIG] == re.findall(r"#ifndef (?!CART_RIG_H)(\w+)", shipped)

@@ -11,16 +11,14 @@ pytest.importorskip("mujoco")
 
 
 from cartpole_rl.choices import choice
-from cartpole_rl.emulator.guards import SOFT_LIMIT
 from cartpole_rl.emulator.settings import EmulatorSettings
-from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT
 
 PAGE = (Path(__file__).parents[2] / "docs" / "emulator.md").read_text(encoding="utf-8")
 LEVELS = choice("actions/nine_levels")["motors"]
 CART = {**choice("cart/ip02"), **choice("pole/medium")["choices"]["medium"]}
 CURVE = (CART["force_quadratic"], CART["force_linear"], CART["force_offset"])
 OTHERWISE = {  # numbers that conf/ has under another name or does not have
-    "track_half_length": CART["track_half_length"] + SOFT_LIMIT * CART_METRES_PER_COUNT,
+    "track_half_length": CART["track_half_length"] + CART["soft_limit"],
     "cart_coulomb_left": CART["cart_coulomb"] * (1 - CART["cart_coulomb_asymmetry"]),
     "cart_coulomb_right": CART["cart_coulomb"] * (1 + CART["cart_coulomb_asymmetry"]),
     "force_curve": CURVE,

@@ -11,7 +11,7 @@ from firmwares import truth
 
 from cartpole_rl.emulator.device import CartDevice
 from cartpole_rl.emulator.settings import EmulatorSettings
-from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
+from cartpole_rl.rig.hardware import nominal_encoders
 from cartpole_rl.wire import (
     ClearFault,
     Fault,
@@ -27,6 +27,7 @@ from cartpole_rl.wire import (
 
 pytestmark = pytest.mark.usefixtures("each_firmware")
 
+METRES, RADIANS = nominal_encoders().metres, nominal_encoders().radians
 NOMINAL_LIMITS = (16704, 17539)  # counts, as docs/protocol.md has them
 
 
@@ -87,7 +88,7 @@ def test_the_limits_are_nominal_until_homing_has_found_the_stops():
     while driven.flags & Flags.HOMING:
         assert driven.limits() == NOMINAL_LIMITS
         driven.tick()
-    assert [limit * CART_METRES_PER_COUNT for limit in driven.limits()] == pytest.approx(
+    assert [limit * METRES for limit in driven.limits()] == pytest.approx(
         [0.4 - 0.027, 0.4 - 0.008], abs=1e-4
     )
 
@@ -98,12 +99,12 @@ def test_limits_and_zeros_last_until_another_homing_succeeds_or_the_cart_restart
     found, state = driven.limits(), driven.ask(Home())
     while driven.flags & Flags.HOMING:
         if driven.cart.now_us < 28e6:
-            assert driven.measured(state)[0] == pytest.approx(driven.x, abs=2 * CART_METRES_PER_COUNT)
+            assert driven.measured(state)[0] == pytest.approx(driven.x, abs=2 * METRES)
         assert driven.limits() == found
         state = driven.tick()
     assert state.fault == Fault.HOMING
     off = driven.measured(state)[1] - driven.angle - driven.settings.angle_offset
-    assert math.remainder(off, 2 * math.pi) == pytest.approx(0, abs=2 * POLE_RADIANS_PER_COUNT)
+    assert math.remainder(off, 2 * math.pi) == pytest.approx(0, abs=2 * RADIANS)
     assert driven.limits() == found
     while driven.cart.now_us <= 100e6:
         driven.tick()
@@ -133,10 +134,8 @@ def test_counts_follow_the_true_state():
     for tick in range(200):
         state = driven.ask(SetMotor(200 if tick // 10 % 2 else -200))
         x, angle = driven.measured(state)
-        assert x == pytest.approx(driven.x, abs=2 * CART_METRES_PER_COUNT)
-        assert angle - driven.angle - driven.settings.angle_offset == pytest.approx(
-            0, abs=2 * POLE_RADIANS_PER_COUNT
-        )
+        assert x == pytest.approx(driven.x, abs=2 * METRES)
+        assert angle - driven.angle - driven.settings.angle_offset == pytest.approx(0, abs=2 * RADIANS)
 
 
 def test_motor_and_angle_are_positive_to_the_right():
@@ -181,11 +180,11 @@ def test_a_hand_holds_the_pole_up_until_the_cart_is_armed():
     driven.home()
     held = [driven.ask(Hello()) for _ in range(3)]
     assert len({state.pole_counts for state in held}) == 1
-    assert abs(held[0].pole_counts * POLE_RADIANS_PER_COUNT) <= 0.03 + POLE_RADIANS_PER_COUNT
+    assert abs(held[0].pole_counts * RADIANS) <= 0.03 + RADIANS
     driven.ask(Start())
     for _ in range(30):
         state = driven.ask(SetMotor(0))
-    assert abs(state.pole_counts * POLE_RADIANS_PER_COUNT) > 0.1 or held[0].pole_counts == 0
+    assert abs(state.pole_counts * RADIANS) > 0.1 or held[0].pole_counts == 0
 
 
 def test_a_hand_takes_the_pole_again_at_another_angle_and_releases_it_for_homing():
@@ -197,12 +196,12 @@ def test_a_hand_takes_the_pole_again_at_another_angle_and_releases_it_for_homing
         driven.ask(SetMotor(0))
     driven.ask(Stop())
     second = driven.ask(Hello())
-    assert abs(math.remainder(second.pole_counts * POLE_RADIANS_PER_COUNT, 2 * math.pi)) <= 0.03 + 0.006
+    assert abs(math.remainder(second.pole_counts * RADIANS, 2 * math.pi)) <= 0.03 + 0.006
     assert second.pole_counts != first.pole_counts
     state = driven.home()
     assert state.fault == 0
-    assert state.pole_counts == pytest.approx(2048 + 0.004 / POLE_RADIANS_PER_COUNT, abs=3)
-    assert abs(driven.ask(Hello()).pole_counts * POLE_RADIANS_PER_COUNT) <= 0.03 + 0.006
+    assert state.pole_counts == pytest.approx(2048 + 0.004 / RADIANS, abs=3)
+    assert abs(driven.ask(Hello()).pole_counts * RADIANS) <= 0.03 + 0.006
 
 
 def trace(**settings: object) -> bytes:
@@ -255,7 +254,11 @@ def test_every_setting_is_tried_here_or_on_the_wire():
     faults = {"unplug_at", "stuck_encoder", "stuck_at"}  # test_faults.py
     rate = {"clock_rate"}  # below
     cogging = {"cogging", "cogging_pitch"}  # test_physics.py
-    firmware = {"firmware", "policy"}  # this module runs with both; test_onboard_policy.py
+    firmware = {
+        "firmware",
+        "policy",
+        "hardware",
+    }  # this module runs with both; test_onboard_policy.py, test_rigs.py
     others = {"journal", "knock"}  # tests/plants/test_stops.py, tests/fuzz/test_soak.py; below
     port = {"port"}  # tests/plants/serial/test_tcp.py
     assert set(OTHER) | firmware | on_the_wire | order | faults | cogging | others | port | rate == set(

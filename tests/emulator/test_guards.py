@@ -10,13 +10,14 @@ from cartpole_rl.emulator.guards import (
     FrozenCartWatch,
     FrozenPoleWatch,
 )
-from cartpole_rl.rig.hardware import CART_NANOMETRES_PER_COUNT
+from cartpole_rl.rig.hardware import nominal_hardware
 
 PERIOD = 62_500  # us
+RIG = nominal_hardware()
 
 
 def cart_encoder_frozen(counts: list[int], motors: list[int]) -> list[bool]:
-    watch = FrozenCartWatch()
+    watch = FrozenCartWatch(RIG)
     return [watch.frozen(count, motor, PERIOD) for count, motor in zip(counts, motors, strict=True)]
 
 
@@ -30,7 +31,7 @@ def test_a_cart_count_is_frozen_after_a_long_push_each_way() -> None:
 @pytest.mark.parametrize("lasts", [3, 4, 5])
 def test_short_pushes_each_way_add_up(lasts: int) -> None:
     """The first period of a push does not count."""
-    watch, motors = FrozenCartWatch(), ([255] * lasts + [-255] * lasts) * 5
+    watch, motors = FrozenCartWatch(RIG), ([255] * lasts + [-255] * lasts) * 5
     answers = [watch.frozen(7, motor, 20_000) for motor in motors]
     whole, rest = divmod(PUSH_US // 20_000, lasts - 1)
     needed = 2 * lasts * whole + lasts + 1 + rest if rest else 2 * lasts * whole
@@ -52,10 +53,10 @@ def test_no_frozen_cart_count(counts: list[int], motors: list[int]) -> None:
 
 
 def pole_encoder_frozen(speeds: list[float], poles: list[int]) -> bool:
-    watch, cart, answers = FrozenPoleWatch(), 0, [False]
+    watch, cart, answers = FrozenPoleWatch(RIG), 0, [False]
     watch.frozen(poles[0], cart, PERIOD)
     for speed, pole in zip(speeds, poles, strict=True):
-        cart += math.ceil(speed * PERIOD / CART_NANOMETRES_PER_COUNT / 1000)
+        cart += math.ceil(speed * PERIOD / RIG.cart_nanometres_per_count / 1000)
         answers.append(watch.frozen(pole, cart, PERIOD))
     return answers[-1]
 

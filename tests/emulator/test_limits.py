@@ -11,7 +11,6 @@ pytest.importorskip("mujoco", reason='pip install "cartpole_rl[emulator]"')
 
 from driven_cart import Driven
 
-from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT
 from cartpole_rl.wire import (
     ClearFault,
     Fault,
@@ -155,7 +154,7 @@ def test_a_limit_that_acts_is_reported():
         state = driven.ask(SetMotor(255))
         flags = driven.flags
     assert state.motor_applied in (0, -255)
-    assert state.cart_counts * CART_METRES_PER_COUNT < 0.375  # before the soft limit
+    assert driven.measured(state)[0] < 0.375  # before the soft limit
 
 
 @pytest.mark.parametrize("frames", [0, 4])

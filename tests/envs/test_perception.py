@@ -10,7 +10,7 @@ from cartpole_rl.choices import choice
 from cartpole_rl.envs.perception import Percept, Previous, perceive, perceive_first, remember
 from cartpole_rl.envs.settings import ObservationSettings
 from cartpole_rl.plants.specs import PlantOutput
-from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
+from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT, nominal_encoders
 from cartpole_rl.tasks.features import ANGULAR_SPEED_SCALE, MOTOR_SCALE, SPEED_SCALE
 from cartpole_rl.tasks.settings import RewardSettings, StartSettings, TaskSettings
 
@@ -66,6 +66,7 @@ def perceived(
         task=task or of_task(),
         rewards=rewards or of_reward(),
         guard=None,
+        encoders=nominal_encoders(),
     )
 
 
@@ -84,7 +85,9 @@ def test_the_newest_of_the_past_comes_first_and_the_oldest_is_forgotten() -> Non
 
 def test_a_first_frame_has_no_velocity_and_no_memory() -> None:
     output = frame()._replace(counts=torch.tensor([[100, 0], [0, 1024]]))
-    first = perceive_first(output, NO_LENGTH, TRACK_END, settings=RAW, guard=None)
+    first = perceive_first(
+        output, NO_LENGTH, TRACK_END, settings=RAW, guard=None, encoders=nominal_encoders()
+    )
     assert first.state[1].tolist() == first.state[3].tolist() == [0, 0]
     assert first.state[2, 1] == pytest.approx(math.pi / 2)
     assert not first.past.any()

@@ -72,7 +72,13 @@ class ExactPlant(OneCartPlant):
         self.commands = commands_under_way(LONGEST_LATENCY, self.period)
         assert isinstance(training.plant, SimulatedSettings)
         plant = training.plant
-        run = partial(run_carts, models=training.models(plant), period=self.period, substeps=plant.substeps)
+        run = partial(
+            run_carts,
+            models=training.models(plant),
+            period=self.period,
+            substeps=plant.substeps,
+            encoders=training.hardware.encoders,
+        )
         column = torch.zeros(4, 1)
         drive = torch.zeros(1 + self.commands, 1)
         example = Carts(torch.ones(len(self.table), 1), column, drive)

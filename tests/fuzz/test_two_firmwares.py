@@ -1,5 +1,6 @@
 """scripts/fuzz/two_firmwares.py in short: both firmwares agree, and a firmware that differs is found."""
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -10,9 +11,24 @@ from bench_scripts import SCRIPTS
 from firmwares import needs_compiler
 
 from cartpole_rl.emulator import c_firmware
+from cartpole_rl.rig.hardware import hardware_of
 
 pytestmark = needs_compiler
 SHORT = ("--bytes", "50000", "--frames", "8000")
+OTHER = {
+    "cart_nanometres_per_count": 98_175,
+    "pole_counts_per_turn": 1001,
+    "track_span": 0.3961,
+    "soft_limit": 0.02,
+    "hard_limit": 0.0053,
+    "braking": 1.3,
+    "hard_push": 150,
+    "moving_mass": 0.31,
+    "moving_friction": 0.27,
+    "motor_offset": 31.5,
+    "motor_per_newton": 90.3,
+    "gentle_force": 1.7,
+}
 
 
 def run_script(*words: str) -> subprocess.CompletedProcess[str]:
@@ -20,19 +36,31 @@ def run_script(*words: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True)
 
 
-def test_both_firmwares_agree_under_sanitizers() -> None:
+@pytest.mark.parametrize("rig", [{}, OTHER], ids=["ip02", "other"])
+def test_both_firmwares_agree_under_sanitizers(rig: dict[str, float]) -> None:
     compiler = c_firmware.find_compiler()
     found = subprocess.run([compiler, "-print-file-name=libasan.so"], capture_output=True, text=True)
     if not Path(found.stdout.strip()).is_absolute():
         pytest.skip("needs the address sanitizer of gcc")
-    done = run_script(*SHORT)
+    done = run_script(*SHORT, "--rig", json.dumps(rig))
     assert (done.returncode, done.stderr) == (0, "")
     assert "no difference" in done.stdout
 
 
-@pytest.mark.parametrize("flag", ["-DCART_NANOMETRES=22760", "-DCART_SPAN_UM=830000", "-DCART_PENDING=1"])
-def test_another_cart_is_a_difference(flag: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    others = [other for other in c_firmware.CART if other.split("=")[0] != flag.split("=")[0]]
-    monkeypatch.setattr(c_firmware, "CART", (*others, flag))
+@pytest.mark.parametrize(
+    "numbers",
+    [{"cart_nanometres_per_count": 22_760}, {"track_span": 0.83}, {"moving_mass": 0.86}, {"hard_push": 150}],
+    ids=lambda numbers: next(iter(numbers)),
+)
+def test_another_rig_is_a_difference(numbers: dict[str, float], monkeypatch: pytest.MonkeyPatch) -> None:
+    other = c_firmware.definitions(hardware_of(numbers))
+    monkeypatch.setattr(c_firmware, "definitions", lambda hardware: other)
+    with pytest.raises(two_firmwares.DifferenceError, match="differ"):
+        two_firmwares.run(1000, 8000, seed=1)
+
+
+def test_another_number_of_waiting_commands_is_a_difference(monkeypatch: pytest.MonkeyPatch) -> None:
+    flags = [flag for flag in c_firmware.FLAGS if not flag.startswith("-DCART_PENDING")]
+    monkeypatch.setattr(c_firmware, "FLAGS", (*flags, "-DCART_PENDING=1"))
     with pytest.raises(two_firmwares.DifferenceError, match="differ"):
         two_firmwares.run(1000, 8000, seed=1)

@@ -15,6 +15,7 @@ from cartpole_rl.randomization.identified import IdentifiedCarts
 from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.randomization.randomizer import Randomizer
 from cartpole_rl.randomization.ranges import Range
+from cartpole_rl.rig.hardware import nominal_encoders
 
 ACTIONS = sorted(path.stem for path in (conf_folder() / "actions").glob("*.yaml"))
 RANDOMIZATIONS = sorted(path.stem for path in (conf_folder() / "randomization").glob("*.yaml"))
@@ -54,7 +55,8 @@ def idle(
     """Ranges without effect for an action set of conf/."""
     chosen: dict[str, Any] = choice(f"actions/{actions}")
     models = models._replace(actuator=ACTUATORS.find(chosen["actuator"]))
-    return set(without_effect(Randomizer(ip02, poles, ranges), ranges, chosen["motors"], models, 0.02))
+    carts, motors = Randomizer(ip02, poles, ranges), chosen["motors"]
+    return set(without_effect(carts, ranges, motors, models, 0.02, nominal_encoders()))
 
 
 @pytest.mark.parametrize(
@@ -123,7 +125,7 @@ def test_identified_carts_report_only_drawn_parameters(ip02: dict[str, float], m
 
     def unread(prior_share: float, identified: list[str] | None) -> list[str]:
         carts = IdentifiedCarts(found, others, prior_share, longest_delay=0.02, identified=identified)
-        return without_effect(carts, ranges, (-200, 0, 200), Models(), 0.02)
+        return without_effect(carts, ranges, (-200, 0, 200), Models(), 0.02, nominal_encoders())
 
     assert unread(0.0, None) == ["cart_mass", "latency"]
     assert unread(0.0, ["cart_mass"]) == ["cart_mass"]

@@ -6,7 +6,7 @@ import pytest
 from firmwares import answering, truth
 
 from cartpole_rl.emulator.device import CartDevice
-from cartpole_rl.emulator.homing import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
+from cartpole_rl.rig.hardware import nominal_hardware
 from cartpole_rl.wire import Flags, Hello, Home, Info, Message, State, decode_frame, encode_frame
 
 OTHER_PHYSICS = {
@@ -38,6 +38,7 @@ class Driven:
 
     def __init__(self, **settings: object) -> None:
         self.settings = truth(**COARSE | settings)
+        self.encoders = (self.settings.hardware or nominal_hardware()).encoders
         self.cart = CartDevice(self.settings)
         self.flags = Flags(0)
         self.newest = 0  # tick of the newest STATE
@@ -79,7 +80,7 @@ class Driven:
         return state
 
     def measured(self, state: State) -> tuple[float, float]:
-        return state.cart_counts * CART_METRES_PER_COUNT, state.pole_counts * POLE_RADIANS_PER_COUNT
+        return state.cart_counts * self.encoders.metres, state.pole_counts * self.encoders.radians
 
 
 def check_homed(driven: Driven, state: State) -> None:
@@ -87,11 +88,11 @@ def check_homed(driven: Driven, state: State) -> None:
     assert driven.flags == Flags.HOMED
     assert state.fault == 0
     x, angle = driven.measured(state)
-    assert x == pytest.approx(driven.x, abs=2 * CART_METRES_PER_COUNT)
+    assert x == pytest.approx(driven.x, abs=2 * driven.encoders.metres)
     assert abs(driven.x) < 2e-3
     true = math.remainder(driven.angle, 2 * math.pi)
     offset = driven.settings.angle_offset
     assert math.remainder(angle - true - offset, 2 * math.pi) == pytest.approx(
-        0, abs=2 * POLE_RADIANS_PER_COUNT
+        0, abs=2 * driven.encoders.radians
     )
     assert angle == pytest.approx(math.pi, abs=0.05)  # regardless of earlier turns

@@ -19,6 +19,7 @@ from cartpole_rl.plants.serial.port import open_port, resolved_port
 from cartpole_rl.plants.serial.statistics import LinkStatistics
 from cartpole_rl.plants.serial.tracking import StateTracker
 from cartpole_rl.plants.settings import SerialSettings
+from cartpole_rl.rig.hardware import Hardware, nominal_hardware
 from cartpole_rl.terminal import waiting
 from cartpole_rl.wire import microseconds_between
 from cartpole_rl.wire.messages import (
@@ -63,8 +64,9 @@ class SerialCart:
     Every method raises LinkError when the cart no longer answers.
     """
 
-    def __init__(self, settings: SerialSettings) -> None:
-        self.settings = settings
+    def __init__(self, settings: SerialSettings, hardware: Hardware | None = None) -> None:
+        """`hardware` is that of the cart's file, ip02's if it is not given."""
+        self.settings, self.hardware = settings, hardware or nominal_hardware()
         self.port = settings.port  # once opened, the one that "auto" was resolved to
         self._tracker = StateTracker()
         self._open_connection: Connection | None = None
@@ -317,8 +319,8 @@ class SerialCart:
             self._tracker.measuring = True
 
     def _arm(self, message: Start | StartPolicy) -> None:
-        check_scales(self.information)
-        check_limits(self.information)
+        check_scales(self.information, self.hardware)
+        check_limits(self.information, self.hardware)
         self._check_round_trip()
         self._connection.request(message, Ack)
         self._tracker.forget_handed_out()

@@ -1,17 +1,11 @@
 """What is wrong with a cart, in words and each with its remedy: its refusals, its faults, its INFO.
 
-Positions, angles and forces are computed from constants: encoder counts per turn, metres per count, the range
-of motor values. With a cart whose INFO has others every number would be wrong, so it is refused.
+Positions, angles and forces are computed from the numbers of the cart's file: metres per count, counts per
+turn, the span of the track. A cart whose INFO has others is refused: every number would be wrong.
 """
 
 from cartpole_rl.errors import FaultError, LinkError, PlantError
-from cartpole_rl.rig.hardware import (
-    CART_METRES_PER_COUNT,
-    CART_NANOMETRES_PER_COUNT,
-    HALF_SPAN,
-    LARGEST_MOTOR,
-    POLE_COUNTS_PER_TURN,
-)
+from cartpole_rl.rig.hardware import LARGEST_MOTOR, Hardware
 from cartpole_rl.wire import Fault, Info, MessageType, Nack, Reason
 
 SPAN_TOLERANCE = 0.05  # share; homing accepts 3 %
@@ -91,18 +85,24 @@ def fault_error(bits: int) -> FaultError:
     return FaultError(f"the cart latched a fault: {fault_words(bits)}")
 
 
-def check_scales(information: Info) -> None:
-    """Raise NotReadyError if the cart's scales or its period are not the ones that this package uses."""
-    constants = {
-        "cart nm per count": (information.cart_nanometres_per_count, CART_NANOMETRES_PER_COUNT),
-        "pole counts per turn": (information.pole_counts_per_turn, POLE_COUNTS_PER_TURN),
-        "motor limit": (information.motor_limit, LARGEST_MOTOR),
+def check_scales(information: Info, hardware: Hardware) -> None:
+    """Raise NotReadyError if the cart's scales are not those of its file, or its period is impossible."""
+    expected = {
+        "cart_nanometres_per_count": hardware.cart_nanometres_per_count,
+        "pole_counts_per_turn": hardware.pole_counts_per_turn,
     }
-    for name, (reported, expected) in constants.items():
-        if reported != expected:
+    for name, number in expected.items():
+        if (reported := getattr(information, name)) != number:
             raise NotReadyError(
-                f"INFO says {name} {reported}, not {expected}", "correct the firmware's settings"
+                f"the cart reports {name} {reported}, not {number}",
+                "give the file of this cart with cart=, or build its firmware from the file "
+                "(cartpole-export format=firmware)",
             )
+    if information.motor_limit != LARGEST_MOTOR:
+        raise NotReadyError(
+            f"INFO says motor limit {information.motor_limit}, not {LARGEST_MOTOR}",
+            "correct the firmware's settings",
+        )
     check_period(information)
 
 
@@ -115,13 +115,14 @@ def check_period(information: Info) -> None:
         )
 
 
-def check_limits(information: Info) -> None:
+def check_limits(information: Info, hardware: Hardware) -> None:
     """Raise NotReadyError if the soft and the hard limit do not fit the track."""
-    soft = information.soft_limit_counts * CART_METRES_PER_COUNT
-    hard = information.hard_limit_counts * CART_METRES_PER_COUNT
-    if not 0.5 * HALF_SPAN < soft < hard < (1 + SPAN_TOLERANCE) * HALF_SPAN:
+    soft = information.soft_limit_counts * hardware.encoders.metres
+    hard = information.hard_limit_counts * hardware.encoders.metres
+    half_span = hardware.half_span
+    if not 0.5 * half_span < soft < hard < (1 + SPAN_TOLERANCE) * half_span:
         raise NotReadyError(
             f"INFO says soft limit {soft * 1e3:.0f} mm, hard limit {hard * 1e3:.0f} mm from the middle; the "
-            f"soft one comes first, and both in the outer half of the {HALF_SPAN * 1e3:.0f} mm to a stop",
+            f"soft one comes first, and both in the outer half of the {half_span * 1e3:.0f} mm to a stop",
             "correct the firmware's limits",
         )

@@ -2,8 +2,7 @@
 
 They are shared by the preflight and by the re-centring between episodes, as homing takes far longer. Motor
 values stay below those for which the cart watches for stalls. The cart is armed, so all of its own limits
-hold. Only nominal values of the cart are known here (motor curve, mass and friction); that is enough for any
-cart that is roughly like the nominal one.
+hold. Only the rough numbers in the cart's file are known here (motor, mass and friction).
 
 Centring: the cart follows a planned speed that slows down towards the middle and changes so gently that the
 pole hardly swings. A PI controller turns the lag behind that speed into a force; friction is added as a
@@ -29,10 +28,9 @@ from dataclasses import dataclass
 from cartpole_rl.errors import PlantError
 from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.errors import NotReadyError, fault_error
-from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT, pole_counts
+from cartpole_rl.rig.hardware import Hardware
 from cartpole_rl.wire import State, seconds_between
 
-GENTLE_MOTOR = 199  # motor value; from 200 on the cart watches for stalls
 REST_SECONDS = 0.3
 REST_COUNTS = 2  # of the cart
 LONGEST_REST = 10.0  # s
@@ -41,40 +39,36 @@ SWING_SECONDS = 1.5  # a whole swing of the large pole takes 1.3 s
 CENTRED = 0.002  # m; an episode starts no farther from the middle
 LONGEST_CENTRING = 15.0  # s
 
-MASS = 0.85  # kg, cart and pole
-FRICTION = 0.5  # N; too much rather than too little: a cart that overcomes its friction can be controlled
-MOTOR_OFFSET, MOTOR_PER_NEWTON = 50, 50.0  # motor value at which the force starts, and that a newton adds
 SMALLEST_FORCE = 0.02  # N; below this the motor is off
 RIGHT, LEFT = 1, -1
-NOMINAL_DEADBAND: dict[int, float] = dict.fromkeys((RIGHT, LEFT), MOTOR_OFFSET + MOTOR_PER_NEWTON * FRICTION)
 
 TRAVEL_SPEED = 0.2  # m/s
 SLOWING = 1.0  # s: the speed is what would cover the remaining distance in this time
 GENTLE = 0.2  # m/s^2: tilts the hanging pole by about 1 degree, 0.2 / 9.81 rad
 
-# The gains are for a nominal cart and a delay of two periods of 20 ms: half a period of sampling, half a
-# period of measuring the speed, and up to one until a motor value acts. The loop
-# L(s) = (SPEED_GAIN + SPEED_INTEGRAL / s) exp(-0.04 s) / (MASS s) then crosses over at 15 rad/s, with a phase
+# The gains are for TUNED_MASS and a delay of two periods of 20 ms: half a period of sampling, half a period
+# of measuring the speed, and up to one until a motor value acts. The loop
+# L(s) = (SPEED_GAIN + SPEED_INTEGRAL / s) exp(-0.04 s) / (TUNED_MASS s) crosses over at 15 rad/s with a phase
 # margin of 31 degrees and a gain margin of 2.4: it is stable with a motor twice as strong or a cart half as
 # heavy, and friction damps it further. The integral acts within SPEED_GAIN / SPEED_INTEGRAL = 0.15 s, and
 # compensates tilt and other friction. A longer period delays more: the gain is scaled by 1 / period and the
-# integral by 1 / period squared, which keeps both margins.
+# integral by 1 / period squared, which keeps both margins; so does scaling both by the mass.
 SPEED_GAIN, SPEED_INTEGRAL = 12.0, 80.0  # N s/m, N/m
-TUNED_FOR = 0.02  # s
-LARGEST_PUSH = 3.0  # N of the integral: what `GENTLE_MOTOR` gives
+TUNED_FOR, TUNED_MASS = 0.02, 0.85  # s, kg
 
 ROLLING_PERIODS, ROLLING = 10, 0.04  # periods, and m in them: 0.2 m/s, a cart that still rolls
 LONGEST_ROLLING = 5.0  # s
 
 ROUNDS = 3  # of braking, centring and waiting
 LONGEST_BRAKING, LONGEST_CALM = 12.0, 4.0  # s
-STILL = pole_counts(1.0)  # peak to peak: worth waiting for, up to LONGEST_CALM
-NEARLY_STILL = pole_counts(2.1)  # peak to peak: good enough
-BRAKED = pole_counts(2.6)  # peak to peak; the cart's friction keeps it from braking smaller swings
-SLIPPED = pole_counts(1.5)  # a pole that rests this far off after homing lost its zero
-SMALL_SWING = pole_counts(90.0)  # peak to peak: its middle is the hanging pole, ...
-WRONG_ZERO = pole_counts(20.0)  # ... which is nearer to the zero than this, or the zero is wrong
-LARGE_SWING = pole_counts(180.0)  # peak to peak: no right brake leaves one after LONGEST_BRAKING
+# degrees
+STILL = 1.0  # peak to peak: worth waiting for, up to LONGEST_CALM
+NEARLY_STILL = 2.1  # peak to peak: good enough
+BRAKED = 2.6  # peak to peak; the cart's friction keeps it from braking smaller swings
+SLIPPED = 1.5  # a pole that rests this far off after homing lost its zero
+SMALL_SWING = 90.0  # peak to peak: its middle is the hanging pole, ...
+WRONG_ZERO = 20.0  # ... which is nearer to the zero than this, or the zero is wrong
+LARGE_SWING = 180.0  # peak to peak: no right brake leaves one after LONGEST_BRAKING
 
 FOLLOW = 0.9  # m/s^2 of the cart for 1 rad/s of the pole
 HARDEST_FOLLOW = 2.0  # m/s^2 in the middle, ...
@@ -88,7 +82,15 @@ class ArmedCart:
     """An armed cart. Every move raises FaultError when it latches a fault. Times by the cart's clock."""
 
     def __init__(self, cart: SerialCart) -> None:
-        self.cart = cart
+        self.cart, self.hardware = cart, cart.hardware
+
+    def metres(self, counts: int) -> float:
+        """Return cart counts in m."""
+        return counts * self.hardware.encoders.metres
+
+    def pole_counts(self, degrees: float) -> int:
+        """Return an angle of the pole in counts, at least one."""
+        return max(1, self.hardware.encoders.pole_counts(degrees))
 
     def arm(self) -> State:
         """Arm the motor, at rest."""
@@ -142,9 +144,15 @@ class ArmedCart:
         return state
 
 
-def metres(counts: int) -> float:
-    """Return cart counts in m."""
-    return counts * CART_METRES_PER_COUNT
+def gentle_motor(hardware: Hardware) -> int:
+    """Return the largest motor value of these moves; from `hard_push` on the cart watches for stalls."""
+    return min(hardware.gentle_motor, hardware.hard_push - 1)
+
+
+def nominal_deadband(hardware: Hardware) -> dict[int, float]:
+    """Return the motor values that just move the cart by its file, to the RIGHT and to the LEFT."""
+    just_moves = hardware.motor_offset + hardware.motor_per_newton * hardware.moving_friction
+    return dict.fromkeys((RIGHT, LEFT), just_moves)
 
 
 def spread(counts: list[int]) -> int:
@@ -156,6 +164,7 @@ def spread(counts: list[int]) -> int:
 class Centring:
     """The controller of one way back to the middle."""
 
+    hardware: Hardware
     period: float  # s
     deadband: Mapping[int, float]  # motor values that just move the cart, to the RIGHT and to the LEFT
     slowest: float = 0.0  # m/s
@@ -164,60 +173,67 @@ class Centring:
 
     def motor(self, before: State, state: State) -> int:
         """Return the next motor value from the last two states."""
-        passed = interval(before, state)
-        away = -metres(state.cart_counts)
+        passed, metres = interval(before, state), self.hardware.encoders.metres
+        away = -metres * state.cart_counts
         target = math.copysign(max(self.slowest, min(TRAVEL_SPEED, abs(away) / SLOWING)), away)
         self.planned += within(GENTLE * passed, target - self.planned)
-        lag = self.planned - metres(state.cart_counts - before.cart_counts) / passed
-        share = min(1.0, TUNED_FOR / self.period)
-        self.integral = within(LARGEST_PUSH, self.integral + share**2 * SPEED_INTEGRAL * lag * passed)
-        return rough_motor(self._friction() + share * SPEED_GAIN * lag + self.integral, self.deadband)
+        lag = self.planned - metres * (state.cart_counts - before.cart_counts) / passed
+        share, mass = min(1.0, TUNED_FOR / self.period), self.hardware.moving_mass / TUNED_MASS
+        integral = self.integral + share**2 * mass * SPEED_INTEGRAL * lag * passed
+        self.integral = within(self.hardware.gentle_force, integral)
+        force = self._friction() + share * mass * SPEED_GAIN * lag + self.integral
+        return rough_motor(force, self.hardware, self.deadband)
 
     def _friction(self) -> float:
         """Force in N that the friction needs in the planned direction."""
         if not self.planned:
             return 0.0
         side = RIGHT if self.planned > 0 else LEFT
-        return side * (self.deadband[side] - motor_offset(self.deadband, side)) / MOTOR_PER_NEWTON
+        offset = motor_offset(self.hardware, self.deadband, side)
+        return side * (self.deadband[side] - offset) / self.hardware.motor_per_newton
 
 
 def centre(
     moves: ArmedCart,
-    deadband: Mapping[int, float] = NOMINAL_DEADBAND,
+    deadband: Mapping[int, float] | None = None,
     tolerance: float = CENTRED,
     slowest: float = 0.0,
 ) -> None:
     """Move the cart to within `tolerance` m of the middle, at least `slowest` m/s fast.
 
-    Raises NotReadyError if it does not get there.
+    Without a `deadband` it is the nominal one. Raises NotReadyError if it does not get there.
     """
-    controller = Centring(moves.period, deadband, slowest)
+    known = nominal_deadband(moves.hardware) if deadband is None else deadband
+    controller = Centring(moves.hardware, moves.period, known, slowest)
     before = moves.drive(0)
     state = moves.drive(0)
     for _ in range(moves.periods(LONGEST_CENTRING)):
-        if abs(metres(state.cart_counts)) < tolerance:
+        if abs(moves.metres(state.cart_counts)) < tolerance:
             return
         before, state = state, moves.drive(controller.motor(before, state))
     raise NotReadyError(
-        f"the cart does not come back to the middle; it is {metres(state.cart_counts) * 1e3:+.0f} mm off",
+        "the cart does not come back to the middle; it is "
+        f"{moves.metres(state.cart_counts) * 1e3:+.0f} mm off",
         "free the cart, put the track level",
     )
 
 
-def rough_motor(force: float, deadband: Mapping[int, float] = NOMINAL_DEADBAND) -> int:
-    """Return the motor value for about a force in N, at most `GENTLE_MOTOR`."""
+def rough_motor(force: float, hardware: Hardware, deadband: Mapping[int, float]) -> int:
+    """Return the motor value for about a force in N, at most `gentle_motor`."""
     if abs(force) < SMALLEST_FORCE:
         return 0
     side = RIGHT if force > 0 else LEFT
-    return round(within(GENTLE_MOTOR, side * motor_offset(deadband, side) + MOTOR_PER_NEWTON * force))
+    motor = side * motor_offset(hardware, deadband, side) + hardware.motor_per_newton * force
+    return round(within(gentle_motor(hardware), motor))
 
 
-def motor_offset(deadband: Mapping[int, float], side: int) -> float:
+def motor_offset(hardware: Hardware, deadband: Mapping[int, float], side: int) -> float:
     """Return the motor value at which the force to a side starts, at most the nominal one.
 
     It falls to 0 with the dead-band: a jump of the motor value where the force changes its sign rattles.
     """
-    return max(0.0, min(MOTOR_OFFSET, MOTOR_OFFSET - 2 * (NOMINAL_DEADBAND[side] - deadband[side])))
+    missing = nominal_deadband(hardware)[side] - deadband[side]
+    return max(0.0, min(hardware.motor_offset, hardware.motor_offset - 2 * missing))
 
 
 def interval(before: State, state: State) -> float:
@@ -248,7 +264,7 @@ def recentre(cart: SerialCart, hanging: int) -> None:
                 cart.stop()
     turn = cart.information.pole_counts_per_turn
     off = math.remainder(settled - hanging, turn)
-    if abs(off) > SLIPPED:
+    if abs(off) > moves.pole_counts(SLIPPED):
         raise NotReadyError(
             f"the pole rests {off * 360 / turn:+.1f} deg from where it did after homing",
             "check the coupling of its encoder",
@@ -262,7 +278,8 @@ def stop_rolling(cart: SerialCart) -> None:
     """
     newest = cart.poll_state()
     counts, began = [newest.cart_counts], newest.time_us
-    while len(counts) <= ROLLING_PERIODS or metres(spread(counts[-ROLLING_PERIODS - 1 :])) > ROLLING:
+    metres = cart.hardware.encoders.metres
+    while len(counts) <= ROLLING_PERIODS or metres * spread(counts[-ROLLING_PERIODS - 1 :]) > ROLLING:
         newest = cart.poll_state()
         counts.append(newest.cart_counts)
         if seconds_between(began, newest.time_us) > LONGEST_ROLLING:
@@ -279,8 +296,8 @@ def settle(moves: ArmedCart) -> float:
     for _ in range(ROUNDS):
         brake(moves)
         centre(moves)
-        states, swing = moves.calm(STILL, LONGEST_CALM)
-        if swing <= NEARLY_STILL:
+        states, swing = moves.calm(moves.pole_counts(STILL), LONGEST_CALM)
+        if swing <= moves.pole_counts(NEARLY_STILL):
             last = [state.pole_counts for state in states[-moves.periods(SWING_SECONDS) :]]
             return (max(last) + min(last)) / 2
     raise NotReadyError(f"the pole still swings by {swing} counts", "keep hands and drafts off it")
@@ -294,35 +311,37 @@ def brake(moves: ArmedCart) -> None:
     zero is seen to be wrong, or if the pole swings far after all.
     """
     turn = moves.cart.information.pole_counts_per_turn
+    braked, small, wrong, large = map(moves.pole_counts, (BRAKED, SMALL_SWING, WRONG_ZERO, LARGE_SWING))
     before = moves.drive(0)
     state, poles = moves.drive(0), [before.pole_counts]
     for _ in range(moves.periods(LONGEST_BRAKING)):
         poles.append(state.pole_counts)
         last = poles[-moves.periods(SWING_SECONDS) - 1 :]
         if len(last) > moves.periods(SWING_SECONDS):
-            if spread(last) <= BRAKED:
+            if spread(last) <= braked:
                 return
             off = math.remainder((max(last) + min(last)) / 2 - turn / 2, turn)
-            if spread(last) < SMALL_SWING and abs(off) > WRONG_ZERO:
+            if spread(last) < small and abs(off) > wrong:
                 raise NotReadyError(
                     f"the pole swings about a point {off * 360 / turn:+.0f} deg from its zero",
                     "check the coupling of its encoder",
                 )
-        before, state = state, moves.drive(braking_motor(before, state))
-    if spread(poles[-moves.periods(SWING_SECONDS) - 1 :]) > LARGE_SWING:
+        before, state = state, moves.drive(braking_motor(moves.hardware, before, state))
+    if spread(poles[-moves.periods(SWING_SECONDS) - 1 :]) > large:
         raise NotReadyError(
             f"the pole still swings far after {LONGEST_BRAKING:g} s of braking", "check the pole's encoder"
         )
 
 
-def braking_motor(before: State, state: State) -> int:
+def braking_motor(hardware: Hardware, before: State, state: State) -> int:
     """Return a motor value that brakes the pole and draws the cart to the middle."""
-    passed = interval(before, state)
-    x, x_dot = metres(state.cart_counts), metres(state.cart_counts - before.cart_counts) / passed
-    swing = state.pole_counts * POLE_RADIANS_PER_COUNT - math.pi  # from hanging
-    swing_dot = (state.pole_counts - before.pole_counts) * POLE_RADIANS_PER_COUNT / passed
+    passed, metres, radians = interval(before, state), hardware.encoders.metres, hardware.encoders.radians
+    x, x_dot = metres * state.cart_counts, metres * (state.cart_counts - before.cart_counts) / passed
+    swing = state.pole_counts * radians - math.pi  # from hanging
+    swing_dot = (state.pole_counts - before.pole_counts) * radians / passed
     room = HARDEST_FOLLOW * max(0.0, 1 - abs(x) / FOLLOW_WITHIN)
     follow = within(room, -FOLLOW * swing_dot * math.cos(swing))
     target = follow + within(HARDEST_RETURN, -RETURN * x - DAMPING * x_dot)
     direction = x_dot if abs(x_dot) > CREEP else target
-    return rough_motor(MASS * target + math.copysign(FRICTION, direction))
+    force = hardware.moving_mass * target + math.copysign(hardware.moving_friction, direction)
+    return rough_motor(force, hardware, nominal_deadband(hardware))

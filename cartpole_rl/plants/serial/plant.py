@@ -29,7 +29,7 @@ from cartpole_rl.plants.serial.preparation import (
 from cartpole_rl.plants.serial.statistics import LinkStatistics
 from cartpole_rl.plants.settings import EmulatedSettings, Rehome, SerialSettings
 from cartpole_rl.plants.specs import TERMINATING, TRUNCATING, Numbers, OneCartPlant, PlantOutput, on_tensors
-from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT
+from cartpole_rl.rig.hardware import Hardware, check_of_ip02, nominal_hardware
 from cartpole_rl.tasks.episode import Ending
 from cartpole_rl.wire import Fault, Flags, State, seconds_between, ticks_between, went_back
 
@@ -75,10 +75,11 @@ class SerialPlant(OneCartPlant):
         prompt: Callable[[str], None] = print,
         owned: Owned | None = None,
         confirm: Confirm = nobody,
+        hardware: Hardware | None = None,
     ) -> None:
-        super().__init__()
+        super().__init__(hardware)
         self.settings = settings
-        self.cart = SerialCart(settings)
+        self.cart = SerialCart(settings, self.hardware)
         self.ended_by = ""
         self.last_error: PlantError | None = None
         self.on_board = False  # resets start the policy on the cart's board; `listen_one` passes periods
@@ -139,7 +140,7 @@ class SerialPlant(OneCartPlant):
     @property
     def track_half_length(self) -> Tensor:
         """m, [1]: the soft limit of the cart, from the span that it measured in homing."""
-        return torch.tensor([self.cart.information.soft_limit_counts * CART_METRES_PER_COUNT])
+        return torch.tensor([self.cart.information.soft_limit_counts * self.hardware.encoders.metres])
 
     def _set_seed(self, seed: int | None) -> None:
         """Do nothing: a real cart has its own randomness, an emulated one has its seed in its settings."""
@@ -295,7 +296,7 @@ class SerialPlant(OneCartPlant):
     def _connect(self) -> None:
         """Open the port and check the cart's scales. Raises PortError, LinkError, NotReadyError."""
         self.cart.open()
-        check_scales(self.cart.information)
+        check_scales(self.cart.information, self.hardware)
 
 
 def real_cart(
@@ -305,9 +306,10 @@ def real_cart(
     start: StartPosition,
     prompt: Callable[[str], None],
     confirm: Confirm = nobody,
+    hardware: Hardware | None = None,
 ) -> SerialPlant:
     """Return the plant of plant=serial. Raises PortError, LinkError, NotReadyError."""
-    return SerialPlant(plant, start, control_period, prompt, confirm=confirm)
+    return SerialPlant(plant, start, control_period, prompt, confirm=confirm, hardware=hardware)
 
 
 def emulated_cart(
@@ -317,11 +319,14 @@ def emulated_cart(
     start: StartPosition,
     prompt: Callable[[str], None],
     confirm: Confirm = nobody,
+    hardware: Hardware | None = None,
 ) -> SerialPlant:
     """Return the plant of plant=emulated, on a new cart with the settings `emulator` and the start `start`.
 
-    It needs nobody to confirm. Raises PortError, LinkError, NotReadyError, EmulatorError.
+    It needs nobody to confirm. Raises PortError, LinkError, NotReadyError, EmulatorError,
+    and ConfigError for the hardware of another cart than ip02.
     """
+    check_of_ip02(hardware or nominal_hardware(), "plant=emulated emulates")
     return emulated_plant(emulator.model_copy(update={"start": start}), control_period, prompt, plant.rehome)
 
 

@@ -16,30 +16,24 @@ from cartpole_rl.errors import FaultError, PlantError
 from cartpole_rl.plants.serial.cart import RESTARTED, SerialCart
 from cartpole_rl.plants.serial.errors import NotReadyError, check_limits, check_period, check_scales
 from cartpole_rl.plants.serial.moves import (
-    GENTLE_MOTOR,
     LEFT,
-    NOMINAL_DEADBAND,
     RIGHT,
     ArmedCart,
     centre,
-    metres,
+    gentle_motor,
+    nominal_deadband,
 )
 from cartpole_rl.plants.serial.preparation import FaultClearing
-from cartpole_rl.rig.hardware import (
-    CART_NANOMETRES_PER_COUNT,
-    POLE_COUNTS_PER_TURN,
-    cart_counts,
-    pole_counts,
-)
+from cartpole_rl.rig.hardware import Hardware
 from cartpole_rl.wire import Fault, Flags, Info, State, seconds_between, ticks_between
 
 FARTHEST = 0.08  # m from the middle: no check needs more
 LEAST_SPEED = 0.03  # m/s of the way back to the middle; slower would take long and show nothing
 NEAR = 0.004  # m from the middle: no check needs to start closer
 RAMP_STEP = 1  # motor values per period
-SMALL_SWING = pole_counts(3.5)  # peak to peak; pushes the cart like three motor values
+SMALL_SWING = 3.5  # degrees peak to peak; pushes the cart like three motor values
 SHORT_PATIENCE = 5.0  # s
-MOVED = cart_counts(0.09e-3)  # more than a pole that swings can press into the gears' play
+MOVED = 0.09e-3  # m, more than a pole that swings can press into the gears' play
 NO_MOTION = (  # the remedy for a cart whose count does not change
     "switch the motor's supply on, check the cables of the motor and of the cart's encoder, free the cart"
 )
@@ -49,12 +43,12 @@ LOST_SHARE = 0.05  # of the frames; a good cable loses none
 PERIOD_TOLERANCE = 0.02  # of the period in INFO
 ROUND_TRIP_SHARE = 0.5  # of a period: a command that comes later acts in the next one
 
-SURELY_MOVED = cart_counts(0.001)
-POLE_MOVED = pole_counts(1.25)  # more, where the pole still swings
+SURELY_MOVED = 0.001  # m
+POLE_MOVED = 1.25  # degrees; more, where the pole still swings
 PUSH = 60  # motor values above the dead-band: about 1.5 m/s^2
 LONGEST_PUSH, FARTHEST_PUSH = 0.3, 0.035  # s, m
 DRIFT = 4  # periods over which a remaining swing is measured
-NO_SWING, LONG_PATIENCE = pole_counts(0.5), 15.0  # peak to peak, s
+NO_SWING, LONG_PATIENCE = 0.5, 15.0  # degrees peak to peak, s
 LARGEST_DEADBAND = 150  # motor value; of nine_levels the two weakest, 100 and 150, would not move such a cart
 STEPS = 4  # for the latency, two to each side
 LONGEST_LATENCY_PERIODS = 2.0  # agents are trained on up to about one period
@@ -95,7 +89,7 @@ def _checks(cart: SerialCart, faults: FaultClearing) -> dict[str, Callable[[], s
     probe = Probe(cart)
     return {
         "link": lambda: link(cart),
-        "limits": lambda: limits(cart.information),
+        "limits": lambda: limits(cart.information, cart.hardware),
         "homing": lambda: homing(cart, faults),
         "cart encoder": lambda: cart_direction(probe),
         "pole encoder": lambda: pole_direction(probe),
@@ -129,7 +123,11 @@ class Probe(ArmedCart):
 
     def settle(self) -> State:
         """Apply motor 0 until the pole hardly swings, but not for long; return the last state."""
-        return self.calm(SMALL_SWING, SHORT_PATIENCE)[0][-1]
+        return self.calm(self.pole_counts(SMALL_SWING), SHORT_PATIENCE)[0][-1]
+
+    def cart_counts(self, metres: float) -> int:
+        """Return a distance of the cart in counts, at least one."""
+        return max(1, self.hardware.encoders.cart_counts(metres))
 
     def ramp(self, side: int) -> tuple[int, State, State]:
         """Raise the motor value to one side until the cart moves.
@@ -137,14 +135,12 @@ class Probe(ArmedCart):
         Returns the size of that value, and the states before and after the move. Raises NotReadyError if the
         cart never moves.
         """
-        before = self.settle()
-        for size in range(RAMP_STEP, GENTLE_MOTOR + 1, RAMP_STEP):
+        before, largest, moved = self.settle(), gentle_motor(self.hardware), self.cart_counts(MOVED)
+        for size in range(RAMP_STEP, largest + 1, RAMP_STEP):
             after = self.drive(side * size)
-            if abs(after.cart_counts - before.cart_counts) >= MOVED:
+            if abs(after.cart_counts - before.cart_counts) >= moved:
                 return size, before, after
-        raise NotReadyError(
-            f"motor values up to {side * GENTLE_MOTOR:+d} do not move the cart's count", NO_MOTION
-        )
+        raise NotReadyError(f"motor values up to {side * largest:+d} do not move the cart's count", NO_MOTION)
 
     def centre(self) -> None:
         """Bring the cart to the middle and to rest. Needs the sign of the cart's count to be right.
@@ -153,7 +149,7 @@ class Probe(ArmedCart):
         does not get there.
         """
         other_side = {-side: motor for side, motor in self.deadband.items()}
-        known = NOMINAL_DEADBAND | other_side | self.deadband
+        known = nominal_deadband(self.hardware) | other_side | self.deadband
         self.rest()
         centre(self, known, NEAR, LEAST_SPEED)
         self.rest()
@@ -163,10 +159,11 @@ class Probe(ArmedCart):
         self.farthest = max(self.farthest, abs(state.cart_counts))
         self.limited = self.limited or bool(self.cart.flags & Flags.SOFT_LIMIT)
         super().check(state)
-        if metres(abs(state.cart_counts)) > FARTHEST:
+        if self.metres(abs(state.cart_counts)) > FARTHEST:
             self.cart.stop()
             raise NotReadyError(
-                f"the cart went {metres(state.cart_counts) * 1e3:+.0f} mm, further than any requested move",
+                f"the cart went {self.metres(state.cart_counts) * 1e3:+.0f} mm, further than any requested "
+                "move",
                 "put the track level, check the motor driver",
             )
         return state
@@ -211,14 +208,15 @@ def link(cart: SerialCart) -> str:
     )
 
 
-def limits(information: Info) -> str:
-    """Check that the scales and limits in INFO are those that this package assumes."""
-    check_scales(information)
-    check_limits(information)
-    soft, hard = metres(information.soft_limit_counts), metres(information.hard_limit_counts)
+def limits(information: Info, hardware: Hardware) -> str:
+    """Check that the scales and limits in INFO are those of the cart's file."""
+    check_scales(information, hardware)
+    check_limits(information, hardware)
+    metres = hardware.encoders.metres
+    soft, hard = information.soft_limit_counts * metres, information.hard_limit_counts * metres
     return (
         f"soft {soft * 1e3:.0f} mm, hard {hard * 1e3:.0f} mm from the middle; "
-        f"{CART_NANOMETRES_PER_COUNT} nm and 1/{POLE_COUNTS_PER_TURN} turn a count"
+        f"{hardware.cart_nanometres_per_count} nm and 1/{hardware.pole_counts_per_turn} turn a count"
     )
 
 
@@ -228,17 +226,21 @@ def homing(cart: SerialCart, faults: FaultClearing) -> str:
         faults.clear(cart, fault)
     before = cart.get_state()
     state = _homed(cart, before)
-    limits(cart.information)
-    pole = (state.pole_counts - POLE_COUNTS_PER_TURN // 2) * 360 / POLE_COUNTS_PER_TURN
-    if abs(metres(state.cart_counts)) > 0.01 or abs(pole) > 2:
+    limits(cart.information, cart.hardware)
+    turn = cart.hardware.pole_counts_per_turn
+    pole, off = (
+        (state.pole_counts - turn // 2) * 360 / turn,
+        state.cart_counts * cart.hardware.encoders.metres,
+    )
+    if abs(off) > 0.01 or abs(pole) > 2:
         raise NotReadyError(
-            f"after homing the cart is {metres(state.cart_counts) * 1e3:+.0f} mm from the middle, "
+            f"after homing the cart is {off * 1e3:+.0f} mm from the middle, "
             f"the pole {pole:+.1f} deg from hanging",
             "keep hands off during homing, check that no gear slips",
         )
     seconds = seconds_between(before.time_us, state.time_us)
-    off = metres(state.cart_counts) * 1e3
-    return f"{seconds:.0f} s; the cart {off:+.1f} mm from the middle, the pole {pole:+.1f} deg from hanging"
+    where = f"the cart {off * 1e3:+.1f} mm from the middle, the pole {pole:+.1f} deg from hanging"
+    return f"{seconds:.0f} s; {where}"
 
 
 def _homed(cart: SerialCart, before: State) -> State:
@@ -252,7 +254,10 @@ def _homed(cart: SerialCart, before: State) -> State:
     try:
         return cart.home(watch)
     except FaultError:
-        if farthest >= SURELY_MOVED or cart.poll_state().fault != Fault.HOMING:
+        if (
+            farthest >= cart.hardware.encoders.cart_counts(SURELY_MOVED)
+            or cart.poll_state().fault != Fault.HOMING
+        ):
             raise
         raise NotReadyError("homing failed: the cart's count does not change", NO_MOTION) from None
 
@@ -262,7 +267,7 @@ def cart_direction(probe: Probe) -> str:
     probe.arm()
     value, before, after = probe.ramp(RIGHT)
     for _ in range(probe.periods(LONGEST_PUSH)):
-        if abs(after.cart_counts - before.cart_counts) >= SURELY_MOVED:
+        if abs(after.cart_counts - before.cart_counts) >= probe.cart_counts(SURELY_MOVED):
             break
         after = probe.drive(value + 10)
     moved = after.cart_counts - before.cart_counts
@@ -281,14 +286,15 @@ def pole_direction(probe: Probe) -> str:
 
     A remaining swing is assumed to continue evenly during the push, and is subtracted.
     """
-    states, swing = probe.calm(NO_SWING, LONG_PATIENCE)
+    no_swing = probe.pole_counts(NO_SWING)
+    states, swing = probe.calm(no_swing, LONG_PATIENCE)
     before, drift = states[-1], (states[-1].pole_counts - states[-1 - DRIFT].pole_counts) / DRIFT
-    enough = max(POLE_MOVED, NO_SWING + swing // 2)
-    value = min(GENTLE_MOTOR, probe.deadband[RIGHT] + PUSH)
+    enough = max(probe.pole_counts(POLE_MOVED), no_swing + swing // 2)
+    value = min(gentle_motor(probe.hardware), probe.deadband[RIGHT] + PUSH)
     for period in range(1, probe.periods(LONGEST_PUSH) + 1):
         after = probe.drive(value)
         swung = round(after.pole_counts - before.pole_counts - drift * period)
-        if abs(swung) >= enough or metres(abs(after.cart_counts - before.cart_counts)) > FARTHEST_PUSH:
+        if abs(swung) >= enough or probe.metres(abs(after.cart_counts - before.cart_counts)) > FARTHEST_PUSH:
             break
     if abs(swung) < enough:
         raise NotReadyError(
@@ -343,17 +349,18 @@ def step_latency(probe: Probe, side: int) -> tuple[float, float]:
     two states during the motion give that start more precisely than a period.
     """
     before = probe.settle()
-    value = side * min(GENTLE_MOTOR, probe.deadband[side] + PUSH)
+    value = side * min(gentle_motor(probe.hardware), probe.deadband[side] + PUSH)
+    moved = probe.cart_counts(MOVED)
     states = [probe.drive(value)]
     age = states[0].command_age_ms * 1e-3
     taken_us = states[0].time_us - states[0].command_age_ms * 1000
     for _ in range(probe.periods(LONGEST_PUSH)):
         states.append(probe.drive(value))
         distances = [side * (state.cart_counts - before.cart_counts) for state in states[-2:]]
-        if MOVED <= distances[0] < distances[1]:
+        if moved <= distances[0] < distances[1]:
             break
     probe.centre()
-    if not MOVED <= distances[0] < distances[1]:
+    if not moved <= distances[0] < distances[1]:
         raise NotReadyError(
             f"motor value {value:+d} does not move the cart evenly within {LONGEST_PUSH:g} s",
             "free the cart; look for a ramp or a filter in the motor driver",
@@ -368,7 +375,7 @@ def soft_limit(probe: Probe) -> str:
     limit = probe.cart.information.soft_limit_counts
     if probe.limited or probe.farthest >= limit:
         raise NotReadyError(
-            f"the soft limit was reached {metres(probe.farthest) * 1e3:.0f} mm from the middle",
+            f"the soft limit was reached {probe.metres(probe.farthest) * 1e3:.0f} mm from the middle",
             "check the firmware's limits and the zero that homing set",
         )
-    return f"not reached; the cart stayed within {metres(probe.farthest) * 1e3:.0f} mm of the middle"
+    return f"not reached; the cart stayed within {probe.metres(probe.farthest) * 1e3:.0f} mm of the middle"

@@ -14,6 +14,7 @@ from cartpole_rl.physics.dynamics import State
 from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import GRAVITY, CartParameters
 from cartpole_rl.plants.simulated import Carts, Inputs, Period, commands_under_way, encoder_counts, run_carts
+from cartpole_rl.rig.hardware import Encoders
 from cartpole_rl.rig.parameters import PARAMETERS
 from cartpole_rl.tasks.features import (
     Measured,
@@ -76,6 +77,11 @@ class KnownCart:
         asymmetries = [getattr(self.one, each.name) for each in PARAMETERS.values() if each.mirrored]
         return mirrored and same_dead_band and not any(map(bool, asymmetries))
 
+    @property
+    def encoders(self) -> Encoders:
+        """The scales of the cart's encoders."""
+        return self.config.hardware.encoders
+
     def table(self, count: int) -> Tensor:
         """Return the parameters of `count` nominal carts, [P, count]."""
         return self.randomizer.nominal.unsqueeze(1).repeat(1, count)
@@ -83,7 +89,7 @@ class KnownCart:
     def hanging(self, position: float) -> Nodes:
         """Return one node: at rest at `position` m, the pole hanging."""
         state = hanging(position)
-        counts = encoder_counts(state, self.one, torch.zeros(3, 1))
+        counts = encoder_counts(state, self.one, torch.zeros(3, 1), self.encoders)
         return Nodes(torch.stack(state), torch.zeros(1 + self.commands, 1), counts, torch.zeros(1))
 
     def step(self, nodes: Nodes, action: Tensor) -> tuple[Nodes, Tensor, Tensor]:
@@ -92,8 +98,9 @@ class KnownCart:
         carts = Carts(self.table(count), nodes.motion, nodes.drive)
         inputs = Inputs(self.motors[action].unsqueeze(0), torch.zeros(3, count))
         after = self._run(carts, inputs)
-        x, theta = measured_position(after.counts)
-        x_dot, theta_dot = measured_velocity(after.counts, nodes.counts, torch.full((count,), period))
+        x, theta = measured_position(after.counts, self.encoders)
+        passed = torch.full((count,), period)
+        x_dot, theta_dot = measured_velocity(after.counts, nodes.counts, passed, self.encoders)
         points = score(Measured(x, x_dot, theta, theta_dot), self.config.task.x_max)
         following = Nodes(after.motion, after.drive, after.counts, nodes.points + points)
         return following, points, ~after.off_track[0]
@@ -106,10 +113,11 @@ class KnownCart:
         count, period, substeps = carts.table.shape[1], self.config.control_period, self.config.plant.substeps
         size = next((size for size in COMPILED_SIZES if size >= count), 0)
         if not self.compiled or count == 1 or not size:
-            return run_carts(carts, inputs, models=self.models, period=period, substeps=substeps)
+            run = {"models": self.models, "period": period, "substeps": substeps, "encoders": self.encoders}
+            return run_carts(carts, inputs, **run)
         rows = torch.arange(size).clamp(max=count - 1)
         padded = (type(each)(*(value[:, rows] for value in each)) for each in (carts, inputs))
-        after = compiled_run(self.models, period, substeps, (len(carts.drive), size))(*padded)
+        after = compiled_run(self.models, period, substeps, self.encoders, (len(carts.drive), size))(*padded)
         return Period(*(value[:, :count] for value in after))
 
     def run(self, nodes: Nodes, actions: Sequence[int]) -> Nodes:
@@ -122,12 +130,14 @@ class KnownCart:
 
 
 @cache
-def compiled_run(models: Models, period: float, substeps: int, drive: tuple[int, int]) -> Compiled[Period]:
+def compiled_run(
+    models: Models, period: float, substeps: int, encoders: Encoders, drive: tuple[int, int]
+) -> Compiled[Period]:
     """Return `run_carts` for a `drive` of that shape, compiled.
 
     It serves every cart with these models whose latency spans as many periods.
     """
-    return Compiled(partial(run_carts, models=models, period=period, substeps=substeps))
+    return Compiled(partial(run_carts, models=models, period=period, substeps=substeps, encoders=encoders))
 
 
 def hanging(position: float) -> State:

@@ -4,9 +4,11 @@ from itertools import pairwise
 
 import pytest
 
-from cartpole_rl.plants.serial.moves import GENTLE, GENTLE_MOTOR, NOMINAL_DEADBAND, Centring
+from cartpole_rl.plants.serial.moves import GENTLE, Centring, nominal_deadband
+from cartpole_rl.rig.hardware import nominal_hardware
 from cartpole_rl.wire import State
 
+IP02 = nominal_hardware()
 PERIOD_US = 20_000
 FAR = 4000  # counts, 91 mm
 
@@ -25,21 +27,21 @@ def motors(controller: Centring, counts: int, periods: int) -> list[int]:
 def test_a_cart_that_does_not_move_is_pushed_towards_the_middle_harder_and_harder_up_to_what_is_gentle(
     counts: int,
 ) -> None:
-    values = motors(Centring(0.02, NOMINAL_DEADBAND), counts, 200)
+    values = motors(Centring(IP02, 0.02, nominal_deadband(IP02)), counts, 200)
     sizes = [-value if counts > 0 else value for value in values]
     assert sizes == sorted(sizes)
     assert 50 < sizes[0] < 90
-    assert sizes[-1] == GENTLE_MOTOR
+    assert sizes[-1] == 199  # below hard_push
 
 
 def test_the_measured_dead_band_of_a_side_is_where_the_push_begins() -> None:
     deadband = {1: 110, -1: 70}
-    assert motors(Centring(0.02, deadband), -FAR, 1)[0] - 110 == pytest.approx(2.5, abs=1.5)
-    assert motors(Centring(0.02, deadband), FAR, 1)[0] + 70 == pytest.approx(-2.5, abs=1.5)
+    assert motors(Centring(IP02, 0.02, deadband), -FAR, 1)[0] - 110 == pytest.approx(2.5, abs=1.5)
+    assert motors(Centring(IP02, 0.02, deadband), FAR, 1)[0] + 70 == pytest.approx(-2.5, abs=1.5)
 
 
 def test_the_planned_speed_changes_gently_and_slows_down_near_the_middle() -> None:
-    controller = Centring(0.02, NOMINAL_DEADBAND)
+    controller = Centring(IP02, 0.02, nominal_deadband(IP02))
     controller.motor(at(-FAR, 0), at(-FAR, 1))
     assert controller.planned == pytest.approx(GENTLE * 0.02)
     for period in range(1, 100):
@@ -49,4 +51,4 @@ def test_the_planned_speed_changes_gently_and_slows_down_near_the_middle() -> No
 
 def test_a_cart_that_is_too_fast_is_braked() -> None:
     before, state = at(-FAR, 0), at(-FAR + 400, 1)
-    assert Centring(0.02, NOMINAL_DEADBAND).motor(before, state) < 0
+    assert Centring(IP02, 0.02, nominal_deadband(IP02)).motor(before, state) < 0

@@ -1,0 +1,128 @@
+"""Carts with other encoders, tracks, masses and motors: both firmwares home them and count alike."""
+
+import math
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+pytest.importorskip("mujoco", reason='pip install "cartpole_rl[emulator]"')
+
+from driven_cart import COARSE, Driven
+from firmwares import needs_compiler
+
+from cartpole_rl.emulator.settings import EmulatorSettings
+from cartpole_rl.rig.hardware import Hardware, hardware_of, nominal_hardware
+from cartpole_rl.wire import Fault, Flags, State
+
+pytestmark = needs_compiler
+DEFAULT = EmulatorSettings()
+
+
+@st.composite
+def rigs(draw: st.DrawFn, spans: tuple[float, float] = (0.25, 2.0)) -> Hardware:
+    """Return the rig of a cart whose motor can move it gently."""
+    span, mass = draw(st.floats(*spans)), draw(st.floats(0.3, 3.0))
+    friction = mass * draw(st.floats(0.2, 1.2))
+    gentle_force = 2 * friction + mass * draw(st.floats(1.0, 3.0))
+    offset, gentle_motor = draw(st.floats(0, 100)), draw(st.floats(160, 250))
+    return Hardware(
+        cart_nanometres_per_count=draw(st.integers(5_000, 120_000)),
+        pole_counts_per_turn=draw(st.integers(600, 20_000)),
+        track_span=span,
+        soft_limit=min(0.027, span / 8),
+        hard_limit=min(0.008, span / 20),
+        braking=draw(st.floats(0.5, 10)),
+        hard_push=draw(st.integers(150, 250)),
+        moving_mass=mass,
+        moving_friction=friction,
+        motor_offset=offset,
+        motor_per_newton=(gentle_motor - offset) / gentle_force,
+        gentle_force=gentle_force,
+    )
+
+
+def cart_of(rig: Hardware, **numbers: Any) -> EmulatorSettings:
+    """Return an emulated cart of a rig, which is a little different from the rig's rough numbers."""
+    pole = 0.15 * rig.moving_mass
+    weight = pole / DEFAULT.pole_mass
+    return EmulatorSettings(
+        cart_mass=1.05 * (rig.moving_mass - pole),
+        pole_mass=pole,
+        pole_inertia=weight * DEFAULT.pole_inertia,
+        pole_viscous=weight * DEFAULT.pole_viscous,
+        pole_coulomb=weight * DEFAULT.pole_coulomb,
+        cart_viscous=0.6 * rig.moving_mass,
+        cart_coulomb_left=1.1 * rig.moving_friction,
+        cart_coulomb_right=1.0 * rig.moving_friction,
+        force_curve=(0.0, 1 / rig.motor_per_newton, -rig.motor_offset / rig.motor_per_newton),
+        deadband_left=rig.motor_offset,
+        deadband_right=rig.motor_offset,
+        **COARSE,
+        **numbers,
+    ).with_hardware(rig)
+
+
+def home(cart: EmulatorSettings, firmware: str) -> tuple[Driven, State]:
+    driven = Driven(**cart.model_dump() | {"firmware": firmware})
+    return driven, driven.home()
+
+
+def check_homes(cart: EmulatorSettings) -> None:
+    """Check that both firmwares home a cart in the same way, and that its zeros are right."""
+    rig = cart.hardware or nominal_hardware()
+    (python, state), (c, same) = (home(cart, firmware) for firmware in ("python", "c"))
+    assert (python.flags, state.fault) == (Flags.HOMED, Fault.NONE)
+    assert (same, c.info(), c.flags) == (state, python.info(), python.flags)
+    info, (x, angle) = python.info(), python.measured(state)
+    assert info.cart_nanometres_per_count == rig.cart_nanometres_per_count
+    assert info.pole_counts_per_turn == rig.pole_counts_per_turn
+    metres, radians = rig.encoders.metres, rig.encoders.radians
+    half = cart.track_half_length
+    found = [info.soft_limit_counts * metres, info.hard_limit_counts * metres]
+    assert found == pytest.approx([half - rig.soft_limit, half - rig.hard_limit], abs=3 * metres)
+    assert x == pytest.approx(python.x, abs=3 * metres)
+    assert abs(python.x) < 2e-3
+    off = math.remainder(angle - python.angle - cart.angle_offset, math.tau)
+    assert abs(off) < max(3 * radians, math.radians(0.3))
+    assert abs(math.remainder(angle - math.pi, math.tau)) < 0.07
+
+
+@settings(max_examples=8, derandomize=True, deadline=None)
+@given(rig=rigs(), seed=st.integers(0, 99))
+def test_both_firmwares_home_the_cart_of_any_rig(rig: Hardware, seed: int) -> None:
+    check_homes(cart_of(rig, seed=seed))
+
+
+@settings(max_examples=3, derandomize=True, deadline=None)
+@given(rig=rigs(spans=(0.2, 0.4)), seed=st.integers(0, 99))
+def test_a_short_track_has_room_for_a_swinging_pole(rig: Hardware, seed: int) -> None:
+    check_homes(cart_of(rig, seed=seed, boot="anywhere"))
+
+
+def test_a_cart_like_ip02_on_half_its_track_homes() -> None:
+    rig = hardware_of({"track_span": 0.396})
+    cart = EmulatorSettings(**COARSE).with_hardware(rig)
+    assert cart.track_half_length == 0.2
+    check_homes(cart)
+    fault = Fault.HOMING  # the span is wrong
+    assert home(cart.model_copy(update={"hardware": None}), "python")[1].fault == fault
+
+
+def test_the_longest_track_is_searched_to_its_end() -> None:
+    check_homes(EmulatorSettings(**COARSE).with_hardware(hardware_of({"track_span": 6.0})))
+
+
+def test_the_coarsest_encoders_are_fine_enough() -> None:
+    rig = hardware_of({"cart_nanometres_per_count": 600_000, "pole_counts_per_turn": 200})
+    driven, state = home(EmulatorSettings(**COARSE).with_hardware(rig), "python")
+    assert (driven.flags, state.fault) == (Flags.HOMED, Fault.NONE)
+
+
+def test_a_rig_survives_json_and_leaves_a_chosen_track() -> None:
+    rig = hardware_of({"track_span": 0.396})
+    cart = EmulatorSettings(track_half_length=0.21).with_hardware(rig)
+    assert cart.track_half_length == 0.21
+    assert EmulatorSettings.model_validate_json(cart.model_dump_json()) == cart
+    assert EmulatorSettings().with_hardware(nominal_hardware()).track_half_length == DEFAULT.track_half_length
