@@ -10,7 +10,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from cartpole_rl.rig.hardware import LARGEST_MOTOR, Hardware
+from cartpole_rl.rig.hardware import LARGEST_MOTOR, Hardware, nominal_hardware
 from cartpole_rl.settings import NonNegative, Positive, Settings
 
 Share = Annotated[
@@ -32,9 +32,7 @@ class EmulatorSettings(Settings):
     # folder of an agent in C that drives after START_POLICY; in cartpole-evaluate onboard: the agent of run=
     policy: Path | None = None
     port: Port = "auto"  # a pseudo-terminal or a local TCP port; auto: pty where the system has it
-    hardware: Hardware | None = (
-        None  # encoders, nominal track and rough numbers in the firmware; None: ip02's
-    )
+    hardware: Hardware | None = None  # of the cart's file, which the firmware is built with; None: ip02's
     seed: Annotated[int, Field(ge=0)] = (
         0  # of latencies, disturbed frames, boot position and the hand's angle
     )
@@ -105,8 +103,31 @@ class EmulatorSettings(Settings):
         return self
 
     def with_hardware(self, hardware: Hardware) -> Self:
-        """Return the settings with a rig; a track of the default length becomes 4 mm longer than its."""
-        changes: dict[str, object] = {"hardware": hardware}
-        if self.track_half_length == type(self).model_fields["track_half_length"].default:
-            changes["track_half_length"] = round(hardware.half_span + 0.002, 6)
-        return self.model_copy(update=changes)
+        """Return the settings of a cart with `hardware`.
+
+        Numbers of the cart that are still those of the default cart become those of one that differs from
+        `hardware` as the default cart differs from ip02.
+        """
+        nominal = nominal_hardware()
+        if self.hardware == hardware or (self.hardware is None and hardware == nominal):
+            return self
+        mass = hardware.moving_mass / nominal.moving_mass
+        friction = hardware.moving_friction / nominal.moving_friction
+        force = nominal.motor_per_newton / hardware.motor_per_newton  # a motor value
+        offset = hardware.motor_offset / nominal.motor_offset
+        default = EmulatorSettings()
+        _, slope, constant = default.force_curve
+        scaled = {
+            "track_half_length": hardware.half_span + default.track_half_length - nominal.half_span,
+            "cart_mass": mass * default.cart_mass,
+            "cart_viscous": friction * default.cart_viscous,
+            "cart_coulomb_left": friction * default.cart_coulomb_left,
+            "cart_coulomb_right": friction * default.cart_coulomb_right,
+            "force_curve": (0.0, force * slope, force * offset * constant),
+            "deadband_left": min(offset * default.deadband_left, LARGEST_MOTOR),
+            "deadband_right": min(offset * default.deadband_right, LARGEST_MOTOR),
+        }
+        changes = {
+            name: value for name, value in scaled.items() if getattr(self, name) == getattr(default, name)
+        }
+        return self.model_copy(update={**changes, "hardware": hardware})

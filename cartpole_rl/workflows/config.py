@@ -19,6 +19,7 @@ from cartpole_rl.envs.settings import (
     ObservationSettings,
     PoleFrictionSettings,
     Randomization,
+    RigSettings,
 )
 from cartpole_rl.errors import CheckpointError, ConfigError
 from cartpole_rl.identification.settings import EnsembleSettings
@@ -376,7 +377,7 @@ class DistillConfig(RunSettings):
     distillation: DistillationSettings
 
 
-class PreflightConfig(OnCart):
+class PreflightConfig(RigSettings, OnCart):
     """The settings of cartpole-preflight."""
 
 

@@ -1,6 +1,6 @@
 """Check a cart by small moves before an agent drives it."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 
 from cartpole_rl.errors import PlantError
@@ -8,15 +8,16 @@ from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.preflight import Finding, preflight
 from cartpole_rl.plants.serial.preparation import FaultClearing, always
 from cartpole_rl.randomization.poles import Pole, one_pole
+from cartpole_rl.rig.hardware import nominal_hardware
 from cartpole_rl.terminal import confirm
 from cartpole_rl.workflows.config import PreflightConfig
 from cartpole_rl.workflows.poles import POLES, emulator_for, plant_words
 
 
-def check_cart(config: PreflightConfig) -> None:
+def check_cart(config: PreflightConfig, words: Sequence[str] = ()) -> None:
     """Check the cart of `config.plant` by small moves, and print a line for each check.
 
-    At the end prints the command that balances the pole. Writes no files. Raises PlantError after the first
+    At the end prints the next command. It keeps the cart's file that `words` of the command line give. Writes no files. Raises PlantError after the first
     check that fails, LinkError if no cart answers.
     """
     faults = FaultClearing(config.plant.clear_faults, confirm if config.plant.can_be_damaged else always)
@@ -28,14 +29,23 @@ def check_cart(config: PreflightConfig) -> None:
         raise PlantError(
             f"the cart is not ready: {finding.check if finding else 'nothing was checked'} failed"
         )
-    print("The cart is ready. Next, hold the pole up when asked (pretrained/large is for one of 0.66 m):")
-    print(next_command(config))
+    if config.hardware == nominal_hardware():
+        print("The cart is ready. Next, hold the pole up when asked (pretrained/large is for one of 0.66 m):")
+    else:
+        print("The cart is ready. Next, measure it; pretrained agents are for carts like cart=ip02:")
+    print(next_command(config, words))
 
 
-def next_command(config: PreflightConfig) -> str:
-    """Return the command that balances the pole on the same cart, with an agent for its length."""
-    plant = plant_words(config.plant, config.emulator)
-    return f"cartpole-evaluate run=pretrained/{mounted_pole(config)} task=balance {plant} episodes=1"
+def next_command(config: PreflightConfig, words: Sequence[str] = ()) -> str:
+    """Return the command that balances the pole on the same cart, with an agent for its length.
+
+    A cart that is not like ip02, which no pretrained agent knows, is identified first.
+    """
+    plant, pole = plant_words(config.plant, config.emulator), mounted_pole(config)
+    if config.hardware == nominal_hardware():
+        return f"cartpole-evaluate run=pretrained/{pole} task=balance {plant} episodes=1"
+    cart = [word for word in words if word.startswith(("cart=", "cart."))]
+    return " ".join(["cartpole-identify", *cart, plant, f"pole={pole}"])
 
 
 def mounted_pole(config: PreflightConfig) -> str:
@@ -47,5 +57,6 @@ def mounted_pole(config: PreflightConfig) -> str:
 @contextmanager
 def connected_cart(config: PreflightConfig) -> Iterator[SerialCart]:
     """Yield the cart, not open yet; disarm and close it at the end, and stop an emulated one."""
-    with config.plant.reachable(config.emulator) as settings, closing(SerialCart(settings)) as cart:
+    emulator = config.emulator.with_hardware(config.hardware)
+    with config.plant.reachable(emulator) as settings, closing(SerialCart(settings, config.hardware)) as cart:
         yield cart

@@ -29,7 +29,7 @@ from cartpole_rl.plants.serial.preparation import (
 from cartpole_rl.plants.serial.statistics import LinkStatistics
 from cartpole_rl.plants.settings import EmulatedSettings, Rehome, SerialSettings
 from cartpole_rl.plants.specs import TERMINATING, TRUNCATING, Numbers, OneCartPlant, PlantOutput, on_tensors
-from cartpole_rl.rig.hardware import Hardware, check_of_ip02, nominal_hardware
+from cartpole_rl.rig.hardware import Hardware
 from cartpole_rl.tasks.episode import Ending
 from cartpole_rl.wire import Fault, Flags, State, seconds_between, ticks_between, went_back
 
@@ -323,10 +323,10 @@ def emulated_cart(
 ) -> SerialPlant:
     """Return the plant of plant=emulated, on a new cart with the settings `emulator` and the start `start`.
 
-    It needs nobody to confirm. Raises PortError, LinkError, NotReadyError, EmulatorError,
-    and ConfigError for the hardware of another cart than ip02.
+    It needs nobody to confirm. Raises PortError, LinkError, NotReadyError, EmulatorError.
     """
-    check_of_ip02(hardware or nominal_hardware(), "plant=emulated emulates")
+    if hardware is not None:
+        emulator = emulator.with_hardware(hardware)
     return emulated_plant(emulator.model_copy(update={"start": start}), control_period, prompt, plant.rehome)
 
 
@@ -342,4 +342,6 @@ def emulated_plant(
     """
     cart = EmulatedCart(emulator)
     settings = cart.settings.model_copy(update={"rehome": rehome, "pole_length": 2 * emulator.pole_com})
-    return SerialPlant(settings, emulator.start, control_period, prompt, owned=cart, confirm=always)
+    return SerialPlant(
+        settings, emulator.start, control_period, prompt, cart, confirm=always, hardware=emulator.hardware
+    )
