@@ -1,7 +1,7 @@
 """Learns the errors of the identified physics: an ensemble of residuals, by matching trajectories.
 
 Windows of recorded motion are predicted by physics and residual together, and gradients flow through the
-whole window: the same encoder counts of positions as in the fit, no measured velocity, no one-step target.
+whole window: the same positions as in the fit, no measured velocity, no one-step target.
 Initial states of windows are nuisance parameters, matched again at intervals, for the current residual; in
 between, any effect that a changed initial state could explain is projected out of the errors (variable
 projection, as in the fit). With fixed initial states learning is several times slower.
@@ -21,9 +21,9 @@ from torch import Tensor
 
 from cartpole_rl.identification.matching import (
     COARSE,
-    FINEST,
     ROUNDS,
     InitialStates,
+    finest_scale,
     first_guess,
     huber,
     match_initial_states,
@@ -45,7 +45,9 @@ class Ensemble:
         self, windows: Windows, dynamics: Dynamics, scale: np.ndarray, settings: EnsembleSettings, seed: int
     ) -> None:
         self.dynamics, self.settings = dynamics, settings
-        self.scale = torch.from_numpy(scale).clamp(FINEST, COARSE)
+        self.scale = torch.maximum(
+            torch.from_numpy(scale).clamp(max=COARSE), finest_scale(windows.resolution)
+        )
         self.positions = torch.from_numpy(windows.positions)
         self.motors = torch.from_numpy(windows.motors)
         self.generator = torch.Generator().manual_seed(seed)
@@ -89,10 +91,10 @@ class Ensemble:
             self.dynamics,
             self.positions,
             self.motors,
+            self.scale,
             self.residual,
             self.initial.motion,
             rounds,
-            self.scale,
         )
         with torch.no_grad():
             error = huber(self.residuals()).mean(-1)
@@ -108,8 +110,8 @@ class Ensemble:
 
     def residuals(self) -> Tensor:
         """Return scaled residuals from the present initial states, [M, W, R]."""
-        counts = self.dynamics.counts(self.initial.motion, self.motors, self.residual)
-        error = scaled_residuals(counts, self.positions.unsqueeze(2), self.scale)
+        positions = self.dynamics.positions(self.initial.motion, self.motors, self.residual)
+        error = scaled_residuals(positions, self.positions.unsqueeze(2), self.scale)
         return error.permute(2, 3, 0, 1).flatten(2)
 
     def cost(self) -> Tensor:

@@ -1,6 +1,6 @@
 """Fit of a cart whose predictions match recorded windows.
 
-Residuals are encoder counts of positions only; see `matching`. One-step regression, the thesis's way, puts
+Residuals are those of positions only; see `matching`. One-step regression, the thesis's way, puts
 the same quantized sample into regressor and target, and one count at 50 Hz is 0.077 rad/s.
 """
 
@@ -15,10 +15,10 @@ from torch import Tensor
 
 from cartpole_rl.identification.matching import (
     COARSE,
-    FINEST,
     ROBUST,
     Match,
     Matching,
+    finest_scale,
     first_guess,
     solvable,
 )
@@ -48,7 +48,7 @@ class Fit:
     point: Array  # [U], in standard deviations before measurement
     covariance: Array  # [U, U] of `point`
     nominal: dict[str, float]
-    rms: Array  # [2] counts: robust spread of the residuals of cart and pole
+    rms: Array  # [2] m, rad: robust spread of the residuals of cart and pole
     correlation: Array  # [2] of each residual with the next one in its window
     cost: float
     iterations: int
@@ -96,7 +96,7 @@ def fit_cart(
 
     The names `known`, of UNKNOWNS, keep their nominal values. Motion shows only ratios of forces and
     masses: unless WEIGHED are known, the prior sets the scale. `extra_latency` is that of `rollout`.
-    The search is from the cart of `near`, if it is given; `sizes`, counts, [2], scale the errors.
+    The search is from the cart of `near`, if it is given; `sizes`, m and rad, [2], scale the errors.
     `on_step` is called before each linearization. Raises RecordingError for windows in which no cart moves.
     """
     check_laws(models, CartParameters(cart_column(nominal)))
@@ -109,10 +109,11 @@ def fit_cart(
         variants = points.shape[1]
         table = parameters_at(points.numpy(), unknowns, nominal).repeat(1, windows.number)
         every = motors.repeat_interleave(variants, 1)
-        counts = rollout(table, motion.flatten(1), every, models, period, substeps, extra_latency)
-        return counts.unflatten(2, (windows.number, variants))
+        measured = rollout(table, motion.flatten(1), every, models, period, substeps, extra_latency)
+        return measured.unflatten(2, (windows.number, variants))
 
-    scale = COARSE if sizes is None else torch.maximum(torch.from_numpy(sizes), FINEST)
+    sizes_before = COARSE if sizes is None else torch.from_numpy(sizes)
+    scale = torch.maximum(sizes_before, finest_scale(windows.resolution))
     problem = Matching(simulate, positions, scale, guess, (low, high), on_step)
     if near is None:
         screened = [problem.minimize(start, guess, SCREENING) for start in starting_points(unknowns)]
@@ -163,7 +164,7 @@ def by_encoder(problem: Matching, match: Match) -> Tensor:
 
 
 def spread(problem: Matching, match: Match) -> Tensor:
-    """Return the robust spread of a match's residuals, counts, [2]: 1.48 times their median size."""
+    """Return the robust spread of a match's residuals, m and rad, [2]: 1.48 times their median size."""
     sizes = by_encoder(problem, match).abs().flatten(0, 1)
     return 1.4826 * sizes.quantile(0.5, dim=0) * problem.scale
 

@@ -23,17 +23,17 @@ from cartpole_rl.identification.windows import Windows, cut_judging, cut_windows
 from cartpole_rl.physics.friction import CART_FRICTIONS
 from cartpole_rl.physics.laws import Law
 from cartpole_rl.physics.models import Models
-from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
+from cartpole_rl.rig.hardware import Encoders
 from cartpole_rl.tasks.episode import Ending, Episode
 
 Array = NDArray[np.floating]
 HORIZON = 1.0  # s of motion, predicted
-MOVING = round(0.02 / CART_METRES_PER_COUNT)  # counts in that time, from which a friction model shows
+MOVING = 0.02  # m in that time, from which a friction model shows
 COARSE_STEPS = 4  # integration steps a period when friction models are compared
 CONTENDS = 1.5  # a screened model stays a candidate up to this multiple of the best one's error
 FALLOFF = 4  # a model with twice the error of the best one has a weight of 2^-FALLOFF
 UNINFORMED = 0.7  # posterior over prior standard deviation, from which the data say little
-ROUNDING = np.array([0.6, 0.6])  # counts: a generous bound of the effect of quantization
+ROUNDING = 0.6  # counts: a generous bound of the effect of quantization
 CORRELATED = 0.5  # correlation of neighbouring residuals from which they are not white
 
 
@@ -118,7 +118,10 @@ def judged(found: Found, fitted: Mapping[str, Episode], held_out: Mapping[str, E
     """
     explained = check_explained(fitted, found.dynamics, HORIZON)
     replays = check_explained(held_out, found.dynamics, HORIZON)
-    doubts = [*early_endings([*fitted.values(), *held_out.values()]), *warnings(found.fit)]
+    doubts = [
+        *early_endings([*fitted.values(), *held_out.values()]),
+        *warnings(found.fit, next(iter(fitted.values())).encoders),
+    ]
     return Identification(*found, explained, replays, prediction_error(replays), doubts)
 
 
@@ -235,7 +238,7 @@ def widened(fit: Fit, best: Candidate, candidates: Sequence[Candidate]) -> Fit:
     return replace(fit, covariance=vectors * bounded @ vectors.T)
 
 
-def warnings(fit: Fit) -> list[str]:
+def warnings(fit: Fit, encoders: Encoders) -> list[str]:
     """Return a sentence for each result of a fit that may be wrong."""
     found = []
     low, high = limits(fit.unknowns, fit.nominal)
@@ -254,13 +257,14 @@ def warnings(fit: Fit) -> list[str]:
             )
         if left > UNINFORMED and np.isfinite(unknown.prior.unusual):
             found.append(f"the recordings hardly show {unknown.name}: its prior value is kept")
-    units = f"{1e3 * CART_METRES_PER_COUNT:.2g} mm", f"{np.degrees(POLE_RADIANS_PER_COUNT):.2g} deg"
-    for name, rms, rounding, correlation, unit in zip(
-        ("cart", "pole"), fit.rms, ROUNDING, fit.correlation, units, strict=True
+    count = encoders.metres, encoders.radians
+    texts = f"{1e3 * fit.rms[0]:.2g} mm", f"{np.degrees(fit.rms[1]):.2g} deg"
+    for name, rms, size, correlation, text in zip(
+        ("cart", "pole"), fit.rms, count, fit.correlation, texts, strict=True
     ):
-        if rms > rounding and correlation > CORRELATED:
+        if rms > ROUNDING * size and correlation > CORRELATED:
             found.append(
-                f"the residuals of the {name}'s position, {rms:.1f} counts of {unit}, are not white "
+                f"the residuals of the {name}'s position, {text}, are not white "
                 f"(neighbours correlate by {correlation:.2f}): the physics models lack something"
             )
     return found

@@ -1,10 +1,11 @@
-"""Matches simulated trajectories to recorded windows: Levenberg-Marquardt on encoder counts of positions.
+"""Matches simulated trajectories to recorded windows: Levenberg-Marquardt on measured positions.
 
 The unknowns are the initial state of each window and, optionally, a point that all windows share. Initial
 states are eliminated from the normal equations (variable projection; Golub and Pereyra, 1973), so that no
 velocity is measured. Derivatives are differences of carts that are simulated side by side.
 """
 
+import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import NamedTuple
@@ -16,10 +17,9 @@ from torch import Tensor
 from cartpole_rl.errors import RecordingError
 from cartpole_rl.identification.rollout import Dynamics
 from cartpole_rl.physics.residual import Residual
-from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 
-COARSE = torch.tensor([20.0, 3.0], dtype=torch.float64)  # counts, first residual scale: 0.5 mm, 0.26 deg
-FINEST = torch.tensor([1.0, 0.4], dtype=torch.float64)  # counts: the effect of quantization alone, about
+COARSE = torch.tensor([4.55e-4, 4.6e-3], dtype=torch.float64)  # m, rad: first residual scale
+QUANTIZATION = torch.tensor([1.0, 0.4], dtype=torch.float64)  # counts: the effect of quantization, about
 ROBUST = 3.0  # scaled residuals beyond this count linearly (Huber)
 RUNAWAY = 1e6  # scaled residual of a prediction that diverged
 POINT_STEP = 1e-5  # for derivatives; larger steps suggest that the data show the scale of all forces
@@ -54,19 +54,23 @@ def huber(residuals: Tensor) -> Tensor:
     return torch.where(size < ROBUST, size**2, 2 * ROBUST * size - ROBUST**2)
 
 
-def scaled_residuals(counts: Tensor, measured: Tensor, scale: Tensor) -> Tensor:
-    """Return (counts [F, 2, ...] - measured [F, 2, ...]) / scale [2] within RUNAWAY, with the same shape."""
-    error = (counts - measured) / scale.reshape(2, *[1] * (counts.dim() - 2))
+def finest_scale(resolution: np.ndarray) -> Tensor:
+    """Return the least scale of residuals, [2], m and rad, of encoders with that `resolution` [2]."""
+    return QUANTIZATION * torch.from_numpy(resolution)
+
+
+def scaled_residuals(positions: Tensor, measured: Tensor, scale: Tensor) -> Tensor:
+    """Return (positions - measured) / scale [2] within RUNAWAY; all others are [F, 2, ...]."""
+    error = (positions - measured) / scale.reshape(2, *[1] * (positions.dim() - 2))
     return error.nan_to_num(RUNAWAY, RUNAWAY, -RUNAWAY).clamp(-RUNAWAY, RUNAWAY)
 
 
 def first_guess(positions: Tensor, period: float) -> Tensor:
-    """Return states [4, W]: parabolas through the first positions [T + 1, 2, W], in counts."""
+    """Return states [4, W]: parabolas through the first positions [T + 1, 2, W]."""
     known = positions[:GUESSED_FROM].numpy()
     time = np.arange(len(known)) * period
     (_, x_dot, x), (_, theta_dot, theta) = (np.polyfit(time, known[:, k], 2) for k in range(2))
-    metres, radians = CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
-    return torch.from_numpy(np.stack((x * metres, x_dot * metres, theta * radians, theta_dot * radians)))
+    return torch.from_numpy(np.stack((x, x_dot, theta, theta_dot)))
 
 
 class NormalEquations(NamedTuple):
@@ -103,10 +107,14 @@ class NormalEquations(NamedTuple):
 
     @solvable()
     def length(self, step: Tensor) -> float:
-        """Return the length of a step of the point [U] in standard deviations, as windows disagree."""
+        """Return the length of a step of the point [U] in standard deviations, as windows disagree.
+
+        It is infinite where rounding leaves no length.
+        """
         matrix, slopes, _ = self.reduced(step.new_zeros(1))
         pulled = matrix @ step
-        return float(pulled @ torch.linalg.solve(self.disagreement(slopes), pulled)) ** 0.5
+        square = float(pulled @ torch.linalg.solve(self.disagreement(slopes), pulled))
+        return math.sqrt(square) if square >= 0 else math.inf
 
     @staticmethod
     def disagreement(slopes: Tensor) -> Tensor:
@@ -180,10 +188,10 @@ class Match(NamedTuple):
 class Matching:
     """The least-squares problem of W windows.
 
-    `simulate` takes K points [U, K] and K initial states of each window [4, W, K] to counts [F, 2, W, K];
-    `measured` [F, 2, W] are counts, `scale` [2] scales residuals, in counts, and `guess` [4, W] the initial
-    states before the search. A point is prior to measurement 0 with standard deviation 1, and stays within
-    `limits`, [U] each. `on_step` is called before each linearization.
+    `simulate` takes K points [U, K] and K initial states of each window [4, W, K] to positions [F, 2, W, K],
+    m and rad; `measured` are such, [F, 2, W]. `scale` [2] scales residuals, and `guess` [4, W] are the
+    initial states before the search. A point is prior to measurement 0 with standard deviation 1,
+    and stays within `limits`, [U] each. `on_step` is called before each linearization.
     """
 
     def __init__(
@@ -271,26 +279,27 @@ def match_initial_states(
     dynamics: Dynamics,
     positions: Tensor,
     motors: Tensor,
+    scale: Tensor,
     residual: Residual | None = None,
     start: Tensor | None = None,
     rounds: int = ROUNDS,
-    scale: Tensor = FINEST,
 ) -> InitialStates:
-    """Return the initial states that lead nearest to `positions` [T + 1, 2, W], in counts.
+    """Return the initial states that lead nearest to `positions` [T + 1, 2, W], m and rad.
 
-    `motors` [H + T, W] are motor values; each member of `residual` has initial states of its own. The
-    search is from `start` [4, M, W], or from the first guess. Components that the positions do not show, such
-    as the speed of a cart that sticks at once, stay near that guess. Raises RecordingError.
+    `motors` [H + T, W] are motor values, `scale` [2] scales residuals; each member of `residual` has initial
+    states of its own. The search is from `start` [4, M, W], or from the first guess. Components that the
+    positions do not show, such as the speed of a cart that sticks at once, stay near that guess. Raises
+    RecordingError.
     """
     members, windows = 1 if residual is None else residual.members, positions.shape[2]
     guess = first_guess(positions, dynamics.period).repeat(1, members)
 
     def simulate(points: Tensor, motion: Tensor) -> Tensor:
         variants = motion.shape[2]
-        counts = dynamics.counts(
+        simulated = dynamics.positions(
             motion.reshape(4, members, -1), motors.repeat_interleave(variants, 1), residual
         )
-        return counts.reshape(len(positions), 2, -1, variants)
+        return simulated.reshape(len(positions), 2, -1, variants)
 
     problem = Matching(simulate, positions.repeat(1, 1, members), scale, guess)
     nothing = guess.new_empty(0)

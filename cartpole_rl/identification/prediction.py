@@ -14,16 +14,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from cartpole_rl.identification.matching import match_initial_states
+from cartpole_rl.identification.matching import finest_scale, match_initial_states
 from cartpole_rl.identification.rollout import Dynamics
 from cartpole_rl.identification.windows import Windows, cut_stretches, joined, lead_periods
 from cartpole_rl.physics.residual import Residual
-from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.tasks.upright import wrap
 
 CERTAIN = 2.0  # spreads that should hold about 95 % of the errors
-PER_COUNT = np.array([CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT]).reshape(2, 1)  # m, rad
 REPORTED = {"x_mm": 1e3, "theta_deg": 180 / np.pi}  # names of the errors in reports: factor from m and rad
 LEAD = 0.1  # s before a stretch of a replay
 AWAY = 0.6  # rad from upright; nearer to it, an error grows e times in 0.15 s for any cart
@@ -44,11 +42,12 @@ def predict(windows: Windows, dynamics: Dynamics, residual: Residual | None = No
     lead, motors = windows.lead, torch.from_numpy(windows.motors)
     history = len(motors) - windows.periods
     positions = torch.from_numpy(windows.positions[: lead + 1])
-    first = match_initial_states(dynamics, positions, motors[: history + lead], residual).motion
+    scale, driven = finest_scale(windows.resolution), motors[: history + lead]
+    first = match_initial_states(dynamics, positions, driven, scale, residual).motion
     with torch.no_grad():
-        counts = dynamics.counts(first, motors, residual)[lead:].numpy()  # [H + 1, 2, M, W]
-    measured = (windows.positions[lead:] * PER_COUNT)[:, :, None]
-    simulated = np.where(np.isnan(measured), np.nan, counts * PER_COUNT[..., None])
+        predicted = dynamics.positions(first, motors, residual)[lead:].numpy()  # [H + 1, 2, M, W]
+    measured = windows.positions[lead:, :, None]
+    simulated = np.where(np.isnan(measured), np.nan, predicted)
     error = simulated - measured
     error[:, 1] = wrap(error[:, 1])
     spread = error.std(2, ddof=1) if error.shape[2] > 1 else np.zeros_like(error[:, :, 0])

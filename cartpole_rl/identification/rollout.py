@@ -15,7 +15,6 @@ from cartpole_rl.physics.dynamics import Drive, MakeAddition, State, advance, me
 from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import CartParameters, cart_column
 from cartpole_rl.physics.residual import UNDER_WAY, Residual, members_in_turn
-from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 
 
 def rollout(
@@ -28,22 +27,22 @@ def rollout(
     extra_latency: float = 0.0,
     addition: MakeAddition | None = None,
 ) -> Tensor:
-    """Return counts [T + 1, 2, N], not rounded, of carts `table` [P, N] from initial states `motion` [4, N].
+    """Return measured positions [T + 1, 2, N], m, rad, of carts `table` [P, N] from states `motion` [4, N].
 
     The first `history_periods` of `motors` [H + T, N] are older than the window: the actuator runs through
     them, since its force lags behind. `extra_latency`, s, is added to each latency: (3.8) moves a cart half a
     step early, so a lead of half a step makes latencies independent of the step.
     """
     cart, state = CartParameters(table), State(*motion.unbind(0))
-    counts = [as_counts(state, cart)]
+    measured = [as_measured(state, cart)]
     if addition is None:
         body, step = mechanism(cart), period / substeps
         forces = forces_in_steps(cart, motors, models, period, substeps, extra_latency)
         for number, force in enumerate(forces, 1):
             state = advance(state, force, cart, body, models, step)
             if number % substeps == 0:
-                counts.append(as_counts(state, cart))
-        return torch.stack(counts)
+                measured.append(as_measured(state, cart))
+        return torch.stack(measured)
     latency, force = cart.latency + extra_latency, torch.zeros_like(motion[0])
     history, in_effect = history_periods(period), motors_in_effect(period)
     for now in range(in_effect - 1, len(motors)):
@@ -52,8 +51,8 @@ def rollout(
             _, force = step_forces(*drive, latency, cart, models.actuator, period, substeps)
             continue
         state, (force, _) = run_period(state, drive, latency, cart, models, period, substeps, addition)
-        counts.append(as_counts(state, cart))
-    return torch.stack(counts)
+        measured.append(as_measured(state, cart))
+    return torch.stack(measured)
 
 
 def forces_in_steps(
@@ -89,11 +88,9 @@ def motors_in_effect(period: float) -> int:
     return max(UNDER_WAY, 1 + math.ceil(LONGEST_LATENCY / period - 1e-9))
 
 
-def as_counts(state: State, cart: CartParameters) -> Tensor:
-    """Return the counts of ideal encoders, [2, N]."""
-    return torch.stack(
-        (state.x / CART_METRES_PER_COUNT, (state.theta + cart.angle_offset) / POLE_RADIANS_PER_COUNT)
-    )
+def as_measured(state: State, cart: CartParameters) -> Tensor:
+    """Return what ideal encoders measure, [2, N], m and rad."""
+    return torch.stack((state.x, state.theta + cart.angle_offset))
 
 
 @dataclass(frozen=True)
@@ -118,8 +115,8 @@ class Dynamics:
         """Return the dynamics of `parameters` by name."""
         return cls(cart_column(parameters), models, period, substeps, extra_latency)
 
-    def counts(self, motion: Tensor, motors: Tensor, residual: Residual | None = None) -> Tensor:
-        """Return counts [T + 1, 2, M, W] from initial states [4, M, W] and motor values [H + T, W].
+    def positions(self, motion: Tensor, motors: Tensor, residual: Residual | None = None) -> Tensor:
+        """Return measured positions [T + 1, 2, M, W] from states [4, M, W] and motor values [H + T, W].
 
         M is the number of members of `residual`, W that of windows.
         """

@@ -31,15 +31,17 @@ class Piece(NamedTuple):
     motors: NDArray[np.float64]  # [H + T]
     episode: int
     first: int  # row of the episode
+    resolution: NDArray[np.float64]  # [2]
 
 
 class Windows(NamedTuple):
     """W windows of T periods, with the motor values of the H periods before them."""
 
-    positions: NDArray[np.float64]  # [T + 1, 2, W] encoder counts of cart and pole, as measured
+    positions: NDArray[np.float64]  # [T + 1, 2, W] m and rad: cart and pole, as their encoders count
     motors: NDArray[np.float64]  # [H + T, W] motor values chosen, oldest first
     episode: NDArray[np.int64]  # [W] number of the episode of each
     first: NDArray[np.int64]  # [W] row of that episode at which each starts
+    resolution: NDArray[np.float64]  # [2] m and rad of a count
     lead: int = 0  # periods at the start of each that give its initial state and are not predicted
 
     @classmethod
@@ -50,6 +52,7 @@ class Windows(NamedTuple):
             np.stack([piece.motors for piece in pieces], -1),
             np.array([piece.episode for piece in pieces]),
             np.array([piece.first for piece in pieces]),
+            pieces[0].resolution,
             lead,
         )
 
@@ -74,7 +77,7 @@ def joined(windows: Sequence[Windows]) -> Windows:
     positions, motors, episode, first = (
         np.concatenate([each[part] for each in windows], -1) for part in range(4)
     )
-    return Windows(positions, motors, episode, first, windows[0].lead)
+    return Windows(positions, motors, episode, first, windows[0].resolution, windows[0].lead)
 
 
 def history_periods(period: float) -> int:
@@ -131,11 +134,11 @@ def cut_stretches(episode: Episode, period: float, seconds: float, lead: int) ->
 
 
 def cut_judging(
-    episodes: Sequence[Episode], period: float, seconds: float, lead: int, moving: int
+    episodes: Sequence[Episode], period: float, seconds: float, lead: int, moving: float
 ) -> Windows:
     """Cut a window of `lead` periods and `seconds` s at every `seconds` s, and keep every JUDGING-th of them.
 
-    Only those count in which the cart moves over `moving` counts or more and no frame is lost or late.
+    Only those count in which the cart moves over `moving` m or more and no frame is lost or late.
     Raises RecordingError where there are none, or for another control period than `period` s.
     """
     periods = round(seconds / period)
@@ -160,13 +163,15 @@ def _pieces(
     late = np.flatnonzero(~regular_frames(episode, period)[:end])
     last_known = np.append(late, end)  # rows after which the motion is not known
     motors = np.concatenate((np.zeros(history), episode.motor.astype(np.float64), np.zeros(length)))
+    every = episode.positions
+    resolution = np.array([episode.encoders.metres, episode.encoders.radians])
     for first in range(0, end - least + 1, step):
         known = last_known[np.searchsorted(last_known, max(0, first - history))] - first
         if known >= least:
             positions = np.full((length + 1, 2), np.nan)
-            measured = episode.counts[first : first + min(known, length) + 1]
+            measured = every[first : first + min(known, length) + 1]
             positions[: len(measured)] = measured
-            yield Piece(positions, motors[first : first + history + length], number, first)
+            yield Piece(positions, motors[first : first + history + length], number, first, resolution)
 
 
 def regular_frames(episode: Episode, period: float) -> NDArray[np.bool_]:

@@ -15,7 +15,6 @@ from cartpole_rl.physics.residual import SPACING, UNITS
 from cartpole_rl.reporting import style
 from cartpole_rl.reporting.episodes import wrapped_line
 from cartpole_rl.reporting.texts import number_text, table
-from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT
 
 REPORTED_TIMES = (0.1, 0.5, 1.0)  # s after a reset
 PHYSICS, LEARNED = "physics alone", "physics + network"  # models that are compared
@@ -169,7 +168,7 @@ def ensemble_figure(
     physics: Prediction, learned: Prediction, ensemble: Ensemble, subtitle: str = ""
 ) -> Figure:
     """Draw predictions by physics alone and by the ensemble, and what the ensemble has learned."""
-    visited = ensemble.positions[:, 0].flatten().numpy() * CART_METRES_PER_COUNT
+    visited = ensemble.positions[:, 0].flatten().numpy()
     return learned_model_figure(
         ensemble.dynamics.period,
         physics,

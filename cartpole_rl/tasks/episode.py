@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cartpole_rl.rig.hardware import Encoders, nominal_encoders
 from cartpole_rl.tasks.settings import Measure
 
 Array = NDArray[np.float64]
@@ -61,6 +62,12 @@ class Episode:
     # [T] the motor value can be compared with `expected`; None unless the cart's board drove
     compared: NDArray[np.bool_] | None = None
     left_out: str = ""  # control periods after the last row that do not count, and why
+    encoders: Encoders = nominal_encoders()  # noqa: RUF009 - it is a tuple
+
+    @property
+    def positions(self) -> Array:
+        """Return cart and pole as the encoders measured them, [T+1, 2], m and rad."""
+        return self.counts * np.array([self.encoders.metres, self.encoders.radians])
 
     @property
     def measured_steps(self) -> int:

@@ -33,7 +33,6 @@ from cartpole_rl.physics.models import Models
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.randomization.identified import IdentifiedCarts
 from cartpole_rl.randomization.poles import PoleSettings
-from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 from cartpole_rl.settings import evaluation_seed
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.terminal import print_message
@@ -214,8 +213,8 @@ class CartLearner:
         fit, models = best_fit(windows, self.training.nominal_with(poles.nominal), self.candidates, period)
         self.show(
             f"simulator fitted to {windows.number} windows of {windows.periods * period:g} s: RMS error "
-            f"{1e3 * CART_METRES_PER_COUNT * fit.rms[0]:.2f} mm and "
-            f"{math.degrees(POLE_RADIANS_PER_COUNT) * fit.rms[1]:.2f} deg",
+            f"{1e3 * fit.rms[0]:.2f} mm and "
+            f"{math.degrees(fit.rms[1]):.2f} deg",
         )
         return fit, models
 

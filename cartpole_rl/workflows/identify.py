@@ -298,7 +298,7 @@ def results(found: Identification, carts: np.ndarray) -> dict[str, Any]:
             for each in found.candidates
         },
         "held_out_1_s": {"x_m": found.error.x, "theta_rad": found.error.theta},
-        "residual_counts": found.fit.rms.tolist(),
+        "residual": {"x_m": float(found.fit.rms[0]), "theta_rad": float(found.fit.rms[1])},
         "warnings": found.warnings,
     }
 

@@ -105,9 +105,10 @@ def fit_physics(windows: Windows, config: ModelConfig, pole: Pole, period: float
         for each in FRICTION_MODELS
     ]
     fit, models = best_fit(windows, nominal, candidates, period, plant.substeps)
+    errors = f"{1e3 * fit.rms[0]:.2f} mm (cart) and {np.degrees(fit.rms[1]):.2f} deg (pole)"
     print(
-        f"physics with cart_friction={models.cart_friction}: RMS error {fit.rms[0]:.1f} counts (cart) and "
-        f"{fit.rms[1]:.2f} counts (pole) over {windows.number} windows of {windows.periods * period:g} s"
+        f"physics with cart_friction={models.cart_friction}: RMS error {errors} over "
+        f"{windows.number} windows of {windows.periods * period:g} s"
     )
     return fit, models
 

@@ -17,8 +17,8 @@ from cartpole_rl.workflows.poles import POLES, emulator_for, plant_words
 def check_cart(config: PreflightConfig, words: Sequence[str] = ()) -> None:
     """Check the cart of `config.plant` by small moves, and print a line for each check.
 
-    At the end prints the next command. It keeps the cart's file that `words` of the command line give. Writes no files. Raises PlantError after the first
-    check that fails, LinkError if no cart answers.
+    At the end prints the next command, with the cart's file that `words` of the command line give. Writes no
+    files. Raises PlantError after the first check that fails, LinkError if no cart answers.
     """
     faults = FaultClearing(config.plant.clear_faults, confirm if config.plant.can_be_damaged else always)
     with connected_cart(config) as cart:

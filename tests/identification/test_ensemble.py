@@ -104,7 +104,7 @@ def record(
 
 def thinned(windows: Windows, count: int) -> Windows:
     parts = (values[..., :count] for values in windows[:4])
-    return Windows(*parts, windows.lead)
+    return Windows(*parts, windows.resolution, windows.lead)
 
 
 def judged(
@@ -117,7 +117,7 @@ def judged(
 
 def test_an_effect_that_the_physics_lacks_is_learned(record: Record, dynamics: Dynamics) -> None:
     windows, held_out = record(True)
-    ensemble = Ensemble(windows, dynamics, np.array([20.0, 3.0]), SETTINGS, seed=0)
+    ensemble = Ensemble(windows, dynamics, np.array([4.5e-4, 4.6e-3]), SETTINGS, seed=0)
     residual = ensemble.learn()
     physics, learned = (judged(held_out, dynamics, each) for each in (None, residual))
     assert physics["rms_x_mm"] > 3  # so that there is something to be learned
@@ -133,7 +133,7 @@ def test_an_effect_that_the_physics_lacks_is_learned(record: Record, dynamics: D
 def test_complete_physics_gets_no_residual(record: Record, dynamics: Dynamics) -> None:
     windows, held_out = record(False)
     settings = SETTINGS.model_copy(update={"updates": 12, "refresh": 6})
-    residual = Ensemble(windows, dynamics, np.array([1.0, 0.4]), settings, seed=0).learn()
+    residual = Ensemble(windows, dynamics, np.array([2.3e-5, 6e-4]), settings, seed=0).learn()
     physics, learned = (judged(held_out, dynamics, each) for each in (None, residual))
     for key in ("rms_x_mm", "median_x_mm", "rms_theta_deg", "median_theta_deg"):
         assert learned[key] < 1.2 * physics[key]
@@ -148,7 +148,7 @@ def test_the_true_model_predicts_held_out_motion(record: Record, dynamics: Dynam
 def test_nothing_after_the_lead_affects_an_initial_state(record: Record, dynamics: Dynamics) -> None:
     _, windows = record(False)
     changed = windows.positions.copy()
-    changed[LEAD + 1 :] += 1000
+    changed[LEAD + 1 :] += 1
     before = predict(windows, dynamics).error
     after = predict(windows._replace(positions=changed), dynamics).error
     assert np.array_equal(before[0], after[0])
@@ -158,10 +158,10 @@ def test_initial_states_are_found(record: Record, dynamics: Dynamics) -> None:
     """The estimates from encoder counts are the true initial states."""
     windows, _ = record(False)
     positions, motors = torch.from_numpy(windows.positions), torch.from_numpy(windows.motors)
-    unscaled = torch.ones(2, dtype=torch.float64)
+    unscaled = torch.from_numpy(windows.resolution)
     match = partial(match_initial_states, dynamics, motors=motors, rounds=4, scale=unscaled)
     true = match(positions).motion
-    again = match(dynamics.counts(true, motors).squeeze(2))
+    again = match(dynamics.positions(true, motors).squeeze(2))
     assert (again.motion - true).abs().squeeze(1)[1].median() < 1e-3  # m/s
     assert (again.motion - true).abs().squeeze(1)[3].median() < 1e-2  # rad/s
     form = again.form[0]

@@ -82,14 +82,15 @@ def test_the_true_cart_predicts_every_count(episodes: list[Episode], nominal: di
     motors = np.concatenate((np.zeros(history_periods(PERIOD)), first.motor[:50]))
     table = cart_column({**nominal, **TRUTH})
     motion = torch.tensor([[0.0], [0.0], [np.pi], [0.0]], dtype=torch.float64)
-    counts = rollout(table, motion, torch.from_numpy(motors).unsqueeze(1), STEP, PERIOD, 4)[..., 0]
-    assert np.abs(counts.numpy() - first.counts[:51]).max() < 0.6
+    measured = rollout(table, motion, torch.from_numpy(motors).unsqueeze(1), STEP, PERIOD, 4)[..., 0]
+    count = np.array([first.encoders.metres, first.encoders.radians])
+    assert np.abs(measured.numpy() / count - first.counts[:51]).max() < 0.6
 
 
 def test_a_fit_finds_the_cart(episodes: list[Episode], nominal: dict[str, float]) -> None:
     fit = fit_cart(cut_windows(episodes, PERIOD), nominal, STEP, PERIOD)
     found = fit.parameters
-    assert (fit.rms < [2.0, 0.6]).all()  # counts
+    assert (fit.rms < [5e-5, 1e-3]).all()  # m, rad
     force = 0.02 * 200 - 1  # N at motor value 200
     gain = (found["force_linear"] * 200 + found["force_offset"]) / (found["cart_mass"] + found["pole_mass"])
     assert gain == pytest.approx(force / 0.83, rel=0.02)
@@ -241,7 +242,8 @@ def test_windows_have_their_lead_and_history(period: float) -> None:
     windows = held_out_windows([numbered(round(8 / period), period)], period, 1.0)
     assert (windows.periods - windows.lead) * period == pytest.approx(1.0)
     assert windows.lead * period >= HELD_OUT_LEAD
-    assert (windows.motors[history_periods(period)] == windows.positions[0, 0]).all()
+    counts = windows.positions[0, 0] / windows.resolution[0]
+    assert windows.motors[history_periods(period)] == pytest.approx(counts)
     assert windows.number > 3
 
 

@@ -2,34 +2,36 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 from cartpole_rl.identification.fit import correlation, neighbours_correlate
 from cartpole_rl.identification.matching import (
-    FINEST,
     ROBUST,
     RUNAWAY,
     Matching,
+    finest_scale,
     first_guess,
     huber,
     scaled_residuals,
 )
-from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
+from cartpole_rl.rig.hardware import nominal_encoders
 
 PERIOD = 0.02
+COUNT = np.array([nominal_encoders().metres, nominal_encoders().radians])
 TIME = PERIOD * torch.arange(26, dtype=torch.float64).reshape(-1, 1, 1)
 ACCELERATION = 0.7  # m/s^2, shared by all windows
 
 
 def accelerated(points: Tensor, motion: Tensor) -> Tensor:
-    """Counts [F, 2, W, K] of carts with the acceleration `points` [1, K], or none, and of poles with none."""
+    """Positions [F, 2, W, K] of carts of acceleration `points` [1, K], or none, and of poles with none."""
     x, x_dot, theta, theta_dot = motion
     acceleration = points[0] if len(points) else 0
     cart = x + x_dot * TIME + acceleration * TIME**2 / 2
     pole = theta + theta_dot * TIME
-    return torch.stack((cart / CART_METRES_PER_COUNT, pole / POLE_RADIANS_PER_COUNT), 1)
+    return torch.stack((cart, pole), 1)
 
 
 @pytest.fixture
@@ -42,9 +44,10 @@ def motion() -> Tensor:
 
 def problem(motion: Tensor, acceleration: list[float], limit: float = math.inf) -> Matching:
     points = torch.tensor(acceleration, dtype=torch.float64).reshape(-1, 1)
-    measured = accelerated(points, motion.unsqueeze(2)).squeeze(3).round()
+    count = torch.from_numpy(COUNT).unsqueeze(1)
+    measured = count * (accelerated(points, motion.unsqueeze(2)).squeeze(3) / count).round()
     ends = torch.full((len(acceleration),), limit, dtype=torch.float64)
-    return Matching(accelerated, measured, FINEST, first_guess(measured, PERIOD), (-ends, ends))
+    return Matching(accelerated, measured, finest_scale(COUNT), first_guess(measured, PERIOD), (-ends, ends))
 
 
 def test_shared_numbers_and_initial_states_are_found(motion: Tensor) -> None:
@@ -78,8 +81,8 @@ def test_the_loss_is_quadratic_and_then_linear() -> None:
 
 
 def test_a_diverged_prediction_has_a_finite_residual() -> None:
-    counts = torch.tensor([[[math.nan], [math.inf]], [[-1e300], [0.0]]], dtype=torch.float64)
-    residuals = scaled_residuals(counts, torch.zeros_like(counts), FINEST)
+    positions = torch.tensor([[[math.nan], [math.inf]], [[-1e300], [0.0]]], dtype=torch.float64)
+    residuals = scaled_residuals(positions, torch.zeros_like(positions), finest_scale(COUNT))
     assert residuals.flatten().tolist() == [RUNAWAY, RUNAWAY, -RUNAWAY, 0.0]
 
 

@@ -38,14 +38,16 @@ import math, sys
 from pathlib import Path
 from cartpole_rl.emulator import firmware, process
 from cartpole_rl.emulator.device import CartDevice
-from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, SPAN
 from cartpole_rl.emulator.homing import Zeros
 from cartpole_rl.emulator.settings import EmulatorSettings
 
-def home_at_once():
-    reading = yield 0
-    half = round(SPAN / 2 / CART_METRES_PER_COUNT)
-    return Zeros(reading.cart - half, reading.cart + half, reading.pole)
+class HomingAtOnce:
+    def __init__(self, hardware):
+        self.half = hardware.encoders.cart_counts(hardware.half_span)
+
+    def home(self):
+        reading = yield 0
+        return Zeros(reading.cart - self.half, reading.cart + self.half, reading.pole)
 
 class Centred(CartDevice):
     "Stands in the middle when it homes."
@@ -56,7 +58,7 @@ class Centred(CartDevice):
             self.physics.place(0.0, math.pi)
         return answer
 
-firmware.home = home_at_once
+firmware.Homing = HomingAtOnce
 process.CartDevice = Centred
 journal = Path(sys.argv[1])
 process.run(EmulatorSettings(clock="real", cart_mass=20.0, physics_step=1e-3, journal=journal))

@@ -13,6 +13,7 @@ import yaml
 from cartpole_rl.checking import validated
 from cartpole_rl.choices import choice, default_choices, group_choices
 from cartpole_rl.composition import compose
+from cartpole_rl.rig.hardware import parameters_of
 from cartpole_rl.workflows.build import replaced_settings
 from cartpole_rl.workflows.checks import note_other_numbers
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig, load_settings
@@ -165,7 +166,7 @@ def test_the_order_of_words_changes_nothing(group: str) -> None:
 @pytest.mark.parametrize(("group", "model"), [("cart_friction", "linear"), ("pole_friction", "bearing")])
 def test_an_evaluation_keeps_a_cart_that_a_person_gave(group: str, model: str) -> None:
     """In the training or in the evaluation, whatever friction model either chooses."""
-    given = {**IP02, VISCOUS: 55.7, "pole_viscous": 0.01}
+    given = {**parameters_of(IP02), VISCOUS: 55.7, "pole_viscous": 0.01}
     for first, second in (({"cart": given}, {group: model}), ({group: model}, {"cart": given})):
         training = load_settings(TrainConfig, first)
         config = load_settings(EvaluateConfig, {"run": "somewhere", **second})

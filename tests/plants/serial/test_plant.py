@@ -308,7 +308,7 @@ def test_a_step_after_the_end_sends_nothing(peer: CartPeer, plant: SerialPlant, 
 
 
 WRONG_INFO = [
-    ({"pole_counts_per_turn": 2048}, "pole counts per turn 2048, not 4096"),
+    ({"pole_counts_per_turn": 2048}, "pole_counts_per_turn 2048, not 4096"),
     ({"cart_nanometres_per_count": 45498}, "cart_nanometres_per_count 45498, not 22749"),
     ({"motor_limit": 100}, "motor limit 100, not 255"),
     ({"period_us": 200_000}, "period 200000 us, not 5000 to 100000"),

@@ -25,6 +25,7 @@ from cartpole_rl.plants.serial.preflight import (
     soft_limit,
 )
 from cartpole_rl.plants.settings import SerialSettings
+from cartpole_rl.rig.hardware import nominal_hardware
 from cartpole_rl.wire import Flags, Home, State
 
 TRUTH: dict[str, Any] = {
@@ -245,14 +246,14 @@ def test_a_port_that_does_not_exist() -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"pole_counts_per_turn": 2048}, "INFO says pole counts per turn 2048, not 4096"),
+        ({"pole_counts_per_turn": 2048}, "the cart reports pole_counts_per_turn 2048, not 4096"),
         ({"soft_limit_counts": 18000}, "soft limit 409 mm, hard limit 399 mm"),
     ],
 )
 def test_limits_that_are_not_this_carts(change: dict[str, int], words: str) -> None:
-    assert "soft 380 mm" in limits(good_limits)
+    assert "soft 380 mm" in limits(good_limits, nominal_hardware())
     with pytest.raises(NotReadyError, match=words):
-        limits(replace(good_limits, **change))
+        limits(replace(good_limits, **change), nominal_hardware())
 
 
 @pytest.mark.parametrize("period_us", [0, 100_001])
