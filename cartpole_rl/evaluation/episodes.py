@@ -185,7 +185,7 @@ def one_episode(
     columns["counts"] = np.array([frame.counts for frame in frames])
     columns["time"] = np.cumsum([0.0, *(frame.dt[0] for frame in frames[1:])])
     columns |= {"motor": motor, "guarded": guarded}
-    episode = _episode(columns, ending, env.hardware.guard is not None)
+    episode = _episode(columns, ending, env)
     return measured_part(episode, env.plant.fault, env.plant.hardware)
 
 
@@ -217,13 +217,12 @@ def run_many(env: CartPoleEnv, policy: Policy, knocks: Knocks | None = None) -> 
     action, guard = torch.stack(actions, 1), torch.cat([frame["guard"] for frame in frames[:-1]], 1)
     columns["motor"] = env.hardware.sent_motors(action, guard)
     columns["guarded"] = env.hardware.guarded(action, guard)
-    has_guard = env.hardware.guard is not None
     dt = torch.cat([torch.zeros_like(first["dt"]), *(step["dt"] for step in steps)], 1)
     columns["time"] = dt.cumsum(1)
     arrays = {key: values.cpu().numpy() for key, values in columns.items()}
     return [
         replace(
-            _episode({key: values[row] for key, values in arrays.items()}, ending, has_guard),
+            _episode({key: values[row] for key, values in arrays.items()}, ending, env),
             origin=origins[row],
         )
         for row, ending in enumerate(endings)
@@ -255,7 +254,7 @@ def ending_of(env: CartPoleEnv, action: int, truncated: bool, theta: float) -> s
     return str(Ending.ANGLE if fallen else Ending.TRACK)
 
 
-def _episode(columns: dict[str, np.ndarray], ended_by: str, has_guard: bool) -> Episode:
+def _episode(columns: dict[str, np.ndarray], ended_by: str, env: CartPoleEnv) -> Episode:
     """Return the episode of one row, cut at its end."""
     steps = 1 + int(np.argmax(columns["done"]))
     x, x_dot, theta, theta_dot = columns["state"][: steps + 1].astype(np.float64).T
@@ -272,5 +271,6 @@ def _episode(columns: dict[str, np.ndarray], ended_by: str, has_guard: bool) -> 
         score_upright=step["score_upright"].astype(np.float64),
         reward=step["reward"].astype(np.float64),
         ended_by=ended_by,
-        guarded=step["guarded"] if has_guard else None,
+        guarded=None if env.hardware.guard is None else step["guarded"],
+        encoders=env.plant.hardware.encoders,
     )

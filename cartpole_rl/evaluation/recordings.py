@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from cartpole_rl.errors import RecordingError
+from cartpole_rl.errors import ConfigError, RecordingError
 from cartpole_rl.files import replacing
-from cartpole_rl.rig.hardware import LARGEST_MOTOR
+from cartpole_rl.rig.hardware import LARGEST_MOTOR, Encoders, hardware_of
 from cartpole_rl.tasks.episode import Ending, Episode, Origin
 
 FORMAT = "cartpole_rl recording 1"
@@ -28,6 +28,7 @@ STATE = {  # column: field of Episode
 STEP = {"score": "score", "score_upright": "score_upright", "reward": "reward"}
 COUNTS = ("cart_counts", "pole_counts")
 FEWEST_COUNTS, MOST_COUNTS = -(2**31), 2**31 - 1  # int32 on the wire
+METRES, TURN = "cart_nanometres_per_count", "pole_counts_per_turn"  # in the heading; without them: ip02's
 LENGTH = "pole_length_m"  # in the heading: twice pivot to centre of mass, empty if not known
 GUARDED = "guarded"  # 1 where the track guard replaced the agent's motor value; empty without a guard
 COLUMNS = (*STATE, *COUNTS, "motor", *STEP)  # that every recording has
@@ -39,7 +40,8 @@ def write_recording(path: Path, episode: Episode, facts: Mapping[str, Any] | Non
     """Write one episode atomically; `facts` are added to the heading."""
     with replacing(path) as beside, beside.open("w", newline="", encoding="utf-8") as file:
         left_out = {"left_out": episode.left_out} if episode.left_out else {}
-        heading = {"format": FORMAT, "ended_by": episode.ended_by, **left_out, **(facts or {})}
+        encoders = {METRES: round(1e9 * episode.encoders.metres), TURN: episode.encoders.turn}
+        heading = {"format": FORMAT, "ended_by": episode.ended_by, **encoders, **left_out, **(facts or {})}
         for key, value in heading.items():
             file.write(f"# {key}: {value}\n")
         lines = csv.writer(file)
@@ -86,7 +88,24 @@ def read_recording(path: Path) -> Episode:
     has_guard = any(row.get(GUARDED) for row in rows[:-1])
     guarded = column(GUARDED, marks, int) != 0 if has_guard else None
     _check_numbers(path, {**columns, **steps}, motor, counts)
-    return Episode(**columns, **steps, counts=counts, motor=motor, ended_by=ended_by, guarded=guarded)
+    return Episode(
+        **columns,
+        **steps,
+        counts=counts,
+        motor=motor,
+        ended_by=ended_by,
+        guarded=guarded,
+        encoders=_encoders(path, facts),
+    )
+
+
+def _encoders(path: Path, facts: Mapping[str, str]) -> Encoders:
+    """Return the encoders in a heading. Raises RecordingError for impossible ones."""
+    try:
+        return hardware_of({name: float(facts[name]) for name in (METRES, TURN) if name in facts}).encoders
+    except (ValueError, ConfigError) as error:
+        wrong = str(error).removeprefix("cart.")
+        raise RecordingError(f"{path} is damaged: in its heading, {wrong}") from None
 
 
 def read_heading(path: Path) -> tuple[dict[str, str], list[str]]:

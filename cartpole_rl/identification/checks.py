@@ -22,7 +22,7 @@ from cartpole_rl.identification.prediction import (
 from cartpole_rl.identification.rollout import Dynamics
 from cartpole_rl.identification.sensors import Motion, question_sensors
 from cartpole_rl.identification.windows import regular_frames
-from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
+from cartpole_rl.rig.hardware import Encoders, Hardware
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.tasks.upright import wrap
 
@@ -94,6 +94,22 @@ def check_recordings(
             "start one with half a second of the pole at rest"
         )
     _check_signs(episodes, period)
+
+
+def check_same_encoders(recordings: Mapping[str, Episode], hardware: Hardware) -> None:
+    """Raise RecordingError for the first recording, by its file, of a cart with other encoders."""
+    encoders = hardware.encoders
+    for file, episode in recordings.items():
+        if episode.encoders != encoders:
+            raise RecordingError(
+                f"{file} is of a cart with {encoders_text(episode.encoders)}, not {encoders_text(encoders)}; "
+                "give the file of that cart with cart="
+            )
+
+
+def encoders_text(encoders: Encoders) -> str:
+    """Return the scales of encoders for a message."""
+    return f"{1e9 * encoders.metres:.0f} nm and 1/{encoders.turn} turn a count"
 
 
 def zero_is_known(episodes: Sequence[Episode], period: float, on_step: Callable[[], object]) -> bool:
@@ -169,8 +185,8 @@ def _check_motion(episodes: Sequence[Episode], travel: float, swing: float) -> N
 
 def _check_units(episode: Episode) -> None:
     for name, values, counts, unit in (
-        ("x", episode.x, episode.counts[:, 0], CART_METRES_PER_COUNT),
-        ("theta", episode.theta, episode.counts[:, 1], POLE_RADIANS_PER_COUNT),
+        ("x", episode.x, episode.counts[:, 0], episode.encoders.metres),
+        ("theta", episode.theta, episode.counts[:, 1], episode.encoders.radians),
     ):
         error = values / unit - counts
         turns = (
@@ -187,8 +203,8 @@ def _check_encoders(episode: Episode, period: float) -> None:
     long = round(FROZEN / period)
     cart, pole = episode.counts[:, 0], episode.counts[:, 1]
     for name, own, other, enough in (
-        ("cart", cart, pole, LEAST_SWING / POLE_RADIANS_PER_COUNT),
-        ("pole", pole, cart, MOVES / CART_METRES_PER_COUNT),
+        ("cart", cart, pole, LEAST_SWING / episode.encoders.radians),
+        ("pole", pole, cart, MOVES / episode.encoders.metres),
     ):
         for first, last in _standstills(own):
             if last - first < long:
@@ -201,7 +217,7 @@ def _check_encoders(episode: Episode, period: float) -> None:
                     f"{'pole' if name == 'cart' else 'cart'} moves: "
                     f"the encoder is frozen, saturated or unplugged; check its cable"
                 )
-    speed = np.abs(np.diff(cart)) * CART_METRES_PER_COUNT / period
+    speed = np.abs(np.diff(cart)) * episode.encoders.metres / period
     for first, last in _standstills(cart):
         if last - first >= 5 and first > 0 and speed[first - 1] > SUDDEN:
             raise RecordingError(

@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cartpole_rl.envs.settings import TrackGuard
 from cartpole_rl.identification.moves import (
     Moves,
     Observed,
@@ -26,11 +25,10 @@ from cartpole_rl.identification.moves import (
 )
 from cartpole_rl.plants.measured import measured_part
 from cartpole_rl.plants.specs import Numbers, Plant, PlantOutput
-from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, LARGEST_MOTOR, POLE_RADIANS_PER_COUNT
+from cartpole_rl.rig.hardware import LARGEST_MOTOR, Encoders
 from cartpole_rl.scheduling import no_garbage_collection
 from cartpole_rl.tasks.episode import Ending, Episode
 
-BREAKAWAY = 90  # motor value that moves most carts, before it is known
 BROKEN_AWAY = 0.002  # m
 RIGHT, LEFT = 1, -1
 
@@ -51,7 +49,7 @@ def ramps(task: Task) -> Moves:
         yield from go_to(-side * 0.08, task)
         yield from hold(0, 0.4, task)
         start = now = yield 0
-        size = 20
+        size = task.least(20)
         while abs(now.x - start.x) < BROKEN_AWAY and size < LARGEST_MOTOR:
             size += 1
             now = yield side * size
@@ -67,7 +65,7 @@ def free_swing(task: Task, swing: float = 1.6, seconds: float = 24.0) -> Moves:
         if abs(math.remainder(now.theta - math.pi, math.tau)) > swing and abs(now.theta_dot) < 2:
             break
         side = -np.sign(now.theta_dot * np.cos(now.theta)) or RIGHT
-        now = yield round(side * task.moving(50) - 120 * now.x)
+        now = yield round(side * task.moving(50) - task.more(120) * now.x)
     yield from hold(0, seconds, task)
     return None
 
@@ -88,7 +86,7 @@ def levels(task: Task) -> Moves:
         for side in (RIGHT, LEFT):
             yield from go_to(-side * task.side, task)
             yield from push(side * task.moving(110), 0.5, task)
-            yield from until_stopped(side * size, side, task)
+            yield from until_stopped(side * task.least(size), side, task)
     return None
 
 
@@ -107,7 +105,8 @@ def excite(task: Task, seconds: float = 60.0) -> Moves:
     """Apply random motor values for random times, so that cart and pole cover their range of motion."""
     left = task.periods(seconds)
     while left > 0:
-        size, periods = int(task.random.integers(50, 256)), int(task.random.integers(2, 18))
+        size = int(task.random.integers(task.least(50), LARGEST_MOTOR + 1))
+        periods = int(task.random.integers(2, 18))
         side = RIGHT if task.random.random() < 0.5 else LEFT
         for _ in range(min(left, periods)):
             yield side * size
@@ -135,8 +134,8 @@ def conduct(
     The cart stands, with the motor at 0, whenever a recording is yielded: nothing controls it while a file is
     written. The next experiment continues from there; after an ending by the plant it starts with a reset.
     """
-    guard = experiment_guard(period)
-    task, present, ended = Task(period, np.random.default_rng(seed), BREAKAWAY), plant.reset_one(), False
+    task = Task.of(period, np.random.default_rng(seed), plant.hardware)
+    present, ended = plant.reset_one(), False
     for number, experiment in enumerate(experiments):
         with no_garbage_collection():
             if number and not ended:
@@ -144,7 +143,7 @@ def conduct(
                 ended = present.ends
             if ended:
                 present = plant.reset_one()
-            recorded, present, breakaway = run(plant, present, and_stop(experiment.moves(task), task), guard)
+            recorded, present, breakaway = run(plant, present, and_stop(experiment.moves(task), task), task)
         task = task._replace(breakaway=breakaway or task.breakaway)
         ended = recorded.ended_by != Ending.TIME
         if number + 1 == len(experiments):
@@ -154,20 +153,19 @@ def conduct(
 
 
 def run(
-    plant: Plant, present: PlantOutput[Numbers], moves: Moves, guard: TrackGuard
+    plant: Plant, present: PlantOutput[Numbers], moves: Moves, task: Task
 ) -> tuple[Episode, PlantOutput[Numbers], int | None]:
     """Make the moves from the frame `present` on; return the recording, the last frame, and their result.
 
-    The recording ends where a count froze or jumped.
-
-    `guard` brakes the cart where the moves do not. The motor is at 0 at the end, whatever the moves or the
-    guard requested last.
+    The recording ends where a count froze or jumped. The guard of `task` brakes the cart where the moves do
+    not. The motor is at 0 at the end, whatever the moves or the guard requested last.
     """
     counts, gaps, motors, ended = [present.counts], [*present.dt], [], str(Ending.TIME)
     requested, breakaway = next(moves), None
+    guard, encoders = experiment_guard(task.period, task.hardware), plant.hardware.encoders
     while True:
-        now = observed(counts, gaps)
-        motor = guarded(requested, now.x, now.x_dot, guard)
+        now = observed(counts, gaps, encoders)
+        motor = guarded(requested, now.x, now.x_dot, guard, task.track_end)
         present = plant.step_one(motor)
         motors.append(plant.drove(motor))
         counts.append(present.counts)
@@ -176,29 +174,31 @@ def run(
             ended = str(plant.ended_by or Ending.TRACK)
             break
         try:
-            requested = moves.send(observed(counts, gaps))
+            requested = moves.send(observed(counts, gaps, encoders))
         except StopIteration as end:
             breakaway = end.value
             present = plant.step_one(0) if motors[-1] else present
             break
-    recorded = recording(np.array(counts), np.array(gaps[1:]), np.array(motors), ended)
+    recorded = recording(np.array(counts), np.array(gaps[1:]), np.array(motors), ended, encoders)
     return measured_part(recorded, plant.fault, plant.hardware), present, breakaway
 
 
-def observed(counts: list[Numbers], gaps: list[float]) -> Observed:
+def observed(counts: list[Numbers], gaps: list[float], encoders: Encoders) -> Observed:
     """Return the newest positions, and speeds from the two newest."""
     (x_before, theta_before), (x, theta) = counts[-2:] if len(counts) > 1 else (counts[0], counts[0])
     return Observed(
-        x * CART_METRES_PER_COUNT,
-        (x - x_before) * CART_METRES_PER_COUNT / gaps[-1],
-        theta * POLE_RADIANS_PER_COUNT,
-        (theta - theta_before) * POLE_RADIANS_PER_COUNT / gaps[-1],
+        x * encoders.metres,
+        (x - x_before) * encoders.metres / gaps[-1],
+        theta * encoders.radians,
+        (theta - theta_before) * encoders.radians / gaps[-1],
     )
 
 
-def recording(counts: np.ndarray, gaps: np.ndarray, motors: np.ndarray, ended_by: str) -> Episode:
+def recording(
+    counts: np.ndarray, gaps: np.ndarray, motors: np.ndarray, ended_by: str, encoders: Encoders
+) -> Episode:
     """Return an episode without a task, with scores of 0."""
-    positions = counts * np.array([CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT])
+    positions = counts * np.array([encoders.metres, encoders.radians])
     speeds = np.vstack((np.zeros((1, 2)), np.diff(positions, axis=0) / gaps[:, None]))
     nothing = np.zeros(len(motors))
     return Episode(
@@ -213,4 +213,5 @@ def recording(counts: np.ndarray, gaps: np.ndarray, motors: np.ndarray, ended_by
         score_upright=nothing,
         reward=nothing,
         ended_by=ended_by,
+        encoders=encoders,
     )

@@ -19,7 +19,7 @@ from cartpole_rl.identification.checks import shows_motion
 from cartpole_rl.identification.experiments import recording
 from cartpole_rl.identification.settings import Direction, Layout, TimeColumn
 from cartpole_rl.identification.windows import IRREGULAR
-from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, LARGEST_MOTOR, POLE_COUNTS_PER_TURN
+from cartpole_rl.rig.hardware import LARGEST_MOTOR, nominal_encoders
 from cartpole_rl.tasks.episode import Ending, Episode
 
 Array = NDArray[np.float64]
@@ -72,14 +72,14 @@ def read_log(path: Path, layout: Layout) -> Log:
         regular = np.abs(gaps - period) <= IRREGULAR * period
     together = counted[:-1] & counted[1:] & regular
     edges = np.flatnonzero(np.diff(np.concatenate(([False], together, [False]))))
-    parts = []
+    parts, encoders = [], nominal_encoders()
     for first, last in edges.reshape(-1, 2):  # rows, the last one included
         rows = np.arange(first, last + 1)
         if (last - first) * period < layout.shortest:
             left_out[SHORT] = left_out.get(SHORT, 0) + len(rows)
             continue
         turns = np.unwrap(theta[rows], period=1.0) if layout.angle.wraps else theta[rows]
-        states = np.stack((x[rows] / CART_METRES_PER_COUNT, turns * POLE_COUNTS_PER_TURN), 1)
+        states = np.stack((x[rows] / encoders.metres, turns * encoders.turn), 1)
         if (beyond := np.abs(states) > MOST_COUNTS).any():
             place, column = np.argwhere(beyond)[0]
             name, row = (layout.position.name, layout.angle.name)[column], first + place
@@ -191,4 +191,5 @@ def resampled(time: Array, states: Array, motor: Array, period: float) -> tuple[
 def _episode(states: Array, motor: Array, period: float) -> Episode:
     full = np.clip(np.rint(motor * LARGEST_MOTOR), -LARGEST_MOTOR, LARGEST_MOTOR)
     gaps = np.full(len(full), period)
-    return recording(np.rint(states).astype(np.int64), gaps, full.astype(np.int64), str(Ending.TIME))
+    counts, motors = np.rint(states).astype(np.int64), full.astype(np.int64)
+    return recording(counts, gaps, motors, str(Ending.TIME), nominal_encoders())

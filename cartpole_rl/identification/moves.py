@@ -21,11 +21,13 @@ import numpy as np
 
 from cartpole_rl.envs.guard import guard_side
 from cartpole_rl.envs.settings import TrackGuard
-from cartpole_rl.rig.hardware import LARGEST_MOTOR
+from cartpole_rl.rig.hardware import LARGEST_MOTOR, Hardware, nominal_hardware
 
-TRACK_END = 0.2874  # m from the middle: 0.3, less what carts overrun that are harder to brake than assumed
+CLEARANCE = 0.0926  # m to the soft limit: what carts overrun that are harder to brake than assumed, and more
+LARGEST_CLEARANCE = 0.25  # of the way from the middle to the soft limit, on a short track
+BREAKAWAY = 1.2  # times the motor value that just moves the cart by its file; moves most carts
 RESPONSE = 0.035  # s, latency and lag of the motor
-ACCELERATION = 1 / 0.24  # m/s^2
+ACCELERATION = 1 / 0.24  # m/s^2, of ip02
 SHORTEST = 0.02  # s: shorter periods have its numbers, since carts have longer latencies than assumed, too
 BRAKE = 220  # motor value of the guard
 
@@ -53,19 +55,38 @@ class Task(NamedTuple):
     period: float  # s, of control
     random: np.random.Generator
     breakaway: int  # motor value that moves the cart from rest
+    hardware: Hardware
+
+    @classmethod
+    def of(cls, period: float, random: np.random.Generator, hardware: Hardware) -> "Task":
+        """Return the conditions before the cart is known."""
+        return cls(period, random, min(LARGEST_MOTOR, round(BREAKAWAY * just_moves(hardware))), hardware)
+
+    @property
+    def track_end(self) -> float:
+        """How far from the middle an experiment may get, m."""
+        return track_end(self.hardware)
 
     @property
     def side(self) -> float:
         """The distance from the middle where a run to the other side starts, m."""
-        return SIDE * reach(self.period)
+        return SIDE * reach(self.period, self.hardware)
 
     def periods(self, seconds: float) -> int:
         """Return the number of control periods in a time."""
         return round(seconds / self.period)
 
+    def more(self, of_ip02: float) -> float:
+        """Return the motor value that accelerates this cart as `of_ip02` does ip02, beyond friction."""
+        return of_ip02 * strength(nominal_hardware()) / strength(self.hardware)
+
+    def least(self, of_ip02: int) -> int:
+        """Return a motor value about the one that just moves the cart, as `of_ip02` is for ip02."""
+        return max(1, round(of_ip02 * just_moves(self.hardware) / just_moves(nominal_hardware())))
+
     def moving(self, more: int) -> int:
-        """Return a motor value that moves the cart, by `more` than needed."""
-        return min(LARGEST_MOTOR, self.breakaway + more)
+        """Return a motor value that moves the cart, by `more` than needed; `more` is that of ip02."""
+        return min(LARGEST_MOTOR, self.breakaway + round(self.more(more)))
 
 
 def hold(motor: int, seconds: float, task: Task) -> Moves:
@@ -105,7 +126,7 @@ def go_to(target: float, task: Task) -> Moves:
         if abs(away) < CLOSE and abs(now.x_dot) < SLOW:
             break
         wish = np.clip(6 * away, -0.5, 0.5) - now.x_dot  # m/s
-        now = yield round(np.sign(wish) * 0.8 * task.breakaway + 250 * wish)
+        now = yield round(np.sign(wish) * 0.8 * task.breakaway + task.more(250) * wish)
     yield 0
     return None
 
@@ -120,23 +141,43 @@ def and_stop(moves: Moves, task: Task) -> Moves:
     return breakaway
 
 
-def experiment_guard(period: float) -> TrackGuard:
+def just_moves(hardware: Hardware) -> float:
+    """Return the motor value that just moves a cart, by the rough numbers of its file."""
+    return hardware.motor_offset + hardware.motor_per_newton * hardware.moving_friction
+
+
+def strength(hardware: Hardware) -> float:
+    """Return the acceleration of a cart by a motor value of 1 beyond the one that just moves it, m/s^2."""
+    return 1 / (hardware.motor_per_newton * hardware.moving_mass)
+
+
+def track_end(hardware: Hardware) -> float:
+    """Return how far from the middle an experiment may get, m."""
+    soft = hardware.half_span - hardware.soft_limit
+    return soft - min(CLEARANCE, LARGEST_CLEARANCE * soft)
+
+
+def experiment_guard(period: float, hardware: Hardware) -> TrackGuard:
     """Return the numbers of the guard at a control period, s."""
     period = max(period, SHORTEST)
     runs_on = period + RESPONSE
     gains = runs_on + period / 2
-    margin = ACCELERATION / 2 * (period * runs_on + runs_on**2 + gains**2)
-    return TrackGuard(margin=round(margin, 4), delay=runs_on + gains, deceleration=ACCELERATION)
+    full, of_ip02 = (
+        strength(each) * (LARGEST_MOTOR - just_moves(each)) for each in (hardware, nominal_hardware())
+    )
+    acceleration = ACCELERATION * full / of_ip02
+    margin = acceleration / 2 * (period * runs_on + runs_on**2 + gains**2)
+    return TrackGuard(margin=round(margin, 4), delay=runs_on + gains, deceleration=acceleration)
 
 
-def reach(period: float) -> float:
+def reach(period: float, hardware: Hardware) -> float:
     """Return how far from the middle the guard lets a cart at rest be, m."""
-    return TRACK_END - experiment_guard(period).margin
+    return track_end(hardware) - experiment_guard(period, hardware).margin
 
 
-def guarded(motor: float, x: float, x_dot: float, guard: TrackGuard) -> int:
-    """Return the motor value, or one that brakes if the cart would get beyond TRACK_END."""
-    side = guard_side(x, x_dot, TRACK_END, guard)
+def guarded(motor: float, x: float, x_dot: float, guard: TrackGuard, track_end: float) -> int:
+    """Return the motor value, or one that brakes if the cart would get beyond `track_end`, m."""
+    side = guard_side(x, x_dot, track_end, guard)
     if side and motor * side < BRAKE:
         return int(side) * BRAKE
     return int(np.clip(motor, -LARGEST_MOTOR, LARGEST_MOTOR))

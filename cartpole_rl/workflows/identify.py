@@ -20,7 +20,7 @@ from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import ConfigError, RecordingError
 from cartpole_rl.evaluation.recordings import read_recording, write_recording
 from cartpole_rl.files import replacing, write_text
-from cartpole_rl.identification.checks import check_recordings
+from cartpole_rl.identification.checks import check_recordings, check_same_encoders
 from cartpole_rl.identification.experiments import EXPERIMENTS, HELD_OUT, conduct
 from cartpole_rl.identification.identify import Identification, identify
 from cartpole_rl.identification.one_step import one_step_estimates
@@ -39,6 +39,7 @@ from cartpole_rl.reporting.identification import (
 )
 from cartpole_rl.reporting.style import save
 from cartpole_rl.reporting.texts import table
+from cartpole_rl.rig.hardware import Hardware, hardware_of
 from cartpole_rl.rig.parameters import PARAMETERS
 from cartpole_rl.run_folder import (
     CART,
@@ -90,7 +91,9 @@ def identify_cart(config: IdentifyConfig, folder: Path) -> None:
         write_config(folder, "identify", config.model_dump(mode="json", by_alias=True))
         record_experiments(config, folder / RECORDINGS)
     files = experiments(source)
-    fitted, held_out = split({name: read_recording(path) for name, path in files.items()}, source)
+    recorded = {name: read_recording(path) for name, path in files.items()}
+    check_same_encoders({str(files[name]): episode for name, episode in recorded.items()}, config.hardware)
+    fitted, held_out = split(recorded, source)
     by_file, held_out_by_file = (
         {str(files[name]): episode for name, episode in chosen.items()} for chosen in (fitted, held_out)
     )
@@ -112,7 +115,7 @@ def identify_cart(config: IdentifyConfig, folder: Path) -> None:
             by_file, held_out_by_file, nominal, models, period, substeps, config.windows, laws, bar.update
         )
     carts = found.fit.draw(config.carts, np.random.default_rng(config.seed))
-    write_choices(found, carts, folder)
+    write_choices(found, carts, folder, config.hardware)
     write_json(folder / IDENTIFIED, results(found, carts) | errors(found.fit.parameters, truth, BY_HAND))
     for name, figure in identification_figures(found, carts, fitted).items():
         save(figure, folder / FIGURES / f"{name}.png")
@@ -164,7 +167,7 @@ def record_experiments(config: IdentifyConfig, folder: Path) -> None:
 def make_plant(config: IdentifyConfig) -> SerialPlant:
     """Connect to the cart that is identified."""
     plant: SerialPlant = config.plant.build(
-        config.emulator, config.control_period, "hanging", tqdm.write, confirm
+        config.emulator, config.control_period, "hanging", tqdm.write, confirm, hardware=config.hardware
     )
     return plant
 
@@ -203,12 +206,12 @@ def print_verdict(found: Identification, folder: Path) -> None:
     print_results(folder, files, next_command(found, folder))
 
 
-def write_choices(found: Identification, carts: np.ndarray, folder: Path) -> None:
+def write_choices(found: Identification, carts: np.ndarray, folder: Path, hardware: Hardware) -> None:
     """Write cart.yaml, pole.yaml, randomization.yaml and posterior.npz into `folder`.
 
     `carts` [P, N] are drawn from the fit.
     """
-    write_cart(found, carts, folder / CART)
+    write_cart(found, carts, folder / CART, hardware)
     for law in found.models[:2]:
         write_friction(law, found.fit.parameters, folder)
     parameters = found.fit.parameters
@@ -241,8 +244,11 @@ def write_choices(found: Identification, carts: np.ndarray, folder: Path) -> Non
     )
 
 
-def write_cart(found: Identification, carts: np.ndarray, path: Path) -> None:
-    """Write the identified cart without its pole; each parameter with its unit and standard error."""
+def write_cart(found: Identification, carts: np.ndarray, path: Path, hardware: Hardware) -> None:
+    """Write the identified cart without its pole; each parameter with its unit and standard error.
+
+    The numbers of its `hardware` are those that were given.
+    """
     parameters, models = found.fit.parameters, found.models
     deviations, identified = standard_deviations(carts), identified_names(found)
     lines = [
@@ -255,6 +261,7 @@ def write_cart(found: Identification, carts: np.ndarray, path: Path) -> None:
         if name not in brought.union(Pole.model_fields):
             error = f"+- {deviations[name]:.2g}" if name in identified else "prior value"
             lines.append(f"{name}: {parameters[name]!r}  # {PARAMETERS[name].unit}, {error}")
+    lines += ["# Encoders, track and motor, as given", *yaml.safe_dump(hardware.model_dump()).splitlines()]
     write_text(path, "\n".join(lines) + "\n")
 
 
@@ -306,11 +313,12 @@ def results(found: Identification, carts: np.ndarray) -> dict[str, Any]:
 def known_truth(config: IdentifyConfig) -> EmulatorSettings | None:
     """Return the truth of the emulated cart that the recordings are of; None for any other cart."""
     if config.source is None:
-        return config.emulator if config.plant.reads_emulator else None
+        return config.emulator.with_hardware(config.hardware) if config.plant.reads_emulator else None
     try:
         recorded = yaml.safe_load((config.source / CONFIG).read_text(encoding="utf-8"))
         of_emulator = recorded["plant"]["kind"] == "emulated"
-        return validated(EmulatorSettings, recorded["emulator"]) if of_emulator else None
+        truth = validated(EmulatorSettings, recorded["emulator"])
+        return truth.with_hardware(hardware_of(recorded["cart"])) if of_emulator else None
     except (OSError, yaml.YAMLError, LookupError, TypeError, ConfigError):  # recordings of another origin
         return None
 

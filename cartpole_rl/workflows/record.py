@@ -13,7 +13,6 @@ from cartpole_rl.envs.settings import CartPoleSettings
 from cartpole_rl.evaluation.recordings import LENGTH, stored_origin, write_recording
 from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.reporting.texts import count_text, guard_text
-from cartpole_rl.rig.hardware import check_of_ip02
 from cartpole_rl.run_folder import RECORDINGS, write_config
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.terminal import as_word, shown
@@ -32,7 +31,6 @@ def record(config: RecordConfig, folder: Path) -> None:
     episodes: dict[Path, Episode] = {}
     try:
         with closing(evaluation.env):
-            check_of_ip02(evaluation.settings.hardware, "cartpole-record writes recordings of")
             evaluation.note_other_pole("record")
             evaluation.note_refitted_guard("record")
             evaluation.note_other_numbers("record")

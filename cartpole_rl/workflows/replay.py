@@ -12,6 +12,7 @@ import yaml
 
 from cartpole_rl.envs.settings import CartPoleSettings
 from cartpole_rl.evaluation.recordings import read_recording
+from cartpole_rl.identification.checks import check_same_encoders
 from cartpole_rl.identification.prediction import all_errors, away_from_upright, errors_at, replay
 from cartpole_rl.identification.rollout import Dynamics
 from cartpole_rl.identification.windows import recorded_period
@@ -43,6 +44,9 @@ def replay_recordings(config: ReplayConfig, folder: Path) -> None:
     settings = recorded_cart(paths)
     given = {name: value for name in GROUPS if (value := getattr(config, name)) is not None}
     settings = settings.model_copy(update=given)
+    check_same_encoders(
+        {str(path): each for path, each in zip(paths, episodes, strict=True)}, settings.hardware
+    )
     name, pole = chosen_pole("a replay", config.pole, paths, settings.pole)
     parameters = {**settings.nominal_with(pole), **(config.parameters or {})}
     check_names(parameters, "parameters")

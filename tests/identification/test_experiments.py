@@ -28,7 +28,7 @@ from cartpole_rl.identification.experiments import (
     hold,
 )
 from cartpole_rl.identification.identify import Found, Identification, identify, judged
-from cartpole_rl.identification.moves import TRACK_END, experiment_guard, guarded, reach
+from cartpole_rl.identification.moves import experiment_guard, guarded, reach, track_end
 from cartpole_rl.identification.one_step import one_step_estimates
 from cartpole_rl.identification.quantities import quantities
 from cartpole_rl.identification.windows import part
@@ -38,7 +38,7 @@ from cartpole_rl.plants.serial.plant import emulated_plant
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.plants.specs import Numbers, PlantOutput
 from cartpole_rl.randomization.poles import PoleSettings
-from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_COUNTS_PER_TURN
+from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_COUNTS_PER_TURN, nominal_hardware
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.tasks.settings import Start, StartSettings
 
@@ -96,7 +96,10 @@ def test_every_experiment_is_made_to_its_end(recordings: dict[str, Episode]) -> 
     assert list(recordings) == [experiment.name for experiment in EXPERIMENTS]
     assert {episode.ended_by for episode in recordings.values()} == {"time"}
     assert sum(episode.steps for episode in recordings.values()) * PERIOD < 600
-    assert max(np.abs(episode.x).max() for episode in recordings.values()) < reach(PERIOD) + 0.08
+    assert (
+        max(np.abs(episode.x).max() for episode in recordings.values())
+        < reach(PERIOD, nominal_hardware()) + 0.08
+    )
     swing = recordings["swing"]
     assert np.abs(swing.theta - np.pi).max() > np.radians(60)
     assert not swing.motor[-round(7.5 / PERIOD) :].any()
@@ -177,20 +180,21 @@ def test_recordings_follow_each_other_on_one_cart(recordings: dict[str, Episode]
     ],
 )
 def test_the_guard_brakes(x: float, x_dot: float, motor: int, given: int) -> None:
-    assert guarded(motor, x, x_dot, experiment_guard(PERIOD)) == given
+    assert guarded(motor, x, x_dot, experiment_guard(PERIOD, nominal_hardware()), 0.2874) == given
 
 
 @pytest.mark.parametrize("period", [0.005, 0.02, 0.1])
 @pytest.mark.parametrize("speed", [0.0, 0.5, 1.0])
 def test_the_guard_allows_for_a_period_in_which_it_does_not_act(period: float, speed: float) -> None:
     """Where it lets a cart run, one that gains speed for a period more and is braked as hard stays within."""
-    guard, late = experiment_guard(period), period + 0.035  # s, period and response of the motor
-    at_rest = TRACK_END - stopping_distance(speed, guard)
+    hardware, late = nominal_hardware(), period + 0.035  # s, period and response of the motor
+    guard, end = experiment_guard(period, hardware), track_end(hardware)
+    at_rest = end - stopping_distance(speed, guard)
     true_speed = speed + guard.deceleration * period / 2  # the measured one is half a period old
     ran_on = true_speed * late + guard.deceleration * late**2 / 2
     braked = (true_speed + guard.deceleration * late) ** 2 / (2 * guard.deceleration)
-    assert at_rest + ran_on + braked <= TRACK_END + 1e-4
-    assert reach(0.02) == pytest.approx(0.27)
+    assert at_rest + ran_on + braked <= end + 1e-4
+    assert reach(0.02, hardware) == pytest.approx(0.27)
 
 
 LIGHT = {"cart_mass": 0.57}
