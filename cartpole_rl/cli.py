@@ -157,16 +157,18 @@ VERBS: dict[str, Verb] = {
     "export": Verb(
         "workflows.config:ExportConfig",
         "workflows.export:export",
-        "writes a trained agent for other programs.\n"
+        "writes a trained agent for other programs, or a cart for its firmware.\n"
         "  format=weights    agent.npz: the weights and all that a program needs to drive a cart with them\n"
         "  format=onnx       agent.onnx, for an ONNX runtime\n"
         "  format=c          policy.h and policy.c, for a microcontroller\n"
-        "  format=web        cart.html, a page where the agent drives a cart that you push",
+        "  format=web        cart.html, a page where the agent drives a cart that you push\n"
+        "  format=firmware   cart_rig.h, the numbers of cart=, which its firmware is built with",
         "exporting",
         (
             "run=runs/train/2026-11-21_12-00-00 format=weights",
             "run=pretrained/medium format=web",
             "-m run=pretrained/medium format=weights,onnx,c,web",
+            "format=firmware cart=ip02",
         ),
         "workflows.checks:check_export",
     ),

@@ -132,7 +132,8 @@ def check_distillation(config: DistillConfig) -> None:
 
 def check_export(config: ExportConfig) -> None:
     """Raise CartPoleError if there is no agent, or what writes the format is not installed."""
-    check_agent(config.run)
+    if config.run is not None:
+        check_agent(config.run)
     if config.format == "onnx" and (find_spec("onnx") is None or find_spec("onnxscript") is None):
         raise ConfigError('format=onnx needs onnx and onnxscript: pip install "cartpole_rl[export]"')
 

@@ -46,6 +46,7 @@ from cartpole_rl.randomization.poles import PoleSettings, check_one_pole
 from cartpole_rl.randomization.ranges import IdentifiedSettings
 from cartpole_rl.registry import Extension
 from cartpole_rl.reporting.loggers import LOGGERS
+from cartpole_rl.rig.hardware import hardware_of
 from cartpole_rl.rig.parameters import check_values
 from cartpole_rl.run_folder import is_own_policy
 from cartpole_rl.settings import Count, Finite, NonNegative, Positive, Seed, Settings
@@ -362,11 +363,24 @@ class ReportConfig(Settings):
 
 
 class ExportConfig(Settings):
-    """The settings of cartpole-export."""
+    """The settings of cartpole-export: an agent, or with format=firmware a cart."""
 
-    run: Path
-    format: Literal["weights", "onnx", "c", "web"]
+    format: Literal["weights", "onnx", "c", "web", "firmware"]
+    run: Path | None = None
+    cart: dict[str, Finite] | None = None
     label: str
+
+    @model_validator(mode="after")
+    def _an_agent_or_a_cart(self) -> Self:
+        if self.format == "firmware":
+            if self.run is not None:
+                raise ValueError("run: format=firmware writes the numbers of a cart; leave it out")
+            hardware_of(self.cart or {})
+        elif self.cart is not None:
+            raise ValueError(f"cart: format={self.format} exports an agent with its own cart; leave it out")
+        elif self.run is None:
+            raise ValueError("run: give run=<run folder, checkpoint file or pretrained/medium>")
+        return self
 
 
 class DistillConfig(RunSettings):

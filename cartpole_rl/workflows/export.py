@@ -1,25 +1,34 @@
-"""Write a trained agent for other programs."""
+"""Write a trained agent for other programs, or the numbers of a cart for its firmware."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
+from cartpole_rl.emulator.c_firmware import rig_header
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.exporting.agent import ExportedAgent
 from cartpole_rl.exporting.c_code import c_files
 from cartpole_rl.exporting.onnx_model import onnx_model
 from cartpole_rl.exporting.web_page import web_page
-from cartpole_rl.files import write_bytes
+from cartpole_rl.files import write_bytes, write_text
+from cartpole_rl.rig.hardware import hardware_of
 from cartpole_rl.run_folder import write_config
 from cartpole_rl.workflows.build import TrainedAgent, exported_agent, network_of, provenance, trained_agent
 from cartpole_rl.workflows.config import ExportConfig
 
+RIG_HEADER = "cart_rig.h"
 
-def export(config: ExportConfig, folder: Path) -> None:
-    """Write the agent of `config.run` as `config.format`.
 
-    Writes into `folder` config.yaml, provenance.json and agent.npz, agent.onnx, policy.h and policy.c, or
-    cart.html. Raises CheckpointError for a missing or damaged agent, ConfigError for one that cannot be
-    exported, or for a folder that already holds a run.
+def export(config: ExportConfig, folder: Path, words: Sequence[str] = ()) -> None:
+    """Write the agent of `config.run` as `config.format`, or the header that a cart's firmware is built with.
+
+    Writes into `folder` config.yaml, provenance.json and agent.npz, agent.onnx, policy.h and policy.c,
+    cart.html, or cart_rig.h, which names the cart as `words` of the command line do. Raises CheckpointError
+    for a missing or damaged agent, ConfigError for one that cannot be exported, or for a folder that already
+    holds a run.
     """
+    if config.run is None:
+        write_rig(config, folder, words)
+        return
     trained = trained_agent(config.run)
     agent = exported_agent(trained, provenance(config.run))
     contents = files_of(config.format, agent, trained)
@@ -28,6 +37,15 @@ def export(config: ExportConfig, folder: Path) -> None:
         write_bytes(folder / name, content)
     files = " and ".join(f"{folder}/{name}" for name in contents)
     print(f"{files} {'are' if len(contents) > 1 else 'is'} written; SHA-256 of the agent: {agent.checksum}")
+
+
+def write_rig(config: ExportConfig, folder: Path, words: Sequence[str]) -> None:
+    """Write cart_rig.h. Raises ConfigError for a folder that already holds a run."""
+    cart = [word.removeprefix("cart=") for word in words if word.startswith("cart=")]
+    header = rig_header(hardware_of(config.cart or {}), " ".join(cart) or "ip02")
+    write_config(folder, "export", {**config.model_dump(mode="json"), "seed": None})
+    write_text(folder / RIG_HEADER, header)
+    print(f"{folder}/{RIG_HEADER} is written; build the firmware with RIG={(folder / RIG_HEADER).resolve()}")
 
 
 def files_of(form: str, agent: ExportedAgent, trained: TrainedAgent) -> dict[str, bytes]:

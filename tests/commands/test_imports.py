@@ -29,8 +29,11 @@ COMPLAINS = {  # command: words, exit code, part of the line on stderr
     "export": [
         ("run=nowhere format=c", 1, "run=nowhere: there is no such file or folder"),
         ("run=pretrained/small format=c", 1, "there are pretrained/"),
-        ("run=pretrained/medium", 2, "format is missing; give format=weights, onnx, c or web"),
-        ("run=pretrained/medium format=java", 2, "'weights', 'onnx', 'c' or 'web'"),
+        ("run=pretrained/medium", 2, "format is missing; give format=weights, onnx, c, web, or firmware"),
+        ("run=pretrained/medium format=java", 2, "'weights', 'onnx', 'c', 'web' or 'firmware'"),
+        ("format=c", 2, "give run=<run folder"),
+        ("format=firmware run=pretrained/medium", 2, "run: format=firmware writes the numbers of a cart"),
+        ("run=pretrained/medium format=c cart=ip02", 2, "format=c exports an agent with its own cart"),
     ],
     "distill": [
         ("run=nowhere", 1, "run=nowhere: there is no such file or folder"),

@@ -14,6 +14,7 @@ from cartpole_rl.errors import RecordingError
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.evaluation.recordings import COLUMNS, GUARDED, read_heading, read_recording, write_recording
 from cartpole_rl.plants.simulated import SimulatedPlant
+from cartpole_rl.rig.hardware import Encoders, nominal_encoders
 from cartpole_rl.tasks.episode import Episode
 
 
@@ -121,3 +122,15 @@ def test_a_file_that_a_spreadsheet_program_saved_is_read(tmp_path: Path, episode
     np.testing.assert_array_equal(again.counts, episode.counts)
     assert (again.motor.dtype, again.counts.dtype) == (episode.motor.dtype, episode.counts.dtype)
     assert (again.ended_by, read_heading(path)[0]["pole"]) == (episode.ended_by, "medium")
+
+
+def test_a_recording_keeps_the_encoders(episode: Episode, tmp_path: Path) -> None:
+    path, encoders = tmp_path / "episode.csv", Encoders(4e-5, 2400)
+    write_recording(path, dataclasses.replace(episode, encoders=encoders))
+    assert read_recording(path).encoders == encoders
+    text = path.read_text()
+    path.write_text("\n".join(line for line in text.splitlines() if "_per_" not in line or "," in line))
+    assert read_recording(path).encoders == nominal_encoders()
+    path.write_text(text.replace("# pole_counts_per_turn: 2400", "# pole_counts_per_turn: 3"))
+    with pytest.raises(RecordingError, match="in its heading, pole_counts_per_turn is 3"):
+        read_recording(path)

@@ -23,7 +23,7 @@ REQUIRED: dict[str, dict[str, Any]] = {
     "replay": {"from": "some"},
     "import": {"from": "some"},
     "preflight": {"plant.port": "auto"},
-    "export": {"run": "some", "format": "c"},
+    "export": {"format": "firmware"},
     "distill": {"run": "some"},
     "report": {"runs": ["some"]},
 }

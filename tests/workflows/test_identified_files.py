@@ -13,6 +13,7 @@ from cartpole_rl.identification.unknowns import WEIGHED, unknowns_of
 from cartpole_rl.physics.friction import CART_FRICTIONS, COULOMB, stribeck_force
 from cartpole_rl.physics.models import Models
 from cartpole_rl.randomization.poles import Pole, PoleSettings
+from cartpole_rl.rig.hardware import nominal_hardware
 from cartpole_rl.rig.parameters import POSITIVE, Parameter, factor
 from cartpole_rl.workflows.identify import friction_choice, write_choices
 
@@ -25,8 +26,9 @@ def write(models: Models, nominal: dict[str, float], folder: Path) -> dict[str, 
     dynamics = Dynamics.of(fit.parameters, models, 0.02, 4)
     error = PredictionError(1e-3, 0.01)
     found = Identification(fit, dynamics, [Candidate(fit, dynamics, error)], [], [], error, [])
-    write_choices(found, fit.draw(10, np.random.default_rng(0)), folder)
-    return {name: value for name, value in fit.parameters.items() if name not in Pole.model_fields}
+    write_choices(found, fit.draw(10, np.random.default_rng(0)), folder, nominal_hardware())
+    of_cart = {name: value for name, value in fit.parameters.items() if name not in Pole.model_fields}
+    return {**of_cart, **nominal_hardware().model_dump()}
 
 
 @pytest.fixture

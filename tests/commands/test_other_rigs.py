@@ -1,0 +1,77 @@
+"""A cart with other encoders, another track and another motor, from its file alone."""
+
+from pathlib import Path
+
+import pytest
+import yaml
+from command_line import COARSE, in_process
+
+from cartpole_rl.choices import choice
+from cartpole_rl.rig.hardware import HARDWARE
+
+RIG = {
+    "cart_nanometres_per_count": 40_000,
+    "pole_counts_per_turn": 2400,
+    "track_span": 0.46,
+    "soft_limit": 0.02,
+    "hard_limit": 0.006,
+    "hard_push": 150,
+    "moving_mass": 0.5,
+    "moving_friction": 0.4,
+    "motor_offset": 25,
+    "motor_per_newton": 83,
+    "gentle_force": 2.2,
+}
+MOTION = {
+    "cart_mass": 0.4,
+    "track_half_length": 0.2,
+    "cart_viscous": 0.8,
+    "cart_coulomb": 0.4,
+    "force_linear": 0.012,
+    "force_offset": -0.3,
+}
+IDENTIFY = ("identify", "cart=lab.yaml", "plant=emulated", COARSE, "windows=60", "carts=64")
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "lab.yaml").write_text(yaml.safe_dump({"defaults": ["ip02"], **MOTION, **RIG}))
+    return tmp_path
+
+
+def test_the_preflight_reads_its_file(folder: Path) -> None:
+    done = in_process("preflight", "cart=lab.yaml", "plant=emulated", COARSE, folder=folder)
+    assert (done.code, done.err) == (0, ""), done
+    *checks, _, following = done.out.splitlines()
+    assert len(checks) == 8
+    assert "OK   limits: soft 210 mm, hard 224 mm from the middle; 40000 nm and 1/2400 turn a count" in checks
+    assert (
+        following == f"cartpole-identify cart=lab.yaml plant=emulated emulator.physics_step=0.001 pole=medium"
+    )
+
+
+def test_its_firmware_has_its_numbers(folder: Path) -> None:
+    done = in_process("export", "format=firmware", "cart=lab.yaml", "hydra.run.dir=run", folder=folder)
+    assert done.code == 0, done
+    header = (folder / "run" / "cart_rig.h").read_text()
+    assert "of cart=lab.yaml." in header
+    assert "#define CART_NANOMETRES 40000 " in header
+    assert "#define CART_POLE_COUNTS 2400 " in header
+
+
+def test_it_is_identified_and_its_recordings_are_its_own(folder: Path) -> None:
+    done = in_process(*IDENTIFY, "hydra.run.dir=run", folder=folder)
+    assert done.code == 0, done
+    found = yaml.safe_load((folder / "run" / "cart.yaml").read_text())
+    assert {name: found[name] for name in HARDWARE} == {
+        name: RIG.get(name, choice("cart/ip02")[name]) for name in HARDWARE
+    }
+    gain = found["force_linear"] / (found["cart_mass"] + 0.129)  # N a motor value and kg
+    truth = 0.99 / 83 / (0.735 / 0.85 * 0.5 + 0.129)
+    assert gain == pytest.approx(truth, rel=0.03)
+    for words in (("identify", "from=run"), ("replay", "from=run", "cart=ip02")):
+        refused = in_process(*words, "hydra.run.dir=other", folder=folder)
+        assert refused.code != 0
+        assert "is of a cart with 40000 nm and 1/2400 turn a count, not 22749 nm and" in refused.err
+        assert "give the file of that cart with cart=" in refused.err
+    assert in_process("replay", "from=run", "cart=lab.yaml", "hydra.run.dir=replay", folder=folder).code == 0
