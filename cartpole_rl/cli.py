@@ -167,7 +167,6 @@ VERBS: dict[str, Verb] = {
         (
             "run=runs/train/2026-11-21_12-00-00 format=weights",
             "run=pretrained/medium format=web",
-            "-m run=pretrained/medium format=weights,onnx,c,web",
             "format=firmware cart=ip02",
         ),
         "workflows.checks:check_export",

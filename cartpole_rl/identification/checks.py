@@ -22,7 +22,7 @@ from cartpole_rl.identification.prediction import (
 from cartpole_rl.identification.rollout import Dynamics
 from cartpole_rl.identification.sensors import Motion, question_sensors
 from cartpole_rl.identification.windows import regular_frames
-from cartpole_rl.rig.hardware import Encoders, Hardware
+from cartpole_rl.rig.hardware import Hardware
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.tasks.upright import wrap
 
@@ -102,14 +102,9 @@ def check_same_encoders(recordings: Mapping[str, Episode], hardware: Hardware) -
     for file, episode in recordings.items():
         if episode.encoders != encoders:
             raise RecordingError(
-                f"{file} is of a cart with {encoders_text(episode.encoders)}, not {encoders_text(encoders)}; "
+                f"{file} is of a cart with {episode.encoders.text}, not {encoders.text}; "
                 "give the file of that cart with cart="
             )
-
-
-def encoders_text(encoders: Encoders) -> str:
-    """Return the scales of encoders for a message."""
-    return f"{1e9 * encoders.metres:.0f} nm and 1/{encoders.turn} turn a count"
 
 
 def zero_is_known(episodes: Sequence[Episode], period: float, on_step: Callable[[], object]) -> bool:

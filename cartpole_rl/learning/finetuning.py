@@ -15,6 +15,7 @@ from cartpole_rl.learning.dqn import COLLECTED, Scalars, Training, n_step_transi
 from cartpole_rl.learning.settings import FinetuningSettings
 from cartpole_rl.plants.recorded import RecordedPlant
 from cartpole_rl.randomization.randomizer import Draws
+from cartpole_rl.rig.hardware import Hardware
 from cartpole_rl.tasks.episode import Episode
 
 
@@ -23,14 +24,16 @@ def recorded_chunks(
     make_env: Callable[[RecordedPlant], CartPoleEnv],
     motors: Sequence[int],
     pole_length: float | None,
+    hardware: Hardware | None = None,
 ) -> list[TensorDictBase]:
     """Return the one-step transitions of an episode in the environment that `make_env` builds.
 
-    `pole_length` m is that of the cart, None if it is not known. The last step before a lost link is left
-    out, since its outcome was not measured. So are the steps that no action of the agent drove, such as those
-    of the firmware's brake or of a late value: they part the episode into chunks [1, T].
+    `pole_length` m is that of the cart, None if it is not known; `hardware` is the cart's, ip02's if it is
+    not given. The last step before a lost link is left out, since its outcome was not measured. So are the
+    steps that no action of the agent drove, such as those of the firmware's brake or of a late value: they
+    part the episode into chunks [1, T].
     """
-    env = make_env(RecordedPlant(episode, pole_length))
+    env = make_env(RecordedPlant(episode, pole_length, hardware))
     index = {motor: action for action, motor in enumerate(motors)}
     current = env.reset()
     parts: list[list[TensorDictBase]] = [[]]

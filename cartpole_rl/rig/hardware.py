@@ -30,6 +30,11 @@ class Encoders(NamedTuple):
         """Of the pole a count."""
         return 2 * math.pi / self.turn
 
+    @property
+    def text(self) -> str:
+        """The scales for a message."""
+        return f"{1e9 * self.metres:.0f} nm and 1/{self.turn} turn a count"
+
     def cart_counts(self, metres: float) -> int:
         """Return a distance of the cart in counts."""
         return round(metres / self.metres)

@@ -24,6 +24,7 @@ from cartpole_rl.learning.checkpoints import AgentCheckpoint, load_agent, restor
 from cartpole_rl.plants.serial.preparation import Confirm, StartPosition, nobody
 from cartpole_rl.plants.settings import PlantSettings
 from cartpole_rl.randomization.poles import Pole, PoleSettings, check_one_pole
+from cartpole_rl.rig.hardware import Hardware, hardware_of
 from cartpole_rl.rig.parameters import check_names
 from cartpole_rl.run_folder import BASELINE, CHECKPOINTS, find_agent, is_own_policy, recorded_provenance
 from cartpole_rl.scheduling import taking_precedence
@@ -239,8 +240,19 @@ def replaced_settings(training: TrainConfig, config: EvaluateConfig) -> CartPole
         given["pole"] = own_pole
     if config.actions is not None:
         check_same_meaning(config.actions, training.actions)
+    if config.cart is not None and config.run != BASELINE and not is_own_policy(config.run):
+        check_same_rig(hardware_of(config.cart), training.hardware)
     settings = validated(CartPoleSettings, {**own, **given, "randomization": config.randomization})
     return with_parameters(settings, config.parameters or {})
+
+
+def check_same_rig(given: Hardware, trained: Hardware) -> None:
+    """Raise ConfigError unless an agent drives a cart with the encoders and the track of its training."""
+    texts = [f"{each.encoders.text}, {each.track_span:g} m of track" for each in (given, trained)]
+    if texts[0] != texts[1]:
+        raise ConfigError(
+            f"cart: it has {texts[0]}, but the agent was trained for {texts[1]}; train one for this cart"
+        )
 
 
 def check_same_meaning(actions: ActionSettings, trained: ActionSettings) -> None:

@@ -38,7 +38,6 @@ from cartpole_rl.reporting.live_view import LiveView
 from cartpole_rl.reporting.scores import SCORES, score_table
 from cartpole_rl.reporting.tensorboard import TensorBoardLog
 from cartpole_rl.reporting.texts import count_text, cut_off
-from cartpole_rl.rig.hardware import check_of_ip02
 from cartpole_rl.run_folder import (
     AGENT_HASH,
     CHECKPOINTS,
@@ -110,7 +109,6 @@ def finetune(config: FinetuneConfig, folder: Path, words: Sequence[str] = ()) ->
     seed_everything(config.seed)
     agent = trained_agent(run)
     training, kind = agent.training, agent.training.agent.kind
-    check_of_ip02(training.hardware, "cartpole-finetune drives")
     if not (isinstance(kind.item, type) and issubclass(kind.item, QAgent)):
         raise ConfigError(f"run={run}: fine-tuning trains Q-networks, this is an agent of agent.kind={kind}")
     evaluation = evaluation_config(config)

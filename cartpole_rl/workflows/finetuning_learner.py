@@ -191,6 +191,7 @@ class CartLearner:
             training.plant.substeps,
             config.seed,
             compiled=config.compile,
+            hardware=training.hardware,
         )
         return Finetuning(
             finetuning,
@@ -232,7 +233,8 @@ class CartLearner:
         """Return an episode's transitions in chunks, as the agent observes them."""
         motors = self.settings.actions.motors
         length = pole_length(self.config)
-        chunks = recorded_chunks(episode, partial(environment, self.settings), motors, length)
+        make_env, hardware = partial(environment, self.settings), self.settings.hardware
+        chunks = recorded_chunks(episode, make_env, motors, length, hardware)
         learned, measured = sum(chunk.shape[1] for chunk in chunks), episode.measured_steps
         if learned < measured:
             others = sorted({*episode.motor[:measured].tolist()} - {*motors})

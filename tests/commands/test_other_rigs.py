@@ -46,7 +46,7 @@ def test_the_preflight_reads_its_file(folder: Path) -> None:
     assert len(checks) == 8
     assert "OK   limits: soft 210 mm, hard 224 mm from the middle; 40000 nm and 1/2400 turn a count" in checks
     assert (
-        following == f"cartpole-identify cart=lab.yaml plant=emulated emulator.physics_step=0.001 pole=medium"
+        following == "cartpole-identify cart=lab.yaml plant=emulated emulator.physics_step=0.001 pole=medium"
     )
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from cartpole_rl.learning.settings import (
     LearningSettings,
     OptimizerSettings,
 )
+from cartpole_rl.rig.hardware import hardware_of
 
 MOTORS = (-250, -200, 0, 200, 250)
 LENGTH = 2 * 0.1778  # m, the medium pole
@@ -105,6 +107,18 @@ def test_a_recording_has_what_the_agent_saw_and_tunes_it(
     after = dict(agent.named_parameters())
     assert any(not torch.equal(after[name], weight) for name, weight in before.items())
     assert all(weight.isfinite().all() for weight in after.values())
+
+
+def test_a_recording_is_observed_with_its_own_encoders(
+    make_plant: Callable, make_environment: Callable
+) -> None:
+    rig = hardware_of({"cart_nanometres_per_count": 40_000, "pole_counts_per_turn": 2400})
+    episode, seen = drive(partial(make_plant, hardware=rig), make_environment, {})
+    (chunk,) = recorded_chunks(
+        episode, lambda plant: make_environment(plant, MOTORS, time_limit=40), MOTORS, None, rig
+    )
+    assert episode.encoders == rig.encoders
+    torch.testing.assert_close(chunk["observation"][0], seen)
 
 
 def test_the_seed_chooses_the_recorded_transitions(make_plant: Callable, make_environment: Callable) -> None:

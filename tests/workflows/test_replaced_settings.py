@@ -48,3 +48,14 @@ def test_motor_values_are_replaced() -> None:
     config = load_settings(EvaluateConfig, {"run": "somewhere", "actions": "nine_levels_linear"})
     settings = replaced_settings(load_settings(TrainConfig), config)
     assert settings.actions.motors == (-250, -188, -125, -63, 0, 63, 125, 188, 250)
+
+
+def test_an_agent_of_another_rig_is_refused() -> None:
+    training = load_settings(TrainConfig, {"cart.track_span": 0.5})
+    for run, refused in (("somewhere", True), ("lqr", False)):
+        config = load_settings(EvaluateConfig, {"run": run, "cart": "ip02"})
+        if refused:
+            with pytest.raises(ConfigError, match=r"0\.814 m of track, but .* 0\.5 m of track; train one"):
+                replaced_settings(training, config)
+        else:
+            assert replaced_settings(training, config).hardware.track_span == 0.814
