@@ -12,6 +12,9 @@ period old. A cart of measured speed v that is braked just as hard, a = ACCELERA
 which is the guard's margin + delay v + v^2 / (2 a) with
 
     margin = a (T t + t^2 + g^2) / 2,    delay = t + g.
+
+ACCELERATION is that of ip02; a is scaled to the cart by the rough numbers of its file. If its brake b is
+weaker than a, v^2 is over 2 b, and g^2 a / b and g a / b stand for g^2 and g.
 """
 
 from collections.abc import Generator
@@ -20,7 +23,8 @@ from typing import NamedTuple
 import numpy as np
 
 from cartpole_rl.envs.guard import guard_side
-from cartpole_rl.envs.settings import TrackGuard
+from cartpole_rl.envs.settings import LARGEST_MARGIN, TrackGuard
+from cartpole_rl.errors import ConfigError
 from cartpole_rl.rig.hardware import LARGEST_MOTOR, Hardware, nominal_hardware
 
 CLEARANCE = 0.0926  # m to the soft limit: what carts overrun that are harder to brake than assumed, and more
@@ -31,6 +35,7 @@ ACCELERATION = 1 / 0.24  # m/s^2, of ip02
 SHORTEST = 0.02  # s: shorter periods have its numbers, since carts have longer latencies than assumed, too
 BRAKE = 220  # motor value of the guard
 
+LEAST_REACH = 0.05  # m from the middle: less shows no friction
 SIDE = 20 / 27  # share of the guard's reach where a run to the other side starts: 0.2 m at 20 ms
 CLOSE, SLOW = 0.02, 0.05  # m, m/s: at the target, and at rest
 LONGEST_MOVE = 4.0  # s
@@ -158,16 +163,34 @@ def track_end(hardware: Hardware) -> float:
 
 
 def experiment_guard(period: float, hardware: Hardware) -> TrackGuard:
-    """Return the numbers of the guard at a control period, s."""
+    """Return the numbers of the guard at a control period, s.
+
+    Raises ConfigError for a cart that cannot be braked, or has no room for it on its track.
+    """
+    given, end = period, track_end(hardware)
     period = max(period, SHORTEST)
     runs_on = period + RESPONSE
     gains = runs_on + period / 2
     full, of_ip02 = (
         strength(each) * (LARGEST_MOTOR - just_moves(each)) for each in (hardware, nominal_hardware())
     )
-    acceleration = ACCELERATION * full / of_ip02
-    margin = acceleration / 2 * (period * runs_on + runs_on**2 + gains**2)
-    return TrackGuard(margin=round(margin, 4), delay=runs_on + gains, deceleration=acceleration)
+    gain = ACCELERATION * full / of_ip02
+    brake = strength(hardware) * (BRAKE - 2 * hardware.motor_offset + just_moves(hardware))
+    if brake <= 0:
+        raise ConfigError(
+            f"cart.motor_offset={hardware.motor_offset:g}: experiments brake with a motor value of {BRAKE}, "
+            "which brakes no such cart; give less"
+        )
+    deceleration = min(gain, brake)
+    margin = gain / 2 * (period * runs_on + runs_on**2 + gain / deceleration * gains**2)
+    delay = runs_on + gain / deceleration * gains
+    if margin > min(LARGEST_MARGIN, end - LEAST_REACH):
+        raise ConfigError(
+            f"control_period={given:g}: full motor accelerates the cart of cart= by {gain:.1f} m/s^2; to brake "
+            f"it takes {margin:.2f} m of the {end:.2f} m to each side; give a shorter period, or correct "
+            "motor_per_newton, moving_mass or track_span"
+        )
+    return TrackGuard(margin=round(margin, 4), delay=delay, deceleration=deceleration)
 
 
 def reach(period: float, hardware: Hardware) -> float:

@@ -23,6 +23,7 @@ from cartpole_rl.files import replacing, write_text
 from cartpole_rl.identification.checks import check_recordings, check_same_encoders
 from cartpole_rl.identification.experiments import EXPERIMENTS, HELD_OUT, conduct
 from cartpole_rl.identification.identify import Identification, identify
+from cartpole_rl.identification.moves import experiment_guard
 from cartpole_rl.identification.one_step import one_step_estimates
 from cartpole_rl.identification.quantities import intervals
 from cartpole_rl.identification.unknowns import WEIGHED
@@ -88,6 +89,7 @@ def identify_cart(config: IdentifyConfig, folder: Path) -> None:
     note_other_numbers("identify", config.nominal_cart, [config.pole.nominal])
     source = config.source or folder
     if config.source is None:
+        experiment_guard(config.control_period, config.hardware)  # or ConfigError
         write_config(folder, "identify", config.model_dump(mode="json", by_alias=True))
         record_experiments(config, folder / RECORDINGS)
     files = experiments(source)

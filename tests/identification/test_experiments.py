@@ -14,7 +14,7 @@ from tensordict import TensorDict
 
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.envs.guard import stopping_distance
-from cartpole_rl.errors import RecordingError
+from cartpole_rl.errors import ConfigError, RecordingError
 from cartpole_rl.identification.checks import check_explained, check_recordings
 from cartpole_rl.identification.experiments import (
     EXPERIMENTS,
@@ -38,7 +38,12 @@ from cartpole_rl.plants.serial.plant import emulated_plant
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.plants.specs import Numbers, PlantOutput
 from cartpole_rl.randomization.poles import PoleSettings
-from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_COUNTS_PER_TURN, nominal_hardware
+from cartpole_rl.rig.hardware import (
+    CART_METRES_PER_COUNT,
+    POLE_COUNTS_PER_TURN,
+    hardware_of,
+    nominal_hardware,
+)
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.tasks.settings import Start, StartSettings
 
@@ -181,6 +186,31 @@ def test_recordings_follow_each_other_on_one_cart(recordings: dict[str, Episode]
 )
 def test_the_guard_brakes(x: float, x_dot: float, motor: int, given: int) -> None:
     assert guarded(motor, x, x_dot, experiment_guard(PERIOD, nominal_hardware()), 0.2874) == given
+
+
+@pytest.mark.parametrize("period", [0.005, 0.02, 0.03])
+@pytest.mark.parametrize("speed", [0.0, 0.5, 1.0])
+def test_a_cart_with_little_friction_is_braked_earlier(period: float, speed: float) -> None:
+    """Its brake is weaker than its motor at full value; nothing but the clearance is kept for errors."""
+    rig = hardware_of({"moving_friction": 0.0, "motor_offset": 0, "motor_per_newton": 30})
+    guard, late, end = experiment_guard(period, rig), period + 0.035, track_end(rig)
+    gain = 255 / 30 / 0.85 * (1 / 0.24) / (180 / 50 / 0.85)  # m/s^2
+    brake = 220 / 30 / 0.85
+    assert guard.deceleration == pytest.approx(brake)
+    speed += gain * period / 2
+    ran_on = speed * late + gain * late**2 / 2
+    stopped = (speed + gain * late) ** 2 / (2 * brake)
+    at_rest = end - stopping_distance(speed - gain * period / 2, guard)
+    assert at_rest + ran_on + stopped <= end + 1e-4
+
+
+def test_a_cart_too_strong_for_its_track_is_refused() -> None:
+    rig = hardware_of({"moving_friction": 0.0, "motor_offset": 0, "motor_per_newton": 30})
+    with pytest.raises(ConfigError, match=r"^control_period=0\.1: .* m/s\^2; .* a shorter period"):
+        experiment_guard(0.1, rig)
+    offset = {"motor_offset": 240, "motor_per_newton": 5, "moving_friction": 0.5}
+    with pytest.raises(ConfigError, match=r"^cart\.motor_offset=240: .* brakes no such cart; give less$"):
+        experiment_guard(0.02, hardware_of(offset))
 
 
 @pytest.mark.parametrize("period", [0.005, 0.02, 0.1])
