@@ -186,9 +186,9 @@ def experiment_guard(period: float, hardware: Hardware) -> TrackGuard:
     delay = runs_on + gain / deceleration * gains
     if margin > min(LARGEST_MARGIN, end - LEAST_REACH):
         raise ConfigError(
-            f"control_period={given:g}: full motor accelerates the cart of cart= by {gain:.1f} m/s^2; to brake "
-            f"it takes {margin:.2f} m of the {end:.2f} m to each side; give a shorter period, or correct "
-            "motor_per_newton, moving_mass or track_span"
+            f"control_period={given:g}: full motor accelerates the cart of cart= by {gain:.1f} m/s^2; to "
+            f"brake it takes {margin:.2f} m of the {end:.2f} m to each side; give a shorter period, or "
+            "correct motor_per_newton, moving_mass or track_span"
         )
     return TrackGuard(margin=round(margin, 4), delay=delay, deceleration=deceleration)
 
