@@ -10,6 +10,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
+from cartpole_rl.errors import ConfigError
 from cartpole_rl.rig.hardware import LARGEST_MOTOR, Hardware, nominal_hardware
 from cartpole_rl.settings import NonNegative, Positive, Settings
 
@@ -106,11 +107,13 @@ class EmulatorSettings(Settings):
         """Return the settings of a cart with `hardware`.
 
         Numbers of the cart that are still those of the default cart become those of one that differs from
-        `hardware` as the default cart differs from ip02.
+        `hardware` as the default cart differs from ip02. Raises ConfigError if they have another rig already.
         """
         nominal = nominal_hardware()
         if self.hardware == hardware or (self.hardware is None and hardware == nominal):
             return self
+        if self.hardware is not None:
+            raise ConfigError("emulator.hardware: it differs from the rig of cart=; leave it out, give cart=")
         mass = hardware.moving_mass / nominal.moving_mass
         friction = hardware.moving_friction / nominal.moving_friction
         force = nominal.motor_per_newton / hardware.motor_per_newton  # a motor value

@@ -198,7 +198,7 @@ def recording(
     counts: np.ndarray, gaps: np.ndarray, motors: np.ndarray, ended_by: str, encoders: Encoders
 ) -> Episode:
     """Return an episode without a task, with scores of 0."""
-    positions = counts * np.array([encoders.metres, encoders.radians])
+    positions = counts * np.array(encoders.resolution)
     speeds = np.vstack((np.zeros((1, 2)), np.diff(positions, axis=0) / gaps[:, None]))
     nothing = np.zeros(len(motors))
     return Episode(

@@ -112,8 +112,8 @@ def fit_cart(
         measured = rollout(table, motion.flatten(1), every, models, period, substeps, extra_latency)
         return measured.unflatten(2, (windows.number, variants))
 
-    sizes_before = COARSE if sizes is None else torch.from_numpy(sizes)
-    scale = torch.maximum(sizes_before, finest_scale(windows.resolution))
+    rough = COARSE if sizes is None else torch.from_numpy(sizes)
+    scale = torch.maximum(rough, finest_scale(windows.resolution))
     problem = Matching(simulate, positions, scale, guess, (low, high), on_step)
     if near is None:
         screened = [problem.minimize(start, guess, SCREENING) for start in starting_points(unknowns)]

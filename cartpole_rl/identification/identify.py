@@ -257,10 +257,9 @@ def warnings(fit: Fit, encoders: Encoders) -> list[str]:
             )
         if left > UNINFORMED and np.isfinite(unknown.prior.unusual):
             found.append(f"the recordings hardly show {unknown.name}: its prior value is kept")
-    count = encoders.metres, encoders.radians
     texts = f"{1e3 * fit.rms[0]:.2g} mm", f"{np.degrees(fit.rms[1]):.2g} deg"
     for name, rms, size, correlation, text in zip(
-        ("cart", "pole"), fit.rms, count, fit.correlation, texts, strict=True
+        ("cart", "pole"), fit.rms, encoders.resolution, fit.correlation, texts, strict=True
     ):
         if rms > ROUNDING * size and correlation > CORRELATED:
             found.append(

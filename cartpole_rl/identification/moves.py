@@ -65,7 +65,7 @@ class Task(NamedTuple):
     @classmethod
     def of(cls, period: float, random: np.random.Generator, hardware: Hardware) -> "Task":
         """Return the conditions before the cart is known."""
-        return cls(period, random, min(LARGEST_MOTOR, round(BREAKAWAY * just_moves(hardware))), hardware)
+        return cls(period, random, min(LARGEST_MOTOR, round(BREAKAWAY * hardware.breakaway_motor)), hardware)
 
     @property
     def track_end(self) -> float:
@@ -87,7 +87,7 @@ class Task(NamedTuple):
 
     def least(self, of_ip02: int) -> int:
         """Return a motor value about the one that just moves the cart, as `of_ip02` is for ip02."""
-        return max(1, round(of_ip02 * just_moves(self.hardware) / just_moves(nominal_hardware())))
+        return max(1, round(of_ip02 * self.hardware.breakaway_motor / nominal_hardware().breakaway_motor))
 
     def moving(self, more: int) -> int:
         """Return a motor value that moves the cart, by `more` than needed; `more` is that of ip02."""
@@ -146,11 +146,6 @@ def and_stop(moves: Moves, task: Task) -> Moves:
     return breakaway
 
 
-def just_moves(hardware: Hardware) -> float:
-    """Return the motor value that just moves a cart, by the rough numbers of its file."""
-    return hardware.motor_offset + hardware.motor_per_newton * hardware.moving_friction
-
-
 def strength(hardware: Hardware) -> float:
     """Return the acceleration of a cart by a motor value of 1 beyond the one that just moves it, m/s^2."""
     return 1 / (hardware.motor_per_newton * hardware.moving_mass)
@@ -172,10 +167,10 @@ def experiment_guard(period: float, hardware: Hardware) -> TrackGuard:
     runs_on = period + RESPONSE
     gains = runs_on + period / 2
     full, of_ip02 = (
-        strength(each) * (LARGEST_MOTOR - just_moves(each)) for each in (hardware, nominal_hardware())
+        strength(each) * (LARGEST_MOTOR - each.breakaway_motor) for each in (hardware, nominal_hardware())
     )
     gain = ACCELERATION * full / of_ip02
-    brake = strength(hardware) * (BRAKE - 2 * hardware.motor_offset + just_moves(hardware))
+    brake = strength(hardware) * (BRAKE - 2 * hardware.motor_offset + hardware.breakaway_motor)
     if brake <= 0:
         raise ConfigError(
             f"cart.motor_offset={hardware.motor_offset:g}: experiments brake with a motor value of {BRAKE}, "

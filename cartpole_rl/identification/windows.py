@@ -164,7 +164,7 @@ def _pieces(
     last_known = np.append(late, end)  # rows after which the motion is not known
     motors = np.concatenate((np.zeros(history), episode.motor.astype(np.float64), np.zeros(length)))
     every = episode.positions
-    resolution = np.array([episode.encoders.metres, episode.encoders.radians])
+    resolution = np.array(episode.encoders.resolution)
     for first in range(0, end - least + 1, step):
         known = last_known[np.searchsorted(last_known, max(0, first - history))] - first
         if known >= least:

@@ -31,6 +31,11 @@ class Encoders(NamedTuple):
         return 2 * math.pi / self.turn
 
     @property
+    def resolution(self) -> tuple[float, float]:
+        """Cart (m) and pole (rad) a count."""
+        return self.metres, self.radians
+
+    @property
     def text(self) -> str:
         """The scales for a message."""
         return f"{1e9 * self.metres:.0f} nm and 1/{self.turn} turn a count"
@@ -95,6 +100,11 @@ class Hardware(Settings):
         return self.track_span / 2
 
     @property
+    def breakaway_motor(self) -> float:
+        """The motor value that just moves the cart, by `moving_friction`."""
+        return self.motor_offset + self.motor_per_newton * self.moving_friction
+
+    @property
     def gentle_motor(self) -> int:
         """The motor value of `gentle_force`."""
         return int(self.motor_offset + self.motor_per_newton * self.gentle_force)
@@ -156,7 +166,3 @@ def check_of_ip02(hardware: Hardware, what: str) -> None:
 # of ip02, for recordings and pictures of one scale
 CART_METRES_PER_COUNT, POLE_COUNTS_PER_TURN = nominal_encoders()
 POLE_RADIANS_PER_COUNT = nominal_encoders().radians
-CART_NANOMETRES_PER_COUNT = nominal_hardware().cart_nanometres_per_count
-SPAN = nominal_hardware().track_span
-HALF_SPAN = nominal_hardware().half_span
-cart_counts, pole_counts = nominal_encoders().cart_counts, nominal_encoders().pole_counts

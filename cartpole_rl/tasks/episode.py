@@ -67,7 +67,7 @@ class Episode:
     @property
     def positions(self) -> Array:
         """Return cart and pole as the encoders measured them, [T+1, 2], m and rad."""
-        return self.counts * np.array([self.encoders.metres, self.encoders.radians])
+        return self.counts * np.array(self.encoders.resolution)
 
     @property
     def measured_steps(self) -> int:

@@ -41,8 +41,8 @@ def export(config: ExportConfig, folder: Path, words: Sequence[str] = ()) -> Non
 
 def write_rig(config: ExportConfig, folder: Path, words: Sequence[str]) -> None:
     """Write cart_rig.h. Raises ConfigError for a folder that already holds a run."""
-    cart = [word.removeprefix("cart=") for word in words if word.startswith("cart=")]
-    header = rig_header(hardware_of(config.cart or {}), " ".join(cart) or "ip02")
+    given = " ".join(word for word in words if word.startswith(("cart=", "cart.")))
+    header = rig_header(hardware_of(config.cart or {}), given.removeprefix("cart=") or "ip02")
     write_config(folder, "export", {**config.model_dump(mode="json"), "seed": None})
     write_text(folder / RIG_HEADER, header)
     print(f"{folder}/{RIG_HEADER} is written; build the firmware with RIG={(folder / RIG_HEADER).resolve()}")

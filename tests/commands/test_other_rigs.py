@@ -57,6 +57,11 @@ def test_its_firmware_has_its_numbers(folder: Path) -> None:
     assert "of cart=lab.yaml." in header
     assert "#define CART_NANOMETRES 40000 " in header
     assert "#define CART_POLE_COUNTS 2400 " in header
+    words = ("format=firmware", "cart=lab.yaml", "cart.track_span=0.5", "hydra.run.dir=longer")
+    assert in_process("export", *words, folder=folder).code == 0
+    header = (folder / "longer" / "cart_rig.h").read_text()
+    assert "of cart=lab.yaml cart.track_span=0.5." in header
+    assert "#define CART_SPAN_UM 500000 " in header
 
 
 def test_it_is_identified_and_its_recordings_are_its_own(folder: Path) -> None:

@@ -13,6 +13,7 @@ from driven_cart import COARSE, Driven
 from firmwares import needs_compiler
 
 from cartpole_rl.emulator.settings import EmulatorSettings
+from cartpole_rl.errors import ConfigError
 from cartpole_rl.rig.hardware import Hardware, hardware_of, nominal_hardware
 from cartpole_rl.wire import Fault, Flags, State
 
@@ -126,3 +127,10 @@ def test_a_rig_survives_json_and_leaves_a_chosen_track() -> None:
     assert cart.track_half_length == 0.21
     assert EmulatorSettings.model_validate_json(cart.model_dump_json()) == cart
     assert EmulatorSettings().with_hardware(nominal_hardware()).track_half_length == DEFAULT.track_half_length
+
+
+def test_another_rig_than_the_given_one_is_refused() -> None:
+    cart = EmulatorSettings(hardware=hardware_of({"track_span": 0.5}))
+    assert cart.with_hardware(hardware_of({"track_span": 0.5})) is cart
+    with pytest.raises(ConfigError, match=r"^emulator\.hardware: it differs from the rig of cart=; leave it"):
+        cart.with_hardware(nominal_hardware())

@@ -151,8 +151,7 @@ def gentle_motor(hardware: Hardware) -> int:
 
 def nominal_deadband(hardware: Hardware) -> dict[int, float]:
     """Return the motor values that just move the cart by its file, to the RIGHT and to the LEFT."""
-    just_moves = hardware.motor_offset + hardware.motor_per_newton * hardware.moving_friction
-    return dict.fromkeys((RIGHT, LEFT), just_moves)
+    return dict.fromkeys((RIGHT, LEFT), hardware.breakaway_motor)
 
 
 def spread(counts: list[int]) -> int:
