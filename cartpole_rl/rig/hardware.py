@@ -53,7 +53,7 @@ class Hardware(Settings):
     """The numbers of a rig that no simulated cart varies. The cart's INFO reports the first five."""
 
     cart_nanometres_per_count: Annotated[int, Field(ge=1_000, le=1_000_000)]  # nm
-    pole_counts_per_turn: Annotated[int, Field(ge=200, le=1_000_000)]
+    pole_counts_per_turn: Annotated[int, Field(ge=200, le=65_535)]  # 16 bits of INFO
     track_span: Annotated[float, Field(ge=0.15, le=10)]  # m, from stop to stop
     soft_limit: Annotated[float, Field(ge=0.003, le=1)]  # m inside a stop: outward motor values give 0
     hard_limit: Annotated[float, Field(ge=0.001, le=1)]  # m inside a stop: the cart is faulted
