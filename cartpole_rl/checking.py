@@ -13,7 +13,7 @@ from cartpole_rl.settings import Settings
 
 # the tags of unions, which pydantic adds to a key
 TAGS = re.compile(
-    r"(?<=^plant\.)(simulated|emulated|serial|learned)\.|(?<=^learner\.)(local|ray)\.|(?<=^randomization\.)(ranges|identified)\."
+    r"(?<=^plant\.)(simulated|emulated|serial|text|driver|learned)\.|(?<=^learner\.)(local|ray)\.|(?<=^randomization\.)(ranges|identified)\."
 )
 NEAR = 0.8  # similarity of two names, 0 to 1, from which one is suggested for the other
 NEAR_VALUE = 0.6  # similarity from which a value is suggested

@@ -17,7 +17,10 @@ WHOLE = ("experiment", "sweep")  # groups without settings of their own: they ch
 OF_CLASSES = {  # choices that are the defaults of a settings class
     "emulator/medium": "cartpole_rl.emulator.settings:EmulatorSettings",
     "plant//serial_defaults@_here_": "cartpole_rl.plants.settings:SerialSettings",
+    "plant//text_defaults@_here_": "cartpole_rl.plants.settings:TextSettings",
+    "plant//driver_defaults@_here_": "cartpole_rl.plants.settings:DriverSettings",
 }
+PORT_KINDS = ("serial", "text", "driver")  # the plants whose defaults are those of a class
 OWN_FILES = (".yaml", ".yml")
 REPLACES = "override /"
 

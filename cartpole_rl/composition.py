@@ -39,6 +39,7 @@ from cartpole_rl.checking import (
 )
 from cartpole_rl.choices import (
     OF_CLASSES,
+    PORT_KINDS,
     REPLACES,
     WHOLE,
     Choice,
@@ -423,8 +424,8 @@ def _with_defaults(group: str, values: dict[str, Any]) -> dict[str, Any]:
     """Return the values of a choice with the defaults of its settings class: all can be overridden."""
     if group == "emulator":
         return merged(_class_defaults("emulator/medium"), values)
-    if group == "plant" and values.get("kind") == "serial":
-        return merged(_class_defaults("plant//serial_defaults@_here_"), values)
+    if group == "plant" and values.get("kind") in PORT_KINDS:
+        return merged(_class_defaults(f"plant//{values['kind']}_defaults@_here_"), values)
     return values
 
 
@@ -433,7 +434,8 @@ def _class_defaults(name: str) -> dict[str, Any]:
     module, _, attribute = OF_CLASSES[name].partition(":")
     settings = getattr(import_module(module), attribute)
     required = {field: "???" for field, info in settings.model_fields.items() if info.is_required()}
-    defaults: dict[str, Any] = settings(**required).model_dump(mode="json")
+    unchecked = settings.model_construct(**required)
+    defaults: dict[str, Any] = unchecked.model_dump(mode="json", warnings=False)
     return defaults
 
 
@@ -549,6 +551,7 @@ def known_settings(command: str, words: Sequence[str]) -> set[str]:
 
 
 OmegaConf.register_new_resolver("constant_settings", list)  # of a command; Hydra 1.3 asks for it always
-# conf/emulator/ and conf/plant/serial.yaml extend these
+# conf/emulator/, conf/plant/serial.yaml, text.yaml and driver.yaml extend these
 ConfigStore.instance().store("medium", _class_defaults("emulator/medium"), "emulator")
-ConfigStore.instance().store("serial_defaults", _class_defaults("plant//serial_defaults@_here_"))
+for _kind in PORT_KINDS:
+    ConfigStore.instance().store(f"{_kind}_defaults", _class_defaults(f"plant//{_kind}_defaults@_here_"))

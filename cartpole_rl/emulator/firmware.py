@@ -14,6 +14,7 @@ from cartpole_rl.emulator.guards import (
     FASTEST_CART,
     FASTEST_POLE,
     LEVER,
+    SAMPLES,
     FrozenCartWatch,
     FrozenPoleWatch,
     JumpWatch,
@@ -115,10 +116,11 @@ class Firmware:
         zero_error: int = 0,
         lever_um: int = LEVER,
         hardware: Hardware | None = None,
+        samples: int = SAMPLES,
     ) -> None:
         """`delay_us` returns a command's latency; homing sets the pole's zero `zero_error` counts too low.
 
-        `lever_um` is that of `TrackLimits`; `hardware` is ip02's if it is None.
+        `lever_um` and `samples` are those of `TrackLimits`; `hardware` is ip02's if it is None.
         """
         self._hardware = hardware = hardware or nominal_hardware()
         self.period_us = PERIOD_US
@@ -130,7 +132,7 @@ class Firmware:
         self._delay_us = delay_us
         self._zero_error = zero_error
         self._line = MotorLine()
-        self._limits = TrackLimits(hardware, lever_um)
+        self._limits = TrackLimits(hardware, lever_um, samples)
         self._limited = False  # the limits have changed the motor value since the newest tick
         self._homing: Generator[int, Reading, Zeros] | None = None
         half_span = nearest_count(micrometres(hardware.track_span) // 2, hardware)
@@ -225,7 +227,7 @@ class Firmware:
             angle = pole - self._pole_zero
             if self.armed and self._limits.lost(now_us, self.motor):
                 self._latch(Fault.CART_ENCODER)
-                self._limits.brake_blindly(now_us)
+                self._brake_blindly(now_us)
             self._limits.apply(now_us, cart - zeros.middle, angle, zeros.half_span, self.armed)
         self._limited |= self.motor != self._line.requested
 
@@ -294,7 +296,7 @@ class Firmware:
                 self.armed, self._homing = False, None
                 self._line.stop(now_us)
             case Home():
-                self.homed, self._homing = False, Homing(self._hardware).home()
+                self.homed, self._homing = False, self._home()
                 next(self._homing)
                 self._line.hold(0)
                 self._limits.release()
@@ -303,6 +305,13 @@ class Firmware:
                 self.fault = self._reported = Fault.NONE
             case SetPeriod(period_us):
                 self.period_us = period_us
+
+    def _brake_blindly(self, now_us: int) -> None:
+        self._limits.brake_blindly(now_us)
+
+    def _home(self) -> Generator[int, Reading, Zeros]:
+        """Return the procedure that finds the zeros."""
+        return Homing(self._hardware).home()
 
     def _step_homing(self, homing: Generator[int, Reading, Zeros], reading: Reading) -> None:
         """Let homing choose the motor value, or end it with its zeros or a fault."""
@@ -374,7 +383,7 @@ class Firmware:
             self.motor,
             self._last_sequence,
             self.fault,
-            min(age, NO_AGE),
+            max(0, min(age, NO_AGE)),  # a board that was read late may have measured before the command
         )
 
     def _flags(self) -> Flags:

@@ -164,8 +164,11 @@ FASTEST_LOST = 2_500_000  # um/s; a higher estimate comes from a count that jump
 class TrackLimits:
     """The limits of one cart. `blocked` and `brake` are directions: 1 right, -1 left, 0 none."""
 
-    def __init__(self, hardware: Hardware, lever: int = LEVER) -> None:
-        """`lever` is m_p l / (m_c + m_p) in um, with l from the pivot to the pole's centre of mass."""
+    def __init__(self, hardware: Hardware, lever: int = LEVER, samples: int = SAMPLES) -> None:
+        """`lever` is m_p l / (m_c + m_p) in um, with l from the pivot to the pole's centre of mass.
+
+        The speed is that over so many `samples`: few where they are far apart.
+        """
         self.soft = nearest_count(micrometres(hardware.soft_limit), hardware)  # counts inside a stop
         self.hard = nearest_count(micrometres(hardware.hard_limit), hardware)  # counts inside a stop
         self._nanometres = hardware.cart_nanometres_per_count
@@ -177,9 +180,9 @@ class TrackLimits:
         self.blocked = 0  # direction in which motor values are held at 0
         self.brake = 0  # direction of the full motor value that brakes the cart
         self._lever = lever
-        self._us: deque[int] = deque(maxlen=SAMPLES)
-        self._carts: deque[int] = deque(maxlen=SAMPLES)
-        self._poles: deque[int] = deque(maxlen=SAMPLES)
+        self._us: deque[int] = deque(maxlen=samples)
+        self._carts: deque[int] = deque(maxlen=samples)
+        self._poles: deque[int] = deque(maxlen=samples)
         self._until_us = 0  # the brake acts until then
         self._blind_us = 0  # the brake of a lost cart acts until then
         self._count: int | None = None  # of the cart, since which its motion is estimated

@@ -1,4 +1,4 @@
-"""Settings of the plants: plant=simulated, learned, emulated and serial.
+"""Settings of the plants: plant=simulated, learned, emulated, serial, text and driver.
 
 Everything that the commands ask about a plant is an attribute or a method of its settings.
 """
@@ -6,18 +6,20 @@ Everything that the commands ask about a plant is an attribute or a method of it
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import Field, field_validator
+from pydantic import Field, TypeAdapter, field_validator, model_validator
 
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import CheckpointError
 from cartpole_rl.physics.laws import Law
 from cartpole_rl.physics.models import INTEGRATORS
+from cartpole_rl.plants.drivers.driver import DRIVERS
 from cartpole_rl.randomization.poles import Pole, PoleSettings, one_pole, pole_of_length
 from cartpole_rl.registry import Extension
+from cartpole_rl.rig.hardware import Hardware
 from cartpole_rl.run_folder import check_program
-from cartpole_rl.settings import Fraction, Settings
+from cartpole_rl.settings import Finite, Fraction, Positive, Settings
 from cartpole_rl.terminal import as_word
 
 # Homing: after connecting and after faults, and re-centring between other episodes; or before each episode.
@@ -175,7 +177,7 @@ class EmulatedSettings(PlantSettings):
         return one_pole(emulated_pole(emulator))
 
     @contextmanager
-    def reachable(self, emulator: EmulatorSettings) -> "Iterator[SerialSettings]":
+    def reachable(self, emulator: EmulatorSettings, hardware: Hardware) -> "Iterator[SerialSettings]":
         """Start a cart whose pole hangs, and yield the settings to reach it. Raises EmulatorError."""
         from cartpole_rl.plants.emulated import EmulatedCart  # which imports this module
 
@@ -188,17 +190,15 @@ def emulated_pole(emulator: EmulatorSettings) -> Pole:
     return Pole(**emulator.model_dump(include=set(Pole.model_fields)))
 
 
-class SerialSettings(PlantSettings):
-    """Settings of a real cart, `plant=serial`. Times in s.
+class RealCartSettings(PlantSettings):
+    """A cart at a port of this computer. Times in s.
 
     Each timeout is an upper limit; a working cart answers sooner.
     """
 
-    place = "cartpole_rl.plants.serial.plant:real_cart"
     is_on_port = True
     can_be_damaged: ClassVar = True
     ignored = OF_SIMULATION
-    kind: Literal["serial"] = "serial"
     port: Annotated[str, Field(min_length=1)]  # /dev/ttyUSB0, COM3, a URL of pyserial, or auto: the only cart
     baud: Annotated[int, Field(ge=1, le=12_000_000)] = 921600  # 115200 is allowed too
     pole_length: Annotated[float, Field(gt=0, le=3)] | None = None  # m, twice pivot to centre of mass
@@ -206,8 +206,6 @@ class SerialSettings(PlantSettings):
     # others; without a terminal the command ends and says what to check.
     clear_faults: Annotated[int, Field(ge=0)] = 0
     rehome: Rehome = "once"
-    # onboard: cartpole-evaluate also lets the policy on the board drive, which is the agent of run=.
-    policy: Literal["onboard"] | None = None
 
     # Without a state for so long, the link is lost. So it is when this computer does not answer a state for
     # so long, or for 1 s if the timeout is larger.
@@ -234,18 +232,9 @@ class SerialSettings(PlantSettings):
         """The name of the cart in a heading."""
         return f"cart on {self.port}"
 
-    @property
-    def has_compiled_agent(self) -> bool:
-        """True if the board drives: what was compiled for it cannot be changed."""
-        return self.policy is not None
-
     def is_real_time(self, emulator: EmulatorSettings) -> bool:
         """Return True: a real cart does not wait for this computer."""
         return True
-
-    def policy_key(self, emulator: EmulatorSettings) -> str:
-        """Return the setting that lets the policy on the board drive; empty if it does not."""
-        return "" if self.policy is None else f"plant.policy={self.policy}"
 
     def known_pole_length(self, emulator: EmulatorSettings) -> float | None:
         """Return the stated length of the pole, m; None if it is not stated."""
@@ -255,11 +244,138 @@ class SerialSettings(PlantSettings):
         """Return a pole of the stated length; None if it is not stated."""
         return pole_of_length(self.pole_length, trained) if self.pole_length else None
 
+
+class SerialSettings(RealCartSettings):
+    """Settings of a real cart with our firmware, `plant=serial`."""
+
+    place = "cartpole_rl.plants.serial.plant:real_cart"
+    kind: Literal["serial"] = "serial"
+    # onboard: cartpole-evaluate also lets the policy on the board drive, which is the agent of run=.
+    policy: Literal["onboard"] | None = None
+
+    @property
+    def has_compiled_agent(self) -> bool:
+        """True if the board drives: what was compiled for it cannot be changed."""
+        return self.policy is not None
+
+    def policy_key(self, emulator: EmulatorSettings) -> str:
+        """Return the setting that lets the policy on the board drive; empty if it does not."""
+        return "" if self.policy is None else f"plant.policy={self.policy}"
+
     @contextmanager
-    def reachable(self, emulator: EmulatorSettings) -> "Iterator[SerialSettings]":
+    def reachable(self, emulator: EmulatorSettings, hardware: Hardware) -> "Iterator[SerialSettings]":
         """Yield these settings."""
         yield self
 
 
+class BoardSettings(RealCartSettings):
+    """A cart with firmware of its own, for which this computer stands in for ours (docs/my-cart.md)."""
+
+    place = "cartpole_rl.plants.serial.plant:bridged_cart"
+    driver: Annotated[Extension, DRIVERS]
+    # hand: a person puts the cart in the middle; board: its own homing; stops: this computer finds the stops.
+    homing: Literal["hand", "board", "stops"] = "hand"
+    home_position: Finite = 0.0  # m right of the middle, where the board's own homing leaves the cart
+    # What the board takes: a motor value (PWM, V, ...), the cart's speed (m/s), or its acceleration (m/s^2).
+    sends: Literal["value", "speed", "acceleration"] = "value"
+    full: Finite  # what is sent at motor value 255 (speed: the acceleration, m/s^2); negative: reversed motor
+    damping: Annotated[float, Field(ge=0, le=20)] = 0.0  # 1/s: slows a cart that its board does not slow down
+    fastest: Positive = 1.0  # m/s, the largest speed that is sent
+    cart_reversed: bool = False  # the cart's counts grow to the left
+    pole_reversed: bool = False  # the pole's counts grow to the left
+    watchdog: bool = False  # the board stops its motor by itself when no command comes
+
+    @model_validator(mode="after")
+    def _full_moves_the_cart(self) -> Self:
+        if not self.full:
+            raise ValueError("full is 0: give what the board takes at motor value 255")
+        if self.damping and self.sends == "value":
+            raise ValueError("damping is for sends=speed and sends=acceleration; leave it out")
+        return self
+
+    @property
+    def lacks(self) -> list[str]:
+        """What protects our carts and not this one, a line each."""
+        every = "this computer stands in for the limits, the brake and the watchdog, once a measurement"
+        alone = "if this computer or the cable fails, nothing stops a moving cart: keep a switch at hand"
+        return [every, *([] if self.watchdog else [alone])]
+
+    def over(self, port: str) -> SerialSettings:
+        """Return the settings of the cart that a bridge on `port` stands for."""
+        shared = set(RealCartSettings.model_fields) - {"kind", "port", "baud"}
+        return SerialSettings(**self.model_dump(include=shared), port=port)
+
+    @contextmanager
+    def reachable(self, emulator: EmulatorSettings, hardware: Hardware) -> "Iterator[SerialSettings]":
+        """Start a bridge, and yield the settings to reach it. Raises LinkError, PortError, ConfigError."""
+        from cartpole_rl.plants.emulated import BridgeProcess  # which imports this module
+
+        with BridgeProcess(self, hardware, None) as bridge:
+            yield self.over(bridge.port)
+
+
+Column = Literal["time", "cart", "pole", "-"]
+
+
+class TextSettings(BoardSettings):
+    """plant=text: a board that sends and takes lines of text."""
+
+    kind: Literal["text"]
+    driver: Annotated[Extension, DRIVERS] = DRIVERS.find("text")
+    baud: Annotated[int, Field(ge=1, le=12_000_000)] = 115200
+    columns: tuple[Column, ...] = ("time", "cart", "pole")  # of a line of the board; - is not read
+    separator: Annotated[str, Field(min_length=1)] = ","
+    time_unit: Literal["us", "ms", "s"] = "us"
+    cart_unit: Literal["counts", "mm", "m"] = "counts"
+    pole_unit: Literal["counts", "deg", "rad"] = "counts"
+    line: str = "{:.0f}"  # of this computer, with the command in place of {}: a={:.3f}
+    stop_line: str | None = None  # otherwise the command 0
+    home_line: str | None = None  # starts the board's own homing
+
+    @field_validator("columns")
+    @classmethod
+    def _cart_and_pole_are_read(cls, columns: tuple[Column, ...]) -> tuple[Column, ...]:
+        for name in ("cart", "pole"):
+            if columns.count(name) != 1:
+                raise ValueError(f"name the column {name} once, as in [time, cart, pole]")
+        if columns.count("time") > 1:
+            raise ValueError("name the column time once at most")
+        return columns
+
+    @field_validator("line")
+    @classmethod
+    def _line_takes_a_number(cls, line: str) -> str:
+        try:
+            written = line.format(-1.5), line.format(1.5)
+        except (ValueError, IndexError, KeyError) as error:
+            raise ValueError(f"{error}; write it with one number, as in a={{:.3f}}") from None
+        if written[0] == written[1] or not written[0].isascii() or not written[0].isprintable():
+            raise ValueError("it must be one line with the command in place of {}, as in a={:.3f}")
+        return line
+
+    @model_validator(mode="after")
+    def _board_homes_by_a_line(self) -> Self:
+        if self.homing == "board" and self.home_line is None:
+            raise ValueError("homing=board needs home_line, the line that starts the board's own homing")
+        return self
+
+    @property
+    def lacks(self) -> list[str]:
+        """What protects our carts and not this one, a line each."""
+        lines = "a damaged line that still reads as numbers is only noticed if they jump"
+        clock = "without a column time, lines that waited in a buffer are taken for new ones"
+        return [*super().lacks, lines, *([] if "time" in self.columns else [clock])]
+
+
+class DriverSettings(BoardSettings):
+    """plant=driver: a class of one's own that reads and commands a board."""
+
+    kind: Literal["driver"]
+    options: Annotated[dict[str, Any], Field(default_factory=dict)]  # for the class
+
+
+BOARDS: TypeAdapter[BoardSettings] = TypeAdapter(
+    Annotated[TextSettings | DriverSettings, Field(discriminator="kind")]
+)
 SimulationSettings = SimulatedSettings | LearnedSettings
-PortSettings = EmulatedSettings | SerialSettings
+PortSettings = EmulatedSettings | SerialSettings | TextSettings | DriverSettings

@@ -6,7 +6,8 @@ from contextlib import closing, contextmanager
 from cartpole_rl.errors import PlantError
 from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.preflight import Finding, preflight
-from cartpole_rl.plants.serial.preparation import FaultClearing, always
+from cartpole_rl.plants.serial.preparation import FaultClearing, always, asking
+from cartpole_rl.plants.settings import BoardSettings
 from cartpole_rl.randomization.poles import Pole, one_pole
 from cartpole_rl.rig.hardware import nominal_hardware
 from cartpole_rl.terminal import confirm
@@ -57,6 +58,10 @@ def mounted_pole(config: PreflightConfig) -> str:
 @contextmanager
 def connected_cart(config: PreflightConfig) -> Iterator[SerialCart]:
     """Yield the cart, not open yet; disarm and close it at the end, and stop an emulated one."""
-    emulator = config.emulator.with_hardware(config.hardware)
-    with config.plant.reachable(emulator) as settings, closing(SerialCart(settings, config.hardware)) as cart:
+    plant, hardware = config.plant, config.hardware
+    asked = asking(plant, confirm) if isinstance(plant, BoardSettings) else lambda: None
+    with (
+        plant.reachable(config.emulator.with_hardware(hardware), hardware) as settings,
+        closing(SerialCart(settings, hardware, asked)) as cart,
+    ):
         yield cart

@@ -92,7 +92,10 @@ def test_the_baseline_has_nothing_to_train_further(command: str, tmp_path: Path)
 def test_a_plant_file_without_a_kind(tmp_path: Path) -> None:
     (tmp_path / "mine.yaml").write_text("")
     done = in_process("finetune", "run=run", "plant=mine.yaml", folder=tmp_path)
-    assert done.complaint == "cartpole-finetune: plant: kind is missing; give plant=emulated, serial"
+    assert (
+        done.complaint
+        == "cartpole-finetune: plant: kind is missing; give plant=emulated, serial, text, driver"
+    )
     assert done.code == 2
 
 
@@ -138,7 +141,12 @@ WRONG_EVALUATION = [
     ("run=run plant=emulated emulator.latencyy=1", "emulator.latencyy", "did you mean emulator.latency?", 2),
     ("run=run plant=emulated task=swingup task.evaluation_start.angle=any", "angle=any", "hanging", 2),
     ("run=run emulator.latency=0.01", "emulator", "give plant=emulated", 2),
-    ("run=run plant.port=/dev/ttyUSB0", "plant.port belongs to plant=serial", "give plant=serial", 2),
+    (
+        "run=run plant.port=/dev/ttyUSB0",
+        "plant.port belongs to plant=driver, serial or text",
+        "give one of them",
+        2,
+    ),
     ("run=run plant=serial", "plant.port is missing", "give plant.port=/dev/ttyUSB0", 2),
     ("run=run plant=serial plant.prot=/dev/ttyUSB0", "plant.prot", "did you mean plant.port?", 2),
     ("run=run plant=serial plant.port=nowhere", "nowhere does not exist", "plug the cart in", 1),

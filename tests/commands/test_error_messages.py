@@ -61,9 +61,9 @@ def test_a_setting_of_each_group_without_a_choice_gets_one_line(command: str) ->
 @pytest.mark.parametrize(
     ("command", "key", "complaint"),
     [
-        ("evaluate", "plant.port", "plant.port belongs to plant=serial: give plant=serial"),
-        ("evaluate", "plant.baud", "plant.baud belongs to plant=serial: give plant=serial"),
-        ("identify", "plant.port", "plant.port belongs to plant=serial: give plant=serial"),
+        ("evaluate", "plant.port", "plant.port belongs to plant=driver, serial or text: give one of them"),
+        ("evaluate", "plant.baud", "plant.baud belongs to plant=driver, serial or text: give one of them"),
+        ("identify", "plant.port", "plant.port belongs to plant=driver, serial or text: give one of them"),
         ("finetune", "learner.address", "learner.address belongs to learner=ray: give learner=ray"),
         ("train", "pole.lengths", "pole.lengths belongs to pole=range: give pole=range"),
         ("preflight", "plant.rehomes", "plant.rehomes: there is no such setting; did you mean plant.rehome?"),

@@ -64,9 +64,15 @@ class SerialCart:
     Every method raises LinkError when the cart no longer answers.
     """
 
-    def __init__(self, settings: SerialSettings, hardware: Hardware | None = None) -> None:
-        """`hardware` is that of the cart's file, ip02's if it is not given."""
+    def __init__(
+        self,
+        settings: SerialSettings,
+        hardware: Hardware | None = None,
+        before_homing: Callable[[], None] = lambda: None,
+    ) -> None:
+        """`hardware` is that of the cart's file, ip02's if it is None. `before_homing` may ask a person."""
         self.settings, self.hardware = settings, hardware or nominal_hardware()
+        self._before_homing = before_homing
         self.port = settings.port  # once opened, the one that "auto" was resolved to
         self._tracker = StateTracker()
         self._open_connection: Connection | None = None
@@ -219,7 +225,6 @@ class SerialCart:
             self._connection.request(SetPeriod(period_us), Info, lambda info: info.period_us == period_us)
         )
 
-    @waiting("homing: the cart moves by itself, usually for 15 to 40 s")
     def home(self, watch: Callable[[State], None] = lambda state: None) -> State:
         """Home, and wait until it is done: zeros set, the cart in the middle, the pole hanging still.
 
@@ -228,6 +233,11 @@ class SerialCart:
         Raises FaultError if homing fails, PlantError if it takes longer than `settings.home_timeout`,
         LinkError if the cart restarts meanwhile.
         """
+        self._before_homing()
+        with waiting("homing: the cart moves by itself, usually for 15 to 40 s"):
+            return self._homed(watch)
+
+    def _homed(self, watch: Callable[[State], None]) -> State:
         self._check_round_trip()
         before = self._tracker.last
         try:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import ConfigError, FaultError, LinkError, PlantError, PortError
-from cartpole_rl.plants.emulated import EmulatedCart
+from cartpole_rl.plants.emulated import BridgeProcess, EmulatedCart
 from cartpole_rl.plants.serial.cart import RESTARTED, SerialCart
 from cartpole_rl.plants.serial.errors import RefusedError, check_scales, fault_error
 from cartpole_rl.plants.serial.preparation import (
@@ -24,12 +24,13 @@ from cartpole_rl.plants.serial.preparation import (
     Preparation,
     StartPosition,
     always,
+    asking,
     nobody,
 )
 from cartpole_rl.plants.serial.statistics import LinkStatistics
-from cartpole_rl.plants.settings import EmulatedSettings, Rehome, SerialSettings
+from cartpole_rl.plants.settings import BoardSettings, EmulatedSettings, Rehome, SerialSettings
 from cartpole_rl.plants.specs import TERMINATING, TRUNCATING, Numbers, OneCartPlant, PlantOutput, on_tensors
-from cartpole_rl.rig.hardware import Hardware
+from cartpole_rl.rig.hardware import Hardware, nominal_hardware
 from cartpole_rl.tasks.episode import Ending
 from cartpole_rl.wire import Fault, Flags, State, seconds_between, ticks_between, went_back
 
@@ -40,6 +41,9 @@ class Owned(Protocol):
     @property
     def died(self) -> str:
         """The reason why it ended early; empty while it runs."""
+
+    def death(self) -> str:
+        """Return `died`, after a short wait."""
 
     def close(self) -> None:
         """End it."""
@@ -76,10 +80,11 @@ class SerialPlant(OneCartPlant):
         owned: Owned | None = None,
         confirm: Confirm = nobody,
         hardware: Hardware | None = None,
+        before_homing: Callable[[], None] = lambda: None,
     ) -> None:
         super().__init__(hardware)
         self.settings = settings
-        self.cart = SerialCart(settings, self.hardware)
+        self.cart = SerialCart(settings, self.hardware, before_homing)
         self.ended_by = ""
         self.last_error: PlantError | None = None
         self.on_board = False  # resets start the policy on the cart's board; `listen_one` passes periods
@@ -153,10 +158,15 @@ class SerialPlant(OneCartPlant):
     def reset_one(self) -> PlantOutput[Numbers]:
         """Prepare the cart, arm it, and return the first frame of an episode."""
         self._reach()
-        self._preparation.prepare()
-        if self.before_start is not None:
-            self.before_start()
-        self._state = self._armed()
+        try:
+            self._preparation.prepare()
+            if self.before_start is not None:
+                self.before_start()
+            self._state = self._armed()
+        except LinkError as error:
+            if why := self._why_lost():
+                raise LinkError(why) from error
+            raise
         self._turns = self._whole_turns()
         self._drove = 0
         self.ended_by = ""
@@ -250,6 +260,8 @@ class SerialPlant(OneCartPlant):
 
     def _break_off(self, error: PlantError) -> None:
         """End the episode without a new state: the last counts are kept, the motor counts as 0."""
+        if isinstance(error, LinkError) and self._owned is not None and self._owned.died:
+            error = LinkError(self._owned.died)
         self.ended_by = Ending.FAULT if isinstance(error, FaultError) else Ending.LINK
         self.last_error = error
         self._driving = False
@@ -290,8 +302,12 @@ class SerialPlant(OneCartPlant):
             self._connect()
         except (PortError, LinkError) as error:
             lost = f" ({self.last_error})" if self.last_error else ""
-            why = self._owned.died if self._owned is not None and self._owned.died else error
+            why = self._why_lost() or error
             raise LinkError(f"the link to the cart was lost{lost} and not restored: {why}") from error
+
+    def _why_lost(self) -> str:
+        """Return the reason why the process that serves the cart has ended; empty if it has not."""
+        return self._owned.death() if self._owned is not None else ""
 
     def _connect(self) -> None:
         """Open the port and check the cart's scales. Raises PortError, LinkError, NotReadyError."""
@@ -310,6 +326,33 @@ def real_cart(
 ) -> SerialPlant:
     """Return the plant of plant=serial. Raises PortError, LinkError, NotReadyError."""
     return SerialPlant(plant, start, control_period, prompt, confirm=confirm, hardware=hardware)
+
+
+def bridged_cart(
+    plant: BoardSettings,
+    emulator: EmulatorSettings,
+    control_period: float,
+    start: StartPosition,
+    prompt: Callable[[str], None],
+    confirm: Confirm = nobody,
+    hardware: Hardware | None = None,
+) -> SerialPlant:
+    """Return the plant of plant=text and plant=driver, on a bridge that lives as long as the plant.
+
+    Raises ConfigError if the board does not measure as often as the period needs, PortError, LinkError.
+    """
+    hardware = hardware or nominal_hardware()
+    bridge = BridgeProcess(plant, hardware, control_period)
+    return SerialPlant(
+        plant.over(bridge.port),
+        start,
+        control_period,
+        prompt,
+        bridge,
+        confirm,
+        hardware,
+        asking(plant, confirm),
+    )
 
 
 def emulated_cart(

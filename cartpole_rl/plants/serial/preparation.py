@@ -16,12 +16,14 @@ from cartpole_rl.plants.serial.cart import RESTARTED, SerialCart
 from cartpole_rl.plants.serial.errors import fault_words
 from cartpole_rl.plants.serial.link import now
 from cartpole_rl.plants.serial.moves import recentre
+from cartpole_rl.plants.settings import BoardSettings
 from cartpole_rl.wire import Flags, State, microseconds_between
 
 LOGGER = logging.getLogger(__name__)
 
 STILL_SECONDS = 0.3  # by the cart's clock, for which the pole has to stay
 
+BY_HAND = "put the cart in the middle of its track and let the pole hang still"
 StartPosition = Literal["hanging", "upright"]
 Confirm = Callable[[str], bool]  # shows a person the text; True if the person says that the cart may move
 
@@ -60,6 +62,25 @@ def nobody(text: str) -> bool:
 def always(text: str) -> bool:
     """Always confirm: for a cart that cannot be damaged."""
     return True
+
+
+def asking(board: BoardSettings, confirm: Confirm) -> Callable[[], None]:
+    """Return what is done before a board homes: say what it lacks, once, and ask for the cart by hand.
+
+    That raises PlantError if nobody confirms.
+    """
+    lacks = list(board.lacks)
+
+    def ask() -> None:
+        while lacks:
+            LOGGER.warning("plant=%s: %s", board.kind, lacks.pop(0))
+        if board.homing == "hand" and not confirm(BY_HAND):
+            raise PlantError(
+                f"plant.homing=hand: a person has to {BY_HAND} and confirm in a terminal; a board that homes "
+                "by itself needs plant.homing=board"
+            )
+
+    return ask
 
 
 class FaultClearing:

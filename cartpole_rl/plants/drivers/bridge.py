@@ -1,0 +1,446 @@
+"""The bridge: this computer stands in for our firmware on a board that has its own.
+
+The bridge reads the board by a driver, applies the rules of the firmware to each measurement (limits, brake,
+watchdog, faults, late commands: `cartpole_rl.emulator.firmware`), and speaks the protocol on a port that the
+commands open like that of any cart. It is a process of its own: if the command that drives is killed, the
+watchdog here still sets the motor to 0. Nothing stands in for the bridge itself, and it can act only as often
+as the board sends. docs/safety.md compares the two.
+
+    board  --lines-->  driver  -->  StandIn (rules)  --frames-->  SerialCart, in the command that drives
+"""
+
+import math
+import time
+from collections import deque
+from collections.abc import Generator
+from contextlib import suppress
+from dataclasses import replace
+from itertools import pairwise
+from statistics import median
+from threading import Lock, Thread
+
+from cartpole_rl.emulator.firmware import LARGEST_MOTOR, LONGEST_US, SHORTEST_US, Firmware
+from cartpole_rl.emulator.guards import FASTEST_CART, FASTEST_POLE
+from cartpole_rl.emulator.homing import Homing, HomingError, Reading, Window, Zeros, find_hanging
+from cartpole_rl.emulator.link import Channel
+from cartpole_rl.errors import CartPoleError, ConfigError, LinkError
+from cartpole_rl.plants.drivers.driver import Driver, Measurement
+from cartpole_rl.plants.settings import BoardSettings
+from cartpole_rl.rig.hardware import Hardware
+from cartpole_rl.wire.messages import Message, Reason, SetPeriod, State
+
+LISTENED = 25  # measurements by which a board's period is known
+PERIOD_TOLERANCE = 0.05  # share
+SAMPLES = 3  # measurements by which the limits know the speed
+LEAK = 0.01  # largest difference between the rates of the two clocks
+LATE_PERIODS = 1.5  # without a measurement, after which the rules look at the clock alone
+MOST_BAD = 50  # damaged measurements more than whole ones
+MOST_REFUSED = 5  # implausible measurements in a row that are taken for damage on the way
+STOPS = 3  # lines that stop a board; the first may be damaged
+STOPPING = 1.0  # s that a cart which does not stop at the value 0 is given to stop
+STANDS = 0.005  # m/s
+SETTLING = 0.1  # s: how fast such a cart is braked
+LONGEST_STEP = 0.2  # s without a command, for which the last one counts
+BOARD_RESTS_US, BOARD_STANDS = 1_500_000, 1e-3  # us without more motion than this, m: its homing has ended
+LONGEST_BOARD_HOMING = 60_000_000  # us
+
+
+class BoardClock:
+    """The board's clock in terms of this computer's, by the arrivals of its measurements.
+
+    A measurement can arrive late but never early: the earliest arrival tells by how much the clocks differ.
+    So one that waited in a buffer is known to be old.
+    """
+
+    def __init__(self) -> None:
+        self._ahead: float | None = None
+        self._last = 0  # stamp, us
+
+    def measured_us(self, stamp_us: int, arrived_us: int) -> int:
+        """Return when a measurement was made, us of this computer's clock, by its `stamp_us`."""
+        ahead = float(arrived_us - stamp_us)
+        if self._ahead is not None:
+            ahead = min(ahead, self._ahead + LEAK * max(0, stamp_us - self._last))
+        self._ahead, self._last = ahead, stamp_us
+        return round(stamp_us + ahead)
+
+
+class StandIn(Firmware):
+    """The firmware's rules for a board with its own firmware, whose measurements set the pace."""
+
+    def __init__(self, settings: BoardSettings, hardware: Hardware, board_us: int, driver: Driver) -> None:
+        """`board_us` is the time between two measurements."""
+        super().__init__(lambda: 0, hardware=hardware, samples=SAMPLES)
+        self._settings, self._driver, self._board_us = settings, driver, board_us
+        self.board_homes = False  # the board moves the cart by itself
+        self.every = math.ceil(SHORTEST_US / board_us)  # measurements a control period
+        self.period_us = self.every * board_us
+        self._stamp_us = 0
+
+    def check_period(self, period_us: int) -> int:
+        """Return the measurements in a control period. Raises ConfigError if they do not make one."""
+        every = max(1, round(period_us / self._board_us))
+        if abs(every * self._board_us / period_us - 1) > PERIOD_TOLERANCE:
+            periods = [n * self._board_us for n in (every, every + 1)]
+            fitting = " or ".join(f"{us / 1e6:.4g}" for us in periods if SHORTEST_US <= us <= LONGEST_US)
+            raise ConfigError(
+                f"control_period={period_us / 1e6:g}: the board measures every {self._board_us / 1e3:.3g} "
+                f"ms; give control_period={fitting}"
+            )
+        return every
+
+    def measure(self, now_us: int, measured_us: int, stamp_us: int, counts: tuple[int, int]) -> list[bytes]:
+        """End a period with a measurement of the board; return the frames to send."""
+        self._expire(now_us)
+        self._stamp_us = stamp_us
+        return self.tick(measured_us, *counts)
+
+    def wait(self, now_us: int) -> None:
+        """Apply the rules of the clock: no measurement comes."""
+        self._expire(now_us)
+
+    @property
+    def is_active(self) -> bool:
+        """True while the motor may be on."""
+        return self.armed or self.homing or self.motor != 0
+
+    def _objection(self, message: Message, now_us: int) -> Reason | None:
+        if isinstance(message, SetPeriod):
+            try:
+                self.check_period(message.period_us)
+            except (ConfigError, ZeroDivisionError):
+                return Reason.OUT_OF_RANGE
+        return super()._objection(message, now_us)
+
+    def _carry_out(self, message: Message, now_us: int) -> None:
+        super()._carry_out(message, now_us)
+        if isinstance(message, SetPeriod):
+            self.every = self.check_period(message.period_us)
+
+    def _state(self, cart: int, pole: int) -> State:
+        return replace(super()._state(cart, pole), time_us=self._stamp_us % 2**32)
+
+    def _brake_blindly(self, now_us: int) -> None:
+        """Leave it to `MotorCommands`, which knows the speed of a cart that it gave one."""
+        if self._settings.sends == "value":
+            super()._brake_blindly(now_us)
+
+    def _home(self) -> Generator[int, Reading, Zeros]:
+        homing = Homing(self._hardware)
+        if self._settings.homing == "stops":
+            return homing.home()
+        return (
+            self._homed_by_board(homing) if self._settings.homing == "board" else self._homed_by_hand(homing)
+        )
+
+    def _homed_by_hand(self, homing: Homing) -> Generator[int, Reading, Zeros]:
+        """Wait until the pole hangs still. A person has put the cart in the middle."""
+        hanging = yield from homing.wait_until_still((yield 0))
+        reading = yield 0
+        return self._zeros_about(reading.cart, hanging)
+
+    def _homed_by_board(self, homing: Homing) -> Generator[int, Reading, Zeros]:
+        """Let the board home, move the cart to the middle, and wait until the pole hangs still."""
+        self.board_homes = True
+        try:
+            self._driver.home()
+            reading = yield from self._until_board_rests((yield 0))
+        finally:
+            self.board_homes = False
+        middle = reading.cart - self._hardware.encoders.cart_counts(self._settings.home_position)
+        reading = yield from homing.centre(middle, reading)
+        hanging, reading = yield from find_hanging(reading)
+        reading = yield from homing.brake_swing(middle, hanging, reading)
+        reading = yield from homing.centre(middle, reading)
+        return self._zeros_about(middle, (yield from homing.wait_until_still(reading)))
+
+    def _until_board_rests(self, reading: Reading) -> Generator[int, Reading, Reading]:
+        window, elapsed = Window(BOARD_RESTS_US), 0
+        stands = self._hardware.encoders.cart_counts(BOARD_STANDS)
+        while elapsed < LONGEST_BOARD_HOMING:
+            window.add(reading.cart, reading.us)
+            if window.spread <= max(1, stands):
+                return reading
+            reading = yield 0
+            elapsed += reading.us
+        raise HomingError(f"the board's own homing did not end within {LONGEST_BOARD_HOMING / 1e6:.0f} s")
+
+    def _zeros_about(self, middle: int, hanging: int) -> Zeros:
+        half_span = self._hardware.encoders.cart_counts(self._hardware.half_span)
+        return Zeros(middle - half_span, middle + half_span, hanging)
+
+
+class MotorCommands:
+    """What is sent for a motor value, in the unit that the board takes: `settings.sends`.
+
+    A board that takes accelerations lets the cart roll at 0. Its speed is then needed also while nothing is
+    measured: it follows from what was sent.
+    """
+
+    def __init__(self, settings: BoardSettings) -> None:
+        self._sends, self._damping = settings.sends, settings.damping
+        self._size, self._sign = abs(settings.full), math.copysign(1.0, settings.full)
+        self._fastest = settings.fastest
+        self._speed = 0.0  # m/s, of the cart; sends=speed: the one that was sent last
+        self._acceleration = 0.0  # m/s^2, that was sent last
+        self._now = 0.0  # s, until which the speed was computed
+
+    def measured(self, speed: float, now: float) -> None:
+        """Note the measured speed of a cart whose count has changed."""
+        if self._sends == "acceleration":
+            self._speed, self._now = speed, now
+
+    def value(self, motor: int, now: float) -> float:
+        """Return the command for a motor value, at the time `now` in s."""
+        wanted = self._size * motor / LARGEST_MOTOR
+        self._pass_time(now)
+        if self._sends == "value":
+            return self._sign * wanted
+        self._acceleration = wanted - self._damping * self._speed
+        return self._sign * (self._speed if self._sends == "speed" else self._acceleration)
+
+    def at_rest(self, now: float) -> float | None:
+        """Return the command that slows the cart to rest; None if it stands or the board's stop does it."""
+        self._pass_time(now)
+        if self._sends != "acceleration":
+            self._speed = self._acceleration = 0.0
+            return None
+        if abs(self._speed) < STANDS:
+            self._acceleration = 0.0
+            return None
+        self._acceleration = -math.copysign(min(self._size, abs(self._speed) / SETTLING), self._speed)
+        return self._sign * self._acceleration
+
+    def _pass_time(self, now: float) -> None:
+        speed = self._speed + self._acceleration * min(now - self._now, LONGEST_STEP)
+        self._speed, self._now = max(-self._fastest, min(self._fastest, speed)), now
+
+
+class Bridge:
+    """One board between its driver and the port of `channel`. `run` returns when it is interrupted."""
+
+    def __init__(
+        self, settings: BoardSettings, hardware: Hardware, driver: Driver, control_period: float | None
+    ) -> None:
+        self._settings, self._hardware, self._driver = settings, hardware, driver
+        self._lock = Lock()
+        self._commands = MotorCommands(settings)
+        self._failure: CartPoleError | None = None
+        self._clock = BoardClock()
+        self._booted = time.monotonic()
+        self._control_period = control_period
+        self._channel: Channel | None = None
+        self._last: Measurement | None = None
+        self._arrived_us = 0  # when the last measurement came
+        self._refused = 0  # implausible ones in a row
+        self._bad = self._excess = 0  # damaged measurements, and how many more than whole ones lately
+        self._pole = 0  # unwrapped
+        self._recent: deque[tuple[int, int]] = deque(maxlen=SAMPLES)  # us and cart count of the newest
+        self._measured = 0  # of the control period
+        self._was_active = False
+        self._stops_left = 0
+
+    def listen(self) -> None:
+        """Open the board, and learn how often it measures. Raises LinkError, PortError or ConfigError."""
+        self._driver.open()
+        stamps: list[int] = []
+        deadline = time.monotonic() + self._settings.connect_timeout
+        while len(stamps) < LISTENED:
+            measurement = self._driver.read(max(0.0, deadline - time.monotonic()))
+            if measurement is None:
+                raise LinkError(f"no measurement comes from {self._settings.port}: {self._what_came()}")
+            stamps.append(self._now_us() if measurement.us is None else measurement.us)
+        board_us = round(median(after - before for before, after in pairwise(stamps)))
+        if board_us <= 0:
+            raise LinkError(
+                f"the time of {self._settings.port} does not advance: {stamps[-2]} us, then {stamps[-1]} us"
+            )
+        if board_us > LONGEST_US:
+            raise LinkError(
+                f"{self._settings.port} measures every {board_us / 1e3:.0f} ms; a pole needs at least one "
+                f"every {LONGEST_US / 1e3:.0f} ms: let the board send more often, or check time_unit"
+            )
+        self._board_us = board_us
+        self._stand_in = self._new_stand_in()
+        if self._control_period is not None:
+            self._stand_in.check_period(round(1e6 * self._control_period))
+
+    def run(self, channel: Channel) -> None:
+        """Pass measurements and commands on; stop the board at the end. Raises LinkError when it is lost."""
+        self._channel = channel
+        self._arrived_us, self._bad = self._now_us(), self._driver.bad
+        Thread(target=self._hear, daemon=True).start()
+        try:
+            while True:
+                measurement = self._driver.read(LATE_PERIODS * self._board_us * 1e-6)
+                with self._lock:
+                    if self._failure is not None:
+                        raise self._failure
+                    self._pass(measurement)
+        finally:
+            self._end()
+
+    def _hear(self) -> None:
+        """Take the frames of the host as they come."""
+        assert self._channel is not None
+        try:
+            while self._failure is None:
+                for frame in self._channel.receive():
+                    with self._lock:
+                        self._obey(frame)
+        except CartPoleError as error:
+            self._failure = error
+        except OSError as error:
+            self._failure = LinkError(f"the bridge's own port failed: {error}")
+
+    def _obey(self, frame: bytes | None) -> None:
+        if frame is None or self._failure is not None:
+            return
+        before, now_us = self._stand_in.motor, self._now_us()
+        self._send(self._stand_in.receive(frame, now_us))
+        self._stand_in.drive(now_us)
+        if self._stand_in.motor != before:
+            self._command()
+
+    def _pass(self, measurement: Measurement | None) -> None:
+        """Pass a measurement on, or what its absence means."""
+        now_us = self._now_us()
+        taken = measurement is not None and self._take(measurement, now_us)
+        silent = (now_us - self._arrived_us) * 1e-6
+        new_bad, self._bad = self._driver.bad - self._bad, self._driver.bad
+        self._excess = max(0, self._excess + new_bad - taken)
+        if self._excess > MOST_BAD:
+            raise LinkError(f"most of what comes from {self._settings.port} is damaged: {self._what_came()}")
+        if silent > self._settings.timeout / 2:  # before the host takes the bridge for lost
+            raise LinkError(
+                f"no measurement came from {self._settings.port} for {silent:.1f} s: {self._what_came()}"
+            )
+        if not taken:
+            self._stand_in.wait(now_us)
+            if silent > LATE_PERIODS * self._board_us * 1e-6:
+                self._command()
+            return
+        if self._measured:  # within a control period
+            self._stand_in.look(self._measured_us, *self._counts)
+        else:
+            frames = self._stand_in.measure(now_us, self._measured_us, self._stamp_us, self._counts)
+            self._send(frames)
+        self._measured = (self._measured + 1) % self._stand_in.every
+        self._command()
+
+    def _take(self, new: Measurement, now_us: int) -> bool:
+        """Note a measurement; return False for one that is implausible: damaged on the way, or repeated."""
+        settings, turn = self._settings, self._hardware.pole_counts_per_turn
+        cart = -new.cart if settings.cart_reversed else new.cart
+        pole = -new.pole if settings.pole_reversed else new.pole
+        new = Measurement(cart, pole, now_us if new.us is None else new.us)
+        assert new.us is not None
+        if self._last is None:
+            self._pole = pole
+        else:
+            assert self._last.us is not None
+            passed = new.us - self._last.us
+            if passed == 0:
+                return self._refuse(f"its time stands still at {new.us} us")
+            turned = (pole - self._last.pole + turn // 2) % turn - turn // 2
+            jump = abs(cart - self._last.cart) - 1
+            too_far = jump * self._hardware.cart_nanometres_per_count * 1e6 > FASTEST_CART * passed
+            too_fast = (abs(turned) - 1) * 1e6 > FASTEST_POLE * turn * passed
+            arrived = now_us - self._arrived_us
+            odd_time = passed < 0 or passed > 2 * arrived + 1_000_000
+            if odd_time or too_far or too_fast:
+                if self._refused < MOST_REFUSED:
+                    return self._refuse(f"its numbers jump: {self._last}, then {new}")
+                self._restart()
+                self._last, self._pole = None, pole
+                return self._take_first(new, now_us)
+            self._pole += turned
+        return self._take_first(new, now_us)
+
+    def _take_first(self, new: Measurement, now_us: int) -> bool:
+        assert new.us is not None
+        self._refused = 0
+        self._last, self._arrived_us = new, now_us
+        self._counts, self._stamp_us = (new.cart, self._pole), new.us
+        self._measured_us = self._clock.measured_us(new.us, now_us)
+        moved = not self._recent or new.cart != self._recent[-1][1]
+        self._recent.append((new.us, new.cart))
+        if moved:
+            self._commands.measured(self._cart_speed, now_us * 1e-6)
+        return True
+
+    def _refuse(self, why: str) -> bool:
+        self._refused += 1
+        self._driver.bad += 1
+        self._driver.why_bad = why
+        return False
+
+    def _restart(self) -> None:
+        """Begin anew, not homed: the board has restarted, or counts something else now."""
+        self._stand_in = self._new_stand_in()
+        self._clock, self._measured = BoardClock(), 0
+        self._recent.clear()
+
+    def _new_stand_in(self) -> StandIn:
+        return StandIn(self._settings, self._hardware, self._board_us, self._driver)
+
+    def _command(self) -> None:
+        """Send what drives the board, or what stops it."""
+        if self._stand_in.board_homes:
+            self._was_active = True
+            return
+        active, self._was_active = self._stand_in.is_active, self._stand_in.is_active
+        if active:
+            self._stops_left = STOPS
+            self._driver.send(self._commands.value(self._stand_in.motor, self._now_us() * 1e-6))
+            return
+        slowing = self._commands.at_rest(self._now_us() * 1e-6) if self._stops_left else None
+        if slowing is not None:
+            self._driver.send(slowing)
+        elif self._stops_left:
+            self._stops_left -= 1
+            self._driver.stop()
+
+    @property
+    def _cart_speed(self) -> float:
+        """The cart's speed by the newest measurements, m/s."""
+        if len(self._recent) < 2:
+            return 0.0
+        (first_us, first), (last_us, last) = self._recent[0], self._recent[-1]
+        return (last - first) * self._hardware.encoders.metres / max(1, last_us - first_us) * 1e6
+
+    def _end(self) -> None:
+        """Stop the board, whatever has happened."""
+        with self._lock:
+            self._failure = self._failure or LinkError("the bridge has ended")
+            with suppress(CartPoleError, OSError):
+                self._slow_down()
+            for _ in range(STOPS):
+                with suppress(CartPoleError, OSError):
+                    self._driver.stop()
+            self._driver.close()
+
+    def _slow_down(self) -> None:
+        deadline = time.monotonic() + STOPPING
+        while time.monotonic() < deadline:
+            slowing = self._commands.at_rest(self._now_us() * 1e-6)
+            if slowing is None:
+                return
+            self._driver.send(slowing)
+            if (measurement := self._driver.read(self._board_us * 1e-6)) is not None:
+                self._take(measurement, self._now_us())
+
+    def _send(self, frames: list[bytes]) -> None:
+        assert self._channel is not None
+        for frame in frames:
+            self._channel.send(frame)
+
+    def _what_came(self) -> str:
+        driver = self._driver
+        if driver.bad:
+            compare = f"compare the settings of plant={self._settings.kind} with what the board sends"
+            return f"{driver.why_bad}; {compare}"
+        return "not a byte; check the cable, the power and plant.baud"
+
+    def _now_us(self) -> int:
+        return int((time.monotonic() - self._booted) * 1e6)

@@ -1,0 +1,157 @@
+"""Lines of text, as makers' firmware often sends them: `t_us,x,theta` one way, a number the other.
+
+    12340000,-812,1003      a line of the board: its clock, the cart, the pole
+    a=-3.200                a line of this computer: the motor
+
+Columns, units, separator and the lines that are sent are settings (`TextSettings`). A line that is not whole,
+or has anything but finite numbers in its columns, is dropped and counted.
+"""
+
+import math
+import time
+from contextlib import suppress
+from typing import TYPE_CHECKING
+
+from cartpole_rl.errors import LinkError
+from cartpole_rl.plants.drivers.driver import Driver, Measurement
+from cartpole_rl.plants.serial.port import open_port, resolved_port, set_exclusive
+from cartpole_rl.rig.hardware import Encoders
+
+if TYPE_CHECKING:
+    import serial
+
+    from cartpole_rl.plants.settings import TextSettings
+
+LONGEST_LINE = 200  # bytes
+LARGEST_COUNT = 2**31
+CLOCK_WRAP = 2**32  # of micros() and millis()
+MICROSECONDS = {"us": 1, "ms": 1_000, "s": 1_000_000}
+
+
+class TextDriver(Driver):
+    """A board that sends a line each period and takes lines. `settings` are `TextSettings`."""
+
+    settings: "TextSettings"
+
+    def __init__(self, settings: "TextSettings", encoders: Encoders) -> None:
+        super().__init__(settings, encoders)
+        self._columns = {name: place for place, name in enumerate(settings.columns)}
+        metres, radians = encoders.resolution
+        self._cart_counts = {"counts": 1.0, "mm": 1e-3 / metres, "m": 1 / metres}[settings.cart_unit]
+        self._pole_counts = {"counts": 1.0, "deg": math.radians(1) / radians, "rad": 1 / radians}[
+            settings.pole_unit
+        ]
+        self._line: serial.SerialBase | None = None
+        self._pending = b""
+        self._clock: tuple[int, int] | None = None  # the newest time in the board's unit, and unwrapped in us
+        self.port = settings.port
+
+    def open(self) -> None:
+        """Open the port. Raises PortError."""
+        self.port = resolved_port(self.settings.port)
+        self._line = open_port(self.port, self.settings.baud, self.settings.write_timeout)
+        self._pending = b""
+
+    def read(self, timeout: float) -> Measurement | None:
+        """Return the next whole line as a measurement; None if none came within `timeout` s."""
+        deadline = time.monotonic() + timeout
+        while True:
+            while b"\n" in self._pending:
+                line, _, self._pending = self._pending.partition(b"\n")
+                if (measurement := self._measured(line)) is not None:
+                    return measurement
+            if time.monotonic() >= deadline:
+                return None
+            self._pending += self._received(deadline)
+            if len(self._pending) > LONGEST_LINE and b"\n" not in self._pending:
+                self._refuse(self._pending)
+                self._pending = b""
+
+    def send(self, value: float) -> None:
+        """Send the line of a motor command."""
+        self._write(self.settings.line.format(value))
+
+    def home(self) -> None:
+        """Send the line that starts the board's own homing."""
+        assert self.settings.home_line is not None  # the settings were checked
+        self._write(self.settings.home_line)
+
+    def stop(self) -> None:
+        """Send the line that stops the motor, which is the command 0 if there is no other."""
+        if self.settings.stop_line is None:
+            self.send(0.0)
+        else:
+            self._write(self.settings.stop_line)
+
+    def close(self) -> None:
+        """Give the port back; never raises."""
+        if self._line is not None:
+            with suppress(OSError):
+                set_exclusive(self._line, False)
+                self._line.close()
+            self._line = None
+
+    def _received(self, deadline: float) -> bytes:
+        """Return what has arrived, or what arrives until `deadline`. Raises LinkError."""
+        line = self._opened
+        try:
+            line.timeout = max(0.0, deadline - time.monotonic())
+            return line.read(line.in_waiting or 1)
+        except OSError as error:
+            raise LinkError(
+                f"{self.port} cannot be read any more: {error}; is the cart unplugged?"
+            ) from error
+
+    def _write(self, text: str) -> None:
+        try:
+            self._opened.write(text.encode() + b"\n")
+        except OSError as error:
+            raise LinkError(
+                f"{self.port} takes no bytes any more: {error}; is the cart unplugged?"
+            ) from error
+
+    @property
+    def _opened(self) -> "serial.SerialBase":
+        if self._line is None:
+            raise LinkError(f"{self.port} is not open")
+        return self._line
+
+    def _measured(self, line: bytes) -> Measurement | None:
+        """Return the measurement in a line; None, and count it as bad, if it has none."""
+        settings = self.settings
+        words = line.decode("ascii", errors="replace").strip().split(settings.separator)
+        if len(words) != len(settings.columns):
+            self._refuse(line)
+            return None
+        try:
+            cart, pole = (float(words[self._columns[name]]) for name in ("cart", "pole"))
+            us = self._time(words[self._columns["time"]]) if "time" in self._columns else None
+        except ValueError:
+            self._refuse(line)
+            return None
+        counts = cart * self._cart_counts, pole * self._pole_counts
+        if not all(map(math.isfinite, counts)) or max(map(abs, counts)) > LARGEST_COUNT:
+            self._refuse(line)
+            return None
+        return Measurement(round(counts[0]), round(counts[1]), us)
+
+    def _time(self, word: str) -> int:
+        """Return the board's time in us, without the wrap of its counter. Raises ValueError if it has none.
+
+        It goes back if the board's counter does.
+        """
+        unit = MICROSECONDS[self.settings.time_unit]
+        if unit == MICROSECONDS["s"]:
+            seconds = float(word)
+            if not abs(seconds) < CLOCK_WRAP:
+                raise ValueError(f"{word} is not a time in s")
+            return round(seconds * unit)
+        ticks = int(word)
+        last, us = self._clock or (ticks, ticks * unit)
+        passed = (ticks - last + CLOCK_WRAP // 2) % CLOCK_WRAP - CLOCK_WRAP // 2
+        self._clock = ticks, us + passed * unit
+        return self._clock[1]
+
+    def _refuse(self, line: bytes) -> None:
+        self.bad += 1
+        self.why_bad = f"{line[:60]!r} is not {self.settings.separator.join(self.settings.columns)}"

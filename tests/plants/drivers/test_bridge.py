@@ -1,0 +1,242 @@
+"""A cart with firmware of its own, driven by lines of text: a program of its own."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from itertools import count, pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from cartpole_rl.emulator.settings import EmulatorSettings
+from cartpole_rl.errors import ConfigError, LinkError, PlantError
+from cartpole_rl.plants.serial.plant import SerialPlant, bridged_cart
+from cartpole_rl.plants.serial.preparation import always, nobody
+from cartpole_rl.plants.settings import TextSettings
+from cartpole_rl.rig.hardware import Hardware, nominal_hardware
+
+BOARD = Path(__file__).parents[2] / "support" / "text_board.py"
+RIG = nominal_hardware().model_copy(
+    update={
+        "cart_nanometres_per_count": 25_000,
+        "pole_counts_per_turn": 4096,
+        "track_span": 0.6,
+        "soft_limit": 0.03,
+        "hard_limit": 0.006,
+        "braking": 10.0,
+        "hard_push": 60,
+        "moving_mass": 1.0,
+        "moving_friction": 0.0,
+        "motor_offset": 0.0,
+        "motor_per_newton": 21.25,
+    }
+)
+STEPPER: dict[str, Any] = {
+    "kind": "text",
+    "sends": "acceleration",
+    "full": 12.0,
+    "damping": 2.0,
+    "line": "a={:.3f}",
+}
+
+
+@contextmanager
+def board(**options: Any) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
+    """A running board: its port and process."""
+    process = subprocess.Popen([sys.executable, str(BOARD), json.dumps(options)], stdout=subprocess.PIPE)
+    assert process.stdout is not None
+    try:
+        yield process.stdout.readline().decode().strip(), process
+    finally:
+        process.kill()
+        process.wait()
+        process.stdout.close()
+
+
+def driven(port: str, period: float = 0.01, hardware: Hardware = RIG, **changed: Any) -> SerialPlant:
+    settings = TextSettings(**STEPPER | {"port": port} | changed)
+    return bridged_cart(settings, EmulatorSettings(), period, "hanging", print, always, hardware)
+
+
+def push(plant: SerialPlant, motor: int) -> TensorDict:
+    return plant.step(TensorDict({"motor": torch.full((1, 1), motor)}, [1]))["next"]
+
+
+def taken(journal: Path) -> list[tuple[float, str, float]]:
+    """What the board took: time in s, line, speed of the cart then in m/s."""
+    lines = [line.split() for line in journal.read_text().splitlines()]
+    return [(float(line[0]), line[1], float(line[-1].removeprefix("v="))) for line in lines]
+
+
+def last_speed(journal: Path) -> float:
+    """The speed at which the cart was left, once the board has taken the last line."""
+    before = -1
+    while len(now := taken(journal)) != before:
+        before = len(now)
+        time.sleep(0.1)
+    return now[-1][2]
+
+
+def test_it_is_driven_and_left_standing(tmp_path: Path) -> None:
+    with board(journal=str(tmp_path / "journal")) as (port, _), closing(driven(port)) as plant:
+        first = plant.reset()
+        assert first["counts"].tolist() == [[0, 2048]]
+        for _ in range(30):
+            frame = push(plant, 60)
+        cart, pole = frame["counts"][0].tolist()
+        assert cart * 25e-6 == pytest.approx(0.10, abs=0.03)  # 2.8 m/s^2 for 0.3 s, with damping
+        assert pole > 2048  # its tip stays behind
+        assert not frame["done"]
+        assert frame["dt"].item() == pytest.approx(0.01, abs=1e-4)
+        plant.close()
+        lines = taken(tmp_path / "journal")
+        assert any(line == "a=2.824" for _, line, _ in lines)
+        assert abs(last_speed(tmp_path / "journal")) < 0.02  # the acceleration 0 alone would let it roll
+
+
+def test_the_end_of_the_track_is_not_touched(tmp_path: Path) -> None:
+    with board(journal=str(tmp_path / "journal")) as (port, _), closing(driven(port)) as plant:
+        plant.reset()
+        for _ in range(300):
+            if push(plant, -255)["done"]:
+                break
+        assert plant.ended_by == "track"
+        plant.reset()
+        assert abs(plant.cart.poll_state().cart_counts) < 100
+        positions = [
+            line.split("x=")[1].split()[0] for line in (tmp_path / "journal").read_text().splitlines()
+        ]
+        assert max(abs(float(x)) for x in positions) < 0.3
+
+
+def test_a_board_that_homes_by_itself(tmp_path: Path) -> None:
+    with (
+        board(journal=str(tmp_path / "journal")) as (port, _),
+        closing(driven(port, homing="board", home_line="home")) as plant,
+    ):
+        assert plant.reset()["counts"].tolist() == [[0, 2048]]
+        assert taken(tmp_path / "journal")[0][1] in ("home", "a=-0.000", "a=0.000")
+        assert [line for _, line, _ in taken(tmp_path / "journal")].count("home") == 1
+
+
+def test_reversed_signs(tmp_path: Path) -> None:
+    """The same motion, as seen from the other side."""
+    with board() as (port, _):
+        changed = {"cart_reversed": True, "pole_reversed": True, "full": -12.0}
+        with closing(driven(port, **changed)) as plant:
+            plant.reset()
+            for _ in range(20):
+                frame = push(plant, 60)
+            assert frame["counts"][0, 0] > 0
+            assert frame["counts"][0, 1] > 2048
+
+
+def test_every_second_line_is_a_period() -> None:
+    with board() as (port, _), closing(driven(port, 0.02)) as plant:
+        plant.reset()
+        assert push(plant, 0)["dt"].item() == pytest.approx(0.02, abs=1e-4)
+
+
+def test_an_impossible_period_is_refused_before_anything_moves(tmp_path: Path) -> None:
+    with board(journal=str(tmp_path / "journal")) as (port, _):
+        with pytest.raises(ConfigError, match=r"measures every 10 ms; give control_period=0.01 or 0.02"):
+            driven(port, 0.014)
+        assert not taken(tmp_path / "journal")
+
+
+def test_a_cart_that_is_put_in_place_by_hand_needs_a_person() -> None:
+    with board() as (port, _):
+        settings = TextSettings(**STEPPER, port=port)
+        with (
+            closing(bridged_cart(settings, EmulatorSettings(), 0.01, "hanging", print, nobody, RIG)) as plant,
+            pytest.raises(
+                PlantError, match=r"plant\.homing=hand: a person has to put the cart in the middle"
+            ),
+        ):
+            plant.reset()
+
+
+def test_damaged_lines_are_dropped() -> None:
+    """A tenth of all lines: nothing jumps, nothing ends."""
+    with board(garbage=0.1) as (port, _), closing(driven(port)) as plant:
+        plant.reset()
+        counts = [
+            push(plant, 40 if period % 40 < 20 else -40)["counts"][0, 0].item() for period in range(120)
+        ]
+        assert not plant.ended_by
+        assert max(abs(after - before) for before, after in pairwise(counts)) < 1500
+
+
+NOTHING_WHOLE = "(most of what|no measurement) (comes|came) from"
+FAILURES = {
+    "death": ({}, "is the cart unplugged|no measurement"),
+    "silence": ({"silent": True}, "no measurement came from .* for"),
+    "noise": (
+        {"noise": True},
+        NOTHING_WHOLE + ".* compare the settings of plant=text",
+    ),
+    "frozen time": ({"freeze": "time"}, NOTHING_WHOLE + ".* its time stands still at"),
+}
+
+
+@pytest.mark.parametrize(("options", "why"), FAILURES.values(), ids=FAILURES)
+def test_a_board_that_fails_is_stopped(options: dict[str, Any], why: str, tmp_path: Path) -> None:
+    journal = tmp_path / "journal"
+    with board(journal=str(journal), at=5, **options) as (port, process), closing(driven(port)) as plant:
+        plant.reset()
+        deadline = time.monotonic() + 20
+        for period in count():
+            if (frame := push(plant, 20 if period % 40 < 20 else -20))["done"]:
+                break
+            if not options:
+                process.kill()
+            assert time.monotonic() < deadline
+        assert frame["truncated"]
+        assert plant.ended_by == "link"
+        with pytest.raises(LinkError, match=why):
+            plant.reset()
+        if options:
+            assert abs(last_speed(journal)) < 0.02  # by what was sent: no measurement tells
+            assert float(taken(journal)[-1][1].removeprefix("a=")) == 0
+
+
+def test_a_frozen_counter_latches_a_fault(tmp_path: Path) -> None:
+    journal = tmp_path / "journal"
+    with board(journal=str(journal), at=4, freeze="both") as (port, _), closing(driven(port)) as plant:
+        plant.reset()
+        for period in range(1500):
+            if (frame := push(plant, 70 if period % 60 < 30 else -70))["done"]:
+                break
+        assert frame["truncated"]
+        assert plant.ended_by == "fault"
+        assert abs(last_speed(journal)) < 0.1
+        assert float(taken(journal)[-1][1].removeprefix("a=")) == 0
+
+
+def test_a_command_that_is_killed_leaves_the_cart_standing(tmp_path: Path) -> None:
+    """The bridge stops the cart by its watchdog, and then ends."""
+    journal = tmp_path / "journal"
+    with board(journal=str(journal)) as (port, _):
+        program = (
+            "import sys, torch; sys.path[:0] = sys.argv[2:]\n"
+            "from test_bridge import driven, push\n"
+            "plant = driven(sys.argv[1]); plant.reset(); print('driving', flush=True)\n"
+            "while True: push(plant, 30)\n"
+        )
+        command = [sys.executable, "-c", program, port, str(Path(__file__).parent), str(BOARD.parent)]
+        with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
+            assert process.stdout is not None
+            while process.stdout.readline().strip() != b"driving":
+                assert process.poll() is None
+            os.kill(process.pid, signal.SIGKILL)
+        assert abs(last_speed(journal)) < 0.02
+        with closing(driven(port)) as plant:  # the port was given back
+            plant.reset()
