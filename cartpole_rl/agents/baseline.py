@@ -98,7 +98,7 @@ class EnergyAndRegulator:
         """Return the regulator's force plus compensation of dry friction, N, [N]."""
         force = -sum(float(gain) * value for gain, value in zip(self.gain, state, strict=True))
         return force + self.models.cart_friction(
-            state.x_dot + self.period * force / self.cart.total_mass, self.cart
+            state.x_dot + self.period * force / self.cart.driven_mass, self.cart
         )
 
     def swing_up(self, state: State) -> Tensor:
@@ -118,14 +118,14 @@ class EnergyAndRegulator:
         moment = self.body.first_moment * terms.cos
         torque = terms.gravity_torque + self.models.pole_friction(state.theta_dot, self.cart)
         theta_ddot = (torque - moment * x_ddot) / self.body.pivot_inertia
-        reaction = moment * theta_ddot - self.body.first_moment * state.theta_dot**2 * terms.sin
+        reaction = self.body.felt_moment * (terms.cos * theta_ddot - state.theta_dot**2 * terms.sin)
         viscous = viscous_coefficient(self.cart, self.models.cart_friction) * state.x_dot
         dry = self.models.cart_friction(state.x_dot + self.period * x_ddot, self.cart)
-        return self.body.total_mass * x_ddot + reaction + viscous + dry
+        return self.body.driven_mass * x_ddot + reaction + viscous + dry
 
     def on_track(self, state: State, force: Tensor) -> Tensor:
         """Return `force` [N], or full braking where the cart would otherwise leave the track."""
-        braking = (self.strongest / self.cart.total_mass).clamp(min=1e-6)
+        braking = (self.strongest / self.cart.driven_mass).clamp(min=1e-6)
         stop = state.x + state.x_dot * state.x_dot.abs() / (
             2 * braking
         )  # m, where the cart would stop under braking

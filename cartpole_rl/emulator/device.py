@@ -143,7 +143,8 @@ class CartDevice:
         """Return the firmware that the settings choose, just booted."""
         cart, rig = self._settings, self._hardware
         zero_error = round(cart.angle_offset / self._encoders.radians)
-        lever_um = round(1e6 * cart.pole_mass * cart.pole_com / (cart.cart_mass + cart.pole_mass))
+        felt = cart.backdrivability * cart.pole_mass
+        lever_um = round(1e6 * felt * cart.pole_com / (cart.cart_mass + felt))
         if cart.firmware == "c":
             return CFirmware(self._latency_us, zero_error, lever_um, cart.policy, 2 * cart.pole_com, rig)
         return Firmware(self._latency_us, zero_error, lever_um, rig)

@@ -14,6 +14,7 @@ from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import EmulatorError
 
 GRAVITY = 9.81  # m/s^2
+LEAST_FELT = 1e-6  # share of the pole's force
 AT_REST = 1e-4  # m/s; below this speed the breakaway friction applies
 MODEL = """
 <mujoco>
@@ -86,9 +87,18 @@ class CartPhysics:
     def __init__(self, settings: EmulatorSettings) -> None:
         mujoco = load_mujoco()
         thin = settings.pole_inertia * 1e-3  # about the pole's own axis, about which nothing rotates
-        model = MODEL.format(thin_inertia=thin, **settings.model_dump())
+        # A motor that feels a share of the pole moves as a cart that is so much heavier, under larger forces.
+        self._larger = larger = 1 / max(settings.backdrivability, LEAST_FELT)
+        numbers = settings.model_dump() | {
+            "cart_mass": larger * settings.cart_mass,
+            "cart_viscous": larger * settings.cart_viscous,
+        }
+        model = MODEL.format(thin_inertia=thin, **numbers)
         self._model = mujoco.MjModel.from_xml_string(model)
         tilt = settings.track_tilt
+        self._held = (
+            (1 - larger) * settings.cart_mass * GRAVITY * math.sin(tilt)
+        )  # N, against the larger weight
         self._model.opt.gravity[:] = (GRAVITY * math.sin(tilt), 0.0, -GRAVITY * math.cos(tilt))
         self._data = mujoco.MjData(self._model)
         self._mj_step = mujoco.mj_step
@@ -143,7 +153,8 @@ class CartPhysics:
         applied, velocity = self._data.qfrc_applied, self._data.qvel
         target, decay = self._motor.static_force(motor), self._motor.decay(step)
         for number in range(1, steps + 1):
-            applied[0] = self._motor.step(target, decay) + self._cogging(self._data.qpos[0])
+            force = self._motor.step(target, decay) + self._cogging(self._data.qpos[0])
+            applied[0] = self._larger * force + self._held
             applied[1] = -drag * velocity[1] * abs(velocity[1])
             friction[0] = self._cart_friction(velocity[0])
             speed = abs(velocity[0])
@@ -170,4 +181,4 @@ class CartPhysics:
         at_rest = abs(x_dot) < AT_REST
         pull = self._data.qacc_smooth[0] if at_rest else x_dot  # at rest: the direction of all other forces
         coulomb = settings.cart_coulomb_right if pull > 0 else settings.cart_coulomb_left
-        return coulomb * settings.cart_stiction_ratio if at_rest else coulomb
+        return self._larger * coulomb * (settings.cart_stiction_ratio if at_rest else 1.0)

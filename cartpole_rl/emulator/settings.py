@@ -5,14 +5,17 @@ cart differs from one that was weighed and measured by hand. ``docs/emulator.md`
 x, motor and angles are positive to the right; angle 0 is upright.
 """
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
+from cartpole_rl.choices import choice
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.rig.hardware import LARGEST_MOTOR, Hardware, nominal_hardware
-from cartpole_rl.settings import NonNegative, Positive, Settings
+from cartpole_rl.rig.hardware import LARGEST_MOTOR, Hardware, hardware_of, nominal_hardware
+from cartpole_rl.rig.parameters import completed
+from cartpole_rl.settings import Fraction, NonNegative, Positive, Settings
 
 Share = Annotated[
     float, Field(allow_inf_nan=False, ge=0, le=0.9)
@@ -54,6 +57,7 @@ class EmulatorSettings(Settings):
     pole_coulomb: NonNegative = 2.0e-4  # N m
     pole_drag: NonNegative = 2.5e-5  # N m s^2, times the square of the angular speed
 
+    backdrivability: Fraction = 1.0  # share of the pole's and gravity's force that moves the cart; stepper: 0
     force_curve: tuple[Coefficient, Coefficient, Coefficient] = (0.0, 0.0198, -0.99)
     # [a, b, c]: F = sign(u) max(0, a u^2 + b |u| + c), N
     force_asymmetry: Annotated[float, Field(ge=-0.9, le=0.9)] = (
@@ -103,34 +107,51 @@ class EmulatorSettings(Settings):
             )
         return self
 
-    def with_hardware(self, hardware: Hardware) -> Self:
-        """Return the settings of a cart with `hardware`.
+    def of_cart(self, cart: Mapping[str, float]) -> Self:
+        """Return the settings of a cart with the hardware, masses, friction and force of a file's numbers.
 
-        Numbers of the cart that are still those of the default cart become those of one that differs from
-        `hardware` as the default cart differs from ip02. Raises ConfigError if they have another rig already.
+        Where these settings are still those of the default cart, they become those of one that differs from
+        the file as the default cart differs from ip02's. A file with ip02's hardware changes nothing. Raises
+        ConfigError for another rig than `hardware`.
         """
-        nominal = nominal_hardware()
-        if self.hardware == hardware or (self.hardware is None and hardware == nominal):
+        hardware, of_ip02 = hardware_of(cart), choice("cart/ip02")
+        if self.hardware == hardware or (self.hardware is None and hardware == nominal_hardware()):
             return self
         if self.hardware is not None:
             raise ConfigError("emulator.hardware: it differs from the rig of cart=; leave it out, give cart=")
-        mass = hardware.moving_mass / nominal.moving_mass
-        friction = hardware.moving_friction / nominal.moving_friction
-        force = nominal.motor_per_newton / hardware.motor_per_newton  # a motor value
-        offset = hardware.motor_offset / nominal.motor_offset
-        default = EmulatorSettings()
+        numbers, default = completed({**of_ip02, **cart}), EmulatorSettings()
+
+        def times(name: str, of: str = "") -> float:
+            return getattr(default, name) * numbers[of or name] / of_ip02[of or name]
+
+        start = zero_force_motor(numbers) / zero_force_motor(of_ip02)
         _, slope, constant = default.force_curve
         scaled = {
-            "track_half_length": hardware.half_span + default.track_half_length - nominal.half_span,
-            "cart_mass": mass * default.cart_mass,
-            "cart_viscous": friction * default.cart_viscous,
-            "cart_coulomb_left": friction * default.cart_coulomb_left,
-            "cart_coulomb_right": friction * default.cart_coulomb_right,
-            "force_curve": (0.0, force * slope, force * offset * constant),
-            "deadband_left": min(offset * default.deadband_left, LARGEST_MOTOR),
-            "deadband_right": min(offset * default.deadband_right, LARGEST_MOTOR),
+            "track_half_length": default.track_half_length
+            + hardware.half_span
+            - nominal_hardware().half_span,
+            "cart_mass": times("cart_mass"),
+            "cart_viscous": times("cart_viscous"),
+            "cart_coulomb_left": times("cart_coulomb_left", "cart_coulomb"),
+            "cart_coulomb_right": times("cart_coulomb_right", "cart_coulomb"),
+            "pole_viscous": times("pole_viscous"),
+            "pole_coulomb": times("pole_coulomb", "pole_viscous"),
+            "pole_drag": times("pole_drag"),
+            "backdrivability": numbers["backdrivability"],
+            "force_curve": (
+                numbers["force_quadratic"],
+                slope * numbers["force_linear"] / of_ip02["force_linear"],
+                constant * numbers["force_offset"] / of_ip02["force_offset"],
+            ),
+            "deadband_left": min(start * default.deadband_left, LARGEST_MOTOR),
+            "deadband_right": min(start * default.deadband_right, LARGEST_MOTOR),
         }
         changes = {
             name: value for name, value in scaled.items() if getattr(self, name) == getattr(default, name)
         }
         return self.model_copy(update={**changes, "hardware": hardware})
+
+
+def zero_force_motor(cart: Mapping[str, float]) -> float:
+    """Return the motor value at which the force of a cart's linear curve starts."""
+    return max(0.0, -cart["force_offset"] / cart["force_linear"])

@@ -14,7 +14,7 @@ from cartpole_rl.physics.models import Models
 from cartpole_rl.plants.settings import SimulationSettings
 from cartpole_rl.randomization.poles import Pole, PoleSettings
 from cartpole_rl.randomization.ranges import IdentifiedSettings, Range
-from cartpole_rl.rig.hardware import Hardware, hardware_of, parameters_of
+from cartpole_rl.rig.hardware import Hardware, hardware_of, nominal_hardware, parameters_of
 from cartpole_rl.rig.parameters import completed
 from cartpole_rl.settings import Finite, NonNegative, Positive, Settings
 from cartpole_rl.tasks.features import ObservationKind
@@ -156,22 +156,27 @@ def shipped_numbers(group: str, model: str) -> dict[str, float]:
 
 @cache
 def shipped_carts() -> tuple[dict[str, float], ...]:
-    """Return the carts in conf/, whose numbers are nominal; the first one is ip02."""
-    carts = group_choices("cart")
-    return (carts.pop("ip02"), *carts.values())
+    """Return the carts in conf/."""
+    return tuple(group_choices("cart").values())
+
+
+@cache
+def replaced_carts() -> tuple[dict[str, float], ...]:
+    """Return the carts in conf/ whose friction is that of a friction model's choice: those on ip02's rig."""
+    return tuple(each for each in shipped_carts() if hardware_of(each) == nominal_hardware())
 
 
 def driven_numbers(cart: Mapping[str, float], *frictions: FrictionSettings) -> dict[str, float]:
     """Return the numbers of the cart that is driven, without the pole's.
 
-    A nominal number (of a cart in conf/) gives way to that of a friction model's choice in conf/. What a
-    person gave replaces both; with `cart` and with a friction model, that with the friction model holds.
+    A number of ip02 or thesis gives way to that of a friction model's choice in conf/. What a person
+    gave replaces both; with `cart` and with a friction model, that with the friction model holds.
     """
     numbers = dict(cart)
     for friction in frictions:
         for name, value in friction.parameters.items():
             is_nominal = name not in cart or any(
-                cart[name] == shipped.get(name) for shipped in shipped_carts()
+                cart[name] == shipped.get(name) for shipped in replaced_carts()
             )
             if is_nominal or value != friction.defaults.get(name):
                 numbers[name] = value

@@ -23,7 +23,14 @@ from cartpole_rl.identification.matching import (
     solvable,
 )
 from cartpole_rl.identification.rollout import rollout
-from cartpole_rl.identification.unknowns import POLE_LENGTH, Unknown, limits, parameters_at, unknowns_of
+from cartpole_rl.identification.unknowns import (
+    POLE_LENGTH,
+    Unknown,
+    hidden,
+    limits,
+    parameters_at,
+    unknowns_of,
+)
 from cartpole_rl.identification.windows import Windows
 from cartpole_rl.physics.models import Models, check_laws
 from cartpole_rl.physics.parameters import CartParameters, cart_column
@@ -94,13 +101,15 @@ def fit_cart(
 ) -> Fit:
     """Return the most probable cart, searched for from several starts.
 
-    The names `known`, of UNKNOWNS, keep their nominal values. Motion shows only ratios of forces and
-    masses: unless WEIGHED are known, the prior sets the scale. `extra_latency` is that of `rollout`.
+    The names `known`, of UNKNOWNS, keep their nominal values, and so do those that a stepper hides.
+    Motion shows only ratios of forces and masses: unless WEIGHED are known, the prior sets the scale.
+    `extra_latency` is that of `rollout`.
     The search is from the cart of `near`, if it is given; `sizes`, m and rad, [2], scale the errors.
     `on_step` is called before each linearization. Raises RecordingError for windows in which no cart moves.
     """
     check_laws(models, CartParameters(cart_column(nominal)))
-    unknowns, nominal = unknowns_of(models, known), completed(nominal)
+    nominal = completed(nominal)
+    unknowns = unknowns_of(models, (*known, *hidden(nominal)))
     positions, motors = torch.from_numpy(windows.positions), torch.from_numpy(windows.motors)
     guess = first_guess(positions, period)
     low, high = map(torch.from_numpy, limits(unknowns, nominal))

@@ -46,7 +46,7 @@ class Quantity(NamedTuple):
 
 def quantities(cart: Mapping[str, float]) -> list[Quantity]:
     """Return the quantities of one cart, from its parameters. The force is that about motor value 200."""
-    mass = cart["cart_mass"] + cart["pole_mass"]
+    mass = cart["cart_mass"] + cart.get("backdrivability", 1.0) * cart["pole_mass"]
     moment = cart["pole_mass"] * cart["pole_com"]
     inertia = cart["pole_inertia"] + moment * cart["pole_com"]
     damping = cart["pole_viscous"] * TYPICAL + cart["pole_drag"] * TYPICAL**2 + cart["pole_coulomb"]

@@ -22,6 +22,14 @@ LEVELS = (
     "track_tilt",
     "angle_offset",
 )  # the last ones, as the order is that of the posterior's random numbers
+OVERCOME = (
+    "cart_mass",
+    "cart_coulomb",
+    "cart_coulomb_asymmetry",
+    "cart_stiction_ratio",
+    "stribeck_velocity",
+    "track_tilt",
+)
 WEIGHED = (POLE_LENGTH, "pole_mass")  # measured with a known pole; they set the scale of forces and masses
 
 
@@ -42,6 +50,11 @@ def unknowns_of(models: Models, known: Sequence[str] = ()) -> list[Unknown]:
     """Return the unknowns that the chosen models read and that are not `known`."""
     without = {*unused_parameters(models), *known}
     return [unknown for unknown in unknowns() if unknown.name not in without]
+
+
+def hidden(nominal: Mapping[str, float]) -> tuple[str, ...]:
+    """Return the unknowns that no motion shows: a stepper overcomes mass, dry friction and tilt by itself."""
+    return () if nominal["backdrivability"] else OVERCOME
 
 
 def bound_of(name: str) -> Bound:

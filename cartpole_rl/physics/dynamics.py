@@ -48,27 +48,28 @@ MakeAddition = Callable[[State, Drive], Addition]  # from the state at the start
 class Mechanism(NamedTuple):
     """The constants of (3.5) and (3.6), evaluated once a period, [N] each."""
 
-    total_mass: Tensor  # kg
+    driven_mass: Tensor  # kg
     first_moment: Tensor  # m_p l, kg m
+    felt_moment: Tensor  # kg m: the share of it that the cart feels
     pivot_inertia: Tensor  # kg m^2
     sin_tilt: Tensor
     cos_tilt: Tensor
-    gravity_force: Tensor  # N along a tilted track
+    gravity_force: Tensor  # N along a tilted track, as far as it moves the cart
     resting_normal_force: Tensor  # N, of the track on the cart while the pole is at rest
 
 
 def mechanism(cart: CartParameters) -> Mechanism:
     """Return the constants of a cart."""
-    total_mass = cart.total_mass
-    weight = total_mass * GRAVITY
+    weight = cart.total_mass * GRAVITY
     sin_tilt, cos_tilt = torch.sin(cart.track_tilt), torch.cos(cart.track_tilt)
     return Mechanism(
-        total_mass,
+        cart.driven_mass,
         cart.first_moment,
+        cart.backdrivability * cart.first_moment,
         cart.pivot_inertia,
         sin_tilt,
         cos_tilt,
-        weight * sin_tilt,
+        cart.backdrivability * weight * sin_tilt,
         weight * cos_tilt,
     )
 
@@ -91,7 +92,7 @@ def coupling(state: State, cart: CartParameters, body: Mechanism) -> Coupling:
         sin=sin,
         cos=cos,
         gravity_torque=body.first_moment * GRAVITY * sin_theta,
-        determinant=body.total_mass * body.pivot_inertia - (body.first_moment * cos) ** 2,
+        determinant=body.driven_mass * body.pivot_inertia - body.felt_moment * body.first_moment * cos**2,
     )
 
 
@@ -100,13 +101,14 @@ def accelerations(
 ) -> tuple[Tensor, Tensor]:
     """Return (x_ddot m/s^2, theta_ddot rad/s^2), [N] each, under `force` on cart and `torque` on pole.
 
-    Equations (3.5) and (3.6) for a pole of any inertia: with k = J / (m_p l^2) they are the thesis's.
+    Equations (3.5) and (3.6) for a pole of any inertia: with k = J / (m_p l^2) they are the thesis's. A cart
+    with a stepper (`backdrivability` 0) moves as its motor wants, whatever the pole does.
     """
-    cart_side = force + body.gravity_force + body.first_moment * state.theta_dot**2 * terms.sin
+    cart_side = force + body.gravity_force + body.felt_moment * state.theta_dot**2 * terms.sin
     pole_side = terms.gravity_torque + torque
     moment = body.first_moment * terms.cos
-    theta_ddot = (body.total_mass * pole_side - moment * cart_side) / terms.determinant
-    x_ddot = (cart_side - moment * theta_ddot) / body.total_mass
+    theta_ddot = (body.driven_mass * pole_side - moment * cart_side) / terms.determinant
+    x_ddot = (cart_side - body.felt_moment * terms.cos * theta_ddot) / body.driven_mass
     return x_ddot, theta_ddot
 
 

@@ -49,6 +49,11 @@ class CartParameters:
         return self.cart_mass + self.pole_mass
 
     @property
+    def driven_mass(self) -> Tensor:
+        """What the motor accelerates, kg, [N]: a motor that cannot be driven back does not feel the pole."""
+        return self.cart_mass + self.backdrivability * self.pole_mass
+
+    @property
     def first_moment(self) -> Tensor:
         """m_p l, kg m, [N]."""
         return self.pole_mass * self.pole_com

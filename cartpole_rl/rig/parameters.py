@@ -136,6 +136,8 @@ for _entry in (
               "standard deviation of the position before quantization", noise=True),
     Parameter("angle_noise", "rad", NON_NEGATIVE, 0.0, None,
               "standard deviation of the angle before quantization", noise=True),
+    Parameter("backdrivability", "1", Bound(0, 1), 1.0, None,
+              "share of the pole's and gravity's force that the cart feels: 1 with a DC motor, 0 a stepper"),
 ):
     add_parameter(_entry)
 # fmt: on

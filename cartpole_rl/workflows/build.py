@@ -318,9 +318,7 @@ def evaluated_env(
         raise ConfigError("task.evaluation_start.angle=any: a cart can start only upright or hanging")
     angle: StartPosition = "upright" if start.angle is Start.UPRIGHT else "hanging"
     emulator = config.emulator.model_copy(update={"seed": config.emulator.seed + config.seed})
-    plant = config.plant.build(
-        emulator, settings.control_period, angle, prompt, confirm, hardware=settings.hardware
-    )
+    plant = config.plant.build(emulator, settings.control_period, angle, prompt, confirm, settings.cart)
     return environment(settings, plant)
 
 

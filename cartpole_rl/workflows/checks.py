@@ -256,12 +256,12 @@ def check_compiler(device: str = "cpu") -> None:
 
 
 def note_other_numbers(command: str, cart: Mapping[str, float], poles: Iterable[Pole]) -> None:
-    """Print the numbers of a simulated cart and its poles that are not the nominal ones, if there are any."""
-    found = [*differences(cart, completed(shipped_carts()[0]))]
+    """Print the numbers that are those of no cart or pole in conf/, and which the most similar one has."""
+    found = min(([*differences(cart, completed(each))] for each in shipped_carts()), key=len)
     for pole in poles:
         found += differences(pole.model_dump(), nominal_pole(pole).model_dump())
     if found:
-        print_message(command, f"note: the cart is not the nominal one: {', '.join(found)}")
+        print_message(command, f"note: no cart in conf/ has these numbers: {', '.join(found)}")
 
 
 def differences(numbers: Mapping[str, float], nominal: Mapping[str, float]) -> Iterator[str]:

@@ -14,4 +14,4 @@ def emulate(config: EmulateConfig) -> None:
     """Run the cart; it prints one line of JSON when it is ready. Raises EmulatorError if it cannot run."""
     from cartpole_rl.emulator.process import run  # imports MuJoCo
 
-    run(config.emulator.with_hardware(config.hardware))
+    run(config.emulator.of_cart(config.cart))

@@ -40,7 +40,7 @@ from cartpole_rl.reporting.identification import (
 )
 from cartpole_rl.reporting.style import save
 from cartpole_rl.reporting.texts import table
-from cartpole_rl.rig.hardware import Hardware, hardware_of
+from cartpole_rl.rig.hardware import Hardware
 from cartpole_rl.rig.parameters import PARAMETERS
 from cartpole_rl.run_folder import (
     CART,
@@ -169,7 +169,7 @@ def record_experiments(config: IdentifyConfig, folder: Path) -> None:
 def make_plant(config: IdentifyConfig) -> SerialPlant:
     """Connect to the cart that is identified."""
     plant: SerialPlant = config.plant.build(
-        config.emulator, config.control_period, "hanging", tqdm.write, confirm, hardware=config.hardware
+        config.emulator, config.control_period, "hanging", tqdm.write, confirm, cart=config.cart
     )
     return plant
 
@@ -315,12 +315,12 @@ def results(found: Identification, carts: np.ndarray) -> dict[str, Any]:
 def known_truth(config: IdentifyConfig) -> EmulatorSettings | None:
     """Return the truth of the emulated cart that the recordings are of; None for any other cart."""
     if config.source is None:
-        return config.emulator.with_hardware(config.hardware) if config.plant.reads_emulator else None
+        return config.emulator.of_cart(config.cart) if config.plant.reads_emulator else None
     try:
         recorded = yaml.safe_load((config.source / CONFIG).read_text(encoding="utf-8"))
         of_emulator = recorded["plant"]["kind"] == "emulated"
         truth = validated(EmulatorSettings, recorded["emulator"])
-        return truth.with_hardware(hardware_of(recorded["cart"])) if of_emulator else None
+        return truth.of_cart(recorded["cart"]) if of_emulator else None
     except (OSError, yaml.YAMLError, LookupError, TypeError, ConfigError):  # recordings of another origin
         return None
 

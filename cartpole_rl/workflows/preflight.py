@@ -61,7 +61,7 @@ def connected_cart(config: PreflightConfig) -> Iterator[SerialCart]:
     plant, hardware = config.plant, config.hardware
     asked = asking(plant, confirm) if isinstance(plant, BoardSettings) else lambda: None
     with (
-        plant.reachable(config.emulator.with_hardware(hardware), hardware) as settings,
+        plant.reachable(config.emulator.of_cart(config.cart), hardware) as settings,
         closing(SerialCart(settings, hardware, asked)) as cart,
     ):
         yield cart

@@ -12,6 +12,8 @@ from cartpole_rl.checking import validated
 from cartpole_rl.choices import conf_folder
 from cartpole_rl.composition import compose
 from cartpole_rl.envs.build import randomizer
+from cartpole_rl.errors import ConfigError
+from cartpole_rl.rig.hardware import hardware_of
 from cartpole_rl.workflows.build import evaluated_settings
 from cartpole_rl.workflows.config import EvaluateConfig, FinetuneConfig, TrainConfig
 
@@ -55,6 +57,10 @@ def test_training_takes_it(chosen: str) -> None:
 @pytest.mark.parametrize("chosen", [case for case in CHOICES if group_of(case) in REPLACEABLE])
 def test_an_evaluation_can_replace_the_agents_choice(chosen: str, trained: TrainConfig) -> None:
     config = validated(EvaluateConfig, composed("evaluate", "run=somewhere", chosen))
+    if config.cart is not None and hardware_of(config.cart) != trained.hardware:
+        with pytest.raises(ConfigError, match="train one for this cart"):
+            evaluated_settings(trained, config)
+        return
     settings = evaluated_settings(trained, config)
     randomizer(settings)
     wanted = validated(TrainConfig, composed("train", chosen))

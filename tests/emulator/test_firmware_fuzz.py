@@ -106,6 +106,7 @@ def test_a_cart_that_is_neither_armed_nor_homing_is_at_most_braked(events, homed
     for event in events:
         if isinstance(event, Message):
             firmware.receive(encode_frame(event, 1)[:-1], now_us)
+            braked |= firmware.armed  # the brake of a cart that is armed and stopped at once goes on
             continue
         idle = not firmware.armed and not firmware.homing
         end_us = now_us + firmware.period_us

@@ -161,6 +161,30 @@ def test_tilt_pulls_the_cart_to_the_lower_end_and_the_pole_hangs_by_gravity():
     assert hanging.angle == pytest.approx(math.pi, abs=1e-6)
 
 
+def test_a_stepper_moves_as_it_is_told_whatever_pole_and_tilt_do():
+    settings = EmulatorSettings(
+        backdrivability=0,
+        cart_mass=2,
+        force_curve=(0, 0.02, 0),
+        deadband_left=0,
+        deadband_right=0,
+        force_asymmetry=0,
+        motor_time_constant=0,
+        cart_viscous=0,
+        cart_coulomb_left=0,
+        cart_coulomb_right=0,
+        track_tilt=0.1,
+        pole_mass=0.5,
+    )
+    cart = CartPhysics(settings)
+    cart.place(0.0, 2.0, 3.0)
+    cart.advance(0, 0.5)
+    assert abs(cart.x) < 1e-5
+    cart.advance(100, 0.5)
+    assert cart.x_dot == pytest.approx(0.5 * 1.0, rel=1e-3)  # 2 N on 2 kg
+    assert cart.x == pytest.approx(0.5 * 1.0 * 0.5**2, rel=5e-3)
+
+
 def test_a_finer_step_changes_little():
     ends = []
     for step in (1e-3, 2.5e-4):

@@ -62,7 +62,7 @@ def cart_of(rig: Hardware, **numbers: Any) -> EmulatorSettings:
         deadband_right=rig.motor_offset,
         **COARSE,
         **numbers,
-    ).with_hardware(rig)
+    ).of_cart(rig.model_dump())
 
 
 def home(cart: EmulatorSettings, firmware: str) -> tuple[Driven, State]:
@@ -104,7 +104,7 @@ def test_a_short_track_has_room_for_a_swinging_pole(rig: Hardware, seed: int) ->
 
 def test_a_cart_like_ip02_on_half_its_track_homes() -> None:
     rig = hardware_of({"track_span": 0.396})
-    cart = EmulatorSettings(**COARSE).with_hardware(rig)
+    cart = EmulatorSettings(**COARSE).of_cart(rig.model_dump())
     assert cart.track_half_length == 0.2
     check_homes(cart)
     fault = Fault.HOMING  # the span is wrong
@@ -112,25 +112,25 @@ def test_a_cart_like_ip02_on_half_its_track_homes() -> None:
 
 
 def test_the_longest_track_is_searched_to_its_end() -> None:
-    check_homes(EmulatorSettings(**COARSE).with_hardware(hardware_of({"track_span": 6.0})))
+    check_homes(EmulatorSettings(**COARSE).of_cart({"track_span": 6.0}))
 
 
 def test_the_coarsest_encoders_are_fine_enough() -> None:
     rig = hardware_of({"cart_nanometres_per_count": 600_000, "pole_counts_per_turn": 200})
-    driven, state = home(EmulatorSettings(**COARSE).with_hardware(rig), "python")
+    driven, state = home(EmulatorSettings(**COARSE).of_cart(rig.model_dump()), "python")
     assert (driven.flags, state.fault) == (Flags.HOMED, Fault.NONE)
 
 
 def test_a_rig_survives_json_and_leaves_a_chosen_track() -> None:
     rig = hardware_of({"track_span": 0.396})
-    cart = EmulatorSettings(track_half_length=0.21).with_hardware(rig)
+    cart = EmulatorSettings(track_half_length=0.21).of_cart(rig.model_dump())
     assert cart.track_half_length == 0.21
     assert EmulatorSettings.model_validate_json(cart.model_dump_json()) == cart
-    assert EmulatorSettings().with_hardware(nominal_hardware()).track_half_length == DEFAULT.track_half_length
+    assert EmulatorSettings().of_cart({}).track_half_length == DEFAULT.track_half_length
 
 
 def test_another_rig_than_the_given_one_is_refused() -> None:
     cart = EmulatorSettings(hardware=hardware_of({"track_span": 0.5}))
-    assert cart.with_hardware(hardware_of({"track_span": 0.5})) is cart
+    assert cart.of_cart({"track_span": 0.5}) is cart
     with pytest.raises(ConfigError, match=r"^emulator\.hardware: it differs from the rig of cart=; leave it"):
-        cart.with_hardware(nominal_hardware())
+        cart.of_cart({})

@@ -60,6 +60,7 @@ CASES = {
     "deadband_right": Case(0.0, 200.0, motor=100),
     "motor_time_constant": Case(0.0, 0.05),
     "latency": Case(0.0, 0.06),
+    "backdrivability": Case(0.0, 1.0),
     "angle_offset": Case(-0.05, 0.05),
 }
 CHANCE = {

@@ -29,6 +29,7 @@ from cartpole_rl.physics.models import INTEGRATORS, Models
 from cartpole_rl.physics.parameters import GRAVITY, CartParameters
 
 MakeCart = Callable[..., CartParameters]
+POLE = ("pole_mass", "pole_com", "pole_inertia")
 FRICTIONLESS = Models.of(cart_friction="none", pole_friction="none", actuator="newtons")
 
 
@@ -130,6 +131,33 @@ class MujocoCart:
             mujoco.mj_step(model, data)
         (x, angle), (x_dot, angle_dot) = data.qpos, data.qvel
         return np.array([x, x_dot, angle + self.tilt, angle_dot])
+
+
+@pytest.mark.parametrize("felt", [0.3, 0.0])
+def test_a_cart_that_feels_less_of_the_pole_is_a_heavier_one_under_more_force(
+    felt: float, make_cart: MakeCart
+) -> None:
+    """0.5 s from 20 states; a cart that feels nothing is a thousand tonnes."""
+    cart, larger = make_cart(20, backdrivability=felt), 1 / max(felt, 1e-6)
+    starts, (force,) = torch.stack(draw(20, 0.2, 0.5, math.pi, 6.0), 1), draw(20, 2.0, seed=1)
+    mass, *pole = (float(getattr(cart, name)[0]) for name in ("cart_mass", *POLE))
+    reference = MujocoCart(larger * mass, *pole)
+    pairs = zip(starts.numpy(), (larger * force).tolist(), strict=True)
+    truth = np.stack([reference.run(start, push, 0.5) for start, push in pairs])
+    state, body = State(*starts.unbind(1)), mechanism(cart)
+    for _ in range(10_000):
+        state = advance(state, force, cart, body, FRICTIONLESS, 5e-5)
+    torch.testing.assert_close(torch.stack(state, 1), torch.tensor(truth), rtol=0, atol=0.01)
+
+
+def test_a_stepper_holds_its_cart_on_a_tilted_track(make_cart: MakeCart) -> None:
+    cart = make_cart(1, backdrivability=0.0, track_tilt=0.1)
+    nothing = torch.zeros(1, dtype=torch.float64)
+    state = State(nothing, nothing, nothing + 2.0, nothing + 3.0)
+    for _ in range(100):
+        state = advance(state, nothing, cart, mechanism(cart), FRICTIONLESS, 1e-3)
+    assert (state.x, state.x_dot) == (0, 0)
+    assert state.theta != 2.0
 
 
 class TestAgainstMujoco:

@@ -186,5 +186,5 @@ def test_numbers_that_are_not_nominal_are_printed(capsys: pytest.CaptureFixture[
     ):
         config = trained(*words)
         note_other_numbers("train", config.nominal_cart, (config.pole.choices or {}).values())
-        head = "cartpole-train: note: the cart is not the nominal one: "
+        head = "cartpole-train: note: no cart in conf/ has these numbers: "
         assert capsys.readouterr().err == (f"{head}{line}\n" if line else "")

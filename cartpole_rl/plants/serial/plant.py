@@ -4,7 +4,7 @@ Time is the cart's: `dt` comes from STATE's clock. `preparation.py` brings the c
 episode. Every ending, by the track, a fault, the link or `close`, sets the motor to 0 and disarms first.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from typing import Any, Protocol
@@ -30,7 +30,7 @@ from cartpole_rl.plants.serial.preparation import (
 from cartpole_rl.plants.serial.statistics import LinkStatistics
 from cartpole_rl.plants.settings import BoardSettings, EmulatedSettings, Rehome, SerialSettings
 from cartpole_rl.plants.specs import TERMINATING, TRUNCATING, Numbers, OneCartPlant, PlantOutput, on_tensors
-from cartpole_rl.rig.hardware import Hardware, nominal_hardware
+from cartpole_rl.rig.hardware import Hardware, hardware_of
 from cartpole_rl.tasks.episode import Ending
 from cartpole_rl.wire import Fault, Flags, State, seconds_between, ticks_between, went_back
 
@@ -322,9 +322,10 @@ def real_cart(
     start: StartPosition,
     prompt: Callable[[str], None],
     confirm: Confirm = nobody,
-    hardware: Hardware | None = None,
+    cart: Mapping[str, float] | None = None,
 ) -> SerialPlant:
-    """Return the plant of plant=serial. Raises PortError, LinkError, NotReadyError."""
+    """Return the plant of plant=serial; `cart` is its file. Raises PortError, LinkError, NotReadyError."""
+    hardware = hardware_of(cart or {})
     return SerialPlant(plant, start, control_period, prompt, confirm=confirm, hardware=hardware)
 
 
@@ -335,13 +336,13 @@ def bridged_cart(
     start: StartPosition,
     prompt: Callable[[str], None],
     confirm: Confirm = nobody,
-    hardware: Hardware | None = None,
+    cart: Mapping[str, float] | None = None,
 ) -> SerialPlant:
     """Return the plant of plant=text and plant=driver, on a bridge that lives as long as the plant.
 
     Raises ConfigError if the board does not measure as often as the period needs, PortError, LinkError.
     """
-    hardware = hardware or nominal_hardware()
+    hardware = hardware_of(cart or {})
     bridge = BridgeProcess(plant, hardware, control_period)
     return SerialPlant(
         plant.over(bridge.port),
@@ -362,14 +363,14 @@ def emulated_cart(
     start: StartPosition,
     prompt: Callable[[str], None],
     confirm: Confirm = nobody,
-    hardware: Hardware | None = None,
+    cart: Mapping[str, float] | None = None,
 ) -> SerialPlant:
     """Return the plant of plant=emulated, on a new cart with the settings `emulator` and the start `start`.
 
     It needs nobody to confirm. Raises PortError, LinkError, NotReadyError, EmulatorError.
     """
-    if hardware is not None:
-        emulator = emulator.with_hardware(hardware)
+    if cart is not None:
+        emulator = emulator.of_cart(cart)
     return emulated_plant(emulator.model_copy(update={"start": start}), control_period, prompt, plant.rehome)
 
 

@@ -63,7 +63,7 @@ def board(**options: Any) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
 
 def driven(port: str, period: float = 0.01, hardware: Hardware = RIG, **changed: Any) -> SerialPlant:
     settings = TextSettings(**STEPPER | {"port": port} | changed)
-    return bridged_cart(settings, EmulatorSettings(), period, "hanging", print, always, hardware)
+    return bridged_cart(settings, EmulatorSettings(), period, "hanging", print, always, hardware.model_dump())
 
 
 def push(plant: SerialPlant, motor: int) -> TensorDict:
@@ -156,7 +156,9 @@ def test_a_cart_that_is_put_in_place_by_hand_needs_a_person() -> None:
     with board() as (port, _):
         settings = TextSettings(**STEPPER, port=port)
         with (
-            closing(bridged_cart(settings, EmulatorSettings(), 0.01, "hanging", print, nobody, RIG)) as plant,
+            closing(
+                bridged_cart(settings, EmulatorSettings(), 0.01, "hanging", print, nobody, RIG.model_dump())
+            ) as plant,
             pytest.raises(
                 PlantError, match=r"plant\.homing=hand: a person has to put the cart in the middle"
             ),
