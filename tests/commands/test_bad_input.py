@@ -73,7 +73,11 @@ def test_training(words: str, named: str, remedy: str, tmp_path: Path) -> None:
         ("mas: 1\n", "mas: there is no such setting; did you mean cart_mass?"),
         ("defaults: [ip02]\nmas: 1\n", "mas: there is no such setting; did you mean cart_mass?"),
         ("defaults: [ip02]\ncart_mass: -1\n", "cart_mass is -1; it must be above 0"),
-        ("defaults: [ip2]\n", "defaults: there is no choice ip2; did you mean ip02? there are ip02, thesis"),
+        (
+            "defaults: [ip2]\n",
+            "defaults: there is no choice ip2; did you mean ip02? "
+            "there are ip02, laboratorio, sensorsini, stepper, thesis",
+        ),
     ],
 )
 def test_a_cart_file_names_what_is_wrong_with_it(text: str, complaint: str, tmp_path: Path) -> None:

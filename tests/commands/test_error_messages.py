@@ -70,7 +70,8 @@ def test_a_setting_of_each_group_without_a_choice_gets_one_line(command: str) ->
         (
             "train",
             "randomization.cart_mass.relative",
-            "randomization.cart_mass.relative belongs to randomization=half, wide or wider: give one of them",
+            "randomization.cart_mass.relative belongs to randomization=dc, half, wide or wider: "
+            "give one of them",
         ),
     ],
 )

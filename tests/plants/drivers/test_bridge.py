@@ -16,29 +16,17 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from cartpole_rl.choices import choice
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import ConfigError, LinkError, PlantError
 from cartpole_rl.plants.serial.plant import SerialPlant, bridged_cart
 from cartpole_rl.plants.serial.preparation import always, nobody
 from cartpole_rl.plants.settings import TextSettings
-from cartpole_rl.rig.hardware import Hardware, nominal_hardware
+from cartpole_rl.rig.hardware import Hardware, hardware_of
 
 BOARD = Path(__file__).parents[2] / "support" / "text_board.py"
-RIG = nominal_hardware().model_copy(
-    update={
-        "cart_nanometres_per_count": 25_000,
-        "pole_counts_per_turn": 4096,
-        "track_span": 0.6,
-        "soft_limit": 0.03,
-        "hard_limit": 0.006,
-        "braking": 10.0,
-        "hard_push": 60,
-        "moving_mass": 1.0,
-        "moving_friction": 0.0,
-        "motor_offset": 0.0,
-        "motor_per_newton": 21.25,
-    }
-)
+CART = choice("cart/stepper")
+RIG = hardware_of(CART)
 STEPPER: dict[str, Any] = {
     "kind": "text",
     "sends": "acceleration",
