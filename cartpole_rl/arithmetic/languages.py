@@ -124,6 +124,9 @@ class C(Python):
             return f"{left} {COMPARISONS[operation]} {right}"
         if operation in ("to_bool", "to_float", "to_int"):
             return self.cast(operands[0], kind)
+        if operation == "remainder" and kind is int and isinstance(operands[1].value, int):
+            value, by = (self.cast(operand, int) for operand in operands)
+            return f"({value} % {by} + {by}) % {by}"  # C rounds a quotient towards 0
         table = self.logical if kind is bool else self.table if kind is float else EXACT
         return table[operation].format(*(self.cast(operand, kind) for operand in operands))
 

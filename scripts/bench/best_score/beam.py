@@ -8,18 +8,19 @@ from torch import Tensor
 from best_score.cart import LOST, KnownCart, Nodes, wrapped
 from cartpole_rl.physics.dynamics import State
 
-LANDINGS = (3, 10)  # steps before the pole stands at which a landing begins
-SETTLING = 30  # steps after that moment at which a landing ends
-HOLDING_STATES, LOOKAHEAD, KEPT_STEPS = 300, 40, 20  # holding looks 40 steps ahead and keeps 20 of them
+LANDINGS = (0.06, 0.2)  # s before the pole stands at which a landing begins
+SETTLING = 0.6  # s after that moment at which a landing ends
+HOLDING_STATES, LOOKAHEAD, KEPT = 300, 0.8, 0.4  # holding looks 0.8 s ahead and keeps 0.4 s of it
+POINTS_PERIOD = 0.02  # s, for which the points in `risk` are
 CELL = (0.002, 0.01, 0.006, 0.03)  # m, m/s, rad, rad/s
 
 
 def landed(cart: KnownCart, position: float, swing: list[int], arrival: int, states: int) -> list[list[int]]:
-    """Return sequences until SETTLING steps after `arrival`, one for each beginning of the landing."""
+    """Return sequences until SETTLING after `arrival`, one for each beginning of the landing."""
     sequences = []
     for early in LANDINGS:
-        first = swing[: max(arrival - early, 0)]
-        steps = min(arrival + SETTLING, cart.steps) - len(first)
+        first = swing[: max(arrival - cart.periods(early), 0)]
+        steps = min(arrival + cart.periods(SETTLING), cart.steps) - len(first)
         root = cart.run(cart.hanging(position), first)
         sequences.append(first + beam(cart, root, steps, states))
     return sequences
@@ -33,8 +34,8 @@ def held(cart: KnownCart, position: float, actions: list[int]) -> list[int]:
     actions, nodes = list(actions), cart.run(cart.hanging(position), actions)
     while len(actions) < cart.steps:
         left = cart.steps - len(actions)
-        ahead = beam(cart, nodes, min(LOOKAHEAD, left), HOLDING_STATES)
-        kept = ahead if len(ahead) in (0, left) else ahead[:KEPT_STEPS]
+        ahead = beam(cart, nodes, min(cart.periods(LOOKAHEAD), left), HOLDING_STATES)
+        kept = ahead if len(ahead) in (0, left) else ahead[: cart.periods(KEPT)]
         if not kept:
             break
         actions, nodes = actions + kept, cart.run(nodes, kept)
@@ -61,8 +62,9 @@ def beam(cart: KnownCart, root: Nodes, steps: int, states: int) -> list[int]:
 def risk(cart: KnownCart, state: State) -> Tensor:
     """Return the points [N] that states near upright are going to lose, roughly."""
     falls = wrapped(state.theta) + state.theta_dot / cart.growth
-    stops_at = ((state.x + 0.3 * state.x_dot) / cart.reach).abs()
-    return 100 * falls.abs() + 30 * stops_at**2 + 200 * (stops_at - 0.8).clamp(min=0) ** 2
+    stops_at = ((state.x + cart.coasting * state.x_dot) / cart.reach).abs()
+    points = 100 * falls.abs() + 30 * stops_at**2 + 200 * (stops_at - 0.8).clamp(min=0) ** 2
+    return points * (POINTS_PERIOD / cart.config.control_period)
 
 
 def cells(state: State) -> Tensor:

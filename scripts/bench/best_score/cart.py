@@ -25,6 +25,7 @@ from cartpole_rl.tasks.rewards import BONUS, score
 from cartpole_rl.workflows.config import TrainConfig
 
 MOST = 1 + 2 * BONUS  # points of a step, standing still in the middle
+COASTING = 0.3  # s; friction stops some carts sooner
 LOST = 1e9  # points: the loss of leaving the track, more than any score
 COMPILED_SIZES = (1000, 2700, 9000)  # carts in a batch
 
@@ -62,6 +63,12 @@ class KnownCart:
         self.reach = float(self.one.track_half_length)
         stiffness = self.one.first_moment * GRAVITY / self.one.pivot_inertia
         self.growth = float(stiffness.sqrt())  # 1/s, growth rate of the angle of a falling pole
+        stopping = float(self.one.driven_mass / self.one.cart_viscous.clamp(min=1e-6))
+        self.coasting = min(COASTING, stopping)  # s at its speed, for which a cart runs on
+
+    def periods(self, seconds: float) -> int:
+        """Return the control periods in `seconds`, at least one."""
+        return max(1, round(seconds / self.config.control_period))
 
     @property
     def steps(self) -> int:

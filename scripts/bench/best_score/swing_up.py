@@ -10,7 +10,7 @@ from best_score.cart import LOST, MOST, KnownCart, wrapped
 from cartpole_rl.physics.dynamics import State
 
 PUSHES = 12  # in a swing-up
-SLOWEST_SWING = 350  # steps
+SLOWEST_SWING = 7.0  # s
 ISLANDS = 8  # populations that evolve separately
 PATIENCE = (1, 1, 1, 3, 3, 3, 10, 10)  # of each island: weight of `lacks` against `lost`
 STANDS = 150  # points; a pole that lacks less than this stands, or nearly
@@ -77,7 +77,7 @@ def evolved(
     firsts = torch.arange(0, ISLANDS * each, each).unsqueeze(1)  # [ISLANDS, 1] first row of each island
     patience = torch.tensor(PATIENCE, dtype=torch.float32).repeat_interleave(each)
     pushes = first_generation(cart, ISLANDS * each, generator)
-    steps = min(SLOWEST_SWING, cart.steps)
+    steps = min(cart.periods(SLOWEST_SWING), cart.steps)
     for _ in range(generations):
         swings = swung(cart, position, pushes, steps, patience)
         loss = swings.lost + patience * swings.lacks
