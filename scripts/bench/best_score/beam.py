@@ -10,7 +10,8 @@ from cartpole_rl.physics.dynamics import State
 
 LANDINGS = (0.06, 0.2)  # s before the pole stands at which a landing begins
 SETTLING = 0.6  # s after that moment at which a landing ends
-HOLDING_STATES, LOOKAHEAD, KEPT = 300, 0.8, 0.4  # holding looks 0.8 s ahead and keeps 0.4 s of it
+HOLDING_STATES, KEPT = 300, 0.4  # holding keeps 0.4 s of what it finds
+LOOKAHEADS = (0.8, 1.6)  # s; the better of two holdings counts, as slow carts need a longer look
 POINTS_PERIOD = 0.02  # s, for which the points in `risk` are
 CELL = (0.002, 0.01, 0.006, 0.03)  # m, m/s, rad, rad/s
 
@@ -27,6 +28,15 @@ def landed(cart: KnownCart, position: float, swing: list[int], arrival: int, sta
 
 
 def held(cart: KnownCart, position: float, actions: list[int]) -> list[int]:
+    """Return the sequence continued to the end of the episode; the better one of LOOKAHEADS."""
+
+    def points(found: list[int]) -> tuple[int, float]:
+        return len(found), float(cart.run(cart.hanging(position), found).points)
+
+    return max((continued(cart, position, actions, ahead) for ahead in LOOKAHEADS), key=points)
+
+
+def continued(cart: KnownCart, position: float, actions: list[int], lookahead: float) -> list[int]:
     """Return the sequence continued to the end of the episode.
 
     Each search starts from the state that the cart reaches alone: among many states it differs by rounding.
@@ -34,7 +44,7 @@ def held(cart: KnownCart, position: float, actions: list[int]) -> list[int]:
     actions, nodes = list(actions), cart.run(cart.hanging(position), actions)
     while len(actions) < cart.steps:
         left = cart.steps - len(actions)
-        ahead = beam(cart, nodes, min(cart.periods(LOOKAHEAD), left), HOLDING_STATES)
+        ahead = beam(cart, nodes, min(cart.periods(lookahead), left), HOLDING_STATES)
         kept = ahead if len(ahead) in (0, left) else ahead[: cart.periods(KEPT)]
         if not kept:
             break

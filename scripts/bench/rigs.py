@@ -1,0 +1,155 @@
+#!/usr/bin/env python
+"""Does the whole chain work on each rig of conf/cart? The tables of docs/results/rigs.md.
+
+    scripts/bench/rigs.py --seeds 3 --jobs 2 --json rigs.json
+
+For each rig: preflight and identification on an emulated cart, then for each seed a training, an evaluation
+of the last checkpoint on the nominal cart and on the emulated one, its C export driving on the emulated
+board, and a fine-tuning. The emulated cart differs from the rig's file as the default one from ip02. A
+fraction is a score over the reference of the rig's nominal cart (reference.py, with the same settings). The
+runs are in runs/bench/rigs/<rig>; what exists is not made again.
+"""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from common import (
+    LOST_SCORE,
+    RUNS,
+    add_seed_options,
+    chosen_seeds,
+    failure,
+    in_parallel,
+    mean_score,
+    option_parser,
+    positive_int,
+    print_table,
+    read_json,
+    run_once,
+    write_json,
+)
+from reference import reference
+
+from cartpole_rl.workflows.config import TrainConfig, load_settings
+
+
+class Rig(NamedTuple):
+    """A cart and what is chosen with it."""
+
+    cart: str
+    pole: str
+    period: float  # s
+    actions: str
+    randomization: str
+
+    @property
+    def training(self) -> dict[str, Any]:
+        """The settings of its training."""
+        chosen = self._asdict()
+        return {"control_period": chosen.pop("period"), **chosen}
+
+    @property
+    def emulated(self) -> tuple[str, ...]:
+        """The words for its emulated cart."""
+        return "plant=emulated", f"emulator={self.pole}"
+
+
+RIGS = (
+    Rig("ip02", "medium", 0.02, "nine_levels", "wide"),
+    Rig("sensorsini", "sensorsini", 0.02, "nine_levels_linear", "dc"),
+    Rig("laboratorio", "laboratorio", 0.01, "nine_levels_linear", "dc"),
+    Rig("stepper", "rod_03", 0.01, "nine_levels_linear", "stepper"),
+)
+
+
+def words(settings: dict[str, Any]) -> list[str]:
+    """Return settings as words of a command."""
+    return [f"{name}={value}" for name, value in settings.items()]
+
+
+def lost(file: Path) -> int:
+    """Return the lost episodes in a metrics.json."""
+    return sum(each["score"] < LOST_SCORE for each in read_json(file)["episodes"])
+
+
+def identified(rig: Rig, folder: Path) -> dict[str, Any]:
+    """Check and identify the emulated cart of a rig; return the figures."""
+    refused = failure("preflight", f"cart={rig.cart}", *rig.emulated)
+    given = (f"cart={rig.cart}", f"pole={rig.pole}", f"control_period={rig.period}")
+    found = run_once(folder / "identify", "identify", *given, *rig.emulated, result="identification.json")
+    report = read_json(found / "identification.json")
+    return {"preflight": refused or "ready", **{name: report[name] for name in ("errors", "held_out_1_s")}}
+
+
+def driven(rig: Rig, folder: Path, seed: int) -> dict[str, Any]:
+    """Train, evaluate, export and fine-tune with one seed; return the figures of the last checkpoint."""
+    parent = folder / str(seed)
+    run = run_once(parent / "train", "train", *words(rig.training), f"seed={seed}")
+
+    def evaluated(name: str, *more: str) -> Path:
+        return run_once(parent / name, "evaluate", f"run={run}", *more) / "metrics.json"
+
+    run_once(parent / "c", "export", f"run={run}", "format=c", result="policy.c")
+    onboard = ("emulator.firmware=c", "emulator.policy=onboard")
+    tuned = run_once(
+        parent / "finetune",
+        "finetune",
+        f"run={run}",
+        *rig.emulated,
+        "episodes=10",
+        "evaluation_episodes=5",
+        result="comparison.json",
+    )
+    return {
+        "drawn": mean_score(run / "metrics.json"),
+        "drawn_lost": lost(run / "metrics.json"),
+        "nominal": mean_score(evaluated("nominal", "randomization=none", "episodes=50")),
+        "emulated": mean_score(evaluated("emulated", *rig.emulated, "episodes=5")),
+        "onboard": onboard_score(evaluated("onboard", *rig.emulated, *onboard, "episodes=3")),
+        "tuned": read_json(tuned / "comparison.json"),
+    }
+
+
+def onboard_score(file: Path) -> float:
+    """Return the mean score (6.2) of the policy on the board."""
+    return float(read_json(file)["onboard"]["score"]["mean"])
+
+
+def main() -> None:
+    """Drive the rigs and print the tables."""
+    parser = option_parser(__doc__)
+    add_seed_options(parser, 3)
+    parser.add_argument("--jobs", type=positive_int, default=1, help="rigs at a time (1)")
+    parser.add_argument("--states", type=positive_int, default=1000, help="of the search (1000)")
+    options = parser.parse_args()
+
+    def work(rig: Rig) -> dict[str, Any]:
+        folder = RUNS / "rigs" / rig.cart
+        found: dict[str, Any] = identified(rig, folder)
+        settings = load_settings(TrainConfig, rig.training)
+        found["reference"] = reference(settings, options.states)["score"]
+        found["seeds"] = {seed: driven(rig, folder, seed) for seed in chosen_seeds(options)}
+        return found
+
+    results = dict(zip([rig.cart for rig in RIGS], in_parallel(work, RIGS, options.jobs), strict=True))
+    write_json(options.json, results)
+    rows = []
+    for rig, found in results.items():
+        for seed, figures in found["seeds"].items():
+            best = found["reference"]
+            rows.append(
+                {
+                    "rig": rig,
+                    "seed": str(seed),
+                    "reference": f"{best:.0f}",
+                    **{
+                        name: f"{figures[name] / best:.3f}"
+                        for name in ("nominal", "drawn", "emulated", "onboard")
+                    },
+                }
+            )
+    print_table(rows)
+
+
+if __name__ == "__main__":
+    main()
