@@ -10,7 +10,7 @@ from cartpole_rl.physics.dynamics import State
 
 LANDINGS = (0.06, 0.2)  # s before the pole stands at which a landing begins
 SETTLING = 0.6  # s after that moment at which a landing ends
-HOLDING_STATES, KEPT = 300, 0.4  # holding keeps 0.4 s of what it finds
+HOLDING_STATES, KEPT = 1000, 0.4  # holding keeps 0.4 s of what it finds
 LOOKAHEADS = (0.8, 1.6)  # s; the better of two holdings counts, as slow carts need a longer look
 POINTS_PERIOD = 0.02  # s, for which the points in `risk` are
 CELL = (0.002, 0.01, 0.006, 0.03)  # m, m/s, rad, rad/s
