@@ -7,7 +7,7 @@ For each rig: preflight and identification on an emulated cart, then for each se
 of the last checkpoint on the nominal cart and on the emulated one, its C export driving on the emulated
 board, and a fine-tuning. The emulated cart differs from the rig's file as the default one from ip02. A
 fraction is a score over the reference of the rig's nominal cart: the best one that reference.py finds with
-the same settings from any of its starts. The runs are in runs/bench/rigs/<rig>; what exists is not made again.
+the same settings from any of its starts. The runs are in runs/bench/rigs; what exists is not made again.
 """
 
 from pathlib import Path

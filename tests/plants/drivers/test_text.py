@@ -1,0 +1,163 @@
+"""Lines of text: what is read, what is sent, and which settings are refused."""
+
+import math
+import os
+import pty
+import tty
+from collections.abc import Iterator
+from contextlib import closing
+from typing import Any
+
+import pytest
+from pydantic import ValidationError
+
+from cartpole_rl.choices import choice
+from cartpole_rl.errors import LinkError
+from cartpole_rl.plants.drivers.driver import Measurement
+from cartpole_rl.plants.drivers.text import TextDriver
+from cartpole_rl.plants.settings import DriverSettings, TextSettings
+from cartpole_rl.rig.hardware import hardware_of
+
+RIG = hardware_of(choice("cart/stepper"))  # 25 um, 4096 counts a turn
+
+
+class Line:
+    """A driver and the other end of its line."""
+
+    def __init__(self, **given: Any) -> None:
+        self.board, end = pty.openpty()
+        tty.setraw(end)
+        self.driver = TextDriver(
+            TextSettings(kind="text", port=os.ttyname(end), full=255, **given), RIG.encoders
+        )
+        self.driver.open()
+        os.close(end)
+
+    def read(self, *lines: bytes, timeout: float = 0.0) -> Measurement | None:
+        for line in lines:
+            os.write(self.board, line)
+        return self.driver.read(timeout or 5.0)
+
+    def sent(self) -> bytes:
+        return os.read(self.board, 100)
+
+    def close(self) -> None:
+        self.driver.close()
+        os.close(self.board)
+
+
+@pytest.fixture
+def line() -> Iterator[Line]:
+    with closing(Line()) as opened:
+        yield opened
+
+
+UNITS = {
+    "counts": ({}, b"1000,-40,12\n", Measurement(-40, 12, 1000)),
+    "two spaces and a carriage return": ({}, b" 1000, -40, 12\r\n", Measurement(-40, 12, 1000)),
+    "mm, deg, ms": (
+        {"cart_unit": "mm", "pole_unit": "deg", "time_unit": "ms"},
+        b"7,-1.0,90\n",
+        Measurement(-40, 1024, 7000),
+    ),
+    "m, rad, s": (
+        {"cart_unit": "m", "pole_unit": "rad", "time_unit": "s"},
+        f"1.5,0.001,{math.pi}\n".encode(),
+        Measurement(40, 2048, 1_500_000),
+    ),
+    "other columns": (
+        {"columns": ["pole", "-", "cart"], "separator": ";"},
+        b"5;nonsense;6\n",
+        Measurement(6, 5, None),
+    ),
+}
+
+
+@pytest.mark.parametrize(("given", "text", "measured"), UNITS.values(), ids=UNITS)
+def test_it_reads_the_columns_in_their_units(
+    given: dict[str, Any], text: bytes, measured: Measurement
+) -> None:
+    with closing(Line(**given)) as line:
+        assert line.read(text) == measured
+
+
+BAD = [
+    b"",
+    b"1,2",
+    b"1,2,3,4",
+    b"1,2,nan",
+    b"1,inf,3",
+    b"1,2,x",
+    b"1.5,2,3",
+    b"\xff,1,2",
+    b"1,2,1e30",
+    b"9" * 300,
+]
+
+
+@pytest.mark.parametrize("bad", BAD)
+def test_a_damaged_line_is_counted_and_not_measured(bad: bytes, line: Line) -> None:
+    assert line.read(bad + b"\n", b"4,5,6\n") == Measurement(5, 6, 4)
+    assert line.driver.bad
+    assert line.driver.why_bad.endswith("is not time,cart,pole")
+
+
+def test_a_line_may_come_in_pieces(line: Line) -> None:
+    assert line.read(b"10,2", timeout=0.01) is None
+    assert line.read(b"0,30\n4") == Measurement(20, 30, 10)
+    assert line.read(b"0,5,6\n") == Measurement(5, 6, 40)
+
+
+def test_a_clock_of_32_bits_goes_on_when_it_wraps(line: Line) -> None:
+    first, second = line.read(b"4294967290,0,0\n"), line.read(b"4,0,0\n")
+    assert first is not None
+    assert second is not None
+    assert (second.us or 0) - (first.us or 0) == 10
+
+
+def test_it_sends_lines(line: Line) -> None:
+    line.driver.send(-12.4)
+    line.driver.stop()
+    assert line.sent() == b"-12\n0\n"
+    with closing(Line(line="a={:.2f}", stop_line="stop", home_line="home")) as other:
+        other.driver.send(1.234)
+        other.driver.stop()
+        other.driver.home()
+        assert other.sent() == b"a=1.23\nstop\nhome\n"
+
+
+def test_a_board_that_is_gone_is_a_lost_link(line: Line) -> None:
+    os.close(line.board)
+    try:
+        with pytest.raises(LinkError, match="is the cart unplugged"):
+            line.driver.read(5)
+    finally:
+        line.board = os.open(os.devnull, os.O_RDONLY)
+
+
+REFUSED = {
+    "full: 0": ({"full": 0}, "full is 0"),
+    "no pole": ({"columns": ["time", "cart"]}, "name the column pole once"),
+    "two times": ({"columns": ["time", "time", "cart", "pole"]}, "the column time once at most"),
+    "no number": ({"line": "go"}, "one line with the command"),
+    "two numbers": ({"line": "{} {}"}, "write it with one number"),
+    "a second line": ({"line": "{}\n{}"}, "write it with one number"),
+    "damping of a voltage": ({"damping": 1.0}, "damping is for sends=speed and sends=acceleration"),
+    "no line to home by": ({"homing": "board"}, "homing=board needs home_line"),
+}
+
+
+@pytest.mark.parametrize(("given", "why"), REFUSED.values(), ids=REFUSED)
+def test_settings_that_cannot_be_are_refused(given: dict[str, Any], why: str) -> None:
+    with pytest.raises(ValidationError, match=why):
+        TextSettings(**{"kind": "text", "port": "auto", "full": 255, **given})
+
+
+def test_what_a_board_lacks_is_said() -> None:
+    board = TextSettings(kind="text", port="auto", full=255)
+    assert len(board.lacks) == 3
+    assert "nothing stops a moving cart" in board.lacks[1]
+    assert len(TextSettings(kind="text", port="auto", full=255, watchdog=True).lacks) == 2
+    assert len(TextSettings(kind="text", port="auto", full=255, columns=("cart", "pole")).lacks) == 4
+    own = DriverSettings(kind="driver", port="x", full=1, driver="cartpole_rl.plants.drivers.text:TextDriver")
+    assert own.driver.item is TextDriver
