@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cartpole_rl.errors import RecordingError
 from cartpole_rl.identification.checks import check_explained
 from cartpole_rl.identification.fit import Fit, fit_cart
 from cartpole_rl.identification.prediction import (
@@ -174,6 +175,11 @@ def find_cart(
         first if each == first.cart_friction else attempt(each, most // 3, COARSE_STEPS, first.fit)
         for each in frictions
     ]
+    if not np.isfinite([each.error.size for each in screened]).all():
+        raise RecordingError(
+            "no cart near the numbers of cart= and pole= moves as in these recordings: check those numbers, "
+            "and the units and signs of the recordings"
+        )
     largest = CONTENDS * min(each.error.size for each in screened)
     contenders = {
         each.cart_friction: attempt(each.cart_friction, most, COARSE_STEPS, each.fit)

@@ -1,5 +1,6 @@
 """The poles of agents, carts and recordings, and the words that choose a cart with one of them."""
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
@@ -14,7 +15,8 @@ from cartpole_rl.plants.settings import PlantSettings, PortSettings, changed_wor
 from cartpole_rl.randomization.poles import HEAVIER, Pole, PoleSettings, check_one_pole, one_pole
 from cartpole_rl.run_folder import CONFIG
 
-POLES = ("medium", "large")  # in conf/pole/ and conf/emulator/; the first is the default
+PRETRAINED = ("medium", "large")  # poles of pretrained agents; the first is the default
+POLES = (*PRETRAINED, "rod_03", "sensorsini", "laboratorio")  # in conf/pole/ and conf/emulator/
 
 
 def other_pole(known: Sequence[PoleSettings], driven: PoleSettings, emulated: bool) -> str | None:
@@ -67,10 +69,11 @@ def emulated_words(known: Sequence[PoleSettings]) -> str:
 def emulator_for(known: Sequence[PoleSettings]) -> str | None:
     """Return the one of POLES whose emulated cart has one of the `known` poles, the newest first."""
     files = group_choices("emulator")  # without the first, which is in code
+    emulated = {name: emulated_pole(EmulatorSettings(**files.get(name, {}))) for name in POLES}
     for poles in reversed(known):
-        for name in POLES:
-            if poles.includes(emulated_pole(EmulatorSettings(**files.get(name, {})))):
-                return name
+        if names := [name for name, pole in emulated.items() if poles.includes(pole)]:
+            mass = emulated[names[0]].pole_mass if poles.choices is None else poles.nominal.pole_mass
+            return min(names, key=lambda name: abs(math.log(emulated[name].pole_mass / mass)))
     return None
 
 
@@ -136,7 +139,7 @@ def recorded_pole(paths: Sequence[Path], own: Mapping[str, Pole] | None = None) 
     for name, pole in known.items():
         if pole.is_about(length):
             return name, pole
-    raise ConfigError(f"pole: one of {length:g} m was recorded; give pole=medium, large or your own")
+    raise ConfigError(f"pole: one of {length:g} m was recorded; give one of {', '.join(POLES)}, or your own")
 
 
 def recorded_length(path: Path) -> float | None:

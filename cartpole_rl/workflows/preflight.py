@@ -7,12 +7,12 @@ from cartpole_rl.errors import PlantError
 from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.preflight import Finding, preflight
 from cartpole_rl.plants.serial.preparation import FaultClearing, always, asking
-from cartpole_rl.plants.settings import BoardSettings
+from cartpole_rl.plants.settings import BoardSettings, emulated_pole
 from cartpole_rl.randomization.poles import Pole, one_pole
 from cartpole_rl.rig.hardware import nominal_hardware
 from cartpole_rl.terminal import confirm
 from cartpole_rl.workflows.config import PreflightConfig
-from cartpole_rl.workflows.poles import POLES, emulator_for, plant_words
+from cartpole_rl.workflows.poles import POLES, PRETRAINED, emulator_for, plant_words
 
 
 def check_cart(config: PreflightConfig, words: Sequence[str] = ()) -> None:
@@ -44,15 +44,18 @@ def next_command(config: PreflightConfig, words: Sequence[str] = ()) -> str:
     """
     plant, pole = plant_words(config.plant, config.emulator), mounted_pole(config)
     if config.hardware == nominal_hardware():
+        pole = pole if pole in PRETRAINED else PRETRAINED[0]
         return f"cartpole-evaluate run=pretrained/{pole} task=balance {plant} episodes=1"
     cart = [word for word in words if word.startswith(("cart=", "cart."))]
     return " ".join(["cartpole-identify", *cart, plant, f"pole={pole}"])
 
 
 def mounted_pole(config: PreflightConfig) -> str:
-    """Return the one of POLES that is about as long as the cart's; the default if there is none."""
+    """Return the one of POLES that is like the cart's; the default if there is none."""
     length = config.plant.known_pole_length(config.emulator)
-    return (length and emulator_for([one_pole(Pole.rod(length))])) or POLES[0]
+    emulated = config.plant.reads_emulator
+    pole = emulated_pole(config.emulator) if emulated else Pole.rod(length) if length else None
+    return (pole and emulator_for([one_pole(pole)])) or POLES[0]
 
 
 @contextmanager
