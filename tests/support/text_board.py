@@ -5,7 +5,8 @@
 It prints its port, then sends `t_us,cart,pole` every 10 ms, and takes `a=<m/s^2>` and `home`. Each line that
 it took goes to the journal with the time in s, and once a second the cart's position and speed. The options
 are failures: `freeze` (what stands still from second `at` on: "time", "cart", "both"), `garbage` (share of
-damaged lines), `silent` (no line from `at` on), `noise` (from `at` on only noise).
+damaged lines), `silent` (no line from `at` on), `noise` (from `at` on only noise). The `damping` of the pole,
+1/s, is so large that it soon hangs still; a swing-up needs less.
 """
 
 import json
@@ -20,11 +21,18 @@ import tty
 
 LENGTH, INERTIA = 0.15, 7.5e-3 + 0.15**2  # m; m^2: of 1 kg of a 0.3 m rod
 PERIOD, STEP = 0.01, 0.0005  # s
-DAMPING = 2.0  # 1/s of the pole, so that it soon hangs still
 STOPS, FASTEST = 0.3, 1.5  # m, m/s
 COUNT, TURN, HANGING = 25e-6, 4096, 1000
 
-options = {"freeze": "", "garbage": 0.0, "silent": False, "noise": False, "at": 1e9, "journal": os.devnull}
+options = {
+    "damping": 2.0,
+    "freeze": "",
+    "garbage": 0.0,
+    "silent": False,
+    "noise": False,
+    "at": 1e9,
+    "journal": os.devnull,
+}
 options |= json.loads(sys.argv[1]) if len(sys.argv) > 1 else {}
 dice = random.Random(1)
 master, slave = pty.openpty()
@@ -56,7 +64,9 @@ while True:
         x += v * STEP
         if abs(x) > STOPS:
             x, v = math.copysign(STOPS, x), 0.0
-        turning = (9.81 * LENGTH * math.sin(theta) - LENGTH * math.cos(theta) * pull) / INERTIA - DAMPING * w
+        turning = (9.81 * LENGTH * math.sin(theta) - LENGTH * math.cos(theta) * pull) / INERTIA - options[
+            "damping"
+        ] * w
         w += turning * STEP
         theta += w * STEP
     failing = ticks * PERIOD > options["at"]
