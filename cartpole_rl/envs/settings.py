@@ -2,19 +2,18 @@
 
 from collections.abc import Mapping
 from functools import cache
-from typing import TYPE_CHECKING, Annotated, Any, Self
+from typing import TYPE_CHECKING, Annotated, Any
 
-from pydantic import Discriminator, Field, Tag, field_validator, model_validator
+from pydantic import Discriminator, Field, Tag, field_validator
 
 from cartpole_rl.choices import group_choices
-from cartpole_rl.errors import ConfigError
 from cartpole_rl.physics.friction import CART_FRICTIONS, POLE_FRICTIONS
 from cartpole_rl.physics.laws import Law
 from cartpole_rl.physics.models import Models
 from cartpole_rl.plants.settings import SimulationSettings
 from cartpole_rl.randomization.poles import Pole, PoleSettings
 from cartpole_rl.randomization.ranges import IdentifiedSettings, Range
-from cartpole_rl.rig.hardware import Hardware, hardware_of, nominal_hardware, parameters_of
+from cartpole_rl.rig.hardware import RigSettings, hardware_of, nominal_hardware, parameters_of
 from cartpole_rl.rig.parameters import completed
 from cartpole_rl.settings import Finite, NonNegative, Positive, Settings
 from cartpole_rl.tasks.features import ObservationKind
@@ -181,25 +180,6 @@ def driven_numbers(cart: Mapping[str, float], *frictions: FrictionSettings) -> d
             if is_nominal or value != friction.defaults.get(name):
                 numbers[name] = value
     return numbers
-
-
-class RigSettings(Settings):
-    """A cart's file: parameters of its motion, and its hardware."""
-
-    cart: dict[str, Finite]
-
-    @model_validator(mode="after")
-    def _hardware_is_possible(self) -> Self:
-        try:
-            hardware_of(self.cart)
-        except ConfigError as error:
-            raise ValueError(str(error)) from None
-        return self
-
-    @property
-    def hardware(self) -> Hardware:
-        """The encoders, track and motor of the cart."""
-        return hardware_of(self.cart)
 
 
 class CartSettings(RigSettings):

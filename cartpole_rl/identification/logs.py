@@ -19,7 +19,7 @@ from cartpole_rl.identification.checks import shows_motion
 from cartpole_rl.identification.experiments import recording
 from cartpole_rl.identification.settings import Direction, Layout, TimeColumn
 from cartpole_rl.identification.windows import IRREGULAR
-from cartpole_rl.rig.hardware import LARGEST_MOTOR, nominal_encoders
+from cartpole_rl.rig.hardware import LARGEST_MOTOR, Encoders
 from cartpole_rl.tasks.episode import Ending, Episode
 
 Array = NDArray[np.float64]
@@ -50,8 +50,8 @@ class Log(NamedTuple):
     report: Report
 
 
-def read_log(path: Path, layout: Layout) -> Log:
-    """Return the episodes in a log. Raises RecordingError that names the file and the line."""
+def read_log(path: Path, layout: Layout, encoders: Encoders) -> Log:
+    """Return the episodes in a log, in counts of `encoders`. Raises RecordingError, with file and line."""
     columns = read_columns(path, layout)
     time = times(path, columns[layout.time.name], layout.time)
     gaps = np.diff(time)
@@ -72,7 +72,7 @@ def read_log(path: Path, layout: Layout) -> Log:
         regular = np.abs(gaps - period) <= IRREGULAR * period
     together = counted[:-1] & counted[1:] & regular
     edges = np.flatnonzero(np.diff(np.concatenate(([False], together, [False]))))
-    parts, encoders = [], nominal_encoders()
+    parts = []
     for first, last in edges.reshape(-1, 2):  # rows, the last one included
         rows = np.arange(first, last + 1)
         if (last - first) * period < layout.shortest:
@@ -90,7 +90,7 @@ def read_log(path: Path, layout: Layout) -> Log:
         values = motor[rows[1:]] if layout.motor.row == "in_force" else motor[rows[:-1]]
         if layout.resample:
             states, values = resampled(time[rows], states, values, period)
-        part = _episode(states, values, period)
+        part = _episode(states, values, period, encoders)
         if shows_motion(part):
             parts.append(part)
         else:
@@ -188,8 +188,8 @@ def resampled(time: Array, states: Array, motor: Array, period: float) -> tuple[
     return at, np.diff(np.interp(grid, time, total)) / period
 
 
-def _episode(states: Array, motor: Array, period: float) -> Episode:
+def _episode(states: Array, motor: Array, period: float, encoders: Encoders) -> Episode:
     full = np.clip(np.rint(motor * LARGEST_MOTOR), -LARGEST_MOTOR, LARGEST_MOTOR)
     gaps = np.full(len(full), period)
     counts, motors = np.rint(states).astype(np.int64), full.astype(np.int64)
-    return recording(counts, gaps, motors, str(Ending.TIME), nominal_encoders())
+    return recording(counts, gaps, motors, str(Ending.TIME), encoders)

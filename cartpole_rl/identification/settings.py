@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from cartpole_rl.errors import ConfigError
+from cartpole_rl.rig.hardware import RigSettings
 from cartpole_rl.settings import Count, Finite, NonNegative, Positive, Settings
 
 
@@ -87,8 +88,8 @@ class Layout(Settings):
         return self
 
 
-class ImportConfig(Settings):
-    """The settings of cartpole-import."""
+class ImportConfig(RigSettings):
+    """The settings of cartpole-import. Recordings are in the counts of `cart`."""
 
     source: Annotated[Path, Field(alias="from")]
     layout: Layout

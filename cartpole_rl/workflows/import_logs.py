@@ -18,6 +18,7 @@ from cartpole_rl.evaluation.recordings import LENGTH, write_recording
 from cartpole_rl.identification.logs import Log, Report, read_log
 from cartpole_rl.identification.sensors import Estimate, Motion, Sensors, question_sensors
 from cartpole_rl.identification.settings import ImportConfig, Layout, log_files
+from cartpole_rl.rig.hardware import nominal_hardware
 from cartpole_rl.run_folder import RECORDINGS, write_config, write_json
 from cartpole_rl.terminal import print_results, progress_bar, shown
 
@@ -42,7 +43,7 @@ def import_logs(config: ImportConfig, folder: Path) -> Sensors:
     logs = {}
     with progress_bar(len(paths), "logs") as bar:
         for path in paths:
-            logs[path] = read_log(path, config.layout)
+            logs[path] = read_log(path, config.layout, config.hardware.encoders)
             bar.update()
     periods = sorted({round(log.report.period, 4) for log in logs.values()})
     if len(periods) > 1:
@@ -78,7 +79,7 @@ def import_logs(config: ImportConfig, folder: Path) -> Sensors:
                 folder / RECORDINGS / f"{name}_{number:02d}.csv", part, {**heading, "log": path.name}
             )
     write_json(folder / IMPORTED, summary(logs, sensors, found))
-    print_summary(logs, parts, period, sensors, found, folder)
+    print_summary(logs, parts, period, sensors, found, folder, config)
     return sensors
 
 
@@ -194,6 +195,7 @@ def print_summary(
     sensors: Sensors,
     found: Sequence[str],
     folder: Path,
+    config: ImportConfig,
 ) -> None:
     """Print the parts that were kept, the rows that were left out, the estimates and the doubts."""
     reports = [log.report for log in logs.values()]
@@ -218,9 +220,10 @@ def print_summary(
             print(f"{name}: {value:.4g}{unit} (95 %: {low:.4g} to {high:.4g})")
     for doubt in found:
         print(f"doubt: {doubt}")
+    cart = "" if config.hardware == nominal_hardware() else " cart=<yours>.yaml"
     rate = "" if math.isclose(period, choice("identify")["control_period"]) else f" control_period={period:g}"
     print_results(
         folder,
         f"{RECORDINGS}/ and {IMPORTED}",
-        f"cartpole-identify from={shown(folder)} pole=<yours>.yaml{rate}",
+        f"cartpole-identify from={shown(folder)}{cart} pole=<yours>.yaml{rate}",
     )

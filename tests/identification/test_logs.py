@@ -11,13 +11,14 @@ import pytest
 from command_line import in_process
 
 from cartpole_rl.checking import validated
-from cartpole_rl.choices import conf_folder
+from cartpole_rl.choices import choice, conf_folder
 from cartpole_rl.composition import compose
 from cartpole_rl.errors import ConfigError, RecordingError
 from cartpole_rl.evaluation.recordings import read_recording
 from cartpole_rl.identification.logs import read_log
 from cartpole_rl.identification.sensors import Motion, question_sensors
 from cartpole_rl.identification.settings import ImportConfig, Layout
+from cartpole_rl.rig.hardware import nominal_encoders
 from cartpole_rl.run_folder import experiments
 from cartpole_rl.workflows.import_logs import import_logs
 
@@ -75,7 +76,9 @@ def layout(**changes: Any) -> Layout:
 
 
 def imported(source: Path) -> ImportConfig:
-    return validated(ImportConfig, {"from": source, "layout": layout(), "label": ""})
+    return validated(
+        ImportConfig, {"from": source, "layout": layout(), "cart": choice("cart/ip02"), "label": ""}
+    )
 
 
 @pytest.mark.parametrize(
@@ -91,7 +94,7 @@ def imported(source: Path) -> ImportConfig:
 def test_a_log_is_read_in_every_style(
     tmp_path: Path, motion: Columns, style: dict[str, str], changes: dict[str, Any]
 ) -> None:
-    log = read_log(written(tmp_path / "log.csv", motion, **style), layout(**changes))
+    log = read_log(written(tmp_path / "log.csv", motion, **style), layout(**changes), nominal_encoders())
     (part,) = log.parts
     assert part.steps == STEPS - 1
     assert part.x == pytest.approx(motion["x"], abs=2e-5)
@@ -124,7 +127,9 @@ def test_a_log_is_read_in_every_style(
 def test_units_and_signs(
     tmp_path: Path, motion: Columns, convert: Callable[[Columns], Columns], changes: dict[str, Any]
 ) -> None:
-    (part,) = read_log(written(tmp_path / "log.csv", convert(motion)), layout(**changes)).parts
+    (part,) = read_log(
+        written(tmp_path / "log.csv", convert(motion)), layout(**changes), nominal_encoders()
+    ).parts
     assert part.x == pytest.approx(motion["x"], abs=3e-5)
     turns = (part.theta - motion["a"]) / (2 * np.pi)
     assert turns == pytest.approx(np.full(STEPS, round(turns[0])), abs=3e-4)
@@ -136,7 +141,7 @@ def test_a_log_is_split_where_rows_are_missing_or_left_out(tmp_path: Path, motio
     kept = np.delete(np.arange(STEPS), [300, 301])
     columns = {**{name: values[kept] for name, values in motion.items()}, "bad": np.zeros(len(kept))}
     columns["bad"][[600, 650]] = 1
-    log = read_log(written(tmp_path / "log.csv", columns), layout(keep={"bad": [0, 0]}))
+    log = read_log(written(tmp_path / "log.csv", columns), layout(keep={"bad": [0, 0]}), nominal_encoders())
     assert [part.steps for part in log.parts] == [299, 299, 2346]
     assert log.report.gaps == 1
     assert log.report.left_out == {"bad not in 0 to 0": 2, "in a part that is too short": 49}
@@ -149,6 +154,7 @@ def test_a_log_with_a_varying_period_is_resampled(tmp_path: Path, motion: Column
     log = read_log(
         written(tmp_path / "log.csv", {**columns, "t": times, "u": motion["u"]}),
         layout(resample=True, period=PERIOD),
+        nominal_encoders(),
     )
     (part,) = log.parts
     assert log.report.jitter > 0.004
@@ -170,7 +176,7 @@ def test_a_bad_log_is_one_line(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "log.csv"
     path.write_text(text)
     with pytest.raises(RecordingError, match=message):
-        read_log(path, layout())
+        read_log(path, layout(), nominal_encoders())
 
 
 @pytest.mark.parametrize(
