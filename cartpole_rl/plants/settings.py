@@ -17,7 +17,7 @@ from cartpole_rl.physics.models import INTEGRATORS
 from cartpole_rl.plants.drivers.driver import DRIVERS
 from cartpole_rl.randomization.poles import Pole, PoleSettings, one_pole, pole_of_length
 from cartpole_rl.registry import Extension
-from cartpole_rl.rig.hardware import Hardware
+from cartpole_rl.rig.hardware import LARGEST_MOTOR, Hardware
 from cartpole_rl.run_folder import check_program
 from cartpole_rl.settings import Finite, Fraction, Positive, Settings
 from cartpole_rl.terminal import as_word
@@ -291,6 +291,10 @@ class BoardSettings(RealCartSettings):
             raise ValueError("full is 0: give what the board takes at motor value 255")
         if self.damping and self.sends == "value":
             raise ValueError("damping is for sends=speed and sends=acceleration; leave it out")
+        if self.homing == "stops" and self.sends != "value":
+            raise ValueError(
+                f"homing=stops with sends={self.sends}: a stepper loses steps at a stop; give hand or board"
+            )
         return self
 
     @property
@@ -298,7 +302,9 @@ class BoardSettings(RealCartSettings):
         """What protects our carts and not this one, a line each."""
         every = "this computer stands in for the limits, the brake and the watchdog, once a measurement"
         alone = "if this computer or the cable fails, nothing stops a moving cart: keep a switch at hand"
-        return [every, *([] if self.watchdog else [alone])]
+        homes = "if the cart does not move now, its board has not homed: press Ctrl-C"
+        told = [] if self.watchdog else [alone]
+        return [every, *told, *([homes] if self.homing == "board" else [])]
 
     def over(self, port: str) -> SerialSettings:
         """Return the settings of the cart that a bridge on `port` stands for."""
@@ -315,6 +321,11 @@ class BoardSettings(RealCartSettings):
 
 
 Column = Literal["time", "cart", "pole", "-"]
+
+
+def is_line(text: str) -> bool:
+    """Return True if `text` can be sent as a line."""
+    return bool(text) and text.isascii() and text.isprintable()
 
 
 class TextSettings(BoardSettings):
@@ -349,9 +360,29 @@ class TextSettings(BoardSettings):
             written = line.format(-1.5), line.format(1.5)
         except (ValueError, IndexError, KeyError) as error:
             raise ValueError(f"{error}; write it with one number, as in a={{:.3f}}") from None
-        if written[0] == written[1] or not written[0].isascii() or not written[0].isprintable():
+        if written[0] == written[1] or not is_line(written[0]):
             raise ValueError("it must be one line with the command in place of {}, as in a={:.3f}")
+        if line.format(1.5e-5).count("e") > line.format(1.5).count("e"):
+            raise ValueError(
+                "it writes small commands as 1.5e-05, which boards misread: give decimals, as in {:.3f}"
+            )
         return line
+
+    @field_validator("stop_line", "home_line")
+    @classmethod
+    def _other_lines_are_lines(cls, line: str | None) -> str | None:
+        if line is not None and not is_line(line):
+            raise ValueError(f"{line!r} is not one line of text")
+        return line
+
+    @model_validator(mode="after")
+    def _line_is_fine_enough(self) -> Self:
+        least = abs(self.full) / LARGEST_MOTOR
+        if self.line.format(least) in (self.line.format(0.0), self.line.format(-0.0)):
+            raise ValueError(
+                f"line={self.line} writes {least:.3g}, which is motor value 1, as 0: give more decimals"
+            )
+        return self
 
     @model_validator(mode="after")
     def _board_homes_by_a_line(self) -> Self:
@@ -363,7 +394,9 @@ class TextSettings(BoardSettings):
     def lacks(self) -> list[str]:
         """What protects our carts and not this one, a line each."""
         lines = "a damaged line that still reads as numbers is only noticed if they jump"
-        clock = "without a column time, lines that waited in a buffer are taken for new ones"
+        clock = (
+            "without a column time, old lines are taken for new ones, and a restart is seen only by a jump"
+        )
         return [*super().lacks, lines, *([] if "time" in self.columns else [clock])]
 
 

@@ -10,12 +10,14 @@ as the board sends. docs/safety.md compares the two.
 """
 
 import math
+import signal
 import time
 from collections import deque
 from collections.abc import Generator
 from contextlib import suppress
 from dataclasses import replace
 from itertools import pairwise
+from operator import index
 from statistics import median
 from threading import Lock, Thread
 
@@ -27,6 +29,7 @@ from cartpole_rl.errors import CartPoleError, ConfigError, LinkError
 from cartpole_rl.plants.drivers.driver import Driver, Measurement
 from cartpole_rl.plants.settings import BoardSettings
 from cartpole_rl.rig.hardware import Hardware
+from cartpole_rl.signals import ending_signals
 from cartpole_rl.wire.messages import Message, Reason, SetPeriod, State
 
 LISTENED = 25  # measurements by which a board's period is known
@@ -35,13 +38,16 @@ SAMPLES = 3  # measurements by which the limits know the speed
 LEAK = 0.01  # largest difference between the rates of the two clocks
 LATE_PERIODS = 1.5  # without a measurement, after which the rules look at the clock alone
 MOST_BAD = 50  # damaged measurements more than whole ones
-MOST_REFUSED = 5  # implausible measurements in a row that are taken for damage on the way
+CONFIRMED = 3  # implausible measurements in a row that fit each other: the board counts from elsewhere now
+SILENT_PERIODS = 3  # control periods without a measurement, after which the motor is off
+LONGEST_SILENCE = 0.5  # s without a measurement, after which the board is lost
 STOPS = 3  # lines that stop a board; the first may be damaged
 STOPPING = 1.0  # s that a cart which does not stop at the value 0 is given to stop
 STANDS = 0.005  # m/s
 SETTLING = 0.1  # s: how fast such a cart is braked
 LONGEST_STEP = 0.2  # s without a command, for which the last one counts
 BOARD_RESTS_US, BOARD_STANDS = 1_500_000, 1e-3  # us without more motion than this, m: its homing has ended
+BOARD_ZERO = 2e-3  # m: a board that stands so near its zero may home without moving
 LONGEST_BOARD_HOMING = 60_000_000  # us
 
 
@@ -104,6 +110,10 @@ class StandIn(Firmware):
         """True while the motor may be on."""
         return self.armed or self.homing or self.motor != 0
 
+    def is_idle(self, now_us: int) -> bool:
+        """Return True while nothing drives an armed cart: the host is late, and no limit brakes it."""
+        return self.armed and self.motor == 0 and now_us >= self._expires_us
+
     def _objection(self, message: Message, now_us: int) -> Reason | None:
         if isinstance(message, SetPeriod):
             try:
@@ -155,12 +165,15 @@ class StandIn(Firmware):
         return self._zeros_about(middle, (yield from homing.wait_until_still(reading)))
 
     def _until_board_rests(self, reading: Reading) -> Generator[int, Reading, Reading]:
-        window, elapsed = Window(BOARD_RESTS_US), 0
-        stands = self._hardware.encoders.cart_counts(BOARD_STANDS)
+        window, elapsed, first, moved = Window(BOARD_RESTS_US), 0, reading.cart, False
+        stands = max(1, self._hardware.encoders.cart_counts(BOARD_STANDS))
         while elapsed < LONGEST_BOARD_HOMING:
             window.add(reading.cart, reading.us)
-            if window.spread <= max(1, stands):
-                return reading
+            moved |= abs(reading.cart - first) > stands
+            if window.spread <= stands:
+                if moved or abs(reading.cart) <= self._hardware.encoders.cart_counts(BOARD_ZERO):
+                    return reading
+                raise HomingError("the cart did not move: plant.home_line does not start its homing")
             reading = yield 0
             elapsed += reading.us
         raise HomingError(f"the board's own homing did not end within {LONGEST_BOARD_HOMING / 1e6:.0f} s")
@@ -197,6 +210,8 @@ class MotorCommands:
         if self._sends == "value":
             return self._sign * wanted
         self._acceleration = wanted - self._damping * self._speed
+        if abs(self._speed) >= self._fastest and self._speed * self._acceleration > 0:
+            self._acceleration = 0.0
         return self._sign * (self._speed if self._sends == "speed" else self._acceleration)
 
     def at_rest(self, now: float) -> float | None:
@@ -213,7 +228,9 @@ class MotorCommands:
 
     def _pass_time(self, now: float) -> None:
         speed = self._speed + self._acceleration * min(now - self._now, LONGEST_STEP)
-        self._speed, self._now = max(-self._fastest, min(self._fastest, speed)), now
+        if self._sends == "speed":
+            speed = max(-self._fastest, min(self._fastest, speed))
+        self._speed, self._now = speed, now
 
 
 class Bridge:
@@ -232,23 +249,26 @@ class Bridge:
         self._channel: Channel | None = None
         self._last: Measurement | None = None
         self._arrived_us = 0  # when the last measurement came
-        self._refused = 0  # implausible ones in a row
+        self._suspects: list[Measurement] = []  # implausible ones in a row
         self._bad = self._excess = 0  # damaged measurements, and how many more than whole ones lately
         self._pole = 0  # unwrapped
         self._recent: deque[tuple[int, int]] = deque(maxlen=SAMPLES)  # us and cart count of the newest
         self._measured = 0  # of the control period
-        self._was_active = False
-        self._stops_left = 0
+        self._stops_left = STOPS  # whatever the board did before
 
     def listen(self) -> None:
-        """Open the board, and learn how often it measures. Raises LinkError, PortError or ConfigError."""
+        """Open and stop the board; learn how often it measures. Raises LinkError, PortError, ConfigError."""
+        if self._settings.homing == "board" and type(self._driver).home is Driver.home:
+            raise ConfigError("plant.homing=board: the driver has no method home; give hand or stops")
         self._driver.open()
+        self._driver.stop()
         stamps: list[int] = []
         deadline = time.monotonic() + self._settings.connect_timeout
         while len(stamps) < LISTENED:
             measurement = self._driver.read(max(0.0, deadline - time.monotonic()))
             if measurement is None:
-                raise LinkError(f"no measurement comes from {self._settings.port}: {self._what_came()}")
+                came = f"only {len(stamps)} measurements came" if stamps else "no measurement comes"
+                raise LinkError(f"{came} from {self._settings.port}: {self._what_came()}")
             stamps.append(self._now_us() if measurement.us is None else measurement.us)
         board_us = round(median(after - before for before, after in pairwise(stamps)))
         if board_us <= 0:
@@ -277,6 +297,10 @@ class Bridge:
                     if self._failure is not None:
                         raise self._failure
                     self._pass(measurement)
+        except (CartPoleError, OSError):
+            raise
+        except Exception as error:  # of a person's own driver
+            raise driver_error(error) from error
         finally:
             self._end()
 
@@ -292,6 +316,8 @@ class Bridge:
             self._failure = error
         except OSError as error:
             self._failure = LinkError(f"the bridge's own port failed: {error}")
+        except Exception as error:  # of a person's own driver
+            self._failure = driver_error(error)
 
     def _obey(self, frame: bytes | None) -> None:
         if frame is None or self._failure is not None:
@@ -311,14 +337,14 @@ class Bridge:
         self._excess = max(0, self._excess + new_bad - taken)
         if self._excess > MOST_BAD:
             raise LinkError(f"most of what comes from {self._settings.port} is damaged: {self._what_came()}")
-        if silent > self._settings.timeout / 2:  # before the host takes the bridge for lost
+        if silent > min(LONGEST_SILENCE, self._settings.timeout / 2):  # before the host takes it for lost
             raise LinkError(
                 f"no measurement came from {self._settings.port} for {silent:.1f} s: {self._what_came()}"
             )
         if not taken:
             self._stand_in.wait(now_us)
             if silent > LATE_PERIODS * self._board_us * 1e-6:
-                self._command()
+                self._command(silent=silent > SILENT_PERIODS * self._stand_in.period_us * 1e-6)
             return
         if self._measured:  # within a control period
             self._stand_in.look(self._measured_us, *self._counts)
@@ -328,38 +354,57 @@ class Bridge:
         self._measured = (self._measured + 1) % self._stand_in.every
         self._command()
 
-    def _take(self, new: Measurement, now_us: int) -> bool:
+    def _take(self, given: Measurement, now_us: int) -> bool:
         """Note a measurement; return False for one that is implausible: damaged on the way, or repeated."""
-        settings, turn = self._settings, self._hardware.pole_counts_per_turn
-        cart = -new.cart if settings.cart_reversed else new.cart
-        pole = -new.pole if settings.pole_reversed else new.pole
-        new = Measurement(cart, pole, now_us if new.us is None else new.us)
-        assert new.us is not None
-        if self._last is None:
-            self._pole = pole
-        else:
-            assert self._last.us is not None
-            passed = new.us - self._last.us
-            if passed == 0:
-                return self._refuse(f"its time stands still at {new.us} us")
-            turned = (pole - self._last.pole + turn // 2) % turn - turn // 2
-            jump = abs(cart - self._last.cart) - 1
-            too_far = jump * self._hardware.cart_nanometres_per_count * 1e6 > FASTEST_CART * passed
-            too_fast = (abs(turned) - 1) * 1e6 > FASTEST_POLE * turn * passed
-            arrived = now_us - self._arrived_us
-            odd_time = passed < 0 or passed > 2 * arrived + 1_000_000
-            if odd_time or too_far or too_fast:
-                if self._refused < MOST_REFUSED:
-                    return self._refuse(f"its numbers jump: {self._last}, then {new}")
-                self._restart()
-                self._last, self._pole = None, pole
-                return self._take_first(new, now_us)
-            self._pole += turned
-        return self._take_first(new, now_us)
+        try:
+            cart, pole = index(given.cart), index(given.pole)
+            us = now_us if given.us is None else index(given.us)
+        except TypeError:
+            return self._refuse(f"{given} is not in whole counts and us")
+        settings, last = self._settings, self._last
+        new = Measurement(
+            -cart if settings.cart_reversed else cart, -pole if settings.pole_reversed else pole, us
+        )
+        if last is None:
+            self._pole = new.pole
+            return self._accept(new, now_us)
+        if new.us == last.us:
+            return self._refuse(f"its time stands still at {new.us} us")
+        if self._fits(last, new, now_us - self._arrived_us, len(self._suspects)):
+            self._pole += self._turned(last, new)
+            return self._accept(new, now_us)
+        if self._suspects and not self._fits(self._suspects[-1], new, now_us - self._arrived_us):
+            self._suspects.clear()
+        self._suspects.append(new)
+        if len(self._suspects) < CONFIRMED:
+            return self._refuse(f"its numbers jump: {last}, then {new}")
+        self._restart()
+        self._pole = new.pole
+        return self._accept(new, now_us)
 
-    def _take_first(self, new: Measurement, now_us: int) -> bool:
+    def _fits(self, last: Measurement, new: Measurement, arrived: int, refused: int = 0) -> bool:
+        """Return True if a cart can move from one measurement to the other; `arrived` us lie between at most.
+
+        The time of `refused` measurements between them does not count: a jump stays one.
+        """
+        assert last.us is not None
         assert new.us is not None
-        self._refused = 0
+        passed = new.us - last.us
+        if passed <= 0 or passed > 2 * arrived + 1_000_000:
+            return False
+        passed = max(passed - refused * self._board_us, self._board_us)
+        way = (abs(new.cart - last.cart) - 1) * self._hardware.cart_nanometres_per_count
+        turn = (abs(self._turned(last, new)) - 1) / self._hardware.pole_counts_per_turn
+        return way * 1e6 <= FASTEST_CART * passed and turn * 1e6 <= FASTEST_POLE * passed
+
+    def _turned(self, last: Measurement, new: Measurement) -> int:
+        """Return by how many counts the pole has turned, the shorter way round."""
+        turn = self._hardware.pole_counts_per_turn
+        return (new.pole - last.pole + turn // 2) % turn - turn // 2
+
+    def _accept(self, new: Measurement, now_us: int) -> bool:
+        assert new.us is not None
+        self._suspects.clear()
         self._last, self._arrived_us = new, now_us
         self._counts, self._stamp_us = (new.cart, self._pole), new.us
         self._measured_us = self._clock.measured_us(new.us, now_us)
@@ -370,7 +415,6 @@ class Bridge:
         return True
 
     def _refuse(self, why: str) -> bool:
-        self._refused += 1
         self._driver.bad += 1
         self._driver.why_bad = why
         return False
@@ -384,22 +428,29 @@ class Bridge:
     def _new_stand_in(self) -> StandIn:
         return StandIn(self._settings, self._hardware, self._board_us, self._driver)
 
-    def _command(self) -> None:
-        """Send what drives the board, or what stops it."""
-        if self._stand_in.board_homes:
-            self._was_active = True
+    def _command(self, silent: bool = False) -> None:
+        """Send what drives the board, or what stops it, also while no measurement comes (`silent`)."""
+        stand_in, now_us = self._stand_in, self._now_us()
+        if stand_in.board_homes:
+            self._stops_left = STOPS  # for a homing that is ended
             return
-        active, self._was_active = self._stand_in.is_active, self._stand_in.is_active
-        if active:
+        if stand_in.is_active:
             self._stops_left = STOPS
-            self._driver.send(self._commands.value(self._stand_in.motor, self._now_us() * 1e-6))
-            return
-        slowing = self._commands.at_rest(self._now_us() * 1e-6) if self._stops_left else None
+            if not silent and not stand_in.is_idle(now_us):
+                self._send_value(self._commands.value(stand_in.motor, now_us * 1e-6))
+                return
+        slowing = self._commands.at_rest(now_us * 1e-6) if self._stops_left else None
         if slowing is not None:
-            self._driver.send(slowing)
+            self._send_value(slowing)
         elif self._stops_left:
             self._stops_left -= 1
             self._driver.stop()
+
+    def _send_value(self, value: float) -> None:
+        """Command the board. Raises LinkError for a value that is not finite; the board is stopped then."""
+        if not math.isfinite(value):
+            raise LinkError(f"the command {value} is not finite")
+        self._driver.send(value)
 
     @property
     def _cart_speed(self) -> float:
@@ -410,15 +461,18 @@ class Bridge:
         return (last - first) * self._hardware.encoders.metres / max(1, last_us - first_us) * 1e6
 
     def _end(self) -> None:
-        """Stop the board, whatever has happened."""
+        """Stop the board, whatever has happened; signals wait until then."""
+        for number in (signal.SIGINT, *ending_signals()):
+            signal.signal(number, signal.SIG_IGN)
         with self._lock:
             self._failure = self._failure or LinkError("the bridge has ended")
-            with suppress(CartPoleError, OSError):
+            with suppress(Exception):
                 self._slow_down()
             for _ in range(STOPS):
-                with suppress(CartPoleError, OSError):
+                with suppress(Exception):
                     self._driver.stop()
-            self._driver.close()
+            with suppress(Exception):
+                self._driver.close()
 
     def _slow_down(self) -> None:
         deadline = time.monotonic() + STOPPING
@@ -426,8 +480,13 @@ class Bridge:
             slowing = self._commands.at_rest(self._now_us() * 1e-6)
             if slowing is None:
                 return
-            self._driver.send(slowing)
-            if (measurement := self._driver.read(self._board_us * 1e-6)) is not None:
+            self._send_value(slowing)
+            measurement = None
+            try:
+                measurement = self._driver.read(self._board_us * 1e-6)
+            except Exception:  # the speed then follows from what was sent
+                time.sleep(self._board_us * 1e-6)
+            if measurement is not None:
                 self._take(measurement, self._now_us())
 
     def _send(self, frames: list[bytes]) -> None:
@@ -444,3 +503,8 @@ class Bridge:
 
     def _now_us(self) -> int:
         return int((time.monotonic() - self._booted) * 1e6)
+
+
+def driver_error(error: Exception) -> LinkError:
+    """Return the error for one that a driver should not raise."""
+    return LinkError(f"the driver failed: {type(error).__name__}: {error}")

@@ -24,7 +24,11 @@ class Measurement(NamedTuple):
 
 
 class Driver(ABC):
-    """Reads and commands one cart. Every method may raise LinkError or OSError: the cart is lost then."""
+    """Reads and commands one cart.
+
+    Every method may raise LinkError or OSError: the cart is lost then, and is stopped. `send`, `stop` and
+    `home` are called one at a time, also while `read` waits in another thread.
+    """
 
     def __init__(self, settings: "BoardSettings", encoders: "Encoders") -> None:
         """`encoders` are those of the cart's file. Opens nothing."""
@@ -45,7 +49,7 @@ class Driver(ABC):
         """Command the motor: motor value, m/s or m/s^2, as `settings.sends` says, times its scale."""
 
     def home(self) -> None:
-        """Start the board's own homing. Called for plant.homing=board only."""
+        """Start the board's own homing, which moves its cart. Needed for plant.homing=board."""
         raise NotImplementedError
 
     def stop(self) -> None:

@@ -143,6 +143,13 @@ REFUSED = {
     "two numbers": ({"line": "{} {}"}, "write it with one number"),
     "a second line": ({"line": "{}\n{}"}, "write it with one number"),
     "damping of a voltage": ({"damping": 1.0}, "damping is for sends=speed and sends=acceleration"),
+    "exponents": ({"line": "a={}"}, "it writes small commands as 1.5e-05"),
+    "too coarse": ({"full": 12, "sends": "acceleration"}, "line={:.0f} writes 0.0471, .* as 0: give more"),
+    "two lines": ({"stop_line": "s\nx"}, "is not one line of text"),
+    "a stepper at a stop": (
+        {"full": 12, "sends": "acceleration", "line": "{:.3f}", "homing": "stops"},
+        "a stepper loses steps at a stop",
+    ),
     "no line to home by": ({"homing": "board"}, "homing=board needs home_line"),
 }
 

@@ -1,0 +1,201 @@
+"""The rules that a bridge keeps, with a driver that is played by the test, in its own time."""
+
+import math
+import signal
+import time
+from collections import deque
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from cartpole_rl.choices import choice
+from cartpole_rl.emulator.homing import HomingError, Reading
+from cartpole_rl.errors import ConfigError, LinkError
+from cartpole_rl.plants.drivers.bridge import CONFIRMED, STOPS, Bridge, MotorCommands, StandIn
+from cartpole_rl.plants.drivers.driver import Driver, Measurement
+from cartpole_rl.plants.settings import DriverSettings
+from cartpole_rl.rig.hardware import Encoders, hardware_of
+
+RIG = hardware_of(choice("cart/stepper"))  # 25 um, 4096 counts a turn
+PERIOD_US = 10_000
+
+
+class Played(Driver):
+    """A board that measures what the test says."""
+
+    def __init__(self, settings: DriverSettings, encoders: Encoders) -> None:
+        super().__init__(settings, encoders)
+        self.sent: list[float] = []
+        self.stops = 0
+        self.script: list[Any] = []
+
+    def open(self) -> None:
+        pass
+
+    def read(self, timeout: float) -> Measurement | None:
+        following = self.script.pop(0) if self.script else None
+        if isinstance(following, BaseException):
+            raise following
+        return following
+
+    def send(self, value: float) -> None:
+        self.sent.append(value)
+
+    def stop(self) -> None:
+        self.stops += 1
+
+    def close(self) -> None:
+        pass
+
+
+class Frames:
+    """The port of a host that says nothing."""
+
+    def send(self, frame: bytes) -> None:
+        pass
+
+    def receive(self) -> list[bytes]:
+        time.sleep(0.01)
+        return []
+
+
+def settings(**given: Any) -> DriverSettings:
+    place = "cartpole_rl.plants.drivers.text:TextDriver"  # which Playing replaces
+    return DriverSettings(**{"kind": "driver", "driver": place, "port": "x", "full": 255} | given)
+
+
+class Playing(Bridge):
+    """A bridge whose clock the test sets."""
+
+    def __init__(self, **given: Any) -> None:
+        chosen = settings(**given)
+        self.played, self.now = Played(chosen, RIG.encoders), 0
+        super().__init__(chosen, RIG, self.played, None)
+        self._board_us, self._channel = PERIOD_US, Frames()  # type: ignore[assignment]
+        self._stand_in = self._new_stand_in()
+
+    def _now_us(self) -> int:
+        return self.now
+
+    def wait(self, periods: int = 1) -> None:
+        for _ in range(periods):
+            self.now += PERIOD_US
+            self._pass(None)
+
+    def measure(self, *carts: Any) -> list[bool]:
+        """Measure cart counts a period apart; return which were taken."""
+        taken = []
+        for cart in carts:
+            self.now += PERIOD_US
+            before = self.played.bad
+            self._pass(Measurement(cart, 0, self.now))
+            taken.append(self.played.bad == before)
+        return taken
+
+    def drive(self, motor: int, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Let the rules ask for a motor value, whatever is measured; 0 for a late host."""
+        self._stand_in.armed = self._stand_in.homed = True
+        monkeypatch.setattr(StandIn, "motor", motor)
+        monkeypatch.setattr(StandIn, "is_idle", lambda stand_in, now_us: motor == 0)
+
+
+def test_a_brake_ends_when_the_board_falls_silent(monkeypatch: pytest.MonkeyPatch) -> None:
+    bridge = Playing(sends="value")
+    bridge.measure(0, 0)
+    bridge.drive(-255, monkeypatch)
+    bridge.wait(2)
+    assert bridge.played.sent[-1] == -255
+    bridge.wait(4)
+    sent, stops = len(bridge.played.sent), bridge.played.stops
+    bridge.wait(5)
+    assert len(bridge.played.sent) == sent
+    assert bridge.played.stops == stops + 5
+
+
+def test_a_stepper_is_slowed_down_when_its_host_is_late(monkeypatch: pytest.MonkeyPatch) -> None:
+    bridge = Playing(sends="acceleration", full=12.0, fastest=2.0)
+    bridge.measure(*range(0, 4000, 400))  # 1 m/s
+    bridge.drive(0, monkeypatch)
+    bridge.measure(4000, 4400)
+    assert bridge.played.sent[-1] == pytest.approx(-10, rel=0.1)
+
+
+def test_a_count_that_is_set_elsewhere_ends_the_homing() -> None:
+    bridge = Playing()
+    bridge.measure(8000, 8001)
+    bridge._stand_in.homed = True
+    assert bridge.measure(0, 0) == [False, False]  # a damaged line or two
+    assert bridge._stand_in.homed
+    assert bridge.measure(8002) == [True]
+    assert bridge.measure(*[0] * CONFIRMED) == [False] * (CONFIRMED - 1) + [True]
+    assert not bridge._stand_in.homed
+
+
+@pytest.mark.parametrize("bad", [math.nan, 1.5, None, "1"])
+def test_a_measurement_without_whole_counts_is_refused(bad: Any) -> None:
+    bridge = Playing()
+    assert bridge.measure(0, bad, 1) == [True, False, True]
+    assert "is not in whole counts" in bridge.played.why_bad
+
+
+def test_no_command_is_infinite() -> None:
+    bridge = Playing()
+    with pytest.raises(LinkError, match="the command nan is not finite"):
+        bridge._send_value(math.nan)
+
+
+@pytest.fixture
+def same_signals() -> Iterator[None]:
+    """Give signals their handlers back."""
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    before = [signal.getsignal(number) for number in numbers]
+    yield
+    for number, handler in zip(numbers, before, strict=True):
+        signal.signal(number, handler)
+
+
+@pytest.mark.usefixtures("same_signals")
+def test_a_driver_that_raises_anything_leaves_a_stopped_board() -> None:
+    bridge = Playing(sends="acceleration", full=12.0)
+    bridge.played.script = [Measurement(0, 0, 0), ValueError("oops"), ValueError("again")]
+    with pytest.raises(LinkError, match="the driver failed: ValueError: oops"):
+        bridge.run(Frames())  # type: ignore[arg-type]
+    assert bridge.played.stops >= STOPS
+
+
+def test_a_board_is_stopped_before_anything_else() -> None:
+    bridge = Playing()
+    bridge.played.script = [Measurement(0, 0, PERIOD_US * number) for number in range(25)]
+    bridge.listen()
+    assert bridge.played.stops == 1
+    bridge.measure(0, 0, 0, 0)
+    assert bridge.played.stops == 1 + STOPS
+    assert not bridge.played.sent
+
+
+def test_few_measurements_are_counted_in_the_message() -> None:
+    bridge = Playing(connect_timeout=0.1)
+    bridge.played.script = [Measurement(0, 0, PERIOD_US * number) for number in range(19)]
+    with pytest.raises(LinkError, match="only 19 measurements came from x"):
+        bridge.listen()
+
+
+def test_a_driver_that_cannot_home_is_not_asked_to() -> None:
+    with pytest.raises(ConfigError, match="the driver has no method home"):
+        Playing(homing="board").listen()
+
+
+def test_a_board_that_ignores_the_line_to_home_is_noticed() -> None:
+    stand_in = Playing(homing="board")._stand_in
+    waiting, still = stand_in._until_board_rests(Reading(8000, 0, PERIOD_US)), Reading(8000, 0, PERIOD_US)
+    next(waiting)
+    with pytest.raises(HomingError, match="the cart did not move"):
+        deque((waiting.send(still) for _ in range(1000)), maxlen=0)
+
+
+def test_a_stepper_is_not_driven_beyond_its_fastest_speed() -> None:
+    commands = MotorCommands(settings(sends="acceleration", full=12.0, fastest=1.0, damping=0.0))
+    commands.measured(1.2, 0.0)
+    assert commands.value(255, 0.0) == 0
+    assert commands.value(-255, 0.0) == -12
