@@ -15,7 +15,7 @@ import yaml
 from tqdm import tqdm
 
 from cartpole_rl.checking import validated
-from cartpole_rl.choices import is_shipped
+from cartpole_rl.choices import choice, is_shipped
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import ConfigError, RecordingError
 from cartpole_rl.evaluation.recordings import read_recording, write_recording
@@ -25,7 +25,7 @@ from cartpole_rl.identification.experiments import EXPERIMENTS, HELD_OUT, conduc
 from cartpole_rl.identification.identify import Identification, identify
 from cartpole_rl.identification.moves import experiment_guard
 from cartpole_rl.identification.one_step import one_step_estimates
-from cartpole_rl.identification.quantities import intervals
+from cartpole_rl.identification.quantities import intervals, no_force_up_to
 from cartpole_rl.identification.unknowns import WEIGHED
 from cartpole_rl.physics.laws import Law
 from cartpole_rl.physics.models import REGISTRIES, Models
@@ -70,6 +70,7 @@ UNIDENTIFIABLE = {  # randomized about the identified cart, since no experiment 
 WIDEN = 2.0  # factor on the standard deviations, for carts to train on
 BY_HAND = ("pole_mass", "pole_com")  # `unknowns.WEIGHED` as parameters: measured with scales and a ruler
 MOTOR = 200  # motor value of the force that is compared; coefficients of a curve are not comparable
+FINE = "actions/nine_levels_fine"  # for carts whose force starts at small motor values
 SAME = ("cart_mass", "pole_mass", "pole_com", "cart_viscous", "pole_viscous")  # names on both sides
 
 Episodes = dict[str, Episode]  # by the name of the experiment, or of the file
@@ -189,11 +190,17 @@ def split(recordings: Episodes, source: Path) -> tuple[Episodes, Episodes]:
 
 def next_command(found: Identification, folder: Path) -> str:
     """Return the command that trains on carts like the identified one."""
-    run, models = shown(folder), found.models
-    return (
-        f"cartpole-train cart={run}/{CART} pole={run}/{POLE} randomization={run}/{RANDOMIZATION} "
-        f"{friction_choice(models.cart_friction, run)} {friction_choice(models.pole_friction, run)}"
-    )
+    run, models, period = shown(folder), found.models, found.dynamics.period
+    words = [
+        f"cartpole-train cart={run}/{CART} pole={run}/{POLE} randomization={run}/{RANDOMIZATION}",
+        friction_choice(models.cart_friction, run),
+        friction_choice(models.pole_friction, run),
+    ]
+    if not math.isclose(period, choice("train")["control_period"]):
+        words.append(f"control_period={period:g}")
+    if no_force_up_to(found.fit.parameters) < min(filter(None, map(abs, choice(FINE)["motors"]))):
+        words.append(FINE.replace("/", "="))
+    return " ".join(words)
 
 
 def print_verdict(found: Identification, folder: Path) -> None:
