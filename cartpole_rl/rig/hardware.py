@@ -132,7 +132,9 @@ def _hardware(given: tuple[tuple[str, float], ...]) -> Hardware:
         first = error.errors()[0]
         name = ".".join(("cart", *map(str, first["loc"])))
         text = first["msg"].removeprefix("Value error, ")
-        number = f" is {first['input']:g}" if first["loc"] else ""
+        given = first["input"]
+        number = f" is {given:g}" if isinstance(given, int | float) else f" is {given!r}"
+        number = number if first["loc"] else ""
         raise ConfigError(f"{name}{number}: {text[0].lower()}{text[1:]}") from None
 
 

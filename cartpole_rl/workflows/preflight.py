@@ -12,7 +12,7 @@ from cartpole_rl.randomization.poles import Pole, one_pole
 from cartpole_rl.rig.hardware import nominal_hardware
 from cartpole_rl.terminal import confirm
 from cartpole_rl.workflows.config import PreflightConfig
-from cartpole_rl.workflows.poles import POLES, PRETRAINED, emulator_for, plant_words
+from cartpole_rl.workflows.poles import PRETRAINED, emulator_for, plant_words
 
 
 def check_cart(config: PreflightConfig, words: Sequence[str] = ()) -> None:
@@ -47,15 +47,15 @@ def next_command(config: PreflightConfig, words: Sequence[str] = ()) -> str:
         pole = pole if pole in PRETRAINED else PRETRAINED[0]
         return f"cartpole-evaluate run=pretrained/{pole} task=balance {plant} episodes=1"
     cart = [word for word in words if word.startswith(("cart=", "cart."))]
-    return " ".join(["cartpole-identify", *cart, plant, f"pole={pole}"])
+    return " ".join(["cartpole-identify", *cart, plant, f"pole={pole or '<yours>.yaml'}"])
 
 
 def mounted_pole(config: PreflightConfig) -> str:
-    """Return the one of POLES that is like the cart's; the default if there is none."""
+    """Return the one of POLES that is like the cart's; empty if there is none."""
     length = config.plant.known_pole_length(config.emulator)
     emulated = config.plant.reads_emulator
     pole = emulated_pole(config.emulator) if emulated else Pole.rod(length) if length else None
-    return (pole and emulator_for([one_pole(pole)])) or POLES[0]
+    return (pole and emulator_for([one_pole(pole)])) or ""
 
 
 @contextmanager

@@ -28,7 +28,7 @@ ENDED = 1  # the status of a preflight that is not ready
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a person who has written the files of the page."""
     folder = tmp_path_factory.mktemp("mine")
-    for name in ("mine.yaml", "my_pole.yaml"):
+    for name in ("mine.yaml", "my_pole.yaml", "board.yaml"):
         block = re.search(rf"`{name}`.*?\n\n((?:    [^\n]*\n)+)", TEXT, re.S)
         assert block
         (folder / name).write_text(re.sub(r"^    ", "", block[1], flags=re.M))
@@ -58,15 +58,13 @@ def test_a_board_that_speaks_text_passes_the_preflight(folder: Path) -> None:
     """The stepper of tests/support, whose lines and command the settings of the page describe."""
     with subprocess.Popen([sys.executable, BOARD], stdout=subprocess.PIPE, text=True) as board:
         assert board.stdout is not None
-        line = COMMANDS[5].replace("/dev/ttyUSB0", board.stdout.readline().strip())
-        line = line.replace("mine.yaml", "stepper").replace("plant.full=255", "plant.full=12")
-        stepper = (
-            "plant.sends=acceleration",
-            "plant.damping=2",
-            "plant.line='a={:.3f}'",
-            "plant.homing=board",
-        )
-        done = run_here(line, *stepper, "plant.home_line=home", cwd=folder)
+        port = board.stdout.readline().strip()
+        stepper = {"sends": "acceleration", "full": 12, "damping": 2, "line": "a={:.3f}", "port": port}
+        lines = {"separator": ",", "time_unit": "us", "cart_unit": "counts", "pole_unit": "counts"}
+        of_page = yaml.safe_load((folder / "board.yaml").read_text())
+        mine = of_page | stepper | lines | {"homing": "board", "home_line": "home"}
+        (folder / "board.yaml").write_text(yaml.safe_dump(mine))
+        done = run_here(COMMANDS[5].replace("mine.yaml", "stepper"), cwd=folder)
         board.kill()
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stdout.count("OK ") == 8

@@ -499,7 +499,7 @@ class Bridge:
         if driver.bad:
             compare = f"compare the settings of plant={self._settings.kind} with what the board sends"
             return f"{driver.why_bad}; {compare}"
-        return "not a byte; check the cable, the power and plant.baud"
+        return "nothing was received; check the cable, the power and plant.baud"
 
     def _now_us(self) -> int:
         return int((time.monotonic() - self._booted) * 1e6)

@@ -124,10 +124,10 @@ class TextDriver(Driver):
             self._refuse(line)
             return None
         try:
-            cart, pole = (float(words[self._columns[name]]) for name in ("cart", "pole"))
+            cart, pole = (self._number(words[self._columns[name]], name) for name in ("cart", "pole"))
             us = self._time(words[self._columns["time"]]) if "time" in self._columns else None
-        except ValueError:
-            self._refuse(line)
+        except ValueError as error:
+            self._refuse(line, f": {error}" if "decimals" in str(error) else "")
             return None
         counts = cart * self._cart_counts, pole * self._pole_counts
         if not all(map(math.isfinite, counts)) or max(map(abs, counts)) > LARGEST_COUNT:
@@ -152,6 +152,12 @@ class TextDriver(Driver):
         self._clock = ticks, us + passed * unit
         return self._clock[1]
 
-    def _refuse(self, line: bytes) -> None:
+    def _number(self, word: str, column: str) -> float:
+        """Return the number of a column. Raises ValueError."""
+        if "." in word and getattr(self.settings, f"{column}_unit") == "counts":
+            raise ValueError(f"{column} has decimals, so it is not in counts: give plant.{column}_unit")
+        return float(word)
+
+    def _refuse(self, line: bytes, why: str = "") -> None:
         self.bad += 1
-        self.why_bad = f"{line[:60]!r} is not {self.settings.separator.join(self.settings.columns)}"
+        self.why_bad = f"{line[:60]!r} is not {self.settings.separator.join(self.settings.columns)}{why}"

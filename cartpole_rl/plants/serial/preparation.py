@@ -74,7 +74,7 @@ def asking(board: BoardSettings, confirm: Confirm) -> Callable[[], None]:
     def ask() -> None:
         while lacks:
             LOGGER.warning("plant=%s: %s", board.kind, lacks.pop(0))
-        if board.homing == "hand" and not confirm(BY_HAND):
+        if board.homing == "hand" and not confirm(BY_HAND[0].upper() + BY_HAND[1:]):
             raise PlantError(
                 f"plant.homing=hand: a person has to {BY_HAND} and confirm in a terminal; a board that homes "
                 "by itself needs plant.homing=board"

@@ -95,6 +95,11 @@ BAD = [
 ]
 
 
+def test_counts_with_decimals_name_the_unit(line: Line) -> None:
+    assert line.read(b"1,0.00,3\n", b"4,5,6\n") == Measurement(5, 6, 4)
+    assert line.driver.why_bad.endswith("cart has decimals, so it is not in counts: give plant.cart_unit")
+
+
 @pytest.mark.parametrize("bad", BAD)
 def test_a_damaged_line_is_counted_and_not_measured(bad: bytes, line: Line) -> None:
     assert line.read(bad + b"\n", b"4,5,6\n") == Measurement(5, 6, 4)
