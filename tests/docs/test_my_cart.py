@@ -98,6 +98,7 @@ def udp_cart() -> Iterator[tuple[int, list[str]]]:
         thread.join()
 
 
+@pytest.mark.nightly
 def test_the_driver_of_the_page_reads_and_stops_its_cart(folder: Path) -> None:
     block = re.search(r"^```python\n# my_cart\.py\n(.*?)^```$", TEXT, re.M | re.S)
     assert block

@@ -40,7 +40,6 @@ LATE_PERIODS = 1.5  # without a measurement, after which the rules look at the c
 MOST_BAD = 50  # damaged measurements more than whole ones
 CONFIRMED = 3  # implausible measurements in a row that fit each other: the board counts from elsewhere now
 SILENT_PERIODS = 3  # control periods without a measurement, after which the motor is off
-LONGEST_SILENCE = 0.5  # s without a measurement, after which the board is lost
 STOPS = 3  # lines that stop a board; the first may be damaged
 STOPPING = 1.0  # s that a cart which does not stop at the value 0 is given to stop
 STANDS = 0.005  # m/s
@@ -337,7 +336,7 @@ class Bridge:
         self._excess = max(0, self._excess + new_bad - taken)
         if self._excess > MOST_BAD:
             raise LinkError(f"most of what comes from {self._settings.port} is damaged: {self._what_came()}")
-        if silent > min(LONGEST_SILENCE, self._settings.timeout / 2):  # before the host takes it for lost
+        if silent > self._settings.timeout / 2:  # before the host takes the bridge for lost
             raise LinkError(
                 f"no measurement came from {self._settings.port} for {silent:.1f} s: {self._what_came()}"
             )

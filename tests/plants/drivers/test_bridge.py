@@ -1,4 +1,7 @@
-"""A cart with firmware of its own, driven by lines of text: a program of its own."""
+"""A cart with firmware of its own, driven by lines of text: a program of its own.
+
+Tests that drive in real time, 10 ms a period, are nightly: they need a machine that has time for them.
+"""
 
 import json
 import os
@@ -73,6 +76,7 @@ def last_speed(journal: Path) -> float:
     return now[-1][2]
 
 
+@pytest.mark.nightly
 def test_it_is_driven_and_left_standing(tmp_path: Path) -> None:
     with board(journal=str(tmp_path / "journal")) as (port, _), closing(driven(port)) as plant:
         first = plant.reset()
@@ -90,6 +94,7 @@ def test_it_is_driven_and_left_standing(tmp_path: Path) -> None:
         assert abs(last_speed(tmp_path / "journal")) < 0.02  # the acceleration 0 alone would let it roll
 
 
+@pytest.mark.nightly
 def test_the_end_of_the_track_is_not_touched(tmp_path: Path) -> None:
     with board(journal=str(tmp_path / "journal")) as (port, _), closing(driven(port)) as plant:
         plant.reset()
@@ -105,6 +110,7 @@ def test_the_end_of_the_track_is_not_touched(tmp_path: Path) -> None:
         assert max(abs(float(x)) for x in positions) < 0.3
 
 
+@pytest.mark.nightly
 def test_a_board_that_homes_by_itself(tmp_path: Path) -> None:
     with (
         board(journal=str(tmp_path / "journal")) as (port, _),
@@ -115,6 +121,7 @@ def test_a_board_that_homes_by_itself(tmp_path: Path) -> None:
         assert [line for _, line, _ in taken(tmp_path / "journal")].count("home") == 1
 
 
+@pytest.mark.nightly
 def test_reversed_signs(tmp_path: Path) -> None:
     """The same motion, as seen from the other side."""
     with board() as (port, _):
@@ -127,6 +134,7 @@ def test_reversed_signs(tmp_path: Path) -> None:
             assert frame["counts"][0, 1] > 2048
 
 
+@pytest.mark.nightly
 def test_every_second_line_is_a_period() -> None:
     with board() as (port, _), closing(driven(port, 0.02)) as plant:
         plant.reset()
@@ -154,6 +162,7 @@ def test_a_cart_that_is_put_in_place_by_hand_needs_a_person() -> None:
             plant.reset()
 
 
+@pytest.mark.nightly
 def test_damaged_lines_are_dropped() -> None:
     """A tenth of all lines: nothing jumps, nothing ends."""
     with board(garbage=0.1) as (port, _), closing(driven(port)) as plant:
@@ -177,6 +186,7 @@ FAILURES = {
 }
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(("options", "why"), FAILURES.values(), ids=FAILURES)
 def test_a_board_that_fails_is_stopped(options: dict[str, Any], why: str, tmp_path: Path) -> None:
     journal = tmp_path / "journal"
@@ -198,6 +208,7 @@ def test_a_board_that_fails_is_stopped(options: dict[str, Any], why: str, tmp_pa
             assert float(taken(journal)[-1][1].removeprefix("a=")) == 0
 
 
+@pytest.mark.nightly
 def test_a_frozen_counter_latches_a_fault(tmp_path: Path) -> None:
     journal = tmp_path / "journal"
     with board(journal=str(journal), at=4, freeze="both") as (port, _), closing(driven(port)) as plant:
@@ -211,6 +222,7 @@ def test_a_frozen_counter_latches_a_fault(tmp_path: Path) -> None:
         assert float(taken(journal)[-1][1].removeprefix("a=")) == 0
 
 
+@pytest.mark.nightly
 def test_a_command_that_is_killed_leaves_the_cart_standing(tmp_path: Path) -> None:
     """The bridge stops the cart by its watchdog, and then ends."""
     journal = tmp_path / "journal"
