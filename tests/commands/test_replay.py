@@ -83,7 +83,8 @@ def test_a_pole_of_another_length_has_to_be_given(recorded: Path, tmp_path: Path
     (tmp_path / "own.csv").write_text(text.replace("pole_length_m: 0.3556", "pole_length_m: 0.5000"))
     done = in_process("replay", "from=own.csv", folder=tmp_path)
     assert done.complaint == (
-        "cartpole-replay: pole: one of 0.5 m was recorded; give pole=medium, large or your own"
+        "cartpole-replay: pole: one of 0.5 m was recorded; give one of medium, large, rod_03, sensorsini, "
+        "laboratorio, or your own"
     )
     assert done.code == 2
 

@@ -26,6 +26,7 @@ READ_BY = {  # where the default models do not
     "pole_coulomb": Models(pole_friction=POLE_FRICTIONS.find("bearing")),
 }
 NARROW = {  # a per cent where nominal is not 0, and about as little where it is
+    "backdrivability": (0.99, 1.0),
     "track_tilt": (0.0, 1e-4),
     "cart_coulomb_asymmetry": (0.0, 0.01),
     "pole_coulomb": (0.0, 1e-6),
@@ -81,7 +82,8 @@ def test_a_dead_band_below_the_smallest_motor_value_has_none(
     names = ("deadband_left", "deadband_right")
     small = {**ranges_of("wide"), **{name: Range(absolute=(0.0, 60.0)) for name in names}}
     assert idle(ip02, small, medium, actions) == set(names)
-    smallest = min(motor for motor in choice(f"actions/{actions}")["motors"] if motor > 0)
+    start = -ip02["force_offset"] / ip02["force_linear"]  # of the force
+    smallest = min(motor for motor in choice(f"actions/{actions}")["motors"] if motor > start)
     large = {**small, **{name: Range(absolute=(0.0, smallest + 10.0)) for name in names}}
     assert idle(ip02, large, medium, actions) == set()
 
@@ -92,6 +94,8 @@ def wide(name: str, nominal: float) -> tuple[float, float]:
         return (0.0, 210.0)
     if nominal == 0:
         return (0.0, 1e-6) if name == "force_quadratic" else (0.0, 0.02)
+    if name == "backdrivability":
+        return (0.8, 1.0)
     low, high = sorted((0.9 * nominal, 1.2 * nominal))
     return (max(low, 1.0), high) if name == "cart_stiction_ratio" else (low, high)
 
