@@ -153,5 +153,6 @@ class EmulatorSettings(Settings):
 
 
 def zero_force_motor(cart: Mapping[str, float]) -> float:
-    """Return the motor value at which the force of a cart's linear curve starts."""
-    return max(0.0, -cart["force_offset"] / cart["force_linear"])
+    """Return the motor value at which the force of a cart's linear curve starts; 0 without a slope."""
+    slope = cart["force_linear"]
+    return max(0.0, -cart["force_offset"] / slope) if slope else 0.0

@@ -4,7 +4,7 @@ The bridge reads the board by a driver, applies the rules of the firmware to eac
 watchdog, faults, late commands: `cartpole_rl.emulator.firmware`), and speaks the protocol on a port that the
 commands open like that of any cart. It is a process of its own: if the command that drives is killed, the
 watchdog here still sets the motor to 0. Nothing stands in for the bridge itself, and it can act only as often
-as the board sends. docs/safety.md compares the two.
+as the board sends. docs/my-cart.md compares the two.
 
     board  --lines-->  driver  -->  StandIn (rules)  --frames-->  SerialCart, in the command that drives
 """
