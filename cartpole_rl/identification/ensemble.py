@@ -13,6 +13,7 @@ Outputs that no window determines are drawn to zero: tables by a penalty on each
 on their outputs at random motions.
 """
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -29,22 +30,34 @@ from cartpole_rl.identification.matching import (
     match_initial_states,
     scaled_residuals,
 )
+from cartpole_rl.identification.prediction import CERTAIN, LEAD, predicted_by_members
 from cartpole_rl.identification.rollout import Dynamics
 from cartpole_rl.identification.settings import EnsembleSettings
-from cartpole_rl.identification.windows import Windows
-from cartpole_rl.physics.residual import INPUTS, UNDER_WAY, Residual
+from cartpole_rl.identification.windows import Windows, lead_periods
+from cartpole_rl.physics.parameters import CartParameters
+from cartpole_rl.physics.residual import Residual
+from cartpole_rl.rig.hardware import LARGEST_MOTOR
 
 REFRESHING = 2  # matching steps in each refresh after the first
 BACKGROUND = 256  # random motions per update
+SHARE = 0.95  # of the errors that lie within CERTAIN spreads
+WIDEST, HALVINGS = 6.0, 5  # factor on the distances between members; steps of the search for it
 
 
 class Ensemble:
-    """The learning of one ensemble on one set of windows."""
+    """The learning of one ensemble on one set of windows, of a cart with `track_span` m between its stops."""
 
     def __init__(
-        self, windows: Windows, dynamics: Dynamics, scale: np.ndarray, settings: EnsembleSettings, seed: int
+        self,
+        windows: Windows,
+        dynamics: Dynamics,
+        scale: np.ndarray,
+        settings: EnsembleSettings,
+        seed: int,
+        track_span: float,
     ) -> None:
         self.dynamics, self.settings = dynamics, settings
+        self.windows = windows._replace(lead=lead_periods(LEAD, dynamics.period))
         self.scale = torch.maximum(
             torch.from_numpy(scale).clamp(max=COARSE), finest_scale(windows.resolution)
         )
@@ -56,7 +69,11 @@ class Ensemble:
         self.left_out = draws.argsort(1).argsort(1) < settings.validation * windows.number  # [M, W]
         weight = -torch.rand(draws.shape, generator=self.generator, dtype=torch.float64).log()
         self.weight = weight * ~self.left_out  # [M, W], of each window for each member
-        self.residual = Residual.untrained(members, settings.hidden, self.generator).as_type(torch.float64)
+        largest = torch.tensor([float(LARGEST_MOTOR)], dtype=torch.float64)
+        force = float(dynamics.models.actuator(largest, CartParameters(dynamics.cart)))
+        self.residual = Residual.untrained(
+            members, settings.hidden, self.generator, dynamics.period, force, track_span
+        ).as_type(torch.float64)
         guess = first_guess(self.positions, dynamics.period)
         self.initial = InitialStates(guess.unsqueeze(1).repeat(1, members, 1), torch.empty(0))
         self.best = self.residual
@@ -69,10 +86,10 @@ class Ensemble:
 
         `on_refresh` is called with the number of updates and each member's loss on those windows.
         """
-        weights = [weight.clone().requires_grad_() for weight in self.residual]
+        weights = [weight.clone().requires_grad_() for weight in self.residual.weights]
         optimizer = torch.optim.Adam(weights, self.settings.learning_rate)
         falling = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, self.settings.updates)
-        self.residual = Residual(*weights)
+        self.residual = self.residual.with_weights(weights)
         self.refresh(ROUNDS, 0)
         for update in range(1, self.settings.updates + 1):
             optimizer.zero_grad()
@@ -83,7 +100,33 @@ class Ensemble:
             if update % self.settings.refresh == 0 or update == self.settings.updates:
                 self.refresh(REFRESHING, update)
                 on_refresh(update, self.history[-1])
+        self.best = self.calibrated()
         return self.best
+
+    def calibrated(self) -> Residual:
+        """Return the best members, so far apart that SHARE of the errors lie within their spread.
+
+        Judged are the windows that each member left out. If motion differs from the members' mean as they
+        do from each other, a member differs from it by sqrt(2) spreads. Members are never moved nearer.
+        """
+        near, far = 1.0, WIDEST
+        if self.covered(near) >= SHARE:
+            return self.best
+        for _ in range(HALVINGS):
+            middle = (near + far) / 2
+            near, far = (near, middle) if self.covered(middle) >= SHARE else (middle, far)
+        return self.best._replace(widening=torch.tensor(far, dtype=torch.float64))
+
+    def covered(self, widening: float) -> float:
+        """Return the share of the members' errors within CERTAIN spreads; 1 if no member adds anything."""
+        residual = self.best._replace(widening=torch.tensor(widening, dtype=torch.float64))
+        _, errors = predicted_by_members(self.windows, self.dynamics, residual)
+        errors = errors[1:]  # [H, 2, M, W]
+        spread = errors.std(2, ddof=1, keepdims=True) if self.settings.members > 1 else 0 * errors
+        if not spread.any():
+            return 1.0
+        judged = np.broadcast_to(self.left_out.numpy(), errors.shape)
+        return float((np.abs(errors) <= math.sqrt(2) * CERTAIN * spread)[judged].mean())
 
     def refresh(self, rounds: int, update: int) -> None:
         """Match the initial states again, and keep each member that beats its best loss so far."""
@@ -104,9 +147,9 @@ class Ensemble:
         better = loss < self.lowest
         kept = [
             torch.where(better.reshape(-1, *[1] * (new.dim() - 1)), new.detach(), old)
-            for new, old in zip(self.residual, self.best, strict=True)
+            for new, old in zip(self.residual.weights, self.best.weights, strict=True)
         ]
-        self.best, self.lowest = Residual(*kept), torch.minimum(loss, self.lowest)
+        self.best, self.lowest = self.best.with_weights(kept), torch.minimum(loss, self.lowest)
 
     def residuals(self) -> Tensor:
         """Return scaled residuals from the present initial states, [M, W, R]."""
@@ -126,9 +169,10 @@ class Ensemble:
         return (errors * self.weight).sum() + table_penalty + output_penalty
 
     def random_inputs(self) -> Tensor:
-        """Return inputs of random motions, [1, INPUTS, BACKGROUND]; see `network_inputs`."""
-        size = torch.tensor([1.0, 2.0, 1.0, 1.0, 2.0, 1.2, *[1.25] * UNDER_WAY], dtype=torch.float64)
-        draws = torch.rand(INPUTS, BACKGROUND, generator=self.generator, dtype=torch.float64)
+        """Return inputs of random motions, [1, I, BACKGROUND]; see `network_inputs`."""
+        motors = [1.25] * self.residual.memory
+        size = torch.tensor([1.0, 2.0, 1.0, 1.0, 2.0, 1.2, *motors], dtype=torch.float64)
+        draws = torch.rand(len(size), BACKGROUND, generator=self.generator, dtype=torch.float64)
         inputs = size.unsqueeze(1) * (2 * draws - 1)
         angle = torch.pi * inputs[2]
         inputs[2], inputs[3] = torch.sin(angle), torch.cos(angle)

@@ -39,6 +39,15 @@ class Prediction(NamedTuple):
 
 def predict(windows: Windows, dynamics: Dynamics, residual: Residual | None = None) -> Prediction:
     """Predict every window after its lead, with each member of `residual`."""
+    simulated, error = predicted_by_members(windows, dynamics, residual)
+    spread = error.std(2, ddof=1) if error.shape[2] > 1 else np.zeros_like(error[:, :, 0])
+    return Prediction(simulated.mean(2), error.mean(2), spread)
+
+
+def predicted_by_members(
+    windows: Windows, dynamics: Dynamics, residual: Residual | None = None
+) -> tuple[Array, Array]:
+    """Return the motion that each member predicts after the lead, and its error, [H + 1, 2, M, W] each."""
     lead, motors = windows.lead, torch.from_numpy(windows.motors)
     history = len(motors) - windows.periods
     positions = torch.from_numpy(windows.positions[: lead + 1])
@@ -50,8 +59,7 @@ def predict(windows: Windows, dynamics: Dynamics, residual: Residual | None = No
     simulated = np.where(np.isnan(measured), np.nan, predicted)
     error = simulated - measured
     error[:, 1] = wrap(error[:, 1])
-    spread = error.std(2, ddof=1) if error.shape[2] > 1 else np.zeros_like(error[:, :, 0])
-    return Prediction(simulated.mean(2), error.mean(2), spread)
+    return simulated, error
 
 
 def errors_at(

@@ -14,7 +14,13 @@ from cartpole_rl.physics.actuator import LAG, lag_shares, mean_commands, step_fo
 from cartpole_rl.physics.dynamics import Drive, MakeAddition, State, advance, mechanism, run_period
 from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import CartParameters, cart_column
-from cartpole_rl.physics.residual import UNDER_WAY, Residual, members_in_turn
+from cartpole_rl.physics.residual import (
+    LEAST_MEMORY,
+    Residual,
+    chosen_members,
+    members_in_turn,
+    memory_periods,
+)
 
 
 def rollout(
@@ -44,7 +50,7 @@ def rollout(
                 measured.append(as_measured(state, cart))
         return torch.stack(measured)
     latency, force = cart.latency + extra_latency, torch.zeros_like(motion[0])
-    history, in_effect = history_periods(period), motors_in_effect(period)
+    history, in_effect = history_periods(period), max(motors_in_effect(period), memory_periods(period))
     for now in range(in_effect - 1, len(motors)):
         drive = Drive(force, [motors[now - age] for age in range(in_effect)])
         if now < history:
@@ -85,7 +91,7 @@ def forces_in_steps(
 
 def motors_in_effect(period: float) -> int:
     """Return the number of motor values, newest first, that can act on a cart within a control period."""
-    return max(UNDER_WAY, 1 + math.ceil(LONGEST_LATENCY / period - 1e-9))
+    return max(LEAST_MEMORY, 1 + math.ceil(LONGEST_LATENCY / period - 1e-9))
 
 
 def as_measured(state: State, cart: CartParameters) -> Tensor:
@@ -129,6 +135,13 @@ class Dynamics:
             self.period,
             self.substeps,
             self.extra_latency,
-            None if residual is None else members_in_turn(residual, windows),
+            None if residual is None else every_member(residual, windows),
         )
         return simulated.reshape(-1, 2, members, windows)
+
+
+def every_member(residual: Residual, each: int) -> MakeAddition:
+    """Return the addition for M times `each` carts, the first member's first, widened."""
+    if residual.widening == 1:
+        return members_in_turn(residual, each)  # a network runs for its own carts alone
+    return chosen_members(residual, torch.arange(residual.members).repeat_interleave(each))

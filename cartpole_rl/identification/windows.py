@@ -16,7 +16,7 @@ from cartpole_rl.errors import RecordingError
 from cartpole_rl.tasks.episode import Episode
 
 WINDOW = 0.5  # s, of the windows that a cart is fitted to
-HISTORY, LEAST_HISTORY = 0.12, 6  # s and periods of motor values before a window: more than latency and lag
+HISTORY, LEAST_HISTORY = 0.24, 6  # s and periods of motor values before a window: what a residual reads
 JUDGING = 4  # one window in so many judges models that are fitted to the others
 LEAST_LEAD = 5  # periods whose positions give an initial state
 HELD_OUT = 5  # one recording in so many is held out

@@ -6,7 +6,7 @@ Both act within the integration, before friction, so a sticking cart stays at re
 nothing.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple, Self
 
 import torch
@@ -14,43 +14,79 @@ from torch import Tensor
 
 from cartpole_rl.physics.dynamics import Addition, Drive, MakeAddition, State
 
-UNDER_WAY = 4  # motor values that the network reads, newest first
-INPUTS = 6 + UNDER_WAY
+MEMORY, LEAST_MEMORY = 0.24, 4  # s and periods of motor values that the network reads
+MOTION = 6  # inputs beside the motor values
 PLACES = 211  # entries of a table
-SPACING = 0.004  # m between entries; the middle one is the middle of the track
-UNITS = (0.5, 2.0)  # N and rad/s^2 per unit of output
+REACH = 1.032  # ends of a table, in half distances between the stops
+FULL_FORCE = 8  # units of force at the largest motor value, about
+TURN = 2.0  # rad/s^2, the unit of the pole's angular acceleration
 
 
 class Residual(NamedTuple):
-    """M members, each with a table and a network with two hidden layers of H units."""
+    """M members, each with a table and a network with two hidden layers of H units.
 
-    places: Tensor  # [M, PLACES] in UNITS[0]
-    first: Tensor  # [M, H, INPUTS]
+    The network reads I = MOTION + D inputs: the motion, and the last D motor values.
+    """
+
+    places: Tensor  # [M, PLACES] in units
+    first: Tensor  # [M, H, I]
     first_bias: Tensor  # [M, H, 1]
     second: Tensor  # [M, H, H]
     second_bias: Tensor  # [M, H, 1]
     last: Tensor  # [M, 2, H]
+    units: Tensor  # [2] N and rad/s^2 of an output of 1
+    spacing: Tensor  # [] m between entries of a table; the middle one is the middle of the track
+    widening: Tensor  # [] factor on the distances of the members' outputs from their mean
 
     @classmethod
-    def untrained(cls, members: int, hidden: int, generator: torch.Generator) -> Self:
-        """Return members that differ and do not add anything yet."""
+    def untrained(
+        cls,
+        members: int,
+        hidden: int,
+        generator: torch.Generator,
+        period: float = 0.02,
+        full_force: float = 4.0,
+        track_span: float = 0.814,
+    ) -> Self:
+        """Return members that differ and do not add anything yet.
+
+        They are for a cart with a control period of `period` s, a force of about `full_force` N at the
+        largest motor value, and `track_span` m between the stops.
+        """
 
         def drawn(*shape: int) -> Tensor:
             return torch.randn(shape, generator=generator) * shape[-1] ** -0.5
 
         return cls(
             torch.zeros(members, PLACES),
-            drawn(members, hidden, INPUTS),
+            drawn(members, hidden, MOTION + memory_periods(period)),
             0.5 * drawn(members, hidden, 1),
             drawn(members, hidden, hidden),
             0.5 * drawn(members, hidden, 1),
             torch.zeros(members, 2, hidden),
+            torch.tensor((full_force / FULL_FORCE, TURN)),
+            torch.tensor(REACH * track_span / (PLACES - 1)),
+            torch.tensor(1.0),
         )
+
+    @property
+    def weights(self) -> tuple[Tensor, ...]:
+        """What is learned: the tables and the networks."""
+        return self[:-3]
+
+    def with_weights(self, weights: Sequence[Tensor]) -> Self:
+        """Return the same with other `weights`."""
+        return type(self)(*weights, *self[len(weights) :])
 
     @property
     def members(self) -> int:
         """M."""
         return len(self.places)
+
+    @property
+    def memory(self) -> int:
+        """D."""
+        return self.first.shape[2] - MOTION
 
     def as_type(self, dtype: torch.dtype) -> Self:
         """Return the same numbers in another type."""
@@ -61,55 +97,64 @@ class Residual(NamedTuple):
         return type(self)(*(weight.detach().float() for weight in self))
 
     def network(self, inputs: Tensor) -> Tensor:
-        """Return outputs [M, 2, N] in UNITS for `inputs` [M, INPUTS, N] or [1, INPUTS, N] for all members."""
+        """Return outputs [M, 2, N] in units for `inputs` [M, I, N] or [1, I, N] for all members."""
         inputs = inputs.expand(self.members, -1, -1)
         hidden = torch.tanh(self.first @ inputs + self.first_bias)
         return self.last @ torch.tanh(self.second @ hidden + self.second_bias)
 
     def place_force(self, x: Tensor, member: Tensor) -> Tensor:
         """Return the force of the tables of `member` [N] int64 at `x` [N] m, N, interpolated linearly."""
-        at = (x / SPACING + PLACES // 2).clamp(0, PLACES - 1.001)
+        at = (x / self.spacing + PLACES // 2).clamp(0, PLACES - 1.001)
         below = at.detach().floor()
         share, index = at - below, member * PLACES + below.long()
         table = self.places.reshape(-1)
         low, high = table.gather(0, index), table.gather(0, index + 1)
-        return UNITS[0] * (low + share * (high - low))
+        return self.units[0] * (low + share * (high - low))
 
 
 def chosen_members(residual: Residual, member: Tensor) -> MakeAddition:
-    """Return the addition for carts of `member` [N] int64 each: all networks run; each cart uses its own."""
+    """Return the addition for carts of `member` [N] int64 each, widened: all networks run."""
 
     def network(inputs: Tensor) -> Tensor:
         own = torch.arange(residual.members, device=member.device).unsqueeze(1) == member  # [M, N]
-        return (residual.network(inputs.unsqueeze(0)) * own.unsqueeze(1)).sum(0)
+        share = torch.lerp(inputs.new_tensor(1 / residual.members), own.to(inputs.dtype), residual.widening)
+        return (residual.network(inputs.unsqueeze(0)) * share.unsqueeze(1)).sum(0)
 
-    return adding(residual, network, member)
+    places = torch.lerp(residual.places.mean(0, keepdim=True), residual.places, residual.widening)
+    return adding(residual._replace(places=places), network, member)
 
 
 def members_in_turn(residual: Residual, each: int) -> MakeAddition:
-    """Return the addition for M times `each` carts, the first member's first."""
+    """Return the addition for M times `each` carts, the first member's first, not widened."""
 
     def network(inputs: Tensor) -> Tensor:
-        by_member = inputs.reshape(INPUTS, residual.members, each).transpose(0, 1)
+        by_member = inputs.reshape(len(inputs), residual.members, each).transpose(0, 1)
         return residual.network(by_member).transpose(0, 1).reshape(2, -1)
 
     return adding(residual, network, torch.arange(residual.members).repeat_interleave(each))
 
 
 def adding(residual: Residual, network: Callable[[Tensor], Tensor], member: Tensor) -> MakeAddition:
-    """Return the addition of `network`, inputs [INPUTS, N] to outputs [2, N], and of the members' tables."""
+    """Return the addition of `network`, inputs [I, N] to outputs [2, N], and of the members' tables."""
 
     def addition(state: State, drive: Drive) -> Addition:
-        push, turn = network(network_inputs(state, drive)).unbind(0)
-        return Addition(UNITS[0] * push, lambda x: residual.place_force(x, member), UNITS[1] * turn)
+        push, turn = network(network_inputs(state, drive, residual)).unbind(0)
+        force, acceleration = residual.units
+        return Addition(force * push, lambda x: residual.place_force(x, member), acceleration * turn)
 
     return addition
 
 
-def network_inputs(state: State, drive: Drive) -> Tensor:
-    """Return the inputs of the network, each about 1 in size, [INPUTS, N]; `drive` has UNDER_WAY motors."""
+def network_inputs(state: State, drive: Drive, residual: Residual) -> Tensor:
+    """Return the inputs of the network, each about 1 in size, [I, N]; `drive` has D motor values or more."""
     x, x_dot, theta, theta_dot = state
-    motors = [motor / 200 for motor in drive.motors[:UNDER_WAY]]
+    far, strong = (PLACES - 1) / 2 * residual.spacing, FULL_FORCE * residual.units[0]
+    motors = [motor / 200 for motor in drive.motors[: residual.memory]]
     return torch.stack(
-        (x / 0.4, x_dot, torch.sin(theta), torch.cos(theta), theta_dot / 8, drive.force / 4, *motors)
+        (x / far, x_dot, torch.sin(theta), torch.cos(theta), theta_dot / 8, drive.force / strong, *motors)
     )
+
+
+def memory_periods(period: float) -> int:
+    """Return the number of motor values that a network reads, at a control period in s."""
+    return max(LEAST_MEMORY, round(MEMORY / period))

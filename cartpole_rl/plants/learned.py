@@ -6,7 +6,7 @@ as well. Carts are drawn as in any simulated plant; the learned residual is adde
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,18 +20,23 @@ from cartpole_rl.errors import CheckpointError, ConfigError
 from cartpole_rl.files import replacing
 from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import cart_column
-from cartpole_rl.physics.residual import PLACES, UNDER_WAY, Residual, chosen_members
+from cartpole_rl.physics.residual import LEAST_MEMORY, PLACES, TURN, Residual, chosen_members
 from cartpole_rl.plants.settings import REMEDY, LearnedSettings, find_model
 from cartpole_rl.plants.simulated import Carts, Inputs, Period, SimulatedPlant, run_carts
 from cartpole_rl.plants.specs import Numbers, Plant, PlantOutput
 from cartpole_rl.randomization.identified import IdentifiedCarts
 from cartpole_rl.randomization.poles import check_one_pole
 from cartpole_rl.randomization.randomizer import Draws
-from cartpole_rl.rig.hardware import Hardware
+from cartpole_rl.rig.hardware import Hardware, hardware_of, nominal_hardware
 from cartpole_rl.rig.parameters import check_values
 from cartpole_rl.tasks.settings import StartSettings
 
 FORMAT = "cartpole_rl learned model 1"
+OLD_SCALES = {  # of files without them
+    "units": torch.tensor((0.5, TURN)),
+    "spacing": torch.tensor(0.004),
+    "widening": torch.tensor(1.0),
+}
 
 
 @dataclass(frozen=True)
@@ -43,6 +48,7 @@ class LearnedModel:
     period: float  # s; a residual holds for one control period
     substeps: int
     residual: Residual  # float32
+    hardware: Hardware = field(default_factory=nominal_hardware)
 
 
 def save_model(path: Path, model: LearnedModel) -> None:
@@ -56,6 +62,7 @@ def save_model(path: Path, model: LearnedModel) -> None:
         "models": models,
         "period": model.period,
         "substeps": model.substeps,
+        "hardware": model.hardware.model_dump(),
         "residual": {name: part.detach() for name, part in model.residual._asdict().items()},
     }
     with replacing(path) as beside, beside.open("wb") as file:  # with a path, torch hides why writing failed
@@ -88,7 +95,7 @@ def load_model(source: Path) -> LearnedModel:
 def _as_model(content: Mapping[str, Any]) -> LearnedModel:
     models = Models.of(**content["models"])  # a user's law brings its parameters
     check_values(content["parameters"])
-    residual = Residual(**content["residual"])
+    residual = Residual(**OLD_SCALES | content["residual"])
     if bad := [name for name, part in residual._asdict().items() if not part.isfinite().all()]:
         raise ValueError(f"its residual's {', '.join(bad)} is not finite")
     if residual.places.shape[1] != PLACES:
@@ -99,6 +106,7 @@ def _as_model(content: Mapping[str, Any]) -> LearnedModel:
         float(content["period"]),
         int(content["substeps"]),
         residual,
+        hardware_of(content.get("hardware", {})),
     )
 
 
@@ -146,8 +154,9 @@ class LearnedPlant(SimulatedPlant):
             hardware,
         )
         self._member = torch.zeros(carts, dtype=torch.int64, device=self.device)
-        if len(self._carts.drive) < 1 + UNDER_WAY:
-            missing = self._carts.drive.new_zeros(1 + UNDER_WAY - len(self._carts.drive), carts)
+        memory = model.residual.memory
+        if len(self._carts.drive) < 1 + memory:
+            missing = self._carts.drive.new_zeros(1 + memory - len(self._carts.drive), carts)
             self._carts = self._carts._replace(drive=torch.cat((self._carts.drive, missing)))
         self._residual = Residual(*(part.to(self.device) for part in model.residual))
         run = partial(
@@ -209,7 +218,7 @@ def learned_carts(
     model = load_model(plant.model)
     check_same_cart(model, config)
     found = cart_column(model.parameters, torch.float32)
-    draws = IdentifiedCarts(found, prior, plant.prior_share, UNDER_WAY * model.period)
+    draws = IdentifiedCarts(found, prior, plant.prior_share, LEAST_MEMORY * model.period)
     return LearnedPlant(carts, model, draws, start, seed, device, compiled, config.hardware)
 
 
@@ -219,6 +228,10 @@ def check_same_cart(model: LearnedModel, config: "CartPoleSettings") -> None:
         raise ConfigError(f"control_period={config.control_period}: plant.model has {model.period} s")
     if model.models.actuator != config.actions.actuator:
         raise ConfigError(f"actions: plant.model has actuator {model.models.actuator}")
+    if config.hardware.scales_text != model.hardware.scales_text:
+        raise ConfigError(
+            f"cart: plant.model has {model.hardware.scales_text}, not {config.hardware.scales_text}"
+        )
     check_one_pole("plant.model", config.pole)
     pole, own = config.pole.nominal, 2 * model.parameters["pole_com"]
     if abs(own / pole.length - 1) > FITTED_LENGTH:

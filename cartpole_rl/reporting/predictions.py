@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from cartpole_rl.drawing import colours
 from cartpole_rl.identification.ensemble import Ensemble
 from cartpole_rl.identification.prediction import Prediction, Replayed, all_errors, root_mean_square
-from cartpole_rl.physics.residual import SPACING, UNITS
+from cartpole_rl.physics.residual import Residual
 from cartpole_rl.reporting import style
 from cartpole_rl.reporting.episodes import wrapped_line
 from cartpole_rl.reporting.texts import number_text, table
@@ -173,7 +173,7 @@ def ensemble_figure(
         ensemble.dynamics.period,
         physics,
         learned,
-        *forces_along_track(ensemble.best.as_float().places.numpy(), visited),
+        *forces_along_track(ensemble.best.as_float(), visited),
         np.array(ensemble.updates, dtype=np.float64),
         np.array(ensemble.history),
         subtitle=subtitle,
@@ -221,14 +221,13 @@ def learned_model_figure(
     return figure
 
 
-def forces_along_track(outputs: Array, visited: Array) -> tuple[Array, Array]:
-    """Return places [K] in m and the force [M, K] in N there, NaN at places that are not in `visited` (m).
-
-    `outputs` [M, K] is the table over places of a `physics.residual.Residual`.
-    """
-    places = SPACING * (np.arange(outputs.shape[1]) - outputs.shape[1] // 2)
-    counts, _ = np.histogram(visited, np.append(places, places[-1] + SPACING) - SPACING / 2)
-    return places, np.where(counts > 0, UNITS[0] * outputs.astype(np.float64), np.nan)
+def forces_along_track(residual: Residual, visited: Array) -> tuple[Array, Array]:
+    """Return places [K] in m and the tables' force [M, K] in N there, NaN at places not in `visited` (m)."""
+    forces = (residual.units[0] * residual.places).numpy().astype(np.float64)
+    spacing = float(residual.spacing)
+    places = spacing * (np.arange(forces.shape[1]) - forces.shape[1] // 2)
+    counts, _ = np.histogram(visited, np.append(places, places[-1] + spacing) - spacing / 2)
+    return places, np.where(counts > 0, forces, np.nan)
 
 
 def _draw_members(axes: Axes, at: Array, values: Array, x: str, y: str) -> None:

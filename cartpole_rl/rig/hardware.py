@@ -95,6 +95,11 @@ class Hardware(Settings):
         return Encoders(self.cart_nanometres_per_count / 1e9, self.pole_counts_per_turn)
 
     @property
+    def scales_text(self) -> str:
+        """The scales of the encoders and the length of the track, for messages."""
+        return f"{self.encoders.text}, {self.track_span:g} m of track"
+
+    @property
     def half_span(self) -> float:
         """Middle of the track to a stop, m."""
         return self.track_span / 2
@@ -172,16 +177,6 @@ class RigSettings(Settings):
     def hardware(self) -> Hardware:
         """The encoders, track and motor of the cart."""
         return hardware_of(self.cart)
-
-
-def check_of_ip02(hardware: Hardware, what: str) -> None:
-    """Raise ConfigError unless `hardware` is ip02's; `what` ("cartpole-model reads") knows no other."""
-    given, known = hardware.model_dump(), nominal_hardware().model_dump()
-    if others := [f"cart.{name}={given[name]:g}" for name in known if given[name] != known[name]]:
-        raise ConfigError(
-            f"{', '.join(others)}: {what} only carts with the encoders, track and motor of cart=ip02; leave "
-            "them out"
-        )
 
 
 # of ip02, for recordings and pictures of one scale

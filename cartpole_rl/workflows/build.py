@@ -248,10 +248,10 @@ def replaced_settings(training: TrainConfig, config: EvaluateConfig) -> CartPole
 
 def check_same_rig(given: Hardware, trained: Hardware) -> None:
     """Raise ConfigError unless an agent drives a cart with the encoders and the track of its training."""
-    texts = [f"{each.encoders.text}, {each.track_span:g} m of track" for each in (given, trained)]
-    if texts[0] != texts[1]:
+    if given.scales_text != trained.scales_text:
         raise ConfigError(
-            f"cart: it has {texts[0]}, but the agent was trained for {texts[1]}; train one for this cart"
+            f"cart: it has {given.scales_text}, but the agent was trained for {trained.scales_text}; "
+            "train one for this cart"
         )
 
 

@@ -18,7 +18,7 @@ from cartpole_rl.envs.settings import shipped_carts
 from cartpole_rl.errors import CheckpointError, ConfigError
 from cartpole_rl.randomization.poles import Pole, check_one_pole
 from cartpole_rl.randomization.ranges import check_carts
-from cartpole_rl.rig.hardware import check_of_ip02, hardware_of, parameters_of
+from cartpole_rl.rig.hardware import hardware_of, parameters_of
 from cartpole_rl.rig.parameters import check_names, check_value, check_values, completed
 from cartpole_rl.run_folder import (
     BASELINE,
@@ -149,7 +149,6 @@ def check_replay(config: ReplayConfig) -> None:
 
 def check_modelling(config: ModelConfig) -> None:
     """Raise CartPoleError if there is no recording, or more than one pole is chosen."""
-    check_of_ip02(config.hardware, "cartpole-model reads")
     for source in config.source:
         recordings(source)
     if config.pole is not None:

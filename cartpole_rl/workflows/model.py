@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from cartpole_rl.evaluation.recordings import read_recording
+from cartpole_rl.identification.checks import check_same_encoders
 from cartpole_rl.identification.ensemble import Ensemble
 from cartpole_rl.identification.fit import Fit, best_fit
 from cartpole_rl.identification.prediction import CERTAIN, REPORTED, errors_at, predict
@@ -30,6 +31,7 @@ from cartpole_rl.reporting.predictions import (
 )
 from cartpole_rl.reporting.style import save
 from cartpole_rl.reporting.texts import count_text
+from cartpole_rl.rig.hardware import Hardware
 from cartpole_rl.run_folder import FIGURES, MODELLED, recordings, write_config, write_json
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.terminal import as_word, print_results, progress_bar, shown
@@ -52,12 +54,15 @@ def learn_model(config: ModelConfig, folder: Path) -> None:
     use_threads(config.threads)
     paths = [path for source in config.source for path in recordings(source)]
     episodes = [read_recording(path) for path in paths]
+    check_same_encoders(
+        {str(path): each for path, each in zip(paths, episodes, strict=True)}, config.hardware
+    )
     pole_name, pole = chosen_pole("a model", config.pole, paths)
     period = recorded_period(episodes[0])
     training, held_out = split(episodes)
     windows = held_out_windows(held_out, period, max(REPORTED_TIMES))
     fit, ensemble = fit_and_learn(training, config, pole, period)
-    model = learned_model(fit, ensemble)
+    model = learned_model(fit, ensemble, config.hardware)
     physics = predict(windows, ensemble.dynamics)
     learned = predict(windows, ensemble.dynamics, ensemble.best)
     errors = {
@@ -85,7 +90,7 @@ def fit_and_learn(
     fit, models = fit_physics(cut_windows(episodes, period), config, pole, period)
     dynamics = Dynamics.of(fit.parameters, models, period, LearnedSettings.substeps)
     windows = cut_windows(episodes, period, most=config.windows)
-    ensemble = Ensemble(windows, dynamics, fit.rms, config.ensemble, config.seed)
+    ensemble = Ensemble(windows, dynamics, fit.rms, config.ensemble, config.seed, config.hardware.track_span)
     with progress_bar(config.ensemble.updates, "updates") as progress:
 
         def show_progress(update: int, losses: list[float]) -> None:
@@ -113,11 +118,16 @@ def fit_physics(windows: Windows, config: ModelConfig, pole: Pole, period: float
     return fit, models
 
 
-def learned_model(fit: Fit, ensemble: Ensemble) -> LearnedModel:
+def learned_model(fit: Fit, ensemble: Ensemble, hardware: Hardware) -> LearnedModel:
     """Return the physics and the residual as the file model.pt holds them."""
     dynamics = ensemble.dynamics
     return LearnedModel(
-        fit.parameters, dynamics.models, dynamics.period, dynamics.substeps, ensemble.best.as_float()
+        fit.parameters,
+        dynamics.models,
+        dynamics.period,
+        dynamics.substeps,
+        ensemble.best.as_float(),
+        hardware,
     )
 
 

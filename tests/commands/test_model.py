@@ -77,10 +77,11 @@ def test_a_model_that_does_not_fit_is_refused(learned: tuple[Path, Outcome], tmp
     for word, complaint in {
         "pole=large": "pole: plant.model has one of 0.36 m, not 0.66 m",
         "pole=both": "pole: plant.model takes one pole, not medium or large; choose one, as pole=medium",
+        "cart=stepper pole=medium": "cart: plant.model has 22749 nm and 1",
         "control_period=0.01": "control_period=0.01: plant.model has 0.02 s",
         "actions=nine_newtons": "actions: plant.model has actuator force_curve",
     }.items():
-        done = in_process("train", "plant=learned", model, word, *TINY, folder=tmp_path)
+        done = in_process("train", "plant=learned", model, *word.split(), *TINY, folder=tmp_path)
         assert done.complaint.startswith(f"cartpole-train: {complaint}"[:60]), done.complaint
         assert done.code == 2
     done = in_process(
@@ -111,5 +112,5 @@ def test_too_short_a_recording_says_so(recorded: Path, tmp_path: Path) -> None:
     heading = sum(line.startswith("#") for line in lines)
     (tmp_path / "short.csv").write_text("\n".join([*lines[: heading + 80], lines[-1]]) + "\n")
     done = in_process("model", "from=short.csv", *SMALL, folder=tmp_path)
-    assert "the held-out recordings have no 1.32 s without a lost frame: record longer" in done.err
+    assert "the held-out recordings have no 1.44 s without a lost frame: record longer" in done.err
     assert done.code == 2

@@ -16,7 +16,7 @@ from cartpole_rl.identification.rollout import Dynamics
 from cartpole_rl.identification.settings import EnsembleSettings
 from cartpole_rl.identification.windows import Windows, cut_windows
 from cartpole_rl.physics.models import Models
-from cartpole_rl.physics.residual import PLACES, SPACING, UNITS, Residual
+from cartpole_rl.physics.residual import PLACES, Residual
 from cartpole_rl.plants.learned import LearnedModel, LearnedPlant
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.randomization.poles import PoleSettings
@@ -34,6 +34,7 @@ TRACK = {"track_half_length": 2.0}
 RIPPLE = 0.6  # N
 PITCH = 0.08  # m
 LEAD = 10  # periods
+SPAN = 0.814  # m between the stops
 SETTINGS = EnsembleSettings(
     members=2,
     hidden=6,
@@ -51,9 +52,10 @@ Record = Callable[[bool], tuple[Windows, Windows]]
 
 def rippled() -> Residual:
     """A residual of one member that adds only a force ripple along the track."""
-    places = SPACING * (torch.arange(PLACES) - PLACES // 2)
     zeros = Residual.untrained(1, 6, torch.Generator().manual_seed(0))
-    return zeros._replace(places=(RIPPLE / UNITS[0] * torch.sin(2 * torch.pi * places / PITCH)).unsqueeze(0))
+    places = zeros.spacing * (torch.arange(PLACES) - PLACES // 2)
+    forces = RIPPLE * torch.sin(2 * torch.pi * places / PITCH)
+    return zeros._replace(places=(forces / zeros.units[0]).unsqueeze(0))
 
 
 def shaken(env: CartPoleEnv, seed: int) -> list[Episode]:
@@ -117,12 +119,16 @@ def judged(
 
 def test_an_effect_that_the_physics_lacks_is_learned(record: Record, dynamics: Dynamics) -> None:
     windows, held_out = record(True)
-    ensemble = Ensemble(windows, dynamics, np.array([4.5e-4, 4.6e-3]), SETTINGS, seed=0)
+    ensemble = Ensemble(windows, dynamics, np.array([4.5e-4, 4.6e-3]), SETTINGS, 0, SPAN)
     residual = ensemble.learn()
     physics, learned = (judged(held_out, dynamics, each) for each in (None, residual))
     assert physics["rms_x_mm"] > 3  # so that there is something to be learned
     assert learned["rms_x_mm"] < 0.6 * physics["rms_x_mm"]
     assert learned["rms_spread_x_mm"] > 0
+    assert residual.widening > 1
+    narrow = judged(held_out, dynamics, residual._replace(widening=torch.ones_like(residual.widening)))
+    assert narrow["within_x_mm"] < learned["within_x_mm"]
+    assert learned["within_x_mm"] > 0.8
     assert physics["rms_spread_x_mm"] == 0
     assert min(ensemble.history[0]) > max(min(each) for each in zip(*ensemble.history, strict=True))
     near = slice(PLACES // 2 - 40, PLACES // 2 + 41)  # 16 cm to each side, where the carts are most
@@ -133,7 +139,8 @@ def test_an_effect_that_the_physics_lacks_is_learned(record: Record, dynamics: D
 def test_complete_physics_gets_no_residual(record: Record, dynamics: Dynamics) -> None:
     windows, held_out = record(False)
     settings = SETTINGS.model_copy(update={"updates": 12, "refresh": 6})
-    residual = Ensemble(windows, dynamics, np.array([2.3e-5, 6e-4]), settings, seed=0).learn()
+    residual = Ensemble(windows, dynamics, np.array([2.3e-5, 6e-4]), settings, 0, SPAN).learn()
+    assert residual.widening == 1
     physics, learned = (judged(held_out, dynamics, each) for each in (None, residual))
     for key in ("rms_x_mm", "median_x_mm", "rms_theta_deg", "median_theta_deg"):
         assert learned[key] < 1.2 * physics[key]
@@ -172,5 +179,7 @@ def test_initial_states_are_found(record: Record, dynamics: Dynamics) -> None:
 def test_the_same_seed_learns_the_same(record: Record, dynamics: Dynamics) -> None:
     few = thinned(record(False)[0], 3)
     settings = SETTINGS.model_copy(update={"updates": 2, "refresh": 2})
-    first, second = (Ensemble(few, dynamics, np.array([1.0, 0.4]), settings, 5).learn() for _ in range(2))
+    first, second = (
+        Ensemble(few, dynamics, np.array([1.0, 0.4]), settings, 5, SPAN).learn() for _ in range(2)
+    )
     assert all(map(torch.equal, first, second))

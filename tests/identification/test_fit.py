@@ -248,7 +248,7 @@ def test_windows_have_their_lead_and_history(period: float) -> None:
 
 
 def test_too_short_is_named() -> None:
-    with pytest.raises(RecordingError, match=r"have no 1\.32 s without a lost frame"):
+    with pytest.raises(RecordingError, match=r"have no 1\.44 s without a lost frame"):
         held_out_windows([numbered(60, 0.02)], 0.02, 1.0)
 
 

@@ -10,9 +10,6 @@ from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.physics.residual import (
     PLACES,
-    SPACING,
-    UNDER_WAY,
-    UNITS,
     Residual,
     chosen_members,
     members_in_turn,
@@ -37,7 +34,7 @@ def residual(members: int = 2, changed: bool = True) -> Residual:
 def motion(carts: int) -> tuple[State, Drive]:
     random = torch.Generator().manual_seed(1)
     draws = torch.rand(6, carts, generator=random, dtype=torch.float64) - 0.5
-    motors = [200 * torch.sign(draws[5])] * UNDER_WAY
+    motors = [200 * torch.sign(draws[5])] * residual().memory
     return State(0.6 * draws[0], 2 * draws[1], 6 * draws[2], 10 * draws[3]), Drive(6 * draws[4], motors)
 
 
@@ -65,11 +62,24 @@ def test_members_in_turn_are_the_members_chosen(make_cart: MakeCart) -> None:
     assert not torch.allclose(stacked(*in_turn), stacked(*exchanged), rtol=1e-3)
 
 
+def test_widened_members_differ_more_about_the_same_mean() -> None:
+    state, drive = motion(1)
+    both = State(*(each.repeat(2) for each in state))
+    pushed = Drive(drive.force.repeat(2), [motor.repeat(2) for motor in drive.motors])
+    ends = [
+        chosen_members(residual()._replace(widening=torch.tensor(factor)), torch.tensor([0, 1]))(both, pushed)
+        for factor in (1.0, 3.0)
+    ]
+    for narrow, wide in zip(*((each.force, each.force_at(both.x)) for each in ends), strict=True):
+        assert wide.mean().item() == pytest.approx(narrow.mean().item())
+        assert wide.diff().item() == pytest.approx(3 * narrow.diff().item())
+
+
 def test_tables_are_interpolated_linearly() -> None:
     learned = residual()
     middle, member = PLACES // 2, torch.tensor([1, 1, 1, 1])
-    x = SPACING * torch.tensor([3.0, 3.5, 4.0, 1e3], dtype=torch.float64)
-    table = UNITS[0] * learned.places[1]
+    x = learned.spacing * torch.tensor([3.0, 3.5, 4.0, 1e3], dtype=torch.float64)
+    table = learned.units[0] * learned.places[1]
     force = learned.place_force(x, member)
     at, after = table[middle + 3], table[middle + 4]
     assert torch.allclose(force[:3], torch.stack((at, (at + after) / 2, after)))
@@ -80,12 +90,12 @@ def test_a_force_that_friction_holds_does_not_move_a_cart(make_cart: MakeCart) -
     """A change of velocity, added after the physics, would move it."""
     zero = torch.zeros(1, dtype=torch.float64)
     hanging = State(zero, zero, zero + torch.pi, zero)
-    places = torch.full((1, PLACES), 0.4 / UNITS[0], dtype=torch.float64)
-    learned = residual(1, changed=False)._replace(places=places)
+    still = residual(1, changed=False)
+    learned = still._replace(places=torch.full_like(still.places, 0.4) / still.units[0])
     moved = {}
     for coulomb in (0.5, 0.3):
         cart = make_cart(cart_coulomb=coulomb)
-        drive = Drive(zero, [zero] * UNDER_WAY)
+        drive = Drive(zero, [zero] * learned.memory)
         after, _ = run_period(hanging, drive, cart.latency, cart, *SETTINGS, members_in_turn(learned, 1))
         moved[coulomb] = after.x_dot.item()
     assert moved[0.5] == 0

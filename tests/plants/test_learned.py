@@ -167,6 +167,15 @@ class TestFile:
         assert "its format is 'cartpole_rl agent 1'" in complaint(tmp_path / "agent.pt")
         content = torch.load(whole)
         assert content["format"] == FORMAT
+        for name in ("units", "spacing", "widening"):
+            del content["residual"][name]
+        torch.save(content, tmp_path / "first.pt")  # of the first version, for ip02 alone
+        old = load_model(tmp_path / "first.pt").residual
+        assert (old.units.tolist(), float(old.spacing), float(old.widening)) == (
+            [0.5, 2.0],
+            pytest.approx(0.004),
+            1,
+        )
         del content["parameters"]["cart_mass"]
         torch.save(content, tmp_path / "older.pt")
         assert "of another version" in complaint(tmp_path / "older.pt")

@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
+import torch
 from figure_contents import line_of
 
 from cartpole_rl.drawing import colours
 from cartpole_rl.identification.prediction import Prediction
-from cartpole_rl.physics.residual import PLACES, SPACING, UNITS
+from cartpole_rl.physics.residual import PLACES, Residual
 from cartpole_rl.reporting.predictions import (
     forces_along_track,
     learned_model_figure,
@@ -30,18 +31,25 @@ def test_a_replay_has_a_row_for_each_time() -> None:
 
 
 def test_forces_are_known_where_the_cart_was() -> None:
-    outputs = np.arange(2.0 * PLACES).reshape(2, PLACES)
-    places, forces = forces_along_track(outputs, np.array([0.0, 3 * SPACING, 3.1 * SPACING]))
+    outputs = torch.arange(2.0 * PLACES).reshape(2, PLACES)
+    residual = with_tables(outputs)
+    spacing = float(residual.spacing)
+    places, forces = forces_along_track(residual, np.array([0.0, 3 * spacing, 3.1 * spacing]))
     visited = np.isfinite(forces[0])
-    np.testing.assert_allclose(places[visited], [0.0, 3 * SPACING], atol=1e-12)
-    np.testing.assert_allclose(forces[:, visited], UNITS[0] * outputs[:, visited])
+    np.testing.assert_allclose(places[visited], [0.0, 3 * spacing], atol=1e-9)
+    np.testing.assert_allclose(forces[:, visited], (residual.units[0] * outputs).numpy()[:, visited])
+
+
+def with_tables(outputs: torch.Tensor) -> Residual:
+    """A residual with tables of `outputs` [M, PLACES]."""
+    return Residual.untrained(len(outputs), 2, torch.Generator())._replace(places=outputs)
 
 
 def test_errors_are_in_the_units_of_the_axes() -> None:
     physics, learned = (
         Prediction(*(np.full((51, 2, 7), each) for each in (0.1, error, 0.005))) for error in (0.02, 0.01)
     )
-    places, forces = forces_along_track(np.ones((3, PLACES)), np.linspace(-0.1, 0.1, 500))
+    places, forces = forces_along_track(with_tables(torch.ones(3, PLACES)), np.linspace(-0.1, 0.1, 500))
     updates, losses = np.array([0.0, 20.0]), np.ones((2, 3))
     figure = learned_model_figure(0.02, physics, learned, places, forces, updates, losses)
     cart, angle, track, learning = figure.axes
