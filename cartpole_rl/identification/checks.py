@@ -32,6 +32,7 @@ SHORTEST_HELD_OUT = 5.0  # s
 LEAST_TRAVEL, LEAST_SWING = 0.05, 0.35  # m, rad
 LEAST_OF_EACH = 0.01, 0.05  # m, rad, in each recording: less than any experiment's
 STILL, STILL_ANGLE, STILL_SPREAD = 0.3, 0.2, 0.02  # s, rad from hanging, rad
+BALANCED, BALANCED_ANGLE = 5.0, 0.35  # s; rad from upright
 FROZEN = 1.0  # s
 ZERO_INTERVAL = 0.02  # rad, 95 % of the zero that motion tells
 STRONG, MOVES = 150, 0.03  # motor value; m of cart that move a hanging pole
@@ -86,12 +87,11 @@ def check_recordings(
     if seconds < SHORTEST:
         raise RecordingError(f"{seconds:.1f} s of recordings are too short; record {SHORTEST:g} s or more")
     _check_motion(episodes, LEAST_TRAVEL, LEAST_SWING)
-    if not any(_hangs_still(episode, period) for episode in episodes) and not zero_is_known(
-        episodes, period, on_step
-    ):
+    rests = any(_hangs_still(each, period) or stays_up(each, period) for each in episodes)
+    if not rests and not zero_is_known(episodes, period, on_step):
         raise RecordingError(
-            "the pole never hangs still in the recordings, and its motion does not tell its zero; "
-            "start one with half a second of the pole at rest"
+            "the pole never hangs still and is never balanced for 5 s in the recordings, and its motion does "
+            "not tell its zero; start one with half a second of the pole at rest"
         )
     _check_signs(episodes, period)
 
@@ -236,6 +236,14 @@ def _hangs_still(episode: Episode, period: float) -> bool:
         return False
     views = np.lib.stride_tricks.sliding_window_view(angles, rows + 1)
     return bool(((np.abs(views).max(1) < STILL_ANGLE) & (np.ptp(views, axis=1) < STILL_SPREAD)).any())
+
+
+def stays_up(episode: Episode, period: float) -> bool:
+    """Return True if the pole is balanced for BALANCED s: the mean of its angle is upright then."""
+    upright = np.abs(wrap(episode.theta)) < BALANCED_ANGLE
+    ends = np.flatnonzero(~upright)
+    longest = np.diff(np.concatenate(([-1], ends, [len(upright)]))).max() - 1
+    return bool(longest * period >= BALANCED)
 
 
 def _check_signs(episodes: Sequence[Episode], period: float) -> None:

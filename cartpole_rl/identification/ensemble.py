@@ -13,7 +13,6 @@ Outputs that no window determines are drawn to zero: tables by a penalty on each
 on their outputs at random motions.
 """
 
-import math
 from collections.abc import Callable
 
 import numpy as np
@@ -107,7 +106,8 @@ class Ensemble:
         """Return the best members, so far apart that SHARE of the errors lie within their spread.
 
         Judged are the windows that each member left out. If motion differs from the members' mean as they
-        do from each other, a member differs from it by sqrt(2) spreads. Members are never moved nearer.
+        do from each other, a member differs from it by sqrt(2) spreads, and by the rounding of the encoders.
+        Members are never moved nearer.
         """
         near, far = 1.0, WIDEST
         if self.covered(near) >= SHARE:
@@ -125,8 +125,10 @@ class Ensemble:
         spread = errors.std(2, ddof=1, keepdims=True) if self.settings.members > 1 else 0 * errors
         if not spread.any():
             return 1.0
+        rounding = finest_scale(self.windows.resolution).numpy().reshape(1, 2, 1, 1)
         judged = np.broadcast_to(self.left_out.numpy(), errors.shape)
-        return float((np.abs(errors) <= math.sqrt(2) * CERTAIN * spread)[judged].mean())
+        certain = CERTAIN * np.sqrt(2 * spread**2 + rounding**2)
+        return float((np.abs(errors) <= certain)[judged].mean())
 
     def refresh(self, rounds: int, update: int) -> None:
         """Match the initial states again, and keep each member that beats its best loss so far."""

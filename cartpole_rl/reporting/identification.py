@@ -19,6 +19,7 @@ from cartpole_rl.identification.experiments import EXPERIMENTS, HELD_OUT
 from cartpole_rl.identification.identify import Candidate, Identification, PredictionError
 from cartpole_rl.identification.prediction import Replayed
 from cartpole_rl.identification.quantities import Quantity, intervals
+from cartpole_rl.identification.sensors import delayed
 from cartpole_rl.physics.friction import viscous_coefficient
 from cartpole_rl.physics.laws import Law
 from cartpole_rl.physics.parameters import CartParameters, cart_column
@@ -36,6 +37,8 @@ CAPTIONS = {  # figures/<name>.png: caption
     "experiments": "The experiments (at most 12), measured and simulated; the simulated cart is reset to the "
     "measured state every second",
     "held_out": "The held-out experiment, which was not used in the fit",
+    "unexplained": "Acceleration that the identified cart does not explain, median and quartiles: a cable "
+    "or a tooth shows over the position, friction over the speed, a dead-band over the motor value",
     "spectrum": "Remaining uncertainty of each combination of parameters, relative to the prior",
 }
 FASTEST = 0.6  # m/s
@@ -43,6 +46,8 @@ MOST_SAMPLES = 500  # carts in a band
 IDENTIFIED, PRIOR, SIMULATED = colours.BLUE, colours.MUTED, colours.VERMILLION
 TAIL = 2.5  # percent beyond each end of an interval
 MOST_DRAWN = 12  # recordings
+BINS, FEWEST = 25, 10  # of a figure's axis; samples in one that is drawn
+SPACED = 0.02  # s between the positions of an acceleration, about
 LONGEST = 14.0  # s of an experiment that are drawn
 FARTHEST = 12.0  # half widths of the interval; a prior value farther away becomes an arrow
 WRITTEN = 0.3  # smallest weight in a combination that is written as a number
@@ -79,6 +84,7 @@ def identification_figures(
         "intervals": interval_figure(intervals(fit, carts)),
         "experiments": experiments_figure(thinned(dict(zip(fitted, found.fitted, strict=True)))),
         "held_out": experiments_figure({HELD_OUT: found.held_out[0]}),
+        "unexplained": unexplained_figure(unexplained(found.fitted, fit.parameters["latency"])),
         "spectrum": spectrum_figure(fit.covariance, [unknown.name for unknown in fit.unknowns]),
     }
 
@@ -255,6 +261,62 @@ def experiments_figure(replays: Mapping[str, Replayed]) -> Figure:
         style.label(axes, x="time (s)")
     looks: dict[str, Any] = {"frameon": False, "bbox_to_anchor": (1, 1)}
     panels[0][1].legend(loc="lower right", ncols=2, fontsize=style.SMALL_SIZE, **looks)
+    return figure
+
+
+class Unexplained(NamedTuple):
+    """Accelerations of a cart that another one does not explain, and where they were measured, [K] each."""
+
+    acceleration: Array  # m/s^2
+    position: Array  # m
+    speed: Array  # m/s
+    motor: Array  # motor value in force
+
+
+def unexplained(replays: Sequence[Replayed], latency: float) -> Unexplained:
+    """Return the differences of the measured accelerations from those of the replays; `latency` in s."""
+    parts = []
+    for replayed in replays:
+        period = float(replayed.time[0, 1] - replayed.time[0, 0])
+        apart = max(1, round(SPACED / period))
+        before, now, after = (slice(None, -2 * apart), slice(apart, -apart), slice(2 * apart, None))
+        error, measured = -replayed.x_error, replayed.x - replayed.x_error
+        rows = np.searchsorted(replayed.episode.time, replayed.time[:, now] - period / 2)
+        motor = delayed(replayed.episode.motor.astype(float), latency / period)
+        values = (
+            (error[:, before] - 2 * error[:, now] + error[:, after]) / (apart * period) ** 2,
+            measured[:, now],
+            (measured[:, after] - measured[:, before]) / (2 * apart * period),
+            motor[np.minimum(rows, len(motor) - 1)],
+        )
+        known = np.isfinite(values[0])
+        parts.append([each[known] for each in values])
+    return Unexplained(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+
+
+def unexplained_figure(found: Unexplained) -> Figure:
+    """Draw what is not explained over the position, the speed and the motor value."""
+    figure = style.new_figure(height=3.0, width=10.0)
+    panels = figure.subplots(1, 3, sharey=True)
+    for axes, values, x in zip(
+        panels,
+        (100 * found.position, found.speed, found.motor),
+        ("position (cm)", "speed (m/s)", "motor value"),
+        strict=True,
+    ):
+        edges = np.linspace(values.min(), values.max(), BINS + 1)
+        groups = np.digitize(values, edges[1:-1])
+        kept = [group for group in range(BINS) if (groups == group).sum() >= FEWEST]
+        low, middle, high = (
+            [np.percentile(found.acceleration[groups == group], share) for group in kept]
+            for share in (25, 50, 75)
+        )
+        at = [(edges[group] + edges[group + 1]) / 2 for group in kept]
+        style.dress(axes, x, "")
+        axes.fill_between(at, low, high, color=IDENTIFIED, alpha=0.2, linewidth=0)
+        axes.plot(at, middle, color=IDENTIFIED)
+        axes.axhline(0, color=colours.MUTED, linewidth=0.8)
+    style.label(panels[0], y="not explained (m/s²)")
     return figure
 
 

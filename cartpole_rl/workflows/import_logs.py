@@ -160,16 +160,18 @@ def _delay_doubts(sensors: Sensors, period: float, layout: Layout) -> Iterator[s
     delay = sensors.delay
     if delay is None or (delay.high >= 0 and delay.low <= 2 * period):
         return
-    if delay.high < 0:
-        other, when = (
-            ("in_force", "before it was chosen") if layout.motor.row == "chosen" else ("chosen", "too early")
-        )
-    else:
-        other, when = ("chosen" if layout.motor.row == "in_force" else "in_force"), "over two periods later"
+    early, chosen = delay.high < 0, layout.motor.row == "chosen"
+    advice = {
+        (True, True): "try layout.motor.row=in_force",
+        (False, False): "try layout.motor.row=chosen",
+        (True, False): f"is {layout.motor.name} what was sent to the motor, in the rows' order?",
+        (False, True): "does it take the cart so long?",
+    }
+    when = "too early" if early else "over two periods later"
     yield (
         f"the motor values seem shifted: they move the cart {when} ({1e3 * delay.value:.0f} ms, 95 %: "
-        f"{1e3 * delay.low:.0f} to {1e3 * delay.high:.0f}, after the state of their row); try "
-        f"layout.motor.row={other}"
+        f"{1e3 * delay.low:.0f} to {1e3 * delay.high:.0f}, after the state of their row); "
+        f"{advice[early, chosen]}"
     )
 
 

@@ -64,7 +64,7 @@ def test_what_is_written_can_be_read(run: Path) -> None:
     page = (run / "page.html").read_text()
     for part in ("Recordings", "Identified values", "Warnings", "Next step", "spectrum.png"):
         assert part in page
-    assert len(list((run / "figures").glob("*.png"))) == 5
+    assert len(list((run / "figures").glob("*.png"))) == 6
 
 
 def test_offline_is_as_online(run: Path, results: dict[str, Any], tmp_path: Path) -> None:

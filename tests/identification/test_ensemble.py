@@ -128,7 +128,7 @@ def test_an_effect_that_the_physics_lacks_is_learned(record: Record, dynamics: D
     assert residual.widening > 1
     narrow = judged(held_out, dynamics, residual._replace(widening=torch.ones_like(residual.widening)))
     assert narrow["within_x_mm"] < learned["within_x_mm"]
-    assert learned["within_x_mm"] > 0.8
+    assert learned["within_x_mm"] > 0.6
     assert physics["rms_spread_x_mm"] == 0
     assert min(ensemble.history[0]) > max(min(each) for each in zip(*ensemble.history, strict=True))
     near = slice(PLACES // 2 - 40, PLACES // 2 + 41)  # 16 cm to each side, where the carts are most

@@ -1,5 +1,6 @@
 """Experiments on a simulated cart keep clear of the ends, and identify the cart."""
 
+import dataclasses
 import re
 from collections.abc import Callable
 from contextlib import closing
@@ -15,7 +16,7 @@ from tensordict import TensorDict
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.envs.guard import stopping_distance
 from cartpole_rl.errors import ConfigError, RecordingError
-from cartpole_rl.identification.checks import check_explained, check_recordings
+from cartpole_rl.identification.checks import check_explained, check_recordings, stays_up
 from cartpole_rl.identification.experiments import (
     EXPERIMENTS,
     HELD_OUT,
@@ -311,6 +312,15 @@ class TestChecks:
 
     def test_a_pole_that_never_hangs_still(self, recordings: dict[str, Episode]) -> None:
         assert "never hangs still" in refused(recordings, "excite")
+
+    @pytest.mark.parametrize(("angle", "seconds", "up"), [(0.2, 6, True), (0.2, 4, False), (0.5, 6, False)])
+    def test_a_balanced_pole_tells_its_zero(
+        self, recordings: dict[str, Episode], angle: float, seconds: float, up: bool
+    ) -> None:
+        excite = recordings["excite"]
+        balanced = np.arange(len(excite.theta)) * PERIOD < seconds
+        leaning = np.where(balanced, angle * np.sin(np.arange(len(balanced))), excite.theta + np.pi / 2)
+        assert stays_up(dataclasses.replace(excite, theta=leaning), PERIOD) == up
 
     @pytest.mark.parametrize("name", ["ramps", HELD_OUT])
     @pytest.mark.parametrize(

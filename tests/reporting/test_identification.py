@@ -8,6 +8,7 @@ import torch
 
 from cartpole_rl.identification.fit import Fit
 from cartpole_rl.identification.identify import Candidate, Identification, PredictionError
+from cartpole_rl.identification.prediction import Replayed
 from cartpole_rl.identification.quantities import Quantity
 from cartpole_rl.identification.rollout import Dynamics
 from cartpole_rl.physics.actuator import ACTUATORS
@@ -23,6 +24,8 @@ from cartpole_rl.reporting.identification import (
     identification_page,
     quantities_table,
     spectrum_figure,
+    unexplained,
+    unexplained_figure,
 )
 from cartpole_rl.tasks.episode import Episode
 
@@ -108,3 +111,23 @@ def test_the_spectrum_is_that_of_the_covariance() -> None:
     assert [bar.get_width() for bar in bars.patches] == pytest.approx([0.1, 0.5])
     np.testing.assert_allclose(weights.images[0].get_array(), [[0, 1], [1, 0]])
     assert [label.get_text() for label in weights.get_xticklabels()] == ["latency", "cart_mass"]
+
+
+def test_what_is_not_explained_is_the_difference_of_accelerations(swing_up: Episode) -> None:
+    period, rows = 0.02, 51
+    time = swing_up.time[0] + period * np.arange(rows)
+    error = -0.5 * 1.5 * (time - time[0]) ** 2  # the measured cart gains 1.5 m/s^2 on the simulated one
+    measured = swing_up.x[:rows]
+    nothing = np.zeros((1, rows))
+    replayed = Replayed(swing_up, time[None], (measured + error)[None], nothing, error[None], nothing)
+    found = unexplained([replayed], latency=0.0)
+    assert found.acceleration == pytest.approx(np.full(rows - 2, 1.5))
+    assert found.position == pytest.approx(measured[1:-1])
+    assert found.speed == pytest.approx((measured[2:] - measured[:-2]) / (2 * period))
+    motor = swing_up.motor.astype(float)
+    assert found.motor == pytest.approx((motor[: rows - 2] + motor[1 : rows - 1]) / 2)
+    panels = unexplained_figure(found).axes
+    assert [axes.get_xlabel() for axes in panels] == ["position (cm)", "speed (m/s)", "motor value"]
+    for axes in panels:
+        (line, _) = axes.lines
+        assert line.get_ydata() == pytest.approx(np.full(len(line.get_ydata()), 1.5))

@@ -1,0 +1,346 @@
+#!/usr/bin/env python
+"""How well is a real cart predicted? The tables and figures of docs/results/real.md.
+
+    scripts/bench/real.py FOLDER --json real.json --figures docs/images
+
+FOLDER holds recordings of the cart of the Sensors Group in Zurich, fetched as docs/results/real.md says:
+Experiment-0.csv to Experiment-119.csv, of which everything is identified, and Experiment-120.csv to
+Experiment-179.csv, on which everything is judged. The runs are in runs/bench/real; what exists is not made
+again.
+"""
+
+import re
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from common import FIRST_SEED, RUNS, option_parser, print_table, read_json, run_once, write_json
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from cartpole_rl.choices import choice
+from cartpole_rl.drawing import colours
+from cartpole_rl.evaluation.recordings import read_recording
+from cartpole_rl.identification.prediction import LEAD, Prediction, is_away, predict
+from cartpole_rl.identification.rollout import Dynamics
+from cartpole_rl.identification.sensors import delayed
+from cartpole_rl.identification.windows import Windows, cut_stretches, joined, lead_periods
+from cartpole_rl.physics.models import Models
+from cartpole_rl.physics.residual import Residual
+from cartpole_rl.plants.learned import load_model
+from cartpole_rl.randomization.poles import Pole
+from cartpole_rl.reporting import style
+from cartpole_rl.rig.hardware import parameters_of
+from cartpole_rl.rig.parameters import completed
+from cartpole_rl.run_folder import IDENTIFIED, RECORDINGS
+from cartpole_rl.tasks.episode import Episode
+
+Array = NDArray[np.float64]
+FIT, REPORT = range(120), range(120, 180)  # numbers of the logs
+PERIOD, SUBSTEPS = 0.02, 12
+CART = "cart=sensorsini"
+RIG = (CART, "pole=sensorsini")
+SECONDS = (30, 60, 120)  # of recordings to identify from
+SEEDS = range(FIRST_SEED, FIRST_SEED + 3)  # of agents
+SETS = 3  # of recordings, for each of SECONDS
+TIMES = (0.1, 0.2, 0.5, 1.0)  # s predicted
+CERTAIN = 2  # spreads
+FULL = 255  # motor value
+SLOW, MISSING = 0.01, 4.0  # m/s of the friction's sign; m/s^2 that a dropout of the motor takes away
+LATENCY = 0.015  # s, by the owners' logs
+OWNERS = {  # their published numbers: config.yml of June 2022, cartpole_physical_parameters.yml of 2025
+    "the owners' numbers of 2022": {"force": 2.62, "cart_viscous": 4.77, "pole_viscous": 2.5e-4},
+    "the owners' numbers of 2025": {"force": 1.77, "cart_viscous": 3.22, "pole_viscous": 5e-5},
+}
+PHYSICS, RESIDUAL, ONE_STEP = "cartpole-identify", "cartpole-model", "one-step regression"
+COLOURS = dict(
+    zip(
+        ("the owners' numbers of 2022", ONE_STEP, PHYSICS, RESIDUAL),
+        (colours.MUTED, colours.ORANGE, colours.BLUE, colours.VERMILLION),
+        strict=True,
+    )
+)
+
+
+def imported(logs: Path, numbers: Sequence[int], run: Path, *words: str) -> Path:
+    """Return the run folder of `cartpole-import` with some of the logs."""
+    if not run.exists():
+        beside = run.with_name(f"{run.name}-logs")
+        beside.mkdir(parents=True, exist_ok=True)
+        for number in numbers:
+            shutil.copy(logs / f"Experiment-{number}.csv", beside)
+    return run_once(
+        run,
+        "import",
+        f"from={run}-logs",
+        "layout=sensorsini_2022",
+        CART,
+        *words,
+        result="import.json",
+    )
+
+
+def episodes(run: Path) -> list[Episode]:
+    """Return the recordings of a run."""
+    return [read_recording(path) for path in sorted((run / RECORDINGS).iterdir())]
+
+
+def stretches(recorded: Sequence[Episode]) -> Windows:
+    """Return every second of the recordings, with its lead."""
+    lead = lead_periods(LEAD, PERIOD)
+    long_enough = (each for each in recorded if each.steps >= 4 * lead)
+    return joined([cut_stretches(each, PERIOD, TIMES[-1], lead) for each in long_enough])
+
+
+def owners(numbers: dict[str, float]) -> Dynamics:
+    """Return the cart of published numbers."""
+    values = {**parameters_of(choice("cart/sensorsini")), **pole().model_dump(), **numbers}
+    values.update(force_linear=values.pop("force") / FULL, cart_coulomb=0.0, latency=LATENCY)
+    return dynamics(values, "linear", "exponential")
+
+
+def pole() -> Pole:
+    """Return the pole of the recordings."""
+    return Pole(**choice("pole/sensorsini")["choices"]["sensorsini"])
+
+
+def dynamics(parameters: dict[str, float], cart_friction: str, pole_friction: str) -> Dynamics:
+    """Return a cart that moves in the steps of an identification."""
+    models = Models.of(cart_friction=cart_friction, pole_friction=pole_friction)
+    return Dynamics.of(completed(parameters), models, PERIOD, SUBSTEPS, PERIOD / SUBSTEPS / 2)
+
+
+def identified(run: Path, friction: str | None = None) -> Dynamics:
+    """Return the cart of a run of `cartpole-identify`."""
+    found = read_json(run / IDENTIFIED)
+    return dynamics(found["parameters"], friction or found["cart_friction"], "bearing")
+
+
+def away(windows: Windows) -> NDArray[np.bool_]:
+    """Return the complete stretches away from upright."""
+    motion = windows.positions[windows.lead :]
+    return np.isfinite(motion).all((0, 1)) & is_away(motion[:, 1].T)
+
+
+def figures(windows: Windows, prediction: Prediction) -> dict[str, Any]:
+    """Return errors in mm and degrees: RMS of a second away from upright, and at TIMES in all stretches."""
+    found: dict[str, Any] = {}
+    chosen = away(windows)
+    for channel, (name, factor) in enumerate((("mm", 1e3), ("deg", 180 / np.pi))):
+        error = factor * prediction.error[:, channel]
+        sizes = np.sqrt((error[:, chosen] ** 2).mean(0))
+        found[f"away_{name}"] = [float(np.percentile(sizes, share)) for share in (50, 90)]
+        for label, kept in (("all", np.full(len(chosen), True)), ("away", chosen)):
+            at = [np.abs(error[round(time / PERIOD), kept]) for time in TIMES]
+            found[f"{label}_at_{name}"] = [
+                [float(np.nanpercentile(each, share)) for share in (50, 90)] for each in at
+            ]
+        if prediction.spread.any():
+            within = np.abs(error) <= CERTAIN * factor * prediction.spread[:, channel]
+            found[f"within_{name}"] = float(within[1:, chosen].mean())
+    return found
+
+
+def subsets(recorded: Sequence[Path], seconds: float, seed: int) -> list[Path]:
+    """Return files, drawn at random, of which about `seconds` s are fitted; every fifth is held out."""
+    order = np.random.default_rng(seed).permutation(len(recorded))
+    chosen, total = [], 0.0
+    for index in order:
+        chosen.append(recorded[index])
+        total += PERIOD * read_recording(recorded[index]).steps
+        if total >= 1.4 * seconds:
+            break
+    return chosen
+
+
+def by_seconds(run: Path, windows: Windows, folder: Path) -> dict[int, list[dict[str, Any]]]:
+    """Return the errors of carts that are identified from fewer recordings."""
+    recorded, found = sorted((run / RECORDINGS).iterdir()), {}
+    for seconds in SECONDS:
+        found[seconds] = []
+        for seed in range(SETS):
+            part = folder / f"{seconds}s_{seed}"
+            (part / RECORDINGS).mkdir(parents=True, exist_ok=True)
+            for file in subsets(recorded, seconds, seed):
+                shutil.copy(file, part / RECORDINGS)
+            fit = run_once(part / "identify", "identify", f"from={part}", *RIG, result=IDENTIFIED)
+            found[seconds].append(figures(windows, predict(windows, identified(fit))))
+    return found
+
+
+def dropouts(windows: Windows, quantities: dict[str, Any]) -> NDArray[np.bool_]:
+    """Return the stretches, [S], in which the motor gives much too little force for three periods."""
+    gain, viscous, dry, latency = (
+        scale * quantities[name]["value"]
+        for name, scale in (("force_gain", 1e-3), ("viscous", 1), ("coulomb", 1), ("latency", 1e-3))
+    )
+    x = windows.positions[windows.lead - 1 :, 0]
+    speed = (x[2:] - x[:-2]) / (2 * PERIOD)
+    acceleration = (x[2:] - 2 * x[1:-1] + x[:-2]) / PERIOD**2
+    motors = windows.motors[-len(x) + 1 :]
+    motor = np.stack([delayed(each, latency / PERIOD)[1:-1] for each in motors.T], 1)
+    expected = gain * motor - viscous * speed - dry * np.tanh(speed / SLOW)
+    missing = np.sign(motor) * (expected - acceleration)
+    running = np.lib.stride_tricks.sliding_window_view(missing, 3, 0).mean(2)
+    return np.asarray((running > MISSING).any(0))
+
+
+def agents(identify: Path, model: Path, folder: Path) -> dict[int, dict[str, Any]]:
+    """Return scores and times to upright of agents of the identified cart: last checkpoints."""
+    cart = [f"{group}={identify}/{group}.yaml" for group in ("cart", "pole", "randomization")]
+    friction = f"cart_friction={read_json(identify / IDENTIFIED)['cart_friction']}"
+    found: dict[int, dict[str, Any]] = {}
+    for seed in SEEDS:
+        run = folder / str(seed)
+        words = (*cart, friction, "pole_friction=bearing", "actions=nine_levels_fine", f"seed={seed}")
+        train = run_once(run / "train", "train", *words)
+        plants = {
+            "drawn": (cart[-1], "episodes=200"),
+            "learned": ("plant=learned", f"plant.model={model}", "episodes=50"),
+            "emulated": ("plant=emulated", "emulator=sensorsini", "episodes=10"),
+        }
+        driven = {
+            name: run_once(run / name, "evaluate", f"run={train}", *more) for name, more in plants.items()
+        }
+        found[seed] = {
+            name: driving(read_json(each / "metrics.json")["episodes"])
+            for name, each in {"nominal": train, **driven}.items()
+        }
+    return found
+
+
+def driving(driven: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return the mean score, the number of episodes that never come up, and the others' median time."""
+    times = [each["time_to_upright_s"] for each in driven]
+    up = [time for time in times if time is not None]
+    return {
+        "episodes": len(driven),
+        "score": float(np.mean([each["score"] for each in driven])),
+        "never_up": len(times) - len(up),
+        "time_to_upright_s": float(np.median(up)) if up else None,
+    }
+
+
+def over_time(period: float, chosen: NDArray[np.bool_], predictions: dict[str, Prediction]) -> Figure:
+    """Draw the median error over the time predicted, away from upright."""
+    figure = style.new_figure(height=3.4)
+    for axes, channel, factor, text in zip(
+        figure.subplots(1, 2), (0, 1), (1e3, 180 / np.pi), ("cart (mm)", "angle (deg)"), strict=True
+    ):
+        for name, colour in COLOURS.items():
+            error = factor * np.abs(predictions[name].error[:, channel, chosen])
+            axes.plot(period * np.arange(len(error)), np.median(error, 1), color=colour, label=name)
+        style.dress(axes, "prediction time (s)", f"median error, {text}")
+        axes.set_xlim(0, TIMES[-1])
+        axes.set_yscale("log")
+        axes.set_ylim(bottom=0.1)
+        if channel == 0:
+            axes.legend(fontsize=style.SMALL_SIZE, frameon=False, loc="lower right")
+            style.title(axes, "A real cart, predicted for a second", f"{chosen.sum()} held-out swing-ups")
+    return figure
+
+
+def worst(windows: Windows, predictions: dict[str, Prediction]) -> Figure:
+    """Draw the swing-up that the physics predicts worst: motor value, speed and position of the cart."""
+    chosen = np.flatnonzero(away(windows))
+    size = (predictions[PHYSICS].error[:, 0, chosen] ** 2).mean(0)
+    index = int(chosen[size.argmax()])
+    lead, time = windows.lead, PERIOD * np.arange(windows.periods - windows.lead + 1)
+    measured = windows.positions[lead:, 0, index]
+    motor = windows.motors[-len(time) + 1 :, index]
+    figure = style.new_figure(height=4.6)
+    force, place = figure.subplots(2, 1, sharex=True)
+    force.step(time[:-1], motor, where="post", color=colours.INK)
+    style.dress(force, "", "motor value")
+    style.title(
+        force,
+        "The held-out swing-up that physics predicts worst",
+        "at 0.34 s the motor loses nearly all of its force for 0.1 s",
+    )
+    place.plot(time, 1e3 * measured, color=colours.INK, label="measured")
+    for name in (PHYSICS, RESIDUAL):
+        simulated = predictions[name].simulated[:, 0, index]
+        place.plot(time, 1e3 * simulated, color=COLOURS[name], label=name)
+    style.dress(place, "prediction time (s)", "position (mm)")
+    place.legend(fontsize=style.SMALL_SIZE, frameon=False)
+    return figure
+
+
+def main() -> None:
+    """Identify, predict and print the tables."""
+    parser = option_parser(__doc__)
+    parser.add_argument("folder", type=Path, help="with Experiment-0.csv to Experiment-179.csv")
+    parser.add_argument("--figures", type=Path, help="folder for the figures")
+    options = parser.parse_args()
+    torch.set_num_threads(2)
+    home = RUNS / "real"
+    fit = imported(options.folder, FIT, home / "fit")
+    report = imported(options.folder, REPORT, home / "report")
+    blind = imported(options.folder, FIT, home / "fit_4096", "layout.angle.unit=4096")
+    own = run_once(home / "identify", "identify", f"from={fit}", *RIG, result=IDENTIFIED)
+    step = run_once(home / "one_step", "identify", f"from={fit}", *RIG, "method=one_step", result=IDENTIFIED)
+    model = run_once(
+        home / "model", "model", f"from={fit}", *RIG, "pole_friction=bearing", result="model.json"
+    )
+    windows = stretches(episodes(report))
+    learned = load_model(model)
+    predictions = {name: predict(windows, owners(numbers)) for name, numbers in OWNERS.items()}
+    predictions[ONE_STEP] = predict(windows, identified(step, "step"))
+    predictions[PHYSICS] = predict(windows, identified(own))
+    predictions[RESIDUAL] = predict(
+        windows,
+        Dynamics.of(learned.parameters, learned.models, learned.period, learned.substeps),
+        Residual.as_type(learned.residual, torch.float64),
+    )
+    results = {name: figures(windows, each) for name, each in predictions.items()}
+    sensors = {
+        name: read_json(run / "import.json")["sensors"] for name, run in (("4271", fit), ("4096", blind))
+    }
+    write_json(
+        options.json,
+        {
+            "stretches": {"all": windows.number, "away": int(away(windows).sum())},
+            "models": results,
+            "by_seconds": by_seconds(fit, windows, home),
+            "sensors": sensors,
+            "identified": read_json(own / IDENTIFIED)["quantities"],
+            "agents": agents(own, model, home / "agent"),
+            "dropouts": after_dropouts(windows, predictions, read_json(own / IDENTIFIED)["quantities"]),
+            "widening": float(learned.residual.widening),
+        },
+    )
+    if options.figures:
+        style.save(over_time(PERIOD, away(windows), predictions), options.figures / "real_over_time.png")
+        style.save(worst(windows, predictions), options.figures / "real_worst.png")
+    print_table([table_row(name, each) for name, each in results.items()])
+
+
+def after_dropouts(
+    windows: Windows, predictions: dict[str, Prediction], quantities: dict[str, Any]
+) -> dict[str, Any]:
+    """Return the errors away from upright in stretches with a dropout of the motor, and in the others."""
+    dropped, chosen = dropouts(windows, quantities), away(windows)
+    found: dict[str, Any] = {"with": int((dropped & chosen).sum()), "without": int((~dropped & chosen).sum())}
+    for name in (PHYSICS, RESIDUAL):
+        sizes = 1e3 * np.sqrt((predictions[name].error[:, 0] ** 2).mean(0))
+        found[name] = {
+            label: np.percentile(sizes[kept & chosen], (50, 90)).tolist()
+            for label, kept in (("with", dropped), ("without", ~dropped))
+        }
+    return found
+
+
+def table_row(name: str, found: dict[str, Any]) -> dict[str, str]:
+    """Return a row of the table."""
+    row = {"model": re.sub("cartpole-model", "cartpole-model (residual)", name)}
+    for unit in ("mm", "deg"):
+        row[f"RMS {unit}, median"], row[f"90 % {unit}"] = (f"{each:.2f}" for each in found[f"away_{unit}"])
+        row[f"1 s {unit}, all"] = f"{found[f'all_at_{unit}'][-1][0]:.2f}"
+    return row
+
+
+if __name__ == "__main__":
+    main()
