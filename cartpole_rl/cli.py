@@ -188,10 +188,10 @@ VERBS: dict[str, Verb] = {
         "workflows.preflight:check_cart",
         "checks a cart by small moves and refuses it if its wiring, limits or delays are wrong.\n"
         "The cart homes and then moves a few centimetres about the middle. Let the pole hang.",
-        "first-hour safety",
+        "first-hour my-cart safety",
         (
-            "plant=serial plant.port=/dev/ttyUSB0",
             "plant=serial plant.port=auto      the only cart that is plugged in",
+            "plant=text plant.port=/dev/ttyUSB0      a board that speaks lines of text",
             "plant=emulated emulator.deadband_right=90",
         ),
         has_run_folder=False,

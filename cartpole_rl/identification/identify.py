@@ -261,7 +261,7 @@ def warnings(fit: Fit, encoders: Encoders) -> list[str]:
                 f"{unknown.name} = {values[unknown.name]:.3g} is unusual for carts of this kind: check that "
                 "the right pole and cart were given"
             )
-        if left > UNINFORMED and np.isfinite(unknown.prior.unusual):
+        if left > UNINFORMED and abs(point) < 1 and np.isfinite(unknown.prior.unusual):
             found.append(f"the recordings hardly show {unknown.name}: its prior value is kept")
     texts = f"{1e3 * fit.rms[0]:.2g} mm", f"{np.degrees(fit.rms[1]):.2g} deg"
     for name, rms, size, correlation, text in zip(

@@ -9,7 +9,6 @@ Experiment-179.csv, on which everything is judged. The runs are in runs/bench/re
 again.
 """
 
-import re
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -51,14 +50,15 @@ CERTAIN = 2  # spreads
 FULL = 255  # motor value
 SLOW, MISSING = 0.01, 4.0  # m/s of the friction's sign; m/s^2 that a dropout of the motor takes away
 LATENCY = 0.015  # s, by the owners' logs
-OWNERS = {  # their published numbers: config.yml of June 2022, cartpole_physical_parameters.yml of 2025
-    "the owners' numbers of 2022": {"force": 2.62, "cart_viscous": 4.77, "pole_viscous": 2.5e-4},
-    "the owners' numbers of 2025": {"force": 1.77, "cart_viscous": 3.22, "pole_viscous": 5e-5},
-}
-PHYSICS, RESIDUAL, ONE_STEP = "cartpole-identify", "cartpole-model", "one-step regression"
+PUBLISHED = {"cart_viscous": 4.77, "pole_viscous": 2.5e-4}  # N s/m, N m s/rad: their config.yml of 2022
+PUBLISHED_FORCE = 2.62  # N at Q = 1
+# their model has no dry friction: Q is the control before their compensation of it
+OWN_CONTROL = ("layout.motor.name=Q", "layout.motor.full=1", "layout.motor.positive=right")
+OWNERS, ONE_STEP = "the owners' numbers", "one-step regression"
+PHYSICS, MODEL, RESIDUAL = "cartpole-identify", "cartpole-model, physics alone", "cartpole-model"
 COLOURS = dict(
     zip(
-        ("the owners' numbers of 2022", ONE_STEP, PHYSICS, RESIDUAL),
+        (OWNERS, ONE_STEP, PHYSICS, RESIDUAL),
         (colours.MUTED, colours.ORANGE, colours.BLUE, colours.VERMILLION),
         strict=True,
     )
@@ -95,10 +95,10 @@ def stretches(recorded: Sequence[Episode]) -> Windows:
     return joined([cut_stretches(each, PERIOD, TIMES[-1], lead) for each in long_enough])
 
 
-def owners(numbers: dict[str, float]) -> Dynamics:
-    """Return the cart of published numbers."""
-    values = {**parameters_of(choice("cart/sensorsini")), **pole().model_dump(), **numbers}
-    values.update(force_linear=values.pop("force") / FULL, cart_coulomb=0.0, latency=LATENCY)
+def owners() -> Dynamics:
+    """Return the cart of the owners' numbers."""
+    values = {**parameters_of(choice("cart/sensorsini")), **pole().model_dump(), **PUBLISHED}
+    values.update(force_linear=PUBLISHED_FORCE / FULL, latency=LATENCY)
     return dynamics(values, "linear", "exponential")
 
 
@@ -287,14 +287,13 @@ def main() -> None:
     )
     windows = stretches(episodes(report))
     learned = load_model(model)
-    predictions = {name: predict(windows, owners(numbers)) for name, numbers in OWNERS.items()}
+    controls = imported(options.folder, REPORT, home / "report_q", *OWN_CONTROL)
+    predictions = {OWNERS: predict(stretches(episodes(controls)), owners())}
     predictions[ONE_STEP] = predict(windows, identified(step, "step"))
     predictions[PHYSICS] = predict(windows, identified(own))
-    predictions[RESIDUAL] = predict(
-        windows,
-        Dynamics.of(learned.parameters, learned.models, learned.period, learned.substeps),
-        Residual.as_type(learned.residual, torch.float64),
-    )
+    physics = Dynamics.of(learned.parameters, learned.models, learned.period, learned.substeps)
+    predictions[MODEL] = predict(windows, physics)
+    predictions[RESIDUAL] = predict(windows, physics, Residual.as_type(learned.residual, torch.float64))
     results = {name: figures(windows, each) for name, each in predictions.items()}
     sensors = {
         name: read_json(run / "import.json")["sensors"] for name, run in (("4271", fit), ("4096", blind))
@@ -324,7 +323,7 @@ def after_dropouts(
     """Return the errors away from upright in stretches with a dropout of the motor, and in the others."""
     dropped, chosen = dropouts(windows, quantities), away(windows)
     found: dict[str, Any] = {"with": int((dropped & chosen).sum()), "without": int((~dropped & chosen).sum())}
-    for name in (PHYSICS, RESIDUAL):
+    for name in (PHYSICS, MODEL, RESIDUAL):
         sizes = 1e3 * np.sqrt((predictions[name].error[:, 0] ** 2).mean(0))
         found[name] = {
             label: np.percentile(sizes[kept & chosen], (50, 90)).tolist()
@@ -335,7 +334,7 @@ def after_dropouts(
 
 def table_row(name: str, found: dict[str, Any]) -> dict[str, str]:
     """Return a row of the table."""
-    row = {"model": re.sub("cartpole-model", "cartpole-model (residual)", name)}
+    row = {"model": name}
     for unit in ("mm", "deg"):
         row[f"RMS {unit}, median"], row[f"90 % {unit}"] = (f"{each:.2f}" for each in found[f"away_{unit}"])
         row[f"1 s {unit}, all"] = f"{found[f'all_at_{unit}'][-1][0]:.2f}"

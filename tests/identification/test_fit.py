@@ -11,10 +11,11 @@ from tensordict import TensorDictBase
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.errors import RecordingError
 from cartpole_rl.evaluation.episodes import run_batch
-from cartpole_rl.identification.fit import fit_cart
+from cartpole_rl.identification.fit import Fit, fit_cart
+from cartpole_rl.identification.identify import warnings
 from cartpole_rl.identification.prediction import errors_at, predict, root_mean_square
 from cartpole_rl.identification.rollout import Dynamics, rollout
-from cartpole_rl.identification.unknowns import limits, parameters_at, unknowns_of
+from cartpole_rl.identification.unknowns import limits, parameters_at, unknowns, unknowns_of
 from cartpole_rl.identification.windows import (
     HELD_OUT_LEAD,
     WINDOW,
@@ -28,6 +29,7 @@ from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import CartParameters, cart_column
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.randomization.poles import PoleSettings
+from cartpole_rl.rig.hardware import nominal_encoders
 from cartpole_rl.rig.parameters import POSITIVE, Parameter, factor
 from cartpole_rl.tasks.episode import Episode
 
@@ -260,3 +262,14 @@ def test_every_fifth_is_held_out_or_the_last_fifth_of_a_few() -> None:
     learned, held_out = split(whole[:1])
     assert (learned[0].steps, held_out[0].steps) == (80, 20)
     assert held_out[0].motor[0] == learned[0].motor[-1] + 1
+
+
+@pytest.mark.parametrize(("point", "said"), [(0.2, "hardly show cart_mass"), (9.0, "cart_mass = ")])
+def test_a_parameter_is_unusual_or_not_shown_but_not_both(
+    ip02: dict[str, float], medium: PoleSettings, point: float, said: str
+) -> None:
+    mass = next(each for each in unknowns() if each.name == "cart_mass")
+    nominal = {**ip02, **medium.nominal.model_dump()}
+    fit = Fit([mass], np.array([point]), np.array([[0.9]]), nominal, np.zeros(2), np.zeros(2), 1.0, 1)
+    (warning,) = warnings(fit, nominal_encoders())
+    assert said in warning
