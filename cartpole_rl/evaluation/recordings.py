@@ -29,6 +29,7 @@ STEP = {"score": "score", "score_upright": "score_upright", "reward": "reward"}
 COUNTS = ("cart_counts", "pole_counts")
 FEWEST_COUNTS, MOST_COUNTS = -(2**31), 2**31 - 1  # int32 on the wire
 METRES, TURN = "cart_nanometres_per_count", "pole_counts_per_turn"  # in the heading; without them: ip02's
+BEFORE = "motor_before"  # in the heading of a part of a log: its motor values before the first row
 LENGTH = "pole_length_m"  # in the heading: twice pivot to centre of mass, empty if not known
 GUARDED = "guarded"  # 1 where the track guard replaced the agent's motor value; empty without a guard
 COLUMNS = (*STATE, *COUNTS, "motor", *STEP)  # that every recording has
@@ -41,7 +42,9 @@ def write_recording(path: Path, episode: Episode, facts: Mapping[str, Any] | Non
     with replacing(path) as beside, beside.open("w", newline="", encoding="utf-8") as file:
         left_out = {"left_out": episode.left_out} if episode.left_out else {}
         encoders = {METRES: round(1e9 * episode.encoders.metres), TURN: episode.encoders.turn}
-        heading = {"format": FORMAT, "ended_by": episode.ended_by, **encoders, **left_out, **(facts or {})}
+        before = {BEFORE: " ".join(map(str, episode.motor_before))} if episode.motor_before else {}
+        known = {"format": FORMAT, "ended_by": episode.ended_by, **encoders, **before, **left_out}
+        heading = {**known, **(facts or {})}
         for key, value in heading.items():
             file.write(f"# {key}: {value}\n")
         lines = csv.writer(file)
@@ -96,7 +99,22 @@ def read_recording(path: Path) -> Episode:
         ended_by=ended_by,
         guarded=guarded,
         encoders=_encoders(path, facts),
+        motor_before=_motor_before(path, facts.get(BEFORE, "")),
     )
+
+
+def _motor_before(path: Path, text: str) -> tuple[int, ...]:
+    """Return the motor values in a heading. Raises RecordingError for impossible ones."""
+    try:
+        values = tuple(map(int, text.split()))
+    except ValueError:
+        values = (LARGEST_MOTOR + 1,)
+    if any(abs(value) > LARGEST_MOTOR for value in values):
+        raise RecordingError(
+            f"{path} is damaged: in its heading, {BEFORE} is {text!r}; give whole numbers from "
+            f"-{LARGEST_MOTOR} to {LARGEST_MOTOR}"
+        )
+    return values
 
 
 def _encoders(path: Path, facts: Mapping[str, str]) -> Encoders:

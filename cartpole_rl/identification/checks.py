@@ -32,7 +32,8 @@ SHORTEST_HELD_OUT = 5.0  # s
 LEAST_TRAVEL, LEAST_SWING = 0.05, 0.35  # m, rad
 LEAST_OF_EACH = 0.01, 0.05  # m, rad, in each recording: less than any experiment's
 STILL, STILL_ANGLE, STILL_SPREAD = 0.3, 0.2, 0.02  # s, rad from hanging, rad
-BALANCED, BALANCED_ANGLE = 5.0, 0.35  # s; rad from upright
+BALANCED, BALANCED_ANGLE, BALANCED_MEAN = 5.0, 0.35, 0.1  # s; rad from upright, of the angle and of its mean
+FLICKER = 0.01  # rad to both sides of its mean: a pole that lies on a stop does not move
 FROZEN = 1.0  # s
 ZERO_INTERVAL = 0.02  # rad, 95 % of the zero that motion tells
 STRONG, MOVES = 150, 0.03  # motor value; m of cart that move a hanging pole
@@ -239,11 +240,17 @@ def _hangs_still(episode: Episode, period: float) -> bool:
 
 
 def stays_up(episode: Episode, period: float) -> bool:
-    """Return True if the pole is balanced for BALANCED s: the mean of its angle is upright then."""
-    upright = np.abs(wrap(episode.theta)) < BALANCED_ANGLE
-    ends = np.flatnonzero(~upright)
-    longest = np.diff(np.concatenate(([-1], ends, [len(upright)]))).max() - 1
-    return bool(longest * period >= BALANCED)
+    """Return True if the pole is balanced for BALANCED s, about 0: the mean of its angle is upright then."""
+    angle = wrap(episode.theta)
+    ends = np.concatenate(([-1], np.flatnonzero(np.abs(angle) >= BALANCED_ANGLE), [len(angle)]))
+    longest = int(np.diff(ends).argmax())
+    balanced = angle[ends[longest] + 1 : ends[longest + 1]]
+    return bool(
+        len(balanced) * period >= BALANCED
+        and abs(balanced.mean()) < BALANCED_MEAN
+        and balanced.min() < balanced.mean() - FLICKER
+        and balanced.max() > balanced.mean() + FLICKER
+    )
 
 
 def _check_signs(episodes: Sequence[Episode], period: float) -> None:

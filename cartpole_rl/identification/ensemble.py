@@ -110,7 +110,8 @@ class Ensemble:
         Members are never moved nearer.
         """
         near, far = 1.0, WIDEST
-        if self.covered(near) >= SHARE:
+        adds = self.best.places.any() or self.best.last.any()
+        if not adds or self.settings.members == 1 or self.covered(near) >= SHARE:
             return self.best
         for _ in range(HALVINGS):
             middle = (near + far) / 2
@@ -118,13 +119,11 @@ class Ensemble:
         return self.best._replace(widening=torch.tensor(far, dtype=torch.float64))
 
     def covered(self, widening: float) -> float:
-        """Return the share of the members' errors within CERTAIN spreads; 1 if no member adds anything."""
+        """Return the share of the members' errors within CERTAIN spreads."""
         residual = self.best._replace(widening=torch.tensor(widening, dtype=torch.float64))
         _, errors = predicted_by_members(self.windows, self.dynamics, residual)
         errors = errors[1:]  # [H, 2, M, W]
-        spread = errors.std(2, ddof=1, keepdims=True) if self.settings.members > 1 else 0 * errors
-        if not spread.any():
-            return 1.0
+        spread = errors.std(2, ddof=1, keepdims=True)
         rounding = finest_scale(self.windows.resolution).numpy().reshape(1, 2, 1, 1)
         judged = np.broadcast_to(self.left_out.numpy(), errors.shape)
         certain = CERTAIN * np.sqrt(2 * spread**2 + rounding**2)

@@ -8,6 +8,7 @@ or left out, so that each part has a constant period.
 import csv
 import io
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,7 +19,7 @@ from cartpole_rl.errors import RecordingError
 from cartpole_rl.identification.checks import shows_motion
 from cartpole_rl.identification.experiments import recording
 from cartpole_rl.identification.settings import Direction, Layout, TimeColumn
-from cartpole_rl.identification.windows import IRREGULAR
+from cartpole_rl.identification.windows import IRREGULAR, history_periods
 from cartpole_rl.rig.hardware import LARGEST_MOTOR, Encoders
 from cartpole_rl.tasks.episode import Ending, Episode
 
@@ -87,10 +88,15 @@ def read_log(path: Path, layout: Layout, encoders: Encoders) -> Log:
                 f"{path}: {name} is {columns[name][row]:g} in row {row + 1}, which no "
                 "encoder counts: correct it, or leave the row out by layout.keep"
             )
-        values = motor[rows[1:]] if layout.motor.row == "in_force" else motor[rows[:-1]]
+        late = int(layout.motor.row == "in_force")
+        values = motor[rows[:-1] + late]
+        steady = np.flatnonzero(~regular[:first])
+        earliest = max(first - history_periods(period), int(steady[-1]) + 1 if len(steady) else 0)
+        before = motor[earliest + late : first + late]
         if layout.resample:
             states, values = resampled(time[rows], states, values, period)
-        part = _episode(states, values, period, encoders)
+            before = before[:0]
+        part = _episode(states, values, period, encoders, before)
         if shows_motion(part):
             parts.append(part)
         else:
@@ -188,8 +194,11 @@ def resampled(time: Array, states: Array, motor: Array, period: float) -> tuple[
     return at, np.diff(np.interp(grid, time, total)) / period
 
 
-def _episode(states: Array, motor: Array, period: float, encoders: Encoders) -> Episode:
-    full = np.clip(np.rint(motor * LARGEST_MOTOR), -LARGEST_MOTOR, LARGEST_MOTOR)
-    gaps = np.full(len(full), period)
-    counts, motors = np.rint(states).astype(np.int64), full.astype(np.int64)
-    return recording(counts, gaps, motors, str(Ending.TIME), encoders)
+def _episode(states: Array, motor: Array, period: float, encoders: Encoders, before: Array) -> Episode:
+    motors, earlier = (
+        np.clip(np.rint(each * LARGEST_MOTOR), -LARGEST_MOTOR, LARGEST_MOTOR).astype(np.int64)
+        for each in (motor, before)
+    )
+    gaps, counts = np.full(len(motors), period), np.rint(states).astype(np.int64)
+    part = recording(counts, gaps, motors, str(Ending.TIME), encoders)
+    return replace(part, motor_before=tuple(earlier.tolist()))

@@ -162,7 +162,10 @@ def _pieces(
     history, end = history_periods(period), episode.measured_steps
     late = np.flatnonzero(~regular_frames(episode, period)[:end])
     last_known = np.append(late, end)  # rows after which the motion is not known
-    motors = np.concatenate((np.zeros(history), episode.motor.astype(np.float64), np.zeros(length)))
+    before = np.zeros(history)
+    if known_before := episode.motor_before[-history:]:
+        before[-len(known_before) :] = known_before
+    motors = np.concatenate((before, episode.motor.astype(np.float64), np.zeros(length)))
     every = episode.positions
     resolution = np.array(episode.encoders.resolution)
     for first in range(0, end - least + 1, step):
@@ -215,7 +218,8 @@ def part(episode: Episode, first: int, last: int) -> Episode:
         name: getattr(episode, name)[first:last] for name in ("motor", "score", "score_upright", "reward")
     }
     guarded = None if episode.guarded is None else episode.guarded[first:last]
-    return replace(episode, **cut, **steps, guarded=guarded)
+    before = (*episode.motor_before, *episode.motor[:first].tolist())
+    return replace(episode, **cut, **steps, guarded=guarded, motor_before=before)
 
 
 def held_out_windows(episodes: Sequence[Episode], period: float, horizon: float) -> Windows:

@@ -88,6 +88,10 @@ class Residual(NamedTuple):
         """D."""
         return self.first.shape[2] - MOTION
 
+    def widened_places(self) -> Tensor:
+        """Return the tables, [M, PLACES], moved away from their mean."""
+        return torch.lerp(self.places.mean(0, keepdim=True), self.places, self.widening)
+
     def as_type(self, dtype: torch.dtype) -> Self:
         """Return the same numbers in another type."""
         return type(self)(*(weight.to(dtype) for weight in self))
@@ -117,11 +121,10 @@ def chosen_members(residual: Residual, member: Tensor) -> MakeAddition:
 
     def network(inputs: Tensor) -> Tensor:
         own = torch.arange(residual.members, device=member.device).unsqueeze(1) == member  # [M, N]
-        share = torch.lerp(inputs.new_tensor(1 / residual.members), own.to(inputs.dtype), residual.widening)
+        share = residual.widening * own + (1 - residual.widening) / residual.members
         return (residual.network(inputs.unsqueeze(0)) * share.unsqueeze(1)).sum(0)
 
-    places = torch.lerp(residual.places.mean(0, keepdim=True), residual.places, residual.widening)
-    return adding(residual._replace(places=places), network, member)
+    return adding(residual._replace(places=residual.widened_places()), network, member)
 
 
 def members_in_turn(residual: Residual, each: int) -> MakeAddition:

@@ -96,6 +96,10 @@ def _as_model(content: Mapping[str, Any]) -> LearnedModel:
     models = Models.of(**content["models"])  # a user's law brings its parameters
     check_values(content["parameters"])
     residual = Residual(**OLD_SCALES | content["residual"])
+    if "units" not in content["residual"]:  # its network read x / 0.4 m
+        rescaled = residual.first.clone()
+        rescaled[:, :, 0] *= float((PLACES - 1) / 2 * residual.spacing) / 0.4
+        residual = residual._replace(first=rescaled)
     if bad := [name for name, part in residual._asdict().items() if not part.isfinite().all()]:
         raise ValueError(f"its residual's {', '.join(bad)} is not finite")
     if residual.places.shape[1] != PLACES:

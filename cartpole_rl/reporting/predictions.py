@@ -223,7 +223,7 @@ def learned_model_figure(
 
 def forces_along_track(residual: Residual, visited: Array) -> tuple[Array, Array]:
     """Return places [K] in m and the tables' force [M, K] in N there, NaN at places not in `visited` (m)."""
-    forces = (residual.units[0] * residual.places).numpy().astype(np.float64)
+    forces = (residual.units[0] * residual.widened_places()).numpy().astype(np.float64)
     spacing = float(residual.spacing)
     places = spacing * (np.arange(forces.shape[1]) - forces.shape[1] // 2)
     counts, _ = np.histogram(visited, np.append(places, places[-1] + spacing) - spacing / 2)

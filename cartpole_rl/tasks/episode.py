@@ -63,6 +63,9 @@ class Episode:
     compared: NDArray[np.bool_] | None = None
     left_out: str = ""  # control periods after the last row that do not count, and why
     encoders: Encoders = nominal_encoders()  # noqa: RUF009 - it is a tuple
+    motor_before: tuple[
+        int, ...
+    ] = ()  # motor values before the first one, oldest first, where they are known
 
     @property
     def positions(self) -> Array:

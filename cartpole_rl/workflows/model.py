@@ -3,13 +3,16 @@
 Every fifth recording is held out: nothing is fitted to it. The resulting model is read by plant=learned.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from cartpole_rl.evaluation.recordings import read_recording
+from cartpole_rl.choices import choice, group_choices
+from cartpole_rl.errors import ConfigError
+from cartpole_rl.evaluation.recordings import LENGTH, read_heading, read_recording
 from cartpole_rl.identification.checks import check_same_encoders
 from cartpole_rl.identification.ensemble import Ensemble
 from cartpole_rl.identification.fit import Fit, best_fit
@@ -31,7 +34,7 @@ from cartpole_rl.reporting.predictions import (
 )
 from cartpole_rl.reporting.style import save
 from cartpole_rl.reporting.texts import count_text
-from cartpole_rl.rig.hardware import Hardware
+from cartpole_rl.rig.hardware import Hardware, hardware_of, nominal_hardware
 from cartpole_rl.run_folder import FIGURES, MODELLED, recordings, write_config, write_json
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.terminal import as_word, print_results, progress_bar, shown
@@ -57,6 +60,9 @@ def learn_model(config: ModelConfig, folder: Path) -> None:
     check_same_encoders(
         {str(path): each for path, each in zip(paths, episodes, strict=True)}, config.hardware
     )
+    foreign = config.hardware.scales_text != nominal_hardware().scales_text
+    if foreign and config.pole is None and not read_heading(paths[0])[0].get(LENGTH):
+        raise ConfigError("pole: the recordings do not say which one it is; give the pole of this cart")
     pole_name, pole = chosen_pole("a model", config.pole, paths)
     period = recorded_period(episodes[0])
     training, held_out = split(episodes)
@@ -79,8 +85,22 @@ def learn_model(config: ModelConfig, folder: Path) -> None:
     print(
         f"\n{spread_table(errors[LEARNED], CERTAIN, 'RMS errors and ensemble spreads on the same windows')}"
     )
-    following = f"cartpole-train plant=learned {as_word('plant.model', shown(folder))}"
-    print_results(folder, f"{MODEL}, {MODELLED} and {FIGURE}", following)
+    print_results(folder, f"{MODEL}, {MODELLED} and {FIGURE}", next_command(model, folder))
+
+
+def next_command(model: LearnedModel, folder: Path) -> str:
+    """Return the command that trains on a model."""
+    words = ["cartpole-train plant=learned", as_word("plant.model", shown(folder))]
+    if model.hardware.scales_text != nominal_hardware().scales_text:
+        names = [
+            name
+            for name in group_choices("cart")
+            if hardware_of(choice(f"cart/{name}")).scales_text == model.hardware.scales_text
+        ]
+        words.append(f"cart={names[0] if names else '<yours>.yaml'} pole=<yours>")
+    if not math.isclose(model.period, choice("train")["control_period"]):
+        words.append(f"control_period={model.period:g}")
+    return " ".join(words)
 
 
 def fit_and_learn(
@@ -138,6 +158,7 @@ def results(
     return {
         "learned_from_windows": ensemble.positions.shape[2],
         "held_out_windows": held_out.number,
+        "widening": float(model.residual.widening),
         "cart_friction": str(model.models.cart_friction),
         "parameters": model.parameters,
         "errors": errors,

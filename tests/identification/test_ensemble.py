@@ -14,7 +14,7 @@ from cartpole_rl.identification.matching import match_initial_states
 from cartpole_rl.identification.prediction import errors_at, predict
 from cartpole_rl.identification.rollout import Dynamics
 from cartpole_rl.identification.settings import EnsembleSettings
-from cartpole_rl.identification.windows import Windows, cut_windows
+from cartpole_rl.identification.windows import Windows, cut_windows, history_periods
 from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.residual import PLACES, Residual
 from cartpole_rl.plants.learned import LearnedModel, LearnedPlant
@@ -134,6 +134,19 @@ def test_an_effect_that_the_physics_lacks_is_learned(record: Record, dynamics: D
     near = slice(PLACES // 2 - 40, PLACES // 2 + 41)  # 16 cm to each side, where the carts are most
     mean = residual.places.mean(0)[near].numpy()
     assert np.corrcoef(mean, rippled().places[0, near].numpy())[0, 1] > 0.5
+
+
+@pytest.mark.parametrize("period", [0.005, 0.01, 0.02, 0.05])
+def test_a_residual_of_zeros_predicts_the_same(parameters: Mapping[str, float], period: float) -> None:
+    late = {**parameters, "motor_time_constant": 0.02, "latency": 0.012}
+    dynamics = Dynamics.of(late, STEP, period, 4)
+    nothing = Residual.untrained(2, 6, torch.Generator().manual_seed(0), period).as_type(torch.float64)
+    random = torch.Generator().manual_seed(1)
+    motors = 400 * torch.rand(history_periods(period) + 20, 3, generator=random, dtype=torch.float64) - 200
+    motion = torch.zeros(4, 1, 3, dtype=torch.float64)
+    plain = dynamics.positions(motion, motors)
+    both = dynamics.positions(motion.repeat(1, 2, 1), motors, nothing)
+    assert torch.allclose(both, plain.expand_as(both), atol=1e-12)
 
 
 def test_complete_physics_gets_no_residual(record: Record, dynamics: Dynamics) -> None:

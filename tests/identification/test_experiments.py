@@ -321,6 +321,8 @@ class TestChecks:
         balanced = np.arange(len(excite.theta)) * PERIOD < seconds
         leaning = np.where(balanced, angle * np.sin(np.arange(len(balanced))), excite.theta + np.pi / 2)
         assert stays_up(dataclasses.replace(excite, theta=leaning), PERIOD) == up
+        on_a_stop = np.where(balanced, angle, leaning)
+        assert not stays_up(dataclasses.replace(excite, theta=on_a_stop), PERIOD)
 
     @pytest.mark.parametrize("name", ["ramps", HELD_OUT])
     @pytest.mark.parametrize(

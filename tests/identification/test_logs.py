@@ -14,10 +14,11 @@ from cartpole_rl.checking import validated
 from cartpole_rl.choices import choice, conf_folder
 from cartpole_rl.composition import compose
 from cartpole_rl.errors import ConfigError, RecordingError
-from cartpole_rl.evaluation.recordings import read_recording
+from cartpole_rl.evaluation.recordings import read_recording, write_recording
 from cartpole_rl.identification.logs import read_log
 from cartpole_rl.identification.sensors import Motion, question_sensors
 from cartpole_rl.identification.settings import ImportConfig, Layout
+from cartpole_rl.identification.windows import cut_windows
 from cartpole_rl.rig.hardware import nominal_encoders
 from cartpole_rl.run_folder import experiments
 from cartpole_rl.workflows.import_logs import import_logs
@@ -145,6 +146,28 @@ def test_a_log_is_split_where_rows_are_missing_or_left_out(tmp_path: Path, motio
     assert [part.steps for part in log.parts] == [299, 299, 2346]
     assert log.report.gaps == 1
     assert log.report.left_out == {"bad not in 0 to 0": 2, "in a part that is too short": 49}
+
+
+@pytest.mark.parametrize(("row", "shift"), [("chosen", 0), ("in_force", 1)])
+def test_a_part_knows_the_motor_values_before_it(
+    tmp_path: Path, motion: Columns, row: str, shift: int
+) -> None:
+    columns = {**motion, "ok": np.ones(STEPS)}
+    columns["ok"][[500, 800]] = 0
+    columns["t"] = motion["t"] + np.where(np.arange(STEPS) > 796, 0.1, 0.0)  # 100 ms are missing
+    path = written(tmp_path / "log.csv", columns)
+    keep = layout(keep={"ok": [1, 1]}, motor={"row": row})
+    first, *others = read_log(path, keep, nominal_encoders()).parts
+    assert first.motor_before == ()
+    values = motion["u"].astype(int).tolist()
+    before = {part.motor_before for part in others}
+    assert tuple(values[489 + shift : 501 + shift]) in before  # 0.24 s
+    assert tuple(values[797 + shift : 801 + shift]) in before  # since the gap
+    write_recording(tmp_path / "part.csv", others[0])
+    assert read_recording(tmp_path / "part.csv").motor_before == others[0].motor_before
+    windows = cut_windows(others[:1], PERIOD)
+    history = windows.motors.shape[0] - windows.periods
+    assert windows.motors[:history, 0].tolist() == [*others[0].motor_before][-history:]
 
 
 def test_a_log_with_a_varying_period_is_resampled(tmp_path: Path, motion: Columns) -> None:
