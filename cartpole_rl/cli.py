@@ -190,8 +190,8 @@ VERBS: dict[str, Verb] = {
         "The cart homes and then moves a few centimetres about the middle. Let the pole hang.",
         "first-hour my-cart safety",
         (
+            "plant=serial plant.port=/dev/ttyUSB0",
             "plant=serial plant.port=auto      the only cart that is plugged in",
-            "plant=text plant.port=/dev/ttyUSB0      a board that speaks lines of text",
             "plant=emulated emulator.deadband_right=90",
         ),
         has_run_folder=False,
