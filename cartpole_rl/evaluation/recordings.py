@@ -107,14 +107,14 @@ def _motor_before(path: Path, text: str) -> tuple[int, ...]:
     """Return the motor values in a heading. Raises RecordingError for impossible ones."""
     try:
         values = tuple(map(int, text.split()))
+        if any(abs(value) > LARGEST_MOTOR for value in values):
+            raise ValueError
+        return values
     except ValueError:
-        values = (LARGEST_MOTOR + 1,)
-    if any(abs(value) > LARGEST_MOTOR for value in values):
         raise RecordingError(
             f"{path} is damaged: in its heading, {BEFORE} is {text!r}; give whole numbers from "
             f"-{LARGEST_MOTOR} to {LARGEST_MOTOR}"
-        )
-    return values
+        ) from None
 
 
 def _encoders(path: Path, facts: Mapping[str, str]) -> Encoders:

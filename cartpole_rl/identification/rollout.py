@@ -50,9 +50,10 @@ def rollout(
                 measured.append(as_measured(state, cart))
         return torch.stack(measured)
     latency, force = cart.latency + extra_latency, torch.zeros_like(motion[0])
-    history, in_effect = history_periods(period), max(motors_in_effect(period), memory_periods(period))
-    for now in range(motors_in_effect(period) - 1, len(motors)):
-        reach = motors_in_effect(period) if now < history else in_effect
+    history, in_effect = history_periods(period), motors_in_effect(period)
+    read = max(in_effect, memory_periods(period))
+    for now in range(in_effect - 1, len(motors)):
+        reach = in_effect if now < history else read
         drive = Drive(force, [motors[now - age] for age in range(reach)])
         if now < history:
             _, force = step_forces(*drive, latency, cart, models.actuator, period, substeps)

@@ -44,9 +44,9 @@ class Residual(NamedTuple):
         members: int,
         hidden: int,
         generator: torch.Generator,
-        period: float = 0.02,
-        full_force: float = 4.0,
-        track_span: float = 0.814,
+        period: float,
+        full_force: float,
+        track_span: float,
     ) -> Self:
         """Return members that differ and do not add anything yet.
 

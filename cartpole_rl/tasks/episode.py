@@ -63,9 +63,8 @@ class Episode:
     compared: NDArray[np.bool_] | None = None
     left_out: str = ""  # control periods after the last row that do not count, and why
     encoders: Encoders = nominal_encoders()  # noqa: RUF009 - it is a tuple
-    motor_before: tuple[
-        int, ...
-    ] = ()  # motor values before the first one, oldest first, where they are known
+    # motor values before the first one, oldest first, where they are known
+    motor_before: tuple[int, ...] = ()
 
     @property
     def positions(self) -> Array:

@@ -23,16 +23,15 @@ from numpy.typing import NDArray
 from cartpole_rl.choices import choice
 from cartpole_rl.drawing import colours
 from cartpole_rl.evaluation.recordings import read_recording
-from cartpole_rl.identification.prediction import LEAD, Prediction, is_away, predict
+from cartpole_rl.identification.prediction import CERTAIN, LEAD, Prediction, is_away, predict
 from cartpole_rl.identification.rollout import Dynamics
 from cartpole_rl.identification.sensors import delayed
 from cartpole_rl.identification.windows import Windows, cut_stretches, joined, lead_periods
 from cartpole_rl.physics.models import Models
-from cartpole_rl.physics.residual import Residual
 from cartpole_rl.plants.learned import load_model
 from cartpole_rl.randomization.poles import Pole
 from cartpole_rl.reporting import style
-from cartpole_rl.rig.hardware import parameters_of
+from cartpole_rl.rig.hardware import LARGEST_MOTOR, parameters_of
 from cartpole_rl.rig.parameters import completed
 from cartpole_rl.run_folder import IDENTIFIED, RECORDINGS
 from cartpole_rl.tasks.episode import Episode
@@ -46,8 +45,6 @@ SECONDS = (30, 60, 120)  # of recordings to identify from
 SEEDS = range(FIRST_SEED, FIRST_SEED + 3)  # of agents
 SETS = 3  # of recordings, for each of SECONDS
 TIMES = (0.1, 0.2, 0.5, 1.0)  # s predicted
-CERTAIN = 2  # spreads
-FULL = 255  # motor value
 SLOW, MISSING = 0.01, 4.0  # m/s of the friction's sign; m/s^2 that a dropout of the motor takes away
 LATENCY = 0.015  # s, by the owners' logs
 PUBLISHED = {"cart_viscous": 4.77, "pole_viscous": 2.5e-4}  # N s/m, N m s/rad: their config.yml of 2022
@@ -97,14 +94,10 @@ def stretches(recorded: Sequence[Episode]) -> Windows:
 
 def owners() -> Dynamics:
     """Return the cart of the owners' numbers."""
-    values = {**parameters_of(choice("cart/sensorsini")), **pole().model_dump(), **PUBLISHED}
-    values.update(force_linear=PUBLISHED_FORCE / FULL, latency=LATENCY)
+    pole = Pole(**choice("pole/sensorsini")["choices"]["sensorsini"])
+    values = {**parameters_of(choice("cart/sensorsini")), **pole.model_dump(), **PUBLISHED}
+    values.update(force_linear=PUBLISHED_FORCE / LARGEST_MOTOR, latency=LATENCY)
     return dynamics(values, "linear", "exponential")
-
-
-def pole() -> Pole:
-    """Return the pole of the recordings."""
-    return Pole(**choice("pole/sensorsini")["choices"]["sensorsini"])
 
 
 def dynamics(parameters: dict[str, float], cart_friction: str, pole_friction: str) -> Dynamics:
@@ -224,7 +217,7 @@ def driving(driven: Sequence[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def over_time(period: float, chosen: NDArray[np.bool_], predictions: dict[str, Prediction]) -> Figure:
+def over_time(chosen: NDArray[np.bool_], predictions: dict[str, Prediction]) -> Figure:
     """Draw the median error over the time predicted, away from upright."""
     figure = style.new_figure(height=3.4)
     for axes, channel, factor, text in zip(
@@ -232,7 +225,7 @@ def over_time(period: float, chosen: NDArray[np.bool_], predictions: dict[str, P
     ):
         for name, colour in COLOURS.items():
             error = factor * np.abs(predictions[name].error[:, channel, chosen])
-            axes.plot(period * np.arange(len(error)), np.median(error, 1), color=colour, label=name)
+            axes.plot(PERIOD * np.arange(len(error)), np.median(error, 1), color=colour, label=name)
         style.dress(axes, "prediction time (s)", f"median error, {text}")
         axes.set_xlim(0, TIMES[-1])
         axes.set_yscale("log")
@@ -293,11 +286,12 @@ def main() -> None:
     predictions[PHYSICS] = predict(windows, identified(own))
     physics = Dynamics.of(learned.parameters, learned.models, learned.period, learned.substeps)
     predictions[MODEL] = predict(windows, physics)
-    predictions[RESIDUAL] = predict(windows, physics, Residual.as_type(learned.residual, torch.float64))
+    predictions[RESIDUAL] = predict(windows, physics, learned.residual.as_type(torch.float64))
     results = {name: figures(windows, each) for name, each in predictions.items()}
     sensors = {
         name: read_json(run / "import.json")["sensors"] for name, run in (("4271", fit), ("4096", blind))
     }
+    quantities = read_json(own / IDENTIFIED)["quantities"]
     write_json(
         options.json,
         {
@@ -305,14 +299,14 @@ def main() -> None:
             "models": results,
             "by_seconds": by_seconds(fit, windows, home),
             "sensors": sensors,
-            "identified": read_json(own / IDENTIFIED)["quantities"],
+            "identified": quantities,
             "agents": agents(own, model, home / "agent"),
-            "dropouts": after_dropouts(windows, predictions, read_json(own / IDENTIFIED)["quantities"]),
+            "dropouts": after_dropouts(windows, predictions, quantities),
             "widening": float(learned.residual.widening),
         },
     )
     if options.figures:
-        style.save(over_time(PERIOD, away(windows), predictions), options.figures / "real_over_time.png")
+        style.save(over_time(away(windows), predictions), options.figures / "real_over_time.png")
         style.save(worst(windows, predictions), options.figures / "real_worst.png")
     print_table([table_row(name, each) for name, each in results.items()])
 

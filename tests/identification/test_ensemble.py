@@ -52,7 +52,7 @@ Record = Callable[[bool], tuple[Windows, Windows]]
 
 def rippled() -> Residual:
     """A residual of one member that adds only a force ripple along the track."""
-    zeros = Residual.untrained(1, 6, torch.Generator().manual_seed(0))
+    zeros = Residual.untrained(1, 6, torch.Generator().manual_seed(0), PERIOD, 4.0, SPAN)
     places = zeros.spacing * (torch.arange(PLACES) - PLACES // 2)
     forces = RIPPLE * torch.sin(2 * torch.pi * places / PITCH)
     return zeros._replace(places=(forces / zeros.units[0]).unsqueeze(0))
@@ -140,7 +140,9 @@ def test_an_effect_that_the_physics_lacks_is_learned(record: Record, dynamics: D
 def test_a_residual_of_zeros_predicts_the_same(parameters: Mapping[str, float], period: float) -> None:
     late = {**parameters, "motor_time_constant": 0.02, "latency": 0.012}
     dynamics = Dynamics.of(late, STEP, period, 4)
-    nothing = Residual.untrained(2, 6, torch.Generator().manual_seed(0), period).as_type(torch.float64)
+    nothing = Residual.untrained(2, 6, torch.Generator().manual_seed(0), period, 4.0, SPAN).as_type(
+        torch.float64
+    )
     random = torch.Generator().manual_seed(1)
     motors = 400 * torch.rand(history_periods(period) + 20, 3, generator=random, dtype=torch.float64) - 200
     motion = torch.zeros(4, 1, 3, dtype=torch.float64)

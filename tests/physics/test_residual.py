@@ -22,7 +22,7 @@ SETTINGS = (STEP, 0.02, 4)
 
 def residual(members: int = 2, changed: bool = True) -> Residual:
     generator = torch.Generator().manual_seed(0)
-    made = Residual.untrained(members, 6, generator).as_type(torch.float64)
+    made = Residual.untrained(members, 6, generator, 0.02, 4.0, 0.814).as_type(torch.float64)
     if not changed:
         return made
     return made._replace(

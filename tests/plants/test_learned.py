@@ -30,7 +30,7 @@ MakeLearned = Callable[..., LearnedPlant]
 
 def learned_model(parameters: dict[str, float], size: float) -> LearnedModel:
     generator = torch.Generator().manual_seed(0)
-    drawn = Residual.untrained(3, 8, generator)
+    drawn = Residual.untrained(3, 8, generator, 0.02, 4.0, 0.814)
     residual = drawn._replace(
         places=size * torch.randn(3, PLACES, generator=generator),
         last=size * torch.randn(3, 2, 8, generator=generator),

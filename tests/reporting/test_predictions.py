@@ -42,7 +42,7 @@ def test_forces_are_known_where_the_cart_was() -> None:
 
 def with_tables(outputs: torch.Tensor) -> Residual:
     """A residual with tables of `outputs` [M, PLACES]."""
-    return Residual.untrained(len(outputs), 2, torch.Generator())._replace(places=outputs)
+    return Residual.untrained(len(outputs), 2, torch.Generator(), 0.02, 4.0, 0.814)._replace(places=outputs)
 
 
 def test_errors_are_in_the_units_of_the_axes() -> None:
