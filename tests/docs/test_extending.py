@@ -13,7 +13,6 @@ from extending_page import PAGE, ROOT, paths
 
 BIN = Path(sys.executable).parent
 PATHS = paths()
-DAILY = (1,)  # a friction law
 
 
 def test_the_page_has_the_six_paths() -> None:
@@ -38,18 +37,28 @@ def assert_tidy(folder: Path, files: set[str]) -> None:
         assert done.returncode == 0, done.stdout + done.stderr
 
 
-@pytest.mark.parametrize(
-    "number",
-    [number if number in DAILY else pytest.param(number, marks=pytest.mark.nightly) for number in PATHS],
-    ids=lambda number: PATHS[number].title,
-)
-def test_path(number: int, tmp_path: Path) -> None:
-    for folder in ("cartpole_rl", "conf", "docs"):
-        shutil.copytree(ROOT / folder, tmp_path / folder, ignore=shutil.ignore_patterns("__pycache__"))
-    shutil.copy(ROOT / "pyproject.toml", tmp_path)
+def changed_copy(number: int, folder: Path) -> None:
+    """Copy the package to `folder`, and apply the steps of a path."""
+    for name in ("cartpole_rl", "conf", "docs"):
+        shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(ROOT / "pyproject.toml", folder)
     for step in PATHS[number].steps:
-        step.apply(tmp_path)
+        step.apply(folder)
+
+
+each_path = pytest.mark.parametrize("number", PATHS, ids=lambda number: PATHS[number].title)
+
+
+@each_path
+def test_every_step_finds_its_place(number: int, tmp_path: Path) -> None:
+    changed_copy(number, tmp_path)
     assert_tidy(tmp_path, {step.file for step in PATHS[number].steps})
+
+
+@pytest.mark.nightly
+@each_path
+def test_path(number: int, tmp_path: Path) -> None:
+    changed_copy(number, tmp_path)
     done = subprocess.run(
         [sys.executable, ROOT / "tests/support/extended_package.py", str(number), tmp_path],
         env={**os.environ, "PYTHONPATH": str(tmp_path)},
