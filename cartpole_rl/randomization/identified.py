@@ -1,5 +1,6 @@
 """Draws carts from a table of carts: the posterior of an identification, correlations included."""
 
+import csv
 import zlib
 from collections.abc import Collection, Mapping
 from pathlib import Path
@@ -16,7 +17,7 @@ from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.randomization.poles import HEAVIER, Pole, PoleSettings
 from cartpole_rl.randomization.randomizer import Draws, Randomizer
 from cartpole_rl.randomization.ranges import IdentifiedSettings
-from cartpole_rl.rig.parameters import PARAMETERS
+from cartpole_rl.rig.parameters import PARAMETERS, check_names
 
 Array = NDArray[np.float64]
 # what NumPy raises for a file that is missing, cut off, changed or another one
@@ -109,9 +110,11 @@ def identified_carts(
     try:
         posterior, identified = read_posterior(settings.posterior)
     except UNREADABLE as error:
+        remedy = "copy it again, or run cartpole-identify from=<its run>"
+        if settings.posterior.suffix == ".csv":
+            remedy = "write names of parameters in its first line, and a number of each in every other one"
         raise ConfigError(
-            f"randomization.posterior={settings.posterior} cannot be read: {error}; copy it again, or run "
-            "cartpole-identify from=<its run>"
+            f"randomization.posterior={settings.posterior} cannot be read: {error}; {remedy}"
         ) from None
     if not poles.is_single or not is_about(poles.nominal, posterior):
         posterior = {name: values for name, values in posterior.items() if name not in Pole.model_fields}
@@ -126,13 +129,33 @@ def identified_carts(
 
 
 def read_posterior(path: Path) -> tuple[dict[str, Array], list[str]]:
-    """Return carts, [M] of each parameter by name, and the names that are identified. Raises UNREADABLE."""
+    """Return carts, [M] of each parameter by name, and the names that are identified.
+
+    A .csv file has a row for each cart, and all of its columns are identified. Raises UNREADABLE.
+    """
+    if path.suffix == ".csv":
+        return read_samples(path)
     with path.open("rb") as file, np.load(file) as stored:
         names, table, identified = (stored[name] for name in ("names", "carts", "identified"))
     if names.ndim != 1 or table.shape[0] != len(names) or table[0].ndim != 1 or not table[0].size:
         raise ValueError("it holds no table of carts")
     carts = dict(zip(names.tolist(), table.astype(np.float64, casting="same_kind"), strict=True))
     return carts, [str(name) for name in identified]
+
+
+def read_samples(path: Path) -> tuple[dict[str, Array], list[str]]:
+    """Return `read_posterior` of a .csv file. Raises ConfigError for an impossible value, UNREADABLE."""
+    with path.open(newline="", encoding="utf-8") as file:
+        rows = [*csv.DictReader(file, skipinitialspace=True)]
+    if not rows:
+        raise ValueError("it holds no cart")
+    carts = {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
+    check_names(carts)
+    for name, values in carts.items():
+        for value in (values.min(), values.max()):
+            if not (bound := PARAMETERS[name].bound).holds(value):
+                raise ConfigError(f"randomization.posterior={path}: {name} is {value:g}; it must be {bound}")
+    return carts, list(carts)
 
 
 def is_about(pole: Pole, posterior: Mapping[str, Any]) -> bool:

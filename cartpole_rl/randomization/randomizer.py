@@ -58,10 +58,12 @@ class Randomizer(Draws):
         self._rows = self._row_numbers(self.ranges)
         limits = torch.tensor([line.limits() for line in lines], dtype=torch.float64, device=device)
         self._low, self._high = limits.reshape(-1, 2, 1).unbind(1)  # [R, 1] each
-        self._distributions = [
-            (each, self._flags([line.distribution is each for line in lines])[:, 0])
-            for each in {line.distribution: None for line in lines}
+        kinds = [line.distribution if line.is_plain else (name,) for name, line in self.ranges.items()]
+        self._lines = [  # those drawn by one call, and their rows
+            (lines[kinds.index(kind)], self._flags([each == kind for each in kinds])[:, 0])
+            for kind in dict.fromkeys(kinds)
         ]
+        self._mixing = self._mixing_matrix()  # [R, R], None for independent lines
         self._scales = self._flags([line.scales_nominal for line in lines])
         self._pole_rows = self._row_numbers(POLE_FIELDS)
         choices = [list(pole.model_dump().values()) for pole in possible_poles(poles)]
@@ -77,10 +79,9 @@ class Randomizer(Draws):
 
         Two tables [P, count] that are equal in every other parameter. `name` must have a range.
         """
-        poles, unit = self._draw_parts(count, generator)
-        row = list(self.ranges).index(name)
-        low, high = unit.clone(), unit.clone()
-        low[row], high[row] = 0, 1
+        poles, low = self._draw_parts(count, generator)
+        row, high = list(self.ranges).index(name), low.clone()
+        low[row], high[row] = self._low[row].to(low.dtype), self._high[row].to(low.dtype)
         return self._table(poles, low), self._table(poles, high)
 
     def longest_delay(self) -> float:
@@ -99,22 +100,28 @@ class Randomizer(Draws):
         return name in self.ranges or self._nominal_of(name) != 0
 
     def _draw_parts(self, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Return nominal carts with drawn poles, [P, count], and a number from 0 to 1 a range, [R, count]."""
+        """Return nominal carts with drawn poles, [P, count], and each range's value or ratio, [R, count]."""
         table = self.nominal.unsqueeze(1).repeat(1, count)
         if self.poles.lengths is not None or self._choices.shape[1] > 1:
             table[self._pole_rows] = self._draw_poles(count, generator)
-        unit = table.new_zeros(0, count)
+        values = table.new_zeros(0, count)
         if self.ranges:
-            unit = torch.rand((len(self._rows), count), generator=generator, device=self.nominal.device)
-        return table, unit
+            values = self._draw_shares(count, generator)
+            for line, rows in self._lines:
+                drawn = line.drawn(values[rows], self._low[rows], self._high[rows])
+                values[rows] = drawn.to(values.dtype)
+        return table, values
 
-    def _table(self, poles: Tensor, unit: Tensor) -> Tensor:
+    def _draw_shares(self, count: int, generator: torch.Generator) -> Tensor:
+        """Return uniform numbers from 0 to 1, [R, count]: a share of each range."""
+        shape, device = (len(self._rows), count), self.nominal.device
+        if self._mixing is None:
+            return torch.rand(shape, generator=generator, device=device)
+        return torch.special.ndtr(self._mixing @ torch.randn(shape, generator=generator, device=device))
+
+    def _table(self, poles: Tensor, values: Tensor) -> Tensor:
         """Return parameters [P, N] of the carts that `_draw_parts` drew."""
-        value = unit.clone()
-        for distribution, lines in self._distributions:
-            drawn = distribution(unit[lines], self._low[lines], self._high[lines])
-            value[lines] = drawn.to(value.dtype)
-        value = torch.where(self._scales, poles.index_select(0, self._rows) * value, value)
+        value = torch.where(self._scales, poles.index_select(0, self._rows) * values, values)
         return poles.index_copy(0, self._rows, value)
 
     def _draw_poles(self, count: int, generator: torch.Generator) -> Tensor:
@@ -130,17 +137,31 @@ class Randomizer(Draws):
         return torch.stack([torch.as_tensor(rods[name]) for name in POLE_FIELDS])
 
     def _check_distributions(self) -> None:
-        """Raise ConfigError for a distribution whose ends are not its bounds, or that leaves them."""
+        """Raise ConfigError for a distribution that leaves its bounds."""
         shares = torch.tensor([0.0, 0.3, 1.0], device=self.nominal.device)
-        for distribution, lines in self._distributions:
-            low, high = self._low[lines], self._high[lines]
-            least, value, most = distribution(shares.expand(len(low), 3), low, high).unbind(1)
-            ends = torch.stack((least, most), 1).double()
-            inside = ((value >= least) & (value <= most)).all()
-            if not (inside and torch.allclose(ends, torch.cat((low, high), 1), rtol=1e-4, atol=1e-9)):
-                raise ConfigError(
-                    f"the distribution {distribution} does not run from the low to the high bound"
-                )
+        for line, rows in self._lines:
+            low, high = self._low[rows], self._high[rows]
+            values = line.drawn(shares.expand(len(low), 3), low, high)
+            room = 1e-9 + 1e-4 * torch.maximum(low.abs(), high.abs())
+            if not ((values >= low - room) & (values <= high + room)).all():
+                raise ConfigError(f"the distribution {line.distribution} leaves its bounds")
+
+    def _mixing_matrix(self) -> Tensor | None:
+        """Return what makes correlated normal numbers of independent ones, [R, R]; None without correlations.
+
+        Raises ConfigError for correlations that no numbers have.
+        """
+        names, matrix = list(self.ranges), torch.eye(len(self.ranges), dtype=torch.float64)
+        for name, line in self.ranges.items():
+            for other, value in line.correlation.items():
+                pair = names.index(name), names.index(other)
+                matrix[pair] = matrix[pair[::-1]] = value
+        if not any(line.correlation for line in self.ranges.values()):
+            return None
+        size, direction = torch.linalg.eigh(matrix)
+        if size.min() < -1e-6:
+            raise ConfigError("randomization: the correlations contradict each other; give smaller ones")
+        return (direction * size.clamp(min=0).sqrt()).to(self.nominal)
 
     def _nominal_of(self, name: str) -> float:
         return float(self.nominal[CartParameters.names().index(name)])

@@ -3,87 +3,137 @@
 Bounds are `absolute` (the value itself), `relative` (nominal * (1 + bound)) or `factor` (nominal * bound).
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from itertools import accumulate, pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
-from pydantic import model_validator
+from pydantic import ConfigDict, Field, model_validator
 
 from cartpole_rl.errors import ConfigError
+from cartpole_rl.randomization.distributions import DISTRIBUTIONS, PLACES, Distribution
 from cartpole_rl.randomization.poles import Pole, PoleSettings, possible_poles
-from cartpole_rl.registry import Extension, Registry
 from cartpole_rl.rig.parameters import PARAMETERS, check_names, check_values, completed
 from cartpole_rl.settings import Finite, Fraction, Positive, Settings
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-Bounds = tuple[Finite, Finite]
-
-
-class Distribution(Extension):
-    """A distribution between bounds, by its quantiles.
-
-    Its function takes shares [R, N] of 0 to 1 and bounds, low and high, [R, 1] float64, to values [R, N]; a
-    share of 0 gives the low bound, 1 the high one. It uses methods of tensors alone, so that settings load
-    without PyTorch. Bounds of a `positive` distribution are above 0.
-    """
-
-    def __init__(
-        self, name: str, item: Callable[["Tensor", "Tensor", "Tensor"], "Tensor"], positive: bool = False
-    ) -> None:
-        super().__init__(name, item)
-        self.positive = positive
-
-
-DISTRIBUTIONS = Registry("distribution", __name__, Distribution, decorated=True)
-
-
-@DISTRIBUTIONS.register("uniform")
-def uniform(share: "Tensor", low: "Tensor", high: "Tensor") -> "Tensor":
-    """Uniform between the bounds."""
-    low = low.to(share.dtype)
-    return low + share * (high.to(share.dtype) - low)
-
-
-@DISTRIBUTIONS.register("log_uniform", positive=True)
-def log_uniform(share: "Tensor", low: "Tensor", high: "Tensor") -> "Tensor":
-    """Uniform in the logarithm."""
-    return uniform(share, low.log(), high.log()).exp()
+Bounds = Annotated[tuple[Finite, ...], Field(min_length=2)]  # [low, high]; values of a discrete distribution
+Correlation = Annotated[float, Field(ge=-1, le=1)]
 
 
 class Range(Settings):
-    """Distribution and exactly one kind of bounds, [low, high]."""
+    """Distribution with its keywords, and exactly one kind of bounds; or a `mixture` of such lines.
 
+    `correlation` with other parameters is that of the normal scores of their shares.
+    """
+
+    model_config = ConfigDict(extra="allow")  # the keywords of the distribution
     distribution: Annotated[Distribution, DISTRIBUTIONS] = DISTRIBUTIONS.find("uniform")
     absolute: Bounds | None = None
     relative: Bounds | None = None
     factor: Bounds | None = None
+    mixture: tuple["Range", ...] | None = None
+    weights: tuple[Positive, ...] | None = None  # of a mixture or of discrete values; None: all alike
+    correlation: dict[str, Correlation] = Field(default_factory=dict)
 
     @model_validator(mode="after")
-    def _one_kind_in_order(self) -> "Range":
-        given = [bounds for bounds in (self.absolute, self.relative, self.factor) if bounds is not None]
-        if len(given) != 1:
-            raise ValueError("give exactly one of absolute, relative, factor")
-        if given[0][0] > given[0][1]:
-            raise ValueError(f"bounds {list(given[0])} are in the wrong order")
+    def _is_consistent(self) -> "Range":
+        if self.mixture is None:
+            return self._is_one_line()
+        if len(self.mixture) < 2:
+            raise ValueError("a mixture takes two or more lines")
+        if self._given or self.model_extra or self.distribution != "uniform":
+            raise ValueError("a mixture has bounds and distributions in its lines alone")
+        if len({line.scales_nominal for line in self.mixture}) > 1:
+            raise ValueError("the lines of a mixture are all absolute, or none is")
+        if any(line.correlation for line in self.mixture):
+            raise ValueError("give correlation beside mixture, not in its lines")
+        self._check_weights(len(self.mixture))
         return self
+
+    def _is_one_line(self) -> "Range":
+        if len(self._given) != 1:
+            raise ValueError("give exactly one of absolute, relative, factor, or a mixture")
+        bounds = self._given[0]
+        if self.distribution.listed:
+            self._check_weights(len(bounds))
+        elif len(bounds) != 2:
+            raise ValueError(f"bounds {list(bounds)}: {self.distribution} takes two, [low, high]")
+        elif bounds[0] > bounds[1]:
+            raise ValueError(f"bounds {list(bounds)} are in the wrong order")
+        try:
+            shape = self.distribution.shape(self._keywords)
+        except ConfigError as error:
+            raise ValueError(str(error)) from None
+        for name in PLACES:
+            if shape.get(name) is not None and not min(bounds) <= shape[name] <= max(bounds):
+                raise ValueError(f"{name} {shape[name]:g} is outside the bounds {list(bounds)}")
+        return self
+
+    def _check_weights(self, count: int) -> None:
+        if self.weights is not None and len(self.weights) != count:
+            raise ValueError(f"give {count} weights, not {len(self.weights)}")
+
+    @property
+    def _given(self) -> list[tuple[float, ...]]:
+        return [bounds for bounds in (self.absolute, self.relative, self.factor) if bounds is not None]
+
+    @property
+    def _keywords(self) -> dict[str, Any]:
+        weights = {} if self.weights is None else {"weights": self.weights}
+        return {**(self.model_extra or {}), **weights}
+
+    @property
+    def is_plain(self) -> bool:
+        """Bounds and the name of the distribution describe the line."""
+        return not (self._keywords or self.mixture or self.distribution.listed)
 
     @property
     def scales_nominal(self) -> bool:
         """The drawn value is a multiple of the nominal one."""
-        return self.absolute is None
+        return self.mixture[0].scales_nominal if self.mixture else self.absolute is None
 
-    def limits(self) -> Bounds:
-        """Return [low, high] of the value (absolute) or of its ratio to the nominal one."""
-        if self.relative is not None:
-            return 1 + self.relative[0], 1 + self.relative[1]
-        bounds = self.absolute or self.factor
-        assert bounds is not None
-        return bounds
+    def limits(self) -> tuple[float, float]:
+        """Return the lowest and the highest value (absolute), or ratio to the nominal one."""
+        if self.mixture:
+            low, high = zip(*(line.limits() for line in self.mixture), strict=True)
+            return min(low), max(high)
+        values = [self._offset + bound for bound in self._given[0]]
+        return min(values), max(values)
+
+    @property
+    def _offset(self) -> float:
+        return 1.0 if self.relative is not None else 0.0
+
+    def drawn(self, share: "Tensor", low: "Tensor", high: "Tensor") -> "Tensor":
+        """Return values [R, N] of shares [R, N], 0 to 1, within limits [R, 1] float64."""
+        if self.mixture:
+            return self._drawn_mixture(share, low)
+        shape = self.distribution.shape(self._keywords)
+        shape |= {name: self._offset + shape[name] for name in PLACES if shape.get(name) is not None}
+        if self.distribution.listed:
+            shape["values"] = [self._offset + value for value in self._given[0]]
+        values: Tensor = self.distribution(share, low, high, **shape)
+        return values
+
+    def _drawn_mixture(self, share: "Tensor", like: "Tensor") -> "Tensor":
+        """Return values of shares: each line has a part of the shares, as wide as its weight."""
+        assert self.mixture
+        weights = self.weights or (1.0,) * len(self.mixture)
+        edges = [0.0, *accumulate(weight / sum(weights) for weight in weights)]
+        values = like.new_zeros(share.shape)
+        for line, (start, stop) in zip(self.mixture, pairwise(edges), strict=True):
+            part = ((share - start) / (stop - start)).clamp(0, 1)
+            low, high = like.new_tensor(line.limits()).unbind(0)
+            values = values.where(share < start, line.drawn(part, low, high).to(values.dtype))
+        return values
 
     def check(self, name: str, nominal: float) -> None:
         """Raise ConfigError if the range makes no sense for this parameter's nominal value."""
+        for line in self.mixture or ():
+            line.check(name, nominal)
         low, high = self.limits()
         if self.scales_nominal:
             if nominal == 0:
@@ -102,17 +152,17 @@ class Range(Settings):
 class IdentifiedSettings(Settings):
     """Identified carts, in place of ranges about the nominal cart."""
 
-    posterior: Path  # posterior.npz of cartpole-identify
-    widen: Positive  # factor of its uncertainty
-    prior_share: Fraction  # of the carts, which are nominal ones within `ranges`
-    ranges: dict[str, Range]  # of parameters that are not identified, and of the prior share
+    posterior: Path  # posterior.npz of cartpole-identify, or carts as .csv: a column for each parameter
+    widen: Positive = 1.0  # factor of its uncertainty
+    prior_share: Fraction = 0.0  # of the carts, which are nominal ones within `ranges`
+    ranges: dict[str, Range] = Field(default_factory=dict)  # of what is not identified, and the prior share
 
 
 def check_carts(cart: Mapping[str, float], poles: PoleSettings, ranges: Mapping[str, Range]) -> None:
     """Raise ConfigError if such carts cannot be drawn.
 
-    Causes: an unknown name, an impossible nominal value, a range that reaches an impossible value, or a
-    parameter of the pole in `cart`.
+    Causes: an unknown name, an impossible nominal value, a range that reaches an impossible value, a
+    correlation with a parameter without a range, or a parameter of the pole in `cart`.
     """
     for name in Pole.model_fields:
         if name in cart:
@@ -123,3 +173,6 @@ def check_carts(cart: Mapping[str, float], poles: PoleSettings, ranges: Mapping[
     for name, line in ranges.items():
         for pole in possible_poles(poles):
             line.check(name, {**nominal, **pole.model_dump()}[name])
+        for other in line.correlation:
+            if other not in ranges or other == name:
+                raise ConfigError(f"randomization of {name}: correlation takes other randomized parameters")

@@ -229,8 +229,8 @@ class EvaluateConfig(RunSettings):
                 raise ValueError("parameters: randomization draws identified carts; leave one of them out")
             return self
         for name in given.keys() & drawn.keys():
-            if bounds := drawn[name].absolute:
-                low, high = bounds
+            if not drawn[name].scales_nominal:
+                low, high = drawn[name].limits()
                 raise ValueError(
                     f"parameters.{name}: randomization.{name} draws it from {low:g} to {high:g}; leave one "
                     "of them out"

@@ -144,9 +144,9 @@ def note_other_carts(config: TrainConfig) -> None:
     """Print the parameters of the nominal cart that lie outside their absolute ranges: no cart has them."""
     nominal = config.nominal_cart
     for name, line in config.ranges.items():
-        if line.absolute is None or name not in nominal:
+        if line.scales_nominal or name not in nominal:
             continue
-        low, high = line.absolute
+        low, high = line.limits()
         if not low <= nominal[name] <= high:
             print_message(
                 "train",

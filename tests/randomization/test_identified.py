@@ -76,6 +76,47 @@ def test_the_identified_cart_carries_the_given_pole(
     assert {round(mass, 3) for mass in drawn[MASS].tolist()} == {0.9, 1.0}
 
 
+def of_samples(path: Path, text: str) -> IdentifiedSettings:
+    path.write_text(text)
+    return IdentifiedSettings(posterior=path, ranges={"cart_mass": Range(absolute=(2.0, 3.0))})
+
+
+def test_samples_of_a_file_stay_together_by_row(
+    ip02: dict[str, float], medium: PoleSettings, tmp_path: Path
+) -> None:
+    """A parameter without a column is drawn from its range."""
+    text = "cart_viscous, cart_coulomb\n0.1,0.5\n0.2,0.6\n0.4,0.3\n"
+    draws = identified_carts(of_samples(tmp_path / "carts.csv", text), ip02, medium)
+    carts = CartParameters(draws.draw(500, torch.Generator().manual_seed(0)))
+    pairs = {
+        (round(a, 4), round(b, 4))
+        for a, b in zip(carts.cart_viscous.tolist(), carts.cart_coulomb.tolist(), strict=True)
+    }
+    assert pairs == {(0.1, 0.5), (0.2, 0.6), (0.4, 0.3)}
+    assert carts.cart_mass.min() >= 2
+    assert carts.cart_mass.std() > 0.2
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("", "holds no cart"),
+        ("cart_mass\n", "holds no cart"),
+        ("cart_mass\nheavy\n", "could not convert string to float: 'heavy'; write names of parameters"),
+        ("cart_mass,latency\n0.5\n", "write names of parameters"),
+        ("cart_mas\n0.5\n", "did you mean 'cart_mass'"),
+        ("cart_mass\n0.5\n-1\n", "cart_mass is -1; it must be above 0"),
+        ("cart_mass\nnan\n", "cart_mass is nan; it must be above 0"),
+    ],
+)
+def test_samples_that_are_no_carts_are_refused(
+    text: str, reason: str, ip02: dict[str, float], medium: PoleSettings, tmp_path: Path
+) -> None:
+    with pytest.raises(ConfigError, match=reason) as raised:
+        identified_carts(of_samples(tmp_path / "carts.csv", text), ip02, medium)
+    assert "\n" not in str(raised.value)
+
+
 def saved(*arrays: object, **named: object) -> bytes:
     file = io.BytesIO()
     np.savez(file, **named) if named else np.save(file, *arrays)

@@ -6,10 +6,12 @@ from typing import Any
 import pytest
 import torch
 from pydantic import ValidationError
+from scipy import stats
 from torch import Tensor
 
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.physics.parameters import CartParameters
+from cartpole_rl.randomization.distributions import DISTRIBUTIONS
 from cartpole_rl.randomization.poles import (
     POLE_DENSITY,
     Pole,
@@ -19,11 +21,12 @@ from cartpole_rl.randomization.poles import (
     uniform_rod,
 )
 from cartpole_rl.randomization.randomizer import POLE_FIELDS, Randomizer
-from cartpole_rl.randomization.ranges import DISTRIBUTIONS, Range
+from cartpole_rl.randomization.ranges import Range
 
 COUNT = 20_000
 POINT = Pole(pole_mass=0.1, pole_com=0.3, pole_inertia=0.0)
 TENTH = {"relative": (-0.1, 0.1)}
+NORMAL = {"absolute": (0, 1), "distribution": "truncated_normal"}
 
 
 @DISTRIBUTIONS.register("squared")  # more carts near the low bound
@@ -31,9 +34,9 @@ def squared(share: Tensor, low: Tensor, high: Tensor) -> Tensor:
     return low + share**2 * (high - low)
 
 
-@DISTRIBUTIONS.register("half")
-def half(share: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    return low + share / 2 * (high - low)
+@DISTRIBUTIONS.register("beyond")
+def beyond(share: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    return low + 2 * share * (high - low)
 
 
 def draw(randomizer: Randomizer, seed: int = 0, count: int = COUNT) -> CartParameters:
@@ -70,6 +73,92 @@ def test_draws_are_within_bounds_and_distributed_as_specified(
     assert farthest_from_uniform(share.clamp(0, 1).sqrt() if distribution == "squared" else share) < 0.015
 
 
+SHAPED: dict[str, tuple[dict[str, Any], Any]] = {  # a line for cart_coulomb, 0.5 N, and SciPy's distribution
+    "truncated_normal": ({"absolute": (0.25, 0.9)}, stats.truncnorm(-2, 2, 0.575, 0.1625)),
+    "truncated_normal, off the middle": (
+        {"relative": (-0.2, 0.3), "mean": 0.1, "std": 0.2},
+        stats.truncnorm(-1.5, 1, 0.55, 0.1),
+    ),
+    "log_normal": ({"factor": (0.25, 4)}, stats.lognorm(math.log(16) / 4, scale=0.5)),
+    "log_normal, wide": ({"factor": (0.01, 10), "median": 0.4, "sigma": 0.3}, stats.lognorm(0.3, scale=0.2)),
+    "beta": ({"factor": (0.5, 1.5)}, stats.beta(2, 2, 0.25, 0.5)),
+    "beta, skewed": ({"absolute": (0, 1), "alpha": 0.5, "beta": 3}, stats.beta(0.5, 3)),
+}
+
+
+@pytest.mark.parametrize("case", SHAPED)
+def test_shaped_distributions_are_those_of_scipy(
+    case: str, ip02: dict[str, float], medium: PoleSettings
+) -> None:
+    settings, expected = SHAPED[case]
+    line = Range(distribution=case.split(",")[0], **settings)
+    values = draw(Randomizer(ip02, medium, {"cart_coulomb": line})).cart_coulomb.double()
+    low, high = (limit * (0.5 if line.scales_nominal else 1) for limit in line.limits())
+    assert low - 1e-6 < values.min()
+    assert values.max() < high + 1e-6
+    shares = torch.from_numpy(expected.cdf(values.numpy()))
+    ends = expected.cdf(low), expected.cdf(high)
+    assert farthest_from_uniform((shares - ends[0]) / (ends[1] - ends[0])) < 0.015
+    assert Range.model_validate_json(line.model_dump_json()) == line
+
+
+def test_values_and_lines_have_the_shares_of_their_weights(
+    ip02: dict[str, float], medium: PoleSettings
+) -> None:
+    lines = {
+        "latency": Range(distribution="discrete", absolute=(0.02, 0.0, 0.01), weights=(1, 2, 5)),
+        "cart_mass": Range(distribution="discrete", relative=(-0.1, 0.1, 0.2)),
+        "cart_viscous": Range(mixture=({"factor": (0.5, 1)}, {"factor": (2, 3)}), weights=(3, 1)),
+    }
+    carts = draw(Randomizer(ip02, medium, lines))
+    shares = [(carts.latency == value).float().mean() for value in torch.tensor([0.02, 0.0, 0.01])]
+    assert shares == pytest.approx([0.125, 0.25, 0.625], abs=0.02)
+    ratios, counts = (carts.cart_mass / ip02["cart_mass"]).unique(return_counts=True)
+    assert ratios.tolist() == pytest.approx([0.9, 1.1, 1.2])
+    assert (counts / COUNT).tolist() == pytest.approx([1 / 3] * 3, abs=0.02)
+    ratio = carts.cart_viscous / ip02["cart_viscous"]
+    assert ((ratio > 1.001) & (ratio < 1.999)).sum() == 0
+    assert (ratio > 1.5).float().mean() == pytest.approx(0.25, abs=0.02)
+    assert farthest_from_uniform(2 * ratio[ratio < 1.5] - 1) < 0.015
+
+
+def test_lines_are_correlated_as_said(ip02: dict[str, float], medium: PoleSettings) -> None:
+    """Each keeps its own distribution; the third is independent of both."""
+    lines = {
+        "cart_mass": Range(**TENTH),
+        "cart_viscous": Range(factor=(0.5, 2), distribution="log_uniform", correlation={"cart_mass": -0.8}),
+        "pole_mass": Range(**TENTH),
+    }
+    randomizer = Randomizer(ip02, medium, lines)
+    carts = draw(randomizer)
+    shares = torch.stack(
+        [
+            5 * (carts.cart_mass / ip02["cart_mass"] - 0.9),
+            (carts.cart_viscous / ip02["cart_viscous"]).log() / math.log(4) + 0.5,
+            5 * (carts.pole_mass / 0.127 - 0.9),
+        ]
+    ).double()
+    assert all(farthest_from_uniform(share) < 0.02 for share in shares)
+    scores = torch.special.ndtri(shares.clamp(1e-6, 1 - 1e-6))
+    wanted = torch.tensor([[1, -0.8, 0], [-0.8, 1, 0], [0, 0, 1]]).double()
+    assert (torch.corrcoef(scores) - wanted).abs().max() < 0.03
+    low, high = randomizer.ends("cart_viscous", 100, torch.Generator().manual_seed(0))
+    assert (low != high).any(1).tolist() == [name == "cart_viscous" for name in CartParameters.names()]
+
+
+def test_correlations_that_no_carts_have_are_refused(ip02: dict[str, float], medium: PoleSettings) -> None:
+    others = {"cart_viscous": 0.9, "pole_mass": 0.9}
+    lines = {
+        "cart_mass": Range(**TENTH, correlation=others),
+        "cart_viscous": Range(**TENTH, correlation={"pole_mass": -0.9}),
+        "pole_mass": Range(**TENTH),
+    }
+    with pytest.raises(ConfigError, match="contradict each other"):
+        Randomizer(ip02, medium, lines)
+    with pytest.raises(ConfigError, match="cart_mass: correlation takes other randomized parameters"):
+        Randomizer(ip02, medium, {"cart_mass": lines["cart_mass"]})
+
+
 def test_parameters_without_a_range_are_nominal_or_have_their_default(
     ip02: dict[str, float], medium: PoleSettings
 ) -> None:
@@ -102,10 +191,21 @@ def test_lines_are_independent_and_the_generator_decides(
         ({"absolute": (0, 1), "factor": (0, 1)}, "exactly one of absolute, relative, factor"),
         ({"relative": (0.2, -0.2)}, "wrong order"),
         (
-            {"absolute": (0, 1), "distribution": "normal"},
+            {"absolute": (0, 1), "distribution": "gauss"},
             "'uniform', 'log_uniform'.* your own as module:name",
         ),
-        ({"absolute": (0, 1), "spread": 2}, "spread"),
+        ({"absolute": (0, 1), "spread": 2}, "spread: uniform takes bounds alone"),
+        ({**NORMAL, "sdt": 2}, "sdt: truncated_normal takes mean, std"),
+        ({**NORMAL, "std": 0}, "std=0: give more than 0"),
+        ({**NORMAL, "std": True}, "std=true: give a number"),
+        ({**NORMAL, "mean": 2}, "mean 2 is outside the bounds"),
+        ({"absolute": (0, 1, 2)}, r"uniform takes two, \[low, high\]"),
+        ({"absolute": (0, 1, 2), "distribution": "discrete", "weights": (1, 2)}, "give 3 weights, not 2"),
+        ({"mixture": [TENTH, TENTH], "weights": (1, 2, 3)}, "give 2 weights, not 3"),
+        ({"mixture": [TENTH, {"absolute": (0, 1)}]}, "all absolute, or none is"),
+        ({"mixture": [TENTH, TENTH], **TENTH}, "in its lines alone"),
+        ({"mixture": [TENTH, {**TENTH, "correlation": {"latency": 0.5}}]}, "beside mixture"),
+        ({**TENTH, "correlation": {"latency": 2}}, "less than or equal to 1"),
         ({"absolute": (0, math.inf)}, "finite"),
     ],
 )
@@ -144,7 +244,7 @@ NEEDS_NOMINAL = "relative and factor bounds need a nominal value"
             {"absolute": (0.0, 0.1), "distribution": "log_uniform"},
             "pole_viscous: log_uniform needs bounds above 0",
         ),
-        ({}, {}, "latency", {"absolute": (0, 0.1), "distribution": "half"}, "half does not run from the low"),
+        ({}, {}, "latency", {"absolute": (0, 0.1), "distribution": "beyond"}, "beyond leaves its bounds"),
     ],
 )
 def test_carts_that_cannot_be_drawn_are_refused(
