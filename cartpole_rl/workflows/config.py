@@ -98,6 +98,7 @@ class TrainConfig(RunSettings, CartPoleSettings):
     compile: bool
     device: Literal["cpu", "cuda", "auto"] = "cpu"  # missing in checkpoints of earlier versions
     logger: Annotated[Extension, LOGGERS] = LOGGERS.find("tensorboard")  # missing there too
+    preview: bool = False  # missing there too
     resume: str | None
 
     @model_validator(mode="before")

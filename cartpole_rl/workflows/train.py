@@ -6,7 +6,7 @@ from pathlib import Path
 
 import torch
 
-from cartpole_rl.envs.build import simulated_env, with_fitted_guard
+from cartpole_rl.envs.build import randomizer, simulated_env, with_fitted_guard
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.evaluation.driving_policy import DrivingPolicy, as_weights
@@ -19,6 +19,8 @@ from cartpole_rl.plants.effects import without_effect
 from cartpole_rl.randomization.randomizer import Draws
 from cartpole_rl.randomization.ranges import IdentifiedSettings
 from cartpole_rl.reporting.episodes import report_episodes
+from cartpole_rl.reporting.randomization import drawn_carts
+from cartpole_rl.reporting.style import save
 from cartpole_rl.run_folder import BEST, CHECKPOINTS, FIGURES, METRICS, write_config
 from cartpole_rl.settings import evaluation_seed
 from cartpole_rl.tasks.episode import Episode
@@ -33,7 +35,7 @@ FALLEN = 0.9  # of the best score: a training that ends below it says so
 
 
 @waiting("preparing: fitting the track guard, compiling")
-def train(config: TrainConfig, folder: Path) -> float:
+def train(config: TrainConfig, folder: Path) -> float | None:
     """Train an agent on randomized simulated carts, or resume the training in `folder`; return its score.
 
     The score is the task's: (6.1) for a balance, (6.2) for a swing-up.
@@ -42,6 +44,9 @@ def train(config: TrainConfig, folder: Path) -> float:
     settings that do not fit together or a folder that already holds a run, CheckpointError for a resumed run
     without a checkpoint, LearningError if learning diverges.
     """
+    if config.preview:
+        preview(config, folder)
+        return None
     checkpoint = None
     if config.resume is not None:
         check_resumable("train", config.resume, folder)
@@ -87,6 +92,13 @@ def train(config: TrainConfig, folder: Path) -> float:
     print_results(folder, f"{METRICS}, {FIGURES}/ and {CHECKPOINTS}/", following)
     score: float = metrics[config.task.measure]["mean"]
     return score
+
+
+def preview(config: TrainConfig, folder: Path) -> None:
+    """Write a picture of the carts that a training draws. Raises ConfigError if all are alike."""
+    path = folder / FIGURES / "randomization.png"
+    save(drawn_carts(randomizer(config), config.seed), path)
+    print(f"{path} shows the drawn carts")
 
 
 def fall_note(scores: Sequence[float]) -> str | None:

@@ -100,6 +100,18 @@ def test_a_pump_does_not_pass_for_one_that_balances(
         assert max(np.cos(episode.theta).max() for episode in episodes) > 0.9  # it does come up
 
 
+def test_a_preview_is_a_picture_and_no_training(tmp_path: Path) -> None:
+    words = ["preview=true", "randomization=friction_6", f"hydra.run.dir={tmp_path}/run"]
+    done = in_process("train", *words, folder=tmp_path)
+    picture = tmp_path / "run/figures/randomization.png"
+    assert done.code == 0, done.err
+    assert str(picture) in done.out
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert [path.name for path in (tmp_path / "run").iterdir()] == ["figures"]
+    done = in_process("train", "preview=true", "randomization=none", folder=tmp_path)
+    assert "preview: randomization draws the nominal cart alone" in done.complaint
+
+
 def test_a_training_that_became_worse_says_so() -> None:
     assert fall_note([100, 9077, 8200]) is None
     assert "scored 1248, the best 9077" in str(fall_note([100, 9077, 1248]))
