@@ -1,5 +1,6 @@
 """The environment: a plant under the hardware transform. `envs.build` builds it."""
 
+from collections.abc import Callable
 from functools import cached_property
 
 from tensordict import TensorDictBase
@@ -20,6 +21,8 @@ class CartPoleEnv(TransformedEnv):
     1024 compiled carts is 1.7 times as fast here (scripts/bench/shortcuts.py). With further transforms
     (`append_transform`) the steps are TransformedEnv's own.
     """
+
+    on_step: Callable[[TensorDictBase], None] | None = None  # called after each step of whole episodes
 
     @property
     def plant(self) -> Plant:

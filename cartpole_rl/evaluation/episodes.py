@@ -204,6 +204,8 @@ def run_many(env: CartPoleEnv, policy: Policy, knocks: Knocks | None = None) -> 
             if knocks:
                 knocks()
             outcome = env.step(current.set("action", action)).get("next")
+            if env.on_step is not None:
+                env.on_step(current)
             actions.append(action)
             frames.append(outcome)
             if outcome.get("done").any():

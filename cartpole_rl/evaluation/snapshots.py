@@ -6,10 +6,13 @@ cart in any case. Nothing is locked. A counter that is odd during a write lets t
 
 import multiprocessing
 import struct
+import time
 from ctypes import Array, c_char
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
+    from tensordict import TensorDictBase
+
     from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 
 COUNTER = struct.Struct("<Q")
@@ -60,10 +63,15 @@ def read(memory: Memory) -> tuple[int, Snapshot] | None:
     return None
 
 
-def followed(env: "CartPoleEnv", memory: Memory | None) -> "CartPoleEnv":
-    """Return `env`, whose cart is published in `memory` from now on, if there is one."""
-    if memory is not None:
+def followed(env: "CartPoleEnv", memory: Memory | None, row: int = 0) -> "CartPoleEnv":
+    """Return `env`, whose cart is published in `memory` from now on, if there is one.
+
+    Of many simulated carts it is that of `row`, and they are driven at the pace of a real one.
+    """
+    if memory is not None and env.plant.drives_one_cart:
         env.plant.on_command = Publisher(env, memory)
+    elif memory is not None:
+        env.on_step = RowPublisher(env, memory, row)
     return env
 
 
@@ -102,3 +110,47 @@ class Publisher:
             self._track_half_length,
         )
         write(self._memory, self._written, snapshot)
+
+
+class RowPublisher:
+    """Writes a snapshot of one of many carts to `memory` after each step, and waits for the time it takes.
+
+    Once the first episode of that cart has ended, nothing is written until the next reset, and nothing waits.
+    """
+
+    def __init__(self, env: "CartPoleEnv", memory: Memory, row: int) -> None:
+        self._env, self._memory, self._row = env, memory, row
+        self._written = self._episode = 0
+        self._ended = False
+
+    def __call__(self, stepped: "TensorDictBase") -> None:
+        """Write the state of `stepped`, and the motor value that was chosen on it."""
+        cart, plant = stepped[self._row], self._env.plant
+        step = int(cart["step_count"])
+        if step == 0:
+            self._episode += 1
+            self._score, self._due, self._ended = 0.0, time.monotonic(), False
+        if self._ended:
+            return
+        self._score += float(cart["score"])
+        self._written += 1
+        motor = self._env.hardware.sent_motors(cart["action"].reshape(1), cart["guard"])
+        x, x_dot, theta, theta_dot = cart["state"].tolist()
+        snapshot = Snapshot(
+            self._episode,
+            step,
+            int(motor),
+            int(cart["guard"]),
+            0,
+            0,
+            x,
+            x_dot,
+            theta,
+            theta_dot,
+            self._score,
+            float(plant.track_half_length[self._row]),
+        )
+        write(self._memory, self._written, snapshot)
+        self._ended = bool(cart["next", "done"])
+        self._due = max(self._due + plant.period, time.monotonic() - plant.period)
+        time.sleep(max(0.0, self._due - time.monotonic()))

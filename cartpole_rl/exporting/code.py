@@ -1,6 +1,5 @@
 """Parts of all exported code: templates, and the perception that drives a cart as graphs."""
 
-import re
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
@@ -10,6 +9,7 @@ import torch
 from torch import Tensor
 
 from cartpole_rl.compilation import Trace, trace
+from cartpole_rl.drawing import pages
 from cartpole_rl.envs.perception import Percept, Previous, perceive, perceive_first
 from cartpole_rl.envs.settings import CartPoleSettings, TrackGuard
 from cartpole_rl.plants.specs import PlantOutput
@@ -24,8 +24,7 @@ FLAG = torch.zeros(1, 1, dtype=torch.bool)
 
 def filled(template: str, values: Mapping[str, object]) -> str:
     """Return the content of a template with `values` in place of @@name@@."""
-    text = (TEMPLATES / template).read_text(encoding="utf-8")
-    return re.sub(r"@@(\w+)@@", lambda match: str(values[match[1]]), text)
+    return pages.filled(TEMPLATES / template, values)
 
 
 class Graph(NamedTuple):

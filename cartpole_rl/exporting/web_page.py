@@ -15,6 +15,7 @@ from torch import Tensor
 
 from cartpole_rl.arithmetic.languages import JAVASCRIPT
 from cartpole_rl.arithmetic.writer import Writer
+from cartpole_rl.drawing.pages import shared_parts
 from cartpole_rl.envs.settings import CartPoleSettings
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.exporting.agent import FLOATS, ExportedAgent
@@ -68,7 +69,8 @@ def web_page(agent: ExportedAgent, settings: CartPoleSettings, plant: Simulation
         raise ConfigError(f"format=web: the agent has an operation that is not known: {error}") from None
     script = filled("cart.js", {"data": data(agent, settings)})
     code = "\n".join((filled("arithmetic.js", {}), *functions, script))
-    return filled("cart.html", {"code": code, "page": filled("page.js", {}), **words(agent)})
+    parts = {**shared_parts(), "page": filled("page.js", {})}
+    return filled("cart.html", {"code": code, **parts, **words(agent)})
 
 
 def encoders(settings: CartPoleSettings) -> Graph:

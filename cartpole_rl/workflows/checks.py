@@ -56,7 +56,7 @@ LONGER = {  # command: how to train further than a run that has ended
 }
 
 
-TAKEN_BY_REPEAT = ("run", "repeat.run", "repeat.episode", "label")
+TAKEN_BY_REPEAT = ("run", "repeat.run", "repeat.episode", "label", "view")
 
 
 def check_training(config: TrainConfig, folder: Path, words: Sequence[str]) -> None:

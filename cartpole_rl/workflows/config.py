@@ -52,7 +52,7 @@ from cartpole_rl.run_folder import is_own_policy
 from cartpole_rl.settings import Count, Finite, NonNegative, Positive, Seed, Settings
 from cartpole_rl.tasks.settings import ActionSettings, RewardSettings, TaskSettings
 
-View = Literal["none", "live"]  # of the cart in the terminal, while it is driven
+View = Literal["none", "live", "web"]  # of the cart while it is driven: in the terminal, or on a page
 
 
 class RunSettings(Settings):
@@ -202,7 +202,7 @@ class EvaluateConfig(RunSettings):
         if unread := [name for name in plant.ignored if getattr(self, name)]:
             raise ValueError(f"{', '.join(unread)}: plant={plant.kind} {plant.why_ignored}")
         if self.view == "live" and not plant.is_on_port:
-            raise ValueError(f"view=live: it shows a cart on a port; plant={plant.kind} has none")
+            raise ValueError(f"view=live: it shows a cart on a port; plant={plant.kind} takes view=web")
         if self.animation.simulation and not plant.is_on_port:
             raise ValueError(f"animation.simulation=true: plant={plant.kind} is simulated itself; omit it")
         check_emulator_is_read(plant, self.emulator)
@@ -288,6 +288,7 @@ class ReplayConfig(Settings):
     actuator: Annotated[Law, ACTUATORS] | None = None
     parameters: dict[str, Finite] | None
     restart: Annotated[float, Field(ge=0.1, le=60)]
+    view: Literal["none", "web"] = "none"
     label: str
 
 

@@ -26,8 +26,8 @@ from cartpole_rl.evaluation.snapshots import followed
 from cartpole_rl.exporting.c_code import c_files
 from cartpole_rl.learning.states import seed_everything
 from cartpole_rl.randomization.poles import Pole, PoleSettings
-from cartpole_rl.reporting.live_view import LiveView
 from cartpole_rl.reporting.texts import guard_text
+from cartpole_rl.reporting.web_view import chosen_view
 from cartpole_rl.run_folder import CONFIG, METRICS, check_program
 from cartpole_rl.tasks.episode import Episode, Origin
 from cartpole_rl.tasks.settings import Measure
@@ -77,7 +77,8 @@ class Evaluation:
     def episodes(self) -> Iterator[Episode]:
         """Drive the repeated episode, or new ones, and yield each as it ends."""
         if self.repetition:
-            yield from repeated(self.env, self.policy, self.repetition, self.knocks)
+            again = repeated(self.env, self.policy, self.repetition, self.knocks)
+            yield from self._shown(again, "episodes", self.repetition.row)
             return
         count = self.config.episodes
         yield from self._shown(run_episodes(self.env, self.policy, count, self.knocks), "episodes")
@@ -109,11 +110,11 @@ class Evaluation:
         driven = run_onboard_episodes(self.env, self.policy, self.config.episodes)
         yield from self._shown(driven, "episodes on the board")
 
-    def _shown(self, episodes: Iterator[Episode], name: str) -> Iterator[Episode]:
-        """Drive episodes behind a progress bar and the live view."""
+    def _shown(self, episodes: Iterator[Episode], name: str, row: int = 0) -> Iterator[Episode]:
+        """Drive episodes behind a progress bar and a view of the cart, or of that in `row`."""
         config = self.config
-        with LiveView(config.plant.title, config.view) as live:
-            followed(self.env, live.memory)
+        with chosen_view(config.plant.title, config.view, self.settings.pole.nominal.length) as view:
+            followed(self.env, view.memory, row)
             silent = config.plant.is_real_time(config.emulator) or config.view != "none"
             with nullcontext() if silent else waiting(name), precedence(config.plant, config.emulator):
                 yield from with_progress(episodes, config.episodes, name, self.settings.task.measure)
@@ -263,7 +264,7 @@ def same_evaluation(config: EvaluateConfig, recorded: Mapping[str, Any], origin:
     The guard is the one of then if it was chosen, or if the agent is the same; else it is the agent's own.
     """
     former = {name: recorded[name] for name in EvaluateConfig.model_fields if name in recorded}
-    own = {name: getattr(config, name) for name in ("run", "label", "repeat", "animation")}
+    own = {name: getattr(config, name) for name in ("run", "label", "repeat", "animation", "view")}
     pole = {name: origin.parameters[name] for name in Pole.model_fields}
     of_cart = {name: value for name, value in origin.parameters.items() if name not in pole}
     one_cart: dict[str, Any] = {

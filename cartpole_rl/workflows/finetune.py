@@ -34,10 +34,10 @@ from cartpole_rl.learning.settings import RayLearnerSettings
 from cartpole_rl.learning.states import seed_everything
 from cartpole_rl.plants.serial.preparation import Confirm
 from cartpole_rl.reporting.episodes import report_episodes, summarized
-from cartpole_rl.reporting.live_view import LiveView
 from cartpole_rl.reporting.scores import SCORES, score_table
 from cartpole_rl.reporting.tensorboard import TensorBoardLog
 from cartpole_rl.reporting.texts import count_text, cut_off
+from cartpole_rl.reporting.web_view import chosen_view
 from cartpole_rl.run_folder import (
     AGENT_HASH,
     CHECKPOINTS,
@@ -136,7 +136,8 @@ def drive_all(
     files: FinetuningFiles, tuned: TunedAgent, settings: CartPoleSettings, evaluation: EvaluateConfig
 ) -> None:
     """Drive the three stages, and learn in the second."""
-    config, live = files.config, LiveView(files.config.plant.title, files.config.view)
+    config, length = files.config, settings.pole.nominal.length
+    live = chosen_view(config.plant.title, config.view, length)
     real_time = config.plant.is_real_time(config.emulator)
     make_env = partial(driven_env, settings, evaluation, live.memory)  # called with `confirm`
     make_policy = partial(greedy_network, tuned.training)

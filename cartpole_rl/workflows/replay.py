@@ -6,6 +6,7 @@ diverge.
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
@@ -13,13 +14,14 @@ import yaml
 from cartpole_rl.envs.settings import CartPoleSettings
 from cartpole_rl.evaluation.recordings import read_recording
 from cartpole_rl.identification.checks import check_same_encoders
-from cartpole_rl.identification.prediction import all_errors, away_from_upright, errors_at, replay
+from cartpole_rl.identification.prediction import Replayed, all_errors, away_from_upright, errors_at, replay
 from cartpole_rl.identification.rollout import Dynamics
 from cartpole_rl.identification.windows import recorded_period
 from cartpole_rl.randomization.poles import Pole
 from cartpole_rl.reporting.predictions import REPORTED_TIMES, replay_figure, replay_table
 from cartpole_rl.reporting.style import save
 from cartpole_rl.reporting.texts import count_text
+from cartpole_rl.reporting.web_view import WebView
 from cartpole_rl.rig.parameters import check_names, check_values
 from cartpole_rl.run_folder import CONFIG, FIGURES, program_of, recordings, write_config, write_json
 from cartpole_rl.terminal import as_word, print_results, shown
@@ -71,6 +73,33 @@ def replay_recordings(config: ReplayConfig, folder: Path) -> None:
     if away:
         print(replay_table(away, "the same away from upright; near it an error grows e times in 0.15 s"))
     print_results(folder, f"{REPLAY} and {FIGURE}", f"cartpole-model {as_word('from', shown(config.source))}")
+    if config.view == "web":
+        track = settings.task.x_max
+        shown_episodes = [columns(*pair, track) for pair in zip(paths, replays, strict=True)]
+        with WebView(f"Replay of {paths[0].parent.parent.name}", pole.length, shown_episodes) as view:
+            view.wait()
+
+
+def columns(path: Path, replayed: Replayed, track: float) -> dict[str, Any]:
+    """Return what the page of `view=web` shows of a recording; the ghost is the simulated cart."""
+    episode, rows = replayed.episode, len(replayed.episode.time)
+    ghost = np.full((2, rows), np.nan)
+    places = np.searchsorted(episode.time, replayed.time - 1e-6)
+    for channel, values in zip(ghost, (replayed.x, replayed.theta), strict=True):
+        known = np.isfinite(values) & (places < rows)
+        channel[places[known]] = values[known]
+    guarded = episode.guarded if episode.guarded is not None else np.zeros(episode.steps)
+    steps = {
+        "motor": [*episode.motor.tolist(), 0],
+        "guard": [*(np.sign(episode.motor) * guarded).astype(int).tolist(), 0],
+        "score": [0.0, *episode.score.cumsum().round(1).tolist()],
+    }
+    series = {"x": episode.x, "theta": episode.theta, "ghost_x": ghost[0], "ghost_theta": ghost[1]}
+    rounded = {
+        name: [None if np.isnan(value) else round(float(value), 5) for value in values]
+        for name, values in series.items()
+    }
+    return {"name": path.stem, "track": track, "time": episode.time.tolist(), **rounded, **steps}
 
 
 def recorded_cart(paths: Sequence[Path]) -> CartPoleSettings:

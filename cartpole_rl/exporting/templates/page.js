@@ -3,17 +3,12 @@ const STIFFNESS = 60; // N/m, of the reader's spring on the cart
 const STRONGEST = 12; // N
 const HISTORY = 10; // s
 const PAUSE = 1.6; // s, after a failure
-const element = (id) => document.getElementById(id);
 const cart = new Cart();
 let before = cart.motion; // one period ago: the picture is drawn between the two
 let pull = null; // the reader's: where it acts, "cart" or "pole", and the pointer in m
 let keys = 0; // N, of the arrow keys
 let time = 0, upright = 0, failedAt = null, wasUpright = false;
 let history = [];
-
-function wrapped(angle) {
-  return Math.atan2(Math.sin(angle), Math.cos(angle));
-}
 
 /** The force on the cart, N, and the angular acceleration of the pole, rad/s^2, that the reader exerts. */
 function pushed() {
@@ -50,6 +45,10 @@ function restart() {
   pull = null;
 }
 
+function sizes() {
+  return { track: cart.parameters.track_half_length, pole: 2 * cart.parameters.pole_com };
+}
+
 function agentDrives() {
   return element("agent").getAttribute("aria-pressed") === "true";
 }
@@ -63,60 +62,10 @@ function verdict() {
 
 // pictures
 
-function prepared(canvas) {
-  const ratio = window.devicePixelRatio || 1, { clientWidth: width, clientHeight: height } = canvas;
-  if (canvas.width !== Math.round(width * ratio) || canvas.height !== Math.round(height * ratio)) {
-    canvas.width = Math.round(width * ratio);
-    canvas.height = Math.round(height * ratio);
-  }
-  const context = canvas.getContext("2d");
-  context.setTransform(ratio, 0, 0, ratio, 0, 0);
-  context.clearRect(0, 0, width, height);
-  return { context, width, height };
-}
-
-/** Pixels per metre, and where the middle of the track is. */
-function view(width, height) {
-  const half = cart.parameters.track_half_length + 0.12, length = 2 * cart.parameters.pole_com;
-  const scale = Math.min(width / (2 * half), height / (2 * length + 0.12));
-  return { scale, middle: width / 2, rail: height / 2 };
-}
-
-function colour(name) {
-  return getComputedStyle(document.documentElement).getPropertyValue(name);
-}
-
-function line(context, style, width, ...points) {
-  context.strokeStyle = style;
-  context.lineWidth = width;
-  context.lineCap = "round";
-  context.beginPath();
-  points.forEach(([x, y]) => context.lineTo(x, y));
-  context.stroke();
-}
-
 function drawScene(share) {
-  const { context, width, height } = prepared(element("scene"));
-  const { scale, middle, rail } = view(width, height);
   const [x, theta] = [0, 2].map((place) => before[place] + share * (cart.motion[place] - before[place]));
-  const end = cart.parameters.track_half_length, length = 2 * cart.parameters.pole_com;
-  const at = (metres) => middle + scale * metres;
-  line(context, colour("--line"), 4, [at(-end - 0.08), rail], [at(end + 0.08), rail]);
-  for (const side of [-1, 1]) {
-    line(context, colour(failedAt === null ? "--soft" : "--bad"), 3, [at(side * end), rail - 9], [at(side * end), rail + 9]);
-  }
-  context.fillStyle = colour("--cart");
-  context.beginPath();
-  context.roundRect(at(x) - 26, rail - 13, 52, 26, 6);
-  context.fill();
-  const tip = [at(x) + scale * length * Math.sin(theta), rail - scale * length * Math.cos(theta)];
-  line(context, colour("--pole"), 7, [at(x), rail], tip);
-  context.fillStyle = colour("--ink");
-  context.beginPath();
-  context.arc(at(x), rail, 3.5, 0, 2 * Math.PI);
-  context.fill();
-  const motor = failedAt === null ? cart.motor : 0;
-  line(context, colour("--cart"), 3, [at(x), rail + 24], [at(x) + motor * 0.25, rail + 24]);
+  const failed = failedAt !== null, motor = failed ? 0 : cart.motor;
+  const { context, at, rail, scale, tip } = drawCart(element("scene"), { x, theta, motor, failed, ...sizes() });
   if (pull) {
     const from = pull.on === "cart" ? [at(x), rail] : tip;
     const to = pull.on === "cart" ? [at(pull.x), rail] : [at(pull.x), rail - scale * pull.y];
@@ -124,26 +73,6 @@ function drawScene(share) {
   } else if (keys) {
     line(context, colour("--push"), 4, [at(x), rail - 24], [at(x) + 8 * keys, rail - 24]);
   }
-}
-
-function drawTrace() {
-  const { context, width, height } = prepared(element("trace"));
-  const level = (angle) => height / 2 - (angle / Math.PI) * (height / 2 - 8);
-  const place = (point) => width * (1 - (time - point.time) / HISTORY);
-  context.fillStyle = colour("--soft");
-  context.font = "11px system-ui, sans-serif";
-  line(context, colour("--line"), 1, [0, level(0)], [width, level(0)]);
-  context.fillText("upright", 6, level(0) - 5);
-  context.fillText("hanging", 6, height - 6);
-  let points = [];
-  history.forEach((point, number) => {
-    if (number && Math.abs(point.angle - history[number - 1].angle) > Math.PI) {
-      line(context, colour("--pole"), 2, ...points);
-      points = [];
-    }
-    points.push([place(point), level(point.angle)]);
-  });
-  if (points.length) line(context, colour("--pole"), 2, ...points);
 }
 
 function drawStatus() {
@@ -165,7 +94,7 @@ function frame(now) {
     period();
   }
   drawScene(due / DATA.period);
-  drawTrace();
+  drawTrace(element("trace"), history, time, HISTORY);
   drawStatus();
   requestAnimationFrame(frame);
 }
@@ -174,7 +103,7 @@ function frame(now) {
 
 function pointer(event) {
   const canvas = element("scene"), box = canvas.getBoundingClientRect();
-  const { scale, middle, rail } = view(canvas.clientWidth, canvas.clientHeight);
+  const { scale, middle, rail } = view(canvas.clientWidth, canvas.clientHeight, sizes());
   return { x: (event.clientX - box.left - middle) / scale, y: (rail - (event.clientY - box.top)) / scale };
 }
 

@@ -1,0 +1,218 @@
+"""The live page of a cart, served on this computer alone by a process of its own, and its stop button.
+
+The process reads the snapshots that the driving process leaves in shared memory, so a slow browser delays
+nothing. The page asks for the newest one: it never shows an old one, and no connection stays open that the
+button would have to wait for. All addresses begin with a secret of the run. The one command that the page
+sends is stop: it interrupts the run as Ctrl-C does. It imports no PyTorch, so that it starts at once.
+"""
+
+import hmac
+import html
+import json
+import math
+import multiprocessing
+import os
+import secrets
+import signal
+import socket
+import sys
+from collections.abc import Sequence
+from contextlib import suppress
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from cartpole_rl.drawing.pages import filled, shared_parts
+from cartpole_rl.errors import ConfigError
+from cartpole_rl.evaluation.snapshots import Memory, new_memory, read
+from cartpole_rl.reporting.live_view import LiveView
+from cartpole_rl.signals import end_with_parent
+
+HERE = "127.0.0.1"
+HOSTS = (HERE, "localhost")  # in the Host of a request: a page elsewhere may give its own name our address
+LONGEST_BODY = 1000  # bytes of a request; that of the button is empty
+LESS_URGENT = 10  # niceness: below the driving process, but the button answers on a busy computer, too
+NOTE = "by the button of the page"
+STOPPED = "Stop is sent: the motor goes to 0. The terminal says what was kept."
+HEADERS = {
+    "Cache-Control": "no-store",
+    "Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; "
+    "connect-src 'self'; form-action 'self'; frame-src 'self'; frame-ancestors 'self'; base-uri 'none'",
+    "Referrer-Policy": "same-origin",
+    "X-Content-Type-Options": "nosniff",
+}
+
+
+def chosen_view(title: str, chosen: str, pole_length: float) -> "LiveView | WebView":
+    """Return the view of `view=chosen`, of a cart with a pole of `pole_length` m. Raises ConfigError."""
+    return WebView(title, pole_length) if chosen == "web" else LiveView(title, chosen)
+
+
+class WebView:
+    """A context manager of the process that serves the page.
+
+    The page shows the cart in `memory`, or the `episodes` of a recording, each a mapping of columns. Raises
+    ConfigError where one process cannot interrupt another.
+    """
+
+    def __init__(self, title: str, pole_length: float, episodes: Sequence[dict[str, Any]] = ()) -> None:
+        if os.name != "posix":
+            raise ConfigError("view=web needs Linux or macOS; leave it out")
+        self.memory: Memory | None = None if episodes else new_memory()
+        self._listener = socket.create_server((HERE, 0))
+        self._secret = secrets.token_urlsafe(24)
+        context = multiprocessing.get_context("spawn")
+        self._stopped = context.RawValue("b", 0)
+        contents = {"": page(title, pole_length, bool(episodes)), "recording": json.dumps(episodes)}
+        ignored = signal.getsignal(signal.SIGINT) == signal.SIG_IGN  # as a shell's & leaves it
+        stop = Stop(os.getpid(), signal.SIGTERM if ignored else signal.SIGINT, self._stopped)
+        arguments = (self._listener, self._secret, contents, self.memory, stop)
+        self._process = context.Process(target=serve, args=arguments, daemon=True)
+
+    @property
+    def address(self) -> str:
+        """The address of the page."""
+        return f"http://{HERE}:{self._listener.getsockname()[1]}/{self._secret}/"
+
+    def __enter__(self) -> Self:
+        print(f"view=web: {self.address}", file=sys.stderr)
+        self._process.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._process.terminate()
+        self._process.join()
+        self._listener.close()
+        if error is not None and self._stopped.value:
+            error.add_note(NOTE)
+
+    def wait(self) -> None:
+        """Return once the button of the page is pressed, or Ctrl-C."""
+        with suppress(KeyboardInterrupt):
+            self._process.join()
+
+
+def page(title: str, pole_length: float, replays: bool) -> str:
+    """Return the HTML of the page."""
+    words = {"button": "Close", "start": "replay"} if replays else {"button": "Stop", "start": "ask"}
+    values = {**shared_parts(), **words, "title": html.escape(title), "pole": pole_length}
+    return filled(Path(__file__).with_name("live.html"), values)
+
+
+class Stop:
+    """What interrupts the process that started this one, which then sets the motor to 0 and reports."""
+
+    def __init__(self, process: int, number: int, stopped: Any) -> None:
+        self.process, self._number, self._stopped = process, number, stopped
+
+    def __call__(self) -> None:
+        """Send the signal, unless that process has ended."""
+        self._stopped.value = 1
+        if os.getppid() == self.process:
+            os.kill(self.process, self._number)
+
+
+def serve(
+    listener: socket.socket, secret: str, contents: dict[str, str], memory: Memory | None, stop: Stop
+) -> None:
+    """Answer requests until the process is ended or its parent ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process
+    end_with_parent(stop.process)
+    os.nice(LESS_URGENT)
+    Server(listener, secret, contents, memory, stop).serve_forever()
+
+
+class Server(ThreadingHTTPServer):
+    """Answers on `listener` with `contents` and the newest snapshot, below the path /`secret`/."""
+
+    daemon_threads = True
+
+    def __init__(
+        self,
+        listener: socket.socket,
+        secret: str,
+        contents: dict[str, str],
+        memory: Memory | None,
+        stop: Stop,
+    ) -> None:
+        super().__init__(listener.getsockname(), Handler, bind_and_activate=False)
+        self.socket.close()
+        self.socket = listener
+        self.secret, self.contents, self.memory, self.stop = secret, contents, memory, stop
+
+    def newest(self) -> str:
+        """Return the newest snapshot and its number as JSON; null for a number that is not finite."""
+        number, snapshot = (self.memory and read(self.memory)) or (0, None)
+        shown = snapshot and {
+            name: value if math.isfinite(value) else None for name, value in snapshot._asdict().items()
+        }
+        return json.dumps({"number": number, "snapshot": shown})
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Do nothing: a browser that goes away is no error."""
+
+
+class Handler(BaseHTTPRequestHandler):
+    """Answers a request; one to another host, or without the secret, is refused."""
+
+    protocol_version = "HTTP/1.1"
+    timeout = 10  # s, of a connection that says nothing
+    server: Server
+
+    def do_GET(self) -> None:
+        """Answer with the page, the recording, or the newest snapshot."""
+        name = self.wanted()
+        if name == "now":
+            self.answer(200, self.server.newest(), "application/json")
+        elif name in self.server.contents:
+            kind = "application/json" if name else "text/html"
+            self.answer(200, self.server.contents[name], kind)
+        elif name is not None:
+            self.answer(404, "There is nothing here.")
+
+    def do_POST(self) -> None:
+        """Stop the run. A page of another origin is refused, although it cannot know the secret."""
+        length = self.headers.get("Content-Length", "0")
+        self.close_connection = True
+        if not length.isdecimal() or int(length) > LONGEST_BODY:
+            self.answer(413, "The request is too long.")
+            return
+        self.rfile.read(int(length))
+        name, origin = self.wanted(), self.headers.get("Origin")
+        if name is not None and origin not in (None, f"http://{self.headers['Host']}"):
+            self.answer(403, "Another page asked.")
+        elif name == "stop":
+            try:  # first: the parent ends this process
+                self.answer(200, f'<meta name="color-scheme" content="light dark">{STOPPED}', "text/html")
+            finally:
+                self.server.stop()
+        elif name is not None:
+            self.answer(404, "There is nothing here.")
+
+    def wanted(self) -> str | None:
+        """Return what follows the secret in the path; None once the request is refused."""
+        secret, _, name = self.path.removeprefix("/").partition("/")
+        if self.headers.get("Host", "").partition(":")[0] not in HOSTS:
+            self.answer(403, "This page is for its own computer alone.")
+        elif not hmac.compare_digest(secret.encode(), self.server.secret.encode()):
+            self.answer(404, "There is nothing here.")
+        else:
+            return name
+        return None
+
+    def answer(self, status: int, text: str, kind: str = "text/plain") -> None:
+        """Send a response; the connection ends after a refusal."""
+        content = text.encode()
+        self.close_connection |= status != 200
+        self.send_response(status)
+        lengths = {"Content-Type": f"{kind}; charset=utf-8", "Content-Length": str(len(content))}
+        for name, value in {**HEADERS, **lengths}.items():
+            self.send_header(name, value)
+        self.end_headers()
+        self.wfile.write(content)
+
+    def log_message(self, format: str, *arguments: Any) -> None:
+        """Print nothing: the terminal is the run's."""
