@@ -1,0 +1,137 @@
+"""The live page over HTTP, and in a headless browser: what it shows, whom it refuses, and its stop button."""
+
+import http.client
+import json
+import re
+import subprocess
+import time
+from collections.abc import Callable
+from itertools import count
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import pytest
+from browser import BROWSER, BROWSERS
+from command_line import COARSE, console_script, outcome
+
+from cartpole_rl.evaluation.snapshots import Snapshot, write
+from cartpole_rl.reporting import web_view
+from cartpole_rl.reporting.web_view import NOTE, WebView, page
+
+CALM = Snapshot(2, 120, -100, 0, 0, 1, 0.19, -0.25, 0.01, 0.5, 812.4, 0.38)
+EPISODE = {"name": "episode_000", "time": [0.0, 0.02]}
+
+
+def ask(address: str, method: str, name: str, **headers: str) -> tuple[int, str]:
+    """The status and the text of an answer."""
+    place = urlsplit(address)
+    connection = http.client.HTTPConnection(place.netloc, timeout=100)
+    connection.request(method, place.path + name, headers=headers)
+    answer = connection.getresponse()
+    return answer.status, answer.read().decode()
+
+
+def snapshot(address: str, fits: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
+    """The first snapshot that fits."""
+    while True:
+        found = json.loads(ask(address, "GET", "now")[1])["snapshot"]
+        if found and fits(found):
+            return found
+        time.sleep(0.01)
+
+
+def test_the_button_stops_a_driven_cart_and_keeps_its_episodes(tmp_path: Path) -> None:
+    journal = tmp_path / "journal.jsonl"
+    words = ("run=lqr", "plant=emulated", COARSE, f"emulator.journal={journal}", "episodes=1000")
+    process = console_script("evaluate", *words, "view=web", "hydra.run.dir=run", folder=tmp_path)
+    assert process.stderr is not None
+    address = next(found[1] for line in process.stderr if (found := re.match(r"view=web: (\S+)", line)))
+    snapshot(address, lambda found: found["episode"] > 1 and found["motor"] != 0)
+    assert ask(address, "POST", "stop", Origin="http://elsewhere.example")[0] == 403
+    status, text = ask(address, "POST", "stop")
+    done = outcome(process)
+    assert (status, done.code) == (200, 130)
+    assert web_view.STOPPED in text
+    assert done.err.splitlines()[-1] == f"cartpole-evaluate: interrupted; {NOTE}"
+    assert json.loads((tmp_path / "run/metrics.json").read_text())["episodes"]
+    told = [json.loads(line) for line in journal.read_text().splitlines()]
+    forces = [line["in_force"] for line in told if "in_force" in line]
+    assert any(forces)
+    assert forces[-1] == 0
+
+
+def test_it_answers_its_own_computer_alone() -> None:
+    with WebView("cart", 0.36) as view:
+        assert view.memory is not None
+        assert "Waiting for the cart" in ask(view.address, "GET", "")[1]
+        write(view.memory, 1, CALM)
+        assert snapshot(view.address, bool) == CALM._asdict()
+        wrong = view.address[:-2] + "/"
+        for method, address, name, headers, status in (
+            ("GET", view.address, "", {"Host": "elsewhere.example"}, 403),
+            ("POST", view.address, "stop", {"Host": "elsewhere.example"}, 403),
+            ("POST", view.address, "stop", {"Origin": "null"}, 403),
+            ("POST", wrong, "stop", {}, 404),
+            ("GET", wrong, "now", {}, 404),
+            ("GET", view.address, "stop", {}, 404),
+            ("POST", view.address, "start", {}, 404),
+            ("POST", view.address, "stop", {"Content-Length": "100000"}, 413),
+        ):
+            assert ask(address, method, name, **headers)[0] == status, (method, name, headers)
+        assert urlsplit(view.address).hostname == "127.0.0.1"
+
+
+def press(address: str) -> None:
+    """Press the button, and wait for what it does."""
+    ask(address, "POST", "stop")
+    time.sleep(100)
+
+
+def test_a_recording_is_shown_until_it_is_closed() -> None:
+    with WebView("Replay", 0.36, [EPISODE]) as view:
+        assert json.loads(ask(view.address, "GET", "recording")[1]) == [EPISODE]
+        with pytest.raises(KeyboardInterrupt):
+            press(view.address)
+
+
+def test_words_of_a_title_are_no_markup() -> None:
+    assert "<h1>&lt;b&gt;</h1>" in page("<b>", 0.36, replays=False)
+
+
+PROBE = """<script>
+const seen = new Set();
+setInterval(() => {
+  const position = document.querySelector("dl div:nth-child(2) dd");
+  if (position) seen.add(position.textContent);
+  if (seen.size === 3) element("stop").click();
+}, 10);
+</script></body>"""
+
+
+@pytest.mark.skipif(BROWSER is None, reason=f"none of {', '.join(BROWSERS)} is installed")
+def test_a_browser_shows_the_cart_moving_and_its_button_stops(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The page presses its button once it has shown three positions."""
+    monkeypatch.setattr(web_view, "page", lambda *given: page(*given).replace("</body>", PROBE))
+    with pytest.raises(KeyboardInterrupt) as stopped:
+        drive_before_a_browser(tmp_path)
+    assert stopped.value.__notes__ == [NOTE]
+
+
+def drive_before_a_browser(folder: Path) -> None:
+    """Move the cart of a page that a browser shows, until this process is interrupted."""
+    assert BROWSER is not None
+    words = ["--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={folder}"]
+    with WebView("cart", 0.36) as view:
+        assert view.memory is not None
+        command = [BROWSER, *words, "--remote-debugging-port=0", view.address]
+        browser = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+        try:
+            for number in count(1):
+                write(view.memory, number, CALM._replace(step=number, x=0.01 * (number % 30)))
+                time.sleep(0.02)
+        finally:
+            browser.terminate()
+            browser.wait()
