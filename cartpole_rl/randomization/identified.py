@@ -149,6 +149,9 @@ def read_samples(path: Path) -> tuple[dict[str, Array], list[str]]:
         rows = [*csv.DictReader(file, skipinitialspace=True)]
     if not rows:
         raise ValueError("it holds no cart")
+    for place, row in enumerate(rows, 1):
+        if None in row or None in row.values():
+            raise ValueError(f"cart {place} has more or fewer numbers than the first line has names")
     carts = {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
     check_names(carts)
     for name, values in carts.items():

@@ -161,7 +161,8 @@ OF: dict[str, Table] = {
         "learning.batch_size": (256, "table 6.2"),
     },
 }
-OF_THE_RUN = {"seed", "label", "device", "threads", "compile", "resume", "logger"}  # not of the experiment
+# not of the experiment
+OF_THE_RUN = {"seed", "label", "device", "threads", "compile", "resume", "logger", "preview"}
 EXPECTED = {
     name: {**BOTH, **{f"cart.{key}": row for key, row in CART.items()}, **own} for name, own in OF.items()
 }

@@ -103,7 +103,7 @@ def test_samples_of_a_file_stay_together_by_row(
         ("", "holds no cart"),
         ("cart_mass\n", "holds no cart"),
         ("cart_mass\nheavy\n", "could not convert string to float: 'heavy'; write names of parameters"),
-        ("cart_mass,latency\n0.5\n", "write names of parameters"),
+        ("cart_mass,latency\n0.5\n", "cart 1 has more or fewer numbers"),
         ("cart_mas\n0.5\n", "did you mean 'cart_mass'"),
         ("cart_mass\n0.5\n-1\n", "cart_mass is -1; it must be above 0"),
         ("cart_mass\nnan\n", "cart_mass is nan; it must be above 0"),
