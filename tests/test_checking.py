@@ -29,7 +29,7 @@ def test_the_kind_of_a_plant_is_no_part_of_a_key(kind: str) -> None:
 @pytest.mark.parametrize(
     ("randomization", "message"),
     [
-        ({"cart_mass": {"spread": 1}}, r"randomization\.cart_mass\.spread: there is no such setting"),
+        ({"cart_mass": {"spread": 1}}, r"randomization\.cart_mass: spread: there is no such setting"),
         ({**IDENTIFIED, "widen": -1}, r"randomization\.widen=-1: "),
         (
             {**IDENTIFIED, "ranges": {"latency": 1}},

@@ -46,8 +46,8 @@ class Distribution(Extension):
     def shape(self, given: Mapping[str, Any]) -> dict[str, Any]:
         """Return the keywords of the function from settings. Raises ConfigError."""
         for name in given.keys() - self._shape.model_fields.keys():
-            taken = ", ".join(self._shape.model_fields) or "bounds alone"
-            raise ConfigError(f"{name}: {self} takes {taken}")
+            taken = ", ".join(("bounds", *self._shape.model_fields))
+            raise ConfigError(f"{name}: there is no such setting; {self} takes {taken}")
         return validated(self._shape, given).model_dump()
 
 

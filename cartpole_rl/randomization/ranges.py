@@ -54,6 +54,10 @@ class Range(Settings):
         return self
 
     def _is_one_line(self) -> "Range":
+        try:
+            shape = self.distribution.shape(self._keywords)
+        except ConfigError as error:
+            raise ValueError(str(error)) from None
         if len(self._given) != 1:
             raise ValueError("give exactly one of absolute, relative, factor, or a mixture")
         bounds = self._given[0]
@@ -63,10 +67,6 @@ class Range(Settings):
             raise ValueError(f"bounds {list(bounds)}: {self.distribution} takes two, [low, high]")
         elif bounds[0] > bounds[1]:
             raise ValueError(f"bounds {list(bounds)} are in the wrong order")
-        try:
-            shape = self.distribution.shape(self._keywords)
-        except ConfigError as error:
-            raise ValueError(str(error)) from None
         for name in PLACES:
             if shape.get(name) is not None and not min(bounds) <= shape[name] <= max(bounds):
                 raise ValueError(f"{name} {shape[name]:g} is outside the bounds {list(bounds)}")
