@@ -4,6 +4,7 @@ Bounds are `absolute` (the value itself), `relative` (nominal * (1 + bound)) or 
 """
 
 from collections.abc import Mapping
+from functools import cached_property
 from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -111,12 +112,17 @@ class Range(Settings):
         """Return values [R, N] of shares [R, N], 0 to 1, within limits [R, 1] float64."""
         if self.mixture:
             return self._drawn_mixture(share, low)
+        values: Tensor = self.distribution(share, low, high, **self._shape)
+        return values
+
+    @cached_property
+    def _shape(self) -> dict[str, Any]:
+        """The keywords of the distribution, in the terms of the limits."""
         shape = self.distribution.shape(self._keywords)
         shape |= {name: self._offset + shape[name] for name in PLACES if shape.get(name) is not None}
         if self.distribution.listed:
             shape["values"] = [self._offset + value for value in self._given[0]]
-        values: Tensor = self.distribution(share, low, high, **shape)
-        return values
+        return shape
 
     def _drawn_mixture(self, share: "Tensor", like: "Tensor") -> "Tensor":
         """Return values of shares: each line has a part of the shares, as wide as its weight."""
