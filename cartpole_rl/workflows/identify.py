@@ -61,6 +61,7 @@ from cartpole_rl.terminal import confirm, print_message, print_results, progress
 from cartpole_rl.workflows.build import precedence, use_threads
 from cartpole_rl.workflows.checks import note_other_numbers
 from cartpole_rl.workflows.config import IdentifyConfig
+from cartpole_rl.workflows.poles import warn_of_another_pole
 
 HELD_OUT_OF = 5  # one recording in so many is held out
 UNIDENTIFIABLE = {  # randomized about the identified cart, since no experiment shows them
@@ -96,6 +97,8 @@ def identify_cart(config: IdentifyConfig, folder: Path) -> None:
     files = experiments(source)
     recorded = {name: read_recording(path) for name, path in files.items()}
     check_same_encoders({str(files[name]): episode for name, episode in recorded.items()}, config.hardware)
+    if config.source is not None:
+        warn_of_another_pole(config.pole.nominal, files.values())
     fitted, held_out = split(recorded, source)
     by_file, held_out_by_file = (
         {str(files[name]): episode for name, episode in chosen.items()} for chosen in (fitted, held_out)

@@ -1,7 +1,7 @@
 """The poles of agents, carts and recordings, and the words that choose a cart with one of them."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -115,11 +115,21 @@ def chosen_pole(
 ) -> tuple[str, Pole]:
     """Return name and parameters of the pole in `poles`; without a choice, of the recorded one, as in `own`.
 
-    Raises ConfigError where `poles` are several, naming `owner`, and what `recorded_pole` raises.
+    A chosen pole with another length than the recorded one is warned of. Raises ConfigError where `poles` are
+    several, naming `owner`, and what `recorded_pole` raises.
     """
     if poles is None:
         return recorded_pole(paths, own.choices if own else None)
-    return poles.name, check_one_pole(owner, poles)
+    pole = check_one_pole(owner, poles)
+    warn_of_another_pole(pole, paths)
+    return poles.name, pole
+
+
+def warn_of_another_pole(pole: Pole, paths: Iterable[Path]) -> None:
+    """Print a warning where a recording states the length of another pole. Raises RecordingError."""
+    recorded = {length for path in paths if (length := recorded_length(path))}
+    if others := [f"{length:g} m" for length in sorted(recorded) if not pole.is_about(length)]:
+        print(f"warning: a pole of {' and '.join(others)} was recorded; pole= gives one of {pole.length:g} m")
 
 
 def recorded_pole(paths: Sequence[Path], own: Mapping[str, Pole] | None = None) -> tuple[str, Pole]:

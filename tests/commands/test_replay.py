@@ -68,6 +68,15 @@ def test_the_recorded_pole_is_the_simulated_one(recorded: Path, tmp_path: Path) 
     assert results["pole"] == "large"
 
 
+def test_a_chosen_pole_of_another_length_is_warned_of(recorded: Path, tmp_path: Path) -> None:
+    warning = "warning: a pole of 0.3556 m was recorded; pole= gives one of 0.6604 m"
+    for verb in ("replay", "identify"):
+        words = (f"from={recorded}", f"hydra.run.dir={verb}")
+        own, other = (in_process(verb, *words, *pole, folder=tmp_path) for pole in ([], ["pole=large"]))
+        assert "warning: a pole" not in own.out
+        assert warning in other.out, verb
+
+
 def test_recordings_of_two_poles_are_refused(recorded: Path, tmp_path: Path) -> None:
     text = (recorded / "recordings/episode_000.csv").read_text()
     for name, length in {"a.csv": "0.3556", "b.csv": "0.6560", "c.csv": "long"}.items():
