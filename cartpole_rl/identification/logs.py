@@ -7,7 +7,7 @@ or left out, so that each part has a constant period.
 
 import csv
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -52,7 +52,10 @@ class Log(NamedTuple):
 
 
 def read_log(path: Path, layout: Layout, encoders: Encoders) -> Log:
-    """Return the episodes in a log, in counts of `encoders`. Raises RecordingError, with file and line."""
+    """Return the episodes in a log, in counts of `encoders`.
+
+    A log is text, or holds arrays by name: .npz, .mat or .parquet. Raises RecordingError, with file and row.
+    """
     columns = read_columns(path, layout)
     time = times(path, columns[layout.time.name], layout.time)
     gaps = np.diff(time)
@@ -122,7 +125,10 @@ def signed(positive: Direction) -> int:
 
 
 def read_columns(path: Path, layout: Layout) -> dict[str, Array]:
-    """Return the columns of a log that the layout names."""
+    """Return the columns of a log that the layout names. Raises RecordingError."""
+    wanted = [layout.time.name, layout.position.name, layout.angle.name, layout.motor.name, *layout.keep]
+    if read := ARRAYS.get(path.suffix.lower()):
+        return array_columns(path, read, wanted)
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
@@ -138,11 +144,75 @@ def read_columns(path: Path, layout: Layout) -> dict[str, Array]:
     delimiter = layout.delimiter or found_delimiter(numbered[0][1], layout.decimal)
     rows = [*csv.reader(io.StringIO("\n".join(line for _, line in numbered)), delimiter=delimiter)]
     heading = [name.strip() for name in rows[0]]
-    wanted = [layout.time.name, layout.position.name, layout.angle.name, layout.motor.name, *layout.keep]
-    if missing := [name for name in wanted if name not in heading]:
-        raise RecordingError(f"{path} has no column {', '.join(missing)}; it has {', '.join(heading)}")
+    check_columns(path, wanted, heading)
     lines = [number for number, _ in numbered[1:]]
     return {name: _numbers(path, name, heading.index(name), rows[1:], lines, layout) for name in wanted}
+
+
+def check_columns(path: Path, wanted: Sequence[str], present: Sequence[str]) -> None:
+    """Raise RecordingError for a wanted column that is not present."""
+    if missing := [name for name in wanted if name not in present]:
+        raise RecordingError(f"{path} has no column {', '.join(missing)}; it has {', '.join(present)}")
+
+
+def read_npz(path: Path) -> Mapping[str, NDArray]:
+    """Return the arrays of an .npz file."""
+    with np.load(path) as file:
+        return dict(file)
+
+
+def read_mat(path: Path) -> Mapping[str, NDArray]:
+    """Return the variables of a .mat file, up to version 7."""
+    from scipy.io import loadmat  # slow to import
+
+    try:
+        return {name: value for name, value in loadmat(path).items() if not name.startswith("__")}
+    except NotImplementedError:
+        raise ValueError("it is of version 7.3; save it with -v7") from None
+
+
+def read_parquet(path: Path) -> Mapping[str, NDArray]:
+    """Return the columns of a Parquet file."""
+    try:
+        from pyarrow import parquet
+    except ImportError:
+        raise ValueError("this needs pyarrow: pip install pyarrow") from None
+    file = parquet.read_table(path)
+    return {name: file[name].to_numpy() for name in file.column_names}
+
+
+ARRAYS: dict[str, Callable[[Path], Mapping[str, NDArray]]] = {
+    ".npz": read_npz,
+    ".mat": read_mat,
+    ".parquet": read_parquet,
+}
+
+
+def array_columns(
+    path: Path, read: Callable[[Path], Mapping[str, NDArray]], wanted: Sequence[str]
+) -> dict[str, Array]:
+    """Return the wanted columns of a file of arrays. Raises RecordingError."""
+    try:
+        present = read(path)
+    except Exception as error:  # the libraries have many for a damaged file
+        reason = [*str(error).splitlines(), type(error).__name__][0]
+        raise RecordingError(f"{path} cannot be read: {reason}") from None
+    check_columns(path, wanted, [*present])
+    columns = {}
+    for name in wanted:
+        column = np.squeeze(present[name])
+        if column.ndim != 1 or column.dtype.kind not in "fiub":
+            raise RecordingError(f"{path}: {name} is no column of numbers")
+        columns[name] = column.astype(float)
+        if (wrong := np.flatnonzero(~np.isfinite(columns[name]))).size:
+            raise RecordingError(
+                f"{path}, row {wrong[0] + 1}: {name} is {columns[name][wrong[0]]}; give a finite number"
+            )
+    sizes = {name: len(column) for name, column in columns.items()}
+    if len(set(sizes.values())) > 1 or min(sizes.values()) < 2:
+        listed = ", ".join(f"{name} {size}" for name, size in sizes.items())
+        raise RecordingError(f"{path}: columns need the same number of rows, 2 at least; rows: {listed}")
+    return columns
 
 
 def found_delimiter(heading: str, decimal: str) -> str:

@@ -23,7 +23,7 @@ class EnsembleSettings(Settings):
     table_penalty: NonNegative  # of a force of 1 at each place, and ten times that of a step between two
 
 
-SUFFIXES = (".csv", ".txt", ".tsv", ".log", ".dat")  # of logs in a folder
+SUFFIXES = (".csv", ".txt", ".tsv", ".log", ".dat", ".npz", ".mat", ".parquet")  # of logs in a folder
 Direction = Literal["right", "left"]
 Name = Annotated[str, Field(min_length=1)]
 

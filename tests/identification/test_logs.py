@@ -1,5 +1,6 @@
 """Logs of others in every shape that people write, and what motion says of their columns."""
 
+import importlib
 import re
 import textwrap
 from collections.abc import Callable
@@ -9,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from command_line import in_process
+from scipy.io import savemat
 
 from cartpole_rl.checking import validated
 from cartpole_rl.choices import choice, conf_folder
@@ -101,6 +103,44 @@ def test_a_log_is_read_in_every_style(
     assert part.x == pytest.approx(motion["x"], abs=2e-5)
     assert part.theta == pytest.approx(motion["a"], abs=1e-3)
     assert part.motor.tolist() == motion["u"][:-1].tolist()
+
+
+def parquet(path: Path, columns: Columns) -> None:
+    arrow = pytest.importorskip("pyarrow", reason="it is an extra")
+    importlib.import_module("pyarrow.parquet").write_table(arrow.table(columns), path)
+
+
+ARRAYS: dict[str, Callable[[Path, Columns], None]] = {
+    "npz": lambda path, columns: np.savez(path, **columns),
+    "mat": savemat,
+    "parquet": parquet,
+}
+
+
+@pytest.mark.parametrize("kind", ARRAYS)
+def test_a_log_of_arrays_is_as_one_of_text(tmp_path: Path, motion: Columns, kind: str) -> None:
+    text = read_log(written(tmp_path / "log.csv", motion, row="{:.17g}"), layout(), nominal_encoders())
+    ARRAYS[kind](tmp_path / f"log.{kind}", motion)
+    log = read_log(tmp_path / f"log.{kind}", layout(), nominal_encoders())
+    (part,), (other,) = log.parts, text.parts
+    assert (log.report, part.counts.tolist(), part.motor.tolist()) == (
+        text.report,
+        other.counts.tolist(),
+        other.motor.tolist(),
+    )
+    path = tmp_path / f"bad.{kind}"
+    lacking = {name: motion[name] for name in "txu"}
+    unknown = {**motion, "x": np.where(np.arange(STEPS) == 2, np.nan, motion["x"])}
+    for columns, message in (
+        (lacking, f"{path} has no column a; it has t, x, u"),
+        (unknown, f"{path}, row 3: x is nan; give a finite number"),
+    ):
+        ARRAYS[kind](path, columns)
+        with pytest.raises(RecordingError, match=re.escape(message)):
+            read_log(path, layout(), nominal_encoders())
+    path.write_bytes(b"neither")
+    with pytest.raises(RecordingError, match="cannot be read: "):
+        read_log(path, layout(), nominal_encoders())
 
 
 @pytest.mark.parametrize(
