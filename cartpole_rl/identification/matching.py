@@ -28,9 +28,11 @@ STATE_SPREAD = torch.tensor([5e-4, 0.5, 5e-3, 3.0], dtype=torch.float64)  # of a
 FARTHEST = 3.0  # of STATE_SPREAD: the largest distance of an initial state from its first guess
 GUESSED_FROM = 3  # positions; when the motor reverses, later ones bend away from any parabola
 CORRELATED = 10.0  # this many correlated residuals of a window count as one independent residual
-FIRST_DAMPING, LEAST_DAMPING = 1e-3, 1e-6
+FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e-6, 1e3
+KEPT = 8.0  # a window's damping grows by it where its step would not lower its cost
 SETTLED_DAMPING = 0.01  # beyond it, a step is short because it is damped
-ATTEMPTS = 6  # to lower the cost from one linearization, with ever more damping
+FACTORS = (0.1, 1.0, 10.0)  # of the dampings that are tried side by side
+ATTEMPTS = 3  # to lower the cost from one linearization, with a hundred times the damping each
 CONVERGED = 1e-4  # relative fall of the cost
 SETTLED = 0.3  # standard deviations: the last step of a point; outliers' initial states may still move
 ROUNDS = 10  # steps from a first guess of the initial states
@@ -83,24 +85,28 @@ class NormalEquations(NamedTuple):
     prior_slope: Tensor  # [U]
     state_slope: Tensor  # [W, 4], prior included
 
-    def reduced(self, damping: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the equations of the point alone: [U, U], each window's share [W, U]; inverses [W, 4, 4]."""
+    def reduced(self, damping: float = 0.0, own: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the equations of the point alone: [U, U], each window's share [W, U]; inverses [W, 4, 4].
+
+        `damping` is that of the point, `own` [W] that of each window's initial state.
+        """
         diagonal = self.state_state.diagonal(dim1=-2, dim2=-1)
-        inverse = torch.linalg.inv(self.state_state + torch.diag_embed(damping.unsqueeze(-1) * diagonal))
+        extra = 0 * diagonal if own is None else own.unsqueeze(-1) * diagonal
+        inverse = torch.linalg.inv(self.state_state + torch.diag_embed(extra))
         carried = self.point_state @ inverse
         matrix = self.point_points.sum(0) + torch.eye(len(self.prior_slope), dtype=inverse.dtype)
-        matrix = matrix + damping[0] * torch.diag(matrix.diagonal())
+        matrix = matrix + damping * torch.diag(matrix.diagonal())
         matrix = matrix - (carried @ self.point_state.mT).sum(0)
         slopes = self.point_slopes - torch.einsum("wis,ws->wi", carried, self.state_slope)
         return matrix, slopes, inverse
 
     @solvable()
-    def solve(self, damping: Tensor) -> tuple[Tensor, Tensor]:
+    def solve(self, damping: float, own: Tensor) -> tuple[Tensor, Tensor]:
         """Return the steps of the point [U] and of the initial states [4, W].
 
-        `damping` is [1], or [W] for windows without a point. Raises RecordingError, as `covariance` does.
+        The arguments are those of `reduced`. Raises RecordingError, as `covariance` does.
         """
-        matrix, slopes, inverse = self.reduced(damping)
+        matrix, slopes, inverse = self.reduced(damping, own)
         step = -torch.linalg.solve(matrix, slopes.sum(0) + self.prior_slope)
         rest = self.state_slope + torch.einsum("wis,i->ws", self.point_state, step)
         return step, -torch.einsum("wst,wt->sw", inverse, rest)
@@ -111,7 +117,7 @@ class NormalEquations(NamedTuple):
 
         It is infinite where rounding leaves no length.
         """
-        matrix, slopes, _ = self.reduced(step.new_zeros(1))
+        matrix, slopes, _ = self.reduced()
         pulled = matrix @ step
         square = float(pulled @ torch.linalg.solve(self.disagreement(slopes), pulled))
         return math.sqrt(square) if square >= 0 else math.inf
@@ -131,7 +137,7 @@ class NormalEquations(NamedTuple):
         Shortcomings of the physics show as episodes that would each have another cart: the point moves when
         one is left out, which is the jackknife's variance (Tukey, 1958), to first order.
         """
-        matrix, slopes, _ = self.reduced(torch.zeros(1, dtype=torch.float64))
+        matrix, slopes, _ = self.reduced()
         inverse = torch.linalg.inv(matrix)
         sampled = inverse @ self.disagreement(slopes) @ inverse
         groups = episode.unique()
@@ -185,6 +191,19 @@ class Match(NamedTuple):
     iterations: int
 
 
+class Place(NamedTuple):
+    """A place in the search."""
+
+    point: Tensor  # [U]
+    motion: Tensor  # [4, W]
+    costs: Tensor  # [W], without the prior of the point
+
+    @property
+    def cost(self) -> float:
+        """The cost of all windows and of the prior."""
+        return float(self.costs.sum() + self.point @ self.point)
+
+
 class Matching:
     """The least-squares problem of W windows.
 
@@ -215,12 +234,10 @@ class Matching:
         scaled = scaled_residuals(self.simulate(points, motion), self.measured.unsqueeze(-1), self.scale)
         return scaled.permute(2, 0, 1, 3).flatten(1, 2)
 
-    def cost(self, point: Tensor, motion: Tensor) -> Tensor:
-        """Return Huber's cost and that of the prior: [W], or [1] for all windows if they share a point."""
-        residuals = self.residuals(point.unsqueeze(1), motion.unsqueeze(2)).squeeze(2)
-        offset = (motion - self.guess) / STATE_SPREAD.unsqueeze(1)
-        each = (huber(residuals).sum(1) + (offset**2).sum(0)) / CORRELATED
-        return each.sum(0, keepdim=True) + point @ point if len(point) else each
+    def costs(self, points: Tensor, motion: Tensor) -> Tensor:
+        """Return Huber's cost of each window [W, K] at `points` [U, K] with initial states [4, W, K]."""
+        offset = (motion - self.guess.unsqueeze(2)) / STATE_SPREAD.reshape(4, 1, 1)
+        return (huber(self.residuals(points, motion)).sum(1) + (offset**2).sum(0)) / CORRELATED
 
     def linearize(self, point: Tensor, motion: Tensor) -> Linearization:
         """Return the residuals and their differences: one simulation of U + 5 carts per window."""
@@ -241,30 +258,52 @@ class Matching:
     def minimize(self, point: Tensor, motion: Tensor, iterations: int) -> Match:
         """Search by Levenberg-Marquardt from a point and initial states.
 
-        Windows without a shared point have their own damping, since steps overshoot near sticking.
+        Steps of initial states overshoot near sticking. So each window has its own damping, besides that of the
+        point, and keeps its state where the step would not lower its cost.
         """
-        shared, made = len(point) > 0, 0
-        cost = self.cost(point, motion)
-        damping = torch.full_like(cost, FIRST_DAMPING)
+        costs = self.costs(point.unsqueeze(1), motion.unsqueeze(2))[:, 0]
+        now, made = Place(point, motion, costs), 0
+        damping, own = FIRST_DAMPING, torch.full_like(costs, FIRST_DAMPING)
         for _ in range(iterations):
             made += 1
-            normal, before = self.normal_equations(point, motion), cost
-            for _ in range(ATTEMPTS if shared else 1):
-                step, moves = normal.solve(damping)
-                trial_point = (point + step).clamp(*self.limits)
-                trial = (motion + moves).clamp(*self.bounds)
-                trial_cost = self.cost(trial_point, trial)
-                better = trial_cost < cost
-                moved = trial_point - point
-                point = trial_point if better.all() else point
-                motion, cost = torch.where(better, trial, motion), torch.where(better, trial_cost, cost)
-                damping = torch.where(better, (damping / 5).clamp(min=LEAST_DAMPING), damping * 8)
-                if better.any():
+            normal, before = self.normal_equations(now.point, now.motion), now
+            for _ in range(ATTEMPTS):
+                trial, moved, factor = self.best_trial(before, normal, damping, own)
+                own = torch.where(moved, own * factor, own * KEPT).clamp(LEAST_DAMPING, MOST_DAMPING)
+                if trial.cost < before.cost:
+                    now, damping = trial, max(LEAST_DAMPING, damping * factor)
                     break
-            settled = shared and damping.max() <= SETTLED_DAMPING and normal.length(moved) < SETTLED
-            if settled or (shared and before - cost < CONVERGED * before):
+                damping *= max(FACTORS) ** 2
+            if now is before:
                 break
-        return Match(point, motion, float(cost.sum()), made)
+            if len(point) and damping <= SETTLED_DAMPING:
+                slow = before.cost - now.cost < CONVERGED * before.cost
+                if slow or normal.length(now.point - before.point) < SETTLED:
+                    break
+        return Match(now.point, now.motion, now.cost, made)
+
+    def best_trial(
+        self, now: Place, normal: NormalEquations, damping: float, own: Tensor
+    ) -> tuple[Place, Tensor, float]:
+        """Return the best place after one step, the windows whose states moved, [W], and its factor.
+
+        The dampings of the steps, all simulated side by side, are those given, times each of FACTORS.
+        """
+        steps = [normal.solve(damping * factor, own * factor) for factor in FACTORS]
+        points = torch.stack([(now.point + step).clamp(*self.limits) for step, _ in steps], 1)
+        motions = torch.stack([(now.motion + moves).clamp(*self.bounds) for _, moves in steps], 2)
+        kept = now.motion.unsqueeze(2).expand_as(motions)
+        costs, kept_costs = self.costs(points.repeat(1, 2), torch.cat((motions, kept), 2)).chunk(2, 1)
+        places = [
+            Place(
+                points[:, k],
+                torch.where(costs[:, k] < kept_costs[:, k], motions[..., k], now.motion),
+                torch.minimum(costs[:, k], kept_costs[:, k]),
+            )
+            for k in range(len(FACTORS))
+        ]
+        best = min(range(len(places)), key=lambda k: places[k].cost)
+        return places[best], costs[:, best] < kept_costs[:, best], FACTORS[best]
 
 
 class InitialStates(NamedTuple):
