@@ -258,8 +258,8 @@ class Matching:
     def minimize(self, point: Tensor, motion: Tensor, iterations: int) -> Match:
         """Search by Levenberg-Marquardt from a point and initial states.
 
-        Steps of initial states overshoot near sticking. So each window has a damping of its own, besides that of
-        the point, and keeps its state where the step would not lower its cost.
+        Steps of initial states overshoot near sticking. So each window has a damping of its own, besides the
+        point's, and keeps its state where the step would not lower its cost.
         """
         costs = self.costs(point.unsqueeze(1), motion.unsqueeze(2))[:, 0]
         now, made = Place(point, motion, costs), 0
