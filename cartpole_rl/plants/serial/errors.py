@@ -91,13 +91,15 @@ def check_scales(information: Info, hardware: Hardware) -> None:
         "cart_nanometres_per_count": hardware.cart_nanometres_per_count,
         "pole_counts_per_turn": hardware.pole_counts_per_turn,
     }
-    for name, number in expected.items():
-        if (reported := getattr(information, name)) != number:
-            raise NotReadyError(
-                f"the cart reports {name} {reported}, not {number}",
-                "give the file of this cart with cart=, or build its firmware from the file "
-                "(cartpole-export format=firmware)",
-            )
+    reported = {name: getattr(information, name) for name in expected}
+    if other := [name for name in expected if reported[name] != expected[name]]:
+        lines = ", ".join(f"`{name}: {reported[name]}`" for name in other)
+        raise NotReadyError(
+            "the cart reports "
+            + " and ".join(f"{name} {reported[name]}, not {expected[name]}" for name in other),
+            f"if this is true, write {lines} into a file of this cart and give it with cart=; if not, build "
+            "its firmware from the file (cartpole-export format=firmware)",
+        )
     if information.motor_limit != LARGEST_MOTOR:
         raise NotReadyError(
             f"INFO says motor limit {information.motor_limit}, not {LARGEST_MOTOR}",

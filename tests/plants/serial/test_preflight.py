@@ -256,6 +256,15 @@ def test_limits_that_are_not_this_carts(change: dict[str, int], words: str) -> N
         limits(replace(good_limits, **change), nominal_hardware())
 
 
+def test_the_lines_of_another_carts_file_are_told() -> None:
+    other = replace(good_limits, cart_nanometres_per_count=84980, pole_counts_per_turn=4271)
+    with pytest.raises(NotReadyError) as refused:
+        limits(other, nominal_hardware())
+    assert (
+        "write `cart_nanometres_per_count: 84980`, `pole_counts_per_turn: 4271` into" in refused.value.remedy
+    )
+
+
 @pytest.mark.parametrize("period_us", [0, 100_001])
 def test_a_period_that_the_protocol_does_not_allow(period_us: int) -> None:
     with CartPeer() as peer:
