@@ -1,13 +1,17 @@
-"""Loggers: where the curves and pictures of a training go, TensorBoard or a logger of one's own.
+"""Loggers: where the curves and pictures of a training go, one place or several.
 
 A logger of one's own is a class that is made as `Logger` is, chosen as `logger=module:Name`.
 """
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
+from cartpole_rl.errors import ConfigError
 from cartpole_rl.registry import Extension, Registry
+from cartpole_rl.run_folder import MULTIRUN
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -50,3 +54,61 @@ def _check_logger(item: Any) -> None:
 
 LOGGERS: Registry[Extension] = Registry("logger", __name__, check=_check_logger)
 LOGGERS.add("tensorboard", "cartpole_rl.reporting.tensorboard:TensorBoardLog")
+LOGGERS.add("wandb", "cartpole_rl.reporting.wandb_log:WandbLog")
+LOGGERS.add("mlflow", "cartpole_rl.reporting.mlflow_log:MlflowLog")
+
+
+class Loggers:
+    """Several loggers of one run; each method of `Logger` is that of each of them, in their order."""
+
+    def __init__(self, kinds: Sequence[Extension], folder: Path, purge_step: int | None = None) -> None:
+        self._each: list[Logger] = [kind(folder, purge_step) for kind in kinds]
+
+    def __getattr__(self, name: str) -> Any:
+        if name not in vars(Logger):
+            raise AttributeError(name)
+
+        def each(*arguments: Any) -> None:
+            for logger in self._each:
+                getattr(logger, name)(*arguments)
+
+        return each
+
+
+def library(name: str) -> Any:
+    """Return the module of the logger `name`. Raises ConfigError where it is not installed."""
+    try:
+        return import_module(name)
+    except ImportError:
+        raise ConfigError(f"logger={name} needs {name}: pip install {name}") from None
+
+
+def sweep_of(folder: Path) -> str | None:
+    """Return the name of the sweep that the run in `folder` is a job of, if it is one."""
+    parent = folder.resolve().parent
+    return parent.name if (parent / MULTIRUN).exists() else None
+
+
+def flatten(config: Mapping[str, Any], prefix: str = "") -> dict[str, float | str]:
+    """Return nested settings as dotted names with plain values: finite numbers stay, all else becomes text.
+
+    True, False and None become "true", "false" and "none": torch stores booleans as numbers and drops None.
+    TensorBoard cannot read numbers that are not finite.
+    """
+    flat: dict[str, float | str] = {}
+    for key, value in config.items():
+        name = f"{prefix}{key}"
+        if isinstance(value, Mapping):
+            flat.update(flatten(value, f"{name}."))
+        else:
+            flat[name] = _plain(value)
+    return flat
+
+
+def _plain(value: Any) -> float | str:
+    """Return one setting as a number or as text."""
+    if value is None or isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, int | float) and math.isfinite(value):
+        return value
+    return str(value)

@@ -34,6 +34,7 @@ from tensorboard.compat.proto.summary_pb2 import (
 )
 from torch.utils.tensorboard import FileWriter, summary
 
+from cartpole_rl.reporting.loggers import flatten
 from cartpole_rl.reporting.style import png
 
 BINS = 40
@@ -184,31 +185,6 @@ def described(points: Summary, data_class: int) -> Summary:
         value.metadata.data_class = data_class
         value.metadata.plugin_data.plugin_name = PLUGINS[data_class]
     return points
-
-
-def flatten(config: Mapping[str, Any], prefix: str = "") -> dict[str, float | str]:
-    """Return nested settings as dotted names with plain values: finite numbers stay, all else becomes text.
-
-    True, False and None become "true", "false" and "none": torch stores booleans as numbers and drops None.
-    TensorBoard cannot read numbers that are not finite.
-    """
-    flat: dict[str, float | str] = {}
-    for key, value in config.items():
-        name = f"{prefix}{key}"
-        if isinstance(value, Mapping):
-            flat.update(flatten(value, f"{name}."))
-        else:
-            flat[name] = _plain(value)
-    return flat
-
-
-def _plain(value: Any) -> float | str:
-    """Return one setting as a number or as text."""
-    if value is None or isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, int | float) and math.isfinite(value):
-        return value
-    return str(value)
 
 
 def description(tag: str) -> str:

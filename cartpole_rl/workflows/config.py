@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from cartpole_rl.agents.settings import AgentSettings
 from cartpole_rl.checking import kinds, validated
@@ -87,6 +87,10 @@ class OnCart(Settings):
         return self
 
 
+def _as_list(given: Any) -> Any:
+    return [given] if isinstance(given, str) else given
+
+
 class TrainConfig(RunSettings, CartPoleSettings):
     """The settings of cartpole-train."""
 
@@ -97,7 +101,9 @@ class TrainConfig(RunSettings, CartPoleSettings):
     learning: LearningSettings
     compile: bool
     device: Literal["cpu", "cuda", "auto"] = "cpu"  # missing in checkpoints of earlier versions
-    logger: Annotated[Extension, LOGGERS] = LOGGERS.find("tensorboard")  # missing there too
+    logger: Annotated[tuple[Annotated[Extension, LOGGERS], ...], BeforeValidator(_as_list)] = (
+        LOGGERS.find("tensorboard"),  # missing there too, or one name
+    )
     preview: bool = False  # missing there too
     resume: str | None
 
@@ -330,16 +336,11 @@ class IdentifyConfig(RunSettings, CartSettings, OnCart):
 class ModelConfig(RunSettings, CartSettings):
     """The settings of cartpole-model."""
 
-    source: Annotated[tuple[Path, ...], Field(alias="from", min_length=1)]
+    source: Annotated[tuple[Path, ...], Field(alias="from", min_length=1), BeforeValidator(_as_list)]
     pole: PoleSettings | None = None
     actuator: Annotated[Law, ACTUATORS]
     windows: Annotated[int, Field(ge=10, le=10_000)]
     ensemble: EnsembleSettings
-
-    @field_validator("source", mode="before")
-    @classmethod
-    def _source_is_a_list(cls, source: Any) -> Any:
-        return [source] if isinstance(source, str) else source
 
 
 class ReportConfig(Settings):

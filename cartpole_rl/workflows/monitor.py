@@ -15,7 +15,7 @@ from cartpole_rl.learning.dqn import Monitor, Scalars, Training
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.reporting.animation import gif
 from cartpole_rl.reporting.episodes import behaviour
-from cartpole_rl.reporting.loggers import Logger
+from cartpole_rl.reporting.loggers import Loggers
 from cartpole_rl.run_folder import BEST, CHECKPOINTS, HISTORY, LAST
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.terminal import print_message, progress_bar
@@ -38,7 +38,7 @@ class TrainingMonitor(Monitor):
         self.folder, self.config = folder, config
         self._settings = config.model_dump(mode="json")
         self._logged = resumed_at or 0
-        self._log: Logger = config.logger(folder, None if resumed_at is None else resumed_at + 1)
+        self._log = Loggers(config.logger, folder, None if resumed_at is None else resumed_at + 1)
         self._total = config.learning.at(config.control_period).collected_transitions
         self._bar = progress_bar(
             self._total, "transitions", initial=self._logged, unit_scale=True, mininterval=1.0

@@ -126,7 +126,7 @@ def test_it_is_trained_logged_and_driven(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
-        ({"logger": "own_agents:Searched"}, "logger=own_agents:Searched: .*it has no `scalars`"),
+        ({"logger": "own_agents:Searched"}, r"logger\.0=own_agents:Searched: .*it has no `scalars`"),
         ({"agent.kind": "own_agents:Lines"}, "agent.kind=own_agents:Lines: .*it has no `greedy_policy`"),
         ({"agent.network": "own_agents:deep"}, "agent.network=own_agents:deep: .*has no 'deep'"),
         ({"agent.kind": "ppo"}, "agent.kind=ppo: .*give 'dqn', or your own as module:name$"),

@@ -1,0 +1,102 @@
+"""Curves and pictures of a run in MLflow: in `runs/mlflow.db`, or wherever `MLFLOW_TRACKING_URI` says.
+
+`MLFLOW_EXPERIMENT_NAME` names the experiment. The jobs of a sweep have its name as the tag `sweep`. A resumed
+run goes on in the same run of MLflow; points after its checkpoint then stand twice.
+"""
+
+import logging
+import os
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+from numpy.typing import ArrayLike
+
+from cartpole_rl.errors import ConfigError
+from cartpole_rl.reporting.loggers import flatten, library, sweep_of
+from cartpole_rl.terminal import print_message
+
+STORE, PICTURES, EXPERIMENT = "runs/mlflow.db", "runs/mlflow", "cartpole_rl"
+IDENTITY = "mlflow_run.txt"  # in the run folder: the run of MLflow
+PATIENCE = {"MLFLOW_HTTP_REQUEST_MAX_RETRIES": "1", "MLFLOW_HTTP_REQUEST_TIMEOUT": "10"}  # else minutes
+MOST = 100  # parameters that MLflow takes at once
+
+
+class MlflowLog:
+    """A run of MLflow; its methods are those of `loggers.Logger`.
+
+    Raises ConfigError where the server does not answer.
+    """
+
+    def __init__(self, folder: Path, purge_step: int | None = None) -> None:
+        for name, number in PATIENCE.items():
+            os.environ.setdefault(name, number)
+        self._mlflow = library("mlflow")
+        logging.getLogger("mlflow").setLevel(logging.WARNING)  # not how it makes its tables
+        store, pictures = os.environ.get("MLFLOW_TRACKING_URI"), None
+        if store is None:
+            Path(STORE).parent.mkdir(exist_ok=True)
+            store, pictures = f"sqlite:///{STORE}", Path(PICTURES).resolve().as_uri()
+        name = os.environ.get("MLFLOW_EXPERIMENT_NAME", EXPERIMENT)
+        self._client, self._lost, file = self._mlflow.MlflowClient(store), False, folder / IDENTITY
+        try:
+            if purge_step is not None and file.exists():
+                self._run = file.read_text()
+                self._client.update_run(self._run, status="RUNNING")
+                return
+            found = self._client.get_experiment_by_name(name)
+            experiment = found.experiment_id if found else self._client.create_experiment(name, pictures)
+            tags = {"sweep": sweep} if (sweep := sweep_of(folder)) else {}
+            created = self._client.create_run(experiment, run_name=folder.name, tags=tags)
+        except self._mlflow.MlflowException as error:
+            raise ConfigError(f"logger=mlflow, {store}: {str(error).splitlines()[0]}") from None
+        self._run = created.info.run_id
+        file.write_text(self._run)
+
+    def scalars(self, values: Mapping[str, float | None], step: int) -> None:
+        """Log one point of each curve; None is no point."""
+        now, metric = int(1e3 * time.time()), self._mlflow.entities.Metric
+        points = [metric(name, float(each), now, step) for name, each in values.items() if each is not None]
+        self._send(self._client.log_batch, metrics=points)
+
+    def histogram(self, name: str, values: ArrayLike, step: int) -> None:
+        """Do nothing: MLflow has no histograms."""
+
+    def figure(self, name: str, figure: Figure, step: int) -> None:
+        """Log a figure as a picture."""
+        self._send(self._client.log_figure, figure, f"{name}_{step}.png")
+
+    def animation(self, name: str, gif: bytes, step: int) -> None:
+        """Log an animation, the bytes of a GIF."""
+        place, _, file = name.rpartition("/")
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / f"{file}_{step}.gif"
+            path.write_bytes(gif)
+            self._send(self._client.log_artifact, str(path), place or None)
+
+    def hparams(self, config: Mapping[str, Any], metrics: Mapping[str, float | None]) -> None:
+        """Log the settings, with dotted names, and the final metrics as `summary/...`."""
+        param = self._mlflow.entities.Param
+        settings = [param(name, str(each)) for name, each in flatten(config).items()]
+        for first in range(0, len(settings), MOST):
+            self._send(self._client.log_batch, params=settings[first : first + MOST])
+        self.scalars({f"summary/{name}": each for name, each in metrics.items()}, 0)
+
+    def flush(self) -> None:
+        """Do nothing: MLflow writes at once."""
+
+    def close(self) -> None:
+        """End the run."""
+        self._send(self._client.set_terminated)
+
+    def _send(self, method: Callable[..., object], *arguments: Any, **named: Any) -> None:
+        """Call a method of the client for this run; a lost server is warned of once, and ends no training."""
+        try:
+            method(self._run, *arguments, **named)
+        except (self._mlflow.MlflowException, OSError) as error:
+            if not self._lost:
+                print_message("train", f"warning: logger=mlflow misses points: {str(error).splitlines()[0]}")
+            self._lost = True

@@ -1,0 +1,126 @@
+"""A training logs to several places at once; Weights & Biases and MLflow are read back from their files."""
+
+import json
+import struct
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from command_line import in_process
+from toy_settings import TOY
+
+from cartpole_rl.errors import ConfigError
+from cartpole_rl.reporting.loggers import LOGGERS
+from cartpole_rl.reporting.tensorboard import scalars
+from cartpole_rl.workflows.config import TrainConfig, load_settings
+from cartpole_rl.workflows.train import train
+
+SHORT = {**TOY[TrainConfig], "task.time_limit": 50}
+
+
+def trained(folder: Path, *loggers: str, **changes: Any) -> list[dict[str, Any]]:
+    """Train shortly; return the evaluations."""
+    train(load_settings(TrainConfig, {**SHORT, "logger": [*loggers], **changes}), folder)
+    return [json.loads(line) for line in (folder / "history.jsonl").read_text().splitlines()]
+
+
+def points(evaluations: list[dict[str, Any]]) -> list[tuple[int, float]]:
+    return [(each["transitions"], pytest.approx(each["score"], rel=1e-6)) for each in evaluations]
+
+
+@pytest.fixture(autouse=True)
+def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("MLFLOW_TRACKING_URI", "MLFLOW_EXPERIMENT_NAME", "WANDB_PROJECT", "WANDB_MODE"):
+        monkeypatch.delenv(name, raising=False)
+
+
+def test_mlflow_stands_beside_tensorboard_and_groups_a_sweep(tmp_path: Path) -> None:
+    mlflow = pytest.importorskip("mlflow", reason="it is an extra")
+    (tmp_path / "multirun.yaml").write_text("{}")
+    run = tmp_path / "first"
+    evaluations = trained(run, "tensorboard", "mlflow", **{"learning.evaluations": 3})
+    assert scalars(run, "evaluation/score") == points(evaluations)
+    client = mlflow.MlflowClient("sqlite:///runs/mlflow.db")
+    identity = (run / "mlflow_run.txt").read_text()
+    logged = client.get_run(identity)
+    assert logged.info.status == "FINISHED"
+    assert (logged.info.run_name, logged.data.tags["sweep"]) == ("first", tmp_path.name)
+    assert logged.data.params["learning.batch_size"] == str(SHORT["learning.batch_size"])
+    history = client.get_metric_history(identity, "evaluation/score")
+    assert [(each.step, each.value) for each in history] == points(evaluations)
+    pictures = {each.path for each in client.list_artifacts(identity, "pictures")}
+    assert any(path.endswith(".png") for path in pictures)
+    assert any(path.endswith(".gif") for path in pictures)
+    again = LOGGERS.find("mlflow")(run, 1)  # as a resumed run
+    again.scalars({"later": 1.0, "nothing": None}, 5000)
+    again.close()
+    assert client.get_run(identity).data.metrics["later"] == 1.0
+
+
+def test_a_lost_server_of_mlflow_ends_no_training(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mlflow = pytest.importorskip("mlflow", reason="it is an extra")
+    log = LOGGERS.find("mlflow")(tmp_path)
+
+    def lost(*_: object, **__: object) -> None:
+        raise mlflow.MlflowException("no answer")
+
+    monkeypatch.setattr(log._client, "log_batch", lost)
+    log.scalars({"score": 1.0}, 1)
+    log.scalars({"score": 2.0}, 2)
+    assert capsys.readouterr().err.count("warning: logger=mlflow misses points: no answer") == 1
+
+
+def stored(data: bytes) -> Iterator[bytes]:
+    """The records of wandb's file: a header of 7 bytes, then LevelDB's log, in blocks of 32 KiB."""
+    block, head, place, parts = 2**15, struct.Struct("<IHB"), 7, b""
+    while place + head.size <= len(data):
+        if (left := block - place % block) < head.size:
+            place += left
+            continue
+        _, length, kind = head.unpack_from(data, place)
+        place += head.size + length
+        parts += data[place - length : place]
+        if kind in (1, 4):  # the whole record, or its last part
+            yield parts
+            parts = b""
+
+
+def test_wandb_is_written_offline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("wandb", reason="it is an extra")
+    from wandb.proto.wandb_internal_pb2 import Record
+
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    run = tmp_path / "first"
+    evaluations = trained(run, "wandb", **{"learning.evaluations": 3})
+    (file,) = run.glob("wandb/offline-run-*/*.wandb")
+    assert file.stem == f"run-{(run / 'wandb_run.txt').read_text()}"
+    logged, settings = [], {}
+    for data in stored(file.read_bytes()):
+        record = Record.FromString(data)
+        items = {item.key or "/".join(item.nested_key): item.value_json for item in record.history.item}
+        logged.append({name: json.loads(value) for name, value in items.items()})
+        for item in (*record.config.update, *record.run.config.update):
+            settings[item.key or ".".join(item.nested_key)] = json.loads(item.value_json)
+    scored = [each for each in logged if "evaluation/score" in each]
+    assert [(each["transitions"], each["evaluation/score"]) for each in scored] == points(evaluations)
+    assert "video-file" in [each.get("pictures/cart/_type") for each in logged]
+    assert settings["learning.batch_size"] == SHORT["learning.batch_size"]
+
+
+@pytest.mark.parametrize("name", ["wandb", "mlflow"])
+def test_a_missing_library_is_one_line(name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(ConfigError, match=f"logger={name} needs {name}: pip install {name}"):
+        LOGGERS.find(name)(tmp_path)
+
+
+def test_several_are_a_list(tmp_path: Path) -> None:
+    assert load_settings(TrainConfig, {"logger": "tensorboard"}).logger == ("tensorboard",)
+    assert load_settings(TrainConfig, {"logger": []}).logger == ()
+    done = in_process("train", "logger=[tensorboard,wanb]", folder=tmp_path)
+    assert "give 'tensorboard', 'wandb', 'mlflow', or" in done.complaint
