@@ -131,7 +131,6 @@ VERBS: dict[str, Verb] = {
         "identification",
         (
             "from=logs/ layout=sensorsini_2022",
-            "from=log.csv layout=sensorsini_2020 layout.angle.upright=3120",
             "from=log.csv layout.time.name=t layout.angle.unit=deg layout.motor.full=255",
             "from=runs/export/2026-11-21_12-00-00/episode_000.mcap",
         ),
@@ -174,7 +173,6 @@ VERBS: dict[str, Verb] = {
         "  format=mcap       recordings as files that Foxglove opens",
         "exporting",
         (
-            "run=runs/train/2026-11-21_12-00-00 format=weights",
             "run=pretrained/medium format=web",
             "format=firmware cart=ip02",
             "format=mcap from=runs/record/2026-11-21_12-00-00",

@@ -59,7 +59,7 @@ def read_mcap(path: Path) -> tuple[Recording, Any]:
     rows: dict[int, dict[str, str]] = {}
     try:
         with path.open("rb") as file:
-            reader = make_reader(file)
+            reader = make_reader(file, validate_crcs=True)
             known = {each.name: each.metadata for each in reader.iter_metadata()}
             settings = json.loads(known.get(SETTINGS, {}).get(SETTINGS, "null"))
             for _, _, message in reader.iter_messages(topics=[*TOPICS]):

@@ -66,7 +66,7 @@ def write_recordings(config: ExportConfig, folder: Path) -> None:
     if data is None:
         for each in loaded:
             write_mcap(folder / f"{each.name}.mcap", each, settings)
-        print(f"{shown(folder)}/ has {len(loaded)} files of MCAP, which Foxglove opens")
+        print(f"{shown(folder)}/ has {count_text(len(loaded), 'MCAP file')} for Foxglove")
         return
     name = DATASET.format(re.sub(r"\W+", "_", config.label) or "recordings")
     place = folder / name / "data"

@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
-from short_episode import EPISODE
+from short_episode import EPISODE, FULL
 
 from cartpole_rl.errors import RecordingError
 from cartpole_rl.evaluation.mcap_files import read_mcap, write_mcap
@@ -38,6 +38,15 @@ def test_any_reader_finds_json_messages_with_a_schema(file: Path) -> None:
         for name, value in json.loads(message.data).items():
             assert isinstance(value, {"number": float, "integer": int}[properties[name]["type"]])
     assert json.loads(messages[2][2].data)["x_m"] == 0.1
+
+
+def test_all_that_a_recording_holds_comes_back(tmp_path: Path) -> None:
+    write_recording(tmp_path / "one.csv", FULL, {"pole": "", "cart": '{"latency": 0.1}'})
+    write_mcap(tmp_path / "one.mcap", load_recording(tmp_path / "one.csv"), None)
+    (name, episode, facts), _ = read_mcap(tmp_path / "one.mcap")
+    write_recording(tmp_path / "again.csv", episode, facts)
+    assert name == "one"
+    assert (tmp_path / "again.csv").read_bytes() == (tmp_path / "one.csv").read_bytes()
 
 
 def test_no_part_of_a_file_is_taken_for_the_whole(file: Path) -> None:

@@ -6,13 +6,13 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
-from short_episode import EPISODE
+from short_episode import EPISODE, FULL
 
 from cartpole_rl.envs.build import shipped_settings
 from cartpole_rl.envs.settings import CartPoleSettings
 from cartpole_rl.errors import ConfigError, RecordingError
 from cartpole_rl.evaluation.minari_data import MinariData, read_minari
-from cartpole_rl.evaluation.recordings import Recording
+from cartpole_rl.evaluation.recordings import Recording, load_recording, write_recording
 from cartpole_rl.tasks.episode import Episode
 
 minari = pytest.importorskip("minari", reason='minari is missing: pip install "cartpole_rl[minari]"')
@@ -75,6 +75,15 @@ def test_observations_are_those_that_the_environment_gave(root: Path, settings: 
     written(root, driven, settings)
     (episode,) = minari.load_dataset(NAME).iterate_episodes()
     np.testing.assert_allclose(episode.observations, seen, atol=1e-6)
+
+
+def test_all_that_a_recording_holds_comes_back(tmp_path: Path) -> None:
+    write_recording(tmp_path / "one.csv", FULL, {"pole": "", "cart": '{"latency": 0.1}'})
+    MinariData([load_recording(tmp_path / "one.csv")], None).write(tmp_path / "data", NAME)
+    [(name, episode, facts)], _ = read_minari(tmp_path / "data")
+    write_recording(tmp_path / "again.csv", episode, facts)
+    assert name == "one"
+    assert (tmp_path / "again.csv").read_bytes() == (tmp_path / "one.csv").read_bytes()
 
 
 def test_motor_values_of_no_action_are_a_box(root: Path, settings: CartPoleSettings) -> None:
