@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from cartpole_rl.envs.settings import CartPoleSettings
-from cartpole_rl.errors import RecordingError
+from cartpole_rl.errors import RecordingError, reason_of
 from cartpole_rl.evaluation.recordings import (
     COLUMNS,
     COUNTS,
@@ -66,7 +66,7 @@ def read_mcap(path: Path) -> tuple[Recording, Any]:
                 row = rows.setdefault(message.sequence, dict.fromkeys((*COLUMNS, GUARDED), ""))
                 row.update((name, str(value)) for name, value in json.loads(message.data).items())
     except Exception as error:  # a damaged file raises errors of many kinds
-        raise RecordingError(f"{path} cannot be read as MCAP: {error or type(error).__name__}") from None
+        raise RecordingError(f"{path} cannot be read as MCAP: {reason_of(error)}") from None
     if HEADING not in known:
         raise RecordingError(f"{path} holds no recording; give a file of cartpole-export format=mcap")
     episode = episode_of(path, known[HEADING], [rows[row] for row in sorted(rows)])

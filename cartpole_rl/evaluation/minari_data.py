@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from cartpole_rl.envs.build import make_env, shipped_settings
 from cartpole_rl.envs.gymnasium import OF_TASK, TAKEN, float32
 from cartpole_rl.envs.settings import CartPoleSettings
-from cartpole_rl.errors import RecordingError
+from cartpole_rl.errors import RecordingError, reason_of
 from cartpole_rl.evaluation.recordings import (
     GUARDED,
     METRES,
@@ -130,16 +130,16 @@ def read_minari(folder: Path) -> tuple[list[Recording], Any]:
         data = MinariDataset(folder)
         settings = json.loads(data.storage.metadata.get(SETTINGS, "null"))
         about = [*data.storage.get_episode_metadata(range(data.total_episodes))]
+        names = [Path(str(each.get(NAME))).name for each in about]
         infos = [episode.infos for episode in data.iterate_episodes()]
         headings = [json.loads(each.get(HEADING, "{}")) for each in about]
         tables = [rows(each) if facts else [] for each, facts in zip(infos, headings, strict=True)]
     except Exception as error:  # a damaged data set raises errors of many kinds
-        raise RecordingError(f"{folder} cannot be read by Minari: {error or type(error).__name__}") from None
+        raise RecordingError(f"{folder} cannot be read by Minari: {reason_of(error)}") from None
     if not all(headings):
         raise RecordingError(
             f"{folder} holds no recordings; give a data set of cartpole-export format=minari"
         )
-    names = [Path(str(each[NAME])).name for each in about]
     parts = zip(names, headings, tables, strict=True)
     return [Recording(name, episode_of(folder / name, *each), each[0]) for name, *each in parts], settings
 
