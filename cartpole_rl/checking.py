@@ -20,7 +20,7 @@ NEAR_VALUE = 0.6  # similarity from which a value is suggested
 SAME_GROUP = 0.15  # added to the similarity within one group
 EXAMPLES = {  # of required settings
     "run": "run=runs/train/<run> or run=pretrained/medium",
-    "format": "format=weights, onnx, c, web, or firmware",
+    "format": "format=weights, onnx, c, web, firmware, minari or mcap",
     "from": "from=<file or folder>",
     "plant.port": "plant.port=/dev/ttyUSB0 (cartpole-find-port lists the ports) or plant.port=auto",
     "plant.model": "plant.model=runs/model/<run>",

@@ -126,14 +126,15 @@ VERBS: dict[str, Verb] = {
         "identification.settings:ImportConfig",
         "workflows.import_logs:import_logs",
         "makes recordings of anyone's logs, and says what is doubtful about them.\n"
-        "A layout names the columns, their units and their signs.",
+        "A layout names the columns, their units and their signs.\n"
+        "Recordings that cartpole-export wrote come back as they were.",
         "identification",
         (
             "from=logs/ layout=sensorsini_2022",
-            "from=log.csv layout=sensorsini_2020 layout.angle.upright=3120",
             "from=log.csv layout.time.name=t layout.angle.unit=deg layout.motor.full=255",
+            "from=runs/export/2026-11-21_12-00-00/episode_000.mcap",
         ),
-        "identification.settings:log_files",
+        "workflows.checks:check_import",
     ),
     "replay": Verb(
         "workflows.config:ReplayConfig",
@@ -162,17 +163,19 @@ VERBS: dict[str, Verb] = {
     "export": Verb(
         "workflows.config:ExportConfig",
         "workflows.export:export",
-        "writes a trained agent for other programs, or a cart for its firmware.\n"
+        "writes a trained agent or recordings for other programs, or a cart for its firmware.\n"
         "  format=weights    agent.npz: the weights and all that a program needs to drive a cart with them\n"
         "  format=onnx       agent.onnx, for an ONNX runtime\n"
         "  format=c          policy.h and policy.c, for a microcontroller\n"
         "  format=web        cart.html, a page where the agent drives a cart that you push\n"
-        "  format=firmware   cart_rig.h, the numbers of cart=, which its firmware is built with",
+        "  format=firmware   cart_rig.h, the numbers of cart=, which its firmware is built with\n"
+        "  format=minari     recordings as a data set of Minari, for offline reinforcement learning\n"
+        "  format=mcap       recordings as files that Foxglove opens",
         "exporting",
         (
-            "run=runs/train/2026-11-21_12-00-00 format=weights",
             "run=pretrained/medium format=web",
             "format=firmware cart=ip02",
+            "format=mcap from=runs/record/2026-11-21_12-00-00",
         ),
         "workflows.checks:check_export",
     ),

@@ -13,6 +13,11 @@ class CartPoleError(Exception):
         return _rebuild, (type(self), self.args), vars(self)
 
 
+def reason_of(error: Exception) -> str:
+    """Return the first line of an error of a library, or its name where it has no text."""
+    return [*str(error).splitlines(), type(error).__name__][0]
+
+
 def _rebuild(kind: type[CartPoleError], arguments: tuple[Any, ...]) -> CartPoleError:
     error = kind.__new__(kind, *arguments)
     error.args = arguments

@@ -55,7 +55,7 @@ USES = {  # command: how its runs can be used
     "identify": "cartpole-train takes its files: cart={1} pole={2} randomization={3}",
     "report": f"it is a page to read: {{0}}/{PAGE}",
     "model": "cartpole-train, cartpole-evaluate and cartpole-record take it as plant=learned plant.model={0}",
-    "export": "its files are for other programs; cartpole-export run=... makes new ones",
+    "export": "its files are for other programs; cartpole-import from={0} takes recordings back",
 }
 RECORDING = ("record", "identify", "finetune", "import")  # commands whose runs hold recordings
 PACKAGES = ("cartpole_rl", "torch", "torchrl", "tensordict", "numpy", "hydra-core", "mujoco", "pyserial")

@@ -8,7 +8,7 @@ simulated cart and its initial state are stored as in metrics.json.
 import csv
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -32,9 +32,18 @@ METRES, TURN = "cart_nanometres_per_count", "pole_counts_per_turn"  # in the hea
 BEFORE = "motor_before"  # in the heading of a part of a log: its motor values before the first row
 LENGTH = "pole_length_m"  # in the heading: twice pivot to centre of mass, empty if not known
 GUARDED = "guarded"  # 1 where the track guard replaced the agent's motor value; empty without a guard
-COLUMNS = (*STATE, *COUNTS, "motor", *STEP)  # that every recording has
+OF_STATE, OF_STEP = (*STATE, *COUNTS), ("motor", *STEP)
+COLUMNS = (*OF_STATE, *OF_STEP)  # that every recording has
 LARGEST = 1e6  # of any state, score or reward, in SI units
 KINDS = {float: "a number", int: "a whole number"}
+
+
+class Recording(NamedTuple):
+    """An episode under its name, with the whole heading of its file."""
+
+    name: str
+    episode: Episode
+    facts: Mapping[str, str]
 
 
 def write_recording(path: Path, episode: Episode, facts: Mapping[str, Any] | None = None) -> None:
@@ -47,17 +56,22 @@ def write_recording(path: Path, episode: Episode, facts: Mapping[str, Any] | Non
         heading = {**known, **(facts or {})}
         for key, value in heading.items():
             file.write(f"# {key}: {value}\n")
-        lines = csv.writer(file)
-        lines.writerow((*COLUMNS, GUARDED))
-        for row in range(episode.steps + 1):
-            state = [repr(float(getattr(episode, field)[row])) for field in STATE.values()]
-            counts = [int(count) for count in episode.counts[row]]
-            if row < episode.steps:
-                step = [repr(float(getattr(episode, field)[row])) for field in STEP.values()]
-                guarded = "" if episode.guarded is None else int(episode.guarded[row])
-                lines.writerow([*state, *counts, int(episode.motor[row]), *step, guarded])
-            else:
-                lines.writerow([*state, *counts, "", *[""] * len(STEP), ""])
+        lines = csv.DictWriter(file, (*COLUMNS, GUARDED))
+        lines.writeheader()
+        lines.writerows(rows_of(episode))
+
+
+def rows_of(episode: Episode) -> list[dict[str, float]]:
+    """Return the rows of a recording as numbers by column. The last one has only the state."""
+    rows: list[dict[str, float]] = []
+    for row, counts in enumerate(episode.counts.tolist()):
+        state = {name: float(getattr(episode, field)[row]) for name, field in STATE.items()}
+        rows.append({**state, **dict(zip(COUNTS, counts, strict=True))})
+    for row, motor in enumerate(episode.motor.tolist()):
+        step = {name: float(getattr(episode, field)[row]) for name, field in STEP.items()}
+        guarded = {} if episode.guarded is None else {GUARDED: int(episode.guarded[row])}
+        rows[row] |= {"motor": motor, **step, **guarded}
+    return rows
 
 
 def read_recording(path: Path) -> Episode:
@@ -68,7 +82,14 @@ def read_recording(path: Path) -> Episode:
     facts, text = read_heading(path)
     if facts.get("format") != FORMAT:
         raise RecordingError(f"{path} is not a recording: its first line is not '# format: {FORMAT}'")
-    rows = list(csv.DictReader(text))
+    return episode_of(path, facts, list(csv.DictReader(text)))
+
+
+def episode_of(path: Path, facts: Mapping[str, str], rows: Sequence[Mapping[str, str]]) -> Episode:
+    """Return the episode with the heading `facts` and `rows` of text cells; `path` is for messages.
+
+    Raises RecordingError for what no recording can hold.
+    """
     if missing := [name for name in COLUMNS if not rows or name not in rows[0]]:
         raise RecordingError(f"{path} lacks {', '.join(missing)}")
     if len(rows) < 2:
@@ -103,6 +124,15 @@ def read_recording(path: Path) -> Episode:
     )
 
 
+def pole_length(path: Path, facts: Mapping[str, str]) -> float | None:
+    """Return the pole's length (m) in a heading; None where it has none. Raises RecordingError."""
+    text = facts.get(LENGTH)
+    try:
+        return float(text) if text else None
+    except ValueError:
+        raise RecordingError(f"{path} is damaged: {LENGTH} is {text!r}, and not a number") from None
+
+
 def _motor_before(path: Path, text: str) -> tuple[int, ...]:
     """Return the motor values in a heading. Raises RecordingError for impossible ones."""
     try:
@@ -124,6 +154,11 @@ def _encoders(path: Path, facts: Mapping[str, str]) -> Encoders:
     except (ValueError, ConfigError) as error:
         wrong = str(error).removeprefix("cart.")
         raise RecordingError(f"{path} is damaged: in its heading, {wrong}") from None
+
+
+def load_recording(path: Path) -> Recording:
+    """Return the recording in a file. Raises RecordingError, as `read_recording`."""
+    return Recording(path.stem, read_recording(path), read_heading(path)[0])
 
 
 def read_heading(path: Path) -> tuple[dict[str, str], list[str]]:

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cartpole_rl.errors import RecordingError
+from cartpole_rl.errors import RecordingError, reason_of
 from cartpole_rl.identification.checks import shows_motion
 from cartpole_rl.identification.experiments import recording
 from cartpole_rl.identification.settings import Direction, Layout, TimeColumn
@@ -195,8 +195,7 @@ def array_columns(
     try:
         present = read(path)
     except Exception as error:  # the libraries have many for a damaged file
-        reason = [*str(error).splitlines(), type(error).__name__][0]
-        raise RecordingError(f"{path} cannot be read: {reason}") from None
+        raise RecordingError(f"{path} cannot be read: {reason_of(error)}") from None
     check_columns(path, wanted, [*present])
     columns = {}
     for name in wanted:

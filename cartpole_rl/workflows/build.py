@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+import yaml
 
 from cartpole_rl.agents.baseline import EnergyAndRegulator
 from cartpole_rl.agents.own import OwnPolicy
@@ -26,7 +27,15 @@ from cartpole_rl.plants.settings import PlantSettings
 from cartpole_rl.randomization.poles import Pole, PoleSettings, check_one_pole
 from cartpole_rl.rig.hardware import Hardware, hardware_of
 from cartpole_rl.rig.parameters import check_names
-from cartpole_rl.run_folder import BASELINE, CHECKPOINTS, find_agent, is_own_policy, recorded_provenance
+from cartpole_rl.run_folder import (
+    BASELINE,
+    CHECKPOINTS,
+    CONFIG,
+    find_agent,
+    is_own_policy,
+    program_of,
+    recorded_provenance,
+)
 from cartpole_rl.scheduling import taking_precedence
 from cartpole_rl.settings import evaluation_seed
 from cartpole_rl.tasks.settings import ActionSettings, Start
@@ -37,6 +46,7 @@ from cartpole_rl.workflows.poles import guard_holds, pole_text
 OF_BASELINE = {"observation": "raw", "observation.past_motors": 1}
 # settings that an evaluation may replace, beside the task
 REPLACEABLE = ("cart", "cart_friction", "pole_friction", "pole", "reward", "guard", "actions")
+RECORDED = "recorded"  # in config.yaml: the settings of an agent that was recorded
 OUTDATING = {"actions": "other full motor values", "pole": "another pole"}  # a guard's numbers, in words
 
 
@@ -177,6 +187,23 @@ def provenance_beside(agent: Path) -> dict[str, Any]:
     except ValueError:  # an infinite number
         return {}
     return recorded
+
+
+def recorded_cart(recordings: Sequence[Path]) -> CartPoleSettings | None:
+    """Return the settings of the agent that was recorded, from the run folder; None where it is unknown.
+
+    Raises CheckpointError for settings of another version.
+    """
+    folder = recordings[0].parent.parent
+    if program_of(folder) == "finetune":
+        training = trained_agent(folder).training
+        return CartPoleSettings(**{name: getattr(training, name) for name in CartPoleSettings.model_fields})
+    try:
+        recorded = yaml.safe_load((folder / CONFIG).read_text(encoding="utf-8")).get(RECORDED)
+    except (OSError, yaml.YAMLError, AttributeError):
+        return None
+    known = program_of(folder) in ("record", "import") and recorded
+    return recorded_settings(CartPoleSettings, recorded, f"from={folder}") if known else None
 
 
 def evaluated_settings(training: TrainConfig, config: EvaluateConfig) -> CartPoleSettings:

@@ -16,6 +16,7 @@ from cartpole_rl.checking import missing
 from cartpole_rl.choices import group_choices
 from cartpole_rl.envs.settings import shipped_carts
 from cartpole_rl.errors import CheckpointError, ConfigError
+from cartpole_rl.identification.settings import ImportConfig, log_files
 from cartpole_rl.randomization.poles import Pole, check_one_pole
 from cartpole_rl.randomization.ranges import check_carts
 from cartpole_rl.rig.hardware import hardware_of, parameters_of
@@ -56,6 +57,12 @@ LONGER = {  # command: how to train further than a run that has ended
 }
 
 
+NEEDED = {  # format: extra of this package, its packages
+    "onnx": ("export", ("onnx", "onnxscript")),
+    "minari": ("minari", ("minari", "h5py")),
+    "mcap": ("mcap", ("mcap",)),
+}
+MINARI_FILE = "main_data.hdf5"
 TAKEN_BY_REPEAT = ("run", "repeat.run", "repeat.episode", "label", "view")
 
 
@@ -131,11 +138,42 @@ def check_distillation(config: DistillConfig) -> None:
 
 
 def check_export(config: ExportConfig) -> None:
-    """Raise CartPoleError if there is no agent, or what writes the format is not installed."""
+    """Raise CartPoleError if there is nothing to export, or what writes the format is not installed."""
     if config.run is not None:
         check_agent(config.run)
-    if config.format == "onnx" and (find_spec("onnx") is None or find_spec("onnxscript") is None):
-        raise ConfigError('format=onnx needs onnx and onnxscript: pip install "cartpole_rl[export]"')
+    if config.source is not None:
+        recordings(config.source)
+    check_installed(f"format={config.format}", config.format)
+
+
+def check_import(config: ImportConfig, words: Sequence[str]) -> None:
+    """Raise CartPoleError if there is no log or recording, or what reads it is not installed."""
+    form, _ = exported_recordings(config.source)
+    if form is None:
+        log_files(config)
+        return
+    refuse_others(words, ("from", "label"), f"from={config.source}: a recording has its own layout and cart")
+    check_installed(f"from={config.source}", form)
+
+
+def check_installed(setting: str, form: str) -> None:
+    """Raise ConfigError if a package that `setting` needs for a format is not installed."""
+    extra, needed = NEEDED.get(form, ("", ()))
+    if any(find_spec(name) is None for name in needed):
+        raise ConfigError(f'{setting} needs {" and ".join(needed)}: pip install "cartpole_rl[{extra}]"')
+
+
+def exported_recordings(source: Path) -> tuple[str | None, list[Path]]:
+    """Return the format of what `source` holds of cartpole-export, None for logs, and its places.
+
+    `source` is a file, a folder of files, the folder of a data set of Minari or its name there.
+    """
+    own = Path(os.environ.get("MINARI_DATASETS_PATH") or Path.home() / ".minari/datasets") / source
+    for data in (source, source / "data", *source.glob("cartpole_rl/*/data"), own / "data"):
+        if (data / MINARI_FILE).is_file():
+            return "minari", [data]
+    files = [source] if source.suffix == ".mcap" and source.is_file() else sorted(source.glob("*.mcap"))
+    return ("mcap" if files else None), files
 
 
 def check_replay(config: ReplayConfig) -> None:

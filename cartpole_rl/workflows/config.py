@@ -366,15 +366,29 @@ class ReportConfig(Settings):
 
 
 class ExportConfig(Settings):
-    """The settings of cartpole-export: an agent, or with format=firmware a cart."""
+    """The settings of cartpole-export: an agent, with format=firmware a cart, or recordings."""
 
-    format: Literal["weights", "onnx", "c", "web", "firmware"]
+    format: Literal["weights", "onnx", "c", "web", "firmware", "minari", "mcap"]
     run: Path | None = None
+    source: Annotated[Path | None, Field(alias="from")] = None
     cart: dict[str, Finite] | None = None
     label: str
 
+    @property
+    def of_recordings(self) -> bool:
+        """True if recordings are exported."""
+        return self.format in ("minari", "mcap")
+
     @model_validator(mode="after")
-    def _an_agent_or_a_cart(self) -> Self:
+    def _an_agent_a_cart_or_recordings(self) -> Self:
+        if self.of_recordings:
+            if self.run is not None or self.cart is not None:
+                raise ValueError(f"format={self.format} writes recordings; leave out run and cart")
+            if self.source is None:
+                raise ValueError(f"from: format={self.format} needs from=<run folder of cartpole-record>")
+            return self
+        if self.source is not None:
+            raise ValueError("from: format=minari or format=mcap exports recordings; leave it out")
         if self.format == "firmware":
             if self.run is not None:
                 raise ValueError("run: format=firmware writes the numbers of a cart; leave it out")

@@ -1,4 +1,4 @@
-"""Make recordings of anyone's logs, and say what is doubtful about them.
+"""Make recordings of anyone's logs, or of exported recordings, and say what is doubtful about the logs.
 
 Motion tells much of what a layout can get wrong: signs, the scale and the zero of the angle, the scale of the
 position, and a motor value that was chosen a row earlier or later.
@@ -14,13 +14,17 @@ import numpy as np
 
 from cartpole_rl.choices import choice
 from cartpole_rl.errors import RecordingError
+from cartpole_rl.evaluation.mcap_files import read_mcap
+from cartpole_rl.evaluation.minari_data import read_minari
 from cartpole_rl.evaluation.recordings import LENGTH, write_recording
 from cartpole_rl.identification.logs import Log, Report, read_log
 from cartpole_rl.identification.sensors import Estimate, Motion, Sensors, question_sensors
 from cartpole_rl.identification.settings import ImportConfig, Layout, log_files
 from cartpole_rl.rig.hardware import nominal_hardware
 from cartpole_rl.run_folder import RECORDINGS, write_config, write_json
-from cartpole_rl.terminal import print_results, progress_bar, shown
+from cartpole_rl.terminal import as_word, print_results, progress_bar, shown
+from cartpole_rl.workflows.build import RECORDED
+from cartpole_rl.workflows.checks import exported_recordings
 
 IMPORTED = "import.json"
 CORRELATED = 0.2  # size of a correlation that has a sign
@@ -32,13 +36,19 @@ SATURATED = 0.5  # share of rows
 TURN = 2 * np.pi
 
 
-def import_logs(config: ImportConfig, folder: Path) -> Sensors:
+def import_logs(config: ImportConfig, folder: Path) -> Sensors | None:
     """Read the logs in `config.source` and write their parts as recordings.
+
+    What cartpole-export wrote comes back as it was, with nothing to estimate.
 
     Writes into `folder` config.yaml, provenance.json, recordings/ and import.json: the rows that were left
     out, and the estimates of the sensors. Prints them, and each doubt. Raises RecordingError for a log that
     cannot be read, or if nothing is left.
     """
+    form, places = exported_recordings(config.source)
+    if form is not None:
+        import_recordings(form, places, config, folder)
+        return None
     paths = log_files(config)
     logs = {}
     with progress_bar(len(paths), "logs") as bar:
@@ -81,6 +91,22 @@ def import_logs(config: ImportConfig, folder: Path) -> Sensors:
     write_json(folder / IMPORTED, summary(logs, sensors, found))
     print_summary(logs, parts, period, sensors, found, folder, config)
     return sensors
+
+
+def import_recordings(form: str, places: Sequence[Path], config: ImportConfig, folder: Path) -> None:
+    """Write the recordings in files of MCAP or a data set of Minari as they were before their export."""
+    if form == "mcap":
+        found = [*map(read_mcap, places)]
+        loaded, settings = [each for each, _ in found], found[0][1]
+        if any(other != settings for _, other in found):  # of several agents
+            settings = None
+    else:
+        loaded, settings = read_minari(places[0])
+    content = {**config.model_dump(mode="json", by_alias=True), "seed": 0}
+    write_config(folder, "import", {**content, **({RECORDED: settings} if settings else {})})
+    for each in loaded:
+        write_recording(folder / RECORDINGS / f"{each.name}.csv", each.episode, each.facts)
+    print_results(folder, f"{RECORDINGS}/", f"cartpole-replay {as_word('from', shown(folder))}")
 
 
 def doubts(reports: Sequence[Report], sensors: Sensors, period: float, layout: Layout) -> Iterator[str]:

@@ -10,7 +10,7 @@ from pydantic import Field, TypeAdapter
 
 from cartpole_rl.choices import choice, group_choices
 from cartpole_rl.emulator.settings import EmulatorSettings
-from cartpole_rl.errors import ConfigError, RecordingError
+from cartpole_rl.errors import ConfigError
 from cartpole_rl.plants.settings import PlantSettings, PortSettings, changed_words, emulated_pole
 from cartpole_rl.randomization.poles import HEAVIER, Pole, PoleSettings, check_one_pole, one_pole
 from cartpole_rl.run_folder import CONFIG
@@ -154,10 +154,6 @@ def recorded_pole(paths: Sequence[Path], own: Mapping[str, Pole] | None = None) 
 
 def recorded_length(path: Path) -> float | None:
     """Return the pole's length (m) in a recording's header; None where it has none. Raises RecordingError."""
-    from cartpole_rl.evaluation.recordings import LENGTH, read_heading  # imports PyTorch
+    from cartpole_rl.evaluation.recordings import pole_length, read_heading  # imports PyTorch
 
-    text = read_heading(path)[0].get(LENGTH)
-    try:
-        return float(text) if text else None
-    except ValueError:
-        raise RecordingError(f"{path} is damaged: {LENGTH} is {text!r}, and not a number") from None
+    return pole_length(path, read_heading(path)[0])

@@ -16,6 +16,7 @@ from cartpole_rl.reporting.texts import count_text, guard_text
 from cartpole_rl.run_folder import RECORDINGS, write_config
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.terminal import as_word, shown
+from cartpole_rl.workflows.build import RECORDED
 from cartpole_rl.workflows.checks import agent_file
 from cartpole_rl.workflows.config import EvaluateConfig, RecordConfig
 from cartpole_rl.workflows.episodes import Evaluation, prepared
@@ -35,7 +36,7 @@ def record(config: RecordConfig, folder: Path) -> None:
             evaluation.note_refitted_guard("record")
             evaluation.note_other_numbers("record")
             settings = agents_settings(evaluation).model_dump(mode="json")
-            content = {**evaluation.config.model_dump(mode="json"), "recorded": settings}
+            content = {**evaluation.config.model_dump(mode="json"), RECORDED: settings}
             write_config(folder, "record", content, agent=agent_file(evaluation.config.run))
             for episode in evaluation.episodes():
                 path = folder / RECORDINGS / f"episode_{len(episodes):03d}.csv"

@@ -4,14 +4,11 @@ The simulated cart is reset to the measured state every `restart` seconds: over 
 diverge.
 """
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
-from cartpole_rl.envs.settings import CartPoleSettings
 from cartpole_rl.evaluation.recordings import read_recording
 from cartpole_rl.identification.checks import check_same_encoders
 from cartpole_rl.identification.prediction import Replayed, all_errors, away_from_upright, errors_at, replay
@@ -23,11 +20,11 @@ from cartpole_rl.reporting.style import save
 from cartpole_rl.reporting.texts import count_text
 from cartpole_rl.reporting.web_view import WebView
 from cartpole_rl.rig.parameters import check_names, check_values
-from cartpole_rl.run_folder import CONFIG, FIGURES, program_of, recordings, write_config, write_json
+from cartpole_rl.run_folder import FIGURES, recordings, write_config, write_json
 from cartpole_rl.terminal import as_word, print_results, shown
-from cartpole_rl.workflows.build import trained_agent
+from cartpole_rl.workflows.build import recorded_cart
 from cartpole_rl.workflows.checks import note_other_numbers
-from cartpole_rl.workflows.config import ReplayConfig, TrainConfig, load_settings, recorded_settings
+from cartpole_rl.workflows.config import ReplayConfig, TrainConfig, load_settings
 from cartpole_rl.workflows.poles import chosen_pole
 
 REPLAY, FIGURE = "replay.json", f"{FIGURES}/replay.png"
@@ -43,7 +40,7 @@ def replay_recordings(config: ReplayConfig, folder: Path) -> None:
     """
     paths = recordings(config.source)
     episodes = [read_recording(path) for path in paths]
-    settings = recorded_cart(paths)
+    settings = recorded_cart(paths) or load_settings(TrainConfig)
     given = {name: value for name in GROUPS if (value := getattr(config, name)) is not None}
     settings = settings.model_copy(update=given)
     check_same_encoders(
@@ -100,20 +97,3 @@ def columns(path: Path, replayed: Replayed, track: float) -> dict[str, Any]:
         for name, values in series.items()
     }
     return {"name": path.stem, "track": track, "time": episode.time.tolist(), **rounded, **steps}
-
-
-def recorded_cart(paths: Sequence[Path]) -> CartPoleSettings:
-    """Return the settings of the agent that was recorded; those of conf/train.yaml where it is unknown.
-
-    Raises CheckpointError for settings of another version.
-    """
-    folder = paths[0].parent.parent
-    try:
-        recorded = yaml.safe_load((folder / CONFIG).read_text(encoding="utf-8")).get("recorded")
-    except (OSError, yaml.YAMLError, AttributeError):
-        recorded = None
-    if program_of(folder) == "record" and recorded:
-        return recorded_settings(CartPoleSettings, recorded, f"from={folder}")
-    if program_of(folder) == "finetune":
-        return trained_agent(folder).training
-    return load_settings(TrainConfig)

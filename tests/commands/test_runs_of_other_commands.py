@@ -39,6 +39,7 @@ SETTINGS = {  # words, with the folder at {0} and an agent at {1}: what is taken
     "record run={0}": (AGENTS, {}),
     "export format=weights run={0}": (AGENTS, {}),
     "distill run={0}": (AGENTS, {}),
+    "export format=mcap from={0}": (RECORDINGS, {}),
     "replay from={0}": (RECORDINGS, {}),
     "model from={0}": (RECORDINGS, {}),
     "identify from={0}": (RECORDINGS, {}),

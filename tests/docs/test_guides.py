@@ -40,6 +40,7 @@ BUDGETS = {  # of each command; what the page gives stays, except where it takes
     "model": MODELLING,
     "distill": [*DISTILLATION],
     "report": ["animations=false"],
+    "record": [],
     "export": [],
     "import": [],
     "preflight": [],
@@ -58,6 +59,8 @@ MAKERS = {  # the command that makes the first run of each kind, most of them fr
     "distill": "cartpole-distill run=runs/train/<run> hidden=[32,32]",
     "finetune": "cartpole-finetune run=runs/train/first episodes=3",  # interrupted, as a page resumes it
     "import": "cartpole-import from=logs/ layout=sensorsini_2022",
+    "record": "cartpole-record run=lqr episodes=2",
+    "export": "cartpole-export format=mcap from=runs/record/<run>",
     "evaluate": "cartpole-evaluate run=runs/train/first episodes=18",  # a page repeats episode 17
 }
 

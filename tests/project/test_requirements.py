@@ -11,6 +11,8 @@ import pytest
 
 REMEDIES = {
     "av": 'pip install "cartpole_rl[video]"',
+    "mcap": 'pip install "cartpole_rl[mcap]"',
+    "minari": 'pip install "cartpole_rl[minari]"',
     "mujoco": 'pip install "cartpole_rl[emulator]"',
     "onnxruntime": 'pip install "cartpole_rl[dev]"',
     "onnxscript": 'pip install "cartpole_rl[export]"',

@@ -1,7 +1,10 @@
-"""A recorded episode of two control periods."""
+"""A recorded episode of two control periods, and one with all that a recording can hold."""
+
+from dataclasses import replace
 
 import numpy as np
 
+from cartpole_rl.rig.hardware import Encoders
 from cartpole_rl.tasks.episode import Episode
 
 EPISODE = Episode(
@@ -16,4 +19,15 @@ EPISODE = Episode(
     score_upright=np.ones(2),
     reward=np.ones(2),
     ended_by="time",
+)
+FULL = replace(
+    EPISODE,
+    x_dot=np.array([-0.0, 5e-324, 0.1 + 0.2]),
+    counts=np.array([[-(2**31), 2**31 - 1], [0, 1], [2, 3]]),
+    reward=np.array([-1 / 3, 1e-17]),
+    ended_by="fault",
+    guarded=np.array([False, True]),
+    encoders=Encoders(85e-6, 4271),
+    motor_before=(7, -8),
+    left_out="a count jumped: the last 1 of 3 control periods do not count",
 )
