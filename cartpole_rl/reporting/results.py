@@ -6,6 +6,7 @@ A measure is a key of metrics.json; the number of an agent is its mean over the 
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol, get_args
 
@@ -70,6 +71,7 @@ class Agent:
     values: Mapping[str, float]
     curves: Mapping[str, Curve] = field(default_factory=dict)
     behaviour: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    folders: Mapping[str, str] = field(default_factory=dict)  # of evaluations that are elsewhere
 
 
 @dataclass(frozen=True)
@@ -109,7 +111,14 @@ class Results:
 
     def members(self, group: str) -> list[Agent]:
         """Return the agents of a group."""
-        return [agent for agent in self.agents if agent.group == group]
+        return self._members.get(group, [])
+
+    @cached_property
+    def _members(self) -> dict[str, list[Agent]]:
+        found: dict[str, list[Agent]] = {}
+        for agent in self.agents:
+            found.setdefault(agent.group, []).append(agent)
+        return found
 
     def estimates(self, evaluation: str) -> dict[str, Estimate]:
         """Return the interquartile mean of each group (by label) that has agents in an evaluation."""
@@ -118,6 +127,8 @@ class Results:
 
     def folder_of(self, agent: Agent, evaluation: str) -> Path:
         """Return the folder of an evaluation of an agent; that of its own run if it has no others."""
+        if evaluation in agent.folders:
+            return Path(agent.folders[evaluation])
         inner = Path(agent.run, EVALUATIONS, evaluation)
         return Path(agent.run) if evaluation == OWN.name and not inner.is_dir() else inner
 
