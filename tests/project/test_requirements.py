@@ -2,6 +2,7 @@
 
 import importlib
 import os
+import re
 import shutil
 import sys
 import sysconfig
@@ -13,11 +14,14 @@ REMEDIES = {
     "av": 'pip install "cartpole_rl[video]"',
     "mcap": 'pip install "cartpole_rl[mcap]"',
     "minari": 'pip install "cartpole_rl[minari]"',
+    "mlflow": 'pip install "cartpole_rl[mlflow]"',
     "mujoco": 'pip install "cartpole_rl[emulator]"',
     "onnxruntime": 'pip install "cartpole_rl[dev]"',
     "onnxscript": 'pip install "cartpole_rl[export]"',
     "psutil": 'pip install "cartpole_rl[dev]"',
+    "pyarrow": 'pip install "cartpole_rl[parquet]"',
     "sphinx": 'pip install "cartpole_rl[docs]"',
+    "wandb": 'pip install "cartpole_rl[wandb]"',
     "g++": "install a C++ compiler",
     "Python.h": "install Python's headers",
 }
@@ -64,3 +68,14 @@ def test_nothing_can_be_missing_in_ci(what: str, monkeypatch: pytest.MonkeyPatch
         monkeypatch.setenv("CI", outside)
         with pytest.raises(pytest.skip.Exception, match="install"):
             require(what)
+
+
+def test_the_stages_of_the_dockerfile_run_the_scripts_of_the_readme() -> None:
+    root = Path(__file__).parents[2]
+    text = (root / "Dockerfile").read_text()
+    assert re.findall(r'^CMD \["(.+)"\]$', text, re.M) == ["scripts/demo", "scripts/test"]
+    extras = re.findall(r"^RUN scripts/install --cpu (\S+)$", text, re.M)
+    assert [f"scripts/install {each}" for each in extras] == [
+        next(line for line in (root / script).read_text().splitlines() if line.startswith("scripts/install "))
+        for script in ("scripts/demo", "scripts/test")
+    ]
