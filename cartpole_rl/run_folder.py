@@ -29,6 +29,7 @@ METRICS = "metrics.json"  # of an evaluation
 HISTORY = "history.jsonl"  # of a training: a line for each evaluation
 COMPARISON = "comparison.json"  # of a fine-tuning: metrics before and after
 PAGE = "page.html"  # of an identification and of a report
+TABLE, EPISODES = "runs.csv", "episodes"  # of a report; the second one's suffix is its format
 IDENTIFIED, MODELLED = "identification.json", "model.json"  # results of these commands
 FIGURES, RECORDINGS = "figures", "recordings"
 ANIMATION, BESIDE_SIMULATION = "episode.gif", "beside_simulation.gif"  # of the first episode

@@ -2,11 +2,12 @@
 
 import json
 from collections import Counter
-from collections.abc import Collection, Hashable, Mapping, Sequence
+from collections.abc import Collection, Hashable, Iterator, Mapping, Sequence
 from functools import cache
 from typing import Any
 
 from cartpole_rl.choices import group_choices
+from cartpole_rl.reporting.runs import shared_settings
 
 MOST_NAMED = 8  # settings in a label
 DERIVED = ("guard.numbers", "agent.guard.numbers")  # fitted from other settings: the last to be named
@@ -17,23 +18,14 @@ Tree = Mapping[str, Any]
 Columns = dict[str, list[str]]  # setting: its value in every run
 
 
-def differing(settings: Sequence[Mapping[str, Hashable]]) -> list[str]:
-    """Return the dotted names whose values differ among runs, in the order of their first occurrence."""
-    names = dict.fromkeys(name for each in settings for name in each)
-    return [name for name in names if len({each.get(name) for each in settings}) > 1]
-
-
-def setting_columns(trees: Sequence[Tree], settings: Sequence[Mapping[str, Hashable]]) -> Columns:
+def setting_columns(trees: Sequence[Tree]) -> Columns:
     """Return the settings that differ among runs, each with its value in every run.
 
-    `settings` are those of `trees` by dotted name. A group of conf/ is named by its choice if all runs have
-    one: "randomization" with values like "wide".
+    A group of conf/ is named by its choice if all runs have one: "randomization" with values like "wide".
     """
     columns: Columns = {}
-    names = differing(settings)
-    for group in dict.fromkeys(map(_group, names)):
-        within = [name for name in names if _group(name) == group]
-        columns |= _columns_of(group, within, trees, settings)
+    for group in dict.fromkeys(group for tree in trees for group in _groups(tree)):
+        columns |= _columns_of(group, [_subtree(tree, group) for tree in trees])
     return columns
 
 
@@ -79,16 +71,40 @@ def _group(name: str) -> str:
     return ".".join(parts[:2] if parts[0] == "agent" and len(parts) > 2 else parts[:1])
 
 
-def _columns_of(
-    group: str, names: Sequence[str], trees: Sequence[Tree], settings: Sequence[Mapping[str, Hashable]]
-) -> dict[str, list[str]]:
-    """Return the columns of one group: its choices, or its settings."""
-    contents = [_subtree(tree, group) for tree in trees]
-    chosen = [_choice(group.rpartition(".")[2], content) for content in contents]
-    distinct = [json.dumps(content, sort_keys=True, default=str) for content in contents]
-    if all(chosen) and len({*zip(chosen, distinct, strict=True)}) == len({*chosen}):
-        return {group: [str(each) for each in chosen]}
-    return {name: _texts([each.get(name) for each in settings]) for name in names}
+def _groups(tree: Tree) -> Iterator[str]:
+    """Yield the groups of conf/ that a tree has settings of."""
+    for name, content in tree.items():
+        yield name
+        if name == "agent" and isinstance(content, Mapping):
+            yield from (f"{name}.{inner}" for inner in content if isinstance(content[inner], Mapping))
+
+
+def _columns_of(group: str, contents: Sequence[Any]) -> Columns:
+    """Return the columns of one group, of which runs have `contents`: its choices, or its settings.
+
+    Runs share what was read once: every object is looked at once.
+    """
+    distinct = {id(content): content for content in contents}
+    if len(distinct) == 1:
+        return {}
+    settings = {key: _settings_of(group, content) for key, content in distinct.items()}
+    every = dict.fromkeys(name for each in settings.values() for name in each)
+    names = [name for name in every if len({each.get(name) for each in settings.values()}) > 1]
+    chosen = {key: _choice(group.rpartition(".")[2], content) for key, content in distinct.items()}
+    texts = {key: json.dumps(content, sort_keys=True, default=str) for key, content in distinct.items()}
+    if (
+        names
+        and all(chosen.values())
+        and len({(chosen[key], texts[key]) for key in distinct}) == len({*chosen.values()})
+    ):
+        return {group: [str(chosen[id(content)]) for content in contents]}
+    return {name: _texts([settings[id(content)].get(name) for content in contents]) for name in names}
+
+
+def _settings_of(group: str, content: Any) -> dict[str, Hashable]:
+    """Return the settings by dotted name of a group, without those of the groups within."""
+    tree = {group: content} if content is not None else {}
+    return {name: value for name, value in shared_settings(tree).items() if _group(name) == group}
 
 
 def _subtree(tree: Tree, group: str) -> Any:

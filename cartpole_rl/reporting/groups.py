@@ -32,6 +32,10 @@ WIDTH, HEIGHT = 4.6, 2.9  # inch, of a figure and of a panel of curves
 LINE = 0.21  # inch, of a row of dots and of a label
 MOST_LINES = 8  # in a figure of curves
 MOST_ROWS = 40  # groups in a figure of dots
+MOST_GREY = 40  # grey lines in a figure of curves
+MOST_DOTS = 200  # in a row
+MOST_CURVES = 30  # thin lines of a group
+MIDDLE = (10, 90)  # percentiles of the band that stands for more curves
 PROFILE_POINTS = 101
 FEWEST_PROFILED = 3  # agents
 DOT, MEAN = 4.0, 7.0  # points
@@ -83,6 +87,8 @@ def dots(results: Results) -> Drawing:
     figure = dot_rows(shown, label, {f"good: {good:g}": good} if good and guided else None)
     better = " Lower is better." if low_is_good(measure) else ""
     alt = described(shown, label, partial(value_text, measure=measure), results.unit)
+    fullest = max(values.size for group in shown.values() for values in group.values())
+    note += f" A row has at most {MOST_DOTS} dots, evenly chosen by rank." if fullest > MOST_DOTS else ""
     return Drawing("agents", figure, alt, f"{key(results.unit)}{better}{note}")
 
 
@@ -137,7 +143,24 @@ def _grey(colours: Mapping[str, str], what: str = "lines") -> str:
     """Return a note about set-ups that are too many to be told apart by colours."""
     if len(colours) <= MOST_LINES:
         return ""
-    return f" The set-ups with the highest and the lowest mean are coloured; the grey {what} are the others."
+    others = (
+        "the others" if len(colours) <= MOST_GREY else f"at most {MOST_GREY} of the {len(colours) - 2} others"
+    )
+    return f" The set-ups with the highest and the lowest mean are coloured; the grey {what} are {others}."
+
+
+def _drawn(labels: Sequence[str], colours: Mapping[str, str]) -> list[str]:
+    """Return the labels whose lines are drawn: those with a colour, and MOST_GREY of the others."""
+    grey = [label for label in labels if colours[label] == MUTED]
+    kept = {*_evenly(grey, MOST_GREY)}
+    return [label for label in labels if colours[label] != MUTED or label in kept]
+
+
+def _evenly(items: Sequence[Content], most: int) -> list[Content]:
+    """Return at most `most` items, evenly chosen, the first and the last among them."""
+    if len(items) <= most:
+        return [*items]
+    return [items[place] for place in np.linspace(0, len(items) - 1, most).round().astype(int)]
 
 
 def profiles(results: Results) -> Iterator[Drawing]:
@@ -147,10 +170,11 @@ def profiles(results: Results) -> Iterator[Drawing]:
     colours, label, unit = group_colours(results), measure_label(results.measure), results.unit
     for last in results.judged:
         groups = _in_evaluation(results, last)
-        names = [label for label in ranked(groups) if groups[label][""].size >= FEWEST_PROFILED]
+        named = [label for label in ranked(groups) if groups[label][""].size >= FEWEST_PROFILED]
+        names = {*_drawn(named, colours)}
         if not names:
             continue
-        chosen = {name: series[""] for name, series in groups.items() if name in names}
+        chosen = {name: groups[name][""] for name in groups if name in names}
         medians = "; ".join(
             f"{name}: half of the {unit}s above {np.median(each):.4g}" for name, each in chosen.items()
         )
@@ -171,20 +195,28 @@ def trainings(results: Results) -> Iterator[Drawing]:
             group.label: [agent.curves[name] for agent in results.members(group.name) if name in agent.curves]
             for group in results.groups
         }
-        groups = {label: curves for label, curves in found.items() if curves}
+        colours = group_colours(results)
+        drawn = _drawn([label for label, curves in found.items() if curves], colours)
+        groups = {label: found[label] for label in drawn}
         ends = "; ".join(
             f"{label}: median {np.median([curve[-1][1] for curve in curves]):.3g} at the end"
             for label, curves in groups.items()
         )
         what = name if name == LOSS else f"{measure_label(name)} of an evaluation"
-        colours = group_colours(results)
         axis = training_axis([max(curve[-1][0] for curve in curves) for curves in groups.values()])
         yield Drawing(
             f"training_{name}",
             training_curves(groups, what, colours),
             f"{sentence_start(what)} over the {axis}. {ends}.",
-            f"Training: {what}. Thin lines: agents. Thick line: their median.{_grey(colours, 'medians')}",
+            f"Training: {what}. {_spread_key(groups)} Thick line: their median.{_grey(colours, 'medians')}",
         )
+
+
+def _spread_key(groups: Mapping[str, Sequence[Curve]]) -> str:
+    """Return what shows the agents of a group beside their median."""
+    lines = "Thin lines: agents."
+    crowded = any(len(curves) > MOST_CURVES for curves in groups.values())
+    return f"{lines} Of more than {MOST_CURVES}, a band: their middle 80 %." if crowded else lines
 
 
 def cut(label: str) -> str:
@@ -262,8 +294,9 @@ def _draw_row(axes: Axes, height: float, values: Array, colour: str) -> None:
     if not values.size:
         _row_text(axes, 0.01, height, "no agent", color=MUTED, style="italic")
         return
-    places = height - 0.2 + JITTER * (np.arange(values.size) % 3 - 1)
-    axes.plot(values, places, "o", color=colour, alpha=0.5, markersize=DOT, markeredgewidth=0)
+    dots = values if values.size <= MOST_DOTS else np.array(_evenly(sorted(values), MOST_DOTS))
+    places = height - 0.2 + JITTER * (np.arange(dots.size) % 3 - 1)
+    axes.plot(dots, places, "o", color=colour, alpha=0.5, markersize=DOT, markeredgewidth=0)
     found, middle = estimate(values), height + 0.2
     if found.low is not None and found.high is not None:
         ends = [found.low, found.high]
@@ -305,26 +338,36 @@ def profile_curves(
 def training_curves(groups: Mapping[str, Sequence[Curve]], name: str, colours: Mapping[str, str]) -> Figure:
     """Draw a curve of each agent over its training as a thin line, and a group's median as a thick one.
 
-    Groups whose colour is grey have a thin median alone. Where trainings differ in length by more than
-    UNEQUAL, the axis is the share of the training.
+    A group of more than MOST_CURVES has a band instead of the thin lines. Groups whose colour is grey have a
+    thin median alone. Where trainings differ in length by more than UNEQUAL, the axis is the share of the
+    training.
     """
     named = _named(groups, colours)
     figure, axes = panel(named)
     lengths = {label: max(curve[-1][0] for curve in curves) for label, curves in groups.items()}
     share = max(lengths.values()) > UNEQUAL * min(lengths.values())
     for label, curves in _grey_first(groups, colours):
-        colour, scale = colours[label], lengths[label] if share else 1e6
-        points = [np.array(curve, dtype=float).T for curve in curves]
-        for transitions, values in points if label in named else ():
-            axes.plot(transitions / scale, values, color=colour, alpha=0.45, linewidth=0.8)
-        shared = points[0][0][points[0][0] <= min(each[0][-1] for each in points)]
-        median = np.median([np.interp(shared, *each) for each in points], axis=0)
-        axes.plot(shared / scale, median, color=colour, linewidth=2.2 if label in named else 0.8)
+        scale = lengths[label] if share else 1e6
+        points = [np.array(curve).T / np.array([[scale], [1.0]]) for curve in curves]
+        _draw_curves(axes, points, colours[label], label in named)
     axes.set_xlim(left=0)
     axes.set_ylim(bottom=min(0.0, axes.dataLim.y0))
     axes.xaxis.set_major_locator(MaxNLocator(nbins=6))
     finish(axes, named, x=training_axis([*lengths.values()]), y=name)
     return figure
+
+
+def _draw_curves(axes: Axes, curves: Sequence[Array], colour: str, named: bool) -> None:
+    """Draw the curves [2, points] of one group and their median; of a group that is not named the median."""
+    shared = curves[0][0][curves[0][0] <= min(each[0][-1] for each in curves)]
+    values = np.array([np.interp(shared, *each) for each in curves])
+    if named and len(curves) > MOST_CURVES:
+        low, high = np.percentile(values, MIDDLE, axis=0)
+        axes.fill_between(shared, low, high, color=colour, alpha=0.2, linewidth=0)
+    elif named:
+        for places, own in curves:
+            axes.plot(places, own, color=colour, alpha=0.45, linewidth=0.8)
+    axes.plot(shared, np.median(values, axis=0), color=colour, linewidth=2.2 if named else 0.8)
 
 
 def training_axis(lengths: Sequence[float]) -> str:

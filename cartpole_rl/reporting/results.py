@@ -6,6 +6,7 @@ A measure is a key of metrics.json; the number of an agent is its mean over the 
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol, get_args
 
@@ -109,7 +110,14 @@ class Results:
 
     def members(self, group: str) -> list[Agent]:
         """Return the agents of a group."""
-        return [agent for agent in self.agents if agent.group == group]
+        return self._members.get(group, [])
+
+    @cached_property
+    def _members(self) -> dict[str, list[Agent]]:
+        found: dict[str, list[Agent]] = {}
+        for agent in self.agents:
+            found.setdefault(agent.group, []).append(agent)
+        return found
 
     def estimates(self, evaluation: str) -> dict[str, Estimate]:
         """Return the interquartile mean of each group (by label) that has agents in an evaluation."""

@@ -2,11 +2,12 @@
 
 import json
 import os
+import re
 from collections import Counter
 from collections.abc import Hashable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +50,7 @@ DAMAGE = (  # what reading a damaged file raises
     RecursionError,
     yaml.YAMLError,
 )
+BLOCK = re.compile("^(?=[A-Za-z_])", re.M)  # the start of a setting that is no part of another one
 LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # ten times faster, where it was compiled
 
 
@@ -59,9 +61,10 @@ class Run:
     folder: Path
     program: str = ""  # the command, without its prefix
     config: Mapping[str, Any] = field(default_factory=dict)
-    results: Mapping[str, Any] = field(default_factory=dict)
+    results: Mapping[str, Any] = field(default_factory=dict)  # without its episodes
     provenance: Mapping[str, Any] = field(default_factory=dict)
     problem: str = ""
+    episodes: int = 0  # in its results
 
     @cached_property
     def settings(self) -> dict[str, Hashable]:
@@ -122,7 +125,8 @@ def read_run(folder: Path) -> Run:
     except DAMAGE as error:
         return Run(folder, problem=f"damaged: {short(error)}")
     try:
-        run = replace(run, results=_results(folder, run.program))
+        results = _results(folder, run.program)
+        run = replace(run, episodes=len(_episodes(results)), results=_without_episodes(results))
         return replace(run, problem=_interruption(run) or _outdated(run))
     except FileNotFoundError as error:
         missing = f"unfinished: it has no {Path(error.filename).name}{_end_of_log(folder)}"
@@ -133,7 +137,7 @@ def read_run(folder: Path) -> Run:
 
 def _started(folder: Path) -> Run:
     """Return the run in `folder` without its results. Raises one of DAMAGE."""
-    config = yaml.load((folder / CONFIG).read_text(encoding="utf-8"), LOADER)
+    config = _settings((folder / CONFIG).read_text(encoding="utf-8"))
     provenance = json.loads((folder / PROVENANCE).read_text(encoding="utf-8"))
     if not isinstance(config, dict):
         raise TypeError(f"{CONFIG} holds no settings")
@@ -142,8 +146,30 @@ def _started(folder: Path) -> Run:
     run = Run(folder, str(provenance["program"]).removeprefix(PREFIX), config, provenance=provenance)
     if "seed" in config and run.seed is None and config["seed"] is not None:
         raise TypeError(f"seed in {CONFIG} is no number")
-    _ = run.settings, run.versions, run.commit  # they raise here, not while runs are compared
+    _ = run.versions, run.commit  # they raise here, not while runs are compared
     return run
+
+
+def _settings(text: str) -> Any:
+    """Return the settings in the text of a YAML file; those that many runs share are read once.
+
+    They are the same objects in all of these runs.
+    """
+    try:
+        blocks = [_block(block) for block in BLOCK.split(text) if block]
+    except yaml.YAMLError:
+        blocks = [None]
+    if all(isinstance(block, dict) for block in blocks):
+        return {name: value for block in blocks for name, value in block.items()}
+    return _block(text)  # a file that was written by hand
+
+
+@lru_cache(maxsize=8192)
+def _block(text: str) -> Any:
+    content = yaml.load(text, LOADER)
+    if isinstance(content, dict):
+        flattened(content)  # it raises here, not while runs are compared
+    return content
 
 
 def _failure(folder: Path) -> str:
@@ -202,8 +228,8 @@ def _interruption(run: Run) -> str:
     if run.program not in EPISODIC:
         return ""
     repeated = (run.config.get("repeat") or {}).get("run")
-    done, asked = len(_episodes(run.results)), 1 if repeated else run.config.get("episodes")
-    return f"interrupted: {done} of {asked} episodes" if done != asked else ""
+    asked = 1 if repeated else run.config.get("episodes")
+    return f"interrupted: {run.episodes} of {asked} episodes" if run.episodes != asked else ""
 
 
 def _episodes(results: Mapping[str, Any]) -> list[Any]:
@@ -212,6 +238,10 @@ def _episodes(results: Mapping[str, Any]) -> list[Any]:
     if not isinstance(episodes, list):
         raise TypeError("its episodes are no list")
     return episodes
+
+
+def _without_episodes(results: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: content for name, content in results.items() if name != "episodes"}
 
 
 def measured(results: Mapping[str, Any], measure: str) -> float | None:
@@ -232,7 +262,7 @@ def _at(results: Mapping[str, Any], measure: str) -> Any:
 def partly_measured_note(runs: Iterable[Run], measure: str) -> str:
     """Return a sentence about means over fewer episodes than the runs have; empty if there is none."""
     counts = [
-        (found["count"], len(_episodes(run.results)))
+        (found["count"], run.episodes)
         for run in runs
         if isinstance(found := _at(run.results, measure), Mapping) and is_number(found.get("count"))
     ]

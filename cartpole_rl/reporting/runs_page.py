@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from PIL import Image
 
@@ -30,7 +30,7 @@ from cartpole_rl.reporting.runs import short
 from cartpole_rl.reporting.statistics import difference, estimate, probability_of_improvement
 from cartpole_rl.reporting.style import svg
 from cartpole_rl.reporting.texts import count_text, number_text
-from cartpole_rl.run_folder import ANIMATION, FIGURES
+from cartpole_rl.run_folder import ANIMATION, FIGURES, TABLE
 
 BUDGET = 12_000_000  # bytes of all pictures; a page takes a third more
 SIZES = ((320, 3), (240, 4), (200, 6))  # width in pixels, frames per kept one: the first that fits is taken
@@ -38,6 +38,7 @@ TYPICAL = (110_000, 65_000, 40_000)  # bytes of an animation of 10 s in these si
 FIGURE_WIDTH, FIGURE_QUALITY = 900, 70
 MOST_FIGURES = 6  # of a run
 MOST_LISTED = 1000  # runs in the list of a set
+MOST_TABLED = 200  # groups in a table
 MOST_ROWS = 24  # of a table that is shown unfolded
 MOST_EXCLUSIONS = 40  # runs named one by one
 OF_RUNS = ("The runs are of ", ": each agent has its own ")  # in notes that stand with the list of runs
@@ -49,6 +50,8 @@ METHOD = (
     "about 94 of 100 such intervals cover the true value, with three only 73. Runs that are unfinished, "
     "damaged, or of other versions or settings than the rest are named and do not count."
 )
+Item = TypeVar("Item")
+
 STYLE = """
 svg * { stroke-linejoin: round; stroke-linecap: butt; }
 svg { width: 100%; height: auto; font-family: inherit; }
@@ -177,8 +180,10 @@ def comparison(first: Results, second: Results, between: Mapping[str, Sequence[s
             f"chance that {names[1]} is higher": estimate_text(probability_of_improvement(others, ours)),
             "agents": f"{ours.size} and {others.size}",
         }
-        for label, ours in values[0].items()
-        if (others := values[1].get(label)) is not None
+        for label, ours in ends(
+            {label: own for label, own in values[0].items() if label in values[1]}.items()
+        )
+        for others in [values[1][label]]
     ]
     lone = [
         f"{label} is only in {name}."
@@ -212,6 +217,7 @@ def figure_parts(
         return
     for name, rows in {"values": _value_rows(results), **(more or {})}.items():
         yield folded(rows, name)
+    yield left_out(len(results.groups))
     yield f'<div class="figures">{"".join(drawn(each, results.name) for each in figures)}</div>'
     animations = [each for each in pictures if each.kind == "gif"]
     others = [each for each in pictures if each.kind != "gif"]
@@ -226,7 +232,7 @@ def figure_parts(
 def _value_rows(results: Results) -> list[dict[str, Any]]:
     """Return a row for each group and evaluation that has agents."""
     measure, several, rows = results.measure, len(results.evaluations) > 1, []
-    for group in results.groups:
+    for group in ends(results.groups):
         for evaluation in results.evaluations:
             values = results.values(group.name, evaluation.name)
             if not values.size:
@@ -242,6 +248,18 @@ def _value_rows(results: Results) -> list[dict[str, Any]]:
                 row[f"above {good:g}"] = f"{(values > good).sum()} of {values.size}"
             rows.append({**row, f"{results.unit}s": values.size})
     return rows
+
+
+def ends(items: Iterable[Item]) -> list[Item]:
+    """Return at most MOST_TABLED of the items: the first and the last ones."""
+    every = [*items]
+    return every if len(every) <= MOST_TABLED else every[: MOST_TABLED // 2] + every[-MOST_TABLED // 2 :]
+
+
+def left_out(groups: int) -> str:
+    """Return a sentence about the groups that `ends` leaves out of a table; empty if there are none."""
+    more = groups - MOST_TABLED
+    return f"<p>{more} groups between them are left out; {TABLE} has every run.</p>" if more > 0 else ""
 
 
 def folded(rows: Sequence[Mapping[str, Any]], name: str) -> str:
@@ -289,7 +307,7 @@ def run_list(results: Results) -> str:
     made = "".join(f"<p>{escaped(line)}</p>" for line in (results.versions, *notes) if line)
     count = len(results.agents)
     heading = f"The {count} runs behind it" if count > 1 else "The run behind it"
-    heading += f": the first {MOST_LISTED}" if count > MOST_LISTED else ""
+    heading += f": the first {MOST_LISTED}; {TABLE} has all" if count > MOST_LISTED else ""
     return f"<details><summary>{heading}</summary>{made}{wide(rows)}</details>"
 
 

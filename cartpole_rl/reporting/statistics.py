@@ -24,7 +24,7 @@ from cartpole_rl.intervals import CONFIDENCE
 RESAMPLES = 5000
 TRIMMED = 0.25  # share of the values cut off at each end
 EDGES = (50 * (1 - CONFIDENCE), 50 * (1 + CONFIDENCE))  # percent
-CHUNKS = 20  # of the samples of pairs, so that their ranks need little memory
+MOST_RESAMPLED = 2_000_000  # values that are drawn at once
 
 Array = NDArray[np.float64]
 Statistic = Callable[..., Array]  # of arrays [..., n], reduced over the last axis
@@ -49,14 +49,18 @@ def bootstrap(statistic: Statistic, *groups: ArrayLike, agents: int | None = Non
     value, generator = float(statistic(*arrays)), np.random.default_rng(0)
     if count < 2:
         return Estimate(value, None, None, count)
-    samples = statistic(*(_resampled(each, generator) for each in arrays))
+    chunks = -(-RESAMPLES * sum(each.size for each in arrays) // MOST_RESAMPLED)
+    sizes = np.diff(np.linspace(0, RESAMPLES, chunks + 1, dtype=int))
+    samples = np.concatenate(
+        [statistic(*(_resampled(each, generator, size) for each in arrays)) for size in sizes]
+    )
     low, high = np.nanpercentile(samples, EDGES)
     return Estimate(value, float(low), float(high), count)
 
 
-def _resampled(values: Array, generator: np.random.Generator) -> Array:
-    """Return bootstrap samples [RESAMPLES, n] of `values` [n]."""
-    return values[generator.integers(values.size, size=(RESAMPLES, values.size))]
+def _resampled(values: Array, generator: np.random.Generator, samples: int) -> Array:
+    """Return bootstrap samples [samples, n] of `values` [n]."""
+    return values[generator.integers(values.size, size=(samples, values.size))]
 
 
 def interquartile_mean(values: ArrayLike) -> Array:
@@ -88,14 +92,7 @@ def difference(values: ArrayLike, others: ArrayLike) -> Estimate:
 
 def probability_of_improvement(values: ArrayLike, others: ArrayLike) -> Estimate:
     """Return the probability that an agent of `values` [n] scores more than one of `others` [m]."""
-
-    def share(*samples: Array) -> Array:
-        if samples[0].ndim == 1:
-            return _share_above(*samples)
-        chunks = (np.array_split(each, CHUNKS) for each in samples)
-        return np.concatenate([_share_above(*chunk) for chunk in zip(*chunks, strict=True)])
-
-    return bootstrap(share, values, others)
+    return bootstrap(_share_above, values, others)
 
 
 def _share_above(values: Array, others: Array) -> Array:
@@ -110,12 +107,11 @@ def _share_above(values: Array, others: Array) -> Array:
 
 
 def performance_profile(values: ArrayLike, scores: ArrayLike) -> tuple[Array, Array, Array]:
-    """Return the share of `values` [n] above each of `scores` [S], and its pointwise 95 % interval."""
-    data, thresholds = np.asarray(values, dtype=float), np.asarray(scores, dtype=float)
+    """Return the share of `values` [n] above each of `scores` [S], and its pointwise 95 % interval.
 
-    def above(sample: Array) -> Array:
-        ordered = np.sort(sample, axis=-1)
-        return np.stack([(ordered > threshold).mean(axis=-1) for threshold in thresholds], axis=-1)
-
-    low, high = np.percentile(above(_resampled(data, np.random.default_rng(0))), EDGES, axis=0)
-    return above(data), low, high
+    The interval is that of the bootstrap: a resampled share is binomial.
+    """
+    ordered = np.sort(np.asarray(values, dtype=float))
+    share = 1 - np.searchsorted(ordered, np.asarray(scores, dtype=float), side="right") / ordered.size
+    low, high = (stats.binom.ppf(edge / 100, ordered.size, share) / ordered.size for edge in EDGES)
+    return share, low, high

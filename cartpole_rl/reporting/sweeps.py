@@ -5,7 +5,7 @@ import io
 import os
 import re
 from collections import Counter
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from glob import glob
@@ -25,7 +25,6 @@ from cartpole_rl.reporting.runs import (
     partly_measured_note,
     read_run,
     run_of,
-    shared_settings,
     short,
 )
 from cartpole_rl.reporting.scores import SCORES
@@ -35,7 +34,7 @@ from cartpole_rl.run_folder import BASELINE, PREFIX
 MOST_MEASURES = 20  # in a message
 MOST_UNSORTED = 12  # groups that are shown in the order of their runs
 AGENT = "agent"  # prefix of the settings of the agent that a run evaluates
-MOST_LACKING = 12  # groups that lack seeds and are named one by one
+MOST_LACKING = 12  # groups that lack seeds, and seeds, that are named one by one
 OVERRIDE = re.compile(r"\+{0,2}([a-z_][\w.]*)=")  # on a command line
 
 
@@ -50,7 +49,6 @@ class Member:
     run: Run
     agent: Run | None
     tree: Mapping[str, Any]
-    settings: Mapping[str, Hashable]
     seeds: tuple[int, ...]
 
     @property
@@ -152,7 +150,7 @@ def grouped(sweeps: Sequence[Sweep]) -> tuple[list[Sweep], Columns]:
     The latter map a setting to its value in each sweep, where it has only one.
     """
     members = [member for sweep in sweeps for member in sweep.members]
-    columns = setting_columns([each.tree for each in members], [each.settings for each in members])
+    columns = setting_columns([each.tree for each in members])
     chosen = {name for member in members for name in _chosen(member.run)}
     bounds = _bounds(sweeps)
     inner = [
@@ -318,7 +316,7 @@ def _member(run: Run, agents: dict[Path, Run]) -> Member:
     elif run.agent:
         tree[AGENT] = {"source": run.agent}
     seeds = tuple(each.seed or 0 for each in chain or [run])
-    return Member(run, chain[0] if chain else None, tree, shared_settings(tree), seeds)
+    return Member(run, chain[0] if chain else None, tree, seeds)
 
 
 def _chain(run: Run, agents: dict[Path, Run]) -> list[Run]:
@@ -366,13 +364,16 @@ def _unequal_seeds(sweep: Sweep) -> list[str]:
     for member, label in zip(sweep.members, sweep.labels, strict=True):
         seeds.setdefault(label, set()).add(member.seed)
     everything = set().union(*seeds.values())
-    lacking = [
-        f"{label} lacks seed {', '.join(map(str, sorted(everything - own)))}"
-        for label, own in seeds.items()
-        if own != everything
-    ]
+    lacking = [label for label, own in seeds.items() if own != everything]
+    named = [f"{label} lacks {_seeds(everything - seeds[label])}" for label in lacking[:MOST_LACKING]]
     more = len(lacking) - MOST_LACKING
-    return lacking if more <= 0 else [*lacking[:MOST_LACKING], f"{more} more groups lack seeds"]
+    return named if more <= 0 else [*named, f"{more} more groups lack seeds"]
+
+
+def _seeds(seeds: set[int]) -> str:
+    if len(seeds) > MOST_LACKING:
+        return f"{len(seeds)} seeds"
+    return f"seed {', '.join(map(str, sorted(seeds)))}"
 
 
 def _untraced(sweep: Sweep) -> list[str]:

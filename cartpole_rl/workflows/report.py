@@ -10,11 +10,9 @@ from cartpole_rl.reporting.runs_page import Gallery, Picture, runs_page
 from cartpole_rl.reporting.style import save
 from cartpole_rl.reporting.sweeps import grouped, read_sweeps, results_of, table
 from cartpole_rl.reporting.texts import count_text
-from cartpole_rl.run_folder import FIGURES, PAGE, write_config
+from cartpole_rl.run_folder import FIGURES, PAGE, TABLE, write_config
 from cartpole_rl.terminal import print_message
 from cartpole_rl.workflows.config import ReportConfig
-
-TABLE = "runs.csv"
 
 
 def make_report(config: ReportConfig, folder: Path) -> None:

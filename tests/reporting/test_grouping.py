@@ -4,11 +4,10 @@ from typing import Any
 
 from cartpole_rl.choices import choice
 from cartpole_rl.reporting.grouping import ALL, fewest, labels, setting_columns
-from cartpole_rl.reporting.runs import flattened
 
 
 def columns(*trees: dict[str, Any]) -> dict[str, list[str]]:
-    return setting_columns(trees, [flattened(tree) for tree in trees])
+    return setting_columns(trees)
 
 
 def test_settings_that_differ_are_named() -> None:

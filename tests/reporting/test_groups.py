@@ -10,6 +10,7 @@ from cartpole_rl.reporting.groups import (
     training_curves,
 )
 from cartpole_rl.reporting.results import Agent, Group, Results
+from cartpole_rl.reporting.runs_page import figure_parts
 
 AGENTS = np.array([400.0, 450.0, 490.0])
 
@@ -30,14 +31,39 @@ def test_trainings_of_other_lengths_are_drawn_over_their_share() -> None:
         assert axes.dataLim.x1 == pytest.approx(1.0 if end == 4e6 else 0.3)
 
 
-def test_of_many_groups_none_is_hidden_and_two_are_coloured() -> None:
-    groups = [Group(f"a{number}", f"arm {number}") for number in range(12)]
+def results_of(count: int) -> Results:
+    """Groups of three agents each, the last one highest."""
+    groups = [Group(f"a{number}", f"arm {number}") for number in range(count)]
     agents = [
         Agent(group.name, seed, "run", {"own": 100.0 * number})
         for number, group in enumerate(groups)
         for seed in range(3)
     ]
-    dots, profile = drawings(Results("one", "One", "score", groups, tuple(agents)))
+    return Results("one", "One", "score", groups, tuple(agents))
+
+
+def test_of_very_many_groups_some_are_shown_and_the_page_says_so() -> None:
+    results = results_of(300)
+    dots, profile = drawings(results)
+    assert "Of 300 groups the 20 highest and the 20 lowest are drawn" in dots.caption
+    assert "at most 40 of the 298 others" in profile.caption
+    assert sum(len(line.get_xdata()) > 1 for line in profile.figure.axes[0].lines) == 42
+    page = "".join(figure_parts(results, (), ()))
+    assert "<p>100 groups between them are left out; runs.csv has every run.</p>" in page
+    assert page.count("<tr>") == 1 + 200
+    assert "left out" not in "".join(figure_parts(results_of(200), (), ()))
+
+
+def test_few_agents_are_lines_and_many_a_band() -> None:
+    curves = [[(1e5, float(seed)), (2e5, 2.0 * seed)] for seed in range(31)]
+    for count, lines, bands in ((3, 3 + 1, 0), (31, 1, 1)):
+        axes = training_curves({"one": curves[:count]}, "score", palette(["one"])).axes[0]
+        assert (len(axes.lines), len(axes.collections)) == (lines, bands)
+    assert axes.lines[0].get_ydata().tolist() == [15.0, 30.0]  # the median
+
+
+def test_of_many_groups_none_is_hidden_and_two_are_coloured() -> None:
+    dots, profile = drawings(results_of(12))
     for drawing in (dots, profile):
         assert all(f"arm {number}: " in drawing.alt for number in range(12))
     (legend,) = profile.figure.legends

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
 from cartpole_rl.reporting.runs import (
     Run,
@@ -41,6 +42,30 @@ def test_damage_is_the_problem_of_its_run(name: str, text: str, problem: str, st
     assert read_run(folder).problem == ""
     (folder / name).write_text(text)
     assert read_run(folder).problem.startswith(problem)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "a: 1\nb:\n- 2\n- c: 3\n",
+        "# a comment\na: 1\n",
+        "a: &one [1]\nb: *one\n",
+        "a: {x: 1,\n y: 2}\n\nb: |\n  c: 3\n",
+        "a: 'x\n\n  b: 3'\nc: 4\n",
+        "a: 1\na: 2\n",
+        '"a": 1\nb: 2\n',
+    ],
+)
+def test_settings_are_those_of_the_whole_file(text: str, study: Path) -> None:
+    folder = study / "much/11/evaluations/heavy"
+    (folder / "config.yaml").write_text(text)
+    assert read_run(folder).config == yaml.safe_load(text)
+
+
+def test_runs_share_the_settings_that_are_the_same(study: Path) -> None:
+    first, second = (read_run(study / f"much/{seed}/evaluations/heavy") for seed in (10, 11))
+    assert first.config["seed"] != second.config["seed"]
+    assert first.config["emulator"] is second.config["emulator"]
 
 
 def test_a_run_that_was_resumed_with_other_versions_has_both(study: Path, edit: Edit) -> None:
@@ -129,7 +154,7 @@ def test_failed_jobs_and_links_are_found(tmp_path: Path) -> None:
 
 def test_a_mean_over_a_part_of_the_episodes_is_noted() -> None:
     def run(count: int) -> Run:
-        return Run(Path("x"), results={"time": {"mean": 1.0, "count": count}, "episodes": [0, 0, 0]})
+        return Run(Path("x"), results={"time": {"mean": 1.0, "count": count}}, episodes=3)
 
     assert partly_measured_note([run(3)], "time") == ""
     assert partly_measured_note([run(3), run(1), run(2)], "time") == (
