@@ -241,7 +241,11 @@ def _episodes(results: Mapping[str, Any]) -> list[Any]:
 
 
 def _without_episodes(results: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: content for name, content in results.items() if name != "episodes"}
+    return {
+        name: _without_episodes(content) if isinstance(content, dict) else content
+        for name, content in results.items()
+        if name != "episodes"
+    }
 
 
 def measured(results: Mapping[str, Any], measure: str) -> float | None:

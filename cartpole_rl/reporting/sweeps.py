@@ -1,7 +1,5 @@
 """Reads any set of runs, groups them by the settings that differ, and compares two sets."""
 
-import csv
-import io
 import os
 import re
 from collections import Counter
@@ -193,7 +191,7 @@ def _chosen(run: Run) -> Iterator[str]:
 
 def results_of(sweep: Sweep, measure: str) -> Results:
     """Return the results of a sweep by group, many of them highest first."""
-    kept, repeated = _without_repetitions(sweep)
+    kept, repeated = without_repetitions(sweep)
     members: dict[str, list[Member]] = {}
     for member, label in kept:
         members.setdefault(label, []).append(member)
@@ -237,7 +235,7 @@ def results_of(sweep: Sweep, measure: str) -> Results:
     )
 
 
-def _without_repetitions(sweep: Sweep) -> tuple[list[tuple[Member, str]], list[Exclusion]]:
+def without_repetitions(sweep: Sweep) -> tuple[list[tuple[Member, str]], list[Exclusion]]:
     """Return the members with their labels without second runs of the same seed, and those runs."""
     kept: dict[tuple[str, tuple[int, ...]], tuple[Member, str]] = {}
     repeated = []
@@ -263,31 +261,6 @@ def _curves(member: Member, measure: str) -> tuple[dict[str, Curve], str]:
     except (OSError, ValueError) as error:
         return {}, f"The learning curve of {folder.as_posix()} is not drawn: {short(error)}."
     return ({name: tuple(curve)} if len(curve) > 1 else {}), ""
-
-
-def table(sweeps: Sequence[Sweep]) -> str:
-    """Return all runs as CSV: their group, differing settings and mean metrics, or why one is left out."""
-    rows: list[dict[str, Any]] = []
-    for sweep in sweeps:
-        repeated = {each.run: each.reason for each in _without_repetitions(sweep)[1]}
-        for number, (member, label) in enumerate(zip(sweep.members, sweep.labels, strict=True)):
-            chosen = {f"setting:{name}": values[number] for name, values in sweep.columns.items()}
-            head = {
-                "set": sweep.name,
-                "run": member.run.folder.as_posix(),
-                "command": member.run.program,
-                "group": label,
-                "seed": member.seed,
-                "left_out": repeated.get(member.run.folder.as_posix(), ""),
-            }
-            rows.append({**head, **chosen, **_means(member.run.results)})
-        rows += [{"set": sweep.name, "run": each.run, "left_out": each.reason} for each in sweep.exclusions]
-    names = dict.fromkeys(name for row in rows for name in row)
-    text = io.StringIO()
-    writer = csv.DictWriter(text, [*names], restval="", lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue()
 
 
 def _found(name: str, source: str) -> list[Path]:
@@ -380,15 +353,6 @@ def _untraced(sweep: Sweep) -> list[str]:
     """Return a note on agents whose own runs are not there."""
     named = {member.run.agent for member in sweep.members if member.agent is None} - {"", str(BASELINE)}
     return [f"The runs of {len(named)} agents were not found and are not checked."] if named else []
-
-
-def _means(results: Mapping[str, Any]) -> dict[str, float]:
-    """Return every number among the results, the mean where a metric has one."""
-    return {
-        name: value
-        for name in results
-        if name != "episodes" and (value := measured(results, name)) is not None
-    }
 
 
 def _check_measure(sweeps: Sequence[Sweep], measure: str) -> None:

@@ -351,9 +351,10 @@ class ReportConfig(Settings):
     measure: Annotated[str, Field(min_length=1)]
     animations: bool
     figures: bool
+    format: tuple[Literal["csv", "parquet"], ...]
     label: str
 
-    @field_validator("runs", "compare", mode="before")
+    @field_validator("runs", "compare", "format", mode="before")
     @classmethod
     def _sources_are_lists(cls, sources: Any) -> Any:
         return () if sources is None else [sources] if isinstance(sources, str) else sources

@@ -1,16 +1,20 @@
 """Make a report: one HTML page from any runs."""
 
 from collections.abc import Mapping, Sequence
+from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 
+from cartpole_rl.errors import ConfigError
 from cartpole_rl.files import write_text
 from cartpole_rl.reporting.groups import Drawing, drawings
 from cartpole_rl.reporting.results import Results
 from cartpole_rl.reporting.runs_page import Gallery, Picture, runs_page
 from cartpole_rl.reporting.style import save
-from cartpole_rl.reporting.sweeps import grouped, read_sweeps, results_of, table
+from cartpole_rl.reporting.sweeps import grouped, read_sweeps, results_of
+from cartpole_rl.reporting.tables import episode_rows, run_rows, write_table
 from cartpole_rl.reporting.texts import count_text
-from cartpole_rl.run_folder import FIGURES, PAGE, TABLE, write_config
+from cartpole_rl.run_folder import EPISODES, FIGURES, PAGE, TABLE, write_config
 from cartpole_rl.terminal import print_message
 from cartpole_rl.workflows.config import ReportConfig
 
@@ -18,20 +22,25 @@ from cartpole_rl.workflows.config import ReportConfig
 def make_report(config: ReportConfig, folder: Path) -> None:
     """Write the page of the runs in `config.runs`, and of their comparison with those in `config.compare`.
 
-    Writes config.yaml, provenance.json, page.html and runs.csv into `folder`, with `config.figures` also
-    figures/. Prints how many runs count, and where the page is.
-    Raises ConfigError for folders without runs.
+    Writes config.yaml, provenance.json, page.html, runs.csv and the table of episodes into `folder`, with
+    `config.figures` also figures/. Prints how many runs count, and where the page is.
+    Raises ConfigError for folders without runs, and if Parquet is asked for and PyArrow is missing.
     """
+    if "parquet" in config.format and find_spec("pyarrow") is None:
+        raise ConfigError('format=parquet needs PyArrow: pip install "cartpole_rl[parquet]"')
     sets = {"runs": config.runs, "compare": config.compare}
     given = {name: sources for name, sources in sets.items() if sources}
     sweeps, between = grouped(read_sweeps(given, config.measure))
     results = [results_of(sweep, config.measure) for sweep in sweeps]
     write_config(folder, "report", {**config.model_dump(mode="json"), "seed": None})
-    write_text(folder / TABLE, table(sweeps))
+    write_table(partial(run_rows, sweeps), folder / TABLE)
+    tables = [f"{EPISODES}.{suffix}" for suffix in config.format]
+    for name in tables:
+        write_table(partial(episode_rows, sweeps), folder / name)
     title = " and ".join(f"{sweep.name}: {', '.join(sweep.sources)}" for sweep in sweeps)
     pictures = pictures_of(results) if config.animations else {}
     write_text(folder / PAGE, runs_page(title, results, pictures, between))
-    print(f"{folder}/{TABLE} holds all runs")
+    print(f"{folder}/{TABLE} holds all runs, {' and '.join(tables)} all episodes")
     if config.figures:
         write_figures({f"{each.name}_{one.name}": one for each in results for one in drawings(each)}, folder)
     print_end(results, folder)

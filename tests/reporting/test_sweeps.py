@@ -1,7 +1,5 @@
 """Any runs are grouped by the settings that differ, and two sets are compared group by group."""
 
-import csv
-import io
 import json
 import re
 import shutil
@@ -13,7 +11,7 @@ import pytest
 
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.reporting.runs_page import comparison
-from cartpole_rl.reporting.sweeps import Sweep, grouped, read_sweeps, results_of, table
+from cartpole_rl.reporting.sweeps import Sweep, grouped, read_sweeps, results_of
 
 Edit = Callable[[Path, Callable[[Any], object]], None]
 MEASURE = "score_upright"
@@ -45,19 +43,6 @@ def test_runs_are_grouped_by_the_settings_that_differ(study: Path) -> None:
     of_study = {agent.run: agent.values["own"] for agent in results.agents}
     metrics = json.loads((study / "much/11/evaluations/heavy/metrics.json").read_text())
     assert of_study["quick/friction/much/11/evaluations/heavy"] == metrics[MEASURE]["mean"]
-
-
-def test_the_table_has_a_row_for_every_run(study: Path) -> None:
-    (study / "much/11/evaluations/heavy/metrics.json").unlink()
-    (sweep,), _ = grouped([read_sweep("runs", ["quick"], MEASURE)])
-    rows = list(csv.DictReader(io.StringIO(table([sweep]))))
-    assert len(rows) == 12
-    assert [row["left_out"] for row in rows if row["left_out"]] == ["unfinished: it has no metrics.json"]
-    by_run = {row["run"]: row for row in rows}
-    metrics = json.loads((study / "much/12/evaluations/heavy/metrics.json").read_text())
-    row = by_run["quick/friction/much/12/evaluations/heavy"]
-    assert float(row["score"]) == metrics["score"]["mean"]
-    assert (row["seed"], row["setting:parameters.cart_mass"]) == ("12", "1.5")
 
 
 def test_patterns_and_lists_name_runs(study: Path) -> None:

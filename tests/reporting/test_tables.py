@@ -1,0 +1,81 @@
+"""Every run and every episode is a row: as CSV, as Parquet, and as data for a frame."""
+
+import csv
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+from command_line import in_process
+
+from cartpole_rl.reporting import tables
+from cartpole_rl.reporting.tables import episodes
+
+HEAVY = "much/12/evaluations/heavy"
+
+
+def report(*words: str) -> tuple[list[dict[str, str]], list[dict[str, str]]]:
+    """Make a report of the study; return its tables of runs and of episodes."""
+    done = in_process(
+        "report", "runs=quick", "measure=score_upright", *words, "hydra.run.dir=report", folder=Path.cwd()
+    )
+    assert done.code == 0, done.err
+    runs, found = (Path("report", name).read_text().splitlines() for name in ("runs.csv", "episodes.csv"))
+    return [*csv.DictReader(runs)], [*csv.DictReader(found)]
+
+
+def test_the_tables_have_a_row_for_every_run_and_every_episode(study: Path) -> None:
+    (study / "much/11/evaluations/heavy/metrics.json").unlink()
+    shutil.copytree(study / "much/10/evaluations/heavy", "quick/zzz_again")
+    runs, found = report()
+    assert len(runs) == 13
+    again = "seed 10 of cart_viscous=3, cart_mass=1.5 is there twice"
+    assert [row["left_out"] for row in runs if row["left_out"]] == [
+        again,
+        "unfinished: it has no metrics.json",
+    ]
+    metrics = json.loads((study / HEAVY / "metrics.json").read_text())
+    (run,) = (row for row in runs if row["run"] == f"quick/friction/{HEAVY}")
+    assert float(run["score"]) == metrics["score"]["mean"]
+    assert (run["seed"], run["setting:parameters.cart_mass"]) == ("12", "1.5")
+    assert len(found) == 12 * 2
+    of_run = [row for row in found if row["run"] == run["run"]]
+    assert [row["episode"] for row in of_run] == ["0", "1"]
+    for row, episode in zip(of_run, metrics["episodes"], strict=True):
+        assert float(row["score"]) == episode["score"]
+        assert float(row["start.theta"]) == episode["start"]["theta"]
+        assert float(row["cart.cart_mass"]) == metrics["cart"]["cart_mass"]
+        assert (row["ended_by"], row["plant"]) == (episode["ended_by"], "simulated")
+        assert {name: row[name] for name in run if name.startswith("setting:")} == {
+            name: value for name, value in run.items() if name.startswith("setting:")
+        }
+    assert {row["left_out"] for row in found if row["run"] == "quick/zzz_again"} == {again}
+
+
+def test_a_fine_tuning_has_episodes_before_and_after(study: Path) -> None:
+    folder = study / HEAVY
+    metrics = json.loads((folder / "metrics.json").read_text())
+    after = {**metrics, "episodes": metrics["episodes"][:1]}
+    (folder / "comparison.json").write_text(json.dumps({"before": metrics, "after": after, "kept": "after"}))
+    rows = [row for row in episodes("quick") if row["run"] == f"quick/friction/{HEAVY}"]
+    assert [(row["stage"], row["episode"]) for row in rows] == [("before", 0), ("before", 1), ("after", 0)]
+
+
+def test_parquet_holds_what_csv_holds(study: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet", reason='pip install "cartpole_rl[parquet]"')
+    monkeypatch.setattr(tables, "BATCH", 7)
+    _, found = report("format=[csv,parquet]")
+    read = parquet.read_table("report/episodes.parquet").to_pylist()
+    texts = [{name: "" if value is None else str(value) for name, value in row.items()} for row in read]
+    assert texts == found
+    assert isinstance(read[0]["score"], float)
+
+
+def test_parquet_without_its_library_is_refused_in_one_line(
+    study: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("cartpole_rl.workflows.report.find_spec", lambda name: None)
+    done = in_process("report", "runs=quick", "format=parquet", "hydra.run.dir=report", folder=Path.cwd())
+    assert done.code == 2
+    assert 'format=parquet needs PyArrow: pip install "cartpole_rl[parquet]"' in done.complaint
+    assert not Path("report").exists()
