@@ -11,7 +11,7 @@ PURPLE = "#CC79A7"
 ORANGE = "#E69F00"
 SKY = "#56B4E9"
 BROWN = "#8C5109"  # darker than Okabe and Ito's yellow, which vanishes on white
-BLACK = "#000000"
+BLACK = "#010101"  # matplotlib leaves #000000 out of an SVG: it would stay black on a dark page
 
 INK = "#222222"  # text
 MUTED = "#6B6B6B"  # secondary text, guide lines

@@ -38,6 +38,7 @@ MOST_CURVES = 30  # thin lines of a group
 MIDDLE = (10, 90)  # percentiles of the band that stands for more curves
 PROFILE_POINTS = 101
 FEWEST_PROFILED = 3  # agents
+FEWEST_BANDED = 10  # agents: the interval of fewer covers the panel
 DOT, MEAN = 4.0, 7.0  # points
 JITTER = 0.16  # of a row
 LONGEST_LABEL = 48  # characters
@@ -314,7 +315,7 @@ def _vertical_guide(axes: Axes, value: float, text: str) -> None:
 def profile_curves(
     groups: Mapping[str, Array], measure: str, colours: Mapping[str, str], unit: str
 ) -> Figure:
-    """Draw the share of each group's agents [agents] above every score, with its 95 % band.
+    """Draw the share of each group's agents [agents] above every score, of many agents with its 95 % band.
 
     Groups whose colour is grey have thin lines without a band. `unit` is what an agent is called.
     """
@@ -327,7 +328,7 @@ def profile_curves(
     for label, values in _grey_first(groups, colours):
         share, lower, upper = performance_profile(values, scores)
         axes.plot(scores, share, color=colours[label], linewidth=2 if label in named else 0.8)
-        if label in named and values.size > 1:
+        if label in named and values.size >= FEWEST_BANDED:
             axes.fill_between(scores, lower, upper, color=colours[label], alpha=0.15, linewidth=0)
     axes.set_ylim(-0.02, 1.04)
     axes.xaxis.set_major_locator(MaxNLocator(nbins=6))

@@ -71,6 +71,7 @@ class Agent:
     values: Mapping[str, float]
     curves: Mapping[str, Curve] = field(default_factory=dict)
     behaviour: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    folders: Mapping[str, str] = field(default_factory=dict)  # of evaluations that are elsewhere
 
 
 @dataclass(frozen=True)
@@ -126,6 +127,8 @@ class Results:
 
     def folder_of(self, agent: Agent, evaluation: str) -> Path:
         """Return the folder of an evaluation of an agent; that of its own run if it has no others."""
+        if evaluation in agent.folders:
+            return Path(agent.folders[evaluation])
         inner = Path(agent.run, EVALUATIONS, evaluation)
         return Path(agent.run) if evaluation == OWN.name and not inner.is_dir() else inner
 

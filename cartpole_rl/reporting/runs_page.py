@@ -107,21 +107,18 @@ def runs_page(
     title: str,
     sweeps: Sequence[Results],
     pictures: Mapping[str, Sequence[Picture]],
-    between: Mapping[str, Sequence[str]],
+    between: Mapping[str, Sequence[str]] | None = None,
 ) -> str:
-    """Return the page of one set of runs, or of two and their comparison.
+    """Return the page of one set of runs, with a section for each command, or of two and their comparison.
 
-    `pictures` maps the name of a set to its pictures, `between` the settings that differ between sets to
+    `pictures` maps the name of a set to its pictures, `between` the settings that differ between two sets to
     their values.
     """
     links = "".join(f'<li><a href="#{anchor(each.name)}">{escaped(each.title)}</a></li>' for each in sweeps)
     parts = [
         f"<h1>{escaped(title)}</h1>",
-        *(
-            [f"<nav><ul>{links}</ul></nav>", comparison(sweeps[0], sweeps[1], between)]
-            if len(sweeps) > 1
-            else []
-        ),
+        *([f"<nav><ul>{links}</ul></nav>"] if len(sweeps) > 1 else []),
+        *([comparison(sweeps[0], sweeps[1], between)] if between is not None else []),
         *(_section(each, pictures.get(each.name, ())) for each in sweeps),
         method(),
     ]
@@ -147,7 +144,9 @@ def _answer(results: Results) -> str:
     if not results.agents:
         return "No result yet."
     found = results.estimates(results.judged[0].name)
-    return f"{sentence_start(measure_label(results.measure))}{ranked_text(found, measure=results.measure)}."
+    last = f", {results.judged[0].label}" if len(results.evaluations) > 1 else ""
+    what = f"{sentence_start(measure_label(results.measure))}{last}"
+    return f"{what}{ranked_text(found, measure=results.measure)}."
 
 
 def anchor(name: str) -> str:

@@ -3,7 +3,7 @@
 import os
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from glob import glob
@@ -11,8 +11,16 @@ from pathlib import Path
 from typing import Any
 
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.reporting.grouping import NULL, Columns, fewest, labels, setting_columns
-from cartpole_rl.reporting.groups import LONGEST_LABEL
+from cartpole_rl.reporting.grouping import (
+    AGENT,
+    NULL,
+    SOURCE,
+    Columns,
+    fewest,
+    labels,
+    setting_columns,
+)
+from cartpole_rl.reporting.groups import LONGEST_LABEL, MOST_LINES
 from cartpole_rl.reporting.results import OWN, Agent, Curve, Exclusion, Group, Results
 from cartpole_rl.reporting.runs import (
     Run,
@@ -27,13 +35,16 @@ from cartpole_rl.reporting.runs import (
 )
 from cartpole_rl.reporting.scores import SCORES
 from cartpole_rl.reporting.statistics import interquartile_mean
-from cartpole_rl.run_folder import BASELINE, PREFIX
+from cartpole_rl.reporting.texts import count_text
+from cartpole_rl.run_folder import BASELINE, CART, COMPARISON, POLE, PREFIX, PRETRAINED, RANDOMIZATION, USES
 
 MOST_MEASURES = 20  # in a message
 MOST_UNSORTED = 12  # groups that are shown in the order of their runs
-AGENT = "agent"  # prefix of the settings of the agent that a run evaluates
+STAGES = ("before", "after")  # of a fine-tuning
+IDENTIFIED_FILES = (CART, POLE, RANDOMIZATION)
+TITLES = {"train": "Trainings", "finetune": "Fine-tunings", "evaluate": "Evaluations", "record": "Recordings"}
 MOST_LACKING = 12  # groups that lack seeds, and seeds, that are named one by one
-OVERRIDE = re.compile(r"\+{0,2}([a-z_][\w.]*)=")  # on a command line
+OVERRIDE = re.compile(r"\+{0,2}([a-z_][\w.]*)=(.*)")  # on a command line
 
 
 @dataclass(frozen=True)
@@ -69,9 +80,16 @@ class Member:
         return self.run.problem or of_agent or ""
 
 
+Kept = tuple[Member, str, str]  # with the labels of its group and of its evaluation
+
+
 @dataclass(frozen=True)
 class Sweep:
-    """Runs of one command. `columns` are the settings that differ, `labels` the groups, by member."""
+    """Runs of one command.
+
+    `columns` are the settings that differ, `labels` the groups, `evaluations` what sets evaluations of the
+    same agent apart, by member.
+    """
 
     name: str
     sources: Sequence[str]
@@ -80,13 +98,26 @@ class Sweep:
     notes: Sequence[str] = ()
     columns: Mapping[str, Sequence[str]] = field(default_factory=dict)
     labels: Sequence[str] = ()
+    evaluations: Sequence[str] = ()
+
+
+def read_groups(sets: Mapping[str, Sequence[str]], measure: str) -> tuple[list[Sweep], Columns | None]:
+    """Return the runs of each set in groups, and what tells two sets apart. Raises ConfigError.
+
+    A single set has a sweep for each command.
+    """
+    sweeps = read_sweeps(sets, measure)
+    if len(sets) > 1:
+        return grouped(sweeps)
+    return [one for sweep in sweeps for one in grouped([sweep])[0]], None
 
 
 def read_sweeps(sets: Mapping[str, Sequence[str]], measure: str) -> list[Sweep]:
     """Return the runs in the folders and glob patterns of each set, without groups. Raises ConfigError.
 
-    Runs count that are complete, of the most frequent command and of the most frequent versions of all sets.
-    A set without any such run keeps its own most frequent ones, with a note.
+    Runs count that are complete, and of the most frequent versions of all sets. Of two sets those of the most
+    frequent command count; a single set has a sweep for each command. A set without any such run keeps its
+    own most frequent ones, with a note.
     """
     agents: dict[Path, Run] = {}
     sweeps = [
@@ -94,10 +125,27 @@ def read_sweeps(sets: Mapping[str, Sequence[str]], measure: str) -> list[Sweep]:
         for name, sources in sets.items()
     ]
     sweeps = [_without(sweep, lambda member: member.problem) for sweep in sweeps]
-    sweeps = _of_one_kind(sweeps, "commands", lambda member: f"{PREFIX}{member.run.program}")
+    if len(sweeps) > 1:
+        sweeps = _of_one_kind(sweeps, "commands", lambda member: f"{PREFIX}{member.run.program}")
+    else:
+        sweeps = _by_command(sweeps[0])
     sweeps = _of_one_kind(sweeps, "versions", lambda member: member.versions or "unknown")
     _check_measure(sweeps, measure)
     return [_without(sweep, partial(_lack, measure)) for sweep in sweeps]
+
+
+def _by_command(sweep: Sweep) -> list[Sweep]:
+    """Return a sweep for each command; the first one names all runs that do not count."""
+    members: dict[str, list[Member]] = {}
+    for member in sweep.members:
+        members.setdefault(member.run.program, []).append(member)
+    if len(members) < 2:
+        return [sweep]
+    ordered = sorted(members, key=lambda program: [*USES, program].index(program))
+    return [
+        replace(sweep, name=program, members=members[program], exclusions=() if number else sweep.exclusions)
+        for number, program in enumerate(ordered)
+    ]
 
 
 def _folders(name: str, sources: Sequence[str]) -> list[Path]:
@@ -148,8 +196,9 @@ def grouped(sweeps: Sequence[Sweep]) -> tuple[list[Sweep], Columns]:
     The latter map a setting to its value in each sweep, where it has only one.
     """
     members = [member for sweep in sweeps for member in sweep.members]
-    columns = setting_columns([each.tree for each in members])
-    chosen = {name for member in members for name in _chosen(member.run)}
+    given = [dict(_given(member)) for member in members]
+    columns = setting_columns([each.tree for each in members], [_words(each) for each in given])
+    chosen = {SOURCE, *(name for each in given for name in each)}
     bounds = _bounds(sweeps)
     inner = [
         name
@@ -161,16 +210,31 @@ def grouped(sweeps: Sequence[Sweep]) -> tuple[list[Sweep], Columns]:
         name: [next(iter(values[start:stop]), NULL) for start, stop in bounds]
         for name, values in outer.items()
     }
-    named = _numbered(labels(fewest({name: columns[name] for name in inner}, chosen), len(members)))
+    named, evaluations = _named(
+        {name: columns[name] for name in inner}, chosen, len(members), len(sweeps) == 1
+    )
     found = [
         replace(
             sweep,
             columns={name: values[start:stop] for name, values in columns.items()},
             labels=named[start:stop],
+            evaluations=evaluations[start:stop],
         )
         for sweep, (start, stop) in zip(sweeps, bounds, strict=True)
     ]
     return found, between
+
+
+def _named(
+    columns: Columns, chosen: Collection[str], count: int, split: bool
+) -> tuple[Sequence[str], Sequence[str]]:
+    """Return the label of each run's group, and that of its evaluation if `split` and these are few."""
+    of_agent = {name: each for name, each in columns.items() if name.startswith((f"{AGENT}.", SOURCE))}
+    own = {name: each for name, each in columns.items() if name not in of_agent}
+    evaluations = labels(fewest(own, chosen), count)
+    if split and own and of_agent and len({*evaluations}) <= MOST_LINES:
+        return _numbered(labels(fewest(of_agent, chosen), count)), evaluations
+    return _numbered(labels(fewest(columns, chosen), count)), [""] * count
 
 
 def _numbered(named: Sequence[str]) -> list[str]:
@@ -181,70 +245,103 @@ def _numbered(named: Sequence[str]) -> list[str]:
     return [f"{numbers[label]}: {label}" for label in named]
 
 
-def _chosen(run: Run) -> Iterator[str]:
-    """Yield the settings that were given on the command line of a run, with those of its agent's prefix."""
-    for word in run.command:
-        if match := OVERRIDE.match(word):
-            yield match[1]
-            yield f"{AGENT}.{match[1]}"
+def _given(member: Member) -> Iterator[tuple[str, str]]:
+    """Yield the settings on the command lines of a run and of its agent, with their values."""
+    for prefix, run in (("", member.run), (f"{AGENT}.", member.agent)):
+        for match in map(OVERRIDE.match, run.command if run else ()):
+            if match:
+                yield f"{prefix}{match[1]}", match[2]
+
+
+def _words(given: Mapping[str, str]) -> dict[str, str]:
+    """Return a word for each group that was given as a file: "identified", or the name of the file."""
+    paths = {name: Path(value) for name, value in given.items() if value.endswith(".yaml")}
+    return {
+        name: "identified" if path.name in IDENTIFIED_FILES else path.stem for name, path in paths.items()
+    }
 
 
 def results_of(sweep: Sweep, measure: str) -> Results:
     """Return the results of a sweep by group, many of them highest first."""
     kept, repeated = without_repetitions(sweep)
-    members: dict[str, list[Member]] = {}
-    for member, label in kept:
-        members.setdefault(label, []).append(member)
-    means = {
-        label: float(interquartile_mean([_value(each, measure) for each in own]))
-        for label, own in members.items()
-    }
-    ordered = (
-        sorted(members, key=means.__getitem__, reverse=True) if len(members) > MOST_UNSORTED else [*members]
-    )
-    groups = [Group(f"group_{number}", label) for number, label in enumerate(ordered, start=1)]
-    curves = {member.run.folder: _curves(member, measure) for member, _ in kept}
-    agents = [
-        Agent(
-            group.name,
-            member.seed,
-            member.run.folder.as_posix(),
-            {OWN.name: _value(member, measure)},
-            curves[member.run.folder][0],
-        )
-        for group in groups
-        for member in members[group.label]
-    ]
+    curves = {member.run.folder: _curves(member, measure) for member, _, _ in kept}
+    agents = _agents(kept, measure, {folder: curve for folder, (curve, _) in curves.items()})
+    groups, ordered = _ordered(agents)
+    evaluations = dict.fromkeys(name for agent in agents for name in agent.values)
     notes = [
         *sweep.notes,
         commits_note(member.run for member in sweep.members),
-        partly_measured_note((member.run for member, _ in kept), measure),
+        partly_measured_note((member.run for member, _, _ in kept), measure),
         *_untraced(sweep),
         *_unequal_seeds(sweep),
         *(note for _, note in curves.values()),
     ]
     return Results(
         sweep.name,
-        sweep.name,
+        TITLES.get(sweep.name, sweep.name),
         measure,
         groups or [Group("none", "no run")],
-        tuple(agents),
+        tuple(ordered),
         (*sweep.exclusions, *repeated),
         tuple(note for note in notes if note),
         sweep.members[0].run.versions if sweep.members else "",
+        [OWN if name == OWN.name else Group(name, name) for name in evaluations] or [OWN],
     )
 
 
-def without_repetitions(sweep: Sweep) -> tuple[list[tuple[Member, str]], list[Exclusion]]:
-    """Return the members with their labels without second runs of the same seed, and those runs."""
-    kept: dict[tuple[str, tuple[int, ...]], tuple[Member, str]] = {}
+def _agents(kept: Sequence[Kept], measure: str, curves: Mapping[Path, Mapping[str, Curve]]) -> list[Agent]:
+    """Return each agent with its evaluations; its group is the label."""
+    found: dict[tuple[str, tuple[int, ...]], dict[str, Member]] = {}
+    for member, label, evaluation in kept:
+        found.setdefault((label, member.seeds), {})[evaluation or OWN.name] = member
+    return [
+        Agent(
+            label,
+            seeds[-1],
+            ", ".join(member.run.folder.as_posix() for member in own.values()),
+            {name: value for each, member in own.items() for name, value in _values(each, member, measure)},
+            curves[next(iter(own.values())).run.folder],
+            folders={each: member.run.folder.as_posix() for each, member in own.items()},
+        )
+        for (label, seeds), own in found.items()
+    ]
+
+
+def _ordered(agents: Sequence[Agent]) -> tuple[list[Group], list[Agent]]:
+    """Return the groups of agents, many of them highest first, and the agents in their order."""
+    members: dict[str, list[Agent]] = {}
+    for agent in agents:
+        members.setdefault(agent.group, []).append(agent)
+    means = {
+        label: float(interquartile_mean([value for agent in own for value in agent.values.values()]))
+        for label, own in members.items()
+    }
+    many = len(members) > MOST_UNSORTED
+    ordered = sorted(members, key=means.__getitem__, reverse=True) if many else [*members]
+    groups = [Group(f"group_{number}", label) for number, label in enumerate(ordered, start=1)]
+    return groups, [replace(agent, group=group.name) for group in groups for agent in members[group.label]]
+
+
+def without_repetitions(sweep: Sweep) -> tuple[list[Kept], list[Exclusion]]:
+    """Return the members with their labels and evaluations without second runs of a seed, and those runs."""
+    kept: dict[tuple[str, str, tuple[int, ...]], Kept] = {}
     repeated = []
-    for member, label in zip(sweep.members, sweep.labels, strict=True):
-        if (label, member.seeds) in kept:
+    for member, label, evaluation in zip(sweep.members, sweep.labels, sweep.evaluations, strict=True):
+        if (label, evaluation, member.seeds) in kept:
             repeated.append(_exclusion(member.run, f"seed {member.seed} of {label} is there twice"))
         else:
-            kept[label, member.seeds] = member, label
+            kept[label, evaluation, member.seeds] = member, label, evaluation
     return [*kept.values()], repeated
+
+
+def _values(evaluation: str, member: Member, measure: str) -> Iterator[tuple[str, float]]:
+    """Yield the measure in each evaluation of a run: a fine-tuning has one before and one after."""
+    results = member.run.results.get(Path(COMPARISON).stem) or {}
+    stages = {stage: measured(results, f"{stage}.{measure}") for stage in STAGES}
+    if all(value is not None for value in stages.values()):
+        yield from ((stage, value) for stage, value in stages.items() if value is not None)
+    else:
+        yield evaluation, _value(member, measure)
 
 
 def _value(member: Member, measure: str) -> float:
@@ -287,7 +384,7 @@ def _member(run: Run, agents: dict[Path, Run]) -> Member:
     if chain:
         tree[AGENT] = _agent_tree((run, *chain))
     elif run.agent:
-        tree[AGENT] = {"source": run.agent}
+        tree[SOURCE] = run.agent
     seeds = tuple(each.seed or 0 for each in chain or [run])
     return Member(run, chain[0] if chain else None, tree, seeds)
 
@@ -352,7 +449,10 @@ def _seeds(seeds: set[int]) -> str:
 def _untraced(sweep: Sweep) -> list[str]:
     """Return a note on agents whose own runs are not there."""
     named = {member.run.agent for member in sweep.members if member.agent is None} - {"", str(BASELINE)}
-    return [f"The runs of {len(named)} agents were not found and are not checked."] if named else []
+    lost = [agent for agent in named if Path(agent).parts[0] != PRETRAINED]
+    return (
+        [f"The runs of {count_text(len(lost), 'agent')} were not found and are not checked."] if lost else []
+    )
 
 
 def _check_measure(sweeps: Sequence[Sweep], measure: str) -> None:

@@ -9,11 +9,10 @@ from typing import Any
 
 from cartpole_rl.files import replacing
 from cartpole_rl.reporting.runs import DAMAGE, flattened, measured
-from cartpole_rl.reporting.sweeps import Sweep, grouped, read_sweeps, without_repetitions
+from cartpole_rl.reporting.sweeps import STAGES, Sweep, read_groups, without_repetitions
 from cartpole_rl.run_folder import COMPARISON, METRICS
 
 BATCH = 10_000  # rows of a Parquet file that are in memory at once
-STAGES = ("before", "after")  # of a fine-tuning
 
 Row = Mapping[str, Hashable]
 Rows = Callable[[], Iterable[Row]]  # is asked twice: for the columns, and for the rows
@@ -21,7 +20,7 @@ Rows = Callable[[], Iterable[Row]]  # is asked twice: for the columns, and for t
 
 def episodes(*sources: str) -> Iterator[dict[str, Hashable]]:
     """Yield a row for each episode of the runs in folders and glob patterns. Raises ConfigError."""
-    return episode_rows(grouped(read_sweeps({"runs": sources}, "score"))[0])
+    return episode_rows(read_groups({"runs": sources}, "score")[0])
 
 
 def run_rows(sweeps: Sequence[Sweep]) -> Iterator[dict[str, Hashable]]:
@@ -57,10 +56,16 @@ def write_table(rows: Rows, path: Path) -> None:
 def _heads(sweep: Sweep) -> Iterator[tuple[Path, dict[str, Hashable]]]:
     """Yield the folder of each run, and what it is."""
     repeated = {each.run: each.reason for each in without_repetitions(sweep)[1]}
-    for number, (member, label) in enumerate(zip(sweep.members, sweep.labels, strict=True)):
+    named = zip(sweep.members, sweep.labels, sweep.evaluations, strict=True)
+    for number, (member, label, evaluation) in enumerate(named):
         run = member.run.folder.as_posix()
         head: dict[str, Hashable] = {"set": sweep.name, "run": run, "command": member.run.program}
-        head |= {"group": label, "seed": member.seed, "left_out": repeated.get(run, "")}
+        head |= {
+            "group": label,
+            "evaluation": evaluation,
+            "seed": member.seed,
+            "left_out": repeated.get(run, ""),
+        }
         yield (
             member.run.folder,
             head | {f"setting:{key}": each[number] for key, each in sweep.columns.items()},

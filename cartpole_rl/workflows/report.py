@@ -11,7 +11,7 @@ from cartpole_rl.reporting.groups import Drawing, drawings
 from cartpole_rl.reporting.results import Results
 from cartpole_rl.reporting.runs_page import Gallery, Picture, runs_page
 from cartpole_rl.reporting.style import save
-from cartpole_rl.reporting.sweeps import grouped, read_sweeps, results_of
+from cartpole_rl.reporting.sweeps import read_groups, results_of
 from cartpole_rl.reporting.tables import episode_rows, run_rows, write_table
 from cartpole_rl.reporting.texts import count_text
 from cartpole_rl.run_folder import EPISODES, FIGURES, PAGE, TABLE, write_config
@@ -30,14 +30,14 @@ def make_report(config: ReportConfig, folder: Path) -> None:
         raise ConfigError('format=parquet needs PyArrow: pip install "cartpole_rl[parquet]"')
     sets = {"runs": config.runs, "compare": config.compare}
     given = {name: sources for name, sources in sets.items() if sources}
-    sweeps, between = grouped(read_sweeps(given, config.measure))
+    sweeps, between = read_groups(given, config.measure)
     results = [results_of(sweep, config.measure) for sweep in sweeps]
     write_config(folder, "report", {**config.model_dump(mode="json"), "seed": None})
     write_table(partial(run_rows, sweeps), folder / TABLE)
     tables = [f"{EPISODES}.{suffix}" for suffix in config.format]
     for name in tables:
         write_table(partial(episode_rows, sweeps), folder / name)
-    title = " and ".join(f"{sweep.name}: {', '.join(sweep.sources)}" for sweep in sweeps)
+    title = " and ".join(f"{name}: {', '.join(sources)}" for name, sources in given.items())
     pictures = pictures_of(results) if config.animations else {}
     write_text(folder / PAGE, runs_page(title, results, pictures, between))
     print(f"{folder}/{TABLE} holds all runs, {' and '.join(tables)} all episodes")

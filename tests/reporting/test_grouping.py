@@ -3,7 +3,8 @@
 from typing import Any
 
 from cartpole_rl.choices import choice
-from cartpole_rl.reporting.grouping import ALL, fewest, labels, setting_columns
+from cartpole_rl.reporting.grouping import ALL, SOURCE, fewest, labels, setting_columns
+from cartpole_rl.workflows.config import TrainConfig, load_settings
 
 
 def columns(*trees: dict[str, Any]) -> dict[str, list[str]]:
@@ -27,6 +28,33 @@ def test_a_choice_of_conf_is_named_by_its_file() -> None:
         {"randomization": choice(f"randomization/{name}") or {}} for name in ("none", "friction_3", "wide")
     ]
     assert columns(*trees) == {"randomization": ["none", "friction_3", "wide"]}
+
+
+def test_the_choice_of_a_run_folder_is_named_by_its_file() -> None:
+    def written(name: str) -> dict[str, Any]:
+        given = load_settings(TrainConfig, {"randomization": name}).model_dump(mode="json")
+        return {"randomization": given["randomization"]}
+
+    found = columns(*map(written, ("half", "wide")))
+    assert found == {"randomization": ["half", "wide"]}
+    assert labels(found, 2) == ["half", "wide"]
+
+
+def test_groups_are_named_in_a_readers_words() -> None:
+    agents = [
+        {"cart": choice("cart/ip02"), "randomization": choice("randomization/wide")},
+        {"cart": {"cart_mass": 0.8}, "randomization": {"cart_mass": {"relative": [-0.01, 0.01]}}},
+    ]
+    words = {"agent.cart": "identified", "agent.randomization": "identified"}
+    trees = [*({"agent": agent} for agent in agents), {SOURCE: "pretrained/medium"}, {SOURCE: "lqr"}]
+    found = setting_columns(trees, [{}, words, {}, {}])
+    chosen = [SOURCE, "agent.cart", "agent.randomization"]
+    assert labels(fewest(found, chosen), 4) == ["wide", "identified", "pretrained/medium", "lqr"]
+
+
+def test_words_that_stand_for_two_things_are_not_used() -> None:
+    trees = [{"cart": {"cart_mass": mass}} for mass in (0.7, 0.8)]
+    assert setting_columns(trees, [{"cart": "identified"}] * 2) == {"cart.cart_mass": ["0.7", "0.8"]}
 
 
 def test_a_choice_with_another_value_is_not_named_by_its_file() -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.reporting.runs_page import comparison
-from cartpole_rl.reporting.sweeps import Sweep, grouped, read_sweeps, results_of
+from cartpole_rl.reporting.sweeps import Sweep, grouped, read_groups, read_sweeps, results_of
 
 Edit = Callable[[Path, Callable[[Any], object]], None]
 MEASURE = "score_upright"
@@ -60,9 +60,11 @@ def test_runs_of_another_command_version_or_without_measure_are_named(study: Pat
     edit(Path(nominal[0], "provenance.json"), lambda content: content.update(program="cartpole-record"))
     edit(Path(nominal[1], "provenance.json"), lambda content: content["packages"].update(numpy="1.0"))
     edit(Path(nominal[2], "metrics.json"), lambda content: content.update(score_upright=None))
-    sweep = read_sweep("runs", ["quick"], MEASURE)
-    reasons = {each.run: each.reason for each in sweep.exclusions}
-    assert len(sweep.members) == 9
+    evaluated, recorded = read_sweeps({"runs": ["quick"]}, MEASURE)
+    assert (evaluated.name, recorded.name) == ("evaluate", "record")
+    assert (len(evaluated.members), len(recorded.members)) == (9, 1)
+    sweeps = read_sweeps({"runs": ["quick"], "compare": ["quick/friction/little"]}, MEASURE)
+    reasons = {each.run: each.reason for each in sweeps[0].exclusions}
     assert reasons[nominal[0]] == "other commands: cartpole-record instead of cartpole-evaluate"
     assert reasons[nominal[1]].startswith("other versions: ")
     assert reasons[nominal[2]] == "it has no score_upright"
@@ -170,3 +172,41 @@ def test_versions_and_commands_are_compared_over_both_sets(study: Path, edit: Ed
     )
     assert versions.startswith("The versions of compare differ from the rest: ")
     assert versions in results_of(grouped([second])[0][0], MEASURE).notes
+
+
+def test_evaluations_of_an_agent_stand_side_by_side(study: Path, edit: Edit) -> None:
+    for seed in (10, 11, 12):
+        for arm in ("little", "much"):
+            agent = Path(f"agents/{arm}/{seed}")
+            shutil.copytree(study / f"{arm}/{seed}/evaluations/nominal", agent)
+            for kind in ("nominal", "heavy"):
+                file = study / f"{arm}/{seed}/evaluations/{kind}/config.yaml"
+                edit(file, lambda content, agent=agent: content.update(run=str(agent)))
+                edit(file, lambda content: content["parameters"].pop("cart_viscous"))
+    (sweep,), between = read_groups({"runs": ["quick"]}, MEASURE)
+    results = results_of(sweep, MEASURE)
+    assert between is None
+    assert [group.label for group in results.groups] == ["cart_viscous=0.2", "cart_viscous=3"]
+    assert [each.label for each in results.evaluations] == ["cart_mass=1.5", "default"]
+    assert [(agent.seed, len(agent.values)) for agent in results.agents] == [(10, 2), (11, 2), (12, 2)] * 2
+    agent = results.agents[0]
+    heavy = results.folder_of(agent, "cart_mass=1.5")
+    assert heavy == study / "little/10/evaluations/heavy"
+    metrics = json.loads((heavy / "metrics.json").read_text())
+    assert agent.values["cart_mass=1.5"] == metrics[MEASURE]["mean"]
+
+
+def test_a_fine_tuning_is_drawn_before_and_after(study: Path, edit: Edit) -> None:
+    for number, seed in enumerate((10, 11, 12)):
+        folder = study / f"much/{seed}/evaluations/heavy"
+        edit(folder / "provenance.json", lambda content: content.update(program="cartpole-finetune"))
+        stages = {"before": {MEASURE: {"mean": 1.0 + number}}, "after": {MEASURE: {"mean": 5.0 + number}}}
+        (folder / "comparison.json").write_text(json.dumps(stages))
+    (tuned, _), _ = read_groups({"runs": ["quick"]}, MEASURE)
+    results = results_of(tuned, MEASURE)
+    assert [each.label for each in results.evaluations] == ["before", "after"]
+    assert [agent.values for agent in results.agents] == [
+        {"before": 1.0, "after": 5.0},
+        {"before": 2.0, "after": 6.0},
+        {"before": 3.0, "after": 7.0},
+    ]
