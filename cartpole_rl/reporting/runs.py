@@ -314,7 +314,9 @@ def flattened(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Hashable]:
     """Return nested settings by dotted name; lists as text."""
     flat: dict[str, Hashable] = {}
     for name, value in tree.items():
-        if isinstance(value, Mapping) and value:
+        if isinstance(value, str | int | float):  # most values, found quickly
+            flat[f"{prefix}{name}"] = value
+        elif isinstance(value, Mapping) and value:
             flat |= flattened(value, f"{prefix}{name}.")
         else:
             flat[f"{prefix}{name}"] = value if isinstance(value, Hashable) else json.dumps(value, default=str)

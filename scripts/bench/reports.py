@@ -11,7 +11,6 @@ import argparse
 import json
 import os
 import re
-import resource
 import subprocess
 import sys
 import tempfile
@@ -25,6 +24,10 @@ from common import option_parser, positive_int, print_table, write_json
 from cartpole_rl.run_folder import CONFIG, HISTORY, METRICS, PAGE, PROVENANCE
 
 REWRITTEN = (CONFIG, PROVENANCE, METRICS, HISTORY)
+# a small process starts the command: a peak counts the memory of the process that was forked
+PEAK = """import resource, subprocess, sys
+subprocess.run(sys.argv[1:], check=True, stdout=subprocess.DEVNULL)
+print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)"""  # kB
 SEEDS = 3  # of each set-up
 SCORES = 101  # different ones
 
@@ -51,11 +54,10 @@ def measured(runs: Path, report: Path, words: list[str]) -> dict[str, Any]:
     """Make a report of the folder `runs`; return its time, its peak memory and the size of its page."""
     command = [Path(sys.executable).with_name("cartpole-report"), f"runs={runs}", f"hydra.run.dir={report}"]
     start = time.perf_counter()
-    subprocess.run([*command, *words], check=True, stdout=subprocess.DEVNULL)
+    done = subprocess.run([sys.executable, "-c", PEAK, *command, *words], check=True, stdout=subprocess.PIPE)
     return {
         "seconds": round(time.perf_counter() - start, 1),
-        # of the largest child until now: sizes are measured in ascending order
-        "peak_mb": resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss // 1000,
+        "peak_mb": int(done.stdout) // 1000,
         "page_mb": round((report / PAGE).stat().st_size / 1e6, 2),
     }
 

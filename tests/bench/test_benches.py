@@ -13,6 +13,7 @@ import learning
 import numpy as np
 import pytest
 import reference
+import reports
 import torch
 import truth_references
 import zero_shot
@@ -151,3 +152,10 @@ def test_drawn_carts_are_possible_and_inside_the_ranges_of_training_unless_wider
             outside = {name for name in drawn & set(bounds) if not within(cart[name], *bounds[name])}
             assert not outside or wider
     assert draw_truths(REPORTED, 20)[:5] == draw_truths(REPORTED, 5)
+
+
+def test_reports_of_more_and_more_runs_are_measured(trained: Path, run: Run) -> None:
+    words = ("runs/bench/medium/10", "animations=false", "--runs", "2", "5")
+    rows = figures(run, reports, trained, *words)
+    assert [row["runs"] for row in rows] == [2, 5]
+    assert all(row["seconds"] > 0 and row["peak_mb"] > 50 and row["page_mb"] > 0.01 for row in rows)

@@ -38,6 +38,15 @@ def test_its_colours_follow_the_page() -> None:
         assert name in DARK
 
 
+def test_every_colour_of_a_series_follows_the_page() -> None:
+    figure = style.new_figure(height=2, width=3)
+    axes = figure.subplots()
+    for index in range(len(style.SERIES)):
+        axes.plot(index, index, "o", color=style.series_colour(index), markeredgewidth=0)
+    text = style.svg(figure, "dots")
+    assert all(f"fill: var(--series-{index})" in text for index in range(len(style.SERIES)))
+
+
 def test_two_figures_share_no_id_and_the_same_one_is_repeated_exactly() -> None:
     first, second = drawn("first"), drawn("second")
     assert not {*re.findall(r'id="(\S+)"', first)} & {*re.findall(r'id="(\S+)"', second)}
