@@ -27,7 +27,8 @@ REWRITTEN = (CONFIG, PROVENANCE, METRICS, HISTORY)
 # a small process starts the command: a peak counts the memory of the process that was forked
 PEAK = """import resource, subprocess, sys
 subprocess.run(sys.argv[1:], check=True, stdout=subprocess.DEVNULL)
-print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)"""  # kB
+used = resource.getrusage(resource.RUSAGE_CHILDREN)
+print(used.ru_maxrss, used.ru_utime + used.ru_stime)"""  # kB, s
 SEEDS = 3  # of each set-up
 SCORES = 101  # different ones
 
@@ -51,13 +52,15 @@ def copy_run(run: Path, copy: Path, setting: str, number: int) -> None:
 
 
 def measured(runs: Path, report: Path, words: list[str]) -> dict[str, Any]:
-    """Make a report of the folder `runs`; return its time, its peak memory and the size of its page."""
+    """Make a report of the folder `runs`; return its times, its peak memory and the size of its page."""
     command = [Path(sys.executable).with_name("cartpole-report"), f"runs={runs}", f"hydra.run.dir={report}"]
     start = time.perf_counter()
     done = subprocess.run([sys.executable, "-c", PEAK, *command, *words], check=True, stdout=subprocess.PIPE)
+    peak, processor = done.stdout.split()
     return {
         "seconds": round(time.perf_counter() - start, 1),
-        "peak_mb": int(done.stdout) // 1000,
+        "processor_s": round(float(processor), 1),
+        "peak_mb": int(peak) // 1000,
         "page_mb": round((report / PAGE).stat().st_size / 1e6, 2),
     }
 
