@@ -176,7 +176,7 @@ def read_parquet(path: Path) -> Mapping[str, NDArray]:
     try:
         from pyarrow import parquet
     except ImportError:
-        raise ValueError("it needs pyarrow: pip install pyarrow") from None
+        raise ValueError('this needs PyArrow: pip install "cartpole_rl[parquet]"') from None
     file = parquet.read_table(path)
     return {name: file[name].to_numpy() for name in file.column_names}
 
