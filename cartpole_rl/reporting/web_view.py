@@ -1,4 +1,4 @@
-"""The live page of a cart, served on this computer alone by a process of its own, and its stop button.
+"""The live page of a cart or a training, served on this computer alone by a process of its own.
 
 The process reads the snapshots that the driving process leaves in shared memory, so a slow browser delays
 nothing. The page asks for the newest one: it never shows an old one, and no connection stays open that the
@@ -16,18 +16,28 @@ import secrets
 import signal
 import socket
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterable
 from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from multiprocessing.connection import Connection
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
 
 from cartpole_rl.drawing.pages import filled, shared_parts
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.evaluation.snapshots import Memory, new_memory, read
 from cartpole_rl.reporting.live_view import LiveView
 from cartpole_rl.signals import end_with_parent
+
+if TYPE_CHECKING:
+    from cartpole_rl.tasks.episode import Episode
+
+Array = NDArray[np.float64]
 
 HERE = "127.0.0.1"
 HOSTS = (HERE, "localhost")  # in the Host of a request: a page elsewhere may give its own name our address
@@ -52,22 +62,29 @@ def chosen_view(title: str, chosen: str, pole_length: float) -> "LiveView | WebV
 class WebView:
     """A context manager of the process that serves the page.
 
-    The page shows the cart in `memory`, or the `episodes` of a recording, each a mapping of columns. Raises
-    ConfigError where one process cannot interrupt another.
+    The page shows the cart in `memory`, or `episodes`, each as `columns` returns it. `add` adds one; the page
+    of a training, which `grows`, shows the newest. Raises ConfigError where no process can interrupt another.
     """
 
-    def __init__(self, title: str, pole_length: float, episodes: Sequence[dict[str, Any]] = ()) -> None:
+    def __init__(
+        self,
+        title: str,
+        pole_length: float,
+        episodes: Iterable[dict[str, Any]] | None = None,
+        grows: bool = False,
+    ) -> None:
         if os.name != "posix":
             raise ConfigError("view=web needs Linux or macOS; leave it out")
-        self.memory: Memory | None = None if episodes else new_memory()
+        self.memory: Memory | None = new_memory() if episodes is None else None
         self._listener = socket.create_server((HERE, 0))
         self._secret = secrets.token_urlsafe(24)
         context = multiprocessing.get_context("spawn")
         self._stopped = context.RawValue("b", 0)
-        contents = {"": page(title, pole_length, bool(episodes)), "recording": json.dumps(episodes)}
+        receiver, self._sender = context.Pipe(duplex=False)
+        shown = page(title, pole_length, self.memory is None, grows)
         ignored = signal.getsignal(signal.SIGINT) == signal.SIG_IGN  # as a shell's & leaves it
         stop = Stop(os.getpid(), signal.SIGTERM if ignored else signal.SIGINT, self._stopped)
-        arguments = (self._listener, self._secret, contents, self.memory, stop)
+        arguments = (self._listener, self._secret, shown, [*(episodes or ())], receiver, self.memory, stop)
         self._process = context.Process(target=serve, args=arguments, daemon=True)
 
     @property
@@ -89,17 +106,47 @@ class WebView:
         if error is not None and self._stopped.value:
             error.add_note(NOTE)
 
+    def add(self, episode: dict[str, Any]) -> None:
+        """Show one more episode; do nothing if the page's process has ended."""
+        with suppress(OSError):
+            self._sender.send(episode)
+
     def wait(self) -> None:
         """Return once the button of the page is pressed, or Ctrl-C."""
         with suppress(KeyboardInterrupt):
             self._process.join()
 
 
-def page(title: str, pole_length: float, replays: bool) -> str:
+def page(title: str, pole_length: float, replays: bool, grows: bool = False) -> str:
     """Return the HTML of the page."""
-    words = {"button": "Close", "start": "replay"} if replays else {"button": "Stop", "start": "ask"}
+    words = {
+        "button": "Close" if replays and not grows else "Stop",
+        "start": "replay" if replays else "ask",
+        "grows": json.dumps(grows),
+    }
     values = {**shared_parts(), **words, "title": html.escape(title), "pole": pole_length}
     return filled(Path(__file__).with_name("live.html"), values)
+
+
+def columns(name: str, episode: "Episode", track: float, ghost: Array | None = None) -> dict[str, Any]:
+    """Return what the page shows of an episode on a track of +-`track` m.
+
+    `ghost` [2, T + 1] has the positions, m, and angles, rad, of a cart beside it, NaN where there is none.
+    """
+    rows = len(episode.time)
+    guarded = episode.guarded if episode.guarded is not None else np.zeros(episode.steps)
+    beside = np.full((2, rows), np.nan) if ghost is None else ghost
+    steps = {
+        "motor": [*episode.motor.tolist(), 0],
+        "guard": [*(np.sign(episode.motor) * guarded).astype(int).tolist(), 0],
+        "score": [0.0, *episode.score.cumsum().round(1).tolist()],
+    }
+    series = {"x": episode.x, "theta": episode.theta, "ghost_x": beside[0], "ghost_theta": beside[1]}
+    rounded = {
+        name: [None if np.isnan(value) else round(float(value), 5) for value in values]
+        for name, values in series.items()
+    }
+    return {"name": name, "track": track, "time": episode.time.tolist(), **rounded, **steps}
 
 
 class Stop:
@@ -116,12 +163,27 @@ class Stop:
 
 
 def serve(
-    listener: socket.socket, secret: str, contents: dict[str, str], memory: Memory | None, stop: Stop
+    listener: socket.socket,
+    secret: str,
+    shown: str,
+    episodes: list[dict[str, Any]],
+    added: Connection,
+    memory: Memory | None,
+    stop: Stop,
 ) -> None:
     """Answer requests until the process is ended or its parent ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process
     end_with_parent(stop.process)
     os.nice(LESS_URGENT)
+    contents = {"": shown, "recording": json.dumps(episodes)}
+
+    def receive() -> None:
+        with suppress(EOFError, OSError):
+            while True:
+                episodes.append(added.recv())
+                contents["recording"] = json.dumps(episodes)
+
+    threading.Thread(target=receive, daemon=True).start()
     Server(listener, secret, contents, memory, stop).serve_forever()
 
 

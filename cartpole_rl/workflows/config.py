@@ -105,6 +105,7 @@ class TrainConfig(RunSettings, CartPoleSettings):
         LOGGERS.find("tensorboard"),  # missing there too, or one name
     )
     preview: bool = False  # missing there too
+    view: Literal["none", "web"] = "none"  # missing there too
     resume: str | None
 
     @model_validator(mode="before")

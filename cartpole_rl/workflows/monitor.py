@@ -16,6 +16,7 @@ from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.reporting.animation import gif
 from cartpole_rl.reporting.episodes import behaviour
 from cartpole_rl.reporting.loggers import Loggers
+from cartpole_rl.reporting.web_view import WebView, columns
 from cartpole_rl.run_folder import BEST, CHECKPOINTS, HISTORY, LAST
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.terminal import print_message, progress_bar
@@ -32,10 +33,13 @@ class TrainingMonitor(Monitor):
     """Monitor of one training in the run folder `folder`; a context manager around `Training.run`.
 
     `resumed_at` is the number of transitions from which a training is resumed: later records are removed.
+    `view` shows the first episode of each evaluation.
     """
 
-    def __init__(self, folder: Path, config: TrainConfig, resumed_at: int | None = None) -> None:
-        self.folder, self.config = folder, config
+    def __init__(
+        self, folder: Path, config: TrainConfig, resumed_at: int | None = None, view: WebView | None = None
+    ) -> None:
+        self.folder, self.config, self._view = folder, config, view
         self._settings = config.model_dump(mode="json")
         self._logged = resumed_at or 0
         self._log = Loggers(config.logger, folder, None if resumed_at is None else resumed_at + 1)
@@ -72,6 +76,9 @@ class TrainingMonitor(Monitor):
         if len(self.history) % max(1, self.config.learning.evaluations // PICTURES) == 0:
             self._log_pictures(episodes[0], transitions)
         score = record[self.config.task.measure]
+        if self._view:
+            name = f"{transitions / 1e6:.2f} M transitions: mean score {score:z.0f}"
+            self._view.add(columns(name, episodes[0], self.config.task.x_max))
         agent = AgentCheckpoint(self._settings, training.agent.state_dict(), transitions, score)
         for name in (LAST, BEST) if is_best else (LAST,):
             save_agent(self.folder / CHECKPOINTS / name, agent)

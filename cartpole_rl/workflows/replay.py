@@ -18,7 +18,7 @@ from cartpole_rl.randomization.poles import Pole
 from cartpole_rl.reporting.predictions import REPORTED_TIMES, replay_figure, replay_table
 from cartpole_rl.reporting.style import save
 from cartpole_rl.reporting.texts import count_text
-from cartpole_rl.reporting.web_view import WebView
+from cartpole_rl.reporting.web_view import WebView, columns
 from cartpole_rl.rig.parameters import check_names, check_values
 from cartpole_rl.run_folder import FIGURES, recordings, write_config, write_json
 from cartpole_rl.terminal import as_word, print_results, shown
@@ -72,12 +72,12 @@ def replay_recordings(config: ReplayConfig, folder: Path) -> None:
     print_results(folder, f"{REPLAY} and {FIGURE}", f"cartpole-model {as_word('from', shown(config.source))}")
     if config.view == "web":
         track = settings.task.x_max
-        shown_episodes = [columns(*pair, track) for pair in zip(paths, replays, strict=True)]
+        shown_episodes = [shown_beside(*pair, track) for pair in zip(paths, replays, strict=True)]
         with WebView(f"Replay of {paths[0].parent.parent.name}", pole.length, shown_episodes) as view:
             view.wait()
 
 
-def columns(path: Path, replayed: Replayed, track: float) -> dict[str, Any]:
+def shown_beside(path: Path, replayed: Replayed, track: float) -> dict[str, Any]:
     """Return what the page of `view=web` shows of a recording; the ghost is the simulated cart."""
     episode, rows = replayed.episode, len(replayed.episode.time)
     ghost = np.full((2, rows), np.nan)
@@ -85,15 +85,4 @@ def columns(path: Path, replayed: Replayed, track: float) -> dict[str, Any]:
     for channel, values in zip(ghost, (replayed.x, replayed.theta), strict=True):
         known = np.isfinite(values) & (places < rows)
         channel[places[known]] = values[known]
-    guarded = episode.guarded if episode.guarded is not None else np.zeros(episode.steps)
-    steps = {
-        "motor": [*episode.motor.tolist(), 0],
-        "guard": [*(np.sign(episode.motor) * guarded).astype(int).tolist(), 0],
-        "score": [0.0, *episode.score.cumsum().round(1).tolist()],
-    }
-    series = {"x": episode.x, "theta": episode.theta, "ghost_x": ghost[0], "ghost_theta": ghost[1]}
-    rounded = {
-        name: [None if np.isnan(value) else round(float(value), 5) for value in values]
-        for name, values in series.items()
-    }
-    return {"name": path.stem, "track": track, "time": episode.time.tolist(), **rounded, **steps}
+    return columns(path.stem, episode, track, ghost)

@@ -1,6 +1,7 @@
 """Train an agent in randomized simulation, from settings to a run folder."""
 
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from pathlib import Path
 
@@ -21,6 +22,7 @@ from cartpole_rl.randomization.ranges import IdentifiedSettings
 from cartpole_rl.reporting.episodes import report_episodes
 from cartpole_rl.reporting.randomization import drawn_carts
 from cartpole_rl.reporting.style import save
+from cartpole_rl.reporting.web_view import WebView
 from cartpole_rl.run_folder import BEST, CHECKPOINTS, FIGURES, METRICS, write_config
 from cartpole_rl.settings import evaluation_seed
 from cartpole_rl.tasks.episode import Episode
@@ -68,7 +70,8 @@ def train(config: TrainConfig, folder: Path) -> float | None:
     with claimed(folder):
         write_config(folder, "train", config.model_dump(mode="json"), resumed=checkpoint is not None)
         print_notes(config, env.plant.randomizer)
-        with TrainingMonitor(folder, config, checkpoint.step if checkpoint else None) as monitor:
+        step = checkpoint.step if checkpoint else None
+        with training_view(config, folder) as view, TrainingMonitor(folder, config, step, view) as monitor:
             settings = config.learning.at(config.control_period), config.buffer, config.optimizer
             run = config.seed, config.compile, config.task.measure
             training = config.agent.kind.learner(*settings, agent, env, evaluate, monitor, *run)
@@ -92,6 +95,13 @@ def train(config: TrainConfig, folder: Path) -> float | None:
     print_results(folder, f"{METRICS}, {FIGURES}/ and {CHECKPOINTS}/", following)
     score: float = metrics[config.task.measure]["mean"]
     return score
+
+
+def training_view(config: TrainConfig, folder: Path) -> AbstractContextManager[WebView | None]:
+    """Return the page of `view=web`, or nothing."""
+    if config.view == "none":
+        return nullcontext()
+    return WebView(f"Training in {shown(folder)}", config.pole.nominal.length, (), grows=True)
 
 
 def preview(config: TrainConfig, folder: Path) -> None:

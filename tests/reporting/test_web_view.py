@@ -5,7 +5,8 @@ import json
 import re
 import subprocess
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -14,13 +15,22 @@ from urllib.parse import urlsplit
 import pytest
 from browser import BROWSER, BROWSERS
 from command_line import COARSE, console_script, outcome
+from toy_settings import TOY
 
 from cartpole_rl.evaluation.snapshots import Snapshot, write
 from cartpole_rl.reporting import web_view
 from cartpole_rl.reporting.web_view import NOTE, WebView, page
+from cartpole_rl.workflows.config import TrainConfig, load_settings
+from cartpole_rl.workflows.train import train
 
 CALM = Snapshot(2, 120, -100, 0, 0, 1, 0.19, -0.25, 0.01, 0.5, 812.4, 0.38)
-EPISODE = {"name": "episode_000", "time": [0.0, 0.02]}
+EPISODE = {
+    "name": "episode_000",
+    "track": 0.38,
+    "time": [0.0, 0.02],
+    **{name: [0, 0] for name in ("x", "theta", "motor", "guard", "score")},
+    **{name: [None, None] for name in ("ghost_x", "ghost_theta")},
+}
 
 
 def ask(address: str, method: str, name: str, **headers: str) -> tuple[int, str]:
@@ -120,18 +130,70 @@ def test_a_browser_shows_the_cart_moving_and_its_button_stops(
     assert stopped.value.__notes__ == [NOTE]
 
 
+NEWEST = """<script>
+setInterval(() => { if (element("state").textContent === "the second") element("stop").click(); }, 10);
+</script></body>"""
+
+
+@pytest.mark.skipif(BROWSER is None, reason=f"none of {', '.join(BROWSERS)} is installed")
+def test_a_browser_shows_the_newest_evaluation_of_a_training(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The page presses its button once it shows the second one, which comes after the first was asked for."""
+    monkeypatch.setattr(web_view, "page", lambda *given: page(*given).replace("</body>", NEWEST))
+    with pytest.raises(KeyboardInterrupt):
+        add_before_a_browser(tmp_path)
+
+
+def add_before_a_browser(folder: Path) -> None:
+    """Add two episodes to a page that a browser shows, and wait for its button."""
+    with WebView("Training", 0.36, (), grows=True) as view, open_browser(view, folder):
+        view.add({**EPISODE, "name": "the first"})
+        while "the first" not in ask(view.address, "GET", "recording")[1]:
+            time.sleep(0.01)
+        view.add({**EPISODE, "name": "the second"})
+        time.sleep(100)
+
+
+def test_a_training_shows_the_first_episode_of_each_evaluation(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown, add = [], WebView.add
+
+    def added(view: WebView, episode: dict[str, Any]) -> None:
+        add(view, episode)
+        while len(found := json.loads(ask(view.address, "GET", "recording")[1])) == len(shown):
+            time.sleep(0.01)
+        shown.append(found[-1])
+
+    monkeypatch.setattr(WebView, "add", added)
+    toy = {**TOY[TrainConfig], "learning.evaluations": 2, "task.time_limit": 50, "view": "web"}
+    train(load_settings(TrainConfig, toy), tmp_path / "run")
+    history = [json.loads(line) for line in (tmp_path / "run/history.jsonl").read_text().splitlines()]
+    assert [each["name"] for each in shown] == [
+        f"{each['transitions'] / 1e6:.2f} M transitions: mean score {each['score']:z.0f}" for each in history
+    ]
+    assert {len(each["theta"]) for each in shown} == {51}
+
+
 def drive_before_a_browser(folder: Path) -> None:
     """Move the cart of a page that a browser shows, until this process is interrupted."""
+    with WebView("cart", 0.36) as view, open_browser(view, folder):
+        assert view.memory is not None
+        for number in count(1):
+            write(view.memory, number, CALM._replace(step=number, x=0.01 * (number % 30)))
+            time.sleep(0.02)
+
+
+@contextmanager
+def open_browser(view: WebView, folder: Path) -> Iterator[None]:
+    """Show the page of `view` in a browser meanwhile."""
     assert BROWSER is not None
     words = ["--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={folder}"]
-    with WebView("cart", 0.36) as view:
-        assert view.memory is not None
-        command = [BROWSER, *words, "--remote-debugging-port=0", view.address]
-        browser = subprocess.Popen(command, stderr=subprocess.DEVNULL)
-        try:
-            for number in count(1):
-                write(view.memory, number, CALM._replace(step=number, x=0.01 * (number % 30)))
-                time.sleep(0.02)
-        finally:
-            browser.terminate()
-            browser.wait()
+    command = [BROWSER, *words, "--remote-debugging-port=0", view.address]
+    browser = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+    try:
+        yield
+    finally:
+        browser.terminate()
+        browser.wait()
