@@ -290,8 +290,10 @@ class BoardSettings(RealCartSettings):
     def _full_moves_the_cart(self) -> Self:
         if not self.full:
             raise ValueError("full is 0: give what the board takes at motor value 255")
-        if self.damping and self.sends == "value":
-            raise ValueError("damping is for sends=speed and sends=acceleration; leave it out")
+        fastest = self.fastest != BoardSettings.model_fields["fastest"].default
+        if self.sends == "value" and (self.damping or fastest):
+            name = "damping" if self.damping else "fastest"
+            raise ValueError(f"{name} is for sends=speed and sends=acceleration; leave it out")
         if self.homing == "stops" and self.sends != "value":
             raise ValueError(
                 f"homing=stops with sends={self.sends}: a stepper loses steps at a stop; give hand or board"

@@ -148,6 +148,7 @@ REFUSED = {
     "two numbers": ({"line": "{} {}"}, "write it with one number"),
     "a second line": ({"line": "{}\n{}"}, "write it with one number"),
     "damping of a voltage": ({"damping": 1.0}, "damping is for sends=speed and sends=acceleration"),
+    "speed of a voltage": ({"fastest": 0.3}, "fastest is for sends=speed and sends=acceleration"),
     "exponents": ({"line": "a={}"}, "it writes small commands as 1.5e-05"),
     "capital exponents": ({"line": "a={:.3G}"}, "it writes small commands as 1.5e-05"),
     "exponents always": ({"line": "{:.3e}"}, "it writes small commands as 1.5e-05"),
