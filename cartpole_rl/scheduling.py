@@ -33,6 +33,13 @@ def taking_precedence() -> Iterator[None]:
         yield
 
 
+def lose_precedence(niceness: int) -> None:
+    """Give this process no real-time priority, which it may have inherited, and raise its niceness."""
+    if hasattr(os, "SCHED_OTHER"):
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    os.nice(niceness)
+
+
 @contextmanager
 def giving_precedence() -> Iterator[None]:
     """Give this process the lowest priority: `SCHED_IDLE`, or niceness 19 on other systems.

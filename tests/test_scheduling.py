@@ -36,6 +36,11 @@ def test_it_goes_last() -> None:
     assert after == os.sched_getscheduler(0)
 
 
+def test_what_it_inherited_is_lost() -> None:
+    said = in_a_process("take_precedence(); lose_precedence(1); print(os.sched_getscheduler(0))")
+    assert said == str(os.SCHED_OTHER)
+
+
 def test_it_goes_first_for_a_while() -> None:
     lines = "with taking_precedence():\n    print(os.sched_getscheduler(0))\nprint(os.sched_getscheduler(0))"
     within, after = map(int, in_a_process(lines).split())

@@ -8,13 +8,12 @@ import time
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
-from types import FrameType
 
 from cartpole_rl.emulator.device import CartDevice
 from cartpole_rl.emulator.link import Channel, open_link
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.scheduling import take_precedence
-from cartpole_rl.signals import ending_signals
+from cartpole_rl.signals import RaiseOnce, ending_signals
 
 HOMING_US = 100_000  # that pass for each frame while the cart homes; the host asks as often
 
@@ -36,11 +35,8 @@ def run(settings: EmulatorSettings) -> None:
 
 @contextmanager
 def until_stopped() -> Iterator[None]:
-    """End the block without an error on SIGINT, SIGTERM or SIGHUP."""
-
-    def interrupt(signum: int, frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
-
+    """End the block without an error on SIGINT, SIGTERM or SIGHUP. A second signal does not end its unwinding."""
+    interrupt = RaiseOnce(lambda number: KeyboardInterrupt())
     before = {number: signal.signal(number, interrupt) for number in (signal.SIGINT, *ending_signals())}
     try:
         yield

@@ -171,7 +171,10 @@ class BridgeProcess(CartProcess):
         super().__init__("cartpole_rl.plants.drivers", json.dumps(given, default=BaseModel.model_dump))
 
     def _why(self, code: int) -> str:
-        return self._stderr_end().splitlines()[-1] if code > 0 else super()._why(code)
+        if code > 0:
+            return self._stderr_end().splitlines()[-1]
+        killed = "; the cart's motor may still be on: switch it off" if code < 0 else ""
+        return f"{super()._why(code)}{killed}"
 
     def _failed(self, code: int) -> CartPoleError:
         kind = ConfigError if code == ConfigError.exit_code else LinkError

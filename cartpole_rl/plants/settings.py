@@ -3,6 +3,7 @@
 Everything that the commands ask about a plant is an attribute or a method of its settings.
 """
 
+import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -289,8 +290,10 @@ class BoardSettings(RealCartSettings):
     def _full_moves_the_cart(self) -> Self:
         if not self.full:
             raise ValueError("full is 0: give what the board takes at motor value 255")
-        if self.damping and self.sends == "value":
-            raise ValueError("damping is for sends=speed and sends=acceleration; leave it out")
+        fastest = self.fastest != BoardSettings.model_fields["fastest"].default
+        if self.sends == "value" and (self.damping or fastest):
+            name = "damping" if self.damping else "fastest"
+            raise ValueError(f"{name} is for sends=speed and sends=acceleration; leave it out")
         if self.homing == "stops" and self.sends != "value":
             raise ValueError(
                 f"homing=stops with sends={self.sends}: a stepper loses steps at a stop; give hand or board"
@@ -320,6 +323,7 @@ class BoardSettings(RealCartSettings):
             yield self.over(bridge.port)
 
 
+EXPONENT = re.compile(r"\de-\d", re.IGNORECASE)
 Column = Literal["time", "cart", "pole", "-"]
 
 
@@ -358,11 +362,11 @@ class TextSettings(BoardSettings):
     def _line_takes_a_number(cls, line: str) -> str:
         try:
             written = line.format(-1.5), line.format(1.5)
-        except (ValueError, IndexError, KeyError) as error:
+        except (ValueError, LookupError, AttributeError, TypeError) as error:
             raise ValueError(f"{error}; write it with one number, as in a={{:.3f}}") from None
         if written[0] == written[1] or not is_line(written[0]):
             raise ValueError("it must be one line with the command in place of {}, as in a={:.3f}")
-        if line.format(1.5e-5).count("e") > line.format(1.5).count("e"):
+        if EXPONENT.search(line.format(1.5e-5)):
             raise ValueError(
                 "it writes small commands as 1.5e-05, which boards misread: give decimals, as in {:.3f}"
             )

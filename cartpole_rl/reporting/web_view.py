@@ -32,6 +32,7 @@ from cartpole_rl.drawing.pages import filled, shared_parts
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.evaluation.snapshots import Memory, new_memory, read
 from cartpole_rl.reporting.live_view import LiveView
+from cartpole_rl.scheduling import lose_precedence
 from cartpole_rl.signals import end_with_parent
 
 if TYPE_CHECKING:
@@ -174,7 +175,7 @@ def serve(
     """Answer requests until the process is ended or its parent ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process
     end_with_parent(stop.process)
-    os.nice(LESS_URGENT)
+    lose_precedence(LESS_URGENT)
     contents = {"": shown, "recording": json.dumps(episodes)}
 
     def receive() -> None:

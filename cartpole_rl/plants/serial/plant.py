@@ -260,14 +260,14 @@ class SerialPlant(OneCartPlant):
 
     def _break_off(self, error: PlantError) -> None:
         """End the episode without a new state: the last counts are kept, the motor counts as 0."""
-        if isinstance(error, LinkError) and self._owned is not None and self._owned.died:
-            error = LinkError(self._owned.died)
         self.ended_by = Ending.FAULT if isinstance(error, FaultError) else Ending.LINK
         self.last_error = error
         self._driving = False
         self._preparation.require_homing()
         if isinstance(error, LinkError):
             self.cart.close()
+            if why := self._why_lost():
+                self.last_error = LinkError(why)
         else:
             self.halt()
         self._state = replace(self._state, motor_applied=0, command_age_ms=0)

@@ -22,6 +22,7 @@ from tensordict import TensorDict
 from cartpole_rl.choices import choice
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import ConfigError, LinkError, PlantError
+from cartpole_rl.plants.emulated import BridgeProcess
 from cartpole_rl.plants.serial.plant import SerialPlant, bridged_cart
 from cartpole_rl.plants.serial.preparation import always, nobody
 from cartpole_rl.plants.settings import TextSettings
@@ -220,6 +221,15 @@ def test_a_frozen_counter_latches_a_fault(tmp_path: Path) -> None:
         assert plant.ended_by == "fault"
         assert abs(last_speed(journal)) < 0.1
         assert float(taken(journal)[-1][1].removeprefix("a=")) == 0
+
+
+def test_a_bridge_that_is_killed_says_that_the_motor_may_be_on() -> None:
+    with board() as (port, _):
+        bridge = BridgeProcess(TextSettings(**STEPPER, port=port), RIG, None)
+        os.kill(bridge.pid, signal.SIGKILL)
+        assert "exit code -9" in bridge.death()
+        assert bridge.died.endswith("the cart's motor may still be on: switch it off")
+        bridge.close()
 
 
 @pytest.mark.nightly

@@ -11,6 +11,7 @@ import pytest
 
 from cartpole_rl.choices import choice
 from cartpole_rl.emulator.homing import HomingError, Reading
+from cartpole_rl.emulator.process import until_stopped
 from cartpole_rl.errors import ConfigError, LinkError
 from cartpole_rl.plants.drivers.bridge import CONFIRMED, STOPS, Bridge, MotorCommands, StandIn
 from cartpole_rl.plants.drivers.driver import Driver, Measurement
@@ -162,6 +163,23 @@ def test_a_driver_that_raises_anything_leaves_a_stopped_board() -> None:
     with pytest.raises(LinkError, match="the driver failed: ValueError: oops"):
         bridge.run(Frames())  # type: ignore[arg-type]
     assert bridge.played.stops >= STOPS
+
+
+@pytest.mark.usefixtures("same_signals")
+def test_two_signals_at_once_leave_a_stopped_board(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A logout sends SIGTERM and SIGHUP; the second one must not interrupt what the first one begins."""
+    bridge, both = Playing(), (signal.SIGTERM, signal.SIGHUP)
+
+    def session_ends(timeout: float) -> None:
+        signal.pthread_sigmask(signal.SIG_BLOCK, both)
+        for number in both:
+            signal.raise_signal(number)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, both)
+
+    monkeypatch.setattr(bridge.played, "read", session_ends)
+    with until_stopped():
+        bridge.run(Frames())  # type: ignore[arg-type]
+    assert bridge.played.stops == STOPS
 
 
 def test_a_board_is_stopped_before_anything_else() -> None:

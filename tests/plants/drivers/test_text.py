@@ -148,7 +148,12 @@ REFUSED = {
     "two numbers": ({"line": "{} {}"}, "write it with one number"),
     "a second line": ({"line": "{}\n{}"}, "write it with one number"),
     "damping of a voltage": ({"damping": 1.0}, "damping is for sends=speed and sends=acceleration"),
+    "speed of a voltage": ({"fastest": 0.3}, "fastest is for sends=speed and sends=acceleration"),
     "exponents": ({"line": "a={}"}, "it writes small commands as 1.5e-05"),
+    "capital exponents": ({"line": "a={:.3G}"}, "it writes small commands as 1.5e-05"),
+    "exponents always": ({"line": "{:.3e}"}, "it writes small commands as 1.5e-05"),
+    "a part of a number": ({"line": "{.x}"}, "write it with one number"),
+    "a place in a number": ({"line": "{[0]}"}, "write it with one number"),
     "too coarse": ({"full": 12, "sends": "acceleration"}, "line={:.0f} writes 0.0471, .* as 0: give more"),
     "two lines": ({"stop_line": "s\nx"}, "is not one line of text"),
     "a stepper at a stop": (
