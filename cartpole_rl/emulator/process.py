@@ -35,7 +35,7 @@ def run(settings: EmulatorSettings) -> None:
 
 @contextmanager
 def until_stopped() -> Iterator[None]:
-    """End the block without an error on SIGINT, SIGTERM or SIGHUP; a second one cuts no unwinding off."""
+    """End the block without an error on SIGINT, SIGTERM or SIGHUP; a second does not end its unwinding."""
     interrupt = RaiseOnce(lambda number: KeyboardInterrupt())
     before = {number: signal.signal(number, interrupt) for number in (signal.SIGINT, *ending_signals())}
     try:

@@ -12,7 +12,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 from pydantic import Field, TypeAdapter, field_validator, model_validator
 
 from cartpole_rl.emulator.settings import EmulatorSettings
-from cartpole_rl.errors import CheckpointError
+from cartpole_rl.errors import CheckpointError, ConfigError
 from cartpole_rl.physics.laws import Law
 from cartpole_rl.physics.models import INTEGRATORS
 from cartpole_rl.plants.drivers.driver import DRIVERS
@@ -179,10 +179,12 @@ class EmulatedSettings(PlantSettings):
 
     @contextmanager
     def reachable(self, emulator: EmulatorSettings, hardware: Hardware) -> "Iterator[SerialSettings]":
-        """Start a cart whose pole hangs, and yield the settings to reach it. Raises EmulatorError."""
+        """Start a hanging cart, and yield the settings to reach it. Raises EmulatorError, ConfigError."""
         from cartpole_rl.plants.emulated import EmulatedCart  # which imports this module
 
-        with EmulatedCart(emulator.model_copy(update={"start": "hanging"})) as cart:
+        if emulator.start != "hanging":
+            raise ConfigError(f"emulator.start={emulator.start}: this cart starts hanging; leave it out")
+        with EmulatedCart(emulator) as cart:
             yield cart.settings
 
 

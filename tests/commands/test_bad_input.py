@@ -144,6 +144,7 @@ WRONG_EVALUATION = [
     ("run=run plant=emulated pole=large", "pole", "emulator=large", 2),
     ("run=run plant=emulated emulator.latencyy=1", "emulator.latencyy", "did you mean emulator.latency?", 2),
     ("run=run plant=emulated task=swingup task.evaluation_start.angle=any", "angle=any", "hanging", 2),
+    ("run=run plant=emulated task=swingup emulator.start=upright", "start=upright", "leave it out", 2),
     ("run=run emulator.latency=0.01", "emulator", "give plant=emulated", 2),
     (
         "run=run plant.port=/dev/ttyUSB0",

@@ -14,10 +14,12 @@ import torch
 from tensordict import TensorDict
 
 from cartpole_rl.emulator.settings import EmulatorSettings
-from cartpole_rl.errors import EmulatorError, LinkError
+from cartpole_rl.errors import ConfigError, EmulatorError, LinkError
 from cartpole_rl.plants.emulated import EmulatedCart
 from cartpole_rl.plants.serial.errors import RefusedError
 from cartpole_rl.plants.serial.plant import SerialPlant, emulated_plant
+from cartpole_rl.plants.settings import EmulatedSettings
+from cartpole_rl.rig.hardware import nominal_hardware
 
 TURN = 4096
 
@@ -175,3 +177,9 @@ def kill(emulated: EmulatedCart, error: Exception | None = None) -> None:
         time.sleep(0.02)
     if error is not None:
         raise error
+
+
+def test_a_start_that_would_be_replaced_is_refused() -> None:
+    chosen = EmulatedSettings(kind="emulated").reachable(fast(start="upright"), nominal_hardware())
+    with pytest.raises(ConfigError, match="start=upright: this cart starts hanging"), chosen:
+        pass

@@ -367,8 +367,10 @@ def emulated_cart(
 ) -> SerialPlant:
     """Return the plant of plant=emulated, on a new cart with the settings `emulator` and the start `start`.
 
-    It needs nobody to confirm. Raises PortError, LinkError, NotReadyError, EmulatorError.
+    It needs nobody to confirm. Raises PortError, LinkError, NotReadyError, EmulatorError, ConfigError.
     """
+    if emulator.start not in ("hanging", start):
+        raise ConfigError(f"emulator.start={emulator.start}: this cart starts {start}; leave it out")
     if cart is not None:
         emulator = emulator.of_cart(cart)
     return emulated_plant(emulator.model_copy(update={"start": start}), control_period, prompt, plant.rehome)

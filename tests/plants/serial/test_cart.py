@@ -187,7 +187,7 @@ def test_the_end_waits_a_few_seconds_at_most_whatever_the_settings(caplog: pytes
             cart.stop()
         cart.close()
         assert time.monotonic() - started < 30
-        assert "our firmware stops it within half a second" in caplog.text
+        assert "our firmware stops it in half a second" in caplog.text
         assert len(peer.messages(Stop)) - before >= 2 + 2  # for LONGEST_STOP, then for LAST_STOP
 
 
