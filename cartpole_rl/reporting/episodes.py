@@ -186,3 +186,24 @@ def _summary(episode: Episode) -> str:
     share = 100 * is_upright(episode.theta[1:]).mean()
     shares = f"upright {share:.0f} % of the time{guard_text(episode)}"
     return f"score {episode.score.sum():z.0f},  {shares},  {ending_text(episode)}"
+
+
+def columns(name: str, episode: Episode, track: float, ghost: Array | None = None) -> dict[str, Any]:
+    """Return what the page of `view=web` shows of an episode on a track of +-`track` m.
+
+    `ghost` [2, T + 1] has the positions, m, and angles, rad, of a cart beside it, NaN where there is none.
+    """
+    rows = len(episode.time)
+    guarded = episode.guarded if episode.guarded is not None else np.zeros(episode.steps)
+    beside = np.full((2, rows), np.nan) if ghost is None else ghost
+    steps = {
+        "motor": [*episode.motor.tolist(), 0],
+        "guard": [*(np.sign(episode.motor) * guarded).astype(int).tolist(), 0],
+        "score": [0.0, *episode.score.cumsum().round(1).tolist()],
+    }
+    series = {"x": episode.x, "theta": episode.theta, "ghost_x": beside[0], "ghost_theta": beside[1]}
+    rounded = {
+        name: [None if np.isnan(value) else round(float(value), 5) for value in values]
+        for name, values in series.items()
+    }
+    return {"name": name, "track": track, "time": episode.time.tolist(), **rounded, **steps}

@@ -23,10 +23,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from multiprocessing.connection import Connection
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import Any, Self
 
 from cartpole_rl.drawing.pages import filled, shared_parts
 from cartpole_rl.errors import ConfigError
@@ -34,11 +31,6 @@ from cartpole_rl.evaluation.snapshots import Memory, new_memory, read
 from cartpole_rl.reporting.live_view import LiveView
 from cartpole_rl.scheduling import lose_precedence
 from cartpole_rl.signals import end_with_parent
-
-if TYPE_CHECKING:
-    from cartpole_rl.tasks.episode import Episode
-
-Array = NDArray[np.float64]
 
 HERE = "127.0.0.1"
 HOSTS = (HERE, "localhost")  # in the Host of a request: a page elsewhere may give its own name our address
@@ -63,8 +55,9 @@ def chosen_view(title: str, chosen: str, pole_length: float) -> "LiveView | WebV
 class WebView:
     """A context manager of the process that serves the page.
 
-    The page shows the cart in `memory`, or `episodes`, each as `columns` returns it. `add` adds one; the page
-    of a training, which `grows`, shows the newest. Raises ConfigError where no process can interrupt another.
+    The page shows the cart in `memory`, or `episodes`, as `episodes.columns` returns each. `add` adds one; the
+    page of a training, which `grows`, shows the newest. Raises ConfigError where no process can interrupt
+    another.
     """
 
     def __init__(
@@ -127,27 +120,6 @@ def page(title: str, pole_length: float, replays: bool, grows: bool = False) -> 
     }
     values = {**shared_parts(), **words, "title": html.escape(title), "pole": pole_length}
     return filled(Path(__file__).with_name("live.html"), values)
-
-
-def columns(name: str, episode: "Episode", track: float, ghost: Array | None = None) -> dict[str, Any]:
-    """Return what the page shows of an episode on a track of +-`track` m.
-
-    `ghost` [2, T + 1] has the positions, m, and angles, rad, of a cart beside it, NaN where there is none.
-    """
-    rows = len(episode.time)
-    guarded = episode.guarded if episode.guarded is not None else np.zeros(episode.steps)
-    beside = np.full((2, rows), np.nan) if ghost is None else ghost
-    steps = {
-        "motor": [*episode.motor.tolist(), 0],
-        "guard": [*(np.sign(episode.motor) * guarded).astype(int).tolist(), 0],
-        "score": [0.0, *episode.score.cumsum().round(1).tolist()],
-    }
-    series = {"x": episode.x, "theta": episode.theta, "ghost_x": beside[0], "ghost_theta": beside[1]}
-    rounded = {
-        name: [None if np.isnan(value) else round(float(value), 5) for value in values]
-        for name, values in series.items()
-    }
-    return {"name": name, "track": track, "time": episode.time.tolist(), **rounded, **steps}
 
 
 class Stop:

@@ -14,9 +14,9 @@ from cartpole_rl.learning.checkpoints import AgentCheckpoint, TrainingCheckpoint
 from cartpole_rl.learning.dqn import Monitor, Scalars, Training
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.reporting.animation import gif
-from cartpole_rl.reporting.episodes import behaviour
+from cartpole_rl.reporting.episodes import behaviour, columns
 from cartpole_rl.reporting.loggers import Loggers
-from cartpole_rl.reporting.web_view import WebView, columns
+from cartpole_rl.reporting.web_view import WebView
 from cartpole_rl.run_folder import BEST, CHECKPOINTS, HISTORY, LAST
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.terminal import print_message, progress_bar

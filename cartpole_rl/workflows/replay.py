@@ -15,10 +15,11 @@ from cartpole_rl.identification.prediction import Replayed, all_errors, away_fro
 from cartpole_rl.identification.rollout import Dynamics
 from cartpole_rl.identification.windows import recorded_period
 from cartpole_rl.randomization.poles import Pole
+from cartpole_rl.reporting.episodes import columns
 from cartpole_rl.reporting.predictions import REPORTED_TIMES, replay_figure, replay_table
 from cartpole_rl.reporting.style import save
 from cartpole_rl.reporting.texts import count_text
-from cartpole_rl.reporting.web_view import WebView, columns
+from cartpole_rl.reporting.web_view import WebView
 from cartpole_rl.rig.parameters import check_names, check_values
 from cartpole_rl.run_folder import FIGURES, recordings, write_config, write_json
 from cartpole_rl.terminal import as_word, print_results, shown
