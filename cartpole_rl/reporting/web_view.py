@@ -55,8 +55,8 @@ def chosen_view(title: str, chosen: str, pole_length: float) -> "LiveView | WebV
 class WebView:
     """A context manager of the process that serves the page.
 
-    The page shows the cart in `memory`, or `episodes`, as `episodes.columns` returns each. `add` adds one; the
-    page of a training, which `grows`, shows the newest. Raises ConfigError where no process can interrupt
+    The page shows the cart in `memory`, or `episodes`, as `episodes.columns` returns each. `add` adds one;
+    the page of a training, which `grows`, shows the newest. Raises ConfigError where no process can interrupt
     another.
     """
 
