@@ -8,10 +8,10 @@ A page marks a generated block with `<!-- claims: NAME -->`; the block ends at t
 Texts and statements name values of agents as study/arm/evaluation; within a row the study may be left out.
 `a+b` in place of an arm pools the agents of two arms. In place of an evaluation, `a:b` is the ratio of two
 evaluations of each agent, `ratio` that of the second to the first, `a&b` the lower and `a,b` the mean of
-several; names with @ are numbers of an agent's curves (CURVES), `a#key` is a mean of metrics.json that
-`report.py --data` stores (reading.BEHAVIOUR). In a text `{iqm arm/evaluation}` is replaced by that number,
-`{iqm arm/evaluation []}` by it with its 95 % interval, `{claim}` by the statistics of the row's statements
-with theirs.
+several; names with @ are numbers of an agent's curves (CURVES), `a#key` is a number of metrics.json or
+identification.json that `report.py --data` stores (reading.BEHAVIOUR). In a text `{iqm arm/evaluation}` is
+replaced by that number, `{iqm arm/evaluation []}` by it with its 95 % interval, `{claim}` by the statistics
+of the row's statements with theirs.
 
 A statement is a statistic (STATISTICS) with its values, an operator and a number, as
 `difference position/emulated constant/emulated > 0`.
@@ -77,7 +77,7 @@ class Row(Settings):
     thesis: str
     here: str = ""
     otherwise: str = ""  # what was done otherwise than in the thesis
-    study: str = ""  # empty: not asked yet
+    study: str = ""  # empty: not asked yet; `otherwise` then says why, and what it would cost
     claim: str = ""  # statements, separated by ";"; empty: the thesis has no result
     because: bool = False  # what was done otherwise could turn the result round
 
@@ -158,6 +158,8 @@ STATISTICS: Mapping[str, tuple[str, Callable[..., Estimate]]] = {  # name: in wo
         lambda values, others: _exact(np.abs(values - others).max(), values.size),
     ),
     "over": ("", _share),
+    "gain": ("difference", lambda values, others: estimate(values - others)),
+    "percent": ("", lambda whole, values: estimate(100 * values / whole)),
     "less": ("percent less", lambda values, others: bootstrap(_percent_less, values, others)),
     "difference": ("difference", difference),
     "distance": ("difference", _nearer),
@@ -324,8 +326,9 @@ def _rows_table(claims: Claims, evidence: Evidence) -> str:
 
 
 def _not_asked(claims: Claims) -> str:
-    lines = ["| place | the thesis |", "|---|---|"]
-    return "\n".join([*lines, *(f"| {row.place} | {row.thesis} |" for row in claims.rows if not row.study)])
+    lines = ["| place | the thesis | why not, and what it would cost |", "|---|---|---|"]
+    open_rows = (row for row in claims.rows if not row.study)
+    return "\n".join([*lines, *(f"| {row.place} | {row.thesis} | {row.otherwise} |" for row in open_rows)])
 
 
 def _counts(claims: Claims, evidence: Evidence) -> str:
