@@ -116,6 +116,7 @@ CURVES: Mapping[str, tuple[str, Callable[[Curve], float]]] = {  # name: curve, n
     "@growth": ("loss", lambda curve: _mean_between(curve, LATE, 1.0) - _mean_between(curve, 0.25, MIDDLE)),
     "@jumps": ("score_upright", lambda curve: float(np.abs(np.diff([y for _, y in curve])).mean())),
     "@start": ("score_upright", lambda curve: _mean_between(curve, 0.0, 0.3)),
+    "@fifth": ("score", lambda curve: _mean_between(curve, 0.1, 0.2)),
     "@first": ("score_upright", lambda curve: next((x for x, y in curve if y > 400), curve[-1][0])),
 }
 
@@ -320,7 +321,8 @@ def blocks(claims: Claims, evidence: Evidence) -> dict[str, str]:
 def _rows_table(claims: Claims, evidence: Evidence) -> str:
     lines = ["| place | the thesis | here | done otherwise | verdict | study |", "|---|---|---|---|---|---|"]
     for row in filter(lambda row: row.study, claims.rows):
-        cells = (row.place, row.thesis, evidence.filled(row.here, row), row.otherwise, evidence.word(row))
+        ours = (evidence.filled(text, row) for text in (row.here, row.otherwise))
+        cells = (row.place, row.thesis, *ours, evidence.word(row))
         lines.append(f"| {' | '.join(cells)} | `{row.study}` |")
     return "\n".join(lines)
 
