@@ -273,7 +273,8 @@ class _Reader:
                 path = (self.folder / arm / str(seed)).as_posix()
                 own = found[ITSELF].run if ITSELF in found else None
                 curves = self._curves(own, self._origin(arms[arm], seed))
-                behaviour = {name: _behaviour((found.get(name) or found[ITSELF]).run) for name in present}
+                known = {OWN.name: found[ITSELF]} | found if ITSELF in found else found
+                behaviour = {name: _behaviour(known[name].run) for name in present if name in known}
                 agents.append(Agent(arm, seed, path, present, curves, behaviour))
         order = [*arms]
         return sorted(agents, key=lambda agent: (order.index(agent.group), agent.seed))
