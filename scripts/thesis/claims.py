@@ -339,7 +339,7 @@ def _counts(claims: Claims, evidence: Evidence) -> str:
     return (
         f"[The table](docs/thesis-results.md) has {asked} answers: {counts[Word.AGREES]} agree with the "
         f"thesis, {counts[Word.CONTRADICTS]} contradict it, {counts[Word.DIFFERS]} differ for a reason that "
-        f"the row names, {counts[Word.NOT_SHOWN]} are not shown with ten agents, and in {counts[Word.NEW]} "
+        f"the row names, {counts[Word.NOT_SHOWN]} are not shown either way, and in {counts[Word.NEW]} "
         f"the thesis has no result. {counts[Word.NOT_ASKED]} more of its questions are not asked yet."
     )
 
