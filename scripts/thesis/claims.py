@@ -8,10 +8,10 @@ A page marks a generated block with `<!-- claims: NAME -->`; the block ends at t
 Texts and statements name values of agents as study/arm/evaluation; within a row the study may be left out.
 `a+b` in place of an arm pools the agents of two arms. In place of an evaluation, `a:b` is the ratio of two
 evaluations of each agent, `ratio` that of the second to the first, `a&b` the lower and `a,b` the mean of
-several; names with @ are numbers of an agent's curves (CURVES), `a#key` is a mean of metrics.json that
-`report.py --data` stores (reading.BEHAVIOUR). In a text `{iqm arm/evaluation}` is replaced by that number,
-`{iqm arm/evaluation []}` by it with its 95 % interval, `{claim}` by the statistics of the row's statements
-with theirs.
+several; names with @ are numbers of an agent's curves (CURVES), `a#key` is a number of metrics.json or
+identification.json that `report.py --data` stores (reading.BEHAVIOUR). In a text `{iqm arm/evaluation}` is
+replaced by that number, `{iqm arm/evaluation []}` by it with its 95 % interval, `{claim}` by the statistics
+of the row's statements with theirs.
 
 A statement is a statistic (STATISTICS) with its values, an operator and a number, as
 `difference position/emulated constant/emulated > 0`.
@@ -77,7 +77,7 @@ class Row(Settings):
     thesis: str
     here: str = ""
     otherwise: str = ""  # what was done otherwise than in the thesis
-    study: str = ""  # empty: not asked yet
+    study: str = ""  # empty: not asked yet; `otherwise` then says why, and what it would cost
     claim: str = ""  # statements, separated by ";"; empty: the thesis has no result
     because: bool = False  # what was done otherwise could turn the result round
 
@@ -116,6 +116,7 @@ CURVES: Mapping[str, tuple[str, Callable[[Curve], float]]] = {  # name: curve, n
     "@growth": ("loss", lambda curve: _mean_between(curve, LATE, 1.0) - _mean_between(curve, 0.25, MIDDLE)),
     "@jumps": ("score_upright", lambda curve: float(np.abs(np.diff([y for _, y in curve])).mean())),
     "@start": ("score_upright", lambda curve: _mean_between(curve, 0.0, 0.3)),
+    "@fifth": ("score", lambda curve: _mean_between(curve, 0.1, 0.2)),
     "@first": ("score_upright", lambda curve: next((x for x, y in curve if y > 400), curve[-1][0])),
 }
 
@@ -158,6 +159,8 @@ STATISTICS: Mapping[str, tuple[str, Callable[..., Estimate]]] = {  # name: in wo
         lambda values, others: _exact(np.abs(values - others).max(), values.size),
     ),
     "over": ("", _share),
+    "gain": ("difference", lambda values, others: estimate(values - others)),
+    "percent": ("", lambda whole, values: estimate(100 * values / whole)),
     "less": ("percent less", lambda values, others: bootstrap(_percent_less, values, others)),
     "difference": ("difference", difference),
     "distance": ("difference", _nearer),
@@ -318,14 +321,16 @@ def blocks(claims: Claims, evidence: Evidence) -> dict[str, str]:
 def _rows_table(claims: Claims, evidence: Evidence) -> str:
     lines = ["| place | the thesis | here | done otherwise | verdict | study |", "|---|---|---|---|---|---|"]
     for row in filter(lambda row: row.study, claims.rows):
-        cells = (row.place, row.thesis, evidence.filled(row.here, row), row.otherwise, evidence.word(row))
+        ours = (evidence.filled(text, row) for text in (row.here, row.otherwise))
+        cells = (row.place, row.thesis, *ours, evidence.word(row))
         lines.append(f"| {' | '.join(cells)} | `{row.study}` |")
     return "\n".join(lines)
 
 
 def _not_asked(claims: Claims) -> str:
-    lines = ["| place | the thesis |", "|---|---|"]
-    return "\n".join([*lines, *(f"| {row.place} | {row.thesis} |" for row in claims.rows if not row.study)])
+    lines = ["| place | the thesis | why not, and what it would cost |", "|---|---|---|"]
+    open_rows = (row for row in claims.rows if not row.study)
+    return "\n".join([*lines, *(f"| {row.place} | {row.thesis} | {row.otherwise} |" for row in open_rows)])
 
 
 def _counts(claims: Claims, evidence: Evidence) -> str:
@@ -334,7 +339,7 @@ def _counts(claims: Claims, evidence: Evidence) -> str:
     return (
         f"[The table](docs/thesis-results.md) has {asked} answers: {counts[Word.AGREES]} agree with the "
         f"thesis, {counts[Word.CONTRADICTS]} contradict it, {counts[Word.DIFFERS]} differ for a reason that "
-        f"the row names, {counts[Word.NOT_SHOWN]} are not shown with ten agents, and in {counts[Word.NEW]} "
+        f"the row names, {counts[Word.NOT_SHOWN]} are not shown either way, and in {counts[Word.NEW]} "
         f"the thesis has no result. {counts[Word.NOT_ASKED]} more of its questions are not asked yet."
     )
 

@@ -41,8 +41,11 @@ MADE = ("measure", "command", "experiment", "ratio", "agents_of")  # what the re
 DERIVED = {"evaluated", "guard"}  # settings that follow from others
 ITSELF = ""  # evaluation of a part that is the run of an arm and a seed itself
 CURVE_POINTS = 60
-# keys of metrics.json that are stored with the scores
-BEHAVIOUR = ("upright_at_end", "time_to_upright_s", "rms_motor_change")
+# keys of metrics.json and identification.json that are stored with the scores
+BEHAVIOUR = (
+    *("upright_at_end", "time_to_upright_s", "rms_motor_change", "rms_angle_rad", "rms_position_m"),
+    *("parameters.pole_coulomb", "parameters.pole_drag"),
+)
 
 
 @dataclass(frozen=True)
@@ -270,7 +273,8 @@ class _Reader:
                 path = (self.folder / arm / str(seed)).as_posix()
                 own = found[ITSELF].run if ITSELF in found else None
                 curves = self._curves(own, self._origin(arms[arm], seed))
-                behaviour = {name: _behaviour(found[name].run) for name in present if name in found}
+                known = {OWN.name: found[ITSELF]} | found if ITSELF in found else found
+                behaviour = {name: _behaviour(known[name].run) for name in present if name in known}
                 agents.append(Agent(arm, seed, path, present, curves, behaviour))
         order = [*arms]
         return sorted(agents, key=lambda agent: (order.index(agent.group), agent.seed))
