@@ -240,7 +240,7 @@ def widened(fit: Fit, best: Candidate, candidates: Sequence[Candidate]) -> Fit:
         covariance += weight * np.outer(away, away)
         total += weight
     values, vectors = np.linalg.eigh(fit.covariance + covariance / total)
-    bounded = np.minimum(values, 1.0)  # the posterior is not wider than the prior
+    bounded = np.clip(values, 0.0, 1.0)  # not below 0 by rounding; the posterior is not wider than the prior
     return replace(fit, covariance=vectors * bounded @ vectors.T)
 
 

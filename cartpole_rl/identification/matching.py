@@ -29,6 +29,7 @@ FARTHEST = 3.0  # of STATE_SPREAD: the largest distance of an initial state from
 GUESSED_FROM = 3  # positions; when the motor reverses, later ones bend away from any parabola
 CORRELATED = 10.0  # this many correlated residuals of a window count as one independent residual
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e-6, 1e3
+EASED = 5.0  # dampings shrink by it after a step that helps; else the search creeps along narrow valleys
 KEPT = 8.0  # a window's damping grows by it where its step would not lower its cost
 SETTLED_DAMPING = 0.01  # beyond it, a step is short because it is damped
 FACTORS = (0.1, 1.0, 10.0)  # of the dampings that are tried side by side
@@ -269,9 +270,9 @@ class Matching:
             normal, before = self.normal_equations(now.point, now.motion), now
             for _ in range(ATTEMPTS):
                 trial, moved, factor = self.best_trial(before, normal, damping, own)
-                own = torch.where(moved, own * factor, own * KEPT).clamp(LEAST_DAMPING, MOST_DAMPING)
+                own = torch.where(moved, own * factor / EASED, own * KEPT).clamp(LEAST_DAMPING, MOST_DAMPING)
                 if trial.cost < before.cost:
-                    now, damping = trial, max(LEAST_DAMPING, damping * factor)
+                    now, damping = trial, max(LEAST_DAMPING, damping * factor / EASED)
                     break
                 damping *= max(FACTORS) ** 2
             if now is before:
