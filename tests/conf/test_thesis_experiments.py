@@ -162,7 +162,7 @@ OF: dict[str, Table] = {
     },
 }
 # not of the experiment
-OF_THE_RUN = {"seed", "label", "device", "threads", "compile", "resume", "logger", "preview"}
+OF_THE_RUN = {"seed", "label", "device", "threads", "compile", "resume", "logger", "preview", "view"}
 EXPECTED = {
     name: {**BOTH, **{f"cart.{key}": row for key, row in CART.items()}, **own} for name, own in OF.items()
 }
