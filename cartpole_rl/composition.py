@@ -52,7 +52,7 @@ from cartpole_rl.choices import (
     load,
     merged,
 )
-from cartpole_rl.errors import ConfigError
+from cartpole_rl.errors import ConfigError, reason_of
 from cartpole_rl.rig.hardware import HARDWARE, hardware_of
 from cartpole_rl.rig.parameters import PARAMETERS, check_value, completed
 from cartpole_rl.run_folder import PREFIX, RUN_FILES, USES, check_program, program_of, use_of
@@ -127,7 +127,7 @@ def as_mapping(config: DictConfig) -> dict[str, Any]:
     try:
         return without_missing(OmegaConf.to_container(config, resolve=True))
     except OmegaConfBaseException as error:
-        reason = str(error).splitlines()[0]
+        reason = reason_of(error)
         raise ConfigError(f"{error.full_key}: {reason}" if error.full_key else reason) from None
 
 

@@ -16,7 +16,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from cartpole_rl.compilation import Compiled
-from cartpole_rl.errors import CheckpointError, ConfigError
+from cartpole_rl.errors import CheckpointError, ConfigError, reason_of
 from cartpole_rl.files import replacing
 from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import cart_column
@@ -86,9 +86,9 @@ def load_model(source: Path) -> LearnedModel:
     try:
         return _as_model(content)
     except Exception as error:  # of another version, or edited by hand
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise CheckpointError(
-            f"plant.model={source} is of another version of this package: {reason}; run cartpole-model again"
+            f"plant.model={source} is of another version of this package: {reason_of(error)}; "
+            "run cartpole-model again"
         ) from None
 
 

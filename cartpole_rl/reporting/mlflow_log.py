@@ -15,7 +15,7 @@ from typing import Any
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
-from cartpole_rl.errors import ConfigError
+from cartpole_rl.errors import ConfigError, reason_of
 from cartpole_rl.reporting.loggers import flatten, library, sweep_of
 from cartpole_rl.terminal import print_message
 
@@ -52,7 +52,7 @@ class MlflowLog:
             tags = {"sweep": sweep} if (sweep := sweep_of(folder)) else {}
             created = self._client.create_run(experiment, run_name=folder.name, tags=tags)
         except self._mlflow.MlflowException as error:
-            raise ConfigError(f"logger=mlflow, {store}: {str(error).splitlines()[0]}") from None
+            raise ConfigError(f"logger=mlflow, {store}: {reason_of(error)}") from None
         self._run = created.info.run_id
         file.write_text(self._run)
 
@@ -98,5 +98,5 @@ class MlflowLog:
             method(self._run, *arguments, **named)
         except (self._mlflow.MlflowException, OSError) as error:
             if not self._lost:
-                print_message("train", f"warning: logger=mlflow misses points: {str(error).splitlines()[0]}")
+                print_message("train", f"warning: logger=mlflow misses points: {reason_of(error)}")
             self._lost = True

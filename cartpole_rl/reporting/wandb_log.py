@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 from PIL import Image
 
-from cartpole_rl.errors import ConfigError
+from cartpole_rl.errors import ConfigError, reason_of
 from cartpole_rl.reporting.loggers import flatten, library, sweep_of
 from cartpole_rl.reporting.style import png
 
@@ -42,8 +42,7 @@ class WandbLog:
                 settings=self._wandb.Settings(silent=True, console="off"),
             )
         except self._wandb.errors.Error as error:
-            reason = str(error).splitlines()[0]
-            raise ConfigError(f"logger=wandb: {reason} Or set WANDB_MODE=offline") from None
+            raise ConfigError(f"logger=wandb: {reason_of(error)} Or set WANDB_MODE=offline") from None
         file.write_text(self._run.id)
         self._run.define_metric("*", step_metric=AXIS)
 

@@ -57,11 +57,15 @@ LONGER = {  # command: how to train further than a run that has ended
 }
 
 
-NEEDED = {  # format: extra of this package, its packages
-    "onnx": ("export", ("onnx", "onnxscript")),
-    "minari": ("minari", ("minari", "h5py")),
-    "mcap": ("mcap", ("mcap",)),
+PACKAGES = {  # extra of this package: its modules, and their names
+    "export": {"onnx": "onnx", "onnxscript": "onnxscript"},
+    "mcap": {"mcap": "mcap"},
+    "minari": {"minari": "minari", "h5py": "h5py"},
+    "parquet": {"pyarrow": "PyArrow"},
+    "ray": {"ray": "Ray"},
+    "video": {"av": "PyAV"},
 }
+EXTRAS = {"onnx": "export", "minari": "minari", "mcap": "mcap"}  # of formats
 MINARI_FILE = "main_data.hdf5"
 TAKEN_BY_REPEAT = ("run", "repeat.run", "repeat.episode", "label", "view")
 
@@ -91,8 +95,8 @@ def check_evaluation(config: EvaluateConfig, words: Sequence[str]) -> None:
         )
     config.plant.check()
     check_parameters(config.parameters or {})
-    if config.animation.mp4 and find_spec("av") is None:
-        raise ConfigError('animation.mp4=true needs PyAV: pip install "cartpole_rl[video]"')
+    if config.animation.mp4:
+        check_installed("animation.mp4=true", "video")
 
 
 def check_repetition(config: EvaluateConfig, words: Sequence[str]) -> None:
@@ -128,8 +132,8 @@ def check_finetuning(config: FinetuneConfig) -> Path:
 
 def check_ray(config: FinetuneConfig) -> None:
     """Raise ConfigError if the settings need Ray, and it is not installed."""
-    if config.learner.kind == "ray" and find_spec("ray") is None:
-        raise ConfigError('learner=ray needs Ray: pip install "cartpole_rl[ray]", on both machines')
+    if config.learner.kind == "ray":
+        check_installed("learner=ray", "ray", where=", on both machines")
 
 
 def check_distillation(config: DistillConfig) -> None:
@@ -143,7 +147,8 @@ def check_export(config: ExportConfig) -> None:
         check_agent(config.run)
     if config.source is not None:
         recordings(config.source)
-    check_installed(f"format={config.format}", config.format)
+    if extra := EXTRAS.get(config.format):
+        check_installed(f"format={config.format}", extra)
 
 
 def check_import(config: ImportConfig, words: Sequence[str]) -> None:
@@ -156,11 +161,12 @@ def check_import(config: ImportConfig, words: Sequence[str]) -> None:
     check_installed(f"from={config.source}", form)
 
 
-def check_installed(setting: str, form: str) -> None:
-    """Raise ConfigError if a package that `setting` needs for a format is not installed."""
-    extra, needed = NEEDED.get(form, ("", ()))
-    if any(find_spec(name) is None for name in needed):
-        raise ConfigError(f'{setting} needs {" and ".join(needed)}: pip install "cartpole_rl[{extra}]"')
+def check_installed(setting: str, extra: str, where: str = "") -> None:
+    """Raise ConfigError if a package of an extra of ours, which `setting` needs, is not installed."""
+    needed = PACKAGES[extra]
+    if any(find_spec(module) is None for module in needed):
+        words = " and ".join(needed.values())
+        raise ConfigError(f'{setting} needs {words}: pip install "cartpole_rl[{extra}]"{where}')
 
 
 def exported_recordings(source: Path) -> tuple[str | None, list[Path]]:

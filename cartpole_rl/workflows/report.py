@@ -2,10 +2,8 @@
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from importlib.util import find_spec
 from pathlib import Path
 
-from cartpole_rl.errors import ConfigError
 from cartpole_rl.files import write_text
 from cartpole_rl.reporting.groups import Drawing, drawings
 from cartpole_rl.reporting.results import Results
@@ -16,6 +14,7 @@ from cartpole_rl.reporting.tables import episode_rows, run_rows, write_table
 from cartpole_rl.reporting.texts import count_text
 from cartpole_rl.run_folder import EPISODES, FIGURES, PAGE, TABLE, write_config
 from cartpole_rl.terminal import print_message
+from cartpole_rl.workflows.checks import check_installed
 from cartpole_rl.workflows.config import ReportConfig
 
 
@@ -26,8 +25,8 @@ def make_report(config: ReportConfig, folder: Path) -> None:
     `config.figures` also figures/. Prints how many runs count, and where the page is.
     Raises ConfigError for folders without runs, and if Parquet is asked for and PyArrow is missing.
     """
-    if "parquet" in config.format and find_spec("pyarrow") is None:
-        raise ConfigError('format=parquet needs PyArrow: pip install "cartpole_rl[parquet]"')
+    if "parquet" in config.format:
+        check_installed("format=parquet", "parquet")
     sets = {"runs": config.runs, "compare": config.compare}
     given = {name: sources for name, sources in sets.items() if sources}
     sweeps, between = read_groups(given, config.measure)

@@ -74,7 +74,7 @@ def test_parquet_holds_what_csv_holds(study: Path, monkeypatch: pytest.MonkeyPat
 def test_parquet_without_its_library_is_refused_in_one_line(
     study: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("cartpole_rl.workflows.report.find_spec", lambda name: None)
+    monkeypatch.setattr("cartpole_rl.workflows.checks.find_spec", lambda name: None)
     done = in_process("report", "runs=quick", "format=parquet", "hydra.run.dir=report", folder=Path.cwd())
     assert done.code == 2
     assert 'format=parquet needs PyArrow: pip install "cartpole_rl[parquet]"' in done.complaint

@@ -120,30 +120,18 @@ setInterval(() => {
 </script></body>"""
 
 
-@pytest.mark.skipif(BROWSER is None, reason=f"none of {', '.join(BROWSERS)} is installed")
-def test_a_browser_shows_the_cart_moving_and_its_button_stops(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The page presses its button once it has shown three positions."""
-    monkeypatch.setattr(web_view, "page", lambda *given: page(*given).replace("</body>", PROBE))
-    with pytest.raises(KeyboardInterrupt) as stopped:
-        drive_before_a_browser(tmp_path)
-    assert stopped.value.__notes__ == [NOTE]
-
-
 NEWEST = """<script>
 setInterval(() => { if (element("state").textContent === "the second") element("stop").click(); }, 10);
 </script></body>"""
 
 
-@pytest.mark.skipif(BROWSER is None, reason=f"none of {', '.join(BROWSERS)} is installed")
-def test_a_browser_shows_the_newest_evaluation_of_a_training(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The page presses its button once it shows the second one, which comes after the first was asked for."""
-    monkeypatch.setattr(web_view, "page", lambda *given: page(*given).replace("</body>", NEWEST))
-    with pytest.raises(KeyboardInterrupt):
-        add_before_a_browser(tmp_path)
+def drive_before_a_browser(folder: Path) -> None:
+    """Move the cart of a page that a browser shows, until this process is interrupted."""
+    with WebView("cart", 0.36) as view, open_browser(view, folder):
+        assert view.memory is not None
+        for number in count(1):
+            write(view.memory, number, CALM._replace(step=number, x=0.01 * (number % 30)))
+            time.sleep(0.02)
 
 
 def add_before_a_browser(folder: Path) -> None:
@@ -154,6 +142,22 @@ def add_before_a_browser(folder: Path) -> None:
             time.sleep(0.01)
         view.add({**EPISODE, "name": "the second"})
         time.sleep(100)
+
+
+@pytest.mark.skipif(BROWSER is None, reason=f"none of {', '.join(BROWSERS)} is installed")
+@pytest.mark.parametrize(
+    ("probe", "run"),
+    [(PROBE, drive_before_a_browser), (NEWEST, add_before_a_browser)],
+    ids=["a cart in three places", "the newest evaluation of a training"],
+)
+def test_a_browser_shows_it_and_its_button_stops(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, probe: str, run: Callable[[Path], None]
+) -> None:
+    """The page presses its button once it has shown it."""
+    monkeypatch.setattr(web_view, "page", lambda *given: page(*given).replace("</body>", probe))
+    with pytest.raises(KeyboardInterrupt) as stopped:
+        run(tmp_path)
+    assert stopped.value.__notes__ == [NOTE]
 
 
 def test_a_training_shows_the_first_episode_of_each_evaluation(
@@ -175,15 +179,6 @@ def test_a_training_shows_the_first_episode_of_each_evaluation(
         f"{each['transitions'] / 1e6:.2f} M transitions: mean score {each['score']:z.0f}" for each in history
     ]
     assert {len(each["theta"]) for each in shown} == {51}
-
-
-def drive_before_a_browser(folder: Path) -> None:
-    """Move the cart of a page that a browser shows, until this process is interrupted."""
-    with WebView("cart", 0.36) as view, open_browser(view, folder):
-        assert view.memory is not None
-        for number in count(1):
-            write(view.memory, number, CALM._replace(step=number, x=0.01 * (number % 30)))
-            time.sleep(0.02)
 
 
 @contextmanager
