@@ -39,7 +39,7 @@ def make_report(config: ReportConfig, folder: Path) -> None:
     title = " and ".join(f"{name}: {', '.join(sources)}" for name, sources in given.items())
     pictures = pictures_of(results) if config.animations else {}
     write_text(folder / PAGE, runs_page(title, results, pictures, between))
-    print(f"{folder}/{TABLE} holds all runs, {' and '.join(tables)} all episodes")
+    print(f"{folder}/{TABLE} holds all runs" + "".join(f", {name} all episodes" for name in tables))
     if config.figures:
         write_figures({f"{each.name}_{one.name}": one for each in results for one in drawings(each)}, folder)
     print_end(results, folder)
