@@ -64,7 +64,7 @@ VERBS: dict[str, Verb] = {
         (
             "run=pretrained/medium plant=emulated animation.simulation=true",
             "run=runs/train/2026-11-21_12-00-00 episodes=20 'parameters={cart_coulomb:0.8}'",
-            "run=runs/train/2026-11-21_12-00-00 plant=serial plant.port=/dev/ttyUSB0 view=live",
+            "run=runs/train/2026-11-21_12-00-00 plant=serial plant.port=/dev/ttyUSB0 view=web",
         ),
         "workflows.checks:check_evaluation",
     ),
@@ -156,7 +156,7 @@ VERBS: dict[str, Verb] = {
         "reports",
         (
             "runs=runs/train/2026-11-21_12-00-00_multirun",
-            "'runs=\"runs/evaluate/2026-11-2*\"' measure=upright_fraction",
+            "'runs=\"runs/evaluate/2026-11-2*\"' measure=upright_fraction format=csv",
             "'runs=[runs/train/a,runs/train/b]' 'compare=\"runs/train/2026-11-22*\"'",
         ),
     ),

@@ -2,18 +2,29 @@
 
 import os
 import re
+import select
 import shlex
 import sys
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 READER_LEFT = 141  # exit code, as of a program that SIGPIPE ends
 BLINK = 1.0  # s, between two updates of a line about work under way
-_under_way: list[str] = []  # the texts of `waiting`, innermost last; "" shows nothing
+_under_way: list["_Work"] = []  # the blocks of `waiting`, innermost last
+
+
+@dataclass(eq=False)
+class _Work:
+    """A block of `waiting`: its text, or "" to show nothing, when it began, and when it was shown last, s."""
+
+    text: str
+    began: float
+    shown: float
 
 
 def confirm(text: str) -> bool:
@@ -99,11 +110,11 @@ def progress_bar(total: int | None, unit: str, **options: Any) -> Any:
 
 
 @contextmanager
-def waiting(text: str) -> Iterator[None]:
+def waiting(text: str, *, thread: bool = True) -> Iterator[None]:
     """Show `text` and the seconds so far on a terminal's stderr while the block runs.
 
     Progress bars are updated instead if there are any. A block inside another one shows its own text; with ""
-    nothing is shown. Not for a loop that keeps a cart's time: a thread does it.
+    nothing is shown. A thread does it; without one, a loop that keeps a cart's time calls `beat`.
     """
     # a process that was started by another one shares its terminal and leaves it alone
     processes = sys.modules.get("multiprocessing.process")
@@ -111,34 +122,68 @@ def waiting(text: str) -> Iterator[None]:
     if sys.stderr is None or not sys.stderr.isatty() or is_child:
         yield
         return
-    ended, started = threading.Event(), time.monotonic()
-    _under_way.append(text)
-    place = len(_under_way)
+    ended, began = threading.Event(), time.monotonic()
+    work = _Work(text, began, began)
+    _under_way.append(work)
 
     def show() -> None:
         while not ended.wait(BLINK):
-            if text and len(_under_way) == place:
-                _show_line(f"{text}, {time.monotonic() - started:.0f} s")
+            if _under_way[-1] is work:
+                _show(work)
 
-    thread = threading.Thread(target=show, daemon=True)
-    thread.start()
+    showing = threading.Thread(target=show, daemon=True)
+    if thread and text:
+        showing.start()
     try:
         yield
     finally:
         ended.set()
-        thread.join()
-        del _under_way[place - 1 :]
-        if text and time.monotonic() - started > BLINK and not _bars():
-            _write("\r\x1b[K")
+        if thread and text:
+            showing.join()
+        del _under_way[_under_way.index(work) :]
+        if text and time.monotonic() - began > BLINK and (thread or _takes_text()):
+            _clear(work)
 
 
-def _show_line(line: str) -> None:
-    """Show a line that the next one replaces, or update the progress bars."""
+def beat() -> None:
+    """Show the innermost block of `waiting` again after a second, if the terminal takes text at once.
+
+    For a loop that keeps a cart's time. It calls this with time to spare, before it waits for the cart.
+    """
+    if not _under_way or time.monotonic() - _under_way[-1].shown < BLINK:
+        return
+    _under_way[-1].shown = time.monotonic()
+    if _takes_text():
+        _show(_under_way[-1])
+
+
+def _takes_text() -> bool:
+    """Return True for a terminal that takes text at once: a stopped one (Ctrl-S) holds up a loop."""
+    with suppress(OSError, ValueError):  # it is closed, or cannot be asked, as on Windows
+        return bool(select.select([], [sys.stderr], [], 0)[1])
+    return False
+
+
+def _show(work: _Work) -> None:
+    """Show a line that the next one replaces, or update the progress bars, which an inner block names."""
+    if not work.text:
+        return
     if bars := _bars():
         for bar in bars:
+            if work is not _under_way[0]:
+                bar.set_description_str(work.text, refresh=False)
             bar.refresh()
     else:
-        _write(f"\r\x1b[K{line}\r")
+        _write(f"\r\x1b[K{work.text}, {time.monotonic() - work.began:.0f} s\r")
+
+
+def _clear(work: _Work) -> None:
+    """Remove the line of a block that has ended, or its name from the progress bars."""
+    if not (bars := _bars()):
+        _write("\r\x1b[K")
+    for bar in bars:
+        if bar.desc == work.text and _under_way:
+            bar.set_description_str("", refresh=False)
 
 
 def _bars() -> list[Any]:

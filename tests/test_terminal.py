@@ -81,3 +81,62 @@ def test_work_under_way_is_shown_with_its_seconds_and_a_bar_goes_on() -> None:
     assert shown.count("0/2 [00:01") >= 1
     piped = subprocess.run([sys.executable, "-c", WAIT], capture_output=True, text=True, check=True)
     assert (piped.stdout, piped.stderr) == ("end\n", "")
+
+
+BEAT = """
+import time
+from cartpole_rl.terminal import beat, progress_bar, waiting
+def loop():
+    end = time.monotonic() + 1.3
+    while time.monotonic() < end:
+        beat()
+        time.sleep(0.02)
+with waiting("driving", thread=False):
+    loop()
+    with progress_bar(2, "episodes"), waiting("bringing the cart to the middle", thread=False):
+        loop()
+    with progress_bar(2, "rounds"):
+        loop()
+print("end", flush=True)
+"""
+
+
+def test_a_loop_that_keeps_time_shows_that_it_goes_on_by_itself() -> None:
+    master, slave = pty.openpty()
+    termios.tcsetwinsize(slave, (24, 100))
+    with subprocess.Popen([sys.executable, "-c", BEAT], stdin=slave, stdout=slave, stderr=slave):
+        shown = read_until(master, b"end").decode()
+    os.close(slave)
+    os.close(master)
+    assert shown.count("driving, 1 s") == 1
+    assert "bringing the cart to the middle:   0%" in shown
+    assert shown.count("0/2 [") >= 6  # each bar: at its start, after a second, at its end
+
+
+STOPPED = """
+import sys, time
+from cartpole_rl.terminal import beat, waiting
+with waiting("driving", thread=False):
+    while not sys.stdin.readline().startswith("go on"):
+        pass
+    end = time.monotonic() + 2.5
+    while time.monotonic() < end:
+        beat()
+        time.sleep(0.02)
+open(sys.argv[1], "w").write("ended")
+"""
+
+
+def test_a_terminal_that_takes_no_text_does_not_hold_up_a_loop(tmp_path: Path) -> None:
+    master, slave = pty.openpty()
+    reader, writer = os.pipe()
+    ended = tmp_path / "ended"
+    with subprocess.Popen(
+        [sys.executable, "-c", STOPPED, str(ended)], stdin=reader, stdout=slave, stderr=slave
+    ) as process:
+        termios.tcflow(slave, termios.TCOOFF)  # as Ctrl-S does
+        os.write(writer, b"go on\n")
+        assert process.wait(120) == 0
+    assert ended.read_text() == "ended"
+    for each in (master, slave, reader, writer):
+        os.close(each)

@@ -6,7 +6,7 @@
 import json
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -115,8 +115,9 @@ class Evaluation:
         config = self.config
         with chosen_view(config.plant.title, config.view, self.settings.pole.nominal.length) as view:
             followed(self.env, view.memory, row)
-            silent = config.plant.is_real_time(config.emulator) or config.view != "none"
-            with nullcontext() if silent else waiting(name), precedence(config.plant, config.emulator):
+            text = "" if config.view == "live" else name  # that view draws on the terminal itself
+            thread = not config.plant.is_real_time(config.emulator)
+            with waiting(text, thread=thread), precedence(config.plant, config.emulator):
                 yield from with_progress(episodes, config.episodes, name, self.settings.task.measure)
 
     @property

@@ -160,6 +160,7 @@ def record_experiments(config: IdentifyConfig, folder: Path) -> None:
         closing(make_plant(config)) as plant,
         precedence(config.plant, config.emulator),
         progress_bar(len(EXPERIMENTS), "experiments") as progress,
+        waiting("experiments", thread=False),
     ):
         progress.set_postfix_str(EXPERIMENTS[0].name)
         for number, (experiment, episode) in enumerate(conduct(plant, config.control_period, config.seed)):

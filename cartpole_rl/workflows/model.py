@@ -37,7 +37,7 @@ from cartpole_rl.reporting.texts import count_text
 from cartpole_rl.rig.hardware import Hardware, hardware_of, nominal_hardware
 from cartpole_rl.run_folder import FIGURES, MODELLED, recordings, write_config, write_json
 from cartpole_rl.tasks.episode import Episode
-from cartpole_rl.terminal import as_word, print_results, progress_bar, shown
+from cartpole_rl.terminal import as_word, print_results, progress_bar, shown, waiting
 from cartpole_rl.workflows.build import use_threads
 from cartpole_rl.workflows.config import ModelConfig
 from cartpole_rl.workflows.poles import chosen_pole
@@ -107,11 +107,12 @@ def fit_and_learn(
     episodes: Sequence[Episode], config: ModelConfig, pole: Pole, period: float
 ) -> tuple[Fit, Ensemble]:
     """Return the fit of the physics and the ensemble that has learned the residual."""
-    fit, models = fit_physics(cut_windows(episodes, period), config, pole, period)
+    with waiting("fitting the physics"):
+        fit, models = fit_physics(cut_windows(episodes, period), config, pole, period)
     dynamics = Dynamics.of(fit.parameters, models, period, LearnedSettings.substeps)
     windows = cut_windows(episodes, period, most=config.windows)
     ensemble = Ensemble(windows, dynamics, fit.rms, config.ensemble, config.seed, config.hardware.track_span)
-    with progress_bar(config.ensemble.updates, "updates") as progress:
+    with progress_bar(config.ensemble.updates, "updates") as progress, waiting("learning"):
 
         def show_progress(update: int, losses: list[float]) -> None:
             progress.set_postfix_str(f"validation loss {np.mean(losses):.2f}")

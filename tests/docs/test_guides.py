@@ -58,7 +58,7 @@ MAKERS = {  # the command that makes the first run of each kind, most of them fr
     "model": "cartpole-model from=runs/identify/<run> pole_friction=bearing",
     "distill": "cartpole-distill run=runs/train/<run> hidden=[32,32]",
     "finetune": "cartpole-finetune run=runs/train/first episodes=3",  # interrupted, as a page resumes it
-    "import": "cartpole-import from=logs/ layout=sensorsini_2022",
+    "import": "cartpole-import from=logs/ layout=sensorsini_2022 cart=sensorsini",
     "record": "cartpole-record run=lqr episodes=2",
     "export": "cartpole-export format=mcap from=runs/record/<run>",
     "evaluate": "cartpole-evaluate run=runs/train/first episodes=18",  # a page repeats episode 17

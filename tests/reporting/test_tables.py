@@ -14,10 +14,15 @@ from cartpole_rl.reporting.tables import episodes
 HEAVY = "much/12/evaluations/heavy"
 
 
-def report(*words: str) -> tuple[list[dict[str, str]], list[dict[str, str]]]:
+def report(format: str = "csv") -> tuple[list[dict[str, str]], list[dict[str, str]]]:
     """Make a report of the study; return its tables of runs and of episodes."""
     done = in_process(
-        "report", "runs=quick", "measure=score_upright", *words, "hydra.run.dir=report", folder=Path.cwd()
+        "report",
+        "runs=quick",
+        "measure=score_upright",
+        f"format={format}",
+        "hydra.run.dir=report",
+        folder=Path.cwd(),
     )
     assert done.code == 0, done.err
     runs, found = (Path("report", name).read_text().splitlines() for name in ("runs.csv", "episodes.csv"))
@@ -64,7 +69,7 @@ def test_a_fine_tuning_has_episodes_before_and_after(study: Path) -> None:
 def test_parquet_holds_what_csv_holds(study: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     parquet = pytest.importorskip("pyarrow.parquet", reason='pip install "cartpole_rl[parquet]"')
     monkeypatch.setattr(tables, "BATCH", 7)
-    _, found = report("format=[csv,parquet]")
+    _, found = report("[csv,parquet]")
     read = parquet.read_table("report/episodes.parquet").to_pylist()
     texts = [{name: "" if value is None else str(value) for name, value in row.items()} for row in read]
     assert texts == found

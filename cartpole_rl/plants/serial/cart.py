@@ -234,7 +234,7 @@ class SerialCart:
         LinkError if the cart restarts meanwhile.
         """
         self._before_homing()
-        with waiting("homing: the cart moves by itself, usually for 15 to 40 s"):
+        with waiting("homing: the cart moves by itself, usually for 15 to 40 s", thread=False):
             return self._homed(watch)
 
     def _homed(self, watch: Callable[[State], None]) -> State:

@@ -28,6 +28,7 @@ from cartpole_rl.plants.serial.link import SerialLink, now
 from cartpole_rl.plants.serial.tracking import StateTracker
 from cartpole_rl.plants.settings import SerialSettings
 from cartpole_rl.rig.hardware import LARGEST_MOTOR
+from cartpole_rl.terminal import beat
 from cartpole_rl.wire import (
     Ack,
     Flags,
@@ -278,6 +279,7 @@ class Connection:
                 self._read(waiting)
             state = self._tracker.take_newest()
             if state is None:
+                beat()
                 self._read()
                 if self.link.waiting() and now() < deadline:
                     continue  # this computer may have paused since it read: newer states wait

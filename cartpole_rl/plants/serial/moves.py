@@ -29,6 +29,7 @@ from cartpole_rl.errors import PlantError
 from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.errors import NotReadyError, fault_error
 from cartpole_rl.rig.hardware import Hardware
+from cartpole_rl.terminal import waiting
 from cartpole_rl.wire import State, seconds_between
 
 REST_SECONDS = 0.3
@@ -245,6 +246,7 @@ def within(limit: float, value: float) -> float:
     return max(-limit, min(limit, value))
 
 
+@waiting("bringing the cart to the middle and its pole to rest", thread=False)
 def recentre(cart: SerialCart, hanging: int) -> None:
     """Bring the cart to the middle, its pole to rest, and disarm it.
 

@@ -25,6 +25,7 @@ from cartpole_rl.plants.serial.moves import (
 )
 from cartpole_rl.plants.serial.preparation import FaultClearing
 from cartpole_rl.rig.hardware import Hardware
+from cartpole_rl.terminal import waiting
 from cartpole_rl.wire import Fault, Flags, Info, State, seconds_between, ticks_between
 
 FARTHEST = 0.08  # m from the middle: no check needs more
@@ -102,7 +103,8 @@ def _checks(cart: SerialCart, faults: FaultClearing) -> dict[str, Callable[[], s
 def _finding(name: str, check: Callable[[], str], cart: SerialCart) -> Finding:
     restarts = cart.restarts
     try:
-        finding = Finding(name, True, check())
+        with waiting(f"checking: {name}", thread=False):
+            finding = Finding(name, True, check())
     except PlantError as error:
         finding = Finding(name, False, str(error))
     return finding if cart.restarts == restarts else Finding(name, False, RESTARTED)
