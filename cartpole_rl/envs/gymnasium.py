@@ -87,6 +87,7 @@ Array = NDArray[Any]
 Randomization = str | Mapping[str, Mapping[str, Any]]
 
 
+@waiting("preparing: fitting the track guard")
 def simulated_environment(
     task: str,
     carts: int,

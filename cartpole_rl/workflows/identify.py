@@ -120,14 +120,15 @@ def identify_cart(config: IdentifyConfig, folder: Path) -> None:
         found = identify(
             by_file, held_out_by_file, nominal, models, period, substeps, config.windows, laws, bar.update
         )
-    carts = found.fit.draw(config.carts, np.random.default_rng(config.seed))
-    write_choices(found, carts, folder, config.hardware)
-    write_json(folder / IDENTIFIED, results(found, carts) | errors(found.fit.parameters, truth, BY_HAND))
-    for name, figure in identification_figures(found, carts, fitted).items():
-        save(figure, folder / FIGURES / f"{name}.png")
-    identified = intervals(found.fit, carts)
-    page = identification_page(found, identified, fitted, next_command(found, folder))
-    write_text(folder / PAGE, page)
+    with waiting("writing the results"):
+        carts = found.fit.draw(config.carts, np.random.default_rng(config.seed))
+        write_choices(found, carts, folder, config.hardware)
+        write_json(folder / IDENTIFIED, results(found, carts) | errors(found.fit.parameters, truth, BY_HAND))
+        for name, figure in identification_figures(found, carts, fitted).items():
+            save(figure, folder / FIGURES / f"{name}.png")
+        identified = intervals(found.fit, carts)
+        page = identification_page(found, identified, fitted, next_command(found, folder))
+        write_text(folder / PAGE, page)
     print(quantities_table(identified))
     print_verdict(found, folder)
 

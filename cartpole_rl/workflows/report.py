@@ -21,8 +21,8 @@ from cartpole_rl.workflows.config import ReportConfig
 def make_report(config: ReportConfig, folder: Path) -> None:
     """Write the page of the runs in `config.runs`, and of their comparison with those in `config.compare`.
 
-    Writes config.yaml, provenance.json, page.html and runs.csv into `folder`, a table of all episodes for each
-    `config.format`, with `config.figures` also figures/. Prints how many runs count, and where the page is.
+    Writes config.yaml, provenance.json, page.html and runs.csv into `folder`, a table of all episodes in each
+    of `config.format`, and with `config.figures` figures/. Prints how many runs count, and where the page is.
     Raises ConfigError for folders without runs, and if Parquet is asked for and PyArrow is missing.
     """
     if "parquet" in config.format:
