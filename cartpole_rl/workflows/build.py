@@ -93,16 +93,19 @@ def evaluated_agent(config: EvaluateConfig) -> TrainedAgent:
         return own_agent(config)
     if config.run != BASELINE:
         return trained_agent(config.run)
-    training = load_settings(TrainConfig, OF_BASELINE)
-    return baseline_agent(config, training.model_copy(update={"actions": config.actions or training.actions}))
+    return baseline_agent(config, own_training(config, ("actions", "cart", "control_period"), OF_BASELINE))
 
 
 def own_agent(config: EvaluateConfig) -> TrainedAgent:
     """Return the policy of one's own at `config.run`, with the settings of conf/train.yaml otherwise."""
-    training = load_settings(TrainConfig, {})
-    given = {name: value for name in ("observation", "actions") if (value := getattr(config, name))}
-    training = training.model_copy(update=given)
+    training = own_training(config, ("observation", "actions", "control_period"), {})
     return TrainedAgent(training, OwnPolicy(config.run, training.actions.motors))
+
+
+def own_training(config: EvaluateConfig, names: Sequence[str], choices: Mapping[str, Any]) -> TrainConfig:
+    """Return the settings of conf/train.yaml with `choices`, and with what `config` gives under `names`."""
+    given = {name: value for name in names if (value := getattr(config, name)) is not None}
+    return load_settings(TrainConfig, choices).model_copy(update=given)
 
 
 def baseline_agent(config: EvaluateConfig, training: TrainConfig) -> TrainedAgent:

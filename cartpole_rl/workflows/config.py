@@ -48,7 +48,7 @@ from cartpole_rl.registry import Extension
 from cartpole_rl.reporting.loggers import LOGGERS
 from cartpole_rl.rig.hardware import hardware_of
 from cartpole_rl.rig.parameters import check_values
-from cartpole_rl.run_folder import is_own_policy
+from cartpole_rl.run_folder import BASELINE, is_own_policy
 from cartpole_rl.settings import Count, Finite, NonNegative, Positive, Seed, Settings
 from cartpole_rl.tasks.settings import ActionSettings, RewardSettings, TaskSettings
 
@@ -197,6 +197,7 @@ class EvaluateConfig(RunSettings):
     guard: GuardSettings | None = None
     actions: ActionSettings | None = None
     observation: ObservationSettings | None = None  # of a policy of one's own
+    control_period: ControlPeriod | None = None  # of the baseline or of a policy of one's own
     knock: NonNegative = 0.0  # rad/s, see `evaluation/episodes.py`
     repeat: RepeatSettings = RepeatSettings()
     view: View = "none"
@@ -205,8 +206,9 @@ class EvaluateConfig(RunSettings):
     @model_validator(mode="after")
     def _plant_reads_every_setting(self) -> "EvaluateConfig":
         """Refuse settings that the chosen plant ignores."""
-        plant = self.plant
-        if unread := [name for name in plant.ignored if getattr(self, name)]:
+        plant, is_told = self.plant, self.run == BASELINE or is_own_policy(self.run)  # which rig it drives
+        ignored = (name for name in plant.ignored if not (is_told and name == "cart"))
+        if unread := [name for name in ignored if getattr(self, name)]:
             raise ValueError(f"{', '.join(unread)}: plant={plant.kind} {plant.why_ignored}")
         if self.view == "live" and not plant.is_on_port:
             raise ValueError(f"view=live: it shows a cart on a port; plant={plant.kind} takes view=web")
@@ -217,6 +219,11 @@ class EvaluateConfig(RunSettings):
             raise ValueError(
                 "observation: an agent observes what it did in its training; leave it out. Only a policy of "
                 "your own takes it (run=module:name or run=file.onnx)"
+            )
+        if self.control_period is not None and not is_told:
+            raise ValueError(
+                "control_period: an agent drives with that of its training; leave it out. Only run=lqr and a "
+                "policy of your own take it"
             )
         if self.drives_on_board and self.repeat != RepeatSettings():
             key = self.plant.policy_key(self.emulator)

@@ -2,9 +2,12 @@
 
 import pytest
 
+from cartpole_rl.agents.baseline import regulator
 from cartpole_rl.errors import ConfigError
+from cartpole_rl.physics.parameters import cart_column
+from cartpole_rl.rig.hardware import hardware_of
 from cartpole_rl.tasks.settings import ActionSettings
-from cartpole_rl.workflows.build import replaced_settings
+from cartpole_rl.workflows.build import evaluated_agent, evaluated_settings, replaced_settings
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig, load_settings
 
 
@@ -59,3 +62,23 @@ def test_an_agent_of_another_rig_is_refused() -> None:
                 replaced_settings(training, config)
         else:
             assert replaced_settings(training, config).hardware.track_span == 0.814
+
+
+def test_the_baseline_is_computed_for_the_cart_and_the_period_that_it_drives() -> None:
+    stepper = {"cart": "stepper", "plant": "emulated", "emulator": "rod_03", "control_period": 0.01}
+    of_ip02 = evaluated_agent(load_settings(EvaluateConfig, {"run": "lqr", "pole": "rod_03"}))
+    config = load_settings(EvaluateConfig, {"run": "lqr", **stepper})
+    agent = evaluated_agent(config)
+    settings = evaluated_settings(agent.training, config)
+    assert (settings.control_period, settings.hardware) == (0.01, hardware_of(config.cart or {}))
+    assert agent.policy.cart.cart_mass == settings.cart["cart_mass"]  # type: ignore[attr-defined]
+    gain = regulator(cart_column(settings.nominal_with(settings.pole.nominal)), agent.policy.models, 0.01)  # type: ignore[attr-defined]
+    assert agent.policy.gain == pytest.approx(gain, rel=0.01)  # type: ignore[attr-defined]
+    assert agent.policy.gain != pytest.approx(of_ip02.policy.gain, rel=0.1)  # type: ignore[attr-defined]
+
+
+def test_a_period_for_an_agent_is_refused() -> None:
+    with pytest.raises(
+        ConfigError, match=r"^control_period: an agent drives with that of its training; leave"
+    ):
+        load_settings(EvaluateConfig, {"run": "pretrained/medium", "control_period": 0.01})
