@@ -42,13 +42,13 @@ NOT_ENDED = "it was killed or interrupted, or is still running"
 LONGEST_NAME = 150  # characters; file systems take 255
 
 
-def run_folder(command: str, label: str, resume: str | None = None) -> str:
+def run_folder(command: str, label: Any, resume: Any = None) -> str:
     """Return the folder of a run: that of the resumed run, or a new one named by date and time.
 
-    A new one is made here, so runs that start in the same second do not share it.
+    A new one is made here, so runs that start in the same second do not share it. Nothing is checked yet.
     """
-    if resume is not None and Path(resume).is_dir():
-        return str(resume)
+    if isinstance(resume, str) and Path(resume).is_dir():
+        return resume
     return new_folder(command, label)
 
 
