@@ -246,7 +246,7 @@ def within(limit: float, value: float) -> float:
     return max(-limit, min(limit, value))
 
 
-@waiting("bringing the cart to the middle and its pole to rest", thread=False)
+@waiting("re-centring", thread=False)
 def recentre(cart: SerialCart, hanging: int) -> None:
     """Bring the cart to the middle, its pole to rest, and disarm it.
 
