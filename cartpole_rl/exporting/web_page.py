@@ -7,6 +7,7 @@ simulation (`plants/simulated.py`, `envs/perception.py`). It computes in float64
 import base64
 import html
 import json
+from dataclasses import asdict, fields
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,10 +23,19 @@ from cartpole_rl.exporting.agent import FLOATS, ExportedAgent
 from cartpole_rl.exporting.code import COUNT, NUMBER, Graph, filled, perception
 from cartpole_rl.physics.dynamics import Addition, Drive, State
 from cartpole_rl.physics.parameters import CartParameters
-from cartpole_rl.plants.settings import SimulationSettings
+from cartpole_rl.plants.serial.cart import LEASE_RENEWAL_US, LONGEST_STOP, LONGEST_SUSPENSION
+from cartpole_rl.plants.serial.connection import ACKNOWLEDGED_STOPS, LONGEST_DEAFNESS
+from cartpole_rl.plants.serial.errors import FAULTS, REASONS, limit_range
+from cartpole_rl.plants.serial.preparation import POSITIONS, STILL_SECONDS
+from cartpole_rl.plants.serial.tracking import OVERTAKEN_TICKS
+from cartpole_rl.plants.settings import SerialSettings, SimulationSettings
 from cartpole_rl.plants.simulated import Carts, Inputs, Period, commands_under_way, encoder_counts, run_carts
 from cartpole_rl.randomization.poles import Pole
+from cartpole_rl.rig.hardware import LARGEST_MOTOR
 from cartpole_rl.tasks.settings import Start
+from cartpole_rl.wire import Fault, Flags, Reason
+from cartpole_rl.wire.frames import LONGEST_FRAME, VERSION
+from cartpole_rl.wire.messages import MESSAGES
 
 LONGEST_LATENCY = 0.04  # s, that the reader can choose
 RODS = [length / 100 for length in range(20, 101, 4)]  # m, poles that the reader can choose
@@ -69,7 +79,7 @@ def web_page(agent: ExportedAgent, settings: CartPoleSettings, plant: Simulation
         raise ConfigError(f"format=web: the agent has an operation that is not known: {error}") from None
     script = filled("cart.js", {"data": data(agent, settings)})
     code = "\n".join((filled("arithmetic.js", {}), *functions, script))
-    parts = {**shared_parts(), "page": filled("page.js", {})}
+    parts = {**shared_parts(), **{name: filled(f"{name}.js", {}) for name in ("page", "serial")}}
     return filled("cart.html", {"code": code, **parts, **words(agent)})
 
 
@@ -146,8 +156,59 @@ def data(agent: ExportedAgent, settings: CartPoleSettings) -> str:
         "trained": poles.index(pole),
         "commands": commands_under_way(LONGEST_LATENCY, about.control_period),
         "longestLatency": LONGEST_LATENCY,
+        "wire": wire(settings),
     }
     return json.dumps(content)
+
+
+def wire(settings: CartPoleSettings) -> dict[str, Any]:
+    """Return the numbers by which the page talks to a real cart: those of `cartpole_rl.wire` and the host's."""
+    hardware, host = settings.hardware, SerialSettings(port="auto")
+    task = settings.task.at(settings.control_period)
+    position = POSITIONS["upright" if task.evaluation_start.angle == Start.UPRIGHT else "hanging"]
+    return {
+        "version": VERSION,
+        "longestFrame": LONGEST_FRAME,
+        "messages": {
+            kind.TYPE.name: {
+                "type": kind.TYPE,
+                "layout": kind.LAYOUT,
+                "fields": [each.name for each in fields(kind)],  # type: ignore[arg-type]
+            }
+            for kind in MESSAGES.values()
+        },
+        "flags": {flag.name: flag for flag in Flags},
+        "faults": FAULTS,
+        "hardLimit": Fault.HARD_LIMIT,
+        "reasons": REASONS,
+        "busy": Reason.BUSY,
+        "stale": Reason.STALE,
+        "cart": {
+            "pole_counts_per_turn": hardware.pole_counts_per_turn,
+            "cart_nanometres_per_count": hardware.cart_nanometres_per_count,
+            "motor_limit": LARGEST_MOTOR,
+        },
+        "metres": hardware.encoders.metres,
+        "turn": hardware.encoders.turn,
+        "limits": limit_range(hardware),
+        "period": round(settings.control_period * 1e6),
+        "periods": task.periods,
+        "baud": host.baud,
+        "timeout": host.timeout,
+        "answerTimeout": host.answer_timeout,
+        "attempts": 1 + host.retries,
+        "connectAttempts": round(host.connect_timeout / host.answer_timeout),
+        "stopAttempts": round(LONGEST_STOP / host.answer_timeout),
+        "homeTimeout": host.home_timeout,
+        "startTimeout": host.start_timeout,
+        "start": asdict(position),
+        "still": STILL_SECONDS,
+        "stops": ACKNOWLEDGED_STOPS,
+        "lease": LEASE_RENEWAL_US,
+        "overtakenTicks": OVERTAKEN_TICKS,
+        "suspension": LONGEST_SUSPENSION,
+        "deafness": LONGEST_DEAFNESS,
+    }
 
 
 def encoded(values: Any) -> str:

@@ -64,11 +64,24 @@ class Cart {
   reset({ x, x_dot, theta, theta_dot }) {
     this.motion = [x, x_dot, theta, theta_dot];
     this.drive = new Array(1 + DATA.commands).fill(0);
-    this.counts = encoderCounts(this.table, this.motion, NO_NOISE).counts;
-    this.percept = perceiveFirst(this.counts, this.poleLength, this.trackEnd);
-    this.motor = 0;
+    this.begin(encoderCounts(this.table, this.motion, NO_NOISE).counts);
     this.offTrack = false;
+  }
+
+  /** Take in the first counts of an episode. */
+  begin(counts) {
+    this.counts = counts;
+    this.percept = perceiveFirst(counts, this.poleLength, this.trackEnd);
+    this.motor = 0;
     this.fallen = false;
+  }
+
+  /** Take in the counts after a period of `dt` s in which `motor` drove. */
+  see(counts, dt, motor) {
+    const { state, past } = this.percept;
+    this.percept = perceive(counts, [dt], this.counts, state, past, [motor], this.poleLength, this.trackEnd);
+    Object.assign(this, { counts, motor });
+    this.fallen = DATA.angleLimit !== null && Math.abs(this.percept.state[2]) > DATA.angleLimit;
   }
 
   /** The motor value that the agent and its track guard choose; 0 where a number is not finite. */
@@ -82,12 +95,7 @@ class Cart {
   /** Drive one control period. force: N on the cart; turn: rad/s^2 of the pole. */
   step(motor, force = 0, turn = 0) {
     const after = runPeriod(this.table, this.motion, this.drive, [motor], NO_NOISE, [force], [turn]);
-    const before = this.percept;
-    this.percept = perceive(
-      after.counts, [DATA.period], this.counts, before.state, before.past, [motor], this.poleLength, this.trackEnd,
-    );
-    Object.assign(this, { motion: after.motion, drive: after.drive, counts: after.counts, motor });
-    this.offTrack = after.off_track[0];
-    this.fallen = DATA.angleLimit !== null && Math.abs(this.percept.state[2]) > DATA.angleLimit;
+    this.see(after.counts, DATA.period, motor);
+    Object.assign(this, { motion: after.motion, drive: after.drive, offTrack: after.off_track[0] });
   }
 }

@@ -3,7 +3,9 @@ const STIFFNESS = 60; // N/m, of the reader's spring on the cart
 const STRONGEST = 12; // N
 const HISTORY = 10; // s
 const PAUSE = 1.6; // s, after a failure
-const cart = new Cart();
+const simulated = new Cart();
+let cart = simulated; // that is shown
+let real = null; // the cart on the serial line, once one was connected
 let before = cart.motion; // one period ago: the picture is drawn between the two
 let pull = null; // the reader's: where it acts, "cart" or "pole", and the pointer in m
 let keys = 0; // N, of the arrow keys
@@ -28,21 +30,32 @@ function period() {
   }
   before = cart.motion;
   cart.step(agentDrives() ? cart.chosen() : 0, ...pushed());
-  const angle = wrapped(cart.motion[2]);
-  upright = Math.abs(angle) < UPRIGHT ? upright + DATA.period : 0;
-  wasUpright = wasUpright || upright > 1;
+  record(DATA.period);
   if (cart.offTrack || cart.fallen) failedAt = time;
+}
+
+/** Note where the cart is, after a period of `dt` s. */
+function record(dt) {
+  const angle = wrapped(cart.motion[2]);
+  upright = Math.abs(angle) < UPRIGHT ? upright + dt : 0;
+  wasUpright = wasUpright || upright > 1;
   history.push({ time, angle });
   while (history.length && history[0].time < time - HISTORY) history.shift();
 }
 
 function restart() {
+  real = null;
+  cart = simulated;
   cart.reset({ ...REST, theta: REST.theta + 0.02 * (Math.random() - 0.5), x: 0.1 * (Math.random() - 0.5) });
+  forget();
+}
+
+/** Show the cart from now on. */
+function forget() {
   before = cart.motion;
-  failedAt = null;
-  upright = 0;
+  failedAt = pull = null;
+  upright = keys = 0;
   wasUpright = false;
-  pull = null;
 }
 
 function sizes() {
@@ -54,8 +67,9 @@ function agentDrives() {
 }
 
 function verdict() {
+  if (real && !real.driving) return [real.over === null ? "Not driving yet" : "Stopped", "--soft"];
   if (failedAt !== null) return [cart.fallen ? "Failed: the pole fell." : "Failed: the cart left its track.", "--bad"];
-  if (!agentDrives()) return ["The motor is off.", "--soft"];
+  if (!real && !agentDrives()) return ["The motor is off.", "--soft"];
   if (upright > 0.5) return [`Upright for ${upright.toFixed(1)} s`, "--good"];
   return wasUpright ? ["Recovering …", "--pole"] : ["Swinging up …", "--soft"];
 }
@@ -87,15 +101,16 @@ let last = null, due = 0;
 function frame(now) {
   const passed = last === null ? 0 : Math.min(0.1, (now - last) / 1000); // after a pause of the page, go on
   last = now;
-  due += passed;
+  if (!real) due += passed;
   while (due >= DATA.period) {
     due -= DATA.period;
     time += DATA.period;
     period();
   }
-  drawScene(due / DATA.period);
+  drawScene(real ? 1 : due / DATA.period);
   drawTrace(element("trace"), history, time, HISTORY);
   drawStatus();
+  drawSerial();
   requestAnimationFrame(frame);
 }
 
@@ -108,6 +123,7 @@ function pointer(event) {
 }
 
 element("scene").addEventListener("pointerdown", (event) => {
+  if (real) return;
   const { x, y } = pointer(event), [cartX, , theta] = cart.motion, length = 2 * cart.parameters.pole_com;
   const toTip = Math.hypot(x - cartX - length * Math.sin(theta), y - length * Math.cos(theta));
   pull = { on: toTip < 0.4 * length ? "pole" : "cart", x, y };
@@ -121,7 +137,7 @@ for (const end of ["pointerup", "pointercancel", "lostpointercapture"]) {
 }
 const ARROWS = { ArrowLeft: -8, ArrowRight: 8 };
 window.addEventListener("keydown", (event) => {
-  if (event.key in ARROWS && event.target.type !== "range") {
+  if (!real && event.key in ARROWS && event.target.type !== "range") {
     keys = ARROWS[event.key];
     event.preventDefault();
   }
@@ -132,9 +148,9 @@ window.addEventListener("keyup", (event) => {
 
 function apply() {
   const friction = Number(element("friction").value), pole = DATA.poles[element("pole").value];
-  for (const name of ["cart_coulomb", "cart_viscous"]) cart.parameters[name] = friction * DATA.cart[name];
-  cart.parameters.latency = element("latency").value / 1000;
-  Object.assign(cart.parameters, pole);
+  for (const name of ["cart_coulomb", "cart_viscous"]) simulated.parameters[name] = friction * DATA.cart[name];
+  simulated.parameters.latency = element("latency").value / 1000;
+  Object.assign(simulated.parameters, pole);
   element("friction-value").textContent = `${friction.toFixed(1)} × nominal`;
   element("latency-value").textContent = `${element("latency").value} ms`;
   element("pole-value").textContent = `${(200 * pole.pole_com).toFixed(0)} cm`;

@@ -122,9 +122,15 @@ def check_limits(information: Info, hardware: Hardware) -> None:
     soft = information.soft_limit_counts * hardware.encoders.metres
     hard = information.hard_limit_counts * hardware.encoders.metres
     half_span = hardware.half_span
-    if not 0.5 * half_span < soft < hard < (1 + SPAN_TOLERANCE) * half_span:
+    least, most = limit_range(hardware)
+    if not least < soft < hard < most:
         raise NotReadyError(
             f"INFO says soft limit {soft * 1e3:.0f} mm, hard limit {hard * 1e3:.0f} mm from the middle; the "
             f"soft one comes first, and both in the outer half of the {half_span * 1e3:.0f} mm to a stop",
             "correct the firmware's limits",
         )
+
+
+def limit_range(hardware: Hardware) -> tuple[float, float]:
+    """Return what the soft limit has to be beyond, and the hard limit within, in m from the middle."""
+    return 0.5 * hardware.half_span, (1 + SPAN_TOLERANCE) * hardware.half_span

@@ -1,0 +1,160 @@
+"""A browser whose Web Serial leads to an emulated cart: bytes go through HTTP to the port of an `EmulatorHost`."""
+
+import json
+import subprocess
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from queue import SimpleQueue
+from typing import Any
+
+import serial
+from browser import BROWSER
+from emulator_host import EmulatorHost
+
+from cartpole_rl.errors import FrameError
+from cartpole_rl.wire import Frame, FrameSplitter, decode_frame
+
+READ_SLICE = 0.05  # s
+PATIENCE = 200.0  # s, timeout of a test
+
+# A port as https://wicg.github.io/serial/ describes it. The cable is pulled when the bridge ends its answer.
+PORT = """<script>
+class BridgedPort {
+  readable = null;
+  async open(options) {
+    this.options = options;
+    const answer = await fetch("/read");
+    const pulled = (control) => {
+      this.readable = null;
+      control.error(new DOMException("The device has been lost.", "NetworkError"));
+    };
+    this.readable = answer.body.pipeThrough(new TransformStream({ flush: pulled }));
+    this.writable = new WritableStream({ write: (bytes) => fetch("/write", { method: "POST", body: bytes }) });
+  }
+  async setSignals(signals) { this.signals = signals; }
+  async close() { await fetch("/close", { method: "POST" }); }
+}
+const port = new BridgedPort();
+Object.defineProperty(navigator, "serial", { value: { requestPort: async () => port } });
+</script>"""
+SCRIPT = """<script>
+const report = (found) => fetch("/report", { method: "POST", body: JSON.stringify(found) });
+window.onerror = report;
+</script><script>
+const until = async (what) => { while (!what()) await new Promise((next) => setTimeout(next, 10)); };
+const shown = (id) => !element(id).hidden;
+const said = () => element("link").textContent;
+(async () => { %s })().catch((error) => report(`${error.stack}`));
+</script></body>"""
+
+
+class Bridge(ThreadingHTTPServer):
+    """Serves a page, and copies bytes between its port and `host`. `report` is what its script reported."""
+
+    daemon_threads = True
+
+    def __init__(self, host: EmulatorHost, page: str) -> None:
+        super().__init__(("127.0.0.1", 0), Handler)
+        self.host, self.page = host, page.encode()
+        self.written, self.read = b"", b""
+        self.reports: SimpleQueue[Any] = SimpleQueue()
+        self.closed, self.idle = threading.Event(), threading.Event()
+        self.idle.set()
+        host.serial.timeout = READ_SLICE
+
+    @property
+    def address(self) -> str:
+        return f"http://127.0.0.1:{self.server_port}/"
+
+
+class Handler(BaseHTTPRequestHandler):
+    """One request of the browser."""
+
+    protocol_version = "HTTP/1.1"
+    server: Bridge
+
+    def log_message(self, format: str, *arguments: Any) -> None:
+        """Print nothing."""
+
+    def answer(self, content: bytes = b"", kind: str = "text/html; charset=utf-8") -> None:
+        self.send_response(200)
+        self.send_header("Content-Type", kind)
+        self.send_header("Content-Length", str(len(content)))
+        self.end_headers()
+        self.wfile.write(content)
+
+    def do_GET(self) -> None:
+        if self.path != "/read":
+            self.answer(self.server.page if self.path == "/" else b"")
+            return
+        self.send_response(200)
+        self.send_header("Content-Type", "application/octet-stream")
+        self.send_header("X-Content-Type-Options", "nosniff")  # Chrome would wait for bytes to look at
+        self.send_header("Connection", "close")
+        self.end_headers()
+        self.wfile.flush()
+        bridge = self.server
+        bridge.closed.clear()
+        bridge.idle.clear()
+        try:
+            while not bridge.closed.is_set():
+                data = bridge.host.serial.read(bridge.host.serial.in_waiting or 1)
+                bridge.read += data
+                self.wfile.write(data)
+        except (serial.SerialException, OSError):
+            pass  # the cable is pulled, or the page has closed its port
+        finally:
+            bridge.idle.set()
+
+    def do_POST(self) -> None:
+        body = self.rfile.read(int(self.headers["Content-Length"] or 0))
+        bridge = self.server
+        if self.path == "/write":
+            bridge.written += body
+            try:
+                bridge.host.serial.write(body)
+            except (serial.SerialException, OSError):
+                pass
+        elif self.path == "/report":
+            bridge.reports.put(json.loads(body))
+        else:
+            bridge.closed.set()
+            bridge.idle.wait(PATIENCE)
+        self.answer()
+
+
+@contextmanager
+def bridged(page: str, script: str, host: EmulatorHost, folder: Path, *options: str) -> Iterator[Bridge]:
+    """Show a page with a port that leads to `host`, and run `script` in it, which may `await`.
+
+    It has `until`, which waits for a condition, and ends with `report(value)`.
+    """
+    assert BROWSER is not None
+    page = page.replace("<body>", f"<body>{PORT}").replace("</body>", SCRIPT % script)
+    with Bridge(host, page) as bridge:
+        threading.Thread(target=bridge.serve_forever, daemon=True).start()
+        words = ["--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={folder / 'profile'}", *options]
+        command = [BROWSER, *words, "--remote-debugging-port=0", bridge.address]
+        browser = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+        try:
+            yield bridge
+        finally:
+            browser.terminate()
+            browser.wait()
+            bridge.closed.set()
+            bridge.idle.wait(PATIENCE)
+            bridge.shutdown()
+
+
+def frames(data: bytes) -> list[Frame]:
+    """Return the undamaged frames in the bytes of one direction."""
+    found = []
+    for run in FrameSplitter().feed(data):
+        try:
+            found.append(decode_frame(run))
+        except FrameError:
+            continue
+    return found
