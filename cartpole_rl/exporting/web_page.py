@@ -24,7 +24,7 @@ from cartpole_rl.exporting.code import COUNT, NUMBER, Graph, filled, perception
 from cartpole_rl.physics.dynamics import Addition, Drive, State
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.serial.cart import LEASE_RENEWAL_US, LONGEST_STOP, LONGEST_SUSPENSION
-from cartpole_rl.plants.serial.connection import ACKNOWLEDGED_STOPS, LONGEST_DEAFNESS
+from cartpole_rl.plants.serial.connection import ACKNOWLEDGED_STOPS, LONGEST_DEAFNESS, ROUND_TRIPS
 from cartpole_rl.plants.serial.errors import FAULTS, REASONS, limit_range
 from cartpole_rl.plants.serial.preparation import POSITIONS, STILL_SECONDS
 from cartpole_rl.plants.serial.tracking import OVERTAKEN_TICKS
@@ -162,7 +162,7 @@ def data(agent: ExportedAgent, settings: CartPoleSettings) -> str:
 
 
 def wire(settings: CartPoleSettings) -> dict[str, Any]:
-    """Return the numbers by which the page talks to a real cart: those of `cartpole_rl.wire` and the host's."""
+    """Return the numbers by which the page talks to a real cart, those of `wire` and of `plants.serial`."""
     hardware, host = settings.hardware, SerialSettings(port="auto")
     task = settings.task.at(settings.control_period)
     position = POSITIONS["upright" if task.evaluation_start.angle == Start.UPRIGHT else "hanging"]
@@ -205,7 +205,8 @@ def wire(settings: CartPoleSettings) -> dict[str, Any]:
         "still": STILL_SECONDS,
         "stops": ACKNOWLEDGED_STOPS,
         "lease": LEASE_RENEWAL_US,
-        "overtakenTicks": OVERTAKEN_TICKS,
+        "overtaken": OVERTAKEN_TICKS,
+        "trips": ROUND_TRIPS,
         "suspension": LONGEST_SUSPENSION,
         "deafness": LONGEST_DEAFNESS,
     }

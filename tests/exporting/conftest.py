@@ -8,7 +8,9 @@ import torch
 
 from cartpole_rl.envs.build import simulated_env
 from cartpole_rl.exporting.agent import ExportedAgent, Floats
-from cartpole_rl.workflows.build import TrainedAgent, exported_agent, provenance, trained_agent
+from cartpole_rl.workflows.build import TrainedAgent, exported_agent, new_agent, provenance, trained_agent
+from cartpole_rl.workflows.config import TrainConfig, load_settings
+from cartpole_rl.workflows.export import page as page_of
 
 MEDIUM = Path("pretrained/medium")
 
@@ -21,6 +23,23 @@ def medium_agent() -> TrainedAgent:
 @pytest.fixture(scope="session")
 def exported(medium_agent: TrainedAgent) -> ExportedAgent:
     return exported_agent(medium_agent, provenance(MEDIUM))
+
+
+@pytest.fixture(scope="session")
+def page(exported: ExportedAgent, medium_agent: TrainedAgent) -> str:
+    return page_of(exported, medium_agent)
+
+
+@pytest.fixture(scope="session")
+def balancing() -> TrainedAgent:
+    """An untrained agent that starts upright."""
+    training = load_settings(TrainConfig, {"task": "balance", "agent.hidden": [8], "compile": False})
+    return TrainedAgent(training, new_agent(training).greedy_policy())
+
+
+@pytest.fixture(scope="session")
+def balancing_page(balancing: TrainedAgent) -> str:
+    return page_of(exported_agent(balancing, {}), balancing)
 
 
 @pytest.fixture(scope="session")

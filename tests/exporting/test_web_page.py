@@ -9,21 +9,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 import torch
-from browser import BROWSER, BROWSERS, in_browser
+from browser import in_browser
+from shown_pages import needs_browser
 
 from cartpole_rl.envs.build import environment
-from cartpole_rl.exporting.agent import ExportedAgent
-from cartpole_rl.exporting.web_page import LONGEST_LATENCY, web_page
+from cartpole_rl.exporting.web_page import LONGEST_LATENCY
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.settings import SimulatedSettings
 from cartpole_rl.plants.simulated import Carts, Inputs, commands_under_way, run_carts
 from cartpole_rl.plants.specs import Numbers, OneCartPlant, PlantOutput
 from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
 from cartpole_rl.scalar import Scalar
-from cartpole_rl.workflows.build import TrainedAgent, exported_agent, network_of, new_agent
-from cartpole_rl.workflows.config import TrainConfig, load_settings
+from cartpole_rl.workflows.build import TrainedAgent, network_of
+from cartpole_rl.workflows.config import TrainConfig
 
 PERIODS = 100  # 2 s
 HANGING = {"x": 0.05, "x_dot": 0.0, "theta": math.pi, "theta_dot": 0.0}
@@ -48,12 +47,6 @@ const results = EPISODES.map(({ parameters, start }) => {
 });
 document.body.textContent = JSON.stringify(results);
 """
-
-
-@pytest.fixture(scope="module")
-def page(exported: ExportedAgent, medium_agent: TrainedAgent) -> str:
-    training = medium_agent.training
-    return web_page(exported, training, training.plant)
 
 
 class ExactPlant(OneCartPlant):
@@ -128,14 +121,10 @@ def test_the_page_needs_no_other_file(page: str) -> None:
     assert len(page) < 150_000
 
 
-NEEDS_BROWSER = pytest.mark.skipif(BROWSER is None, reason=f"none of {', '.join(BROWSERS)} is installed")
-
-
-@NEEDS_BROWSER
-def test_a_balancing_agent_starts_upright_and_fails_when_the_pole_falls(tmp_path: Path) -> None:
-    training = load_settings(TrainConfig, {"task": "balance", "agent.hidden": [8], "compile": False})
-    assert isinstance(training.plant, SimulatedSettings)
-    agent = exported_agent(TrainedAgent(training, new_agent(training).greedy_policy()), {})
+@needs_browser
+def test_a_balancing_agent_starts_upright_and_fails_when_the_pole_falls(
+    balancing: TrainedAgent, balancing_page: str, tmp_path: Path
+) -> None:
     script = """
     const driven = new Cart(), start = driven.motion[2], angles = [];
     driven.reset({ ...REST, theta: 0.1 });
@@ -145,12 +134,12 @@ def test_a_balancing_agent_starts_upright_and_fails_when_the_pole_falls(tmp_path
     }
     document.body.textContent = JSON.stringify([start, ...angles.slice(-2)]);
     """
-    start, before, last = in_browser(web_page(agent, training, training.plant), script, tmp_path)
+    start, before, last = in_browser(balancing_page, script, tmp_path)
     assert start == 0
-    assert before <= training.task.angle_limit < last
+    assert before <= balancing.training.task.angle_limit < last
 
 
-@NEEDS_BROWSER
+@needs_browser
 def test_it_drives_as_the_simulation(page: str, medium_agent: TrainedAgent, tmp_path: Path) -> None:
     script = f"const EPISODES = {json.dumps(EPISODES)}, PERIODS = {PERIODS};{DRIVE}"
     for episode, rows in zip(EPISODES, in_browser(page, script, tmp_path), strict=True):

@@ -1,24 +1,22 @@
-"""A browser whose Web Serial leads to an emulated cart: bytes go through HTTP to the port of an `EmulatorHost`."""
+"""A browser whose Web Serial leads to an emulated cart: bytes go through HTTP to its `EmulatorHost`."""
 
 import json
 import subprocess
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 
-import serial
 from browser import BROWSER
-from emulator_host import EmulatorHost
+from emulator_host import SILENCE, EmulatorHost
 
 from cartpole_rl.errors import FrameError
 from cartpole_rl.wire import Frame, FrameSplitter, decode_frame
 
 READ_SLICE = 0.05  # s
-PATIENCE = 200.0  # s, timeout of a test
 
 # A port as https://wicg.github.io/serial/ describes it. The cable is pulled when the bridge ends its answer.
 PORT = """<script>
@@ -32,7 +30,8 @@ class BridgedPort {
       control.error(new DOMException("The device has been lost.", "NetworkError"));
     };
     this.readable = answer.body.pipeThrough(new TransformStream({ flush: pulled }));
-    this.writable = new WritableStream({ write: (bytes) => fetch("/write", { method: "POST", body: bytes }) });
+    const write = (bytes) => fetch("/write", { method: "POST", body: bytes });
+    this.writable = new WritableStream({ write });
   }
   async setSignals(signals) { this.signals = signals; }
   async close() { await fetch("/close", { method: "POST" }); }
@@ -47,12 +46,13 @@ window.onerror = report;
 const until = async (what) => { while (!what()) await new Promise((next) => setTimeout(next, 10)); };
 const shown = (id) => !element(id).hidden;
 const said = () => element("link").textContent;
+WIRE.timeout = 200; // a slow machine is no silent cart
 (async () => { %s })().catch((error) => report(`${error.stack}`));
 </script></body>"""
 
 
 class Bridge(ThreadingHTTPServer):
-    """Serves a page, and copies bytes between its port and `host`. `report` is what its script reported."""
+    """Serves a page, and copies bytes between its port and `host`."""
 
     daemon_threads = True
 
@@ -60,10 +60,16 @@ class Bridge(ThreadingHTTPServer):
         super().__init__(("127.0.0.1", 0), Handler)
         self.host, self.page = host, page.encode()
         self.written, self.read = b"", b""
-        self.reports: SimpleQueue[Any] = SimpleQueue()
+        self.reported: SimpleQueue[Any] = SimpleQueue()
         self.closed, self.idle = threading.Event(), threading.Event()
         self.idle.set()
-        host.serial.timeout = READ_SLICE
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Print nothing: a browser that was ended takes no answer."""
+
+    def report(self) -> Any:
+        """Wait for what the script reports."""
+        return self.reported.get(timeout=SILENCE)
 
     @property
     def address(self) -> str:
@@ -97,33 +103,30 @@ class Handler(BaseHTTPRequestHandler):
         self.end_headers()
         self.wfile.flush()
         bridge = self.server
+        bridge.host.serial.timeout = READ_SLICE
         bridge.closed.clear()
         bridge.idle.clear()
-        try:
+        with suppress(OSError):  # the cable is pulled, or the page has closed its port
             while not bridge.closed.is_set():
                 data = bridge.host.serial.read(bridge.host.serial.in_waiting or 1)
                 bridge.read += data
                 self.wfile.write(data)
-        except (serial.SerialException, OSError):
-            pass  # the cable is pulled, or the page has closed its port
-        finally:
-            bridge.idle.set()
+        bridge.host.serial.timeout = SILENCE
+        bridge.idle.set()
 
     def do_POST(self) -> None:
         body = self.rfile.read(int(self.headers["Content-Length"] or 0))
         bridge = self.server
         if self.path == "/write":
             bridge.written += body
-            try:
+            with suppress(OSError):  # the cable is pulled
                 bridge.host.serial.write(body)
-            except (serial.SerialException, OSError):
-                pass
-        elif self.path == "/report":
-            bridge.reports.put(json.loads(body))
-        else:
+        elif self.path == "/close":
             bridge.closed.set()
-            bridge.idle.wait(PATIENCE)
+            bridge.idle.wait(SILENCE)
         self.answer()
+        if self.path == "/report":  # the browser may be ended now
+            bridge.reported.put(json.loads(body))
 
 
 @contextmanager
@@ -136,7 +139,13 @@ def bridged(page: str, script: str, host: EmulatorHost, folder: Path, *options: 
     page = page.replace("<body>", f"<body>{PORT}").replace("</body>", SCRIPT % script)
     with Bridge(host, page) as bridge:
         threading.Thread(target=bridge.serve_forever, daemon=True).start()
-        words = ["--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={folder / 'profile'}", *options]
+        words = [
+            "--headless",
+            "--no-sandbox",
+            "--disable-gpu",
+            f"--user-data-dir={folder / 'profile'}",
+            *options,
+        ]
         command = [BROWSER, *words, "--remote-debugging-port=0", bridge.address]
         browser = subprocess.Popen(command, stderr=subprocess.DEVNULL)
         try:
@@ -145,7 +154,7 @@ def bridged(page: str, script: str, host: EmulatorHost, folder: Path, *options: 
             browser.terminate()
             browser.wait()
             bridge.closed.set()
-            bridge.idle.wait(PATIENCE)
+            bridge.idle.wait(SILENCE)
             bridge.shutdown()
 
 

@@ -1,0 +1,255 @@
+"""The page drives an emulated cart over Web Serial, in a headless browser.
+
+The cart has the lockstep clock: nothing depends on how fast this machine is.
+"""
+
+import copy
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from browser import in_browser
+from emulator_host import EmulatorHost, emulator
+from serial_bridge import Bridge, bridged, frames
+from shown_pages import needs_browser
+
+from cartpole_rl.envs.build import environment
+from cartpole_rl.plants.specs import Numbers, OneCartPlant, PlantOutput
+from cartpole_rl.rig.hardware import nominal_hardware
+from cartpole_rl.wire import Flags, Frame, Hello, Home, Info, SetMotor, Start, State, Stop
+from cartpole_rl.workflows.build import TrainedAgent, network_of
+
+VECTORS = json.loads(Path("tests/wire/vectors.json").read_text(encoding="utf-8"))
+
+AGREED = """
+element("connect").click();
+await until(() => real?.asking || real?.done);
+element("agree").click();
+"""
+DRIVEN = f"""{AGREED}
+await until(() => real.driving || real.done);
+"""
+ENDED = """
+await until(() => real.done);
+report([real.line, real.answered]);
+"""
+SILENCE = """
+WIRE.timeout = 0.3;
+const earlier = real.states;
+await until(() => real.states > earlier + 10); // waits for each of them for 0.3 s
+real.take = () => {};
+"""
+CODEC = """
+const bytesOf = (hex) => hex.split(" ").map((byte) => parseInt(byte, 16));
+const framesOf = (hex) => [...new Splitter().feed(bytesOf(hex))].map(decodedFrame);
+const good = VECTORS.good.map(({ hex, type, sequence, flags, fields }) => {
+  const values = WIRE.messages[type].fields.map((field) => fields[field]), frame = framesOf(hex)[0];
+  const bytes = [...encodedFrame(type, values, sequence, flags)];
+  return [bytes, bytesOf(hex), frame.name, frame.sequence, frame.flags, frame.message];
+});
+const damaged = VECTORS.damaged.map(({ hex }) => {
+  return framesOf(`${hex} ${VECTORS.good[0].hex}`).map((frame) => frame?.name);
+});
+const taker = new SerialCart(null, null, null);
+for (const tick of [8, 10, 9, 10]) {
+  const run = encodedFrame("STATE", [tick, 0, 0, 0, 0, 0, 0, 0], 0).slice(0, -1);
+  taker.take(decodedFrame(run));
+}
+document.body.textContent = JSON.stringify({ good, damaged, newest: [taker.fresh.tick, taker.states] });
+"""
+
+
+def read(bridge: Bridge, kind: type) -> list[Any]:
+    """The messages of a kind that the cart sent."""
+    return [frame.message for frame in frames(bridge.read) if isinstance(frame.message, kind)]
+
+
+def written(bridge: Bridge, kind: type) -> list[Any]:
+    """The messages of a kind that the page sent."""
+    return [frame.message for frame in frames(bridge.written) if isinstance(frame.message, kind)]
+
+
+def check_answers(bridge: Bridge, answered: int) -> None:
+    """Each motor value answers another state that the cart has sent, in their order."""
+    ticks = [motor.tick for motor in written(bridge, SetMotor)]
+    assert len(ticks) == answered > 0
+    assert ticks == sorted(set(ticks))
+    assert set(ticks) <= {state.tick for state in read(bridge, State)}
+
+
+def check_stopped(bridge: Bridge, host: EmulatorHost) -> None:
+    """The last word of the page is STOP, and the cart stands disarmed."""
+    assert isinstance(frames(bridge.written)[-1].message, Stop)
+    state = host.ask(Hello())[-1]
+    assert not state.flags & (Flags.ARMED | Flags.HOMING)
+    assert isinstance(state.message, State)
+    assert state.message.motor_applied == 0
+
+
+class RecordedPlant(OneCartPlant):
+    """A cart that moves as another one did while the page drove it, whatever is sent."""
+
+    def __init__(self, states: list[Frame], soft_limit_counts: int) -> None:
+        super().__init__()
+        self.states = iter(states)
+        self.track_end = soft_limit_counts * self.hardware.encoders.metres
+
+    @property
+    def track_half_length(self) -> torch.Tensor:
+        return torch.tensor([self.track_end])
+
+    def _set_seed(self, seed: int | None) -> None:
+        """Nothing is random."""
+
+    def reset_one(self) -> PlantOutput[Numbers]:
+        self.time_us = 0
+        return self.step_one(0)
+
+    def step_one(self, motor: int) -> PlantOutput[Numbers]:
+        frame = next(self.states)
+        state, self.limited = frame.message, frame.flags & Flags.SOFT_LIMIT
+        assert isinstance(state, State)
+        dt, self.time_us, self.motor = (
+            (state.time_us - self.time_us) * 1e-6,
+            state.time_us,
+            state.motor_applied,
+        )
+        return PlantOutput((state.cart_counts, state.pole_counts), (dt,), (self.motor,), (False,), (False,))
+
+    def drove(self, given: int) -> int:
+        return self.motor if self.limited else given
+
+
+@torch.no_grad()
+def chosen(trained: TrainedAgent, bridge: Bridge) -> list[int]:
+    """The motor values that this program chooses on the states that the page answered."""
+    states = {state.tick: frame for frame in frames(bridge.read) if isinstance(state := frame.message, State)}
+    answered = [states[motor.tick] for motor in written(bridge, SetMotor)]
+    plant = RecordedPlant([*answered, answered[-1]], read(bridge, Info)[-1].soft_limit_counts)
+    cart, network = environment(trained.training, plant).one_cart, copy.deepcopy(network_of(trained)).double()
+    step, motors = cart.reset(), []
+    for _ in answered:
+        action = int(network(torch.tensor(step.observation, dtype=torch.float64)).argmax())
+        motors.append(cart.sent_motor(action))
+        step = cart.step(action)
+    return motors
+
+
+@needs_browser
+def test_its_frames_are_those_of_the_vectors(page: str, tmp_path: Path) -> None:
+    found = in_browser(page, f"const VECTORS = {json.dumps(VECTORS)};{CODEC}", tmp_path)
+    for vector, (encoded, expected, *frame) in zip(VECTORS["good"], found["good"], strict=True):
+        assert encoded == expected
+        assert frame == [vector[key] for key in ("type", "sequence", "flags", "fields")]
+    for *damaged, next_one in found["damaged"]:
+        assert not any(damaged)
+        assert next_one == VECTORS["good"][0]["type"]
+    assert found["newest"] == [10, 2]
+
+
+@needs_browser
+def test_without_web_serial_one_line_says_so(page: str, tmp_path: Path) -> None:
+    script = """
+    drawSerial();
+    document.body.textContent = JSON.stringify([element("connect").disabled, element("link").textContent]);
+    """
+    without = page.replace("<body>", "<body><script>delete Navigator.prototype.serial;</script>")
+    disabled, words = in_browser(without, script, tmp_path)
+    assert disabled
+    assert "has no Web Serial" in words
+
+
+@needs_browser
+def test_it_homes_a_cart_swings_its_pole_up_and_stops(
+    page: str, medium_agent: TrainedAgent, tmp_path: Path
+) -> None:
+    stand = """
+    await until(() => upright > 1 || real.done);
+    element("stop").click();
+    """
+    with emulator() as host, bridged(page, DRIVEN + stand + ENDED, host, tmp_path) as bridge:
+        line, answered = bridge.report()
+        check_answers(bridge, answered)
+        check_stopped(bridge, host)
+    assert line == "Stopped by hand."
+    assert len(written(bridge, Home)) == len(written(bridge, Start)) == 1
+    motors = [motor.motor for motor in written(bridge, SetMotor)]
+    assert any(motors)
+    assert motors == chosen(medium_agent, bridge)
+
+
+@needs_browser
+def test_a_hidden_page_stops_a_cart_on_a_bad_line(page: str, tmp_path: Path) -> None:
+    hide = """
+    await until(() => real.answered >= 100 || real.done);
+    Object.defineProperty(document, "hidden", { value: true });
+    document.dispatchEvent(new Event("visibilitychange"));
+    """
+    shares = dict.fromkeys(("frame_loss", "frame_corruption", "frame_duplication", "frame_reordering"), 0.01)
+    with emulator(**shares) as host, bridged(page, DRIVEN + hide + ENDED, host, tmp_path) as bridge:
+        line, answered = bridge.report()
+        check_answers(bridge, answered)
+        check_stopped(bridge, host)
+    assert line.startswith("The page was hidden")
+
+
+@needs_browser
+def test_a_cart_of_another_rig_is_refused(page: str, tmp_path: Path) -> None:
+    other = nominal_hardware().model_copy(update={"pole_counts_per_turn": 4000})
+    with (
+        emulator(hardware=other.model_dump()) as host,
+        bridged(page, AGREED + ENDED, host, tmp_path) as bridge,
+    ):
+        line, _ = bridge.report()
+        check_stopped(bridge, host)
+    assert line == "This is not a cart as the agent's; it reports pole_counts_per_turn 4000, not 4096."
+    assert not written(bridge, Home)
+
+
+@needs_browser
+@pytest.mark.parametrize(
+    ("trouble", "words"),
+    [
+        ({"unplug_at": 3.0}, "The cable to the cart was pulled"),
+        ({"reset_at": 3.0}, "The cart has restarted"),
+        ({"stuck_encoder": "cart"}, "The cart latched a fault"),
+    ],
+    ids=["cable", "restart", "fault"],
+)
+def test_trouble_ends_it_with_one_line(
+    page: str, tmp_path: Path, trouble: dict[str, Any], words: str
+) -> None:
+    with emulator(**trouble) as host, bridged(page, AGREED + ENDED, host, tmp_path) as bridge:
+        line, _ = bridge.report()
+        assert isinstance(frames(bridge.written)[-1].message, Stop)
+    assert line.startswith(words)
+    assert not written(bridge, Start)
+
+
+@needs_browser
+@pytest.mark.parametrize(
+    ("event", "words"),
+    [
+        ("window.dispatchEvent(new KeyboardEvent('keydown', { key: 'Escape' }));", "Stopped by hand."),
+        (SILENCE, "No state came for 0.3 s"),
+    ],
+    ids=["escape", "silence"],
+)
+def test_homing_ends_early(page: str, tmp_path: Path, event: str, words: str) -> None:
+    script = f"{AGREED} await until(() => real.newest.flags & WIRE.flags.HOMING); {event} {ENDED}"
+    with emulator() as host, bridged(page, script, host, tmp_path) as bridge:
+        line, _ = bridge.report()
+        check_stopped(bridge, host)
+    assert line.startswith(words)
+
+
+@needs_browser
+def test_it_waits_until_a_hand_holds_the_pole_up(balancing_page: str, tmp_path: Path) -> None:
+    with emulator(start="upright") as host, bridged(balancing_page, AGREED + ENDED, host, tmp_path) as bridge:
+        line, answered = bridge.report()
+        check_answers(bridge, answered)
+        check_stopped(bridge, host)
+    assert re.match(r"The pole fell\.|The cart reached the end of its track\.", line)
