@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import torch
 from browser import in_browser
-from emulator_host import EmulatorHost, emulator
+from emulator_host import SILENCE, EmulatorHost, emulator
 from serial_bridge import Bridge, bridged, frames
 from shown_pages import needs_browser
 
@@ -36,7 +36,7 @@ ENDED = """
 await until(() => real.done);
 report([real.line, real.answered]);
 """
-SILENCE = """
+SILENT = """
 WIRE.timeout = 0.3;
 const earlier = real.states;
 await until(() => real.states > earlier + 10); // waits for each of them for 0.3 s
@@ -225,6 +225,8 @@ def test_trouble_ends_it_with_one_line(
     with emulator(**trouble) as host, bridged(page, AGREED + ENDED, host, tmp_path) as bridge:
         line, _ = bridge.report()
         assert isinstance(frames(bridge.written)[-1].message, Stop)
+        if "unplug_at" in trouble:
+            host.process.wait(SILENCE)  # the emulator of a pulled cable ends by itself
     assert line.startswith(words)
     assert not written(bridge, Start)
 
@@ -234,7 +236,7 @@ def test_trouble_ends_it_with_one_line(
     ("event", "words"),
     [
         ("window.dispatchEvent(new KeyboardEvent('keydown', { key: 'Escape' }));", "Stopped by hand."),
-        (SILENCE, "No state came for 0.3 s"),
+        (SILENT, "No state came for 0.3 s"),
     ],
     ids=["escape", "silence"],
 )

@@ -1,6 +1,7 @@
 """A browser whose Web Serial leads to an emulated cart: bytes go through HTTP to its `EmulatorHost`."""
 
 import json
+import select
 import subprocess
 import threading
 from collections.abc import Iterator
@@ -102,16 +103,15 @@ class Handler(BaseHTTPRequestHandler):
         self.send_header("Connection", "close")
         self.end_headers()
         self.wfile.flush()
-        bridge = self.server
-        bridge.host.serial.timeout = READ_SLICE
+        bridge, port = self.server, self.server.host.serial
         bridge.closed.clear()
         bridge.idle.clear()
         with suppress(OSError):  # the cable is pulled, or the page has closed its port
             while not bridge.closed.is_set():
-                data = bridge.host.serial.read(bridge.host.serial.in_waiting or 1)
-                bridge.read += data
-                self.wfile.write(data)
-        bridge.host.serial.timeout = SILENCE
+                if select.select([port], [], [], READ_SLICE)[0]:
+                    data = port.read(port.in_waiting or 1)
+                    bridge.read += data
+                    self.wfile.write(data)
         bridge.idle.set()
 
     def do_POST(self) -> None:

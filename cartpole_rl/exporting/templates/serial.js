@@ -114,7 +114,7 @@ class SerialCart {
   connected = false;
   closing = false;
   answered = 0; // STATEs
-  periods = 0; // since START; those without an answer were lost or came late
+  periods = 0; // since START
   states = 0; // that came
   bytes = 0; // that came
   newest = null; // STATE
@@ -145,7 +145,7 @@ class SerialCart {
     this.line = sentence(this.over);
     const reached = this.connected && this.over !== LOST;
     const stopped = reached && (await this.ask("STOP", [], WIRE.stopAttempts).catch(() => null));
-    if (this.connected && !stopped) this.line += " It did not confirm the STOP; our firmware stops it by itself.";
+    if (this.connected && !stopped) this.line += " The cart did not confirm the STOP; our firmware stops it by itself.";
     await this.close();
     this.done = true;
   }
@@ -450,7 +450,8 @@ function drawSerial() {
   element("agree").hidden = !(running && real.asking);
   element("stop").hidden = !running;
   if (element("link").textContent !== text) element("link").textContent = text;
-  element("states").textContent = real ? `${real.answered} of ${real.periods} periods answered` : "";
+  const missed = real && Math.max(0, real.periods - real.answered); // lost, or another one had come
+  element("states").textContent = real?.answered ? `${real.answered} states answered, ${missed} missed` : "";
 }
 
 element("connect").addEventListener("click", connectCart);
