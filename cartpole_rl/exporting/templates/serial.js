@@ -142,10 +142,11 @@ class SerialCart {
     }
     this.closing = true;
     this.driving = this.asking = false;
+    this.cart.motor = 0;
     this.line = sentence(this.over);
     const reached = this.connected && this.over !== LOST;
     const stopped = reached && (await this.ask("STOP", [], WIRE.stopAttempts).catch(() => null));
-    if (this.connected && !stopped) this.line += " The cart did not confirm the STOP; our firmware stops it by itself.";
+    if (this.connected && !stopped) this.line += " The cart did not confirm STOP; our firmware stops it by itself.";
     await this.close();
     this.done = true;
   }
