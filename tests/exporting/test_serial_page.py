@@ -34,7 +34,7 @@ await until(() => real.driving || real.done);
 """
 ENDED = """
 await until(() => real.done);
-report([real.line, real.answered]);
+report([real.line, real.answered, real.soft]);
 """
 SILENT = """
 WIRE.timeout = 0.3;
@@ -171,10 +171,12 @@ def test_it_homes_a_cart_swings_its_pole_up_and_stops(
     element("stop").click();
     """
     with emulator() as host, bridged(page, DRIVEN + stand + ENDED, host, tmp_path) as bridge:
-        line, answered = bridge.report()
+        line, answered, soft_limit = bridge.report()
         check_answers(bridge, answered)
         check_stopped(bridge, host)
     assert line == "Stopped by hand."
+    before, *_, measured = [information.soft_limit_counts for information in read(bridge, Info)]
+    assert soft_limit == measured != before
     assert len(written(bridge, Home)) == len(written(bridge, Start)) == 1
     motors = [motor.motor for motor in written(bridge, SetMotor)]
     assert any(motors)
@@ -190,7 +192,7 @@ def test_a_hidden_page_stops_a_cart_on_a_bad_line(page: str, tmp_path: Path) -> 
     """
     shares = dict.fromkeys(("frame_loss", "frame_corruption", "frame_duplication", "frame_reordering"), 0.01)
     with emulator(**shares) as host, bridged(page, DRIVEN + hide + ENDED, host, tmp_path) as bridge:
-        line, answered = bridge.report()
+        line, answered, _ = bridge.report()
         check_answers(bridge, answered)
         check_stopped(bridge, host)
     assert line.startswith("The page was hidden")
@@ -203,10 +205,18 @@ def test_a_cart_of_another_rig_is_refused(page: str, tmp_path: Path) -> None:
         emulator(hardware=other.model_dump()) as host,
         bridged(page, AGREED + ENDED, host, tmp_path) as bridge,
     ):
-        line, _ = bridge.report()
+        line, *_ = bridge.report()
         check_stopped(bridge, host)
-    assert line == "This is not a cart as the agent's; it reports pole_counts_per_turn 4000, not 4096."
+    assert line == "This cart is not of the agent's kind; it reports pole_counts_per_turn 4000, not 4096."
     assert not written(bridge, Home)
+
+
+@needs_browser
+def test_another_version_of_the_protocol_is_refused(page: str, tmp_path: Path) -> None:
+    script = f"WIRE.version = 3; {AGREED}{ENDED}"
+    with emulator() as host, bridged(page, script, host, tmp_path) as bridge:
+        line, *_ = bridge.report()
+    assert line.startswith("No cart answers: it speaks protocol version 2, this page 3; update")
 
 
 @needs_browser
@@ -223,7 +233,7 @@ def test_trouble_ends_it_with_one_line(
     page: str, tmp_path: Path, trouble: dict[str, Any], words: str
 ) -> None:
     with emulator(**trouble) as host, bridged(page, AGREED + ENDED, host, tmp_path) as bridge:
-        line, _ = bridge.report()
+        line, *_ = bridge.report()
         assert isinstance(frames(bridge.written)[-1].message, Stop)
         if "unplug_at" in trouble:
             host.process.wait(SILENCE)  # the emulator of a pulled cable ends by itself
@@ -243,7 +253,7 @@ def test_trouble_ends_it_with_one_line(
 def test_homing_ends_early(page: str, tmp_path: Path, event: str, words: str) -> None:
     script = f"{AGREED} await until(() => real.newest.flags & WIRE.flags.HOMING); {event} {ENDED}"
     with emulator() as host, bridged(page, script, host, tmp_path) as bridge:
-        line, _ = bridge.report()
+        line, *_ = bridge.report()
         check_stopped(bridge, host)
     assert line.startswith(words)
 
@@ -251,7 +261,7 @@ def test_homing_ends_early(page: str, tmp_path: Path, event: str, words: str) ->
 @needs_browser
 def test_it_waits_until_a_hand_holds_the_pole_up(balancing_page: str, tmp_path: Path) -> None:
     with emulator(start="upright") as host, bridged(balancing_page, AGREED + ENDED, host, tmp_path) as bridge:
-        line, answered = bridge.report()
+        line, answered, _ = bridge.report()
         check_answers(bridge, answered)
         check_stopped(bridge, host)
     assert re.match(r"The pole fell\.|The cart reached the end of its track\.", line)

@@ -238,6 +238,7 @@ class SerialCart {
   /** Ask until the cart answers. Return the answer, and the sequence of the first frame that asked. */
   async ask(name, values = [], attempts = WIRE.attempts, fits = () => true) {
     const asked = [], isInfo = ["HELLO", "SET_PERIOD"].includes(name);
+    this.answers = []; // INFO of an earlier HELLO has earlier limits
     while (asked.length < attempts) {
       this.check();
       asked.push(this.send(name, ...values));
@@ -286,7 +287,7 @@ class SerialCart {
     const found = await this.ask("HELLO");
     const other = Object.entries(WIRE.cart).filter(([name, value]) => found[name] !== value);
     const words = other.map(([name, value]) => `${name} ${found[name]}, not ${value}`).join(", ");
-    if (words) throw new Error(`this is not a cart as the agent's; it reports ${words}`);
+    if (words) throw new Error(`this cart is not of the agent's kind; it reports ${words}`);
     await this.ask("SET_PERIOD", [WIRE.period], WIRE.attempts, ({ period_us }) => period_us === WIRE.period);
   }
 
