@@ -48,6 +48,7 @@ const until = async (what) => { while (!what()) await new Promise((next) => setT
 const shown = (id) => !element(id).hidden;
 const said = () => element("link").textContent;
 WIRE.timeout = 200; // a slow machine is no silent cart
+WIRE.attempts = WIRE.connectAttempts = WIRE.stopAttempts = 400;
 (async () => { %s })().catch((error) => report(`${error.stack}`));
 </script></body>"""
 
