@@ -49,6 +49,7 @@ const shown = (id) => !element(id).hidden;
 const said = () => element("link").textContent;
 WIRE.timeout = 200; // a slow machine is no silent cart
 WIRE.attempts = WIRE.connectAttempts = WIRE.stopAttempts = 400;
+WIRE.trips = 0; // the time of a cart in lockstep passes with each question, also with a repeated one
 (async () => { %s })().catch((error) => report(`${error.stack}`));
 </script></body>"""
 

@@ -119,6 +119,7 @@ class SerialCart {
   bytes = 0; // that came
   newest = null; // STATE
   fresh = null; // the same until it is answered
+  asked = null; // sequence of the last question, until a STATE acknowledges it
   answers = [];
   splitter = new Splitter();
   sequence = Math.floor(256 * Math.random()); // unlike that of the last host
@@ -219,6 +220,7 @@ class SerialCart {
     if (restarted && this.connected) this.end("the cart has restarted; check its power");
     this.states += 1;
     this.newest = this.fresh = state;
+    if (this.asked !== null && isNewer(state.last_sequence, this.asked)) this.asked = null;
   }
 
   /** Wait until something comes, for `ms` at most, and then until all that has come is read. */
@@ -235,32 +237,34 @@ class SerialCart {
     if (this.over !== null && !this.closing) throw new Error(this.over);
   }
 
-  /** Ask until the cart answers. Return the answer, and the sequence of the first frame that asked. */
+  /** Ask until the cart answers. Return the answer. */
   async ask(name, values = [], attempts = WIRE.attempts, fits = () => true) {
     const asked = [], isInfo = ["HELLO", "SET_PERIOD"].includes(name);
     this.answers = []; // INFO of an earlier HELLO has earlier limits
     while (asked.length < attempts) {
       this.check();
       asked.push(this.send(name, ...values));
+      this.asked = asked[0];
       for (const end = performance.now() + 1000 * WIRE.answerTimeout; performance.now() < end; ) {
         await this.event(end - performance.now());
         for (const { name: kind, message, states } of this.answers.splice(0)) {
           const { type, sequence, reason } = message, isOurs = NAMES[type] === name && asked.includes(sequence);
           const heard = isOurs && reason === WIRE.busy && asked.length > 1; // the first time; its ACK was lost
           if (kind === "NACK" && isOurs && !heard) throw new Error(this.refusal(message));
-          if (isInfo ? kind === "INFO" && fits(message) : isOurs) return { ...message, states, first: asked[0] };
+          if (isInfo ? kind === "INFO" && fits(message) : isOurs) return { ...message, states };
         }
       }
     }
     throw new Error(`the cart did not answer ${name}, asked ${attempts} times: check its cable and power`);
   }
 
-  /** The newest STATE, each at most once; with `since`, one that was measured after that frame was taken. */
-  async state(since = null) {
+  /** The newest STATE, each at most once; with `taken`, one that was measured after the last question was taken. */
+  async state(taken = false) {
     for (const end = performance.now() + 1000 * WIRE.timeout; ; ) {
+      this.check(); // after a STOP, no motor value
       const state = this.fresh, left = end - performance.now();
       this.fresh = null;
-      if (state && (since === null || isNewer(state.last_sequence, since))) return state;
+      if (state && !(taken && this.asked !== null)) return state;
       if (left <= 0) throw new Error(`no state came for ${WIRE.timeout} s: check the cart's cable and power`);
       await this.event(left);
     }
@@ -313,8 +317,9 @@ class SerialCart {
     await this.consent(fault ? `${sentence(this.faults(fault))} If its cause is gone: ` : "");
     if (fault) await this.ask("CLEAR_FAULT");
     this.line = "The cart homes: it moves by itself, usually for 15 to 40 s.";
-    const before = this.newest, { first } = await this.ask("HOME");
-    let state = await this.seen(first), renewed = before;
+    const before = this.newest;
+    await this.ask("HOME");
+    let state = await this.seen(true), renewed = before;
     for (; state.flags & WIRE.flags.HOMING; state = await this.seen()) {
       if (seconds(before, state) > WIRE.homeTimeout) throw new Error("homing took too long: clear the track");
       if (between(renewed.time_us, state.time_us) < WIRE.lease) continue;
@@ -343,8 +348,8 @@ class SerialCart {
   }
 
   /** The next STATE of a cart that the agent does not drive. Before homing its angle means nothing. */
-  async seen(since = null) {
-    const state = await this.state(since);
+  async seen(taken = false) {
+    const state = await this.state(taken);
     if (state.fault && !this.asking) throw new Error(this.faults(state.fault));
     const angle = state.flags & WIRE.flags.HOMED ? (2 * Math.PI * state.pole_counts) / WIRE.turn : Math.PI;
     Object.assign(this.cart, { motion: [WIRE.metres * state.cart_counts, 0, angle, 0], motor: state.motor_applied });
@@ -372,7 +377,8 @@ class SerialCart {
 
   async drive() {
     await this.checkLink();
-    const { first } = await this.ask("START"), start = await this.state(first), cart = this.cart;
+    await this.ask("START");
+    const start = await this.state(true), cart = this.cart;
     const turns = WIRE.turn * Math.round(start.pole_counts / WIRE.turn - WIRE.start.angle / (2 * Math.PI));
     const counts = (state) => [state.cart_counts, state.pole_counts - turns];
     this.driving = true;
