@@ -43,7 +43,10 @@ FIT, REPORT = range(120), range(120, 180)  # numbers of the logs
 PERIOD, PERIOD_2020, SUBSTEPS = 0.02, 0.005, 12
 WINDOWS = 300  # that a cart is fitted to, at most: the default of cartpole-identify
 LAYOUT = "layout=sensorsini_2022"
-MOTORS_2020 = {"stock_motor": 3086, "pololu": 3129}  # part of the logs' names: counts of the upright pole
+MOTORS_2020 = {  # its logs, and what their layout lacks
+    "stock": ("*2020-03-09-14-2*.csv", ("layout.angle.upright=3086",)),
+    "Pololu": ("*2020-02-20-15-16-37*.csv", ("layout.angle.upright=3114", "layout.motor.full=7055")),
+}
 CART = "cart=sensorsini"
 RIG = (CART, "pole=sensorsini")
 SECONDS = (30, 60, 120)  # of recordings to identify from
@@ -158,9 +161,8 @@ def at_times(error: Array, period: float) -> list[list[float]]:
 def of_2020(logs: Path, home: Path) -> dict[str, Any]:
     """Return for each motor of 2020 what its logs tell of the sensors and of the cart, or why not."""
     found: dict[str, Any] = {}
-    for name, upright in MOTORS_2020.items():
-        words = ("layout=sensorsini_2020", f"layout.angle.upright={upright}")
-        run = imported(sorted(logs.glob(f"*{name}*.csv")), home / name, *words)
+    for name, (files, layout) in MOTORS_2020.items():
+        run = imported(sorted(logs.glob(files)), home / name, "layout=sensorsini_2020", *layout)
         found[name] = {"import": read_json(run / "import.json")}
         words = (f"from={run}", *RIG, f"control_period={PERIOD_2020}")
         own, step = home / f"{name}-identify", home / f"{name}-one_step"

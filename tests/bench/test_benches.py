@@ -207,7 +207,7 @@ def test_mujocos_toolbox_finds_the_cart_that_moved() -> None:
 
 
 def test_a_motor_whose_logs_are_too_short_is_refused(tmp_path: Path, monkeypatch: Any) -> None:
-    monkeypatch.setattr(real, "MOTORS_2020", {"short": 3000})
+    monkeypatch.setattr(real, "MOTORS_2020", {"short": ("*.csv", ("layout.angle.upright=3000",))})
     time = np.arange(0, 8, 0.005)
     angle, position = 3000 + 300 * np.sin(9 * time), 1000 * np.sin(3 * time)
     rows = np.stack((time, angle.round(), position.round(), (4000 * np.cos(5 * time)).round()), 1)
