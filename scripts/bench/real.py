@@ -5,18 +5,19 @@
 
 FOLDER holds recordings of the cart of the Sensors Group in Zurich, fetched as docs/results/real.md says:
 Experiment-0.csv to Experiment-119.csv, of which everything is identified, and Experiment-120.csv to
-Experiment-179.csv, on which everything is judged. The runs are in runs/bench/real; what exists is not made
-again.
+Experiment-179.csv, on which everything is judged. The folder of --of-2020 holds logs of PD control in 2020.
+The runs are in runs/bench/real; what exists is not made again.
 """
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import toolbox
 import torch
-from common import FIRST_SEED, RUNS, option_parser, print_table, read_json, run_once, write_json
+from common import FIRST_SEED, RUNS, failure, option_parser, print_table, read_json, run_once, write_json
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -26,7 +27,7 @@ from cartpole_rl.evaluation.recordings import read_recording
 from cartpole_rl.identification.prediction import CERTAIN, LEAD, Prediction, is_away, predict
 from cartpole_rl.identification.rollout import Dynamics
 from cartpole_rl.identification.sensors import delayed
-from cartpole_rl.identification.windows import Windows, cut_stretches, joined, lead_periods
+from cartpole_rl.identification.windows import Windows, cut_stretches, cut_windows, joined, lead_periods
 from cartpole_rl.physics.models import Models
 from cartpole_rl.plants.learned import load_model
 from cartpole_rl.randomization.poles import Pole
@@ -35,23 +36,31 @@ from cartpole_rl.rig.hardware import LARGEST_MOTOR, parameters_of
 from cartpole_rl.rig.parameters import completed
 from cartpole_rl.run_folder import IDENTIFIED, RECORDINGS
 from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.workflows.identify import split
 
 Array = NDArray[np.float64]
 FIT, REPORT = range(120), range(120, 180)  # numbers of the logs
-PERIOD, SUBSTEPS = 0.02, 12
+PERIOD, PERIOD_2020, SUBSTEPS = 0.02, 0.005, 12
+WINDOWS = 300  # that a cart is fitted to, at most: the default of cartpole-identify
+LAYOUT = "layout=sensorsini_2022"
+MOTORS_2020 = {  # its logs, and what their layout lacks
+    "stock": ("*2020-03-09-14-2*.csv", ("layout.angle.upright=3086",)),
+    "Pololu": ("*2020-02-20-15-16-37*.csv", ("layout.angle.upright=3114", "layout.motor.full=7055")),
+}
 CART = "cart=sensorsini"
 RIG = (CART, "pole=sensorsini")
 SECONDS = (30, 60, 120)  # of recordings to identify from
 SEEDS = range(FIRST_SEED, FIRST_SEED + 3)  # of agents
 SETS = 3  # of recordings, for each of SECONDS
 TIMES = (0.1, 0.2, 0.5, 1.0)  # s predicted
+UNITS = {"mm": 1e3, "deg": 180 / np.pi}  # of m and rad
 SLOW, MISSING = 0.01, 4.0  # m/s of the friction's sign; m/s^2 that a dropout of the motor takes away
 LATENCY = 0.015  # s, by the owners' logs
 PUBLISHED = {"cart_viscous": 4.77, "pole_viscous": 2.5e-4}  # N s/m, N m s/rad: their config.yml of 2022
 PUBLISHED_FORCE = 2.62  # N at Q = 1
 # their model has no dry friction: Q is the control before their compensation of it
 OWN_CONTROL = ("layout.motor.name=Q", "layout.motor.full=1", "layout.motor.positive=right")
-OWNERS, ONE_STEP = "the owners' numbers", "one-step regression"
+OWNERS, ONE_STEP, TOOLBOX = "the owners' numbers", "one-step regression", "mujoco.sysid"
 PHYSICS, MODEL, RESIDUAL = "cartpole-identify", "cartpole-model, physics alone", "cartpole-model"
 COLOURS = dict(
     zip(
@@ -62,54 +71,63 @@ COLOURS = dict(
 )
 
 
-def imported(logs: Path, numbers: Sequence[int], run: Path, *words: str) -> Path:
-    """Return the run folder of `cartpole-import` with some of the logs."""
+def imported(logs: Iterable[Path], run: Path, *words: str) -> Path:
+    """Return the run folder of `cartpole-import` with some logs."""
     if not run.exists():
         beside = run.with_name(f"{run.name}-logs")
         beside.mkdir(parents=True, exist_ok=True)
-        for number in numbers:
-            shutil.copy(logs / f"Experiment-{number}.csv", beside)
-    return run_once(
-        run,
-        "import",
-        f"from={run}-logs",
-        "layout=sensorsini_2022",
-        CART,
-        *words,
-        result="import.json",
-    )
+        for log in logs:
+            shutil.copy(log, beside)
+    return run_once(run, "import", f"from={run}-logs", CART, *words, result="import.json")
 
 
-def episodes(run: Path) -> list[Episode]:
-    """Return the recordings of a run."""
-    return [read_recording(path) for path in sorted((run / RECORDINGS).iterdir())]
+def recordings(run: Path) -> dict[str, Episode]:
+    """Return the recordings of a run by name."""
+    return {path.stem: read_recording(path) for path in sorted((run / RECORDINGS).iterdir())}
 
 
-def stretches(recorded: Sequence[Episode]) -> Windows:
+def stretches(recorded: Iterable[Episode], period: float = PERIOD) -> Windows:
     """Return every second of the recordings, with its lead."""
-    lead = lead_periods(LEAD, PERIOD)
+    lead = lead_periods(LEAD, period)
     long_enough = (each for each in recorded if each.steps >= 4 * lead)
-    return joined([cut_stretches(each, PERIOD, TIMES[-1], lead) for each in long_enough])
+    return joined([cut_stretches(each, period, TIMES[-1], lead) for each in long_enough])
 
 
 def owners() -> Dynamics:
     """Return the cart of the owners' numbers."""
+    force = {"force_linear": PUBLISHED_FORCE / LARGEST_MOTOR, "latency": LATENCY}
+    return dynamics({**nominal(), **PUBLISHED, **force}, "linear", "exponential")
+
+
+def nominal() -> dict[str, float]:
+    """Return the parameters of cart=sensorsini and its pole."""
     pole = Pole(**choice("pole/sensorsini")["choices"]["sensorsini"])
-    values = {**parameters_of(choice("cart/sensorsini")), **pole.model_dump(), **PUBLISHED}
-    values.update(force_linear=PUBLISHED_FORCE / LARGEST_MOTOR, latency=LATENCY)
-    return dynamics(values, "linear", "exponential")
+    return {**parameters_of(choice("cart/sensorsini")), **pole.model_dump()}
 
 
-def dynamics(parameters: dict[str, float], cart_friction: str, pole_friction: str) -> Dynamics:
+def dynamics(
+    parameters: dict[str, float], cart_friction: str, pole_friction: str, period: float = PERIOD
+) -> Dynamics:
     """Return a cart that moves in the steps of an identification."""
     models = Models.of(cart_friction=cart_friction, pole_friction=pole_friction)
-    return Dynamics.of(completed(parameters), models, PERIOD, SUBSTEPS, PERIOD / SUBSTEPS / 2)
+    return Dynamics.of(completed(parameters), models, period, SUBSTEPS, period / SUBSTEPS / 2)
 
 
-def identified(run: Path, friction: str | None = None) -> Dynamics:
+def identified(run: Path, friction: str | None = None, period: float = PERIOD) -> Dynamics:
     """Return the cart of a run of `cartpole-identify`."""
     found = read_json(run / IDENTIFIED)
-    return dynamics(found["parameters"], friction or found["cart_friction"], "bearing")
+    return dynamics(found["parameters"], friction or found["cart_friction"], "bearing", period)
+
+
+def by_toolbox(fit: Path, file: Path) -> Any:
+    """Return the cart that MuJoCo's toolbox finds from the windows of an identification; None without it."""
+    if not toolbox.INSTALLED:
+        return None
+    if not file.exists():
+        fitted, _ = split(recordings(fit), fit)
+        found = toolbox.fitted(cut_windows([*fitted.values()], PERIOD, most=WINDOWS), PERIOD)
+        write_json(file, {"parameters": found, "at_bounds": toolbox.at_bounds(found)})
+    return toolbox.MujocoCart.of(read_json(file)["parameters"], PERIOD)
 
 
 def away(windows: Windows) -> NDArray[np.bool_]:
@@ -122,18 +140,56 @@ def figures(windows: Windows, prediction: Prediction) -> dict[str, Any]:
     """Return errors in mm and degrees: RMS of a second away from upright, and at TIMES in all stretches."""
     found: dict[str, Any] = {}
     chosen = away(windows)
-    for channel, (name, factor) in enumerate((("mm", 1e3), ("deg", 180 / np.pi))):
+    for channel, (name, factor) in enumerate(UNITS.items()):
         error = factor * prediction.error[:, channel]
         sizes = np.sqrt((error[:, chosen] ** 2).mean(0))
         found[f"away_{name}"] = [float(np.percentile(sizes, share)) for share in (50, 90)]
         for label, kept in (("all", np.full(len(chosen), True)), ("away", chosen)):
-            at = [np.abs(error[round(time / PERIOD), kept]) for time in TIMES]
-            found[f"{label}_at_{name}"] = [
-                [float(np.nanpercentile(each, share)) for share in (50, 90)] for each in at
-            ]
+            found[f"{label}_at_{name}"] = at_times(error[:, kept], PERIOD)
         if prediction.spread.any():
             within = np.abs(error) <= CERTAIN * factor * prediction.spread[:, channel]
             found[f"within_{name}"] = float(within[1:, chosen].mean())
+    return found
+
+
+def at_times(error: Array, period: float) -> list[list[float]]:
+    """Return the median and the 90 % of the absolute errors [T + 1, S] at TIMES."""
+    at = [np.abs(error[round(time / period)]) for time in TIMES]
+    return [[float(np.nanpercentile(each, share)) for share in (50, 90)] for each in at]
+
+
+def of_2020(logs: Path, home: Path) -> dict[str, Any]:
+    """Return for each motor of 2020 what its logs tell of the sensors and of the cart, or why not."""
+    found: dict[str, Any] = {}
+    for name, (files, layout) in MOTORS_2020.items():
+        run = imported(sorted(logs.glob(files)), home / name, "layout=sensorsini_2020", *layout)
+        found[name] = {"import": read_json(run / "import.json")}
+        words = (f"from={run}", *RIG, f"control_period={PERIOD_2020}")
+        own, step = home / f"{name}-identify", home / f"{name}-one_step"
+        if not (own / IDENTIFIED).exists() and (error := failure("identify", *words, f"hydra.run.dir={own}")):
+            found[name]["refused"] = error
+            continue
+        run_once(step, "identify", *words, "method=one_step", result=IDENTIFIED)
+        found[name] |= held_out_2020(run, own, step)
+    return found
+
+
+def held_out_2020(run: Path, own: Path, step: Path) -> dict[str, Any]:
+    """Return what is identified of a motor of 2020, and errors in mm and degrees at TIMES in its last log."""
+    _, held_out = split(recordings(run), run)
+    windows = stretches(held_out.values(), PERIOD_2020)
+    carts = {
+        CART: dynamics(nominal(), "step", "bearing", PERIOD_2020),
+        ONE_STEP: identified(step, "step", PERIOD_2020),
+        PHYSICS: identified(own, period=PERIOD_2020),
+    }
+    found = {"stretches": windows.number, "identified": read_json(own / IDENTIFIED)["quantities"]}
+    for name, cart in carts.items():
+        error = predict(windows, cart).error
+        found[name] = {
+            unit: at_times(factor * error[:, channel], PERIOD_2020)
+            for channel, (unit, factor) in enumerate(UNITS.items())
+        }
     return found
 
 
@@ -266,23 +322,27 @@ def main() -> None:
     """Identify, predict and print the tables."""
     parser = option_parser(__doc__)
     parser.add_argument("folder", type=Path, help="with Experiment-0.csv to Experiment-179.csv")
+    parser.add_argument("--of-2020", type=Path, metavar="FOLDER", help="with the logs of PD control in 2020")
     parser.add_argument("--figures", type=Path, help="folder for the figures")
     options = parser.parse_args()
     torch.set_num_threads(2)
     home = RUNS / "real"
-    fit = imported(options.folder, FIT, home / "fit")
-    report = imported(options.folder, REPORT, home / "report")
-    blind = imported(options.folder, FIT, home / "fit_4096", "layout.angle.unit=4096")
+    first, rest = ([options.folder / f"Experiment-{each}.csv" for each in part] for part in (FIT, REPORT))
+    fit = imported(first, home / "fit", LAYOUT)
+    report = imported(rest, home / "report", LAYOUT)
+    blind = imported(first, home / "fit_4096", LAYOUT, "layout.angle.unit=4096")
     own = run_once(home / "identify", "identify", f"from={fit}", *RIG, result=IDENTIFIED)
     step = run_once(home / "one_step", "identify", f"from={fit}", *RIG, "method=one_step", result=IDENTIFIED)
     model = run_once(
         home / "model", "model", f"from={fit}", *RIG, "pole_friction=bearing", result="model.json"
     )
-    windows = stretches(episodes(report))
+    windows = stretches(recordings(report).values())
     learned = load_model(model)
-    controls = imported(options.folder, REPORT, home / "report_q", *OWN_CONTROL)
-    predictions = {OWNERS: predict(stretches(episodes(controls)), owners())}
+    controls = imported(rest, home / "report_q", LAYOUT, *OWN_CONTROL)
+    predictions = {OWNERS: predict(stretches(recordings(controls).values()), owners())}
     predictions[ONE_STEP] = predict(windows, identified(step, "step"))
+    if (cart := by_toolbox(fit, home / "toolbox.json")) is not None:
+        predictions[TOOLBOX] = predict(windows, cart)
     predictions[PHYSICS] = predict(windows, identified(own))
     physics = Dynamics.of(learned.parameters, learned.models, learned.period, learned.substeps)
     predictions[MODEL] = predict(windows, physics)
@@ -303,6 +363,8 @@ def main() -> None:
             "agents": agents(own, model, home / "agent"),
             "dropouts": after_dropouts(windows, predictions, quantities),
             "widening": float(learned.residual.widening),
+            "toolbox": cart and read_json(home / "toolbox.json"),
+            "2020": of_2020(options.of_2020, home / "2020") if options.of_2020 else None,
         },
     )
     if options.figures:

@@ -12,8 +12,10 @@ import fine_tuning
 import learning
 import numpy as np
 import pytest
+import real
 import reference
 import reports
+import toolbox
 import torch
 import truth_references
 import zero_shot
@@ -24,6 +26,7 @@ from truths import REPORTED, draw_truths, simulated_cart
 
 from cartpole_rl.choices import choice
 from cartpole_rl.emulator.settings import EmulatorSettings
+from cartpole_rl.identification.windows import Windows, history_periods
 from cartpole_rl.randomization.ranges import Range
 from cartpole_rl.tasks.rewards import UPRIGHT_ANGLE
 from cartpole_rl.workflows.config import TrainConfig, load_settings
@@ -159,3 +162,60 @@ def test_reports_of_more_and_more_runs_are_measured(trained: Path, run: Run) -> 
     rows = figures(run, reports, trained, *words)
     assert [row["runs"] for row in rows] == [2, 5]
     assert all(row["seconds"] > 0 and row["peak_mb"] > 50 and row["page_mb"] > 0.01 for row in rows)
+
+
+WINDOWS, PERIODS = 12, 25
+
+
+def known_cart(**values: float) -> dict[str, float]:
+    return {name: toolbox.nominal()[name] for name in toolbox.BOUNDS} | values
+
+
+def drawn_windows(cart: toolbox.MujocoCart) -> tuple[torch.Tensor, Windows]:
+    dice = np.random.default_rng(0)
+    motion = dice.normal(size=(4, 1, WINDOWS)) * np.array([0.1, 0.3, 0.8, 3.0]).reshape(4, 1, 1)
+    motion[2] += np.pi
+    levels = dice.integers(-2, 3, ((history_periods(real.PERIOD) + PERIODS) // 3 + 1, WINDOWS))
+    motors = 100.0 * np.repeat(levels, 3, axis=0)[: history_periods(real.PERIOD) + PERIODS]
+    positions = cart.positions(torch.from_numpy(motion), torch.from_numpy(motors))[:, :, 0].numpy()
+    numbers = np.arange(WINDOWS)
+    return torch.from_numpy(motion), Windows(positions, motors, numbers, 0 * numbers, np.full(2, 1e-4))
+
+
+def test_the_cart_in_mujoco_moves_as_the_packages_own_one() -> None:
+    late = real.nominal()["latency"] + real.PERIOD / toolbox.SUBSTEPS / 2  # its steps move a cart early
+    motion, windows = drawn_windows(
+        toolbox.MujocoCart.of(known_cart(cart_coulomb=0.0, latency=late, angle_offset=0.02), real.PERIOD)
+    )
+    own = real.dynamics({**real.nominal(), "angle_offset": 0.02}, "linear", "exponential")
+    motion[2] -= 0.02  # states in MuJoCo are as measured
+    error = own.positions(motion, torch.from_numpy(windows.motors))[:, :, 0].numpy() - windows.positions
+    assert np.abs(error[:, 0]).max() < 2e-3
+    assert np.abs(error[:, 1]).max() < 0.05
+
+
+@pytest.mark.skipif(not toolbox.INSTALLED, reason='mujoco.sysid is missing: pip install "mujoco[sysid]"')
+def test_mujocos_toolbox_finds_the_cart_that_moved() -> None:
+    true = known_cart(force_linear=0.025, latency=0.022, cart_coulomb=0.3, angle_offset=0.01)
+    _, windows = drawn_windows(toolbox.MujocoCart.of(true, real.PERIOD))
+    found = toolbox.values_of(toolbox.search(toolbox.starting(1.0), windows, real.PERIOD, 4)[0])
+    assert found["latency"] == pytest.approx(0.022, abs=1e-3)
+    assert found["angle_offset"] == pytest.approx(0.01, abs=1e-3)
+    for ratio in ("force_linear", "cart_viscous"):  # motion shows them over the mass
+        assert found[ratio] / found["cart_mass"] == pytest.approx(true[ratio] / true["cart_mass"], rel=0.05)
+    assert toolbox.at_bounds(found | {"latency": 0.0}) == ["latency"]
+
+
+def test_a_motor_whose_logs_are_too_short_is_refused(tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.setattr(real, "MOTORS_2020", {"short": ("*.csv", ("layout.angle.upright=3000",))})
+    time = np.arange(0, 8, 0.005)
+    angle, position = 3000 + 300 * np.sin(9 * time), 1000 * np.sin(3 * time)
+    rows = np.stack((time, angle.round(), position.round(), (4000 * np.cos(5 * time)).round()), 1)
+    for name in ("a_short.csv", "b_short.csv"):
+        head = "time,angle,position,actualMotorCmd"
+        np.savetxt(tmp_path / name, rows, fmt="%.6g", delimiter=",", header=head, comments="")
+    found = real.of_2020(tmp_path, tmp_path / "runs")["short"]
+    assert "too short" in found["refused"]
+    assert found["import"]["sensors"]["delay"] is not None
+    assert "identified" not in found
+    assert real.at_times(np.full((201, 3), -2.0), 0.005) == [[2.0, 2.0]] * 4
