@@ -158,18 +158,18 @@ def regress(
 def record_experiments(config: IdentifyConfig, folder: Path) -> None:
     """Run every experiment on the cart, and write each one when it ends."""
     with (
+        progress_bar(len(EXPERIMENTS), "experiments") as progress,
         closing(make_plant(config)) as plant,
         precedence(config.plant, config.emulator),
-        progress_bar(len(EXPERIMENTS), "experiments") as progress,
-        waiting("experiments", thread=False),
+        waiting("experiments", thread=False),  # paints the bar: a stopped terminal must not hold up the cart
     ):
-        progress.set_postfix_str(EXPERIMENTS[0].name)
+        progress.set_postfix_str(EXPERIMENTS[0].name, refresh=False)
         for number, (experiment, episode) in enumerate(conduct(plant, config.control_period, config.seed)):
             header = {"experiment": experiment.name, "control_period_s": config.control_period}
             write_recording(folder / f"{number:02d}_{experiment.name}.csv", episode, header)
             following = EXPERIMENTS[number + 1 : number + 2]
-            progress.set_postfix_str(following[0].name if following else "")
-            progress.update()
+            progress.set_postfix_str(following[0].name if following else "", refresh=False)
+            progress.n += 1
 
 
 def make_plant(config: IdentifyConfig) -> SerialPlant:

@@ -260,6 +260,16 @@ def test_homing_ends_early(page: str, tmp_path: Path, event: str, words: str) ->
 
 
 @needs_browser
+def test_a_number_that_is_not_finite_ends_it(page: str, tmp_path: Path) -> None:
+    broken = "await until(() => real.answered >= 10 || real.done); LAYERS[0].bias[0] = Infinity;"
+    with emulator() as host, bridged(page, f"{DRIVEN} {broken} {ENDED}", host, tmp_path) as bridge:
+        line, answered, _ = bridge.report()
+        check_answers(bridge, answered)
+        check_stopped(bridge, host)
+    assert line == "The agent gave a number that is not finite."
+
+
+@needs_browser
 def test_it_waits_until_a_hand_holds_the_pole_up(balancing_page: str, tmp_path: Path) -> None:
     with emulator(start="upright") as host, bridged(balancing_page, AGREED + ENDED, host, tmp_path) as bridge:
         line, answered, _ = bridge.report()

@@ -84,10 +84,10 @@ class Cart {
     this.fallen = DATA.angleLimit !== null && Math.abs(this.percept.state[2]) > DATA.angleLimit;
   }
 
-  /** The motor value that the agent and its track guard choose; 0 where a number is not finite. */
+  /** The motor value that the agent and its track guard choose; null where a number is not finite. */
   chosen() {
     const values = actionValues(this.percept.observation);
-    if (![...this.percept.observation, ...values].every(Number.isFinite)) return 0;
+    if (![...this.percept.observation, ...values].every(Number.isFinite)) return null;
     const side = this.percept.guard[0];
     return side ? DATA.inward.at(side) : DATA.motors[values.indexOf(Math.max(...values))];
   }

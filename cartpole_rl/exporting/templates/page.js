@@ -29,7 +29,7 @@ function period() {
     return;
   }
   before = cart.motion;
-  cart.step(agentDrives() ? cart.chosen() : 0, ...pushed());
+  cart.step((agentDrives() && cart.chosen()) || 0, ...pushed());
   record(DATA.period);
   if (cart.offTrack || cart.fallen) failedAt = time;
 }

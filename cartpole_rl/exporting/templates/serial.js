@@ -112,7 +112,8 @@ class SerialCart {
   agreed = false;
   driving = false;
   connected = false;
-  closing = false;
+  closing = false; // only the last STOP is left
+  closed = false;
   answered = 0; // STATEs
   periods = 0; // since START
   states = 0; // that came
@@ -172,7 +173,7 @@ class SerialCart {
 
   async read() {
     let lost = false;
-    while (this.port.readable && !lost && !this.closing) {
+    while (this.port.readable && !lost && !this.closed) {
       this.reader = this.port.readable.getReader();
       try {
         for (let part = await this.reader.read(); !part.done; part = await this.reader.read()) {
@@ -197,6 +198,7 @@ class SerialCart {
   }
 
   async close() {
+    this.closed = true;
     await this.reader?.cancel().catch(() => {});
     await this.reading;
     this.writer?.releaseLock();
@@ -313,8 +315,11 @@ class SerialCart {
 
   async home() {
     await this.checkLink();
-    const { fault } = await this.state();
-    await this.consent(fault ? `${sentence(this.faults(fault))} If its cause is gone: ` : "");
+    let { fault } = await this.state();
+    for (let shown = null; shown !== fault; fault = this.newest.fault) { // another one may latch meanwhile
+      shown = fault;
+      await this.consent(fault ? `${sentence(this.faults(fault))} If its cause is gone: ` : "");
+    }
     if (fault) await this.ask("CLEAR_FAULT");
     this.line = "The cart homes: it moves by itself, usually for 15 to 40 s.";
     const before = this.newest;
@@ -333,6 +338,7 @@ class SerialCart {
   /** Wait until the reader agrees that the cart moves. HELLO keeps an emulated cart without a clock going. */
   async consent(found) {
     this.line = `${found}The cart moves by itself while it homes: keep the track clear, let the pole hang.`;
+    this.agreed = false;
     for (this.asking = true; !this.agreed; await this.seen()) this.send("HELLO");
     this.asking = false;
   }
@@ -386,7 +392,9 @@ class SerialCart {
     cart.begin(counts(start));
     for (let state = start; ; this.periods = between(start.tick, state.tick)) {
       this.judge(state);
-      const before = state, sent = this.bounded(cart.chosen()), sequence = this.send("SET_MOTOR", sent, before.tick);
+      const before = state, motor = cart.chosen();
+      if (motor === null) throw new Error("the agent gave a number that is not finite");
+      const sent = this.bounded(motor), sequence = this.send("SET_MOTOR", sent, before.tick);
       this.answered += 1;
       state = await this.state();
       const dt = seconds(before, state);
