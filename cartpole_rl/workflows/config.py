@@ -207,7 +207,8 @@ class EvaluateConfig(RunSettings):
     def _plant_reads_every_setting(self) -> "EvaluateConfig":
         """Refuse settings that the chosen plant ignores."""
         plant, is_told = self.plant, self.run == BASELINE or is_own_policy(self.run)  # which rig it drives
-        ignored = (name for name in plant.ignored if not (is_told and name == "cart"))
+        takes_cart = is_told and plant.is_on_port
+        ignored = (name for name in plant.ignored if not (takes_cart and name == "cart"))
         if unread := [name for name in ignored if getattr(self, name)]:
             raise ValueError(f"{', '.join(unread)}: plant={plant.kind} {plant.why_ignored}")
         if self.view == "live" and not plant.is_on_port:

@@ -82,3 +82,9 @@ def test_a_period_for_an_agent_is_refused() -> None:
         ConfigError, match=r"^control_period: an agent drives with that of its training; leave"
     ):
         load_settings(EvaluateConfig, {"run": "pretrained/medium", "control_period": 0.01})
+
+
+def test_a_learned_model_has_its_own_rig() -> None:
+    learned = {"run": "lqr", "plant": "learned", "plant.model": "model", "cart": "stepper"}
+    with pytest.raises(ConfigError, match=r"^cart: plant=learned"):
+        load_settings(EvaluateConfig, learned)
