@@ -128,19 +128,20 @@ def waiting(text: str, *, thread: bool = True) -> Iterator[None]:
 
     def show() -> None:
         while not ended.wait(BLINK):
-            if _under_way[-1] is work:
+            if work in _under_way[-1:]:
                 _show(work)
 
-    showing = threading.Thread(target=show, daemon=True)
-    if thread and text:
+    showing = threading.Thread(target=show, daemon=True) if thread and text else None
+    if showing:
         showing.start()
     try:
         yield
     finally:
         ended.set()
-        if thread and text:
+        if showing:
             showing.join()
-        del _under_way[_under_way.index(work) :]
+        with suppress(ValueError):  # a block that outlived the one around it, as in a generator, is gone
+            del _under_way[_under_way.index(work) :]
         if text and time.monotonic() - began > BLINK and (thread or _takes_text()):
             _clear(work)
 

@@ -68,13 +68,19 @@ print("end", flush=True)
 """
 
 
-def test_work_under_way_is_shown_with_its_seconds_and_a_bar_goes_on() -> None:
+def shown_by(script: str) -> str:
+    """Run a script on a terminal of 100 columns; return what it shows, up to the "end" that it prints."""
     master, slave = pty.openpty()
     termios.tcsetwinsize(slave, (24, 100))
-    with subprocess.Popen([sys.executable, "-c", WAIT], stdin=slave, stdout=slave, stderr=slave):
+    with subprocess.Popen([sys.executable, "-c", script], stdin=slave, stdout=slave, stderr=slave):
         shown = read_until(master, b"end").decode()
     os.close(slave)
     os.close(master)
+    return shown
+
+
+def test_work_under_way_is_shown_with_its_seconds_and_a_bar_goes_on() -> None:
+    shown = shown_by(WAIT)
     assert shown.count("homing, 1 s") == 1
     assert "homing, 2 s" not in shown  # the inner block shows nothing
     assert "driving" not in shown
@@ -102,12 +108,7 @@ print("end", flush=True)
 
 
 def test_a_loop_that_keeps_time_shows_that_it_goes_on_by_itself() -> None:
-    master, slave = pty.openpty()
-    termios.tcsetwinsize(slave, (24, 100))
-    with subprocess.Popen([sys.executable, "-c", BEAT], stdin=slave, stdout=slave, stderr=slave):
-        shown = read_until(master, b"end").decode()
-    os.close(slave)
-    os.close(master)
+    shown = shown_by(BEAT)
     assert shown.count("driving, 1 s") == 1
     assert "bringing the cart to the middle:   0%" in shown
     assert shown.count("0/2 [") >= 6  # each bar: at its start, after a second, at its end
@@ -140,3 +141,21 @@ def test_a_terminal_that_takes_no_text_does_not_hold_up_a_loop(tmp_path: Path) -
     assert ended.read_text() == "ended"
     for each in (master, slave, reader, writer):
         os.close(each)
+
+
+OUTLIVED = """
+from contextlib import ExitStack
+from cartpole_rl.terminal import beat, waiting
+outer, inner = ExitStack(), ExitStack()
+outer.enter_context(waiting("driving", thread=False))
+inner.enter_context(waiting("homing", thread=False))
+outer.close()
+beat()
+inner.close()
+print("in order", flush=True)
+print("end", flush=True)
+"""
+
+
+def test_a_block_may_outlive_the_one_around_it() -> None:
+    assert "in order" in shown_by(OUTLIVED)
