@@ -17,7 +17,8 @@ full motor outward under way, keeps it for one more period, since the guard deci
 brakes with full motor inward. Half of them run to the right, half to the left: carts may brake better in one
 direction. A share `quantile` of each half stays within some way, which depends on the measured speed. The
 guard's way bounds it from above as closely as possible: a linear program in margin, delay and
-1 / deceleration.
+1 / deceleration. Carts that their motor's back-EMF brakes run on in proportion to their speed: their
+deceleration is FASTEST.
 """
 
 import math
@@ -47,6 +48,8 @@ BIN = 0.1  # m/s
 LEAST_SAMPLES = 500  # in a bin, for its quantile
 MOST_ENERGY = 1.3  # of the pole, as a multiple of that of the upright pole at rest, above hanging
 BRAKING = 1.2  # s; the slowest carts of randomization=wide stop within 1
+STOPPED = 0.01  # m/s
+FASTEST = 100.0  # m/s^2, the largest deceleration
 SUBSTEPS = 4
 
 Array = NDArray[np.float64]
@@ -79,15 +82,15 @@ def fitted_guard(
     if not min(motors) < 0 < max(motors):
         raise ConfigError(f"guard: actions.motors={list(motors)} brake in one direction; choose guard=none")
     with one_thread():
-        speed, way, rightward = braking_distances(draws, motors, models, period)
+        speed, way, rightward, stopped = braking_distances(draws, motors, models, period)
     if not np.isfinite((speed, way)).all():
         raise ConfigError(
             "guard: simulated carts brake to numbers that are not finite; check cart.*, or guard=none"
         )
+    if stopped.mean() < quantile:
+        raise ConfigError("guard: full motor does not stop these carts; choose guard=none, or other actions")
     halves = [quantiles(speed[half], way[half], quantile) for half in (rightward, ~rightward)]
     margin, delay, curvature = closest_bound(*map(np.concatenate, zip(*halves, strict=True)))
-    if curvature <= 0:
-        raise ConfigError("guard: full motor does not stop these carts; choose guard=none, or other actions")
     if round(margin, 4) >= LARGEST_MARGIN:
         raise ConfigError(
             f"guard: even from rest these carts run on by {margin:.3f} m before full motor stops them; this "
@@ -114,8 +117,8 @@ def one_thread() -> Iterator[None]:
 
 def braking_distances(
     draws: Draws, motors: Sequence[int], models: Models, period: float
-) -> tuple[Array, Array, Flags]:
-    """Return measured speeds, m/s, ways that carts run on, m, and which run to the right, [SAMPLES] each.
+) -> tuple[Array, Array, Flags, Flags]:
+    """Return measured speeds, m/s, ways that carts run on, m, which run right and which stop, [SAMPLES].
 
     Speeds and ways are positive in the direction of motion.
     """
@@ -132,11 +135,13 @@ def braking_distances(
     drive = Drive(models.actuator(outward, cart), [outward] * commands)
     before, (state, drive) = state, run_period(state, drive, cart.latency, cart, models, period, SUBSTEPS)
     speed, start, farthest = side * (state.x - before.x) / period, state.x, torch.zeros(SAMPLES)
+    stopped = torch.zeros(SAMPLES, dtype=torch.bool)
     for step in range(math.ceil(BRAKING / period)):
         drive = Drive(drive.force, [inward if step else outward, *drive.motors[:-1]])
         state, drive = run_period(state, drive, cart.latency, cart, models, period, SUBSTEPS)
         farthest = torch.maximum(farthest, side * (state.x - start))
-    return speed.double().numpy(), farthest.double().numpy(), rightward.numpy()
+        stopped |= side * state.x_dot < STOPPED
+    return speed.double().numpy(), farthest.double().numpy(), rightward.numpy(), stopped.numpy()
 
 
 def random_states(cart: CartParameters, generator: torch.Generator) -> State:
@@ -170,6 +175,8 @@ def closest_bound(speed: Array, way: Array) -> tuple[float, float, float]:
     from scipy.optimize import linprog  # slow to import
 
     terms = np.stack((np.ones_like(speed), speed, speed * np.abs(speed)), 1)
-    result = linprog(terms.sum(0), A_ub=-terms, b_ub=-way, bounds=[(0, None)] * 3)
+    result = linprog(
+        terms.sum(0), A_ub=-terms, b_ub=-way, bounds=[(0, None), (0, None), (0.5 / FASTEST, None)]
+    )
     margin, delay, curvature = result.x
     return float(margin), float(delay), float(curvature)

@@ -27,6 +27,7 @@ STATE_STEP = torch.tensor([1e-7, 1e-6, 1e-6, 1e-5], dtype=torch.float64)  # m, m
 STATE_SPREAD = torch.tensor([5e-4, 0.5, 5e-3, 3.0], dtype=torch.float64)  # of an initial state's first guess
 FARTHEST = 3.0  # of STATE_SPREAD: the largest distance of an initial state from its first guess
 GUESSED_FROM = 3  # positions; when the motor reverses, later ones bend away from any parabola
+PRIOR_FREEDOM = 9.0  # half the weight at three standard deviations
 CORRELATED = 10.0  # this many correlated residuals of a window count as one independent residual
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e-6, 1e3
 EASED = 5.0  # dampings shrink by it after a step that helps; else the search creeps along narrow valleys
@@ -68,6 +69,19 @@ def scaled_residuals(positions: Tensor, measured: Tensor, scale: Tensor) -> Tens
     return error.nan_to_num(RUNAWAY, RUNAWAY, -RUNAWAY).clamp(-RUNAWAY, RUNAWAY)
 
 
+def prior_cost(point: Tensor) -> Tensor:
+    """Return the cost of a point [U]: that of a Gaussian near 0, with the tails of Student's distribution.
+
+    A cart that is nothing like its file is not pulled to it: the motion counts.
+    """
+    return PRIOR_FREEDOM * (point**2 / PRIOR_FREEDOM).log1p().sum()
+
+
+def prior_weights(point: Tensor) -> Tensor:
+    """Return the weights of squared numbers of a point that touch `prior_cost`, [U]."""
+    return 1 / (1 + point**2 / PRIOR_FREEDOM)
+
+
 def first_guess(positions: Tensor, period: float) -> Tensor:
     """Return states [4, W]: parabolas through the first positions [T + 1, 2, W]."""
     known = positions[:GUESSED_FROM].numpy()
@@ -83,6 +97,7 @@ class NormalEquations(NamedTuple):
     point_state: Tensor  # [W, U, 4]
     state_state: Tensor  # [W, 4, 4], prior included
     point_slopes: Tensor  # [W, U], of each window
+    prior_weights: Tensor  # [U]
     prior_slope: Tensor  # [U]
     state_slope: Tensor  # [W, 4], prior included
 
@@ -95,7 +110,7 @@ class NormalEquations(NamedTuple):
         extra = 0 * diagonal if own is None else own.unsqueeze(-1) * diagonal
         inverse = torch.linalg.inv(self.state_state + torch.diag_embed(extra))
         carried = self.point_state @ inverse
-        matrix = self.point_points.sum(0) + torch.eye(len(self.prior_slope), dtype=inverse.dtype)
+        matrix = self.point_points.sum(0) + torch.diag(self.prior_weights)
         matrix = matrix + damping * torch.diag(matrix.diagonal())
         matrix = matrix - (carried @ self.point_state.mT).sum(0)
         slopes = self.point_slopes - torch.einsum("wis,ws->wi", carried, self.state_slope)
@@ -123,12 +138,10 @@ class NormalEquations(NamedTuple):
         square = float(pulled @ torch.linalg.solve(self.disagreement(slopes), pulled))
         return math.sqrt(square) if square >= 0 else math.inf
 
-    @staticmethod
-    def disagreement(slopes: Tensor) -> Tensor:
+    def disagreement(self, slopes: Tensor) -> Tensor:
         """Return the covariance of the sum of the windows' slopes [W, U] and of the prior's, [U, U]."""
         centred, count = slopes - slopes.mean(0), len(slopes)
-        identity = torch.eye(slopes.shape[1], dtype=slopes.dtype)
-        return centred.mT @ centred * count / max(1, count - 1) + identity
+        return centred.mT @ centred * count / max(1, count - 1) + torch.diag(self.prior_weights)
 
     @solvable()
     def covariance(self, episode: Tensor) -> Tensor:
@@ -178,7 +191,8 @@ class Linearization(NamedTuple):
             point_state=weighted_point.mT @ self.by_state,
             state_state=weighted_state.mT @ self.by_state + torch.diag(prior),
             point_slopes=(weighted_point.mT @ residuals).squeeze(-1),
-            prior_slope=point,
+            prior_weights=prior_weights(point),
+            prior_slope=prior_weights(point) * point,
             state_slope=(weighted_state.mT @ residuals).squeeze(-1) + offset.T * prior,
         )
 
@@ -202,7 +216,7 @@ class Place(NamedTuple):
     @property
     def cost(self) -> float:
         """The cost of all windows and of the prior."""
-        return float(self.costs.sum() + self.point @ self.point)
+        return float(self.costs.sum() + prior_cost(self.point))
 
 
 class Matching:

@@ -35,7 +35,7 @@ class Bound(NamedTuple):
 
 
 class Prior(NamedTuple):
-    """The knowledge of a parameter before it is identified: a normal distribution, cut off at the bounds."""
+    """The knowledge of a parameter before it is identified: normal near its mean, within the bounds."""
 
     spread: float  # standard deviation: of the logarithm, or in the parameter's unit
     logarithmic: bool = False

@@ -15,6 +15,8 @@ from cartpole_rl.identification.matching import (
     finest_scale,
     first_guess,
     huber,
+    prior_cost,
+    prior_weights,
     scaled_residuals,
 )
 from cartpole_rl.rig.hardware import nominal_encoders
@@ -78,6 +80,14 @@ def test_the_loss_is_quadratic_and_then_linear() -> None:
     assert torch.equal(losses, huber(-sizes))
     assert losses[:2].tolist() == [0.25, ROBUST**2]
     assert losses[3] - losses[2] == losses[2] - losses[1]
+
+
+def test_the_prior_is_gaussian_near_its_mean_and_lets_go_of_a_cart_unlike_its_file() -> None:
+    point = torch.tensor([0.1, -3.0, 10.0], dtype=torch.float64, requires_grad=True)
+    cost = prior_cost(point)
+    (slope,) = torch.autograd.grad(cost, point)
+    torch.testing.assert_close(slope, 2 * prior_weights(point) * point)
+    assert prior_weights(point).tolist() == pytest.approx([1, 0.5, 0.08], abs=0.003)
 
 
 def test_a_diverged_prediction_has_a_finite_residual() -> None:
