@@ -47,7 +47,7 @@ SPEEDS = (0.0, 2.2)  # m/s, of the cart at the start; agents of the shipped expe
 BIN = 0.1  # m/s
 LEAST_SAMPLES = 500  # in a bin, for its quantile
 MOST_ENERGY = 1.3  # of the pole, as a multiple of that of the upright pole at rest, above hanging
-BRAKING = 1.2  # s; the slowest carts of randomization=wide stop within 1
+BRAKING = 1.2, 5.0  # s, at least and at most; the slowest carts of randomization=wide stop within 1
 STOPPED = 0.01  # m/s
 FASTEST = 100.0  # m/s^2, the largest deceleration
 SUBSTEPS = 4
@@ -136,7 +136,10 @@ def braking_distances(
     before, (state, drive) = state, run_period(state, drive, cart.latency, cart, models, period, SUBSTEPS)
     speed, start, farthest = side * (state.x - before.x) / period, state.x, torch.zeros(SAMPLES)
     stopped = torch.zeros(SAMPLES, dtype=torch.bool)
-    for step in range(math.ceil(BRAKING / period)):
+    least, most = (math.ceil(each / period) for each in BRAKING)
+    for step in range(most):
+        if step >= least and stopped.all():
+            break
         drive = Drive(drive.force, [inward if step else outward, *drive.motors[:-1]])
         state, drive = run_period(state, drive, cart.latency, cart, models, period, SUBSTEPS)
         farthest = torch.maximum(farthest, side * (state.x - start))

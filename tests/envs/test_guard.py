@@ -142,7 +142,7 @@ def test_motor_values_of_one_sign_are_refused() -> None:
 
 
 WEAK = {
-    "cart.force_linear": 0.002,
+    "cart.force_linear": 0.0002,
     "cart.force_offset": 0,
     "cart.cart_coulomb": 0.01,
     "cart.cart_viscous": 0.01,
