@@ -23,7 +23,9 @@ RANGES = {"cart_mass": Range(relative=(-0.2, 0.2)), "angle_noise": Range(absolut
 pytestmark = pytest.mark.skipif(shutil.which("g++") is None, reason="needs a C++ compiler: install g++")
 
 
-@pytest.fixture(params=["history", "raw", "positions"])
+@pytest.fixture(
+    params=["history", *(pytest.param(name, marks=pytest.mark.nightly) for name in ("raw", "positions"))]
+)
 def course(
     request: pytest.FixtureRequest,
     make_plant: Callable[..., SimulatedPlant],

@@ -149,10 +149,17 @@ def test_what_the_loss_cannot_do_is_refused() -> None:
         loss.make_value_estimator(gamma=0.9, average_rewards=True)
 
 
-@pytest.mark.parametrize("compiled", [False, True])
+RECURRENT = ({"recurrent": 8, "mirrored": True}, False, 100.0)
+
+
 @pytest.mark.parametrize(
-    ("network", "weighted", "max_norm"),
-    [({"mirrored": True}, True, 1e-2), ({"recurrent": 8, "mirrored": True}, False, 100.0)],
+    ("network", "weighted", "max_norm", "compiled"),
+    [
+        ({"mirrored": True}, True, 1e-2, False),
+        ({"mirrored": True}, True, 1e-2, True),
+        (*RECURRENT, False),
+        pytest.param(*RECURRENT, True, marks=pytest.mark.nightly),
+    ],
 )
 def test_the_gradient_is_that_of_the_loss(
     network: dict, weighted: bool, max_norm: float, compiled: bool
