@@ -13,7 +13,7 @@ from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.envs.build import environment, randomizer, shipped_settings, simulated_env, with_fitted_guard
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.guard import braking_distances, closest_bound, guard_side, stopping_distance
-from cartpole_rl.envs.settings import CartPoleSettings, TrackGuard
+from cartpole_rl.envs.settings import TrackGuard
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.physics.dynamics import State
@@ -109,8 +109,7 @@ def test_the_bound_is_the_least_one_above_all_quantiles() -> None:
 WEAK_TO_THE_LEFT = {"force_asymmetry": 0.12, "track_tilt": -0.008}
 
 
-@pytest.mark.parametrize("quantile", [0.6, 0.99])
-@pytest.mark.parametrize("one_cart", [False, True])
+@pytest.mark.parametrize(("quantile", "one_cart"), [(0.6, False), (0.99, True)])
 def test_the_share_of_brakings_within_the_bound(quantile: float, one_cart: bool) -> None:
     """In both directions, also of a cart that brakes better in one of them."""
     ends = {name: [value, value + 1e-4] for name, value in WEAK_TO_THE_LEFT.items()}
@@ -194,18 +193,13 @@ def test_no_sequence_of_actions_overruns_the_quantile(
     assert lost <= (1 - settings.guard.quantile) * brakings
 
 
-@pytest.mark.parametrize("action", [0, 8])
-def test_an_emulated_cart_stays_on_the_track(action: int) -> None:
+def test_an_emulated_cart_stays_on_the_track() -> None:
     """The guard reads where the track of the cart ends, from the span that the cart measured."""
-    settings = with_fitted_guard(shipped_settings({"guard": "careful"}))
-    settings = shortened(settings)
+    settings = with_fitted_guard(shipped_settings({"guard": "careful", "task.time_limit": 150}))
     plant = emulated_plant(EmulatorSettings(physics_step=1e-3, cart_viscous=0.1, latency=0.015))
     with closing(environment(settings, plant)) as env:
-        (episode,) = run_batch(env, lambda td: td.set("action", torch.tensor([action])))
-    assert episode.ended_by == Ending.TIME
-    assert episode.guarded is not None
-    assert episode.guarded.any()
-
-
-def shortened(settings: CartPoleSettings) -> CartPoleSettings:
-    return settings.model_copy(update={"task": settings.task.model_copy(update={"time_limit": 150})})
+        for action in (0, 8):
+            (episode,) = run_batch(env, lambda td, action=action: td.set("action", torch.tensor([action])))
+            assert episode.ended_by == Ending.TIME
+            assert episode.guarded is not None
+            assert episode.guarded.any()
