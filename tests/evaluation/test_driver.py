@@ -1,4 +1,4 @@
-"""The driving process on a scripted cart: confirmation, refusals and exit."""
+"""The driving process on a scripted cart: confirmation and exit."""
 
 import os
 import signal
@@ -22,7 +22,6 @@ from cartpole_rl.errors import FaultError, LinkError
 from cartpole_rl.evaluation.driver import Driver, EpisodeRequest
 from cartpole_rl.evaluation.driving_policy import as_weights
 from cartpole_rl.learning.agent import QAgent
-from cartpole_rl.plants.serial.errors import NotReadyError
 from cartpole_rl.plants.serial.plant import SerialPlant
 from cartpole_rl.plants.serial.preparation import Confirm
 from cartpole_rl.plants.settings import SerialSettings
@@ -115,10 +114,3 @@ def test_a_person_is_asked_and_a_hangup_stops_the_motor(
     assert len(asked) == 2
     assert [type(frame.message) for frame in peer.received[-2:]] == [SetMotor, Stop]
     assert peer.state.motor_applied == 0
-
-
-def test_a_refusal_keeps_its_message(peer: Faulty) -> None:
-    peer.info = replace(peer.info, motor_limit=100)
-    with pytest.raises(NotReadyError, match="INFO says motor limit 100, not 255") as refused:
-        driver(peer, lambda text: True)
-    assert refused.value.remedy == "correct the firmware's settings"
