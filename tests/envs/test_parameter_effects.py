@@ -20,7 +20,7 @@ from cartpole_rl.tasks.settings import Start, StartSettings
 
 MakePlant = Callable[..., SimulatedPlant]
 MakeEnvironment = Callable[..., CartPoleEnv]
-CARTS, STEPS = 32, 40
+CARTS, STEPS = 32, 20
 UPRIGHT = StartSettings(
     angle=Start.UPRIGHT, position_spread=0, angle_spread=0, speed_spread=0, angular_speed_spread=0
 )

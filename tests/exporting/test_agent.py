@@ -51,19 +51,18 @@ def test_the_definition_is_the_observation(overrides: dict[str, Any]) -> None:
     training = load_settings(TrainConfig, {**overrides, "guard": "none", "task.time_limit": 30})
     numbers = observed_numbers(training.observation)
     env = simulated_env(training, training.plant, 1, training.task.start, seed=1)
-    cart, count = env.one_cart, len(training.actions.motors)
     past: deque = deque([defaultdict(float)] * 17, 17)
-    step: Any = cart.reset()
+    present = env.reset()
     for period in range(20):
-        x, x_dot, theta, theta_dot = step.state
+        x, x_dot, theta, theta_dot = present["state"][0].tolist()
         now = {"x": x, "x_dot": x_dot, "theta": theta, "theta_dot": theta_dot}
         now |= {"cos_theta": math.cos(theta), "sin_theta": math.sin(theta)}
         past.appendleft(now | {"pole_length": float(env.plant.pole_length)})
         found = [past[number.periods_ago][number.name] / number.scale for number in numbers]
-        assert found == pytest.approx(step.observation, rel=1e-5, abs=1e-6)
-        action = 7 * period % count
-        past[0]["motor"] = cart.motor(action)
-        step = cart.step(action)
+        assert found == pytest.approx(present["observation"][0].tolist(), rel=1e-5, abs=1e-6)
+        action = torch.tensor([7 * period % len(env.hardware.motors)])
+        past[0]["motor"] = env.hardware.motors[action].item()
+        present = env.step(present.set("action", action))["next"].exclude("reward")
 
 
 def test_a_quantity_without_a_name_is_refused() -> None:
