@@ -15,7 +15,7 @@ from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.randomization.ranges import Range
 from cartpole_rl.tasks.settings import Start, StartSettings
 
-CARTS, STEPS, LIMIT = 16, 400, 60
+CARTS, STEPS, LIMIT = 32, 150, 60
 ANYWHERE = StartSettings(
     angle=Start.ANY, position_spread=0.2, angle_spread=0, speed_spread=0.5, angular_speed_spread=1.0
 )

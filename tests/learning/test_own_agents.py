@@ -107,6 +107,7 @@ def own_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "own_agents.py").write_text(MODULE)
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_it_is_trained_logged_and_driven(tmp_path: Path) -> None:
     run, kind = tmp_path / "run", "own_agents:Searched"
     score = train(load_settings(TrainConfig, {**TOY, "agent.kind": kind}), run)
