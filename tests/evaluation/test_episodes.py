@@ -14,6 +14,7 @@ from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.tasks.settings import Start, StartSettings
 
 RIGHT, NONE = 2, 1  # of the motor values -200, 0, 200
+CONSTANT = {"kind": "constant", "scale": 1.0, "track_penalty": 7.0}
 
 
 def always(action: int) -> Callable[[TensorDictBase], TensorDictBase]:
@@ -34,23 +35,29 @@ def test_the_batch_does_not_change_the_count(simulated: Callable) -> None:
 def test_a_fall_ends_an_episode_of_the_balance(simulated: Callable) -> None:
     limit = math.radians(12)
     start = scattered(Start.UPRIGHT, angle_spread=0.05)
-    env = simulated(plant={"start": start, "seed": 3}, angle_limit=limit)
+    env = simulated(plant={"start": start, "seed": 3}, angle_limit=limit, reward=CONSTANT)
     (episode,) = run_episodes(env, always(NONE), 1)
     assert episode.ended_by == "angle"
     assert abs(episode.theta[-1]) > limit
     assert (np.abs(episode.theta[:-1]) <= limit).all()
+    assert (episode.reward == 1).all()  # the penalty is the track's alone
 
 
 def test_each_row_is_cut_at_its_own_first_end(simulated: Callable) -> None:
     """Carts pushed from different places leave the track one after the other, each once."""
     start = scattered(position_spread=0.3)
-    together = simulated(16, {"start": start, "seed": 1})
+    reward = {"track_penalty": 7.0, "scale": 0.5}
+    together = simulated(16, {"start": start, "seed": 1}, reward=reward)
     episodes = list(run_episodes(together, always(RIGHT), 16))
     assert len({episode.steps for episode in episodes}) > 4
     by_place = sorted(episodes, key=lambda episode: episode.x[0])
     assert [episode.steps for episode in by_place] == sorted((e.steps for e in episodes), reverse=True)
-    assert all(episode.ended_by == "track" for episode in episodes)
-    assert all((np.abs(episode.x[:-1]) < 0.38 + 1e-4).all() for episode in episodes)
+    for episode in episodes:
+        assert episode.ended_by == "track"
+        assert (np.abs(episode.x[:-1]) < 0.38 + 1e-4).all()
+        assert abs(episode.x[-1]) > 0.38
+        penalty = 7 * (np.arange(episode.steps) == episode.steps - 1)
+        assert episode.reward == pytest.approx(0.5 * episode.score - penalty, abs=1e-5)
 
 
 def test_short_episodes_are_not_over_represented(simulated: Callable) -> None:
