@@ -19,7 +19,6 @@ from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.physics.dynamics import State
 from cartpole_rl.plants.serial.plant import emulated_plant
 from cartpole_rl.plants.settings import SimulatedSettings
-from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.tasks.episode import Ending
 from cartpole_rl.tasks.features import MOTOR_SCALE
 from cartpole_rl.tasks.settings import NO_ACTION
@@ -49,11 +48,9 @@ def test_it_brakes_if_the_cart_would_stop_beyond_the_end(x: float, x_dot: float,
 
 
 @pytest.fixture
-def env(
-    make_plant: Callable[..., SimulatedPlant], make_environment: Callable[..., CartPoleEnv]
-) -> CartPoleEnv:
+def env(simulated: Callable[..., CartPoleEnv]) -> CartPoleEnv:
     """Two carts with motor values -250, 0 and 200: the second one is fast and near the right end."""
-    return make_environment(make_plant(2), (-250, 0, 200), guard=GUARD, past_motors=1, time_limit=60)
+    return simulated(2, motors=(-250, 0, 200), guard=GUARD, past_motors=1, time_limit=60)
 
 
 def near_the_end(env: CartPoleEnv) -> None:
@@ -71,20 +68,12 @@ def test_the_guard_replaces_the_motor_value_of_the_agent(env: CartPoleEnv) -> No
     near_the_end(env)
     current = step(env, current, torch.tensor([2, 2]))  # the speed is measured from here on
     assert current["guard"].flatten().tolist() == [0, -1]
-    command = env.hardware.command(current.set("action", torch.tensor([2, 2])))
-    assert command["motor"].flatten().tolist() == [200, -250]
+    for actions, motors in (([NO_ACTION, NO_ACTION], [0, 0]), ([2, 2], [200, -250])):
+        command = env.hardware.command(current.set("action", torch.tensor(actions)))
+        assert command["motor"].flatten().tolist() == motors
     after = step(env, current, torch.tensor([2, 2]))
     sent = after["past"][:, 0] * MOTOR_SCALE
     assert sent.tolist() == pytest.approx([200, -250])  # the agent observes what was sent
-
-
-def test_no_action_stays_motor_0(env: CartPoleEnv) -> None:
-    current = env.reset()
-    near_the_end(env)
-    current = step(env, current, torch.tensor([2, 2]))
-    assert env.hardware.command(current.set("action", torch.tensor([NO_ACTION, NO_ACTION])))[
-        "motor"
-    ].flatten().tolist() == [0, 0]
 
 
 def test_an_episode_holds_the_motor_values_that_were_sent(env: CartPoleEnv) -> None:
