@@ -12,7 +12,7 @@ those checks. If it is removed, replace it here with `torch.compile` and the `gu
 from collections.abc import Callable, Iterable, Sequence
 from itertools import chain, islice
 from types import BuiltinFunctionType
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, Generic, Literal, NamedTuple, TypeVar
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -42,8 +42,12 @@ def trace(
     function: Callable[..., tuple[Tensor, ...]],
     arguments: Arguments,
     store: Callable[[Tensor], Tensor] = lambda part: part,
+    mode: Literal["real", "fake"] = "real",
 ) -> Trace:
-    """Return the graph of `function`, which stores each part of the result as `store` returns it."""
+    """Return the graph of `function`, which stores each part of the result as `store` returns it.
+
+    The `mode` "fake" computes shapes alone, and takes two thirds of the time.
+    """
     kinds: list[Any] = []
 
     def flat(*tensors: Tensor) -> list[Tensor]:
@@ -52,7 +56,9 @@ def trace(
         kinds.extend((rebuild(value), [part.dtype for part in value]))
         return [store(part) for part in value]
 
-    graph = make_fx(flat)(*map(copied, chain.from_iterable(arguments)))
+    graph = make_fx(flat, tracing_mode=mode, _allow_non_fake_inputs=True)(
+        *map(copied, chain.from_iterable(arguments))
+    )
     graph.graph.eliminate_dead_code()
     graph.recompile()
     return Trace(graph, *kinds)

@@ -26,7 +26,7 @@ class Scalar:
 
     def __init__(self, function: Callable[..., tuple[Tensor, ...]], *examples: tuple[Tensor, ...]) -> None:
         with torch.no_grad():
-            traced = trace(function, examples)
+            traced = trace(function, examples, mode="fake")
         self._result = traced.result
         self._compute = compiled(traced.graph, examples)
 

@@ -171,3 +171,13 @@ def make_environment() -> Callable[..., CartPoleEnv]:
         )
 
     return build
+
+
+@pytest.fixture(scope="session")
+def simulated(make_plant: Callable[..., SimulatedPlant], make_environment: Callable[..., CartPoleEnv]) -> Any:
+    """The swing-up over simulated carts; `plant` and the other keywords are those of the two builders."""
+
+    def build(carts: int = 1, plant: dict[str, Any] | None = None, **environment: Any) -> CartPoleEnv:
+        return make_environment(make_plant(carts, **(plant or {})), **environment)
+
+    return build

@@ -2,15 +2,13 @@
 
 import itertools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from typing import Any
 
+import numpy as np
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
-from operations import AWKWARD, OPERATIONS
+from operations import AWKWARD, OPERATIONS, PAIRS
 from torch import Tensor
 
 from cartpole_rl.choices import choice
@@ -28,11 +26,10 @@ from cartpole_rl.tasks.features import ObservationKind
 from cartpole_rl.tasks.rewards import Reward
 from cartpole_rl.tasks.settings import RewardSettings, TaskSettings
 
-numbers = st.sampled_from(AWKWARD) | st.floats(-10, 10)
+CARTS = 100
 GUARD = TrackGuard(margin=0.01, delay=0.05, deceleration=3.0)
 TASK = TaskSettings(**choice("task/swingup") | {"x_max": 0.38, "time_limit": 500})
 REWARD = RewardSettings(**choice("reward/score"))
-quick = settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 @pytest.fixture(autouse=True)
@@ -40,35 +37,37 @@ def doubles() -> Iterator[None]:
     """PyTorch computes in float64 as Python does, so that results can be compared closely."""
     before = torch.get_default_dtype()
     torch.set_default_dtype(torch.float64)
+    torch.manual_seed(0)
     yield
     torch.set_default_dtype(before)
 
 
-def check(function: Callable[..., Any], scalar: Scalar, *arguments: tuple[Tensor, ...]) -> None:
-    """Compare `scalar` with the `function` that it was made of."""
-    expected, result = function(*arguments), scalar(*(tuple(map(plain, each)) for each in arguments))
-    assert type(result) is type(expected)
-    for value, right in zip(result, expected, strict=True):
-        assert len(value) == right.numel()
-        kind = {torch.bool: bool, torch.int64: int}.get(right.dtype, float)
-        for number, exact in zip(value, plain(right), strict=True):
-            assert kind(number) == pytest.approx(exact, rel=1e-9, abs=1e-9, nan_ok=True)
+def column(arguments: tuple[Tensor, ...], number: int) -> tuple[Tensor, ...]:
+    """One cart of many: the tensors [k, 1] of tensors [k, N]."""
+    parts = [each[:, number : number + 1] for each in arguments]
+    return arguments._make(parts) if hasattr(arguments, "_make") else tuple(parts)
 
 
-@pytest.mark.parametrize("number", range(len(OPERATIONS)))
-@quick
-@given(a=numbers, b=numbers)
-def test_an_operation_behaves_as_in_torch(number: int, a: float, b: float) -> None:
-    def function(pair: tuple[Tensor, Tensor]) -> tuple[Tensor]:
-        return (OPERATIONS[number](*pair),)
+def check(function: Callable[..., tuple[Tensor, ...]], *arguments: tuple[Tensor, ...]) -> None:
+    """Compare a `Scalar` of one cart, for each in turn, with the `function` of all carts: tensors [k, N]."""
+    scalar = Scalar(function, *(column(each, 0) for each in arguments))
+    expected = function(*arguments)
+    results = [
+        scalar(*(tuple(map(plain, column(each, number))) for each in arguments))
+        for number in range(arguments[0][0].shape[1])
+    ]
+    assert type(results[0]) is type(expected)
+    for part, right in enumerate(expected):
+        found = np.array([result[part] for result in results], right.numpy().dtype).T
+        assert found == pytest.approx(right.numpy(), rel=1e-9, abs=1e-9, nan_ok=True)
 
-    pair = torch.tensor([a]), torch.tensor([b])
-    check(function, Scalar(function, pair), pair)
+
+@pytest.mark.parametrize("operation", OPERATIONS, ids=range(len(OPERATIONS)))
+def test_an_operation_behaves_as_in_torch(operation: Callable[[Tensor, Tensor], Tensor]) -> None:
+    check(lambda pair: (operation(*pair),), tuple(torch.tensor(PAIRS).T.unsqueeze(1)))
 
 
-@given(values=st.lists(numbers, min_size=6, max_size=6))
-@quick
-def test_shapes_are_followed(values: list[float]) -> None:
+def test_shapes_are_followed() -> None:
     def function(given: tuple[Tensor, Tensor]) -> tuple[Tensor, ...]:
         table, row = given
         first, second = table.unbind(0)
@@ -76,8 +75,10 @@ def test_shapes_are_followed(values: list[float]) -> None:
         parts = table.split([1, 1, 0])
         return newest, torch.stack((second, first)), parts[1], parts[2], table[0] + row[0, 1:].unsqueeze(0)
 
-    given = torch.tensor(values[:4]).reshape(2, 2), torch.tensor([values[4:]])
-    check(function, Scalar(function, given), given)
+    given = torch.arange(4.0).reshape(2, 2), torch.tensor([[math.nan, -math.inf]])
+    result, expected = Scalar(function, given)(tuple(map(plain, given))), function(given)
+    for values, right in zip(result, expected, strict=True):
+        assert values == pytest.approx(plain(right), nan_ok=True)
 
 
 def test_one_tensor_may_be_the_example_of_two() -> None:
@@ -97,85 +98,61 @@ def test_a_call_with_other_shapes_is_refused() -> None:
         scalar(((1.0, 2.0, 3.0),))
 
 
-def cart(draw: st.DrawFn) -> Carts:
-    """A cart whose parameters lie anywhere near those of a real one, at any speed."""
-    table = torch.tensor([[draw(st.floats(0.01, 2))] for _ in CartParameters.names()])
-    motion = torch.tensor([[draw(st.floats(-8, 8) | st.sampled_from((0.0, math.nan)))] for _ in range(4)])
-    return Carts(table, motion, torch.tensor([[draw(st.floats(-5, 5))], [200.0], [-90.0], [0.0]]))
+def drawn(rows: int, low: float, high: float, awkward: Sequence[float] = ()) -> Tensor:
+    """Numbers [rows, CARTS] between two bounds; half of them are `awkward` ones, where there are such."""
+    values = torch.empty(rows, CARTS).uniform_(low, high)
+    if not awkward:
+        return values
+    chosen = torch.tensor(awkward)[torch.randint(len(awkward), (rows, CARTS))]
+    return torch.where(torch.rand(rows, CARTS) < 0.5, chosen, values)
 
 
-MODELS = [Models(*each) for each in itertools.product(CART_FRICTIONS, POLE_FRICTIONS, ACTUATORS)]
-DYNAMICS = list(itertools.product(INTEGRATORS, (False, True)))  # integrator, and whether the pole presses
+KINDS = [list(kind) for kind in (CART_FRICTIONS, POLE_FRICTIONS, ACTUATORS, INTEGRATORS)]
+MODELS = [Models(*(laws[number % len(laws)] for laws in KINDS), number % 3 == 0) for number in range(10)]
 
 
-@pytest.mark.parametrize("number", range(len(MODELS)), ids=lambda number: "-".join(MODELS[number][:3]))
-def test_physics_is_that_of_many_carts(number: int) -> None:
-    integrator, pole_presses = DYNAMICS[number % len(DYNAMICS)]
-    models = MODELS[number]._replace(integrator=integrator, pole_presses=pole_presses)
+@pytest.mark.parametrize("models", MODELS, ids=lambda models: "-".join(models[:3]))
+def test_physics_is_that_of_many_carts(models: Models) -> None:
+    """Of carts whose parameters lie anywhere near those of a real one, at any speed."""
     run = partial(run_carts, models=models, period=0.02, substeps=2, encoders=nominal_encoders())
-    inputs = Inputs(torch.tensor([[0]]), torch.tensor([[0.5], [1.0], [-1.0]]))
-    scalar = Scalar(run, Carts(torch.zeros(len(CartParameters.names()), 1), *torch.zeros(2, 4, 1)), inputs)
-
-    @settings(max_examples=20, deadline=None)
-    @given(present=st.composite(cart)(), motor=st.integers(-255, 255))
-    def compare(present: Carts, motor: int) -> None:
-        check(run, scalar, present, inputs._replace(motor=torch.tensor([[motor]])))
-
-    compare()
+    drive = torch.cat((drawn(1, -5, 5), torch.tensor([200.0, -90.0, 0.0]).unsqueeze(1).expand(3, CARTS)))
+    carts = Carts(drawn(len(CartParameters.names()), 0.01, 2), drawn(4, -8, 8, (0.0, math.nan)), drive)
+    noise = torch.tensor([[0.5], [1.0], [-1.0]]).expand(3, CARTS)
+    check(run, carts, Inputs(torch.randint(-255, 256, (1, CARTS)), noise))
 
 
-@pytest.mark.parametrize("guard", [None, GUARD], ids=["no guard", "guard"])
-@pytest.mark.parametrize("kind", ObservationKind)
-@pytest.mark.parametrize("reward", Reward)
-def test_perception_is_that_of_many_carts(
-    reward: Reward, kind: ObservationKind, guard: TrackGuard | None
-) -> None:
-    memory = list(Reward).index(reward) % 3
+OBSERVED = itertools.product(ObservationKind, range(3))  # with some of the past
+
+
+@pytest.mark.parametrize(("number", "kind", "memory"), [(n, *each) for n, each in enumerate(OBSERVED)])
+def test_perception_is_that_of_many_carts(number: int, kind: ObservationKind, memory: int) -> None:
+    guard, reward = (None, GUARD)[number % 2], list(Reward)[number % len(Reward)]
     observation = ObservationSettings(
         kind=kind, past_motors=memory, past_velocities=memory, past_positions=memory, pole_length=memory > 1
     )
     task = TASK.model_copy(update={"angle_limit": 0.2 if memory else None, "time_limit": 3})
     rewards = REWARD.model_copy(update={"kind": reward, "position_cost": 0.1})
-    encoders = nominal_encoders()
-    later = partial(
-        perceive, settings=observation, task=task, rewards=rewards, guard=guard, encoders=encoders
-    )
+    rules = {"settings": observation, "guard": guard, "encoders": nominal_encoders()}
 
     def first(frame: PlantOutput[Tensor], cart: tuple[Tensor, Tensor]) -> tuple[Tensor, ...]:
-        return perceive_first(frame, *cart, settings=observation, guard=guard, encoders=encoders)
+        return perceive_first(frame, *cart, **rules)
 
-    length = torch.full((int(memory > 1), 1), 0.6)
-    counts, flags, motor = st.integers(-(2**30), 2**30), st.booleans(), st.integers(-255, 255)
-    previous = st.builds(
-        Previous,
-        columns(2, counts),
-        columns(4, numbers),
-        columns(observation.past_size, numbers),
-        columns(1, st.integers(0, 3)),
-        columns(1, motor),
-        st.just(length),
-        columns(1, st.sampled_from((0.4, math.inf))),
+    def counts() -> Tensor:
+        return torch.randint(-(2**30), 2**30, (2, CARTS))
+
+    def motor() -> Tensor:
+        return torch.randint(-255, 256, (1, CARTS))
+
+    previous = Previous(
+        counts(),
+        drawn(4, -10, 10, AWKWARD),
+        drawn(observation.past_size, -10, 10, AWKWARD),
+        torch.randint(4, (1, CARTS)),
+        motor(),
+        torch.full((int(memory > 1), CARTS), 0.6),
+        drawn(1, 0.4, 0.4, (math.inf,)),
     )
-    dt = st.sampled_from((0.0, 0.02, math.nan, 1.0))
-    parts = columns(2, counts), columns(1, dt), columns(1, motor), columns(1, flags), columns(1, flags)
-    frame = st.builds(PlantOutput, *parts)
-    scalars: list[Scalar] = []
-
-    @settings(max_examples=20, deadline=None)
-    @given(previous=previous, frame=frame)
-    def compare(previous: Previous[Tensor], frame: PlantOutput[Tensor]) -> None:
-        cart = length, previous.track_end
-        if not scalars:
-            scalars.extend((Scalar(first, frame, cart), Scalar(later, previous, frame)))
-        check(first, scalars[0], frame, cart)
-        check(later, scalars[1], previous, frame)
-
-    compare()
-
-
-def columns(size: int, values: st.SearchStrategy[Any]) -> st.SearchStrategy[Tensor]:
-    """Columns [size, 1]."""
-    empty = torch.zeros(0, 1)
-    if size == 0:
-        return st.just(empty)
-    return st.lists(values, min_size=size, max_size=size).map(lambda each: torch.tensor(each).unsqueeze(1))
+    flags = torch.rand(2, 1, CARTS) < 0.5
+    frame = PlantOutput(counts(), drawn(1, 0.02, 0.02, (0.0, math.nan, 1.0)), motor(), *flags)
+    check(first, frame, (previous.length, previous.track_end))
+    check(partial(perceive, task=task, rewards=rewards, **rules), previous, frame)

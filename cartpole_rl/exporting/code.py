@@ -37,7 +37,7 @@ class Graph(NamedTuple):
     def of(cls, function: Callable[..., tuple[Tensor, ...]], *examples: Any) -> "Graph":
         """Trace a `function` of named tuples of tensors."""
         with torch.no_grad():
-            traced = trace(function, examples)
+            traced = trace(function, examples, mode="fake")
         return cls(traced, {name: part for example in examples for name, part in example._asdict().items()})
 
 

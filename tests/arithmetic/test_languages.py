@@ -1,7 +1,6 @@
 """JavaScript and C compute what PyTorch computes, also for NaN, infinities, zeros and halves."""
 
 import ctypes
-import itertools
 import json
 import math
 import shutil
@@ -13,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 from browser import BROWSER, BROWSERS, in_browser
-from operations import AWKWARD, OPERATIONS
+from operations import OPERATIONS, PAIRS
 from torch import Tensor
 
 from cartpole_rl.arithmetic.languages import C99, JAVASCRIPT
@@ -21,8 +20,6 @@ from cartpole_rl.arithmetic.writer import Writer
 from cartpole_rl.exporting.code import Graph, filled
 from cartpole_rl.exporting.web_page import function
 
-NUMBERS = [*AWKWARD, 0.3, -7.4, 3.0]
-PAIRS = list(itertools.product(NUMBERS, NUMBERS))
 NOT_IN_C = {5, 14, 24, 25}  # remainders, and conversions of infinite numbers to integers
 
 

@@ -7,14 +7,12 @@ from typing import Any
 
 import pytest
 import torch
-from tensordict import TensorDictBase
+from courses import course
 
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
-from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.randomization.ranges import Range
 from cartpole_rl.tasks.settings import Start, StartSettings
 
-CARTS, STEPS = 16, 25
 ANYWHERE = StartSettings(
     angle=Start.ANY, position_spread=0.3, angle_spread=0, speed_spread=0.5, angular_speed_spread=1.0
 )
@@ -23,42 +21,29 @@ RANGES = {"cart_mass": Range(relative=(-0.2, 0.2)), "angle_noise": Range(absolut
 pytestmark = pytest.mark.skipif(shutil.which("g++") is None, reason="needs a C++ compiler: install g++")
 
 
-@pytest.fixture(params=["history", "raw", "positions"])
-def course(
-    request: pytest.FixtureRequest,
-    make_plant: Callable[..., SimulatedPlant],
-    make_environment: Callable[..., CartPoleEnv],
-) -> Callable[[bool], list[TensorDictBase]]:
-    """Transitions under the same actions, compiled or not, with resets on the way."""
-    observation: dict[str, Any] = {
-        "history": {"pole_length": True},
-        "raw": {"kind": "raw", "past_motors": 0, "past_velocities": 0},
-        "positions": {"kind": "positions", "past_motors": 3, "past_velocities": 0, "past_positions": 2},
-    }[request.param]
-
-    def run(compiled: bool) -> list[TensorDictBase]:
-        plant = make_plant(CARTS, ranges=RANGES, start=ANYWHERE, compiled=compiled)
-        env = make_environment(plant, time_limit=10, **observation)
-        generator = torch.Generator().manual_seed(0)
-        present, taken = env.reset(), []
-        for _ in range(STEPS):
-            present["action"] = torch.randint(3, (CARTS,), generator=generator)
-            transition, present = env.step_and_maybe_reset(present)
-            taken.append(transition)
-        return taken
-
-    return run
+OBSERVATIONS: dict[str, dict[str, Any]] = {
+    "history": {"pole_length": True},
+    "raw": {"kind": "raw", "past_motors": 0, "past_velocities": 0},
+    "positions": {"kind": "positions", "past_motors": 3, "past_velocities": 0, "past_positions": 2},
+}
 
 
+@pytest.mark.parametrize(
+    "kind", ["history", *(pytest.param(each, marks=pytest.mark.nightly) for each in ("raw", "positions"))]
+)
 def test_equals_the_plain_environment_and_overwrites_no_earlier_result(
-    course: Callable[[bool], list[TensorDictBase]],
+    kind: str, simulated: Callable[..., CartPoleEnv]
 ) -> None:
-    taken = course(True)
-    for earlier, later in pairwise(taken):
+    runs = []
+    for compile_it in (False, True):
+        plant = {"ranges": RANGES, "start": ANYWHERE, "compiled": compile_it}
+        env = simulated(16, plant, time_limit=10, **OBSERVATIONS[kind])
+        runs.append([transition for transition, _ in course(env, 25)])
+    for earlier, later in pairwise(runs[1]):
         going_on = ~earlier["next", "done"].squeeze(-1)
         for key in ("observation", "state", "past", "counts", "step_count"):
             assert torch.equal(earlier["next", key][going_on], later[key][going_on])
-    plain, compiled = torch.stack(course(False)), torch.stack(taken)
+    plain, compiled = map(torch.stack, runs)
     assert set(plain.keys(True, True)) == set(compiled.keys(True, True))
     for key in plain.keys(True, True):
         assert plain[key].dtype == compiled[key].dtype

@@ -13,13 +13,12 @@ from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.envs.build import environment, randomizer, shipped_settings, simulated_env, with_fitted_guard
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.guard import braking_distances, closest_bound, guard_side, stopping_distance
-from cartpole_rl.envs.settings import CartPoleSettings, TrackGuard
+from cartpole_rl.envs.settings import TrackGuard
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.physics.dynamics import State
 from cartpole_rl.plants.serial.plant import emulated_plant
 from cartpole_rl.plants.settings import SimulatedSettings
-from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.tasks.episode import Ending
 from cartpole_rl.tasks.features import MOTOR_SCALE
 from cartpole_rl.tasks.settings import NO_ACTION
@@ -49,11 +48,9 @@ def test_it_brakes_if_the_cart_would_stop_beyond_the_end(x: float, x_dot: float,
 
 
 @pytest.fixture
-def env(
-    make_plant: Callable[..., SimulatedPlant], make_environment: Callable[..., CartPoleEnv]
-) -> CartPoleEnv:
+def env(simulated: Callable[..., CartPoleEnv]) -> CartPoleEnv:
     """Two carts with motor values -250, 0 and 200: the second one is fast and near the right end."""
-    return make_environment(make_plant(2), (-250, 0, 200), guard=GUARD, past_motors=1, time_limit=60)
+    return simulated(2, motors=(-250, 0, 200), guard=GUARD, past_motors=1, time_limit=60)
 
 
 def near_the_end(env: CartPoleEnv) -> None:
@@ -71,20 +68,12 @@ def test_the_guard_replaces_the_motor_value_of_the_agent(env: CartPoleEnv) -> No
     near_the_end(env)
     current = step(env, current, torch.tensor([2, 2]))  # the speed is measured from here on
     assert current["guard"].flatten().tolist() == [0, -1]
-    command = env.hardware.command(current.set("action", torch.tensor([2, 2])))
-    assert command["motor"].flatten().tolist() == [200, -250]
+    for actions, motors in (([NO_ACTION, NO_ACTION], [0, 0]), ([2, 2], [200, -250])):
+        command = env.hardware.command(current.set("action", torch.tensor(actions)))
+        assert command["motor"].flatten().tolist() == motors
     after = step(env, current, torch.tensor([2, 2]))
     sent = after["past"][:, 0] * MOTOR_SCALE
     assert sent.tolist() == pytest.approx([200, -250])  # the agent observes what was sent
-
-
-def test_no_action_stays_motor_0(env: CartPoleEnv) -> None:
-    current = env.reset()
-    near_the_end(env)
-    current = step(env, current, torch.tensor([2, 2]))
-    assert env.hardware.command(current.set("action", torch.tensor([NO_ACTION, NO_ACTION])))[
-        "motor"
-    ].flatten().tolist() == [0, 0]
 
 
 def test_an_episode_holds_the_motor_values_that_were_sent(env: CartPoleEnv) -> None:
@@ -117,8 +106,7 @@ def test_a_cart_that_back_emf_brakes_has_a_bound_too() -> None:
 WEAK_TO_THE_LEFT = {"force_asymmetry": 0.12, "track_tilt": -0.008}
 
 
-@pytest.mark.parametrize("quantile", [0.6, 0.99])
-@pytest.mark.parametrize("cart", [None, WEAK_TO_THE_LEFT])
+@pytest.mark.parametrize(("quantile", "cart"), [(0.6, None), (0.99, WEAK_TO_THE_LEFT)])
 def test_the_share_of_brakings_within_the_bound(quantile: float, cart: dict[str, float] | None) -> None:
     """In both directions, also of a cart that brakes better in one of them."""
     ends = {name: [value, value + 1e-4] for name, value in (cart or {}).items()}
@@ -209,18 +197,13 @@ def test_no_sequence_of_actions_overruns_the_quantile(
     assert lost <= (1 - settings.guard.quantile) * brakings
 
 
-@pytest.mark.parametrize("action", [0, 8])
-def test_an_emulated_cart_stays_on_the_track(action: int) -> None:
+def test_an_emulated_cart_stays_on_the_track() -> None:
     """The guard reads where the track of the cart ends, from the span that the cart measured."""
-    settings = with_fitted_guard(shipped_settings({"guard": "careful"}))
-    settings = shortened(settings)
+    settings = with_fitted_guard(shipped_settings({"guard": "careful", "task.time_limit": 150}))
     plant = emulated_plant(EmulatorSettings(physics_step=1e-3, cart_viscous=0.1, latency=0.015))
     with closing(environment(settings, plant)) as env:
-        (episode,) = run_batch(env, lambda td: td.set("action", torch.tensor([action])))
-    assert episode.ended_by == Ending.TIME
-    assert episode.guarded is not None
-    assert episode.guarded.any()
-
-
-def shortened(settings: CartPoleSettings) -> CartPoleSettings:
-    return settings.model_copy(update={"task": settings.task.model_copy(update={"time_limit": 150})})
+        for action in (0, 8):
+            (episode,) = run_batch(env, lambda td, action=action: td.set("action", torch.tensor([action])))
+            assert episode.ended_by == Ending.TIME
+            assert episode.guarded is not None
+            assert episode.guarded.any()

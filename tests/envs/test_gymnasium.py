@@ -20,7 +20,7 @@ from cartpole_rl.envs.gymnasium_vector import CartPoleVector
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.registration import ENVIRONMENTS, MAX_EPISODE_STEPS, register
 
-STEPS = 520  # longer than an episode may be
+STEPS, LIMIT = 130, 50
 ONE_COUNT = 0.01  # of an encoder, in an observation: where float32 rounds it otherwise
 
 
@@ -33,19 +33,31 @@ def test_importing_registers_once() -> None:
         assert env.spec.id == "cartpole_rl/Balance-v0"
 
 
-@pytest.mark.parametrize(
-    "imports",
-    [
-        "import cartpole_rl; assert 'gymnasium' not in sys.modules; import gymnasium",
-        "import cartpole_rl, torchrl.envs, gymnasium",
-    ],
-)
-def test_the_order_of_imports_does_not_matter(imports: str) -> None:
-    """Checking whether Gymnasium is installed, as TorchRL does, does not import it."""
-    known = f"import sys; {imports}; print(sorted(name for name in gymnasium.registry if 'cartpole' in name))"
-    done = subprocess.run([sys.executable, "-c", known], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout == f"{sorted(ENVIRONMENTS)}\n"
+LATE = """
+import sys, cartpole_rl
+assert 'gymnasium' not in sys.modules
+import gymnasium
+print(sorted(name for name in gymnasium.registry if 'cartpole' in name))
+"""
+FORKED = """
+import cartpole_rl, torchrl.envs, gymnasium, torch
+torch.set_num_threads(2)
+print(sorted(name for name in gymnasium.registry if 'cartpole' in name))
+envs = gymnasium.make_vec("cartpole_rl/Balance-v0", 1, "async", vector_kwargs={"context": "fork"})
+envs.reset(seed=0)
+assert envs.step(envs.action_space.sample())[0].shape == (1, 10)
+envs.close()
+"""
+
+
+@pytest.mark.parametrize("script", [LATE, FORKED], ids=["late", "forked"])
+def test_the_order_of_imports_does_not_matter_and_processes_can_be_forked(script: str) -> None:
+    """Checking whether Gymnasium is installed, as TorchRL does, does not import it.
+
+    Fitting the guard starts no threads: in a process that is forked from one with threads torch blocks.
+    """
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stdout) == (0, f"{sorted(ENVIRONMENTS)}\n"), done.stderr
 
 
 def vector(name: str, carts: int = 8, **options: object) -> VectorEnv:
@@ -60,16 +72,15 @@ def course(env: VectorEnv, seed: int) -> Iterator[tuple]:
         yield env.step(env.action_space.sample())
 
 
-@pytest.mark.parametrize("name", ENVIRONMENTS)
-def test_passes_both_checkers_without_a_display(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With a display, test_rendering.py checks the windows too."""
+def test_passes_both_checkers_without_a_display(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a display, test_rendering.py checks the swing-up and its windows too."""
     monkeypatch.setattr("cartpole_rl.envs.gymnasium.has_display", bool)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warnings.filterwarnings("ignore", message=".*infinity.*")  # a measured state has no bounds
-        check_env(gymnasium.make(name).unwrapped)
+        check_env(gymnasium.make("cartpole_rl/Balance-v0").unwrapped)
         env_checker = pytest.importorskip("stable_baselines3.common.env_checker")
-        env_checker.check_env(gymnasium.make(name))
+        env_checker.check_env(gymnasium.make("cartpole_rl/SwingUp-v0"))
 
 
 @pytest.mark.parametrize(("name", "actions", "limit"), [("SwingUp", 9, None), ("Balance", 3, np.radians(12))])
@@ -90,10 +101,9 @@ def test_the_constants_are_those_of_conf() -> None:
 
 
 def test_max_episode_steps_sets_the_length_of_an_episode() -> None:
-    steps = 510
-    single = gymnasium.make("cartpole_rl/SwingUp-v0", max_episode_steps=steps)
-    many = vector("cartpole_rl/SwingUp-v0", carts=2, max_episode_steps=steps)
-    for env, action in ((single, 4), (many, np.full(2, 4))):  # the middle action: no motor
+    single = gymnasium.make("cartpole_rl/SwingUp-v0", max_episode_steps=510)
+    many = vector("cartpole_rl/SwingUp-v0", carts=2, max_episode_steps=7)
+    for env, steps, action in ((single, 510, 4), (many, 7, np.full(2, 4))):  # the middle action: no motor
         env.reset(seed=0)
         ends = [np.all(env.step(action)[3]) for _ in range(steps)]
         assert ends == [False] * (steps - 1) + [True]
@@ -101,40 +111,31 @@ def test_max_episode_steps_sets_the_length_of_an_episode() -> None:
 
 @pytest.mark.parametrize("name", ENVIRONMENTS)
 class TestVector:
-    def test_spaces_hold(self, name: str) -> None:
-        env = vector(name)
-        for outcome in course(env, 0):
-            assert env.observation_space.contains(outcome[0])
-            if len(outcome) > 2:
-                assert [part.shape for part in outcome[1:4]] == [(8,)] * 3
-                assert [part.dtype for part in outcome[1:4]] == [np.float32, np.bool_, np.bool_]
-
-    def test_seeds_repeat(self, name: str) -> None:
-        env = vector(name, randomization="wide")
-        first, again, other = (np.stack([outcome[0] for outcome in course(env, seed)]) for seed in (1, 1, 2))
-        assert (first == again).all()
-        assert (first != other).any()
+    def test_spaces_hold_seeds_repeat_and_ended_episodes_restart(self, name: str) -> None:
+        env = vector(name, randomization="wide", max_episode_steps=LIMIT)
+        assert env.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
+        first, again, other = (list(course(env, seed)) for seed in (1, 1, 2))
+        observations, *others = (np.stack([each[0] for each in found]) for found in (first, again, other))
+        assert (observations == others[0]).all()
+        assert (observations != others[1]).any()
+        assert all(env.observation_space.contains(each) for each in observations)
+        ends = 0
+        for observation, *outcome, info in first[1:]:
+            assert [part.shape for part in outcome] == [(8,)] * 3
+            assert [part.dtype for part in outcome] == [np.float32, np.bool_, np.bool_]
+            ended = outcome[1] | outcome[2]
+            assert (info.get("_final_obs", np.zeros(8, bool)) == ended).all()
+            for row in np.flatnonzero(ended):
+                assert env.single_observation_space.contains(info["final_obs"][row])
+                assert (info["final_obs"][row] != observation[row]).any()
+                ends += 1
+        assert ends >= 16
 
     def test_does_not_touch_torchs_global_generator(self, name: str) -> None:
         env = vector(name)
         before = torch.random.get_rng_state()
         env.reset(seed=3)
         assert torch.equal(torch.random.get_rng_state(), before)
-
-    def test_an_ended_episode_reports_its_final_observation_and_restarts(self, name: str) -> None:
-        env = vector(name)
-        assert env.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
-        ends = 0
-        outcomes = course(env, 0)
-        next(outcomes)
-        for observation, _, terminated, truncated, info in outcomes:
-            ended = terminated | truncated
-            assert (info.get("_final_obs", np.zeros(8, bool)) == ended).all()
-            for row in np.flatnonzero(ended):
-                assert env.single_observation_space.contains(info["final_obs"][row])
-                assert (info["final_obs"][row] != observation[row]).any()
-                ends += 1
-        assert ends >= 8
 
     def test_a_cart_in_a_batch_equals_a_single_cart(self, name: str) -> None:
         alone, batch = gymnasium.make(name), vector(name, carts=1)
@@ -191,22 +192,6 @@ def test_keyword_arguments_take_what_the_configuration_takes(make: Any) -> None:
 def test_keyword_arguments_are_checked_as_the_configuration(given: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         gymnasium.make("cartpole_rl/SwingUp-v0", **given)
-
-
-FORKED = """
-import gymnasium, torch, cartpole_rl
-torch.set_num_threads(2)
-envs = gymnasium.make_vec("cartpole_rl/Balance-v0", 1, "async", vector_kwargs={"context": "fork"})
-envs.reset(seed=0)
-print(envs.step(envs.action_space.sample())[0].shape)
-envs.close()
-"""
-
-
-def test_processes_can_be_forked() -> None:
-    """Fitting the guard starts no threads: in a process that is forked from one with threads torch blocks."""
-    done = subprocess.run([sys.executable, "-c", FORKED], capture_output=True, text=True, timeout=120)
-    assert done.stdout == "(1, 10)\n", done.stderr
 
 
 @pytest.mark.parametrize("action", [-1, 9, 2.0, True, [2]])

@@ -19,7 +19,7 @@ from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.randomization.ranges import Range
 from cartpole_rl.tasks.settings import NO_ACTION
 
-MOTORS = (-200, 0, 200)
+Simulated = Callable[..., CartPoleEnv]
 GUARD = TrackGuard(margin=0.05, delay=0.1, deceleration=3.0)
 NOISY = {
     "latency_jitter": Range(absolute=(0.001, 0.01)),
@@ -68,48 +68,39 @@ def same(percept: Any, present: TensorDictBase, *keys: str) -> None:
         np.testing.assert_allclose(getattr(percept, key), present[key][0], rtol=1e-5, atol=1e-5)
 
 
-@pytest.mark.parametrize("guard", [None, GUARD], ids=["no guard", "guard"])
-@pytest.mark.parametrize("observation", OBSERVATIONS, ids=["history", "raw", "positions"])
+@pytest.mark.parametrize(
+    ("observation", "guard"),
+    zip(OBSERVATIONS, (GUARD, None, GUARD), strict=True),
+    ids=["history", "raw", "positions"],
+)
 def test_a_simulated_cart(
-    make_plant: Callable[..., SimulatedPlant],
-    make_environment: Callable[..., CartPoleEnv],
-    observation: dict[str, Any],
-    guard: TrackGuard | None,
+    simulated: Simulated, observation: dict[str, Any], guard: TrackGuard | None
 ) -> None:
-    """With noise, from the same random numbers; then until the track's end or the time limit."""
-    pair = [
-        make_environment(
-            make_plant(1, ranges=NOISY, seed=3), MOTORS, time_limit=60, guard=guard, **observation
-        )
-        for _ in range(2)
-    ]
+    """With noise, from the same random numbers; to the track's end or the time limit; without an action."""
+    plant = {"ranges": NOISY, "seed": 3}
+    pair = [simulated(1, plant, time_limit=60, guard=guard, **observation) for _ in range(2)]
     actions = np.random.default_rng(0).choice(3, 60, p=[0.1, 0.2, 0.7]).tolist()
     assert compare(*pair, actions, rounding=1) > 20
-    assert (compare(*pair, [2] * 60, rounding=1) == 60) == (guard is not None)  # the second episode
-
-
-def test_no_action_sends_motor_0_and_truncates(
-    make_plant: Callable[..., SimulatedPlant], make_environment: Callable[..., CartPoleEnv]
-) -> None:
-    pair = [make_environment(make_plant(1), MOTORS, guard=GUARD) for _ in range(2)]
+    assert (compare(*pair, [2] * 60, rounding=1) == 60) == (guard is not None)
     assert compare(*pair, [2, 2, NO_ACTION, 2], rounding=1) == 3
     cart = pair[1].one_cart
     assert cart.sent_motor(NO_ACTION) == cart.frame.motor_applied[0] == 0
 
 
-@pytest.mark.parametrize("action", [-2, 3])
-def test_an_action_that_does_not_exist_is_refused(
-    make_plant: Callable[..., SimulatedPlant], make_environment: Callable[..., CartPoleEnv], action: int
+def test_an_action_that_does_not_exist_is_refused_and_a_rehearsal_changes_nothing(
+    simulated: Simulated,
 ) -> None:
-    cart = make_environment(make_plant(1), MOTORS).one_cart
+    cart = simulated().one_cart
     cart.reset()
-    with pytest.raises(IndexError):
-        cart.step(action)
+    before = cart.frame, cart.percept
+    for action in (-2, 3):
+        with pytest.raises(IndexError):
+            cart.step(action)
+    assert all(map(math.isfinite, cart.rehearse().observation))
+    assert (cart.frame, cart.percept) == before
 
 
-def test_the_state_of_a_simulated_cart_stays_in_one_place(
-    make_plant: Callable[..., SimulatedPlant],
-) -> None:
+def test_the_state_of_a_simulated_cart_stays_in_one_place(make_plant: Callable[..., SimulatedPlant]) -> None:
     """A snapshot between steps of either kind is that of the same cart."""
     plant = make_plant(1, ranges=NOISY)
     plant.reset_one()
@@ -126,30 +117,18 @@ def test_the_state_of_a_simulated_cart_stays_in_one_place(
     assert all(math.isfinite(value) for value in plant.origins()[0].state.values())
 
 
-def test_a_recorded_cart(
-    make_plant: Callable[..., SimulatedPlant], make_environment: Callable[..., CartPoleEnv]
-) -> None:
-    env = make_environment(make_plant(1, cart={"track_half_length": 0.1}), MOTORS)
+def test_a_recorded_cart(simulated: Simulated, make_environment: Callable[..., CartPoleEnv]) -> None:
+    env = simulated(plant={"cart": {"track_half_length": 0.1}})
     (episode,) = run_batch(env, lambda present: present.set("action", torch.tensor([2])))
-    pair = [make_environment(RecordedPlant(episode, None), MOTORS, guard=GUARD) for _ in range(2)]
+    pair = [make_environment(RecordedPlant(episode, None), guard=GUARD) for _ in range(2)]
     assert compare(*pair, [2] * 500) == episode.steps
-
-
-def test_a_rehearsal_changes_nothing(
-    make_plant: Callable[..., SimulatedPlant], make_environment: Callable[..., CartPoleEnv]
-) -> None:
-    cart = make_environment(make_plant(1), MOTORS).one_cart
-    cart.reset()
-    before = cart.frame, cart.percept
-    assert all(map(math.isfinite, cart.rehearse().observation))
-    assert (cart.frame, cart.percept) == before
 
 
 def test_an_emulated_cart(make_environment: Callable[..., CartPoleEnv]) -> None:
     """Two lockstep carts with the same seed, to the end of the track."""
     plants = [emulated_plant(EmulatorSettings(seed=1)) for _ in range(2)]
     try:
-        pair = [make_environment(plant, MOTORS, time_limit=100) for plant in plants]
+        pair = [make_environment(plant, time_limit=100) for plant in plants]
         assert 5 < compare(*pair, [0, 2, 1, 0, 2] * 5 + [2] * 75) < 100
         assert pair[0].plant.ended_by == pair[1].plant.ended_by == "track"
     finally:

@@ -124,12 +124,3 @@ def test_the_reward_has_its_scale_and_the_costs_of_the_track() -> None:
     value, reward = (perceived(later, rewards=rewards).reward for rewards in (plain, costly))
     nearness = (5000 * CART_METRES_PER_COUNT / 0.4) ** 2
     torch.testing.assert_close(reward, 2 * value - torch.tensor([[0.0, 7 + 3 * nearness]]))
-
-
-def test_the_scores_do_not_depend_on_the_reward() -> None:
-    constant, cosine = (
-        perceived(frame(), rewards=RewardSettings(**choice(f"reward/{kind}")))
-        for kind in ("constant", "cosine")
-    )
-    assert torch.equal(constant.score, cosine.score)
-    assert torch.equal(constant.score_upright, cosine.score_upright)

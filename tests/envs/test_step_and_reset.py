@@ -5,8 +5,9 @@ from typing import Any
 
 import pytest
 import torch
+from courses import course
 from tensordict import TensorDictBase
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import TransformedEnv
 
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.hardware import HardwareTransform
@@ -15,7 +16,7 @@ from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.randomization.ranges import Range
 from cartpole_rl.tasks.settings import Start, StartSettings
 
-CARTS, STEPS, LIMIT = 16, 400, 60
+CARTS, LIMIT = 32, 60
 ANYWHERE = StartSettings(
     angle=Start.ANY, position_spread=0.2, angle_spread=0, speed_spread=0.5, angular_speed_spread=1.0
 )
@@ -46,17 +47,6 @@ def environments(
     return ours, TransformedEnv(plant(), hardware)
 
 
-def course(env: EnvBase) -> list[tuple[TensorDictBase, TensorDictBase]]:
-    """Return the result of each step under actions that move the carts."""
-    generator = torch.Generator().manual_seed(0)
-    present, course = env.reset(), []
-    for _ in range(STEPS):
-        present["action"] = torch.randint(3, (CARTS,), generator=generator)
-        transition, present = env.step_and_maybe_reset(present)
-        course.append((transition.clone(), present.clone()))
-    return course
-
-
 def assert_equal(ours: TensorDictBase, theirs: TensorDictBase, but: tuple[str, ...] = ()) -> None:
     assert set(ours.keys(True, True)) == set(theirs.keys(True, True))
     assert (ours.batch_size, ours.device) == (theirs.batch_size, theirs.device)
@@ -68,7 +58,7 @@ def assert_equal(ours: TensorDictBase, theirs: TensorDictBase, but: tuple[str, .
 
 def test_equals_torchrls_step(environments: tuple[CartPoleEnv, TransformedEnv]) -> None:
     endings: dict[str, Any] = {"terminated": [], "truncated": []}
-    for ours, theirs in zip(*(course(env) for env in environments), strict=True):
+    for ours, theirs in zip(*(course(env, 150) for env in environments), strict=True):
         assert_equal(ours[0], theirs[0])
         assert_equal(ours[1], theirs[1], but=("action",))  # of the step that was made
         for key, rows in endings.items():

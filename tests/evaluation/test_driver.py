@@ -1,10 +1,10 @@
-"""The driving process on a scripted cart: confirmation, refusals and exit."""
+"""The driving process on a scripted cart: confirmation and exit."""
 
 import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 
@@ -22,7 +22,6 @@ from cartpole_rl.errors import FaultError, LinkError
 from cartpole_rl.evaluation.driver import Driver, EpisodeRequest
 from cartpole_rl.evaluation.driving_policy import as_weights
 from cartpole_rl.learning.agent import QAgent
-from cartpole_rl.plants.serial.errors import NotReadyError
 from cartpole_rl.plants.serial.plant import SerialPlant
 from cartpole_rl.plants.serial.preparation import Confirm
 from cartpole_rl.plants.settings import SerialSettings
@@ -32,10 +31,10 @@ from cartpole_rl.wire import ClearFault, Fault, Message, SetMotor, Stop
 LONG = 100_000  # periods
 
 
-def scripted_env(port: str, time_limit: int, confirm: Confirm) -> CartPoleEnv:
+def scripted_env(port: str, confirm: Confirm) -> CartPoleEnv:
     """Made in the driving process."""
     plant = SerialPlant(SerialSettings(port=port), confirm=confirm)
-    task = choice("task/swingup") | {"x_max": 0.38, "time_limit": time_limit}
+    task = choice("task/swingup") | {"x_max": 0.38, "time_limit": LONG}
     return make_env(
         plant,
         ActionSettings(**choice("actions/two")),
@@ -71,15 +70,8 @@ def peer() -> Iterator[Faulty]:
         yield peer
 
 
-def driver(peer: CartPeer, confirm: Confirm, time_limit: int = LONG) -> Driver:
-    return Driver(partial(scripted_env, peer.port, time_limit), network, False, confirm)
-
-
-def wait_for(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 60
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+def driver(peer: CartPeer, confirm: Confirm) -> Driver:
+    return Driver(partial(scripted_env, peer.port), network, False, confirm)
 
 
 def test_a_person_is_asked_and_a_hangup_stops_the_motor(
@@ -88,37 +80,32 @@ def test_a_person_is_asked_and_a_hangup_stops_the_motor(
     """The person declines, then confirms; the terminal is closed while the cart is driven."""
     drive, asked = EpisodeRequest(as_weights(network()), 0.0, 0), []
 
-    def disagree(text: str) -> bool:
-        asked.append(text)
-        return False
+    def answering(agreed: bool) -> Confirm:
+        def confirm(text: str) -> bool:
+            asked.append(text)
+            if agreed:
+                threading.Thread(target=hang_up).start()
+            return agreed
 
-    with driver(peer, disagree) as driving:
+        return confirm
+
+    def hang_up() -> None:
+        deadline = time.monotonic() + 60
+        while not any(message.motor for message in peer.messages(SetMotor)):
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        os.kill(driving.pid, signal.SIGHUP)
+
+    with driver(peer, answering(False)) as driving:
         driving.start(drive)
         with pytest.raises(FaultError, match=r"the motor was driven but the cart did not move.*confirm"):
             driving.result()
-
     assert "Traceback" not in capfd.readouterr().err
 
-    def agree(text: str) -> bool:
-        asked.append(text)
-        threading.Thread(target=hang_up).start()
-        return True
-
-    def hang_up() -> None:
-        wait_for(lambda: any(message.motor for message in peer.messages(SetMotor)))
-        os.kill(driving.pid, signal.SIGHUP)
-
-    with driver(peer, agree) as driving:
+    with driver(peer, answering(True)) as driving:
         driving.start(drive)
         with pytest.raises(LinkError, match="has died"):
             driving.result()
     assert len(asked) == 2
     assert [type(frame.message) for frame in peer.received[-2:]] == [SetMotor, Stop]
     assert peer.state.motor_applied == 0
-
-
-def test_a_refusal_keeps_its_message(peer: Faulty) -> None:
-    peer.info = replace(peer.info, motor_limit=100)
-    with pytest.raises(NotReadyError, match="INFO says motor limit 100, not 255") as refused:
-        driver(peer, lambda text: True)
-    assert refused.value.remedy == "correct the firmware's settings"

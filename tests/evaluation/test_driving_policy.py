@@ -20,12 +20,10 @@ def network(seed: int, **changes: object) -> nn.Module:
 
 
 @pytest.mark.parametrize("compiled", [False, True])
-@pytest.mark.parametrize(
-    "changes", [{}, {"mirrored": True}, {"recurrent": 4}, {"recurrent": 4, "mirrored": True}]
-)
+@pytest.mark.parametrize("changes", [{"mirrored": True}, {"recurrent": 4, "mirrored": True}])
 def test_it_acts_like_the_network_whose_weights_it_loaded(compiled: bool, changes: dict) -> None:
     policy = DrivingPolicy(network(0, **changes), compiled)
-    observations = torch.randn(200, 1, 4, generator=torch.Generator().manual_seed(5))
+    observations = torch.randn(50, 1, 4, generator=torch.Generator().manual_seed(5))
     for seed in (0, 1):  # the second has other weights than the one that was compiled
         expected = network(seed, **changes)
         policy.load(as_weights(expected))

@@ -33,21 +33,13 @@ def episode(theta: list[float], x: list[float] | None = None, motor: list[int] |
     )
 
 
-def test_sums_and_steps() -> None:
+def test_sums_and_steps_and_none_of_an_upright_part() -> None:
     metrics = episode_metrics(episode([180, 170, 160, 150]), 0.4)
-    assert metrics["score"] == 6
+    assert (metrics["score"], metrics["reward"], metrics["steps"]) == (6, -6, 3)
     assert metrics["score_upright"] == pytest.approx(0.6)
-    assert metrics["reward"] == -6
-    assert metrics["steps"] == 3
     assert metrics["ended_by"] == "time"
-
-
-def test_metrics_over_the_upright_part_are_none_without_one() -> None:
-    metrics = episode_metrics(episode([180, 170, 160, 150]), 0.4)
     assert metrics["upright_fraction"] == 0
-    assert metrics["time_to_upright_s"] is None
-    assert metrics["rms_angle_rad"] is None
-    assert metrics["rms_position_m"] is None
+    assert all(metrics[name] is None for name in ("time_to_upright_s", "rms_angle_rad", "rms_position_m"))
 
 
 def test_rms_is_over_the_upright_part_alone() -> None:
@@ -72,11 +64,8 @@ def test_motor_change_and_margin() -> None:
     assert episode_metrics(episode([0, 0], x=[0, 0.5]), 0.4)["min_track_margin_m"] == pytest.approx(-0.1)
 
 
-def test_equal_values_have_an_interval_without_width() -> None:
+def test_equal_values_have_a_narrow_interval_without_a_warning(recwarn: pytest.WarningsRecorder) -> None:
     assert interval([3.0, 3.0, 3.0]) == (3.0, 3.0)
-
-
-def test_values_equal_but_for_rounding_have_a_finite_interval(recwarn: pytest.WarningsRecorder) -> None:
     low, high = interval([1.0] * 9 + [float(np.nextafter(1, 2))])
     assert low <= 1.0 <= high
     assert high - low < 1e-12
@@ -112,18 +101,17 @@ def test_the_summary_counts_endings_and_skips_missing_metrics() -> None:
 
 
 @pytest.mark.parametrize(
-    ("last", "stands"), [([0.0] * 51, 1), ([6.0] + [0.0] * 49, 0), ([0.0] * 50 + [6.0], 0)]
+    ("angles", "ended_by", "stands"),
+    [
+        ([90.0] * 20 + [0.0] * 51, "time", 1),
+        ([90.0] * 20 + [6.0] + [0.0] * 49, "time", 0),
+        ([90.0] * 20 + [0.0] * 50 + [6.0], "time", 0),
+        ([0.0] * 50, "time", 0),  # less than a second
+        ([0.0] * 80, "track", 0),
+    ],
 )
-def test_the_pole_is_upright_at_the_end_if_it_was_during_the_last_second(
-    last: list[float], stands: int
+def test_the_pole_is_upright_at_the_end_if_it_was_during_the_last_second_on_the_track(
+    angles: list[float], ended_by: str, stands: int
 ) -> None:
-    assert episode_metrics(episode([90.0] * 20 + last), 0.4)["upright_at_end"] == stands
-
-
-def test_an_episode_of_less_than_a_second_does_not_end_upright() -> None:
-    assert episode_metrics(episode([0.0] * 50), 0.4)["upright_at_end"] == 0
-
-
-def test_an_upright_pole_on_a_cart_that_left_its_track_does_not_stand_at_the_end() -> None:
-    left = replace(episode([0.0] * 80), ended_by="track")
-    assert episode_metrics(left, 0.4)["upright_at_end"] == 0
+    whole = replace(episode(angles), ended_by=ended_by)
+    assert episode_metrics(whole, 0.4)["upright_at_end"] == stands

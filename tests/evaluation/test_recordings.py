@@ -13,19 +13,17 @@ from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.errors import RecordingError
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.evaluation.recordings import COLUMNS, GUARDED, read_heading, read_recording, write_recording
-from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.rig.hardware import Encoders, nominal_encoders
 from cartpole_rl.tasks.episode import Episode
 
 
 @pytest.fixture(scope="module")
-def episode(
-    make_plant: Callable[..., SimulatedPlant], make_environment: Callable[..., CartPoleEnv]
-) -> Episode:
+def episode(simulated: Callable[..., CartPoleEnv]) -> Episode:
     """Forty periods of random motor values."""
     random = torch.Generator().manual_seed(0)
-    env = make_environment(make_plant(1), time_limit=40)
-    (recorded,) = run_batch(env, lambda td: td.set("action", torch.randint(3, (1,), generator=random)))
+    (recorded,) = run_batch(
+        simulated(time_limit=40), lambda td: td.set("action", torch.randint(3, (1,), generator=random))
+    )
     return recorded
 
 
@@ -73,14 +71,8 @@ def test_any_reader_of_csv_sees_columns_with_units(tmp_path: Path, episode: Epis
         (lambda text: with_cell(text, 1, "motor", "999"), "beyond 255 in row 1; record it again"),
         (lambda text: with_cell(text, 3, "pole_counts", str(10**25)), "beyond 2147483647 in row 3; record"),
         (lambda text: with_cell(text, 4, "x_m", "1e308"), "x is beyond 1e\\+06 in row 4; record it again"),
-        (
-            lambda text: with_cell(text, 5, "motor", ""),
-            "motor in row 5 is empty; give a whole number, or leave",
-        ),
-        (
-            lambda text: with_cell(text, 5, "motor", "-250.5"),
-            "motor in row 5 is '-250.5'; give a whole number",
-        ),
+        (lambda text: with_cell(text, 5, "motor", ""), "motor in row 5 is empty; give a whole number, or"),
+        (lambda text: with_cell(text, 5, "motor", "-250.5"), "row 5 is '-250.5'; give a whole number"),
         (lambda text: with_cell(text, 6, "x_m", ""), "x_m in row 6 is empty; give a number, or leave"),
         (lambda text: with_cell(text, 7, "pole_counts", "1,5"), "damaged"),
         (lambda text: with_cell(text, 40, "score", "none"), "score in row 40 is 'none'; give a number"),

@@ -56,7 +56,7 @@ def test_a_snapshot_that_is_being_written_is_not_read() -> None:
 
 def test_another_process_never_reads_parts_of_two_snapshots() -> None:
     memory = new_memory()
-    context = multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context("fork")  # it imports nothing again
     enough = context.Event()
     process = context.Process(target=write_until, args=(enough, memory), daemon=True)
     process.start()

@@ -46,7 +46,7 @@ def balancing_page(balancing: TrainedAgent) -> str:
 def observed(medium_agent: TrainedAgent) -> tuple[Floats, Floats]:
     """Observations [M, K] of whole episodes on randomized carts, and their action values [M, A]."""
     training = medium_agent.training
-    env = simulated_env(training, training.plant, 50, training.task.evaluation_start, seed=7)
+    env = simulated_env(training, training.plant, 20, training.task.evaluation_start, seed=7)
     observations, values, current = [], [], env.reset()
     with torch.no_grad():
         for _ in range(400):

@@ -33,37 +33,35 @@ from cartpole_rl.workflows.build import TrainedAgent, exported_agent, network_of
 from cartpole_rl.workflows.config import TrainConfig, load_settings
 from examples.drive_without_torch import action_values
 
-Members = dict[str, bytes]
+Change = Callable[[dict[str, bytes]], object]  # of the members of a file
 SIGNS = [-1, 1, -1, -1]
 
 
-@pytest.mark.parametrize(
-    "overrides",
-    [
-        {},
-        {"observation": "raw"},
-        {"observation": "positions"},
-        {"observation": "history_length", "pole": "range", "observation.past_velocities": 2},
-    ],
-    ids=["history", "raw", "positions", "length"],
-)
+OBSERVATIONS: dict[str, dict[str, Any]] = {
+    "history": {},
+    "raw": {"observation": "raw"},
+    "positions": {"observation": "positions"},
+    "length": {"observation": "history_length", "pole": "range", "observation.past_velocities": 2},
+}
+
+
+@pytest.mark.parametrize("overrides", OBSERVATIONS.values(), ids=OBSERVATIONS)
 def test_the_definition_is_the_observation(overrides: dict[str, Any]) -> None:
     training = load_settings(TrainConfig, {**overrides, "guard": "none", "task.time_limit": 30})
     numbers = observed_numbers(training.observation)
     env = simulated_env(training, training.plant, 1, training.task.start, seed=1)
-    cart, count = env.one_cart, len(training.actions.motors)
     past: deque = deque([defaultdict(float)] * 17, 17)
-    step: Any = cart.reset()
+    present = env.reset()
     for period in range(20):
-        x, x_dot, theta, theta_dot = step.state
+        x, x_dot, theta, theta_dot = present["state"][0].tolist()
         now = {"x": x, "x_dot": x_dot, "theta": theta, "theta_dot": theta_dot}
         now |= {"cos_theta": math.cos(theta), "sin_theta": math.sin(theta)}
         past.appendleft(now | {"pole_length": float(env.plant.pole_length)})
         found = [past[number.periods_ago][number.name] / number.scale for number in numbers]
-        assert found == pytest.approx(step.observation, rel=1e-5, abs=1e-6)
-        action = 7 * period % count
-        past[0]["motor"] = cart.motor(action)
-        step = cart.step(action)
+        assert found == pytest.approx(present["observation"][0].tolist(), rel=1e-5, abs=1e-6)
+        action = torch.tensor([7 * period % len(env.hardware.motors)])
+        past[0]["motor"] = env.hardware.motors[action].item()
+        present = env.step(present.set("action", action))["next"].exclude("reward")
 
 
 def test_a_quantity_without_a_name_is_refused() -> None:
@@ -135,10 +133,7 @@ def test_a_weight_that_is_not_finite_is_refused_for_every_format(medium_agent: T
         exported_agent(broken, {})
 
 
-@pytest.mark.parametrize(
-    "text",
-    ["", "[]", '{"command": [1]}', '{"seed": Infinity}', "\xff"],
-)
+@pytest.mark.parametrize("text", ["", "[]", '{"command": [1]}', '{"seed": Infinity}', "\xff"])
 def test_a_damaged_provenance_is_left_out(text: str, medium_agent: TrainedAgent, tmp_path: Path) -> None:
     shutil.copy("cartpole_rl/pretrained/medium/agent.pt", tmp_path)
     (tmp_path / "provenance.json").write_text(text, encoding="latin-1")
@@ -177,29 +172,28 @@ def test_the_description_defines_the_agent(file: Path) -> None:
     assert about["provenance"]["command"][:2] == ["cartpole-train", "experiment=medium"]
 
 
-def with_array(name: str, values: Any, kind: Any = np.float32) -> Callable[[Members], object]:
-    content = io.BytesIO()
-    np.save(content, np.asarray(values, kind), allow_pickle=True)
-    return lambda members: members.update({f"{name}.npy": content.getvalue()})
-
-
-def with_json(**changes: Any) -> Callable[[Members], object]:
-    def change(members: Members) -> None:
-        members["agent.json"] = json.dumps(json.loads(members["agent.json"]) | changes).encode()
-
-    return change
-
-
-def with_member(name: str, content: bytes) -> Callable[[Members], object]:
+def with_member(name: str, content: bytes) -> Change:
     return lambda members: members.update({name: content})
 
 
-def without(name: str) -> Callable[[Members], object]:
+def with_array(name: str, values: Any, kind: Any = np.float32) -> Change:
+    content = io.BytesIO()
+    np.save(content, np.asarray(values, kind), allow_pickle=True)
+    return with_member(f"{name}.npy", content.getvalue())
+
+
+def with_json(**changes: Any) -> Change:
+    return lambda members: members.update(
+        {"agent.json": json.dumps(json.loads(members["agent.json"]) | changes).encode()}
+    )
+
+
+def without(name: str) -> Change:
     return lambda members: members.pop(name)
 
 
 NO_FILE = "is not a weights file"
-DAMAGE: dict[str, tuple[Callable[[Members], object], str]] = {
+DAMAGE: dict[str, tuple[Change, str]] = {
     "another weight": (with_array("layer0.bias", np.zeros(128)), "checksum"),
     "another guard": (with_json(guard=None), "checksum"),
     "another motor value": (with_json(motors=[-255, -200, -150, -100, 0, 100, 150, 200, 250]), "checksum"),
@@ -221,7 +215,7 @@ DAMAGE: dict[str, tuple[Callable[[Members], object], str]] = {
 }
 
 
-def rewritten(file: Path, change: Callable[[Members], object]) -> Path:
+def rewritten(file: Path, change: Change) -> Path:
     """Change the members of a file."""
     with zipfile.ZipFile(file) as archive:
         members = {name: archive.read(name) for name in archive.namelist()}
@@ -232,30 +226,29 @@ def rewritten(file: Path, change: Callable[[Members], object]) -> Path:
     return file
 
 
-def complaint(path: Path) -> str:
+def check_refused(path: Path, expected: str) -> None:
     with pytest.raises(CheckpointError) as caught:
         read_agent(path)
-    text = str(caught.value)
-    assert str(path) in text
-    assert "\n" not in text
-    return text
+    assert str(path) in str(caught.value)
+    assert expected in str(caught.value)
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("damage", DAMAGE)
 def test_a_damaged_file_is_refused(damage: str, file: Path) -> None:
     change, expected = DAMAGE[damage]
-    assert expected in complaint(rewritten(file, change))
+    check_refused(rewritten(file, change), expected)
 
 
 @pytest.mark.parametrize("kind", [np.float64, np.complex128, ">f4"])
 def test_numbers_of_another_kind_are_refused(kind: Any, exported: ExportedAgent, file: Path) -> None:
     """Converted to float32, these are the weights of the file, and have its checksum."""
-    assert NO_FILE in complaint(rewritten(file, with_array("layer0.bias", exported.layers[0].bias, kind)))
+    check_refused(rewritten(file, with_array("layer0.bias", exported.layers[0].bias, kind)), NO_FILE)
 
 
 def test_a_file_that_is_none_is_refused(file: Path, tmp_path: Path) -> None:
-    assert "there is no such file" in complaint(tmp_path / "nowhere.npz")
+    check_refused(tmp_path / "nowhere.npz", "there is no such file")
     file.write_bytes(file.read_bytes()[:1000])
-    assert f"{NO_FILE}, or is damaged" in complaint(file)
+    check_refused(file, f"{NO_FILE}, or is damaged")
     file.write_text("text")
-    assert NO_FILE in complaint(file)
+    check_refused(file, NO_FILE)

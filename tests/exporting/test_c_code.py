@@ -5,7 +5,7 @@ import math
 import re
 import shutil
 import subprocess
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -60,7 +60,7 @@ class Compiled:
     """The library of an exported agent, with one cart."""
 
     def __init__(self, files: Mapping[str, str], folder: Path) -> None:
-        self.folder = folder
+        self.folder, self.header = folder, files["policy.h"]
         for name, text in {**files, "size.c": SIZE}.items():
             (folder / name).write_text(text)
         words = ["gcc", *FLAGS, "-shared", "-fPIC", "-o", "policy.so", "policy.c", "size.c", "-lm"]
@@ -139,12 +139,12 @@ def test_so_they_are_for_every_observation_and_network(name: str, tmp_path: Path
     compiled = Compiled(c_files(exported, trained.training), tmp_path)
     check_motors(trained.training, trained.policy, compiled, 200)
     observes = int(trained.training.observation.pole_length)
-    assert f"#define POLICY_OBSERVES_LENGTH {observes}" in (tmp_path / "policy.h").read_text()
+    assert f"#define POLICY_OBSERVES_LENGTH {observes}" in compiled.header
     assert_figures(exported, compiled)
     if observes:
         assert_lengths(compiled, trained.training)
     if name == "plain":
-        assert_overflow_is_no_action(exported, trained.training, tmp_path)
+        assert_overflow_is_no_action(exported, trained.training, tmp_path / "overflow")
 
 
 def assert_lengths(compiled: Compiled, training: TrainConfig) -> None:
@@ -156,48 +156,60 @@ def assert_lengths(compiled: Compiled, training: TrainConfig) -> None:
         assert compiled.motor((0, 2048), 0.02) == 0
     compiled.start(0.38, 0.3556)
     assert compiled.motor((0, 2048), 0.02) in training.actions.motors
-    assert "above 0 and at most 3" in (compiled.folder / "policy.h").read_text()
+    assert "above 0 and at most 3" in compiled.header
 
 
 def assert_overflow_is_no_action(exported: ExportedAgent, training: TrainConfig, folder: Path) -> None:
     """A unit that is not finite reaches the action values."""
     first = exported.layers[0]
     layer = first._replace(weight=np.full_like(first.weight, 3e38))
-    agent = replace(exported, layers=(layer, *exported.layers[1:]))
-    (folder / "overflow").mkdir()
-    compiled = Compiled(c_files(agent, training), folder / "overflow")
+    folder.mkdir()
+    compiled = Compiled(c_files(replace(exported, layers=(layer, *exported.layers[1:])), training), folder)
     assert compiled.action(np.array([2, -2] * 5, np.float32)) == -1  # infinity minus infinity
 
 
 def assert_figures(exported: ExportedAgent, compiled: Compiled) -> None:
-    comment = (compiled.folder / "policy.h").read_text().split("*/")[0]
-    assert f"{len(compiled.memory)} bytes for each cart" in comment
+    comment = compiled.header.split("*/")[0]
     tables = re.findall(r"static const float \w+\[(\d+)\]", (compiled.folder / "policy.c").read_text())
     motors = 2 * (len(exported.description.motors) + 2)
-    assert f"{4 * sum(map(int, tables)) + motors} bytes of tables" in comment
     products = sum(inputs * outputs for inputs, outputs in pairwise(exported.description.sizes))
+    assert f"{len(compiled.memory)} bytes for each cart" in comment
+    assert f"{4 * sum(map(int, tables)) + motors} bytes of tables" in comment
     assert f"{products} multiply-adds" in comment
     assert exported.checksum in comment
 
 
 @pytest.fixture(scope="module")
-def small() -> tuple[ExportedAgent, TrainConfig]:
-    """A small agent, which is exported and compiled at once."""
+def small() -> Callable[..., dict[str, str]]:
+    """The C files of a small agent, which is exported and compiled at once, with another description."""
     trained = untrained(**AGENTS["plain"])
-    return exported_agent(trained, {}), trained.training
+    exported = exported_agent(trained, {})
+
+    def build(command: str, **changes: Any) -> dict[str, str]:
+        changes = {"provenance": {"command": [command]}, **changes}
+        about = exported.description.model_copy(update=changes)
+        return c_files(replace(exported, description=about), trained.training)
+
+    return build
 
 
 @pytest.mark.parametrize("origin", ["*/ int x; /*", "a ??/\nb\\"])
-def test_no_origin_leaves_the_comment(
-    origin: str, small: tuple[ExportedAgent, TrainConfig], tmp_path: Path
-) -> None:
-    exported, training = small
-    about = exported.description.model_copy(update={"provenance": {"command": [origin]}})
-    done = validated(c_files(replace(exported, description=about), training), tmp_path)
+def test_no_origin_leaves_the_comment(origin: str, small: Callable, tmp_path: Path) -> None:
+    files = small(origin)
+    done = validated(files, tmp_path)
     assert done.returncode == 0, done.stderr
-    first, second = (tmp_path / "policy.h").read_text().split("*/")[0].splitlines()[-3:-1]
+    first, second = files["policy.h"].split("*/")[0].splitlines()[-3:-1]
     assert first.startswith(' * Training: "')
     assert second.startswith(" * SHA-256: ")
+
+
+def test_files_of_two_exports_compile_only_if_the_agent_is_the_same(small: Callable, tmp_path: Path) -> None:
+    files = small("first")
+    for other, fits in ((small("first", angle_limit=1.0), False), (small("second"), True)):
+        assert other["policy.h"] != files["policy.h"]
+        done = validated({**files, "policy.h": other["policy.h"]}, tmp_path)
+        assert (done.returncode == 0) == fits
+        assert ("policy.h is of another export than policy.c" in done.stderr) != fits
 
 
 def test_after_a_bad_number_the_motor_stays_at_0(compiled: Compiled) -> None:
@@ -229,7 +241,7 @@ def test_the_motor_stays_at_0_once_the_pole_fell(tmp_path: Path) -> None:
         assert compiled.motor((0, 0), 0.02) == 0
     compiled.start(0.38, 0.36)
     assert compiled.motor((0, 2048), 0.0) == 0
-    assert "#define POLICY_STARTS_UPRIGHT 1" in (tmp_path / "policy.h").read_text()
+    assert "#define POLICY_STARTS_UPRIGHT 1" in compiled.header
 
 
 def test_a_resumed_policy_forgets_what_it_observed(compiled: Compiled) -> None:
@@ -249,22 +261,6 @@ def test_a_resumed_policy_forgets_what_it_observed(compiled: Compiled) -> None:
 def test_without_a_start_the_motor_stays_at_0(compiled: Compiled) -> None:
     ctypes.memset(compiled.memory, 0, len(compiled.memory))
     assert [compiled.motor((0, 2048), 0.02) for _ in range(3)] == [0, 0, 0]
-
-
-@pytest.mark.parametrize(
-    ("change", "fits"), [({"angle_limit": 1.0}, False), ({"provenance": {}}, True)], ids=["agent", "origin"]
-)
-def test_files_of_two_exports_compile_only_if_the_agent_is_the_same(
-    small: tuple[ExportedAgent, TrainConfig], tmp_path: Path, change: dict[str, Any], fits: bool
-) -> None:
-    exported, training = small
-    about = exported.description.model_copy(update={"provenance": {"command": ["first"]}})
-    files = c_files(replace(exported, description=about), training)
-    other = c_files(replace(exported, description=about.model_copy(update=change)), training)
-    assert other["policy.h"] != files["policy.h"]
-    done = validated({**files, "policy.h": other["policy.h"]}, tmp_path)
-    assert (done.returncode == 0) == fits
-    assert ("policy.h is of another export than policy.c" in done.stderr) != fits
 
 
 def test_options_that_remove_the_checks_are_refused(compiled: Compiled) -> None:

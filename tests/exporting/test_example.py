@@ -29,10 +29,14 @@ assert not {{"torch", "tensordict", "torchrl"}} & {{*sys.modules}}
 pytest.importorskip("mujoco", reason='mujoco is missing: pip install "cartpole_rl[emulator]"')
 
 
+def written(agent: ExportedAgent, folder: Path) -> Path:
+    (folder / "agent.npz").write_bytes(agent.weights_file())
+    return folder / "agent.npz"
+
+
 @pytest.fixture
 def file(exported: ExportedAgent, tmp_path: Path) -> Path:
-    (tmp_path / "agent.npz").write_bytes(exported.weights_file())
-    return tmp_path / "agent.npz"
+    return written(exported, tmp_path)
 
 
 def started(*arguments: str | Path) -> subprocess.Popen[str]:
@@ -87,19 +91,18 @@ def test_two_interrupts_stop_the_cart(file: Path, tmp_path: Path) -> None:
     assert taken(journal)[-1] == "STOP"
 
 
+def check_refused(text: str, *arguments: str | Path) -> None:
+    code, _, err = ended(started(*arguments))
+    assert code == 1
+    assert text in err
+    assert err.count("\n") == 1
+
+
 def test_wrong_arguments_are_named_in_one_line(file: Path, tmp_path: Path) -> None:
-    expected: dict[tuple[str | Path, ...], str] = {
-        (): "usage: drive_without_torch.py AGENT.npz PORT [POLE_LENGTH]",
-        (file,): "usage:",
-        (tmp_path / "nowhere.npz", "/dev/null"): "there is no such file",
-        (file, tmp_path / "port"): "port",
-        (file, tmp_path / "port", "long"): "POLE_LENGTH: 'long' is not a number",
-    }
-    for arguments, text in expected.items():
-        code, _, err = ended(started(*arguments))
-        assert code == 1
-        assert text in err
-        assert err.count("\n") == 1
+    check_refused("usage: drive_without_torch.py AGENT.npz PORT [POLE_LENGTH]", file)
+    check_refused("there is no such file", tmp_path / "nowhere.npz", "/dev/null")
+    check_refused("port", file, tmp_path / "port")
+    check_refused("POLE_LENGTH: 'long' is not a number", file, tmp_path / "port", "long")
 
 
 def test_an_agent_that_observes_the_length_needs_it_before_the_port_opens(
@@ -112,24 +115,20 @@ def test_an_agent_that_observes_the_length_needs_it_before_the_port_opens(
     first = exported.layers[0]
     wider = first._replace(weight=np.pad(first.weight, ((0, 0), (0, 1))))
     agent = ExportedAgent(about.model_copy(update={**changes, "sizes": sizes}), (wider, *exported.layers[1:]))
-    (tmp_path / "agent.npz").write_bytes(agent.weights_file())
+    file = written(agent, tmp_path)
     for length in ((), ("nan",), ("355.6",)):
-        code, _, err = ended(started(tmp_path / "agent.npz", tmp_path / "port", *length))
-        assert code == 1
-        assert "this agent observes the pole's length" in err
+        check_refused("this agent observes the pole's length", file, tmp_path / "port", *length)
 
 
 def test_an_agent_that_needs_an_upright_pole_is_refused(exported: ExportedAgent, tmp_path: Path) -> None:
     about = exported.description.model_copy(update={"start": Start.UPRIGHT, "angle_limit": 0.2})
-    (tmp_path / "agent.npz").write_bytes(replace(exported, description=about).weights_file())
-    code, _, err = ended(started(tmp_path / "agent.npz", tmp_path / "port"))
-    assert code == 1
-    assert "needs an upright pole" in err
+    file = written(replace(exported, description=about), tmp_path)
+    check_refused("needs an upright pole", file, tmp_path / "port")
 
 
 def test_a_fallen_pole_ends_the_drive(exported: ExportedAgent, tmp_path: Path) -> None:
     about = exported.description.model_copy(update={"angle_limit": 0.2})
-    (tmp_path / "agent.npz").write_bytes(replace(exported, description=about).weights_file())
-    code, _, err = driven(tmp_path / "agent.npz", tmp_path / "journal.jsonl")
+    file, journal = written(replace(exported, description=about), tmp_path), tmp_path / "journal.jsonl"
+    code, _, err = driven(file, journal)
     assert (code, err) == (1, "the pole fell\n")
-    assert taken(tmp_path / "journal.jsonl")[-1] == "STOP"
+    assert taken(journal)[-1] == "STOP"

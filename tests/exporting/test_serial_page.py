@@ -90,6 +90,19 @@ def check_stopped(bridge: Bridge, host: EmulatorHost) -> None:
     assert state.message.motor_applied == 0
 
 
+def answer(
+    page: str, script: str, folder: Path, stopped: bool = True, answers: bool = False, **emulated: Any
+) -> tuple[str, Bridge]:
+    """The line with which a script on the page of an emulated cart ends, once the cart is checked."""
+    with emulator(**emulated) as host, bridged(page, script, host, folder) as bridge:
+        line, answered, _ = bridge.report()
+        if answers:
+            check_answers(bridge, answered)
+        if stopped:
+            check_stopped(bridge, host)
+    return line, bridge
+
+
 class RecordedPlant(OneCartPlant):
     """A cart that moves as another one did while the page drove it, whatever is sent."""
 
@@ -113,11 +126,8 @@ class RecordedPlant(OneCartPlant):
         frame = next(self.states)
         state, self.limited = frame.message, frame.flags & Flags.SOFT_LIMIT
         assert isinstance(state, State)
-        dt, self.time_us, self.motor = (
-            (state.time_us - self.time_us) * 1e-6,
-            state.time_us,
-            state.motor_applied,
-        )
+        dt = (state.time_us - self.time_us) * 1e-6
+        self.time_us, self.motor = state.time_us, state.motor_applied
         return PlantOutput((state.cart_counts, state.pole_counts), (dt,), (self.motor,), (False,), (False,))
 
     def drove(self, given: int) -> int:
@@ -192,22 +202,14 @@ def test_a_hidden_page_stops_a_cart_on_a_bad_line(page: str, tmp_path: Path) -> 
     document.dispatchEvent(new Event("visibilitychange"));
     """
     shares = dict.fromkeys(("frame_loss", "frame_corruption", "frame_duplication", "frame_reordering"), 0.005)
-    with emulator(**shares) as host, bridged(page, DRIVEN + hide + ENDED, host, tmp_path) as bridge:
-        line, answered, _ = bridge.report()
-        assert line.startswith("The page was hidden")
-        check_answers(bridge, answered)
-        check_stopped(bridge, host)
+    line, _ = answer(page, DRIVEN + hide + ENDED, tmp_path, answers=True, **shares)
+    assert line.startswith("The page was hidden")
 
 
 @needs_browser
 def test_a_cart_of_another_rig_is_refused(page: str, tmp_path: Path) -> None:
     other = nominal_hardware().model_copy(update={"pole_counts_per_turn": 4000})
-    with (
-        emulator(hardware=other.model_dump()) as host,
-        bridged(page, AGREED + ENDED, host, tmp_path) as bridge,
-    ):
-        line, *_ = bridge.report()
-        check_stopped(bridge, host)
+    line, bridge = answer(page, AGREED + ENDED, tmp_path, hardware=other.model_dump())
     assert line == "This cart is not of the agent's kind; it reports pole_counts_per_turn 4000, not 4096."
     assert not written(bridge, Home)
 
@@ -215,8 +217,7 @@ def test_a_cart_of_another_rig_is_refused(page: str, tmp_path: Path) -> None:
 @needs_browser
 def test_another_version_of_the_protocol_is_refused(page: str, tmp_path: Path) -> None:
     script = f"WIRE.version = 3; WIRE.connectAttempts = 2; {AGREED}{ENDED}"
-    with emulator() as host, bridged(page, script, host, tmp_path) as bridge:
-        line, *_ = bridge.report()
+    line, _ = answer(page, script, tmp_path, stopped=False)
     assert line.startswith("No cart answers: it speaks protocol version 2, this page 3; update")
 
 
@@ -253,26 +254,18 @@ def test_trouble_ends_it_with_one_line(
 )
 def test_homing_ends_early(page: str, tmp_path: Path, event: str, words: str) -> None:
     script = f"{AGREED} await until(() => real.newest.flags & WIRE.flags.HOMING); {event} {ENDED}"
-    with emulator() as host, bridged(page, script, host, tmp_path) as bridge:
-        line, *_ = bridge.report()
-        check_stopped(bridge, host)
+    line, _ = answer(page, script, tmp_path)
     assert line.startswith(words)
 
 
 @needs_browser
 def test_a_number_that_is_not_finite_ends_it(page: str, tmp_path: Path) -> None:
     broken = "await until(() => real.answered >= 10 || real.done); LAYERS[0].bias[0] = Infinity;"
-    with emulator() as host, bridged(page, f"{DRIVEN} {broken} {ENDED}", host, tmp_path) as bridge:
-        line, answered, _ = bridge.report()
-        check_answers(bridge, answered)
-        check_stopped(bridge, host)
+    line, _ = answer(page, f"{DRIVEN} {broken} {ENDED}", tmp_path, answers=True)
     assert line == "The agent gave a number that is not finite."
 
 
 @needs_browser
 def test_it_waits_until_a_hand_holds_the_pole_up(balancing_page: str, tmp_path: Path) -> None:
-    with emulator(start="upright") as host, bridged(balancing_page, AGREED + ENDED, host, tmp_path) as bridge:
-        line, answered, _ = bridge.report()
-        check_answers(bridge, answered)
-        check_stopped(bridge, host)
+    line, _ = answer(balancing_page, AGREED + ENDED, tmp_path, answers=True, start="upright")
     assert re.match(r"The pole fell\.|The cart reached the end of its track\.", line)

@@ -119,24 +119,6 @@ def test_loss_is_that_of_the_target_computed_by_hand(double: bool) -> None:
     assert (batch.exclude("td_error") == given).all()
 
 
-def test_the_action_gap_widens_and_keeps_the_best_action() -> None:
-    """One state, two actions worth 1 and 0.9, the end: what is left is 1 and 1 - 0.1 / (1 - 0.5)."""
-    for gap, expected in ((0.0, [1.0, 0.9]), (0.5, [1.0, 0.8])):
-        agent = make_agent(actions=2, action_gap=gap, layer_norm=False)
-        optimizer = torch.optim.SGD(agent.loss.parameters(), lr=0.1)
-        batch = transitions(2)
-        batch["observation"][:] = 0.5
-        batch["action"] = torch.tensor([0, 1])
-        batch["next", "reward"] = torch.tensor([[1.0], [0.9]])
-        batch["next", "terminated"][:] = True
-        for _ in range(100):
-            optimizer.zero_grad()
-            agent.loss(batch)["loss"].backward()
-            optimizer.step()
-        values = agent.actor(batch.select("observation"))["action_value"][0]
-        assert torch.allclose(values, torch.tensor(expected), atol=0.01)
-
-
 def test_what_the_loss_cannot_do_is_refused() -> None:
     actor = QValueActor(nn.Linear(3, 4), in_keys=["observation"], spec=Binary(4), action_space="binary")
     with pytest.raises(ValueError, match="action_space=binary: give categorical or one-hot"):
@@ -149,10 +131,17 @@ def test_what_the_loss_cannot_do_is_refused() -> None:
         loss.make_value_estimator(gamma=0.9, average_rewards=True)
 
 
-@pytest.mark.parametrize("compiled", [False, True])
+RECURRENT = ({"recurrent": 8, "mirrored": True}, False, 100.0)
+
+
 @pytest.mark.parametrize(
-    ("network", "weighted", "max_norm"),
-    [({"mirrored": True}, True, 1e-2), ({"recurrent": 8, "mirrored": True}, False, 100.0)],
+    ("network", "weighted", "max_norm", "compiled"),
+    [
+        ({"mirrored": True}, True, 1e-2, False),
+        ({"mirrored": True}, True, 1e-2, True),
+        (*RECURRENT, False),
+        pytest.param(*RECURRENT, True, marks=pytest.mark.nightly),
+    ],
 )
 def test_the_gradient_is_that_of_the_loss(
     network: dict, weighted: bool, max_norm: float, compiled: bool
@@ -231,21 +220,19 @@ def test_the_greedy_policy_acts_with_the_average_of_the_weights_as_they_move() -
     assert torch.equal(flat(policy), flat(agent.greedy_policy()))
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [
+WRONG = [
+    *(
         {"target_period": 10},
         {"target_tau": None},
         {"target_tau": 0.0},
         {"target_tau": None, "target_period": 0},
-        {"gamma": 1.0},
-        {"action_gap": 1.0},
-        {"loss": "l3"},
-        {"hidden": [0]},
-        {"hidden": [15], "mirrored": True},
-        {"dropout": 0.1},
-    ],
-)
+    ),
+    *({"gamma": 1.0}, {"action_gap": 1.0}, {"loss": "l3"}, {"dropout": 0.1}),
+    *({"hidden": [0]}, {"hidden": [15], "mirrored": True}),
+]
+
+
+@pytest.mark.parametrize("wrong", WRONG)
 def test_settings_that_make_no_sense_are_refused(wrong: dict) -> None:
     with pytest.raises(ValidationError):
         AgentSettings(**{**DQN, **wrong})

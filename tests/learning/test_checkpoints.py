@@ -1,6 +1,7 @@
 """Checkpoints are written whole or not at all, and a file that is none is named in one clear line."""
 
 import errno
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -23,16 +24,15 @@ from cartpole_rl.learning.checkpoints import (
 
 AGENT = AgentCheckpoint(config={"seed": 1}, weights={"w": torch.arange(3.0)}, transitions=10, score=2.5)
 TRAINING = TrainingCheckpoint(config={"seed": 1}, state={"counters": [1, 2]}, step=10)
-LAST = Path("checkpoints/last.pt")
+LAST, RESUME = Path("checkpoints/last.pt"), Path("checkpoints/resume.pt")
 
 
-def complaint(load, path: Path) -> str:
+def check_refused(load: Callable[[Path], object], path: Path, words: str) -> None:
     with pytest.raises(CheckpointError) as caught:
         load(path)
-    text = str(caught.value)
-    assert str(path) in text
-    assert "\n" not in text
-    return text
+    assert str(path) in str(caught.value)
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
 
 
 def test_a_training_comes_back(tmp_path: Path) -> None:
@@ -61,17 +61,10 @@ def test_weights_that_are_not_finite_are_neither_written_nor_read(value: float, 
     with pytest.raises(CheckpointError, match=r"resume\.pt is not written: its weight w is not finite"):
         save_training(tmp_path, TrainingCheckpoint({}, {"agent": diverged.weights}, step=20))
     torch.save({"format": "cartpole_rl agent 1", **vars(diverged)}, tmp_path / LAST)
-    assert "is refused: its weight w is not finite" in complaint(load_agent, tmp_path / LAST)
-    torch.save(
-        {
-            "format": TRAINING_FORMAT,
-            "config": {},
-            "state": {"agent": diverged.weights},
-            "step": 20,
-        },
-        tmp_path / "checkpoints/resume.pt",
-    )
-    assert "is refused: its weight w is not finite" in complaint(load_training, tmp_path)
+    check_refused(load_agent, tmp_path / LAST, "is refused: its weight w is not finite")
+    resumed = {"format": TRAINING_FORMAT, "config": {}, "state": {"agent": diverged.weights}, "step": 20}
+    torch.save(resumed, tmp_path / RESUME)
+    check_refused(load_training, tmp_path, "is refused: its weight w is not finite")
 
 
 @pytest.mark.parametrize("content", [b"", b"hello, I am a text file\n", b"PK\x03\x04 and no more", 0.1, 0.99])
@@ -80,15 +73,15 @@ def test_a_foreign_or_truncated_file_is_named(content: bytes | float, tmp_path: 
     save_agent(path := tmp_path / "agent.pt", AGENT)
     whole = path.read_bytes()
     path.write_bytes(content if isinstance(content, bytes) else whole[: int(content * len(whole))])
-    assert "is not a checkpoint of this package, or is damaged" in complaint(load_agent, path)
+    check_refused(load_agent, path, "is not a checkpoint of this package, or is damaged")
 
 
 def test_a_torch_file_of_another_kind_is_named(tmp_path: Path) -> None:
     for content in ({"state_dict": {}}, torch.zeros(3)):
         torch.save(content, tmp_path / "other.pt")
-        assert "its format is None" in complaint(load_agent, tmp_path / "other.pt")
+        check_refused(load_agent, tmp_path / "other.pt", "its format is None")
     save_training(tmp_path, TRAINING)
-    assert "not an agent" in complaint(load_agent, tmp_path / "checkpoints/resume.pt")
+    check_refused(load_agent, tmp_path / RESUME, "not an agent")
 
 
 @pytest.mark.parametrize(
@@ -107,7 +100,7 @@ def test_a_torch_file_of_another_kind_is_named(tmp_path: Path) -> None:
 def test_an_agent_with_a_wrong_part_is_named(part: str, value: object, named: str, tmp_path: Path) -> None:
     path, parts = tmp_path / "agent.pt", {"format": AGENT_FORMAT, **vars(AGENT), part: value}
     torch.save({name: each for name, each in parts.items() if each is not ...}, path)
-    assert f"is damaged, or of another version of this package: {named}" in complaint(load_agent, path)
+    check_refused(load_agent, path, f"is damaged, or of another version of this package: {named}")
 
 
 @pytest.mark.parametrize(
@@ -120,9 +113,8 @@ def test_an_agent_with_a_wrong_part_is_named(part: str, value: object, named: st
 )
 def test_a_training_with_a_wrong_part_is_named(change: dict, named: str, tmp_path: Path) -> None:
     save_training(tmp_path, TRAINING)
-    content = {"format": TRAINING_FORMAT, **vars(TRAINING), **change}
-    torch.save(content, tmp_path / "checkpoints/resume.pt")
-    assert named in complaint(load_training, tmp_path)
+    torch.save({"format": TRAINING_FORMAT, **vars(TRAINING), **change}, tmp_path / RESUME)
+    check_refused(load_training, tmp_path, named)
 
 
 def test_a_file_that_would_run_code_is_refused(tmp_path: Path) -> None:
@@ -131,7 +123,7 @@ def test_a_file_that_would_run_code_is_refused(tmp_path: Path) -> None:
             return (Path.touch, (tmp_path / "touched",))
 
     torch.save(Malicious(), tmp_path / "malicious.pt")
-    complaint(load_agent, tmp_path / "malicious.pt")
+    check_refused(load_agent, tmp_path / "malicious.pt", "is not a checkpoint of this package")
     assert not (tmp_path / "touched").exists()
 
 
@@ -148,7 +140,7 @@ def test_a_file_left_half_written_does_no_harm(tmp_path: Path) -> None:
 @pytest.mark.parametrize("count", [2_000, 1_000_000])  # the weights are written at once, or in parts
 def test_a_checkpoint_that_cannot_be_written_leaves_the_earlier_one(count: int, tmp_path: Path) -> None:
     save_training(tmp_path, TRAINING)
-    path = tmp_path / "checkpoints/resume.pt"
+    path = tmp_path / RESUME
     larger = TrainingCheckpoint({}, {"agent": {"w": torch.zeros(count)}}, step=20)
     with files_of_at_most(4096), pytest.raises(OSError, match="File too large") as caught:
         save_training(tmp_path, larger)

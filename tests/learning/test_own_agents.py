@@ -18,6 +18,7 @@ from cartpole_rl.workflows.config import TrainConfig, load_settings
 from cartpole_rl.workflows.train import nominal_env, train
 
 MODULE = '''
+import copy
 import time
 import torch
 from torchrl.data import Categorical
@@ -33,16 +34,15 @@ class Search:
         self.best = -1.0
 
     def run(self):
-        for number in range(self.rounds):
-            kept, started = self.agent.state_dict(), time.perf_counter()
-            kept = {name: weight.clone() for name, weight in kept.items()}
+        for _ in range(self.rounds):
+            kept, started = copy.deepcopy(self.agent.state_dict()), time.perf_counter()
             with torch.no_grad():
                 for weight in self.agent.parameters():
                     weight.add_(torch.randn_like(weight))
             episodes = self.evaluate()
             score = sum(each.total(self.measure) for each in episodes) / len(episodes)
             if score <= self.best:
-                self.agent.load_state_dict(kept)
+                self.restore({"agent": kept})
             self.best = max(score, self.best)
             self.transitions += 100
             self.seconds += time.perf_counter() - started
@@ -107,6 +107,7 @@ def own_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "own_agents.py").write_text(MODULE)
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_it_is_trained_logged_and_driven(tmp_path: Path) -> None:
     run, kind = tmp_path / "run", "own_agents:Searched"
     score = train(load_settings(TrainConfig, {**TOY, "agent.kind": kind}), run)

@@ -32,6 +32,7 @@ def test_a_file_of_that_name_comes_first(tmp_path: Path, monkeypatch: pytest.Mon
     assert find_agent(Path("pretrained/medium")) == mine
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_a_pretrained_agent_drives_an_emulated_cart(tmp_path: Path) -> None:
     pytest.importorskip("mujoco", reason='mujoco is missing: pip install "cartpole_rl[emulator]"')
     words = ("run=pretrained/medium", "plant=emulated", COARSE, "episodes=1", "hydra.run.dir=run")

@@ -20,41 +20,52 @@ from cartpole_rl.randomization.ranges import IdentifiedSettings, Range
 MASS, VISCOUS = (CartParameters.names().index(name) for name in ("cart_mass", "cart_viscous"))
 
 
-def heavy_carts(ip02: dict[str, float], medium: PoleSettings, prior_share: float) -> IdentifiedCarts:
-    prior = Randomizer(ip02, medium, {"cart_mass": Range(absolute=(5.0, 6.0))})
-    table = prior.nominal.unsqueeze(1).repeat(1, 100)
-    table[MASS] = torch.linspace(0.5, 1.0, 100)
-    table[VISCOUS] = 2 * table[MASS]
-    return IdentifiedCarts(table, prior, prior_share, longest_delay=0.03)
+@pytest.fixture
+def heavy_carts(ip02: dict[str, float], medium: PoleSettings) -> Callable[..., IdentifiedCarts]:
+    """Carts with twice as much friction as mass; those of the prior have 5 to 6 kg."""
+
+    def build(prior_share: float, spoilt: float = 1.0) -> IdentifiedCarts:
+        prior = Randomizer(ip02, medium, {"cart_mass": Range(absolute=(5.0, 6.0))})
+        table = prior.nominal.unsqueeze(1).repeat(1, 100)
+        table[MASS] = torch.linspace(0.5, 1.0, 100)
+        table[VISCOUS] = 2 * table[MASS]
+        table[VISCOUS, 7] *= spoilt
+        return IdentifiedCarts(table, prior, prior_share, longest_delay=0.03)
+
+    return build
 
 
-def test_rows_stay_together(ip02: dict[str, float], medium: PoleSettings) -> None:
-    drawn = heavy_carts(ip02, medium, 0.0).draw(500, torch.Generator().manual_seed(0))
+def test_rows_stay_together(heavy_carts: Callable) -> None:
+    drawn = heavy_carts(0.0).draw(500, torch.Generator().manual_seed(0))
     assert torch.equal(drawn[VISCOUS], 2 * drawn[MASS])
     assert len(drawn[MASS].unique()) > 50
 
 
-def test_a_number_that_is_not_finite_is_refused(ip02: dict[str, float], medium: PoleSettings) -> None:
-    prior = Randomizer(ip02, medium, {})
-    table = prior.nominal.unsqueeze(1).repeat(1, 100)
-    table[VISCOUS, 7] = float("nan")
+def test_a_number_that_is_not_finite_is_refused(heavy_carts: Callable) -> None:
     with pytest.raises(ConfigError, match="cart_viscous is not finite"):
-        IdentifiedCarts(table, prior, 0.0, longest_delay=0.03)
+        heavy_carts(0.0, spoilt=float("nan"))
 
 
-def test_the_share_of_the_prior(ip02: dict[str, float], medium: PoleSettings) -> None:
-    drawn = heavy_carts(ip02, medium, 0.2).draw(5000, torch.Generator().manual_seed(0))
+def test_the_share_of_the_prior(heavy_carts: Callable) -> None:
+    drawn = heavy_carts(0.2).draw(5000, torch.Generator().manual_seed(0))
     assert 0.17 < (drawn[MASS] >= 5).float().mean() < 0.23
 
 
 def test_a_plant_goes_on_with_other_carts(
-    ip02: dict[str, float], medium: PoleSettings, make_plant: Callable[..., SimulatedPlant]
+    heavy_carts: Callable, make_plant: Callable[..., SimulatedPlant]
 ) -> None:
     plant = make_plant(8)
-    plant.replace_randomizer(heavy_carts(ip02, medium, 0.0))
+    plant.replace_randomizer(heavy_carts(0.0))
     plant.reset()
     assert torch.equal(plant.parameters.cart_viscous, 2 * plant.parameters.cart_mass)
-    assert heavy_carts(ip02, medium, 0.0).longest_delay() == 0.03
+    assert heavy_carts(0.0).longest_delay() == 0.03
+
+
+def identified(folder: Path, **columns: list[float]) -> IdentifiedSettings:
+    """The posterior of an identification, as a file."""
+    names, posterior = list(columns), folder / "posterior.npz"
+    np.savez(posterior, names=names, carts=np.array([*columns.values()]), identified=names)
+    return IdentifiedSettings(posterior=posterior, widen=1.0, prior_share=0.0, ranges={})
 
 
 @pytest.mark.parametrize(
@@ -64,11 +75,7 @@ def test_the_identified_cart_carries_the_given_pole(
     pole: str, masses: set[float], ip02: dict[str, float], tmp_path: Path
 ) -> None:
     """The identified pole, if the given one is about the same, and else the given one."""
-    carts = {"cart_mass": [0.9, 1.0], "pole_mass": [0.12, 0.13], "pole_com": [0.18] * 2}
-    posterior = tmp_path / "posterior.npz"
-    names = list(carts)
-    np.savez(posterior, names=names, carts=np.array([carts[name] for name in names]), identified=names)
-    settings = IdentifiedSettings(posterior=posterior, widen=1.0, prior_share=0.0, ranges={})
+    settings = identified(tmp_path, cart_mass=[0.9, 1.0], pole_mass=[0.12, 0.13], pole_com=[0.18] * 2)
     poles = PoleSettings(**group_choices("pole")[pole])
     drawn = identified_carts(settings, ip02, poles).draw(100, torch.Generator().manual_seed(0))
     pole_mass = drawn[CartParameters.names().index("pole_mass")]
@@ -137,14 +144,10 @@ HARMS: dict[str, Callable[[bytes], bytes]] = {
 def test_a_damaged_posterior_is_refused_in_one_line(
     harm: str, ip02: dict[str, float], medium: PoleSettings, tmp_path: Path
 ) -> None:
-    posterior = tmp_path / "posterior.npz"
-    np.savez(posterior, names=["cart_mass"], carts=np.array([[0.9, 1.0]]), identified=["cart_mass"])
-    settings = IdentifiedSettings(posterior=posterior, widen=1.0, prior_share=0.0, ranges={})
+    settings, posterior = identified(tmp_path, cart_mass=[0.9, 1.0]), tmp_path / "posterior.npz"
     assert identified_carts(settings, ip02, medium)
     posterior.write_bytes(HARMS[harm](posterior.read_bytes()))
-    with pytest.raises(
-        ConfigError, match=r"cannot be read: .*; copy it again, or run cartpole-identify"
-    ) as raised:
+    with pytest.raises(ConfigError, match=r"cannot be read: .*; copy it again, or run cartp") as raised:
         identified_carts(settings, ip02, medium)
     assert str(raised.value).startswith(f"randomization.posterior={posterior}")
     assert "\n" not in str(raised.value)

@@ -1,6 +1,7 @@
 """Drawn carts: inside their bounds, distributed as said, poles whole; what cannot be drawn is refused."""
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -24,6 +25,7 @@ from cartpole_rl.randomization.randomizer import POLE_FIELDS, Randomizer
 from cartpole_rl.randomization.ranges import Range
 
 COUNT = 20_000
+Of = Callable[..., Randomizer]
 POINT = Pole(pole_mass=0.1, pole_com=0.3, pole_inertia=0.0)
 TENTH = {"relative": (-0.1, 0.1)}
 NORMAL = {"absolute": (0, 1), "distribution": "truncated_normal"}
@@ -43,14 +45,18 @@ def draw(randomizer: Randomizer, seed: int = 0, count: int = COUNT) -> CartParam
     return CartParameters(randomizer.draw(count, torch.Generator().manual_seed(seed)))
 
 
+@pytest.fixture(scope="module")
+def of(ip02: dict[str, float], medium: PoleSettings) -> Callable[..., Randomizer]:
+    """Randomizers of the nominal cart with the medium pole, of other `poles` or another `cart`."""
+    return lambda lines, poles=medium, **cart: Randomizer({**ip02, **cart}, poles, lines)
+
+
 def farthest_from_uniform(values: Tensor) -> float:
     """Kolmogorov-Smirnov distance between the values and the uniform distribution on [0, 1]."""
     return (values.double().sort().values - torch.linspace(0, 1, len(values)).double()).abs().max().item()
 
 
-@pytest.mark.parametrize(
-    ("distribution", "warp"), [("uniform", float), ("log_uniform", math.log), ("squared", None)]
-)
+@pytest.mark.parametrize("distribution", ["uniform", "log_uniform", "squared"])
 @pytest.mark.parametrize(
     ("bounds", "limits"),
     [
@@ -60,11 +66,9 @@ def farthest_from_uniform(values: Tensor) -> float:
     ],
 )
 def test_draws_are_within_bounds_and_distributed_as_specified(
-    ip02: dict[str, float], medium: PoleSettings, bounds: dict, limits: Any, distribution: str, warp: Any
+    of: Of, bounds: dict, limits: Any, distribution: str
 ) -> None:
-    assert ip02["cart_coulomb"] == 0.5
-    line = Range(distribution=distribution, **bounds)
-    values = draw(Randomizer(ip02, medium, {"cart_coulomb": line})).cart_coulomb.double()
+    values = draw(of({"cart_coulomb": Range(distribution=distribution, **bounds)})).cart_coulomb.double()
     assert values.min() > limits[0] - 1e-6
     assert values.max() < limits[1] + 1e-6
     if distribution == "log_uniform":
@@ -87,12 +91,10 @@ SHAPED: dict[str, tuple[dict[str, Any], Any]] = {  # a line for cart_coulomb, 0.
 
 
 @pytest.mark.parametrize("case", SHAPED)
-def test_shaped_distributions_are_those_of_scipy(
-    case: str, ip02: dict[str, float], medium: PoleSettings
-) -> None:
+def test_shaped_distributions_are_those_of_scipy(case: str, of: Of) -> None:
     settings, expected = SHAPED[case]
     line = Range(distribution=case.split(",")[0], **settings)
-    values = draw(Randomizer(ip02, medium, {"cart_coulomb": line})).cart_coulomb.double()
+    values = draw(of({"cart_coulomb": line})).cart_coulomb.double()
     low, high = (limit * (0.5 if line.scales_nominal else 1) for limit in line.limits())
     assert low - 1e-6 < values.min()
     assert values.max() < high + 1e-6
@@ -102,15 +104,13 @@ def test_shaped_distributions_are_those_of_scipy(
     assert Range.model_validate_json(line.model_dump_json()) == line
 
 
-def test_values_and_lines_have_the_shares_of_their_weights(
-    ip02: dict[str, float], medium: PoleSettings
-) -> None:
+def test_values_and_lines_have_the_shares_of_their_weights(of: Of, ip02: dict[str, float]) -> None:
     lines = {
         "latency": Range(distribution="discrete", absolute=(0.02, 0.0, 0.01), weights=(1, 2, 5)),
         "cart_mass": Range(distribution="discrete", relative=(-0.1, 0.1, 0.2)),
         "cart_viscous": Range(mixture=({"factor": (0.5, 1)}, {"factor": (2, 3)}), weights=(3, 1)),
     }
-    carts = draw(Randomizer(ip02, medium, lines))
+    carts = draw(of(lines))
     shares = [(carts.latency == value).float().mean() for value in torch.tensor([0.02, 0.0, 0.01])]
     assert shares == pytest.approx([0.125, 0.25, 0.625], abs=0.02)
     ratios, counts = (carts.cart_mass / ip02["cart_mass"]).unique(return_counts=True)
@@ -122,14 +122,14 @@ def test_values_and_lines_have_the_shares_of_their_weights(
     assert farthest_from_uniform(2 * ratio[ratio < 1.5] - 1) < 0.015
 
 
-def test_lines_are_correlated_as_said(ip02: dict[str, float], medium: PoleSettings) -> None:
+def test_lines_are_correlated_as_said(of: Of, ip02: dict[str, float]) -> None:
     """Each keeps its own distribution; the third is independent of both."""
     lines = {
         "cart_mass": Range(**TENTH),
         "cart_viscous": Range(factor=(0.5, 2), distribution="log_uniform", correlation={"cart_mass": -0.8}),
         "pole_mass": Range(**TENTH),
     }
-    randomizer = Randomizer(ip02, medium, lines)
+    randomizer = of(lines)
     carts = draw(randomizer)
     shares = torch.stack(
         [
@@ -146,7 +146,7 @@ def test_lines_are_correlated_as_said(ip02: dict[str, float], medium: PoleSettin
     assert (low != high).any(1).tolist() == [name == "cart_viscous" for name in CartParameters.names()]
 
 
-def test_correlations_that_no_carts_have_are_refused(ip02: dict[str, float], medium: PoleSettings) -> None:
+def test_correlations_that_no_carts_have_are_refused(of: Of) -> None:
     others = {"cart_viscous": 0.9, "pole_mass": 0.9}
     lines = {
         "cart_mass": Range(**TENTH, correlation=others),
@@ -154,9 +154,9 @@ def test_correlations_that_no_carts_have_are_refused(ip02: dict[str, float], med
         "pole_mass": Range(**TENTH),
     }
     with pytest.raises(ConfigError, match="contradict each other"):
-        Randomizer(ip02, medium, lines)
+        of(lines)
     with pytest.raises(ConfigError, match="cart_mass: correlation takes other randomized parameters"):
-        Randomizer(ip02, medium, {"cart_mass": lines["cart_mass"]})
+        of({"cart_mass": lines["cart_mass"]})
 
 
 def test_parameters_without_a_range_are_nominal_or_have_their_default(
@@ -169,17 +169,8 @@ def test_parameters_without_a_range_are_nominal_or_have_their_default(
             torch.testing.assert_close(getattr(carts, name), torch.full((10,), float(value)))
 
 
-def test_lines_are_independent_and_the_generator_decides(
-    ip02: dict[str, float], medium: PoleSettings
-) -> None:
-    lines = {
-        "cart_mass": Range(relative=(-0.2, 0.2)),
-        "cart_viscous": Range(distribution="log_uniform", factor=(0.5, 2)),
-        "pole_mass": Range(**TENTH),
-    }
-    randomizer = Randomizer(ip02, medium, lines)
-    values = torch.stack([getattr(draw(randomizer), name) for name in lines])
-    assert (torch.corrcoef(values) - torch.eye(3)).abs().max() < 0.03
+def test_the_generator_decides(of: Of) -> None:
+    randomizer = of({"cart_mass": Range(**TENTH)})
     assert (draw(randomizer, 1).table == draw(randomizer, 1).table).all()
     assert (draw(randomizer, 1).cart_mass != draw(randomizer, 2).cart_mass).any()
 
@@ -190,10 +181,7 @@ def test_lines_are_independent_and_the_generator_decides(
         ({}, "exactly one of absolute, relative, factor"),
         ({"absolute": (0, 1), "factor": (0, 1)}, "exactly one of absolute, relative, factor"),
         ({"relative": (0.2, -0.2)}, "wrong order"),
-        (
-            {"absolute": (0, 1), "distribution": "gauss"},
-            "'uniform', 'log_uniform'.* your own as module:name",
-        ),
+        ({"absolute": (0, 1), "distribution": "gauss"}, "'uniform', 'log_uniform'.* your own as module:n"),
         ({"absolute": (0, 1), "spread": 2}, "spread: there is no such setting; uniform takes bounds"),
         ({**NORMAL, "sdt": 2}, "sdt: there is no such setting; truncated_normal takes bounds, mean, std"),
         ({**NORMAL, "std": 0}, "std=0: give more than 0"),
@@ -237,29 +225,21 @@ NEEDS_NOMINAL = "relative and factor bounds need a nominal value"
         ({}, {}, "track_tilt", TENTH, f"track_tilt: {NEEDS_NOMINAL}"),
         ({}, {}, "latency_jitter", {"factor": (0.5, 2.0)}, f"latency_jitter: {NEEDS_NOMINAL}"),
         ({}, {"point": POINT}, "pole_inertia", TENTH, f"pole_inertia: {NEEDS_NOMINAL}"),  # for one pole
-        (
-            {},
-            {},
-            "pole_viscous",
-            {"absolute": (0.0, 0.1), "distribution": "log_uniform"},
-            "pole_viscous: log_uniform needs bounds above 0",
-        ),
+        ({}, {}, "latency", {"absolute": (0, 0.1), "distribution": "log_uniform"}, "needs bounds above 0"),
         ({}, {}, "latency", {"absolute": (0, 0.1), "distribution": "beyond"}, "beyond leaves its bounds"),
     ],
 )
 def test_carts_that_cannot_be_drawn_are_refused(
-    ip02: dict[str, float], medium: PoleSettings, cart: dict, poles: dict, name: str, line: dict, reason: str
+    of: Of, medium: PoleSettings, cart: dict, poles: dict, name: str, line: dict, reason: str
 ) -> None:
     choices = PoleSettings(choices={**(medium.choices or {}), **poles})
     with pytest.raises(ConfigError, match=reason):
-        Randomizer({**ip02, **cart}, choices, {name: Range(**line)} if name else {})
+        of({name: Range(**line)} if name else {}, choices, **cart)
 
 
 class TestPoles:
-    def test_a_choice_sets_mass_centre_and_inertia_together(
-        self, ip02: dict[str, float], both_poles: PoleSettings
-    ) -> None:
-        carts = draw(Randomizer(ip02, both_poles, {}))
+    def test_a_choice_sets_mass_centre_and_inertia_together(self, of: Of, both_poles: PoleSettings) -> None:
+        carts = draw(of({}, both_poles))
         drawn = torch.stack([getattr(carts, name) for name in POLE_FIELDS], 1)
         shares = [
             torch.isclose(drawn, torch.tensor(list(pole.model_dump().values()))).all(1).double().mean().item()
@@ -268,8 +248,8 @@ class TestPoles:
         assert shares == pytest.approx([0.5, 0.5], abs=0.02)
         assert sum(shares) == 1
 
-    def test_a_length_gives_a_consistent_rod(self, ip02: dict[str, float]) -> None:
-        carts = draw(Randomizer(ip02, PoleSettings(lengths=(0.2, 1.0)), {}))
+    def test_a_length_gives_a_consistent_rod(self, of: Of) -> None:
+        carts = draw(of({}, PoleSettings(lengths=(0.2, 1.0))))
         length = carts.pole_length
         assert length.min() >= 0.2
         assert length.max() < 1.0
@@ -278,10 +258,8 @@ class TestPoles:
         torch.testing.assert_close(carts.pivot_inertia, carts.pole_mass * length**2 / 3)
         assert Pole.rod(0.6) == Pole(**uniform_rod(0.6))
 
-    def test_scaling_is_about_the_pole_that_was_drawn(
-        self, ip02: dict[str, float], both_poles: PoleSettings
-    ) -> None:
-        carts = draw(Randomizer(ip02, both_poles, {"pole_mass": Range(**TENTH)}))
+    def test_scaling_is_about_the_pole_that_was_drawn(self, of: Of, both_poles: PoleSettings) -> None:
+        carts = draw(of({"pole_mass": Range(**TENTH)}, both_poles))
         large = carts.pole_com > 0.25
         for rows, nominal in ((~large, 0.127), (large, 0.23)):
             ratio = carts.pole_mass[rows] / nominal
@@ -305,9 +283,9 @@ class TestPoles:
         with pytest.raises(ConfigError, match="an identification takes one pole, not"):
             check_one_pole("an identification", both_poles)
 
-    def test_poles_in_turn_repeat_cyclically(self, ip02: dict[str, float]) -> None:
+    def test_poles_in_turn_repeat_cyclically(self, of: Of) -> None:
         poles = PoleSettings(choices={"short": Pole.rod(0.3), "long": Pole.rod(0.8)}, in_turn=True)
-        lengths = draw(Randomizer(ip02, poles, {}), count=5).pole_length
+        lengths = draw(of({}, poles), count=5).pole_length
         assert lengths.tolist() == pytest.approx([0.3, 0.8, 0.3, 0.8, 0.3])
 
     @pytest.mark.parametrize(
@@ -326,15 +304,21 @@ class TestPoles:
             PoleSettings(**settings)
 
 
-def test_what_needs_simulating(ip02: dict[str, float], medium: PoleSettings) -> None:
-    def longest(**ranges: Range) -> float:
-        return Randomizer({**ip02, "latency_jitter": 0.002}, medium, ranges).longest_delay()
+@pytest.mark.parametrize(
+    ("lines", "delay"),
+    [
+        ({}, 0.007),
+        ({"latency": Range(absolute=(0.0, 0.03))}, 0.032),
+        ({"latency": Range(relative=(-0.5, 0.5))}, 0.0095),
+        ({"latency_jitter": Range(factor=(1, 3))}, 0.011),
+    ],
+)
+def test_the_longest_delay(of: Of, lines: dict[str, Range], delay: float) -> None:
+    assert of(lines, latency_jitter=0.002).longest_delay() == pytest.approx(delay)
 
-    assert longest() == pytest.approx(0.007)
-    assert longest(latency=Range(absolute=(0.0, 0.03))) == pytest.approx(0.032)
-    assert longest(latency=Range(relative=(-0.5, 0.5))) == pytest.approx(0.0095)
-    assert longest(latency_jitter=Range(factor=(1, 3))) == pytest.approx(0.011)
-    randomizer = Randomizer(ip02, medium, {"angle_noise": Range(absolute=(0.0, 0.01))})
+
+def test_what_needs_simulating(of: Of) -> None:
+    randomizer = of({"angle_noise": Range(absolute=(0.0, 0.01))})
     assert randomizer.can_differ_from_zero("angle_noise")
     assert randomizer.can_differ_from_zero("cart_mass")
     assert not randomizer.can_differ_from_zero("position_noise")

@@ -3,7 +3,6 @@
 Tk ends its process when the display goes away, so this is no part of a test's own process.
 """
 
-import sys
 import warnings
 
 import gymnasium
@@ -16,12 +15,12 @@ from cartpole_rl.envs.rendering import tiled
 SWING_UP = "cartpole_rl/SwingUp-v0"
 
 
-def check_both_modes(name: str) -> None:
-    """Let Gymnasium check the environment with every render mode."""
+def check_both_modes() -> None:
+    """Let Gymnasium check an environment with every render mode."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warnings.filterwarnings("ignore", message=".*infinity.*")  # a measured state has no bounds
-        check_env(gymnasium.make(name, render_mode="rgb_array").unwrapped)
+        check_env(gymnasium.make(SWING_UP, render_mode="rgb_array").unwrapped)
 
 
 def check_a_window_that_the_user_closes() -> None:
@@ -49,8 +48,7 @@ def check_a_window_that_the_environment_closes() -> None:
 
 
 if __name__ == "__main__":
-    for each in sys.argv[1:]:
-        check_both_modes(each)
+    check_both_modes()
     check_a_window_that_the_user_closes()
     check_a_window_that_the_environment_closes()
     print("all windows are right")

@@ -1,5 +1,6 @@
 """Operations of PyTorch that can be written as plain arithmetic, and numbers that are awkward for them."""
 
+import itertools
 import math
 from collections.abc import Callable
 
@@ -7,6 +8,7 @@ import torch
 from torch import Tensor
 
 AWKWARD = (0.0, -0.0, 0.5, -0.5, 1.5, 2.5, 1.0, -1.0, math.nan, math.inf, -math.inf, 1e300, -1e300, 710.0)
+PAIRS = list(itertools.product((*AWKWARD, 0.3, -7.4, 3.0), repeat=2))
 
 OPERATIONS: tuple[Callable[[Tensor, Tensor], Tensor], ...] = (
     lambda a, b: a + 2 * b - 1,

@@ -1,0 +1,16 @@
+"""Courses of many simulated carts under random actions."""
+
+import torch
+from tensordict import TensorDictBase
+from torchrl.envs import EnvBase
+
+
+def course(env: EnvBase, steps: int, motors: int = 3) -> list[tuple[TensorDictBase, TensorDictBase]]:
+    """Transitions and what follows them, after resets, under actions that are the same each time."""
+    generator = torch.Generator().manual_seed(0)
+    present, results = env.reset(), []
+    for _ in range(steps):
+        present["action"] = torch.randint(motors, env.batch_size, generator=generator)
+        transition, present = env.step_and_maybe_reset(present)
+        results.append((transition.clone(recurse=False), present.clone(recurse=False)))  # the same tensors
+    return results
