@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
-from typing import Protocol
+from typing import NamedTuple
 
 import matplotlib
 import numpy as np
@@ -48,28 +48,14 @@ Colour = tuple[int, int, int]
 Draw = ImageDraw.ImageDraw
 
 
-class Course(Protocol):
-    """The part of an episode of T control periods that is drawn; a `tasks.episode.Episode` is one."""
+class Course(NamedTuple):
+    """The part of an episode of T control periods that is drawn."""
 
-    @property
-    def time(self) -> NDArray[np.float64]:
-        """[T+1] s."""
-
-    @property
-    def x(self) -> NDArray[np.float64]:
-        """[T+1] m."""
-
-    @property
-    def theta(self) -> NDArray[np.float64]:
-        """[T+1] rad."""
-
-    @property
-    def motor(self) -> NDArray[np.int64]:
-        """[T] or [T+1] motor value drawn at each row; 0 at the last row if it is missing."""
-
-    @property
-    def score(self) -> NDArray[np.float64]:
-        """[T] equation (6.2) of each step."""
+    time: NDArray[np.float64]  # [T+1] s
+    x: NDArray[np.float64]  # [T+1] m
+    theta: NDArray[np.float64]  # [T+1] rad
+    motor: NDArray[np.int64]  # [T] or [T+1] drawn at each row; 0 at the last row if it is missing
+    score: NDArray[np.float64]  # [T] equation (6.2) of each step
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import ImageDraw
 
-from cartpole_rl.drawing.cart import FINER, CartDrawing
+from cartpole_rl.drawing.cart import FINER, CartDrawing, Course
 from cartpole_rl.drawing.window import Window
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.plants.specs import Plant
@@ -33,20 +33,13 @@ class EpisodeSoFar:
 
     def picture(self, pole_length: float, track_half_length: float, period: float, steps: int) -> Picture:
         """Return the newest state; lengths in m, the time bar spans `steps` periods of `period` s."""
-        course = Course(self, period)
+        time = np.linspace(0.0, period * (len(self.xs) - 1), len(self.xs))
+        motion = np.array(self.xs), np.array(self.thetas), np.array(self.motors)
+        course = Course(time, *motion, np.array(self.scores[1:]))
         drawing = CartDrawing.of(course, pole_length, track_half_length, duration=steps * period)
         canvas = drawing.background("")
         drawing.draw(ImageDraw.Draw(canvas), len(self.xs) - 1)
         return np.asarray(canvas.reduce(FINER))
-
-
-class Course:
-    """An `EpisodeSoFar` as arrays, as `CartDrawing` reads them."""
-
-    def __init__(self, episode: EpisodeSoFar, period: float) -> None:
-        self.time = np.linspace(0.0, period * (len(episode.xs) - 1), len(episode.xs))
-        self.x, self.theta = np.array(episode.xs), np.array(episode.thetas)
-        self.motor, self.score = np.array(episode.motors), np.array(episode.scores[1:])
 
 
 class Renderer:

@@ -12,7 +12,6 @@ from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from multiprocessing.connection import Connection
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -77,9 +76,7 @@ class Driver:
         context = multiprocessing.get_context("spawn")
         self._ours, theirs = context.Pipe()
         self._process = context.Process(
-            target=_serve,
-            args=(theirs, make_env, make_policy, real_time, os.getpid()),
-            daemon=True,
+            target=_serve, args=(theirs, make_env, make_policy, real_time, os.getpid()), daemon=True
         )
         self._process.start()
         theirs.close()
@@ -118,9 +115,7 @@ class Driver:
     def __enter__(self) -> "Driver":
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _receive(self) -> Any:
@@ -150,11 +145,7 @@ class _Ended(BaseException):
 
 
 def _serve(
-    pipe: Connection,
-    make_env: MakeEnv,
-    make_policy: Callable[[], nn.Module],
-    real_time: bool,
-    parent: int,
+    pipe: Connection, make_env: MakeEnv, make_policy: Callable[[], nn.Module], real_time: bool, parent: int
 ) -> None:
     endings = ending_signals()
     RaiseOnce(_Ended).handle(*endings)
@@ -172,11 +163,7 @@ def _serve(
 
 
 def _drive_on_demand(
-    pipe: Connection,
-    make_env: MakeEnv,
-    policy: DrivingPolicy,
-    real_time: bool,
-    parent: int,
+    pipe: Connection, make_env: MakeEnv, policy: DrivingPolicy, real_time: bool, parent: int
 ) -> None:
     """Drive an episode for each `EpisodeRequest` in the pipe, until it is closed."""
     with closing(make_env(partial(_ask, pipe))) as env:

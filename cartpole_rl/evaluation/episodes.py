@@ -224,8 +224,7 @@ def run_many(env: CartPoleEnv, policy: Policy, knocks: Knocks | None = None) -> 
     arrays = {key: values.cpu().numpy() for key, values in columns.items()}
     return [
         replace(
-            _episode({key: values[row] for key, values in arrays.items()}, ending, env),
-            origin=origins[row],
+            _episode({key: values[row] for key, values in arrays.items()}, ending, env), origin=origins[row]
         )
         for row, ending in enumerate(endings)
         if ending

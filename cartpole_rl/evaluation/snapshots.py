@@ -94,22 +94,9 @@ class Publisher:
         self._score += score
         self._written += 1
         statistics = self._statistics
-        x, x_dot, theta, theta_dot = percept.state
-        snapshot = Snapshot(
-            self._episode,
-            step,
-            motor,
-            guard,
-            statistics.late_ticks,
-            statistics.lost_frames,
-            x,
-            x_dot,
-            theta,
-            theta_dot,
-            self._score,
-            self._track_half_length,
-        )
-        write(self._memory, self._written, snapshot)
+        present = self._episode, step, motor, guard, statistics.late_ticks, statistics.lost_frames
+        snapshot = (*present, *percept.state, self._score, self._track_half_length)
+        write(self._memory, self._written, Snapshot._make(snapshot))
 
 
 class RowPublisher:
@@ -134,23 +121,10 @@ class RowPublisher:
             return
         self._score += float(cart["score"])
         self._written += 1
-        motor = self._env.hardware.sent_motors(cart["action"].reshape(1), cart["guard"])
-        x, x_dot, theta, theta_dot = cart["state"].tolist()
-        snapshot = Snapshot(
-            self._episode,
-            step,
-            int(motor),
-            int(cart["guard"]),
-            0,
-            0,
-            x,
-            x_dot,
-            theta,
-            theta_dot,
-            self._score,
-            float(plant.track_half_length[self._row]),
-        )
-        write(self._memory, self._written, snapshot)
+        motor = int(self._env.hardware.sent_motors(cart["action"].reshape(1), cart["guard"]))
+        present, track = (self._episode, step, motor, int(cart["guard"])), plant.track_half_length[self._row]
+        snapshot = (*present, 0, 0, *cart["state"].tolist(), self._score, float(track))
+        write(self._memory, self._written, Snapshot._make(snapshot))
         self._ended = bool(cart["next", "done"])
         self._due = max(self._due + plant.period, time.monotonic() - plant.period)
         time.sleep(max(0.0, self._due - time.monotonic()))

@@ -32,14 +32,7 @@ from cartpole_rl.errors import CheckpointError, ConfigError
 from cartpole_rl.randomization.poles import possible_poles
 from cartpole_rl.rig.hardware import nominal_encoders
 from cartpole_rl.settings import Count, Finite, Positive, Settings
-from cartpole_rl.tasks.features import (
-    LENGTH_SCALE,
-    MOTOR_SCALE,
-    THETA_DOT,
-    X_DOT,
-    ObservationKind,
-    Quantity,
-)
+from cartpole_rl.tasks.features import LENGTH_SCALE, MOTOR_SCALE, THETA_DOT, X_DOT, ObservationKind, Quantity
 from cartpole_rl.tasks.settings import MotorValue, Start
 
 FORMAT: Literal["cartpole_rl weights 1"] = "cartpole_rl weights 1"

@@ -132,13 +132,7 @@ class Ensemble:
     def refresh(self, rounds: int, update: int) -> None:
         """Match the initial states again, and keep each member that beats its best loss so far."""
         self.initial = match_initial_states(
-            self.dynamics,
-            self.positions,
-            self.motors,
-            self.scale,
-            self.residual,
-            self.initial.motion,
-            rounds,
+            self.dynamics, self.positions, self.motors, self.scale, self.residual, self.initial.motion, rounds
         )
         with torch.no_grad():
             error = huber(self.residuals()).mean(-1)

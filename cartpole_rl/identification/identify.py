@@ -10,14 +10,7 @@ from numpy.typing import NDArray
 from cartpole_rl.errors import RecordingError
 from cartpole_rl.identification.checks import check_explained
 from cartpole_rl.identification.fit import Fit, fit_cart
-from cartpole_rl.identification.prediction import (
-    LEAD,
-    Prediction,
-    Replayed,
-    away_from_upright,
-    is_away,
-    predict,
-)
+from cartpole_rl.identification.prediction import LEAD, Replayed, is_away, predict
 from cartpole_rl.identification.rollout import Dynamics
 from cartpole_rl.identification.unknowns import WEIGHED, limits
 from cartpole_rl.identification.windows import Windows, cut_judging, cut_windows, lead_periods
@@ -123,7 +116,10 @@ def judged(found: Found, fitted: Mapping[str, Episode], held_out: Mapping[str, E
         *early_endings([*fitted.values(), *held_out.values()]),
         *warnings(found.fit, next(iter(fitted.values())).encoders),
     ]
-    return Identification(*found, explained, replays, prediction_error(replays), doubts)
+    motion = zip(*((each.x_error, each.theta_error, each.theta) for each in replays), strict=True)
+    x_error, theta_error, theta = map(np.concatenate, motion)
+    error = median_error(x_error, theta_error, theta, np.isfinite(x_error).all(1))
+    return Identification(*found, explained, replays, error, doubts)
 
 
 def find_cart(
@@ -167,7 +163,10 @@ def find_cart(
             on_step=on_step,
         )
         dynamics = Dynamics.of(fit.parameters, under, period, steps, half_step)
-        return Candidate(fit, dynamics, judged_error(predict(judging, dynamics)))
+        simulated, error, _ = predict(judging, dynamics)
+        x_error, theta_error = error.transpose(1, 2, 0)
+        every = np.full(judging.number, True)  # also one that is not finite, which no cart may cause
+        return Candidate(fit, dynamics, median_error(x_error, theta_error, simulated[:, 1].T, every))
 
     frictions = dict.fromkeys([*(each for each in CART_FRICTIONS.loaded() if each.candidate), *laws])
     first = attempt(models.cart_friction, most // 3, COARSE_STEPS)
@@ -192,28 +191,17 @@ def find_cart(
     return Found(widened(whole.fit, best, [*contenders.values()]), whole.dynamics, candidates)
 
 
-def prediction_error(replays: Sequence[Replayed]) -> PredictionError:
-    """Return the RMS errors over a stretch: the medians of the complete stretches away from upright."""
-    x = np.concatenate([each.x_error for each in replays])
-    theta = np.concatenate([each.theta_error for each in replays])
-    whole = np.isfinite(x).all(1)
-    return median_error(x, theta, np.concatenate([away_from_upright(each) for each in replays]), whole)
-
-
-def judged_error(prediction: Prediction) -> PredictionError:
-    """Return the same of predicted windows."""
-    x, theta = prediction.error.transpose(1, 2, 0)
-    away = is_away((prediction.simulated[:, 1] - prediction.error[:, 1]).T)
-    return median_error(x, theta, away, np.full(len(x), True))
-
-
 def median_error(
-    x: Array, theta: Array, away: NDArray[np.bool_], whole: NDArray[np.bool_]
+    x_error: Array, theta_error: Array, theta: Array, whole: NDArray[np.bool_]
 ) -> PredictionError:
-    """Return the medians of the RMS errors of stretches, [S, T + 1], that are `away`; if none is, `whole`."""
+    """Return the medians of the RMS errors of stretches, [S, T + 1], that are `whole` and away from upright.
+
+    If none is, those that are `whole` count. `theta` is simulated.
+    """
+    away = whole & is_away(theta - theta_error)
     kept = away if away.any() else whole
-    x_error, theta_error = (float(np.median(np.sqrt((each[kept] ** 2).mean(1)))) for each in (x, theta))
-    return PredictionError(x_error, theta_error)
+    sizes = (np.sqrt((each[kept] ** 2).mean(1)) for each in (x_error, theta_error))
+    return PredictionError(*(float(np.median(each)) for each in sizes))
 
 
 def early_endings(episodes: Sequence[Episode]) -> list[str]:

@@ -97,11 +97,7 @@ class Samples:
         """Return the terms [K, 3] of the pole's acceleration: gravity, the cart, friction."""
         theta = scale * (self._theta - zero)
         return np.stack(
-            (
-                self.smooth(np.sin(theta)),
-                -self.x_ddot * self.smooth(np.cos(theta)),
-                -scale * self.theta_dot,
-            ),
+            (self.smooth(np.sin(theta)), -self.x_ddot * self.smooth(np.cos(theta)), -scale * self.theta_dot),
             1,
         )
 

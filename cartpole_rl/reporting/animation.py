@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageDraw, ImageSequence
 
-from cartpole_rl.drawing.cart import FINER, SIZE, CartDrawing, palette
+from cartpole_rl.drawing.cart import FINER, SIZE, CartDrawing, Course, palette
 from cartpole_rl.files import replacing
 from cartpole_rl.reporting.texts import ending_text
 from cartpole_rl.tasks.episode import Ending, Episode
@@ -65,7 +65,8 @@ def drawn(
 ) -> CartDrawing:
     """Return the drawing of an episode; its time bar spans `duration` s, or the episode."""
     ending = "" if episode.ended_by == Ending.TIME else ending_text(episode)
-    return CartDrawing.of(episode, pole_length, track_half_length, duration, ending)
+    course = Course(episode.time, episode.x, episode.theta, episode.motor, episode.score)
+    return CartDrawing.of(course, pole_length, track_half_length, duration, ending)
 
 
 def picture(drawing: CartDrawing, background: Image.Image, row: int) -> Image.Image:

@@ -85,7 +85,7 @@ def dots(results: Results) -> Drawing:
     good, label = GOOD.get(measure), measure_label(measure)
     values = [value for agent in results.agents for value in agent.values.values()]
     guided = good is not None and min(values) < good < max(values)
-    figure = dot_rows(shown, label, {f"good: {good:g}": good} if good and guided else None)
+    figure = dot_rows(shown, label, {f"good: {good:g}": good} if good and guided else {})
     better = " Lower is better." if low_is_good(measure) else ""
     alt = described(shown, label, partial(value_text, measure=measure), results.unit)
     fullest = max(values.size for group in shown.values() for values in group.values())
@@ -257,7 +257,7 @@ def finish(axes: Axes, colours: Mapping[str, str], x: str, y: str | None = None)
     style.label(axes, *lines)
 
 
-def dot_rows(groups: Groups, measure: str, guides: Mapping[str, float] | None = None) -> Figure:
+def dot_rows(groups: Groups, measure: str, guides: Mapping[str, float]) -> Figure:
     """Draw the values of each group's series as a row of dots, with interquartile mean and interval.
 
     A series has one colour throughout, another one than set-ups have in other figures; rows of a single
@@ -277,8 +277,10 @@ def dot_rows(groups: Groups, measure: str, guides: Mapping[str, float] | None = 
             height += 1
             _draw_row(axes, height, values, of_groups.get(label, colours[name]))
         height += 1
-    for name, value in (guides or {}).items():
-        _vertical_guide(axes, value, name)
+    for name, value in guides.items():
+        axes.axvline(value, color=MUTED, linewidth=1, linestyle=DASHES, zorder=1)
+        of = "data", "axes fraction"
+        style.note(axes, name, (value, 1), of, (0, 2), MUTED, ha="center", va="bottom")
     axes.set_ylim(height - 0.4, -0.5)
     axes.set_yticks([])
     finish(axes, colours, x=measure)
@@ -303,13 +305,6 @@ def _draw_row(axes: Axes, height: float, values: Array, colour: str) -> None:
         ends = [found.low, found.high]
         axes.plot(ends, [middle] * 2, color=colour, linewidth=2.5, solid_capstyle="butt")
     axes.plot(found.value, middle, "D", color=colour, markersize=MEAN - 1, markeredgewidth=0)
-
-
-def _vertical_guide(axes: Axes, value: float, text: str) -> None:
-    """Draw a dashed line, with its text over the panel."""
-    axes.axvline(value, color=MUTED, linewidth=1, linestyle=DASHES, zorder=1)
-    of = "data", "axes fraction"
-    style.note(axes, text, (value, 1), of, (0, 2), MUTED, ha="center", va="bottom")
 
 
 def profile_curves(

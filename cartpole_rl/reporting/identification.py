@@ -5,7 +5,6 @@ The first figure shows figures 5.2, 5.3 and 5.5 of the thesis for the identified
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,10 +22,10 @@ from cartpole_rl.identification.sensors import delayed
 from cartpole_rl.physics.friction import viscous_coefficient
 from cartpole_rl.physics.laws import Law
 from cartpole_rl.physics.parameters import CartParameters, cart_column
-from cartpole_rl.reporting import style
+from cartpole_rl.reporting import style, texts
 from cartpole_rl.reporting.episodes import wrapped_line
-from cartpole_rl.reporting.page import page
-from cartpole_rl.reporting.texts import interval_text, number_text, table
+from cartpole_rl.reporting.page import document, escaped, table
+from cartpole_rl.reporting.texts import interval_text, number_text
 from cartpole_rl.rig.hardware import LARGEST_MOTOR
 from cartpole_rl.run_folder import FIGURES
 from cartpole_rl.tasks.episode import Episode
@@ -63,7 +62,7 @@ def quantities_table(quantities: Sequence[Quantity]) -> str:
         {"name": each.words, "value": interval_text(each.value, each.low, each.high), "unit": each.unit}
         for each in quantities
     ]
-    return table(rows, {"name": "quantity", "value": "value, 95 % interval", "unit": "unit"})
+    return texts.table(rows, {"name": "quantity", "value": "value, 95 % interval", "unit": "unit"})
 
 
 def error_text(error: PredictionError) -> str:
@@ -90,27 +89,30 @@ def identification_figures(
 
 
 def identification_page(
-    found: Identification,
-    quantities: Sequence[Quantity],
-    fitted: Mapping[str, Episode],
-    next_command: str,
+    found: Identification, quantities: Sequence[Quantity], fitted: Mapping[str, Episode], next_command: str
 ) -> str:
     """Return the HTML page of an identification, which shows the figures of CAPTIONS in figures/."""
-    sections: list[tuple[str, Any]] = [
-        ("Recordings", _recording_rows(fitted, found.dynamics.period)),
-        ("Identified values", _quantity_rows(quantities)),
-        ("Friction models of the cart", _friction_rows(found.candidates)),
-        (
-            "",
-            "The table's errors are those over seconds of the recordings that were left out of these fits. "
-            "RMS prediction error over one second of held-out motion away from upright, with the best model: "
-            f"{error_text(found.error)}.",
+    title = "Identification of a cart"
+    errors = (
+        "The table's errors are those over seconds of the recordings that were left out of these fits. "
+        "RMS prediction error over one second of held-out motion away from upright, with the best model: "
+        f"{error_text(found.error)}."
+    )
+    warnings = "".join(f"<li>{escaped(each)}</li>" for each in found.warnings or ["None."])
+    parts = [
+        f"<h1>{title}</h1>",
+        f"<h2>Recordings</h2>\n{table(_recording_rows(fitted, found.dynamics.period))}",
+        f"<h2>Identified values</h2>\n{table(_quantity_rows(quantities))}",
+        f"<h2>Friction models of the cart</h2>\n{table(_friction_rows(found.candidates))}",
+        f"<p>{escaped(errors)}</p>\n<h2>Warnings</h2>\n<ul>{warnings}</ul>",
+        "<h2>Next step: train on carts like this one</h2>",
+        f"<ul><li><code>{escaped(next_command)}</code></li></ul>",
+        *(
+            f'<h2>{caption}</h2>\n<img src="{FIGURES}/{name}.png" alt="{caption}">'
+            for name, caption in CAPTIONS.items()
         ),
-        ("Warnings", found.warnings or ["None."]),
-        ("Next step: train on carts like this one", [f"<code>{next_command}</code>"]),
-        *[(caption, Path(FIGURES) / f"{name}.png") for name, caption in CAPTIONS.items()],
     ]
-    return page("Identification of a cart", sections)
+    return document(title, "\n".join(parts))
 
 
 def _recording_rows(recordings: Mapping[str, Episode], period: float) -> list[dict[str, str]]:

@@ -13,7 +13,6 @@ import signal
 import sys
 import time
 from contextlib import suppress
-from types import TracebackType
 from typing import NoReturn
 
 from cartpole_rl.evaluation.snapshots import Memory, Snapshot, new_memory, read
@@ -50,9 +49,7 @@ class LiveView:
             self._process.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self.memory is None:
             return
         self._process.terminate()

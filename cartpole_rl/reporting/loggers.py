@@ -54,8 +54,8 @@ def _check_logger(item: Any) -> None:
 
 LOGGERS: Registry[Extension] = Registry("logger", __name__, check=_check_logger)
 LOGGERS.add("tensorboard", "cartpole_rl.reporting.tensorboard:TensorBoardLog")
-LOGGERS.add("wandb", "cartpole_rl.reporting.wandb_log:WandbLog")
-LOGGERS.add("mlflow", "cartpole_rl.reporting.mlflow_log:MlflowLog")
+LOGGERS.add("wandb", "cartpole_rl.reporting.trackers:WandbLog")
+LOGGERS.add("mlflow", "cartpole_rl.reporting.trackers:MlflowLog")
 
 
 class Loggers:

@@ -6,7 +6,6 @@ A page needs no other file, no network and no script. `reporting.style.svg` draw
 import html
 import re
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 from cartpole_rl.drawing.colours import FAINT, INK, MUTED, PAPER
@@ -67,7 +66,6 @@ code {{ background: var(--faint); padding: .1rem .3rem; overflow-wrap: anywhere;
 }}
 """
 NUMBER = re.compile(r"-?\d[\w.,%±() –-]{0,28}$")  # "4104 (4062 to 4177)", "10 of 10"
-Section = Sequence[Mapping[str, str]] | Sequence[str] | str | Path
 
 
 class Html(str):
@@ -101,35 +99,3 @@ def _cell(key: str, content: Any) -> str:
     text = escaped(content)
     kind = ' class="number"' if NUMBER.match(text) else ""
     return f'<td{kind} data-label="{html.escape(key)}">{text}</td>'
-
-
-def page(title: str, sections: Sequence[tuple[str, Any]]) -> str:
-    """Return HTML: each section is a heading and its content.
-
-    Mappings become a table headed by their keys, texts a list, one text a paragraph, and a path a figure.
-    Texts are escaped; only a list's text that starts with <code> and ends with </code> keeps these tags.
-    """
-    parts = [f"<h1>{html.escape(title)}</h1>"]
-    for heading, content in sections:
-        if heading:
-            parts.append(f"<h2>{html.escape(heading)}</h2>")
-        parts.append(_section(content, heading))
-    return document(title, "\n".join(parts))
-
-
-def _section(content: Section, heading: str) -> str:
-    if isinstance(content, Path):
-        return f'<img src="{html.escape(content.as_posix())}" alt="{html.escape(heading)}">'
-    if isinstance(content, str):
-        return f"<p>{html.escape(content)}</p>"
-    rows = [row for row in content if isinstance(row, Mapping)]
-    if rows:
-        return table(rows)
-    items = "".join(f"<li>{_text(str(item))}</li>" for item in content)
-    return f"<ul>{items}</ul>"
-
-
-def _text(item: str) -> str:
-    if item.startswith("<code>") and item.endswith("</code>"):
-        return f"<code>{html.escape(item[6:-7])}</code>"
-    return html.escape(item)

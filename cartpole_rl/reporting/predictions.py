@@ -70,11 +70,7 @@ def _error_cells(line: Mapping[str, Any]) -> dict[str, str]:
 
 
 def replay_figure(
-    replays: Sequence[Replayed],
-    period: float,
-    times: Sequence[float],
-    title: str = "Replay",
-    subtitle: str = "",
+    replays: Sequence[Replayed], period: float, times: Sequence[float], title: str, subtitle: str
 ) -> Figure:
     """Draw the first episode, measured and simulated, above the errors of all episodes.
 
@@ -164,9 +160,7 @@ def _mark_times(axes: Axes, lag: Array, errors: Array, times: Sequence[float], u
         style.note(axes, f"{number_text(place[1])} {unit}", place, "data", (-4 if last else 4, 7), **looks)
 
 
-def ensemble_figure(
-    physics: Prediction, learned: Prediction, ensemble: Ensemble, subtitle: str = ""
-) -> Figure:
+def ensemble_figure(physics: Prediction, learned: Prediction, ensemble: Ensemble, subtitle: str) -> Figure:
     """Draw predictions by physics alone and by the ensemble, and what the ensemble has learned."""
     visited = ensemble.positions[:, 0].flatten().numpy()
     return learned_model_figure(
@@ -188,7 +182,6 @@ def learned_model_figure(
     forces: Array,
     updates: Array,
     losses: Array,
-    title: str = "Learned model",
     subtitle: str = "",
 ) -> Figure:
     """Draw prediction errors above the learned force and the loss.
@@ -207,7 +200,7 @@ def learned_model_figure(
         ):
             looks = {"color": colour, "linestyle": dashes, "linewidth": width, "label": name}
             _draw_over_time(axes, time, factor * each[:, channel], **looks)
-    style.title(cart, title, subtitle)
+    style.title(cart, "Learned model", subtitle)
     style.label(cart, x="prediction time (s)", y="RMS error, cart (mm)")
     style.label(angle, x="prediction time (s)", y="RMS error, angle (deg)")
     cart.legend(loc="lower right", fontsize=style.SMALL_SIZE, frameon=False)

@@ -52,15 +52,13 @@ def bootstrap(statistic: Statistic, *groups: ArrayLike, agents: int | None = Non
     chunks = -(-RESAMPLES * sum(each.size for each in arrays) // MOST_RESAMPLED)
     sizes = np.diff(np.linspace(0, RESAMPLES, chunks + 1, dtype=int))
     samples = np.concatenate(
-        [statistic(*(_resampled(each, generator, size) for each in arrays)) for size in sizes]
+        [
+            statistic(*(each[generator.integers(each.size, size=(size, each.size))] for each in arrays))
+            for size in sizes
+        ]
     )
     low, high = np.nanpercentile(samples, EDGES)
     return Estimate(value, float(low), float(high), count)
-
-
-def _resampled(values: Array, generator: np.random.Generator, samples: int) -> Array:
-    """Return bootstrap samples [samples, n] of `values` [n]."""
-    return values[generator.integers(values.size, size=(samples, values.size))]
 
 
 def interquartile_mean(values: ArrayLike) -> Array:

@@ -3,23 +3,16 @@
 import os
 import re
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from glob import glob
+from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Any
 
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.reporting.grouping import (
-    AGENT,
-    NULL,
-    SOURCE,
-    Columns,
-    fewest,
-    labels,
-    setting_columns,
-)
+from cartpole_rl.reporting.grouping import AGENT, NULL, SOURCE, Columns, fewest, labels, setting_columns
 from cartpole_rl.reporting.groups import LONGEST_LABEL, MOST_LINES
 from cartpole_rl.reporting.results import OWN, Agent, Curve, Exclusion, Group, Results
 from cartpole_rl.reporting.runs import (
@@ -160,13 +153,9 @@ def _lack(measure: str, member: Member) -> str:
 
 def _without(sweep: Sweep, problem: Callable[[Member], str]) -> Sweep:
     """Return a sweep without the members that have a problem, which it names."""
-    reasons = [problem(member) for member in sweep.members]
-    kept = [member for member, reason in zip(sweep.members, reasons, strict=True) if not reason]
-    left_out = [
-        _exclusion(member.run, reason)
-        for member, reason in zip(sweep.members, reasons, strict=True)
-        if reason
-    ]
+    judged = [(member, problem(member)) for member in sweep.members]
+    kept = [member for member, reason in judged if not reason]
+    left_out = [_exclusion(member.run, reason) for member, reason in judged if reason]
     return replace(sweep, members=kept, exclusions=[*sweep.exclusions, *left_out])
 
 
@@ -199,7 +188,7 @@ def grouped(sweeps: Sequence[Sweep]) -> tuple[list[Sweep], Columns]:
     given = [dict(_given(member)) for member in members]
     columns = setting_columns([each.tree for each in members], [_words(each) for each in given])
     chosen = {SOURCE, *(name for each in given for name in each)}
-    bounds = _bounds(sweeps)
+    bounds = [*pairwise(accumulate((len(sweep.members) for sweep in sweeps), initial=0))]
     inner = [
         name
         for name, values in columns.items()
@@ -341,13 +330,9 @@ def _values(evaluation: str, member: Member, measure: str) -> Iterator[tuple[str
     if all(value is not None for value in stages.values()):
         yield from ((stage, value) for stage, value in stages.items() if value is not None)
     else:
-        yield evaluation, _value(member, measure)
-
-
-def _value(member: Member, measure: str) -> float:
-    value = measured(member.run.results, measure)
-    assert value is not None  # `read_sweeps` leaves such runs out
-    return value
+        value = measured(member.run.results, measure)
+        assert value is not None  # `read_sweeps` leaves such runs out
+        yield evaluation, value
 
 
 def _curves(member: Member, measure: str) -> tuple[dict[str, Curve], str]:
@@ -417,15 +402,6 @@ def _agent_tree(chain: Sequence[Run]) -> dict[str, Any]:
     if len(chain) > 2:
         tree[AGENT] = _agent_tree(chain[1:])
     return {"checkpoint": path.stem if path.suffix == ".pt" else "last", **tree}
-
-
-def _bounds(sweeps: Iterable[Sweep]) -> list[tuple[int, int]]:
-    """Return the first and the last row (exclusive) of each sweep among the members of all."""
-    bounds, start = [], 0
-    for sweep in sweeps:
-        bounds.append((start, start + len(sweep.members)))
-        start += len(sweep.members)
-    return bounds
 
 
 def _unequal_seeds(sweep: Sweep) -> list[str]:

@@ -36,11 +36,7 @@ def table(rows: Sequence[Mapping[str, Cell]], columns: Mapping[str, str] | Seque
 
 
 def interval_text(
-    mean: float,
-    low: float | None,
-    high: float | None,
-    ends: bool = False,
-    most_decimals: int = MOST_DECIMALS,
+    mean: float, low: float | None, high: float | None, ends: bool = False, most_decimals: int = MOST_DECIMALS
 ) -> str:
     """Return a mean with the half width of its interval: "4210 ± 85".
 

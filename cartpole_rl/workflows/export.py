@@ -6,8 +6,7 @@ from pathlib import Path
 
 from cartpole_rl.emulator.c_firmware import rig_header
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.evaluation.mcap_files import write_mcap
-from cartpole_rl.evaluation.minari_data import MinariData
+from cartpole_rl.evaluation.exchange import MinariData, write_mcap
 from cartpole_rl.evaluation.recordings import load_recording
 from cartpole_rl.exporting.agent import ExportedAgent
 from cartpole_rl.exporting.c_code import c_files

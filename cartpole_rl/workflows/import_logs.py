@@ -14,8 +14,7 @@ import numpy as np
 
 from cartpole_rl.choices import choice
 from cartpole_rl.errors import RecordingError
-from cartpole_rl.evaluation.mcap_files import read_mcap
-from cartpole_rl.evaluation.minari_data import read_minari
+from cartpole_rl.evaluation.exchange import read_mcap, read_minari
 from cartpole_rl.evaluation.recordings import LENGTH, write_recording
 from cartpole_rl.identification.logs import Log, Report, read_log
 from cartpole_rl.identification.sensors import Estimate, Motion, Sensors, question_sensors

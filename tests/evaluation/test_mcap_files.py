@@ -7,7 +7,7 @@ import pytest
 from short_episode import EPISODE, FULL
 
 from cartpole_rl.errors import RecordingError
-from cartpole_rl.evaluation.mcap_files import read_mcap, write_mcap
+from cartpole_rl.evaluation.exchange import read_mcap, write_mcap
 from cartpole_rl.evaluation.recordings import load_recording, write_recording
 
 REASON = 'mcap is missing: pip install "cartpole_rl[mcap]"'

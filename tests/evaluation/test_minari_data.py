@@ -11,7 +11,7 @@ from short_episode import EPISODE, FULL
 from cartpole_rl.envs.build import shipped_settings
 from cartpole_rl.envs.settings import CartPoleSettings
 from cartpole_rl.errors import ConfigError, RecordingError
-from cartpole_rl.evaluation.minari_data import MinariData, read_minari
+from cartpole_rl.evaluation.exchange import MinariData, read_minari
 from cartpole_rl.evaluation.recordings import Recording, load_recording, write_recording
 from cartpole_rl.tasks.episode import Episode
 

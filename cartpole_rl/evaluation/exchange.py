@@ -1,9 +1,14 @@
-"""Recordings as a data set of Minari, for offline reinforcement learning.
+"""Recordings in formats of others: MCAP files, and data sets of Minari.
 
-Observations are those of the agent that was recorded, from the recorded counts. Actions are indices of its
-motor values: where the track guard replaced one, that of the value sent. They are a Box of motor values over
-255 where the agent is unknown or lacks one of the values. The infos hold the columns of a recording: those of
-a state in its row, those of a step in the row after it, as `step` of an environment returns them.
+MCAP, which Foxglove opens: JSON messages with a schema, and the heading as metadata. A control period is a
+message on /cart/state, then one on /cart/action, both at the cart's time in ns. Their fields are the columns
+of a recording.
+
+Minari, for offline reinforcement learning: observations are those of the agent that was recorded, from the
+recorded counts. Actions are indices of its motor values: where the track guard replaced one, that of the
+value sent. They are a Box of motor values over 255 where the agent is unknown or lacks one of the values. The
+infos hold the columns of a recording: those of a state in its row, those of a step in the row after it, as
+`step` of an environment returns them.
 """
 
 import copy
@@ -22,6 +27,8 @@ from cartpole_rl.envs.gymnasium import OF_TASK, TAKEN, float32
 from cartpole_rl.envs.settings import CartPoleSettings
 from cartpole_rl.errors import RecordingError, reason_of
 from cartpole_rl.evaluation.recordings import (
+    COLUMNS,
+    COUNTS,
     GUARDED,
     METRES,
     OF_STATE,
@@ -32,13 +39,62 @@ from cartpole_rl.evaluation.recordings import (
     pole_length,
     rows_of,
 )
+from cartpole_rl.files import replacing
 from cartpole_rl.plants.recorded import RecordedPlant
 from cartpole_rl.registration import ENVIRONMENTS
 from cartpole_rl.rig.hardware import LARGEST_MOTOR, hardware_of
 from cartpole_rl.tasks.episode import Ending, Episode
 
-NAME, HEADING, SETTINGS = "recording", "heading", "settings"  # in the metadata of episodes and data set
+SETTINGS, RECORDING, HEADING = "settings", "recording", "heading"  # names in metadata
+TOPICS = {"/cart/state": OF_STATE, "/cart/action": (*OF_STEP, GUARDED)}
+WHOLE = (*COUNTS, "motor", GUARDED)  # columns of whole numbers
 TERMINATED = (Ending.TRACK, Ending.ANGLE)
+
+
+def write_mcap(path: Path, recording: Recording, settings: CartPoleSettings | None) -> None:
+    """Write a recording, with the `settings` of its agent if they are known."""
+    from mcap.writer import Writer  # of the extra mcap
+
+    with replacing(path) as beside, beside.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        channels = {}
+        for topic, names in TOPICS.items():
+            fields = {name: {"type": "integer" if name in WHOLE else "number"} for name in names}
+            schema = json.dumps({"type": "object", "properties": fields}).encode()
+            number = writer.register_schema(topic.strip("/").replace("/", "."), "jsonschema", schema)
+            channels[topic] = writer.register_channel(topic, "json", number)
+        for row, values in enumerate(rows_of(recording.episode)):
+            time = round(1e9 * values["time_s"])
+            for topic, channel in channels.items():
+                if own := {name: values[name] for name in TOPICS[topic] if name in values}:
+                    data = json.dumps(own).encode()
+                    writer.add_message(channel, log_time=time, data=data, publish_time=time, sequence=row)
+        writer.add_metadata(RECORDING, dict(recording.facts))
+        if settings:
+            writer.add_metadata(SETTINGS, {SETTINGS: settings.model_dump_json()})
+        writer.finish()
+
+
+def read_mcap(path: Path) -> tuple[Recording, Any]:
+    """Return the recording in a file of `write_mcap`, and its settings or None. Raises RecordingError."""
+    from mcap.reader import make_reader
+
+    rows: dict[int, dict[str, str]] = {}
+    try:
+        with path.open("rb") as file:
+            reader = make_reader(file, validate_crcs=True)
+            known = {each.name: each.metadata for each in reader.iter_metadata()}
+            settings = json.loads(known.get(SETTINGS, {}).get(SETTINGS, "null"))
+            for _, _, message in reader.iter_messages(topics=[*TOPICS]):
+                row = rows.setdefault(message.sequence, dict.fromkeys((*COLUMNS, GUARDED), ""))
+                row.update((name, str(value)) for name, value in json.loads(message.data).items())
+    except Exception as error:  # a damaged file raises errors of many kinds
+        raise RecordingError(f"{path} cannot be read as MCAP: {reason_of(error)}") from None
+    if RECORDING not in known:
+        raise RecordingError(f"{path} holds no recording; give a file of cartpole-export format=mcap")
+    episode = episode_of(path, known[RECORDING], [rows[row] for row in sorted(rows)])
+    return Recording(path.stem, episode, known[RECORDING]), settings
 
 
 class MinariData:
@@ -72,7 +128,7 @@ class MinariData:
         storage.update_metadata({"dataset_id": name, "minari_version": __version__, **settings})
         storage.update_episodes(EpisodeBuffer(**each) for each in self.episodes)
         storage.update_episode_metadata(
-            {NAME: each.name, HEADING: json.dumps(dict(each.facts))} for each in self.recordings
+            {RECORDING: each.name, HEADING: json.dumps(dict(each.facts))} for each in self.recordings
         )
 
 
@@ -130,7 +186,7 @@ def read_minari(folder: Path) -> tuple[list[Recording], Any]:
         data = MinariDataset(folder)
         settings = json.loads(data.storage.metadata.get(SETTINGS, "null"))
         about = [*data.storage.get_episode_metadata(range(data.total_episodes))]
-        names = [Path(str(each.get(NAME))).name for each in about]
+        names = [Path(str(each.get(RECORDING))).name for each in about]
         infos = [episode.infos for episode in data.iterate_episodes()]
         headings = [json.loads(each.get(HEADING, "{}")) for each in about]
         tables = [rows(each) if facts else [] for each, facts in zip(infos, headings, strict=True)]

@@ -1,9 +1,12 @@
-"""Curves and pictures of a run in MLflow: in `runs/mlflow.db`, or wherever `MLFLOW_TRACKING_URI` says.
+"""Curves and pictures of a run on Weights & Biases, over the number of transitions, and in MLflow.
 
-`MLFLOW_EXPERIMENT_NAME` names the experiment. The jobs of a sweep have its name as the tag `sweep`. A resumed
-run goes on in the same run of MLflow; points after its checkpoint then stand twice.
+The environment variables of both hold, such as `WANDB_PROJECT` and `WANDB_MODE=offline`. MLflow is in
+`runs/mlflow.db`, or wherever `MLFLOW_TRACKING_URI` says; `MLFLOW_EXPERIMENT_NAME` names the experiment. The
+jobs of a sweep are a group of wandb, and have the sweep's name as the tag `sweep` in MLflow. A resumed run
+goes on in the same run of either; points after its checkpoint then stand twice.
 """
 
+import io
 import logging
 import os
 import tempfile
@@ -12,21 +15,77 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
+from PIL import Image
 
 from cartpole_rl.errors import ConfigError, reason_of
-from cartpole_rl.reporting.loggers import flatten, library, sweep_of
+from cartpole_rl.reporting.loggers import Logger, flatten, library, sweep_of
+from cartpole_rl.reporting.style import png
 from cartpole_rl.terminal import print_message
 
+PROJECT, AXIS = "cartpole_rl", "transitions"  # of wandb
 STORE, PICTURES, EXPERIMENT = "runs/mlflow.db", "runs/mlflow", "cartpole_rl"
-IDENTITY = "mlflow_run.txt"  # in the run folder: the run of MLflow
+WANDB_RUN, MLFLOW_RUN = "wandb_run.txt", "mlflow_run.txt"  # in the run folder: the run of either
 PATIENCE = {"MLFLOW_HTTP_REQUEST_MAX_RETRIES": "1", "MLFLOW_HTTP_REQUEST_TIMEOUT": "10"}  # else minutes
 MOST = 100  # parameters that MLflow takes at once
 
 
-class MlflowLog:
-    """A run of MLflow; its methods are those of `loggers.Logger`.
+class WandbLog(Logger):
+    """A run of Weights & Biases, which writes at once, in a process of its own.
+
+    Raises ConfigError where nobody is logged in.
+    """
+
+    def __init__(self, folder: Path, purge_step: int | None = None) -> None:
+        self._wandb, file = library("wandb"), folder / WANDB_RUN
+        try:
+            self._run = self._wandb.init(
+                project=os.environ.get("WANDB_PROJECT", PROJECT),
+                name=folder.name,
+                group=sweep_of(folder),
+                dir=folder,
+                id=file.read_text() if purge_step is not None and file.exists() else None,
+                resume="allow",
+                settings=self._wandb.Settings(silent=True, console="off"),
+            )
+        except self._wandb.errors.Error as error:
+            raise ConfigError(f"logger=wandb: {reason_of(error)} Or set WANDB_MODE=offline") from None
+        file.write_text(self._run.id)
+        self._run.define_metric("*", step_metric=AXIS)
+
+    def scalars(self, values: Mapping[str, float | None], step: int) -> None:
+        """Log one point of each curve; None is no point."""
+        self._run.log({**{name: each for name, each in values.items() if each is not None}, AXIS: step})
+
+    def histogram(self, name: str, values: ArrayLike, step: int) -> None:
+        """Log the distribution of the finite `values`, of any shape."""
+        flat = np.asarray(values, dtype=np.float64).ravel()
+        self._run.log({name: self._wandb.Histogram(flat[np.isfinite(flat)]), AXIS: step})
+
+    def figure(self, name: str, figure: Figure, step: int) -> None:
+        """Log a figure as a picture."""
+        self._run.log({name: self._wandb.Image(Image.open(io.BytesIO(png(figure)))), AXIS: step})
+
+    def animation(self, name: str, gif: bytes, step: int) -> None:
+        """Log an animation, the bytes of a GIF."""
+        path = Path(self._run.dir) / f"{name.replace('/', '_')}_{step}.gif"
+        path.write_bytes(gif)
+        self._run.log({name: self._wandb.Video(str(path), format="gif"), AXIS: step})
+
+    def hparams(self, config: Mapping[str, Any], metrics: Mapping[str, float | None]) -> None:
+        """Log the settings, with dotted names, and the final metrics as the summary."""
+        self._run.config.update(flatten(config), allow_val_change=True)
+        self._run.summary.update({f"summary/{name}": each for name, each in metrics.items()})
+
+    def close(self) -> None:
+        """Send or write the rest."""
+        self._run.finish()
+
+
+class MlflowLog(Logger):
+    """A run of MLflow, which has no histograms and writes at once.
 
     Raises ConfigError where the server does not answer.
     """
@@ -41,7 +100,7 @@ class MlflowLog:
             Path(STORE).parent.mkdir(exist_ok=True)
             store, pictures = f"sqlite:///{STORE}", Path(PICTURES).resolve().as_uri()
         name = os.environ.get("MLFLOW_EXPERIMENT_NAME", EXPERIMENT)
-        self._client, self._lost, file = self._mlflow.MlflowClient(store), False, folder / IDENTITY
+        self._client, self._lost, file = self._mlflow.MlflowClient(store), False, folder / MLFLOW_RUN
         try:
             if purge_step is not None and file.exists():
                 self._run = file.read_text()
@@ -62,9 +121,6 @@ class MlflowLog:
         points = [metric(name, float(each), now, step) for name, each in values.items() if each is not None]
         self._send(self._client.log_batch, metrics=points)
 
-    def histogram(self, name: str, values: ArrayLike, step: int) -> None:
-        """Do nothing: MLflow has no histograms."""
-
     def figure(self, name: str, figure: Figure, step: int) -> None:
         """Log a figure as a picture."""
         self._send(self._client.log_figure, figure, f"{name}_{step}.png")
@@ -84,9 +140,6 @@ class MlflowLog:
         for first in range(0, len(settings), MOST):
             self._send(self._client.log_batch, params=settings[first : first + MOST])
         self.scalars({f"summary/{name}": each for name, each in metrics.items()}, 0)
-
-    def flush(self) -> None:
-        """Do nothing: MLflow writes at once."""
 
     def close(self) -> None:
         """End the run."""
