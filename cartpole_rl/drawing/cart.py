@@ -120,7 +120,6 @@ class CartDrawing:
         return FINER * SIZE[0] / 2 + self.episode.x[row] * self.scale, FINER * float(PIVOT_HEIGHT)
 
     def _tip(self, row: int) -> tuple[float, float]:
-        """Return the position of the pole's tip."""
         x, y = self._cart(row)
         theta = self.episode.theta[row]
         return x + self.pole * math.sin(theta), y - self.pole * math.cos(theta)
@@ -130,7 +129,6 @@ class CartDrawing:
         return colours.UPRIGHT if self.upright[row] else colours.POLE
 
     def _draw_title(self, draw: Draw, title: str) -> None:
-        """Draw the title, cut to TITLE_WIDTH."""
         font, whole = _font(15, bold=True), title
         while font.getlength(title) > FINER * TITLE_WIDTH:
             whole = whole[:-1].rstrip()
@@ -173,7 +171,6 @@ class CartDrawing:
         )
 
     def _draw_cart(self, draw: Draw, row: int) -> None:
-        """Draw wheels, cart and pole."""
         x, y = self._cart(row)
         half_width, half_height = FINER * CART_WIDTH / 2, FINER * CART_HEIGHT / 2
         for side in (-0.55, 0.55):
@@ -250,5 +247,4 @@ def _draw_legend(draw: Draw) -> None:
 
 
 def _disc(draw: Draw, x: float, y: float, radius: float, colour: str) -> None:
-    """Draw a filled circle."""
     draw.ellipse((x - radius, y - radius, x + radius, y + radius), fill=colour)

@@ -98,47 +98,13 @@ def identify(
 ) -> Identification:
     """Identify the cart that recordings, by the names of their files, are of, with the pole of `nominal`.
 
-    `held_out` only gives the error that is reported; see `find_cart` for the other arguments. Raises
-    RecordingError where the recordings are not sufficient, or no cart explains one of them.
-    """
-    found = find_cart([*fitted.values()], nominal, models, period, substeps, most, laws, on_step)
-    return judged(found, fitted, held_out)
-
-
-def judged(found: Found, fitted: Mapping[str, Episode], held_out: Mapping[str, Episode]) -> Identification:
-    """Return the cart with the error of its predictions.
-
-    Raises RecordingError for a motion of another cart.
-    """
-    explained = check_explained(fitted, found.dynamics, HORIZON)
-    replays = check_explained(held_out, found.dynamics, HORIZON)
-    doubts = [
-        *early_endings([*fitted.values(), *held_out.values()]),
-        *warnings(found.fit, next(iter(fitted.values())).encoders),
-    ]
-    motion = zip(*((each.x_error, each.theta_error, each.theta) for each in replays), strict=True)
-    x_error, theta_error, theta = map(np.concatenate, motion)
-    error = median_error(x_error, theta_error, theta, np.isfinite(x_error).all(1))
-    return Identification(*found, explained, replays, error, doubts)
-
-
-def find_cart(
-    episodes: Sequence[Episode],
-    nominal: Mapping[str, float],
-    models: Models,
-    period: float,
-    substeps: int,
-    most: int,
-    laws: Sequence[Law],
-    on_step: Callable[[], object] = lambda: None,
-) -> Found:
-    """Return the cart that best explains `episodes`. Raises RecordingError where they are not sufficient.
-
     The law of the cart's friction is chosen here, among the registered candidates and further `laws`: the one
-    that best predicts seconds of the episodes that were left out of its fit. `models` gives the others, and
-    the law that is tried first. Each search starts where the one before it ended. The chosen law is then
-    fitted to at most `most` windows of all episodes.
+    that best predicts seconds of the episodes `fitted` to that were left out of its fit. `models` gives the
+    others, and the law that is tried first. Each search starts where the one before it ended. The chosen law
+    is then fitted to at most `most` windows of all these episodes. `held_out` only gives the error that is
+    reported. Raises RecordingError where the recordings are not sufficient, or no cart explains one of them.
     """
+    episodes = [*fitted.values()]
     judging = cut_judging(episodes, period, HORIZON, lead_periods(LEAD, period), MOVING)
 
     def attempt(
@@ -188,7 +154,25 @@ def find_cart(
     candidates = [contenders.get(each.cart_friction, each) for each in screened]
     best = min(contenders.values(), key=lambda each: each.error.size)
     whole = attempt(best.cart_friction, most, substeps, best.fit, apart_from=None)
-    return Found(widened(whole.fit, best, [*contenders.values()]), whole.dynamics, candidates)
+    found = Found(widened(whole.fit, best, [*contenders.values()]), whole.dynamics, candidates)
+    return judged(found, fitted, held_out)
+
+
+def judged(found: Found, fitted: Mapping[str, Episode], held_out: Mapping[str, Episode]) -> Identification:
+    """Return the cart with the error of its predictions.
+
+    Raises RecordingError for a motion of another cart.
+    """
+    explained = check_explained(fitted, found.dynamics, HORIZON)
+    replays = check_explained(held_out, found.dynamics, HORIZON)
+    doubts = [
+        *early_endings([*fitted.values(), *held_out.values()]),
+        *warnings(found.fit, next(iter(fitted.values())).encoders),
+    ]
+    motion = zip(*((each.x_error, each.theta_error, each.theta) for each in replays), strict=True)
+    x_error, theta_error, theta = map(np.concatenate, motion)
+    error = median_error(x_error, theta_error, theta, np.isfinite(x_error).all(1))
+    return Identification(*found, explained, replays, error, doubts)
 
 
 def median_error(

@@ -7,7 +7,7 @@ upright. Half a second is long enough for parameters to show and short enough fo
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,16 +24,6 @@ HELD_OUT_LEAD = 0.2  # s of a held-out window that give its initial state
 IRREGULAR = 0.2  # share of the period that a frame may come early or late
 
 
-class Piece(NamedTuple):
-    """One window of an episode."""
-
-    positions: NDArray[np.float64]  # [T + 1, 2]
-    motors: NDArray[np.float64]  # [H + T]
-    episode: int
-    first: int  # row of the episode
-    resolution: NDArray[np.float64]  # [2]
-
-
 class Windows(NamedTuple):
     """W windows of T periods, with the motor values of the H periods before them."""
 
@@ -43,18 +33,6 @@ class Windows(NamedTuple):
     first: NDArray[np.int64]  # [W] row of that episode at which each starts
     resolution: NDArray[np.float64]  # [2] m and rad of a count
     lead: int = 0  # periods at the start of each that give its initial state and are not predicted
-
-    @classmethod
-    def of(cls, pieces: Sequence[Piece], lead: int = 0) -> Self:
-        """Return one window for each piece."""
-        return cls(
-            np.stack([piece.positions for piece in pieces], -1),
-            np.stack([piece.motors for piece in pieces], -1),
-            np.array([piece.episode for piece in pieces]),
-            np.array([piece.first for piece in pieces]),
-            pieces[0].resolution,
-            lead,
-        )
 
     @property
     def periods(self) -> int:
@@ -66,10 +44,10 @@ class Windows(NamedTuple):
         """W."""
         return self.positions.shape[2]
 
-    def share_frames(self, episode: int, first: int, last: int) -> bool:
-        """Return True if a window includes one of the rows from `first` to `last` of an episode."""
-        within = (self.first <= last) & (self.first + self.periods >= first)
-        return bool((within & (self.episode == episode)).any())
+    def share_frames(self, other: "Windows") -> bool:
+        """Return True if a window includes a frame of `other`, which is a single one."""
+        within = (self.first <= other.first + other.periods) & (self.first + self.periods >= other.first)
+        return bool((within & (self.episode == other.episode)).any())
 
 
 def joined(windows: Sequence[Windows]) -> Windows:
@@ -107,14 +85,14 @@ def cut_windows(
         piece
         for number, episode in enumerate(episodes)
         for piece in _pieces(episode, period, periods, step=periods, least=periods, number=number)
-        if apart_from is None or not apart_from.share_frames(number, piece.first, piece.first + periods)
+        if apart_from is None or not apart_from.share_frames(piece)
     ]
     if not pieces:
         raise RecordingError(
             f"no recording holds {periods * period:g} s without a lost frame: record longer, check the cable"
         )
     chosen = np.unique(np.linspace(0, len(pieces) - 1, min(most, len(pieces))).round().astype(int))
-    return Windows.of([pieces[index] for index in chosen])
+    return joined([pieces[index] for index in chosen])
 
 
 def cut_stretches(episode: Episode, period: float, seconds: float, lead: int) -> Windows:
@@ -130,7 +108,7 @@ def cut_stretches(episode: Episode, period: float, seconds: float, lead: int) ->
             f"a recording of {episode.steps * period:.2f} s is too short to be replayed, or its frames are "
             "late or lost"
         )
-    return Windows.of(pieces, lead)
+    return joined(pieces)._replace(lead=lead)
 
 
 def cut_judging(
@@ -152,13 +130,13 @@ def cut_judging(
         raise RecordingError(
             f"the cart never moves for {seconds:g} s without a lost frame: drive it more, check the cable"
         )
-    return Windows.of(pieces[(JUDGING - 1) % len(pieces) :: JUDGING], lead)
+    return joined(pieces[(JUDGING - 1) % len(pieces) :: JUDGING])._replace(lead=lead)
 
 
 def _pieces(
     episode: Episode, period: float, length: int, step: int, least: int, number: int = 0
-) -> Iterator[Piece]:
-    """Yield windows of `length` periods, every `step` periods, whose history and first `least` are known."""
+) -> Iterator[Windows]:
+    """Yield single windows of `length` periods, every `step`, whose history and first `least` are known."""
     history, end = history_periods(period), episode.measured_steps
     late = np.flatnonzero(~regular_frames(episode, period)[:end])
     last_known = np.append(late, end)  # rows after which the motion is not known
@@ -174,7 +152,8 @@ def _pieces(
             positions = np.full((length + 1, 2), np.nan)
             measured = every[first : first + min(known, length) + 1]
             positions[: len(measured)] = measured
-            yield Piece(positions, motors[first : first + history + length], number, first, resolution)
+            driven = motors[first : first + history + length, None]
+            yield Windows(positions[..., None], driven, np.array([number]), np.array([first]), resolution)
 
 
 def regular_frames(episode: Episode, period: float) -> NDArray[np.bool_]:

@@ -100,16 +100,11 @@ def side_by_side(
     halves = [drawn(episode, pole_length, track_half_length, duration) for episode in episodes]
     backgrounds = [half.background(title) for half, title in zip(halves, titles, strict=True)]
     pictures = []
-    for pair in zip(*(nearest_rows(episode, longer) for episode in episodes), strict=True):
-        parts = [picture(*each) for each in zip(halves, backgrounds, pair, strict=True)]
+    for time in longer.time[rows(longer)]:
+        nearest = (int(np.abs(episode.time - time).argmin()) for episode in episodes)
+        parts = [picture(*each) for each in zip(halves, backgrounds, nearest, strict=True)]
         pictures.append(joined(*parts))
     return pictures, durations(longer)
-
-
-def nearest_rows(episode: Episode, longer: Episode) -> Iterator[int]:
-    """Yield the row of `episode` nearest in time to each picture of `longer`."""
-    for time in longer.time[rows(longer)]:
-        yield int(np.abs(episode.time - time).argmin())
 
 
 def joined(left: Image.Image, right: Image.Image) -> Image.Image:

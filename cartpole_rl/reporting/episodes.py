@@ -149,7 +149,6 @@ def _draw_angle(axes: Axes, episode: Episode) -> None:
 
 
 def _draw_position(axes: Axes, episode: Episode, track_half_length: float | None) -> None:
-    """Draw the cart's position between the ends of its track."""
     style.dress(axes, y="cart (cm)")
     position = 100 * episode.x
     axes.plot(episode.time, position, color=colours.CART, linewidth=1.6)

@@ -83,15 +83,11 @@ def labels(columns: Columns, count: int) -> list[str]:
 def _word(part: str) -> str:
     """Return the value of "randomization=wide", and other parts of a label as they are."""
     name, _, value = part.partition("=")
-    return value if name == SOURCE or _is_choosable(name) else part
+    return value if name == SOURCE or _choices(name) else part
 
 
 def _may_be_left_out(name: str) -> bool:
-    return name == FREELY_LEFT_OUT or _is_choosable(name.removeprefix(f"{AGENT}."))
-
-
-def _is_choosable(name: str) -> bool:
-    return bool(_choices(name))
+    return name == FREELY_LEFT_OUT or bool(_choices(name.removeprefix(f"{AGENT}.")))
 
 
 def _group(name: str) -> str:

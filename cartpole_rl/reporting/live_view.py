@@ -109,12 +109,12 @@ def view(title: str, snapshot: Snapshot | None, fresh: bool, width: int, colour:
     rule = "-" * width
     if snapshot is None:
         waiting = [title, "waiting for the cart to start its first episode"]
-        return [cut(line, width) for line in [*waiting, *[""] * (LINES - 3), rule]]
+        return [line[:width] for line in [*waiting, *[""] * (LINES - 3), rule]]
     state = f"step {snapshot.step}" if fresh else f"ended at step {snapshot.step}"
     heading = f"{title}: episode {snapshot.episode}, {state}"
     return [
-        cut(heading, width),
-        *(painted(cut(line, width), tint, colour) for line, tint in gauges(snapshot, width)),
+        heading[:width],
+        *(painted(line[:width], tint, colour) for line, tint in gauges(snapshot, width)),
         rule,
     ]
 
@@ -146,11 +146,6 @@ def gauge(label: str, share: float, value: str, width: int) -> str:
     cells[half] = "."
     cells[half + round(max(-1.0, min(1.0, share)) * half)] = "#"
     return f"{label:<{LABEL}}[{''.join(cells)}]{value}"
-
-
-def cut(line: str, width: int) -> str:
-    """Return a line without what exceeds `width`."""
-    return line[:width]
 
 
 def painted(line: str, tint: str, colour: bool) -> str:

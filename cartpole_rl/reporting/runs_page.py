@@ -17,7 +17,6 @@ from cartpole_rl.reporting.page import document, escaped, table
 from cartpole_rl.reporting.results import (
     GOOD,
     Agent,
-    Exclusion,
     Results,
     estimate_text,
     low_is_good,
@@ -216,7 +215,8 @@ def figure_parts(
         return
     for name, rows in {"values": _value_rows(results), **(more or {})}.items():
         yield folded(rows, name)
-    yield left_out(len(results.groups))
+    if (left_out := len(results.groups) - MOST_TABLED) > 0:
+        yield f"<p>{left_out} groups between them are left out; {TABLE} has every run.</p>"
     yield f'<div class="figures">{"".join(drawn(each, results.name) for each in figures)}</div>'
     animations = [each for each in pictures if each.kind == "gif"]
     others = [each for each in pictures if each.kind != "gif"]
@@ -255,12 +255,6 @@ def ends(items: Iterable[Item]) -> list[Item]:
     return every if len(every) <= MOST_TABLED else every[: MOST_TABLED // 2] + every[-MOST_TABLED // 2 :]
 
 
-def left_out(groups: int) -> str:
-    """Return a sentence about the groups that `ends` leaves out of a table; empty if there are none."""
-    more = groups - MOST_TABLED
-    return f"<p>{more} groups between them are left out; {TABLE} has every run.</p>" if more > 0 else ""
-
-
 def folded(rows: Sequence[Mapping[str, Any]], name: str) -> str:
     """Return a table that scrolls on a phone, folded if it is long; paper shows it unfolded."""
     if len(rows) <= MOST_ROWS:
@@ -277,7 +271,8 @@ def doubts(results: Results, missing: Sequence[str] = (), remarks: Sequence[str]
     """Return the box that names what is missing and what does not count; empty without any."""
     shown = [f"{each.run} does not count: {each.reason}." for each in results.exclusions[:MOST_EXCLUSIONS]]
     if more := results.exclusions[MOST_EXCLUSIONS:]:
-        shown.append(f"{len(more)} more runs do not count, as: {_reasons(more)}.")
+        reasons = "; ".join(dict.fromkeys(each.reason for each in more[:5]))
+        shown.append(f"{len(more)} more runs do not count, as: {reasons}.")
     notes = (note for note in results.notes if not _is_of_runs(note))
     lines = [*missing, *shown, *notes, *remarks]
     listed = "".join(f"<li>{escaped(line)}</li>" for line in lines)
@@ -288,10 +283,6 @@ def doubts(results: Results, missing: Sequence[str] = (), remarks: Sequence[str]
 def _is_of_runs(note: str) -> bool:
     """Return True for a note on how the runs were made, which is no reason to doubt them."""
     return any(part in note for part in OF_RUNS)
-
-
-def _reasons(exclusions: Sequence[Exclusion]) -> str:
-    return "; ".join(dict.fromkeys(each.reason for each in exclusions[:5]))
 
 
 def run_list(results: Results) -> str:

@@ -377,23 +377,20 @@ def _member(run: Run, agents: dict[Path, Run]) -> Member:
 def _chain(run: Run, agents: dict[Path, Run]) -> list[Run]:
     """Return the run that made the agent of `run`, the one that this was fine-tuned from, and so on.
 
-    A run that is its own origin occurs once.
+    A run that is its own origin occurs once. `agents` were read before.
     """
     chain: list[Run] = []
     last = run
-    while last.agent and (found := _read_agent(last, agents)) and found not in (run, *chain):
+    while last.agent:
+        folder = run_of(Path(last.agent))
+        if folder not in agents and folder.is_dir():
+            agents[folder] = read_run(folder)
+        found = agents.get(folder)
+        if not found or not found.config or found in (run, *chain):
+            break
         chain.append(found)
         last = found
     return chain
-
-
-def _read_agent(run: Run, agents: dict[Path, Run]) -> Run | None:
-    """Return the run that made the agent of `run`; None if it is not there. `agents` were read before."""
-    folder = run_of(Path(run.agent))
-    if folder.is_dir():
-        agents[folder] = agents.get(folder) or read_run(folder)
-    found = agents.get(folder)
-    return found if found and found.config else None
 
 
 def _agent_tree(chain: Sequence[Run]) -> dict[str, Any]:

@@ -28,7 +28,9 @@ def run_rows(sweeps: Sequence[Sweep]) -> Iterator[dict[str, Hashable]]:
     for sweep in sweeps:
         results = {member.run.folder: member.run.results for member in sweep.members}
         for folder, head in _heads(sweep):
-            yield {**head, **_means(results.get(folder, {}))}
+            values = results.get(folder, {})
+            means = {name: value for name in values if (value := measured(values, name)) is not None}
+            yield {**head, **means}
 
 
 def episode_rows(sweeps: Sequence[Sweep]) -> Iterator[dict[str, Hashable]]:
@@ -72,11 +74,6 @@ def _heads(sweep: Sweep) -> Iterator[tuple[Path, dict[str, Hashable]]]:
         )
     for each in sweep.exclusions:
         yield Path(each.run), {"set": sweep.name, "run": each.run, "left_out": each.reason}
-
-
-def _means(results: Mapping[str, Any]) -> dict[str, float]:
-    """Return every number among the results, the mean where a metric has one."""
-    return {name: value for name in results if (value := measured(results, name)) is not None}
 
 
 def _stages(folder: Path) -> list[tuple[str, Mapping[str, Any]]]:

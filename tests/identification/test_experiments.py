@@ -25,11 +25,14 @@ from cartpole_rl.identification.experiments import (
     Task,
     conduct,
     excite,
+    experiment_guard,
     free_swing,
+    guarded,
     hold,
+    reach,
+    track_end,
 )
 from cartpole_rl.identification.identify import Found, Identification, identify, judged
-from cartpole_rl.identification.moves import experiment_guard, guarded, reach, track_end
 from cartpole_rl.identification.one_step import one_step_estimates
 from cartpole_rl.identification.quantities import quantities
 from cartpole_rl.identification.windows import part

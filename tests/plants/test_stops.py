@@ -20,8 +20,7 @@ from serial_peer import Between
 from tensordict import TensorDictBase
 
 from cartpole_rl.evaluation.episodes import run_batch
-from cartpole_rl.identification.experiments import Experiment, conduct
-from cartpole_rl.identification.moves import Moves, Task, hold
+from cartpole_rl.identification.experiments import Experiment, Moves, Task, conduct, hold
 from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.plant import SerialPlant
 from cartpole_rl.plants.settings import SerialSettings
