@@ -13,7 +13,7 @@ import serial
 
 pytest.importorskip("mujoco", reason='pip install "cartpole_rl[emulator]"')
 
-from driven_cart import Driven, check_homed
+from driven_cart import COARSE, Driven, check_homed, homed
 from emulator_host import SILENCE, EmulatorHost, emulator
 from firmwares import truth
 
@@ -37,7 +37,6 @@ from cartpole_rl.wire.frames import LONGEST_FRAME
 
 pytestmark = pytest.mark.usefixtures("each_firmware")
 
-COARSE = {"physics_step": 1e-3}
 CLOCKS = pytest.mark.parametrize("clock", ["lockstep", "real"])
 
 
@@ -83,12 +82,10 @@ def test_a_reset_is_a_boot(clock):
 
 
 def test_a_reset_while_driving_stops_the_motor_and_loses_the_zeros():
-    driven = Driven(reset_at=45.0)
-    driven.home()
-    while driven.cart.now_us < 44.7e6:
-        driven.tick()
+    driven = homed()
     driven.ask(Start())
-    while driven.cart.now_us < 45e6:
+    driven.cart._reset_us = reset_us = driven.cart.now_us + 300_000
+    while driven.cart.now_us < reset_us:
         assert driven.ask(SetMotor(150)).motor_applied == 150
     frames = driven.cart.pass_period(driven.cart.period_end_us)
     assert frames[0] == BANNER
@@ -131,16 +128,15 @@ def test_every_boot_anywhere_is_homed():
 
 def frozen(encoder: str, motors: list[int]) -> tuple[State, float]:
     """Return the STATE with a fault and the seconds of driving since an encoder froze after homing."""
-    driven = Driven(stuck_encoder=encoder, stuck_at=40.0)
-    assert driven.home().fault == 0
-    while driven.cart.now_us < 40e6:
-        driven.tick()
+    driven = homed()
+    driven.freeze(encoder)
+    frozen_us = driven.cart.now_us
     driven.ask(Start())
     for motor in itertools.islice(itertools.cycle(motors), 100):
         state = driven.ask(SetMotor(motor))
         if state.fault:
             break
-    return state, driven.cart.now_us / 1e6 - 40
+    return state, (driven.cart.now_us - frozen_us) / 1e6
 
 
 @pytest.mark.parametrize(("encoder", "fault"), [("cart", Fault.CART_ENCODER), ("pole", Fault.POLE_ENCODER)])
@@ -209,8 +205,7 @@ def test_homing_fails_with_a_frozen_encoder(encoder, fault):
 )
 def test_random_driving_through_swing_ups_raises_no_false_alarm(settings):
     """Drive 1500 periods with random values and durations; put the cart back after it reaches an end."""
-    dice, driven = random.Random(5), Driven(**settings)
-    driven.home()
+    dice, driven = random.Random(5), homed(**settings)
     driven.ask(Start())
     lasts, fastest, faults = 0, 0.0, set()
     for _ in range(1500):
