@@ -6,10 +6,10 @@ import os
 import re
 import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
 
 import pytest
-from command_line import in_process
 from firmwares import needs_compiler
 
 from cartpole_rl.emulator import c_firmware
@@ -23,7 +23,9 @@ from cartpole_rl.emulator.c_firmware import (
     load_library,
     rig_header,
 )
+from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import EmulatorError
+from cartpole_rl.plants.serial.plant import emulated_plant
 from cartpole_rl.rig.hardware import nominal_hardware
 from cartpole_rl.wire import FrameSplitter, MessageType
 from cartpole_rl.wire.messages import MESSAGES
@@ -130,17 +132,23 @@ def test_the_library_compiles_without_a_warning(tmp_path):
     compile_c(tmp_path / "library.so", c_firmware.sources(), "-shared", "-fPIC", *STRICT[1:])
 
 
-def test_an_evaluation_sends_and_receives_the_same_with_both(tmp_path):
+def test_a_driven_cart_sends_and_takes_the_same_with_both(tmp_path):
     pytest.importorskip("mujoco", reason='pip install "cartpole_rl[emulator]"')
+    counts = {}
     for kind in ("python", "c"):
-        emulator = (f"emulator.firmware={kind}", f"emulator.journal={kind}.jsonl", "emulator.latency=0.012")
-        words = ("run=lqr", "plant=emulated", "episodes=2", *emulator, f"hydra.run.dir={kind}")
-        done = in_process("evaluate", *words, folder=tmp_path)
-        assert done.code == 0, done.err
-    for name in ("{}/metrics.json", "{}.jsonl"):
-        python, c = (tmp_path.joinpath(name.format(kind)).read_text() for kind in ("python", "c"))
-        assert len(python) > 1000
-        assert c == python
+        truth = {"firmware": kind, "journal": tmp_path / kind, "latency": 0.012, "physics_step": 1e-3}
+        with closing(emulated_plant(EmulatorSettings(**truth))) as plant:
+            frames = [plant.reset_one()]
+            for step in range(150):
+                if frames[-1].ends:
+                    break
+                frames.append(plant.step_one(200 if step // 12 % 2 else -200))
+            frames.append(plant.reset_one())  # the host brings it back to the middle
+        counts[kind] = [frame.counts for frame in frames]
+    journals = [(tmp_path / kind).read_text() for kind in counts]
+    assert counts["python"] == counts["c"]
+    assert journals[0] == journals[1]
+    assert len(journals[0]) > 1000
 
 
 def test_a_cart_without_a_compiler_ends_with_one_line():
