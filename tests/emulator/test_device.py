@@ -13,7 +13,6 @@ from cartpole_rl.emulator.device import CartDevice
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.rig.hardware import nominal_encoders
 from cartpole_rl.wire import (
-    ClearFault,
     Fault,
     Flags,
     Hello,
@@ -133,29 +132,6 @@ def test_counts_follow_the_true_state():
         x, angle = driven.measured(state)
         assert x == pytest.approx(driven.x, abs=2 * METRES)
         assert angle - driven.angle - driven.settings.angle_offset == pytest.approx(0, abs=2 * RADIANS)
-
-
-def test_motor_and_angle_are_positive_to_the_right():
-    driven = Driven()
-    before = driven.home()
-    driven.ask(Start())
-    for _ in range(5):
-        state = driven.ask(SetMotor(200))
-    assert state.cart_counts > before.cart_counts
-    assert state.pole_counts > before.pole_counts  # the pole's lower end stays behind, to the left
-
-
-def test_a_cart_at_the_end_of_its_track_latches_a_fault_and_home_recovers():
-    driven = homed()
-    driven.cart.physics.place(0.405, driven.angle)
-    for _ in range(10):
-        driven.tick()
-    driven.ask(Start())
-    state = driven.ask(SetMotor(255))
-    assert state.fault == Fault.HARD_LIMIT
-    assert state.motor_applied == 0
-    driven.ask(ClearFault())
-    check_homed(driven, driven.home())
 
 
 def test_soft_limit_stops_a_slow_cart():
