@@ -1,13 +1,11 @@
-"""The C firmware: the vectors of the wire, strict compilation, and a machine without a compiler."""
+"""The C firmware: strict compilation, a machine without a compiler, the same drive as in Python."""
 
 import ctypes
-import json
 import os
 import re
 import subprocess
 import sys
 from contextlib import closing
-from pathlib import Path
 
 import pytest
 from firmwares import needs_compiler
@@ -27,81 +25,9 @@ from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import EmulatorError
 from cartpole_rl.plants.serial.plant import emulated_plant
 from cartpole_rl.rig.hardware import nominal_hardware
-from cartpole_rl.wire import FrameSplitter, MessageType
-from cartpole_rl.wire.messages import MESSAGES
 
 pytestmark = needs_compiler
-PATH = Path(__file__).parents[1] / "wire" / "vectors.json"
-VECTORS = json.loads(PATH.read_text(encoding="utf-8"))
-LONGEST_RUN = 64
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Wpedantic", "-Wshadow", "-Werror")
-
-
-class EnvelopeInC(ctypes.Structure):
-    """`cart_envelope` of firmware/src/cart_frames.h."""
-
-    _fields_ = (
-        ("header", ctypes.c_uint8 * 4),
-        ("payload", ctypes.c_uint8 * LONGEST_RUN),
-        ("payload_length", ctypes.c_size_t),
-    )
-
-
-class SplitterInC(ctypes.Structure):
-    """`cart_splitter` of firmware/src/cart_frames.h."""
-
-    _fields_ = (
-        ("run", ctypes.c_uint8 * LONGEST_RUN),
-        ("length", ctypes.c_size_t),
-        ("dropping", ctypes.c_bool),
-    )
-
-
-def runs_in_c(stream: bytes) -> list[bytes]:
-    """Return the runs of bytes that the splitter of the C firmware finds."""
-    library, splitter, length, runs = load_library(), SplitterInC(), ctypes.c_size_t(), []
-    library.cart_split.restype = ctypes.c_bool
-    for byte in stream:
-        if library.cart_split(ctypes.byref(splitter), ctypes.c_uint8(byte), ctypes.byref(length)):
-            runs.append(bytes(splitter.run[: length.value]))
-    return runs
-
-
-def opened_in_c(stuffed: bytes) -> tuple[bytes, bytes] | None:
-    """Return header and payload of a frame, or None for a damaged one."""
-    library, envelope = load_library(), EnvelopeInC()
-    library.cart_open.restype = ctypes.c_bool
-    if not library.cart_open(stuffed, ctypes.c_size_t(len(stuffed)), ctypes.byref(envelope)):
-        return None
-    return bytes(envelope.header), bytes(envelope.payload[: envelope.payload_length])
-
-
-def named(vectors: list[dict]) -> list:
-    return [pytest.param(vector, id=vector["name"]) for vector in vectors]
-
-
-@pytest.mark.parametrize("vector", named(VECTORS["good"]))
-def test_a_good_frame_is_encoded_and_opened(vector):
-    wire, kind = bytes.fromhex(vector["hex"]), MessageType[vector["type"]]
-    payload = MESSAGES[kind](**vector["fields"]).pack()
-    frame = ctypes.create_string_buffer(LONGEST_RUN)
-    library = load_library()
-    library.cart_frame.restype = ctypes.c_size_t
-    length = library.cart_frame(
-        int(kind), vector["sequence"], vector["flags"], payload, ctypes.c_size_t(len(payload)), frame
-    )
-    assert frame.raw[:length] == wire
-    (run,) = runs_in_c(wire)
-    assert opened_in_c(run) == (bytes((2, kind, vector["sequence"], vector["flags"])), payload)
-
-
-@pytest.mark.parametrize("vector", named(VECTORS["damaged"]))
-def test_a_damaged_frame_is_dropped_and_the_next_one_is_not(vector):
-    stream = bytes.fromhex(vector["hex"]) + bytes.fromhex(VECTORS["good"][0]["hex"])
-    *damaged, last = runs_in_c(stream)
-    assert [*damaged, last] == list(FrameSplitter().feed(stream))
-    assert all(opened_in_c(run) is None for run in damaged)
-    assert opened_in_c(last) is not None
 
 
 def test_the_head_of_a_cart_is_where_python_expects_it():
