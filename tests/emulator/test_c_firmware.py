@@ -1,15 +1,13 @@
-"""The C firmware: the vectors of the wire, strict compilation, and a machine without a compiler."""
+"""The C firmware: strict compilation, a machine without a compiler, the same drive as in Python."""
 
 import ctypes
-import json
 import os
 import re
 import subprocess
 import sys
-from pathlib import Path
+from contextlib import closing
 
 import pytest
-from command_line import in_process
 from firmwares import needs_compiler
 
 from cartpole_rl.emulator import c_firmware
@@ -23,83 +21,13 @@ from cartpole_rl.emulator.c_firmware import (
     load_library,
     rig_header,
 )
+from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import EmulatorError
+from cartpole_rl.plants.serial.plant import emulated_plant
 from cartpole_rl.rig.hardware import nominal_hardware
-from cartpole_rl.wire import FrameSplitter, MessageType
-from cartpole_rl.wire.messages import MESSAGES
 
 pytestmark = needs_compiler
-PATH = Path(__file__).parents[1] / "wire" / "vectors.json"
-VECTORS = json.loads(PATH.read_text(encoding="utf-8"))
-LONGEST_RUN = 64
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Wpedantic", "-Wshadow", "-Werror")
-
-
-class EnvelopeInC(ctypes.Structure):
-    """`cart_envelope` of firmware/src/cart_frames.h."""
-
-    _fields_ = (
-        ("header", ctypes.c_uint8 * 4),
-        ("payload", ctypes.c_uint8 * LONGEST_RUN),
-        ("payload_length", ctypes.c_size_t),
-    )
-
-
-class SplitterInC(ctypes.Structure):
-    """`cart_splitter` of firmware/src/cart_frames.h."""
-
-    _fields_ = (
-        ("run", ctypes.c_uint8 * LONGEST_RUN),
-        ("length", ctypes.c_size_t),
-        ("dropping", ctypes.c_bool),
-    )
-
-
-def runs_in_c(stream: bytes) -> list[bytes]:
-    """Return the runs of bytes that the splitter of the C firmware finds."""
-    library, splitter, length, runs = load_library(), SplitterInC(), ctypes.c_size_t(), []
-    library.cart_split.restype = ctypes.c_bool
-    for byte in stream:
-        if library.cart_split(ctypes.byref(splitter), ctypes.c_uint8(byte), ctypes.byref(length)):
-            runs.append(bytes(splitter.run[: length.value]))
-    return runs
-
-
-def opened_in_c(stuffed: bytes) -> tuple[bytes, bytes] | None:
-    """Return header and payload of a frame, or None for a damaged one."""
-    library, envelope = load_library(), EnvelopeInC()
-    library.cart_open.restype = ctypes.c_bool
-    if not library.cart_open(stuffed, ctypes.c_size_t(len(stuffed)), ctypes.byref(envelope)):
-        return None
-    return bytes(envelope.header), bytes(envelope.payload[: envelope.payload_length])
-
-
-def named(vectors: list[dict]) -> list:
-    return [pytest.param(vector, id=vector["name"]) for vector in vectors]
-
-
-@pytest.mark.parametrize("vector", named(VECTORS["good"]))
-def test_a_good_frame_is_encoded_and_opened(vector):
-    wire, kind = bytes.fromhex(vector["hex"]), MessageType[vector["type"]]
-    payload = MESSAGES[kind](**vector["fields"]).pack()
-    frame = ctypes.create_string_buffer(LONGEST_RUN)
-    library = load_library()
-    library.cart_frame.restype = ctypes.c_size_t
-    length = library.cart_frame(
-        int(kind), vector["sequence"], vector["flags"], payload, ctypes.c_size_t(len(payload)), frame
-    )
-    assert frame.raw[:length] == wire
-    (run,) = runs_in_c(wire)
-    assert opened_in_c(run) == (bytes((2, kind, vector["sequence"], vector["flags"])), payload)
-
-
-@pytest.mark.parametrize("vector", named(VECTORS["damaged"]))
-def test_a_damaged_frame_is_dropped_and_the_next_one_is_not(vector):
-    stream = bytes.fromhex(vector["hex"]) + bytes.fromhex(VECTORS["good"][0]["hex"])
-    *damaged, last = runs_in_c(stream)
-    assert [*damaged, last] == list(FrameSplitter().feed(stream))
-    assert all(opened_in_c(run) is None for run in damaged)
-    assert opened_in_c(last) is not None
 
 
 def test_the_head_of_a_cart_is_where_python_expects_it():
@@ -130,17 +58,23 @@ def test_the_library_compiles_without_a_warning(tmp_path):
     compile_c(tmp_path / "library.so", c_firmware.sources(), "-shared", "-fPIC", *STRICT[1:])
 
 
-def test_an_evaluation_sends_and_receives_the_same_with_both(tmp_path):
+def test_a_driven_cart_sends_and_takes_the_same_with_both(tmp_path):
     pytest.importorskip("mujoco", reason='pip install "cartpole_rl[emulator]"')
+    counts = {}
     for kind in ("python", "c"):
-        emulator = (f"emulator.firmware={kind}", f"emulator.journal={kind}.jsonl", "emulator.latency=0.012")
-        words = ("run=lqr", "plant=emulated", "episodes=2", *emulator, f"hydra.run.dir={kind}")
-        done = in_process("evaluate", *words, folder=tmp_path)
-        assert done.code == 0, done.err
-    for name in ("{}/metrics.json", "{}.jsonl"):
-        python, c = (tmp_path.joinpath(name.format(kind)).read_text() for kind in ("python", "c"))
-        assert len(python) > 1000
-        assert c == python
+        truth = {"firmware": kind, "journal": tmp_path / kind, "latency": 0.012, "physics_step": 1e-3}
+        with closing(emulated_plant(EmulatorSettings(**truth))) as plant:
+            frames = [plant.reset_one()]
+            for step in range(150):
+                if frames[-1].ends:
+                    break
+                frames.append(plant.step_one(200 if step // 12 % 2 else -200))
+            frames.append(plant.reset_one())  # the host brings it back to the middle
+        counts[kind] = [frame.counts for frame in frames]
+    journals = [(tmp_path / kind).read_text() for kind in counts]
+    assert counts["python"] == counts["c"]
+    assert journals[0] == journals[1]
+    assert len(journals[0]) > 1000
 
 
 def test_a_cart_without_a_compiler_ends_with_one_line():

@@ -9,7 +9,7 @@ import pytest
 
 pytest.importorskip("mujoco", reason='pip install "cartpole_rl[emulator]"')
 
-from driven_cart import Driven
+from driven_cart import Driven, homed
 
 from cartpole_rl.wire import (
     ClearFault,
@@ -81,8 +81,8 @@ def dying(driven: Driven) -> Host:
 )
 @pytest.mark.parametrize("host", [outward, to_and_fro, pumping, dying])
 def test_no_host_drives_the_cart_against_a_stop(host, cart, period_us):
-    driven, touched, fastest = ready(**cart, period_us=period_us)
-    motors = host(driven)
+    driven, touched = ready(**cart, period_us=period_us)
+    motors, fastest = host(driven), 0.0
     ends_us = driven.cart.now_us + SECONDS * 1e6
     while driven.cart.now_us < ends_us:
         if not driven.cart.firmware.armed:  # it crept into the hard limit
@@ -99,33 +99,28 @@ def test_no_host_drives_the_cart_against_a_stop(host, cart, period_us):
 @pytest.mark.parametrize("cart", [{}, LARGE, HEAVY, SLIPPERY], ids=["default", "large", "heavy", "slippery"])
 @pytest.mark.parametrize("host", [outward, to_and_fro])
 def test_a_cart_whose_encoder_freezes_is_stopped_before_it_touches_a_stop(host, cart, after):
-    driven, touched, _ = ready(**cart, until_s=45, stuck_encoder="cart", stuck_at=45 + after)
-    motors = host(driven)
-    while driven.cart.now_us < 49e6:
+    driven, touched = ready(**cart)
+    driven.freeze("cart", 1e6 * after)
+    motors, end_us = host(driven), driven.cart.now_us + 4e6
+    while driven.cart.now_us < end_us:
         state = driven.ask(SetMotor(next(motors))) if driven.cart.firmware.armed else driven.tick()
     assert state.fault & Fault.CART_ENCODER
     assert max(touched, default=0.0) <= 0.1
 
 
-def ready(period_us: int = 20_000, until_s: float = 0, **cart: float) -> tuple[Driven, list[float], float]:
-    """Return a homed and armed cart, and the list of the speeds at which it touches a stop from then on.
-
-    It is armed 1 s after homing, or at `until_s` of its own clock.
-    """
-    driven, touched = Driven(**cart), []
-    driven.home()
+def ready(period_us: int = 20_000, **cart: float) -> tuple[Driven, list[float]]:
+    """Return a homed and armed cart, and the list of the speeds at which it touches a stop from then on."""
+    driven, touched = homed(**cart), []
     driven.cart.physics.on_contact = touched.append
     driven.ask(SetPeriod(period_us))
-    armed_us = 1e6 * until_s or driven.cart.now_us + 1e6
-    while driven.cart.now_us < armed_us:
-        driven.tick()
+    driven.tick_until(driven.cart.now_us + 1e6)
     driven.ask(Start())
-    return driven, touched, 0.0
+    return driven, touched
 
 
 @pytest.mark.parametrize("leave", [Stop(), None], ids=["stop", "silence"])
 def test_a_cart_that_is_left_at_speed_is_braked_and_then_left_alone(leave):
-    driven, touched, _ = ready()
+    driven, touched = ready()
     while driven.x < 0.1:
         driven.ask(SetMotor(255))
     assert driven.cart.physics.x_dot > 0.6
@@ -139,7 +134,7 @@ def test_a_cart_that_is_left_at_speed_is_braked_and_then_left_alone(leave):
 
 
 def test_a_hand_that_moves_an_idle_cart_is_not_fought():
-    driven, _, _ = ready()
+    driven, _ = ready()
     driven.ask(Stop())
     for _ in range(200):
         driven.tick()
@@ -148,7 +143,7 @@ def test_a_hand_that_moves_an_idle_cart_is_not_fought():
 
 
 def test_a_limit_that_acts_is_reported():
-    driven, _, _ = ready()
+    driven, _ = ready()
     flags = Flags(0)
     while not flags & Flags.SOFT_LIMIT:
         state = driven.ask(SetMotor(255))
@@ -177,7 +172,7 @@ def test_homing_ends_half_a_second_after_its_host_died(frames):
     ("age", "motor", "stale"), [(0, 9, 0), (2, 9, 0), (3, 9, 1), (-1, 9, 1), (300, 0, 0)]
 )
 def test_a_motor_value_that_answers_an_old_or_unknown_state_is_refused(age, motor, stale):
-    driven, _, _ = ready()
+    driven, _ = ready()
     frame = encode_frame(SetMotor(motor, driven.newest - age), 7)[:-1]
     answers = [decode_frame(one[:-1]).message for one in driven.cart.receive(frame, driven.cart.now_us)]
     assert answers == ([Nack(7, SetMotor.TYPE, Reason.STALE)] if stale else [])
@@ -186,7 +181,7 @@ def test_a_motor_value_that_answers_an_old_or_unknown_state_is_refused(age, moto
 @pytest.mark.parametrize("age", [0, 1, 2])
 def test_no_motor_value_is_in_force_three_periods_after_the_state_that_it_answers(age):
     """It arrives late, the last one before the host falls silent."""
-    driven, _, _ = ready()
+    driven, _ = ready()
     answered = driven.newest
     for _ in range(age):
         driven.tick()

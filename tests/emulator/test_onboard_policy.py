@@ -1,6 +1,7 @@
 """A policy on the board drives from START_POLICY on, under all rules, until the host takes over."""
 
 import ctypes
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -224,6 +225,22 @@ def test_an_emulated_cart_drives_by_the_c_code_of_a_policy():
     assert driven.flags == Flags.ARMED | Flags.HOMED
 
 
+def driving(policy: Path, pole_length: float = 0.25) -> CFirmware:
+    """A homed cart that drives by the C code of a policy."""
+    firmware = CFirmware(lambda: 0, policy=policy, pole_length=pole_length)
+    firmware.homed = True
+    firmware.receive(encode_frame(StartPolicy(), 1)[:-1], 0)
+    return firmware
+
+
+def changed(folder: Path, old: str, new: str) -> Path:
+    """Write the policy of SHUTTLE, with a text replaced, into a folder; return the folder."""
+    for file in ("policy.h", "policy.c"):
+        text = (SHUTTLE / file).read_text(encoding="utf-8")
+        folder.joinpath(file).write_text(text.replace(old, new), encoding="utf-8")
+    return folder
+
+
 def test_the_c_code_of_a_policy_gives_0_at_another_period():
     firmware = CFirmware(lambda: 0, policy=SHUTTLE, pole_length=0.3556)
     firmware.homed = True
@@ -239,19 +256,13 @@ def test_the_c_code_of_a_policy_gives_0_at_another_period():
 
 @pytest.mark.parametrize("name", ["POLICY_CART_NANOMETRES_PER_COUNT", "POLICY_POLE_COUNTS_PER_TURN"])
 def test_a_policy_for_other_encoders_does_not_compile(name, tmp_path):
-    for file in ("policy.h", "policy.c"):
-        text = (SHUTTLE / file).read_text(encoding="utf-8")
-        tmp_path.joinpath(file).write_text(text.replace(f"{name} ", f"{name} 1"), encoding="utf-8")
     with pytest.raises(EmulatorError, match="for other encoders"):
-        build_library(tmp_path)
+        build_library(changed(tmp_path, f"{name} ", f"{name} 1"))
 
 
 @pytest.mark.parametrize("flags", [[], ["-DCART_POLE_LENGTH=0.3556f"]])
 def test_an_agent_that_observes_the_length_compiles_only_with_one(flags, tmp_path):
-    header = (SHUTTLE / "policy.h").read_text(encoding="utf-8")
-    tmp_path.joinpath("policy.h").write_text(
-        header.replace("POLICY_OBSERVES_LENGTH 0", "POLICY_OBSERVES_LENGTH 1"), encoding="utf-8"
-    )
+    changed(tmp_path, "POLICY_OBSERVES_LENGTH 0", "POLICY_OBSERVES_LENGTH 1")
     board = tmp_path / "board.c"
     board.write_text(
         '#include "onboard.h"\nvoid boot(cart *self);\nvoid boot(cart *self) { onboard_attach(self); }\n'
@@ -266,8 +277,7 @@ def test_an_agent_that_observes_the_length_compiles_only_with_one(flags, tmp_pat
 
 def test_the_c_code_of_a_policy_observes_the_length_of_the_emulated_pole(tmp_path):
     """A policy that returns its pole's length in mm as the motor value."""
-    for name in ("policy.h", "policy.c"):
-        tmp_path.joinpath(name).write_text((SHUTTLE / name).read_text(encoding="utf-8"), encoding="utf-8")
+    shutil.copy(SHUTTLE / "policy.h", tmp_path)
     tmp_path.joinpath("policy.c").write_text(
         '#include "policy.h"\n'
         "void policy_start(policy_t *policy, float track_end, float pole_length)\n"
@@ -278,10 +288,7 @@ def test_the_c_code_of_a_policy_observes_the_length_of_the_emulated_pole(tmp_pat
         "{\n    (void)cart_counts, (void)pole_counts, (void)dt;\n"
         "    return (int16_t)(1000 * policy->track_end);\n}\n"
     )
-    carts = [CFirmware(lambda: 0, policy=tmp_path, pole_length=length) for length in (0.25, 0.125)]
-    for firmware in carts:
-        firmware.homed = True
-        firmware.receive(encode_frame(StartPolicy(), 1)[:-1], 0)
+    carts = [driving(tmp_path, length) for length in (0.25, 0.125)]
     for firmware in carts:
         firmware.tick(20_000, 0, 2048)
     assert [firmware.motor for firmware in carts] == [250, 125]
@@ -290,12 +297,7 @@ def test_the_c_code_of_a_policy_observes_the_length_of_the_emulated_pole(tmp_pat
 def test_a_policy_that_replaces_another_in_its_folder_is_compiled(tmp_path):
     motors = []
     for push in ("110", "90"):
-        for name in ("policy.h", "policy.c"):
-            text = (SHUTTLE / name).read_text(encoding="utf-8").replace("PUSH 110", f"PUSH {push}")
-            tmp_path.joinpath(name).write_text(text, encoding="utf-8")
-        firmware = CFirmware(lambda: 0, policy=tmp_path, pole_length=0.25)
-        firmware.homed = True
-        firmware.receive(encode_frame(StartPolicy(), 1)[:-1], 0)
+        firmware = driving(changed(tmp_path, "PUSH 110", f"PUSH {push}"))
         firmware.tick(20_000, 0, 2048)
         motors.append(firmware.motor)
     assert motors == [110, 90]

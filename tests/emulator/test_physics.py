@@ -8,7 +8,7 @@ pytest.importorskip("mujoco", reason='pip install "cartpole_rl[emulator]"')
 
 import itertools
 
-from cartpole_rl.emulator.physics import GRAVITY, CartPhysics
+from cartpole_rl.emulator.physics import GRAVITY, CartPhysics, Motor
 from cartpole_rl.emulator.settings import EmulatorSettings
 
 FREE = {
@@ -31,6 +31,27 @@ MEDIUM = {"pole_mass": 0.127, "pole_com": 0.1778, "pole_inertia": 1.199e-3}
 NO_POLE = {"pole_mass": 1e-6, "pole_com": 0.01, "pole_inertia": 1e-10}
 HELD = {"cart_mass": 1e4}
 PERIOD = 0.02
+
+
+def test_force_curve_dead_band_and_asymmetry():
+    settings = EmulatorSettings(
+        force_curve=(1e-5, 0.02, -1.0), force_asymmetry=0.1, deadband_left=80, deadband_right=60
+    )
+    motor = Motor(settings)
+    assert motor.static_force(100) == pytest.approx(1.1 * 1.1)
+    assert motor.static_force(-100) == pytest.approx(-1.1)
+    assert motor.static_force(60) == motor.static_force(-80) == motor.static_force(0) == 0.0
+    assert motor.static_force(61) > 0 > motor.static_force(-81)
+    assert Motor(EmulatorSettings(deadband_right=0)).static_force(30) == 0.0  # the curve is never negative
+
+
+def test_force_lags_by_its_time_constant():
+    motor = Motor(EmulatorSettings(**PLAIN_MOTOR | {"motor_time_constant": 0.01}))
+    decay = motor.decay(0.01)
+    assert motor.step(motor.static_force(100), decay) == pytest.approx(2.0 * (1 - math.exp(-1)))
+    assert motor.step(motor.static_force(0), decay) == pytest.approx(2.0 * (1 - math.exp(-1)) * math.exp(-1))
+    without_lag = Motor(EmulatorSettings(**PLAIN_MOTOR))
+    assert without_lag.step(without_lag.static_force(100), without_lag.decay(0.001)) == pytest.approx(2.0)
 
 
 def energy(cart: CartPhysics, settings: EmulatorSettings) -> float:
@@ -162,21 +183,8 @@ def test_tilt_pulls_the_cart_to_the_lower_end_and_the_pole_hangs_by_gravity():
 
 
 def test_a_stepper_moves_as_it_is_told_whatever_pole_and_tilt_do():
-    settings = EmulatorSettings(
-        backdrivability=0,
-        cart_mass=2,
-        force_curve=(0, 0.02, 0),
-        deadband_left=0,
-        deadband_right=0,
-        force_asymmetry=0,
-        motor_time_constant=0,
-        cart_viscous=0,
-        cart_coulomb_left=0,
-        cart_coulomb_right=0,
-        track_tilt=0.1,
-        pole_mass=0.5,
-    )
-    cart = CartPhysics(settings)
+    moved = {"backdrivability": 0, "cart_mass": 2, "track_tilt": 0.1, "pole_mass": 0.5}
+    cart = CartPhysics(EmulatorSettings(**FREE | PLAIN_MOTOR | moved))
     cart.place(0.0, 2.0, 3.0)
     cart.advance(0, 0.5)
     assert abs(cart.x) < 1e-5

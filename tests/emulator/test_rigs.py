@@ -90,7 +90,7 @@ def check_homes(cart: EmulatorSettings) -> None:
     assert abs(math.remainder(angle - math.pi, math.tau)) < 0.07
 
 
-@settings(max_examples=8, derandomize=True, deadline=None)
+@settings(max_examples=6, derandomize=True, deadline=None)
 @given(rig=rigs(), seed=st.integers(0, 99))
 def test_both_firmwares_home_the_cart_of_any_rig(rig: Hardware, seed: int) -> None:
     check_homes(cart_of(rig, seed=seed))

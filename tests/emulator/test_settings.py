@@ -8,21 +8,6 @@ from pydantic import ValidationError
 from cartpole_rl.emulator.settings import EmulatorSettings
 
 PAGE = (Path(__file__).parents[2] / "docs" / "emulator.md").read_text(encoding="utf-8")
-FAULTS = ["unplug_at", "reset_at", "stuck_encoder", "stuck_at"]
-OURS = [
-    "boot",
-    "clock",
-    "clock_rate",
-    "firmware",
-    "journal",
-    "knock",
-    "physics_step",
-    "policy",
-    "port",
-    "seed",
-    "start",
-    *FAULTS,
-]
 
 
 @pytest.mark.parametrize(
@@ -50,6 +35,7 @@ def test_settings_survive_json():
     assert EmulatorSettings.model_validate_json(settings.model_dump_json()) == settings
 
 
-@pytest.mark.parametrize("name", [*FAULTS, *OURS])
-def test_the_page_names(name):
-    assert f"`{name}`" in PAGE
+def test_the_page_names_every_setting():
+    """`deadband_right` is shortened there; `backdrivability` is a number of a cart's file."""
+    unnamed = {name for name in EmulatorSettings.model_fields if f"`{name}`" not in PAGE}
+    assert unnamed == {"deadband_right", "backdrivability"}

@@ -26,11 +26,15 @@ needs_zig = pytest.mark.skipif(
 )
 
 
+def run_make(*words: object, folder: Path | None = None) -> "subprocess.CompletedProcess[str]":
+    command = ["make", "-C", str(firmware_folder()), *map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True, cwd=folder)
+
+
 @needs_arm
 @pytest.mark.parametrize("board", ["nucleo_f401re", "qemu_an386"])
 def test_a_board_of_cortex_m_compiles_and_is_small(board: str, tmp_path: Path) -> None:
-    make = ["make", "-C", str(firmware_folder()), f"BUILD={tmp_path}", board]
-    done = subprocess.run(make, capture_output=True, text=True)
+    done = run_make(f"BUILD={tmp_path}", board)
     assert (done.returncode, done.stderr) == (0, "")
     sizes = re.search(r"text\s+data\s+bss.*\n\s*(?P<text>\d+)\s+\d+\s+(?P<bss>\d+)", done.stdout)
     assert sizes is not None
@@ -40,37 +44,36 @@ def test_a_board_of_cortex_m_compiles_and_is_small(board: str, tmp_path: Path) -
 @needs_arm
 def test_a_program_with_a_policy_does_not_take_the_place_of_the_one_without(tmp_path: Path) -> None:
     """A new policy.h is compiled; the plain program stays as it was and is not the one with the policy."""
-    policy = shutil.copytree(SHUTTLE, tmp_path / "policy")
-    build = tmp_path / "build"
-
-    def make(*words: str) -> str:
-        command = ["make", "-C", str(firmware_folder()), f"BUILD={build}", "nucleo_f401re", *words]
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout
-
-    make(f"POLICY={policy}")
-    assert ARM in make()
+    policy, other = (shutil.copytree(SHUTTLE, tmp_path / name) for name in ("policy", "other"))
+    build, chosen = tmp_path / "build", f"POLICY={policy}"
+    for words in ([chosen], []):
+        assert ARM in run_make(f"BUILD={build}", "nucleo_f401re", *words).stdout
     programs = [build / "nucleo_f401re-policy.elf", build / "nucleo_f401re.elf"]
     assert programs[0].read_bytes() != programs[1].read_bytes()
-    assert ARM not in make(f"POLICY={policy}")
-    other = f"POLICY={shutil.copytree(policy, tmp_path / 'other')}"
-    assert ARM in make(other)
-    assert ARM in make(other, "POLE_LENGTH=0.3")
+
+    def compiles_again(*words: str) -> bool:
+        copy = shutil.copytree(build, tmp_path / f"copy_{len([*tmp_path.iterdir()])}")
+        return ARM in run_make("-n", f"BUILD={copy}", "nucleo_f401re", *words).stdout
+
+    assert not compiles_again(chosen)
+    assert not compiles_again()
+    assert compiles_again(f"POLICY={other}")
+    assert compiles_again(chosen, "POLE_LENGTH=0.3")
     os.utime(policy / "policy.h", (2**31, 2**31))
-    assert ARM in make(f"POLICY={policy}")
+    assert compiles_again(chosen)
+    assert not compiles_again()
 
 
 @needs_arm
 @pytest.mark.parametrize("length", ["1", ".3"])
 def test_any_notation_of_a_length_compiles(length: str, tmp_path: Path) -> None:
-    words = (f"BUILD={tmp_path}", "nucleo_f401re", f"POLICY={SHUTTLE}", f"POLE_LENGTH={length}")
-    done = subprocess.run(["make", "-C", str(firmware_folder()), *words], capture_output=True, text=True)
+    done = run_make(f"BUILD={tmp_path}", "nucleo_f401re", f"POLICY={SHUTTLE}", f"POLE_LENGTH={length}")
     assert (done.returncode, done.stderr) == (0, "")
 
 
 @pytest.mark.parametrize("length", ["355.6", "0", "0,3556", "nan"])
 def test_a_length_that_no_pole_has_is_refused(length: str) -> None:
-    words = ("-n", "nucleo_f401re", f"POLICY={SHUTTLE}", f"POLE_LENGTH={length}")
-    done = subprocess.run(["make", "-C", str(firmware_folder()), *words], capture_output=True, text=True)
+    done = run_make("-n", "nucleo_f401re", f"POLICY={SHUTTLE}", f"POLE_LENGTH={length}")
     assert done.returncode != 0
     assert f"POLE_LENGTH={length}: give twice the distance from pivot to centre of mass in m" in done.stderr
 
@@ -79,9 +82,7 @@ def test_a_length_that_no_pole_has_is_refused(length: str) -> None:
 def test_a_folder_without_a_policy_is_named(tmp_path: Path) -> None:
     """make -C looks for a relative folder in firmware/."""
     folder = shutil.copytree(SHUTTLE, tmp_path / "policy").name
-    words = (f"BUILD={tmp_path}", "nucleo_f401re", f"POLICY={folder}")
-    make = ["make", "-C", str(firmware_folder()), *words]
-    done = subprocess.run(make, capture_output=True, text=True, cwd=tmp_path)
+    done = run_make(f"BUILD={tmp_path}", "nucleo_f401re", f"POLICY={folder}", folder=tmp_path)
     assert done.returncode != 0
     assert f"POLICY={folder}: there is no policy.c in it; give the absolute path" in done.stderr
 

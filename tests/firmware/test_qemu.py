@@ -3,7 +3,7 @@
 import json
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -18,8 +18,10 @@ pytestmark = pytest.mark.skipif(
 
 from cartpole_rl.errors import LinkError  # noqa: E402
 from cartpole_rl.plants.serial.cart import SerialCart  # noqa: E402
+from cartpole_rl.plants.serial.errors import RefusedError  # noqa: E402
 from cartpole_rl.plants.settings import SerialSettings  # noqa: E402
-from cartpole_rl.wire import Fault, Flags  # noqa: E402
+from cartpole_rl.rig.hardware import nominal_hardware  # noqa: E402
+from cartpole_rl.wire import Fault, Flags, State  # noqa: E402
 
 PUSH, FAR = 110, 400  # motor value, and counts from the middle: 9 mm
 SHUTTLE = Path(__file__).parents[1] / "support" / "shuttle"
@@ -46,15 +48,37 @@ def _a_slow_machine_is_not_suspended(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(SerialCart, "longest_suspension", 60.0)
 
 
-def home(cart: SerialCart) -> None:
+def home(cart: SerialCart, watch: Callable[[State], None] = lambda state: None) -> None:
     """Home; again if this machine was so busy that the board heard nothing for half a second."""
     while not cart.flags & Flags.HOMED:
         try:
-            cart.home()
+            cart.home(watch)
         except LinkError as error:
             assert "ended homing" in str(error) or "is too slow" in str(error)  # noqa: PT017
 
 
+class MovedError(Exception):
+    """The cart moves."""
+
+
+def test_it_moves_when_it_homes_and_stops_when_its_host_falls_silent() -> None:
+    def watch(state: State) -> None:
+        if state.cart_counts < -FAR:
+            assert cart.flags & Flags.HOMING
+            raise MovedError
+
+    with board() as port, SerialCart(SETTINGS.model_copy(update={"port": port})) as cart:
+        assert cart.information.pole_counts_per_turn == nominal_hardware().pole_counts_per_turn
+        with pytest.raises(RefusedError, match="it is not homed"):
+            cart.start()
+        with pytest.raises(MovedError):
+            home(cart, watch)
+        while cart.flags & Flags.HOMING:
+            state = cart.get_state()
+        assert (state.motor_applied, state.fault, cart.flags) == (0, Fault.NONE, Flags(0))
+
+
+@pytest.mark.nightly  # homing takes half a minute of the clock
 def test_it_homes_drives_and_stops_like_any_cart_and_then_drives_by_its_own_policy() -> None:
     with (
         board("--policy", str(SHUTTLE)) as port,

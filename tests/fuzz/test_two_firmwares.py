@@ -14,7 +14,7 @@ from cartpole_rl.emulator import c_firmware
 from cartpole_rl.rig.hardware import hardware_of
 
 pytestmark = needs_compiler
-SHORT = ("--bytes", "50000", "--frames", "8000")
+SHORT = ("--bytes", "20000", "--frames", "3000")
 OTHER = {
     "cart_nanometres_per_count": 98_175,
     "pole_counts_per_turn": 1001,
@@ -31,20 +31,22 @@ OTHER = {
 }
 
 
-def run_script(*words: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, str(SCRIPTS / "fuzz" / "two_firmwares.py"), *words]
-    return subprocess.run(command, capture_output=True, text=True)
-
-
-@pytest.mark.parametrize("rig", [{}, OTHER], ids=["ip02", "other"])
-def test_both_firmwares_agree_under_sanitizers(rig: dict[str, float]) -> None:
+@pytest.mark.parametrize(
+    ("rig", "seed", "counted"),
+    [({}, "16", " 2 POLE_ENCODER,"), (OTHER, "6", " 1 homings,")],
+    ids=["ip02, with failing encoders", "other, homed and driven"],
+)
+def test_both_firmwares_agree_under_sanitizers(rig: dict[str, float], seed: str, counted: str) -> None:
     compiler = c_firmware.find_compiler()
     found = subprocess.run([compiler, "-print-file-name=libasan.so"], capture_output=True, text=True)
     if not Path(found.stdout.strip()).is_absolute():
         pytest.skip("needs the address sanitizer of gcc")
-    done = run_script(*SHORT, "--rig", json.dumps(rig))
+    command = [sys.executable, str(SCRIPTS / "fuzz" / "two_firmwares.py"), *SHORT]
+    words = ["--seed", seed, "--rig", json.dumps(rig)]
+    done = subprocess.run([*command, *words], capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
     assert "no difference" in done.stdout
+    assert counted in done.stdout
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,7 @@ from cartpole_rl.wire import Flags, Frame, SetMotor, Start, State
 MOTORS = (-255, -100, 0, 255)
 PERIODS = 12
 RELAXED = settings(
-    max_examples=15,
+    max_examples=10,
     deadline=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )

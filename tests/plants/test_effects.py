@@ -88,18 +88,6 @@ def test_a_dead_band_below_the_smallest_motor_value_has_none(
     assert idle(ip02, large, medium, actions) == set()
 
 
-def wide(name: str, nominal: float) -> tuple[float, float]:
-    """A range of a parameter about its nominal value."""
-    if name.startswith("deadband"):
-        return (0.0, 210.0)
-    if nominal == 0:
-        return (0.0, 1e-6) if name == "force_quadratic" else (0.0, 0.02)
-    if name == "backdrivability":
-        return (0.8, 1.0)
-    low, high = sorted((0.9 * nominal, 1.2 * nominal))
-    return (max(low, 1.0), high) if name == "cart_stiction_ratio" else (low, high)
-
-
 def test_narrow_ranges_have_an_effect(ip02: dict[str, float], medium: PoleSettings) -> None:
     """Of every parameter, by a per cent, under models that read all of them but the slope of the sigmoid."""
     models = Models.of(cart_friction="stribeck", pole_friction="bearing")

@@ -54,18 +54,12 @@ def test_the_end_of_the_track_ends_the_episode_and_the_next_one_begins(plant: Se
     assert plant.ended_by == "track"
     assert side * frame["counts"][0, 0] >= plant.cart.information.soft_limit_counts
     assert side * plant.cart.poll_state().motor_applied <= 0  # the firmware brakes
+    before_us = plant.cart.poll_state().time_us
     frame = plant.reset()
+    assert plant.cart.poll_state().time_us - before_us < 20e6  # its brake lost no counts: it need not home
     assert not frame["done"]
     assert abs(frame["counts"][0, 0]) < 100
-
-
-def test_an_episode_can_be_had_again() -> None:
-    def episode() -> list[list[int]]:
-        with contextlib.closing(emulated_plant(fast(seed=3))) as plant:
-            plant.reset()
-            return [push(plant, 200 if step % 24 < 12 else -200)["counts"][0].tolist() for step in range(60)]
-
-    assert episode() == episode()
+    assert abs(frame["counts"][0, 1] % TURN - TURN // 2) < 16
 
 
 def test_an_upright_start() -> None:

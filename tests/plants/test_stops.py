@@ -178,23 +178,28 @@ def host() -> Iterator[Callable[..., "subprocess.Popen[bytes]"]]:
     [
         (signal.SIGKILL, "plain", "watchdog"),
         (signal.SIGSTOP, "plain", "watchdog"),
-        (signal.SIGTERM, "plain", "watchdog"),
         (signal.SIGTERM, "unwinds", "STOP"),
         (signal.SIGHUP, "unwinds", "STOP"),
         (signal.SIGINT, "plain", "STOP"),
     ],
 )
-def test_a_signal(
+def test_a_signal_after_which_the_cart_can_be_driven_again(
     cart: TellingCart,
     host: Callable[..., "subprocess.Popen[bytes]"],
     ending: signal.Signals,
     manner: str,
     by: str,
 ) -> None:
-    host(cart.port, manner).send_signal(ending)
+    process = host(cart.port, manner)
+    process.send_signal(ending)
     after, through = cart.stopped()
     assert 0 < after <= WATCHDOG_MS
     assert through == by
+    process.kill()
+    process.wait()
+    with SerialCart(SerialSettings(port=cart.port)) as again:
+        assert again.get_state().motor_applied == 0
+        assert again.flags & (Flags.ARMED | Flags.HOMED) == Flags.HOMED
 
 
 def test_a_pulled_cable(cart: TellingCart, host: Callable[..., "subprocess.Popen[bytes]"]) -> None:
@@ -287,15 +292,3 @@ def test_the_end_of_an_episode(cart: TellingCart, make_environment: Callable) ->
         after, through = cart.stopped()  # though the port is still open
         assert 0 < after <= WATCHDOG_MS
         assert through == "STOP"
-
-
-def test_the_cart_can_be_driven_again_after_all_that(
-    cart: TellingCart, host: Callable[..., "subprocess.Popen[bytes]"]
-) -> None:
-    host(cart.port).kill()
-    cart.stopped()
-    with SerialCart(SerialSettings(port=cart.port)) as again:
-        state = again.get_state()
-        assert state.motor_applied == 0
-        assert not again.flags & Flags.ARMED
-        assert again.flags & Flags.HOMED

@@ -1,10 +1,14 @@
 """An emulated cart without a process or a wire, and a changed value of each of its physical settings."""
 
+import copy
+import ctypes
+import functools
 import math
 
 import pytest
-from firmwares import answering, truth
+from firmwares import UnderTest, answering, truth
 
+from cartpole_rl.emulator.c_firmware import CFirmware
 from cartpole_rl.emulator.device import CartDevice
 from cartpole_rl.rig.hardware import nominal_hardware
 from cartpole_rl.wire import Flags, Hello, Home, Info, Message, State, decode_frame, encode_frame
@@ -79,8 +83,39 @@ class Driven:
             state = self.ask(Hello())
         return state
 
+    def tick_until(self, end_us: float) -> None:
+        while self.cart.now_us < end_us:
+            self.tick()
+
+    def freeze(self, encoder: str, after_us: float = 0) -> None:
+        """Let the count of an encoder stand still from a time on."""
+        self.cart._settings = self.cart._settings.model_copy(update={"stuck_encoder": encoder})
+        self.cart._stuck_us = self.cart.now_us + round(after_us)
+
     def measured(self, state: State) -> tuple[float, float]:
         return state.cart_counts * self.encoders.metres, state.pole_counts * self.encoders.radians
+
+
+def homed(**settings: object) -> Driven:
+    """Return a cart that has just homed: a copy, as the same settings are homed once."""
+    original = homed_once(UnderTest.kind, tuple(settings.items()))
+    old, twin = original.cart.firmware, None
+    if isinstance(old, CFirmware):
+        twin = original.cart._new_firmware()
+        own_memory = twin._head.policy_memory
+        ctypes.memmove(twin._memory, old._memory, len(old._memory))
+        twin._head.policy_memory = own_memory
+    driven = copy.deepcopy(original, {id(old): twin} if twin else {})
+    driven.cart.firmware._delay_us = driven.cart._latency_us
+    return driven
+
+
+@functools.cache
+def homed_once(kind: str, settings: tuple[tuple[str, object], ...]) -> Driven:
+    """Return a cart of `settings` with the firmware `kind` that has just homed."""
+    driven = Driven(**dict(settings))
+    assert driven.home().fault == 0
+    return driven
 
 
 def check_homed(driven: Driven, state: State) -> None:

@@ -190,6 +190,18 @@ class Forgetful(CartPeer):
         yield from super().answer(frame)
 
 
+class HomingForever(Forgetful):
+    """Homes until it is stopped; hears no STOP while `deaf_to` is above 0."""
+
+    def __init__(self) -> None:
+        super().__init__(Stop, 0)
+
+    def carry_out(self, message: Message) -> None:
+        super().carry_out(message)
+        if isinstance(message, Home | Stop):
+            self.flags = Flags.HOMING if isinstance(message, Home) else Flags(0)
+
+
 class Between:
     """A cable between a cart's port and the new `port`: frames pass, some with a sign changed.
 

@@ -1,4 +1,4 @@
-"""The controller that centres a cart, on made-up states. On emulated carts: test_serial_recentring.py."""
+"""The controller that centres a cart, on made-up states. On emulated carts: test_recentring.py."""
 
 from itertools import pairwise
 

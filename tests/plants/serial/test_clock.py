@@ -8,13 +8,13 @@ from contextlib import contextmanager
 from dataclasses import replace
 
 import pytest
-from serial_peer import INFO, CartPeer, quick_settings, wait_for
+from serial_peer import INFO, HomingForever, quick_settings, wait_for
 
 from cartpole_rl.errors import LinkError
 from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.link import now
 from cartpole_rl.plants.serial.tracking import LARGEST_RATE_ERROR, ClockComparison
-from cartpole_rl.wire import Flags, Home, Message
+from cartpole_rl.wire import Flags
 
 PERIOD = 0.02  # s by the cart's clock
 WRONG, RIGHT = (1.3, 0.6, 1.02, 0.985), (1.0, 1.005, 0.995)
@@ -104,18 +104,13 @@ def test_a_single_busy_second_is_not_taken_for_the_cart() -> None:
     assert arrivals.largest_error < LARGEST_RATE_ERROR
 
 
-class Ticking(CartPeer):
-    """A cart whose clock passes `rate` s in a second, and which homes for as long as it is left alone."""
+class Ticking(HomingForever):
+    """A cart whose clock passes `rate` s in a second."""
 
     def __init__(self, rate: float) -> None:
-        super().__init__(paced=True)
+        super().__init__()
+        self.paced, self.rate = True, rate
         self.info = replace(INFO, period_us=100_000)  # no busy computer takes so long to answer
-        self.rate = rate
-
-    def carry_out(self, message: Message) -> None:
-        super().carry_out(message)
-        if isinstance(message, Home):
-            self.flags = Flags.HOMING
 
     @contextmanager
     def ticking(self) -> Iterator[None]:

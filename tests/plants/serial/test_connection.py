@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 
 import pytest
-from serial_peer import CartPeer, Forgetful, Refusing, quick_settings
+from serial_peer import CartPeer, Forgetful, HomingForever, Refusing, quick_settings
 
 from cartpole_rl.errors import FaultError, LinkError, PlantError
 from cartpole_rl.plants.serial import connection
@@ -19,7 +19,6 @@ from cartpole_rl.wire import (
     Frame,
     Hello,
     Home,
-    Message,
     Nack,
     Reason,
     SetMotor,
@@ -232,15 +231,6 @@ def test_a_homing_that_does_not_end() -> None:
         with pytest.raises(PlantError, match=r"not done after 0\.1 s"):
             cart.home()
         assert isinstance(peer.received[-1].message, Stop)
-
-
-class HomingForever(CartPeer):
-    """Homes and never ends; `carry_out` of another frame is that of a cart."""
-
-    def carry_out(self, message: Message) -> None:
-        super().carry_out(message)
-        if isinstance(message, Home):
-            self.flags = Flags.HOMING
 
 
 def test_a_cart_that_homes_is_asked_ten_times_a_second_of_its_own_clock() -> None:

@@ -1,4 +1,4 @@
-"""The plant on a scripted cart: endings, clocks and faults. On the emulated cart: test_emulated_plant.py."""
+"""The plant on a scripted cart: endings, clocks and faults. On the emulated cart: ../test_emulated.py."""
 
 from collections.abc import Iterable, Iterator
 from contextlib import closing

@@ -107,9 +107,8 @@ class Recording(Probe):
         return super().drive(motor)
 
 
-@pytest.mark.parametrize("small", [16, 48])
-def test_a_small_dead_band_does_not_make_the_way_back_rattle(small: int) -> None:
-    breakaway = small * 0.02  # N
+def test_a_small_dead_band_does_not_make_the_way_back_rattle() -> None:
+    small, breakaway = 16, 0.32  # motor value, N
     easy = {
         "deadband_right": 0.0,
         "cart_coulomb_left": breakaway / 1.2,
@@ -166,7 +165,7 @@ def test_a_motor_without_power(probe: Probe, monkeypatch: pytest.MonkeyPatch) ->
         cart_direction(probe)
 
 
-def test_a_cart_that_hardly_moves(emulated: EmulatedCart) -> None:
+def test_a_cart_that_hardly_moves() -> None:
     with (
         EmulatedCart(fast(**{**TRUTH, "deadband_left": 170.0})) as stiff,
         SerialCart(patient(stiff.port)) as cart,
@@ -243,20 +242,8 @@ def test_a_port_that_does_not_exist() -> None:
     assert finding.words.startswith("/dev/nosuch0 does not exist")
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"pole_counts_per_turn": 2048}, "the cart reports pole_counts_per_turn 2048, not 4096"),
-        ({"soft_limit_counts": 18000}, "soft limit 409 mm, hard limit 399 mm"),
-    ],
-)
-def test_limits_that_are_not_this_carts(change: dict[str, int], words: str) -> None:
-    assert "soft 380 mm" in limits(good_limits, nominal_hardware())
-    with pytest.raises(NotReadyError, match=words):
-        limits(replace(good_limits, **change), nominal_hardware())
-
-
 def test_the_lines_of_another_carts_file_are_told() -> None:
+    assert "soft 380 mm" in limits(good_limits, nominal_hardware())
     other = replace(good_limits, cart_nanometres_per_count=84980, pole_counts_per_turn=4271)
     with pytest.raises(NotReadyError) as refused:
         limits(other, nominal_hardware())

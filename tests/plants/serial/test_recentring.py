@@ -55,7 +55,7 @@ def hangs_in_the_middle(frame: TensorDict) -> bool:
     return abs(cart) < MIDDLE and abs(pole - TURN // 2) < 16
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def plant() -> Iterator[SerialPlant]:
     with contextlib.closing(emulated_plant(fast())) as plant:
         yield plant
@@ -64,13 +64,11 @@ def plant() -> Iterator[SerialPlant]:
 @pytest.mark.parametrize(
     "truth",
     [
-        {"cart_coulomb_left": 0.8, "cart_coulomb_right": 0.6},
-        {"latency": 0.023},
-        {"track_tilt": 0.0087},
-        {"pole_mass": 0.23, "pole_com": 0.3302, "pole_inertia": 0.0079},
+        {"cart_coulomb_left": 0.8, "cart_coulomb_right": 0.6, "latency": 0.023},
+        {"pole_mass": 0.23, "pole_com": 0.3302, "pole_inertia": 0.0079, "track_tilt": 0.0087},
         {"pole_viscous": 1e-5, "pole_coulomb": 0.0, "pole_drag": 0.0},
     ],
-    ids=["friction", "latency", "tilt", "large", "no pole friction"],
+    ids=["friction and latency", "large on a tilt", "no pole friction"],
 )
 def test_many_carts_come_back_to_the_middle_sooner_than_homing(truth: dict[str, Any]) -> None:
     with contextlib.closing(emulated_plant(fast(**truth))) as plant:
@@ -114,17 +112,6 @@ def test_rehome_always_homes_each_time() -> None:
             push(plant, 100)
 
 
-def test_after_the_end_of_the_track_the_cart_need_not_be_homed(plant: SerialPlant) -> None:
-    """Its brake stops it before it meets the end stop, so no counts are lost."""
-    plant.reset()
-    while not push(plant, 250)["done"]:
-        pass
-    assert plant.ended_by == "track"
-    seconds, frame = reset(plant)
-    assert seconds < HOMING
-    assert hangs_in_the_middle(frame)
-
-
 def test_a_cart_that_has_restarted_is_homed() -> None:
     with contextlib.closing(emulated_plant(fast(reset_at=26.0))) as plant:
         plant.reset()
@@ -138,7 +125,7 @@ def test_a_cart_that_has_restarted_is_homed() -> None:
 
 
 def test_whole_turns_of_the_pole_do_not_add_up(plant: SerialPlant) -> None:
-    for _ in range(3):
+    for _ in range(2):
         _, frame = reset(plant)
         assert hangs_in_the_middle(frame)
         swing_up(plant, 150)

@@ -1,4 +1,4 @@
-"""The tracker of states, with ticks and times that a test chooses. Behind a port: test_serial_states.py."""
+"""The tracker of states, with ticks and times that a test chooses. Behind a port: test_states.py."""
 
 from dataclasses import replace
 

@@ -8,25 +8,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from serial_peer import INFO, CartPeer, wait_for
+from serial_peer import INFO, HomingForever, wait_for
 
 from cartpole_rl.signals import UNWINDING
-from cartpole_rl.wire import Flags, Home, Message, Stop
+from cartpole_rl.wire import Flags, Home, Stop
 
 PREFLIGHT = (sys.executable, "-m", "cartpole_rl.cli", "preflight")
-
-
-class Homing(CartPeer):
-    """A cart that homes until it is stopped."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.info = replace(INFO, soft_limit_counts=16704, hard_limit_counts=17539)
-
-    def carry_out(self, message: Message) -> None:
-        super().carry_out(message)
-        if isinstance(message, Home | Stop):
-            self.flags = Flags.HOMING if isinstance(message, Home) else Flags(0)
 
 
 @pytest.mark.parametrize(
@@ -38,7 +25,8 @@ def test_the_exit_code_is_that_of_the_first_signal(
     first: signal.Signals, second: signal.Signals, code: int, tmp_path: Path
 ) -> None:
     """It comes while the cart is being stopped, and again and again until the interpreter is gone."""
-    with Homing() as peer:
+    with HomingForever() as peer:
+        peer.info = replace(INFO, soft_limit_counts=16704, hard_limit_counts=17539)
         words = ["plant=serial", f"plant.port={peer.port}", f"hydra.run.dir={tmp_path}"]
         with subprocess.Popen(
             [*PREFLIGHT, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE

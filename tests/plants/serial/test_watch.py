@@ -9,9 +9,9 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
-from serial_peer import CartPeer, wait_for
+from serial_peer import CartPeer, HomingForever, wait_for
 
-from cartpole_rl.wire import Ack, ClearFault, Fault, Flags, Frame, Home, Nack, Reason, SetMotor, Start, Stop
+from cartpole_rl.wire import ClearFault, Fault, Frame, Home, Nack, Reason, SetMotor, Start, Stop
 
 SCRIPT = Path(__file__).parents[3] / "scripts/watch.py"
 OUTPUT_SPEED = 5  # of termios.tcgetattr
@@ -37,7 +37,7 @@ def test_counts_are_printed_until_an_interrupt(words: tuple[str, ...], speed: in
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP], ids=lambda number: number.name)
 def test_a_signal_while_the_cart_homes_stops_it(number: signal.Signals) -> None:
-    with Homing() as peer:
+    with HomingForever() as peer:
         command = [sys.executable, SCRIPT, peer.port, "--home"]
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
             wait_for(lambda: bool(peer.messages(Home)))
@@ -47,31 +47,16 @@ def test_a_signal_while_the_cart_homes_stops_it(number: signal.Signals) -> None:
 
 
 def test_a_second_interrupt_does_not_leave_a_homing_cart_without_stop() -> None:
-    with Homing() as peer:
+    with HomingForever() as peer:
         command = [sys.executable, SCRIPT, peer.port, "--home"]
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
             wait_for(lambda: bool(peer.messages(Home)))
-            before, peer.lost_stops = len(peer.messages(Stop)), 1
+            before, peer.deaf_to = len(peer.messages(Stop)), 1
             process.send_signal(signal.SIGINT)
             wait_for(lambda: len(peer.messages(Stop)) > before)
             process.send_signal(signal.SIGINT)
             assert process.wait(timeout=60) == 0
         assert len(peer.messages(Stop)) >= before + 2  # the first was lost, the second is answered
-
-
-class Homing(CartPeer):
-    """A cart that accepts HOME and never ends it, and to which some STOPs are lost."""
-
-    lost_stops = 0
-
-    def answer(self, frame: Frame) -> Iterable[bytes]:
-        if isinstance(frame.message, Stop) and self.lost_stops:
-            self.lost_stops -= 1
-        elif not isinstance(frame.message, Home):
-            yield from super().answer(frame)
-        else:
-            self.flags |= Flags.HOMING
-            yield self.encode(Ack(frame.sequence, Home.TYPE))
 
 
 class Faulted(CartPeer):
