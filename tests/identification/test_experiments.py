@@ -232,14 +232,19 @@ LIGHT = {"cart_mass": 0.57}
 HEAVY = {"cart_mass": 1.1, "pole_mass": 0.23, "pole_com": 0.33, "pole_inertia": 7.88e-3}
 
 
-@pytest.mark.parametrize(("cart", "period"), [(LIGHT, 0.1), (HEAVY, 0.1)])
-def test_an_emulated_cart_keeps_within_0_3_m_at_long_periods(cart: dict[str, float], period: float) -> None:
-    everything = tuple(each for each in EXPERIMENTS if each.name not in ("ramps", "swing"))
+@pytest.mark.parametrize(
+    ("cart", "names"), [(LIGHT, ("coast", "levels", "square", "excite")), (HEAVY, ("excite",))]
+)
+def test_an_emulated_cart_keeps_within_0_3_m_at_long_periods(
+    cart: dict[str, float], names: tuple[str, ...]
+) -> None:
+    """Random motor values try the guard most."""
+    chosen, period = tuple(each for each in EXPERIMENTS if each.name in names), 0.1
     with closing(emulated_plant(EmulatorSettings(physics_step=1e-3, **cart), period)) as plant:
-        recorded = [episode for _, episode in conduct(plant, period, seed=1, experiments=everything)]
+        recorded = [episode for _, episode in conduct(plant, period, seed=1, experiments=chosen)]
     assert {episode.ended_by for episode in recorded} == {"time"}
     assert max(np.abs(episode.x).max() for episode in recorded) < 0.3
-    assert sum(episode.steps for episode in recorded) * period < 240  # runs start within the guard's reach
+    assert sum(episode.steps for episode in recorded) * period < 200  # runs start within the guard's reach
 
 
 def test_the_cart_is_found(found: Identification, nominal: dict[str, float]) -> None:
