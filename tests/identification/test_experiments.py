@@ -319,11 +319,12 @@ class TestChecks:
     def test_good_recordings_pass(self, recordings: dict[str, Episode]) -> None:
         check_recordings(*split(recordings), PERIOD)
 
-    def test_too_short(self, recordings: dict[str, Episode]) -> None:
-        assert "too short; record 20 s or more" in refused(recordings, "square")
-
-    def test_a_pole_that_never_hangs_still(self, recordings: dict[str, Episode]) -> None:
-        assert "never hangs still" in refused(recordings, "excite")
+    @pytest.mark.parametrize(
+        ("name", "said"),
+        [("square", "too short; record 20 s or more"), ("excite", "never hangs still")],
+    )
+    def test_a_recording_alone(self, recordings: dict[str, Episode], name: str, said: str) -> None:
+        assert said in refused(recordings, name)
 
     @pytest.mark.parametrize(("angle", "seconds", "up"), [(0.2, 6, True), (0.2, 4, False), (0.5, 6, False)])
     def test_a_balanced_pole_tells_its_zero(
@@ -378,18 +379,21 @@ class TestChecks:
             f"{HELD_OUT}: 2.0 s are too short to judge"
         )
 
-    def test_swapped_motor_wires(self, recordings: dict[str, Episode]) -> None:
-        swapped = {name: changed(each, motor=lambda motor: -motor) for name, each in recordings.items()}
-        assert "swap the motor's wires" in refused(swapped)
-
-    def test_a_swapped_pole_encoder(self, recordings: dict[str, Episode]) -> None:
-        swapped = {
-            name: changed(
-                each, theta=lambda theta: 2 * np.pi - theta, pole=lambda counts: POLE_COUNTS_PER_TURN - counts
-            )
-            for name, each in recordings.items()
-        }
-        assert "swap the pole encoder's channels" in refused(swapped)
+    @pytest.mark.parametrize(
+        ("changes", "said"),
+        [
+            ({"motor": lambda motor: -motor}, "swap the motor's wires"),
+            (
+                {
+                    "theta": lambda theta: 2 * np.pi - theta,
+                    "pole": lambda counts: POLE_COUNTS_PER_TURN - counts,
+                },
+                "swap the pole encoder's channels",
+            ),
+        ],
+    )
+    def test_swapped_wires(self, recordings: dict[str, Episode], changes: dict[str, Any], said: str) -> None:
+        assert said in refused({name: changed(each, **changes) for name, each in recordings.items()})
 
     def test_a_saturated_cart_encoder(self, recordings: dict[str, Episode]) -> None:
         most = 9000

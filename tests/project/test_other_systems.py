@@ -41,6 +41,7 @@ for command, words in (
     (train, "compile=false learning.transitions=512 learning.carts=16 learning.chunk=8 learning.updates=1 "
         "learning.batch_size=16 learning.warmup_transitions=64 learning.evaluations=1 buffer.size=1000 "
         "learning.evaluation_episodes=1 task.time_limit=40 hydra.run.dir=trained"),
+    (evaluate, "run=trained episodes=1"),
     (evaluate, "run=trained episodes=1 plant=emulated emulator.port=tcp"),
 ):
     sys.argv = ["cartpole", *words.split()]
