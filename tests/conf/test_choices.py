@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from functools import cache
+from itertools import zip_longest
 from typing import Any
 
 import pytest
@@ -19,21 +20,24 @@ from cartpole_rl.workflows.config import EvaluateConfig, FinetuneConfig, TrainCo
 
 CONF = conf_folder()
 GROUPS = sorted(path.name for path in CONF.iterdir() if path.is_dir() and path.name != "hydra")
-CHOICES = [f"{group}={path.stem}" for group in GROUPS for path in sorted((CONF / group).glob("*.yaml"))]
-NOT_OF_TRAINING = (
-    "emulator",
-    "plant",
-    "finetuning",
-    "layout",
-    "learner",
-    "sweep",
-)  # groups with choices that are not settings of it
+NOT_OF_TRAINING = ("emulator", "plant", "finetuning", "layout", "learner", "sweep")  # or not all choices
+REPLACEABLE = ("task", "pole", "cart_friction", "pole_friction", "reward", "randomization")
+
+
+def choices(group: str) -> list[str]:
+    return sorted(path.stem for path in (CONF / group).glob("*.yaml"))
+
+
+def side_by_side(*groups: str) -> list[list[str]]:
+    """Words that choose the first of each group, the second of each, and so on to the last of the longest."""
+    named = ([f"{group}={choice}" for choice in choices(group)] for group in groups)
+    return [[word for word in words if word] for words in zip_longest(*named)]
+
+
+EXPERIMENTS = choices("experiment")
+ALONE = ("experiment", "agent", "cart")  # groups whose choices do not go with all others
+OTHERS = [group for group in GROUPS if group not in (*NOT_OF_TRAINING, *ALONE)]
 NEEDED = {"agent=recurrent": ["observation=positions"]}  # beside a choice
-REPLACEABLE = ("task", "pole", "cart_friction", "pole_friction", "reward", "randomization", "cart")
-
-
-def group_of(choice: str) -> str:
-    return choice.split("=")[0]
 
 
 @cache
@@ -43,39 +47,39 @@ def composed(name: str, *overrides: str) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def trained(hydra_reads_conf: None) -> TrainConfig:
-    return validated(TrainConfig, composed("train"))
+    """Without a guard, whose numbers an evaluation would fit anew."""
+    return validated(TrainConfig, composed("train", "guard=none"))
 
 
-@pytest.mark.parametrize("chosen", [case for case in CHOICES if group_of(case) not in NOT_OF_TRAINING])
-def test_training_takes_it(chosen: str) -> None:
-    config = validated(TrainConfig, composed("train", chosen, *NEEDED.get(chosen, [])))
+@pytest.mark.parametrize(
+    "chosen", [*side_by_side(*OTHERS), *(words for group in ALONE for words in side_by_side(group))], ids=str
+)
+def test_training_takes_it(chosen: list[str]) -> None:
+    config = validated(TrainConfig, composed("train", *chosen, *NEEDED.get(chosen[0], [])))
     draws = randomizer(config)
     assert float(draws.nominal.abs().sum()) > 0
     assert config.models(config.plant).integrator
 
 
-@pytest.mark.parametrize("chosen", [case for case in CHOICES if group_of(case) in REPLACEABLE])
-def test_an_evaluation_can_replace_the_agents_choice(chosen: str, trained: TrainConfig) -> None:
-    config = validated(EvaluateConfig, composed("evaluate", "run=somewhere", chosen))
+@pytest.mark.parametrize("chosen", [*side_by_side(*REPLACEABLE), *side_by_side("cart")], ids=str)
+def test_an_evaluation_can_replace_the_agents_choice(chosen: list[str], trained: TrainConfig) -> None:
+    config = validated(EvaluateConfig, composed("evaluate", "run=somewhere", *chosen))
     if config.cart is not None and hardware_of(config.cart) != trained.hardware:
         with pytest.raises(ConfigError, match="train one for this cart"):
             evaluated_settings(trained, config)
         return
     settings = evaluated_settings(trained, config)
     randomizer(settings)
-    wanted = validated(TrainConfig, composed("train", chosen))
-    group = group_of(chosen)
-    if group not in ("cart_friction", "pole_friction"):  # whose numbers are then the cart's
-        assert getattr(settings, group) == getattr(wanted, group)
+    wanted = validated(TrainConfig, composed("train", *chosen))
+    for group in {word.partition("=")[0] for word in chosen} - {"cart_friction", "pole_friction"}:
+        assert getattr(settings, group) == getattr(wanted, group)  # numbers of friction are then the cart's
     assert settings.nominal_cart == wanted.nominal_cart
 
 
-@pytest.mark.parametrize("chosen", [case for case in CHOICES if group_of(case) == "finetuning"])
+@pytest.mark.parametrize("chosen", choices("finetuning"))
 def test_fine_tuning_takes_it(chosen: str) -> None:
-    assert validated(FinetuneConfig, composed("finetune", "run=somewhere", chosen)).finetuning.iterations > 0
-
-
-EXPERIMENTS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
+    words = ("run=somewhere", f"finetuning={chosen}")
+    assert validated(FinetuneConfig, composed("finetune", *words)).finetuning.iterations > 0
 
 
 def leaves(tree: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -106,7 +110,7 @@ def test_an_experiment_holds_only_differences(experiment: str) -> None:
     assert not [name for name, value in leaves(content) if name in before and before[name] == value]
 
 
-@pytest.mark.parametrize("sweep", sorted(path.stem for path in (CONF / "sweep").glob("*.yaml")))
+@pytest.mark.parametrize("sweep", choices("sweep"))
 def test_training_takes_every_value_of_a_sweep(sweep: str) -> None:
     params = yaml.safe_load((CONF / f"sweep/{sweep}.yaml").read_text())["hydra"]["sweeper"]["params"]
     for parsed in OverridesParser.create().parse_overrides(
@@ -115,9 +119,9 @@ def test_training_takes_every_value_of_a_sweep(sweep: str) -> None:
         interval = parsed.value() if parsed.is_interval_sweep() else None
         values = [interval.start, interval.end] if interval else [*parsed.sweep_string_iterator()]
         assert len({*values}) > 1
-        for value in values:
+        group, _, name = parsed.get_key_element().partition(".")
+        for value in values if group in GROUPS and not name else (values[0], values[-1]):  # of numbers
             config = validated(TrainConfig, composed("train", f"{parsed.get_key_element()}={value}"))
-            group, _, name = parsed.get_key_element().partition(".")
             if name:
                 assert getattr(getattr(config, group), name) == float(value)
 

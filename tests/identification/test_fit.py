@@ -113,9 +113,11 @@ def test_a_fit_finds_another_pole(
 ) -> None:
     random = torch.Generator().manual_seed(0)
     large = PoleSettings(choices={"large": (both_poles.choices or {})["large"]})
-    env = make_environment(make_plant(2, poles=large, models=STEP, cart={"track_half_length": 2.0}), MOTORS)
+    env = make_environment(
+        make_plant(2, poles=large, models=STEP, cart={"track_half_length": 2.0}), MOTORS, time_limit=300
+    )
     recorded = run_batch(env, lambda present: present.set("action", torch.randint(5, (2,), generator=random)))
-    found = fit_cart(cut_windows(recorded, PERIOD, most=30), nominal, STEP, PERIOD).parameters
+    found = fit_cart(cut_windows(recorded, PERIOD, most=16), nominal, STEP, PERIOD).parameters
     assert found["pole_com"] == pytest.approx(large.nominal.pole_com, rel=0.05)
 
 
@@ -197,7 +199,7 @@ class TestWindows:
 
         cart = {**TRUTH, "latency": latency}
         plant = make_plant(2, cart=cart, models=STEP, period=period, substeps=4)
-        recorded = run_batch(make_environment(plant, MOTORS, time_limit=800), shake)
+        recorded = run_batch(make_environment(plant, MOTORS, time_limit=250), shake)
         windows = cut_windows(recorded, period, most=4)
         assert windows.periods * period == pytest.approx(WINDOW)
         assert len(windows.motors) == windows.periods + history_periods(period)

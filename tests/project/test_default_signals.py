@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -41,10 +40,11 @@ def test_an_interrupt_is_raised_in_this_process() -> None:
         signal.raise_signal(signal.SIGINT)
 
 
+@pytest.mark.nightly
 def test_also_where_pytest_was_started_with_signals_ignored() -> None:
     """As a script's `&` and nohup start it."""
     others = [
-        f"{Path(__file__)}::{test.__name__}"
+        f"{__file__}::{test.__name__}"
         for test in (
             test_a_child_program_ignores_no_signal,
             test_a_spawned_process_ignores_no_signal,

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.nightly
 pytest.importorskip("mujoco", reason='pip install "cartpole_rl[emulator]"')
 
 PROGRAM = """

@@ -4,6 +4,7 @@ import json
 import struct
 import sys
 from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -17,43 +18,51 @@ from cartpole_rl.reporting.tensorboard import scalars
 from cartpole_rl.workflows.config import TrainConfig, load_settings
 from cartpole_rl.workflows.train import train
 
-SHORT = {**TOY[TrainConfig], "task.time_limit": 50}
+SHORT = {**TOY[TrainConfig], "task.time_limit": 50, "learning.evaluations": 2}
+INSTALLED = [name for name in ("mlflow", "wandb") if find_spec(name)]
 
 
-def trained(folder: Path, *loggers: str, **changes: Any) -> list[dict[str, Any]]:
-    """Train shortly; return the evaluations."""
-    train(load_settings(TrainConfig, {**SHORT, "logger": [*loggers], **changes}), folder)
-    return [json.loads(line) for line in (folder / "history.jsonl").read_text().splitlines()]
+@pytest.fixture(scope="module", autouse=True)
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """The folder of a sweep, which the loggers find around the run and in which they leave their files."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("MLFLOW_TRACKING_URI", "MLFLOW_EXPERIMENT_NAME", "WANDB_PROJECT"):
+            patch.delenv(name, raising=False)
+        patch.setenv("WANDB_MODE", "offline")
+        patch.chdir(found := tmp_path_factory.mktemp("sweep"))
+        (found / "multirun.yaml").write_text("{}")
+        yield found
 
 
-def points(evaluations: list[dict[str, Any]]) -> list[tuple[int, float]]:
+@pytest.fixture(scope="module")
+def run(folder: Path) -> Path:
+    """A short training that logged to all places at once."""
+    train(load_settings(TrainConfig, {**SHORT, "logger": ["tensorboard", *INSTALLED]}), folder / "first")
+    return folder / "first"
+
+
+@pytest.fixture(scope="module")
+def points(run: Path) -> list[tuple[int, Any]]:
+    """Transitions and score of each evaluation."""
+    evaluations = [json.loads(line) for line in (run / "history.jsonl").read_text().splitlines()]
     return [(each["transitions"], pytest.approx(each["score"], rel=1e-6)) for each in evaluations]
 
 
-@pytest.fixture(autouse=True)
-def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    for name in ("MLFLOW_TRACKING_URI", "MLFLOW_EXPERIMENT_NAME", "WANDB_PROJECT", "WANDB_MODE"):
-        monkeypatch.delenv(name, raising=False)
-
-
-def test_mlflow_stands_beside_tensorboard_and_groups_a_sweep(tmp_path: Path) -> None:
+def test_mlflow_stands_beside_tensorboard_and_groups_a_sweep(
+    run: Path, points: list[tuple[int, Any]]
+) -> None:
     mlflow = pytest.importorskip("mlflow", reason="it is an extra")
-    (tmp_path / "multirun.yaml").write_text("{}")
-    run = tmp_path / "first"
-    evaluations = trained(run, "tensorboard", "mlflow", **{"learning.evaluations": 3})
-    assert scalars(run, "evaluation/score") == points(evaluations)
+    assert scalars(run, "evaluation/score") == points
     client = mlflow.MlflowClient("sqlite:///runs/mlflow.db")
     identity = (run / "mlflow_run.txt").read_text()
     logged = client.get_run(identity)
     assert logged.info.status == "FINISHED"
-    assert (logged.info.run_name, logged.data.tags["sweep"]) == ("first", tmp_path.name)
+    assert (logged.info.run_name, logged.data.tags["sweep"]) == ("first", run.parent.name)
     assert logged.data.params["learning.batch_size"] == str(SHORT["learning.batch_size"])
     history = client.get_metric_history(identity, "evaluation/score")
-    assert [(each.step, each.value) for each in history] == points(evaluations)
-    pictures = {each.path for each in client.list_artifacts(identity, "pictures")}
-    assert any(path.endswith(".png") for path in pictures)
-    assert any(path.endswith(".gif") for path in pictures)
+    assert [(each.step, each.value) for each in history] == points
+    pictures = {Path(each.path).suffix for each in client.list_artifacts(identity, "pictures")}
+    assert {".png", ".gif"} <= pictures
     again = LOGGERS.find("mlflow")(run, 1)  # as a resumed run
     again.scalars({"later": 1.0, "nothing": None}, 5000)
     again.close()
@@ -90,13 +99,10 @@ def stored(data: bytes) -> Iterator[bytes]:
             parts = b""
 
 
-def test_wandb_is_written_offline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_wandb_is_written_offline(run: Path, points: list[tuple[int, Any]]) -> None:
     pytest.importorskip("wandb", reason="it is an extra")
     from wandb.proto.wandb_internal_pb2 import Record
 
-    monkeypatch.setenv("WANDB_MODE", "offline")
-    run = tmp_path / "first"
-    evaluations = trained(run, "wandb", **{"learning.evaluations": 3})
     (file,) = run.glob("wandb/offline-run-*/*.wandb")
     assert file.stem == f"run-{(run / 'wandb_run.txt').read_text()}"
     logged, settings = [], {}
@@ -107,7 +113,7 @@ def test_wandb_is_written_offline(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         for item in (*record.config.update, *record.run.config.update):
             settings[item.key or ".".join(item.nested_key)] = json.loads(item.value_json)
     scored = [each for each in logged if "evaluation/score" in each]
-    assert [(each["transitions"], each["evaluation/score"]) for each in scored] == points(evaluations)
+    assert [(each["transitions"], each["evaluation/score"]) for each in scored] == points
     assert "video-file" in [each.get("pictures/cart/_type") for each in logged]
     assert settings["learning.batch_size"] == SHORT["learning.batch_size"]
 

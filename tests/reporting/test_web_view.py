@@ -2,10 +2,10 @@
 
 import http.client
 import json
-import re
 import subprocess
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from itertools import count
 from pathlib import Path
@@ -14,7 +14,7 @@ from urllib.parse import urlsplit
 
 import pytest
 from browser import BROWSER, BROWSERS
-from command_line import COARSE, console_script, outcome
+from command_line import COARSE, in_process
 from toy_settings import TOY
 
 from cartpole_rl.evaluation.snapshots import Snapshot, write
@@ -23,6 +23,7 @@ from cartpole_rl.reporting.web_view import NOTE, WebView, page
 from cartpole_rl.workflows.config import TrainConfig, load_settings
 from cartpole_rl.workflows.train import train
 
+pytestmark = pytest.mark.usefixtures("without_pictures")
 CALM = Snapshot(2, 120, -100, 0, 0, 1, 0.19, -0.25, 0.01, 0.5, 812.4, 0.38)
 EPISODE = {
     "name": "episode_000",
@@ -51,18 +52,28 @@ def snapshot(address: str, fits: Callable[[dict[str, Any]], bool]) -> dict[str, 
         time.sleep(0.01)
 
 
-def test_the_button_stops_a_driven_cart_and_keeps_its_episodes(tmp_path: Path) -> None:
+def test_the_button_stops_a_driven_cart_and_keeps_its_episodes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    enter, pool, answers = WebView.__enter__, ThreadPoolExecutor(), []
+
+    def stop(address: str) -> list[tuple[int, str]]:
+        snapshot(address, lambda found: found["episode"] > 1 and found["motor"] != 0)
+        return [ask(address, "POST", "stop", **each) for each in ({"Origin": "http://elsewhere.example"}, {})]
+
+    def entered(view: WebView) -> WebView:
+        answers.append(pool.submit(stop, view.address))
+        return enter(view)
+
+    monkeypatch.setattr(WebView, "__enter__", entered)
     journal = tmp_path / "journal.jsonl"
-    words = ("run=lqr", "plant=emulated", COARSE, f"emulator.journal={journal}", "episodes=1000")
-    process = console_script("evaluate", *words, "view=web", "hydra.run.dir=run", folder=tmp_path)
-    assert process.stderr is not None
-    address = next(found[1] for line in process.stderr if (found := re.match(r"view=web: (\S+)", line)))
-    snapshot(address, lambda found: found["episode"] > 1 and found["motor"] != 0)
-    assert ask(address, "POST", "stop", Origin="http://elsewhere.example")[0] == 403
-    status, text = ask(address, "POST", "stop")
-    done = outcome(process)
-    assert (status, done.code) == (200, 130)
+    words = f"run=lqr plant=emulated {COARSE} emulator.journal={journal} task=swingup task.duration=2 "
+    given = (words + "episodes=1000 view=web hydra.run.dir=run").split()
+    done = in_process("evaluate", *given, folder=tmp_path)
+    (refused, _), (status, text) = answers[0].result()
+    assert (refused, status) == (403, 200)
     assert web_view.STOPPED in text
+    assert done.code == 130
     assert done.err.splitlines()[-1] == f"cartpole-evaluate: interrupted; {NOTE}"
     assert json.loads((tmp_path / "run/metrics.json").read_text())["episodes"]
     told = [json.loads(line) for line in journal.read_text().splitlines()]
