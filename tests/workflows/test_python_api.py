@@ -65,7 +65,7 @@ def signal_handlers() -> Iterator[None]:
         signal.signal(number, handler)
 
 
-@pytest.mark.usefixtures("signal_handlers")
+@pytest.mark.usefixtures("signal_handlers", "without_pictures")
 def test_every_block_runs(notebook: Path, make_plant: Callable, make_environment: Callable) -> None:
     record_shaken_carts(notebook / "recordings", make_plant, make_environment)
     names: dict[str, Any] = {"__name__": "notebook"}
