@@ -24,12 +24,10 @@ REWARD = {"kind": "score", "scale": 0.1, "track_penalty": 0, "position_cost": 0}
 HEAVY = "defaults: [ip02]\ncart_mass: 1.4\n"
 KINDS = {  # of files that are right: name, and what is done with the text
     "named like a shipped choice": ("{shipped}.yaml", str.encode),
-    "in a folder": ("deep/{shipped}.yaml", str.encode),
     "with a byte order mark": ("mine.yaml", lambda text: text.encode("utf-8-sig")),
     "of Windows": ("mine.yaml", lambda text: text.replace("\n", "\r\n").encode()),
     "with odd characters": ("a b,c#d=e[f](g){h}é'.yaml", str.encode),
     "named like a value": ("true.yaml", str.encode),
-    "named like a number": ("1.5.yaml", str.encode),
     "in an odd folder": ("a b,c=#é/mine.yaml", str.encode),
     "with a short suffix": ("mine.yml", str.encode),
 }
