@@ -82,22 +82,23 @@ def test_a_run_continues_after_each_kind_of_interruption(
 ) -> None:
     """The agent that it started from has gone; an interrupted one is as of a learner on a lost machine."""
     run, agent = tmp_path / "run", shutil.copytree(trained, tmp_path / "agent")
-    words = (f"run={agent}", *FINETUNING, f"hydra.run.dir={run}")
-    first = run / "recordings/tune_000.csv"
+    number = 0 if is_killed else 1  # of the last episode before
+    words = (f"run={agent}", *FINETUNING, f"episodes={number + 2}", f"hydra.run.dir={run}")
+    last = run / f"recordings/tune_00{number}.csv"
     if is_killed:
         process = console_script("finetune", *words, folder=tmp_path)
-        while not first.exists():
+        while not last.exists():
             assert process.poll() is None, process.communicate()
             time.sleep(0.02)
         os.kill(process.pid, signal.SIGKILL)
         assert outcome(process).code == -signal.SIGKILL
     else:
-        interrupt_after(first)
+        interrupt_after(last)
         assert in_process("finetune", *words, folder=tmp_path).code == 130
         lose_the_learner(run)
     shutil.rmtree(agent)
     before = contents(run)
-    assert "tune_001.csv" not in before
+    assert last.name == [*before][-1]
     again = (f"resume={run}", "learner=local")
     done = in_process("finetune", *again, "seed=1", folder=tmp_path)
     assert done.code == 2
@@ -106,7 +107,8 @@ def test_a_run_continues_after_each_kind_of_interruption(
     assert done.code == 0, done.err
     ended = contents(run)
     assert {name: ended[name] for name in before} == before
-    assert [*ended] == ["after_000.csv", "before_000.csv", "tune_000.csv", "tune_001.csv"]
+    tuned = [f"tune_00{each}.csv" for each in range(number + 2)]
+    assert [*ended] == ["after_000.csv", "before_000.csv", *tuned]
 
 
 def contents(run: Path) -> dict[str, bytes]:
