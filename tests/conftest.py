@@ -20,6 +20,7 @@ from typing import Any
 import pytest
 import torch
 import yaml
+from command_line import no_pictures
 from hydra_configs import shipped_choices
 
 from cartpole_rl.envs.build import make_env
@@ -96,12 +97,9 @@ def make_cart(ip02: dict[str, float], medium: PoleSettings) -> Callable[..., Car
 
 
 @pytest.fixture
-def without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Draw no figures and no animations, which take most of the time of a tiny run."""
-    episodes = "cartpole_rl.reporting.episodes"
-    for name in (f"{episodes}.draw", "cartpole_rl.workflows.monitor.TrainingMonitor._log_pictures"):
-        monkeypatch.setattr(name, lambda *arguments: None)
-    monkeypatch.setattr(f"{episodes}.style.save", lambda *arguments: None)
+def without_pictures() -> Iterator[None]:
+    with no_pictures():
+        yield
 
 
 @pytest.fixture

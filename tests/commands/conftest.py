@@ -10,6 +10,7 @@ from command_line import (
     Outcome,
     in_process,
     interrupt_after,
+    no_pictures,
     prints_only_progress,
 )
 
@@ -30,7 +31,8 @@ def interrupted(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Outcome
     folder = tmp_path_factory.mktemp("stopped")
     interrupt_after(folder / "run/checkpoints/resume.pt")
     longer = ("actions=two", "learning.transitions=2000000", "learning.evaluations=2000", "hydra.run.dir=run")
-    return folder / "run", in_process("train", *TINY, *longer, folder=folder)
+    with no_pictures():
+        return folder / "run", in_process("train", *TINY, *longer, folder=folder)
 
 
 @pytest.fixture(scope="session")
@@ -54,6 +56,7 @@ def identified(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Outcome]
 def tuned(trained: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Outcome]:
     """The run folder and the outcome of a short fine-tuning on an emulated cart."""
     folder = tmp_path_factory.mktemp("tuned")
-    done = in_process("finetune", f"run={trained}", *FINETUNING, "hydra.run.dir=run", folder=folder)
+    with no_pictures():
+        done = in_process("finetune", f"run={trained}", *FINETUNING, "hydra.run.dir=run", folder=folder)
     assert done.code == 0, done.err
     return folder / "run", done

@@ -10,7 +10,7 @@ from pathlib import Path
 from unittest.mock import patch
 
 import pytest
-from command_line import HANDLED
+from command_line import HANDLED, in_process
 from hydra._internal.core_plugins.basic_launcher import BasicLauncher
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
@@ -25,8 +25,17 @@ from cartpole_rl.signals import UNWINDING, RaiseOnce, ending_signals
 from cartpole_rl.workflows.find_port import FindPortConfig
 
 
-def run_until_signalled(number: signal.Signals, folder: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Send signal `number` to a command at work; return what it did."""
+@pytest.fixture(autouse=True)
+def handlers() -> object:
+    before = {number: signal.getsignal(number) for number in HANDLED}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+def test_a_signal_unwinds_the_work(number: signal.Signals, code: int, tmp_path: Path) -> None:
+    """Every `with` then stops its motor."""
     happened: list[str] = []
 
     def main(config: FindPortConfig) -> None:
@@ -37,36 +46,9 @@ def run_until_signalled(number: signal.Signals, folder: Path, monkeypatch: pytes
         finally:
             happened.append("unwound")
 
-    GlobalHydra.instance().clear()
-    monkeypatch.chdir(folder)
-    with patch("sys.argv", ["cartpole-find-port"]):
-        try:
-            run_command("find_port", VERBS["find_port"]._replace(function=main))
-        except SystemExit as ended:
-            happened.append(f"exit code {ended.code}")
-    return happened
-
-
-@pytest.fixture(autouse=True)
-def handlers() -> object:
-    before = {number: signal.getsignal(number) for number in HANDLED}
-    yield
-    for number, handler in before.items():
-        signal.signal(number, handler)
-
-
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGHUP, 129)])
-def test_a_signal_unwinds_the_work(
-    number: signal.Signals,
-    code: int,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    """Every `with` then stops its motor."""
     signal.signal(number, signal.SIG_DFL)
-    assert run_until_signalled(number, tmp_path, monkeypatch) == ["unwound", f"exit code {code}"]
-    assert capsys.readouterr().err == "cartpole-find-port: terminated\n"
+    done = in_process("find_port", folder=tmp_path, function=main)
+    assert (happened, done.code, done.err) == (["unwound"], code, "cartpole-find-port: terminated\n")
 
 
 def test_an_interrupt_during_the_first_imports_is_silent(
@@ -104,20 +86,13 @@ def test_a_hangup_that_nohup_ignores_stays_ignored() -> None:
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="the system has no device that is always full")
-def test_a_full_disk_ends_a_command_with_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_full_disk_ends_a_command_with_one_line(tmp_path: Path) -> None:
     def main(config: FindPortConfig) -> None:
         Path("/dev/full").write_text("as a log that is appended to")
 
-    GlobalHydra.instance().clear()
-    monkeypatch.chdir(tmp_path)
-    with patch("sys.argv", ["cartpole-find-port"]), pytest.raises(SystemExit) as ended:
-        run_command("find_port", VERBS["find_port"]._replace(function=main))
-    assert ended.value.code == 1
-    assert capsys.readouterr().err.startswith(
-        "cartpole-find-port: a file was not written: No space left on dev"
-    )
+    done = in_process("find_port", folder=tmp_path, function=main)
+    assert done.code == 1
+    assert done.complaint.startswith("cartpole-find-port: a file was not written: No space left on dev")
 
 
 def test_a_pipe_without_a_reader_ends_a_command_quietly() -> None:

@@ -2,7 +2,6 @@
 
 import os
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -15,8 +14,6 @@ WRONG_TRAINING = [
     ("agent.gama=0.9", "agent.gama", "did you mean agent.gamma?"),
     ("+agent.foo=1", "agent.foo", "there is no such setting"),
     ("gamma=0.9", "gamma", "did you mean agent.gamma?"),
-    ("polee=large", "polee", "did you mean pole?"),
-    ("cart.cart_mas=1", "cart.cart_mas", "did you mean cart.cart_mass?"),
     ("~agent.double", "agent.double is missing", "give agent.double=..."),
     ("agent.loss=smoth_l1", "agent.loss=smoth_l1", "did you mean smooth_l1? give 'l2' or 'smooth_l1'"),
     ("control_period=1", "control_period=1", "give at most 0.1"),
@@ -25,20 +22,13 @@ WRONG_TRAINING = [
     ("pole=medium,large", "pole=medium,large", "-m runs each"),
     ("seed", "seed", "key=value"),
     ("experiment medium", "experiment medium", "did you mean experiment=medium?"),
-    ("agent.hidden=128", "agent.hidden=128", "give a list, as [128]"),
     ("--seed=1", "--seed=1", "without dashes: seed=1"),
-    ("--seed 1", "--seed: ", "without dashes: seed=1"),
-    ("--hlep", "--hlep", "did you mean --help?"),
-    ("--cfg", "--cfg", "give --cfg job"),
     ("learning.epsilon=0.5", "learning.epsilon=0.5", "give a list, as [0.5]"),
     ("learning.epsilon=[0.5]", "learning.epsilon: ", "value 2 is missing"),
-    ("learning.transitions=many", "learning.transitions=many", "give an integer"),
     ("agent.mirrored=maybe", "agent.mirrored=maybe", "give true or false"),
     ("label=a(b", "label=a(b", "text with special characters in quotes"),
     ("emulator=large", "emulator: ", "cartpole-train does not read this group"),
-    ("+emulator.latency=0", "emulator", "there is no such setting"),
     ("+seed=1", "seed", "Either remove + prefix"),
-    ("--config-dir=nowhere", "nowhere", "not found"),
     ("pole=range pole.lengths=[0,1]", "pole.lengths", "give more than 0"),
     ("pole.choices.medium.pole_mass=-0.1", "pole.choices.medium.pole_mass=-0.1", "give more than 0"),
     ("+cart.pole_mass=1", "pole_mass", "belongs to the pole"),
@@ -49,7 +39,6 @@ WRONG_TRAINING = [
     ("agent.target_period=10", "agent", "either target_tau or target_period"),
     ("actions.motors=[100,100]", "actions", "two or more different values"),
     ("plant=emulated", "plant=emulated: ", "use cartpole-evaluate for plant=emulated"),
-    ("plant=serial", "plant=serial: ", "cartpole-train takes simulated, learned"),
 ]
 
 
@@ -125,10 +114,7 @@ WRONG_EVALUATION = [
     ("run=empty", "run=empty", "holds no checkpoints/last.pt", 1),
     ("run=resume.pt", "resume.pt", "not an agent of this package: it is the state that a training", 1),
     ("run=run plant.substeps=0", "plant.substeps=0", "give at least 1", 2),
-    ("run=run parameters={cart_mas:1}", "parameters: ", "did you mean 'cart_mass'?", 2),
-    ("run=run parameters={cart_mass:-1}", "cart_mass is -1", "above 0", 2),
     ("run=run parameters={pole_mass:0.2} pole=range", "pole_mass", "choose one pole", 2),
-    ("run=run task=balance task.time_limit=0", "task.time_limit=0", "give at least 1", 2),
     (
         "run=run plant=emulated parameters={cart_mass:1}",
         "parameters: ",
@@ -153,7 +139,6 @@ WRONG_EVALUATION = [
         2,
     ),
     ("run=run plant=serial", "plant.port is missing", "give plant.port=/dev/ttyUSB0", 2),
-    ("run=run plant=serial plant.prot=/dev/ttyUSB0", "plant.prot", "did you mean plant.port?", 2),
     ("run=run plant=serial plant.port=nowhere", "nowhere does not exist", "plug the cart in", 1),
     (
         "run=run plant=serial plant.port=/dev/null",
@@ -265,49 +250,17 @@ def test_a_checkpoint_of_another_version(trained: Path, files: Path) -> None:
     assert done.code == 1
 
 
-def renamed(weights: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    return {f"{name}_of_before": weight for name, weight in weights.items()}
-
-
-def resized(weights: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    return {name: torch.cat((weight, weight)) if weight.ndim else weight for name, weight in weights.items()}
-
-
-@pytest.mark.parametrize("change", [renamed, resized])
-def test_a_checkpoint_with_another_network(
-    trained: Path, files: Path, change: Callable[[dict[str, torch.Tensor]], dict[str, torch.Tensor]]
-) -> None:
+def test_a_checkpoint_with_another_network(trained: Path, files: Path) -> None:
     content = torch.load(trained / "checkpoints/last.pt", weights_only=True)
-    weights = change(content["weights"])
+    weights = {
+        name: torch.cat((each, each)) if each.ndim else each for name, each in content["weights"].items()
+    }
     torch.save({**content, "weights": weights}, files / "older.pt")
     done = in_process("evaluate", "run=older.pt", folder=files)
     assert done.complaint.endswith(
         "run=older.pt is of another version of this package: its network has other weights; train it again"
     )
     assert done.code == 1
-
-
-def test_a_training_that_has_ended_is_not_resumed(trained: Path) -> None:
-    before = {path: path.read_bytes() for path in trained.rglob("*") if path.is_file()}
-    done = in_process("train", "resume=run", folder=trained.parent)
-    assert done.complaint == (
-        "cartpole-train: resume=run: this run of cartpole-train has ended; cartpole-evaluate run=run drives "
-        "its agent, cartpole-train with more learning.transitions makes a longer training"
-    )
-    assert done.code == 2
-    assert {path: path.read_bytes() for path in trained.rglob("*") if path.is_file()} == before
-
-
-def test_a_training_with_another_network_is_not_resumed(stopped: Path, tmp_path: Path) -> None:
-    older = shutil.copytree(stopped, tmp_path / "older")
-    content = torch.load(older / "checkpoints/resume.pt", weights_only=True)
-    agent = renamed(content["state"]["agent"])
-    torch.save({**content, "state": {**content["state"], "agent": agent}}, older / "checkpoints/resume.pt")
-    before = (older / "history.jsonl").read_text()
-    done = in_process("train", f"resume={older}", folder=tmp_path)
-    assert "its network has other weights; train it again" in done.complaint
-    assert done.code == 1
-    assert (older / "history.jsonl").read_text() == before
 
 
 def test_without_a_compiler_the_remedy_is_stated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

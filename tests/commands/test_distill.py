@@ -22,13 +22,8 @@ def test_the_student_is_an_agent_like_any_other(trained: Path, tmp_path: Path) -
     assert done.code == 0, done.err
     assert done.out.splitlines()[-1] == "cartpole-export run=student format=c"
     student = tmp_path / "student"
-    assert {path.name for path in student.iterdir()} == {
-        "checkpoints",
-        "config.yaml",
-        "figures",
-        "metrics.json",
-        "provenance.json",
-    }
+    files = {"checkpoints", "config.yaml", "figures", "metrics.json", "provenance.json"}
+    assert {path.name for path in student.iterdir()} == files
     assert json.loads((student / "provenance.json").read_text())["program"] == "cartpole-distill"
     assert trained_agent(student).known_poles == trained_agent(tmp_path / "teacher").known_poles
     teacher = yaml.safe_load((student / "config.yaml").read_text())["teacher"]

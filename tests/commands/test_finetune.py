@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from command_line import FINETUNING, Outcome, console_script, in_process, interrupt, outcome
+from command_line import FINETUNING, Outcome, console_script, in_process, interrupt_after, outcome
 from tensorboard.backend.event_processing.event_file_loader import EventFileLoader
 
 from cartpole_rl.evaluation.recordings import read_recording
@@ -25,27 +25,22 @@ from cartpole_rl.learning.checkpoints import (
 from cartpole_rl.workflows.build import trained_agent
 
 
-def recordings(run: Path) -> list[str]:
-    return sorted(path.name for path in (run / "recordings").iterdir())
-
-
 def test_every_episode_is_on_disk_once(tuned: tuple[Path, Outcome]) -> None:
     run, _ = tuned
-    assert recordings(run) == ["after_000.csv", "before_000.csv", "tune_000.csv", "tune_001.csv"]
+    assert [*contents(run)] == ["after_000.csv", "before_000.csv", "tune_000.csv", "tune_001.csv"]
     assert all(read_recording(path).steps > 1 for path in (run / "recordings").iterdir())
 
 
 def test_the_better_policy_is_kept_and_reported(tuned: tuple[Path, Outcome]) -> None:
     run, done = tuned
     compared = json.loads((run / "comparison.json").read_text())
-    better = (
-        "after" if compared["after"]["score"]["mean"] >= compared["before"]["score"]["mean"] else "before"
-    )
+    after, before = (compared[stage]["score"]["mean"] for stage in ("after", "before"))
+    better = "after" if after >= before else "before"
     assert compared["kept"] == better
     assert f"kept: the policy {better} fine-tuning" in done.out
     assert trained_agent(run).training.seed == 0
     metrics = json.loads((run / "metrics.json").read_text())
-    assert metrics["score"]["mean"] == compared[better]["score"]["mean"]
+    assert metrics["score"]["mean"] == max(after, before)
     assert metrics["latency_samples"] > 0
 
 
@@ -63,69 +58,71 @@ def test_tensorboard_shows_cart_and_simulation_side_by_side(tuned: tuple[Path, O
     assert steps["link/late_ticks"] == [1, 2, 3, 4]
 
 
-def test_one_that_has_ended_is_not_resumed(tuned: tuple[Path, Outcome], tmp_path: Path) -> None:
+def test_one_that_has_ended_has_no_state_to_resume(tuned: tuple[Path, Outcome], tmp_path: Path) -> None:
     run, _ = tuned
     assert [path.name for path in (run / "checkpoints").iterdir()] == ["last.pt"]
-    done = in_process("finetune", f"resume={run}", folder=tmp_path)
-    assert done.code == 2
-    assert f"this run of cartpole-finetune has ended; cartpole-evaluate run={run}" in done.complaint
     done = in_process("finetune", f"resume={run}", "hydra.run.dir=other", folder=tmp_path)
     assert done.code == 2
     assert "leave out hydra.run.dir" in done.complaint
     assert not (tmp_path / "other").exists()
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_a_tuned_agent_is_evaluated_like_any_other(tuned: tuple[Path, Outcome], tmp_path: Path) -> None:
     run, _ = tuned
-    done = in_process(
-        "evaluate", f"run={run}", "episodes=2", f"hydra.run.dir={tmp_path}/evaluated", folder=tmp_path
-    )
+    done = in_process("evaluate", f"run={run}", "episodes=2", folder=tmp_path)
     assert done.code == 0, done.err
+
+
+@pytest.mark.parametrize(
+    "is_killed", [True, pytest.param(False, marks=pytest.mark.nightly, id="interrupted, its learner lost")]
+)
+def test_a_run_continues_after_each_kind_of_interruption(
+    is_killed: bool, trained: Path, tmp_path: Path
+) -> None:
+    """The agent that it started from has gone; an interrupted one is as of a learner on a lost machine."""
+    run, agent = tmp_path / "run", shutil.copytree(trained, tmp_path / "agent")
+    number = 0 if is_killed else 1  # of the last episode before
+    words = (f"run={agent}", *FINETUNING, f"episodes={number + 2}", f"hydra.run.dir={run}")
+    last = run / f"recordings/tune_00{number}.csv"
+    if is_killed:
+        process = console_script("finetune", *words, folder=tmp_path)
+        while not last.exists():
+            assert process.poll() is None, process.communicate()
+            time.sleep(0.02)
+        os.kill(process.pid, signal.SIGKILL)
+        assert outcome(process).code == -signal.SIGKILL
+    else:
+        interrupt_after(last)
+        assert in_process("finetune", *words, folder=tmp_path).code == 130
+        lose_the_learner(run)
+    shutil.rmtree(agent)
+    before = contents(run)
+    assert last.name == [*before][-1]
+    again = (f"resume={run}", "learner=local")
+    done = in_process("finetune", *again, "seed=1", folder=tmp_path)
+    assert done.code == 2
+    assert done.complaint.endswith("resume uses that run's own config; leave out seed=1")
+    done = in_process("finetune", *again, folder=tmp_path)
+    assert done.code == 0, done.err
+    ended = contents(run)
+    assert {name: ended[name] for name in before} == before
+    tuned = [f"tune_00{each}.csv" for each in range(number + 2)]
+    assert [*ended] == ["after_000.csv", "before_000.csv", *tuned]
 
 
 def contents(run: Path) -> dict[str, bytes]:
-    """The recordings of a run."""
-    return {name: (run / "recordings" / name).read_bytes() for name in recordings(run)}
+    """The recordings of a run, in the order of their names."""
+    return {path.name: path.read_bytes() for path in sorted((run / "recordings").iterdir())}
 
 
-def test_a_run_continues_after_each_kind_of_interruption(trained: Path, tmp_path: Path) -> None:
-    """One run: killed, then interrupted, then its checkpoint is as of a learner on a machine that is lost.
-
-    The agent that it started from has gone after the first time.
-    """
-    run, agent = tmp_path / "run", tmp_path / "agent"
-    shutil.copytree(trained, agent)
-    words = (f"run={agent}", *FINETUNING, "finetuning.refit=2", "episodes=3", f"hydra.run.dir={run}")
-    process = console_script("finetune", *words, folder=tmp_path)
-    while not (run / "recordings/tune_000.csv").exists():
-        assert process.poll() is None, process.communicate()
-        time.sleep(0.02)
-    os.kill(process.pid, signal.SIGKILL)
-    assert outcome(process).code == -signal.SIGKILL
-    shutil.rmtree(agent)
-    killed = contents(run)
-    assert "tune_001.csv" not in killed
-
-    interrupt(tmp_path, "tune_001.csv", signal.SIGINT)
-    assert in_process("finetune", f"resume={run}", folder=tmp_path).code == 130
-    interrupted = contents(run)
-    assert {name: interrupted[name] for name in killed} == killed
+def lose_the_learner(run: Path) -> None:
+    """Let the checkpoint of a run be that of one whose learner was on another machine."""
     saved = load_training(run, FINETUNING_FORMAT)
-    assert saved.step >= 1
-
     learner = {"kind": "ray", "address": "gone:6379", "episodes_ahead": 5, "timeout": 10.0}
     state = {"agent": saved.state["agent"], "learner": "name"}
-    save_training(
-        run, TrainingCheckpoint({**saved.config, "learner": learner}, state, saved.step), FINETUNING_FORMAT
-    )
-    done = in_process("finetune", f"resume={run}", "learner=local", "seed=1", folder=tmp_path)
-    assert done.code == 2
-    assert done.complaint.endswith("resume uses that run's own config; leave out seed=1")
-    done = in_process("finetune", f"resume={run}", "learner=local", folder=tmp_path)
-    assert done.code == 0, done.err
-    ended = contents(run)
-    assert {name: ended[name] for name in interrupted} == interrupted
-    assert [*ended] == ["after_000.csv", "before_000.csv", *(f"tune_00{number}.csv" for number in range(3))]
+    config = {**saved.config, "learner": learner}
+    save_training(run, TrainingCheckpoint(config, state, saved.step), FINETUNING_FORMAT)
 
 
 def test_what_the_simulation_reads_is_missed_before_the_cart_moves(trained: Path, tmp_path: Path) -> None:

@@ -3,7 +3,8 @@
 import json
 from pathlib import Path
 
-from command_line import TINY, in_process
+import pytest
+from command_line import ONCE, TINY, in_process
 from tensorboard.backend.event_processing.event_file_loader import EventFileLoader
 
 FRACTION = "guarded_fraction"
@@ -15,10 +16,11 @@ def tags(run: Path) -> set[str]:
     return {value.tag for event in EventFileLoader(str(file)).Load() for value in event.summary.value}
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_every_command_shows_how_often_the_guard_acts(tmp_path: Path) -> None:
     run = tmp_path / "run"
     wide = "task.evaluation_start.position_spread=0.37"  # the guard acts in some of these starts
-    done = in_process("train", *TINY, "guard=careful", wide, f"hydra.run.dir={run}", folder=tmp_path)
+    done = in_process("train", *TINY, ONCE, "guard=careful", wide, f"hydra.run.dir={run}", folder=tmp_path)
     assert done.code == 0, done.err
     assert "track guard: margin 0.0" in done.err
     assert {f"exploration/{FRACTION}", "evaluation/track_guard_fraction"} <= tags(run)
@@ -26,27 +28,17 @@ def test_every_command_shows_how_often_the_guard_acts(tmp_path: Path) -> None:
     metrics = json.loads((run / "metrics.json").read_text())
     assert history[-1][FRACTION] == metrics[FRACTION]["mean"]
 
-    shown = in_process(
-        "evaluate", f"run={run}", "episodes=20", f"hydra.run.dir={tmp_path}/shown", folder=tmp_path
-    )
+    shown = in_process("evaluate", "run=run", "episodes=20", "hydra.run.dir=shown", folder=tmp_path)
     assert "share of time under the track guard" in shown.out
     assert "track guard: margin 0.0" in shown.out
     metrics = json.loads((tmp_path / "shown" / "metrics.json").read_text())
     shares = [episode[FRACTION] for episode in metrics["episodes"]]
     assert max(shares) > 0
 
-    recorded = in_process(
-        "record", f"run={run}", "episodes=20", f"hydra.run.dir={tmp_path}/rec", folder=tmp_path
-    )
+    recorded = in_process("record", "run=run", "episodes=20", "hydra.run.dir=rec", folder=tmp_path)
     assert f"recordings/ holds 20 episodes, guarded {100 * sum(shares) / 20:.1f} %" in recorded.out
 
-    unguarded = in_process(
-        "evaluate",
-        f"run={run}",
-        "guard=none",
-        "episodes=2",
-        f"hydra.run.dir={tmp_path}/none",
-        folder=tmp_path,
-    )
+    words = ("run=run", "guard=none", "episodes=2", "hydra.run.dir=none")
+    unguarded = in_process("evaluate", *words, folder=tmp_path)
     assert "track guard" not in unguarded.out
     assert json.loads((tmp_path / "none" / "metrics.json").read_text())[FRACTION] is None

@@ -7,16 +7,15 @@ import pkgutil
 import subprocess
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
-
-import pytest
+from typing import Any
 
 import cartpole_rl
 from cartpole_rl.cli import VERBS
 from cartpole_rl.settings import Settings
 
 SHOWS = (("--help", 0, ""), ("--cfg job", 0, ""), ("seeed=1", 2, "seeed: there is no such setting"))
+COMPLETION = {"COMP_LINE": "cartpole-train opt", "COMP_POINT": "18", "COMP_CWORD": "1"}  # as of a shell
 COMPLAINS = {  # command: words, exit code, part of the line on stderr
     "emulate": [("emulator.latency=2", 2, "give at most 1")],
     "evaluate": [
@@ -97,13 +96,13 @@ from hydra.core.global_hydra import GlobalHydra
 from cartpole_rl.cli import run
 
 runs = []
-for words in {words}:
+for command, words in {commands}:
     GlobalHydra.instance().clear()
     sys.argv[1:] = words.split()
     code, said = 0, io.StringIO()
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(said):
         try:
-            run("{command}")
+            run(command)
         except SystemExit as ended:
             code = ended.code
     runs.append((code, said.getvalue(), sorted({{name.partition(".")[0] for name in sys.modules}})))
@@ -116,17 +115,8 @@ print(json.dumps(sorted({{name.partition(".")[0] for name in sys.modules}})))
 """
 
 
-@dataclass(frozen=True)
-class Run:
-    """The outcome of a command, and the top-level modules imported by its process."""
-
-    code: int
-    said: str
-    modules: set[str]
-
-
-def process(script: str, folder: Path, **environment: str) -> str:
-    """Return the last line that a script prints in a separate process."""
+def last_line(script: str, folder: Path, **environment: str) -> Any:
+    """The last line, which is JSON, that a script prints in a separate process."""
     done = subprocess.run(
         [sys.executable, "-c", script],
         cwd=folder,
@@ -135,53 +125,29 @@ def process(script: str, folder: Path, **environment: str) -> str:
         text=True,
     )
     assert done.returncode == 0, done.stderr
-    return done.stdout.splitlines()[-1]
+    return json.loads(done.stdout.splitlines()[-1])
 
 
-def in_turn(command: str, *words: str, folder: Path, **environment: str) -> list[Run]:
-    """Run `cartpole-<command>` with each of `words` in one process; return the outcomes."""
-    script = RUN_IN_TURN.format(command=command, words=repr(words))
-    runs = json.loads(process(script, folder, **environment))
-    return [Run(code, said, set(modules)) for code, said, modules in runs]
-
-
-def modules_after(statement: str, folder: Path) -> set[str]:
-    """Top-level modules of a process after `statement`."""
-    return set(json.loads(process(IMPORT.format(statement=statement), folder)))
-
-
-def test_every_command_is_here() -> None:
+def test_help_completion_and_errors_need_no_slow_imports(tmp_path: Path) -> None:
+    """All commands in one process: the first one that imports what is slow is named."""
     assert VERBS.keys() == COMPLAINS.keys()
-
-
-@pytest.mark.parametrize("command", COMPLAINS)
-def test_help_and_errors_need_no_slow_imports(command: str, tmp_path: Path) -> None:
-    cases = [*SHOWS, *COMPLAINS[command]]
-    runs = in_turn(command, *(words for words, _, _ in cases), folder=tmp_path)
-    for (words, code, said), run in zip(cases, runs, strict=True):
-        assert run.code == code, words
-        assert said in run.said, words
-        assert run.modules & {*WORK, "numpy"} == set(), words
-
-
-def test_a_missing_port_is_reported_without_pytorch(tmp_path: Path) -> None:
-    (run,) = in_turn("preflight", "plant.port=nowhere", folder=tmp_path)
-    assert run.code == 1
-    assert run.modules & WORK == set()
-
-
-def test_completion_needs_no_work(tmp_path: Path) -> None:
-    line = {"COMP_LINE": "cartpole-train opt", "COMP_POINT": "18", "COMP_CWORD": "1"}
-    (run,) = in_turn("train", "-sc query=bash", folder=tmp_path, **line)
-    assert run.code == 0
-    assert run.modules & {*WORK, "numpy"} == set()
+    cases = [("train", "-sc query=bash", 0, "")]
+    for command, complaints in COMPLAINS.items():
+        shows = SHOWS if command in ("train", "preflight") else SHOWS[:1]
+        cases += [(command, *case) for case in (*shows, *complaints)]
+    cases.append(("preflight", "plant.port=nowhere", 1, ""))
+    script = RUN_IN_TURN.format(commands=[case[:2] for case in cases])
+    runs = last_line(script, tmp_path, **COMPLETION)
+    for (command, words, expected, part), (code, said, modules) in zip(cases, runs, strict=True):
+        slow = WORK if words == "plant.port=nowhere" else {*WORK, "numpy"}
+        assert (code, slow & {*modules}) == (expected, set()), (command, words)
+        assert part in said, (command, words)
 
 
 def test_slow_imports_print_nothing(tmp_path: Path) -> None:
-    module = "cartpole_rl.command"
-    quiet = f"from {module} import quieten; quieten(); import logging, torchrl"
+    quiet = "from cartpole_rl.command import quieten; quieten(); import logging, torchrl"
     level = "assert logging.getLogger('torchrl').getEffectiveLevel() == logging.WARNING"
-    assert "torchrl" in modules_after(f"{quiet}; {level}", tmp_path)
+    assert "torchrl" in last_line(IMPORT.format(statement=f"{quiet}; {level}"), tmp_path)
 
 
 def settings_classes() -> Iterator[type[Settings]]:
@@ -200,4 +166,5 @@ def test_a_settings_class_needs_no_work(tmp_path: Path) -> None:
     """All modules that define one are imported together."""
     names = {kind.__module__ for kind in settings_classes() if kind.__module__.startswith("cartpole_rl.")}
     assert len(names) > 10
-    assert modules_after(f"import {', '.join(sorted(names))}", tmp_path) & WORK == set()
+    imported = last_line(IMPORT.format(statement=f"import {', '.join(sorted(names))}"), tmp_path)
+    assert WORK & {*imported} == set()

@@ -75,16 +75,15 @@ def test_every_command_gives_each_multirun_its_own(
     command: str, composing_here: None, same_second: None
 ) -> None:
     given = {"evaluate": ["run=any"], "record": ["run=any"], "replay": ["from=any"], "model": ["from=any"]}
-    multiruns = [hydra.compose(command, given.get(command, []), return_hydra_config=True) for _ in range(3)]
+    multiruns = [hydra.compose(command, given.get(command, []), return_hydra_config=True) for _ in range(2)]
     folders = [multirun.hydra.sweep.dir for multirun in multiruns]
-    assert len(set(folders)) == 3
+    assert len(set(folders)) == 2
     assert all(
         Path(folder).is_dir() and Path(folder).parent == Path.cwd() / "runs" / command for folder in folders
     )
     for multirun, folder in zip(multiruns, folders, strict=True):
         assert folder_of_a_job(multirun, "label=first") == folder
-        assert folder_of_a_job(multirun, "label=second") == folder
-    assert len(list(Path("runs", command).iterdir())) == 3
+    assert len(list(Path("runs", command).iterdir())) == 2
 
 
 def test_jobs_in_other_processes_share_the_folder(tmp_path: Path, composing_here: None) -> None:

@@ -30,7 +30,6 @@ MOTION = {
     "force_linear": 0.012,
     "force_offset": -0.3,
 }
-IDENTIFY = ("identify", "cart=lab.yaml", "plant=emulated", COARSE, "windows=60", "carts=64")
 
 
 @pytest.fixture
@@ -64,9 +63,10 @@ def test_its_firmware_has_its_numbers(folder: Path) -> None:
     assert "#define CART_SPAN_UM 500000 " in header
 
 
-def test_it_is_identified_and_its_recordings_are_its_own(folder: Path) -> None:
-    done = in_process(*IDENTIFY, "hydra.run.dir=run", folder=folder)
-    assert done.code == 0, done
+@pytest.mark.nightly  # workflows/test_identified_files.py has its files, test_identify.py the fit
+def test_it_is_identified(folder: Path) -> None:
+    words = ("cart=lab.yaml", "plant=emulated", COARSE, "windows=60", "carts=64", "hydra.run.dir=run")
+    assert in_process("identify", *words, folder=folder).code == 0
     found = yaml.safe_load((folder / "run" / "cart.yaml").read_text())
     assert {name: found[name] for name in HARDWARE} == {
         name: RIG.get(name, choice("cart/ip02")[name]) for name in HARDWARE
@@ -74,6 +74,11 @@ def test_it_is_identified_and_its_recordings_are_its_own(folder: Path) -> None:
     gain = found["force_linear"] / (found["cart_mass"] + 0.129)  # N a motor value and kg
     truth = 0.99 / 83 / (0.735 / 0.85 * 0.5 + 0.129)
     assert gain == pytest.approx(truth, rel=0.03)
+
+
+def test_its_recordings_are_its_own(folder: Path) -> None:
+    words = ("run=lqr", "cart=lab.yaml", "task=swingup", "task.time_limit=200", "hydra.run.dir=run")
+    assert in_process("record", *words, folder=folder).code == 0
     for words in (("identify", "from=run"), ("replay", "from=run", "cart=ip02")):
         refused = in_process(*words, "hydra.run.dir=other", folder=folder)
         assert refused.code != 0

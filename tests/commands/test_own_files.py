@@ -24,12 +24,10 @@ REWARD = {"kind": "score", "scale": 0.1, "track_penalty": 0, "position_cost": 0}
 HEAVY = "defaults: [ip02]\ncart_mass: 1.4\n"
 KINDS = {  # of files that are right: name, and what is done with the text
     "named like a shipped choice": ("{shipped}.yaml", str.encode),
-    "in a folder": ("deep/{shipped}.yaml", str.encode),
     "with a byte order mark": ("mine.yaml", lambda text: text.encode("utf-8-sig")),
     "of Windows": ("mine.yaml", lambda text: text.replace("\n", "\r\n").encode()),
     "with odd characters": ("a b,c#d=e[f](g){h}é'.yaml", str.encode),
     "named like a value": ("true.yaml", str.encode),
-    "named like a number": ("1.5.yaml", str.encode),
     "in an odd folder": ("a b,c=#é/mine.yaml", str.encode),
     "with a short suffix": ("mine.yml", str.encode),
 }
@@ -100,11 +98,14 @@ def test_files_of_all_groups_are_found_from_everywhere(command: str, tmp_path: P
     before = contents(tmp_path)
     expected = validated(SCHEMAS[command], compose(command, by_name))
     assert all(given == number for given, number in found_numbers(expected, command).values())
-    for where, given in words.items():
-        done, config = run(command, *required(command), *given, folder=tmp_path)
+    all_ways = command == "train"  # the others have some of its groups
+    for where in words if all_ways else [[*words][len(command) % len(words)]]:
+        done, config = run(command, *required(command), *words[where], folder=tmp_path)
         assert (done.code, done.err) == (0, ""), (where, done)
         assert config == expected, where
     assert contents(tmp_path) == before
+    if not all_ways:
+        return
     group, *_ = next(own_choices(command))
     both = f"{group}={group}.yaml,{group}_extended.yaml"
     found: list[Settings] = []
@@ -115,20 +116,17 @@ def test_files_of_all_groups_are_found_from_everywhere(command: str, tmp_path: P
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_file_may_have_any_name(kind: str, tmp_path: Path) -> None:
-    """Of cartpole-train, which reads most groups, and of another command."""
-    others = [command for command in COMMANDS if command != "train"]
     name, encoded = KINDS[kind]
-    for command in ("train", others[[*KINDS].index(kind) % len(others)]):
-        words = required(command)
-        for group, default, changes in own_choices(command):
-            file = tmp_path / command / group / name.replace("{shipped}", default)
-            file.parent.mkdir(parents=True)
-            file.write_bytes(encoded(yaml.safe_dump({"defaults": [default], **changes})))
-            words.append(f"{group}={file}")
-        done, config = run(command, *words, folder=tmp_path)
-        assert (done.code, done.err) == (0, ""), done
-        assert config is not None
-        assert all(given == number for given, number in found_numbers(config, command).values())
+    words = []
+    for group, default, changes in own_choices("train"):  # which reads most groups
+        file = tmp_path / group / name.replace("{shipped}", default)
+        file.parent.mkdir(parents=True)
+        file.write_bytes(encoded(yaml.safe_dump({"defaults": [default], **changes})))
+        words.append(f"{group}={file}")
+    done, config = run("train", *words, folder=tmp_path)
+    assert (done.code, done.err) == (0, ""), done
+    assert config is not None
+    assert all(given == number for given, number in found_numbers(config, "train").values())
 
 
 def shown(folder: Path, *words: str) -> dict[str, Any]:
@@ -162,15 +160,24 @@ def test_files_of_config_dir(tmp_path: Path) -> None:
     assert complaint == "--config-dir=own: cart/ip02.yaml has the name of a shipped choice; rename it"
 
 
-@pytest.mark.parametrize("words", [("--config-dir", "/nonexistent"), ("--config-dir=/nonexistent",)])
-def test_a_config_dir_that_is_not_there(words: tuple[str, ...], tmp_path: Path) -> None:
-    complaint = refused(tmp_path, *words, "cart=ip02")
-    assert complaint.startswith("--config-dir=/nonexistent: not found")
-
-
-def test_a_search_path_that_is_not_there(tmp_path: Path) -> None:
-    complaint = refused(tmp_path, "hydra.searchpath=[file:///nonexistent]", "seed=x")
-    assert complaint == "hydra.searchpath: /nonexistent not found; give a folder"
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (("--config-dir", "/nonexistent", "cart=ip02"), "--config-dir=/nonexistent: not found"),
+        (
+            ("hydra.searchpath=[file:///nonexistent]", "seed=x"),
+            "hydra.searchpath: /nonexistent not found; give a folder",
+        ),
+        (("seed=true",), "seed=true: give an integer"),
+        (("agent.gamma=false",), "agent.gamma=false: give a number"),
+        (("actions.motors=[true,false]",), "actions.motors.0=true: give an integer"),
+        (("cart.cart_mass=1e308",), "cart.cart_mass=1e+308, which is over 1e+30: give a number"),
+    ],
+)
+def test_folders_that_are_not_there_and_what_is_no_number(
+    words: tuple[str, ...], complaint: str, tmp_path: Path
+) -> None:
+    assert refused(tmp_path, *words).startswith(complaint)
 
 
 def test_a_file_extends_a_file_beside_it(tmp_path: Path) -> None:
@@ -189,23 +196,10 @@ def test_a_file_extends_a_file_beside_it(tmp_path: Path) -> None:
 @pytest.mark.parametrize("text", ["no", "yes", "1:30", "on"])
 def test_a_number_is_a_number(text: str, tmp_path: Path) -> None:
     (tmp_path / "mine.yaml").write_text(f"defaults: [ip02]\ncart_viscous: {text}\n")
-    assert refused(tmp_path, "cart=mine.yaml") == f"mine.yaml: cart.cart_viscous={text}: give a number"
+    if text == "no":
+        assert refused(tmp_path, "cart=mine.yaml") == f"mine.yaml: cart.cart_viscous={text}: give a number"
     with pytest.raises(ConfigError, match=f"cart.cart_viscous={text}: give a number"):
         load_settings(TrainConfig, {"cart": tmp_path / "mine.yaml"})
-
-
-@pytest.mark.parametrize(
-    ("word", "complaint"),
-    [
-        ("seed=true", "seed=true: give an integer"),
-        ("agent.gamma=false", "agent.gamma=false: give a number"),
-        ("actions.motors=[true,false]", "actions.motors.0=true: give an integer"),
-        ("cart.cart_mass=1e308", "cart.cart_mass=1e+308, which is over 1e+30: give a number"),
-        ("randomization.cart_mass.relative=[0,1e308]", "randomization.cart_mass.relative.1=1e+308, which"),
-    ],
-)
-def test_what_is_no_number(word: str, complaint: str, tmp_path: Path) -> None:
-    assert refused(tmp_path, word).startswith(complaint)
 
 
 def test_a_persons_file_outlasts_an_experiment(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from cartpole_rl.workflows.preflight import next_command
 
 
 def test_the_emulated_cart_is_ready(tmp_path: Path) -> None:
-    words = ("plant=emulated", "plant.rehome=always", "emulator=large", "emulator.cart_coulomb_right=0.8")
+    words = ("plant=emulated", "plant.rehome=always", "emulator=large", "emulator.physics_step=0.001")
     done = in_process("preflight", *words, folder=tmp_path)
     assert (done.code, done.err) == (0, ""), done
     *checks, last, following = done.out.splitlines()

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from command_line import in_process, interrupt_after
+from command_line import COARSE, in_process, interrupt_after
 
 from cartpole_rl.evaluation.recordings import read_recording
 
@@ -34,7 +34,7 @@ def test_every_episode_of_an_agent_is_a_file(trained: Path, tmp_path: Path) -> N
 
 
 def test_the_baseline_drives_the_emulated_cart_with_its_own_pole(tmp_path: Path) -> None:
-    words = ("run=lqr", "plant=emulated", "emulator=large", "episodes=1", "hydra.run.dir=run")
+    words = ("run=lqr", "plant=emulated", COARSE, "emulator=large", "episodes=1", "hydra.run.dir=run")
     done = in_process("record", *words, folder=tmp_path)
     assert done.code == 0, done.err
     path = tmp_path / "run/recordings/episode_000.csv"
@@ -44,7 +44,14 @@ def test_the_baseline_drives_the_emulated_cart_with_its_own_pole(tmp_path: Path)
 
 def test_the_baseline_knows_the_nominal_cart_and_not_the_simulated_one(tmp_path: Path) -> None:
     for run, parameters in {"nominal": "null", "other": "{force_linear:0.03}"}.items():
-        words = ("run=lqr", "episodes=1", f"parameters={parameters}", f"hydra.run.dir={run}")
+        words = (
+            "run=lqr",
+            "episodes=1",
+            "task=swingup",
+            "task.time_limit=10",
+            f"parameters={parameters}",
+            f"hydra.run.dir={run}",
+        )
         assert in_process("record", *words, folder=tmp_path).code == 0
     first = [read_recording(tmp_path / run / "recordings/episode_000.csv") for run in ("nominal", "other")]
     assert first[0].motor[0] == first[1].motor[0]
@@ -62,7 +69,15 @@ def test_the_baseline_has_one_pole(pole: str, tmp_path: Path) -> None:
 
 def test_an_interrupt_keeps_the_finished_episodes(tmp_path: Path) -> None:
     interrupt_after(tmp_path / "run/recordings/episode_000.csv")
-    words = ("run=lqr", "plant=emulated", "episodes=1000", "hydra.run.dir=run")
+    words = (
+        "run=lqr",
+        "plant=emulated",
+        COARSE,
+        "task=swingup",
+        "task.time_limit=50",
+        "episodes=1000",
+        "hydra.run.dir=run",
+    )
     done = in_process("record", *words, folder=tmp_path)
     assert done.code == 130
     assert done.err.endswith("cartpole-record: interrupted\n")

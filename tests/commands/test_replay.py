@@ -29,13 +29,13 @@ def test_the_same_cart_is_followed(recorded: Path, tmp_path: Path) -> None:
     soon, later, last = results["errors"]
     assert [each["after_s"] for each in results["errors"]] == [0.1, 0.5, 1.0]
     assert (soon["rms_x_mm"], soon["rms_theta_deg"]) < (0.05, 0.3)
-    assert soon["rms_theta_deg"] < 0.3
     assert later["rms_x_mm"] < 2
     assert later["median_theta_deg"] < 3
     assert soon["windows"] == 20
     assert last["windows"] < 20  # the last stretch of an episode is cut by its end
     assert (results["pole"], results["control_period_s"], len(results["recordings"])) == ("medium", 0.02, 2)
     assert "errors of 2 episodes, pole=medium" in done.out
+    assert "warning: a pole" not in done.out
     assert (tmp_path / "run/figures/replay.png").stat().st_size > 10_000
     config = yaml.safe_load((tmp_path / "run/config.yaml").read_text())
     assert config["from"] == str(recorded)
@@ -71,31 +71,30 @@ def test_the_recorded_pole_is_the_simulated_one(recorded: Path, tmp_path: Path) 
 def test_a_chosen_pole_of_another_length_is_warned_of(recorded: Path, tmp_path: Path) -> None:
     warning = "warning: a pole of 0.3556 m was recorded; pole= gives one of 0.6604 m"
     for verb in ("replay", "identify"):
-        words = (f"from={recorded}", f"hydra.run.dir={verb}")
-        own, other = (in_process(verb, *words, *pole, folder=tmp_path) for pole in ([], ["pole=large"]))
-        assert "warning: a pole" not in own.out
-        assert warning in other.out, verb
+        done = in_process(verb, f"from={recorded}", "pole=large", folder=tmp_path)
+        assert warning in done.out, verb
 
 
-def test_recordings_of_two_poles_are_refused(recorded: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("lengths", "complaint"),
+    [
+        (("long",), "length_m is 'long'"),
+        (("0.3556", "0.6560"), "poles of 0.3556, 0.656 m were recorded; replay those of one pole"),
+        (
+            ("0.5000",),
+            "pole: one of 0.5 m was recorded; give one of medium, large, rod_03, sensorsini, laboratorio, or",
+        ),
+    ],
+)
+def test_the_recorded_poles_are_one_that_is_known(
+    lengths: tuple[str, ...], complaint: str, recorded: Path, tmp_path: Path
+) -> None:
     text = (recorded / "recordings/episode_000.csv").read_text()
-    for name, length in {"a.csv": "0.3556", "b.csv": "0.6560", "c.csv": "long"}.items():
-        (tmp_path / name).write_text(text.replace("pole_length_m: 0.3556", f"pole_length_m: {length}"))
-    assert "length_m is 'long'" in in_process("replay", "from=c.csv", folder=tmp_path).complaint
-    (tmp_path / "c.csv").unlink()
+    for length in lengths:
+        (tmp_path / f"{length}.csv").write_text(text.replace("length_m: 0.3556", f"length_m: {length}"))
     done = in_process("replay", "from=.", folder=tmp_path)
-    assert "poles of 0.3556, 0.656 m were recorded; replay those of one pole" in done.complaint
-
-
-def test_a_pole_of_another_length_has_to_be_given(recorded: Path, tmp_path: Path) -> None:
-    text = (recorded / "recordings/episode_000.csv").read_text()
-    (tmp_path / "own.csv").write_text(text.replace("pole_length_m: 0.3556", "pole_length_m: 0.5000"))
-    done = in_process("replay", "from=own.csv", folder=tmp_path)
-    assert done.complaint == (
-        "cartpole-replay: pole: one of 0.5 m was recorded; give one of medium, large, rod_03, sensorsini, "
-        "laboratorio, or your own"
-    )
-    assert done.code == 2
+    assert complaint in done.complaint
+    assert done.code in (1, 2)
 
 
 def test_wrong_parameters_and_poles_are_named(recorded: Path, tmp_path: Path) -> None:

@@ -27,19 +27,7 @@ from page_commands import (
 )
 
 VERBS = (
-    "train",
-    "evaluate",
-    "record",
-    "replay",
-    "identify",
-    "model",
-    "finetune",
-    "distill",
-    "emulate",
-    "find-port",
-    "preflight",
-    "report",
-    "export",
+    "train evaluate record replay identify model finetune distill emulate find-port preflight report export"
 )
 COMMANDS = block_lines(README, r"cartpole-|tensorboard|\./scripts/")
 
@@ -68,10 +56,11 @@ def test_the_installation_is_that_of_the_demo() -> None:
 
 def test_every_command_is_one_that_a_test_here_runs() -> None:
     known = {"./scripts/demo", "./scripts/test", "./scripts/install", "tensorboard"}
-    known |= {f"cartpole-{verb}" for verb in VERBS}
+    known |= {f"cartpole-{verb}" for verb in VERBS.split()}
     assert {command.split()[0] for command in COMMANDS} == known
 
 
+@pytest.mark.usefixtures("without_pictures")
 @pytest.mark.parametrize(
     "command",
     [
@@ -90,6 +79,7 @@ def test_train(command: str, tmp_path: Path) -> None:
     assert len(runs) == (6 if " -m " in command else 1)
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_resume(trained: Path) -> None:
     """A training is interrupted, resumed, and interrupted again."""
     (command,) = [command for command in listed("cartpole-train") if "resume" in command]
@@ -110,6 +100,7 @@ def num_evaluations(folder: Path) -> int:
     return len(history.read_text().splitlines()) if history.exists() else 0
 
 
+@pytest.mark.usefixtures("without_pictures")
 @pytest.mark.parametrize("command", listed("cartpole-evaluate"))
 def test_evaluate(command: str, trained: Path, serial_port: Callable[[], str]) -> None:
     command = command.replace("<run>", "first").replace("/dev/ttyUSB0", "PORT")
@@ -145,6 +136,7 @@ def test_identify_train_on_it_and_model_it(trained: Path, serial_port: Callable[
     assert result.returncode == 0, result.stderr
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_record_and_replay(trained: Path) -> None:
     (record,), (replay,) = listed("cartpole-record"), listed("cartpole-replay")
     recorded = run_here(

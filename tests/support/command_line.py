@@ -8,7 +8,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -97,6 +97,18 @@ def in_process(
     return Outcome(code, out.getvalue(), err.getvalue())
 
 
+@contextlib.contextmanager
+def no_pictures() -> Iterator[None]:
+    """Draw no figures and no animations, which take most of the time of a tiny run."""
+    episodes = "cartpole_rl.reporting.episodes"
+    monitor = "cartpole_rl.workflows.monitor.TrainingMonitor"
+    names = (f"{episodes}.draw", f"{episodes}.style.save", f"{monitor}._log_pictures")
+    with contextlib.ExitStack() as stack:
+        for name in names:
+            stack.enter_context(patch(name, lambda *arguments: None))
+        yield
+
+
 def interrupt_after(file: Path, number: signal.Signals = signal.SIGINT) -> None:
     """Send a signal to this process as soon as `file` is written, for the first time or again."""
     before = modified(file)
@@ -107,17 +119,6 @@ def interrupt_after(file: Path, number: signal.Signals = signal.SIGINT) -> None:
         os.kill(os.getpid(), number)
 
     threading.Thread(target=interrupt, daemon=True).start()
-
-
-def interrupt(folder: Path, recording: str, stop: signal.Signals) -> None:
-    """Send `stop` to this process once an episode of the run in `folder`/run is on disk."""
-
-    def send() -> None:
-        while not (folder / "run/recordings" / recording).exists():
-            time.sleep(0.01)
-        os.kill(os.getpid(), stop)
-
-    threading.Thread(target=send, daemon=True).start()
 
 
 def modified(file: Path) -> int | None:

@@ -23,11 +23,11 @@ TOY: dict[type[Settings], dict[str, Any]] = {
         "learning.evaluations": 1,
         "learning.evaluation_episodes": 2,
         "buffer.size": 2000,
-        "task.time_limit": 400,
+        "task.time_limit": 100,
         "compile": False,
     },
     EvaluateConfig: {"episodes": 2},
-    RecordConfig: {"episodes": 2},
+    RecordConfig: {"episodes": 2, "task": "swingup", "task.time_limit": 400},
     ModelConfig: {
         "windows": 10,
         "ensemble.members": 2,
@@ -40,6 +40,7 @@ TOY: dict[type[Settings], dict[str, Any]] = {
         "episodes": 1,
         "evaluation_episodes": 1,
         "finetuning.iterations": 1,
+        "emulator.physics_step": 1e-3,
         "compile": False,
     },
 }

