@@ -344,6 +344,10 @@ def main() -> None:
     if (cart := by_toolbox(fit, home / "toolbox.json")) is not None:
         predictions[TOOLBOX] = predict(windows, cart)
     predictions[PHYSICS] = predict(windows, identified(own))
+    fitted = stretches(recordings(fit).values())
+    to_fitted = {PHYSICS: figures(fitted, predict(fitted, identified(own)))}
+    if cart is not None:
+        to_fitted[TOOLBOX] = figures(fitted, predict(fitted, cart))
     physics = Dynamics.of(learned.parameters, learned.models, learned.period, learned.substeps)
     predictions[MODEL] = predict(windows, physics)
     predictions[RESIDUAL] = predict(windows, physics, learned.residual.as_type(torch.float64))
@@ -357,6 +361,7 @@ def main() -> None:
         {
             "stretches": {"all": windows.number, "away": int(away(windows).sum())},
             "models": results,
+            "fitted": {"away": int(away(fitted).sum()), **to_fitted},
             "by_seconds": by_seconds(fit, windows, home),
             "sensors": sensors,
             "identified": quantities,
