@@ -17,7 +17,7 @@ from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 
 from cartpole_rl.composition import error_message
-from cartpole_rl.errors import CartPoleError, ConfigError
+from cartpole_rl.errors import CartPoleError, ConfigError, reason_of
 from cartpole_rl.files import FULL
 from cartpole_rl.signals import RaiseOnce, ending_signals
 from cartpole_rl.terminal import exit_if_nobody_reads, print_message
@@ -61,7 +61,7 @@ def one_line(error: Exception, name: str, plants: Collection[str] = ()) -> str:
     if isinstance(error, OSError):
         remedy = "; make room, or give hydra.run.dir= a folder on another disk" if error.errno in FULL else ""
         return f"{error.filename or 'a file was not written'}: {error.strerror}{remedy}"
-    first = next(iter(str(error).splitlines()), type(error).__name__)
+    first = reason_of(error)
     return first if isinstance(error, EXPECTED) else f"{type(error).__name__}: {first}"
 
 

@@ -83,22 +83,15 @@ class Evaluation:
         count = self.config.episodes
         yield from self._shown(run_episodes(self.env, self.policy, count, self.knocks), "episodes")
 
-    def note_other_pole(self, command: str) -> None:
-        """Print a warning if the agent was trained with other poles; other policies were not trained here."""
-        line = other_pole(self.known_poles, self.settings.pole, self.config.plant.reads_emulator)
-        if line and self.known_poles:
-            print_message(command, line)
-
-    def note_refitted_guard(self, command: str) -> None:
-        """Print the numbers of the track guard if they are not those of the training, and were not chosen."""
-        if line := guard_note(self.training, self.config, self.settings):
-            print_message(command, line)
-
-    def note_other_numbers(self, command: str) -> None:
-        """Print the numbers of a simulated cart that are not the nominal ones."""
-        if "cart" not in self.config.plant.ignored:
-            poles = self.settings.pole.choices or {}
-            note_other_numbers(command, self.settings.nominal_cart, poles.values())
+    def print_notes(self, command: str) -> None:
+        """Print what differs from the training, and the numbers of a simulated cart that are not nominal."""
+        known, plant, poles = self.known_poles, self.config.plant, self.settings.pole
+        if known and (warning := other_pole(known, poles, plant.reads_emulator)):
+            print_message(command, warning)
+        if note := guard_note(self.training, self.config, self.settings):
+            print_message(command, note)
+        if "cart" not in plant.ignored:
+            note_other_numbers(command, self.settings.nominal_cart, (poles.choices or {}).values())
 
     def check_board(self) -> None:
         """Raise PlantError if the cart's board shall drive and has no agent, or another one."""

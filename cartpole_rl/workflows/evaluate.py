@@ -42,9 +42,7 @@ def evaluate(config: EvaluateConfig, folder: Path) -> None:
     onboard: list[Episode] = []
     try:
         with closing(evaluation.env):
-            evaluation.note_other_pole("evaluate")
-            evaluation.note_refitted_guard("evaluate")
-            evaluation.note_other_numbers("evaluate")
+            evaluation.print_notes("evaluate")
             evaluation.check_board()
             settings = evaluation.settings.model_dump(mode="json")
             content = {**evaluation.config.model_dump(mode="json"), "evaluated": settings}
