@@ -202,25 +202,10 @@ class CartSettings(RigSettings):
         return {**self.nominal_cart, **pole.model_dump()}
 
 
-class SimulatedCartSettings(CartSettings):
-    """The nominal cart with its friction laws."""
-
-    cart_friction: CartFrictionSettings
-
-    @property
-    def frictions(self) -> tuple[FrictionSettings, ...]:
-        """The friction laws that are chosen."""
-        return self.cart_friction, self.pole_friction
-
-    def models_with(self, actuator: Law, plant: SimulationSettings) -> Models:
-        """Return the physics models of the cart with `actuator`, on `plant`."""
-        friction = self.cart_friction.model, self.pole_friction.model
-        return Models(*friction, actuator, plant.integrator, plant.pole_presses)
-
-
-class CartPoleSettings(SimulatedCartSettings):
+class CartPoleSettings(CartSettings):
     """Settings of an environment without its plant, shared by training and evaluation."""
 
+    cart_friction: CartFrictionSettings
     pole: PoleSettings
     actions: ActionSettings
     task: TaskSettings
@@ -231,11 +216,17 @@ class CartPoleSettings(SimulatedCartSettings):
     control_period: ControlPeriod
 
     @property
+    def frictions(self) -> tuple[FrictionSettings, ...]:
+        """The friction laws that are chosen."""
+        return self.cart_friction, self.pole_friction
+
+    @property
     def ranges(self) -> dict[str, Range]:
         """The ranges of the randomization; of an identified cart, those that it leaves open."""
         given = self.randomization
         return given.ranges if isinstance(given, IdentifiedSettings) else given
 
-    def models(self, plant: SimulationSettings) -> Models:
-        """Return the physics models of the simulated cart."""
-        return self.models_with(self.actions.actuator, plant)
+    def models(self, plant: SimulationSettings, actuator: Law | None = None) -> Models:
+        """Return the physics models of the cart on `plant`, by default with its own actuator."""
+        laws = self.cart_friction.model, self.pole_friction.model, actuator or self.actions.actuator
+        return Models(*laws, plant.integrator, plant.pole_presses)

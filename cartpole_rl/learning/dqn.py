@@ -14,13 +14,13 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import dispatch
 from torch import Tensor
+from torchrl.data import LazyTensorStorage, PrioritizedSampler, RandomSampler, TensorDictReplayBuffer
 from torchrl.objectives import DQNLoss, ValueEstimators
 from torchrl.objectives.utils import dispatch_value_estimator, distance_loss
 
 from cartpole_rl.compilation import Columns, LossGradient
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.errors import LearningError
-from cartpole_rl.learning.replay import make_buffer
 from cartpole_rl.learning.retries import Retries
 from cartpole_rl.learning.settings import BufferSettings, LearningSettings, OptimizerSettings, linear
 from cartpole_rl.learning.states import Resumable
@@ -229,6 +229,24 @@ class Training(Resumable):
             guarded = self.env.hardware.guarded(chunk["action"], chunk["guard"].squeeze(-1))
             scalars["exploration/guarded_fraction"] = guarded.float().mean().item()
         return scalars | self.retries.describe()
+
+
+def make_buffer(
+    settings: BufferSettings, batch_size: int, device: torch.device | str = "cpu"
+) -> TensorDictReplayBuffer:
+    """Return an empty buffer on `device` whose `sample` returns `batch_size` transitions.
+
+    A prioritized one draws from NumPy's global generator, a uniform one from torch's. Its priorities are on
+    the CPU on every device: TorchRL has trees on a GPU in its CUDA wheels alone.
+    """
+    sampler = RandomSampler()
+    if settings.kind == "prioritized":
+        shape = {"alpha": settings.alpha, "beta": settings.beta[0], "eps": settings.priority_eps}
+        sampler = PrioritizedSampler(settings.size, device="cpu", **shape)
+    storage = LazyTensorStorage(settings.size, device=device)
+    return TensorDictReplayBuffer(
+        storage=storage, sampler=sampler, batch_size=batch_size, priority_key="td_error"
+    )
 
 
 def n_step_transitions(chunk: TensorDictBase, n: int, gamma: float, held: int = 0) -> TensorDictBase:
