@@ -126,11 +126,6 @@ class FrictionSettings(Settings):
         is_mapping = isinstance(given, Mapping)
         return {name: value for name, value in given.items() if value is not None} if is_mapping else given
 
-    @property
-    def defaults(self) -> Mapping[str, float]:
-        """The numbers of the choice in conf/ with this law."""
-        return shipped_numbers(self.model.registry.kind, self.model)
-
 
 class CartFrictionSettings(FrictionSettings):
     """The friction law of the cart."""
@@ -173,11 +168,12 @@ def driven_numbers(cart: Mapping[str, float], *frictions: FrictionSettings) -> d
     """
     numbers = dict(cart)
     for friction in frictions:
+        defaults = shipped_numbers(friction.model.registry.kind, friction.model)
         for name, value in friction.parameters.items():
             is_nominal = name not in cart or any(
                 cart[name] == shipped.get(name) for shipped in replaced_carts()
             )
-            if is_nominal or value != friction.defaults.get(name):
+            if is_nominal or value != defaults.get(name):
                 numbers[name] = value
     return numbers
 
