@@ -75,7 +75,7 @@ def exit_after_signal(name: str, signalled: BaseException) -> NoReturn:
 
 def catch_signals() -> None:
     """Make SIGTERM, SIGHUP and SIGINT raise, except for those that the parent process ignores."""
-    handler = RaiseOnce(_exception_of)
+    handler = RaiseOnce(lambda number: KeyboardInterrupt() if number == signal.SIGINT else Terminated(number))
     handler.handle(*ending_signals())
     if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
         handler.handle(signal.SIGINT)
@@ -102,8 +102,3 @@ def job_signals() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def _exception_of(number: int) -> BaseException:
-    """Return the exception that a signal raises."""
-    return KeyboardInterrupt() if number == signal.SIGINT else Terminated(number)
