@@ -153,10 +153,10 @@ class Carts:
     seeded = False  # the plant, from Gymnasium's generator
 
     def make_carts(
-        self: Any, task: str, carts: int, mode: str | None, period: float, limit: int | None, **choices: Any
+        self: Any, task: str, carts: int, mode: str | None, period: float, limit: int | None, /, **given: Any
     ) -> None:
         """Make the carts, with episodes of `limit` periods, and what draws them. Raises ConfigError."""
-        self.env = simulated_environment(task, carts, period=period, time_limit=limit, **choices)
+        self.env = simulated_environment(task, carts, period=period, time_limit=limit, **given)
         modes = [each for each in RENDER_MODES if each != "human" or has_display()]
         self.metadata = {**self.metadata, "render_modes": modes, "render_fps": round(1 / period)}
         self.render_mode = mode
