@@ -160,9 +160,10 @@ def _extended(
             parts.append(this)
         elif isinstance(line, str):
             parts.append(load(group, line, folder, above))
-        else:
-            found = {key.removeprefix(REPLACES): _beside(value, folder) for key, value in line.items()}
-            parts.append(Chosen({}, {}, found))
+        else:  # a file's path is relative to the folder of the experiment
+            found = {key.removeprefix(REPLACES): each for key, each in line.items()}
+            beside = {key: folder / each if is_own_file(each) else each for key, each in found.items()}
+            parts.append(Chosen({}, {}, beside))
     return _joined(parts)
 
 
@@ -173,23 +174,13 @@ def _is_line(line: Any, others: bool) -> bool:
     return isinstance(line, str)
 
 
-def _beside(chosen: Any, folder: Path) -> Any:
-    """Return a choice in a person's experiment; a file's path is relative to the folder of the experiment."""
-    return folder / chosen if is_own_file(chosen) else chosen
-
-
 def _joined(parts: Iterable[Chosen]) -> Chosen:
     """Return choices of one group, each on top of those before."""
-    values: dict[str, Any] = {}
-    given: dict[str, Any] = {}
-    groups: dict[str, Any] = {}
+    whole = Chosen({}, {})
     for each in parts:
-        values, given, groups = (
-            merged(values, each.values),
-            merged(given, each.given),
-            {**groups, **each.groups},
-        )
-    return Chosen(values, given, groups)
+        values, given = merged(whole.values, each.values), merged(whole.given, each.given)
+        whole = Chosen(values, given, {**whole.groups, **each.groups})
+    return whole
 
 
 def read_file(group: str, path: Path) -> dict[str, Any]:

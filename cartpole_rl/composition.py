@@ -497,7 +497,7 @@ def error_message(error: Exception, command: str, words: Sequence[str], plants: 
     if isinstance(error, OverrideParseException):
         return _no_override(str(error.override), words)
     if not isinstance(error, HydraException):
-        return next(iter(str(error).splitlines()), type(error).__name__)
+        return reason_of(error)
     text = " ".join(str(error).split())
     if unknown := re.match(r"Could not override '([^']+)'", text):
         setting = getattr(error.__cause__, "full_key", None) or unknown[1]  # the key inside of a mapping

@@ -1,5 +1,6 @@
 """The error tree. Messages say in one line what is wrong and what to do."""
 
+import copyreg
 from typing import Any
 
 
@@ -10,18 +11,12 @@ class CartPoleError(Exception):
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Support pickling, whatever arguments the constructor takes."""
-        return _rebuild, (type(self), self.args), vars(self)
+        return copyreg.__newobj__, (type(self), *self.args), vars(self)  # type: ignore[attr-defined]
 
 
 def reason_of(error: Exception) -> str:
     """Return the first line of an error of a library, or its name where it has no text."""
     return [*str(error).splitlines(), type(error).__name__][0]
-
-
-def _rebuild(kind: type[CartPoleError], arguments: tuple[Any, ...]) -> CartPoleError:
-    error = kind.__new__(kind, *arguments)
-    error.args = arguments
-    return error
 
 
 class ConfigError(CartPoleError):

@@ -17,7 +17,7 @@ from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 
 from cartpole_rl.composition import error_message
-from cartpole_rl.errors import CartPoleError, ConfigError
+from cartpole_rl.errors import CartPoleError, ConfigError, reason_of
 from cartpole_rl.files import FULL
 from cartpole_rl.signals import RaiseOnce, ending_signals
 from cartpole_rl.terminal import exit_if_nobody_reads, print_message
@@ -61,7 +61,7 @@ def one_line(error: Exception, name: str, plants: Collection[str] = ()) -> str:
     if isinstance(error, OSError):
         remedy = "; make room, or give hydra.run.dir= a folder on another disk" if error.errno in FULL else ""
         return f"{error.filename or 'a file was not written'}: {error.strerror}{remedy}"
-    first = next(iter(str(error).splitlines()), type(error).__name__)
+    first = reason_of(error)
     return first if isinstance(error, EXPECTED) else f"{type(error).__name__}: {first}"
 
 
@@ -75,7 +75,7 @@ def exit_after_signal(name: str, signalled: BaseException) -> NoReturn:
 
 def catch_signals() -> None:
     """Make SIGTERM, SIGHUP and SIGINT raise, except for those that the parent process ignores."""
-    handler = RaiseOnce(_exception_of)
+    handler = RaiseOnce(lambda number: KeyboardInterrupt() if number == signal.SIGINT else Terminated(number))
     handler.handle(*ending_signals())
     if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
         handler.handle(signal.SIGINT)
@@ -102,8 +102,3 @@ def job_signals() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def _exception_of(number: int) -> BaseException:
-    """Return the exception that a signal raises."""
-    return KeyboardInterrupt() if number == signal.SIGINT else Terminated(number)

@@ -145,18 +145,21 @@ class Registry(Generic[Kind]):
 
     def find(self, name: str) -> Kind:
         """Return the extension of that name. Raises ConfigError in one line if there is none."""
+        try:
+            found = self._found(name)
+        except ConfigError as error:
+            raise ConfigError(f"{self.words} {name!r}: {error}") from None
+        if found is None:
+            raise ConfigError(f"{self.words} {name!r} is unknown: give {self.expected}")
+        return found
+
+    def _found(self, name: str) -> Kind | None:
+        """Return the extension of that name, a user's registered under it; None without one."""
         if name in self._entries:
             return self._entries[name]
         place = name if ":" in name else _entry_points(self.kind).get(name)
         if place is None:
-            raise ConfigError(f"{self.words} {name!r} is unknown: give {self.expected}")
-        try:
-            return self._own(name, place)
-        except ConfigError as error:
-            raise ConfigError(f"{self.words} {name!r}: {error}") from None
-
-    def _own(self, name: str, place: str) -> Kind:
-        """Return the extension of a user, registered under `name`. Raises ConfigError."""
+            return None
         item = object_at(place)
         found = next((each for each in self if each._item is item), None)
         if found is None and self.decorated:
@@ -184,15 +187,13 @@ class Registry(Generic[Kind]):
     def _validated(self, given: Any) -> Kind:
         if not isinstance(given, str):
             raise PydanticCustomError("string_type", "give text")
-        if given in self._entries:
-            return self._entries[given]
-        place = given if ":" in given else _entry_points(self.kind).get(given)
-        if place is None:
-            raise PydanticCustomError("enum", "give {expected}", {"expected": self.expected})
         try:
-            return self._own(given, place)
+            found = self._found(given)
         except ConfigError as error:
             raise ValueError(str(error)) from None
+        if found is None:
+            raise PydanticCustomError("enum", "give {expected}", {"expected": self.expected})
+        return found
 
 
 def _recall(home: str, kind: str, name: str) -> Extension:

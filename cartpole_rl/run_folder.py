@@ -63,11 +63,7 @@ PACKAGES = ("cartpole_rl", "torch", "torchrl", "tensordict", "numpy", "hydra-cor
 
 
 def write_config(
-    folder: Path,
-    program: str,
-    config: Mapping[str, Any],
-    resumed: bool = False,
-    agent: Path | None = None,
+    folder: Path, program: str, config: Mapping[str, Any], resumed: bool = False, agent: Path | None = None
 ) -> None:
     """Write config.yaml and provenance.json of a run of cartpole-<program>, which starts from `agent`.
 

@@ -32,19 +32,14 @@ def confirm(text: str) -> bool:
     if sys.stdin is None or not sys.stdin.isatty():
         return False
     with waiting(""):
-        return _confirmed(text)
-
-
-def _confirmed(text: str) -> bool:
-    print(f"{text}.", file=sys.stderr)
-    print("Check the cart. It homes as soon as you confirm: keep the track clear.", file=sys.stderr)
-    discard_typed()
-    print("Press Enter to continue, Ctrl-C to stop. ", end="", file=sys.stderr, flush=True)
-    try:
-        input()
-    except EOFError:
-        return False
-    return True
+        print(f"{text}.", file=sys.stderr)
+        print("Check the cart. It homes as soon as you confirm: keep the track clear.", file=sys.stderr)
+        discard_typed()
+        print("Press Enter to continue, Ctrl-C to stop. ", end="", file=sys.stderr, flush=True)
+        with suppress(EOFError):
+            input()
+            return True
+    return False
 
 
 def discard_typed() -> None:

@@ -19,7 +19,7 @@ from PIL import Image, ImageColor, ImageDraw, ImageFont
 
 from cartpole_rl.drawing import colours
 from cartpole_rl.rig.hardware import LARGEST_MOTOR
-from cartpole_rl.tasks.upright import is_upright
+from cartpole_rl.tasks.episode import is_upright
 
 SIZE = (480, 320)  # pixels
 FINER = 2

@@ -38,10 +38,13 @@ def with_fitted_guard(config: Config) -> Config:
         return config
     shared = CartPoleSettings(**{name: getattr(config, name) for name in CartPoleSettings.model_fields})
     if isinstance(config.randomization, IdentifiedSettings):
-        numbers = guard_numbers(shared)
-    else:
-        numbers = known_guard_numbers(shared.model_dump_json())
-    return config.model_copy(update={"guard": guard.model_copy(update={"numbers": numbers})})
+        return with_guard_numbers(config, guard_numbers(shared))
+    return with_guard_numbers(config, known_guard_numbers(shared.model_dump_json()))
+
+
+def with_guard_numbers(config: Config, numbers: TrackGuard | None) -> Config:
+    """Return `config` with these numbers of its track guard; with None, it is not fitted yet."""
+    return config.model_copy(update={"guard": config.guard.model_copy(update={"numbers": numbers})})
 
 
 @lru_cache(maxsize=64)

@@ -47,7 +47,7 @@ A pickle holds the arguments: a copy starts anew, as with Gymnasium's own enviro
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -128,12 +128,6 @@ def environment_settings(task: str, choices: Mapping[str, Any]) -> CartPoleSetti
     return shipped_settings({**OF_TASK[task], "pole": "medium", **named})
 
 
-def metadata_here(metadata: Mapping[str, Any], period: float) -> dict[str, Any]:
-    """Return `metadata` with the render modes that work on this computer, for a control period in s."""
-    modes = [mode for mode in RENDER_MODES if mode != "human" or has_display()]
-    return {**metadata, "render_modes": modes, "render_fps": round(1 / period)}
-
-
 def check_count(name: str, value: Any) -> None:
     """Raise ConfigError if `value` is not an integer of at least 1."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
@@ -151,26 +145,48 @@ def checked_actions(actions: Any, space: spaces.Space[Any], number: int) -> Arra
     return given.astype(np.int64)
 
 
-def observation_space(env: CartPoleEnv) -> spaces.Box:
-    """Return the observation space of one cart."""
-    return spaces.Box(-np.inf, np.inf, (env.hardware.observation_settings.size,), np.float32)
+class Carts:
+    """What the environments of one cart and of many share: the simulated carts `env` and their pictures."""
+
+    env: CartPoleEnv
+    renderer: Renderer | None = None
+    seeded = False  # the plant, from Gymnasium's generator
+
+    def make_carts(
+        self: Any, task: str, carts: int, mode: str | None, period: float, limit: int | None, /, **given: Any
+    ) -> None:
+        """Make the carts, with episodes of `limit` periods, and what draws them. Raises ConfigError."""
+        self.env = simulated_environment(task, carts, period=period, time_limit=limit, **given)
+        modes = [each for each in RENDER_MODES if each != "human" or has_display()]
+        self.metadata = {**self.metadata, "render_modes": modes, "render_fps": round(1 / period)}
+        self.render_mode = mode
+        if mode is not None:
+            steps = MAX_EPISODE_STEPS if limit in (None, UNLIMITED) else limit
+            self.renderer = Renderer(mode, self.env.plant, f"cartpole_rl {task}", period, steps)
+
+    def spaces_of_one(self) -> tuple[spaces.Box, spaces.Discrete]:
+        """Return the spaces of one cart: its observation, and an action as an index of its motor values."""
+        hardware = self.env.hardware
+        shape = (hardware.observation_settings.size,)
+        return spaces.Box(-np.inf, np.inf, shape, np.float32), spaces.Discrete(len(hardware.motors))
+
+    def seed_plant(self: Any, seed: int | None) -> None:
+        """Seed the plant from Gymnasium's generator: before the first episodes, and for a new `seed`."""
+        if seed is not None or not self.seeded:
+            self.env.set_seed(int(self.np_random.integers(2**31)))
+            self.seeded = True
+
+    def drawn(self: Any) -> tuple[Picture, ...]:
+        """Return the newest picture of each cart; none without a renderer, or if a window shows them."""
+        return () if self.render_mode in (None, "human") else self.renderer.pictures()
+
+    def close_window(self) -> None:
+        """Close the window, if there is one."""
+        if self.renderer is not None:
+            self.renderer.close()
 
 
-def action_space(env: CartPoleEnv) -> spaces.Discrete:
-    """Return the action space of one cart: an index of its motor values."""
-    return spaces.Discrete(len(env.hardware.motors))
-
-
-def renderer(
-    mode: str | None, env: CartPoleEnv, task: str, period: float, steps: int | None
-) -> Renderer | None:
-    """Return the renderer of a mode, or None without one; `steps` periods of `period` s are an episode."""
-    if mode is None:
-        return None
-    return Renderer(mode, env.plant, f"cartpole_rl {task}", period, steps or MAX_EPISODE_STEPS)
-
-
-class CartPoleGymnasium(gymnasium.Env[Array, np.int64], EzPickle):
+class CartPoleGymnasium(Carts, gymnasium.Env[Array, np.int64], EzPickle):
     """One simulated cart. It has no time limit; `gymnasium.make` adds that of the registration.
 
     `choices` are the settings named above, as keyword arguments. Raises ConfigError.
@@ -187,19 +203,15 @@ class CartPoleGymnasium(gymnasium.Env[Array, np.int64], EzPickle):
         **choices: Any,
     ) -> None:
         EzPickle.__init__(self, task, randomization, render_mode, period, **choices)
-        choices = {**choices, "randomization": randomization, "period": period}
-        self.env = simulated_environment(task, 1, time_limit=UNLIMITED, **choices)
-        self.metadata = metadata_here(METADATA, period)
-        self.observation_space, self.action_space = observation_space(self.env), action_space(self.env)
-        self.render_mode, self.renderer = render_mode, renderer(render_mode, self.env, task, period, None)
-        self.seeded = False  # the plant, from `np_random`
+        self.make_carts(task, 1, render_mode, period, UNLIMITED, randomization=randomization, **choices)
+        self.observation_space, self.action_space = self.spaces_of_one()
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Array, dict[str, Any]]:
         """Start an episode."""
         super().reset(seed=seed)
-        seed_plant(self, seed)
+        self.seed_plant(seed)
         first = self.env.one_cart.reset()
         if self.renderer is not None:
             x, _, theta, _ = first.state
@@ -222,34 +234,13 @@ class CartPoleGymnasium(gymnasium.Env[Array, np.int64], EzPickle):
 
     def render(self) -> Picture | None:
         """Return the newest picture, uint8 [320, 480, 3]; None if it is shown in a window."""
-        if self.renderer is None or self.render_mode == "human":
-            return None
-        return self.renderer.pictures()[0]
+        return next(iter(self.drawn()), None)
 
     def close(self) -> None:
         """Close the window."""
-        if self.renderer is not None:
-            self.renderer.close()
+        self.close_window()
 
 
 def float32(numbers: Sequence[float]) -> Array:
     """Return numbers as an array of float32."""
     return np.array(numbers, np.float32)
-
-
-class Seeded(Protocol):
-    """An environment of Gymnasium over `env`, whose plant may be seeded already."""
-
-    env: CartPoleEnv
-    seeded: bool
-
-    @property
-    def np_random(self) -> np.random.Generator:
-        """Gymnasium's generator."""
-
-
-def seed_plant(wrapper: Seeded, seed: int | None) -> None:
-    """Before the first episodes and those after a new `seed`, seed the plant's generator from Gymnasium's."""
-    if seed is not None or not wrapper.seeded:
-        wrapper.env.set_seed(int(wrapper.np_random.integers(2**31)))
-        wrapper.seeded = True

@@ -10,24 +10,11 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from tensordict import TensorDictBase
 
-from cartpole_rl.envs.gymnasium import (
-    METADATA,
-    PERIOD,
-    SCORES,
-    Array,
-    Randomization,
-    action_space,
-    checked_actions,
-    metadata_here,
-    observation_space,
-    renderer,
-    seed_plant,
-    simulated_environment,
-)
+from cartpole_rl.envs.gymnasium import METADATA, PERIOD, SCORES, Array, Carts, Randomization, checked_actions
 from cartpole_rl.envs.rendering import Picture, Renderer
 
 
-class CartPoleVector(VectorEnv[Array, Array, Array], EzPickle):
+class CartPoleVector(Carts, VectorEnv[Array, Array, Array], EzPickle):
     """Many simulated carts at once; a cart whose episode ends starts the next in the same step.
 
     `info` then holds the last observation under `final_obs`, as in Gymnasium's own vector environments.
@@ -49,21 +36,12 @@ class CartPoleVector(VectorEnv[Array, Array, Array], EzPickle):
     ) -> None:
         arguments = task, num_envs, randomization, compiled, render_mode, max_episode_steps, period
         EzPickle.__init__(self, *arguments, **choices)
-        choices = {**choices, "randomization": randomization, "period": period}
-        self.env = simulated_environment(
-            task, num_envs, compiled=compiled, time_limit=max_episode_steps, **choices
-        )
-        self.metadata = metadata_here(self.metadata, period)
+        choices = {**choices, "randomization": randomization, "compiled": compiled}
+        self.make_carts(task, num_envs, render_mode, period, max_episode_steps, **choices)
         self.num_envs = num_envs
-        self.render_mode, self.renderer = (
-            render_mode,
-            renderer(render_mode, self.env, task, period, max_episode_steps),
-        )
-        self.single_observation_space = observation_space(self.env)
-        self.single_action_space = action_space(self.env)
+        self.single_observation_space, self.single_action_space = self.spaces_of_one()
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self.seeded = False  # the plant, from `np_random`
         self._present: TensorDictBase
 
     def reset(
@@ -71,7 +49,7 @@ class CartPoleVector(VectorEnv[Array, Array, Array], EzPickle):
     ) -> tuple[Array, dict[str, Any]]:
         """Start an episode on each cart; one seed serves all."""
         super().reset(seed=seed)
-        seed_plant(self, seed)
+        self.seed_plant(seed)
         self._present = self.env.reset()
         if self.renderer is not None:
             start_all(self.renderer, self._present, range(self.num_envs))
@@ -96,14 +74,11 @@ class CartPoleVector(VectorEnv[Array, Array, Array], EzPickle):
 
     def render(self) -> tuple[Picture, ...] | None:
         """Return the newest picture of each cart, uint8 [320, 480, 3]; None if they are shown in a window."""
-        if self.renderer is None or self.render_mode == "human":
-            return None
-        return self.renderer.pictures()
+        return self.drawn() or None
 
     def close_extras(self, **kwargs: Any) -> None:
         """Close the window."""
-        if self.renderer is not None:
-            self.renderer.close()
+        self.close_window()
 
     def _draw(self, renderer: Renderer, transition: TensorDictBase) -> None:
         """Show the carts after a step; those whose episode ended show the start of the next."""

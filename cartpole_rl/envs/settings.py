@@ -126,11 +126,6 @@ class FrictionSettings(Settings):
         is_mapping = isinstance(given, Mapping)
         return {name: value for name, value in given.items() if value is not None} if is_mapping else given
 
-    @property
-    def defaults(self) -> Mapping[str, float]:
-        """The numbers of the choice in conf/ with this law."""
-        return shipped_numbers(self.model.registry.kind, self.model)
-
 
 class CartFrictionSettings(FrictionSettings):
     """The friction law of the cart."""
@@ -173,11 +168,12 @@ def driven_numbers(cart: Mapping[str, float], *frictions: FrictionSettings) -> d
     """
     numbers = dict(cart)
     for friction in frictions:
+        defaults = shipped_numbers(friction.model.registry.kind, friction.model)
         for name, value in friction.parameters.items():
             is_nominal = name not in cart or any(
                 cart[name] == shipped.get(name) for shipped in replaced_carts()
             )
-            if is_nominal or value != friction.defaults.get(name):
+            if is_nominal or value != defaults.get(name):
                 numbers[name] = value
     return numbers
 
@@ -202,25 +198,10 @@ class CartSettings(RigSettings):
         return {**self.nominal_cart, **pole.model_dump()}
 
 
-class SimulatedCartSettings(CartSettings):
-    """The nominal cart with its friction laws."""
-
-    cart_friction: CartFrictionSettings
-
-    @property
-    def frictions(self) -> tuple[FrictionSettings, ...]:
-        """The friction laws that are chosen."""
-        return self.cart_friction, self.pole_friction
-
-    def models_with(self, actuator: Law, plant: SimulationSettings) -> Models:
-        """Return the physics models of the cart with `actuator`, on `plant`."""
-        friction = self.cart_friction.model, self.pole_friction.model
-        return Models(*friction, actuator, plant.integrator, plant.pole_presses)
-
-
-class CartPoleSettings(SimulatedCartSettings):
+class CartPoleSettings(CartSettings):
     """Settings of an environment without its plant, shared by training and evaluation."""
 
+    cart_friction: CartFrictionSettings
     pole: PoleSettings
     actions: ActionSettings
     task: TaskSettings
@@ -231,11 +212,17 @@ class CartPoleSettings(SimulatedCartSettings):
     control_period: ControlPeriod
 
     @property
+    def frictions(self) -> tuple[FrictionSettings, ...]:
+        """The friction laws that are chosen."""
+        return self.cart_friction, self.pole_friction
+
+    @property
     def ranges(self) -> dict[str, Range]:
         """The ranges of the randomization; of an identified cart, those that it leaves open."""
         given = self.randomization
         return given.ranges if isinstance(given, IdentifiedSettings) else given
 
-    def models(self, plant: SimulationSettings) -> Models:
-        """Return the physics models of the simulated cart."""
-        return self.models_with(self.actions.actuator, plant)
+    def models(self, plant: SimulationSettings, actuator: Law | None = None) -> Models:
+        """Return the physics models of the cart on `plant`, by default with its own actuator."""
+        laws = self.cart_friction.model, self.pole_friction.model, actuator or self.actions.actuator
+        return Models(*laws, plant.integrator, plant.pole_presses)

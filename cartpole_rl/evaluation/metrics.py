@@ -10,8 +10,7 @@ import numpy as np
 from scipy import stats
 
 from cartpole_rl.intervals import CONFIDENCE, student_interval
-from cartpole_rl.tasks.episode import Ending, Episode
-from cartpole_rl.tasks.upright import is_upright, upright_at_end, upright_since, wrap
+from cartpole_rl.tasks.episode import Ending, Episode, is_upright, upright_at_end, upright_since, wrap
 
 RESAMPLES = 5000
 

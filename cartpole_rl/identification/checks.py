@@ -23,8 +23,7 @@ from cartpole_rl.identification.rollout import Dynamics
 from cartpole_rl.identification.sensors import Motion, question_sensors
 from cartpole_rl.identification.windows import regular_frames
 from cartpole_rl.rig.hardware import Hardware
-from cartpole_rl.tasks.episode import Episode
-from cartpole_rl.tasks.upright import wrap
+from cartpole_rl.tasks.episode import Episode, wrap
 
 Array = NDArray[np.floating]
 SHORTEST = 20.0  # s

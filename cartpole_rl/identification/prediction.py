@@ -18,8 +18,7 @@ from cartpole_rl.identification.matching import finest_scale, match_initial_stat
 from cartpole_rl.identification.rollout import Dynamics
 from cartpole_rl.identification.windows import Windows, cut_stretches, joined, lead_periods
 from cartpole_rl.physics.residual import Residual
-from cartpole_rl.tasks.episode import Episode
-from cartpole_rl.tasks.upright import wrap
+from cartpole_rl.tasks.episode import Episode, wrap
 
 CERTAIN = 2.0  # spreads that should hold about 95 % of the errors
 REPORTED = {"x_mm": 1e3, "theta_deg": 180 / np.pi}  # names of the errors in reports: factor from m and rad

@@ -81,10 +81,9 @@ class Distillation:
         losses = []
         for update in range(settings.updates):
             progress = (number + update / settings.updates) / settings.rounds
+            rate = half_cosine(settings.learning_rate, LAST_RATE * settings.learning_rate, progress)
             for group in self._optimizer.param_groups:
-                group["lr"] = half_cosine(
-                    settings.learning_rate, LAST_RATE * settings.learning_rate, progress
-                )
+                group["lr"] = rate
             rows = torch.randint(len(observations), (settings.batch_size,), generator=self._random)
             losses.append(self._update(observations[rows], values[rows]))
         return sum(losses) / len(losses)

@@ -176,9 +176,7 @@ class FinetuningSettings(Settings):
     widen: Positive  # factor on the fit's standard deviations
     epsilon: Annotated[float, Field(ge=0, le=0.2)]  # share of random actions on the cart
     simulated_epsilon: tuple[Fraction, Fraction]  # share of random actions in simulation, first to last
-    simulated_epsilon_share: Annotated[
-        float, Field(gt=0, le=1)
-    ]  # of the simulated transitions, over which it falls
+    simulated_epsilon_share: Annotated[float, Field(gt=0, le=1)]  # of these transitions, over which it falls
     warmup_transitions: Annotated[int, Field(ge=0)]  # random actions in simulation before the first update
     buffer_kind: Literal["prioritized", "uniform"]  # of the simulated transitions
     learning_rate: Positive  # at the start; it falls along half a cosine

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cartpole_rl.rig.hardware import Hardware, nominal_hardware
-from cartpole_rl.tasks.episode import Array, Ending, Episode
-from cartpole_rl.tasks.upright import wrap
+from cartpole_rl.tasks.episode import Array, Ending, Episode, wrap
 from cartpole_rl.wire import Fault
 
 LOGGER = logging.getLogger(__name__)

@@ -22,13 +22,12 @@ from cartpole_rl.physics.models import Models, check_laws
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.settings import SimulatedSettings
 from cartpole_rl.plants.specs import Numbers, Plant, PlantOutput
-from cartpole_rl.randomization.randomizer import Draws
+from cartpole_rl.randomization.randomizer import Draws, draw_start
 from cartpole_rl.rig.hardware import Encoders, Hardware
 from cartpole_rl.rig.parameters import PARAMETERS
 from cartpole_rl.scalar import Scalar, plain
 from cartpole_rl.tasks.episode import Origin
 from cartpole_rl.tasks.settings import StartSettings
-from cartpole_rl.tasks.starts import draw_start
 
 if TYPE_CHECKING:
     from cartpole_rl.envs.settings import CartPoleSettings

@@ -70,12 +70,7 @@ def log_uniform(share: "Tensor", low: "Tensor", high: "Tensor") -> "Tensor":
 
 @DISTRIBUTIONS.register("truncated_normal")
 def truncated_normal(
-    share: "Tensor",
-    low: "Tensor",
-    high: "Tensor",
-    *,
-    mean: Finite | None = None,
-    std: Positive | None = None,
+    share: "Tensor", low: "Tensor", high: "Tensor", *, mean: Finite | None = None, std: Positive | None = None
 ) -> "Tensor":
     """Normal, cut off at the bounds; by default about their middle, with the bounds at two deviations."""
     middle = (low + high) / 2 if mean is None else mean

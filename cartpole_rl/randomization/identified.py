@@ -21,16 +21,7 @@ from cartpole_rl.rig.parameters import PARAMETERS, check_names
 
 Array = NDArray[np.float64]
 # what NumPy raises for a file that is missing, cut off, changed or another one
-UNREADABLE = (
-    OSError,
-    ValueError,
-    LookupError,
-    TypeError,
-    EOFError,
-    RuntimeError,
-    BadZipFile,
-    zlib.error,
-)
+UNREADABLE = (OSError, ValueError, LookupError, TypeError, EOFError, RuntimeError, BadZipFile, zlib.error)
 LATENCY = CartParameters.names().index("latency")
 
 

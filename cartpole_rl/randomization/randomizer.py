@@ -1,10 +1,14 @@
 """Draws the parameters of carts: first a pole, then each randomized parameter about its nominal value.
 
+Their initial states are drawn here, too.
+
 A draw is a table [P, N] with rows in the order of `CartParameters.names()`, so that the rows of
 finished episodes are replaced by one assignment.
 """
 
+import math
 from collections.abc import Iterable, Mapping
+from functools import cache
 from typing import Protocol
 
 import torch
@@ -14,6 +18,7 @@ from cartpole_rl.errors import ConfigError
 from cartpole_rl.physics.parameters import CartParameters, cart_column
 from cartpole_rl.randomization.poles import Pole, PoleSettings, possible_poles, uniform_rod
 from cartpole_rl.randomization.ranges import Range, check_carts
+from cartpole_rl.tasks.settings import Start, StartSettings
 
 POLE_FIELDS = tuple(Pole.model_fields)
 
@@ -173,3 +178,28 @@ class Randomizer(Draws):
 
     def _flags(self, values: list[bool]) -> Tensor:
         return torch.tensor(values, dtype=torch.bool, device=self.nominal.device).unsqueeze(1)
+
+
+def draw_start(count: int, start: StartSettings, generator: torch.Generator) -> Tensor:
+    """Draw true states [count, 4]: x m, x_dot m/s, theta rad, theta_dot rad/s."""
+    device = generator.device
+    unit = 2 * torch.rand((count, 4), generator=generator, device=device) - 1
+    state = torch.addcmul(*bounds(start, device, resting=False), unit)
+    if start.resting_share == 0:
+        return state
+    rests = torch.rand((count, 1), generator=generator, device=device) < start.resting_share
+    return torch.where(rests, torch.addcmul(*bounds(start, device, resting=True), unit), state)
+
+
+@cache
+def bounds(start: StartSettings, device: torch.device, resting: bool) -> tuple[Tensor, Tensor]:
+    """Return centre and spread [4] of the initial states; with `resting`, of those at rest."""
+    angle, angle_spread = {
+        Start.UPRIGHT: (0.0, start.angle_spread),
+        Start.HANGING: (math.pi, start.angle_spread),
+        Start.ANY: (0.0, math.pi),
+    }[start.angle]
+    spread = [start.position_spread, start.speed_spread, angle_spread, start.angular_speed_spread]
+    if resting:
+        angle, spread = math.pi, [start.position_spread, 0.0, 0.0, 0.0]
+    return torch.tensor([0.0, 0.0, angle, 0.0], device=device), torch.tensor(spread, device=device)

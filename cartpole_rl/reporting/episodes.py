@@ -24,10 +24,9 @@ from cartpole_rl.reporting.scores import learning_curve
 from cartpole_rl.reporting.texts import ending_text, guard_text
 from cartpole_rl.rig.hardware import LARGEST_MOTOR
 from cartpole_rl.run_folder import ANIMATION, FIGURES, METRICS, write_json
-from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.tasks.episode import Episode, is_upright, upright_since
 from cartpole_rl.tasks.rewards import UPRIGHT_ANGLE
 from cartpole_rl.tasks.settings import TaskSettings
-from cartpole_rl.tasks.upright import is_upright, upright_since
 
 SMALL_SWING = 40.0  # deg; the angle axis of an episode within it is enlarged
 MOTOR_TICKS = (-250, -125, 0, 125, 250)

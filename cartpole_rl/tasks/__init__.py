@@ -1,1 +1,1 @@
-"""The tasks: features, rewards, scores, starts and endings, as pure tensor functions."""
+"""The tasks: features, rewards, scores and endings, as pure tensor functions."""

@@ -1,8 +1,10 @@
 """One finished episode as arrays, for scores, figures and recordings, and the reasons of its ending.
 
-The plant reports track, fault and link; angle and time belong to the task.
+The plant reports track, fault and link; angle and time belong to the task. Upright is defined here too: the
+angle of score (6.2), and how long it has to be held.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from enum import StrEnum
@@ -12,9 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cartpole_rl.rig.hardware import Encoders, nominal_encoders
+from cartpole_rl.tasks.rewards import UPRIGHT_ANGLE
 from cartpole_rl.tasks.settings import Measure
 
 Array = NDArray[np.float64]
+HOLD = 1.0  # s that the pole has to stay upright
 
 
 class Ending(StrEnum):
@@ -91,3 +95,38 @@ class Episode:
     def steps(self) -> int:
         """Number of control periods."""
         return len(self.motor)
+
+
+def wrap(theta: Array) -> Array:
+    """Return angles in rad, of any shape, wrapped to (-pi, pi]."""
+    return -((-theta + math.pi) % (2 * math.pi) - math.pi)
+
+
+def is_upright(theta: Array) -> NDArray[np.bool_]:
+    """Return True for each angle (rad, wrapped or not) within 5 degrees of upright."""
+    return np.abs(wrap(theta)) < UPRIGHT_ANGLE
+
+
+def upright_at_end(time: Array, theta: Array) -> bool:
+    """Return True if the pole is upright during the whole last second (`HOLD`).
+
+    `time` [T] in s, ascending; `theta` [T] in rad.
+    """
+    last = time >= time[-1] - HOLD
+    return bool(time[-1] - time[0] >= HOLD and is_upright(theta[last]).all())
+
+
+def upright_since(time: Array, theta: Array) -> float | None:
+    """Return the first time (s) from which the pole stays upright for one second; None if it never does.
+
+    `time` [T] in s, ascending; `theta` [T] in rad.
+    """
+    start: float | None = None
+    for moment, upright in zip(time, is_upright(theta), strict=True):
+        if not upright:
+            start = None
+        elif start is None:
+            start = float(moment)
+        elif moment - start >= HOLD:
+            return start
+    return None

@@ -14,7 +14,7 @@ from cartpole_rl.agents.baseline import EnergyAndRegulator
 from cartpole_rl.agents.own import OwnPolicy
 from cartpole_rl.checking import validated
 from cartpole_rl.emulator.settings import EmulatorSettings
-from cartpole_rl.envs.build import environment, simulated_env, with_fitted_guard
+from cartpole_rl.envs.build import environment, simulated_env, with_fitted_guard, with_guard_numbers
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.settings import CartPoleSettings, TrackGuard
 from cartpole_rl.errors import ConfigError
@@ -90,16 +90,11 @@ def evaluated_agent(config: EvaluateConfig) -> TrainedAgent:
     Raises CheckpointError, ConfigError.
     """
     if is_own_policy(config.run):
-        return own_agent(config)
+        training = own_training(config, ("observation", "actions", "control_period"), {})
+        return TrainedAgent(training, OwnPolicy(config.run, training.actions.motors))
     if config.run != BASELINE:
         return trained_agent(config.run)
     return baseline_agent(config, own_training(config, ("actions", "cart", "control_period"), OF_BASELINE))
-
-
-def own_agent(config: EvaluateConfig) -> TrainedAgent:
-    """Return the policy of one's own at `config.run`, with the settings of conf/train.yaml otherwise."""
-    training = own_training(config, ("observation", "actions", "control_period"), {})
-    return TrainedAgent(training, OwnPolicy(config.run, training.actions.motors))
 
 
 def own_training(config: EvaluateConfig, names: Sequence[str], choices: Mapping[str, Any]) -> TrainConfig:
@@ -136,10 +131,10 @@ def compiled_training(trained: TrainedAgent) -> TrainConfig:
     if training.guard.active is None:
         return training
     others = [pole for pole in trained.known_poles if not guard_holds(training.pole, pole)]
-    driven = [without_guard_numbers(training).model_copy(update={"pole": pole}) for pole in others]
+    driven = [with_guard_numbers(training, None).model_copy(update={"pole": pole}) for pole in others]
     guards = [each.guard.active for each in (training, *map(with_fitted_guard, driven)) if each.guard.active]
     numbers = reduce(TrackGuard.at_least, guards)
-    return training.model_copy(update={"guard": training.guard.model_copy(update={"numbers": numbers})})
+    return with_guard_numbers(training, numbers)
 
 
 def exported_agent(trained: TrainedAgent, origin: Mapping[str, Any]) -> ExportedAgent:
@@ -167,29 +162,18 @@ def network_of(trained: TrainedAgent) -> Any:
 
 def provenance(run: Path) -> dict[str, Any]:
     """Return the origin of the agent of `run`: its command, versions, commit, transitions and score."""
-    checkpoint, recorded = load_agent(run), provenance_beside(find_agent(run))
+    checkpoint, agent = load_agent(run), find_agent(run)
+    recorded = recorded_provenance(agent.parent.parent if agent.parent.name == CHECKPOINTS else agent.parent)
+    try:
+        canonical_json(recorded)
+    except ValueError:  # an infinite number
+        recorded = {}
     match recorded.get("command"):
         case [str(program), *arguments]:
             command = [Path(program).name, *arguments]
         case _:
             command = []
-    return {
-        **recorded,
-        "command": command,
-        "transitions": checkpoint.transitions,
-        "score": checkpoint.score,
-    }
-
-
-def provenance_beside(agent: Path) -> dict[str, Any]:
-    """Return the provenance.json of the run that wrote `agent`; empty if it is missing or damaged."""
-    folder = agent.parent.parent if agent.parent.name == CHECKPOINTS else agent.parent
-    recorded = recorded_provenance(folder)
-    try:
-        canonical_json(recorded)
-    except ValueError:  # an infinite number
-        return {}
-    return recorded
+    return {**recorded, "command": command, "transitions": checkpoint.transitions, "score": checkpoint.score}
 
 
 def recorded_cart(recordings: Sequence[Path]) -> CartPoleSettings | None:
@@ -219,13 +203,8 @@ def evaluated_settings(training: TrainConfig, config: EvaluateConfig) -> CartPol
     settings = replaced_settings(training, config)
     fitted_to = settings.model_copy(update={"randomization": config.randomization or training.randomization})
     if changes := outdated(training, config):
-        fitted_to = without_guard_numbers(training).model_copy(update=changes)
+        fitted_to = with_guard_numbers(training, None).model_copy(update=changes)
     return settings.model_copy(update={"guard": with_fitted_guard(fitted_to).guard})
-
-
-def without_guard_numbers(training: TrainConfig) -> TrainConfig:
-    """Return `training` with a track guard that is not fitted yet."""
-    return training.model_copy(update={"guard": training.guard.model_copy(update={"numbers": None})})
 
 
 def outdated(training: TrainConfig, config: EvaluateConfig) -> dict[str, Any]:

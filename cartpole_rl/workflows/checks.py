@@ -126,14 +126,9 @@ def check_finetuning(config: FinetuneConfig) -> Path:
     if config.compile:
         check_compiler()
     check_agent(config.run)
-    check_ray(config)
-    return config.run
-
-
-def check_ray(config: FinetuneConfig) -> None:
-    """Raise ConfigError if the settings need Ray, and it is not installed."""
     if config.learner.kind == "ray":
         check_installed("learner=ray", "ray", where=", on both machines")
+    return config.run
 
 
 def check_distillation(config: DistillConfig) -> None:
@@ -265,12 +260,9 @@ def check_has_agent(run: Path) -> None:
         raise ConfigError(
             f"run={run}: this run of {PREFIX}{program} has no agent yet; {use_of(run, program)}"
         )
-    can_resume = (run / CHECKPOINTS / RESUME).exists()
-    again = (
-        f"{PREFIX}{program} {as_word('resume', run)} continues it"
-        if can_resume
-        else f"start {PREFIX}{program} again"
-    )
+    again = f"start {PREFIX}{program} again"
+    if (run / CHECKPOINTS / RESUME).exists():
+        again = f"{PREFIX}{program} {as_word('resume', run)} continues it"
     raise ConfigError(f"run={run}: it holds no {CHECKPOINTS}/{LAST}; the file was removed; {again}")
 
 

@@ -69,6 +69,12 @@ def check_emulator_is_read(plant: PlantSettings, emulator: EmulatorSettings) -> 
         raise ValueError(f"emulator: plant={plant.kind} does not read it; give plant=emulated")
 
 
+def check_computer_drives(plant: PlantSettings, emulator: EmulatorSettings) -> None:
+    """Raise ValueError for the settings of an agent on the cart's board."""
+    if key := plant.policy_key(emulator):
+        raise ValueError(f"{key}: only cartpole-evaluate lets the cart's board drive; leave it out")
+
+
 class OnCart(Settings):
     """The cart on a port: `plant`, which is a real one or one with the settings `emulator`."""
 
@@ -76,14 +82,9 @@ class OnCart(Settings):
     emulator: EmulatorSettings
 
     @model_validator(mode="after")
-    def _plant_reads_the_emulator(self) -> Self:
+    def _this_computer_drives_what_it_reads(self) -> Self:
         check_emulator_is_read(self.plant, self.emulator)
-        return self
-
-    @model_validator(mode="after")
-    def _this_computer_drives(self) -> Self:
-        if key := self.plant.policy_key(self.emulator):
-            raise ValueError(f"{key}: only cartpole-evaluate lets the cart's board drive; leave it out")
+        check_computer_drives(self.plant, self.emulator)
         return self
 
 
@@ -121,17 +122,13 @@ class TrainConfig(RunSettings, CartPoleSettings):
         return values
 
     @model_validator(mode="after")
-    def _mirrored_actions_are_symmetric(self) -> "TrainConfig":
+    def _agent_fits(self) -> Self:
         motors = self.actions.motors
         if self.agent.mirrored and any(a != -b for a, b in zip(motors, reversed(motors), strict=True)):
             raise ValueError(
                 f"agent.mirrored=true needs actions.motors that are symmetric about 0, not {list(motors)}; "
                 "give agent.mirrored=false, or symmetric values"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _recurrent_network_reads_frames(self) -> "TrainConfig":
         if self.agent.recurrent is not None and not self.observation.frames:
             raise ValueError(
                 "agent.recurrent needs observation.kind=positions and more past_motors than past_positions; "
@@ -140,21 +137,16 @@ class TrainConfig(RunSettings, CartPoleSettings):
         return self
 
     @model_validator(mode="after")
-    def _learning_is_long_enough_at_its_period(self) -> "TrainConfig":
+    def _learning_fits(self) -> Self:
         learning = self.learning.at(self.control_period)
         if learning.iterations < learning.evaluations:
             raise ValueError(
                 f"learning.transitions={learning.transitions} is too few; give at least "
                 f"{learning.carts * learning.chunk * learning.evaluations}, or fewer evaluations"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _buffer_holds_a_batch(self) -> "TrainConfig":
-        if self.buffer.size < self.learning.batch_size:
+        if self.buffer.size < learning.batch_size:
             raise ValueError(
-                f"buffer.size {self.buffer.size} must be at least learning.batch_size "
-                f"{self.learning.batch_size}"
+                f"buffer.size {self.buffer.size} must be at least learning.batch_size {learning.batch_size}"
             )
         return self
 
@@ -263,16 +255,10 @@ class RecordConfig(EvaluateConfig):
     """The settings of cartpole-record, which are those of an evaluation without figures."""
 
     @model_validator(mode="after")
-    def _no_figures(self) -> "RecordConfig":
+    def _this_computer_drives_without_figures(self) -> Self:
         if self.animation != AnimationSettings():
             raise ValueError("animation: cartpole-record draws nothing; use cartpole-evaluate")
-        return self
-
-    @model_validator(mode="after")
-    def _this_computer_drives(self) -> Self:
-        if self.drives_on_board:
-            key = self.plant.policy_key(self.emulator)
-            raise ValueError(f"{key}: only cartpole-evaluate lets the cart's board drive; leave it out")
+        check_computer_drives(self.plant, self.emulator)
         return self
 
 
@@ -322,15 +308,11 @@ class IdentifyConfig(RunSettings, CartSettings, OnCart):
     @model_validator(mode="after")
     def _recordings_need_no_cart(self) -> Self:
         """Refuse settings of a cart where recordings are read."""
-        unused = {
-            "plant": self.plant != EmulatedSettings(kind="emulated"),
-            "emulator": self.emulator != EmulatorSettings(),
-        }
-        given = [name for name, changed in unused.items() if changed]
+        unused = {"plant": EmulatedSettings(kind="emulated"), "emulator": EmulatorSettings()}
+        given = ", ".join(name for name, default in unused.items() if getattr(self, name) != default)
         if self.source is not None and given:
             raise ValueError(
-                f"{', '.join(given)}: from={self.source} reads recordings and drives no cart; leave one of "
-                "them out"
+                f"{given}: from={self.source} reads recordings and drives no cart; leave one of them out"
             )
         return self
 

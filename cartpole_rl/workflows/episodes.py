@@ -30,7 +30,6 @@ from cartpole_rl.reporting.texts import guard_text
 from cartpole_rl.reporting.web_view import chosen_view
 from cartpole_rl.run_folder import CONFIG, METRICS, check_program
 from cartpole_rl.tasks.episode import Episode, Origin
-from cartpole_rl.tasks.settings import Measure
 from cartpole_rl.terminal import confirm, print_message, progress_bar, waiting
 from cartpole_rl.workflows.build import (
     TrainedAgent,
@@ -83,22 +82,15 @@ class Evaluation:
         count = self.config.episodes
         yield from self._shown(run_episodes(self.env, self.policy, count, self.knocks), "episodes")
 
-    def note_other_pole(self, command: str) -> None:
-        """Print a warning if the agent was trained with other poles; other policies were not trained here."""
-        line = other_pole(self.known_poles, self.settings.pole, self.config.plant.reads_emulator)
-        if line and self.known_poles:
-            print_message(command, line)
-
-    def note_refitted_guard(self, command: str) -> None:
-        """Print the numbers of the track guard if they are not those of the training, and were not chosen."""
-        if line := guard_note(self.training, self.config, self.settings):
-            print_message(command, line)
-
-    def note_other_numbers(self, command: str) -> None:
-        """Print the numbers of a simulated cart that are not the nominal ones."""
-        if "cart" not in self.config.plant.ignored:
-            poles = self.settings.pole.choices or {}
-            note_other_numbers(command, self.settings.nominal_cart, poles.values())
+    def print_notes(self, command: str) -> None:
+        """Print what differs from the training, and the numbers of a simulated cart that are not nominal."""
+        known, plant, poles = self.known_poles, self.config.plant, self.settings.pole
+        if known and (warning := other_pole(known, poles, plant.reads_emulator)):
+            print_message(command, warning)
+        if note := guard_note(self.training, self.config, self.settings):
+            print_message(command, note)
+        if "cart" not in plant.ignored:
+            note_other_numbers(command, self.settings.nominal_cart, (poles.choices or {}).values())
 
     def check_board(self) -> None:
         """Raise PlantError if the cart's board shall drive and has no agent, or another one."""
@@ -111,14 +103,19 @@ class Evaluation:
         yield from self._shown(driven, "episodes on the board")
 
     def _shown(self, episodes: Iterator[Episode], name: str, row: int = 0) -> Iterator[Episode]:
-        """Drive episodes behind a progress bar and a view of the cart, or of that in `row`."""
-        config = self.config
+        """Drive episodes behind a progress bar with the score of each, and a view of the cart in `row`."""
+        config, measure = self.config, self.settings.task.measure
         with chosen_view(config.plant.title, config.view, self.settings.pole.nominal.length) as view:
             followed(self.env, view.memory, row)
             text = "" if config.view == "live" else name  # that view draws on the terminal itself
             thread = not config.plant.is_real_time(config.emulator)
-            with waiting(text, thread=thread), precedence(config.plant, config.emulator):
-                yield from with_progress(episodes, config.episodes, name, self.settings.task.measure)
+            priority = precedence(config.plant, config.emulator)
+            with waiting(text, thread=thread), priority, progress_bar(config.episodes, name) as progress:
+                for episode in episodes:
+                    score = f"{measure} {episode.total(measure):z.0f}{guard_text(episode)}"
+                    progress.set_postfix_str(score, refresh=False)
+                    progress.update()
+                    yield episode
 
     @property
     def knocks(self) -> Knocks | None:
@@ -154,17 +151,6 @@ def repeated(env: CartPoleEnv, policy: Policy, again: Repetition, knocks: Knocks
     """Drive the same simulated cart from the same start."""
     env.plant.start_from(again.origin.state)
     yield run_batch(env, policy, knocks)[again.row]
-
-
-def with_progress(episodes: Iterator[Episode], count: int, name: str, measure: Measure) -> Iterator[Episode]:
-    """Drive `count` episodes behind a progress bar that shows the score of each, its `measure`."""
-    with progress_bar(count, name) as progress:
-        for episode in episodes:
-            progress.set_postfix_str(
-                f"{measure} {episode.total(measure):z.0f}{guard_text(episode)}", refresh=False
-            )
-            progress.update()
-            yield episode
 
 
 @contextmanager

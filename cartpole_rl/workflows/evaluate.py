@@ -42,9 +42,7 @@ def evaluate(config: EvaluateConfig, folder: Path) -> None:
     onboard: list[Episode] = []
     try:
         with closing(evaluation.env):
-            evaluation.note_other_pole("evaluate")
-            evaluation.note_refitted_guard("evaluate")
-            evaluation.note_other_numbers("evaluate")
+            evaluation.print_notes("evaluate")
             evaluation.check_board()
             settings = evaluation.settings.model_dump(mode="json")
             content = {**evaluation.config.model_dump(mode="json"), "evaluated": settings}
@@ -117,16 +115,10 @@ def compared(again: Repetition, episode: Episode) -> str:
     """Return a line that compares the score with that of the repeated episode."""
     repeat, score = again.config.repeat, float(episode.score.sum())
     then = f"episode {repeat.episode} of {repeat.run} had score {again.score:.1f}"
-    if by_chance := left_to_chance(again):
-        chance = ", ".join(by_chance)
-        return f"{then}, now {score:.1f}: {chance} is random, so the episode cannot be repeated exactly"
-    return f"{then}, now {'exactly the same' if score == again.score else f'{score:.1f}'}"
-
-
-def left_to_chance(again: Repetition) -> list[str]:
-    """Return the parameters of the cart that make its episodes random."""
     noises = (each.name for each in PARAMETERS.values() if each.noise)
-    return [name for name in noises if again.origin.parameters[name] != 0]
+    if by_chance := ", ".join(name for name in noises if again.origin.parameters[name] != 0):
+        return f"{then}, now {score:.1f}: {by_chance} is random, so the episode cannot be repeated exactly"
+    return f"{then}, now {'exactly the same' if score == again.score else f'{score:.1f}'}"
 
 
 def draw_beside_simulation(evaluation: Evaluation, episode: Episode, path: Path) -> str:

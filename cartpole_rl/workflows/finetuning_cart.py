@@ -3,6 +3,7 @@
 The recordings in the run folder say how far a fine-tuning has come: what is on disk is not driven again.
 """
 
+import itertools
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from enum import StrEnum
@@ -53,10 +54,7 @@ class FinetuningFiles:
 
     def count(self, stage: Stage) -> int:
         """Return the number of recorded episodes of a stage."""
-        number = 0
-        while self.path(stage, number).exists():
-            number += 1
-        return number
+        return next(number for number in itertools.count() if not self.path(stage, number).exists())
 
     def episode(self, stage: Stage, number: int) -> Episode:
         """Read an episode. Raises RecordingError."""

@@ -215,7 +215,7 @@ class CartLearner:
         self.show(
             f"simulator fitted to {windows.number} windows of {windows.periods * period:g} s: RMS error "
             f"{1e3 * fit.rms[0]:.2f} mm and "
-            f"{math.degrees(fit.rms[1]):.2f} deg",
+            f"{math.degrees(fit.rms[1]):.2f} deg"
         )
         return fit, models
 

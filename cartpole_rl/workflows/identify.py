@@ -243,17 +243,12 @@ def write_choices(found: Identification, carts: np.ndarray, folder: Path, hardwa
             covariance=found.fit.covariance,
         )
     absolute = [name for name, line in UNIDENTIFIABLE.items() if "absolute" in line]
-    randomization = {
-        "posterior": "${here}/" + POSTERIOR,
-        "widen": WIDEN,
-        "prior_share": 0.0,
-        "ranges": UNIDENTIFIABLE,
-    }
+    source = {"posterior": "${here}/" + POSTERIOR, "widen": WIDEN, "prior_share": 0.0}
     write_text(
         folder / RANDOMIZATION,
         f"# Carts drawn from the posterior, correlations included; standard deviations times {WIDEN:g}.\n"
         f"# Absolute ranges are in {', '.join(f'{PARAMETERS[name].unit} ({name})' for name in absolute)}.\n"
-        + yaml.safe_dump(randomization, sort_keys=False),
+        + yaml.safe_dump({**source, "ranges": UNIDENTIFIABLE}, sort_keys=False),
     )
 
 

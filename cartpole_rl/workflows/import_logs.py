@@ -75,18 +75,12 @@ def import_logs(config: ImportConfig, folder: Path) -> Sensors | None:
     found = [*doubts([log.report for log in logs.values()], sensors, period, config.layout)]
     write_config(folder, "import", {**config.model_dump(mode="json", by_alias=True), "seed": 0})
     stems = Counter(path.stem for path in logs)
+    heading = {"plant": "log", "pole": "", LENGTH: config.pole_length or "", "control_period_s": period}
     for path, log in logs.items():
         name = path.stem if stems[path.stem] == 1 else path.name  # log.csv and log.txt
         for number, part in enumerate(log.parts):
-            heading = {
-                "plant": "log",
-                "pole": "",
-                LENGTH: config.pole_length or "",
-                "control_period_s": period,
-            }
-            write_recording(
-                folder / RECORDINGS / f"{name}_{number:02d}.csv", part, {**heading, "log": path.name}
-            )
+            place = folder / RECORDINGS / f"{name}_{number:02d}.csv"
+            write_recording(place, part, {**heading, "log": path.name})
     write_json(folder / IMPORTED, summary(logs, sensors, found))
     print_summary(logs, parts, period, sensors, found, folder, config)
     return sensors

@@ -92,12 +92,9 @@ def next_command(model: LearnedModel, folder: Path) -> str:
     """Return the command that trains on a model."""
     words = ["cartpole-train plant=learned", as_word("plant.model", shown(folder))]
     if model.hardware.scales_text != nominal_hardware().scales_text:
-        names = [
-            name
-            for name in group_choices("cart")
-            if hardware_of(choice(f"cart/{name}")).scales_text == model.hardware.scales_text
-        ]
-        words.append(f"cart={names[0] if names else '<yours>.yaml'} pole=<yours>")
+        scales = {name: hardware_of(cart).scales_text for name, cart in group_choices("cart").items()}
+        alike = (name for name, text in scales.items() if text == model.hardware.scales_text)
+        words.append(f"cart={next(alike, '<yours>.yaml')} pole=<yours>")
     if not math.isclose(model.period, choice("train")["control_period"]):
         words.append(f"control_period={model.period:g}")
     return " ".join(words)
@@ -141,15 +138,9 @@ def fit_physics(windows: Windows, config: ModelConfig, pole: Pole, period: float
 
 def learned_model(fit: Fit, ensemble: Ensemble, hardware: Hardware) -> LearnedModel:
     """Return the physics and the residual as the file model.pt holds them."""
-    dynamics = ensemble.dynamics
-    return LearnedModel(
-        fit.parameters,
-        dynamics.models,
-        dynamics.period,
-        dynamics.substeps,
-        ensemble.best.as_float(),
-        hardware,
-    )
+    dynamics, residual = ensemble.dynamics, ensemble.best.as_float()
+    simulated = dynamics.models, dynamics.period, dynamics.substeps
+    return LearnedModel(fit.parameters, *simulated, residual, hardware)
 
 
 def results(

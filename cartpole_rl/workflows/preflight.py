@@ -1,7 +1,7 @@
 """Check a cart by small moves before an agent drives it."""
 
-from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Sequence
+from contextlib import closing
 
 from cartpole_rl.errors import PlantError
 from cartpole_rl.plants.serial.cart import SerialCart
@@ -21,16 +21,20 @@ def check_cart(config: PreflightConfig, words: Sequence[str] = ()) -> None:
     At the end prints the next command, with the cart's file that `words` of the command line give. Writes no
     files. Raises PlantError after the first check that fails, LinkError if no cart answers.
     """
-    faults = FaultClearing(config.plant.clear_faults, confirm if config.plant.can_be_damaged else always)
-    with connected_cart(config) as cart:
-        finding: Finding | None = None
+    plant, hardware = config.plant, config.hardware
+    faults = FaultClearing(plant.clear_faults, confirm if plant.can_be_damaged else always)
+    asked = asking(plant, confirm) if isinstance(plant, BoardSettings) else lambda: None
+    finding: Finding | None = None
+    with (
+        plant.reachable(config.emulator.of_cart(config.cart), hardware) as settings,
+        closing(SerialCart(settings, hardware, asked)) as cart,  # it is disarmed and closed at the end
+    ):
         for finding in preflight(cart, faults):
             print(finding, flush=True)
     if finding is None or not finding.ready:
-        raise PlantError(
-            f"the cart is not ready: {finding.check if finding else 'nothing was checked'} failed"
-        )
-    if config.hardware == nominal_hardware():
+        failed = finding.check if finding else "nothing was checked"
+        raise PlantError(f"the cart is not ready: {failed} failed")
+    if hardware == nominal_hardware():
         print("The cart is ready. Next, hold the pole up when asked (pretrained/large is for one of 0.66 m):")
     else:
         print("The cart is ready. Next, measure it; pretrained agents are for carts like cart=ip02:")
@@ -56,15 +60,3 @@ def mounted_pole(config: PreflightConfig) -> str:
     emulated = config.plant.reads_emulator
     pole = emulated_pole(config.emulator) if emulated else Pole.rod(length) if length else None
     return (pole and emulator_for([one_pole(pole)])) or ""
-
-
-@contextmanager
-def connected_cart(config: PreflightConfig) -> Iterator[SerialCart]:
-    """Yield the cart, not open yet; disarm and close it at the end, and stop an emulated one."""
-    plant, hardware = config.plant, config.hardware
-    asked = asking(plant, confirm) if isinstance(plant, BoardSettings) else lambda: None
-    with (
-        plant.reachable(config.emulator.of_cart(config.cart), hardware) as settings,
-        closing(SerialCart(settings, hardware, asked)) as cart,
-    ):
-        yield cart

@@ -32,9 +32,7 @@ def record(config: RecordConfig, folder: Path) -> None:
     episodes: dict[Path, Episode] = {}
     try:
         with closing(evaluation.env):
-            evaluation.note_other_pole("record")
-            evaluation.note_refitted_guard("record")
-            evaluation.note_other_numbers("record")
+            evaluation.print_notes("record")
             settings = agents_settings(evaluation).model_dump(mode="json")
             content = {**evaluation.config.model_dump(mode="json"), RECORDED: settings}
             write_config(folder, "record", content, agent=agent_file(evaluation.config.run))

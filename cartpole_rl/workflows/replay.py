@@ -54,7 +54,7 @@ def replay_recordings(config: ReplayConfig, folder: Path) -> None:
     cart = {name: value for name, value in parameters.items() if name not in Pole.model_fields}
     note_other_numbers("replay", cart, [Pole(**{name: parameters[name] for name in Pole.model_fields})])
     period, plant = recorded_period(episodes[0]), config.plant
-    models = settings.models_with(config.actuator or settings.actions.actuator, plant)
+    models = settings.models(plant, config.actuator)
     dynamics = Dynamics.of(parameters, models, period, plant.substeps)
     replays = replay(episodes, dynamics, config.restart)
     errors = errors_at(all_errors(replays), REPORTED_TIMES, period)

@@ -36,10 +36,10 @@ from cartpole_rl.envs.gymnasium import simulated_environment
 from cartpole_rl.physics.dynamics import Drive, State, run_period
 from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import CartParameters
+from cartpole_rl.randomization.randomizer import draw_start
 from cartpole_rl.reporting.texts import table
 from cartpole_rl.tasks.features import Measured
 from cartpole_rl.tasks.rewards import score
-from cartpole_rl.tasks.starts import draw_start
 
 PERIOD, TIME_LIMIT = 0.02, 500  # s; periods
 ROLLOUT = 32  # steps

@@ -50,9 +50,9 @@ from cartpole_rl.envs.build import simulated_env
 from cartpole_rl.errors import CartPoleError, ConfigError
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.randomization.poles import Pole, PoleSettings
+from cartpole_rl.tasks.episode import upright_since
 from cartpole_rl.tasks.rewards import UPRIGHT_ANGLE, UPRIGHT_SPEED
 from cartpole_rl.tasks.settings import Start, StartSettings
-from cartpole_rl.tasks.upright import upright_since
 from cartpole_rl.workflows.config import TrainConfig, load_settings
 
 STARTS = (-0.1, -0.05, 0.0, 0.05, 0.1)  # m: an evaluation places the cart within 0.1 m of the middle

@@ -21,9 +21,9 @@ from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.serial.plant import emulated_plant
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.randomization.poles import PoleSettings
+from cartpole_rl.tasks.episode import is_upright
 from cartpole_rl.tasks.features import Measured, ObservationKind, observe
 from cartpole_rl.tasks.settings import Start, StartSettings
-from cartpole_rl.tasks.upright import is_upright
 
 PERIOD = 0.02
 MOTORS = tuple(choice("actions/nine_levels")["motors"])

@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from cartpole_rl.envs.perception import fallen
+from cartpole_rl.randomization.randomizer import draw_start
+from cartpole_rl.tasks.episode import is_upright, upright_since, wrap
 from cartpole_rl.tasks.features import Measured
 from cartpole_rl.tasks.rewards import BALANCE_ANGLE
 from cartpole_rl.tasks.settings import Start, StartSettings
-from cartpole_rl.tasks.starts import draw_start
-from cartpole_rl.tasks.upright import is_upright, upright_since, wrap
 
 SPREAD = {"position_spread": 0.2, "angle_spread": 0.1, "speed_spread": 0.3, "angular_speed_spread": 1.0}
 
