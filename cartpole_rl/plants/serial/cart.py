@@ -137,6 +137,11 @@ class SerialCart:
             self._disconnect(self._open_connection)
 
     @property
+    def is_lockstep(self) -> bool:
+        """Whether the cart is known to wait for frames, as an emulator does on which no time passes."""
+        return self._tracker.is_lockstep and not self._tracker.ticks_alone
+
+    @property
     def is_open(self) -> bool:
         """True while the port is open."""
         return self._open_connection is not None
@@ -338,7 +343,7 @@ class SerialCart:
     def _check_round_trip(self) -> None:
         """Raise LinkError if the link takes over a period. On a lockstep emulator no time passes."""
         period = self.information.period_us * 1e-6
-        if self._tracker.is_lockstep and not self._tracker.ticks_alone:
+        if self.is_lockstep:
             return
         for _ in range(SLOW_LINK_ATTEMPTS):
             trip = self._connection.round_trip()
