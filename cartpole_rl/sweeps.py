@@ -21,16 +21,14 @@ from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.errors import HydraException
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict, read_write
-from omegaconf.errors import OmegaConfBaseException
 
-from cartpole_rl.checking import validated
+from cartpole_rl.checking import kinds, validated
 from cartpole_rl.composition import as_mapping, is_completing, task_overrides
 from cartpole_rl.errors import CartPoleError, ConfigError
-from cartpole_rl.exits import EXPECTED, exit_with_message, one_line
+from cartpole_rl.exits import EXPECTED, OF_HYDRA, exit_with_message, one_line
 from cartpole_rl.files import write_text
 from cartpole_rl.run_folder import ERROR
 from cartpole_rl.settings import Settings
@@ -113,10 +111,9 @@ class SweepStart(Callback):
         It exits for a wrong setting, since Hydra swallows what a callback raises.
         """
         try:
-            with suppress(HydraException, OmegaConfBaseException):  # Hydra raises its own again
-                check_jobs(config, SweepStart.schema)
-        except ConfigError as error:
-            exit_with_message(SweepStart.command, error)
+            check_jobs(config, SweepStart.schema)
+        except (ConfigError, *OF_HYDRA) as error:
+            exit_with_message(SweepStart.command, error, kinds(SweepStart.schema, "plant"))
         SweepStart.folder = Path(config.hydra.sweep.dir)
         _ = config.hydra.job.config.override_dirname.exclude_keys
 
