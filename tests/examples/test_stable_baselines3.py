@@ -10,7 +10,7 @@ pytest.importorskip("stable_baselines3", reason="Stable-Baselines3 is not instal
 from examples.stable_baselines3_dqn import main
 
 
-@pytest.mark.parametrize(("name", "least"), [("Balance", 1), ("SwingUp", 0)])  # a hanging pole scores 0
+@pytest.mark.parametrize(("name", "least"), [("Balance", 1), ("SwingUp", -5)])  # 5 off for leaving the track
 def test_the_example_trains_and_judges(
     name: str, least: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
