@@ -16,8 +16,9 @@ types:
 floors:
 	$(BIN)/lint-imports
 
+# three workers on two cores, since many tests wait for a cart
 test:
-	$(BIN)/pytest -n 2 --dist worksteal --durations=20 --durations-min=5
+	$(BIN)/pytest -n 3 --dist worksteal --durations=20 --durations-min=5
 
 # what `make test` leaves out: benches, the wheel and the site
 nightly:
