@@ -82,15 +82,16 @@ def fitted_guard(
     if not min(motors) < 0 < max(motors):
         raise ConfigError(f"guard: actions.motors={list(motors)} brake in one direction; choose guard=none")
     with one_thread():
-        speed, way, rightward, stopped = braking_distances(draws, motors, models, period)
-    if not np.isfinite((speed, way)).all():
+        speed, way, rightward = braking_distances(draws, motors, models, period)
+    if not np.isfinite(speed).all() or np.isnan(way).any():
         raise ConfigError(
             "guard: simulated carts brake to numbers that are not finite; check cart.*, or guard=none"
         )
-    if stopped.mean() < quantile:
-        raise ConfigError("guard: full motor does not stop these carts; choose guard=none, or other actions")
     halves = [quantiles(speed[half], way[half], quantile) for half in (rightward, ~rightward)]
-    margin, delay, curvature = closest_bound(*map(np.concatenate, zip(*halves, strict=True)))
+    middles, ways = map(np.concatenate, zip(*halves, strict=True))
+    if not np.isfinite(ways).all():
+        raise ConfigError("guard: full motor does not stop these carts; choose guard=none, or other actions")
+    margin, delay, curvature = closest_bound(middles, ways)
     if round(margin, 4) >= LARGEST_MARGIN:
         raise ConfigError(
             f"guard: even from rest these carts run on by {margin:.3f} m before full motor stops them; this "
@@ -117,10 +118,11 @@ def one_thread() -> Iterator[None]:
 
 def braking_distances(
     draws: Draws, motors: Sequence[int], models: Models, period: float
-) -> tuple[Array, Array, Flags, Flags]:
-    """Return measured speeds, m/s, ways that carts run on, m, which run right and which stop, [SAMPLES].
+) -> tuple[Array, Array, Flags]:
+    """Return measured speeds, m/s, ways that carts run on, m, and which run to the right, [SAMPLES] each.
 
-    Speeds and ways are positive in the direction of motion.
+    Speeds and ways are positive in the direction of motion. The way of a cart that still runs on after the
+    longest time of BRAKING is infinite.
     """
     generator = torch.Generator().manual_seed(0)
     table = draws.draw(SAMPLES, generator)
@@ -135,16 +137,17 @@ def braking_distances(
     drive = Drive(models.actuator(outward, cart), [outward] * commands)
     before, (state, drive) = state, run_period(state, drive, cart.latency, cart, models, period, SUBSTEPS)
     speed, start, farthest = side * (state.x - before.x) / period, state.x, torch.zeros(SAMPLES)
-    stopped = torch.zeros(SAMPLES, dtype=torch.bool)
+    runs_on = torch.ones(SAMPLES, dtype=torch.bool)
     least, most = (math.ceil(each / period) for each in BRAKING)
     for step in range(most):
-        if step >= least and stopped.all():
+        if step >= least and not runs_on.any():
             break
         drive = Drive(drive.force, [inward if step else outward, *drive.motors[:-1]])
         state, drive = run_period(state, drive, cart.latency, cart, models, period, SUBSTEPS)
         farthest = torch.maximum(farthest, side * (state.x - start))
-        stopped |= side * state.x_dot < STOPPED
-    return speed.double().numpy(), farthest.double().numpy(), rightward.numpy(), stopped.numpy()
+        runs_on = side * state.x_dot > STOPPED
+    farthest[runs_on] = math.inf
+    return speed.double().numpy(), farthest.double().numpy(), rightward.numpy()
 
 
 def random_states(cart: CartParameters, generator: torch.Generator) -> State:
@@ -169,7 +172,8 @@ def quantiles(speed: Array, way: Array, quantile: float) -> tuple[Array, Array]:
         inside = bins == number
         if inside.sum() >= LEAST_SAMPLES:
             middles.append((number + 0.5) * BIN)
-            ways.append(np.quantile(way[inside], quantile))
+            with np.errstate(invalid="ignore"):  # between two infinite ways
+                ways.append(np.quantile(way[inside], quantile))
     return np.array(middles), np.array(ways)
 
 

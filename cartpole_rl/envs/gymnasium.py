@@ -76,6 +76,7 @@ OF_TASK = {
 }
 SCORES = ("score", "score_upright")
 PERIOD = 0.02  # s, the control period of conf/train.yaml
+OF_GYMNASIUM = {"time_limit": "max_episode_steps", "carts": "num_envs of gymnasium.make_vec"}
 UNLIMITED = 2**62  # control periods, where Gymnasium's TimeLimit ends the episode
 METADATA = {"render_modes": list(RENDER_MODES), "render_fps": round(1 / PERIOD)}
 TAKEN = (
@@ -156,6 +157,9 @@ class Carts:
         self: Any, task: str, carts: int, mode: str | None, period: float, limit: int | None, /, **given: Any
     ) -> None:
         """Make the carts, with episodes of `limit` periods, and what draws them. Raises ConfigError."""
+        for name, instead in OF_GYMNASIUM.items():
+            if name in given:
+                raise ConfigError(f"{name}: give {instead} instead")
         self.env = simulated_environment(task, carts, period=period, time_limit=limit, **given)
         modes = [each for each in RENDER_MODES if each != "human" or has_display()]
         self.metadata = {**self.metadata, "render_modes": modes, "render_fps": round(1 / period)}

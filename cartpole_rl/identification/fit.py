@@ -6,7 +6,7 @@ the same quantized sample into regressor and target, and one count at 50 Hz is 0
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -83,7 +83,14 @@ def best_fit(
 ) -> tuple[Fit, Models]:
     """Return the fit with the lowest cost among those under each of the `candidates`, and its models."""
     fits = [(fit_cart(windows, nominal, models, period, substeps), models) for models in candidates]
-    return min(fits, key=lambda each: each[0].cost)
+    fit, chosen = min(fits, key=lambda each: each[0].cost)
+    return replace(fit, covariance=within_prior(fit.covariance)), chosen
+
+
+def within_prior(covariance: Array) -> Array:
+    """Return a covariance of points [U, U] that is nowhere wider than the prior, nor below 0 by rounding."""
+    values, vectors = np.linalg.eigh(covariance)
+    return vectors * np.clip(values, 0.0, 1.0) @ vectors.T
 
 
 def fit_cart(

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from cartpole_rl.errors import RecordingError
 from cartpole_rl.identification.checks import check_explained
-from cartpole_rl.identification.fit import Fit, fit_cart
+from cartpole_rl.identification.fit import Fit, fit_cart, within_prior
 from cartpole_rl.identification.prediction import LEAD, Replayed, is_away, predict
 from cartpole_rl.identification.rollout import Dynamics
 from cartpole_rl.identification.unknowns import WEIGHED, limits
@@ -211,9 +211,7 @@ def widened(fit: Fit, best: Candidate, candidates: Sequence[Candidate]) -> Fit:
         away = np.array([theirs.get(name, own[name]) - own[name] for name in names])
         covariance += weight * np.outer(away, away)
         total += weight
-    values, vectors = np.linalg.eigh(fit.covariance + covariance / total)
-    bounded = np.clip(values, 0.0, 1.0)  # not below 0 by rounding; the posterior is not wider than the prior
-    return replace(fit, covariance=vectors * bounded @ vectors.T)
+    return replace(fit, covariance=within_prior(fit.covariance + covariance / total))
 
 
 def warnings(fit: Fit, encoders: Encoders) -> list[str]:

@@ -115,7 +115,7 @@ def test_the_share_of_brakings_within_the_bound(quantile: float, cart: dict[str,
     overrides = {"guard": "fitted", "guard.quantile": quantile, "randomization": randomization}
     settings = with_fitted_guard(shipped_settings(overrides))
     models = settings.models(SimulatedSettings(**choice("plant/simulated")))
-    speed, way, rightward, _ = braking_distances(
+    speed, way, rightward = braking_distances(
         randomizer(settings), settings.actions.motors, models, settings.control_period
     )
     within = way <= stopping_distance(speed, settings.guard.active)
@@ -135,6 +135,12 @@ WEAK = {
     "cart.cart_coulomb": 0.01,
     "cart.cart_viscous": 0.01,
 }
+WEAK_TO_ONE_SIDE = {
+    "guard": "bold",
+    "actions": {"motors": [-60, 0, 250], "actuator": "force_curve"},
+    "cart.cart_coulomb": 0.01,
+    "cart.cart_viscous": 0.01,
+}
 LATE = {"control_period": 0.1, "cart.latency": 0.1, "cart.latency_jitter": 0.1, "guard": "careful"}
 
 
@@ -144,6 +150,7 @@ LATE = {"control_period": 0.1, "cart.latency": 0.1, "cart.latency_jitter": 0.1, 
         (LATE, r"run on by 0\.30\d m before full motor stops them; .* below 0\.3 m: give a shorter"),
         ({"cart.cart_viscous": 1e9}, "not finite; check cart"),
         (WEAK, "full motor does not stop these carts; choose guard=none"),
+        (WEAK_TO_ONE_SIDE, "full motor does not stop these carts; choose guard=none"),
     ],
 )
 def test_carts_that_no_guard_keeps_on_the_track_are_refused(

@@ -197,7 +197,8 @@ def link(cart: SerialCart) -> str:
             f"a period takes {measured * 1e3:.2f} ms by the cart's clock, not {period * 1e3:g} ms as it says",
             "its firmware does too much in a period, or miscounts its time",
         )
-    if trip > ROUND_TRIP_SHARE * period and not cart.is_lockstep:
+    slow = trip > ROUND_TRIP_SHARE * period
+    if slow and not cart.is_lockstep:
         raise NotReadyError(
             f"a question is answered after {trip * 1e3:.1f} ms, more than half a period",
             "with an FTDI chip, set its latency_timer in /sys/bus/usb-serial/devices/ to 1; "
@@ -206,7 +207,8 @@ def link(cart: SerialCart) -> str:
     version = (information.firmware_major, information.firmware_minor, information.firmware_patch)
     return (
         f"firmware {'.'.join(map(str, version))}, period {measured * 1e3:.2f} ms, "
-        f"round trip {trip * 1e3:.1f} ms, {bad} of {counted.frames_received} frames bad or lost"
+        f"round trip {trip * 1e3:.1f} ms{' in lockstep' * slow}, "
+        f"{bad} of {counted.frames_received} frames bad or lost"
     )
 
 
