@@ -20,7 +20,7 @@ floors:
 test:
 	$(BIN)/pytest -n 3 --dist worksteal --durations=20 --durations-min=5
 
-# what `make test` leaves out: benches, the wheel and the site
+# what `make test` leaves out: see tests/README.md
 nightly:
 	$(BIN)/pytest -m nightly -n 2 --dist worksteal
 
