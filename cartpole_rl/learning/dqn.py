@@ -6,7 +6,7 @@ base class of the loss are TorchRL's; docs/torchrl.md says why the rest is not.
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
@@ -14,13 +14,14 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import dispatch
 from torch import Tensor
-from torchrl.data import LazyTensorStorage, PrioritizedSampler, RandomSampler, TensorDictReplayBuffer
 from torchrl.objectives import DQNLoss, ValueEstimators
 from torchrl.objectives.utils import dispatch_value_estimator, distance_loss
 
 from cartpole_rl.compilation import Columns, LossGradient
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.errors import LearningError
+from cartpole_rl.learning.replay import make_buffer
+from cartpole_rl.learning.retries import Retries
 from cartpole_rl.learning.settings import BufferSettings, LearningSettings, OptimizerSettings, linear
 from cartpole_rl.learning.states import Resumable
 from cartpole_rl.tasks.episode import Episode
@@ -34,8 +35,6 @@ COLLECTED: tuple[NestedKey, ...] = ("observation", "action", "guard", *NEXT, ("n
 LEARNED: tuple[NestedKey, ...] = ("observation", "action", "steps_to_next_obs", *NEXT)
 OPTIMIZERS = {"adam": torch.optim.Adam, "adamw": torch.optim.AdamW}
 FEW_EPISODES = 1.5  # of each cart in a full buffer
-FAILURE_SHARE = 0.5  # of the mean score of a whole episode: one that scores less is a failure
-AVERAGED_PERIODS = 1000  # time constant of the mean score of a period
 Scalars = dict[str, float]
 
 
@@ -230,74 +229,6 @@ class Training(Resumable):
             guarded = self.env.hardware.guarded(chunk["action"], chunk["guard"].squeeze(-1))
             scalars["exploration/guarded_fraction"] = guarded.float().mean().item()
         return scalars | self.retries.describe()
-
-
-class Retries:
-    """Retries of failed carts: after a failed episode a cart is kept for another one with `probability` p.
-
-    Difficult carts are thus driven up to 1 / (1 - p) times as often (after Jiang et al., "Prioritized level
-    replay", 2021, and Rajeswaran et al., "EPOpt", 2017).
-    """
-
-    def __init__(self, env: CartPoleEnv, probability: float, random: torch.Generator) -> None:
-        self.env, self.probability, self.random = env, probability, random
-        self._mean_score = 0.0  # of a period
-        self._ended: list[tuple[float, int]] = []  # score and length of the ended episodes
-        self.reset()
-
-    def reset(self) -> None:
-        """Count from new episodes on every cart."""
-        self._score = torch.zeros(self.env.batch_size, device=self.env.device)  # of the current episodes
-
-    def record(self, outcome: TensorDictBase) -> Tensor | None:
-        """Add a step to the scores; return the carts to keep, [N] bool, or None if no episode ended."""
-        score, done = outcome["score"].squeeze(-1), outcome["done"].squeeze(-1)
-        self._score += score
-        self._mean_score += (score.mean().item() - self._mean_score) / AVERAGED_PERIODS
-        if not done.any():
-            return None
-        lengths = outcome["step_count"].squeeze(-1)[done]
-        self._ended += zip(self._score[done].tolist(), lengths.tolist(), strict=True)
-        chance = torch.rand(self.env.batch_size, generator=self.random, device=self.env.device)
-        whole_score = self._mean_score * self.env.hardware.task.periods
-        retry = (self._score < FAILURE_SHARE * whole_score) & (chance < self.probability)
-        self._score.masked_fill_(done, 0)
-        return retry
-
-    def describe(self) -> dict[str, float]:
-        """Return mean score (6.2) and length of the episodes that ended since the last call, if any."""
-        if not self._ended:
-            return {}
-        scores, lengths = zip(*self._ended, strict=True)
-        self._ended.clear()
-        return {"exploration/score": fmean(scores), "exploration/episode_length": fmean(lengths)}
-
-    def snapshot(self) -> dict[str, Any]:
-        """Return the state, to be saved at once."""
-        return {"score": self._score, "mean_score": self._mean_score, "finished": self._ended}
-
-    def restore(self, snapshot: Mapping[str, Any]) -> None:
-        """Restore the state in `snapshot`."""
-        self._score = snapshot["score"].to(self.env.device, copy=True)
-        self._mean_score, self._ended = snapshot["mean_score"], list(snapshot["finished"])
-
-
-def make_buffer(
-    settings: BufferSettings, batch_size: int, device: torch.device | str = "cpu"
-) -> TensorDictReplayBuffer:
-    """Return an empty buffer on `device` whose `sample` returns `batch_size` transitions.
-
-    A prioritized one draws from NumPy's global generator, a uniform one from torch's. Its priorities are on
-    the CPU on every device: TorchRL has trees on a GPU in its CUDA wheels alone.
-    """
-    sampler = RandomSampler()
-    if settings.kind == "prioritized":
-        shape = {"alpha": settings.alpha, "beta": settings.beta[0], "eps": settings.priority_eps}
-        sampler = PrioritizedSampler(settings.size, device="cpu", **shape)
-    storage = LazyTensorStorage(settings.size, device=device)
-    return TensorDictReplayBuffer(
-        storage=storage, sampler=sampler, batch_size=batch_size, priority_key="td_error"
-    )
 
 
 def n_step_transitions(chunk: TensorDictBase, n: int, gamma: float, held: int = 0) -> TensorDictBase:

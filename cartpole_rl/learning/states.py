@@ -7,11 +7,8 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 from torch import Tensor
-from torchrl.data import TensorDictReplayBuffer
 
-# Priorities in the state of TorchRL's PrioritizedSampler, by their private names: they are compiled objects,
-# which `torch.load` refuses with weights_only. A sampler whose state holds tensors would replace this.
-TREES = ("_sum_tree", "_min_tree")
+from cartpole_rl.learning.replay import buffer_state, restore_buffer
 
 
 class Resumable:
@@ -56,38 +53,6 @@ class Resumable:
         self.random.set_state(snapshot["collector"]["generator"])
         self.env.plant.restore(snapshot["plant"])
         restore_random_state(snapshot["random"])
-
-
-def buffer_state(buffer: TensorDictReplayBuffer) -> dict[str, Any]:
-    """Return the state of `buffer`: the filled rows of the storage and the trees.
-
-    A full buffer shares its memory with it.
-    """
-    filled, transitions = len(buffer), {}
-    if filled:
-        everything = filled == buffer.storage.max_size
-        rows = slice(None) if everything else torch.arange(filled, device=buffer.storage.device)
-        transitions = dict(buffer.storage.get(rows).flatten_keys(".").items())
-    sampler = buffer.sampler.state_dict()
-    trees = {name: torch.as_tensor(sampler[name][torch.arange(filled)]) for name in TREES if name in sampler}
-    return {"transitions": transitions, "writer": buffer.writer.state_dict(), "sampler": {**sampler, **trees}}
-
-
-def restore_buffer(buffer: TensorDictReplayBuffer, snapshot: Mapping[str, Any]) -> None:
-    """Restore the state that `buffer_state` returned: a tree's nodes follow from its leaves."""
-    buffer.empty()
-    transitions = snapshot["transitions"]
-    if transitions:
-        filled = len(next(iter(transitions.values())))
-        buffer.extend(TensorDict(transitions, [filled]).unflatten_keys("."))
-    sampler, own = dict(snapshot["sampler"]), buffer.sampler.state_dict()
-    for name in TREES:
-        if name in sampler:
-            tree = own[name]
-            tree[torch.arange(len(sampler[name]))] = sampler[name]
-            sampler[name] = tree
-    buffer.sampler.load_state_dict(sampler)
-    buffer.writer.load_state_dict(snapshot["writer"])
 
 
 def on_device(value: Any, device: torch.device | str) -> Any:

@@ -19,8 +19,9 @@ from cartpole_rl.envs.build import shipped_settings, with_fitted_guard
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.errors import LearningError
 from cartpole_rl.learning.agent import QAgent
-from cartpole_rl.learning.dqn import COLLECTED, Retries, Scalars, Training, n_step_transitions
+from cartpole_rl.learning.dqn import COLLECTED, Scalars, Training, n_step_transitions
 from cartpole_rl.learning.finetuning import Finetuning
+from cartpole_rl.learning.retries import Retries
 from cartpole_rl.learning.settings import (
     BufferSettings,
     FinetuningSettings,
