@@ -16,8 +16,6 @@ from pathlib import Path
 import pytest
 from page_commands import NEED_EXTRAS, PAGES, ROOT, guide_commands, run_here
 
-from cartpole_rl.emulator.__main__ import read_settings
-
 OTHER_PAGES = [*(page for page in PAGES if page.name != "extending.md"), ROOT / "README.md"]
 CHECKED = (
     "cartpole-",
@@ -26,7 +24,6 @@ CHECKED = (
     "pip ",
     "make ",
     "tensorboard ",
-    "python -m cartpole_rl.emulator ",
 )
 ACTIVATE = "source .venv/bin/activate"
 NEED_HARDWARE = {
@@ -120,8 +117,3 @@ def test_the_target_exists_and_the_folder_is_that_of_runs(page: str, command: st
         assert words[1:] == ["--logdir", "runs"], f"{page}: {command}"
     elif "-C" not in words:
         assert subprocess.run([*words, "--dry-run"], cwd=ROOT, capture_output=True).returncode == 0
-
-
-@pytest.mark.parametrize(("page", "command"), guide_commands("python -m cartpole_rl.emulator "))
-def test_the_settings_of_an_emulator_exist(page: str, command: str) -> None:
-    assert read_settings(shlex.split(command)[-1]), page
