@@ -17,8 +17,8 @@ full motor outward under way, keeps it for one more period, since the guard deci
 brakes with full motor inward. Half of them run to the right, half to the left: carts may brake better in one
 direction. A share `quantile` of each half stays within some way, which depends on the measured speed. The
 guard's way bounds it from above as closely as possible: a linear program in margin, delay and
-1 / deceleration. Carts that their motor's back-EMF brakes run on in proportion to their speed: their
-deceleration is FASTEST.
+1 / deceleration. A cart that is braked by its motor's back-EMF runs on in proportion to its speed: its guard
+has the deceleration FASTEST.
 """
 
 import math
