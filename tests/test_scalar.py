@@ -135,7 +135,7 @@ def test_perception_is_that_of_many_carts(number: int, kind: ObservationKind, me
     rules = {"settings": observation, "guard": guard, "encoders": nominal_encoders()}
 
     def first(frame: PlantOutput[Tensor], cart: tuple[Tensor, Tensor]) -> tuple[Tensor, ...]:
-        return perceive_first(frame, *cart, **rules)
+        return perceive_first(frame, *cart, **rules, speed_periods=task.speed_periods)
 
     def counts() -> Tensor:
         return torch.randint(-(2**30), 2**30, (2, CARTS))
@@ -147,6 +147,7 @@ def test_perception_is_that_of_many_carts(number: int, kind: ObservationKind, me
         counts(),
         drawn(4, -10, 10, AWKWARD),
         drawn(observation.past_size, -10, 10, AWKWARD),
+        drawn(task.speed_periods - 1, -10, 10, AWKWARD),
         torch.randint(4, (1, CARTS)),
         motor(),
         torch.full((int(memory > 1), CARTS), 0.6),

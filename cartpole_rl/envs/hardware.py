@@ -31,7 +31,7 @@ Observation, key `observation` [N, K] float32, in this order (`envs.settings.Obs
 
 All but `raw` are divided by the scales in `tasks.features`. Other keys, [N, 1] each: `reward`; the scores of
 this step, `score` (6.2) and `score_upright` (6.1); `step_count`; and those of the plant. `past` holds the
-numbers that an observation needs from earlier steps.
+numbers that an observation needs from earlier steps, `speeds` those that rewards and scores need.
 
 `terminated`: the cart left the track, or the pole fell (balance). `truncated`: the time limit, a lost link, a
 fault that the cart reported, or NO_ACTION. `done` is either; an episode that ends in both ways is terminated.
@@ -79,7 +79,13 @@ class HardwareTransform(Transform):
         self.register_buffer("inward", inward)
         self.guard = guard
         self.register_buffer("_by_action", torch.tensor([0, *motors], dtype=torch.int64))  # from NO_ACTION on
-        self.first_perception = partial(perceive_first, settings=observation, guard=guard, encoders=encoders)
+        self.first_perception = partial(
+            perceive_first,
+            settings=observation,
+            guard=guard,
+            encoders=encoders,
+            speed_periods=task.speed_periods,
+        )
         self.perception: Perception = partial(
             perceive, settings=observation, task=task, rewards=reward, guard=guard, encoders=encoders
         )
@@ -106,6 +112,7 @@ class HardwareTransform(Transform):
         carts, device = observation_spec.shape[0], observation_spec.device
         settings = self.observation_settings
         floats = {"state": 4, "observation": settings.size, "past": settings.past_size}
+        floats["speeds"] = self.task.speed_periods - 1
         for key, size in {**floats, "score": 1, "score_upright": 1}.items():
             observation_spec[key] = Unbounded((carts, size), dtype=torch.float32, device=device)
         observation_spec["guard"] = Bounded(-1, 1, (carts, 1), dtype=torch.int64, device=device)
@@ -159,6 +166,7 @@ class HardwareTransform(Transform):
             current.get("counts").T,
             current.get("state").T,
             current.get("past").T,
+            current.get("speeds").T,
             current.get("step_count").T,
             command.get("motor").T,
             self.scaled_length(),

@@ -28,11 +28,12 @@ class OneCart:
         count, flag = torch.zeros(1, 1, dtype=torch.int64), torch.zeros(1, 1, dtype=torch.bool)
         counts, number = count.repeat(2, 1), torch.zeros(1, 1)
         state, past = number.repeat(4, 1), number.repeat(hardware.observation_settings.past_size, 1)
+        speeds = number.repeat(hardware.task.speed_periods - 1, 1)
         frame = PlantOutput(counts, number, count, flag, flag)
         self._perceive_first = Scalar(
             lambda frame, cart: hardware.first_perception(frame, *cart), frame, (length, track_end)
         )
-        previous = Previous(counts, state, past, count, count, length, track_end)
+        previous = Previous(counts, state, past, speeds, count, count, length, track_end)
         self._perceive = Scalar(hardware.perception, previous, frame)
         self._any_period = tuple(
             tuple(plain(torch.ones_like(each)) for each in part) for part in (previous, frame)
@@ -82,7 +83,7 @@ class OneCart:
     def advance(self, motor: int, frame: PlantOutput[Numbers]) -> Percept[Numbers]:
         """Perceive the frame at the end of a period under a motor value."""
         before, earlier, self.frame = self.percept, self.frame.counts, frame
-        memory = before.state, before.past, before.step_count
+        memory = before.state, before.past, before.speeds, before.step_count
         previous = Previous(earlier, *memory, (motor,), self._length, self._track_end)
         self.percept = self._perceive(previous, frame)
         return self.percept

@@ -33,6 +33,7 @@ class Previous(NamedTuple, Generic[Values]):
     counts: Values  # [2, N] int64
     state: Values  # [4, N]: x m, x_dot m/s, theta rad, theta_dot rad/s
     past: Values  # [past_size, N]
+    speeds: Values  # [speed_periods - 1, N] rad/s of the pole in the steps before, newest first
     step_count: Values  # [1, N] int64
     motor: Values  # [1, N] int64, the value chosen
     length: Values  # [1, N] scaled length of the pole if it is observed, otherwise [0, N]
@@ -44,6 +45,7 @@ class Percept(NamedTuple, Generic[Values]):
 
     state: Values  # [4, N]
     past: Values  # [past_size, N]
+    speeds: Values  # [speed_periods - 1, N] rad/s
     observation: Values  # [size, N]
     guard: Values  # [1, N] int64, direction of the track guard's motor value, 0 if the agent's is sent
     reward: Values  # [1, N]
@@ -63,6 +65,7 @@ def perceive_first(
     settings: ObservationSettings,
     guard: TrackGuard | None,
     encoders: Encoders,
+    speed_periods: int = 1,
 ) -> Percept[Tensor]:
     """Return the percept of a first frame: velocities and memory are 0."""
     x, theta = measured_position(frame.counts, encoders)
@@ -73,6 +76,7 @@ def perceive_first(
     return Percept(
         torch.stack(state),
         past,
+        x.new_zeros(speed_periods - 1, len(x)),
         observation(state, past, length, settings),
         guarded(state, track_end, guard),
         nothing,
@@ -104,12 +108,15 @@ def perceive(
     off_track = frame.terminated
     terminated = off_track | fallen(theta, task.angle_limit)
     ended = terminated | frame.truncated | (step_count >= task.periods)
+    speeds = torch.cat((theta_dot.unsqueeze(0), previous.speeds))
+    judged = state._replace(theta_dot=speeds.mean(0)) if task.speed_periods > 1 else state
     values = {  # each once: the reward is often a score
-        kind: kind.formula(state, task.x_max).unsqueeze(0) for kind in {rewards.kind, SCORE, SCORE_UPRIGHT}
+        kind: kind.formula(judged, task.x_max).unsqueeze(0) for kind in {rewards.kind, SCORE, SCORE_UPRIGHT}
     }
     return Percept(
         torch.stack(state),
         past,
+        speeds[:-1],
         observation(state, past, previous.length, settings),
         guarded(state, previous.track_end, guard),
         rewards.scale * values[rewards.kind] - track_cost(x, off_track, task, rewards),

@@ -20,6 +20,7 @@ NUMBER = torch.zeros(1, 1)
 COUNT = torch.zeros(1, 1, dtype=torch.int64)
 COUNTS = torch.zeros(2, 1, dtype=torch.int64)
 FLAG = torch.zeros(1, 1, dtype=torch.bool)
+NO_SPEEDS = torch.zeros(0, 1)  # rewards and scores alone need them
 
 
 def filled(template: str, values: Mapping[str, object]) -> str:
@@ -94,7 +95,7 @@ def perception(settings: CartPoleSettings, guard: TrackGuard | None) -> tuple[Gr
         return DrivingPercept.of(perceive_start(output, scaled(first.pole_length), first.track_end))
 
     def advance(later: Later) -> DrivingPercept:
-        remembered = later.last_counts, later.state, later.past, COUNT, later.motor
+        remembered = later.last_counts, later.state, later.past, NO_SPEEDS, COUNT, later.motor
         previous = Previous(*remembered, scaled(later.pole_length), later.track_end)
         output = PlantOutput(later.counts, later.dt, COUNT, FLAG, FLAG)
         return DrivingPercept.of(perceive_next(previous, output))

@@ -51,7 +51,7 @@ from cartpole_rl.errors import CartPoleError, ConfigError
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.randomization.poles import Pole, PoleSettings
 from cartpole_rl.tasks.episode import upright_since
-from cartpole_rl.tasks.rewards import UPRIGHT_ANGLE, UPRIGHT_SPEED
+from cartpole_rl.tasks.rewards import BONUS, UPRIGHT_ANGLE
 from cartpole_rl.tasks.settings import Start, StartSettings
 from cartpole_rl.workflows.config import TrainConfig, load_settings
 
@@ -112,13 +112,12 @@ class Replay(NamedTuple):
 
     points: list[float]  # score (6.2) of each step
     theta: list[float]  # rad, measured: at the start and after each step
-    theta_dot: list[float]  # rad/s
 
     def figures(self, period: float) -> dict[str, float | None]:
         """Return the figures of one start in the JSON file."""
         angle = np.abs(np.array(self.theta[1:]))
         upright = angle < UPRIGHT_ANGLE
-        still = upright & (np.abs(np.array(self.theta_dot[1:])) < UPRIGHT_SPEED)
+        still = np.array(self.points) >= 2 * BONUS
         moments = period * np.arange(len(self.theta), dtype=np.float64)
         return {
             "score": round(sum(self.points), 1),
@@ -144,7 +143,7 @@ def replay(config: TrainConfig, position: float, actions: Sequence[int]) -> Repl
         points.append(float(step["score"]))
         if step["done"].any():
             break
-    return Replay(points, [float(state[2]) for state in states], [float(state[3]) for state in states])
+    return Replay(points, [float(state[2]) for state in states])
 
 
 def reference(config: TrainConfig, states: int) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """From one frame to the next: memory, scores, costs and endings, by hand."""
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import pytest
@@ -35,6 +36,7 @@ def previous(steps: int = 3) -> Previous:
         counts=torch.zeros(2, 2, dtype=torch.int64),
         state=torch.tensor([[0.0, 0.0], [0.0, 0.5], [0.0, 0.0], [0.0, -2.0]]),
         past=torch.tensor([[0.1, 0.2], [0.3, 0.4], [0.5, 0.6], [0.7, 0.8]]),
+        speeds=torch.zeros(0, 2),
         step_count=torch.full((1, 2), steps),
         motor=torch.tensor([[-255, 51]]),
         length=NO_LENGTH,
@@ -58,9 +60,11 @@ def perceived(
     task: TaskSettings | None = None,
     rewards: RewardSettings | None = None,
     steps: int = 3,
+    speeds: Sequence[float] = (),
 ) -> Percept:
+    before = previous(steps)._replace(speeds=torch.tensor(speeds).unsqueeze(1).expand(-1, 2))
     return perceive(
-        previous(steps),
+        before,
         later,
         settings=RAW,
         task=task or of_task(),
@@ -75,6 +79,19 @@ def test_velocities_are_differences_of_counts() -> None:
     x, theta = 100 * CART_METRES_PER_COUNT, 10 * POLE_RADIANS_PER_COUNT
     torch.testing.assert_close(state[:, 0], torch.zeros(4))
     torch.testing.assert_close(state[:, 1], torch.tensor([x, x / 0.02, theta, theta / 0.02]))
+
+
+def test_scores_measure_the_speed_of_the_pole_over_20_ms_or_one_period() -> None:
+    """A count of 4096 in 10 ms is 8.8 degrees/s, over the 6 of (6.2); in 20 ms it is 4.4."""
+    task = of_task(x_max=0.38).at(0.01)
+    moved = frame(cart=0, pole=1)._replace(dt=torch.full((1, 2), 0.01))
+    assert perceived(moved, of_task(x_max=0.38)).score[0].tolist() == pytest.approx([11, 6], abs=1e-5)
+    after_rest = perceived(moved, task, speeds=(0.0,))
+    assert after_rest.score[0].tolist() == pytest.approx([11, 11], abs=1e-5)
+    assert float(after_rest.speeds[0, 1]) == float(after_rest.state[3, 1]) == pytest.approx(math.tau / 40.96)
+    assert perceived(moved, task, speeds=(0.15,)).score[0].tolist() == pytest.approx([11, 6], abs=1e-5)
+    periods = (0.005, 0.01, 0.012, 0.019, 0.02, 0.04, 0.05)
+    assert [of_task().at(each).speed_periods for each in periods] == [4, 2, 2, 2, 1, 1, 1]
 
 
 def test_the_newest_of_the_past_comes_first_and_the_oldest_is_forgotten() -> None:

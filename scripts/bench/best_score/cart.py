@@ -36,6 +36,7 @@ class Nodes(NamedTuple):
     motion: Tensor  # [4, N], the true state
     drive: Tensor  # [1 + D, N]: force N, then delayed motor values, newest first
     counts: Tensor  # [2, N] encoder counts
+    speeds: Tensor  # [speed_periods - 1, N] rad/s of the pole, measured in the steps before, newest first
     points: Tensor  # [N] score so far
 
     @property
@@ -53,6 +54,7 @@ class KnownCart:
 
     def __init__(self, config: TrainConfig, compiled: bool = False) -> None:
         self.config, self.compiled = config, compiled
+        self.task = config.task.at(config.control_period)
         self.randomizer = randomizer(config)
         self.models = config.models(config.plant)
         self.motors = torch.tensor(config.actions.motors)
@@ -73,7 +75,7 @@ class KnownCart:
     @property
     def steps(self) -> int:
         """Control periods in an episode."""
-        return self.config.task.at(self.config.control_period).periods
+        return self.task.periods
 
     @property
     def symmetric(self) -> bool:
@@ -97,7 +99,8 @@ class KnownCart:
         """Return one node: at rest at `position` m, the pole hanging."""
         state = hanging(position)
         counts = encoder_counts(state, self.one, torch.zeros(3, 1), self.encoders)
-        return Nodes(torch.stack(state), torch.zeros(1 + self.commands, 1), counts, torch.zeros(1))
+        drive, speeds = torch.zeros(1 + self.commands, 1), torch.zeros(self.task.speed_periods - 1, 1)
+        return Nodes(torch.stack(state), drive, counts, speeds, torch.zeros(1))
 
     def step(self, nodes: Nodes, action: Tensor) -> tuple[Nodes, Tensor, Tensor]:
         """Take actions [N]; return (nodes a period later, points [N], which are on the track [N])."""
@@ -108,8 +111,9 @@ class KnownCart:
         x, theta = measured_position(after.counts, self.encoders)
         passed = torch.full((count,), period)
         x_dot, theta_dot = measured_velocity(after.counts, nodes.counts, passed, self.encoders)
-        points = score(Measured(x, x_dot, theta, theta_dot), self.config.task.x_max)
-        following = Nodes(after.motion, after.drive, after.counts, nodes.points + points)
+        speeds = torch.cat((theta_dot.unsqueeze(0), nodes.speeds))
+        points = score(Measured(x, x_dot, theta, speeds.mean(0)), self.task.x_max)
+        following = Nodes(after.motion, after.drive, after.counts, speeds[:-1], nodes.points + points)
         return following, points, ~after.off_track[0]
 
     def _run(self, carts: Carts, inputs: Inputs) -> Period:
