@@ -19,7 +19,7 @@ from torch import Tensor
 
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.physics.dynamics import State, advance, coupling, mechanism
-from cartpole_rl.physics.friction import CART_FRICTIONS, viscous_coefficient
+from cartpole_rl.physics.friction import CART_FRICTIONS, viscous_coefficient, viscous_share
 from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import GRAVITY, CartParameters, cart_column
 from cartpole_rl.tasks.features import (
@@ -81,12 +81,13 @@ class EnergyAndRegulator:
 
     def predict(self, measured: State, motor: Tensor) -> State:
         """Return the state [N] at which the next motor value takes effect; `motor` [N] acts until then."""
-        force = self.models.actuator(motor, self.cart)
-        now = self._after(measured, force, self.period / 2)._replace(x=measured.x, theta=measured.theta)
-        return self._after(now, force, float(self.cart.latency))
+        now = self._after(measured, motor, self.period / 2)._replace(x=measured.x, theta=measured.theta)
+        return self._after(now, motor, float(self.cart.latency))
 
-    def _after(self, state: State, force: Tensor, step: float) -> State:
-        return advance(state, force, self.cart, self.body, self.models, step)
+    def _after(self, state: State, motor: Tensor, step: float) -> State:
+        force = self.models.actuator(motor, self.cart)
+        share = viscous_share(motor, self.cart)
+        return advance(state, force, self.cart, self.body, self.models, step, share)
 
     def force(self, state: State) -> Tensor:
         """Return the control force in `state`, N, [N]."""
@@ -160,16 +161,20 @@ def regulator(table: Tensor, models: Models, period: float) -> Array:
 
 
 def linearized(table: Tensor, models: Models, period: float) -> tuple[Array, Array]:
-    """Return (A [4, 4], B [4, 1]) of one period about upright, at constant force, without dry friction."""
+    """Return (A [4, 4], B [4, 1]) of one period about upright, at constant force, without dry friction.
+
+    The viscous friction is that at motor value 0.
+    """
     cart = CartParameters(table)
     smooth = CART_FRICTIONS.find("linear" if "cart_viscous" in models.cart_friction.reads else "none")
     body, smooth_models = mechanism(cart), models._replace(cart_friction=smooth)
+    share = viscous_share(torch.zeros(1), cart)
 
     def after_a_period(numbers: Tensor) -> Tensor:
         *motion, force = numbers.unsqueeze(-1)
         state = State(*motion)
         for _ in range(SUBSTEPS):
-            state = advance(state, force, cart, body, smooth_models, period / SUBSTEPS)
+            state = advance(state, force, cart, body, smooth_models, period / SUBSTEPS, share)
         return torch.cat(state)
 
     jacobian_matrix = torch.autograd.functional.jacobian(

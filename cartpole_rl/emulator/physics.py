@@ -12,6 +12,7 @@ from types import ModuleType
 
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import EmulatorError
+from cartpole_rl.rig.hardware import LARGEST_MOTOR
 
 GRAVITY = 9.81  # m/s^2
 LEAST_FELT = 1e-6  # share of the pole's force
@@ -28,8 +29,7 @@ MODEL = """
   </default>
   <worldbody>
     <body>
-      <joint type="slide" axis="1 0 0" damping="{cart_viscous}"
-             range="-{track_half_length} {track_half_length}"/>
+      <joint type="slide" axis="1 0 0" range="-{track_half_length} {track_half_length}"/>
       <inertial pos="0 0 0" mass="{cart_mass}" diaginertia="0.001 0.001 0.001"/>
       <body>
         <joint type="hinge" axis="0 1 0" damping="{pole_viscous}" frictionloss="{pole_coulomb}"/>
@@ -70,6 +70,11 @@ class Motor:
         force = max(0.0, a * size * size + b * size + c)
         return force * (1 + settings.force_asymmetry) if motor > 0 else -force
 
+    def friction_share(self, motor: int) -> float:
+        """Return the share of the cart's viscous friction at a motor value: less of it than at full motor."""
+        off = 1 - abs(motor) / LARGEST_MOTOR
+        return 1 - self._settings.coasting * off
+
     def decay(self, seconds: float) -> float:
         """Return the share of the gap to the steady force that is left after `seconds`."""
         lag = self._settings.motor_time_constant
@@ -91,8 +96,8 @@ class CartPhysics:
         self._larger = larger = 1 / max(settings.backdrivability, LEAST_FELT)
         numbers = settings.model_dump() | {
             "cart_mass": larger * settings.cart_mass,
-            "cart_viscous": larger * settings.cart_viscous,
         }
+        self._viscous = larger * settings.cart_viscous  # N s/m at full motor
         model = MODEL.format(thin_inertia=thin, **numbers)
         self._model = mujoco.MjModel.from_xml_string(model)
         tilt = settings.track_tilt
@@ -151,7 +156,8 @@ class CartPhysics:
         self._model.opt.timestep = step
         drag, friction = self._settings.pole_drag, self._model.dof_frictionloss
         applied, velocity = self._data.qfrc_applied, self._data.qvel
-        target, decay = self._motor.static_force(motor), self._motor.decay(step)
+        decay = self._motor.decay(step)
+        target = self._enforce(motor)
         for number in range(1, steps + 1):
             force = self._motor.step(target, decay) + self._cogging(self._data.qpos[0])
             applied[0] = self._larger * force + self._held
@@ -161,7 +167,12 @@ class CartPhysics:
             self._mj_step(self._model, self._data)
             self._notice_contact(speed)
             if look is not None and (chosen := look(number * step)) != motor:
-                motor, target = chosen, self._motor.static_force(chosen)
+                motor, target = chosen, self._enforce(chosen)
+
+    def _enforce(self, motor: int) -> float:
+        """Set the cart's viscous friction at a motor value; return the steady force, N."""
+        self._model.dof_damping[0] = self._viscous * self._motor.friction_share(motor)
+        return self._motor.static_force(motor)
 
     def _notice_contact(self, speed: float) -> None:
         """Report it if the cart, which ran at `speed` m/s, has just touched an end stop."""

@@ -58,6 +58,7 @@ class EmulatorSettings(Settings):
     pole_drag: NonNegative = 2.5e-5  # N m s^2, times the square of the angular speed
 
     backdrivability: Fraction = 1.0  # share of the pole's and gravity's force that moves the cart; stepper: 0
+    coasting: Fraction = 0.0  # share of cart_viscous that fades with the motor value
     force_curve: tuple[Coefficient, Coefficient, Coefficient] = (0.0, 0.0198, -0.99)
     # [a, b, c]: F = sign(u) max(0, a u^2 + b |u| + c), N
     force_asymmetry: Annotated[float, Field(ge=-0.9, le=0.9)] = (
@@ -138,6 +139,7 @@ class EmulatorSettings(Settings):
             "pole_coulomb": times("pole_coulomb", "pole_viscous"),
             "pole_drag": times("pole_drag"),
             "backdrivability": numbers["backdrivability"],
+            "coasting": numbers["coasting"],
             "force_curve": (
                 numbers["force_quadratic"],
                 slope * numbers["force_linear"] / of_ip02["force_linear"],

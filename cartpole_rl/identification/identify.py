@@ -18,6 +18,7 @@ from cartpole_rl.physics.friction import CART_FRICTIONS
 from cartpole_rl.physics.laws import Law
 from cartpole_rl.physics.models import Models
 from cartpole_rl.rig.hardware import Encoders
+from cartpole_rl.rig.parameters import PARAMETERS
 from cartpole_rl.tasks.episode import Ending, Episode
 
 Array = NDArray[np.floating]
@@ -221,7 +222,8 @@ def warnings(fit: Fit, encoders: Encoders) -> list[str]:
     deviation = np.sqrt(np.diag(fit.covariance))
     values = fit.parameters
     for unknown, point, least, most, left in zip(fit.unknowns, fit.point, low, high, deviation, strict=True):
-        if min(point - least, most - point) < 1e-6:
+        absent = unknown.name in PARAMETERS and values[unknown.name] == PARAMETERS[unknown.name].default
+        if min(point - least, most - point) < 1e-6 and not absent:
             found.append(
                 f"{unknown.name} = {values[unknown.name]:g} is at the limit of its range: another friction "
                 "model, or another number, may be wrong"

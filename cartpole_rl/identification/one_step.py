@@ -16,6 +16,7 @@ from scipy.optimize import least_squares
 from torch import Tensor
 
 from cartpole_rl.physics.dynamics import State, advance, mechanism
+from cartpole_rl.physics.friction import viscous_share
 from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import CartParameters, cart_column
 from cartpole_rl.tasks.episode import Episode
@@ -101,4 +102,5 @@ def predicted(data: Transitions, values: Mapping[str, float], models: Models, pe
     rod = {**values, "pole_inertia": values["pole_mass"] * values["pole_com"] ** 2 / 3}
     cart = CartParameters(cart_column(rod))
     force = models.actuator(data.motor, cart)
-    return torch.stack(advance(State(*data.before), force, cart, mechanism(cart), models, period))
+    share = viscous_share(data.motor, cart)
+    return torch.stack(advance(State(*data.before), force, cart, mechanism(cart), models, period, share))

@@ -12,6 +12,7 @@ from cartpole_rl.identification.unknowns import LONGEST_LATENCY
 from cartpole_rl.identification.windows import history_periods
 from cartpole_rl.physics.actuator import LAG, lag_shares, mean_commands, step_forces
 from cartpole_rl.physics.dynamics import Drive, MakeAddition, State, advance, mechanism, run_period
+from cartpole_rl.physics.friction import viscous_share
 from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import CartParameters, cart_column
 from cartpole_rl.physics.residual import (
@@ -44,8 +45,10 @@ def rollout(
     if addition is None:
         body, step = mechanism(cart), period / substeps
         forces = forces_in_steps(cart, motors, models, period, substeps, extra_latency)
-        for number, force in enumerate(forces, 1):
-            state = advance(state, force, cart, body, models, step)
+        held = viscous_share(motors, cart)
+        shares, before = held_in_steps(held, cart.latency + extra_latency, period, substeps)
+        for number, (force, share) in enumerate(zip(forces, shares[before:], strict=True), 1):
+            state = advance(state, force, cart, body, models, step, share)
             if number % substeps == 0:
                 measured.append(as_measured(state, cart))
         return torch.stack(measured)
@@ -75,12 +78,8 @@ def forces_in_steps(
 
     Equals `step_forces`, period by period; `motors` [H + T, N] and `extra_latency` are as in `rollout`.
     """
-    law, history, in_effect = models.actuator, history_periods(period), motors_in_effect(period)
-    held = law(motors, cart)
-    every = [held[in_effect - 1 - age : len(held) - age] for age in range(in_effect)]
-    means = mean_commands(every, cart.latency + extra_latency, period, substeps)
-    targets = torch.stack(means, 1).flatten(0, 1)
-    before = substeps * (history - in_effect + 1)  # steps of history
+    law = models.actuator
+    targets, before = held_in_steps(law(motors, cart), cart.latency + extra_latency, period, substeps)
     if LAG not in law.reads:
         return targets[before:]
     mean, end = lag_shares(cart.motor_time_constant, period / substeps)
@@ -89,6 +88,14 @@ def forces_in_steps(
         gaps.append(force - target)
         force = target + gaps[-1] * end
     return targets[before:] + torch.stack(gaps[before:]) * mean
+
+
+def held_in_steps(held: Tensor, latency: Tensor, period: float, substeps: int) -> tuple[Tensor, int]:
+    """Return the mean of each step, [S, N], under commands `held` [H + T, N], and the steps of history."""
+    in_effect = motors_in_effect(period)
+    every = [held[in_effect - 1 - age : len(held) - age] for age in range(in_effect)]
+    means = mean_commands(every, latency, period, substeps)
+    return torch.stack(means, 1).flatten(0, 1), substeps * (history_periods(period) - in_effect + 1)
 
 
 def motors_in_effect(period: float) -> int:

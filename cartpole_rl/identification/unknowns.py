@@ -29,6 +29,7 @@ OVERCOME = (
     "cart_stiction_ratio",
     "stribeck_velocity",
     "track_tilt",
+    "coasting",
 )
 WEIGHED = (POLE_LENGTH, "pole_mass")  # measured with a known pole; they set the scale of forces and masses
 
@@ -53,7 +54,7 @@ def unknowns_of(models: Models, known: Sequence[str] = ()) -> list[Unknown]:
 
 
 def hidden(nominal: Mapping[str, float]) -> tuple[str, ...]:
-    """Return the unknowns that no motion shows: a stepper overcomes mass, dry friction and tilt by itself."""
+    """Return the unknowns that no motion shows: a stepper moves as it is told, whatever these are."""
     return () if nominal["backdrivability"] else OVERCOME
 
 

@@ -11,8 +11,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from cartpole_rl.physics.actuator import step_forces
-from cartpole_rl.physics.friction import viscous_coefficient
+from cartpole_rl.physics.actuator import mean_commands, step_forces
+from cartpole_rl.physics.friction import viscous_coefficient, viscous_share
 from cartpole_rl.physics.laws import Law
 from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import GRAVITY, CartParameters
@@ -138,12 +138,21 @@ def speed_lost(
 
 
 def advance(
-    state: State, force: Tensor, cart: CartParameters, body: Mechanism, models: Models, step: float
+    state: State,
+    force: Tensor,
+    cart: CartParameters,
+    body: Mechanism,
+    models: Models,
+    step: float,
+    viscous: Tensor | float = 1.0,
 ) -> State:
-    """Return the state after `step` s under a constant `force` (N, [N]); `body` is `mechanism(cart)`."""
+    """Return the state after `step` s under a constant `force` (N, [N]); `body` is `mechanism(cart)`.
+
+    `viscous` is the share of the viscous friction that is in effect.
+    """
     terms = coupling(state, cart, body)
     torque = models.pole_friction(state.theta_dot, cart)
-    driven = force - viscous_coefficient(cart, models.cart_friction) * state.x_dot
+    driven = force - viscous * viscous_coefficient(cart, models.cart_friction) * state.x_dot
     x_ddot, theta_ddot = accelerations(state, driven, torque, body, terms)
     x_dot = state.x_dot + step * x_ddot
     theta_dot = state.theta_dot + step * theta_ddot
@@ -179,12 +188,15 @@ def run_period(
     body = mechanism(cart)
     added = None if addition is None else addition(state, drive)
     forces, last = step_forces(*drive, latency, cart, models.actuator, period, substeps)
-    for mean in forces:
+    held = [viscous_share(motor, cart) for motor in drive.motors]
+    shares = mean_commands(held, latency, period, substeps)
+    for mean, share in zip(forces, shares, strict=True):
         if added is None:
-            state = advance(state, mean, cart, body, models, step)
+            state = advance(state, mean, cart, body, models, step, share)
         else:
             acting = mean + added.force + added.force_at(state.x)
-            state = turned(advance(state, acting, cart, body, models, step), added.angular_acceleration, step)
+            state = advance(state, acting, cart, body, models, step, share)
+            state = turned(state, added.angular_acceleration, step)
     return state, Drive(last, drive.motors)
 
 

@@ -7,6 +7,7 @@ at the normal force of a resting pole; where the pole's motion changes that forc
 from typing import TYPE_CHECKING
 
 from cartpole_rl.physics.laws import Law, law_registry, zero
+from cartpole_rl.rig.hardware import LARGEST_MOTOR
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -19,7 +20,7 @@ CART_FRICTIONS = law_registry("cart_friction")
 # The formula gives the torque, N m, against the angular velocity in rad/s.
 POLE_FRICTIONS = law_registry("pole_friction")
 
-VISCOUS = ("cart_viscous",)
+VISCOUS = ("cart_viscous", "coasting")
 COULOMB = (*VISCOUS, "cart_coulomb", "cart_coulomb_asymmetry")
 DRAG = ("pole_viscous", "pole_drag")
 SLOW_POLE = 0.05  # rad/s, two thirds of a count a period: slower, the bearing's Coulomb friction fades
@@ -74,6 +75,15 @@ def drag_torque(theta_dot: "Tensor", cart: "CartParameters") -> "Tensor":
 def bearing_torque(theta_dot: "Tensor", cart: "CartParameters") -> "Tensor":
     """Viscous friction, air drag, and the bearing's Coulomb friction."""
     return drag_torque(theta_dot, cart) - cart.pole_coulomb * (theta_dot / SLOW_POLE).tanh()
+
+
+def viscous_share(motor: "Tensor", cart: "CartParameters") -> "Tensor":
+    """Return the share of the viscous friction that is in effect at a motor value, [N].
+
+    With a DC motor most of it is back-EMF. Its current flows all the time if the H-bridge brakes while it is
+    off, and in the share |motor| / 255 of the time if it coasts then.
+    """
+    return 1 - cart.coasting * (1 - motor.abs() / LARGEST_MOTOR)
 
 
 def viscous_coefficient(cart: "CartParameters", law: Law) -> "Tensor":

@@ -138,6 +138,8 @@ for _entry in (
               "standard deviation of the angle before quantization", noise=True),
     Parameter("backdrivability", "1", Bound(0, 1), 1.0, None,
               "share of the pole's and gravity's force that the cart feels: 1 with a DC motor, 0 a stepper"),
+    Parameter("coasting", "1", Bound(0, 1), 0.0, Prior(0.3),
+              "share of the viscous friction that fades with the motor value, if an H-bridge coasts"),
 ):
     add_parameter(_entry)
 # fmt: on

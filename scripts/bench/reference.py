@@ -169,16 +169,26 @@ def reference(config: TrainConfig, states: int) -> dict[str, Any]:
 
 def truth_config(truth: Truth) -> TrainConfig:
     """Return the settings of a simulated cart with the numbers of a truth."""
-    cart = {**simulated_cart(truth), "latency_jitter": 0.0}  # a search cannot foresee draws
+    return known_config(simulated_cart(truth))
+
+
+def known_config(cart: dict[str, float], **settings: object) -> TrainConfig:
+    """Return the settings of a simulated cart with the friction laws of an emulated one, for a search."""
+    cart = {**cart, "latency_jitter": 0.0}  # a search cannot foresee draws
     pole = {name: cart.pop(name) for name in Pole.model_fields}
     friction = {"cart_friction": "stribeck", "pole_friction": "bearing"}
     choices = {"cart": cart, "pole": {"choices": {"truth": pole}}, **ALONE}
-    return load_settings(TrainConfig, {**choices, **friction})
+    return load_settings(TrainConfig, {**settings, **choices, **friction})
 
 
 def truth_reference(states: int, truth: Truth) -> dict[str, Any]:
     """Return the best score found on the simulated cart of a truth from 0 m, and the cost of the search."""
-    config, started = truth_config(truth), time.process_time()
+    return known_reference(truth_config(truth), states)
+
+
+def known_reference(config: TrainConfig, states: int) -> dict[str, Any]:
+    """Return the best score found on a simulated cart from 0 m, and the cost of the search."""
+    started = time.process_time()
     actions = search(KnownCart(config, compiled=True), 0.0, states)
     score = round(sum(replay(config, 0.0, actions).points), 1)
     return {"score": score, "states": states, "seconds": round(time.process_time() - started, 1)}

@@ -6,8 +6,9 @@
 For each rig: preflight and identification on an emulated cart, then for each seed a training, an evaluation
 of the last checkpoint on the nominal cart and on the emulated one, its C export driving on the emulated
 board, and a fine-tuning. The emulated cart differs from the rig's file as the default one from ip02. A
-fraction is a score over the reference of the rig's nominal cart: the best one that reference.py finds with
-the same settings from any of its starts. The runs are in runs/bench/rigs; what exists is not made again.
+fraction is a score over the best one that reference.py finds with the same settings: on the rig's nominal
+cart from any of its starts, and on a simulated cart with the numbers of the emulated one. The runs are in
+runs/bench/rigs; what exists is not made again.
 """
 
 from pathlib import Path
@@ -28,7 +29,8 @@ from common import (
     run_once,
     write_json,
 )
-from reference import reference
+from reference import known_config, known_reference, reference
+from truths import simulated
 
 from cartpole_rl.choices import choice, group_choices
 from cartpole_rl.emulator.settings import EmulatorSettings
@@ -91,10 +93,25 @@ def best_score(rig: Rig, file: Path, states: int) -> float:
     return max(each["score"] for each in read_json(file)["starts"].values())
 
 
+def emulated_score(rig: Rig, file: Path, states: int) -> float:
+    """Return the best score of the search with the numbers of the emulated cart, from 0 m."""
+    if not file.exists():
+        cart = choice(f"cart/{rig.cart}")
+        numbers = {**cart, **simulated(emulated_cart(rig), cart)}
+        config = known_config(numbers, control_period=rig.period, actions=rig.actions)
+        write_json(file, known_reference(config, states))
+    return float(read_json(file)["score"])
+
+
+def emulated_cart(rig: Rig) -> EmulatorSettings:
+    """Return the settings of the emulated cart of a rig."""
+    pole = EmulatorSettings(**group_choices("emulator").get(rig.pole, {}))
+    return pole.of_cart(choice(f"cart/{rig.cart}"))
+
+
 def true_ratios(rig: Rig) -> dict[str, float]:
     """Return the emulated cart's quantities of which motion shows the ratio to the mass, as identified."""
-    pole = EmulatorSettings(**group_choices("emulator").get(rig.pole, {}))
-    truth = pole.of_cart(choice(f"cart/{rig.cart}"))
+    truth = emulated_cart(rig)
     mass = truth.cart_mass + truth.backdrivability * truth.pole_mass
     a, b, _ = truth.force_curve
     gain = 1e3 * (b + 400 * a) * (1 + truth.force_asymmetry / 2) / mass
@@ -149,6 +166,7 @@ def main() -> None:
         folder = RUNS / "rigs" / rig.cart
         found: dict[str, Any] = identified(rig, folder)
         found["reference"] = best_score(rig, folder / "reference.json", options.states)
+        found["emulated_reference"] = emulated_score(rig, folder / "emulated_reference.json", options.states)
         found["seeds"] = {seed: driven(rig, folder, seed) for seed in chosen_seeds(options)}
         return found
 
@@ -157,16 +175,14 @@ def main() -> None:
     rows = []
     for rig, found in results.items():
         for seed, figures in found["seeds"].items():
-            best = found["reference"]
+            best, emulated = found["reference"], found["emulated_reference"]
             rows.append(
                 {
                     "rig": rig,
                     "seed": str(seed),
-                    "reference": f"{best:.0f}",
-                    **{
-                        name: f"{figures[name] / best:.3f}"
-                        for name in ("nominal", "drawn", "emulated", "onboard")
-                    },
+                    "references": f"{best:.0f}, {emulated:.0f}",
+                    **{name: f"{figures[name] / best:.3f}" for name in ("nominal", "drawn")},
+                    **{name: f"{figures[name] / emulated:.3f}" for name in ("emulated", "onboard")},
                 }
             )
     print_table(rows)

@@ -75,23 +75,29 @@ def widened(bounds: tuple[float, float], share: float, smallest: float = -math.i
 
 
 def simulated_cart(truth: Mapping[str, object]) -> dict[str, float]:
-    """Return the simulator's parameters of the cart and its pole for a truth. Some are nominal.
+    """Return the simulator's parameters of the cart and its pole for a truth. Some are nominal."""
+    return simulated(EmulatorSettings(**truth), choice("cart/ip02"))
+
+
+def simulated(emulated: EmulatorSettings, cart: Mapping[str, float]) -> dict[str, float]:
+    """Return the simulator's parameters of an emulated cart and its pole. Some are those of the file `cart`.
 
     The simulator's `stribeck_velocity` is the speed below which the emulator applies the breakaway friction,
     and its track ends at the soft limit.
     """
-    settings = EmulatorSettings(**truth).model_dump()
+    hardware, settings = emulated.hardware or nominal_hardware(), emulated.model_dump()
     left, right = settings["cart_coulomb_left"], settings["cart_coulomb_right"]
     a, b, c = settings["force_curve"]
-    hardware = nominal_hardware()
     encoders = hardware.encoders
     soft_limit = encoders.cart_counts(hardware.soft_limit) * encoders.metres
     same = {name: settings[name] for name in CartParameters.names() if name in settings}
+    coulomb = {"cart_coulomb": (left + right) / 2, "cart_coulomb_asymmetry": 0.0}
+    if left + right:
+        coulomb["cart_coulomb_asymmetry"] = (right - left) / (right + left)
     return {
-        **parameters_of(choice("cart/ip02")),
+        **parameters_of(cart),
         **same,
-        "cart_coulomb": (left + right) / 2,
-        "cart_coulomb_asymmetry": (right - left) / (right + left),
+        **coulomb,
         "stribeck_velocity": AT_REST,
         "track_half_length": settings["track_half_length"] - soft_limit,
         "force_quadratic": a,

@@ -195,6 +195,7 @@ OTHER = OTHER_PHYSICS | {
     "seed": 1,
     "pole_drag": 2e-4,
     "backdrivability": 0.5,
+    "coasting": 0.5,
     "latency": 0.01,
     "latency_jitter": 0.003,
     "track_tilt": -0.004,

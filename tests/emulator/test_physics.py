@@ -203,6 +203,19 @@ def test_a_finer_step_changes_little():
     assert ends[0] == pytest.approx(ends[1], abs=0.01)
 
 
+@pytest.mark.parametrize(("motor", "share"), [(0, 0.4), (-51, 0.52), (255, 1.0)])
+def test_a_coasting_motor_brakes_less_the_less_it_is_on(motor: int, share: float) -> None:
+    """The speed approaches force over friction with the time constant mass over friction."""
+    cart = CartPhysics(EmulatorSettings(**BARE | PLAIN_MOTOR | {"cart_viscous": 2.0, "coasting": 0.6}))
+    end = 0.02 * motor / (2.0 * share)  # m/s
+    cart.place(0.0, math.pi)
+    cart.advance(200, 0.05)
+    before = cart.x_dot
+    cart.advance(motor, 0.03)
+    left = math.exp(-0.03 * 2.0 * share / BARE["cart_mass"])
+    assert cart.x_dot == pytest.approx(end + (before - end) * left, rel=1e-3)
+
+
 # cogging: a force ripple along the track
 
 BARE = FREE | NO_POLE | {"cart_mass": 0.8}

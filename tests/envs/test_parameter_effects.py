@@ -45,6 +45,7 @@ CASES: dict[str, tuple[float, float]] = {
     "motor_time_constant": (0.0, 0.05),
     "latency": (0.0, 0.06),
     "backdrivability": (0.0, 1.0),
+    "coasting": (0.0, 1.0),
     "angle_offset": (-0.05, 0.05),
 }
 CHANCE = {"latency_jitter": (0.0, 0.05), "position_noise": (0.0, 0.01), "angle_noise": (0.0, 0.05)}

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from cartpole_rl.physics.dynamics import State, advance, mechanism
+from cartpole_rl.physics.dynamics import Drive, State, advance, mechanism, run_period
 from cartpole_rl.physics.friction import (
     CART_FRICTIONS,
     POLE_FRICTIONS,
@@ -61,6 +61,24 @@ class TestPower:
         power = torque * self.speeds
         assert (power <= 0).all()
         assert (power[self.speeds.abs() > 1e-9] < 0).all() == (law != "none")
+
+
+@pytest.mark.parametrize(("motor", "share"), [(0.0, 0.4), (-51.0, 0.52), (255.0, 1.0)])
+def test_a_coasting_motor_brakes_less_the_less_it_is_on(
+    make_cart: MakeCart, motor: float, share: float
+) -> None:
+    """As one whose viscous friction is so much smaller; after its latency, that of the motor value before."""
+    seconds, models = 0.02, Models()._replace(cart_friction=CART_FRICTIONS.find("linear"))
+    cart = make_cart(cart_viscous=2.0, coasting=0.6, latency=0.005, motor_time_constant=0.0)
+    drive = Drive(at(0.0), [at(motor), at(200.0), at(200.0)])
+    state, _ = run_period(still(0.3), drive, cart.latency, cart, models, seconds, 4)
+    alone, expected = make_cart(cart_viscous=2.0), still(0.3)
+    for number in range(4):
+        now = at(200.0) if number == 0 else at(motor)
+        part = 1 - 0.6 * (1 - 200 / 255) if number == 0 else share
+        force = models.actuator(now, alone)
+        expected = advance(expected, force, alone, mechanism(alone), models, seconds / 4, at(part))
+    torch.testing.assert_close(torch.cat(state), torch.cat(expected))
 
 
 class TestFormulas:

@@ -39,6 +39,7 @@ NARROW = {  # a per cent where nominal is not 0, and about as little where it is
     "angle_offset": (0.0, 1e-4),
     "position_noise": (0.0, 1e-6),
     "angle_noise": (0.0, 1e-4),
+    "coasting": (0.0, 0.01),
 }
 
 
