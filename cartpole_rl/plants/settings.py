@@ -286,6 +286,8 @@ class BoardSettings(RealCartSettings):
     fastest: Positive = 1.0  # m/s, the largest speed that is sent
     cart_reversed: bool = False  # the cart's counts grow to the left
     pole_reversed: bool = False  # the pole's counts grow to the left
+    # The counts between which a potentiometer at the pole is right; the rest of the turn is its dead zone.
+    pole_range: tuple[int, int] | None = None
     watchdog: bool = False  # the board stops its motor by itself when no command comes
 
     @model_validator(mode="after")
@@ -296,6 +298,8 @@ class BoardSettings(RealCartSettings):
         if self.sends == "value" and (self.damping or fastest):
             name = "damping" if self.damping else "fastest"
             raise ValueError(f"{name} is for sends=speed and sends=acceleration; leave it out")
+        if self.pole_range is not None and not self.pole_range[0] < self.pole_range[1]:
+            raise ValueError(f"pole_range={list(self.pole_range)}: give the smaller count first")
         if self.homing == "stops" and self.sends != "value":
             raise ValueError(
                 f"homing=stops with sends={self.sends}: a stepper loses steps at a stop; give hand or board"

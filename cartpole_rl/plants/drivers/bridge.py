@@ -27,6 +27,7 @@ from cartpole_rl.emulator.homing import Homing, HomingError, Reading, Window, Ze
 from cartpole_rl.emulator.link import Channel
 from cartpole_rl.errors import CartPoleError, ConfigError, LinkError
 from cartpole_rl.plants.drivers.driver import Driver, Measurement
+from cartpole_rl.plants.drivers.potentiometer import Potentiometer
 from cartpole_rl.plants.settings import BoardSettings
 from cartpole_rl.rig.hardware import Hardware
 from cartpole_rl.signals import ending_signals
@@ -47,6 +48,7 @@ SETTLING = 0.1  # s: how fast such a cart is braked
 LONGEST_STEP = 0.2  # s without a command, for which the last one counts
 BOARD_RESTS_US, BOARD_STANDS = 1_500_000, 1e-3  # us without more motion than this, m: its homing has ended
 BOARD_ZERO = 2e-3  # m: a board that stands so near its zero may home without moving
+MOST = 2**62  # counts: an encoder has no dead zone
 LONGEST_BOARD_HOMING = 60_000_000  # us
 
 
@@ -251,6 +253,10 @@ class Bridge:
         self._suspects: list[Measurement] = []  # implausible ones in a row
         self._bad = self._excess = 0  # damaged measurements, and how many more than whole ones lately
         self._pole = 0  # unwrapped
+        turn = hardware.pole_counts_per_turn
+        if settings.pole_range is not None and settings.pole_range[1] - settings.pole_range[0] >= turn:
+            raise ConfigError(f"plant.pole_range covers the whole turn of {turn} counts: leave it out")
+        self._potentiometer = Potentiometer(*(settings.pole_range or (-MOST, MOST)), turn)
         self._recent: deque[tuple[int, int]] = deque(maxlen=SAMPLES)  # us and cart count of the newest
         self._measured = 0  # of the control period
         self._stops_left = STOPS  # whatever the board did before
@@ -361,17 +367,19 @@ class Bridge:
         except TypeError:
             return self._refuse(f"{given} is not in whole counts and us")
         settings, last = self._settings, self._last
+        if (carried := self._potentiometer.count(pole, us)) is None:
+            return self._refuse(f"the pole stays outside plant.pole_range, at {pole}")
         new = Measurement(
-            -cart if settings.cart_reversed else cart, -pole if settings.pole_reversed else pole, us
+            -cart if settings.cart_reversed else cart, -carried if settings.pole_reversed else carried, us
         )
         if last is None:
             self._pole = new.pole
-            return self._accept(new, now_us)
+            return self._accept(new, pole, now_us)
         if new.us == last.us:
             return self._refuse(f"its time stands still at {new.us} us")
         if self._fits(last, new, now_us - self._arrived_us, len(self._suspects)):
             self._pole += self._turned(last, new)
-            return self._accept(new, now_us)
+            return self._accept(new, pole, now_us)
         if self._suspects and not self._fits(self._suspects[-1], new, now_us - self._arrived_us):
             self._suspects.clear()
         self._suspects.append(new)
@@ -379,7 +387,7 @@ class Bridge:
             return self._refuse(f"its numbers jump: {last}, then {new}")
         self._restart()
         self._pole = new.pole
-        return self._accept(new, now_us)
+        return self._accept(new, pole, now_us)
 
     def _fits(self, last: Measurement, new: Measurement, arrived: int, refused: int = 0) -> bool:
         """Return True if a cart can move from one measurement to the other; `arrived` us lie between at most.
@@ -401,11 +409,12 @@ class Bridge:
         turn = self._hardware.pole_counts_per_turn
         return (new.pole - last.pole + turn // 2) % turn - turn // 2
 
-    def _accept(self, new: Measurement, now_us: int) -> bool:
+    def _accept(self, new: Measurement, reading: int, now_us: int) -> bool:
         assert new.us is not None
         self._suspects.clear()
         self._last, self._arrived_us = new, now_us
         self._counts, self._stamp_us = (new.cart, self._pole), new.us
+        self._potentiometer.accept(reading, new.us)
         self._measured_us = self._clock.measured_us(new.us, now_us)
         moved = not self._recent or new.cart != self._recent[-1][1]
         self._recent.append((new.us, new.cart))
@@ -423,6 +432,7 @@ class Bridge:
         self._stand_in = self._new_stand_in()
         self._clock, self._measured = BoardClock(), 0
         self._recent.clear()
+        self._potentiometer.forget()
 
     def _new_stand_in(self) -> StandIn:
         return StandIn(self._settings, self._hardware, self._board_us, self._driver)

@@ -4,7 +4,7 @@ import math
 import signal
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import pytest
@@ -131,6 +131,59 @@ def test_a_count_that_is_set_elsewhere_ends_the_homing() -> None:
     assert bridge.measure(8002) == [True]
     assert bridge.measure(*[0] * CONFIRMED) == [False] * (CONFIRMED - 1) + [True]
     assert not bridge._stand_in.homed
+
+
+LOW, HIGH = 60, 3860  # of 4096: 26 degrees are not measured
+
+
+def seen_from_start(bridge: Playing, counts: Sequence[float], reversed_by: int = 1) -> list[int]:
+    """Let the pole be at true counts, a period each; return how far the bridge saw it turn."""
+    seen: list[int] = []
+    for number, count in enumerate(counts):
+        bridge.now += PERIOD_US
+        reading = round(reversed_by * count) % RIG.pole_counts_per_turn
+        if not LOW <= reading <= HIGH:
+            reading = 4095 if number % 2 else 0  # a dead zone gives anything
+        bridge._pass(Measurement(0, reading, bridge.now))
+        seen.append(bridge._counts[1])
+    return [each - seen[0] for each in seen]
+
+
+def test_a_range_of_the_pole_is_a_part_of_a_turn() -> None:
+    with pytest.raises(
+        ConfigError, match=r"^plant.pole_range covers the whole turn of 4096 counts: leave it out$"
+    ):
+        Playing(pole_range=[0, 4096])
+    with pytest.raises(ValueError, match=r"pole_range=\[4035, 60\]: give the smaller count first"):
+        settings(pole_range=[4035, 60])
+
+
+@pytest.mark.parametrize("reversed_by", [1, -1])
+@pytest.mark.parametrize("speed", [-12.0, 4.0])  # rad/s
+def test_a_pole_is_carried_through_the_dead_zone_of_its_potentiometer(speed: float, reversed_by: int) -> None:
+    bridge = Playing(pole_range=[LOW, HIGH], pole_reversed=reversed_by < 0)
+    turns = speed / math.tau * PERIOD_US * 1e-6
+    true = [1000 * reversed_by + each * turns * RIG.pole_counts_per_turn for each in range(400)]
+    turned = [each - true[0] for each in true]
+    assert seen_from_start(bridge, true, reversed_by) == pytest.approx(turned, abs=4)
+    assert bridge.played.bad == 0
+
+
+def test_a_pole_that_turns_back_in_the_dead_zone_is_kept_in_it() -> None:
+    """It comes out where it went in, after 0.16 s; the estimate is at most the zone away."""
+    bridge = Playing(pole_range=[LOW, HIGH])
+    true = [3840 + 2400 * t - 15_000 * t * t for t in (0.01 * each for each in range(17))]
+    seen = seen_from_start(bridge, true)
+    assert max(seen) <= 4096 + LOW - 3840
+    assert seen[-1] == pytest.approx(true[-1] - true[0], abs=1)
+    assert bridge.played.bad == 0
+
+
+def test_a_pole_that_stays_in_the_dead_zone_is_not_guessed() -> None:
+    bridge = Playing(pole_range=[LOW, HIGH])
+    seen_from_start(bridge, [3800, 3840, *[4000] * 40])
+    assert bridge.played.why_bad.startswith("the pole stays outside plant.pole_range, at ")
+    assert 15 < bridge.played.bad < 25  # 0.2 s are carried
 
 
 @pytest.mark.parametrize("bad", [math.nan, 1.5, None, "1"])
