@@ -130,7 +130,8 @@ def test_perception_is_that_of_many_carts(number: int, kind: ObservationKind, me
     observation = ObservationSettings(
         kind=kind, past_motors=memory, past_velocities=memory, past_positions=memory, pole_length=memory > 1
     )
-    task = TASK.model_copy(update={"angle_limit": 0.2 if memory else None, "time_limit": 3})
+    limits = {"angle_limit": 0.2 if memory else None, "time_limit": 3, "speed_periods": 1 + memory}
+    task = TASK.model_copy(update=limits)
     rewards = REWARD.model_copy(update={"kind": reward, "position_cost": 0.1})
     rules = {"settings": observation, "guard": guard, "encoders": nominal_encoders()}
 
