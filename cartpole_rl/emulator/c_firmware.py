@@ -37,9 +37,10 @@ RIG = {  # macros of cart_rig.h
     "CART_MOTOR_OFFSET": "motor value at which the force starts",
     "CART_MOTOR_PER_NEWTON": "motor values per N beyond it",
     "CART_GENTLE_FORCE": "N, the largest of homing",
+    "CART_SWITCHES": "end switches: 0 none, 1 left, 2 right, 3 both",
 }
 LONGEST_ANSWER = 70  # bytes: 2 * CART_FRAME_BYTES
-SNAPSHOT_NUMBERS = 90
+SNAPSHOT_NUMBERS = 93
 
 
 class CartHead(ctypes.Structure):
@@ -57,6 +58,7 @@ class CartHead(ctypes.Structure):
         ("homing", ctypes.c_bool),
         ("fault", ctypes.c_uint16),
         ("carried_out", ctypes.c_uint8),
+        ("switches", ctypes.c_uint8),
     )
 
 
@@ -117,6 +119,15 @@ class CFirmware:
     def fault(self) -> Fault:
         """The latched faults."""
         return Fault(self._head.fault)
+
+    @property
+    def switches(self) -> int:
+        """The end switches that are pressed, as bits: 1 left, 2 right. Set it before each `look`."""
+        return self._head.switches
+
+    @switches.setter
+    def switches(self, switches: int) -> None:
+        self._head.switches = switches
 
     @property
     def snapshot(self) -> list[int]:
@@ -201,6 +212,7 @@ def rig_macros(hardware: Hardware) -> dict[str, str | int]:
         repr(hardware.motor_offset),
         repr(hardware.motor_per_newton),
         repr(hardware.gentle_force),
+        hardware.switches,
     )
     return dict(zip(RIG, values, strict=True))
 

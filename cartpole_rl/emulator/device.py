@@ -109,6 +109,7 @@ class CartDevice:
             self.now_us = start_us + round(seconds * rate * 1e6)
             if self.now_us - self._looked_us >= LOOK_US:
                 self._looked_us = self.now_us
+                self.firmware.switches = self.physics.switches
                 self.firmware.look(self.now_us - self._booted_us, *self._counts())
                 self._note_motor()
             return self.firmware.motor

@@ -23,7 +23,7 @@ from cartpole_rl.emulator.guards import (
     micrometres,
     nearest_count,
 )
-from cartpole_rl.emulator.homing import Homing, HomingError, Reading, Zeros
+from cartpole_rl.emulator.homing import LEFT, Homing, HomingError, Reading, Zeros
 from cartpole_rl.emulator.settings import LARGEST_MOTOR
 from cartpole_rl.errors import FrameError
 from cartpole_rl.rig.hardware import Hardware, nominal_hardware
@@ -146,6 +146,10 @@ class Firmware:
         self._ticks = 0
         self._measured_us = [0] * KEPT_TICKS  # times of the newest ticks, at their number modulo 4
         self._cart = self._pole = 0  # raw counts that were read last
+        self.switches = 0  # end switches that are pressed, 1 left, 2 right; set it before each `look`
+        self._seen = 0  # switches at the newest look
+        self._pressed = 0  # switches at the newest two looks: a single look may be noise
+        self._pressed_at = 0  # raw count of the cart at the look that saw a switch newly pressed
         self._reset_watches()
 
     @property
@@ -184,12 +188,26 @@ class Firmware:
     def look(self, now_us: int, cart: int, pole: int) -> None:
         """Apply the rules that cannot wait for the end of a period, to the clock and the raw counts."""
         self._expire(now_us)
+        self._see_switches(cart)
         self._limits.sample(now_us, cart, pole)
         self._limit(now_us, cart, pole)
 
+    def _see_switches(self, cart: int) -> None:
+        """Stop a homing cart at a newly pressed switch; fault an armed one at any that is pressed."""
+        switches = self._hardware.switches & self.switches
+        pressed, self._seen = switches & self._seen, switches
+        if pressed & ~self._pressed:
+            self._pressed_at = cart
+            if self.homing:
+                self._line.hold(0)
+        self._pressed = pressed
+        if self.armed and pressed:
+            self._latch(Fault.HARD_LIMIT | Fault(pressed * Fault.LEFT_SWITCH))
+
     def tick(self, now_us: int, cart: int, pole: int) -> list[bytes]:
         """End a period with two raw counts: apply the rules and return the frames to send, STATE last."""
-        reading = Reading(cart, pole, max(1, now_us - self._ticked_us))
+        us = max(1, now_us - self._ticked_us)
+        reading = Reading(cart, pole, us, self._pressed, self._pressed_at)
         self._ticks += 1
         self._measured_us[self._ticks % KEPT_TICKS] = now_us
         self._limits.sample(now_us, cart, pole)
@@ -228,8 +246,14 @@ class Firmware:
             if self.armed and self._limits.lost(now_us, self.motor):
                 self._latch(Fault.CART_ENCODER)
                 self._brake_blindly(now_us)
-            self._limits.apply(now_us, cart - zeros.middle, angle, zeros.half_span, self.armed)
+            self._limits.apply(now_us, self._outward(cart), angle, zeros.half_span, self.armed)
         self._limited |= self.motor != self._line.requested
+
+    def _outward(self, cart: int) -> int:
+        """Return the counts right of the middle. A pressed switch knows the place of slipped counts."""
+        if self._pressed:
+            return -self._zeros.half_span if self._pressed & LEFT else self._zeros.half_span
+        return cart - self._zeros.middle
 
     def _obey(self, envelope: Envelope, now_us: int) -> Message | Reason | None:
         """Carry out a frame and return the answer; None for SET_MOTOR, which the next STATE acknowledges."""
@@ -322,8 +346,8 @@ class Firmware:
             self._pole_zero = end.value.hanging - self._hardware.pole_counts_per_turn // 2 - self._zero_error
             self.homed, self._homing = True, None
             self._line.hold(0)
-        except HomingError:
-            self._latch(Fault.HOMING)
+        except HomingError as error:
+            self._latch(Fault.HOMING | Fault(error.switches * Fault.LEFT_SWITCH))
 
     def _check_faults(self, reading: Reading) -> None:
         """Latch new faults. Homing may touch the stops and detects a stall itself."""
@@ -341,11 +365,11 @@ class Firmware:
             self._latch(Fault.STALL)
 
     def _latch(self, fault: Fault) -> None:
-        """Disarm, set motor 0 and latch the fault. An encoder fault makes the zeros invalid."""
+        """Disarm, set motor 0 and latch the fault. That of an encoder or a switch makes the zeros invalid."""
         self.fault |= fault
         self.armed, self._homing = False, None
         self._line.hold(0)
-        if fault in Fault.CART_ENCODER | Fault.POLE_ENCODER:
+        if fault & (Fault.CART_ENCODER | Fault.POLE_ENCODER | Fault.LEFT_SWITCH | Fault.RIGHT_SWITCH):
             self.homed = False
         if fault == Fault.CART_ENCODER:
             self._limits.release()  # nobody knows where the cart is

@@ -1,4 +1,7 @@
-"""Homing: touch both stops, check the span, centre the cart, wait until the pole hangs still.
+"""Homing: touch both ends, check the span, centre the cart, wait until the pole hangs still.
+
+An end is a stop that holds the cart or, on a rig with end switches, the place where one is pressed. A side
+without a switch is then not visited: it is one span from the other.
 
 Homing works on raw encoder counts, one reading per tick, and needs only rough numbers of the cart (motor
 curve, mass and friction in `Hardware`), as firmware does. Distances and times are whole numbers of counts,
@@ -20,8 +23,13 @@ from cartpole_rl.rig.hardware import Hardware
 SEARCH_SPEED = 0.08  # m/s, towards a stop
 TRAVEL_SPEED = 0.2  # m/s, far from a stop whose position is known
 TOUCH_ZONE = 60_000_000  # nm, distance from such a stop at which the slow search begins
+SWITCH_ZONE = (
+    120_000_000  # the same for a switch, which must not be overrun: SEARCH_SPEED is reached before it
+)
 ASTRAY = 20_000_000  # nm, a motion the wrong way that means a reversed motor or encoder
 FAST = 6  # tenths of a turn a second of a pole that may push a driven cart: 3.8 rad/s
+LEFT, RIGHT = 1, 2  # bits of end switches
+RELEASED = 30_000  # um; so far inside the place where it is pressed, any switch is released
 AGAINST_STOP = 400_000  # us under full push without motion that mean a stop
 STANDS = 300_000  # nm, largest motion in that time, or one count
 LONGEST_SEARCH = 30_000_000, 20  # us for one stop; at least so many for a um of the track
@@ -49,6 +57,8 @@ class Reading:
     cart: int
     pole: int
     us: int
+    pressed: int = 0  # end switches
+    pressed_at: int = 0  # cart count where one was newly pressed
 
     @property
     def seconds(self) -> float:
@@ -76,7 +86,12 @@ class Zeros:
 
 
 class HomingError(CartPoleError):
-    """A stop was not found, the span was wrong, or the pole did not come to rest."""
+    """An end was not found, the span was wrong, or the pole did not come to rest."""
+
+    def __init__(self, text: str, switches: int = 0) -> None:
+        """`switches` are those that are to blame."""
+        super().__init__(text)
+        self.switches = switches
 
 
 class RoughMotor:
@@ -194,6 +209,9 @@ class Homing:
             max(shortest, self._span_um * us) for shortest, us in (LONGEST_SEARCH, LONGEST_CENTRING)
         )
         self._fast = self._turn * FAST // 10  # counts/s
+        self._released = nearest_count(RELEASED, hardware)
+        self._ends = {LEFT: 0, RIGHT: 0}  # raw counts; where homing began, until they are found
+        self._touch_zone = SWITCH_ZONE if hardware.switches else TOUCH_ZONE
         self._full_push = RoughMotor(hardware).value(hardware.gentle_force)
 
     def home(self) -> Generator[int, Reading, Zeros]:
@@ -202,15 +220,12 @@ class Homing:
         Nothing is taken from an earlier homing: its zeros may be why the cart is homed again.
         """
         reading = yield 0
-        reading = yield from self.touch_stop(-1, None, reading)
-        left = reading.cart
-        expected = left + nearest_count(self._span_um, self._hardware)
-        reading = yield from self.touch_stop(+1, expected, reading)
-        right = reading.cart
+        reading = yield from self._touch_ends(reading)
+        left, right = self._ends.values()
         span, nominal = (right - left) * self._nanometres, self._span_um * 1000  # nm
         if abs(span - nominal) > nominal * 3 // 100:
             track = f"{self._hardware.track_span:g} m"
-            raise HomingError(f"the stops are {span / 1e9:.3f} m apart, not {track}")
+            raise HomingError(f"the ends are {span / 1e9:.3f} m apart, not {track}")
         middle = (left + right) // 2
         reading = yield from self.centre(middle, reading)
         hanging, reading = yield from find_hanging(reading)
@@ -218,8 +233,50 @@ class Homing:
         reading = yield from self.centre(middle, reading)
         return Zeros(left, right, (yield from self.wait_until_still(reading)))
 
-    def touch_stop(self, direction: int, expected: int | None, reading: Reading) -> Procedure:
-        """Move until a stop holds the cart. `expected` is its raw count, or None if that is unknown.
+    def _touch_ends(self, reading: Reading) -> Procedure:
+        """Find the ends that have a switch, or without any both stops."""
+        self._ends = {LEFT: reading.cart, RIGHT: reading.cart}
+        span, switches = nearest_count(self._span_um, self._hardware), self._hardware.switches
+        if switches:
+            reading = yield from self.leave_switch(reading)
+        expected = None
+        if switches != RIGHT:
+            reading = yield from self.touch_end(LEFT, None, reading)
+            expected = self._ends[LEFT] + span
+        if switches != LEFT:
+            reading = yield from self.touch_end(RIGHT, expected, reading)
+        if switches == LEFT:
+            self._ends[RIGHT] = self._ends[LEFT] + span
+        if switches == RIGHT:
+            self._ends[LEFT] = self._ends[RIGHT] - span
+        return reading
+
+    def leave_switch(self, reading: Reading) -> Procedure:
+        """Move off the switch that is searched first, if the cart stands on it."""
+        first = self._hardware.switches & LEFT or RIGHT
+        return (yield from self.touch_stop(1 if first == LEFT else -1, None, reading, first, until=0))
+
+    def touch_end(self, side: int, expected: int | None, reading: Reading) -> Procedure:
+        """Move until the switch of a side is pressed, or without switches until a stop holds the cart."""
+        direction, switch = -1 if side == LEFT else 1, self._hardware.switches & side
+        reading = yield from self.touch_stop(direction, expected, reading, switch, until=switch)
+        self._ends[side] = reading.pressed_at if switch else reading.cart
+        return reading
+
+    def _check_switches(self, reading: Reading) -> None:
+        """Raise HomingError if a switch is pressed where it cannot be: with the other one, or far inside."""
+        inside = LEFT * (reading.cart - self._ends[LEFT] > self._released)
+        inside |= RIGHT * (self._ends[RIGHT] - reading.cart > self._released)
+        suspects = reading.pressed & (inside if reading.pressed != LEFT | RIGHT else LEFT | RIGHT)
+        if suspects:
+            raise HomingError(f"{switch_names(suspects)} pressed where the cart cannot press it", suspects)
+
+    def touch_stop(
+        self, direction: int, expected: int | None, reading: Reading, switch: int = 0, until: int = 0
+    ) -> Procedure:
+        """Move until a stop holds the cart, or until the state of a `switch` of the rig is `until`.
+
+        `expected` is the end's raw count, or None if that is unknown.
 
         Raises HomingError if the cart moves the wrong way, faster than at the beginning, when it may have
         rolled, and faster than when a fast pole last pushed it.
@@ -227,7 +284,10 @@ class Homing:
         servo, window, elapsed, before = SpeedServo(self._hardware), Window(AGAINST_STOP), 0, reading
         start, rolled = reading.cart, 0.0
         while elapsed < self._longest_search:
-            far = expected is not None and abs(expected - reading.cart) * self._nanometres > TOUCH_ZONE
+            self._check_switches(reading)
+            if switch and reading.pressed & switch == until:
+                return reading
+            far = expected is not None and abs(expected - reading.cart) * self._nanometres > self._touch_zone
             speed = (reading.cart - before.cart) * self._metres / reading.seconds
             fast = pole_speed(before, reading) > self._fast
             if elapsed <= reading.us or fast:  # two readings give the first speed
@@ -239,16 +299,19 @@ class Homing:
             window.add(reading.cart, reading.us)
             motor = servo.motor(direction * (TRAVEL_SPEED if far else SEARCH_SPEED), speed, reading.seconds)
             if window.spread <= self._stands and motor == direction * self._full_push:
+                if switch:
+                    raise HomingError(f"the cart stands, and {switch_names(switch)} as before", switch)
                 return reading
             reading = yield motor
             elapsed += reading.us
         side, seconds = "right" if direction > 0 else "left", self._longest_search / 1e6
-        raise HomingError(f"no {side} stop within {seconds:.0f} s")
+        raise HomingError(f"no end found on the {side} within {seconds:.0f} s", switch)
 
     def centre(self, middle: int, reading: Reading) -> Procedure:
         """Move gently to the middle and switch the motor off."""
         servo, elapsed, before, start = SpeedServo(self._hardware), 0, reading, reading.cart
         while elapsed < self._longest_centring:
+            self._check_switches(reading)
             away = middle - reading.cart
             if abs(away) * self._nanometres < CENTRED:
                 return reading
@@ -298,6 +361,13 @@ class Homing:
     def _swing(self, centidegrees: int) -> int:
         """Return an angle in counts, at least one."""
         return max(1, (centidegrees * self._turn + 18_000) // 36_000)
+
+
+def switch_names(switches: int) -> str:
+    """Return which end switches the bits mean, for a message."""
+    return {LEFT: "the left end switch is", RIGHT: "the right end switch is"}.get(
+        switches, "both end switches are"
+    )
 
 
 def find_hanging(reading: Reading) -> Generator[int, Reading, tuple[int, Reading]]:

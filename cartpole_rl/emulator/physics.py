@@ -4,6 +4,7 @@ Coordinates: x in m from the middle of the rail, angle in rad from upright; both
 tilt of the rail is a rotation of gravity, so MuJoCo's joint angle, which is measured from the normal of the
 rail, is the angle minus the tilt. Dry friction is MuJoCo's friction loss, made almost rigid (with the soft
 default a cart at rest would creep); the stops are stiff joint limits.
+Where the rig has an end switch, the track ends there, and a stop lies a little behind it.
 """
 
 import math
@@ -12,10 +13,12 @@ from types import ModuleType
 
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import EmulatorError
-from cartpole_rl.rig.hardware import LARGEST_MOTOR
+from cartpole_rl.rig.hardware import LARGEST_MOTOR, nominal_hardware
 
 GRAVITY = 9.81  # m/s^2
 LEAST_FELT = 1e-6  # share of the pole's force
+STOP_BEHIND = 0.005  # m from where an end switch is pressed to the stop: a homing cart runs on for 3 mm
+HYSTERESIS = 0.001  # m inward of where it is pressed, an end switch is released
 AT_REST = 1e-4  # m/s; below this speed the breakaway friction applies
 MODEL = """
 <mujoco>
@@ -29,7 +32,7 @@ MODEL = """
   </default>
   <worldbody>
     <body>
-      <joint type="slide" axis="1 0 0" range="-{track_half_length} {track_half_length}"/>
+      <joint type="slide" axis="1 0 0" range="{left_stop} {right_stop}"/>
       <inertial pos="0 0 0" mass="{cart_mass}" diaginertia="0.001 0.001 0.001"/>
       <body>
         <joint type="hinge" axis="0 1 0" damping="{pole_viscous}" frictionloss="{pole_coulomb}"/>
@@ -94,7 +97,14 @@ class CartPhysics:
         thin = settings.pole_inertia * 1e-3  # about the pole's own axis, about which nothing rotates
         # A motor that feels a share of the pole moves as a cart that is so much heavier, under larger forces.
         self._larger = larger = 1 / max(settings.backdrivability, LEAST_FELT)
+        self._rig = settings.hardware or nominal_hardware()
+        half = settings.track_half_length
+        self._left_stop = -half - STOP_BEHIND * self._rig.left_switch
+        self._right_stop = half + STOP_BEHIND * self._rig.right_switch
+        self.switches = 0  # end switches that the cart presses, as bits: 1 left, 2 right
         numbers = settings.model_dump() | {
+            "left_stop": self._left_stop,
+            "right_stop": self._right_stop,
             "cart_mass": larger * settings.cart_mass,
         }
         self._viscous = larger * settings.cart_viscous  # N s/m at full motor
@@ -137,6 +147,7 @@ class CartPhysics:
         """Place the cart at x m, at rest, and the pole at an angle and angular velocity, rad and rad/s."""
         self._data.qpos[0] = x
         self._data.qvel[0] = 0.0
+        self._press_switches()
         self.place_pole(angle, angle_dot)
 
     def place_pole(self, angle: float, angle_dot: float = 0.0) -> None:
@@ -166,6 +177,7 @@ class CartPhysics:
             speed = abs(velocity[0])
             self._mj_step(self._model, self._data)
             self._notice_contact(speed)
+            self._press_switches()
             if look is not None and (chosen := look(number * step)) != motor:
                 motor, target = chosen, self._enforce(chosen)
 
@@ -176,10 +188,17 @@ class CartPhysics:
 
     def _notice_contact(self, speed: float) -> None:
         """Report it if the cart, which ran at `speed` m/s, has just touched an end stop."""
-        touches = abs(self._data.qpos[0]) >= self._settings.track_half_length
+        touches = not self._left_stop < self._data.qpos[0] < self._right_stop
         if touches and not self._touches and self.on_contact is not None:
             self.on_contact(speed)
         self._touches = touches
+
+    def _press_switches(self) -> None:
+        """Press the switches that the rig has, at the ends of the track."""
+        x, half = self._data.qpos[0], self._settings.track_half_length
+        left = -x >= half - HYSTERESIS * (self.switches & 1)
+        right = x >= half - HYSTERESIS * (self.switches >> 1)
+        self.switches = self._rig.switches & (left + 2 * right)
 
     def _cogging(self, x: float) -> float:
         """Return the cogging force, which pulls the cart to the nearest stable position, N."""

@@ -45,7 +45,7 @@ class EmulatorSettings(Settings):
     pole_mass: Positive = 0.129  # kg
     pole_com: Positive = 0.1765  # m, pivot to centre of mass
     pole_inertia: Positive = 1.22e-3  # kg m^2, about the centre of mass
-    track_half_length: Annotated[float, Field(ge=0.05, le=10)] = 0.409  # m, middle to a stop
+    track_half_length: Annotated[float, Field(ge=0.05, le=10)] = 0.409  # m, middle to a stop or an end switch
 
     cart_viscous: NonNegative = 0.65  # N s/m
     cart_coulomb_left: NonNegative = 0.58  # N, while the cart moves left

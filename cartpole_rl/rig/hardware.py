@@ -64,6 +64,8 @@ class Hardware(Settings):
     motor_offset: Annotated[float, Field(ge=0, le=LARGEST_MOTOR)]  # motor value at which the force starts
     motor_per_newton: Positive
     gentle_force: Positive  # N, the largest of homing
+    left_switch: Annotated[int, Field(ge=0, le=1)]  # 1: a switch marks that end of `track_span`, not a stop
+    right_switch: Annotated[int, Field(ge=0, le=1)]
 
     @model_validator(mode="after")
     def _limits_lie_on_the_track(self) -> Self:
@@ -103,6 +105,11 @@ class Hardware(Settings):
     def half_span(self) -> float:
         """Middle of the track to a stop, m."""
         return self.track_span / 2
+
+    @property
+    def switches(self) -> int:
+        """The end switches that the rig has, as bits: 1 left, 2 right."""
+        return self.left_switch + 2 * self.right_switch
 
     @property
     def breakaway_motor(self) -> float:

@@ -54,6 +54,9 @@ class Fault(IntFlag):
     CART_ENCODER = 0x0004
     POLE_ENCODER = 0x0008
     HOMING = 0x0010  # the cart moved the wrong way, no stop was found, the span was wrong, or the pole swings
+    # with HOMING or HARD_LIMIT: an end switch was pressed where it cannot be, or not pressed at its end
+    LEFT_SWITCH = 0x0020
+    RIGHT_SWITCH = 0x0040
 
 
 class Reason(IntEnum):

@@ -94,6 +94,9 @@ static void add_core(list *all, const cart *self)
     add(all, self->pole_zero);
     add(all, self->line.requested);
     add(all, self->line.pending);
+    add(all, self->seen);
+    add(all, self->procedure.pressed);
+    add(all, self->procedure.pressed_at);
 }
 
 static void add_limits(list *all, const cart *self)

@@ -8,6 +8,8 @@
 #define LONGEST_TICK_US 1000000000u /* a longer period counts as this long */
 #define NO_AGE 65535u
 #define KEPT_TICKS (CART_WATCHDOG_PERIODS + 1)
+#define SWITCH_FAULTS (CART_SWITCHES * CART_FAULT_LEFT_SWITCH)
+#define UNHOMING (CART_FAULT_CART_ENCODER | CART_FAULT_POLE_ENCODER | SWITCH_FAULTS)
 
 void cart_boot(cart *self)
 {
@@ -157,23 +159,31 @@ static cart_reason objection(const cart *self, const cart_envelope *envelope, ui
     return old && cart_read_i16(envelope->payload) != 0 ? CART_STALE : CART_ACCEPTED;
 }
 
-/* Disarm, set motor 0 and latch the fault. An encoder fault makes the zeros invalid. */
+/* Disarm, set motor 0 and latch the fault. That of an encoder or a switch makes the zeros invalid. */
 static void latch(cart *self, uint16_t fault)
 {
     self->fault |= fault;
     self->armed = self->homing = self->self_driven = false;
     cart_line_hold(&self->line, 0);
-    if (fault & (CART_FAULT_CART_ENCODER | CART_FAULT_POLE_ENCODER))
+    if (fault & UNHOMING)
         self->homed = false;
     if (fault & CART_FAULT_CART_ENCODER)
         cart_limits_release(&self->limits); /* nobody knows where the cart is */
 }
 
+/* Counts right of the middle. A pressed switch knows the place of a cart whose counts slipped. */
+static int64_t outward(const cart *self, int32_t cart_count)
+{
+    uint8_t pressed = CART_SWITCHES & self->procedure.pressed;
+    if (pressed)
+        return (pressed & CART_LEFT ? -1 : 1) * (int64_t)cart_zeros_half_span(&self->zeros);
+    return (int64_t)cart_count - cart_zeros_middle(&self->zeros);
+}
+
 /* Let the limits of the track decide, which need the zeros of a homing. */
 static void apply_limits(cart *self, uint64_t now_us, int32_t cart_count, int32_t pole_count)
 {
-    cart_place place = {(int64_t)cart_count - cart_zeros_middle(&self->zeros),
-                        (int64_t)pole_count - self->pole_zero, cart_zeros_half_span(&self->zeros),
+    cart_place place = {outward(self, cart_count), (int64_t)pole_count - self->pole_zero, cart_zeros_half_span(&self->zeros),
                         self->pole_lever_um, self->armed};
     self->cart_count = cart_count;
     self->pole_count = pole_count;
@@ -324,7 +334,8 @@ static void step_homing(cart *self, const cart_reading *reading)
         cart_line_hold(&self->line, 0);
         break;
     default: /* CART_HOMING_FAILED */
-        latch(self, CART_FAULT_HOMING);
+        latch(self, CART_FAULT_HOMING |
+                        (SWITCH_FAULTS & (self->procedure.suspects * CART_FAULT_LEFT_SWITCH)));
         break;
     }
 }
@@ -350,9 +361,28 @@ static bool expire(cart *self, uint64_t now_us)
     return true;
 }
 
+/* A newly pressed switch stops a homing cart at once. Any that is pressed is the hard limit of an armed one. */
+static void see_switches(cart *self, int32_t cart_count)
+{
+    cart_homing *homing = &self->procedure;
+    uint8_t switches = CART_SWITCHES & self->switches;
+    uint8_t pressed = switches & self->seen;
+    self->seen = switches;
+    if (pressed & ~homing->pressed) {
+        homing->pressed_at = cart_count;
+        if (self->homing)
+            cart_line_hold(&self->line, 0);
+    }
+    homing->pressed = pressed;
+    if (self->armed && pressed)
+        latch(self, (uint16_t)(CART_FAULT_HARD_LIMIT | pressed * CART_FAULT_LEFT_SWITCH));
+}
+
 void cart_look(cart *self, uint64_t now_us, int32_t cart_count, int32_t pole_count)
 {
     expire(self, now_us);
+    if (CART_SWITCHES)
+        see_switches(self, cart_count);
     cart_limits_sample(&self->limits, now_us, cart_count, pole_count);
     apply_limits(self, now_us, cart_count, pole_count);
 }

@@ -62,6 +62,8 @@ typedef struct {
     uint16_t fault;      /* latched faults */
     uint8_t carried_out; /* type of the message that cart_receive carried out; 0: refused or damaged */
 
+    uint8_t switches; /* set it before each cart_look if CART_SWITCHES is not 0: those pressed, CART_LEFT, _RIGHT */
+
     /* Private. */
     cart_motor_line line;
     cart_limits limits;
@@ -84,6 +86,7 @@ typedef struct {
     uint32_t ticks;
     uint8_t last_sequence; /* of the host */
     uint8_t sequence;      /* of the next frame sent */
+    uint8_t seen;          /* switches at the newest look */
     cart_homing procedure;
 } cart;
 

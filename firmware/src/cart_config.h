@@ -23,6 +23,11 @@
 #define CART_WATCHDOG_PERIODS 3u /* after a state was measured, no value that answers it is in force any more */
 #define CART_LEASE_US 500000u     /* without an accepted frame, after which homing ends */
 
+/* Bits of end switches: in CART_SWITCHES, those that the rig has. */
+#define CART_LEFT 1u
+#define CART_RIGHT 2u
+#define CART_BOTH 3u
+
 /* The nearest whole count to a positive distance in um. */
 #define CART_COUNTS(um) ((int32_t)(((int64_t)(um)*1000 + CART_NANOMETRES / 2) / CART_NANOMETRES))
 

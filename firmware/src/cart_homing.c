@@ -11,9 +11,14 @@
 
 #define SEARCH_SPEED 0.08 /* m/s, towards a stop */
 #define TRAVEL_SPEED 0.2  /* m/s, far from a stop whose position is known */
-#define TOUCH_ZONE_NM 60000000 /* distance from such a stop at which the slow search begins */
+/* Distance from such a stop at which the slow search begins. A switch must not be overrun: the cart is slow before. */
+#define TOUCH_ZONE_NM (CART_SWITCHES ? 120000000 : 60000000)
 #define ASTRAY_NM 20000000 /* a motion the wrong way that means a reversed motor or encoder */
 #define FAST_POLE (CART_POLE_COUNTS * 6 / 10) /* counts/s; it may move the cart against its motor: 3.8 rad/s */
+#define RELEASED CART_COUNTS(30000) /* so far inside the place where it is pressed, any switch is released: 30 mm */
+#define FIRST_SWITCH (CART_SWITCHES & CART_LEFT ? CART_LEFT : CART_SWITCHES)
+#define EXPECTS_RIGHT(homing) \
+    (!CART_SWITCHES || ((homing)->stage == CART_TOUCH_RIGHT && CART_SWITCHES != CART_RIGHT))
 #define AGAINST_STOP_US 400000u /* under full push without motion that mean a stop */
 #define STANDS_COUNTS AT_LEAST_ONE(300000 / CART_NANOMETRES) /* largest motion in that time: 0.3 mm */
 #define LONGEST_SEARCH_US (CART_SPAN_UM > 1500000 ? CART_SPAN_UM * 20u : 30000000u) /* for one stop */
@@ -59,7 +64,7 @@ static void enter(cart_homing *homing, cart_homing_stage stage)
 
 void cart_homing_begin(cart_homing *homing)
 {
-    enter(homing, CART_TOUCH_LEFT);
+    enter(homing, CART_SWITCHES ? CART_LEAVE_SWITCH : CART_TOUCH_LEFT);
 }
 
 /* Count the time of a stage; return true for its first reading. */
@@ -102,15 +107,39 @@ static bool goes_astray(cart_homing *homing, const cart_reading *reading, int di
     return moved * CART_NANOMETRES > ASTRAY_NM && wrong > homing->rolled;
 }
 
-/* Move until a stop holds the cart. The right stop is expected one span from the left one. */
-static outcome touch_stop(cart_homing *homing, const cart_reading *reading, int direction, int16_t *motor)
+/* True if a switch is pressed where it cannot be: both at once, or far inside the end that it marks. */
+static bool switches_lie(cart_homing *homing, int32_t cart)
+{
+    bool far_left = (int64_t)cart - homing->zeros.left_stop > RELEASED;
+    bool far_right = (int64_t)homing->zeros.right_stop - cart > RELEASED;
+    unsigned inside = (far_left ? CART_LEFT : 0u) | (far_right ? CART_RIGHT : 0u);
+    homing->suspects = (uint8_t)(homing->pressed & (homing->pressed == CART_BOTH ? CART_BOTH : inside));
+    return homing->suspects != 0;
+}
+
+/* A switch should have ended the motion; without one, a stop has to. */
+static outcome misses(cart_homing *homing, uint8_t side)
+{
+    if (CART_SWITCHES)
+        homing->suspects = side;
+    return FAILS;
+}
+
+/* Move until a stop holds the cart or, with switches, until that of `side` is `pressed` or released. The right end is
+   expected one span from the left one. */
+static outcome touch_stop(cart_homing *homing, const cart_reading *reading, int direction, uint8_t side,
+                          bool pressed, int16_t *motor)
 {
     first_reading(homing, reading, AGAINST_STOP_US);
     if (homing->elapsed_us >= LONGEST_SEARCH_US)
+        return misses(homing, side);
+    if (CART_SWITCHES && switches_lie(homing, reading->cart))
         return FAILS;
+    if (CART_SWITCHES && ((homing->pressed & side) != 0) == pressed)
+        return ENDS;
     int64_t expected = (int64_t)homing->zeros.left_stop + CART_COUNTS(CART_SPAN_UM);
     int64_t away = expected > reading->cart ? expected - reading->cart : reading->cart - expected;
-    bool far = direction > 0 && away * CART_NANOMETRES > TOUCH_ZONE_NM;
+    bool far = direction > 0 && EXPECTS_RIGHT(homing) && away * CART_NANOMETRES > TOUCH_ZONE_NM;
     double speed = cart_speed(homing, reading);
     if (goes_astray(homing, reading, direction, speed))
         return FAILS;
@@ -119,11 +148,42 @@ static outcome touch_stop(cart_homing *homing, const cart_reading *reading, int 
     *motor = cart_servo_motor(&homing->servo, direction * (far ? TRAVEL_SPEED : SEARCH_SPEED), speed,
                               seconds(reading));
     bool stands = cart_window_spread(&homing->window) <= STANDS_COUNTS;
-    return stands && *motor == direction * CART_FULL_PUSH ? ENDS : YIELDS;
+    if (!stands || *motor != direction * CART_FULL_PUSH)
+        return YIELDS;
+    return CART_SWITCHES ? misses(homing, side) : ENDS;
 }
 
-static bool span_is_right(const cart_zeros *zeros)
+#if CART_SWITCHES
+/* Move off the switch that is searched first, if the cart stands on it. */
+static outcome leave_switch(cart_homing *homing, const cart_reading *reading, int16_t *motor)
 {
+    if (!homing->entered)
+        homing->zeros.left_stop = homing->zeros.right_stop = reading->cart;
+    return touch_stop(homing, reading, FIRST_SWITCH == CART_LEFT ? 1 : -1, FIRST_SWITCH, false, motor);
+}
+#endif
+
+/* Find the end on a side, unless only the other one has a switch: then the span tells where it is. */
+static outcome touch_end(cart_homing *homing, const cart_reading *reading, int direction, int32_t *end,
+                         int16_t *motor)
+{
+    uint8_t side = direction < 0 ? CART_LEFT : CART_RIGHT;
+    if (CART_SWITCHES && !(CART_SWITCHES & side))
+        return ENDS;
+    outcome how = touch_stop(homing, reading, direction, side, true, motor);
+    if (!CART_SWITCHES)
+        *end = reading->cart;
+    else if (how == ENDS)
+        *end = homing->pressed_at;
+    return how;
+}
+
+static bool span_is_right(cart_zeros *zeros)
+{
+    if (CART_SWITCHES == CART_LEFT)
+        zeros->right_stop = zeros->left_stop + CART_COUNTS(CART_SPAN_UM);
+    if (CART_SWITCHES == CART_RIGHT)
+        zeros->left_stop = zeros->right_stop - CART_COUNTS(CART_SPAN_UM);
     int64_t span_nm = ((int64_t)zeros->right_stop - zeros->left_stop) * CART_NANOMETRES;
     return span_nm >= SPAN_NM - SPAN_TOLERANCE_NM && span_nm <= SPAN_NM + SPAN_TOLERANCE_NM;
 }
@@ -132,7 +192,7 @@ static bool span_is_right(const cart_zeros *zeros)
 static outcome centre(cart_homing *homing, const cart_reading *reading, int16_t *motor)
 {
     first_reading(homing, reading, 0);
-    if (homing->elapsed_us >= LONGEST_CENTRING_US)
+    if (homing->elapsed_us >= LONGEST_CENTRING_US || (CART_SWITCHES && switches_lie(homing, reading->cart)))
         return FAILS;
     int32_t middle = cart_zeros_middle(&homing->zeros);
     if (cart_distance(middle, reading->cart) * CART_NANOMETRES < CENTRED_NM)
@@ -207,13 +267,14 @@ static outcome handle(cart_homing *homing, const cart_reading *reading, int16_t 
 {
     outcome how;
     switch (homing->stage) {
+#if CART_SWITCHES
+    case CART_LEAVE_SWITCH:
+        return leave_switch(homing, reading, motor);
+#endif
     case CART_TOUCH_LEFT:
-        how = touch_stop(homing, reading, -1, motor);
-        homing->zeros.left_stop = reading->cart;
-        return how;
+        return touch_end(homing, reading, -1, &homing->zeros.left_stop, motor);
     case CART_TOUCH_RIGHT:
-        how = touch_stop(homing, reading, 1, motor);
-        homing->zeros.right_stop = reading->cart;
+        how = touch_end(homing, reading, 1, &homing->zeros.right_stop, motor);
         return how == ENDS && !span_is_right(&homing->zeros) ? FAILS : how;
     case CART_FIND_HANGING:
         return find_hanging(homing, reading, motor);

@@ -1,4 +1,7 @@
-/* Homing: touch both stops, check the span, centre the cart, wait until the pole hangs still.
+/* Homing: touch both ends, check the span, centre the cart, wait until the pole hangs still.
+
+   An end is a stop that holds the cart or, on a rig with end switches, the place where one is pressed. A side without
+   a switch is then not visited: it is one span from the other.
 
    One step a period, on raw counts. It needs only rough numbers of the cart. The pole's zero is the middle of
    its last small swing: friction in the bearing holds a stopped pole up to a count off the vertical. */
@@ -26,6 +29,7 @@ typedef struct {
 typedef enum { CART_HOMING_GOES_ON, CART_HOMING_DONE, CART_HOMING_FAILED } cart_homing_status;
 
 typedef enum {
+    CART_LEAVE_SWITCH, /* on which the cart may stand */
     CART_TOUCH_LEFT,
     CART_TOUCH_RIGHT,
     CART_CENTRE,
@@ -39,11 +43,14 @@ typedef enum {
 typedef struct {
     cart_homing_stage stage;
     bool entered;        /* the stage has handled a reading */
+    uint8_t pressed;     /* switches at the newest two looks, also without homing: a single look may be noise */
+    uint8_t suspects;    /* switches for which homing failed */
     uint32_t elapsed_us; /* since the stage began */
     cart_reading before; /* the reading before the present one */
     int32_t start;       /* cart count when the stage began, or when the pole was last fast */
     double rolled;       /* m/s the wrong way then */
-    cart_zeros zeros;    /* as far as they are found */
+    cart_zeros zeros;    /* as far as they are found; before that, ends are where homing began */
+    int32_t pressed_at;  /* cart count at the look that saw a switch newly pressed */
     int64_t fastest;     /* counts/s of the pole, while the hanging count is searched */
     cart_servo servo;
     cart_window window;

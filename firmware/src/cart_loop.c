@@ -70,6 +70,9 @@ static void look(cart_loop *loop)
     if (loop->now_us - loop->looked_us < LOOK_US)
         return;
     loop->looked_us = loop->now_us;
+#if CART_SWITCHES
+    loop->core.switches = cart_hardware_switches();
+#endif
     cart_look(&loop->core, loop->now_us, cart_hardware_cart_count(), cart_hardware_pole_count());
     apply_motor(loop);
 }

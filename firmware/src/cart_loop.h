@@ -1,6 +1,6 @@
 /* The cart's main loop over a board's hardware.
 
-   A board provides the six functions below and calls cart_loop_boot once and cart_loop_poll again and again,
+   A board provides the functions below and calls cart_loop_boot once and cart_loop_poll again and again,
    at least once a millisecond. No function may block. */
 #ifndef CART_LOOP_H
 #define CART_LOOP_H
@@ -17,6 +17,11 @@ uint32_t cart_hardware_clock_us(void);
 /* The count of an encoder since boot, positive to the right, 4 counts per line of the disc. */
 int32_t cart_hardware_cart_count(void);
 int32_t cart_hardware_pole_count(void);
+
+#if CART_SWITCHES
+/* The end switches that are pressed: CART_LEFT, CART_RIGHT or both. */
+uint8_t cart_hardware_switches(void);
+#endif
 
 /* Put a motor value, -255 to 255, on the motor; 0 must leave it without power. */
 void cart_hardware_set_motor(int16_t value);

@@ -35,7 +35,9 @@ enum {
     CART_FAULT_STALL = 0x0002,
     CART_FAULT_CART_ENCODER = 0x0004,
     CART_FAULT_POLE_ENCODER = 0x0008,
-    CART_FAULT_HOMING = 0x0010
+    CART_FAULT_HOMING = 0x0010,
+    CART_FAULT_LEFT_SWITCH = 0x0020, /* times CART_RIGHT: that of the right switch */
+    CART_FAULT_RIGHT_SWITCH = 0x0040
 };
 
 typedef enum {

@@ -39,5 +39,8 @@
 #ifndef CART_GENTLE_FORCE
 #define CART_GENTLE_FORCE 3.0 /* N, the largest of homing */
 #endif
+#ifndef CART_SWITCHES
+#define CART_SWITCHES 0 /* end switches: 0 none, 1 left, 2 right, 3 both */
+#endif
 
 #endif

@@ -7,7 +7,7 @@ from typing import Any
 from cartpole_rl.emulator.firmware import Firmware
 from cartpole_rl.emulator.guards import SAMPLES
 
-STAGES = {"find_hanging": 3, "brake_swing": 4, "wait_until_still": 6}  # of homing; see stage_of
+STAGES = {"find_hanging": 4, "brake_swing": 5, "wait_until_still": 7}  # of homing; see stage_of
 
 
 def state_of(firmware: Firmware) -> list[int]:
@@ -39,6 +39,9 @@ def core(firmware: Any) -> list[int]:
         firmware._pole_zero,
         line.requested,
         len(line._pending),
+        firmware._seen,
+        firmware._pressed,
+        firmware._pressed_at,
     ]
 
 
@@ -111,7 +114,7 @@ def homing(firmware: Any) -> list[int]:
         bits(servo._integral) if servo else 0,
         len(window._counts) if window else 0,
         int(window.spread) if window and window._full else -1,
-        local["hanging"] if stage in (3, 4) else 0,
+        local["hanging"] if stage in (4, 5) else 0,
     ]
 
 
@@ -128,9 +131,10 @@ def stage_of(stack: list[Any]) -> int:
     """Return the number of the stage of homing, as in ``firmware/src/cart_homing.h``."""
     name, local = stack[-1].gi_code.co_name, stack[-1].gi_frame.f_locals
     if name == "touch_stop":
-        return 0 if local["direction"] < 0 else 1
+        leaves = stack[-2].gi_code.co_name == "leave_switch"
+        return 0 if leaves else 1 if local["direction"] < 0 else 2
     if name == "centre":
-        return 2
+        return 3
     return STAGES[name]
 
 

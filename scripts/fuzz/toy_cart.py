@@ -7,6 +7,7 @@ from cartpole_rl.rig.hardware import Hardware
 
 GRAVITY, LENGTH = 9.81, 0.24  # m/s^2 and m, of the pole as a pendulum
 STEP = 1e-3  # s, longest step
+PRESSED = 0.005  # m before a stop, an end switch is pressed
 
 
 class ToyCart:
@@ -21,6 +22,7 @@ class ToyCart:
         self._origin = self._counts()
         self._frozen: dict[str, int] = {}
         self._jammed = False
+        self._stuck: tuple[bool, bool] | None = None  # both switches, whatever the cart does
 
     def advance(self, motor: int, us: int) -> None:
         """Move for `us` under one motor value."""
@@ -46,12 +48,17 @@ class ToyCart:
         cart, pole = (now - then for now, then in zip(self._counts(), self._origin, strict=True))
         return self._frozen.get("cart", cart), self._frozen.get("pole", pole)
 
+    def switches(self) -> int:
+        """Return the end switches that are pressed, a little before the stops."""
+        left, right = self._stuck or (side * self._x > self._half - PRESSED for side in (-1, 1))
+        return left + 2 * right
+
     def maybe_fail(self, share: float) -> None:
-        """With a small chance, freeze an encoder, free it again, jam or throw the cart, or turn the pole."""
+        """With a small chance, freeze an encoder or the switches, jam or throw the cart, or turn the pole."""
         if self._dice.random() >= share:
             return
         cart, pole = self.counts()
-        match self._dice.randrange(6):
+        match self._dice.randrange(7):
             case 0:
                 self._frozen["cart"] = cart
             case 1:
@@ -62,13 +69,15 @@ class ToyCart:
                 self._jammed = True
             case 4:
                 self._x = self._dice.uniform(-self._half, self._half)
+            case 5:
+                self._stuck = self._dice.choice([(False, True), (True, False), (True, True)])
             case _:
                 self._rate += self._dice.uniform(-30, 30)
 
     def repair(self) -> None:
-        """Free the encoders and the cart, and put the cart near the middle."""
+        """Free the encoders, the switches and the cart, and put the cart near the middle."""
         self._frozen.clear()
-        self._jammed = False
+        self._jammed, self._stuck = False, None
         self._x, self._v = self._half * self._dice.uniform(-0.25, 0.25), 0.0
 
     def _counts(self) -> tuple[int, int]:

@@ -112,10 +112,11 @@ class Pair:
         self.now_us = dues[leader]
         return motors[leader]
 
-    def look(self, cart: int, pole: int) -> None:
-        """Look at the counts."""
+    def look(self, cart: int, pole: int, switches: int = 0) -> None:
+        """Look at the counts and the end switches."""
         self.counts["looks"] += 1
         for firmware in (self.python, self.c):
+            firmware.switches = switches
             firmware.look(self.now_us, cart, pole)
         self.counts["braked looks"] += self.python._limits.brake != 0
         self._same_state()
@@ -178,7 +179,7 @@ def traffic(kind: str, pair: Pair, dice: random.Random, size: int) -> None:
             end_us = pair.now_us + dice.choice([pair.python.period_us, dice.randint(1, 200_000)])
             while pair.now_us < end_us:
                 pair.drive(min(end_us, pair.now_us + dice.randint(1, 60_000)), 0)
-                pair.look(cart, pole)
+                pair.look(cart, pole, dice.choice([0, 0, 0, 0, 0, 0, 1, 2, 3, 255]))
             pair.tick(cart, pole)
 
 
@@ -198,7 +199,7 @@ def rough_drive(pair: Pair, dice: random.Random, leader: int) -> None:
             while (since_us := pair.now_us) < end_us:
                 motor = pair.drive(min(end_us, since_us + between_looks_us), leader)
                 toy.advance(motor, pair.now_us - since_us)
-                pair.look(*toy.counts())
+                pair.look(*toy.counts(), toy.switches())
             if dice.random() < strange:
                 pair.feed(any_frame(dice, pair.python._ticks))
         toy.maybe_fail(failing)

@@ -40,7 +40,7 @@ PORT = re.compile(r"char device redirected to (\S+) \(label host\)")
 MOTOR, CLOCK, COUNT = struct.Struct("<Ih"), struct.Struct("<I"), struct.Struct("<i")
 PATIENCE = 20.0  # s for QEMU to start
 BOOT = (0.05, math.pi)  # m from the middle and rad from upright
-ENCODERS = (b"X", b"P")  # what the board sends to ask for a count
+ASKED = (b"X", b"P", b"S")  # what the board sends to ask for a count, or for the end switches
 
 
 def missing_programs() -> list[str]:
@@ -49,7 +49,7 @@ def missing_programs() -> list[str]:
 
 
 class Pins:
-    """The motor and the two encoders at the pins of the board, on a cart with physics."""
+    """The motor, the two encoders and the end switches at the pins of the board, on a cart with physics."""
 
     def __init__(self, settings: EmulatorSettings) -> None:
         self._physics = CartPhysics(settings)
@@ -63,10 +63,11 @@ class Pins:
         """Answer the board until it is gone."""
         with line.makefile("rb") as stream:
             while kind := stream.read(1):
-                if kind in ENCODERS:
+                if kind in ASKED:
                     self._advance(*CLOCK.unpack(stream.read(CLOCK.size)))
-                    number = ENCODERS.index(kind)
-                    line.sendall(COUNT.pack(self._discs()[number] - self._boot[number]))
+                    cart, pole = (now - boot for now, boot in zip(self._discs(), self._boot, strict=True))
+                    answers = dict(zip(ASKED, (cart, pole, self._physics.switches), strict=True))
+                    line.sendall(COUNT.pack(answers[kind]))
                 else:
                     clock_us, motor = MOTOR.unpack(stream.read(MOTOR.size))
                     self._advance(clock_us)

@@ -21,6 +21,7 @@ RIG = {
     "motor_offset": 25,
     "motor_per_newton": 83,
     "gentle_force": 2.2,
+    "right_switch": 1,
 }
 MOTION = {
     "cart_mass": 0.4,
@@ -56,6 +57,7 @@ def test_its_firmware_has_its_numbers(folder: Path) -> None:
     assert "of cart=lab.yaml." in header
     assert "#define CART_NANOMETRES 40000 " in header
     assert "#define CART_POLE_COUNTS 2400 " in header
+    assert "#define CART_SWITCHES 2 " in header
     words = ("format=firmware", "cart=lab.yaml", "cart.track_span=0.5", "hydra.run.dir=longer")
     assert in_process("export", *words, folder=folder).code == 0
     header = (folder / "longer" / "cart_rig.h").read_text()

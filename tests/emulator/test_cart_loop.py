@@ -7,7 +7,16 @@ import pytest
 from firmwares import needs_compiler
 
 from cartpole_rl.emulator.c_firmware import compile_c, firmware_folder
-from cartpole_rl.wire import FrameSplitter, Hello, Message, StartPolicy, State, decode_frame, encode_frame
+from cartpole_rl.wire import (
+    Fault,
+    FrameSplitter,
+    Hello,
+    Message,
+    StartPolicy,
+    State,
+    decode_frame,
+    encode_frame,
+)
 
 pytestmark = needs_compiler
 BENCH = Path(__file__).parents[1] / "support" / "loop" / "bench.c"
@@ -50,7 +59,11 @@ class Bench:
 @pytest.fixture(scope="module")
 def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("loop") / "loop.so"
-    compile_c(path, [*sorted(firmware_folder().glob("src/*.c")), BENCH], "-shared", "-fPIC")
+    return compiled(path)
+
+
+def compiled(path: Path, *flags: str) -> Path:
+    compile_c(path, [*sorted(firmware_folder().glob("src/*.c")), BENCH], "-shared", "-fPIC", *flags)
     return path
 
 
@@ -80,3 +93,16 @@ def test_a_policy_is_asked_after_state_was_written_and_its_value_is_put_on_the_m
     assert bench.library.bench_written_when_asked() == len(bench.output)
     assert bench.states[-1].motor_applied == 0
     assert bench.library.bench_motor() == 100
+
+
+def test_an_end_switch_is_read_at_each_look(tmp_path: Path) -> None:
+    bench = Bench(compiled(tmp_path / "switches.so", "-DCART_SWITCHES=2"))
+    bench.send(StartPolicy())
+    bench.send(Hello())
+    bench.ends([0, 100, PERIOD])
+    assert bench.library.bench_motor() == 100
+    bench.library.bench_press(3)  # the rig has no left one
+    bench.ends([PERIOD + 1000, PERIOD + 2000])
+    assert bench.library.bench_motor() == 0
+    bench.ends([2 * PERIOD])
+    assert bench.states[-1].fault == Fault.HARD_LIMIT | Fault.RIGHT_SWITCH

@@ -28,13 +28,15 @@ OTHER = {
     "motor_offset": 31.5,
     "motor_per_newton": 90.3,
     "gentle_force": 1.7,
+    "left_switch": 1,
+    "right_switch": 1,
 }
 
 
 @pytest.mark.parametrize(
     ("rig", "seed", "counted"),
-    [({}, "16", " 2 POLE_ENCODER,"), (OTHER, "6", " 1 homings,")],
-    ids=["ip02, with failing encoders", "other, homed and driven"],
+    [({}, "3", " 2 POLE_ENCODER,"), (OTHER, "6", " 1 homings,")],
+    ids=["ip02, with failing encoders", "other, with switches, homed and driven"],
 )
 def test_both_firmwares_agree_under_sanitizers(rig: dict[str, float], seed: str, counted: str) -> None:
     compiler = c_firmware.find_compiler()

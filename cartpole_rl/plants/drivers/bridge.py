@@ -265,6 +265,10 @@ class Bridge:
         """Open and stop the board; learn how often it measures. Raises LinkError, PortError, ConfigError."""
         if self._settings.homing == "board" and type(self._driver).home is Driver.home:
             raise ConfigError("plant.homing=board: the driver has no method home; give hand or stops")
+        if self._settings.homing == "stops" and self._hardware.switches:
+            raise ConfigError(
+                "plant.homing=stops: cart= has end switches, which only its board reads; give hand or board"
+            )
         self._driver.open()
         self._driver.stop()
         stamps: list[int] = []

@@ -41,7 +41,13 @@ REASONS: dict[int, str] = {
     "short cable, without a network between, and end what keeps this computer busy",
 }
 
+SWITCH = (
+    "its {} end switch was pressed where it cannot be, or not pressed at its end; or the cart's counts "
+    "slipped (press it by hand, check its wires and that the cart reaches it)"
+)
 FAULTS: dict[Fault, str] = {
+    Fault.LEFT_SWITCH: SWITCH.format("left"),  # they come first: the cause of HOMING or HARD_LIMIT
+    Fault.RIGHT_SWITCH: SWITCH.format("right"),
     Fault.HARD_LIMIT: "the cart ran into the end of the track (switch the motor's supply off, push the cart "
     "back towards the middle, switch the supply on)",
     Fault.STALL: "the motor was driven but the cart did not move (check the motor's supply and cable, free "

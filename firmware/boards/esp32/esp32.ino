@@ -11,10 +11,13 @@
    | GPIO26 | pole encoder B                                                         |
    | GPIO18 | H-bridge input that drives the cart right; 10 kohm to ground           |
    | GPIO19 | H-bridge input that drives the cart left; 10 kohm to ground            |
-   | GND    | ground of both encoders and of the H-bridge                            |
+   | GPIO27 | left end switch, if cart_rig.h has one, 3.3 V                           |
+   | GPIO14 | right end switch                                                       |
+   | GND    | ground of the encoders, the H-bridge and the switches                  |
 
    5 V encoders need level shifters. The two resistors keep the motor off while the board resets. If a count
-   or the cart runs the wrong way, swap A and B of that encoder, or the two inputs of the H-bridge. */
+   or the cart runs the wrong way, swap A and B of that encoder, or the two inputs of the H-bridge. A switch joins
+   its pin to ground and opens when the cart presses it (contacts C and NC): a broken wire counts as pressed. */
 #include <Arduino.h>
 #include <cart_loop.h>
 #ifdef CART_ONBOARD_POLICY
@@ -26,6 +29,9 @@
 #include <soc/gpio_sig_map.h>
 #include <soc/gpio_struct.h>
 
+#if CART_SWITCHES
+static const int LEFT_SWITCH = 27, RIGHT_SWITCH = 14; /* high while pressed */
+#endif
 static const int CART_A = 32, CART_B = 33, POLE_A = 25, POLE_B = 26, RIGHT = 18, LEFT = 19;
 static const uint32_t BAUD = 921600, PWM_HZ = 20000, HANG_MS = 150; /* longer than a period */
 static const int PWM_BITS = 8, COUNTER_LIMIT = 32000, GLITCH_NS = 200;
@@ -138,6 +144,13 @@ int32_t cart_hardware_pole_count(void)
     return count_of(pole_counter, &last);
 }
 
+#if CART_SWITCHES
+uint8_t cart_hardware_switches(void)
+{
+    return (digitalRead(LEFT_SWITCH) ? CART_LEFT : 0u) | (digitalRead(RIGHT_SWITCH) ? CART_RIGHT : 0u);
+}
+#endif
+
 void cart_hardware_set_motor(int16_t value)
 {
     int on = value > 0 ? RIGHT : LEFT, off = value > 0 ? LEFT : RIGHT;
@@ -167,6 +180,10 @@ void setup(void)
     Serial.setRxBufferSize(512);
     Serial.setTxBufferSize(512);
     Serial.begin(BAUD);
+#if CART_SWITCHES
+    pinMode(LEFT_SWITCH, INPUT_PULLUP);
+    pinMode(RIGHT_SWITCH, INPUT_PULLUP);
+#endif
     cart_counter = start_counter(CART_A, CART_B);
     pole_counter = start_counter(POLE_A, POLE_B);
     start_watchdog();

@@ -12,10 +12,13 @@
    | PB3  | D3         | pole encoder B (TIM2 channel 2)                                             |
    | PA6  | D12        | H-bridge input that drives the cart right (TIM3 channel 1); 10 kohm to ground |
    | PA7  | D11        | H-bridge input that drives the cart left (TIM3 channel 2); 10 kohm to ground |
-   | GND  | GND        | ground of both encoders and of the H-bridge                                 |
+   | PA8  | D7         | left end switch, if cart_rig.h has one, 3.3 V                                |
+   | PA9  | D8         | right end switch                                                            |
+   | GND  | GND        | ground of the encoders, the H-bridge and the switches                       |
 
    5 V encoders need level shifters. The two resistors keep the motor off while the board resets. If a count
-   or the cart runs the wrong way, swap A and B of that encoder, or the two inputs of the H-bridge. */
+   or the cart runs the wrong way, swap A and B of that encoder, or the two inputs of the H-bridge. A switch joins
+   its pin to ground and opens when the cart presses it (contacts C and NC): a broken wire counts as pressed. */
 #include "cart_loop.h"
 #ifdef CART_ONBOARD_POLICY
 #include "onboard.h"
@@ -42,6 +45,7 @@
 #define GPIOB(offset) REGISTER(0x40020400u + (offset))
 #define MODER 0x00u
 #define PUPDR 0x0Cu
+#define IDR 0x10u
 #define AFRL 0x20u
 #define AFRH 0x24u
 
@@ -77,6 +81,7 @@
 #define CORE_MHZ 83u
 #define APB1_HZ 41500000u
 #define BAUD 921600u       /* APB1_HZ / 45 is 0.07 % more; the oscillator's own error adds to it */
+#define SWITCHES_PIN 8u    /* of port A, the left one; high while pressed */
 #define PWM_STEPS 255u     /* motor value 255 is always on */
 #define PWM_PRESCALER 16u  /* 83 MHz / 16 / 255 = 20.3 kHz */
 #define RECEIVE_BYTES 512u /* powers of two */
@@ -141,6 +146,10 @@ static void start_pins(void)
     pull_up(a, 1);
     pull_up(a, 15);
     pull_up(b, 3);
+#if CART_SWITCHES
+    pull_up(a, SWITCHES_PIN);
+    pull_up(a, SWITCHES_PIN + 1u);
+#endif
     set_alternate(a, 2, 7);
     set_alternate(a, 3, 7);
 }
@@ -224,6 +233,13 @@ int32_t cart_hardware_pole_count(void)
 {
     return (int32_t)REGISTER(TIM2 + CNT);
 }
+
+#if CART_SWITCHES
+uint8_t cart_hardware_switches(void)
+{
+    return (uint8_t)(GPIOA(IDR) >> SWITCHES_PIN & CART_BOTH);
+}
+#endif
 
 void cart_hardware_set_motor(int16_t value)
 {

@@ -4,7 +4,8 @@
    the physics. Little-endian, without a checksum:
 
      'M', clock us u32, motor value i16    the motor value in force from now on
-     'X' or 'P', clock us u32              asks for the count of the cart or of the pole; the answer is an i32 */
+     'X' or 'P', clock us u32              asks for the count of the cart or of the pole; the answer is an i32
+     'S', clock us u32                     asks for the end switches that are pressed: an i32 */
 #include "cart_loop.h"
 #ifdef CART_ONBOARD_POLICY
 #include "onboard.h"
@@ -46,10 +47,10 @@ static void put_number(uint32_t number, int bytes)
         put(UART1, (uint8_t)(number >> (8 * at)));
 }
 
-static int32_t ask(uint8_t encoder)
+static int32_t ask(uint8_t what)
 {
     uint32_t count = 0;
-    put(UART1, encoder);
+    put(UART1, what);
     put_number(clock_us, 4);
     for (int at = 0; at < 4; at++) {
         while (!(REGISTER(UART1 + STATE) & RECEIVE_FULL))
@@ -89,6 +90,13 @@ int32_t cart_hardware_pole_count(void)
 {
     return ask('P');
 }
+
+#if CART_SWITCHES
+uint8_t cart_hardware_switches(void)
+{
+    return (uint8_t)ask('S');
+}
+#endif
 
 void cart_hardware_set_motor(int16_t value)
 {

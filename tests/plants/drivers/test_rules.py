@@ -257,6 +257,13 @@ def test_a_driver_that_cannot_home_is_not_asked_to() -> None:
         Playing(homing="board").listen()
 
 
+def test_stops_are_not_searched_on_a_cart_with_end_switches() -> None:
+    bridge = Playing(sends="value", damping=0.0, homing="stops")
+    bridge._hardware = RIG.model_copy(update={"left_switch": 1})
+    with pytest.raises(ConfigError, match="cart= has end switches, which only its board reads; give hand"):
+        bridge.listen()
+
+
 def test_a_board_that_ignores_the_line_to_home_is_noticed() -> None:
     stand_in = Playing(homing="board")._stand_in
     waiting, still = stand_in._until_board_rests(Reading(8000, 0, PERIOD_US)), Reading(8000, 0, PERIOD_US)

@@ -35,6 +35,20 @@ int32_t cart_hardware_pole_count(void)
     return 0;
 }
 
+#if CART_SWITCHES
+static uint8_t switches;
+
+uint8_t cart_hardware_switches(void)
+{
+    return switches;
+}
+
+void bench_press(uint8_t pressed)
+{
+    switches = pressed;
+}
+#endif
+
 void cart_hardware_set_motor(int16_t value)
 {
     motor = value;

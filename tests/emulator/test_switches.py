@@ -1,0 +1,152 @@
+"""Carts with end switches: both firmwares home by them, and stop where one is not as it can be."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+pytest.importorskip("mujoco", reason='pip install "cartpole_rl[emulator]"')
+
+from driven_cart import Driven, homed
+from firmwares import needs_compiler
+
+from cartpole_rl.emulator.physics import STOP_BEHIND
+from cartpole_rl.rig.hardware import hardware_of
+from cartpole_rl.wire import ClearFault, Fault, Flags, Hello, Home, SetMotor, SetPeriod, Start, State
+
+LEFT, RIGHT, BOTH = 1, 2, 3
+HALF = 0.2  # m, of the emulated track; that of the rig is 0.198
+each_firmware = pytest.mark.usefixtures("each_firmware")
+
+
+def settings_of(switches: int) -> dict[str, Any]:
+    rig = hardware_of({"left_switch": switches & 1, "right_switch": switches >> 1, "track_span": 0.396})
+    return {"hardware": rig, "track_half_length": HALF}
+
+
+def reads(driven: Driven, switches: Callable[[float], int]) -> None:
+    """Let the switches read what a function of the cart's place returns."""
+    physics = driven.cart.physics
+    physics._press_switches = lambda: setattr(physics, "switches", switches(physics.x))
+
+
+def home_from(place: float, switches: int, firmware: str, period_us: int) -> tuple[Driven, State, float]:
+    """Return the homed cart, its state, and how far from the middle it came, in m."""
+    driven = Driven(**settings_of(switches) | {"firmware": firmware})
+    driven.cart.physics.place(place, math.pi)
+    driven.ask(SetPeriod(period_us))
+    state, farthest = driven.ask(Home()), 0.0
+    while driven.flags & Flags.HOMING:
+        state = driven.ask(Hello())
+        farthest = max(farthest, abs(driven.x))
+    return driven, state, farthest
+
+
+@needs_compiler
+@pytest.mark.parametrize(
+    ("place", "period_us"),
+    [(0.03, 20_000), (-HALF - 0.0035, 20_000), (HALF + 0.0035, 5_000), (0.03, 100_000)],
+    ids=["inside", "on the left one", "on the right one", "long periods"],
+)
+@pytest.mark.parametrize("switches", [BOTH, LEFT, RIGHT], ids=["both", "left", "right"])
+def test_both_firmwares_find_the_same_ends(switches: int, place: float, period_us: int) -> None:
+    driven, state, farthest = home_from(place, switches, "python", period_us)
+    c, same, _ = home_from(place, switches, "c", period_us)
+    assert (driven.flags, state.fault) == (Flags.HOMED, Fault.NONE)
+    assert (c.flags, c.info(), same) == (driven.flags, driven.info(), state)
+    half = HALF if switches == BOTH else 0.198
+    middle = {BOTH: 0.0, LEFT: half - HALF, RIGHT: HALF - half}[switches]
+    found = driven.limits()[1] * driven.encoders.metres + 0.008
+    assert found == pytest.approx(half, abs=2e-4)
+    assert driven.measured(state)[0] == pytest.approx(driven.x - middle, abs=2e-4)
+    if period_us <= 20_000:
+        assert farthest < HALF + STOP_BEHIND
+
+
+@each_firmware
+@pytest.mark.parametrize(
+    ("switches", "reading", "fault"),
+    [
+        (LEFT, lambda x: 0, Fault.LEFT_SWITCH),
+        (RIGHT, lambda x: 0, Fault.RIGHT_SWITCH),
+        (BOTH, lambda x: LEFT * (x < -HALF), Fault.RIGHT_SWITCH),
+        (LEFT, lambda x: LEFT, Fault.LEFT_SWITCH),
+        (BOTH, lambda x: LEFT, Fault.LEFT_SWITCH),
+        (BOTH, lambda x: RIGHT, Fault.RIGHT_SWITCH),
+        (BOTH, lambda x: BOTH, Fault.LEFT_SWITCH | Fault.RIGHT_SWITCH),
+        (BOTH, lambda x: RIGHT * (x < -HALF) + LEFT * (x > HALF), Fault.RIGHT_SWITCH),
+        (BOTH, lambda x: LEFT * (x < -HALF or x > 0.1), Fault.LEFT_SWITCH),
+        (BOTH, lambda x: LEFT if x < -HALF else BOTH * (x > HALF), Fault.LEFT_SWITCH | Fault.RIGHT_SWITCH),
+    ],
+    ids=[
+        "left dead",
+        "right dead",
+        "second dead",
+        "left stuck",
+        "left stuck of both",
+        "right stuck",
+        "both stuck",
+        "swapped",
+        "left on the way right",
+        "both at the right",
+    ],
+)
+def test_a_switch_that_lies_ends_homing(switches: int, reading: Callable[[float], int], fault: Fault) -> None:
+    driven = Driven(**settings_of(switches))
+    reads(driven, reading)
+    state = driven.home()
+    assert (driven.flags, state.motor_applied) == (Flags.FAULTED, 0)
+    assert Fault(state.fault) == Fault.HOMING | fault
+
+
+@each_firmware
+@pytest.mark.parametrize("side", [-1, 1])
+def test_a_cart_whose_counts_slipped_is_stopped_by_a_switch(side: int) -> None:
+    driven = homed(**settings_of(BOTH))
+    cart, pole = driven.cart._boot
+    driven.cart._boot = (cart + side * driven.encoders.cart_counts(0.06), pole)
+    driven.tick()
+    state = driven.ask(Start())
+    while not state.fault:
+        assert abs(state.cart_counts) < driven.limits()[0]
+        state = driven.ask(SetMotor(110 * side))
+    assert state.fault == Fault.HARD_LIMIT | (Fault.RIGHT_SWITCH if side > 0 else Fault.LEFT_SWITCH)
+    assert driven.flags & ~Flags.SOFT_LIMIT == Flags.FAULTED  # not homed: its zeros are wrong
+    assert state.motor_applied == -side * 255
+    states = [driven.tick() for _ in range(50)]
+    assert states[-1].motor_applied == 0
+    assert driven.cart.physics.x_dot == pytest.approx(0, abs=1e-3)
+
+
+@each_firmware
+def test_a_cart_armed_on_a_switch_faults_in_that_period() -> None:
+    driven = homed(**settings_of(LEFT))
+    reads(driven, lambda x: LEFT)
+    assert driven.tick().fault == 0
+    assert driven.ask(Start()).fault == Fault.HARD_LIMIT | Fault.LEFT_SWITCH
+    assert not driven.flags & (Flags.ARMED | Flags.HOMED)
+    driven.ask(ClearFault())
+    assert driven.home().fault == Fault.HOMING | Fault.LEFT_SWITCH
+
+
+@each_firmware
+def test_noise_at_one_look_is_no_pressed_switch() -> None:
+    driven = homed(**settings_of(BOTH))
+    driven.ask(Start())
+    firmware, now_us = driven.cart.firmware, driven.cart.now_us
+    counts = driven.cart._counts()
+    for look, switches in enumerate([BOTH, 0, LEFT, RIGHT, 0, LEFT]):
+        firmware.switches = switches
+        firmware.look(now_us + look + 1, *counts)
+    assert firmware.fault == Fault.NONE
+    firmware.look(now_us + 9, *counts)
+    assert firmware.fault == Fault.HARD_LIMIT | Fault.LEFT_SWITCH
+
+
+@each_firmware
+def test_a_rig_without_switches_reads_none() -> None:
+    driven = homed()
+    driven.ask(Start())
+    reads(driven, lambda x: BOTH)
+    assert driven.tick().fault == driven.tick().fault == 0
