@@ -23,12 +23,11 @@ from cartpole_rl.rig.hardware import Hardware
 SEARCH_SPEED = 0.08  # m/s, towards a stop
 TRAVEL_SPEED = 0.2  # m/s, far from a stop whose position is known
 TOUCH_ZONE = 60_000_000  # nm, distance from such a stop at which the slow search begins
-SWITCH_ZONE = (
-    120_000_000  # the same for a switch, which must not be overrun: SEARCH_SPEED is reached before it
-)
+SWITCH_ZONE = 120_000_000  # the same for a switch, which must not be overrun: the cart is slow before
 ASTRAY = 20_000_000  # nm, a motion the wrong way that means a reversed motor or encoder
 FAST = 6  # tenths of a turn a second of a pole that may push a driven cart: 3.8 rad/s
 LEFT, RIGHT = 1, 2  # bits of end switches
+SIDES = {LEFT: "left", RIGHT: "right", LEFT | RIGHT: "left and right"}
 RELEASED = 30_000  # um; so far inside the place where it is pressed, any switch is released
 AGAINST_STOP = 400_000  # us under full push without motion that mean a stop
 STANDS = 300_000  # nm, largest motion in that time, or one count
@@ -269,7 +268,7 @@ class Homing:
         inside |= RIGHT * (self._ends[RIGHT] - reading.cart > self._released)
         suspects = reading.pressed & (inside if reading.pressed != LEFT | RIGHT else LEFT | RIGHT)
         if suspects:
-            raise HomingError(f"{switch_names(suspects)} pressed where the cart cannot press it", suspects)
+            raise HomingError(f"end switch {SIDES[suspects]}: pressed where it cannot be", suspects)
 
     def touch_stop(
         self, direction: int, expected: int | None, reading: Reading, switch: int = 0, until: int = 0
@@ -300,7 +299,7 @@ class Homing:
             motor = servo.motor(direction * (TRAVEL_SPEED if far else SEARCH_SPEED), speed, reading.seconds)
             if window.spread <= self._stands and motor == direction * self._full_push:
                 if switch:
-                    raise HomingError(f"the cart stands, and {switch_names(switch)} as before", switch)
+                    raise HomingError(f"end switch {SIDES[switch]}: as before, and the cart stands", switch)
                 return reading
             reading = yield motor
             elapsed += reading.us
@@ -361,13 +360,6 @@ class Homing:
     def _swing(self, centidegrees: int) -> int:
         """Return an angle in counts, at least one."""
         return max(1, (centidegrees * self._turn + 18_000) // 36_000)
-
-
-def switch_names(switches: int) -> str:
-    """Return which end switches the bits mean, for a message."""
-    return {LEFT: "the left end switch is", RIGHT: "the right end switch is"}.get(
-        switches, "both end switches are"
-    )
 
 
 def find_hanging(reading: Reading) -> Generator[int, Reading, tuple[int, Reading]]:

@@ -12,7 +12,7 @@
    | GPIO18 | H-bridge input that drives the cart right; 10 kohm to ground           |
    | GPIO19 | H-bridge input that drives the cart left; 10 kohm to ground            |
    | GPIO27 | left end switch, if cart_rig.h has one, 3.3 V                           |
-   | GPIO14 | right end switch                                                       |
+   | GPIO13 | right end switch                                                       |
    | GND    | ground of the encoders, the H-bridge and the switches                  |
 
    5 V encoders need level shifters. The two resistors keep the motor off while the board resets. If a count
@@ -30,7 +30,7 @@
 #include <soc/gpio_struct.h>
 
 #if CART_SWITCHES
-static const int LEFT_SWITCH = 27, RIGHT_SWITCH = 14; /* high while pressed */
+static const int LEFT_SWITCH = 27, RIGHT_SWITCH = 13; /* high while pressed */
 #endif
 static const int CART_A = 32, CART_B = 33, POLE_A = 25, POLE_B = 26, RIGHT = 18, LEFT = 19;
 static const uint32_t BAUD = 921600, PWM_HZ = 20000, HANG_MS = 150; /* longer than a period */
