@@ -130,13 +130,12 @@ def test_perception_is_that_of_many_carts(number: int, kind: ObservationKind, me
     observation = ObservationSettings(
         kind=kind, past_motors=memory, past_velocities=memory, past_positions=memory, pole_length=memory > 1
     )
-    limits = {"angle_limit": 0.2 if memory else None, "time_limit": 3, "speed_periods": 1 + memory}
-    task = TASK.model_copy(update=limits)
+    task = TASK.model_copy(update={"angle_limit": 0.2 if memory else None, "time_limit": 3})
     rewards = REWARD.model_copy(update={"kind": reward, "position_cost": 0.1})
     rules = {"settings": observation, "guard": guard, "encoders": nominal_encoders()}
 
     def first(frame: PlantOutput[Tensor], cart: tuple[Tensor, Tensor]) -> tuple[Tensor, ...]:
-        return perceive_first(frame, *cart, **rules, speed_periods=task.speed_periods)
+        return perceive_first(frame, *cart, **rules, speed_periods=1 + memory)
 
     def counts() -> Tensor:
         return torch.randint(-(2**30), 2**30, (2, CARTS))
@@ -148,7 +147,7 @@ def test_perception_is_that_of_many_carts(number: int, kind: ObservationKind, me
         counts(),
         drawn(4, -10, 10, AWKWARD),
         drawn(observation.past_size, -10, 10, AWKWARD),
-        drawn(task.speed_periods - 1, -10, 10, AWKWARD),
+        drawn(memory, -10, 10, AWKWARD),
         torch.randint(4, (1, CARTS)),
         motor(),
         torch.full((int(memory > 1), CARTS), 0.6),

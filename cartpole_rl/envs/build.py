@@ -17,6 +17,7 @@ from cartpole_rl.plants.specs import Plant
 from cartpole_rl.randomization.identified import identified_carts
 from cartpole_rl.randomization.randomizer import Draws, Randomizer
 from cartpole_rl.randomization.ranges import IdentifiedSettings
+from cartpole_rl.tasks.rewards import speed_periods
 from cartpole_rl.tasks.settings import ActionSettings, RewardSettings, StartSettings, TaskSettings
 
 
@@ -67,10 +68,12 @@ def make_env(
     observation: ObservationSettings,
     reward: RewardSettings,
     guard: TrackGuard | None = None,
+    speed_periods: int = 1,
 ) -> CartPoleEnv:
     """Return the environment over `plant`; its specs do not depend on the plant."""
+    encoders, compiled = plant.hardware.encoders, plant.compiled
     hardware = HardwareTransform(
-        actions.motors, task, observation, reward, guard, plant.compiled, plant.hardware.encoders
+        actions.motors, task, observation, reward, guard, compiled, encoders, speed_periods
     )
     return CartPoleEnv(plant, hardware)
 
@@ -79,7 +82,8 @@ def environment(config: CartPoleSettings, plant: Plant) -> CartPoleEnv:
     """Return the environment of `config` over `plant`, with the track guard of `with_fitted_guard`."""
     config = with_fitted_guard(config)
     task, reward = config.task.at(config.control_period), config.reward.at(config.control_period)
-    return make_env(plant, config.actions, task, config.observation, reward, config.guard.active)
+    periods = speed_periods(config.control_period, plant.hardware.encoders)
+    return make_env(plant, config.actions, task, config.observation, reward, config.guard.active, periods)
 
 
 def simulated_env(

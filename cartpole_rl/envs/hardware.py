@@ -69,11 +69,13 @@ class HardwareTransform(Transform):
         guard: TrackGuard | None = None,
         compiled: bool = False,
         encoders: Encoders | None = None,
+        speed_periods: int = 1,
     ) -> None:
-        """`encoders` are the plant's, ip02's if they are not given."""
+        """`encoders` are the plant's, ip02's if they are not given; `speed_periods` as in `tasks.rewards`."""
         super().__init__()
         encoders = encoders or nominal_encoders()
         self.task, self.observation_settings, self.reward = task, observation, reward
+        self.speed_periods = speed_periods
         self.register_buffer("motors", torch.tensor(list(motors), dtype=torch.int64))
         inward = torch.tensor([0, max(0, *motors), min(0, *motors)])  # by the guard's direction: 0, 1, -1
         self.register_buffer("inward", inward)
@@ -84,7 +86,7 @@ class HardwareTransform(Transform):
             settings=observation,
             guard=guard,
             encoders=encoders,
-            speed_periods=task.speed_periods,
+            speed_periods=speed_periods,
         )
         self.perception: Perception = partial(
             perceive, settings=observation, task=task, rewards=reward, guard=guard, encoders=encoders
@@ -112,7 +114,7 @@ class HardwareTransform(Transform):
         carts, device = observation_spec.shape[0], observation_spec.device
         settings = self.observation_settings
         floats = {"state": 4, "observation": settings.size, "past": settings.past_size}
-        floats["speeds"] = self.task.speed_periods - 1
+        floats["speeds"] = self.speed_periods - 1
         for key, size in {**floats, "score": 1, "score_upright": 1}.items():
             observation_spec[key] = Unbounded((carts, size), dtype=torch.float32, device=device)
         observation_spec["guard"] = Bounded(-1, 1, (carts, 1), dtype=torch.int64, device=device)

@@ -28,7 +28,7 @@ class OneCart:
         count, flag = torch.zeros(1, 1, dtype=torch.int64), torch.zeros(1, 1, dtype=torch.bool)
         counts, number = count.repeat(2, 1), torch.zeros(1, 1)
         state, past = number.repeat(4, 1), number.repeat(hardware.observation_settings.past_size, 1)
-        speeds = number.repeat(hardware.task.speed_periods - 1, 1)
+        speeds = number.repeat(hardware.speed_periods - 1, 1)
         frame = PlantOutput(counts, number, count, flag, flag)
         self._perceive_first = Scalar(
             lambda frame, cart: hardware.first_perception(frame, *cart), frame, (length, track_end)

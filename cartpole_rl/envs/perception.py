@@ -109,7 +109,7 @@ def perceive(
     terminated = off_track | fallen(theta, task.angle_limit)
     ended = terminated | frame.truncated | (step_count >= task.periods)
     speeds = torch.cat((theta_dot.unsqueeze(0), previous.speeds))
-    judged = state._replace(theta_dot=sum(speeds[1:], start=speeds[0]) / task.speed_periods)
+    judged = state._replace(theta_dot=sum(speeds[1:], start=speeds[0]) / len(speeds))
     values = {  # each once: the reward is often a score
         kind: kind.formula(judged, task.x_max).unsqueeze(0) for kind in {rewards.kind, SCORE, SCORE_UPRIGHT}
     }

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from enum import StrEnum
 from typing import TYPE_CHECKING, Self
 
+from cartpole_rl.rig.hardware import Encoders
 from cartpole_rl.tasks.features import Measured
 
 if TYPE_CHECKING:
@@ -20,21 +21,20 @@ Formula = Callable[[Measured, float], "Tensor"]  # of the measured state and x_m
 
 UPRIGHT_ANGLE = math.radians(5)  # rad
 UPRIGHT_SPEED = math.radians(6)  # rad/s
-SPEED_TIME = (
-    0.02  # s over which theta_dot is measured at least: the thesis's control period (see speed_periods)
-)
+SPEED_TIME = 0.02  # s over which rewards and scores measure it at least: the control period of the thesis
 BONUS = 5.0  # (6.2), once for the angle and once more for angle and speed
 UPRIGHT_BONUS = 10.0  # (5.5)
 BALANCE_ANGLE = math.radians(12)  # rad, theta_thr of (5.5): where the classical task ends
 
 
-def speed_periods(control_period: float) -> int:
+def speed_periods(control_period: float, encoders: Encoders) -> int:
     """Return over how many control periods, s each, rewards and scores measure the pole's speed.
 
-    (6.2) is defined for 20 ms. In 10 ms one count of 4096 is 8.8 degrees/s, so that a pole would not be still
-    whenever its count changes.
+    (6.2) is defined for 20 ms. Over a shorter time, or with a coarse encoder, a single count would be faster
+    than UPRIGHT_SPEED, and a pole that stands would not be still whenever its count changes.
     """
-    return max(1, math.ceil(SPEED_TIME / control_period - 1e-9))
+    seconds = max(SPEED_TIME, encoders.radians / UPRIGHT_SPEED)
+    return max(1, math.ceil(seconds / control_period - 1e-9))
 
 
 def constant(state: Measured, x_max: float) -> "Tensor":

@@ -9,7 +9,7 @@ from cartpole_rl.physics.actuator import ACTUATORS
 from cartpole_rl.physics.laws import Law
 from cartpole_rl.rig.hardware import LARGEST_MOTOR
 from cartpole_rl.settings import Count, Finite, Fraction, NonNegative, Positive, Settings
-from cartpole_rl.tasks.rewards import Reward, speed_periods
+from cartpole_rl.tasks.rewards import Reward
 
 Measure = Literal["score", "score_upright"]  # equations (6.2) and (6.1), as in metrics.json
 NO_ACTION = -1  # where an observation or action value is not finite: motor 0, and the episode ends
@@ -77,7 +77,6 @@ class TaskSettings(Settings):
     time_limit: Count | None = None  # or its length in control periods, which takes precedence
     angle_limit: Finite | None  # rad; None: the pole may hang
     x_max: Positive  # m, of (5.4), (6.1), (6.2)
-    speed_periods: Count = 1  # control periods over which these measure the pole's speed; `at` sets it
 
     @model_validator(mode="after")
     def _has_an_end(self) -> Self:
@@ -92,13 +91,11 @@ class TaskSettings(Settings):
         return self.time_limit
 
     def at(self, control_period: float) -> Self:
-        """Return the task with its `time_limit` and `speed_periods`, for a control period in s."""
-        periods = self.time_limit
-        if periods is None:
-            assert self.duration is not None
-            periods = max(1, round(self.duration / control_period))
-        update = {"time_limit": periods, "speed_periods": speed_periods(control_period)}
-        return self.model_copy(update=update)
+        """Return the task with its `time_limit`, for a control period in s."""
+        if self.time_limit is not None:
+            return self
+        assert self.duration is not None
+        return self.model_copy(update={"time_limit": max(1, round(self.duration / control_period))})
 
     @property
     def measure(self) -> Measure:

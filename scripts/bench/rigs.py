@@ -29,7 +29,7 @@ from common import (
     run_once,
     write_json,
 )
-from reference import known_config, known_reference, reference
+from reference import ALONE, known_config, known_reference, reference
 from truths import simulated
 
 from cartpole_rl.choices import choice, group_choices
@@ -89,7 +89,8 @@ def identified(rig: Rig, folder: Path) -> dict[str, Any]:
 def best_score(rig: Rig, file: Path, states: int) -> float:
     """Return the best score of the search on the nominal cart; a search in `file` is not made again."""
     if not file.exists():
-        write_json(file, reference(load_settings(TrainConfig, rig.training), states))
+        config = load_settings(TrainConfig, {**rig.training, **ALONE})
+        write_json(file, reference(config, states))
     return max(each["score"] for each in read_json(file)["starts"].values())
 
 

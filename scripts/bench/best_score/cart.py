@@ -21,7 +21,7 @@ from cartpole_rl.tasks.features import (
     measured_position,
     measured_velocity,
 )
-from cartpole_rl.tasks.rewards import BONUS, score
+from cartpole_rl.tasks.rewards import BONUS, score, speed_periods
 from cartpole_rl.workflows.config import TrainConfig
 
 MOST = 1 + 2 * BONUS  # points of a step, standing still in the middle
@@ -55,6 +55,7 @@ class KnownCart:
     def __init__(self, config: TrainConfig, compiled: bool = False) -> None:
         self.config, self.compiled = config, compiled
         self.task = config.task.at(config.control_period)
+        self.speed_periods = speed_periods(config.control_period, self.encoders)
         self.randomizer = randomizer(config)
         self.models = config.models(config.plant)
         self.motors = torch.tensor(config.actions.motors)
@@ -99,7 +100,7 @@ class KnownCart:
         """Return one node: at rest at `position` m, the pole hanging."""
         state = hanging(position)
         counts = encoder_counts(state, self.one, torch.zeros(3, 1), self.encoders)
-        drive, speeds = torch.zeros(1 + self.commands, 1), torch.zeros(self.task.speed_periods - 1, 1)
+        drive, speeds = torch.zeros(1 + self.commands, 1), torch.zeros(self.speed_periods - 1, 1)
         return Nodes(torch.stack(state), drive, counts, speeds, torch.zeros(1))
 
     def step(self, nodes: Nodes, action: Tensor) -> tuple[Nodes, Tensor, Tensor]:
