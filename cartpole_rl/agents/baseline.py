@@ -76,7 +76,8 @@ class EnergyAndRegulator:
     def __call__(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Add `action` [N] and `action_value` [N, A] to `tensordict`."""
         state, motor = decode(tensordict["observation"], self.kind)
-        value = self.value(self.force(self.predict(state, motor)))
+        ahead = self.predict(state, motor)
+        value = self.value(self.force(ahead), ahead.x_dot)
         return tensordict.set("action_value", value).set("action", value.argmax(-1))
 
     def predict(self, measured: State, motor: Tensor) -> State:
@@ -133,12 +134,15 @@ class EnergyAndRegulator:
         end = self.cart.track_half_length - MARGIN
         return torch.where(stop.abs() > end, -stop.sign() * self.strongest, force)
 
-    def value(self, force: Tensor) -> Tensor:
+    def value(self, force: Tensor, x_dot: Tensor) -> Tensor:
         """Return the negative distance between each motor value's force and `force`, [N, A].
 
-        A tie goes to the smallest motor value.
+        `force` is meant for all of the viscous friction, of which a motor that coasts at a small value takes
+        away a part. A tie goes to the smallest motor value.
         """
-        return -(force.unsqueeze(-1) - self.forces).abs() - 1e-6 * self.motors.abs()
+        viscous = viscous_coefficient(self.cart, self.models.cart_friction)
+        spared = (1 - viscous_share(self.motors, self.cart)) * viscous * x_dot.unsqueeze(-1)
+        return -(force.unsqueeze(-1) - self.forces - spared).abs() - 1e-6 * self.motors.abs()
 
 
 def decode(observation: Tensor, kind: ObservationKind) -> tuple[State, Tensor]:
@@ -161,20 +165,16 @@ def regulator(table: Tensor, models: Models, period: float) -> Array:
 
 
 def linearized(table: Tensor, models: Models, period: float) -> tuple[Array, Array]:
-    """Return (A [4, 4], B [4, 1]) of one period about upright, at constant force, without dry friction.
-
-    The viscous friction is that at motor value 0.
-    """
+    """Return (A [4, 4], B [4, 1]) of one period about upright, at constant force, without dry friction."""
     cart = CartParameters(table)
     smooth = CART_FRICTIONS.find("linear" if "cart_viscous" in models.cart_friction.reads else "none")
     body, smooth_models = mechanism(cart), models._replace(cart_friction=smooth)
-    share = viscous_share(torch.zeros(1), cart)
 
     def after_a_period(numbers: Tensor) -> Tensor:
         *motion, force = numbers.unsqueeze(-1)
         state = State(*motion)
         for _ in range(SUBSTEPS):
-            state = advance(state, force, cart, body, smooth_models, period / SUBSTEPS, share)
+            state = advance(state, force, cart, body, smooth_models, period / SUBSTEPS)
         return torch.cat(state)
 
     jacobian_matrix = torch.autograd.functional.jacobian(

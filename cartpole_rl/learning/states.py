@@ -38,17 +38,22 @@ class Resumable:
         """Restore the state in `snapshot`; scores in another measure than this training's are forgotten."""
         device, carts = self.env.device, self.env.batch_size
         self.iteration, self.seconds = snapshot["iteration"], snapshot["seconds"]
-        if snapshot.get("measure", "score") == self.measure:  # missing in states of earlier versions: (6.2)
+        collector = on_device(snapshot["collector"], device)
+        speeds = torch.zeros(*carts, self.env.hardware.speed_periods - 1, device=device)
+        older = "speeds" not in collector["current"]  # a state of earlier versions: speeds over one period
+        current = {"speeds": speeds, **collector["current"]}
+        same = snapshot.get("measure", "score") == self.measure and not (older and speeds.numel())
+        if same:  # the measure is missing in states of earlier versions: (6.2)
             self.best_score, self.last_score = snapshot["scores"]
         else:
             self.best_score, self.last_score = -float("inf"), None
         self.agent.load_state_dict(snapshot["agent"])
         self.optimizer.load_state_dict(snapshot["optimizer"])
         restore_buffer(self.buffer, snapshot["replay"])
-        waiting, collector = on_device(snapshot["returns"], device), on_device(snapshot["collector"], device)
+        waiting = on_device(snapshot["returns"], device)
         held = self.settings.steps - 1
         self.waiting = None if waiting is None else TensorDict(waiting, [*carts, held])
-        self.current = TensorDict(collector["current"], carts)
+        self.current = TensorDict(current, carts)
         self.retries.restore(collector)
         self.random.set_state(snapshot["collector"]["generator"])
         self.env.plant.restore(snapshot["plant"])

@@ -31,9 +31,10 @@ def speed_periods(control_period: float, encoders: Encoders) -> int:
     """Return over how many control periods, s each, rewards and scores measure the pole's speed.
 
     (6.2) is defined for 20 ms. Over a shorter time, or with a coarse encoder, a single count would be faster
-    than UPRIGHT_SPEED, and a pole that stands would not be still whenever its count changes.
+    than UPRIGHT_SPEED, and a pole that stands would not be still whenever its count changes. A tenth more
+    than the time of one count is room for periods that differ. Before an episode the pole counts as at rest.
     """
-    seconds = max(SPEED_TIME, encoders.radians / UPRIGHT_SPEED)
+    seconds = max(SPEED_TIME, 1.1 * encoders.radians / UPRIGHT_SPEED)
     return max(1, math.ceil(seconds / control_period - 1e-9))
 
 

@@ -99,7 +99,7 @@ def test_scores_measure_the_speed_of_the_pole_over_20_ms_at_least() -> None:
         1,
     ]
     coarse = nominal_encoders()._replace(turn=2400)  # a count is 0.15 degrees, 25 ms at 6 degrees/s
-    assert [speed_periods(each, coarse) for each in (0.01, 0.02, 0.05)] == [3, 2, 1]
+    assert [speed_periods(each, coarse) for each in (0.01, 0.02, 0.025, 0.05)] == [3, 2, 2, 1]
 
 
 def test_the_newest_of_the_past_comes_first_and_the_oldest_is_forgotten() -> None:

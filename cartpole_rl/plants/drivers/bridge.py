@@ -31,7 +31,7 @@ from cartpole_rl.plants.drivers.potentiometer import Potentiometer
 from cartpole_rl.plants.settings import BoardSettings
 from cartpole_rl.rig.hardware import Hardware
 from cartpole_rl.signals import ending_signals
-from cartpole_rl.wire.messages import Message, Reason, SetPeriod, State
+from cartpole_rl.wire.messages import Fault, Message, Reason, SetPeriod, State
 
 LISTENED = 25  # measurements by which a board's period is known
 PERIOD_TOLERANCE = 0.05  # share
@@ -105,6 +105,11 @@ class StandIn(Firmware):
     def wait(self, now_us: int) -> None:
         """Apply the rules of the clock: no measurement comes."""
         self._expire(now_us)
+
+    def lose_pole(self) -> None:
+        """Fault a driven cart whose pole is not measured any more."""
+        if self.armed or self.homing:
+            self._latch(Fault.POLE_ENCODER)
 
     @property
     def is_active(self) -> bool:
@@ -371,11 +376,15 @@ class Bridge:
         except TypeError:
             return self._refuse(f"{given} is not in whole counts and us")
         settings, last = self._settings, self._last
-        if (carried := self._potentiometer.count(pole, us)) is None:
-            return self._refuse(f"the pole stays outside plant.pole_range, at {pole}")
-        new = Measurement(
-            -cart if settings.cart_reversed else cart, -carried if settings.pole_reversed else carried, us
-        )
+        carried = self._potentiometer.count(pole, us)
+        if carried is not None:
+            turned = -carried if settings.pole_reversed else carried
+        elif last is None:
+            return self._refuse(f"the pole is outside plant.pole_range, at {pole}")
+        else:
+            self._stand_in.lose_pole()
+            turned = last.pole  # the cart's count still rules
+        new = Measurement(-cart if settings.cart_reversed else cart, turned, us)
         if last is None:
             self._pole = new.pole
             return self._accept(new, pole, now_us)
@@ -405,7 +414,8 @@ class Bridge:
             return False
         passed = max(passed - refused * self._board_us, self._board_us)
         way = (abs(new.cart - last.cart) - 1) * self._hardware.cart_nanometres_per_count
-        turn = (abs(self._turned(last, new)) - 1) / self._hardware.pole_counts_per_turn
+        unsure = self._potentiometer.width + 1  # an estimate may be off by the whole dead zone
+        turn = (abs(self._turned(last, new)) - unsure) / self._hardware.pole_counts_per_turn
         return way * 1e6 <= FASTEST_CART * passed and turn * 1e6 <= FASTEST_POLE * passed
 
     def _turned(self, last: Measurement, new: Measurement) -> int:
