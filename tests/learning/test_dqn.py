@@ -156,16 +156,17 @@ def test_the_best_is_the_first_of_the_highest_scores(
 
 @pytest.mark.parametrize("named", [True, False])
 def test_the_best_score_in_another_measure_is_forgotten(make_training: MakeTraining, named: bool) -> None:
-    """Snapshots of earlier versions name no measure: it was the score."""
+    """Snapshots of earlier versions name no measure: it was the score; nor have they the pole's past speeds."""
     training = make_training(evaluate=lambda: [episode(9.0, 1.0)])
     training.run_evaluation()
     snapshot = training.snapshot()
     if not named:
-        del snapshot["measure"]
+        del snapshot["measure"], snapshot["collector"]["current"]["speeds"]
     for measure, expected in (("score_upright", (-float("inf"), None)), ("score", (9.0, 9.0))):
         resumed = make_training(evaluate=lambda: [episode(9.0, 1.0)], measure=measure)
         resumed.restore(snapshot)
         assert (resumed.best_score, resumed.last_score) == expected
+        assert resumed.current["speeds"].shape == (resumed.env.plant.carts, 0)
         resumed.run_evaluation()
         assert resumed.monitor.evaluations == [(0, measure == "score_upright")]
 
