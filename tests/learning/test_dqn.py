@@ -156,7 +156,7 @@ def test_the_best_is_the_first_of_the_highest_scores(
 
 @pytest.mark.parametrize("named", [True, False])
 def test_the_best_score_in_another_measure_is_forgotten(make_training: MakeTraining, named: bool) -> None:
-    """Snapshots of earlier versions name no measure: it was the score; nor have they the pole's past speeds."""
+    """Snapshots of earlier versions name no measure: it was the score. They lack the past speeds, too."""
     training = make_training(evaluate=lambda: [episode(9.0, 1.0)])
     training.run_evaluation()
     snapshot = training.snapshot()
