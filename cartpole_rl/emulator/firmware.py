@@ -23,7 +23,7 @@ from cartpole_rl.emulator.guards import (
     micrometres,
     nearest_count,
 )
-from cartpole_rl.emulator.homing import LEFT, Homing, HomingError, Reading, Zeros
+from cartpole_rl.emulator.homing import Homing, HomingError, Reading, Zeros
 from cartpole_rl.emulator.settings import LARGEST_MOTOR
 from cartpole_rl.errors import FrameError
 from cartpole_rl.rig.hardware import Hardware, nominal_hardware
@@ -246,14 +246,9 @@ class Firmware:
             if self.armed and self._limits.lost(now_us, self.motor):
                 self._latch(Fault.CART_ENCODER)
                 self._brake_blindly(now_us)
-            self._limits.apply(now_us, self._outward(cart), angle, zeros.half_span, self.armed)
+            outward = cart - zeros.middle
+            self._limits.apply(now_us, outward, angle, zeros.half_span, self.armed, self._pressed)
         self._limited |= self.motor != self._line.requested
-
-    def _outward(self, cart: int) -> int:
-        """Return the counts right of the middle. A pressed switch knows the place of slipped counts."""
-        if self._pressed:
-            return -self._zeros.half_span if self._pressed & LEFT else self._zeros.half_span
-        return cart - self._zeros.middle
 
     def _obey(self, envelope: Envelope, now_us: int) -> Message | Reason | None:
         """Carry out a frame and return the answer; None for SET_MOTOR, which the next STATE acknowledges."""

@@ -31,6 +31,7 @@ from collections import deque
 
 from cartpole_rl.rig.hardware import Hardware
 
+LEFT, RIGHT = 1, 2  # bits of end switches
 STALL_US = 500_000
 STALL_UM = 1000
 PUSH_US = 100_000  # of such pushes one way, after which the count must have changed
@@ -225,10 +226,13 @@ class TrackLimits:
             self._blind_us = now_us + abs(self._speed_um) * 1_000_000 // PUSHED
             self.brake = -1 if self._speed_um > 0 else 1
 
-    def apply(self, now_us: int, outward: int, pole: int, half_span: int, armed: bool) -> None:
+    def apply(
+        self, now_us: int, outward: int, pole: int, half_span: int, armed: bool, pressed: int = 0
+    ) -> None:
         """Decide for a cart `outward` counts right of the middle and a pole `pole` counts from upright.
 
-        The stops are `half_span` counts from the middle.
+        The stops are `half_span` counts from the middle. Towards an end whose switch is `pressed`, the cart
+        counts as being at that end or beyond: a false press never makes the way longer.
         """
         if now_us < self._blind_us and self._newest == self._count:
             return
@@ -241,13 +245,14 @@ class TrackLimits:
         self.blocked = 0
         if armed and abs(outward) >= half_span - self.soft:
             self.blocked = 1 if outward > 0 else -1
-        self.brake = self._brake(speed, outward, pole, half_span) if now_us < self._until_us else 0
+        acts = now_us < self._until_us
+        self.brake = self._brake(speed, outward, pole, half_span, pressed) if acts else 0
 
     def release(self) -> None:
         """End all limits: the cart homes, or its count is not to be trusted."""
         self.blocked = self.brake = self._until_us = self._blind_us = 0
 
-    def _brake(self, speed: int, outward: int, pole: int, half_span: int) -> int:
+    def _brake(self, speed: int, outward: int, pole: int, half_span: int, pressed: int) -> int:
         if abs(speed) < REST:
             return 0
         direction = 1 if speed > 0 else -1
@@ -255,7 +260,10 @@ class TrackLimits:
         turning = max(-fast, min(fast, self._speed(self._poles)))  # counts/s
         swing = int(self._lever * (turning * self._radians) * math.cos(pole * self._radians))  # um/s
         size = min(FASTEST, max(abs(speed), direction * (speed + swing)))
-        left = (half_span - self.hard - direction * outward) * self._nanometres // 1000  # um
+        counts = direction * outward  # towards the end ahead
+        if pressed & (RIGHT if direction > 0 else LEFT):
+            counts = max(counts, half_span)
+        left = (half_span - self.hard - counts) * self._nanometres // 1000  # um
         shake = 2 * self._lever * turning * turning // (fast * fast)
         lag_us = (self._us[-1] - self._us[0]) // 2 + REACTION_US
         if self.brake == -direction:

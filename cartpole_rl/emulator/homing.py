@@ -16,7 +16,7 @@ from collections import deque
 from collections.abc import Generator
 from dataclasses import dataclass
 
-from cartpole_rl.emulator.guards import micrometres, nearest_count
+from cartpole_rl.emulator.guards import LEFT, RIGHT, micrometres, nearest_count
 from cartpole_rl.errors import CartPoleError
 from cartpole_rl.rig.hardware import Hardware
 
@@ -26,12 +26,12 @@ TOUCH_ZONE = 60_000_000  # nm, distance from such a stop at which the slow searc
 SWITCH_ZONE = 120_000_000  # the same for a switch, which must not be overrun: the cart is slow before
 ASTRAY = 20_000_000  # nm, a motion the wrong way that means a reversed motor or encoder
 FAST = 6  # tenths of a turn a second of a pole that may push a driven cart: 3.8 rad/s
-LEFT, RIGHT = 1, 2  # bits of end switches
 SIDES = {LEFT: "left", RIGHT: "right", LEFT | RIGHT: "left and right"}
 RELEASED = 30_000  # um; so far inside the place where it is pressed, any switch is released
 AGAINST_STOP = 400_000  # us under full push without motion that mean a stop
 STANDS = 300_000  # nm, largest motion in that time, or one count
 LONGEST_SEARCH = 30_000_000, 20  # us for one stop; at least so many for a um of the track
+LONGEST_LEAVING = 5_000_000  # us to move off a switch, for which a second is usual
 CENTRED = 1_000_000  # nm
 LONGEST_CENTRING = 20_000_000, 5  # the same for the way to the middle
 
@@ -282,7 +282,8 @@ class Homing:
         """
         servo, window, elapsed, before = SpeedServo(self._hardware), Window(AGAINST_STOP), 0, reading
         start, rolled = reading.cart, 0.0
-        while elapsed < self._longest_search:
+        longest = LONGEST_LEAVING if switch and not until else self._longest_search
+        while elapsed < longest:
             self._check_switches(reading)
             if switch and reading.pressed & switch == until:
                 return reading
@@ -303,8 +304,9 @@ class Homing:
                 return reading
             reading = yield motor
             elapsed += reading.us
-        side, seconds = "right" if direction > 0 else "left", self._longest_search / 1e6
-        raise HomingError(f"no end found on the {side} within {seconds:.0f} s", switch)
+        side = "right" if direction > 0 else "left"
+        missed = f"end switch {SIDES[switch]}: as before" if switch else f"no end found on the {side}"
+        raise HomingError(f"{missed} after {longest / 1e6:.0f} s", switch)
 
     def centre(self, middle: int, reading: Reading) -> Procedure:
         """Move gently to the middle and switch the motor off."""

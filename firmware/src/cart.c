@@ -171,20 +171,15 @@ static void latch(cart *self, uint16_t fault)
         cart_limits_release(&self->limits); /* nobody knows where the cart is */
 }
 
-/* Counts right of the middle. A pressed switch knows the place of a cart whose counts slipped. */
-static int64_t outward(const cart *self, int32_t cart_count)
-{
-    uint8_t pressed = CART_SWITCHES & self->procedure.pressed;
-    if (pressed)
-        return (pressed & CART_LEFT ? -1 : 1) * (int64_t)cart_zeros_half_span(&self->zeros);
-    return (int64_t)cart_count - cart_zeros_middle(&self->zeros);
-}
-
 /* Let the limits of the track decide, which need the zeros of a homing. */
 static void apply_limits(cart *self, uint64_t now_us, int32_t cart_count, int32_t pole_count)
 {
-    cart_place place = {outward(self, cart_count), (int64_t)pole_count - self->pole_zero, cart_zeros_half_span(&self->zeros),
-                        self->pole_lever_um, self->armed};
+    cart_place place = {(int64_t)cart_count - cart_zeros_middle(&self->zeros),
+                        (int64_t)pole_count - self->pole_zero,
+                        cart_zeros_half_span(&self->zeros),
+                        self->pole_lever_um,
+                        self->armed,
+                        CART_SWITCHES & self->procedure.pressed};
     self->cart_count = cart_count;
     self->pole_count = pole_count;
     if (self->homing) {

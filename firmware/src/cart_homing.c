@@ -22,6 +22,7 @@
 #define AGAINST_STOP_US 400000u /* under full push without motion that mean a stop */
 #define STANDS_COUNTS AT_LEAST_ONE(300000 / CART_NANOMETRES) /* largest motion in that time: 0.3 mm */
 #define LONGEST_SEARCH_US (CART_SPAN_UM > 1500000 ? CART_SPAN_UM * 20u : 30000000u) /* for one stop */
+#define LONGEST_LEAVING_US 5000000u /* to move off a switch, for which a second is usual */
 #define CENTRED_NM 1000000
 #define LONGEST_CENTRING_US (CART_SPAN_UM > 4000000 ? CART_SPAN_UM * 5u : 20000000u)
 
@@ -131,7 +132,7 @@ static outcome touch_stop(cart_homing *homing, const cart_reading *reading, int 
                           bool pressed, int16_t *motor)
 {
     first_reading(homing, reading, AGAINST_STOP_US);
-    if (homing->elapsed_us >= LONGEST_SEARCH_US)
+    if (homing->elapsed_us >= (pressed ? LONGEST_SEARCH_US : LONGEST_LEAVING_US))
         return misses(homing, side);
     if (CART_SWITCHES && switches_lie(homing, reading->cart))
         return FAILS;

@@ -119,7 +119,10 @@ static int8_t brake(const cart_limits *limits, int64_t speed, const cart_place *
         size = of_centre;
     if (size > FASTEST)
         size = FASTEST;
-    int64_t left = (int64_t)place->half_span - CART_HARD_COUNTS - direction * place->outward;
+    int64_t counts = direction * place->outward; /* towards the end ahead */
+    if (CART_SWITCHES & place->pressed & (direction > 0 ? CART_RIGHT : CART_LEFT) && counts < place->half_span)
+        counts = place->half_span;
+    int64_t left = (int64_t)place->half_span - CART_HARD_COUNTS - counts;
     int64_t left_um = cart_floor_divide(left * CART_NANOMETRES, 1000);
     int64_t shake_um = 2 * (int64_t)place->lever_um * turning * turning / (FAST_POLE * FAST_POLE);
     int64_t lag_us = window_us(limits) / 2 + REACTION_US;

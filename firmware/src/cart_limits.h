@@ -9,6 +9,8 @@
    than the motor can hold it: by up to `lever` to each side of the common centre of mass, whose speed counts here
    if it is higher than the cart's. `shake` is twice the lever for a pole that turns 1.6 times a second or faster.
 
+   Towards an end whose switch is pressed, the cart counts as being at that end or beyond.
+
    The brake acts while the cart is armed and after that until it has come to rest: a cart that STOP, the watchdog
    or a fault leaves at speed would roll into an end stop. It never pushes a cart that stands or moves inward.
 
@@ -50,6 +52,7 @@ typedef struct {
     int32_t half_span; /* counts from the middle to a stop */
     int32_t lever_um;  /* m_p l / (m_c + m_p), with l from the pivot to the pole's centre of mass */
     bool armed;
+    uint8_t pressed; /* end switches */
 } cart_place;
 
 /* Take a sample of the raw counts, unless the newest is younger than a millisecond. */

@@ -120,6 +120,38 @@ def test_a_cart_whose_counts_slipped_is_stopped_by_a_switch(side: int) -> None:
 
 
 @each_firmware
+@pytest.mark.parametrize("side", [-1, 1])
+@pytest.mark.parametrize("both", [False, True], ids=["at the far end", "both"])
+def test_a_false_press_lets_no_cart_run_into_its_end(both: bool, side: int) -> None:
+    driven = homed(**settings_of(BOTH))
+    false = BOTH if both else LEFT if side > 0 else RIGHT
+    reads(driven, lambda x: false * (side * x > 0.08))
+    state, farthest, braked = driven.ask(Start()), 0.0, False
+    while not state.fault:
+        state = driven.ask(SetMotor(255 * side))
+    assert side * driven.cart.physics.x_dot > 0.3
+    for _ in range(100):
+        braked |= state.motor_applied == -255 * side
+        farthest = max(farthest, side * driven.x)
+        state = driven.tick()
+    assert state.fault == Fault.HARD_LIMIT | Fault(false * Fault.LEFT_SWITCH)
+    assert braked
+    assert state.motor_applied == 0
+    assert farthest < HALF
+
+
+@each_firmware
+def test_a_cart_that_does_not_leave_its_switch_ends_homing_within_seconds() -> None:
+    driven = Driven(**settings_of(LEFT))
+    reads(driven, lambda x: LEFT)
+    shake, (cart, pole) = driven.encoders.cart_counts(0.001), driven.cart._counts()
+    driven.cart._counts = lambda: (cart + shake * (driven.newest % 2), pole)
+    state = driven.home()
+    assert state.fault == Fault.HOMING | Fault.LEFT_SWITCH
+    assert driven.cart.now_us / 1e6 == pytest.approx(5, abs=0.1)
+
+
+@each_firmware
 def test_a_cart_armed_on_a_switch_faults_in_that_period() -> None:
     driven = homed(**settings_of(LEFT))
     reads(driven, lambda x: LEFT)
