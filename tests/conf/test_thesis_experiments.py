@@ -105,6 +105,7 @@ CART: Table = {
     "deadband_right": (0.0, "6.3"),
     "sigmoid_slope": (100.0, "6.3: rho"),
     "backdrivability": (1.0, "equations (3.5) and (3.6): the pole pushes the cart"),
+    "coasting": (0.0, SILENT),
     "cart_coulomb": (0.5, SILENT),
     "cart_coulomb_asymmetry": (0.0, "equation (5.8)"),
     "pole_viscous": (2.1e-4, SILENT),
