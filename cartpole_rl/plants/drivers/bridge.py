@@ -382,7 +382,6 @@ class Bridge:
         elif last is None:
             return self._refuse(f"the pole is outside plant.pole_range, at {pole}")
         else:
-            self._stand_in.lose_pole()
             turned = last.pole  # the cart's count still rules
         new = Measurement(-cart if settings.cart_reversed else cart, turned, us)
         if last is None:
@@ -391,6 +390,8 @@ class Bridge:
         if new.us == last.us:
             return self._refuse(f"its time stands still at {new.us} us")
         if self._fits(last, new, now_us - self._arrived_us, len(self._suspects)):
+            if carried is None:
+                self._stand_in.lose_pole()
             self._pole += self._turned(last, new)
             return self._accept(new, pole, now_us)
         if self._suspects and not self._fits(self._suspects[-1], new, now_us - self._arrived_us):

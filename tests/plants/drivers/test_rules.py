@@ -191,6 +191,14 @@ def test_noise_at_the_edge_of_the_dead_zone_carries_no_pole_out_of_it() -> None:
     assert set(seen[2:]) == {0}  # 3860, where the zone begins
 
 
+def test_a_damaged_line_from_the_dead_zone_is_refused_and_faults_nothing() -> None:
+    bridge = Playing(pole_range=[LOW, HIGH])
+    seen_from_start(bridge, [3800, 3840, 4000])
+    bridge._stand_in.armed = bridge._stand_in.homed = True
+    bridge._pass(Measurement(0, 4000, bridge.now - 10_000_000))
+    assert (bridge.played.bad, bridge._stand_in.fault, bridge._stand_in.armed) == (1, 0, True)
+
+
 def test_a_pole_that_is_lost_faults_an_armed_cart_which_is_still_measured() -> None:
     bridge = Playing(pole_range=[LOW, HIGH], sends="value")
     seen_from_start(bridge, [3800, 3840, *[4000] * 10])
