@@ -116,6 +116,13 @@ def test_the_environment_counts_what_the_search_for_a_reference_counted() -> Non
     assert sum(reference.replay(config, 0.0, actions).points) == pytest.approx(float(points), abs=1e-4)
 
 
+@pytest.mark.parametrize("file", sorted(truth_references.FOLDER.glob("*.json")), ids=lambda file: file.stem)
+def test_the_stored_references_are_those_of_the_carts_of_today(file: Path) -> None:
+    seed, wider = file.stem.split("_")
+    draw = truth_references.Draw(int(seed), float(wider))
+    assert all(truth_references.known_references(draw, draw.truths(len(json.loads(file.read_text())))))
+
+
 def test_zero_shot_fractions_are_relative_to_the_reference_of_the_cart(
     trained: Path, run: Run, tmp_path: Path, monkeypatch: Any
 ) -> None:
