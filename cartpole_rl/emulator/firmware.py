@@ -412,6 +412,7 @@ class Firmware:
             | (Flags.HOMING if self.homing else Flags(0))
             | (Flags.FAULTED if self.fault else Flags(0))
             | (Flags.SOFT_LIMIT if self.motor != self._line.requested else Flags(0))
+            | Flags(self._hardware.switches * Flags.LEFT_SWITCH)
         )
 
     def _frame(self, message: Message, flags: Flags | None = None) -> bytes:

@@ -187,6 +187,7 @@ def wire(settings: CartPoleSettings) -> dict[str, Any]:
             "pole_counts_per_turn": hardware.pole_counts_per_turn,
             "cart_nanometres_per_count": hardware.cart_nanometres_per_count,
             "motor_limit": LARGEST_MOTOR,
+            "switches": hardware.switches * Flags.LEFT_SWITCH,
         },
         "metres": hardware.encoders.metres,
         "turn": hardware.encoders.turn,

@@ -43,6 +43,8 @@ class Flags(IntFlag):
     FAULTED = 0x08
     SOFT_LIMIT = 0x10  # the limits hold the motor value at 0, or brake the cart, or did since the last STATE
     WATCHDOG = 0x20  # the newest accepted SET_MOTOR answers a state three periods old or older; motor 0
+    LEFT_SWITCH = 0x40  # the firmware homes by an end switch there
+    RIGHT_SWITCH = 0x80
 
 
 class Fault(IntFlag):

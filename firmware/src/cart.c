@@ -49,7 +49,8 @@ static uint8_t flags(const cart *self)
 {
     return (uint8_t)((self->armed ? CART_ARMED : 0) | (self->homed ? CART_HOMED : 0) |
                      (self->homing ? CART_HOMING : 0) | (self->fault ? CART_FAULTED : 0) |
-                     (cart_motor(self) != self->line.requested ? CART_SOFT_LIMIT : 0));
+                     (cart_motor(self) != self->line.requested ? CART_SOFT_LIMIT : 0) |
+                     CART_SWITCHES * CART_HAS_LEFT_SWITCH);
 }
 
 static size_t send(cart *self, uint8_t type, uint8_t all_flags, const uint8_t *payload, size_t length,

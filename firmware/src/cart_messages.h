@@ -27,7 +27,8 @@ enum {
     CART_HOMING = 0x04,
     CART_FAULTED = 0x08,
     CART_SOFT_LIMIT = 0x10,
-    CART_WATCHDOG = 0x20
+    CART_WATCHDOG = 0x20,
+    CART_HAS_LEFT_SWITCH = 0x40, /* times CART_RIGHT: 0x80, a right one */
 };
 
 enum {

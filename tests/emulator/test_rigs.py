@@ -77,7 +77,7 @@ def check_homes(cart: EmulatorSettings) -> None:
     """Check that both firmwares home a cart in the same way, and that its zeros are right."""
     rig = cart.hardware or nominal_hardware()
     (python, state), (c, same) = (home(cart, firmware) for firmware in ("python", "c"))
-    assert (python.flags, state.fault) == (Flags.HOMED, Fault.NONE)
+    assert (python.flags, state.fault) == (Flags.HOMED | rig.switches * Flags.LEFT_SWITCH, Fault.NONE)
     assert (same, c.info(), c.flags) == (state, python.info(), python.flags)
     info, (x, angle) = python.info(), python.measured(state)
     assert info.cart_nanometres_per_count == rig.cart_nanometres_per_count

@@ -16,6 +16,7 @@ from cartpole_rl.rig.hardware import hardware_of
 from cartpole_rl.wire import ClearFault, Fault, Flags, Hello, Home, SetMotor, SetPeriod, Start, State
 
 LEFT, RIGHT, BOTH = 1, 2, 3
+HAS_BOTH = Flags.LEFT_SWITCH | Flags.RIGHT_SWITCH
 HALF = 0.2  # m, of the emulated track; that of the rig is 0.198
 each_firmware = pytest.mark.usefixtures("each_firmware")
 
@@ -53,7 +54,7 @@ def home_from(place: float, switches: int, firmware: str, period_us: int) -> tup
 def test_both_firmwares_find_the_same_ends(switches: int, place: float, period_us: int) -> None:
     driven, state, farthest = home_from(place, switches, "python", period_us)
     c, same, _ = home_from(place, switches, "c", period_us)
-    assert (driven.flags, state.fault) == (Flags.HOMED, Fault.NONE)
+    assert (driven.flags, state.fault) == (Flags.HOMED | switches * Flags.LEFT_SWITCH, Fault.NONE)
     assert (c.flags, c.info(), same) == (driven.flags, driven.info(), state)
     half = HALF if switches == BOTH else 0.198
     middle = {BOTH: 0.0, LEFT: half - HALF, RIGHT: HALF - half}[switches]
@@ -96,7 +97,7 @@ def test_a_switch_that_lies_ends_homing(switches: int, reading: Callable[[float]
     driven = Driven(**settings_of(switches))
     reads(driven, reading)
     state = driven.home()
-    assert (driven.flags, state.motor_applied) == (Flags.FAULTED, 0)
+    assert (driven.flags & ~HAS_BOTH, state.motor_applied) == (Flags.FAULTED, 0)
     assert Fault(state.fault) == Fault.HOMING | fault
 
 
@@ -112,7 +113,9 @@ def test_a_cart_whose_counts_slipped_is_stopped_by_a_switch(side: int) -> None:
         assert abs(state.cart_counts) < driven.limits()[0]
         state = driven.ask(SetMotor(110 * side))
     assert state.fault == Fault.HARD_LIMIT | (Fault.RIGHT_SWITCH if side > 0 else Fault.LEFT_SWITCH)
-    assert driven.flags & ~Flags.SOFT_LIMIT == Flags.FAULTED  # not homed: its zeros are wrong
+    assert (
+        driven.flags == Flags.FAULTED | HAS_BOTH | driven.flags & Flags.SOFT_LIMIT
+    )  # not homed: its zeros are wrong
     assert state.motor_applied == -side * 255
     states = [driven.tick() for _ in range(50)]
     assert states[-1].motor_applied == 0

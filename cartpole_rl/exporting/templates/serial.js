@@ -213,7 +213,7 @@ class SerialCart {
     if (version !== WIRE.version) this.otherVersion = version;
     else if (name === "STATE") this.takeState({ ...message, flags });
     else if (name === "NACK" && NAMES[message.type] === "SET_MOTOR") this.refused = message;
-    else this.answers.push({ name, message, states: this.states });
+    else this.answers.push({ name, message: { ...message, flags }, states: this.states });
   }
 
   takeState(state) {
@@ -290,7 +290,8 @@ class SerialCart {
       throw new Error(this.over ?? `no cart answers: ${this.whatCame()}`);
     }
     this.connected = true;
-    const found = await this.ask("HELLO");
+    const information = await this.ask("HELLO"), { LEFT_SWITCH, RIGHT_SWITCH } = WIRE.flags;
+    const found = { ...information, switches: information.flags & (LEFT_SWITCH | RIGHT_SWITCH) };
     const other = Object.entries(WIRE.cart).filter(([name, value]) => found[name] !== value);
     const words = other.map(([name, value]) => `${name} ${found[name]}, not ${value}`).join(", ");
     if (words) throw new Error(`this cart is not of the agent's kind; it reports ${words}`);

@@ -13,7 +13,7 @@ from typing import Self
 
 from cartpole_rl.errors import LinkError, PlantError
 from cartpole_rl.plants.serial.connection import WATCHDOG_PERIODS, Connection
-from cartpole_rl.plants.serial.errors import RefusedError, check_limits, check_scales, fault_error
+from cartpole_rl.plants.serial.errors import RefusedError, check_limits, check_rig, fault_error
 from cartpole_rl.plants.serial.link import SerialLink, now
 from cartpole_rl.plants.serial.port import open_port, resolved_port
 from cartpole_rl.plants.serial.statistics import LinkStatistics
@@ -334,7 +334,7 @@ class SerialCart:
             self._tracker.measuring = True
 
     def _arm(self, message: Start | StartPolicy) -> None:
-        check_scales(self.information, self.hardware)
+        check_rig(self.information, self.flags, self.hardware)
         check_limits(self.information, self.hardware)
         self._check_round_trip()
         self._connection.request(message, Ack)

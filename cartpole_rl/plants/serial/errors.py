@@ -6,7 +6,7 @@ turn, the span of the track. A cart whose INFO has others is refused: every numb
 
 from cartpole_rl.errors import FaultError, LinkError, PlantError
 from cartpole_rl.rig.hardware import LARGEST_MOTOR, Hardware
-from cartpole_rl.wire import Fault, Info, MessageType, Nack, Reason
+from cartpole_rl.wire import Fault, Flags, Info, MessageType, Nack, Reason
 
 SPAN_TOLERANCE = 0.05  # share; homing accepts 3 %
 SHORTEST_PERIOD_US, LONGEST_PERIOD_US = 5_000, 100_000  # docs/protocol.md, SET_PERIOD
@@ -91,13 +91,23 @@ def fault_error(bits: int) -> FaultError:
     return FaultError(f"the cart latched a fault: {fault_words(bits)}")
 
 
-def check_scales(information: Info, hardware: Hardware) -> None:
-    """Raise NotReadyError if the cart's scales are not those of its file, or its period is impossible."""
+def check_rig(information: Info, flags: Flags, hardware: Hardware) -> None:
+    """Raise NotReadyError if scales or end switches are not those of the cart's file, or the period is none.
+
+    `flags` are those of a state of the cart.
+    """
     expected = {
         "cart_nanometres_per_count": hardware.cart_nanometres_per_count,
         "pole_counts_per_turn": hardware.pole_counts_per_turn,
+        "left_switch": hardware.left_switch,
+        "right_switch": hardware.right_switch,
     }
-    reported = {name: getattr(information, name) for name in expected}
+    reported = {
+        "cart_nanometres_per_count": information.cart_nanometres_per_count,
+        "pole_counts_per_turn": information.pole_counts_per_turn,
+        "left_switch": int(Flags.LEFT_SWITCH in flags),
+        "right_switch": int(Flags.RIGHT_SWITCH in flags),
+    }
     if other := [name for name in expected if reported[name] != expected[name]]:
         lines = ", ".join(f"`{name}: {reported[name]}`" for name in other)
         raise NotReadyError(

@@ -17,7 +17,7 @@ from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import ConfigError, FaultError, LinkError, PlantError, PortError
 from cartpole_rl.plants.emulated import BridgeProcess, EmulatedCart
 from cartpole_rl.plants.serial.cart import RESTARTED, SerialCart
-from cartpole_rl.plants.serial.errors import RefusedError, check_scales, fault_error
+from cartpole_rl.plants.serial.errors import RefusedError, check_rig, fault_error
 from cartpole_rl.plants.serial.preparation import (
     Confirm,
     FaultClearing,
@@ -310,9 +310,9 @@ class SerialPlant(OneCartPlant):
         return self._owned.death() if self._owned is not None else ""
 
     def _connect(self) -> None:
-        """Open the port and check the cart's scales. Raises PortError, LinkError, NotReadyError."""
+        """Open the port and check which rig the cart is. Raises PortError, LinkError, NotReadyError."""
         self.cart.open()
-        check_scales(self.cart.information, self.hardware)
+        check_rig(self.cart.information, self.cart.flags, self.hardware)
 
 
 def real_cart(

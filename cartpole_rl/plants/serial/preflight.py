@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 from cartpole_rl.errors import FaultError, PlantError
 from cartpole_rl.plants.serial.cart import RESTARTED, SerialCart
-from cartpole_rl.plants.serial.errors import NotReadyError, check_limits, check_period, check_scales
+from cartpole_rl.plants.serial.errors import NotReadyError, check_limits, check_period, check_rig
 from cartpole_rl.plants.serial.moves import (
     LEFT,
     RIGHT,
@@ -90,7 +90,7 @@ def _checks(cart: SerialCart, faults: FaultClearing) -> dict[str, Callable[[], s
     probe = Probe(cart)
     return {
         "link": lambda: link(cart),
-        "limits": lambda: limits(cart.information, cart.hardware),
+        "limits": lambda: limits(cart.information, cart.flags, cart.hardware),
         "homing": lambda: homing(cart, faults),
         "cart encoder": lambda: cart_direction(probe),
         "pole encoder": lambda: pole_direction(probe),
@@ -212,9 +212,9 @@ def link(cart: SerialCart) -> str:
     )
 
 
-def limits(information: Info, hardware: Hardware) -> str:
-    """Check that the scales and limits in INFO are those of the cart's file."""
-    check_scales(information, hardware)
+def limits(information: Info, flags: Flags, hardware: Hardware) -> str:
+    """Check that the scales, end switches and limits of the cart are those of its file."""
+    check_rig(information, flags, hardware)
     check_limits(information, hardware)
     metres = hardware.encoders.metres
     soft, hard = information.soft_limit_counts * metres, information.hard_limit_counts * metres
@@ -230,7 +230,7 @@ def homing(cart: SerialCart, faults: FaultClearing) -> str:
         faults.clear(cart, fault)
     before = cart.get_state()
     state = _homed(cart, before)
-    limits(cart.information, cart.hardware)
+    limits(cart.information, cart.flags, cart.hardware)
     turn = cart.hardware.pole_counts_per_turn
     pole, off = (
         (state.pole_counts - turn // 2) * 360 / turn,

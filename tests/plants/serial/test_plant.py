@@ -13,6 +13,7 @@ from torchrl.envs.utils import check_env_specs
 from cartpole_rl.errors import FaultError, LinkError, PortError
 from cartpole_rl.plants.serial.errors import NotReadyError
 from cartpole_rl.plants.serial.plant import SerialPlant
+from cartpole_rl.rig.hardware import nominal_hardware
 from cartpole_rl.wire import ClearFault, Fault, Flags, Frame, Home, SetMotor, Start, Stop
 
 
@@ -325,6 +326,17 @@ def test_a_cart_of_another_kind_is_never_armed(peer: CartPeer, changes: dict, wo
         SerialPlant(quick_settings(peer.port)).reset()
     assert not peer.messages(Start)
     assert not any(message.motor for message in peer.messages(SetMotor))
+
+
+def test_firmware_without_the_end_switches_of_the_file_neither_homes_nor_drives(peer: CartPeer) -> None:
+    rig = nominal_hardware().model_copy(update={"left_switch": 1})
+    with pytest.raises(NotReadyError, match="the cart reports left_switch 0, not 1"):
+        SerialPlant(quick_settings(peer.port), hardware=rig).reset()
+    assert not peer.messages(Home)
+    assert not peer.messages(Start)
+    peer.flags |= Flags.LEFT_SWITCH
+    SerialPlant(quick_settings(peer.port), hardware=rig).reset()
+    assert peer.messages(Start)
 
 
 def test_a_cart_that_restarts_is_a_lost_link(peer: CartPeer, plant: SerialPlant) -> None:

@@ -243,13 +243,11 @@ def test_a_port_that_does_not_exist() -> None:
 
 
 def test_the_lines_of_another_carts_file_are_told() -> None:
-    assert "soft 380 mm" in limits(good_limits, nominal_hardware())
+    assert "soft 380 mm" in limits(good_limits, Flags.HOMED, nominal_hardware())
     other = replace(good_limits, cart_nanometres_per_count=84980, pole_counts_per_turn=4271)
     with pytest.raises(NotReadyError) as refused:
-        limits(other, nominal_hardware())
-    assert (
-        "write `cart_nanometres_per_count: 84980`, `pole_counts_per_turn: 4271` into" in refused.value.remedy
-    )
+        limits(other, Flags.RIGHT_SWITCH, nominal_hardware())
+    assert "`pole_counts_per_turn: 4271`, `right_switch: 1` into a file" in refused.value.remedy
 
 
 @pytest.mark.parametrize("period_us", [0, 100_001])
